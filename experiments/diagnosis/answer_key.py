@@ -2,6 +2,8 @@
 README.md.
 """
 
+import functools
+
 import numpy as np
 
 from experiments.diagnosis import cases, effects, measure, plant, sensors, unknowns, vehicle
@@ -80,7 +82,7 @@ def answer_of(fleet, i, squares, floor, wrong):
         "garbage": ["garbage"],
     }
     weighed = spec["told"].weighed
-    scale = lambda n: scale_stands_in(fleet, i, n, squares, floor)
+    scale = functools.partial(scale_stands_in, fleet, i, squares=squares, floor=floor)
     return {
         "case": spec["name"],
         "category": category,

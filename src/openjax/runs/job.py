@@ -383,12 +383,10 @@ def _programs(job):
     if tried and (keep := job.keep):
         step = keep("step", step, lambda: (abstract,), carry=abstract)
         fresh = start
-        arguments = lambda: (jax.random.key(settings.seed),)
 
         def start(key):
-            return jax.jit(
-                keep("start", fresh, arguments, carry=abstract), out_shardings=shardings
-            )(key)
+            program = keep("start", fresh, lambda: (key,), carry=abstract)
+            return jax.jit(program, out_shardings=shardings)(key)
 
     # without shardings, the compiler may move a leaf, and the next call would compile again; all
     # processes can read the rest
