@@ -10,6 +10,7 @@ trained on. Game "own": the policy's; "honest": no clamp on the speed, the rate 
 import dataclasses
 import functools
 from collections import defaultdict
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -17,10 +18,11 @@ import numpy as np
 
 from experiments.diagnosis.figures import wilson
 from experiments.flying.vehicles import vehicles
-from experiments.table import Page, Table, page_parser, publish
+from experiments.table import RESULTS, Page, Table, page_parser, publish
 from openjax.command_line import run_command
 from openjax.evaluation.evaluator import layout_slots, layout_tasks, stacked
 from openjax.evaluation.validation import uniform_tasks
+from openjax.files import read_json
 from openjax.learning.best_response import make_duel
 from openjax.pursuit import (
     SCENARIOS,
@@ -131,7 +133,7 @@ def page(results: dict) -> Page:
         "worst evader, layouts": "worst.layouts",
     }
     rows = [dict(zip(of, name, strict=True)) | overview(own) for name, own in by_policy.items()]
-    parts: list[Table | str] = [Table(columns, rows, title="Overview")]
+    parts: list[Table | str] = [from_outside(), Table(columns, rows, title="Overview")]
     parts += [*told(results, "findings", "What was found"), everyone(by_policy)]
     for name, own in by_policy.items():
         if name[0] == DEFAULT_POLICY:
@@ -153,6 +155,23 @@ def page(results: dict) -> Page:
         "after the capture too."
     )
     return Page("Policies against evaders", prose, parts)
+
+
+def from_outside() -> Table:
+    """What somebody else measured with evaders of other code (evaders_outside.json)."""
+    stored = read_json(RESULTS / "evaders_outside.json")
+    places = (*SCENARIOS, "uniform")
+
+    def rate(place: str) -> Callable:
+        return lambda row: f"{row['capture_rate'][place]:.2f}".removeprefix("0")
+
+    columns = {"evaders from outside": "evader", **{place: rate(place) for place in places}}
+    prose = (
+        f"Tried from outside, at {stored['commit']} on {stored['machine']}, with evaders of other "
+        f"code: {stored['episodes_a_layout']} episodes a layout, {stored['uniform_tasks']} uniform "
+        f"tasks. {stored['note']} {stored['reading'][0]}"
+    )
+    return Table(columns, stored["rows"], "What evaders from outside find", prose)
 
 
 def told(results: dict, name: str, title: str) -> list[str]:
