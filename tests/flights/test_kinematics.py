@@ -88,6 +88,22 @@ def test_a_world_that_leans_is_found_and_put_upright():
     assert read_kinematics([corrected(t, found) for t in tracks]).findings == {}
 
 
+@pytest.mark.parametrize("missing", ["position", "velocity"])
+def test_an_upright_world_needs_no_position(missing):
+    """What was logged is turned, neighbours too; what wasn't is left alone."""
+    track = _track(tilt=np.radians(4.0))
+    found = read_kinematics([track])
+    beside = track.position + np.array([0.0, 0.0, 0.5])
+    bare = dataclasses.replace(track, neighbours=beside[None], **{missing: None})
+    upright = corrected(bare, found)
+    assert getattr(upright, missing) is None
+    logged = corrected(dataclasses.replace(track, neighbours=beside[None]), found)
+    apart = logged.neighbours[0] - logged.position
+    assert np.allclose(np.linalg.norm(apart, axis=1), 0.5)
+    assert np.allclose(apart[0], apart[-1]) and abs(apart[0, 1]) > 0.02
+    np.testing.assert_array_equal(upright.neighbours, logged.neighbours)
+
+
 def test_streams_on_clocks_that_wander_tell_no_gain():
     track = _track()
     late = np.interp(track.time + 0.12 * np.sin(track.time), track.time, track.time)

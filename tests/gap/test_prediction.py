@@ -1,6 +1,9 @@
 """The physics along several tracks at once against one track and one parameter vector at a time."""
 
+import dataclasses
+
 import numpy as np
+import pytest
 
 from openjax.flights.track import Track
 from openjax.gap.channels.instruments import Feedback
@@ -9,6 +12,7 @@ from openjax.gap.model.observer import TICKS
 from openjax.gap.model.prediction import LANES, RATES, make_physics
 from openjax.gap.model.replay import make_replay
 from openjax.vehicle import load_vehicle
+from openjax.vehicle.effects import EFFECTS
 
 
 def track_of(rows: int, seed: int) -> Track:
@@ -39,6 +43,29 @@ def test_tracks_and_parameters_that_share_a_call_are_not_mixed_up():
         assert together[number].shape == (len(theta), len(track), 9)
     assert len({channels[0, -1, 5] for channels in together}) == 3
     assert len(np.unique(together[0][:, -1, 5])) == len(theta)
+
+
+def below(height: float, ceiling_z: float | None) -> np.ndarray:
+    """Specific force (T, 3) of a vehicle at a height, m, with downwash of one .4 m above."""
+    track = track_of(200, 0)
+    track.position[:] = [0.0, 0.0, height]
+    over = np.tile([[[0.0, 0.0, height + 0.4]]], (1, 200, 1))
+    track = dataclasses.replace(track, neighbours=over, ceiling_z=ceiling_z)
+    theta = ABSENT.copy()
+    for (effect, parameter), place in PLACE.items():
+        if effect in ("downwash", "ceiling_effect"):
+            theta[place] = EFFECTS[effect].typical()[parameter]
+    ticks = [np.repeat(track.motor[:, None], TICKS, 1)]
+    return make_physics([track], [load_vehicle()], ticks).predict(theta[None])[0][0, :, 6:]
+
+
+@pytest.mark.parametrize("height", [1.25, 1.6, 3.0])
+def test_a_room_higher_than_the_arena_has_the_wakes_and_the_ceiling_that_it_has(height):
+    """Only a ceiling that somebody measured clips a height, and those who fly along likewise."""
+    free = below(0.5, 50.0)
+    np.testing.assert_allclose(below(height, None), free, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(below(height, height + 0.5), below(0.5, 1.0), rtol=1e-4, atol=1e-4)
+    assert np.abs(below(height, height + 0.5) - free).max() > 0.01
 
 
 def test_a_wrong_moment_of_inertia_turns_nothing_that_motors_hold_against():

@@ -7,8 +7,10 @@ import pytest
 
 from openjax.commands.sample_flights import main
 from openjax.errors import UserError
+from openjax.flights import samples
 from openjax.flights.case import load_case
 from openjax.flights.samples import fly, references
+from openjax.gap.model.library import CARDS
 from openjax.vehicle import load_vehicle
 from openjax.vehicle.effects import EFFECTS
 
@@ -56,6 +58,18 @@ def test_the_command_makes_a_case_that_passes_every_check(tmp_path):
     assert [p.read_bytes() for p in first] == [
         p.read_bytes() for p in second
     ]  # same seed, same bytes
+
+
+@pytest.mark.parametrize("effect", ["none", *EFFECTS])
+def test_a_sample_says_weighed_only_where_its_effect_can_still_be_named(
+    effect, tmp_path, monkeypatch, sample_columns
+):
+    """A weighed mass can't be wrong: the diagnosis doesn't try it."""
+    monkeypatch.setattr(samples, "fly", lambda *_: [sample_columns["flight_b"]])
+    main([str(tmp_path / "case"), "--effect", effect])
+    case = load_case(tmp_path / "case")
+    assert case.vehicle_file.mass_weighed == (effect != "mass")
+    assert effect == "none" or not (case.vehicle_file.mass_weighed and CARDS[effect].weighed)
 
 
 @pytest.mark.parametrize(

@@ -54,7 +54,9 @@ def make_case(arguments: Arguments) -> list[Path]:
     )
     source = f"simulated: openjax.sample_flights, seed {arguments.seed}, effect: {arguments.effect}"
     log = {"source": source, "motor_rows": "mean", "floor_z": 0.0}
-    described = dataclasses.replace(load_vehicle_file(), mass_weighed=True, log=log)
+    # On a scale a vehicle that weighs more would have shown it.
+    weighed = arguments.effect == "none" or not EFFECTS[arguments.effect].card.weighed
+    described = dataclasses.replace(load_vehicle_file(), mass_weighed=weighed, log=log)
     decimals = {c: DECIMALS.get(c, _REST) for c in LOG_COLUMNS}
     flights = references(
         arguments.seed, arguments.duration, neighbour=arguments.effect == "downwash"

@@ -111,9 +111,12 @@ def corrected(track: Track, found: Kinematics) -> Track:
         changes["body_rates"] = track.body_rates / found.gain
     if found.tilt is not None:
         turn = Rotation.from_rotvec([*-found.tilt, 0.0])
-        changes |= {name: turn.apply(getattr(track, name)) for name in ("position", "velocity")}
+        logged = [n for n in ("position", "velocity") if getattr(track, n) is not None]
+        changes |= {name: turn.apply(getattr(track, name)) for name in logged}
         attitude = turn * Rotation.from_quat(track.quaternion, scalar_first=True)
         changes["quaternion"] = attitude.as_quat(scalar_first=True)
+        if len(track.neighbours):
+            changes["neighbours"] = np.stack([turn.apply(p) for p in track.neighbours])
     return dataclasses.replace(track, **changes) if changes else track
 
 

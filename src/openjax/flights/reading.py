@@ -9,6 +9,8 @@ import hashlib
 import math
 import re
 import zlib
+from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -20,9 +22,15 @@ from openjax.flights.flight import CHANNEL_COLUMNS, Flight
 LOG_COLUMNS = ("t", "vehicle", *(c for columns in CHANNEL_COLUMNS.values() for c in columns))
 
 WHOLE = ("quaternion", "motor_command")  # channels of which a part is a mistake, not a choice
-LARGEST = (
-    256 << 20
-)  # bytes of text in one log: a quarter of an hour at 1 kHz; more is no flight log
+# What one log may hold: a quarter of an hour at 1 kHz is 256 MB of text and a million rows; the
+# micro-SD logger of the Crazyflie writes at most some hundred variables; swarms are of tens.
+LARGEST = 256 << 20  # bytes of text
+MOST_ROWS = 3_000_000
+MOST_COLUMNS = 2_000
+MOST_VEHICLES = 200
+CHUNK = 1 << 20  # bytes that are unpacked at once
+NAMES_SHOWN = 12  # of columns in one message
+QUOTED = re.compile('"([^"]*)"')
 LARGEST_VALUE = 1e6  # no sensor's reading in SI units is larger; squares of what is would overflow
 
 
@@ -43,31 +51,26 @@ class LogTable:
 
 
 def read_csv(
-    path: str | Path, delimiter: str = ",", known: tuple[str, ...] | None = LOG_COLUMNS
+    path: str | Path,
+    delimiter: str = ",",
+    known: tuple[str, ...] = LOG_COLUMNS,
+    time: str = "t",
 ) -> LogTable:
-    """Read a `.csv` or `.csv.gz` log. Columns outside `known` are left out with a remark (None
-    keeps all).
+    """Read a `.csv` or `.csv.gz` log. Columns outside `known` are left out with a remark, whatever
+    they hold; the column `time` must be there.
 
-    Raises LogError if it isn't such a file: unreadable, no header, a cell that is no number.
+    Raises LogError if it isn't such a file: unreadable, no header, a cell of a known column that is
+    no number.
     """
     path = Path(path)
     header, *lines = _text(path).split("\n")
-    names = [name.strip().strip('"') for name in header.split(delimiter)]
-    _check_header(names, delimiter, known)
+    names = [name.strip().strip('"') for name in _unquoted(header, delimiter).split(delimiter)]
+    _check_header(names, delimiter, time)
     lines, remarks = _whole_lines(lines, delimiter, len(names))
-    first = lines[0].split(delimiter)
-    kept = [
-        i
-        for i, name in enumerate(names)
-        if name
-        and name != "vehicle"
-        and (name in known if known is not None else _is_number(first[i]))
-    ]
-    unknown = [n for n in names if n and known is not None and n not in known]
+    kept = [i for i, name in enumerate(names) if name != "vehicle" and name in known]
+    unknown = [n for n in names if n and n not in known]
     if unknown:
-        remarks.append(
-            f"unknown column{'s' * (len(unknown) > 1)} left out: {', '.join(unknown[:8])}"
-        )
+        remarks.append(f"unknown column{'s' * (len(unknown) > 1)} left out: {_listed(unknown)}")
     try:
         values = np.loadtxt(
             lines, delimiter=delimiter, usecols=kept, ndmin=2, comments=None, converters=_number
@@ -98,7 +101,7 @@ def flights_of(
     """
     if "t" not in table.columns:
         raise LogError(
-            f"no column t; the log has {', '.join(table.columns)}: name it in columns.toml"
+            f"no column t; the log has {_listed(table.columns)}: name it in columns.toml"
         )
     remarks = list(table.remarks)
     read = {c: _channel(table, c, names, remarks) for c, names in CHANNEL_COLUMNS.items()}
@@ -107,6 +110,11 @@ def flights_of(
         channels["motor_command"] = channels["motor_command"][:, list(motor_permutation)]
     fingerprint = _fingerprint(channels)
     ids = list(dict.fromkeys(table.vehicle.tolist()))
+    if len(ids) > MOST_VEHICLES:
+        raise LogError(
+            f"column vehicle holds {len(ids)} ids, {_listed(ids, 3)}; it names which vehicle a row "
+            "belongs to"
+        )
     flights = []
     for vehicle_id in ids:
         rows = np.flatnonzero(table.vehicle == vehicle_id)
@@ -173,16 +181,31 @@ def write_csv(path: str | Path, table: LogTable, decimals: dict[str, int] | None
 
 
 def _text(path: Path) -> str:
-    """A file's text with line ends of one kind. Never unpacks more than LARGEST bytes."""
+    """A file's text with line ends of one kind, without blank lines at its start. Stops unpacking
+    at LARGEST bytes or MOST_ROWS lines.
+    """
+    chunks = []
+    size = 0
+    lines = 0
     try:
         with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file:
-            data = file.read(LARGEST + 1)
+            while chunk := file.read(CHUNK):
+                chunks.append(chunk)
+                size += len(chunk)
+                lines += max(chunk.count(b"\n"), chunk.count(b"\r"))
+                if size > LARGEST:
+                    raise LogError(
+                        f"holds more than {LARGEST >> 20} MB of text: no log of a flight; cut it "
+                        "into flights"
+                    )
+                if lines > MOST_ROWS:
+                    raise LogError(
+                        f"holds more than {MOST_ROWS} lines: no log of a flight; cut it into "
+                        "flights"
+                    )
     except (OSError, EOFError, zlib.error) as error:
         raise LogError(f"can't be read: {error}") from error
-    if len(data) > LARGEST:
-        raise LogError(
-            f"holds more than {LARGEST >> 20} MB of text: no log of a flight; cut it into flights"
-        )
+    data = b"".join(chunks)
     if b"\0" in data:
         raise LogError("not a text file in UTF-8")
     try:
@@ -192,29 +215,45 @@ def _text(path: Path) -> str:
     return text.replace("\r\n", "\n").replace("\r", "\n").lstrip("\n")
 
 
-def _check_header(names: list[str], delimiter: str, known: tuple[str, ...] | None) -> None:
+def _check_header(names: list[str], delimiter: str, time: str) -> None:
     if delimiter == "," and len(names) == 1 and ";" in names[0]:
         raise LogError(
             "columns are separated by ';'; the log format wants ',' (or a columns.toml with its "
             "delimiter)"
         )
+    if len(names) > MOST_COLUMNS:
+        raise LogError(
+            f"the first row has {len(names)} cells, more than {MOST_COLUMNS} columns: has the log "
+            "lost its line ends?"
+        )
     if not any(re.search("[A-Za-z]", name) for name in names):
         raise LogError("the first row holds no column names")
-    repeated = {name for name in names if name and names.count(name) > 1}
+    counts = Counter(names)
+    repeated = [name for name in names if name and counts[name] > 1]
     if repeated:
         raise LogError(f"column {min(repeated)!r} occurs more than once")
-    if known is not None and "t" not in names:
+    if time not in names:
+        asked = "t" if time == "t" else f"{time!r}, which columns.toml names for t"
         raise LogError(
-            f"no column t; the log has {', '.join(n for n in names if n)}: say in columns.toml "
+            f"no column {asked}; the log has {_listed(n for n in names if n)}: say in columns.toml "
             "which is which"
         )
+
+
+def _listed(names: Iterable[str], most: int = NAMES_SHOWN) -> str:
+    """The first names, and how many more there are."""
+    names = list(names)
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more
 
 
 def _whole_lines(lines: list[str], delimiter: str, cells: int) -> tuple[list[str], list[str]]:
     """The lines that aren't blank, and a remark where the last was cut off: power went while it was
     written.
     """
-    numbered = [(number, line) for number, line in enumerate(lines, 2) if line.strip()]
+    numbered = [
+        (number, _unquoted(line, delimiter)) for number, line in enumerate(lines, 2) if line.strip()
+    ]
     remarks = []
     if len(numbered) > 1 and numbered[-1][1].count(delimiter) + 1 < cells:
         del numbered[-1]
@@ -227,6 +266,13 @@ def _whole_lines(lines: list[str], delimiter: str, cells: int) -> tuple[list[str
     if not numbered:
         raise LogError("no rows")
     return [line for _, line in numbered], remarks
+
+
+def _unquoted(line: str, delimiter: str) -> str:
+    """A line without quotes around its cells, and without the delimiters that stand in them."""
+    if '"' not in line:
+        return line
+    return QUOTED.sub(lambda cell: cell[1].replace(delimiter, " "), line)
 
 
 def _number(cell: str) -> float:

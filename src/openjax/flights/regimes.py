@@ -3,7 +3,9 @@
 import numpy as np
 
 from openjax.flights.track import Track, smooth
+from openjax.vehicle.effects.effect import ARENA_CEILING
 
+NEAR_CEILING = 0.15  # m, as near as `low` is to the floor
 REGIMES = tuple(
     "hover fast climb low high under_neighbour low_battery high_thrust transient".split()
 )
@@ -25,7 +27,8 @@ def regimes_of(track: Track) -> dict[str, np.ndarray]:
         masks["climb"] = np.abs(track.velocity[:, 2]) > 0.3
     if track.position is not None:
         masks["low"] = track.position[:, 2] < 0.15
-        masks["high"] = track.position[:, 2] > 1.05
+        ceiling = ARENA_CEILING if track.ceiling_z is None else track.ceiling_z
+        masks["high"] = track.position[:, 2] > ceiling - NEAR_CEILING
         for other in track.neighbours:
             gap = other - track.position
             near = (gap[:, 2] > 0.05) & (np.hypot(gap[:, 0], gap[:, 1]) < 0.2)

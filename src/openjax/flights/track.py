@@ -46,6 +46,7 @@ class Track:
     motors_logged: bool = True  # False: made by the nominal rate controller from the commands
     # of logs faster than the grid: times (S,) s, mean of the motors (S,)
     fast_thrust: tuple[Array, Array] | None = None
+    ceiling_z: float | None = None  # m, what z reads at the ceiling; None: no ceiling is known
     missing: Array | None = None  # (T,) rows that weren't logged: lines between their neighbours
 
     def __len__(self) -> int:
@@ -120,6 +121,7 @@ def _on_grid(part: Flight, flight: Flight, case: Case, name: str) -> Track:
         voltage=None if voltage is None else smooth(voltage, 0.3, period),
         neighbours=np.array(neighbours) if neighbours else np.zeros((0, count, 3)),
         pose_age=part.pose_age,
+        ceiling_z=case.vehicle_file.log.get("ceiling_z"),
         fast_thrust=fast_thrust,
         missing=_missing(part.time, grid, period),
     )
@@ -234,4 +236,6 @@ def undelayed(track: Track, delay: float) -> Track:
     pose = [n for n in ("position", "quaternion", "velocity") if getattr(track, n) is not None]
     moved = {n: earlier(getattr(track, n), -delay, track) for n in pose}
     moved["quaternion"] /= np.linalg.norm(moved["quaternion"], axis=1, keepdims=True)
+    if len(track.neighbours):  # the same cameras saw them
+        moved["neighbours"] = np.stack([earlier(p, -delay, track) for p in track.neighbours])
     return replace(track, **moved)

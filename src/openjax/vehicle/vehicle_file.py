@@ -6,7 +6,7 @@ leaves out is the nominal vehicle.
 
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Any, Literal
@@ -88,6 +88,7 @@ class _Log:
     """What openjax reads of `[log]`."""
 
     floor_z: Annotated[float, Interval("[-1000, 1000]", "m")] = 0.0
+    ceiling_z: Annotated[float, Interval("[-1000, 1000]", "m")] | None = None
 
 
 @dataclass(frozen=True)
@@ -233,7 +234,8 @@ def _from_tables(plain: dict, path: Path, dtype) -> VehicleFile:
     root = f"{path}: "
     told = tables.vehicle
     motor = tables.motor
-    from_plain(_Log, {k: v for k, v in tables.log.items() if k == "floor_z"}, f"{root}log")
+    read = {f.name for f in fields(_Log)}
+    from_plain(_Log, {k: v for k, v in tables.log.items() if k in read}, f"{root}log")
     if sorted(motor.order) != sorted(NOMINAL_ORDER):
         raise UserError(
             f"{root}motor.order is {list(motor.order)}; it must name each of "

@@ -28,7 +28,9 @@ def read_log(path: Path, mapping: ColumnMapping | None = None) -> LogTable:
         return read_micro_sd(path, mapping)
     if mapping is None:
         return read_csv(path)
-    return mapping.table(path.name, read_csv(path, mapping.delimiter, known=None))
+    return mapping.table(
+        path.name, read_csv(path, mapping.delimiter, mapping.names(), mapping.time)
+    )
 
 
 def _is_csv(path: Path) -> bool:

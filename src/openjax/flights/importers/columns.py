@@ -73,6 +73,19 @@ class ColumnMapping:
     columns: dict[str, Source] = field(default_factory=dict)
     delimiter: str = ","
 
+    @property
+    def time(self) -> str:
+        """The raw name of the column that holds the time."""
+        return self.columns["t"].name if "t" in self.columns else "t"
+
+    def names(self) -> tuple[str, ...]:
+        """The raw names of a CSV that are read: those it names, and those of the log format that
+        it puts nothing in the place of.
+        """
+        usual = dict.fromkeys(c for c in LOG_COLUMNS if c not in self.columns)
+        usual = usual if not set(EULER) & set(self.columns) else _without_attitude(usual)
+        return (*usual, *(source.name for source in self.columns.values()))
+
     def over(self, usual: dict[str, Source]) -> dict[str, Source]:
         """The `usual` sources of columns, and in their place those that the mapping names; time is
         no source.

@@ -147,4 +147,6 @@ def _hidden(card, reading: Reading) -> bool:
         return True
     if (reading.blind and card.torque_axes) or (reading.pwm and card.thrust_map):
         return True
-    return card.impossible is not None and any(card.impossible(t.position) for t in reading.tracks)
+    return card.impossible is not None and any(
+        t.ceiling_z is None and card.impossible(t.position) for t in reading.tracks
+    )

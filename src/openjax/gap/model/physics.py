@@ -35,6 +35,7 @@ class Path:
     motor: jax.Array  # (T, TICKS, 4) 0..1 in the row's ticks
     voltage: jax.Array  # (T,) V, NaN where unknown
     others: jax.Array  # (T, M, 3) m
+    ceiling: jax.Array  # () m
     dt: jax.Array  # () s
 
 
@@ -62,7 +63,14 @@ def _channels(effects, parameters, theta, vehicle, path: Path):
 
     def context(position, quaternion, velocity, rates, voltage, others, speed):
         state = DroneState(position, quaternion, velocity, rates, speed, rates, rates, ())
-        return make_context(flown, state, others_position=others, battery_voltage=voltage, dt=step)
+        return make_context(
+            flown,
+            state,
+            others_position=others,
+            battery_voltage=voltage,
+            ceiling_height=path.ceiling,
+            dt=step,
+        )
 
     along = (
         path.position,

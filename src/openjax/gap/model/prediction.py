@@ -20,6 +20,7 @@ RATES = slice(0, 3)
 VELOCITY = slice(3, 6)
 FORCE = slice(6, 9)
 BUCKETS = (256, 512, 1024, 2048, 4096, 8192, 16384, 32768)
+FAR = 1e3  # m, where a ceiling does nothing
 LANES = 8  # parameter vectors along tracks that one call of the physics takes
 
 
@@ -94,11 +95,10 @@ def _path(track: Track, ticks: np.ndarray, size: int, neighbours: int) -> Path:
     quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
     # Without a pose the vehicle is taken to be in mid-air, far from everything.
     position = track.position if track.position is not None else unknown + np.array([0.0, 0.0, 0.6])
-    # Neither floor nor ceiling can be entered: a log that says so has an offset in height.
-    position = np.concatenate([position[:, :2], np.clip(position[:, 2:], 0.0, ARENA_CEILING)], 1)
+    position, *neighbours_at = (_inside(p, track.ceiling_z) for p in (position, *track.neighbours))
     velocity = track.velocity if track.velocity is not None else unknown
     # Who didn't fly along is far away.
-    others = [middle(p) for p in track.neighbours]
+    others = [middle(p) for p in neighbours_at]
     others += [np.tile(np.float32([50.0, 50.0, -50.0]), (size, 1))] * (neighbours - len(others))
     voltage = np.full(size, np.nan, np.float32) if track.voltage is None else middle(track.voltage)
     return Path(
@@ -109,8 +109,26 @@ def _path(track: Track, ticks: np.ndarray, size: int, neighbours: int) -> Path:
         padded(ticks, size),
         voltage,
         np.stack(others, 1),
+        np.float32(_ceiling(position, track.ceiling_z)),
         np.float32(track.dt),
     )
+
+
+def _inside(position: np.ndarray, ceiling_z: float | None) -> np.ndarray:
+    """Positions (T, 3) in the room. Neither floor nor a known ceiling can be entered: a log that
+    says so has an offset in height.
+    """
+    highest = np.inf if ceiling_z is None else ceiling_z
+    return np.concatenate([position[:, :2], np.clip(position[:, 2:], 0.0, highest)], 1)
+
+
+def _ceiling(position: np.ndarray, ceiling_z: float | None) -> float:
+    """Height (m) of the ceiling whose effect is tried: where none is known, the arena's, unless the
+    vehicle flew above it.
+    """
+    if ceiling_z is not None:
+        return ceiling_z
+    return ARENA_CEILING if (position[:, 2] <= ARENA_CEILING).all() else FAR
 
 
 def _integrated(rows: np.ndarray, dt: float) -> np.ndarray:
