@@ -3,6 +3,7 @@ may leave out costly passes.
 """
 
 import gc
+import importlib
 import os
 from importlib.metadata import version
 from pathlib import Path
@@ -25,6 +26,7 @@ if version("jaxlib").startswith("0.10."):
     # its way of fusing compiles three times as long; later versions know no such flag
     _flags += " --xla_cpu_use_fusion_emitters=false"
 os.environ.setdefault("XLA_FLAGS", _flags)
+importlib.import_module("openjax")  # adds the flag without which sums are wrong, if JAX needs it
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 os.environ.setdefault("JAX_PLATFORMS", "cpu")

@@ -15,6 +15,7 @@ import types
 from typing import TYPE_CHECKING
 
 from openjax.lazy import lazy_names
+from openjax.xla_flags import avoid_wrong_sums
 
 if TYPE_CHECKING:  # so that editors complete and check what is loaded on first use only
     from openjax.commands.calls import evaluate as evaluate
@@ -29,6 +30,8 @@ if TYPE_CHECKING:  # so that editors complete and check what is loaded on first 
     from openjax.store.policies import load_policy as load_policy
 
 __version__ = "0.1.0"
+
+avoid_wrong_sums()  # before JAX looks for its devices
 
 # imported on first use: `openjax diagnose --help` needn't wait for MuJoCo
 __getattr__, __dir__, __all__ = lazy_names(
