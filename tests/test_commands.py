@@ -27,7 +27,7 @@ from openjax.runs import job
 from openjax.show.metrics import read_metrics
 from openjax.store.checkpoint_files import is_checkpoint, load_arrays
 from openjax.store.checkpoints import Checkpoints
-from openjax.store.policy_files import shipped_policies
+from openjax.store.policy_files import load_policy_file, shipped_policies
 
 pytestmark = pytest.mark.slow
 
@@ -179,6 +179,50 @@ def test_killed_in_the_middle_of_a_checkpoint_and_resumed_equals_whole(
         for path in (whole_run[0], out)
     ]
     assert losses[0] == losses[1]
+
+
+@pytest.mark.parametrize("line", ["loading JAX", "compiling the first", "compiling the training"])
+def test_signal_before_the_first_update_ends_at_once_and_loses_nothing(
+    line, whole_run, tmp_path, train_arguments
+):
+    out = tmp_path / "stopped"
+    process, output = start([*train_arguments, *ALONE, "--out", str(out)])
+    while process.poll() is None and line not in _printed(output):
+        time.sleep(0.01)
+    process.terminate()
+    printed = finish((process, output), status=143)
+    assert printed.splitlines()[-1].startswith("SIGTERM: ")
+    if not (out / "settings.json").exists():
+        return
+    assert "go on with openjax train --resume" in printed and not list(out.glob(".writing-*"))
+    finish(start(["openjax.train", "--resume", str(out)]))
+    expected, _, _ = load_policy_file(whole_run[0] / "policy.npz")
+    policy, _, _ = load_policy_file(out / "policy.npz")
+    for name, array in expected.items():
+        np.testing.assert_array_equal(array, policy[name], err_msg=name)
+
+
+def test_a_start_that_is_validated_only_when_resumed_ships_the_same_policy(
+    whole_run, tmp_path, train_arguments
+):
+    out = tmp_path / "short"
+    limit = ["--minutes", "0.0001"]  # over as soon as the first flights are
+    finish(start([*train_arguments, *ALONE, *limit, "--out", str(out)]))
+    assert Checkpoints(out / "checkpoints").latest().update == 0
+    finish(start(["openjax.train", "--resume", str(out)]))
+    scores = [
+        [
+            (row["update"], row["score"])
+            for row in read_metrics(path / "metrics.jsonl", "validation")
+        ]
+        for path in (whole_run[0], out)
+    ]
+    assert scores[0] == scores[1] and scores[0][0][0] == 0
+
+
+def _printed(output):
+    """What a process has written so far to its file, whose place is left alone."""
+    return os.pread(output.fileno(), 1 << 24, 0).decode(errors="replace")
 
 
 def test_signal_saves_and_exits_cleanly(whole_run, tmp_path, train_arguments):

@@ -23,7 +23,7 @@ OVER = {"lines": 49, "branches": 10, "arguments": 62}
 experiments alone.
 """
 FLOORS = (
-    "errors lazy platform background xla_flags",
+    "errors lazy platform background xla_flags interruption",
     "files ranges kernels",
     "plain command_line",
     "vehicle show",

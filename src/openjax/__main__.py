@@ -4,8 +4,7 @@ import importlib
 import sys
 from collections.abc import Sequence
 
-from openjax import __version__
-from openjax.command_line import run_command
+from openjax import __version__, interruption
 from openjax.errors import UserError, suggestion
 
 COMMANDS = {
@@ -58,6 +57,9 @@ def entry(*command: str) -> None:
     """What the installed script `openjax` calls; with a command's name, what `python -m
     openjax.NAME` does.
     """
+    interruption.install()
+    from openjax.command_line import run_command  # takes its time, so only now
+
     run_command(lambda arguments: main([*command, *arguments]))
 
 

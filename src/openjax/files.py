@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from openjax.errors import UserError
+from openjax.interruption import undivided, unfinished
 
 LARGEST_TEXT = 16 * 2**20
 """Bytes of the largest TOML or JSON file that is read."""
@@ -21,7 +22,9 @@ DEEPEST = 32
 """Levels of nesting in a TOML or JSON file."""
 
 WRITING = ".writing-"
-"""What the names of unfinished files begin with; only a killed process leaves one behind."""
+"""What the names of unfinished files begin with; only a process that was killed (SIGKILL) leaves one
+behind.
+"""
 
 
 def read_toml(path: str | Path, what: str = "file") -> dict[str, Any]:
@@ -102,20 +105,28 @@ def replacing(path: str | Path) -> Iterator[Path]:
     path.parent.mkdir(parents=True, exist_ok=True)
     # the suffix stays the last, since some writers choose their format by it
     partial = path.with_name(f"{WRITING}{os.getpid()}-{path.name}")
-    try:
-        yield partial
-        for written in (partial, *partial.rglob("*")) if partial.is_dir() else (partial,):
-            flush(written)
-        if path.is_dir() and not path.is_symlink():
-            if not partial.is_dir():
-                raise IsADirectoryError(21, "is a folder", str(path))
+    with unfinished(partial):
+        try:
+            yield partial
+            _put_in_place(partial, path)
+        except BaseException:
+            with contextlib.suppress(OSError):
+                shutil.rmtree(partial) if partial.is_dir() else partial.unlink(missing_ok=True)
+            raise
+
+
+def _put_in_place(partial: Path, path: Path) -> None:
+    """Rename what was written to where it belongs, once it is on the disk."""
+    for written in (partial, *partial.rglob("*")) if partial.is_dir() else (partial,):
+        flush(written)
+    folder_there = path.is_dir() and not path.is_symlink()
+    if folder_there and not partial.is_dir():
+        raise IsADirectoryError(21, "is a folder", str(path))
+    with undivided():  # else neither the old folder nor the new one might be left
+        if folder_there:
             shutil.rmtree(path)
         os.replace(partial, path)
-        flush(path.parent)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            shutil.rmtree(partial) if partial.is_dir() else partial.unlink(missing_ok=True)
-        raise
+    flush(path.parent)
 
 
 def flush(path: Path) -> None:

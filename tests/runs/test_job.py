@@ -13,7 +13,7 @@ from openjax.learning import build, preset
 from openjax.pursuit import Pursuit
 from openjax.runs.job import keep_best
 from openjax.runs.options import TrainCommand
-from openjax.runs.start import prepare
+from openjax.runs.start import other_compiler, prepare
 from openjax.store.leaves import named_leaves
 from openjax.store.policy_files import load_policy_file, save_policy_file
 from openjax.store.run_directory import RunDirectory
@@ -81,3 +81,12 @@ def test_a_vehicle_that_is_known_by_name_needs_no_file_in_the_run(tmp_path):
     )
     job, _, files = prepare(command, [], 0.0, Processes())
     assert job.settings.environment.airframe == "brushless" and files == {}
+
+
+def test_a_run_that_another_jax_goes_on_with_says_so():
+    def facts(version):
+        return {"machine": {"versions": {"jax": version}}}
+
+    assert other_compiler(facts(jax.__version__)) is None
+    assert other_compiler({}) is None
+    assert f"JAX 0.9.1 so far; JAX {jax.__version__} goes on" in other_compiler(facts("0.9.1"))

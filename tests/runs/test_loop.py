@@ -15,10 +15,11 @@ import pytest
 from flax import struct
 from rich.console import Console
 
-from openjax.runs.loop import Loop, NotFiniteError, Plan, StopRequest, guarded
+from openjax.interruption import StopRequest
+from openjax.runs.loop import Loop, NotFiniteError, Plan, guarded
 from openjax.show.metrics import MetricsWriter, read_metrics
 from openjax.show.progress import Progress
-from openjax.store.checkpoint_files import is_checkpoint
+from openjax.store.checkpoint_files import is_checkpoint, load_arrays
 from openjax.store.checkpoints import Checkpoints
 from openjax.store.leaves import abstract_like, named_leaves, place
 
@@ -113,6 +114,25 @@ def test_resumed_run_equals_uninterrupted_run_and_compiles_once(tmp_path, compil
         for d in ("whole", "parts")
     ]
     assert losses[0] == losses[1]
+
+
+def test_a_start_that_was_stopped_before_its_validation_ships_the_same_policy(tmp_path, compiled):
+    """The start is the best there is; the run that was stopped finds that out when it is resumed."""
+
+    def falling(stop):
+        return lambda carry: (1.0 / (1.0 + float(carry.update)), {})
+
+    plan = {"evaluate": falling, "validate_start": True}
+    run(tmp_path / "whole", compiled, 8, **plan)
+    run(tmp_path / "parts", compiled, 8, **plan, time_limit=0.0)
+    assert Checkpoints(tmp_path / "parts" / "checkpoints").latest().score is None
+    parts = run(tmp_path / "parts", compiled, 8, resume=True, **plan)
+    records = [Checkpoints(tmp_path / name / "checkpoints").best() for name in ("whole", "parts")]
+    assert [(record.update, record.score) for record in records] == [(0, 1.0)] * 2
+    states = [load_arrays(record.path) for record in records]
+    for name, array in states[0].items():
+        np.testing.assert_array_equal(array, states[1][name], err_msg=name)
+    assert parts.update == 8
 
 
 def test_best_and_last_checkpoints_are_kept(tmp_path, compiled):

@@ -15,6 +15,7 @@ from typing import Annotated
 import tyro
 
 from openjax.command_line import output_console, parse
+from openjax.interruption import as_exception
 from openjax.ranges import Interval
 from openjax.virtual_crazyflie.link import BASE_PORT, LinkFaults
 
@@ -80,7 +81,8 @@ def main(arguments: Sequence[str]) -> None:
     try:
         real_time.hurry()
         console.print(f"listening: --uri {' '.join(virtual.uris)}")
-        virtual.run(lambda: virtual.time >= (parsed.seconds or math.inf))
+        with as_exception():
+            virtual.run(lambda: virtual.time >= (parsed.seconds or math.inf))
     except KeyboardInterrupt:
         pass
     finally:

@@ -14,6 +14,7 @@ import numpy as np
 
 from openjax.errors import UserError
 from openjax.export.c_program import CProgram
+from openjax.interruption import unfinished
 
 FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-pedantic", "-shared", "-fPIC")
 
@@ -22,7 +23,7 @@ class Compiled:
     """A compiled program. Raises UserError if the compiler refuses it."""
 
     def __init__(self, program: CProgram, name: str, compiler: str):
-        with tempfile.TemporaryDirectory() as scratch:
+        with tempfile.TemporaryDirectory() as scratch, unfinished(Path(scratch)):
             folder = Path(scratch)
             (folder / f"{name}.h").write_text(program.header, encoding="utf-8")
             (folder / f"{name}.c").write_text(program.source, encoding="utf-8")

@@ -12,6 +12,7 @@ import sys
 
 from openjax.flying.board import DEAF
 from openjax.flying.state import Request
+from openjax.interruption import settle
 
 STOP = b" qQ"
 LAND = b"lL"
@@ -56,6 +57,7 @@ class Operator:
         return self
 
     def __exit__(self, *_):
+        settle()
         self._restore.close()
 
     def _signal(self, *_):

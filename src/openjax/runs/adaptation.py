@@ -23,6 +23,7 @@ from openjax.evaluation.evaluator import episode_figures
 from openjax.evaluation.validation import selection_score, uniform_tasks
 from openjax.files import write_json, write_text
 from openjax.flights.case import load_case
+from openjax.interruption import cleaning
 from openjax.learning.adaptation import bounds_of, fine_tune, make_adaptation, starting_parameters
 from openjax.runs.machine import describe_machine
 from openjax.store.policies import load_policy
@@ -233,7 +234,8 @@ def _diagnosis(command: "AdaptCommand") -> Iterator[Callable[[], Path]]:
         return out / name / "effects.toml"
 
     try:
-        yield effects
+        with cleaning(process.terminate):
+            yield effects
     finally:
         process.terminate()
         process.wait()

@@ -13,6 +13,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from openjax import interruption
 from openjax.background import compile_ahead, in_background
 from openjax.baselines import Heuristic
 from openjax.cluster.devices import (
@@ -29,6 +30,7 @@ from openjax.errors import UserError
 from openjax.evaluation.episodes import summarise
 from openjax.evaluation.validation import Validation, flat_metrics, selection_score
 from openjax.files import write_json
+from openjax.interruption import StopRequest
 from openjax.learning import TrainSettings, build, make_start
 from openjax.learning.train_state import policy_leaf
 from openjax.policy import PolicyParameters
@@ -39,7 +41,7 @@ from openjax.runs.gradient_stages import (
     compile_last_stage,
     first_flights,
 )
-from openjax.runs.loop import Loop, NotFiniteError, Outcome, Plan, StopRequest, guarded
+from openjax.runs.loop import Loop, NotFiniteError, Outcome, Plan, guarded
 from openjax.runs.report import game_for, report
 from openjax.runs.words import closing_words
 from openjax.show.metrics import MetricsWriter
@@ -122,8 +124,12 @@ def run_job(job: TrainingJob, directory: RunDirectory, console: Console) -> int:
     if not job.processes.is_first:
         console = Console(quiet=True)
     title = f"openjax.train → {directory.path}"
-    with StopRequest() as stop, Progress(title, job.settings.total_steps, console) as progress:
+    with contextlib.ExitStack() as stack:
+        stop = stack.enter_context(StopRequest())
+        progress = stack.enter_context(Progress(title, job.settings.total_steps, console))
         run = _Run(job, directory, stop, progress)
+        stack.enter_context(interruption.cleaning(run.checkpoints.abandon))
+        stack.enter_context(interruption.telling(run.last_words))
         try:
             outcome = run.train()
         except NotFiniteError as error:
@@ -181,7 +187,8 @@ class _Run:
             self.directory.write_settings(settings, job.facts)
         over = self._over()
         if over and not self.first_update and not self.taught:
-            self.progress.message("nothing was learnt yet; ending as soon as the compiler does")
+            limit = f"the time limit came: {self.last_words()}"
+            self.progress.message(f"{limit}; ending as soon as the compiler does")
             return None
         with self._metrics() as metrics:
             self.progress.phase("compiling the training step", announce=not (done or over))
@@ -200,7 +207,14 @@ class _Run:
                 seconds=seconds + time.monotonic() - job.started,
                 everyone=self.processes.everyone,
             )
-            return loop.run(carry)
+            with self.stop.while_learning():
+                return loop.run(carry)
+
+    def last_words(self) -> str:
+        """What there is of the run, and how it goes on, should it end now."""
+        update = self.checkpoints.last_finished()
+        saved = "nothing was learnt yet" if update is None else f"saved at update {update}"
+        return f"{saved}; go on with openjax train --resume {self.directory.path}"
 
     def _plan(self, seconds):
         """What the loop is to do after so many seconds of earlier processes."""
@@ -218,7 +232,6 @@ class _Run:
         run.
         """
         settings = self.settings
-        path = self.directory.path
         signals = [name for name in self.processes.everyone(self.stop.name) if name is not None]
         if not self.processes.is_first:
             return None
@@ -230,8 +243,7 @@ class _Run:
             self.progress.phase("learning by the gradient through the simulation")
             self.progress.message(self._learn_last())
         if asked := (*signals, self.stop.name)[0]:
-            said = f"{asked}: saved at update {outcome.update}; go on with openjax train --resume {path}"
-            self.progress.message(said)
+            self.progress.message(f"{asked}: {self.last_words()}")
             return None
         return report(self.job, self.directory, self.validation(), outcome, self.progress)
 
@@ -241,12 +253,18 @@ class _Run:
         def validate(parameters):
             # the far tasks: by the uniform ones the best of many checkpoints was chosen, in part by
             # luck
-            return summarise(self.validation()(parameters)[1].evaluation)
+            return summarise(self._await_validation()(parameters)[1].evaluation)
 
         learn = self.last_stage()
-        return keep_best(
-            self.directory, learn, validate, self.settings, lambda: self.stop.name is not None
-        )
+        with self.stop.while_learning():
+            return keep_best(
+                self.directory, learn, validate, self.settings, lambda: self.stop.name is not None
+            )
+
+    def _await_validation(self):
+        """The validation, as soon as it is compiled."""
+        with self.stop.while_compiling():
+            return self.validation()
 
     def _first_flights(self):
         """The stage before MAPPO, of a run that has it still to come; else None."""
@@ -275,6 +293,14 @@ class _Run:
         checkpoints.remove_unfinished()
         if self.processes.of_first(checkpoints.any_finished()):
             carry, record = checkpoints.restore_latest(self.abstract, self.progress.message)
+            # a run that was stopped before its start was validated does that now: what it starts
+            # from may be the best there will be
+            self.taught = (
+                record.update == 0
+                and record.score is None
+                and settings.first_flights.updates > 0
+                and job.facts["start_from"] is None
+            )
             self.progress.message(f"resumed at update {record.update} of {settings.total_updates}")
             return carry, record.update, float(record.notes.get("seconds", 0.0))
         carry = start(jax.random.key(settings.seed))
@@ -350,7 +376,7 @@ class _Run:
         if not self.processes.is_first:
             return self.processes.of_first()
         uniform, far = (
-            summarise(kind.evaluation) for kind in self.validation()(own_copy(carry.policy))
+            summarise(kind.evaluation) for kind in self._await_validation()(own_copy(carry.policy))
         )
         score = selection_score(uniform, self.settings.environment.episode_length)
         return self.processes.of_first((score, {**flat_metrics(uniform, far), "score": score}))

@@ -5,7 +5,6 @@ Works on any carry; it knows nothing of what is trained.
 """
 
 import dataclasses
-import signal
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -16,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from openjax.files import write_json
+from openjax.interruption import StopRequest
 from openjax.show.metrics import MetricsWriter
 from openjax.show.progress import Progress
 from openjax.store.checkpoint_files import save_state
@@ -63,29 +63,6 @@ class Outcome:
     seconds: float
     stopped_by: str | None
     """None: all updates are done; else the signal or limit that ended it."""
-
-
-class StopRequest:
-    """SIGINT and SIGTERM ask to stop after the present update; a second SIGINT interrupts at
-    once.
-    """
-
-    def __init__(self):
-        self.name: str | None = None
-        self._previous = {}
-
-    def __enter__(self):
-        for number in (signal.SIGINT, signal.SIGTERM):
-            self._previous[number] = signal.signal(number, self._ask)
-        return self
-
-    def __exit__(self, *_):
-        for number, handler in self._previous.items():
-            signal.signal(number, handler)
-
-    def _ask(self, number, frame):
-        self.name = signal.Signals(number).name
-        signal.signal(signal.SIGINT, self._previous[signal.SIGINT])
 
 
 def guarded(step: Callable[[Any], tuple[Any, dict]]) -> Callable:

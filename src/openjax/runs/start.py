@@ -102,6 +102,8 @@ def start(
             output_console().print(opening_words(job.settings), soft_wrap=True)
         elif processes.is_first:
             remove_unfinished(directory.path)
+            if line := other_compiler(directory.read_facts()):
+                output_console().print(line, soft_wrap=True)
         processes.everyone()
         if not directory.path.is_dir():
             raise UserError(
@@ -156,6 +158,21 @@ def prepare(
     )
     job.check()
     return job, directory, {name: path for name, path in files.items() if path is not None}
+
+
+def other_compiler(facts: dict) -> str | None:
+    """What to say of a run whose last process, by its facts, had another JAX than this one; None
+    where it had the same, or nobody noted it.
+    """
+    machine = facts.get("machine")
+    versions = machine.get("versions") if isinstance(machine, dict) else None
+    before = versions.get("jax") if isinstance(versions, dict) else None
+    if before in (None, jax.__version__):
+        return None
+    return (
+        f"this run was trained by JAX {before} so far; JAX {jax.__version__} goes on with it, but "
+        "rounds differently: what follows isn't bit for bit what it would have been"
+    )
 
 
 def _files(command, resumed):

@@ -81,6 +81,13 @@ class Checkpoints:
         """Whether there is a checkpoint, damaged or not."""
         return any(is_checkpoint(path) for path in self.directory.glob("[0-9]" * _DIGITS))
 
+    def last_finished(self) -> int | None:
+        """The update of the newest checkpoint, damaged or not; by the names of files alone, so that
+        it may be asked at any time.
+        """
+        paths = self.directory.glob("[0-9]" * _DIGITS)
+        return max((int(path.name) for path in paths if is_checkpoint(path)), default=None)
+
     def load_best(
         self, name_of: Callable[[str], str | None], warn: Callable[[str], None]
     ) -> tuple[dict[str, np.ndarray], CheckpointRecord]:
@@ -117,17 +124,34 @@ class Checkpoints:
         donated.
 
         A second save of the same update is ignored: training is deterministic, the content would be
-        the same.
+        the same. Only a score that the first one lacked is worth writing it again.
         """
         self.wait()
         path = self.directory / f"{update:0{_DIGITS}d}"
-        if self._processes.of_first(is_checkpoint(path) and path.name not in self._damaged):
+        if self._processes.of_first(self._holds(path, score)):
             return
         if self._processes.is_first:
             remove_state(path)
             self._known.pop(path.name, None), self._damaged.pop(path.name, None)
         started = start_save(path, carry, {**(notes or {}), "score": score})
         self._pending = in_background(functools.partial(commit, path, started))
+
+    def _holds(self, path, score):
+        """Whether a checkpoint is there, with a score if there is one to write."""
+        if not is_checkpoint(path) or path.name in self._damaged:
+            return False
+        return score is None or any(
+            record.path == path and record.score is not None for record in self.records()
+        )
+
+    def abandon(self) -> None:
+        """Before the process is ended: let the checkpoint under way get on disk, and delete what
+        else is unfinished.
+        """
+        pending = self._pending
+        if pending is not None:
+            pending()
+        self.remove_unfinished()
 
     def wait(self) -> None:
         """Block until the checkpoint under way is on disk, then drop the ones that are no longer

@@ -1,7 +1,6 @@
 """`python -m openjax.virtual_crazyflie`: the command is `openjax.commands.virtual_crazyflie`."""
 
-from openjax.command_line import run_command
-from openjax.commands.virtual_crazyflie import main
+from openjax.__main__ import entry
 
 if __name__ == "__main__":
-    run_command(main)
+    entry("virtual_crazyflie")
