@@ -4,12 +4,16 @@ stored.
 from experiments.table import Page, Table, page_parser, publish
 
 def study(options) -> dict: ...            # what is stored, beside command, machine, commit and
-seconds def page(results) -> Page:                 # what is read from there
+seconds
+def page(results) -> Page:                         # what is read from there
     columns = {"policy": "name", "capture": "summary.capture_rate:.3f", "step": "capture_step:.0f"}
     return Page("Policies on other vehicles", "No clamp, drawn starts.", Table(columns,
     results["records"]))
 
 publish(page_parser(__doc__, "vehicles").parse_args(arguments), study, page)
+
+`--report` prints every table of what is stored. A page of results has one of them, between two
+marks, in words that somebody wrote: those stay, and the table between the marks is made anew.
 """
 
 import argparse
@@ -32,6 +36,9 @@ PLACES = ("--out", "--work", "--results", "--flights", "--commit")
 """Options that say where files lie, or what git would say."""
 RELEASE = "0.1.0"
 """Of results that don't name theirs."""
+
+MARKS = ("<!-- table -->", "<!-- end of table -->")
+"""Between them stands a page's table, which a program makes."""
 
 Column = str | Callable[[Mapping], Any]
 """Of a record: a path through it with a format, `summary.capture_rate:.3f`, or what is computed
@@ -64,15 +71,28 @@ class Table:
 
 @dataclass(frozen=True)
 class Page:
-    """A title, what was done in words, then tables or paragraphs."""
+    """A title, what was done in words, then tables or paragraphs: all that a study prints.
+
+    `table` is the one of at most ten rows that stands on the page of results; by default the first.
+    """
 
     title: str
     prose: str
     parts: Table | str | Sequence[Table | str] = ()
+    table: Table | None = None
+
+    def all_parts(self) -> Sequence[Table | str]:
+        """Tables and paragraphs in their order."""
+        return [self.parts] if isinstance(self.parts, Table | str) else self.parts
+
+    def rows(self) -> list[str]:
+        """The Markdown of the one table that stands between the marks of the page of results."""
+        chosen = self.table or next(part for part in self.all_parts() if isinstance(part, Table))
+        return Table(chosen.columns, chosen.records).lines()
 
     def lines(self, facts: Mapping) -> list[str]:
-        """The page's Markdown, at its end command, commit and machine of `facts`."""
-        parts = [self.parts] if isinstance(self.parts, Table | str) else self.parts
+        """The report's Markdown, at its end command, commit and machine of `facts`."""
+        parts = self.all_parts()
         lines = [f"# {self.title}", "", self.prose]
         for part in parts:
             lines += ["", *(part.lines() if isinstance(part, Table) else [part])]
@@ -158,8 +178,8 @@ def publish(
     page: Callable[[Any], Page],
     draw: Callable[[Any, Path], None] | None = None,
 ) -> None:
-    """Store what `study` finds (unless told to read it), then write and print the page made from
-    what is stored.
+    """Store what `study` finds (unless told to read it), print the report made from what is stored,
+    and write its page.
 
     Command, machine and seconds stand beside it; `draw` draws the page's figure.
     """
@@ -177,9 +197,23 @@ def write_page(
     results: Any,
     draw: Callable[[Any, Path], None] | None = None,
 ) -> None:
-    """Write and print the page of `results`, and draw its figure if there is one."""
-    text = "\n".join(page(results).lines(results)) + "\n"
-    write_text(out.with_suffix(".md"), text)
+    """Print the report of `results`, write its page, and draw its figure if there is one.
+
+    A page whose table stands between the marks keeps its words; any other becomes the report.
+    """
+    made = page(results)
+    report = "\n".join(made.lines(results)) + "\n"
+    path = out.with_suffix(".md")
+    written = path.read_text(encoding="utf-8") if path.exists() else ""
+    write_text(path, with_table(written, made) if MARKS[0] in written else report)
     if draw is not None:
         draw(results, out.with_suffix(".png"))
-    print(text, end="")
+    print(report, end="")
+
+
+def with_table(text: str, page: Page) -> str:
+    """A page's text, with the table between the marks as `page` has it."""
+    begin, end = MARKS
+    before, _, rest = text.partition(begin)
+    after = rest.partition(end)[2]
+    return "\n".join([before + begin, *page.rows(), end + after])

@@ -1,17 +1,64 @@
-"""The page of the effects is what their files say, and that of the flying policies what is
-stored.
+"""The page of the effects is what their files say, that of the flying policies what is stored, and
+pages of results have one form that reads at a glance.
 """
 
 import importlib.util
 import json
+import re
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from openjax.pursuit import SCENARIOS
 from openjax.vehicle.effects import EFFECTS
 
-DOCS = Path(__file__).parents[1] / "docs"
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+RESULTS = ROOT / "experiments" / "results"
+MADE = ("_build", "jupyter_execute", "measured")  # folders that building the site leaves
+PAGES = [path for path in sorted(DOCS.rglob("*.md")) if not set(MADE) & set(path.parts)]
+PAGES += [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")]
+MOST = {"words": 600, "rows": 10, "line": 400, "sentences": 3, "pictures": 1}
+"""Of a page of results: words of prose, rows of its one table, characters of a line, sentences of
+the answer, pictures.
+"""
+
+
+def prose_of(text: str) -> list[str]:
+    """Lines that are neither of a table, nor of a picture, nor of code."""
+    text = re.sub(r"^```.*?^```", "", text, flags=re.MULTILINE | re.DOTALL)
+    return [line for line in text.splitlines() if not line.lstrip().startswith(("|", "!", "<"))]
+
+
+@pytest.mark.parametrize("path", sorted(RESULTS.rglob("*.md")), ids=lambda path: path.stem)
+def test_results_have_one_form(path):
+    """A question, an answer of at most three sentences, one short table, one picture, how sure.
+
+    Seeds, cores, commits and further tables belong into the JSON beside the page.
+    """
+    text = path.read_text(encoding="utf-8")
+    title, question, answer = text.split("\n\n")[:3]
+    assert title.startswith("# ") and question.endswith("?"), "title, then the question"
+    assert "\n## How sure\n" in text
+    sentences = re.findall(r"[.!?](?=\s|$)", answer)
+    assert len(sentences) <= MOST["sentences"], answer
+    tables = re.findall(r"(?:^\|.*\n)+", text, re.MULTILINE)
+    assert len(tables) == 1, "one table; `--report` prints the others"
+    assert tables[0].count("\n") - 2 <= MOST["rows"]
+    assert len(re.findall(r"^!\[", text, re.MULTILINE)) <= MOST["pictures"]
+    words = re.findall(r"\S*[^\W\d_]\S*", "\n".join(prose_of(text)))
+    assert len(words) <= MOST["words"], len(words)
+
+
+@pytest.mark.parametrize(
+    "path",
+    [*PAGES, *sorted(RESULTS.rglob("*.md"))],
+    ids=lambda path: f"{path.parent.name}/{path.stem}",
+)
+def test_lines_of_prose_are_short(path):
+    for line in prose_of(path.read_text(encoding="utf-8")):
+        assert len(line) <= MOST["line"], line
 
 
 def test_page_of_the_effects_is_made_from_their_files():
@@ -27,7 +74,7 @@ def test_page_of_the_effects_is_made_from_their_files():
 
 def test_policies_that_fly_are_as_stored():
     """Mean of the six layouts, of each policy with each kind of vehicle."""
-    results = Path(__file__).parents[1] / "experiments" / "results" / "vehicles.json"
+    results = RESULTS / "vehicles.json"
     policies = json.loads(results.read_text(encoding="utf-8"))["policies"]
     page = (DOCS / "policies_that_fly.md").read_text(encoding="utf-8")
 

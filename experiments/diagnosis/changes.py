@@ -94,28 +94,39 @@ def cut(record: dict) -> float:
     return max(record["truth"].get("mm", {"": 0.0}).values())
 
 
-def figures_of(records: list[dict]) -> str:
+def figures_of(records: list[dict]) -> Table:
     """How often the answers are right."""
-
-    def share(what: str, chosen: list[dict], right) -> str:
-        return f"* {what}: {sum(map(right, chosen))} of {len(chosen)}"
-
     samples = [r for r in records if r["vehicle"] == "sample"]
     real = [r for r in records if r["vehicle"] != "sample"]
-    quiet = [r for r in real if r["truth"]["cause"] in ("none", "tape")]
-    found = [r for r in real if cut(r) and r["changed"]]
+    rows = []
+
+    def count(what: str, chosen: list[dict], right) -> None:
+        rows.append({"what": what, "right": sum(map(right, chosen)), "of": len(chosen)})
+
     sampled = [r for r in samples if r["truth"]["cause"] != "none"]
-    lines = [
-        share("sample flights with an effect: it is named first", sampled,
-              lambda r: r["effects"][:1] == [r["truth"]["cause"]]),
-        share("sample flights without: no change", [r for r in samples if r not in sampled], lambda r: not r["changed"]),
-        share("real, normal flights of another day and tape: no change", quiet, lambda r: not r["changed"]),
-        share("real, a propeller cut by 4 mm or more: changed", [r for r in real if cut(r) >= 4], lambda r: r["changed"]),
-        share("real, cut by less: changed", [r for r in real if 0 < cut(r) < 4], lambda r: r["changed"]),
-        share("real, cuts that were found: the rotors are among those named", found,
-              lambda r: set(r["truth"]["rotors"]) <= set(r["rotors"])),
-    ]  # fmt: skip
-    return "\n".join(lines)
+    count(
+        "sample flights with an effect: it is named first",
+        sampled,
+        lambda r: r["effects"][:1] == [r["truth"]["cause"]],
+    )
+    plain = [r for r in samples if r not in sampled]
+    count("sample flights without: no change", plain, lambda r: not r["changed"])
+    quiet = [r for r in real if r["truth"]["cause"] in ("none", "tape")]
+    count(
+        "real, normal flights of another day and tape: no change",
+        quiet,
+        lambda r: not r["changed"],
+    )
+    deep = [r for r in real if cut(r) >= 4]
+    count("real, a propeller cut by 4 mm or more: changed", deep, lambda r: r["changed"])
+    shallow = [r for r in real if 0 < cut(r) < 4]
+    count("real, cut by less: changed", shallow, lambda r: r["changed"])
+    count(
+        "real, cuts that were found: the rotors are among those named",
+        [r for r in real if cut(r) and r["changed"]],
+        lambda r: set(r["truth"]["rotors"]) <= set(r["rotors"]),
+    )
+    return Table({"flights": "what", "right": "right:d", "of": "of:d"}, rows)
 
 
 def page(results: dict) -> Page:

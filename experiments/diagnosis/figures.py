@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from experiments.table import table
+from experiments.table import Table, table
 
 # figure -> what it says
 FIGURES = {
@@ -118,6 +118,24 @@ def figures_table(lines: list[dict]) -> list[str]:
     found = [figures([r for r in lines if r["set"] == s]) for s in sets]
     rows = [[what, *(cell(f[key]) for f in found)] for key, what in FIGURES.items()]
     return table(["figure", *sets], [row for row in rows if set(row[1:]) != {"–"}])
+
+
+SHOWN = (
+    "first", "nothing_else", "false_unknown", "none", "pairs", "unknown", "wrong_name", "garbage",
+    "coverage", "calibration",
+)  # fmt: skip
+"""What stands on the page of results; `--report` prints the rest."""
+
+
+def shown(lines: list[dict]) -> Table:
+    """The page's table: counts, a column for each set."""
+    sets = sorted({r["set"] for r in lines})
+    found = {s: figures([r for r in lines if r["set"] == s]) for s in sets}
+    rows = []
+    for key in SHOWN:
+        cells = {s: cell(f[key]).partition(" ")[0] for s, f in found.items()}
+        rows.append({"figure": FIGURES[key], **cells})
+    return Table({name: name for name in ("figure", *sets)}, rows)
 
 
 def misses(lines: list[dict]) -> list[str]:

@@ -92,7 +92,8 @@ def page(results: dict) -> Page:
         "\n".join(part(results["cases"])) for part in (figures.figures_table, figures.misses)
     )
     misses += results.get("history", "")
-    return Page("The exam of the diagnosis", prose, [table, f"## Misses\n\n{misses}"])
+    parts = [table, f"## Misses\n\n{misses}"]
+    return Page("The exam of the diagnosis", prose, parts, figures.shown(results["cases"]))
 
 
 def main() -> None:

@@ -9,6 +9,7 @@ trained on. Game "own": the policy's; "honest": no clamp on the speed, the rate 
 
 import dataclasses
 import functools
+import math
 from collections import defaultdict
 from collections.abc import Callable
 
@@ -154,7 +155,7 @@ def page(results: dict) -> Page:
         "count to the end of the 8 s, "
         "after the capture too."
     )
-    return Page("Policies against evaders", prose, parts)
+    return Page("Policies against evaders", prose, parts, summary_table(by_policy))
 
 
 def from_outside() -> Table:
@@ -172,6 +173,21 @@ def from_outside() -> Table:
         f"tasks. {stored['note']} {stored['reading'][0]}"
     )
     return Table(columns, stored["rows"], "What evaders from outside find", prose)
+
+
+def summary_table(by_policy: dict[tuple, list[dict]]) -> Table:
+    """What stands on the page: evaders from outside, then this package's own scripted ones."""
+    outside = from_outside()
+    records = by_policy.get((DEFAULT_POLICY, "honest", "nominal"), [])
+    rows = list(outside.records)
+    trained = [name for name in SCRIPTED if name not in HELD_OUT]
+    for name, evaders in (("six that no training met", HELD_OUT), ("the other six", trained)):
+        least = {}
+        for place in (*SCENARIOS, "uniform"):
+            cell = [r for r in records if r["tasks"] == place and r["evader"] in evaders]
+            least[place] = min((r["capture_rate"] for r in cell), default=math.nan)
+        rows.append({"evader": f"own scripted evaders, {name}", "capture_rate": least})
+    return Table(outside.columns, rows)
 
 
 def told(results: dict, name: str, title: str) -> list[str]:

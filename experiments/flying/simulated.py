@@ -354,8 +354,45 @@ def page(results) -> Page:
         "on at the end": "armed:d", "longest end (s)": "longest:.1f", "nearest two (m)": "nearest:.2f",
     }  # fmt: skip
     return Page(
-        "Faults where they happen, in simulated time", prose, Table(columns, results["summary"])
+        "Faults where they happen, in simulated time",
+        prose,
+        Table(columns, results["summary"]),
+        by_group(results["summary"]),
     )
+
+
+SHOWN = {
+    "the camera sends something wrong, late or nothing": ("camera",),
+    "... its drift, which the estimator on board follows": ("camera drifts, the",),
+    "poses, gyroscope or packets are lost or wrong": ("poses", "packets", "gyroscope"),
+    "processes stop": ("loop", "links", "guard"),
+    "the policy is silent, stuck or wild": ("policy",),
+    "a battery, a link or a drone fails, a key": ("battery", "drone", "link lost", "key"),
+    "all processes stand still for a while": ("all processes",),
+}
+"""Rows of the page, by how the kinds begin; the longest beginning counts."""
+
+
+def by_group(rows: list[dict]) -> Table:
+    """The page's table: kinds of one source together."""
+    starts = {start: group for group, own in SHOWN.items() for start in own}
+    grouped: dict[str, list[dict]] = {group: [] for group in SHOWN}
+    for row in rows:
+        if row["kind"] in KINDS:
+            start = max((s for s in starts if row["kind"].startswith(s)), key=len)
+            grouped[starts[start]].append(row)
+    added = ("faults", "well", "out", "fell", "hard", "armed")
+    records = [
+        {"group": group, "farthest": max(r["farthest"] for r in own)}
+        | {name: sum(r[name] for r in own) for name in added}
+        for group, own in grouped.items()
+        if own
+    ]
+    columns = {
+        "what fails": "group", "flights": "faults:d", "as they must": "well:d", "out by more than .1 m": "out:d",
+        "farthest (m)": "farthest:.2f", "fell": "fell:d", "down hard": "hard:d", "on at the end": "armed:d",
+    }  # fmt: skip
+    return Table(columns, records)
 
 
 if __name__ == "__main__":

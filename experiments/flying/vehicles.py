@@ -13,7 +13,7 @@ import functools
 import jax
 import numpy as np
 
-from experiments.table import Page, Table, cell, page_parser, publish
+from experiments.table import Column, Page, Table, cell, page_parser, publish
 from openjax.command_line import run_command
 from openjax.evaluation.episodes import make_evaluate, summarise
 from openjax.evaluation.evaluator import layout_slots, layout_tasks, stacked
@@ -135,7 +135,24 @@ def page(results: dict) -> Page:
         "and poses 10 ms late, drag of .0125 N s/m; family: the vehicles of the preset flight, "
         "half of them rare ones. " + results.get("note", ""),
         Table({"policy": "policy", "vehicle": "vehicle", "tasks": "tasks", **FIGURES}, rows),
+        over_layouts(results),
     )
+
+
+def over_layouts(results: dict) -> Table:
+    """A row per policy: captures and crashes with each kind of vehicle, mean over the layouts."""
+    columns: dict[str, Column] = {"policy": "policy"}
+    rows = []
+    for name, kinds in results["policies"].items():
+        row: dict = {"policy": name}
+        for kind, found in kinds.items():
+            layouts = [summary for tasks, summary in found.items() if tasks in SCENARIOS]
+            for word, figure in (("captures", "capture_rate"), ("crashes", "crash_rate")):
+                head = f"{kind}: {word}"
+                row[head] = float(np.mean([summary[figure] for summary in layouts]))
+                columns[head] = lambda r, head=head: f"{r[head]:.3f}"
+        rows.append(row)
+    return Table(columns, rows)
 
 
 def main(arguments: list[str]) -> int:

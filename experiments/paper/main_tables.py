@@ -63,7 +63,21 @@ def page(results: dict) -> Page:
                 "Mean distance to the true one over all steps, seen or not; speed clamp.",
             ),
         ),
+        captures(results),
     )
+
+
+def captures(results: dict) -> Table:
+    """The page's table: a row per method, ours / the paper's capture rate in each layout."""
+    rows = []
+    for method in METHODS:
+        row = {"method": method}
+        for record in cells(results, [method], "clamp", LAYOUTS):
+            ours = float(np.mean(record["capture_rate"]))
+            paper = f"{record['paper'][0][0]:.2f}" if record["paper"] else "–"
+            row[record["layout"]] = f"{ours:.2f} / {paper}"
+        rows.append(row)
+    return Table({name: name for name in ("method", *LAYOUTS)}, rows)
 
 
 def cells(

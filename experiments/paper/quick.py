@@ -16,6 +16,7 @@ import os
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -144,7 +145,42 @@ def page(results: dict) -> Page:
         )
     parts.append("\n".join(f"* {found}" for found in results.get("findings", ())))
     prose = f"{results['preset']} Each cell: capture rate, seconds to the capture, crash rate. {results.get('note', '')}"
-    return Page("The quick preset: what two CPU cores learn", prose, parts)
+    todays = [run for run in results["runs"] if "recipe" not in run]
+    return Page(
+        "The quick preset: what two CPU cores learn", prose, parts, Table(SHOWN, todays[:MOST])
+    )
+
+
+def _layout(figure: str, of: Callable):
+    """A column: the least or most of a figure over the six layouts."""
+
+    def show(run):
+        return f"{of(r[figure] for r in run.get('after', []) if r['scenario'] in SCENARIOS):.2f}"
+
+    return show
+
+
+def _rate(scenario: str, figure: str):
+    """A column: a figure of one kind of task."""
+
+    def show(run):
+        (record,) = (r for r in run["after"] if r["scenario"] == scenario)
+        return f"{record[figure]:.2f}"
+
+    return show
+
+
+MOST = 10
+"""Rows of the page."""
+SHOWN = {
+    "seed": "seed",
+    "JAX": "jax",
+    "whole command, s": "whole_command",
+    "new tasks caught": _rate("validation", "capture_rate"),
+    "... crash, in every step of the physics": "every_physics_step.crash_rate:.2f",
+    "least caught in a layout": _layout("capture_rate", min),
+    "crash in `random`": _rate("random", "crash_rate"),
+}
 
 
 def _column(kind, scenario):

@@ -15,6 +15,9 @@ from experiments.table import Page, Table, spread
 
 RADII = (0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.5)
 SPEEDS = (1.0, 1.2, 1.3, 1.4, 1.6, 1.8, 2.0, 2.3, 2.6)
+SHOWN_RADII = (0.2, 0.25, 0.3)
+SHOWN_SPEEDS = (1.3, 2.0, 2.6)
+"""What stands on the page; `--report` prints all."""
 RADIUS = 0.3
 SPEED = 1.3
 """Of the training."""
@@ -71,7 +74,24 @@ def page(results: dict) -> Page:
         "Capture rate (standard "
         "deviation over seeds) / capture step. The paper shows both as figures without numbers.",
         (*parts, "![Capture rate and step over radius and speed](sweeps.png)"),
+        shown(methods),
     )
+
+
+def shown(methods: dict[str, list[dict]]) -> Table:
+    """The page's table: capture rates of three radii and three speeds, mean over the seeds."""
+    rows = []
+    for method, seeds in methods.items():
+        row = {"method": method}
+        for axis, values, unit, chosen in (
+            ("radius", RADII, "m", SHOWN_RADII),
+            ("speed", SPEEDS, "m/s", SHOWN_SPEEDS),
+        ):
+            for value in chosen:
+                rates = [seed[axis]["capture_rate"][values.index(value)] for seed in seeds]
+                row[f"{value} {unit}"] = f"{np.mean(rates):.2f}"
+        rows.append(row)
+    return Table({name: (lambda row, name=name: row[name]) for name in rows[0]}, rows)
 
 
 def at(axis: str, i: int):

@@ -3,7 +3,7 @@
 import json
 import sys
 
-from experiments.table import Page, Table, page_parser, publish
+from experiments.table import Page, Table, page_parser, publish, write_page
 
 
 def test_results_name_the_command_without_their_own_places_and_the_commit(tmp_path, monkeypatch):
@@ -37,6 +37,19 @@ def test_results_name_the_command_without_their_own_places_and_the_commit(tmp_pa
     written = (tmp_path / "page.md").read_text()
     assert written.startswith("# Things\n\n3 of them.\n\n| number |\n| --- |\n| 3 |\n\nMade with ")
     assert f"(abc) by `{results['command']}` on " in written
+
+
+def test_words_of_a_page_stay_and_its_table_is_made_anew(tmp_path, capsys):
+    path = tmp_path / "page.md"
+    path.write_text("# Words\n\n<!-- table -->\n| old |\n<!-- end of table -->\n\nMore words.\n")
+    number = {"number": "number"}
+    made = Page("Things", "", [Table(number, [{"number": 1}])], Table(number, [{"number": 2}]))
+    write_page(tmp_path / "page", lambda results: made, {"command": "make things"})
+    table = "| number |\n| --- |\n| 2 |"
+    assert path.read_text() == (
+        f"# Words\n\n<!-- table -->\n{table}\n<!-- end of table -->\n\nMore words.\n"
+    )
+    assert "| 1 |" in capsys.readouterr().out  # the report has what the page has not
 
 
 def test_cells_of_records():

@@ -26,7 +26,7 @@ from experiments.flying.single_thread import share_out
 from experiments.flying.worlds.game import play
 from experiments.flying.worlds.plant import PlantWorld, rng_of
 from experiments.flying.worlds.rotorpy import RotorPyWorld
-from experiments.table import Page, Table, page_parser, publish
+from experiments.table import Column, Page, Table, page_parser, publish
 from openjax.evaluation.evaluator import layout_slots
 from openjax.pursuit import SCENARIOS, scenario_task
 from openjax.pursuit.evaders import HELD_OUT
@@ -52,6 +52,8 @@ SIZES = {
 }
 """Of the causes, in the plant's own unit."""
 CAUSES = tuple(f"plant:{effect}" for effect in SIZES)
+WORST = 4
+"""Causes with rows of their own on the page."""
 FIGURES = ("captured", "capture_step", "collision_rate", "crashed", "over_speed_rate")
 
 
@@ -186,7 +188,52 @@ def page(results: dict) -> Page:
         "code), also with each of its causes at three quarters of its range; rotorpy: RotorPy's "
         "own Crazyflie.",
         Table(columns, rows),
+        overview(results["records"]),
     )
+
+
+def overview(records: dict) -> Table:
+    """A row per world, columns of captures and crashes by policy, mean over the layouts; of the
+    plant's causes only the worst, and their mean.
+    """
+
+    def mean(policy: str, world: str, figure: str) -> float:
+        layouts = records[policy].get(world, {})
+        return float(np.mean([r[figure] for r in layouts.values()])) if layouts else math.nan
+
+    worlds_flown = dict.fromkeys(world for worlds in records.values() for world in worlds)
+    shown = [world for world in worlds_flown if ":" not in world]
+    rows = []
+    for world in shown:
+        rates = {(p, f): mean(p, world, f) for p in records for f in ("captured", "crashed")}
+        rows.append({"world": world, **rates})
+    causes = [world for world in worlds_flown if ":" in world]
+    first = next(iter(records))
+    if causes:
+        rates = {
+            (first, f): float(np.mean([mean(first, w, f) for w in causes]))
+            for f in ("captured", "crashed")
+        }
+        rows.append({"world": f"plant, mean of {len(causes)} causes", **rates})
+        worst = sorted(causes, key=lambda world: -mean(first, world, "crashed"))[:WORST]
+        for world in worst:
+            rates = {(first, f): mean(first, world, f) for f in ("captured", "crashed")}
+            rows.append({"world": world.replace(":", ", "), **rates})
+    columns: dict[str, Column] = {"world": "world"}
+    for policy in records:
+        for word, figure in (("captures", "captured"), ("crashes", "crashed")):
+            columns[f"{policy}: {word}"] = _format((policy, figure))
+    return Table(columns, rows)
+
+
+def _format(key: tuple[str, str]) -> Column:
+    """A column of the rate that stands under `key`, or a dash."""
+
+    def show(row: dict) -> str:
+        rate = row.get(key, math.nan)
+        return f"{rate:.3f}" if math.isfinite(rate) else "–"
+
+    return show
 
 
 def main() -> None:
