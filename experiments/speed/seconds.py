@@ -186,16 +186,7 @@ def page(results: dict) -> Page:
         "most crash": "whole.most:.2f",
     }
     prose = f"Uniform validation tasks. An update is the median of a run's. {results['note']}"
-    for start in dict.fromkeys(run["start"] for run in rows):
-        for kept in ("all", "nothing"):
-            own = [
-                run
-                for run in rows
-                if (run["start"], run["kept"]) == (start, kept) and run["validations"][1:]
-            ]
-            seconds = [run["reached"]["seconds"] if run["reached"] else np.inf for run in own]
-            if len(own) > 2 and np.isfinite(np.median(seconds)):
-                prose += f" `{start}` with {kept} kept: {np.median(seconds):.1f} s in the median of {len(own)} runs."
+    prose += medians(rows)
     goals = {name: name for name in ("figure", "goal", "value", "machine", "page or command")}
     parts = [Table(goals, results.get("goals", []), "Goals"), Table(columns, rows, "Runs")]
     shown = [
@@ -208,6 +199,25 @@ def page(results: dict) -> Page:
         [*parts, *results.get("tried", [])],
         Table(short, shown),
     )
+
+
+def medians(rows: list[dict]) -> str:
+    """A sentence for each start that three runs or more caught from, with all or nothing kept."""
+    prose = ""
+    for start in dict.fromkeys(run["start"] for run in rows):
+        for kept in ("all", "nothing"):
+            own = [
+                run
+                for run in rows
+                if (run["start"], run["kept"]) == (start, kept) and run["validations"][1:]
+            ]
+            seconds = [run["reached"]["seconds"] if run["reached"] else np.inf for run in own]
+            if len(own) > 2 and np.isfinite(np.median(seconds)):
+                prose += (
+                    f" `{start}` with {kept} kept: {np.median(seconds):.1f} s in the median of "
+                    f"{len(own)} runs."
+                )
+    return prose
 
 
 def main(arguments: list[str]) -> int:
