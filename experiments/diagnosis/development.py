@@ -20,8 +20,9 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.diagnosis import truth
+from experiments.diagnosis import decisions, truth
 from experiments.diagnosis.figures import figures_table, misses
+from experiments.diagnosis.healthy import healthy_beside
 from experiments.diagnosis.magnitudes import parameters
 from experiments.flying.single_thread import use_single_thread
 
@@ -51,6 +52,9 @@ def diagnose(job: tuple) -> dict:
     """The line of one case."""
     global _done
     place, folder, answer, options = job
+    options = dict(options)
+    kept = options.pop("kept", None)
+    healthy = options.pop("healthy", False)
     true = truth.truth_of(answer)
     start = time.perf_counter()
     report = None
@@ -62,7 +66,10 @@ def diagnose(job: tuple) -> dict:
         from openjax.gap.diagnosis import diagnose_case
 
         try:
-            report = diagnose_case(load_case(folder), **options).to_dict()
+            if healthy:
+                options["reference"] = [load_case(healthy_beside(folder.parent) / folder.name)]
+            made = diagnose_case(load_case(folder), **options)
+            report = made.to_dict()
         except UserError as refusal:
             error = str(refusal).replace(f"{folder.parent}/", "")[
                 :500
@@ -79,7 +86,9 @@ def diagnose(job: tuple) -> dict:
     line |= {"top": truth.top_probability(right, (report or {}).get("probabilities", {}))}
     line |= {"severity": answer.get("severity"), "magnitudes": parameters(answer, report)}
     line |= {"seconds": seconds, "first": _done == 1, "error": error, "traceback": trace}
-    kept = (
+    if kept and report:
+        decisions.keep(made, line, Path(kept))
+    fields = (
         "probabilities",
         "shares",
         "parameters",
@@ -89,7 +98,7 @@ def diagnose(job: tuple) -> dict:
         "quality",
         "residual",
     )
-    return line | {k: report[k] for k in kept if report and k in report}
+    return line | {k: report[k] for k in fields if report and k in report}
 
 
 def run(jobs: list[tuple], cores: int, out: Path, seconds: float | None) -> None:
@@ -132,14 +141,17 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--engine-options", type=json.loads, default={}, metavar="JSON")
     parser.add_argument("--seconds", type=float, help="stop then; what is done counts")
     parser.add_argument("--report", nargs="+", type=Path, default=[], help="tables of stored lines")
+    parser.add_argument("--healthy", action="store_true", help="use DIR_healthy as references")
+    parser.add_argument("--kept", type=Path, help="where `decisions` are stored")
     options = parser.parse_args(arguments)
+    more = {"healthy": options.healthy, "kept": str(options.kept) if options.kept else None}
     if options.sets:
         done = (
             {(r["set"], r["case"]) for r in read_lines([options.out])}
             if options.out.exists()
             else ()
         )
-        jobs = find_jobs(options.sets, options.engine_options)
+        jobs = find_jobs(options.sets, options.engine_options | more)
         jobs = [job for job in jobs if (job[0], job[1].name) not in done]
         if jobs:
             run(jobs, options.cores, options.out, options.seconds)

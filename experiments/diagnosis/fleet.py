@@ -86,6 +86,7 @@ class Fleet:
         for (spec, _), columns, own in zip(self.variants, self.columns, causes_of, strict=True):
             sensors.apply_nuisances(p, columns, spec["sensors"])
             real.apply(spec.get("form_errors"), p, columns)
+            p["rotor_gain"][:, columns] *= np.array(spec.get("day", np.ones(4)))[:, None]
             said = []
             for i, cause in enumerate(own):
                 rng = cases.case_rng(self.seed, self.column, spec["number"], 2, i)

@@ -2,6 +2,7 @@
 
     python -m experiments.diagnosis.generate --seed 1 --count 60 --logs OUT/logs --answers
     OUT/answers.json [--jobs 8] [--column stranger] [--only single,none]
+    [--healthy]
 
 Prints the SHA-256 of the answers. In one pass a case is flown with four sizes of its cause; the one
 whose gap, by the plant's own measure, comes nearest to the severity drawn is kept.
@@ -19,6 +20,7 @@ import numpy as np
 
 from experiments.diagnosis import answer_key, cases, effects, measure, unknowns
 from experiments.diagnosis.fleet import Fleet, bodies, write_case
+from experiments.diagnosis.healthy import write_healthy
 from experiments.flying.single_thread import use_single_thread
 
 SIZES = 4
@@ -40,7 +42,9 @@ def _variants(spec):
 
 def fly_chunk(job):
     """Fly, choose and write a list of cases; returns their answers."""
-    seed, column, specs, folder = job
+    seed, column, specs, folder, healthy = job
+    if healthy:
+        write_healthy(seed, column, specs, folder)
     drawn = {s["name"]: bodies(seed, column, s) for s in specs}
     tried = [(s, key, own) for s in specs for key, own in _variants(s).items()]
     first = Fleet(seed, column, [(s, own) for s, _, own in tried], drawn)
@@ -123,11 +127,15 @@ def in_processes(do, work, jobs):
             yield from pool.imap_unordered(do, work)
 
 
-def generate(seed, column, count, logs, jobs=1, only=None):
-    """All cases; writes the logs and returns the answers, sorted by case."""
+def generate(seed, column, count, logs, jobs=1, only=None, healthy=False):
+    """All cases, and their reference flights if they are to be `healthy`; writes the logs and
+    returns the answers, sorted by case.
+    """
     specs = cases.draw_cases(seed, column, count, only)
     size = max(1, min(CHUNK, math.ceil(len(specs) / jobs)))
-    work = [(seed, column, specs[i : i + size], Path(logs)) for i in range(0, len(specs), size)]
+    work = [
+        (seed, column, specs[i : i + size], Path(logs), healthy) for i in range(0, len(specs), size)
+    ]
     answers = []
     start = time.perf_counter()
     for part in in_processes(fly_chunk, work, jobs):
@@ -163,6 +171,7 @@ def main():
     parser = case_parser(__doc__)
     parser.add_argument("--column", choices=list(cases.COLUMN), default="known")
     parser.add_argument("--count", type=int, default=60)
+    parser.add_argument("--healthy", action="store_true", help="also LOGS_healthy: references")
     parser.add_argument("--only", help="categories, comma-separated: " + ", ".join(cases.SHARES))
     options = parser.parse_args()
     use_single_thread()
@@ -170,7 +179,13 @@ def main():
         parser.error("--answers must not lie inside --logs")
     only = options.only.split(",") if options.only else None
     answers = generate(
-        options.seed, options.column, options.count, options.logs, options.jobs, only
+        options.seed,
+        options.column,
+        options.count,
+        options.logs,
+        options.jobs,
+        only,
+        options.healthy,
     )
     print("sha256", write_answers(options.answers, answers, options.seed, options.column))
 

@@ -1,7 +1,7 @@
 """The whole diagnosis of one case: evidence, selection, shares, words, report."""
 
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +12,7 @@ from openjax.gap.intervals import estimates
 from openjax.gap.model.bounds import BOUND
 from openjax.gap.model.library import CARDS, library, path_of
 from openjax.gap.probabilities import probabilities
+from openjax.gap.reference import differs, joined, read_reference
 from openjax.gap.report import Report
 from openjax.gap.residual import Check, check_residual
 from openjax.gap.selection import DETECTABLE, Selection, select
@@ -19,13 +20,17 @@ from openjax.gap.shares import Split, split
 from openjax.gap.where import locate
 
 
-def diagnose_case(case: Case, without: Iterable[str] = (), progress=None) -> Report:
+def diagnose_case(
+    case: Case, without: Iterable[str] = (), progress=None, reference: Sequence[Case] = ()
+) -> Report:
     """Diagnose the flights of a case, `without` effects that the library must do without;
-    `progress(text)` is called as the work goes on. Raises UserError where the flights are too short
-    or hold no commands.
+    `progress(text)` is called as the work goes on. `reference`: flights of the same vehicle while
+    nothing was wrong with it, a case for each day; told is then what changed since. Raises
+    UserError where the flights are too short or hold no commands.
     """
     begin = time.perf_counter()
-    evidence = gather(case, library(without), progress)
+    baseline = read_reference(joined(reference), progress) if reference else None
+    evidence = gather(case, library(without), progress, baseline)
     if progress:
         progress("trying every effect that the flights can show")
     return replace(conclude(evidence), seconds=time.perf_counter() - begin)
@@ -35,7 +40,12 @@ def conclude(evidence: Evidence) -> Report:
     """The report that the evidence supports."""
     selection = select(evidence)
     acting = {e: selection.probability(e) for e in selection.effects}
-    acting |= {e: p for channel in evidence.channels for e, p in channel.named().items()}
+    acting |= {
+        e: p
+        for channel in evidence.channels
+        for e, p in channel.named().items()
+        if differs(channel, e, evidence.baseline)
+    }
     check = check_residual(evidence, selection.fit)
     parts = split(evidence, selection, check.predicted, [e for e, p in acting.items() if p >= 0.5])
     present = {e: acting[e] for e in parts.effects}

@@ -1,6 +1,6 @@
 """Everything that a case's flights say about causes, before any decision, channel by channel."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from openjax.errors import UserError
 from openjax.flights.flight import Case
@@ -12,6 +12,7 @@ from openjax.gap.channels.pose import Pose, read_pose
 from openjax.gap.channels.radio import read_radio
 from openjax.gap.channels.rate_loop import read_rate_loop, with_motors
 from openjax.gap.decision import DECISION
+from openjax.gap.model.baseline import Baseline
 from openjax.gap.model.library import CARDS, Library
 from openjax.gap.model.replay import Replay
 
@@ -29,14 +30,18 @@ class Evidence:
     sensors: Kinematics
     channels: tuple[Channel, ...]
     motion: Motion
+    baseline: Baseline | None = None
 
     @property
     def replay(self) -> Replay:
         return self.motion.replay
 
 
-def gather(case: Case, library: Library, progress=None) -> Evidence:
-    """Read a case by all its channels. Raises UserError where no stretch of flight is long
+def gather(
+    case: Case, library: Library, progress=None, baseline: Baseline | None = None, reference=False
+) -> Evidence:
+    """Read a case by all its channels. `baseline`: what the vehicle is like while nothing acts;
+    `reference`: these flights are to tell that. Raises UserError where no stretch of flight is long
     enough.
     """
     tell = progress or (lambda text: None)
@@ -51,10 +56,12 @@ def gather(case: Case, library: Library, progress=None) -> Evidence:
         radio = read_radio(tracks, library, rows_are_samples(case))
     arrived = None if radio is None else radio.arrived
     reading = make_reading(case, library, tracks, vehicles, arrived, sensors)
+    reading = replace(reading, baseline=baseline, reference=reference)
     loop = None if radio is None else read_rate_loop(reading)
     tell("replaying the flights")
     channels = tuple(c for c in (pose, radio, loop) if c is not None)
-    return Evidence(case, library, tracks, vehicles, sensors, channels, read_motion(reading, loop))
+    motion = read_motion(reading, loop)
+    return Evidence(case, library, tracks, vehicles, sensors, channels, motion, baseline)
 
 
 def _tracks(case: Case) -> tuple[list[Track], list]:

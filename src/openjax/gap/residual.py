@@ -68,7 +68,11 @@ def check_residual(evidence: Evidence, fit: SetFit) -> Check:
     """Whether a fit leaves no more than what cases without an unknown cause leave."""
     residuals = residuals_of(fit)
     measured, excess = measure(evidence, residuals)
-    p_value, name = conformal_p(measured)
+    p_value, name = (
+        conformal_p(measured)
+        if evidence.baseline is None
+        else changed_p(measured, evidence.baseline.measures)
+    )
     predicted = excess if p_value <= DECISION.unknown else np.zeros(9)
     return Check(measured, HORIZONS.get(name, (0.0, ""))[1], p_value, predicted)
 
@@ -137,6 +141,20 @@ def _path_against_accelerometer(track: Track) -> np.ndarray:
     """
     apart = track.specific_force - specific_force_of(track.quaternion, track.velocity, track.dt)
     return np.cumsum(apart - apart.mean(0), 0) * track.dt
+
+
+def changed_p(measured: dict[str, float], before: dict[str, float]) -> tuple[float, str]:
+    """As `conformal_p`, against the same vehicle's reference: by the measure that grew most. What
+    known causes and other flights make it grow by has an exponential tail.
+    """
+    grown = {
+        n: float(np.log(v / max(before[n], 1e-12))) for n, v in measured.items() if n in before
+    }
+    if not grown:
+        return 1.0, ""
+    name = max(grown, key=lambda n: grown[n])
+    rate = np.log(1.0 / DECISION.unknown) / DECISION.left_over
+    return float(np.exp(-rate * max(grown[name], 0.0))), name
 
 
 def conformal_p(measured: dict[str, float]) -> tuple[float, str]:

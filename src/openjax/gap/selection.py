@@ -1,33 +1,42 @@
-"""Which physics effects act: a search that climbs one score, then the most plausible set that isn't
-clearly worse.
+"""Which physics effects act: all small sets weighed by the model linearised, the best of them
+fitted, then the most plausible set that isn't clearly worse.
 
 The score of a set of effects is its log predictive density on stretches left out (Vehtari, Gelman,
-Gabry 2017) plus the log prior odds of its effects. A move takes one effect in, out, or puts it in
-another's place, and is made only if the score rises, so the search ends. Chosen is the set of the
+Gabry 2017) plus the log prior odds of its effects. Chosen is the set of the
 largest prior odds among those that these flights can't tell from the best: the difference is within
 two standard errors, or too small to matter (the one-standard-error rule of Breiman et al. 1984,
 with a region of practical equivalence). How often each set is chosen when blocks of flight are
 weighed anew by a Bayesian bootstrap is its probability; named is the most probable one.
 """
 
+from __future__ import annotations
+
 from collections import Counter
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import combinations
 
 import numpy as np
 
 from openjax.gap.decision import DECISION
 from openjax.gap.evidence import Evidence
-from openjax.gap.model.cross_validation import Judged, judge, promise
+from openjax.gap.model.cross_validation import Judged, judge, promise, screened
 from openjax.gap.model.hypotheses import SetFit, fit_set
 from openjax.gap.model.library import CARDS, places
-from openjax.gap.model.table import Table, build, with_effects
+from openjax.gap.model.table import Model, Table, build, with_effects
 
 # Nats that an effect of usual size must promise: its gain is then expected at two standard errors,
 # as the gain of a true effect is half the square of what it does, and its standard error that
 # square's root.
 DETECTABLE = 2.0 * DECISION.standard_errors**2
-TRIED = 2  # neighbours of each kind that are fitted in full
+NOTHING = frozenset()
+LARGEST = 3  # effects of a set
+# Sets that are fitted in full, of those that the model promises as linearised around nothing, and
+# then around the best of these.
+FITTED = 10
+FITTED_AGAIN = 6
+SCREENED = 4  # times as many are weighed with bounded nuisances before that
+SIMPLER = 2  # of the best sets, those without one of their effects are fitted as well
 DRAWS = 400  # of the bootstrap
 ROUNDS = 10  # of the chosen set's last fit, between which nuisances are worked out anew
 
@@ -61,6 +70,7 @@ class Selection:
     effects: tuple[str, ...]
     weights: dict[frozenset, float]
     equivalent: dict[str, list[str]]
+    search: Search
 
     @property
     def fit(self) -> SetFit:
@@ -75,7 +85,8 @@ class Selection:
 def select(evidence: Evidence) -> Selection:
     """Choose among the physics effects that the flights can show."""
     search = Search(evidence, testable(evidence))
-    search.climb(search.nothing)
+    search.enumerate(search.nothing, FITTED)
+    search.enumerate(search.best, FITTED_AGAIN)
     weights = search.weights()
     chosen = search.visited[max(weights, key=weights.get)]
     without = {e: search.of_set(set(chosen.effects) - {e}, chosen.fit) for e in chosen.effects}
@@ -87,7 +98,7 @@ def select(evidence: Evidence) -> Selection:
         chosen, fit=fit_set(chosen.fit.replay, chosen.effects, chosen.fit.theta, rounds=ROUNDS)
     )
     table = build(chosen.fit, {})
-    return Selection(chosen, table, ordered, weights, search.equivalents(chosen, ordered))
+    return Selection(chosen, table, ordered, weights, search.equivalents(chosen, ordered), search)
 
 
 def testable(evidence: Evidence) -> dict[str, SetFit]:
@@ -131,6 +142,11 @@ def matters(squares: np.ndarray, floor: np.ndarray, nothing: np.ndarray):
     )
 
 
+def log_odds(effects) -> float:
+    """The log prior odds of a set of effects."""
+    return sum(CARDS[e].log_odds for e in effects)
+
+
 def possible(fit: SetFit) -> bool:
     """Whether all fitted parameters lie within physical bounds."""
     found = fit.parameters()
@@ -155,8 +171,7 @@ class Search:
         key = frozenset(fit.effects)
         if key not in self.visited:
             table = build(fit, None)
-            odds = sum(CARDS[e].log_odds for e in key)
-            self.visited[key] = Hypothesis(fit, judge(table, with_effects(table)), odds)
+            self.visited[key] = Hypothesis(fit, judge(table, with_effects(table)), log_odds(key))
         return self.visited[key]
 
     def of_set(self, effects, near: SetFit) -> Hypothesis:
@@ -171,35 +186,42 @@ class Search:
             start[places((new,))] = self.singles[new].theta[places((new,))]
         return self.of_fit(fit_set(near.replay, [e for e in CARDS if e in key], start))
 
-    def climb(self, here: Hypothesis) -> Hypothesis:
-        """Move to the best neighbour while the score rises and flights tell the two apart."""
-        while True:
-            better = [h for h in self.neighbours(here) if h.score > here.score and possible(h.fit)]
-            better = [h for h in better if self.clearly_worse(here, h)]
-            if not better:
-                return here
-            here = max(better, key=lambda h: h.score)
-
-    def neighbours(self, here: Hypothesis) -> list[Hypothesis]:
-        """The most promising neighbours, screened by the model linearised here and fitted in full:
-        sets with one effect more, with another in one's place, and of those the ones of larger
-        prior odds, which need not score as high.
+    def enumerate(self, near: Hypothesis, most: int) -> None:
+        """Fit and judge the most promising sets of up to LARGEST effects that weren't visited yet,
+        by the model linearised around the hypothesis `near`, and what is left of each when one of
+        its effects goes.
         """
-        effects = frozenset(here.effects)
-        table = build(here.fit, self.singles)
-        more = {effects | {new}: ((new,), ()) for new in table.step}
-        instead = {
-            effects - {old} | {new}: ((new,), (old,)) for new in table.step for old in effects
-        }
-        odds = {s: sum(CARDS[e].log_odds for e in s) for s in (effects, *instead)}
-        simpler = {s: change for s, change in instead.items() if odds[s] > odds[effects]}
-        sets = []
-        for kind in (more, instead, simpler):
-            line = {s: promise(table, with_effects(table, *change)) for s, change in kind.items()}
-            sets += sorted(line, key=lambda s: -line[s])[:TRIED]
-        alone = sorted(table.step, key=lambda e: -self.singles[e].score)[:TRIED]
-        sets += [effects | {e} for e in alone]
-        return [self.of_set(s, here.fit) for s in dict.fromkeys(sets)]
+        table = build(near.fit, self.singles)
+        models = {key: self._model(table, key) for key in self.sets()}
+
+        def ranked(keys, promise_of):
+            score = {
+                k: promise_of(table, models[k]) - len(models[k].free) + log_odds(k) for k in keys
+            }
+            return [k for k in sorted(keys, key=lambda k: -score[k]) if score[k] > score[NOTHING]]
+
+        likely = ranked(models, screened)[: SCREENED * most]
+        best = ranked([NOTHING, *(k for k in likely if k != NOTHING)], promise)
+        chosen = [key for key in best if key not in self.visited][:most]
+        chosen += [key - {effect} for key in best[:SIMPLER] for effect in key]
+        for key in dict.fromkeys(chosen):
+            self.of_set(key, near.fit)
+
+    def _model(self, table: Table, key: frozenset) -> Model:
+        """A set in the table of another one."""
+        before = set(table.fit.effects)
+        come, gone = ([e for e in CARDS if e in change] for change in (key - before, before - key))
+        return with_effects(table, come, gone)
+
+    def sets(self) -> list[frozenset]:
+        """All sets of up to LARGEST effects that may act."""
+        sizes = range(LARGEST + 1)
+        return [frozenset(s) for n in sizes for s in combinations(self.singles, n)]
+
+    @property
+    def best(self) -> Hypothesis:
+        """Of the visited sets that are possible the one of the largest score."""
+        return max((h for h in self.visited.values() if possible(h.fit)), key=lambda h: h.score)
 
     def clearly_worse(self, other: Hypothesis, best: Hypothesis) -> bool:
         """Whether flights tell a hypothesis from the best one, and it leaves a gap so much larger

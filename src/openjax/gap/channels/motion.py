@@ -14,6 +14,7 @@ from openjax.flights.kinematics import Kinematics
 from openjax.flights.track import GRID_PERIOD, Track
 from openjax.gap.channels.instruments import caused_by_commands, read_feedback
 from openjax.gap.channels.rate_loop import ROW_DELAY, RateLoop
+from openjax.gap.model.baseline import FORM, Baseline
 from openjax.gap.model.hypotheses import SetFit, fit_set, fit_singles, model_noise
 from openjax.gap.model.library import CARDS, Library, numbers_of
 from openjax.gap.model.observer import TICKS
@@ -33,7 +34,8 @@ class Reading:
     without commands; `pwm`: motors are duty cycles; `at_once`: a row's motors are one sample, as
     the vehicle file's [log] says by motor_rows = "sample"; `blind`: what motors do within a row
     isn't known; `late` s: by how much they may be off against the gyroscope, None where that isn't
-    known either.
+    known either; `baseline`: what the vehicle is like while nothing acts, None where that isn't
+    known; `reference`: whether that is what these flights are to tell.
     """
 
     library: Library
@@ -45,13 +47,30 @@ class Reading:
     at_once: bool
     blind: bool
     late: float | None
+    baseline: Baseline | None = None
+    reference: bool = False
 
     @property
     def numbers(self):
         situation = (
             "nuisance_duty" if self.pwm else "nuisance_samples" if self.blind else "nuisance"
         )
-        return numbers_of(situation, self.vehicles[0])
+        usual = numbers_of(situation, self.vehicles[0])
+        if self.reference:  # which fits them
+            return tuple(n for n in usual if n[0] not in FORM)
+        if self.baseline is None:
+            return usual
+        known = self.baseline.numbers
+        told = {n[:2] for n in known}
+        return (*known, *(n for n in usual if n[:2] not in told))
+
+    @property
+    def unmapped(self) -> bool:
+        """Whether it isn't known what thrust a motor command makes: of duty cycles without a
+        reference, or without the voltage that changes it.
+        """
+        volts = all(t.voltage is not None for t in self.tracks)
+        return self.pwm and (self.baseline is None or not volts) and not self.reference
 
     @property
     def heard(self) -> list[Track]:
@@ -91,9 +110,9 @@ def make_reading(
     slow = shortest > 0.8 * GRID_PERIOD  # faster logs are averaged
     seldom = max(t.dt for t in tracks) > SLOW_ROWS * GRID_PERIOD
     at_once = rows_are_samples(case) and slow and all(t.motors_logged for t in tracks)
-    hidden = (not slow and GRID_PERIOD / shortest < FEW_ROWS) or any(
-        f.body_rates_derived for f in case.flights
-    )
+    means = case.vehicle_file.log.get("motor_rows") == "mean"  # declared, not taken for granted
+    few = not means and not slow and GRID_PERIOD / shortest < FEW_ROWS
+    hidden = few or any(f.body_rates_derived for f in case.flights)
     blind = hidden or (at_once and (arrived is None or seldom))
     late = None if blind or seldom else ROW_DELAY[0 if slow else 1]
     pwm = case.vehicle_file.motor.command == "pwm"
@@ -133,7 +152,9 @@ def read_motion(reading: Reading, loop: RateLoop | None) -> Motion:
         ]
     feedback = read_feedback(tracks, reading.vehicles, reading.by_commands)
     clocks = sensors.one_clock, reading.at_once
-    replay = make_replay(tracks, reading.vehicles, ticks, feedback, reading.numbers, *clocks)
+    replay = make_replay(
+        tracks, reading.vehicles, ticks, feedback, reading.numbers, clocks, reading.baseline
+    )
     replay, exposure = model_noise(replay, library)
     exposure |= {e: 0.0 for e in library.physics if _hidden(CARDS[e], reading)}
     return Motion(replay, library, exposure)
@@ -145,7 +166,7 @@ def _hidden(card, reading: Reading) -> bool:
     """
     if card.needs and any(getattr(t, card.needs) is None for t in reading.tracks):
         return True
-    if (reading.blind and card.torque_axes) or (reading.pwm and card.thrust_map):
+    if (reading.blind and card.torque_axes) or (reading.unmapped and card.thrust_map):
         return True
     return card.impossible is not None and any(
         t.ceiling_z is None and card.impossible(t.position) for t in reading.tracks

@@ -13,14 +13,15 @@ from openjax.gap.model.table import Model, Table
 
 @dataclass(frozen=True, eq=False)
 class Judged:
-    """A model on stretches left out: `nats` (B,) minus half the whitened sum of squares, `squares`
-    (B, K) of the errors of logged channels, `taken` (B, N) of the shared nuisances.
+    """A model on stretches left out: `nats` (B,) minus half the whitened sum of squares, a block's
+    own nuisances marginalised; `squares` (B, K) of the errors of logged channels, `taken` (B, N) of
+    the shared nuisances.
     """
 
     nats: np.ndarray
     squares: np.ndarray
     taken: np.ndarray
-    left: np.ndarray  # (M,) whitened residuals, block after block
+    left: np.ndarray  # (M,) whitened residuals and own nuisances, block after block
     starts: np.ndarray  # (B,) where each block begins
 
 
@@ -59,11 +60,20 @@ class Equations:
         return out
 
 
+def screened(table: Table, model: Model) -> float:
+    """`promise` with nuisances of any size, which costs next to nothing."""
+    own = [0, *model.parts]
+    hessian = table.reduced[np.ix_(model.free, model.free)] + model.precision
+    push = table.reduced[model.free][:, own].sum(1) + model.precision @ model.mean
+    square = table.reduced[np.ix_(own, own)].sum()
+    return float(0.5 * push @ np.linalg.solve(hessian, push) - 0.5 * square)
+
+
 def promise(table: Table, model: Model) -> float:
     """Log posterior of a model at its best, fitted to all blocks, up to what all of a table share:
     what screening needs.
     """
-    sums = table.marginal.sum(0)
+    sums = table.total
     own = [0, *model.parts]
     hessian, push, found = Equations(table, model).solve(sums)
     square = sums[np.ix_(own, own)].sum()
@@ -73,7 +83,7 @@ def promise(table: Table, model: Model) -> float:
 def left_out(table: Table, model: Model) -> np.ndarray:
     """Coefficients (B, C) of a model on each block, fitted to all others."""
     equations = Equations(table, model)
-    sums = table.marginal.sum(0)
+    sums = table.total
     others = (equations.solve(sums - block)[2] for block in table.marginal)
     return np.array([equations.coefficients(found, k) for k, found in enumerate(others)])
 
@@ -81,7 +91,11 @@ def left_out(table: Table, model: Model) -> np.ndarray:
 def judge(table: Table, model: Model) -> Judged:
     """The model on each block, fitted to all others."""
     found = left_out(table, model)
-    left = [u @ columns for u, columns in zip(found, table.columns, strict=True)]
+    # |y - Nv|^2 + |v|^2 at its least is y'(I + NN')^-1 y: what a block's nuisances take costs.
+    left = [
+        np.concatenate([u @ columns, u[table.own]])
+        for u, columns in zip(found, table.columns, strict=True)
+    ]
     return Judged(
         np.array([-0.5 * (r @ r) for r in left]),
         _squares(table, found),

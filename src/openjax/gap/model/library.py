@@ -76,9 +76,9 @@ def places(effects) -> np.ndarray:
     return np.array([PLACE[e, p.name] for e in effects for p in CARDS[e].fitted], int)
 
 
-def prior(effects) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Indices (p,), mean (p,) and precision (p, p) of the parameters of a set of physics
-    effects.
+def prior(effects, absent: np.ndarray = ABSENT) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Indices (p,), mean (p,) and precision (p, p) of the parameters of a set of physics effects,
+    for a vehicle that has `absent` (P,) while nothing acts.
     """
     index = []
     mean = []
@@ -90,4 +90,5 @@ def prior(effects) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         block = np.diag([p.spread**2 for p in card.fitted]) + card.common**2
         blocks.append(block - BALANCE * block.mean() if card.balanced else block)
     precision = np.linalg.inv(block_diag(*blocks)) if blocks else np.zeros((0, 0))
-    return np.array(index, int), np.array(mean), precision
+    index = np.array(index, int)
+    return index, np.array(mean) + (absent - ABSENT)[index], precision

@@ -7,7 +7,7 @@ flight.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -43,7 +43,7 @@ class Replay:
     physics: Physics
     measured: list[np.ndarray]  # (T, 9)
     nominal: list[np.ndarray]  # (T, 9)
-    nuisances: list[np.ndarray]  # (N, T, 9), in units of their standard deviations
+    columns: list[np.ndarray]  # (N, T, 9) nuisances, each of its usual size
     nuisance_names: tuple[str, ...]
     sizes: list[
         np.ndarray
@@ -54,10 +54,19 @@ class Replay:
     loudness: tuple[np.ndarray, ...] | None = (
         None  # (T', 9) of each track, in units of the noise models
     )
+    absent: np.ndarray = field(default_factory=ABSENT.copy)  # (P,) the vehicle while nothing acts
+    mixing: np.ndarray | None = None  # (N, N) of `columns` to independent ones
 
     @property
     def tracks(self) -> tuple[Track, ...]:
         return self.physics.tracks
+
+    @cached_property
+    def nuisances(self) -> list[np.ndarray]:
+        """(N, T, 9) of each track, in units of their standard deviations."""
+        if self.mixing is None:
+            return self.columns
+        return [np.tensordot(self.mixing, c, 1) for c in self.columns]
 
     @cached_property
     def flights(self) -> tuple[str, ...]:
@@ -98,12 +107,12 @@ class Replay:
         motors that hold against it.
         """
         places = [PLACE[key[:2]] for key in self.numbers] + [len(theta) - 2, len(theta) - 1]
-        nuisances = []
+        columns = []
         moved = (column[1:] for column in self.linearised(theta, places))
-        for m, old, size in zip(moved, self.nuisances, self.sizes, strict=True):
+        for m, old, size in zip(moved, self.columns, self.sizes, strict=True):
             own = np.concatenate([m, m[-1:]]) * size[:, None, None]
-            nuisances.append(np.concatenate([own, old[len(own) :]]))
-        return replace(self, nuisances=nuisances)
+            columns.append(np.concatenate([own, old[len(own) :]]))
+        return replace(self, columns=columns)
 
     def whiten(self, x: np.ndarray, track: int) -> np.ndarray:
         """x (..., T, 9) of a track -> (..., T', 9) in units of the noise, without the first
@@ -150,14 +159,17 @@ class Replay:
 
 
 def make_replay(
-    tracks, vehicles, motor_ticks, feedback, numbers, one_clock=True, at_once=False
+    tracks, vehicles, motor_ticks, feedback, numbers, clocks=(True, False), baseline=None
 ) -> Replay:
     """Replay of tracks with their nominal vehicles and motor commands (T, TICKS, 4) of the rate
     loop's ticks. `feedback` of each track: what it made of the motors may be anything in strength
-    and lag. `at_once`: motor commands are single samples, whose quick part and time within a row
-    aren't known. Without `one_clock` the IMU's stream and the motors' are apart by unknown times:
-    the IMU counts nothing, and the motors may be off by tens of milliseconds.
+    and lag. `clocks` are `one_clock` and `at_once`. Without the former the IMU's stream and the
+    motors' are apart by unknown times: the IMU counts nothing, and the motors may be off by tens of
+    milliseconds. With the latter motor commands are single samples, whose quick part and time
+    within a row aren't known. `baseline`: what the vehicle is like while nothing acts.
     """
+    one_clock, at_once = clocks
+    absent = ABSENT if baseline is None else baseline.theta
     usable = np.ones(9)
     if any(t.velocity is None for t in tracks):
         usable[VELOCITY] = 0.0
@@ -170,7 +182,7 @@ def make_replay(
             0.0  # motors made from commands tell the thrust, not how a real loop shares it out
         )
     physics = make_physics(tracks, vehicles, motor_ticks)
-    nominal = [p[0] for p in physics.predict(ABSENT[None])]
+    nominal = [p[0] for p in physics.predict(absent[None])]
     named = [
         columns_of(track, path, p, made, at_once)
         for track, path, p, made in zip(tracks, physics.paths, nominal, feedback, strict=True)
@@ -198,9 +210,23 @@ def make_replay(
         numbers,
         usable,
         tuple(first_noise(a, i, d) for (a, i), d in zip(GROUPS, FIRST_NOISE, strict=True)),
-    )
-    replay = replay.around(ABSENT)
-    return replace(replay, nuisances=[_balanced(n, len(numbers)) for n in replay.nuisances])
+        absent=absent.copy(),
+    ).around(absent)
+    if baseline is None:
+        return replace(replay, columns=[_balanced(c, len(numbers)) for c in replay.columns])
+    return _known(replay, baseline)
+
+
+def _known(replay: Replay, baseline) -> Replay:
+    """With what the reference knows of the nuisances: taken off what was measured, and their joint
+    distribution.
+    """
+    names = replay.nuisance_names
+    mean = np.array([baseline.mean.get(n, 0.0) for n in names])
+    measured = [
+        y - np.tensordot(mean, c, 1) for y, c in zip(replay.measured, replay.columns, strict=True)
+    ]
+    return replace(replay, measured=measured, mixing=baseline.mixing(names))
 
 
 def _balanced(nuisances: np.ndarray, count: int) -> np.ndarray:

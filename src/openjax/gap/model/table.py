@@ -19,7 +19,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from openjax.gap.model.hypotheses import SetFit
-from openjax.gap.model.library import ABSENT, CARDS, places, prior
+from openjax.gap.model.library import CARDS, places, prior
 from openjax.gap.model.replay import FORCE, SKIP, block_count
 
 # s of the predictions whose errors are the gap; "acceleration" is the velocity that the
@@ -67,6 +67,18 @@ class Table:
         return np.linalg.solve(inside + np.eye(len(self.own)), self.white[:, self.own])
 
     @cached_property
+    def total(self) -> np.ndarray:
+        """(C, C): `marginal` of all blocks together."""
+        return self.marginal.sum(0)
+
+    @cached_property
+    def reduced(self) -> np.ndarray:
+        """(C, C): `total` with the shared nuisances marginalised as well."""
+        shared = self.nuisances[self.shared]
+        inside = self.total[np.ix_(shared, shared)] + np.eye(len(shared))
+        return self.total - self.total[:, shared] @ np.linalg.solve(inside, self.total[shared])
+
+    @cached_property
     def marginal(self) -> np.ndarray:
         """`white` with a block's own nuisances marginalised (Frisch, Waugh, Lovell)."""
         return self.white - self.white[:, :, self.own] @ self.taken
@@ -96,7 +108,7 @@ def build(fit: SetFit, singles: dict[str, SetFit] | None) -> Table:
     for effect in (*others, *own):
         point = fit.theta.copy()
         at = places((effect,))
-        point[at] = ABSENT[at] if effect in own else singles[effect].theta[at]
+        point[at] = replay.absent[at] if effect in own else singles[effect].theta[at]
         points.append(point)
     columns = fit.columns if singles is None else replay.linearised(fit.theta, index)
     moved = (
@@ -152,7 +164,7 @@ def with_effects(table: Table, add=(), drop=()) -> Model:
     or go.
     """
     kept = tuple(e for e in table.fit.effects if e not in drop)
-    index, mean, precision = prior(kept)
+    index, mean, precision = prior(kept, table.fit.replay.absent)
     own = np.array([table.derivative[int(i)] for i in index], int)
     # The set's parameters: coefficients count from where they were fitted.
     mean = mean - table.fit.theta[index] if len(index) else mean
