@@ -4,8 +4,11 @@ import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 
+from openjax.gap.channels import Estimated
+from openjax.gap.intervals import _estimate
 from openjax.gap.model.bounds import BOUND, bounded
 from openjax.gap.model.library import ABSENT, CARDS, STEP, THETA, places, prior
+from openjax.vehicle import load_vehicle
 from openjax.vehicle.effects import EFFECTS
 
 
@@ -81,3 +84,21 @@ def test_above_the_ceiling_there_is_none():
     high = np.zeros((5, 3))
     high[2, 2] = 1.3
     assert CARDS["ceiling_effect"].impossible(high) and not CARDS["ceiling_effect"].impossible(low)
+
+
+@pytest.mark.parametrize("spread", [0.1, 1.0, 100.0])
+@pytest.mark.parametrize("name", EFFECTS)
+def test_an_interval_ends_where_its_parameter_means_nothing(name, spread):
+    """However wide the error of a fit, and wherever its value."""
+    vehicle = load_vehicle()
+    for parameter in EFFECTS[name].parameters.values():
+        low, high = parameter.limits(vehicle)
+        width = spread * (parameter.prior[1] - parameter.prior[0])
+        for value in (parameter.none - width, parameter.none, parameter.none + width):
+            found = _estimate(Estimated(value, width, width), parameter, vehicle)
+            start, end = found.interval90
+            assert low <= start <= found.value <= end <= high
+            assert found.may_be_none
+    assert not _estimate(
+        Estimated(9.0, 0.1, 0.1), EFFECTS["inertia"].parameters["xx"], vehicle
+    ).may_be_none

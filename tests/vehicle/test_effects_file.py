@@ -2,10 +2,12 @@
 right.
 """
 
+import numpy as np
 import pytest
 
 from openjax.errors import UserError
 from openjax.vehicle.effects import EFFECTS, load_effects, save_effects
+from openjax.vehicle.effects.effects_file import load_intervals
 
 
 def test_everything_comes_back(tmp_path):
@@ -64,3 +66,48 @@ def test_nothing_is_written_for_strangers(tmp_path):
             save_effects(path, strange)
     with pytest.raises(UserError, match="no such effects file"):
         load_effects(path)
+
+
+BOUNDED = [
+    (name, key)
+    for name, effect in EFFECTS.items()
+    for key, parameter in effect.parameters.items()
+    if np.isfinite(parameter.limits()[0])
+]
+
+
+def test_what_no_vehicle_has_is_bounded():
+    """Moments of inertia, lags, delays, ratios, drags: where a fit's error may leave the domain."""
+    named = {f"{name}.{key}" for name, key in BOUNDED}
+    assert {f"inertia.{axis}" for axis in ("xx", "yy", "zz")} <= named
+    assert {"motor_lag.extra_up", "motor_lag.extra_down", "yaw_torque.ratio"} <= named
+    assert {"command_latency.delay", "state_latency.delay", "packet_loss.probability"} <= named
+    assert {"mass.extra", "thrust_scale.scale", "rotor_drag.d_xy", "rate_gains.p"} <= named
+    for effect in EFFECTS.values():
+        for parameter in effect.parameters.values():
+            low, high = parameter.limits()
+            assert low <= min(parameter.none, *parameter.prior)
+            assert max(parameter.none, *parameter.prior) <= high
+
+
+@pytest.mark.parametrize(("name", "key"), BOUNDED)
+@pytest.mark.parametrize("where", ["value", "interval90"])
+def test_what_no_vehicle_has_is_refused_in_one_line(name, key, where, tmp_path):
+    """By whatever reads an effects file: training, adapting, evaluating."""
+    parameter = EFFECTS[name].parameters[key]
+    least = parameter.limits()[0]
+    below = least - 0.5 * (parameter.prior[1] - parameter.prior[0])
+    usual = parameter.prior[1]
+    entry = (
+        f"value = {below}"
+        if where == "value"
+        else f"value = {usual}, interval90 = [{below}, {usual}]"
+    )
+    path = tmp_path / "effects.toml"
+    path.write_text(f"[{name}]\n{key} = {{ {entry} }}\n")
+    for read in (load_effects, load_intervals):
+        with pytest.raises(UserError, match="can't be; it lies between") as caught:
+            read(path)
+        assert "\n" not in str(caught.value) and f"{name}.{key}" in str(caught.value)
+    path.write_text(f"[{name}]\n{key} = {{ value = {usual}, interval90 = [{least}, {usual}] }}\n")
+    assert load_intervals(path)[name][key] == (least, usual)

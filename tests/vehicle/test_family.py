@@ -66,7 +66,14 @@ def test_a_family_grows_from_the_nominal_vehicle():
 
 
 @pytest.mark.parametrize(
-    "entry", [("mas.extra", 0, 1, 0, 1), ("mass.more", 0, 1, 0, 1), ("mass.extra", 1, 0, 0, 1)]
+    "entry",
+    [
+        ("mas.extra", 0, 1, 0, 1),
+        ("mass.more", 0, 1, 0, 1),
+        ("mass.extra", 1, 0, 0, 1),
+        ("inertia.xx", -0.31, 0.97, 1.0, 1.0),
+        ("motor_lag.extra_up", 0.0, 0.0, -0.03, 0.01),
+    ],
 )
 def test_impossible_families_are_refused(entry):
     with pytest.raises(UserError):

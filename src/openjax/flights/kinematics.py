@@ -31,13 +31,15 @@ class Kinematics:
     """`gain` of the gyroscope, 1 where it isn't clearly another; `tilt` (2,) rad by which the world
     leans about its x and y axes, None where that isn't clear; `one_clock`: whether attitude and
     gyroscope can be compared sample by sample: what their streams leave of each other is noise, not
-    time; `findings`: what is off by more than usual, in words, by name.
+    time; `motor_clock`: the same of motors and gyroscope (`clocks`); `findings`: what is off by
+    more than usual, in words, by name.
     """
 
     gain: float
     tilt: np.ndarray | None
     one_clock: bool
     findings: dict[str, str]
+    motor_clock: bool = True
 
 
 def read_kinematics(tracks: list[Track], limits) -> Kinematics:

@@ -3,11 +3,12 @@
 from dataclasses import dataclass, replace
 
 from openjax.errors import UserError
+from openjax.flights.clocks import on_gyroscope_clock, read_command_clock, read_motor_clock
 from openjax.flights.flight import Case
 from openjax.flights.kinematics import Kinematics, corrected, read_kinematics
 from openjax.flights.track import Track, tracks_of, undelayed
 from openjax.gap.channels import Channel
-from openjax.gap.channels.motion import Motion, make_reading, read_motion, rows_are_samples
+from openjax.gap.channels.motion import Motion, make_reading, motor_rows, read_motion
 from openjax.gap.channels.pose import Pose, read_pose
 from openjax.gap.channels.radio import read_radio
 from openjax.gap.channels.rate_loop import read_rate_loop, with_motors
@@ -50,10 +51,11 @@ def gather(
     tell("reading the channels of the log")
     tracks, vehicles = _tracks(case)
     tracks, pose, sensors = _sensors(tracks, library)
+    tracks, sensors = _motors(case, tracks, vehicles, sensors)
     tracks = [with_motors(t, v) for t, v in zip(tracks, vehicles, strict=True)]
     radio = None
     if all(t.command is not None and t.motors_logged for t in tracks):
-        radio = read_radio(tracks, library, rows_are_samples(case))
+        radio = read_radio(tracks, library, motor_rows(case) == "sample")
     arrived = None if radio is None else radio.arrived
     reading = make_reading(case, library, tracks, vehicles, arrived, sensors)
     reading = replace(reading, baseline=baseline, reference=reference)
@@ -62,6 +64,20 @@ def gather(
     channels = tuple(c for c in (pose, radio, loop) if c is not None)
     motion = read_motion(reading, loop)
     return Evidence(case, library, tracks, vehicles, sensors, channels, motion, baseline)
+
+
+def _motors(case: Case, tracks, vehicles, sensors: Kinematics) -> tuple[list[Track], Kinematics]:
+    """The tracks with motor commands when they act, and what the sensors say with what the motors'
+    clock says.
+    """
+    row = min(f.row_period for f in case.flights)
+    if apart := read_command_clock(tracks, row):
+        sensors = replace(sensors, findings=sensors.findings | {"command clock": apart})
+        tracks = [t if t.motor is None else replace(t, command=None) for t in tracks]
+    clock = read_motor_clock(tracks, vehicles, row, motor_rows(case), sensors.one_clock)
+    findings = sensors.findings | clock.findings
+    sensors = replace(sensors, findings=findings, motor_clock=clock.one_clock)
+    return [on_gyroscope_clock(t, clock) for t in tracks], sensors
 
 
 def _tracks(case: Case) -> tuple[list[Track], list]:

@@ -13,6 +13,7 @@ from openjax.gap.model.hypotheses import SetFit
 from openjax.gap.model.library import CARDS, PLACE, path_of
 from openjax.gap.report import Estimate
 from openjax.vehicle.effects import EFFECTS
+from openjax.vehicle.effects.effect import Parameter
 
 REACH = 1.645  # standard deviations of a 90 % interval
 
@@ -29,16 +30,19 @@ def estimates(evidence: Evidence, fit: SetFit, named) -> dict[str, dict[str, Est
         }
         parameters = EFFECTS[effect].parameters
         out[effect] = {
-            p: Estimate(
-                v.value,
-                parameters[p].unit,
-                (v.value - REACH * v.below, v.value + REACH * v.above),
-                parameters[p].prior,
-                bool(-REACH * v.below <= parameters[p].none - v.value <= REACH * v.above),
-            )
-            for p, v in told.items()
+            p: _estimate(v, parameters[p], evidence.vehicles[0]) for p, v in told.items()
         }
     return out
+
+
+def _estimate(v: Estimated, parameter: Parameter, vehicle) -> Estimate:
+    """A value with its 90 % interval, both as far as they lie where the parameter means
+    anything.
+    """
+    ends = (v.value - REACH * v.below, v.value + REACH * v.above)
+    value, *interval = np.clip((v.value, *ends), *parameter.limits(vehicle)).tolist()
+    may_be_none = bool(ends[0] <= parameter.none <= ends[1])
+    return Estimate(value, parameter.unit, tuple(interval), parameter.prior, may_be_none)
 
 
 def _of_physics(fit: SetFit, effect: str, parameter) -> Estimated:

@@ -130,7 +130,8 @@ def _series(evidence: Evidence, residuals: list[np.ndarray]) -> dict[str, list[n
         out["position"] = [
             t.position - (np.cumsum(t.velocity, 0) - 0.5 * t.velocity) * t.dt for t in tracks
         ]
-        if all(t.specific_force is not None and t.quaternion is not None for t in tracks):
+        felt = all(t.specific_force is not None and t.quaternion is not None for t in tracks)
+        if felt and evidence.sensors.one_clock:
             out["accelerometer"] = [_path_against_accelerometer(t) for t in tracks]
     return out
 

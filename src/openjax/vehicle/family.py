@@ -50,7 +50,7 @@ def check_ranges(ranges: Sequence[VehicleRange]) -> None:
     """
     seen = set()
     for name, low, high, rare_low, rare_high in ranges:
-        find_parameter(name)
+        _, parameter = find_parameter(name)
         if name in seen:
             raise UserError(f"vehicles: {name} comes twice")
         seen.add(name)
@@ -62,6 +62,12 @@ def check_ranges(ranges: Sequence[VehicleRange]) -> None:
             raise UserError(
                 f"vehicles: {name} lies in {low}..{high}, rarely {rare_low}..{rare_high}; bounds "
                 "must rise"
+            )
+        least, most = parameter.limits()
+        if min(low, rare_low) < least or max(high, rare_high) > most:
+            raise UserError(
+                f"vehicles: {name} lies in {low}..{high}, rarely {rare_low}..{rare_high}; it can't "
+                f"leave {least:g}..{most:g}"
             )
 
 

@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from openjax.errors import UserError
+from openjax.flights.clocks import ROWS
 from openjax.flights.flight import Case
 from openjax.flights.kinematics import Kinematics
 from openjax.flights.track import GRID_PERIOD, Track
@@ -19,6 +20,7 @@ from openjax.gap.model.hypotheses import SetFit, fit_set, fit_singles, model_noi
 from openjax.gap.model.library import CARDS, Library, numbers_of
 from openjax.gap.model.observer import TICKS
 from openjax.gap.model.replay import Replay, make_replay
+from openjax.vehicle.effects import EFFECTS
 
 # of a log in one of the grid's: if they are samples, their mean isn't what five ticks of the loop
 # did
@@ -90,16 +92,15 @@ class Reading:
         ]
 
 
-def rows_are_samples(case: Case) -> bool:
-    """Whether a row's motor commands are one sample, and not the mean since the last row. Raises
-    UserError for anything else.
-    """
-    rows = case.vehicle_file.log.get("motor_rows", "mean")
-    if rows not in ("mean", "sample"):
+def motor_rows(case: Case) -> str:
+    """What a row's motor commands are, of `clocks.ROWS`. Raises UserError for anything else."""
+    rows = case.vehicle_file.log.get("motor_rows", ROWS[0])
+    if rows not in ROWS:
         raise UserError(
-            f'{case.name}: vehicle.toml has [log] motor_rows = {rows!r}; "mean" or "sample" is needed'
+            f"{case.name}: vehicle.toml has [log] motor_rows = {rows!r}; it must be one of "
+            f"{', '.join(ROWS)}"
         )
-    return rows == "sample"
+    return rows
 
 
 def make_reading(
@@ -109,8 +110,8 @@ def make_reading(
     shortest = min(f.row_period for f in case.flights)
     slow = shortest > 0.8 * GRID_PERIOD  # faster logs are averaged
     seldom = max(t.dt for t in tracks) > SLOW_ROWS * GRID_PERIOD
-    at_once = rows_are_samples(case) and slow and all(t.motors_logged for t in tracks)
-    means = case.vehicle_file.log.get("motor_rows") == "mean"  # declared, not taken for granted
+    at_once = motor_rows(case) == "sample" and slow and all(t.motors_logged for t in tracks)
+    means = case.vehicle_file.log.get("motor_rows", "").startswith("mean")  # said, not assumed
     few = not means and not slow and GRID_PERIOD / shortest < FEW_ROWS
     hidden = few or any(f.body_rates_derived for f in case.flights)
     blind = hidden or (at_once and (arrived is None or seldom))
@@ -157,7 +158,14 @@ def read_motion(reading: Reading, loop: RateLoop | None) -> Motion:
     )
     replay, exposure = model_noise(replay, library)
     exposure |= {e: 0.0 for e in library.physics if _hidden(CARDS[e], reading)}
+    if not sensors.motor_clock:
+        exposure |= {e: 0.0 for e in library.physics if _is_lag(e)}
     return Motion(replay, library, exposure)
+
+
+def _is_lag(effect: str) -> bool:
+    """Whether an effect is a time by which something comes later."""
+    return any(EFFECTS[effect].parameters[p.name].unit == "s" for p in CARDS[effect].fitted)
 
 
 def _hidden(card, reading: Reading) -> bool:

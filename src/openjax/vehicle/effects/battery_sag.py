@@ -4,7 +4,7 @@ now.
 
 import jax.numpy as jnp
 
-from openjax.vehicle.effects.effect import RARE, Card, Effect, Fitted, Parameter
+from openjax.vehicle.effects.effect import NOT_NEGATIVE, RARE, Card, Effect, Fitted, Parameter
 
 
 def voltage(parameters, context):
@@ -42,10 +42,10 @@ EFFECT = Effect(
             source="0 with voltage compensation, 2 where speed follows voltage; to 40 % less thrust empty",
         ),
         "reference": Parameter(
-            "V", 3.9, (3.7, 4.2), _CELL, "voltage at which the nominal thrust holds"
+            "V", 3.9, (3.7, 4.2), _CELL, "voltage at which the nominal thrust holds", NOT_NEGATIVE
         ),
         "full": Parameter(
-            "V", 4.0, (3.8, 4.15), _CELL, "voltage at take-off, where none is logged"
+            "V", 4.0, (3.8, 4.15), _CELL, "voltage at take-off, where none is logged", NOT_NEGATIVE
         ),
         "discharge": Parameter(
             "V/s", 0.0017, (0.001, 0.003), _CELL, "loss per second, where none is logged"

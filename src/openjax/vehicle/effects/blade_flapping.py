@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 
 from openjax.vehicle.effects.airspeed import body_velocity, hub_velocity, hub_wrench
-from openjax.vehicle.effects.effect import VERY_RARE, Card, Effect, Fitted, Parameter
+from openjax.vehicle.effects.effect import NOT_NEGATIVE, VERY_RARE, Card, Effect, Fitted, Parameter
 
 
 def wrench(parameters, context):
@@ -29,12 +29,14 @@ EFFECT = Effect(
             none=0.0,
             prior=(0.0, 0.05),
             source="tilt of the tip-path plane per airspeed (Mahony, Kumar, Corke 2012)",
+            domain=NOT_NEGATIVE,
         ),
         "stiffness": Parameter(
             unit="N m s/m",
             none=0.0,
             prior=(2e-5, 5e-4),
             source="hub moment (Hoffmann et al. 2007), rotor drag 1 cm above the centre of mass",
+            domain=NOT_NEGATIVE,
         ),
     },
     wrench=wrench,

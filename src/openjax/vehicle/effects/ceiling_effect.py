@@ -1,7 +1,14 @@
 """Rotors near the ceiling push more: they pull the vehicle up to it."""
 
 from openjax.vehicle.effects.airspeed import hub_height
-from openjax.vehicle.effects.effect import ARENA_CEILING, Card, Effect, Fitted, Parameter
+from openjax.vehicle.effects.effect import (
+    ARENA_CEILING,
+    NOT_NEGATIVE,
+    Card,
+    Effect,
+    Fitted,
+    Parameter,
+)
 from openjax.vehicle.effects.ground_effect import gain
 
 
@@ -23,7 +30,7 @@ EFFECT = Effect(
     description="thrust grows by strength (R / (distance + offset))^2 near the ceiling, per rotor",
     formula=r"T_i' = T_i\left(1 + s\,\frac{R^2}{(h_c - z_i + \delta)^2}\right)",
     parameters={
-        "strength": Parameter("1", 0.0, (0.2, 1.5), _SOURCE),
+        "strength": Parameter("1", 0.0, (0.2, 1.5), _SOURCE, domain=NOT_NEGATIVE),
         "offset": Parameter("m", 0.0, (0.0, 0.03), "distance of the rotors from the tracked point"),
     },
     thrust=thrust,

@@ -1,7 +1,7 @@
 """Commands arrive late."""
 
 from openjax.vehicle.effects.delay import fill, look_back, push
-from openjax.vehicle.effects.effect import Card, Effect, Fitted, Parameter
+from openjax.vehicle.effects.effect import NOT_NEGATIVE, Card, Effect, Fitted, Parameter
 from openjax.vehicle.parameters import hover_command
 
 
@@ -21,7 +21,11 @@ EFFECT = Effect(
     formula=r"u'(t) = u(t - \Delta)",
     parameters={
         "delay": Parameter(
-            "s", 0.0, (0.004, 0.06), "radio links of the Crazyflie and of ROS bridges"
+            "s",
+            0.0,
+            (0.004, 0.06),
+            "radio links of the Crazyflie and of ROS bridges",
+            domain=NOT_NEGATIVE,
         )
     },
     command=command,

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 
 from openjax.vehicle.effects.airspeed import hub_wrench
-from openjax.vehicle.effects.effect import Card, Effect, Fitted, Parameter
+from openjax.vehicle.effects.effect import NOT_NEGATIVE, Card, Effect, Fitted, Parameter
 from openjax.vehicle.rigid_body import rotate, rotate_inverse
 
 
@@ -33,12 +33,21 @@ EFFECT = Effect(
     description="force along -z under another vehicle, decaying with the distance below it and to the side",
     formula=r"f = -A\,e^{-\Delta z/h}\,e^{-r^2/2s^2}\,e_z,\quad s = w + b\,\Delta z",
     parameters={
-        "force": Parameter("N", 0.0, (0.03, 0.2), _SOURCE, "right under the other vehicle"),
-        "length": Parameter("m", 0.5, (0.2, 1.0), _SOURCE, "decay below"),
-        "width": Parameter(
-            "m", 0.05, (0.03, 0.08), _SOURCE, "standard deviation to the side, at the rotors"
+        "force": Parameter(
+            "N", 0.0, (0.03, 0.2), _SOURCE, "right under the other vehicle", NOT_NEGATIVE
         ),
-        "spread": Parameter("1", 0.1, (0.0, 0.3), "turbulent jets widen by about 0.1 m per m"),
+        "length": Parameter("m", 0.5, (0.2, 1.0), _SOURCE, "decay below", NOT_NEGATIVE),
+        "width": Parameter(
+            "m",
+            0.05,
+            (0.03, 0.08),
+            _SOURCE,
+            "standard deviation to the side, at the rotors",
+            NOT_NEGATIVE,
+        ),
+        "spread": Parameter(
+            "1", 0.1, (0.0, 0.3), "turbulent jets widen by about 0.1 m per m", domain=NOT_NEGATIVE
+        ),
     },
     wrench=wrench,
     card=Card(

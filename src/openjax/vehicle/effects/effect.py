@@ -7,9 +7,10 @@ from typing import Any
 import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from openjax.vehicle.arena import Arena
-from openjax.vehicle.parameters import Vehicle
+from openjax.vehicle.parameters import Vehicle, load_vehicle
 from openjax.vehicle.rotors import rotor_thrust
 from openjax.vehicle.state import DroneState
 
@@ -64,12 +65,20 @@ def make_context(vehicle: Vehicle, state: DroneState, **known) -> Context:
     )
 
 
+Domain = tuple[float, float]
+# Of strengths, lengths and times; of multiples of what is assumed, less of which no vehicle flies
+# with.
+NOT_NEGATIVE: Domain = (0.0, np.inf)
+RATIO: Domain = (0.05, np.inf)
+
+
 @dataclass(frozen=True)
 class Parameter:
     """A scalar parameter of an effect.
 
     none: with every parameter of an effect at this value the effect is absent.
     prior: the usual range (weak, not a bound), in the parameter's unit.
+    domain: the range in which it means anything, as numbers or by the vehicle.
     """
 
     unit: str
@@ -77,6 +86,13 @@ class Parameter:
     prior: tuple[float, float]
     source: str
     meaning: str = ""
+    domain: Domain | Callable[[Vehicle], Domain] = (-np.inf, np.inf)
+
+    def limits(self, vehicle: Vehicle | None = None) -> Domain:
+        """The domain for a vehicle, by default the nominal one."""
+        if not callable(self.domain):
+            return self.domain
+        return self.domain(load_vehicle() if vehicle is None else vehicle)
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ import tomlkit
 from openjax.errors import UserError
 from openjax.files import read_toml, write_text
 from openjax.plain import from_plain
+from openjax.vehicle.effects.effect import Parameter
 from openjax.vehicle.effects.registry import find_effect
 
 FAR = 100.0
@@ -77,17 +78,30 @@ def _entry(path: Path, name: str, key: str, told) -> _Entry:
     entry = from_plain(_Entry, told if isinstance(told, dict) else {"value": told}, where)
     if entry.unit not in (None, parameter.unit):
         raise UserError(f"{where} is in {entry.unit!r}; {parameter.unit!r} would be right")
-    low, high = parameter.prior
-    if not low - FAR * (high - low) <= entry.value <= high + FAR * (high - low):
-        raise UserError(
-            f"{where} = {entry.value:g} {parameter.unit} is far from what occurs, {low:g} to "
-            f"{high:g}"
-        )
-    if entry.interval90 is not None and entry.interval90[0] > entry.interval90[1]:
+    if entry.interval90 is not None and not entry.interval90[0] <= entry.interval90[1]:
         raise UserError(
             f"{where}: interval90 is {list(entry.interval90)}; low must not exceed high"
         )
+    for number in (entry.value, *(entry.interval90 or ())):
+        _check_number(parameter, number, where)
     return entry
+
+
+def _check_number(parameter: Parameter, number: float, where: str) -> None:
+    """Refuse a value, or an end of an interval, that no vehicle has."""
+    usual = parameter.prior
+    reach = FAR * (usual[1] - usual[0])
+    if not usual[0] - reach <= number <= usual[1] + reach:
+        raise UserError(
+            f"{where} = {number:g} {parameter.unit} is far from what occurs, {usual[0]:g} to "
+            f"{usual[1]:g}"
+        )
+    low, high = parameter.limits()
+    slack = 1e-6 * (usual[1] - usual[0])  # of numbers written with six digits
+    if not low - slack <= number <= high + slack:
+        raise UserError(
+            f"{where} = {number:g} {parameter.unit} can't be; it lies between {low:g} and {high:g}"
+        )
 
 
 def save_effects(

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 
 from openjax.vehicle.effects.airspeed import PROPELLER_RADIUS, hub_height
-from openjax.vehicle.effects.effect import Card, Effect, Fitted, Parameter
+from openjax.vehicle.effects.effect import NOT_NEGATIVE, Card, Effect, Fitted, Parameter
 
 
 def gain(strength, distance):
@@ -27,7 +27,7 @@ EFFECT = Effect(
     description="thrust grows by strength (R / (z + offset))^2 near the floor, per rotor",
     formula=r"T_i' = T_i\left(1 + s\,\frac{R^2}{(z_i + \delta)^2}\right)",
     parameters={
-        "strength": Parameter("1", 0.0, (0.2, 1.2), _SOURCE),
+        "strength": Parameter("1", 0.0, (0.2, 1.2), _SOURCE, domain=NOT_NEGATIVE),
         "offset": Parameter(
             "m", 0.0, (0.0, 0.03), "height of the rotors above the tracked point, mocap offset"
         ),

@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 
-from openjax.vehicle.effects.effect import Card, Effect, Fitted, Parameter
+from openjax.vehicle.effects.effect import RATIO, Card, Effect, Fitted, Parameter
 
 AXES = ("xx", "yy", "zz")
 
@@ -17,7 +17,7 @@ EFFECT = Effect(
     name="inertia",
     description="moments of inertia as multiples of the assumed ones",
     formula=r"J' = \mathrm{diag}(k_{xx}, k_{yy}, k_{zz})\,J",
-    parameters={axis: Parameter("1", 1.0, (0.7, 1.6), _SOURCE) for axis in AXES},
+    parameters={axis: Parameter("1", 1.0, (0.7, 1.6), _SOURCE, domain=RATIO) for axis in AXES},
     body=body,
     card=Card(
         torque_axes=(0, 1),

@@ -1,11 +1,16 @@
 """The vehicle weighs more or less than assumed."""
 
-from openjax.vehicle.effects.effect import Card, Effect, Fitted, Parameter
+from openjax.vehicle.effects.effect import RATIO, Card, Effect, Fitted, Parameter
 
 
 def body(parameters, vehicle):
     """Inertia stays: a payload at the centre of mass."""
     return vehicle.replace(mass=vehicle.mass + parameters["extra"])
+
+
+def some_is_left(vehicle):
+    """kg: a vehicle weighs something."""
+    return (RATIO[0] - 1.0) * float(vehicle.mass), RATIO[1]
 
 
 EFFECT = Effect(
@@ -19,6 +24,7 @@ EFFECT = Effect(
             prior=(-0.005, 0.010),
             source="Crazyflie 2.x with and without decks and other batteries: 27-42 g, nominal 32.1 g",
             meaning="mass beyond the assumed one",
+            domain=some_is_left,
         )
     },
     body=body,

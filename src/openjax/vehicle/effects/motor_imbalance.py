@@ -19,7 +19,8 @@ EFFECT = Effect(
     description="rotor i gives (1 + m_i) times its thrust and torque",
     formula=r"T_i' = (1 + m_i)\,T_i,\quad Q_i' = (1 + m_i)\,Q_i",
     parameters={
-        name: Parameter("1", 0.0, (-0.15, 0.15), _SOURCE) for name in ("m1", "m2", "m3", "m4")
+        name: Parameter("1", 0.0, (-0.15, 0.15), _SOURCE, domain=(-1.0, jnp.inf))
+        for name in ("m1", "m2", "m3", "m4")
     },
     thrust=thrust,
     card=Card(

@@ -1,6 +1,7 @@
 """Motors follow their commands more slowly than assumed; spin-up isn't spin-down."""
 
 import jax.numpy as jnp
+import numpy as np
 
 from openjax.vehicle.effects.effect import Card, Effect, Fitted, Parameter
 
@@ -36,6 +37,17 @@ def spin_down_error(vehicle):
     return 0.15 * vehicle.motor_time_constant * vehicle.motor_slowdown_ratio
 
 
+def up(vehicle):
+    """s: a time constant isn't negative, nor shorter than `body` makes it."""
+    return _SHORTEST - float(vehicle.motor_time_constant), np.inf
+
+
+def down(vehicle):
+    """s: the same of slowing down."""
+    usual = float(vehicle.motor_time_constant * vehicle.motor_slowdown_ratio)
+    return _SHORTEST - usual, np.inf
+
+
 _SOURCE = "coreless motors of this size: time constants of 0.02-0.12 s, against a nominal 0.025 s"
 
 EFFECT = Effect(
@@ -44,10 +56,10 @@ EFFECT = Effect(
     formula=r"\dot\omega_i = (\omega_i^{\ast} - \omega_i)/\tau_{\pm},\quad \tau_{\pm} = \tau_{\pm,0} + \Delta\tau_{\pm}",
     parameters={
         "extra_up": Parameter(
-            "s", 0.0, (-0.005, 0.095), _SOURCE, "added to the time constant of speeding up"
+            "s", 0.0, (-0.005, 0.095), _SOURCE, "added to the time constant of speeding up", up
         ),
         "extra_down": Parameter(
-            "s", 0.0, (-0.005, 0.095), _SOURCE, "added to the time constant of slowing down"
+            "s", 0.0, (-0.005, 0.095), _SOURCE, "added to the time constant of slowing down", down
         ),
     },
     body=body,

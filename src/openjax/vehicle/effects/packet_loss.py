@@ -31,7 +31,11 @@ EFFECT = Effect(
     formula=r"u'_k = u_k \text{ with probability } 1 - p,\ \text{else } u'_{k-1}",
     parameters={
         "probability": Parameter(
-            "1", 0.0, (0.01, 0.5), "2.4 GHz radio in crowded rooms and swarms: 1-50 %"
+            "1",
+            0.0,
+            (0.01, 0.5),
+            "2.4 GHz radio in crowded rooms and swarms: 1-50 %",
+            domain=(0.0, 1.0),
         )
     },
     command=command,

@@ -1,6 +1,6 @@
 """The rate controller on board isn't tuned as assumed."""
 
-from openjax.vehicle.effects.effect import Card, Effect, Fitted, Parameter
+from openjax.vehicle.effects.effect import NOT_NEGATIVE, Card, Effect, Fitted, Parameter
 
 GAINS = ("p", "i", "d")
 
@@ -19,7 +19,9 @@ EFFECT = Effect(
     name="rate_gains",
     description="gains of the rate controller as multiples of the assumed ones",
     formula=r"K_P' = k_p K_P,\quad K_I' = k_i K_I,\quad K_D' = k_d K_D",
-    parameters={gain: Parameter("1", 1.0, (0.5, 2.0), _SOURCE) for gain in GAINS},
+    parameters={
+        gain: Parameter("1", 1.0, (0.5, 2.0), _SOURCE, domain=NOT_NEGATIVE) for gain in GAINS
+    },
     body=body,
     card=Card(
         path="rate_loop",

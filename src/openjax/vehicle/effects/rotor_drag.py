@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 
 from openjax.vehicle.effects.airspeed import hub_velocity, hub_wrench
-from openjax.vehicle.effects.effect import Card, Effect, Fitted, Parameter
+from openjax.vehicle.effects.effect import NOT_NEGATIVE, Card, Effect, Fitted, Parameter
 
 
 def wrench(parameters, context):
@@ -26,10 +26,20 @@ EFFECT = Effect(
     formula=r"f_i = -\tfrac14\,\mathrm{diag}(d_{xy}, d_{xy}, d_z)\,v_i",
     parameters={
         "d_xy": Parameter(
-            "N s/m", 0.0, (0.005, 0.03), _SOURCE, "in the rotor plane, all four rotors"
+            "N s/m",
+            0.0,
+            (0.005, 0.03),
+            _SOURCE,
+            "in the rotor plane, all four rotors",
+            NOT_NEGATIVE,
         ),
         "d_z": Parameter(
-            "N s/m", 0.0, (0.0, 0.03), _SOURCE, "along the rotor axes, all four rotors"
+            "N s/m",
+            0.0,
+            (0.0, 0.03),
+            _SOURCE,
+            "along the rotor axes, all four rotors",
+            NOT_NEGATIVE,
         ),
     },
     wrench=wrench,

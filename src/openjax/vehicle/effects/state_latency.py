@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 
 from openjax.vehicle.effects.delay import fill, look_back, push
-from openjax.vehicle.effects.effect import Card, Effect, Fitted, Parameter
+from openjax.vehicle.effects.effect import NOT_NEGATIVE, Card, Effect, Fitted, Parameter
 
 
 def _pose(state):
@@ -39,7 +39,9 @@ EFFECT = Effect(
     description="position, attitude and velocity are seen a fixed time late",
     formula=r"(p, q, v)_{\mathrm{seen}}(t) = (p, q, v)(t - \Delta)",
     parameters={
-        "delay": Parameter("s", 0.0, (0.004, 0.06), "motion capture, filtering and network")
+        "delay": Parameter(
+            "s", 0.0, (0.004, 0.06), "motion capture, filtering and network", domain=NOT_NEGATIVE
+        )
     },
     sensor=sensor,
     record=record,

@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 
-from openjax.vehicle.effects.effect import Card, Effect, Fitted, Parameter
+from openjax.vehicle.effects.effect import RATIO, Card, Effect, Fitted, Parameter
 
 _REFERENCE_VOLTAGE = 3.9  # V
 
@@ -43,6 +43,7 @@ EFFECT = Effect(
             prior=(0.6, 0.95),
             source="brushed motors on a worn battery top out 10-30 % early",
             meaning="largest thrust as a share of the nominal one, at 3.9 V",
+            domain=RATIO,
         ),
         "voltage_slope": Parameter(
             unit="1/V",

@@ -1,6 +1,6 @@
 """Every rotor pushes by the same factor more or less, its reaction torque with it."""
 
-from openjax.vehicle.effects.effect import Card, Effect, Fitted, Parameter
+from openjax.vehicle.effects.effect import RATIO, Card, Effect, Fitted, Parameter
 
 
 def body(parameters, vehicle):
@@ -21,6 +21,7 @@ EFFECT = Effect(
             none=0.0,
             prior=(-0.2, 0.2),
             source="spread of published Crazyflie thrust maps and of propellers: 2-20 %",
+            domain=(RATIO[0] - 1.0, RATIO[1]),
         )
     },
     body=body,

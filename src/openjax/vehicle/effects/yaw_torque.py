@@ -1,6 +1,6 @@
 """The rotors' reaction torque differs from what is assumed, their thrust doesn't."""
 
-from openjax.vehicle.effects.effect import Card, Effect, Fitted, Parameter
+from openjax.vehicle.effects.effect import RATIO, Card, Effect, Fitted, Parameter
 
 
 def body(parameters, vehicle):
@@ -17,6 +17,7 @@ EFFECT = Effect(
             none=1.0,
             prior=(0.15, 2.0),
             source="torque per thrust of 0.005-0.007 m measured on Crazyflies, against a nominal 0.031 m",
+            domain=RATIO,
         )
     },
     body=body,

@@ -1,0 +1,192 @@
+"""When motors act: their commands against the turning of the body, without any fit of what acts.
+
+Torques turn the body at once: the angular acceleration that motors would make, through their lag,
+is where the cross-correlation with what the gyroscope reads is largest (Knapp, Carter 1976). It may
+come later than the motors' lag says, as slow motors and late links do. It can't come earlier: then
+a row of commands holds what acted before it, or the two streams are on different clocks.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.signal import butter, find_peaks, lfilter, sosfiltfilt
+
+from openjax.flights.track import Track, earlier, turn_increments
+
+# What a row of motor commands may hold: their mean from its time until the next row, their mean
+# since the last row, or a single one.
+ROWS = ("mean", "mean_before", "sample")
+BAND = (0.7, 8.0)  # Hz: above trims, below what single samples of motors hide
+EDGE = 0.4  # s at either end that the filter spoils
+REACH = 0.3  # s by which the streams may be apart
+FINER = 4  # steps of an offset in a row of the grid
+LOUD = 3.0  # times the median size, at which the signals are cut
+FOLLOWS = 0.25  # mean squared correlation from which motors and turning belong together
+BETTER = 0.9  # share of it that a peak at another offset may have, and be as good
+# s that motors may seem early: half a row where rows are single samples, and EARLY of a motor that
+# is faster than assumed. The largest in 120 cases of four simulators was .0025.
+EARLY = 0.0015
+SLOWEST_ROW = 0.004  # s: rows that are shorter hide nothing by a row's shift
+# s that motors may seem late by: a time constant of .13 s looks like .05 in this band
+LATE = 0.06
+LINK = 0.1  # s: no link that one can fly by takes as long
+APART = 0.03  # s by which flights of one logger may differ
+
+
+@dataclass(frozen=True)
+class MotorClock:
+    """`late` {flight and vehicle: s by which its motor commands stand later in the log than they act};
+    `one_clock`: whether motors and gyroscope share one, but for a row; `findings` in words, by
+    name.
+    """
+
+    late: dict[str, float]
+    one_clock: bool
+    findings: dict[str, str]
+
+
+def read_motor_clock(
+    tracks: Sequence[Track], vehicles, row: float, rows: str = "mean", gyroscope: bool = True
+) -> MotorClock:
+    """Compare motors and turning of all tracks of one case with their nominal `vehicles`. `row`: s
+    between the log's own rows; `rows`: what is said of them, see ROWS; without `gyroscope` the
+    attitude says how the body turns.
+    """
+    both = zip(tracks, vehicles, strict=True)
+    turning = (_turning(t, v, gyroscope) for t, v in both if t.motor is not None)
+    said = row if rows == "mean_before" else 0.0
+    by_a_row = dict.fromkeys(map(_flight_of, tracks), row)
+    late = {flight: -d for flight, d in _offsets(turning).items()}
+    usual = float(np.median(list(late.values()))) if late else said
+    least = 0.5 * row + EARLY + (0.5 * row if rows == "sample" else 0.0)
+    alike = not late or max(late.values()) - min(late.values()) < APART
+    if alike and -LATE < usual - said <= least:
+        return MotorClock(by_a_row if said else {}, True, {})
+    if alike and not said and row >= SLOWEST_ROW and least < usual < 1.5 * row + EARLY:
+        text = (
+            f"motor commands act {1e3 * usual:.0f} ms before their row: rows hold what acted since "
+            "the last one, and are read one row earlier"
+        )
+        return MotorClock(by_a_row, True, {"motor rows": text})
+    words = ", ".join(
+        f"{1e3 * abs(time):.0f} ms {'late' if time > 0 else 'early'} in {flight}"
+        for flight, time in late.items()
+        if abs(time) > least
+    )
+    text = (
+        f"motors and gyroscope don't share a clock: motor commands are {words}; they are moved by "
+        "that, and torques, lags and latencies can't be told from these logs"
+    )
+    return MotorClock(late, False, {"motor clock": text})
+
+
+def on_gyroscope_clock(track: Track, clock: MotorClock) -> Track:
+    """The track with its motor commands when they act. Without one clock they tell the thrust and
+    no torques.
+    """
+    late = clock.late.get(_flight_of(track), 0.0)
+    if track.motor is None or (late == 0.0 and clock.one_clock):
+        return track
+    fast = track.fast_thrust
+    return dataclasses.replace(
+        track,
+        motor=earlier(track.motor, -late, track),
+        fast_thrust=None if fast is None else (fast[0] - late, fast[1]),
+        motors_logged=track.motors_logged and clock.one_clock,
+    )
+
+
+def read_command_clock(tracks: Sequence[Track], row: float) -> str:
+    """What is wrong with the clock of commanded thrust against the motors, which follow it after
+    the link's delay; empty where nothing is.
+    """
+    both = [t for t in tracks if t.command is not None and t.motor is not None]
+    pairs = ((t, t.motor.mean(1)[:, None], t.command[:, :1]) for t in both)
+    early = {f: d for f, d in _offsets(pairs).items() if not -1.5 * row - EARLY < d < LINK}
+    words = ", ".join(
+        f"{1e3 * abs(time):.0f} ms {'early' if time > 0 else 'late'} in {flight}"
+        for flight, time in early.items()
+    )
+    return (
+        f"commands and motors don't share a clock: commands are {words}; they aren't used, and "
+        "link and rate controller can't be told from these logs"
+        if early
+        else ""
+    )
+
+
+def _flight_of(track: Track) -> str:
+    """The flight and vehicle whose stretch a track is."""
+    return track.name.split("#")[0]
+
+
+def _offsets(signals) -> dict[str, float]:
+    """{flight and vehicle: s by which one signal (T, C) is later than the other}, of `signals`
+    (track, that one, the other) that are alike.
+    """
+    likeness: dict[str, list] = {}
+    for track, late, early in signals:
+        if (found := _likeness(late, early, track.dt)) is not None:
+            likeness.setdefault(_flight_of(track), []).append((found, track.dt / FINER))
+    out = {}
+    for flight, parts in likeness.items():
+        whole = sum(part for part, _ in parts) / len(parts)
+        best = int(np.argmax(whole))
+        middle = len(whole) // 2
+        if whole[best] < FOLLOWS:
+            continue
+        # Of peaks that are as high the one in the middle, as where a flight is periodic.
+        high = find_peaks(whole, BETTER * whole[best], distance=int(APART / parts[0][1]))[0]
+        if len(high):
+            best = int(high[np.argmin(np.abs(high - middle))])
+        out[flight] = (best - middle) * parts[0][1]
+    return out
+
+
+def _likeness(late: np.ndarray, early: np.ndarray, dt: float) -> np.ndarray | None:
+    """Squared correlation, with its sign, of two signals (T, C) at offsets up to REACH in steps of
+    a row / FINER; mean of the columns.
+    """
+    edge = int(EDGE / dt)
+    if len(late) < 4 * edge:
+        return None
+    band = butter(2, (BAND[0], min(BAND[1], 0.4 / dt)), "bandpass", fs=1 / dt, output="sos")
+    passed = (sosfiltfilt(band, v, axis=0)[edge:-edge] for v in (late, early))
+    # The one turn at a start outweighs a whole flight.
+    late, early = (np.clip(v, -u, u) for v in passed for u in [LOUD * np.median(np.abs(v), 0)])
+    size = 1 << int(np.ceil(np.log2(2 * len(late))))
+    spectrum = np.fft.rfft(late, size, axis=0) * np.conj(np.fft.rfft(early, size, axis=0))
+    steps = int(REACH / dt) * FINER
+    cross = FINER * np.fft.irfft(spectrum, FINER * size, axis=0)
+    cross = np.concatenate([cross[-steps:], cross[: steps + 1]])
+    power = np.sqrt((late**2).sum(0) * (early**2).sum(0))
+    correlation = cross / np.maximum(power, 1e-12)
+    return (np.abs(correlation) * correlation).mean(1)
+
+
+def _turning(track: Track, vehicle, gyroscope: bool) -> tuple[Track, np.ndarray, np.ndarray]:
+    """The track, its angular acceleration and that which its motors make, but for their units,
+    (T - 1, 3).
+    """
+    rates = track.body_rates
+    if not gyroscope or rates is None:
+        turned = turn_increments(track.quaternion) / track.dt
+        rates = np.concatenate([turned, turned[-1:]])
+    return track, np.diff(rates, axis=0) / track.dt, _torques(track, vehicle)[:-1]
+
+
+def _torques(track: Track, vehicle) -> np.ndarray:
+    """Torques (T, 3), but for their unit, that motors make in each row through their lag: the mean
+    over the row of a first-order answer to a command that is held.
+    """
+    place = np.asarray(vehicle.rotor_position, float)
+    spin = np.asarray(vehicle.rotor_spin, float)
+    time = float(vehicle.motor_time_constant)
+    kept = np.exp(-track.dt / time)
+    start = kept * track.motor[:1]
+    after = lfilter([1.0 - kept], [1.0, -kept], track.motor, axis=0, zi=start)[0]
+    before = np.concatenate([track.motor[:1], after[:-1]])
+    mean = track.motor + (before - track.motor) * (1.0 - kept) * time / track.dt
+    return mean @ np.stack([place[:, 1], -place[:, 0], spin], 1)

@@ -1,0 +1,115 @@
+"""When motors act: a shift of a row is found and undone, another clock is a finding, and motors
+that are slow are neither.
+"""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from openjax.flights import clocks
+from openjax.flights.case import load_case
+from openjax.flights.clocks import on_gyroscope_clock, read_command_clock, read_motor_clock
+from openjax.flights.track import Track, tracks_of
+from openjax.vehicle import load_vehicle
+
+VEHICLE = load_vehicle()
+
+
+@pytest.fixture(scope="module")
+def tracks(sample_columns, tmp_path_factory):
+    """Of three sample flights; a row's motors are the mean until the next row."""
+    from openjax.flights.reading import write_csv
+    from openjax.flights.samples import log_of
+
+    folder = tmp_path_factory.mktemp("case")
+    (folder / "vehicle.toml").write_text("")
+    for name, columns in sample_columns.items():
+        write_csv(folder / f"{name}.csv", log_of([columns], name))
+    return tracks_of(load_case(folder))
+
+
+def moved(track: Track, late: float) -> Track:
+    """The track as a logger would write it whose motor commands stand `late` s too late."""
+    motor = [np.interp(track.time - late, track.time, column) for column in track.motor.T]
+    return dataclasses.replace(track, motor=np.stack(motor, 1))
+
+
+def slower(track: Track, time: float) -> Track:
+    """The track as if its motors had a time constant that is longer by `time` s: the body answers
+    what motors did before.
+    """
+    kept = np.exp(-track.dt / time)
+    rates = track.body_rates.copy()
+    for row in range(1, len(rates)):
+        rates[row] = kept * rates[row - 1] + (1.0 - kept) * track.body_rates[row]
+    return dataclasses.replace(track, body_rates=rates)
+
+
+def read(tracks, **said):
+    return read_motor_clock(tracks, [VEHICLE] * len(tracks), 0.01, **said)
+
+
+def test_motors_that_act_from_their_row_on_are_no_finding(tracks):
+    assert read(tracks) == clocks.MotorClock({}, True, {})
+    assert read([moved(t, 0.005) for t in tracks], rows="sample") == read(tracks)
+
+
+@pytest.mark.parametrize("time", [0.02, 0.05, 0.095])
+def test_slow_motors_are_no_clock(tracks, time):
+    assert read([slower(t, time) for t in tracks]) == read(tracks)
+
+
+def test_rows_that_hold_what_acted_before_them_are_read_a_row_earlier(tracks):
+    shifted = [moved(t, 0.01) for t in tracks]
+    found = read(shifted)
+    assert found.one_clock and list(found.findings) == ["motor rows"]
+    for logged, track in zip(tracks, shifted, strict=True):
+        back = on_gyroscope_clock(track, found)
+        np.testing.assert_allclose(back.motor[1:-1], logged.motor[1:-1], atol=1e-9)
+        assert back.motors_logged
+    said = read(shifted, rows="mean_before")
+    assert said.late == found.late and not said.findings
+
+
+@pytest.mark.parametrize("late", [-0.25, -0.14, -0.08, 0.04, 0.08, 0.14, 0.25])
+@pytest.mark.parametrize("which", [slice(None), slice(1, 2)])
+def test_motors_on_another_clock_are_a_finding(tracks, late, which):
+    """In all flights or in one: commands are put where they act, and tell no torques."""
+    rest = range(len(tracks))[which]
+    mixed = [moved(t, late) if k in rest else t for k, t in enumerate(tracks)]
+    found = read(mixed)
+    assert not found.one_clock and list(found.findings) == ["motor clock"]
+    words = found.findings["motor clock"]
+    assert words.count(" ms ") == len(rest) == words.count(" ms late" if late > 0 else " ms early")
+    for number in rest:
+        name = mixed[number].name
+        assert found.late[name] == pytest.approx(late, abs=0.0076)
+        assert not on_gyroscope_clock(mixed[number], found).motors_logged
+
+
+@pytest.mark.parametrize("late", [-0.25, -0.14, -0.05, 0.0, 0.01, 0.05, 0.14, 0.25])
+def test_commands_that_motors_obey_before_they_were_sent_are_a_finding(tracks, late):
+    """Commands of the link's delay earlier, and a row late, are none."""
+    sent = [np.interp(t.time - late, t.time, t.command[:, 0]) for t in tracks]
+    mixed = [
+        dataclasses.replace(t, command=np.c_[thrust, t.command[:, 1:]])
+        for t, thrust in zip(tracks, sent, strict=True)
+    ]
+    words = read_command_clock(mixed, 0.01)
+    usual = -0.1 < late < 0.02
+    assert words.count(" ms late" if late > 0 else " ms early") == len(tracks) * (not usual)
+    assert bool(words) != usual
+
+
+def test_motors_that_turn_nothing_tell_no_clock(tracks):
+    rng = np.random.default_rng(0)
+    calm = [
+        dataclasses.replace(
+            t, motor=0.6 + 0.01 * rng.standard_normal(t.motor.shape), body_rates=0 * t.body_rates
+        )
+        for t in tracks
+    ]
+    assert read(calm) == clocks.MotorClock({}, True, {})
+    bare = [dataclasses.replace(t, motor=None) for t in tracks]
+    assert read(bare) == read(calm)
