@@ -31,6 +31,8 @@ def check_flight(
 
     try:
         _has_what_is_needed(flight, comparison)
+        if not (flight.has_pose or flight.has_imu):
+            note("columns", "no accelerometer, nor a pose: torques alone can be told (log ax, ay, az)")
         checked = _in_time(flight, note)
         checked = put_in_step(drop_repeats(drop_frozen(checked, note), note), note)
         checked = _in_range(checked, note)
@@ -60,11 +62,11 @@ def _has_what_is_needed(flight: Flight, comparison: bool) -> None:
         if not flight.has_motors:
             raise Refused("columns", "holds no motor commands (m1..m4), which a comparison needs")
         return
-    if not (flight.has_pose or flight.has_imu):
+    # A gyroscope beside the motors shows what torques do; nothing less shows anything.
+    if not (flight.has_pose or flight.body_rates is not None):
         pose = "x, y, z, qw, qx, qy, qz"
-        imu = "ax, ay, az, wx, wy, wz"
-        sensors = f"position and orientation ({pose}) or accelerometer and gyroscope ({imu})"
-        raise Refused("columns", f"needs {sensors}")
+        imu = "gyroscope (wx, wy, wz), best with accelerometer (ax, ay, az)"
+        raise Refused("columns", f"needs position and orientation ({pose}) or {imu}")
     if not (flight.has_motors or flight.has_commands):
         raise Refused(
             "columns", "holds no commands: needs m1..m4, or cmd_thrust and cmd_wx, cmd_wy, cmd_wz"

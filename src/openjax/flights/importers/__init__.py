@@ -1,37 +1,60 @@
 """Importers: logs of other formats become the same table as a CSV of the log format.
 
-A case folder may hold CSV logs, Bitcraze micro-SD logs and ROS 2 bags side by side. A
-`columns.toml` in the folder says which of their columns is what, where the names aren't the usual
-ones.
+A case folder may hold logs of several formats side by side. A `columns.toml` in the folder says
+which of their columns is what, where the names aren't the usual ones. A format of your own is an
+`Importer` that you `register`.
 """
 
 from pathlib import Path
 
+from openjax.flights.importers import (
+    betaflight,
+    crazyflie,
+    log_format,
+    micro_sd,
+    px4,
+    ros2,
+    topic_times,
+)
 from openjax.flights.importers.columns import MAPPING_FILE, ColumnMapping, load_mapping
-from openjax.flights.importers.micro_sd import is_micro_sd, read_micro_sd
-from openjax.flights.importers.ros2 import is_bag, read_bag
-from openjax.flights.reading import LogTable, read_csv
+from openjax.flights.importers.registry import Importer, importer_of, importers, register
+from openjax.flights.reading import LogError, LogTable
 
-__all__ = ["MAPPING_FILE", "ColumnMapping", "find_logs", "load_mapping", "read_log"]
+__all__ = [
+    "MAPPING_FILE",
+    "ColumnMapping",
+    "Importer",
+    "find_logs",
+    "importers",
+    "load_mapping",
+    "read_log",
+    "register",
+]
+
+# The last that is registered is the first that is asked: a CSV that no other one knows is taken
+# for one of the log format, and a layout with several time stamps may hold a firmware's names.
+for _importer in (
+    log_format.IMPORTER,
+    crazyflie.IMPORTER,
+    betaflight.CSV_IMPORTER,
+    topic_times.IMPORTER,
+    betaflight.BINARY_IMPORTER,
+    px4.IMPORTER,
+    micro_sd.IMPORTER,
+    ros2.IMPORTER,
+):
+    register(_importer)
 
 
 def find_logs(folder: Path) -> list[Path]:
     """The logs of a case folder, by name."""
-    return sorted(p for p in folder.iterdir() if _is_csv(p) or is_bag(p) or is_micro_sd(p))
+    return sorted(path for path in folder.iterdir() if importer_of(path) is not None)
 
 
 def read_log(path: Path, mapping: ColumnMapping | None = None) -> LogTable:
     """One log of any known format as a table. Raises LogError if it can't be read."""
-    if is_bag(path):
-        return read_bag(path, mapping)
-    if not _is_csv(path):
-        return read_micro_sd(path, mapping)
-    if mapping is None:
-        return read_csv(path)
-    return mapping.table(
-        path.name, read_csv(path, mapping.delimiter, mapping.names(), mapping.time)
-    )
-
-
-def _is_csv(path: Path) -> bool:
-    return path.is_file() and path.name.endswith((".csv", ".csv.gz"))
+    importer = importer_of(path)
+    if importer is None:
+        known = ", ".join(importer.name for importer in importers())
+        raise LogError(f"no known format; known are {known}")
+    return importer.read(path, mapping)

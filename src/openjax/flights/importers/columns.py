@@ -11,6 +11,14 @@ that has a name of the log format is taken as it is:
     ax     = { from = "/cf1/imu:linear_acceleration.x" }   # a field of a ROS 2 topic
     cmd_wy = { from = "pitch_rate", unit = "deg/s", scale = -1 }
 
+A CSV whose topics have time stamps of their own names each, and what is `of` it; where names begin
+as the stamp's does ("imu.time", "imu.wx"), that may be left out:
+
+    t = [
+        { from = "pose.time", unit = "ns" },
+        { from = "stamp_2", unit = "ns", of = ["wx", "wy", "wz"] },
+    ]
+
 Besides the columns of the log format, `roll`, `pitch`, `yaw` (z-y-x, body to world) may stand for
 the quaternion.
 """
@@ -58,6 +66,14 @@ class Source:
     offset: float = 0.0
 
 
+@dataclass(frozen=True)
+class Clock:
+    """A time stamp of some columns: its source, and the columns that are said to be of it."""
+
+    source: Source
+    columns: tuple[str, ...] = ()
+
+
 @dataclass(frozen=True, eq=False)
 class Stream:
     """Raw signals sampled together: time (N,) s and values {raw name: (N,)}."""
@@ -68,10 +84,13 @@ class Stream:
 
 @dataclass(frozen=True, eq=False)
 class ColumnMapping:
-    """Sources of the log format's columns."""
+    """Sources of the log format's columns. `clocks`: the time stamps where there are several, of
+    which the first is `t`.
+    """
 
     columns: dict[str, Source] = field(default_factory=dict)
     delimiter: str = ","
+    clocks: tuple[Clock, ...] = ()
 
     @property
     def time(self) -> str:
@@ -132,8 +151,28 @@ def load_mapping(path: str | Path) -> ColumnMapping:
     delimiter = tables.get("delimiter", ",")
     if not isinstance(delimiter, str) or len(delimiter) != 1:
         raise UserError(f"{path}: delimiter must be one character")
-    columns = {c: source_of(c, entry, path) for c, entry in tables["columns"].items()}
-    return ColumnMapping(columns, delimiter)
+    entries = dict(tables["columns"])
+    clocks = ()
+    if isinstance(entries.get("t"), list):
+        clocks = tuple(_clock(entry, path) for entry in entries.pop("t"))
+    columns = {c: source_of(c, entry, path) for c, entry in entries.items()}
+    if clocks:
+        columns["t"] = clocks[0].source
+    return ColumnMapping(columns, delimiter, clocks)
+
+
+def _clock(entry, path: Path) -> Clock:
+    """One of several time stamps. Raises UserError for an unknown column, key or unit."""
+    named = entry.get("of", []) if isinstance(entry, dict) else []
+    known = (*LOG_COLUMNS[2:], *EULER)
+    unknown = [name for name in named if name not in known] if isinstance(named, list) else [named]
+    if unknown:
+        raise UserError(
+            f"{path}: a time stamp is `of` {unknown[0]!r}; it must be a list of columns out of "
+            f"{', '.join(known)}"
+        )
+    rest = {k: v for k, v in entry.items() if k != "of"} if isinstance(entry, dict) else entry
+    return Clock(source_of("t", rest, path), tuple(named))
 
 
 def merge_streams(streams: list[Stream], columns: dict[str, Source]) -> dict[str, np.ndarray]:
@@ -154,12 +193,13 @@ def merge_streams(streams: list[Stream], columns: dict[str, Source]) -> dict[str
                 c: (s.scale * stream.values[s.name] + s.offset)[finite][order]
                 for c, s in own.items()
             }
+            converted |= _without_flips(converted)
             used.append((stream.time[finite][order], converted))
     with_motion = [u for u in used if _MOTION & set(u[1])]
     if not with_motion:
         raise LogError(
-            "holds neither position and orientation nor accelerometer and gyroscope under known "
-            "names"
+            "holds neither position and orientation nor a gyroscope under known names: name what it "
+            "has in columns.toml"
         )
     clock = min(with_motion, key=lambda u: float(np.median(np.diff(u[0]))))[0]
     clock = clock[np.r_[True, np.diff(clock) > 0]]
@@ -169,6 +209,19 @@ def merge_streams(streams: list[Stream], columns: dict[str, Source]) -> dict[str
         for column, values in converted.items():
             merged.setdefault(column, _onto(clock, time, values, column, period))
     return with_quaternion(merged)
+
+
+def _without_flips(converted: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The quaternion of a stream without jumps between q and -q, which no line between two samples
+    may cross; nothing where it has none.
+    """
+    names = CHANNEL_COLUMNS["quaternion"]
+    if not all(name in converted for name in names):
+        return {}
+    quaternion = np.stack([converted[name] for name in names], 1)
+    turned = (quaternion[1:] * quaternion[:-1]).sum(1) < 0.0
+    sign = np.where(np.cumsum(np.r_[False, turned]) % 2, -1.0, 1.0)
+    return dict(zip(names, (quaternion * sign[:, None]).T, strict=True))
 
 
 def _without_attitude(columns: dict) -> dict:

@@ -13,26 +13,14 @@ from zlib import crc32
 
 import numpy as np
 
-from openjax.files import read_toml
-from openjax.flights.importers.columns import (
-    ColumnMapping,
-    Source,
-    Stream,
-    merge_streams,
-    source_of,
-)
+from openjax.flights.importers.columns import ColumnMapping, Stream, merge_streams
+from openjax.flights.importers.firmware import firmware_columns, with_mixer
+from openjax.flights.importers.registry import Importer
 from openjax.flights.reading import LARGEST, LogError, LogTable
 
 MAGIC = 0xBC
 _VERSIONS = {1: ("<HI", 1e-3), 2: ("<HQ", 1e-6)}
 _TYPES = set("bBhHiIqQefd")
-
-_FIRMWARE = Path(__file__).with_name("micro_sd.toml")
-FIRMWARE_SOURCES = {
-    column: [source_of(column, entry, _FIRMWARE) for entry in entries]
-    for column, entries in read_toml(_FIRMWARE).items()
-}
-"""Log variables of the firmware that hold each column, best first."""
 
 
 def is_micro_sd(path: Path) -> bool:
@@ -55,41 +43,11 @@ def read_micro_sd(path: str | Path, mapping: ColumnMapping | None = None) -> Log
         raise LogError(f"holds more than {LARGEST >> 20} MB: no log of a flight")
     streams, remarks = decode(path.read_bytes())
     streams = [with_mixer(stream) for stream in streams]
-    names = {name for stream in streams for name in stream.values}
-    columns = {
-        c: next((s for s in options if s.name in names), None)
-        for c, options in FIRMWARE_SOURCES.items()
-    }
-    columns = {c: s for c, s in columns.items() if s is not None}
-    if mapping is not None:
-        columns = mapping.over(columns)
-        missing = [s.name for s in columns.values() if s.name not in names]
-        remarks += [f"no log variable {name!r}" for name in missing]
-    if columns.get("m1", Source("")).name == "mixer.m1":
-        remarks.append("no motor commands were logged: they are made from the mixer's inputs")
+    columns, found = firmware_columns(streams, mapping)
+    remarks += found
     merged = merge_streams(streams, columns)
     merged["t"] = merged["t"] - merged["t"][0]
     return LogTable(path.name, merged, np.full(len(merged["t"]), "0"), tuple(remarks))
-
-
-def with_mixer(stream: Stream) -> Stream:
-    """The stream with `mixer.m1` to `mixer.m4`, 0 to 65535, where it holds the mixer's four inputs:
-    what the firmware's legacy power distribution (power_distribution_quadrotor.c) makes of them,
-    before the battery compensation.
-    """
-    inputs = [
-        stream.values.get(f"controller.cmd_{name}") for name in ("thrust", "roll", "pitch", "yaw")
-    ]
-    if any(values is None for values in inputs):
-        return stream
-    thrust = inputs[0]
-    roll = inputs[1] / 2
-    pitch = inputs[2] / 2
-    yaw = inputs[3]
-    motors = (thrust - roll + pitch + yaw, thrust - roll - pitch - yaw,
-              thrust + roll - pitch + yaw, thrust + roll + pitch - yaw)  # fmt: skip
-    mixed = {f"mixer.m{i}": np.clip(m, 0.0, 65535.0) for i, m in enumerate(motors, 1)}
-    return Stream(stream.time, stream.values | mixed)
 
 
 def decode(data: bytes) -> tuple[list[Stream], list[str]]:
@@ -174,3 +132,6 @@ def _header(data: bytes, event_types: int) -> tuple[dict[int, np.dtype], int]:
             fields.append((name, "<" + np.dtype(letter).str[1:]))
         events[event] = np.dtype(fields)
     return events, at
+
+
+IMPORTER = Importer("micro-SD log of a Crazyflie", is_micro_sd, read_micro_sd)

@@ -6,12 +6,22 @@ else the bag's receive times.
 """
 
 import re
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from openjax.errors import UserError
 from openjax.flights.importers.columns import ColumnMapping, Source, Stream, merge_streams
+from openjax.flights.importers.crazyswarm import (
+    DEFINITIONS,
+    LOG_TYPE,
+    custom_topics,
+    log_stream,
+    variables_of,
+)
+from openjax.flights.importers.firmware import firmware_columns
+from openjax.flights.importers.registry import Importer
 from openjax.flights.reading import CHANNEL_COLUMNS, LogError, LogTable
 
 _POSITION = CHANNEL_COLUMNS["position"]
@@ -37,6 +47,7 @@ KNOWN_TYPES = {
     "geometry_msgs/msg/TransformStamped": _pose("transform.translation", "transform.rotation"),
     "nav_msgs/msg/Odometry": _pose("pose.pose.position", "pose.pose.orientation"),
     "sensor_msgs/msg/BatteryState": {"vbat": "voltage"},
+    "crazyflie_interfaces/msg/Status": {"vbat": "battery_voltage"},
     "mavros_msgs/msg/AttitudeTarget": {"cmd_thrust": "thrust"}
     | {f"cmd_w{a}": f"body_rate.{a}" for a in "xyz"},
     "actuator_msgs/msg/Actuators": {f"m{i + 1}": f"normalized[{i}]" for i in range(4)},
@@ -64,51 +75,95 @@ def read_bag(path: str | Path, mapping: ColumnMapping | None = None) -> LogTable
     """
     try:
         from rosbags.highlevel import AnyReader
-        from rosbags.typesys import Stores, get_typestore
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
     except ImportError as error:
         raise UserError(
             f"{path}: reading ROS 2 bags needs the rosbags library: pip install rosbags"
         ) from error
     path = Path(path)
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    for name, text in DEFINITIONS.items():
+        store.register(get_types_from_msg(text, name))
     try:
-        with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
-            wanted = _wanted(reader.connections, mapping)
-            streams = {
-                c.topic: _stream(reader, c, wanted[c.topic])
-                for c in reader.connections
-                if c.topic in wanted
-            }
+        with AnyReader([path], default_typestore=store) as reader:
+            vehicles, remarks = _vehicles(reader, mapping, path)
     except LogError:
         raise
-    except (
-        Exception
-    ) as error:  # the library raises many kinds for a damaged bag; all mean the same here
+    except Exception as error:  # the library raises many kinds for a damaged bag; all mean the same
         raise LogError(
             f"ROS 2 bag can't be read: {str(error).splitlines()[0] if str(error) else type(error)}"
         ) from error
-    return _joined(path.name, *_by_vehicle(streams, wanted, mapping))
+    return _joined(path.name, *_merged(vehicles, remarks, mapping))
 
 
-def _by_vehicle(
-    streams, wanted, mapping: ColumnMapping | None
+@dataclass(eq=False)
+class _Recording:
+    """What a bag holds of one vehicle: streams of topics, sources of columns that their types name,
+    and streams of log variables on the firmware's clock, which is `ahead` s behind the bag's.
+    """
+
+    streams: list[Stream] = field(default_factory=list)
+    columns: dict[str, Source] = field(default_factory=dict)
+    log_streams: list[Stream] = field(default_factory=list)
+    ahead: list[float] = field(default_factory=list)
+
+    def all_streams(self) -> list[Stream]:
+        """On one clock. The radio delays a message, never hastens it, so that the least that a
+        stamp is ahead of its tick is what the clocks are apart.
+        """
+        ahead = min(self.ahead, default=0.0)
+        moved = [Stream(stream.time + ahead, stream.values) for stream in self.log_streams]
+        return [*moved, *self.streams]
+
+
+def _vehicles(
+    reader, mapping: ColumnMapping | None, path: Path
+) -> tuple[dict[str, _Recording], list[str]]:
+    """{vehicle: what the bag holds of it}, and remarks. With a mapping all is one vehicle's."""
+    wanted = _wanted(reader.connections, mapping)
+    files = custom_topics(path) if mapping is None else []
+    vehicles: dict[str, _Recording] = {}
+    remarks = []
+    for connection in reader.connections:
+        topic = connection.topic
+        vehicle = "" if mapping is not None else topic.rpartition("/")[0]
+        if topic in wanted:
+            recording = vehicles.setdefault(vehicle, _Recording())
+            recording.streams.append(_stream(reader, connection, wanted[topic]))
+            recording.columns |= {c: Source(f"{topic}:{f}") for c, f in wanted[topic].items()}
+        elif mapping is None and connection.msgtype == LOG_TYPE:
+            variables = variables_of(topic, files)
+            if variables is None:
+                remarks.append(
+                    f"{topic} holds values without names: put the crazyflies.yaml that names them "
+                    "beside the bag"
+                )
+                continue
+            messages = list(_messages(reader, connection))
+            if messages:
+                stream, ahead = log_stream(topic, variables, messages)
+                recording = vehicles.setdefault(vehicle, _Recording())
+                recording.log_streams.append(stream)
+                recording.ahead.append(ahead)
+    return vehicles, remarks
+
+
+def _merged(
+    vehicles: dict[str, _Recording], remarks: list[str], mapping: ColumnMapping | None
 ) -> tuple[dict[str, dict], list[str]]:
-    """The columns of each vehicle, and remarks on topics that hold none. Raises LogError if none
+    """The columns of each vehicle, and remarks on those that hold none. Raises LogError if none
     does.
     """
-    vehicles: dict[str, list[str]] = {}
-    for topic in streams:
-        vehicles.setdefault("" if mapping is not None else topic.rpartition("/")[0], []).append(
-            topic
-        )
     tables = {}
-    remarks = []
-    for vehicle, topics in vehicles.items():
+    for vehicle, recording in vehicles.items():
         if mapping is not None:
             columns = {c: s for c, s in mapping.columns.items() if c not in ("t", "vehicle")}
         else:
-            columns = {c: Source(f"{t}:{f}") for t in topics for c, f in wanted[t].items()}
+            by_name, found = firmware_columns(recording.log_streams)
+            columns = recording.columns | by_name
+            remarks += found
         try:
-            tables[vehicle.strip("/") or "0"] = merge_streams([streams[t] for t in topics], columns)
+            tables[vehicle.strip("/") or "0"] = merge_streams(recording.all_streams(), columns)
         except LogError as error:
             remarks.append(f"topics of {vehicle or '/'}: {error}")
     if not tables:
@@ -141,12 +196,8 @@ def _stream(reader, connection, fields: dict[str, str]) -> Stream:
     """The wanted fields of one topic, named "TOPIC:FIELD"."""
     times = []
     rows = []
-    for _, received, data in reader.messages(connections=[connection]):
-        message = reader.deserialize(data, connection.msgtype)
-        stamp = getattr(getattr(message, "header", None), "stamp", None)
-        nanoseconds = 0 if stamp is None else stamp.sec * 1_000_000_000 + stamp.nanosec
-        # Integer nanoseconds since the bag's start keep their resolution as floats of seconds.
-        times.append((nanoseconds or received) - reader.start_time)
+    for stamp, message in _messages(reader, connection):
+        times.append(stamp)
         rows.append([_field(message, field, connection.topic) for field in fields.values()])
     values = np.asarray(rows, float).reshape(len(rows), len(fields))
     named = {
@@ -154,6 +205,17 @@ def _stream(reader, connection, fields: dict[str, str]) -> Stream:
         for field, column in zip(fields.values(), values.T, strict=True)
     }
     return Stream(np.asarray(times, float) * 1e-9, named)
+
+
+def _messages(reader, connection):
+    """(stamp, message) of a topic: integer nanoseconds since the bag's start, which keep their
+    resolution as floats of seconds; the header's where there is one, else when it was received.
+    """
+    for _, received, data in reader.messages(connections=[connection]):
+        message = reader.deserialize(data, connection.msgtype)
+        stamp = getattr(getattr(message, "header", None), "stamp", None)
+        nanoseconds = 0 if stamp is None else stamp.sec * 1_000_000_000 + stamp.nanosec
+        yield (nanoseconds or received) - reader.start_time, message
 
 
 def _field(message, path: str, topic: str) -> float:
@@ -176,3 +238,6 @@ def _joined(name: str, tables: dict[str, dict[str, np.ndarray]], remarks: list[s
     columns["t"] = columns["t"] - start
     vehicle = np.concatenate([np.full(len(t["t"]), v) for v, t in tables.items()])
     return LogTable(name, columns, vehicle, tuple(remarks))
+
+
+IMPORTER = Importer("ROS 2 bag", is_bag, read_bag)

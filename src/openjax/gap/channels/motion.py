@@ -174,6 +174,10 @@ def _hidden(card, reading: Reading) -> bool:
     """
     if card.needs and any(getattr(t, card.needs) is None for t in reading.tracks):
         return True
+    # Torques alone tell a weaker push from nothing: heavier moments of inertia look the same.
+    weightless = any(t.velocity is None and t.specific_force is None for t in reading.tracks)
+    if card.needs_force and weightless:
+        return True
     if (reading.blind and card.torque_axes) or (reading.unmapped and card.thrust_map):
         return True
     return card.impossible is not None and any(

@@ -126,7 +126,8 @@ class Card:
         held near zero, `others`: more starts of the search.
     path: by which way of the log it is read: "physics" (motors to motion), "radio", "rate_loop",
     "estimator". needs: the channel without which it can't be told, though it leaves a trace in
-    others. coordinate: the variable that its force follows, for pictures; none where it makes
+    others. needs_force: whether it can't be told without a force, of the path or of an accelerometer.
+    coordinate: the variable that its force follows, for pictures; none where it makes
     torques or delays. thrust_map: a map from duty cycles to thrust that isn't known can imitate it.
     torque_axes: those of the torques by which it is told, which what motors do between two rows can
     imitate. log_odds: log prior odds that it acts at a size that matters. possible({parameter:
@@ -148,6 +149,7 @@ class Card:
     balanced: bool = False
     others: tuple[tuple[float, ...], ...] = ()
     needs: str = ""
+    needs_force: bool = False
     coordinate: str = ""
     thrust_map: bool = False
     torque_axes: tuple[int, ...] = ()

@@ -29,6 +29,7 @@ EFFECT = Effect(
     },
     body=body,
     card=Card(
+        needs_force=True,
         coordinate="thrust",
         fitted=(Fitted("extra", mean=0.0, spread=0.005, start=0.001, step=2e-05),),
         thrust_map=True,

@@ -26,6 +26,7 @@ EFFECT = Effect(
     },
     body=body,
     card=Card(
+        needs_force=True,
         coordinate="thrust",
         fitted=(Fitted("scale", mean=0.0, spread=0.1, start=0.02, step=0.001),),
         nuisance={"scale": 0.004},

@@ -1,0 +1,136 @@
+"""Betaflight's blackbox: CSV files as `blackbox_decode` writes them.
+
+Fields and their units (blackbox-tools, blackbox_decode.c): a field's unit stands in brackets behind
+its name unless it is raw. Raw are degrees per second for `gyroADC` and `setpoint`, counts of the
+sensor for `accSmooth`, thousandths for the throttle, and for `motor` either pulses of 1000 to 2000
+us or DShot's 48 to 2047. Axes are forward, left, up, as here: the mixer's signs say so, in which a
+positive pitch raises the rear motors. Motors are rear right, front right, rear left, front left.
+"""
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from openjax.flights.importers.columns import (
+    UNITS,
+    ColumnMapping,
+    Source,
+    Stream,
+    merge_streams,
+)
+from openjax.flights.importers.csv_files import delimiter_of, header_of, raw_columns
+from openjax.flights.importers.registry import Importer
+from openjax.flights.reading import CHANNEL_COLUMNS, LogError, LogTable
+
+MAGIC = b"H Product:Blackbox"
+DSHOT = (48.0, 2047.0)  # the least and the largest throttle value of the protocol
+PULSE = (1000.0, 2000.0)  # us
+# {nominal place's column: index of Betaflight's motor}, mixerQuadX in flight/mixer_init.c
+MOTOR_OF = {"m1": 1, "m2": 0, "m3": 2, "m4": 3}
+_UNIT_NAMES = {"m/s2": "m/s^2"}
+_FIELD = re.compile(r"(.*?)(?: \((.*)\))?")
+
+
+def is_blackbox_csv(path: Path) -> bool:
+    """Whether a CSV is a decoded blackbox."""
+    names = header_of(path)
+    return "loopIteration" in names and any(n.startswith("gyroADC[0]") for n in names)
+
+
+def is_blackbox_binary(path: Path) -> bool:
+    """Whether a file is a blackbox that is still to be decoded."""
+    if not path.is_file():
+        return False
+    if path.suffix.lower() in (".bbl", ".bfl"):
+        return True
+    with path.open("rb") as file:
+        return file.read(len(MAGIC)) == MAGIC
+
+
+def read_blackbox_binary(path: Path, mapping: ColumnMapping | None = None) -> LogTable:
+    """Raises LogError, which names the decoder."""
+    raise LogError(
+        f"a Betaflight blackbox in its binary form: decode it first, `blackbox_decode {path.name}` "
+        "(github.com/betaflight/blackbox-tools), and put the .csv here"
+    )
+
+
+def read_blackbox_csv(path: Path, mapping: ColumnMapping | None = None) -> LogTable:
+    """A decoded blackbox. Raises LogError where it lacks what is needed."""
+    delimiter = delimiter_of(mapping)
+    names = header_of(path, delimiter)
+    fields = {_FIELD.fullmatch(name)[1]: name for name in names}
+    usual = _usual(fields)
+    time = fields.get("time", "time")
+    asked = {} if mapping is None else mapping.columns
+    wanted = (time, *(source.name for source in (*usual.values(), *asked.values())))
+    raw, remarks = raw_columns(path, wanted, time, delimiter)
+    columns = usual | _force(raw, fields, remarks) | _motors(raw, fields, remarks)
+    if mapping is not None:
+        columns = mapping.over(columns)
+    seconds = raw[time] * (1.0 if time.endswith("(s)") else 1e-6)
+    merged = merge_streams([Stream(seconds, raw)], columns)
+    merged["t"] = merged["t"] - merged["t"][0]
+    for motor in set(CHANNEL_COLUMNS["motor_command"]) & set(merged) - set(asked):
+        merged[motor] = np.maximum(merged[motor], 0.0)  # a motor at rest is below DShot's least
+    return LogTable(path.name, merged, np.full(len(merged["t"]), "0"), tuple(remarks))
+
+
+def _usual(fields: dict[str, str]) -> dict[str, Source]:
+    """{column: source} of fields that are there. The force and the motors are raw as yet."""
+    wanted = {f"w{a}": (f"gyroADC[{i}]", UNITS["deg/s"]) for i, a in enumerate("xyz")}
+    wanted |= {f"cmd_w{a}": (f"setpoint[{i}]", UNITS["deg/s"]) for i, a in enumerate("xyz")}
+    wanted |= {f"a{a}": (f"accSmooth[{i}]", 1.0) for i, a in enumerate("xyz")}
+    wanted |= {column: (f"motor[{i}]", 1.0) for column, i in MOTOR_OF.items()}
+    wanted |= {"cmd_thrust": ("setpoint[3]", 1e-3), "vbat": ("vbatLatest", 1.0)}
+    return {
+        column: Source(fields[field], _scale(fields[field], usual))
+        for column, (field, usual) in wanted.items()
+        if field in fields
+    }
+
+
+def _scale(name: str, usual: float) -> float:
+    """The factor of a field to the log format's unit: that in its brackets, or the usual one."""
+    unit = _FIELD.fullmatch(name)[2]
+    return usual if unit is None else UNITS.get(_UNIT_NAMES.get(unit, unit), usual)
+
+
+def _force(raw, fields: dict[str, str], remarks: list[str]) -> dict[str, Source]:
+    """The accelerometer's columns. Raw counts have no unit in the CSV: sensors have a power of two
+    for 1 g, and it is the one nearest to what was felt in the median.
+    """
+    names = [fields.get(f"accSmooth[{i}]") for i in range(3)]
+    if any(name is None or name not in raw for name in names) or "(" in names[0]:
+        return {}
+    felt = np.nanmedian(np.linalg.norm([raw[name] for name in names], axis=0))
+    counts = 2.0 ** np.rint(np.log2(max(felt, 1.0)))
+    remarks.append(f"accSmooth is in the sensor's counts: {counts:g} are taken for 1 g")
+    return {
+        f"a{a}": Source(name, UNITS["g"] / counts) for a, name in zip("xyz", names, strict=True)
+    }
+
+
+def _motors(raw, fields: dict[str, str], remarks: list[str]) -> dict[str, Source]:
+    """The motors' columns, as shares of the range of the protocol that they show: pulses are never
+    below their least, and DShot's largest is beyond that of pulses.
+    """
+    names = {c: fields[f"motor[{i}]"] for c, i in MOTOR_OF.items() if f"motor[{i}]" in fields}
+    values = [raw[name] for name in names.values() if name in raw]
+    if not values:
+        return {}
+    low = min(float(np.nanmin(v)) for v in values)
+    high = max(float(np.nanmax(v)) for v in values)
+    digital = low < PULSE[0] - 1.0 or high > PULSE[1] + 1.0
+    least, most = DSHOT if digital else PULSE
+    kind = "DShot values" if digital else "pulses in us"
+    remarks.append(
+        f"motor[0..3] reach from {low:g} to {high:g}: taken for {kind}, {least:g}..{most:g}"
+    )
+    scale = 1.0 / (most - least)
+    return {c: Source(name, scale, -least * scale) for c, name in names.items()}
+
+
+CSV_IMPORTER = Importer("Betaflight blackbox CSV", is_blackbox_csv, read_blackbox_csv)
+BINARY_IMPORTER = Importer("Betaflight blackbox", is_blackbox_binary, read_blackbox_binary)

@@ -1,0 +1,94 @@
+"""CSV files with the firmware's names: what the Crazyflie's client writes of a log block, and what
+scripts with cflib write.
+
+The client's `LogWriter` puts the firmware's tick in ms into a column `Timestamp` and one file per
+log block; scripts call it `timestamp` or `tick`. Files of several blocks of one flight, which have
+the same ticks, may lie in one folder of the case: they are one log.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from openjax.flights.importers.columns import ColumnMapping, Stream, merge_streams
+from openjax.flights.importers.csv_files import (
+    delimiter_of,
+    header_of,
+    is_csv,
+    is_log_format,
+    raw_columns,
+    seconds_per_unit,
+)
+from openjax.flights.importers.firmware import VARIABLES, firmware_columns, with_mixer
+from openjax.flights.importers.registry import Importer
+from openjax.flights.reading import LogError, LogTable
+
+TIME_NAMES = ("timestamp", "tick", "ticks", "time", "time_ms", "timestamp_ms", "t")
+GROUPS = ("stateEstimate", "stateEstimateZ", "stabilizer", "kalman", "gyro", "acc", "controller")
+"""Of log variables whose names no other program has; other programs have a `motor.m1`, too."""
+SELDOM = 2000.0  # ms between rows: the slowest log block of the firmware has 2550
+
+
+def is_block(path: Path) -> bool:
+    """Whether a CSV holds a time and log variables of the firmware."""
+    names = header_of(path)
+    known = VARIABLES.intersection(names)
+    evident = {name.partition(".")[0] for name in known} & set(GROUPS)
+    # A log block of motors or of the battery alone has nothing else to be known by.
+    alone = known and len(known) == len(names) - 1
+    return bool((evident or alone) and time_name(names) and not is_log_format(names))
+
+
+def is_client_log(path: Path) -> bool:
+    """Whether a path is such a CSV, or a folder of one flight's log blocks and nothing else."""
+    if path.is_dir():
+        inside = sorted(path.iterdir())
+        return len(inside) > 1 and all(is_csv(file) and is_block(file) for file in inside)
+    return is_block(path)
+
+
+def time_name(names: list[str]) -> str | None:
+    """The column that holds the time."""
+    return next((name for name in names if name.lower() in TIME_NAMES), None)
+
+
+def read_client_log(path: Path, mapping: ColumnMapping | None = None) -> LogTable:
+    """A flight's log blocks. Raises LogError where they hold nothing that can be used."""
+    files = sorted(path.iterdir()) if path.is_dir() else [path]
+    streams = []
+    remarks = []
+    for file in files:
+        stream, found = _block(file, mapping)
+        streams.append(with_mixer(stream))
+        remarks += found
+    columns, found = firmware_columns(streams, mapping)
+    merged = merge_streams(streams, columns)
+    merged["t"] = merged["t"] - merged["t"][0]
+    return LogTable(path.name, merged, np.full(len(merged["t"]), "0"), (*remarks, *found))
+
+
+def _block(path: Path, mapping: ColumnMapping | None) -> tuple[Stream, list[str]]:
+    """One file as a stream, time in seconds since the firmware started, and remarks."""
+    delimiter = delimiter_of(mapping)
+    names = header_of(path, delimiter)
+    asked = {} if mapping is None else mapping.columns
+    time = asked["t"].name if "t" in asked else time_name(names)
+    if time is None:
+        raise LogError(f"no column {' or '.join(TIME_NAMES[:2])}: which holds the ticks in ms?")
+    wanted = (time, *VARIABLES, *(source.name for source in asked.values()))
+    values, remarks = raw_columns(path, wanted, time, delimiter)
+    ticks = values.pop(time)
+    scale = asked["t"].scale if "t" in asked else _tick(ticks)
+    return Stream(scale * ticks, values), remarks
+
+
+def _tick(ticks: np.ndarray) -> float:
+    """Seconds of a tick: a ms in the firmware, so that a block that is logged once a second has
+    steps of 1000; where rows are further apart, or not whole numbers, what the steps look like.
+    """
+    steps = np.diff(np.unique(ticks[np.isfinite(ticks)]))
+    whole = len(steps) and not (steps % 1.0).any()
+    return 1e-3 if whole and np.median(steps) <= SELDOM else seconds_per_unit(ticks)
+
+
+IMPORTER = Importer("CSV of the Crazyflie's client or cflib", is_client_log, read_client_log)

@@ -1,0 +1,84 @@
+"""Topics of Crazyswarm2: log blocks of the firmware as `LogDataGeneric`, an array of values.
+
+The message doesn't say what its values are. The `crazyflies.yaml` with which the server was started
+does, under `firmware_logging.custom_topics` of `all`, of a robot's type, or of the robot; it is
+looked for beside the bag and in it.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from openjax.flights.importers.columns import Stream
+from openjax.flights.importers.firmware import with_mixer
+from openjax.flights.reading import LogError
+
+LOG_TYPE = "crazyflie_interfaces/msg/LogDataGeneric"
+# Of bags that don't hold them themselves (crazyswarm2, crazyflie_interfaces/msg).
+DEFINITIONS = {
+    LOG_TYPE: "std_msgs/Header header\nuint32 timestamp\nfloat32[] values\n",
+    "crazyflie_interfaces/msg/Status": (
+        "std_msgs/Header header\nuint16 supervisor_info\nfloat32 battery_voltage\nuint8 pm_state\n"
+        "uint8 rssi\nuint32 num_rx_broadcast\nuint32 num_tx_broadcast\nuint32 num_rx_unicast\n"
+        "uint32 num_tx_unicast\n"
+    ),
+}
+LARGEST_YAML = 1 << 20  # bytes
+
+
+def custom_topics(bag: Path) -> list[dict]:
+    """What the yaml files beside a bag and in it say, those that name custom topics. One that can't
+    be read says nothing: a case's folder may hold any.
+    """
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError
+
+    found = []
+    for path in sorted(p for folder in (bag, bag.parent) for p in folder.glob("*.y*ml")):
+        if not path.is_file() or path.stat().st_size > LARGEST_YAML:
+            continue
+        try:
+            tables = YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))
+        except (YAMLError, UnicodeDecodeError, OSError):
+            continue
+        if isinstance(tables, dict) and any(k in tables for k in ("all", "robots", "robot_types")):
+            found.append(tables)
+    return found
+
+
+def variables_of(topic: str, files: list[dict]) -> tuple[str, ...] | None:
+    """The log variables of a topic ("/cf1/state"), in their order; None where no file names it."""
+    vehicle, _, name = topic.strip("/").rpartition("/")
+    for tables in files:
+        robot = _table(tables, "robots", vehicle)
+        kind = robot.get("type")
+        for owner in (robot, _table(tables, "robot_types", kind), _table(tables, "all")):
+            variables = _table(owner, "firmware_logging", "custom_topics", name).get("vars")
+            if isinstance(variables, list):
+                return tuple(str(variable) for variable in variables)
+    return None
+
+
+def _table(tables, *keys) -> dict:
+    """The table under some keys; an empty one where there is none."""
+    for key in keys:
+        tables = tables.get(key) if isinstance(tables, dict) else None
+    return tables if isinstance(tables, dict) else {}
+
+
+def log_stream(topic: str, variables: tuple[str, ...], messages) -> tuple[Stream, float]:
+    """A topic's messages [(stamp in ns, message)] as a stream of log variables at the firmware's
+    ticks, which don't wait for the radio, and by how much stamps are ahead of ticks at least (s).
+    Raises LogError where messages hold another number of values.
+    """
+    counts = {len(message.values) for _, message in messages}
+    if counts - {len(variables)}:
+        raise LogError(
+            f"messages of {topic} hold {', '.join(map(str, sorted(counts)))} values, but "
+            f"crazyflies.yaml names {len(variables)}: {', '.join(variables)}"
+        )
+    values = np.array([message.values for _, message in messages], float)
+    ticks = np.array([message.timestamp for _, message in messages], float) * 1e-3
+    ahead = float(np.min(np.array([stamp for stamp, _ in messages], float) * 1e-9 - ticks))
+    named = dict(zip(variables, values.T, strict=True))
+    return with_mixer(Stream(ticks, named)), ahead

@@ -1,0 +1,22 @@
+"""CSV files of the log format, and any others whose columns a `columns.toml` names."""
+
+from pathlib import Path
+
+from openjax.flights.importers.columns import ColumnMapping
+from openjax.flights.importers.csv_files import is_csv
+from openjax.flights.importers.registry import Importer
+from openjax.flights.importers.topic_times import read_topic_times
+from openjax.flights.reading import LogTable, read_csv
+
+
+def read_log_format(path: Path, mapping: ColumnMapping | None = None) -> LogTable:
+    """A CSV as a table. Raises LogError where it can't be read."""
+    if mapping is None:
+        return read_csv(path)
+    if mapping.clocks:
+        return read_topic_times(path, mapping)
+    table = read_csv(path, mapping.delimiter, mapping.names(), mapping.time)
+    return mapping.table(path.name, table)
+
+
+IMPORTER = Importer("CSV of the log format", is_csv, read_log_format)

@@ -1,0 +1,238 @@
+"""PX4's ULog files (`.ulg`), through the `pyulog` library.
+
+PX4's world is north, east, down and its body forward, right, down; here they are east, north, up
+and forward, left, up. Motors are put into the nominal order by the places that the log's parameters
+give them (CA_ROTORi_PX, _PY, metres forward and right), or by PX4's quad X.
+
+`actuator_motors` holds shares of the largest thrust. Where it wasn't logged, `actuator_outputs` is
+taken between its least and largest value, and turned into thrust by PX4's own curve,
+thrust = f s^2 + (1 - f) s with f = THR_MDL_FAC (FunctionMotors.hpp).
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from openjax.errors import UserError
+from openjax.flights.importers.columns import ColumnMapping, Source, Stream, merge_streams
+from openjax.flights.importers.registry import Importer
+from openjax.flights.reading import LARGEST, LogError, LogTable
+
+MAGIC = b"ULog\x01\x12\x35"
+QUAD_X = ("front_right", "rear_left", "front_left", "rear_right")  # PX4's motors 1 to 4
+COLUMN_OF = {"front_right": "m1", "rear_right": "m2", "rear_left": "m3", "front_left": "m4"}
+PULSE = (1000.0, 2000.0)  # us, PX4's defaults of PWM_MIN and PWM_MAX
+MOTOR_1 = 101  # the output function of motor 1 in PWM_MAIN_FUNCi
+
+# Topics and, in the frames of the log format, the columns that they hold: (field, scale).
+TOPICS: dict[str, dict[str, tuple[str, float]]] = {
+    "vehicle_local_position": {
+        "x": ("y", 1.0),
+        "y": ("x", 1.0),
+        "z": ("z", -1.0),
+        "vx": ("vy", 1.0),
+        "vy": ("vx", 1.0),
+        "vz": ("vz", -1.0),
+    },
+    "sensor_combined": {
+        "wx": ("gyro_rad[0]", 1.0),
+        "wy": ("gyro_rad[1]", -1.0),
+        "wz": ("gyro_rad[2]", -1.0),
+        "ax": ("accelerometer_m_s2[0]", 1.0),
+        "ay": ("accelerometer_m_s2[1]", -1.0),
+        "az": ("accelerometer_m_s2[2]", -1.0),
+    },
+    "vehicle_angular_velocity": {
+        "wx": ("xyz[0]", 1.0),
+        "wy": ("xyz[1]", -1.0),
+        "wz": ("xyz[2]", -1.0),
+    },
+    "vehicle_acceleration": {
+        "ax": ("xyz[0]", 1.0),
+        "ay": ("xyz[1]", -1.0),
+        "az": ("xyz[2]", -1.0),
+    },
+    "vehicle_rates_setpoint": {
+        "cmd_thrust": ("thrust_body[2]", -1.0),
+        "cmd_wx": ("roll", 1.0),
+        "cmd_wy": ("pitch", -1.0),
+        "cmd_wz": ("yaw", -1.0),
+    },
+    "battery_status": {"vbat": ("voltage_v", 1.0)},
+}
+ATTITUDE = "vehicle_attitude"
+MOTORS = "actuator_motors"
+OUTPUTS = "actuator_outputs"
+
+
+def is_ulog(path: Path) -> bool:
+    """Whether a file starts like a ULog, or is called like one."""
+    if not path.is_file():
+        return False
+    if path.suffix.lower() == ".ulg":
+        return True
+    with path.open("rb") as file:
+        return file.read(len(MAGIC)) == MAGIC
+
+
+def read_ulog(path: Path, mapping: ColumnMapping | None = None) -> LogTable:
+    """Read a ULog. With a mapping, sources are "TOPIC:FIELD" in PX4's frames and units; what it
+    doesn't name is recognised.
+
+    Raises LogError if it is damaged or holds nothing known, UserError without the library.
+    """
+    asked = {} if mapping is None else mapping.over({})
+    log = _parsed(path, {source.name.partition(":")[0] for source in asked.values()})
+    topics = {data.name: data for data in log.data_list if data.multi_id == 0}
+    streams = {name: _stream(data, log.start_timestamp) for name, data in topics.items()}
+    if ATTITUDE in streams:
+        streams[ATTITUDE] = _turned(streams[ATTITUDE])
+    motors, remarks = _motors(streams, log.initial_parameters)
+    if motors is not None:
+        streams["motors"] = motors
+    fastest_first = sorted(streams.values(), key=_period)
+    columns = _columns(fastest_first)
+    if mapping is not None:
+        columns = mapping.over(columns)
+    if log.dropouts:
+        lost = sum(dropout.duration for dropout in log.dropouts)
+        remarks.append(f"{len(log.dropouts)} dropouts of {lost} ms in all while it was logged")
+    merged = merge_streams(fastest_first, columns)
+    merged["t"] = merged["t"] - merged["t"][0]
+    return LogTable(path.name, merged, np.full(len(merged["t"]), "0"), tuple(remarks))
+
+
+def _parsed(path: Path, more: set[str]):
+    """The library's log of the topics that are known and `more`. Raises as `read_ulog` does."""
+    try:
+        from pyulog import ULog
+    except ImportError as error:
+        raise UserError(
+            f"{path}: reading PX4 logs needs the pyulog library: pip install pyulog"
+        ) from error
+    if path.stat().st_size > LARGEST:
+        raise LogError(f"holds more than {LARGEST >> 20} MB: cut it into flights")
+    wanted = {*TOPICS, ATTITUDE, MOTORS, OUTPUTS, *more}
+    try:
+        log = ULog(str(path), sorted(wanted))
+    except Exception as error:  # damaged logs raise many kinds; all mean the same here
+        words = (str(error).splitlines() or [type(error).__name__])[0]
+        raise LogError(f"PX4 log can't be read: {words}") from error
+    if not log.data_list:
+        raise LogError(
+            "a PX4 log without a flight: none of the topics sensor_combined, vehicle_attitude, "
+            "vehicle_local_position, actuator_motors"
+        )
+    return log
+
+
+def _stream(data, start: int) -> Stream:
+    """A topic as a stream of "TOPIC:FIELD", in seconds since the log's start: when it was measured
+    where that is logged, else when it was published.
+    """
+    fields = data.data
+    stamp = np.asarray(fields["timestamp"], np.int64)
+    measured = fields.get("timestamp_sample")
+    if measured is not None and np.all(measured > 0):
+        stamp = np.asarray(measured, np.int64)
+    values = {f"{data.name}:{name}": np.asarray(v, float) for name, v in fields.items()}
+    return Stream((stamp - int(start)) * 1e-6, values)
+
+
+def _period(stream: Stream) -> float:
+    """s between rows; sensors of one rate count as equally fast."""
+    steps = np.diff(stream.time)
+    return round(float(np.median(steps)), 4) if len(steps) else np.inf
+
+
+def _turned(stream: Stream) -> Stream:
+    """The attitude's stream with the quaternion of the log format, body (forward, left, up) to
+    world (east, north, up): q' = (i + j)/sqrt(2) q i*, of q from body to world in PX4's frames.
+    """
+    w, x, y, z = (stream.values[f"{ATTITUDE}:q[{i}]"] for i in range(4))
+    half = np.sqrt(0.5)
+    turned = {
+        "qw": half * (w + z),
+        "qx": half * (x + y),
+        "qy": half * (x - y),
+        "qz": half * (w - z),
+    }
+    return Stream(stream.time, stream.values | turned)
+
+
+def _columns(streams: list[Stream]) -> dict[str, Source]:
+    """{column: source} of what was logged, by the first stream that has it."""
+    found: dict[str, Source] = {}
+    known = {
+        f"{topic}:{field}": (column, scale)
+        for topic, columns in TOPICS.items()
+        for column, (field, scale) in columns.items()
+    }
+    own = {c: (c, 1.0) for c in ("qw", "qx", "qy", "qz", *COLUMN_OF.values())}
+    for stream in streams:
+        for name in stream.values:
+            if name in known or name in own:
+                column, scale = (known | own)[name]
+                found.setdefault(column, Source(name, scale))
+    return found
+
+
+def _motors(streams, parameters) -> tuple[Stream | None, list[str]]:
+    """The motors' thrusts as a stream of m1 to m4, and remarks; None where neither motors nor
+    outputs were logged. Raises LogError for another number of rotors.
+    """
+    places = _places(parameters)
+    if MOTORS in streams:
+        stream = streams[MOTORS]
+        names = [f"{MOTORS}:control[{i}]" for i in range(4)]
+        thrust = [stream.values[name] for name in names]
+    elif OUTPUTS in streams:
+        stream = streams[OUTPUTS]
+        outputs = [_output_of(motor, parameters) for motor in range(4)]
+        signals = [_signal(stream.values[f"{OUTPUTS}:output[{o}]"], o, parameters) for o in outputs]
+        curve = float(parameters.get("THR_MDL_FAC", 0.0))
+        thrust = [curve * s**2 + (1.0 - curve) * s for s in signals]
+    else:
+        return None, []
+    remarks = [] if MOTORS in streams else ["motors are taken from actuator_outputs"]
+    columns = {COLUMN_OF[place]: values for place, values in zip(places, thrust, strict=True)}
+    spins = [parameters.get(f"CA_ROTOR{i}_KM") for i in range(4)]
+    if None not in spins:
+        turns = {p: "ccw" if spin > 0 else "cw" for p, spin in zip(places, spins, strict=True)}
+        said = ", ".join(f'"{turns[place]}"' for place in COLUMN_OF)
+        remarks.append(f"by the log's parameters, motor.spin in vehicle.toml is [{said}]")
+    return Stream(stream.time, columns), remarks
+
+
+def _places(parameters) -> tuple[str, ...]:
+    """Where PX4's motors 1 to 4 sit. Raises LogError where that isn't four corners."""
+    count = int(parameters.get("CA_ROTOR_COUNT", 4))
+    if count != 4:
+        raise LogError(f"the airframe has {count} rotors (CA_ROTOR_COUNT); four are needed")
+    corners = [[parameters.get(f"CA_ROTOR{i}_P{a}") for a in "XY"] for i in range(4)]
+    if any(None in corner for corner in corners):
+        return QUAD_X
+    places = tuple(
+        f"{'front' if x > 0 else 'rear'}_{'right' if y > 0 else 'left'}" for x, y in corners
+    )
+    if set(places) != set(COLUMN_OF):
+        raise LogError(f"rotors sit at {', '.join(places)} (CA_ROTORi_PX, _PY): no quad X")
+    return places
+
+
+def _output_of(motor: int, parameters) -> int:
+    """Index of the output that a motor, from 0 on, is on: by PWM_MAIN_FUNCi, or its own number."""
+    functions = {i: parameters.get(f"PWM_MAIN_FUNC{i + 1}") for i in range(16)}
+    return next((i for i, f in functions.items() if f == MOTOR_1 + motor), motor)
+
+
+def _signal(output: np.ndarray, index: int, parameters) -> np.ndarray:
+    """An output as a share of its range."""
+    least, most = (
+        float(parameters.get(f"PWM_MAIN_{end}{index + 1}", parameters.get(f"PWM_{end}", usual)))
+        for end, usual in (("MIN", PULSE[0]), ("MAX", PULSE[1]))
+    )
+    return np.clip((output - least) / max(most - least, 1.0), 0.0, 1.0)
+
+
+IMPORTER = Importer("PX4 ULog", is_ulog, read_ulog)

@@ -1,0 +1,49 @@
+"""Which importers there are: each says which files are its own, and reads them as a `LogTable`.
+
+The shipped ones are in a list like any other; a program of yours adds one by `register`.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from openjax.flights.importers.columns import ColumnMapping
+from openjax.flights.reading import LogTable
+
+
+@dataclass(frozen=True)
+class Importer:
+    """How logs of one format are read.
+
+    name: of the format, in words.
+    matches(path): whether a file or folder of a case is such a log. It is asked of everything in
+        the folder, so it looks at the name or at the first bytes, and never raises.
+    read(path, mapping): the log in the log format's columns and units. `mapping` is what the case's
+        `columns.toml` says, None without one. Raises LogError, in one line, for a log that can't be
+        read.
+    """
+
+    name: str
+    matches: Callable[[Path], bool]
+    read: Callable[[Path, ColumnMapping | None], LogTable]
+
+
+_IMPORTERS: list[Importer] = []
+
+
+def register(importer: Importer) -> Importer:
+    """Add an importer, which is asked before those that are there already; one of the same name
+    takes the other's place. Returns it.
+    """
+    _IMPORTERS[:] = [importer, *(other for other in _IMPORTERS if other.name != importer.name)]
+    return importer
+
+
+def importers() -> tuple[Importer, ...]:
+    """All importers, in the order in which they are asked."""
+    return tuple(_IMPORTERS)
+
+
+def importer_of(path: Path) -> Importer | None:
+    """The first importer that knows a file or folder; None where none does."""
+    return next((importer for importer in _IMPORTERS if importer.matches(path)), None)

@@ -1,0 +1,166 @@
+"""CSV files with a time stamp for each topic, as exports from bags have them: `pose.time, pose.x,
+..., imu.time, imu.wx, ...`. What stands in a row together needn't have been measured together, so
+that each topic is a stream with its own clock, merged as a bag's topics are.
+
+The layout is evident where two or more columns are called like a topic and a time. Without a
+`columns.toml` the last part of a name says what it holds: `imu.wx` is `wx`, `quat.w` is `qw`.
+"""
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from openjax.errors import suggestion
+from openjax.flights.importers.columns import (
+    EULER,
+    ColumnMapping,
+    Source,
+    Stream,
+    merge_streams,
+)
+from openjax.flights.importers.csv_files import (
+    delimiter_of,
+    header_of,
+    is_log_format,
+    raw_columns,
+    seconds_per_unit,
+)
+from openjax.flights.importers.registry import Importer
+from openjax.flights.reading import LOG_COLUMNS, LogError, LogTable
+
+SEPARATORS = "./:"
+_STAMP = re.compile(rf"(.+?)(?:[{SEPARATORS}]header)?[{SEPARATORS}_](time|timestamp|stamp|t)", re.I)
+# What the last part of a name holds by the topic that it stands in: "vel.x" is vx.
+GROUPS = {
+    "pos": {a: a for a in "xyz"},
+    "position": {a: a for a in "xyz"},
+    "quat": {a: f"q{a}" for a in "wxyz"},
+    "quaternion": {a: f"q{a}" for a in "wxyz"},
+    "orientation": {a: f"q{a}" for a in "wxyz"},
+    "vel": {a: f"v{a}" for a in "xyz"},
+    "velocity": {a: f"v{a}" for a in "xyz"},
+    "gyro": {a: f"w{a}" for a in "xyz"},
+    "angular_velocity": {a: f"w{a}" for a in "xyz"},
+    "acc": {a: f"a{a}" for a in "xyz"},
+    "accel": {a: f"a{a}" for a in "xyz"},
+    "linear_acceleration": {a: f"a{a}" for a in "xyz"},
+}
+
+
+def stamps_of(names: list[str]) -> dict[str, str]:
+    """{topic: the column of its time stamp} of a header's names."""
+    found = {name: _STAMP.fullmatch(name) for name in names}
+    return {match[1]: name for name, match in found.items() if match}
+
+
+def topic_of(name: str, topics) -> str | None:
+    """The topic of a column: the longest that its name begins with."""
+    mine = [t for t in topics if name == t or re.match(rf"{re.escape(t)}[{SEPARATORS}_]", name)]
+    return max(mine, key=len, default=None)
+
+
+def has_topic_times(path: Path) -> bool:
+    """Whether a CSV has several time stamps, and none for all."""
+    names = header_of(path)
+    if len(names) == 1:  # separated by something else, as a columns.toml may say
+        names = header_of(path, ";")
+    return len(stamps_of(names)) > 1 and not is_log_format(names)
+
+
+def read_topic_times(path: Path, mapping: ColumnMapping | None = None) -> LogTable:
+    """A CSV of topics. Raises LogError where it holds no column that is known."""
+    delimiter = delimiter_of(mapping)
+    names = header_of(path, delimiter)
+    stamps = _named_stamps(names, mapping)
+    sources = recognised(names, stamps) if mapping is None else mapping.over({})
+    clock_of = _clocks(sources, stamps, mapping)
+    wanted = (*stamps.values(), *(source.name for source in sources.values()))
+    raw, remarks = raw_columns(path, wanted, next(iter(stamps.values())), delimiter)
+    streams = _streams(raw, sources, clock_of, mapping)
+    missing = [source.name for source in sources.values() if source.name not in raw]
+    remarks += [f"no column {name!r}" for name in missing]
+    used = sorted(set(clock_of.values()))
+    if mapping is not None and not mapping.clocks and len(used) > 1:
+        remarks.append(f"each topic's columns are at its own times: {', '.join(used)}")
+    merged = merge_streams(streams, sources)
+    merged["t"] = merged["t"] - merged["t"][0]
+    return LogTable(path.name, merged, np.full(len(merged["t"]), "0"), tuple(remarks))
+
+
+def recognised(names: list[str], stamps: dict[str, str]) -> dict[str, Source]:
+    """{column: source} of what a header's names say by themselves. Raises LogError for nothing."""
+    found = {}
+    for name in names:
+        topic = topic_of(name, stamps)
+        if topic is None or name in stamps.values():
+            continue
+        *groups, last = re.split(rf"[{SEPARATORS}]", name)
+        column = next((GROUPS[g][last] for g in groups[::-1] if last in GROUPS.get(g, ())), last)
+        if column in LOG_COLUMNS[2:] or column in EULER:
+            found.setdefault(column, Source(name))
+    if not found:
+        raise LogError(
+            f"each topic has a time stamp ({', '.join(stamps.values())}), but no column is called "
+            f"like x, qw, wx, m1: say in columns.toml which is which"
+        )
+    return found
+
+
+def _named_stamps(names: list[str], mapping: ColumnMapping | None) -> dict[str, str]:
+    """{topic: column} of the time stamps that the header shows and those that `columns.toml`
+    names. Raises LogError for one that isn't there.
+    """
+    stamps = stamps_of(names)
+    for clock in () if mapping is None else mapping.clocks:
+        name = clock.source.name
+        if name not in names:
+            raise LogError(f"no column {name!r} for t; {suggestion(name, names)}")
+        if name not in stamps.values():
+            stamps[name] = name
+    return stamps
+
+
+def _clocks(sources, stamps: dict[str, str], mapping: ColumnMapping | None) -> dict[str, str]:
+    """{column: the time stamp's column} of what is read: what `columns.toml` says, its topic's, or
+    else the first that it names. Raises LogError for a column that has none.
+    """
+    said = {}
+    usual = None
+    if mapping is not None:
+        said = {column: c.source.name for c in mapping.clocks for column in c.columns}
+        usual = mapping.columns["t"].name if "t" in mapping.columns else None
+    found = {}
+    for column, source in sources.items():
+        topic = topic_of(source.name, stamps)
+        found[column] = said.get(column, usual if topic is None else stamps[topic])
+        if found[column] is None:
+            raise LogError(f"column {source.name!r} has no time stamp: name it for t")
+    return found
+
+
+def _streams(raw, sources, clock_of: dict[str, str], mapping) -> list[Stream]:
+    """A stream for each time stamp in use, in seconds since the first of any; rows that repeat a
+    stamp hold nothing new.
+    """
+    clocks = [clock for clock in set(clock_of.values()) if clock in raw]
+    units = {} if mapping is None else {c.source.name: c.source.scale for c in mapping.clocks}
+    usual = None if mapping is None or "t" not in mapping.columns else mapping.columns["t"].scale
+    scale = {c: units.get(c, usual or seconds_per_unit(raw[c])) for c in clocks}
+    # Stamps since 1970 in ns are known to 256 ns as floats; their differences lose no more.
+    begin = {
+        unit: min(np.nanmin(raw[c]) for c in clocks if scale[c] == unit) for unit in scale.values()
+    }
+    start = min(unit * first for unit, first in begin.items())
+    streams = []
+    for clock in clocks:
+        unit = scale[clock]
+        time = (raw[clock] - begin[unit]) * unit + (begin[unit] * unit - start)
+        _, rows = np.unique(time, return_index=True)
+        rows = rows[np.isfinite(time[rows])]
+        mine = {sources[c].name for c, k in clock_of.items() if k == clock} & set(raw)
+        streams.append(Stream(time[rows], {name: raw[name][rows] for name in mine}))
+    return streams
+
+
+IMPORTER = Importer("CSV with a time stamp for each topic", has_topic_times, read_topic_times)
