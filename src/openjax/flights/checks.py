@@ -32,7 +32,10 @@ def check_flight(
     try:
         _has_what_is_needed(flight, comparison)
         if not (flight.has_pose or flight.has_imu):
-            note("columns", "no accelerometer, nor a pose: torques alone can be told (log ax, ay, az)")
+            note(
+                "columns",
+                "no accelerometer, nor a pose: torques alone can be told (log ax, ay, az)",
+            )
         checked = _in_time(flight, note)
         checked = put_in_step(drop_repeats(drop_frozen(checked, note), note), note)
         checked = _in_range(checked, note)

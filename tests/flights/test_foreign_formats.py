@@ -1,0 +1,469 @@
+"""Files as laboratories have them, each made small from a sample flight and read without a
+`columns.toml`: what arrives is what was flown.
+"""
+
+import struct
+
+import numpy as np
+import pytest
+
+from openjax.flights.case import load_case
+from openjax.flights.importers import find_logs, load_mapping, read_log
+from openjax.flights.importers.columns import CHANNEL_COLUMNS
+from openjax.flights.reading import LogError, flights_of
+
+DEGREES = 180 / np.pi
+G = 9.80665
+
+
+@pytest.fixture
+def columns(sample_columns):
+    return {name: values[:400] for name, values in sample_columns["flight_c"].items()}
+
+
+def write_table(path, table, form="{:.9g}", separator=","):
+    """A CSV of {name: values}; text stays as it is."""
+    rows = zip(*table.values(), strict=True)
+    cells = [[v if isinstance(v, str) else form.format(v) for v in row] for row in rows]
+    lines = [separator.join(table), *(separator.join(row) for row in cells)]
+    path.write_text("\n".join(lines) + "\n")
+
+
+def assert_read(table, columns, names, tolerance=1e-4, rows=slice(None)):
+    for name in names:
+        np.testing.assert_allclose(
+            table.columns[name][rows], columns[name][rows], atol=tolerance, err_msg=name
+        )
+
+
+def mixer_inputs(columns):
+    """What the firmware's legacy power distribution makes these motors of."""
+    m = 65535 * np.stack([columns[f"m{i}"] for i in "1234"])
+    return {
+        "controller.cmd_thrust": m.mean(0),
+        "controller.cmd_roll": (m[2] + m[3] - m[0] - m[1]) / 2,
+        "controller.cmd_pitch": (m[0] + m[3] - m[1] - m[2]) / 2,
+        "controller.cmd_yaw": (m[0] + m[2] - m[1] - m[3]) / 4,
+    }
+
+
+def client_blocks(c):
+    """Log blocks as the client has them: the firmware's units, and its sense of pitch."""
+    roll, pitch, yaw = euler(c)
+    return {
+        "stabilizer": {
+            "stateEstimate.x": c["x"],
+            "stateEstimate.y": c["y"],
+            "stateEstimate.z": c["z"],
+            "stabilizer.roll": roll * DEGREES,
+            "stabilizer.pitch": -pitch * DEGREES,
+            "stabilizer.yaw": yaw * DEGREES,
+        },
+        "imu": {f"gyro.{a}": c[f"w{a}"] * DEGREES for a in "xyz"}
+        | {f"acc.{a}": c[f"a{a}"] / G for a in "xyz"},
+        "motors": {f"motor.m{i}": np.rint(c[f"m{i}"] * 65535) for i in (1, 2, 3, 4)},
+    }
+
+
+def euler(c):
+    """Roll, pitch and yaw (rad) of a sample's quaternion, turned in the order z, y, x."""
+    qw, qx, qy, qz = (c[f"q{a}"] for a in "wxyz")
+    roll = np.arctan2(2 * (qw * qx + qy * qz), 1 - 2 * (qx**2 + qy**2))
+    pitch = np.arcsin(2 * (qw * qy - qz * qx))
+    yaw = np.arctan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy**2 + qz**2))
+    return roll, pitch, yaw
+
+
+MOTION = ("t", "x", "z", "qw", "qx", "qy", "qz", "wx", "wy", "wz", "ax", "az", "m1", "m2", "m4")
+
+
+@pytest.mark.parametrize("name", ["Timestamp", "timestamp", "tick"])
+def test_the_clients_csv_is_read_by_its_firmware_names(tmp_path, columns, name):
+    ticks = 81234 + np.rint(columns["t"] * 1000)
+    blocks = client_blocks(columns)
+    table = {name: ticks} | blocks["stabilizer"] | blocks["imu"] | blocks["motors"]
+    table["sys.flightmode"] = ["0"] + ["HOVER"] * 399  # a text beside the numbers
+    write_table(tmp_path / "flight.csv", table)
+    assert find_logs(tmp_path) == [tmp_path / "flight.csv"]
+    read = read_log(tmp_path / "flight.csv")
+    assert_read(read, columns, MOTION)
+    assert read.remarks == ()
+
+
+def test_the_clients_log_blocks_of_one_flight_are_one_log(tmp_path, columns):
+    """One file for each block, as the client writes them, at rates of their own."""
+    flight = tmp_path / "20261127T10-11-12"
+    flight.mkdir()
+    every = {"stabilizer": 2, "imu": 1, "motors": 1}
+    for block, values in client_blocks(columns).items():
+        rows = slice(None, None, every[block])
+        table = {"Timestamp": 500 + np.rint(columns["t"] * 1000)} | values
+        write_table(flight / f"{block}.csv", {n: v[rows] for n, v in table.items()})
+    battery = {"Timestamp": np.array([600, 1600, 2600]), "pm.vbat": np.array([4.0, 3.9, 3.8])}
+    write_table(flight / "battery.csv", battery)
+    assert find_logs(tmp_path) == [flight]
+    read = read_log(flight)
+    assert_read(read, columns, ("t", "wx", "wy", "az", "m1", "m3"))
+    assert_read(read, columns, ("x", "qw", "qy"), 2e-3, slice(0, -1, 2))
+    assert np.isfinite(read.columns["vbat"]).sum() == 3
+
+
+def test_mixer_and_controller_stand_for_motors_and_gyroscope(tmp_path, columns):
+    """What CrazyPAD's logs hold: the mixer's inputs, the controller's gyroscope (rad/s, legacy
+    pitch) and vertical force, ticks with fractions of a ms.
+    """
+    table = {"timestamp": columns["t"] * 1000 + 0.003} | mixer_inputs(columns)
+    table |= {
+        "controller.r_roll": columns["wx"],
+        "controller.r_pitch": -columns["wy"],
+        "controller.r_yaw": columns["wz"],
+        "controller.accelz": columns["az"] / G,
+        "stateEstimate.x": columns["x"],
+        "stateEstimate.y": columns["y"],
+        "stateEstimate.z": columns["z"],
+    }
+    write_table(tmp_path / "log.csv", table)
+    (tmp_path / "vehicle.toml").write_text("")
+    read = read_log(tmp_path / "log.csv")
+    assert_read(read, columns, ("wx", "wy", "wz", "az", "x", "m1", "m2", "m3", "m4"))
+    assert any("mixer" in remark for remark in read.remarks)
+    (flight,) = load_case(tmp_path).flights
+    assert flight.specific_force is None and flight.quaternion is None
+
+
+def test_gyroscope_and_motors_alone_are_a_flight(tmp_path, columns):
+    names = ("t", *CHANNEL_COLUMNS["body_rates"], *CHANNEL_COLUMNS["motor_command"])
+    write_table(tmp_path / "log.csv", {n: columns[n] for n in names})
+    (tmp_path / "vehicle.toml").write_text("")
+    case = load_case(tmp_path)
+    assert [flight.name for flight in case.flights] == ["log.csv"]
+    assert any("torques alone" in issue.issue for issue in case.quality)
+
+
+TOPICS = {
+    "pose": ("x", "y", "z", "qw", "qx", "qy", "qz"),
+    "imu": ("wx", "wy", "wz", "ax", "ay", "az"),
+    "motor": ("m1", "m2", "m3", "m4"),
+}
+
+
+def topic_table(columns, name="{topic}.{column}", stamp="{topic}.time"):
+    """Topics that were put side by side by the number of their rows: their times in a row are up
+    to 80 ms apart.
+    """
+    table = {}
+    for late, (topic, names) in enumerate(TOPICS.items()):
+        rows = slice(4 * late, len(columns["t"]) - 8 + 4 * late)
+        stamps = 1_700_000_000_000_000_000 + np.rint(columns["t"][rows] * 1e9).astype(np.int64)
+        table[stamp.format(topic=topic)] = [str(s) for s in stamps]
+        table |= {name.format(topic=topic, column=c): columns[c][rows] for c in names}
+    return table
+
+
+@pytest.mark.parametrize("name", ["{topic}.{column}", "/cf1/{topic}/{column}"])
+def test_each_topic_of_a_csv_has_its_own_time(tmp_path, columns, name):
+    stamp = name.replace("{column}", "time")
+    write_table(tmp_path / "flight.csv", topic_table(columns, name, stamp))
+    read = read_log(tmp_path / "flight.csv")
+    for column in ("x", "qy", "wx", "az", "m1"):
+        shifted = {column: columns[column][_first(read, columns) :]}
+        assert_read(read, shifted, (column,), 1e-4, slice(10, 300))
+
+
+def _first(read, columns):
+    """The row of the sample with which the merged table begins, by its gyroscope."""
+    wx = read.columns["wx"]
+    row = int(np.flatnonzero(np.isfinite(wx))[0])
+    return int(np.argmin(np.abs(columns["wx"] - wx[row]))) - row
+
+
+def test_columns_toml_names_a_time_for_each_group(tmp_path, columns):
+    """Stamps with names that say nothing, one of them in another unit."""
+    table = topic_table(columns, "{column}_raw", "{topic}_t")
+    table = {n.replace("motor_t", "stamp 3").replace("_t", " clock"): v for n, v in table.items()}
+    table["stamp 3"] = [f"{int(v) * 1e-6:.6f}" for v in table["stamp 3"]]
+    write_table(tmp_path / "flight.csv", table)
+    groups = {"pose clock": "pose", "imu clock": "imu", "stamp 3": "motor"}
+    units = dict.fromkeys(groups, "ns") | {"stamp 3": "ms"}
+    clocks = ", ".join(
+        f'{{ from = "{stamp}", unit = "{units[stamp]}", of = {list(TOPICS[topic])} }}'
+        for stamp, topic in groups.items()
+    )
+    text = f"[columns]\nt = [{clocks}]\n"
+    text += "".join(f'{c} = "{c}_raw"\n' for names in TOPICS.values() for c in names)
+    (tmp_path / "columns.toml").write_text(text)
+    read = read_log(tmp_path / "flight.csv", load_mapping(tmp_path / "columns.toml"))
+    first = _first(read, columns)
+    for column in ("x", "wx", "m1"):
+        shifted = {column: columns[column][first:]}
+        assert_read(read, shifted, (column,), 1e-3, slice(10, 300))
+    (tmp_path / "columns.toml").write_text(text.replace("pose clock", "pose time"))
+    with pytest.raises(LogError, match="no column 'pose time' for t"):
+        read_log(tmp_path / "flight.csv", load_mapping(tmp_path / "columns.toml"))
+
+
+def test_one_named_time_does_not_take_the_others_away(tmp_path, columns):
+    write_table(tmp_path / "flight.csv", topic_table(columns))
+    text = '[columns]\nt = { from = "pose.time", unit = "ns" }\n'
+    text += "".join(f'{c} = "{t}.{c}"\n' for t, names in TOPICS.items() for c in names)
+    (tmp_path / "columns.toml").write_text(text)
+    mapped = read_log(tmp_path / "flight.csv", load_mapping(tmp_path / "columns.toml"))
+    plain = read_log(tmp_path / "flight.csv")
+    assert "each topic's columns are at its own times" in mapped.remarks[0]
+    assert_read(mapped, plain.columns, ("t", "x", "wx", "m1"))
+
+
+# --- PX4
+
+
+def ulog(topics, parameters):
+    """A ULog as PX4 writes it: {topic: (times in s, {field: (type, values)})}, {name: float}."""
+
+    def message(kind, data):
+        return struct.pack("<HB", len(data), ord(kind)) + data
+
+    out = b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 1_000_000)
+    out += message("B", bytes(40))
+    letters = {"float": "f", "uint64_t": "Q"}
+    for topic, (_, fields) in topics.items():
+        kinds = {name: kind for name, (kind, _) in fields.items()}
+        text = "".join(f"{kind} {name};" for name, kind in kinds.items())
+        out += message("F", f"{topic}:uint64_t timestamp;{text}".encode())
+    for name, value in parameters.items():
+        key = f"float {name}".encode()
+        out += message("P", bytes([len(key)]) + key + struct.pack("<f", value))
+    records = []
+    for number, (topic, (times, fields)) in enumerate(topics.items()):
+        out += message("A", struct.pack("<BH", 0, number) + topic.encode())
+        for row, time in enumerate(times):
+            data = struct.pack("<HQ", number, 1_500_000 + round(time * 1e6))
+            for kind, values in fields.values():
+                cells = np.atleast_1d(values[row])
+                data += struct.pack(f"<{len(cells)}{letters[kind.partition('[')[0]]}", *cells)
+            records.append((time, message("D", data)))
+    return out + b"".join(data for _, data in sorted(records, key=lambda r: r[0]))
+
+
+def frame(forward, left, up):
+    """A vector of ours in PX4's body."""
+    return np.stack([forward, -left, -up], 1)
+
+
+def px4_topics(c, order=("m1", "m3", "m4", "m2")):
+    """A sample flight in PX4's frames; `order`: our column of PX4's motors 1 to 4."""
+    t = c["t"]
+    half = np.sqrt(0.5)
+    qw, qx, qy, qz = (c[f"q{a}"] for a in "wxyz")
+    turned = np.stack([half * (qw + qz), half * (qx + qy), half * (qx - qy), half * (qw - qz)], 1)
+    turned[::3] *= -1.0  # the same attitude
+    slow = slice(None, None, 2)
+    motors = np.full((len(t), 12), np.nan)
+    motors[:, :4] = np.stack([c[m] for m in order], 1)
+    rates = frame(c["wx"], c["wy"], c["wz"])
+    force = frame(c["ax"], c["ay"], c["az"])
+    return {
+        "vehicle_attitude": (t[slow], {"q": ("float[4]", turned[slow])}),
+        "vehicle_local_position": (
+            t[slow],
+            {
+                "x": ("float", c["y"][slow]),
+                "y": ("float", c["x"][slow]),
+                "z": ("float", -c["z"][slow]),
+                "vx": ("float", c["vy"][slow]),
+                "vy": ("float", c["vx"][slow]),
+                "vz": ("float", -c["vz"][slow]),
+            },
+        ),
+        "sensor_combined": (
+            t,
+            {"gyro_rad": ("float[3]", rates), "accelerometer_m_s2": ("float[3]", force)},
+        ),
+        "actuator_motors": (t, {"control": ("float[12]", motors)}),
+        "battery_status": (t[::50], {"voltage_v": ("float", np.full(len(t[::50]), 15.2))}),
+    }
+
+
+PX4_NAMES = ("wx", "wy", "wz", "ax", "ay", "az", "m1", "m2", "m3", "m4")
+
+
+def test_a_px4_log_arrives_in_our_frames_and_order(tmp_path, columns):
+    pytest.importorskip("pyulog")
+    (tmp_path / "flight.ulg").write_bytes(ulog(px4_topics(columns), {"THR_MDL_FAC": 0.3}))
+    assert find_logs(tmp_path) == [tmp_path / "flight.ulg"]
+    read = read_log(tmp_path / "flight.ulg")
+    assert_read(read, columns, PX4_NAMES)
+    (flight,), _ = flights_of(read)
+    rows = slice(0, -2, 2)
+    (own,), _ = flights_of(type(read)("own", columns, np.full(len(columns["t"]), "0")))
+    np.testing.assert_allclose(flight.position[rows], own.position[rows], atol=1e-5)
+    np.testing.assert_allclose(flight.velocity[rows], own.velocity[rows], atol=1e-5)
+    agreement = np.abs((flight.quaternion * own.quaternion).sum(1))
+    np.testing.assert_allclose(agreement[rows], 1.0, atol=1e-6)
+    assert np.nanmedian(read.columns["vbat"]) == pytest.approx(15.2)
+    (tmp_path / "vehicle.toml").write_text("")
+    case = load_case(tmp_path)  # all checks of agreement pass
+    assert [f.name for f in case.flights] == ["flight.ulg"], case.quality
+
+
+def test_a_px4_airframe_is_taken_from_its_parameters(tmp_path, columns):
+    """Motors in another order, logged as pulses of outputs that aren't in order either."""
+    pytest.importorskip("pyulog")
+    places = {"m2": (-1, 1, -1), "m1": (1, 1, 1), "m4": (1, -1, -1), "m3": (-1, -1, 1)}
+    topics = px4_topics(columns)
+    del topics["actuator_motors"]
+    # outputs 3, 4, 1, 2 are motors 1, 2, 3, 4
+    wired = ("m4", "m3", "m2", "m1")
+    curve = 0.4
+    thrust = np.stack([columns[m] for m in wired], 1)
+    signal = (-(1 - curve) + np.sqrt((1 - curve) ** 2 + 4 * curve * thrust)) / (2 * curve)
+    pulses = np.full((len(thrust), 16), 900.0)
+    pulses[:, :4] = 1100 + 800 * signal
+    topics["actuator_outputs"] = (columns["t"], {"output": ("float[16]", pulses)})
+    parameters = {"THR_MDL_FAC": curve, "CA_ROTOR_COUNT": 4.0, "PWM_MIN": 1100, "PWM_MAX": 1900}
+    for i, (x, y, spin) in enumerate(places.values()):
+        parameters |= {f"CA_ROTOR{i}_PX": x, f"CA_ROTOR{i}_PY": y, f"CA_ROTOR{i}_KM": 0.05 * spin}
+    parameters |= {f"PWM_MAIN_FUNC{o}": 101 + m for m, o in enumerate((3, 4, 1, 2))}
+    (tmp_path / "flight.ulg").write_bytes(ulog(topics, parameters))
+    read = read_log(tmp_path / "flight.ulg")
+    assert_read(read, columns, PX4_NAMES, 2e-4)
+    assert any('"ccw", "cw", "ccw", "cw"' in remark for remark in read.remarks)
+    parameters["CA_ROTOR_COUNT"] = 6.0
+    (tmp_path / "flight.ulg").write_bytes(ulog(topics, parameters))
+    with pytest.raises(LogError, match="6 rotors"):
+        read_log(tmp_path / "flight.ulg")
+
+
+@pytest.mark.parametrize("data", [b"ULog\x01\x12\x35", b"ULog\x01\x12\x35\x01" + bytes(8)])
+def test_a_px4_log_without_a_flight_says_so(tmp_path, data):
+    pytest.importorskip("pyulog")
+    (tmp_path / "flight.ulg").write_bytes(data)
+    with pytest.raises(LogError, match="PX4 log"):
+        read_log(tmp_path / "flight.ulg")
+
+
+# --- Betaflight
+
+
+def blackbox(c, unit=""):
+    """A decoded blackbox: raw values, or with blackbox_decode's --unit-rotation and
+    --unit-acceleration.
+    """
+    force = G if unit else G / 2048
+    table = {"loopIteration": np.arange(len(c["t"])), "time (us)": 12_345 + c["t"] * 1e6}
+    table |= {f"setpoint[{i}]": c[f"cmd_w{a}"] * DEGREES for i, a in enumerate("xyz")}
+    table["setpoint[3]"] = c["cmd_thrust"] * 1000
+    table["vbatLatest (V)"] = np.full(len(c["t"]), 16.1)
+    rate = (DEGREES, "") if not unit else (1.0, " (rad/s)")
+    table |= {f"gyroADC[{i}]{rate[1]}": c[f"w{a}"] * rate[0] for i, a in enumerate("xyz")}
+    table |= {f"accSmooth[{i}]{unit}": c[f"a{a}"] / force for i, a in enumerate("xyz")}
+    for number, column in enumerate(("m2", "m1", "m3", "m4")):
+        table[f"motor[{number}]"] = 48 + 1999 * c[column]
+    table["flightModeFlags (flags)"] = ["0", *["ANGLE_MODE|HORIZON_MODE"] * (len(c["t"]) - 1)]
+    return table
+
+
+@pytest.mark.parametrize("unit", ["", " (g)"])
+def test_a_decoded_blackbox_is_read(tmp_path, columns, unit):
+    path = tmp_path / "LOG00001.01.csv"
+    write_table(path, blackbox(columns, unit), separator=", ")
+    read = read_log(path)
+    assert_read(read, columns, (*PX4_NAMES, "cmd_thrust", "cmd_wx", "cmd_wy", "cmd_wz"))
+    assert_read(read, columns, ("t",), 1e-6)
+    (tmp_path / "vehicle.toml").write_text("")
+    case = load_case(tmp_path)
+    assert [f.name for f in case.flights] == [path.name], case.quality
+
+
+def test_a_blackbox_of_pulses_is_told_from_one_of_dshot(tmp_path, columns):
+    table = blackbox(columns)
+    for number, column in enumerate(("m2", "m1", "m3", "m4")):
+        table[f"motor[{number}]"] = 1000 + 1000 * columns[column]
+    write_table(tmp_path / "log.csv", table, separator=", ")
+    read = read_log(tmp_path / "log.csv")
+    assert_read(read, columns, ("m1", "m2", "m3", "m4"))
+    assert any("pulses" in remark for remark in read.remarks)
+
+
+@pytest.mark.parametrize("name", ["LOG00001.BFL", "blackbox.bbl", "LOG1.TXT"])
+def test_a_binary_blackbox_names_its_decoder(tmp_path, name):
+    (tmp_path / name).write_bytes(b"H Product:Blackbox flight data recorder\nH Data version:2\n")
+    assert find_logs(tmp_path) == [tmp_path / name]
+    with pytest.raises(LogError, match=f"blackbox_decode {name}"):
+        read_log(tmp_path / name)
+
+
+# --- Crazyswarm2
+
+SWARM_YAML = """
+robots:
+  cf1: { enabled: true, type: cf21 }
+  cf2:
+    enabled: true
+    type: cf21
+    firmware_logging:
+      custom_topics:
+        rates: { frequency: 100, vars: ["gyro.z", "gyro.y", "gyro.x"] }
+robot_types:
+  cf21:
+    firmware_logging:
+      custom_topics:
+        rates: { frequency: 100, vars: ["gyro.x", "gyro.y", "gyro.z"] }
+all:
+  firmware_logging:
+    enabled: true
+    default_topics: { pose: { frequency: 50 } }
+    custom_topics:
+      mixer: { frequency: 100, vars: [%s] }
+      rates: { frequency: 10, vars: ["acc.x"] }
+"""
+
+
+def write_swarm_bag(path, c):
+    """Two vehicles with custom topics; every message waits for the radio for some ms more."""
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    from openjax.flights.importers.crazyswarm import DEFINITIONS, LOG_TYPE
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    store.register(get_types_from_msg(DEFINITIONS[LOG_TYPE], LOG_TYPE))
+    types = store.types
+    log, header, stamp = (
+        types[n] for n in (LOG_TYPE, "std_msgs/msg/Header", "builtin_interfaces/msg/Time")
+    )
+    waits = np.random.default_rng(1).integers(0, 8, len(c["t"])) * 1_000_000
+    waits[7] = 0
+    values = {
+        "mixer": np.stack(list(mixer_inputs(c).values()), 1),
+        "rates": np.stack([c["wx"], c["wy"], c["wz"]], 1) * DEGREES,
+    }
+    with Writer(path, version=8, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        for vehicle in ("cf1", "cf2"):
+            for topic, rows in values.items():
+                rows = rows[:, ::-1] if (vehicle, topic) == ("cf2", "rates") else rows
+                name = f"/{vehicle}/{topic}"
+                connection = writer.add_connection(name, LOG_TYPE, typestore=store)
+                for k, row in enumerate(rows):
+                    tick = 40_000 + round(float(c["t"][k]) * 1000)
+                    at = 1_700_000_000_000_000_000 + tick * 1_000_000 + int(waits[k])
+                    time = stamp(at // 10**9, at % 10**9)
+                    message = log(header(time, ""), tick, row.astype(np.float32))
+                    writer.write(connection, at, store.serialize_cdr(message, LOG_TYPE))
+
+
+def test_crazyswarms_topics_are_named_by_its_yaml(tmp_path, columns):
+    pytest.importorskip("rosbags")
+    write_swarm_bag(tmp_path / "bag", columns)
+    with pytest.raises(LogError, match=r"/cf1/mixer holds values without names: put the crazyfl"):
+        read_log(tmp_path / "bag")
+    names = ", ".join(f'"{name}"' for name in mixer_inputs(columns))
+    (tmp_path / "crazyflies.yaml").write_text(SWARM_YAML % names)
+    read = read_log(tmp_path / "bag")
+    assert set(read.vehicle.tolist()) == {"cf1", "cf2"}
+    for vehicle in ("cf1", "cf2"):
+        rows = read.vehicle == vehicle
+        own = type(read)("bag", {n: v[rows] for n, v in read.columns.items()}, read.vehicle[rows])
+        assert_read(own, columns, ("t", "wx", "wy", "wz", "m1", "m2", "m3", "m4"), 2e-4)
+    (tmp_path / "crazyflies.yaml").write_text(SWARM_YAML % '"gyro.x"')
+    with pytest.raises(LogError, match=r"/cf1/mixer hold 4 values, but crazyflies\.yaml names 1"):
+        read_log(tmp_path / "bag")
