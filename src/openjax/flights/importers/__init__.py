@@ -17,7 +17,7 @@ from openjax.flights.importers import (
     topic_times,
 )
 from openjax.flights.importers.columns import MAPPING_FILE, ColumnMapping, load_mapping
-from openjax.flights.importers.registry import Importer, importer_of, importers, register
+from openjax.flights.importers.importer import Importer, importer_of, importers, register
 from openjax.flights.reading import LogError, LogTable
 
 __all__ = [

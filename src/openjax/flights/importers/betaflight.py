@@ -20,7 +20,7 @@ from openjax.flights.importers.columns import (
     merge_streams,
 )
 from openjax.flights.importers.csv_files import delimiter_of, header_of, raw_columns
-from openjax.flights.importers.registry import Importer
+from openjax.flights.importers.importer import Importer
 from openjax.flights.reading import CHANNEL_COLUMNS, LogError, LogTable
 
 MAGIC = b"H Product:Blackbox"

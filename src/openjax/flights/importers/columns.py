@@ -198,8 +198,8 @@ def merge_streams(streams: list[Stream], columns: dict[str, Source]) -> dict[str
     with_motion = [u for u in used if _MOTION & set(u[1])]
     if not with_motion:
         raise LogError(
-            "holds neither position and orientation nor a gyroscope under known names: name what it "
-            "has in columns.toml"
+            "holds neither position and orientation nor a gyroscope under known names: name what "
+            "it has in columns.toml"
         )
     clock = min(with_motion, key=lambda u: float(np.median(np.diff(u[0]))))[0]
     clock = clock[np.r_[True, np.diff(clock) > 0]]

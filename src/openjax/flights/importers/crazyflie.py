@@ -20,7 +20,7 @@ from openjax.flights.importers.csv_files import (
     seconds_per_unit,
 )
 from openjax.flights.importers.firmware import VARIABLES, firmware_columns, with_mixer
-from openjax.flights.importers.registry import Importer
+from openjax.flights.importers.importer import Importer
 from openjax.flights.reading import LogError, LogTable
 
 TIME_NAMES = ("timestamp", "tick", "ticks", "time", "time_ms", "timestamp_ms", "t")

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from openjax.flights.importers.columns import ColumnMapping
 from openjax.flights.importers.csv_files import is_csv
-from openjax.flights.importers.registry import Importer
+from openjax.flights.importers.importer import Importer
 from openjax.flights.importers.topic_times import read_topic_times
 from openjax.flights.reading import LogTable, read_csv
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from openjax.flights.importers.columns import ColumnMapping, Stream, merge_streams
 from openjax.flights.importers.firmware import firmware_columns, with_mixer
-from openjax.flights.importers.registry import Importer
+from openjax.flights.importers.importer import Importer
 from openjax.flights.reading import LARGEST, LogError, LogTable
 
 MAGIC = 0xBC

@@ -15,7 +15,7 @@ import numpy as np
 
 from openjax.errors import UserError
 from openjax.flights.importers.columns import ColumnMapping, Source, Stream, merge_streams
-from openjax.flights.importers.registry import Importer
+from openjax.flights.importers.importer import Importer
 from openjax.flights.reading import LARGEST, LogError, LogTable
 
 MAGIC = b"ULog\x01\x12\x35"

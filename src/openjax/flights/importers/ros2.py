@@ -21,7 +21,7 @@ from openjax.flights.importers.crazyswarm import (
     variables_of,
 )
 from openjax.flights.importers.firmware import firmware_columns
-from openjax.flights.importers.registry import Importer
+from openjax.flights.importers.importer import Importer
 from openjax.flights.reading import CHANNEL_COLUMNS, LogError, LogTable
 
 _POSITION = CHANNEL_COLUMNS["position"]

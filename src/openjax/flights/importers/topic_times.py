@@ -26,7 +26,7 @@ from openjax.flights.importers.csv_files import (
     raw_columns,
     seconds_per_unit,
 )
-from openjax.flights.importers.registry import Importer
+from openjax.flights.importers.importer import Importer
 from openjax.flights.reading import LOG_COLUMNS, LogError, LogTable
 
 SEPARATORS = "./:"
