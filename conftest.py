@@ -45,6 +45,14 @@ settings.load_profile("suite")
 # tracing leaves many objects and little garbage
 gc.set_threshold(100_000, 50, 50)
 
+
+def pytest_collection_modifyitems(items):
+    """What needs the machine to itself is no part of `make test`, whoever forgot to say so."""
+    for item in items:
+        if item.get_closest_marker("real_time"):
+            item.add_marker(pytest.mark.slow)
+
+
 VEHICLE_TOML = """
 [vehicle]
 name = "crazyflie-2.1"

@@ -18,7 +18,7 @@ from openjax.commands.evaluate import EvaluateCommand
 from openjax.commands.view import ViewCommand
 from openjax.errors import UserError
 from openjax.files import to_plain
-from openjax.flying.limits import SafetySettings
+from openjax.flying.state import SafetySettings
 from openjax.learning import GeneratorSettings, MappoSettings, TrainSettings
 from openjax.learning.settings import AdaptSettings
 from openjax.plain import from_plain

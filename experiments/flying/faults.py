@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from openjax.flying.controller import Pose
-from openjax.flying.limits import SafetySettings
+from openjax.flying.state import SafetySettings
 
 FOLLOWED = "camera drifts, the estimator follows"
 """A limit: with nothing on board that sees the floor, a slow drift looks like a tilt that is wrong

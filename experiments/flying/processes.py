@@ -303,7 +303,7 @@ class Flown:
 
     def _try_second(self):
         from openjax.errors import UserError
-        from openjax.flying.preflight import sole_command
+        from openjax.flying.endpoints import sole_command
 
         try:
             with sole_command(self._virtual.uris):

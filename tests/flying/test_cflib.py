@@ -25,7 +25,6 @@ from openjax.flying.crtp import Supervisor
 from openjax.flying.estimation import see
 from openjax.flying.flight_files import write_case
 from openjax.flying.guard import RawLinks, fly_down
-from openjax.flying.limits import SafetySettings
 from openjax.flying.links import Links
 from openjax.flying.loop import Flight, Plan, flight_state
 from openjax.flying.motion_capture import MotionCaptured
@@ -38,7 +37,7 @@ from openjax.flying.set_point import (
     as_sent,
     manual_arguments,
 )
-from openjax.flying.state import Mode, initial_state
+from openjax.flying.state import Mode, SafetySettings, initial_state
 from openjax.vehicle import load_vehicle
 from openjax.vehicle.vehicle_file import load_vehicle_file
 from openjax.virtual_crazyflie.firmware import VirtualFirmware

@@ -24,11 +24,9 @@ def mute():
 
 
 def test_a_vehicle_that_says_nothing_is_a_line(mute):
-    begin = time.monotonic()
     with pytest.raises(UserError, match="no connection") as error:
         Links([mute]).connect(timeout=1.0)
     assert mute in str(error.value) and "\n" not in str(error.value)
-    assert time.monotonic() - begin < 60.0
 
 
 CONNECTING = """

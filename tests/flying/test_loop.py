@@ -8,11 +8,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from openjax.flying import loop
 from openjax.flying.controller import Pose, nominal_airframe
 from openjax.flying.game import Play
-from openjax.flying.limits import SafetySettings
 from openjax.flying.loop import PATIENCE, Flight, Plan, Record, await_poses, flight_state
-from openjax.flying.state import Mode, PoseSample
+from openjax.flying.state import Mode, PoseSample, SafetySettings
 
 STARTS = ((0.5, 0.3, 0.5), (0.5, 0.0, 0.5), (0.5, -0.3, 0.5))
 
@@ -128,20 +128,24 @@ def test_the_record_says_when_each_tick_was_due_and_done(flight):
 
 
 @pytest.mark.parametrize("waiting", [False, True])
-def test_a_tick_after_a_stall_gives_poses_time_to_arrive(waiting):
+def test_a_tick_after_a_stall_gives_poses_time_to_arrive(waiting, monkeypatch):
     """All processes stood still: the loop, which woke up first, took poses for lost that were a
-    millisecond away.
+    millisecond away. By a clock of the test's own.
     """
     links = Hovering()
+    stall = 0.07
+    clock = SimpleNamespace(now=10.0)
     waited = []
 
     def wait(until):
         waited.append(until)
         if len(waited) == 1 + waiting:
-            links.now = time.perf_counter()
+            links.now = clock.now  # a pose arrives
         else:
-            time.sleep(0.07)  # where it spends most of its time
+            clock.now += stall
 
-    links.wait, links.now = wait, time.perf_counter() - 0.07 * (not waiting)
+    monkeypatch.setattr(loop, "perf_counter", lambda: clock.now)
+    links.wait = wait
+    links.now = clock.now - stall * (not waiting)
     await_poses(links, links.now + (0.008 if waiting else 0.06))
-    assert len(waited) == 1 + waiting and waited[-1] - links.now <= PATIENCE
+    assert len(waited) == 1 + waiting and waited[-1] - links.now <= PATIENCE + 1e-9

@@ -3,15 +3,12 @@ do.
 """
 
 import math
-import subprocess
-import sys
 
 import pytest
 
-from openjax.errors import UserError
 from openjax.flying.controller import Pose
 from openjax.flying.crtp import Supervisor
-from openjax.flying.preflight import faults, sole_command
+from openjax.flying.preflight import faults
 from openjax.flying.state import PoseSample, initial_state
 
 LEVEL = (1.0, 0.0, 0.0, 0.0)
@@ -68,35 +65,6 @@ def test_link_and_guard():
     assert line.startswith("vehicle 1: 60 of 100 poses")
     (line,) = found(sample(), guarded=False)
     assert "guard" in line and "--" not in line  # not: fly without
-
-
-HOLDER = """
-from openjax.flying.preflight import sole_command
-with sole_command(["udp://one", "udp://two"]):
-    print("held", flush=True)
-    input()
-"""
-
-
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="Linux's abstract names")
-def test_a_second_fly_is_refused_until_the_first_is_gone_however_it_went():
-    first = subprocess.Popen(
-        [sys.executable, "-c", HOLDER], stdin=subprocess.PIPE, stdout=subprocess.PIPE
-    )
-    try:
-        assert first.stdout.readline() == b"held\n"
-        with (
-            pytest.raises(UserError, match="has this vehicle"),
-            sole_command(["udp://zero", "udp://two"]),
-        ):
-            pass
-        with sole_command(["udp://zero"]):  # what was held before the refusal is free again
-            pass
-    finally:
-        first.kill()
-        first.wait()
-    with sole_command(["udp://one", "udp://two"]):
-        pass
 
 
 def test_a_scaled_frame_is_told_by_the_vehicles_own():

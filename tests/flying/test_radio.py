@@ -18,6 +18,8 @@ from openjax.flying.swarm import Swarm
 from openjax.virtual_crazyflie.firmware import VirtualFirmware
 from openjax.virtual_crazyflie.tables import Sensors
 
+pytestmark = [pytest.mark.slow, pytest.mark.real_time]
+
 NOTHING = np.zeros(3)
 STILL = Sensors(NOTHING, NOTHING, np.array([1.0, 0, 0, 0]), NOTHING, NOTHING, np.zeros(4))
 HOVER = SetPoint(RATES, 0.0, 0.0, 0.0, 0.3)
@@ -98,7 +100,6 @@ def check_the_others_fly_on(links, vehicles):
         assert vehicle.firmware.set_point(time.perf_counter()).mode != OFF
 
 
-@pytest.mark.real_time
 def test_a_vehicle_that_doesnt_answer_keeps_no_other_waiting(vehicles):
     """cflib waits two seconds for it, by when the others' watchdogs would have stopped their
     motors.
@@ -114,7 +115,6 @@ def test_a_vehicle_that_doesnt_answer_keeps_no_other_waiting(vehicles):
         swarm.close()
 
 
-@pytest.mark.real_time
 def test_nor_does_one_that_the_guard_never_reaches(vehicles):
     list(vehicles.values())[1].dead = True
     own = RawLinks(list(vehicles), [0, 0, 0])

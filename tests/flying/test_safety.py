@@ -14,16 +14,23 @@ from openjax.flying.board import Board, Role
 from openjax.flying.controller import Pose, accelerate, nominal_airframe, roll_pitch_yaw
 from openjax.flying.guard import fly_down, take_over
 from openjax.flying.judge import Track
-from openjax.flying.limits import (
-    SafetySettings,
+from openjax.flying.safety import (
     fence_velocity,
     parting_velocity,
     resting_places,
+    step,
     stopping_point,
 )
-from openjax.flying.safety import step
 from openjax.flying.set_point import OFF, RATES, SetPoint, from_action
-from openjax.flying.state import Drone, Event, Mode, PoseSample, Request, initial_state
+from openjax.flying.state import (
+    Drone,
+    Event,
+    Mode,
+    PoseSample,
+    Request,
+    SafetySettings,
+    initial_state,
+)
 
 LIMITS = SafetySettings()
 LEVEL = (1.0, 0.0, 0.0, 0.0)

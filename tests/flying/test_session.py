@@ -15,9 +15,9 @@ from experiments.flying.virtual import VirtualProcess
 from openjax.commands.fly import Arguments, Prepared
 from openjax.flying.controller import nominal_airframe
 from openjax.flying.game import Play
-from openjax.flying.limits import SafetySettings
 from openjax.flying.loop import flight_state
 from openjax.flying.session import SessionSettings
+from openjax.flying.state import SafetySettings
 from openjax.vehicle.vehicle_file import load_vehicle_file
 
 pytestmark = [

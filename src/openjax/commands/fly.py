@@ -16,7 +16,8 @@ from typing import Annotated, NamedTuple
 from openjax.command_line import one_line, output_console, parse
 from openjax.errors import UserError
 from openjax.files import check_new_folder, replacing
-from openjax.flying.limits import SafetySettings
+from openjax.flying.endpoints import UDP_PORT, endpoints_of, sole_command
+from openjax.flying.state import SafetySettings
 from openjax.ranges import Interval
 from openjax.store import DEFAULT_POLICY
 
@@ -33,11 +34,7 @@ class Arguments:
 
     policy: str = DEFAULT_POLICY
     """A run's directory, a policy file (.npz), or the name of a policy in the package."""
-    uri: tuple[str, ...] = (
-        "udp://127.0.0.1:19850",
-        "udp://127.0.0.1:19851",
-        "udp://127.0.0.1:19852",
-    )
+    uri: tuple[str, ...] = tuple(f"udp://127.0.0.1:{UDP_PORT + i}" for i in range(3))
     """One vehicle per pursuer: udp://HOST:PORT (virtual), radio://0/80/2M/E7E7E7E7E7 (real)."""
     evader_uri: str | None = None
     """A further vehicle that flies the evader by the game's rule; without it the evader is a point
@@ -81,14 +78,20 @@ def main(arguments: Sequence[str]) -> None:
     fly(parse(Arguments, Arguments(), arguments, PROGRAM))
 
 
-def fly(arguments: Arguments, prepared: Prepared | None = None):
+def fly(arguments: Arguments, prepared: Prepared | None = None) -> None:
     """Fly. Raises UserError for what can't be, and where another process had to land the vehicles.
 
     Args:
       arguments: the command's.
       prepared: what `prepare` made of them, where that was done before.
     """
-    _check(arguments)
+    arguments = checked(arguments)
+    with sole_command(uris_of(arguments)):  # before minutes of compiling
+        _fly(arguments, prepared)
+
+
+def _fly(arguments: Arguments, prepared: Prepared | None) -> None:
+    """Fly vehicles that are nobody else's."""
     console = output_console()
     from openjax.flying.loop import Flight, Plan
     from openjax.flying.session import Session
@@ -156,7 +159,7 @@ def prepare(arguments: Arguments) -> Prepared:
     slots = max(settings.max_pillars, len(scenario.pillars))
     game = Game(policy, scenario_task(dataclasses.replace(settings, max_pillars=slots), scenario))
     game.airframe = airframe_of(vehicle.vehicle)
-    uris = (*arguments.uri, *([arguments.evader_uri] if arguments.evader_uri else []))
+    uris = uris_of(arguments)
     body_logs = arguments.body_logs
     if body_logs is None:
         body_logs = 5 if all(uri.startswith("udp:") for uri in uris) else 1
@@ -203,15 +206,20 @@ def _check_numbers(arguments, starts, pursuers):
         )
 
 
-def _check(arguments):
-    uris = (*arguments.uri, arguments.evader_uri)
-    if len(set(uris)) < len(uris):
-        raise UserError("--uri names a vehicle twice")
-    for uri in uris:
-        if uri is not None and not uri.startswith(("udp://", "radio://")):
-            raise UserError(f"--uri {uri}: expected udp://HOST:PORT or radio://0/80/2M/E7E7E7E7E7")
+def uris_of(arguments: Arguments) -> tuple[str, ...]:
+    """The vehicles: pursuers, then the evader where it is one."""
+    evader = () if arguments.evader_uri is None else (arguments.evader_uri,)
+    return (*arguments.uri, *evader)
+
+
+def checked(arguments: Arguments) -> Arguments:
+    """The arguments, their URIs as `cflib` wants them. Raises UserError."""
+    uris = [endpoint.uri for endpoint in endpoints_of(uris_of(arguments))]
+    number = len(arguments.uri)
+    evader = None if arguments.evader_uri is None else uris[-1]
     if arguments.out is not None:
         check_new_folder(arguments.out, "--out")
+    return dataclasses.replace(arguments, uri=tuple(uris[:number]), evader_uri=evader)
 
 
 def _show(console, flight):

@@ -21,7 +21,7 @@ from collections.abc import Callable, Sequence
 from openjax.flying import real_time
 from openjax.flying.board import Board, Role, say, stand_alone
 from openjax.flying.crtp import LOG_TYPES, Port, Supervisor, SupervisorCommand
-from openjax.flying.safety import step
+from openjax.flying.safety import resting_places_of, step
 from openjax.flying.set_point import SetPoint
 from openjax.flying.state import FLYING, LANDING, Event, Mode, PoseSample, Request, State
 from openjax.flying.swarm import (
@@ -57,7 +57,7 @@ def take_over(state: State, now: float) -> State:
         drone = drone._replace(seen=now)
         return drone.to(mode, now, anchor, "another process took over")
 
-    drones = tuple(map(taken, state.drones, state.resting_places()))
+    drones = tuple(map(taken, state.drones, resting_places_of(state)))
     return state._replace(drones=drones, time=now, action_time=now)
 
 

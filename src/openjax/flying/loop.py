@@ -15,11 +15,10 @@ import numpy as np
 from openjax.flying.controller import accelerate, wanted_acceleration
 from openjax.flying.estimation import see
 from openjax.flying.game import Game
-from openjax.flying.limits import SafetySettings
 from openjax.flying.links import Links
 from openjax.flying.safety import decide
 from openjax.flying.set_point import OFF, RATES, as_sent, from_action
-from openjax.flying.state import Event, Mode, Request, State, initial_state
+from openjax.flying.state import Event, Mode, Request, SafetySettings, State, initial_state
 from openjax.pursuit.environment import THRUST_LIMIT
 
 PERIOD = 0.01

@@ -1,14 +1,9 @@
-"""Before take-off: what must be so, each failure a line that says what to do. And that nobody else
-commands.
-"""
+"""Before take-off: what must be so, each failure a line that says what to do."""
 
-import contextlib
 import math
-import socket
 import time
 from collections.abc import Iterator, Sequence
 
-from openjax.errors import UserError
 from openjax.flying.controller import Vector, roll_pitch_yaw, up
 from openjax.flying.crtp import Supervisor
 from openjax.flying.judge import agree, at_one_time, judge
@@ -29,27 +24,6 @@ AHEAD = math.radians(30.0)
 """A vehicle stands along x as far as somebody can see."""
 FLOOR = 0.1
 """Nor higher or lower (m) than this does it stand."""
-
-
-@contextlib.contextmanager
-def sole_command(uris: Sequence[str]) -> Iterator[None]:
-    """Hold the vehicles against another `fly` on this machine, until this process ends. UserError:
-    one has them.
-
-    A name in Linux's abstract namespace ends with its process; elsewhere only the vehicles' own
-    word protects them.
-    """
-    with contextlib.ExitStack() as held:
-        for uri in uris:
-            name = held.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_STREAM))
-            try:
-                name.bind(f"\0openjax.fly {uri}")
-            except OSError as error:
-                if error.errno is not None and "in use" in (error.strerror or ""):
-                    raise UserError(
-                        f"{uri}: another openjax.fly has this vehicle; end it first"
-                    ) from None
-        yield
 
 
 def poses_arriving(links) -> list[float]:

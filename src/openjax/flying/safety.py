@@ -1,9 +1,14 @@
 """Safety of a flight as a pure state machine: what was seen in, set-points out.
 
+Three parts, from what is wanted to what is possible:
+
+* decisions: who flies each vehicle, the policy or the controller that lifts, waits and lands;
+* steering: how a vehicle is flown in each mode;
+* limits: where a vehicle may stop, turn back, part, wait, and what it can follow.
+
 `see` (`openjax.flying.estimation`) judges the poses and brings each vehicle's estimate to now;
-`decide` says who flies each vehicle: the policy, or the controller that lifts, waits and lands, at
-need by reckoning (`openjax.flying.steering`). `step` is both. Nothing here reads a clock or touches
-a link, so that thousands of faults can be flown in simulated time.
+`decide` does the rest; `step` is both. Nothing here reads a clock or touches a link, so that
+thousands of faults can be flown in simulated time.
 
 A vehicle in trouble lands; all others stop where they are, wait a moment, and land too. Troubles:
 its pose is lost, its link is silent, its battery low, it is too fast, too tilted, or outside the
@@ -11,20 +16,57 @@ arena; no action came in time; a key.
 """
 
 import math
+from collections.abc import Sequence
 
-from openjax.flying.controller import up
+from openjax.flying.controller import (
+    Airframe,
+    Pose,
+    Vector,
+    accelerate,
+    level_acceleration,
+    lift_acceleration,
+    turned_on,
+    up,
+    wanted_acceleration,
+    wanted_velocity,
+)
 from openjax.flying.crtp import Supervisor
 from openjax.flying.estimation import see
-from openjax.flying.set_point import SetPoint
-from openjax.flying.state import FLYING, SPIN_UP, Drone, Event, Mode, Request, State
-from openjax.flying.steering import steer
+from openjax.flying.set_point import ANGLES, LEAST_THRUST, MOTORS_OFF, RATES, SetPoint
+from openjax.flying.state import (
+    FLYING,
+    SPIN_UP,
+    Drone,
+    Event,
+    Mode,
+    PoseSample,
+    Request,
+    SafetySettings,
+    State,
+)
 
 ASIDE = 0.08
 """How far (m) a vehicle may move sideways in the test lift: a hover that starts beside its trim."""
 RISEN = 0.04
 """The test lift is over this close (m) to its height."""
+APART = 0.35
+"""Waiting vehicles keep this distance (m)."""
+LOW = 0.05
+"""Below this height (m) a landing settles."""
+SETTLING = 0.75
+SETTLING_LIFT = 0.85
+"""A landing ends level, with this share of its weight, for so long (s): from .4 m it comes down at
+1.1 m/s. So far may the floor be from where it is thought.
+"""
+TRIM_GAIN = 0.25
+TRIM_LIMIT = 0.15
 _DOWN = (Mode.GROUND, Mode.LANDED)
 _UNTROUBLED = (Mode.LIFT, Mode.TRANSFER, Mode.READY, Mode.PURSUIT)
+
+
+# -----------------------------------------------------------------------------------------------
+# Decisions: who flies each vehicle
+# -----------------------------------------------------------------------------------------------
 
 
 def step(state: State, event: Event) -> tuple[State, tuple[SetPoint, ...]]:
@@ -67,7 +109,7 @@ def _requested(state, event) -> tuple[Drone, ...]:
         return tuple(d.to(Mode.PURSUIT, now) for d in drones)
     answer = {Request.LAND: _land, Request.HOLD: _hold}.get(event.request)
     if answer is not None:
-        anchors = state.resting_places()
+        anchors = resting_places_of(state)
     elif event.request is Request.TRANSFER:
         able = (*_DOWN, Mode.HOLD, Mode.PURSUIT, Mode.READY)
         if all(d.mode in able and not d.reason and d.estimate is not None for d in drones):
@@ -177,7 +219,7 @@ def _react(state, drones, troubles) -> tuple[Drone, ...]:
     """
     now = state.time
     team = any(d.reason for d in drones) or any(troubles)
-    anchors = state.resting_places() if team else [None] * len(drones)
+    anchors = resting_places_of(state) if team else [None] * len(drones)
     risen = all(d.mode is Mode.LIFT and _risen(d, now) for d in drones) and not team
     reacted = []
     for drone, trouble, anchor, start in zip(drones, troubles, anchors, state.starts, strict=True):
@@ -202,3 +244,289 @@ def _react(state, drones, troubles) -> tuple[Drone, ...]:
 def _risen(drone, now) -> bool:
     near = abs(drone.estimate.position[2] - drone.anchor[2]) < RISEN
     return near and now - drone.since > 2.0 * SPIN_UP
+
+
+# -----------------------------------------------------------------------------------------------
+# Steering: by the policy within its limits, or by the controller
+# -----------------------------------------------------------------------------------------------
+
+
+def steer(state: State, i: int, action: SetPoint | None, sample: PoseSample) -> Drone:
+    """Vehicle i after this tick, with its set-point. `action`: the policy's, where there is one."""
+    drone = _watched(state, state.drones[i], sample)._replace(sent=MOTORS_OFF)
+    now = state.time
+    if drone.mode not in FLYING or drone.estimate is None:
+        return drone
+    if drone.mode is Mode.SETTLE and now - drone.since > SETTLING:
+        return drone.to(Mode.LANDED, now)
+    if drone.mode is Mode.LAND and _is_low(state, drone):
+        drone = drone.to(Mode.SETTLE, now)
+    if drone.mode is Mode.SETTLE:
+        lift = SETTLING_LIFT * (state.airframe.hover_thrust + drone.trim)
+        return drone._replace(sent=SetPoint(ANGLES, thrust=lift))
+    if drone.mode is Mode.PURSUIT and action is not None:
+        return drone._replace(sent=_pursue(state, drone, i, action))
+    return _go(state, drone, i)
+
+
+def _watched(state, drone, sample) -> Drone:
+    """The drone with since when its battery is low and since when it is upside down."""
+
+    def since(before, is_so):
+        return (state.time if before is None else before) if is_so else None
+
+    low = sample.voltage < state.settings.battery_low  # an unknown voltage is not low
+    over = drone.estimate is not None and up(drone.estimate.quaternion) < 0.0
+    return drone._replace(
+        low_since=since(drone.low_since, low), over_since=since(drone.over_since, over)
+    )
+
+
+def _is_low(state, drone) -> bool:
+    """Whether a landing is near the floor, or long enough on the way."""
+    late = state.time - drone.since > state.settings.landing_time
+    return late or drone.estimate.position[2] < LOW
+
+
+def _pursue(state, drone, i, action) -> SetPoint:
+    """The policy's action, or what keeps the drone in the arena and off the others."""
+    settings = state.settings
+    estimate = drone.estimate
+    parting = None
+    if settings.separation > 0.0:
+        poses = [d.estimate if d.mode in FLYING else None for d in state.drones]
+        parting = parting_velocity(settings, i, poses)
+    aimed = estimate if parting is None else estimate._replace(velocity=parting)
+    sent = state.drones[i].sent
+    # until its motors have followed it turns on
+    turned = turned_on(estimate.quaternion, estimate.body_rates, state.airframe.motor_time_constant)
+    present = lift_acceleration(
+        turned, max(sent.thrust, LEAST_THRUST) / state.airframe.hover_thrust
+    )
+    wanted = (
+        fence_velocity(settings, estimate, present)
+        or fence_velocity(settings, aimed, present)
+        or parting
+    )
+    if wanted is None:
+        return within_reach(action, sent, state.airframe, state.dt)
+    acceleration = wanted_acceleration(estimate.velocity, wanted)
+    return accelerate(estimate.quaternion, acceleration, state.airframe, drone.trim, RATES)
+
+
+def _go(state, drone, i) -> Drone:
+    """The drone on its way to its anchor, or waiting there, by the controller."""
+    estimate = drone.estimate
+    airframe = state.airframe
+    wanted = _wanted(state, drone, i)
+    acceleration = wanted_acceleration(estimate.velocity, wanted)
+    attitude = estimate.quaternion
+    if state.time - drone.seen > state.settings.pose_timeout:
+        # by reckoning: the vehicle does what it is asked for, and is level else
+        share = min(state.dt / state.settings.reaction, 1.0)
+        lagged = tuple(
+            a + share * (b - a) for a, b in zip(drone.acceleration, acceleration, strict=True)
+        )
+        drone = drone._replace(acceleration=lagged)
+        attitude = _yaw_only(attitude)
+    else:
+        if estimate.position[2] > (0.02 if drone.mode is Mode.LIFT else 0.1):
+            error = min(max(wanted[2] - estimate.velocity[2], -0.3), 0.3)
+            trim = min(max(drone.trim + TRIM_GAIN * state.dt * error, -TRIM_LIMIT), TRIM_LIMIT)
+            drone = drone._replace(trim=trim)
+        if drone.mode is Mode.TRANSFER and _arrived(estimate, drone.anchor):
+            drone = drone.to(Mode.READY, state.time)
+    return drone._replace(sent=accelerate(attitude, acceleration, airframe, drone.trim, ANGLES))
+
+
+def _wanted(state, drone, i) -> Vector:
+    """The velocity (m/s) that the drone's mode asks for."""
+    position = drone.estimate.position
+    settings = state.settings
+    if drone.mode is Mode.LAND:
+        x, y, _ = wanted_velocity(position, (*drone.anchor[:2], position[2]), 0.5)
+        return x, y, -(0.6 if position[2] < 0.2 else 1.0) * settings.landing_speed
+    x, y, z = wanted_velocity(position, drone.anchor, settings.transfer_speed)
+    if drone.mode is not Mode.TRANSFER:
+        return x, y, z
+    if position[2] < 0.2:  # straight up first
+        x = y = 0.0
+    if math.dist(position, drone.anchor) < 0.3:  # starts may be close to each other
+        return x, y, z
+    for j, other in enumerate(state.drones):  # around each other, to the right
+        if j == i or other.estimate is None or other.mode not in FLYING:
+            continue
+        dx = position[0] - other.estimate.position[0]
+        dy = position[1] - other.estimate.position[1]
+        distance = math.hypot(dx, dy)
+        if 1e-6 < distance < APART:
+            push = (APART - distance) / distance * 2.0
+            x = x + push * (dx + dy)
+            y = y + push * (dy - dx)
+    return x, y, z
+
+
+def _arrived(estimate, target) -> bool:
+    return (
+        math.dist(estimate.position, target) < 0.06
+        and math.dist(estimate.velocity, (0.0, 0.0, 0.0)) < 0.15
+    )
+
+
+def _yaw_only(quaternion):
+    w, _, _, z = quaternion
+    size = math.hypot(w, z)
+    return (w / size, 0.0, 0.0, z / size) if size > 1e-6 else (1.0, 0.0, 0.0, 0.0)
+
+
+# -----------------------------------------------------------------------------------------------
+# Limits: where a vehicle may stop, turn back, part, wait, and what it can follow
+# -----------------------------------------------------------------------------------------------
+
+
+def stopping_point(
+    settings: SafetySettings, pose: Pose, acceleration: Vector | None = None
+) -> Vector:
+    """Where a vehicle comes to rest that brakes now (m): its acceleration fades with the time
+    constant `reaction`, and as slowly the braking sets in.
+
+    `acceleration`: at present (m/s^2, world); that of level flight at its tilt, if it isn't known.
+    """
+    lag = settings.reaction
+    present = acceleration or level_acceleration(pose.quaternion)
+    velocity = [
+        v + lag * a for v, a in zip(pose.velocity, present, strict=True)
+    ]  # once it has faded
+    time = lag + math.hypot(*velocity) / (2.0 * settings.braking)
+    return tuple(
+        p + time * v - lag**2 * a for p, v, a in zip(pose.position, velocity, present, strict=True)
+    )
+
+
+def fence_velocity(
+    settings: SafetySettings, pose: Pose, acceleration: Vector | None = None
+) -> Vector | None:
+    """The velocity (m/s) that keeps a vehicle in the arena; None while it could still stop inside.
+    See `stopping_point`.
+    """
+    x, y, z = stopping_point(settings, pose, acceleration)
+    out = math.hypot(x, y)
+    outside = out > settings.arena_radius
+    above = z > settings.arena_height
+    below = z < settings.floor
+    if not (outside or above or below):
+        return None
+    vx, vy, _ = pose.velocity
+    if outside:
+        vx = -0.5 * x / out
+        vy = -0.5 * y / out
+    return vx, vy, -0.4 if above else 0.4 if below else 0.0
+
+
+def parting_velocity(
+    settings: SafetySettings, i: int, poses: Sequence[Pose | None]
+) -> Vector | None:
+    """The velocity (m/s) that keeps vehicle i off the others; None while all could still stop
+    apart.
+
+    Two vehicles that close in at `c` and both brake at `braking` need `c * reaction + c**2 / (4 *
+    braking)` to stop.
+    """
+    own = poses[i]
+    wanted = None
+    for j, other in enumerate(poses):
+        if j == i or other is None:
+            continue
+        distance = math.dist(own.position, other.position)
+        if distance < 1e-6:
+            continue
+        away = tuple((p - q) / distance for p, q in zip(own.position, other.position, strict=True))
+        closing = sum(
+            a * (w - v) for a, v, w in zip(away, own.velocity, other.velocity, strict=True)
+        )
+        stopping = max(closing, 0.0) * (
+            settings.reaction + max(closing, 0.0) / (4.0 * settings.braking)
+        )
+        lack = settings.separation - (distance - stopping)
+        if lack > 0.0:
+            push = 0.5 * max(closing, 0.0) + min(lack / settings.reaction, 0.5)
+            wanted = tuple(w + push * a for w, a in zip(wanted or own.velocity, away, strict=True))
+    return wanted
+
+
+def within_reach(action: SetPoint, sent: SetPoint, airframe: Airframe, dt: float) -> SetPoint:
+    """The action within its bounds, and no farther from what was sent `dt` (s) before than the
+    vehicle can follow.
+
+    Its rates can't change faster than its largest angular acceleration, its thrust than its motors'
+    time constant.
+    """
+
+    def near(value, old, room):
+        return min(max(value, old - room), old + room) if sent.mode == RATES else value
+
+    turn = airframe.angular_acceleration * dt
+    lift = dt / airframe.motor_time_constant
+    rates = (
+        near(min(max(new, -math.pi), math.pi), old, turn)
+        for new, old in (
+            (action.roll, sent.roll),
+            (action.pitch, sent.pitch),
+            (action.yaw_rate, sent.yaw_rate),
+        )
+    )
+    return SetPoint(RATES, *rates, near(min(max(action.thrust, 0.0), 1.0), sent.thrust, lift))
+
+
+def resting_places(
+    settings: SafetySettings, pillars: Sequence[Vector], poses: Sequence[Pose | None]
+) -> list[Vector]:
+    """Where vehicles may wait or land: near where they would stop, inside, off the pillars, apart
+    (m).
+
+    Args:
+      settings: limits.
+      pillars: x, y, radius (m).
+      poses: of the vehicles; None for one that was never seen.
+    """
+    places = [
+        stopping_point(settings, pose) if pose is not None else (0.0, 0.0, 0.0) for pose in poses
+    ]
+    reach = settings.arena_radius - 0.15
+    low = 0.3
+    high = settings.arena_height - 0.3
+    places = [(x, y, min(max(z, low), high)) for x, y, z in places]
+    for _ in range(20):
+        moved = []
+        for i, place in enumerate(places):
+            for x, y, radius in pillars:
+                place = _pushed(place, (x, y), radius + 0.15)
+            for j, other in enumerate(places):
+                if j != i:
+                    place = _pushed(place, other, APART, 0.5)
+            inside = min(1.0, reach / max(math.hypot(*place[:2]), 1e-6))
+            moved.append((place[0] * inside, place[1] * inside, place[2]))
+        if all(math.dist(a, b) < 1e-4 for a, b in zip(moved, places, strict=True)):
+            break
+        places = moved
+    return places
+
+
+def resting_places_of(state: State) -> list[Vector]:
+    """Where the vehicles of a flight may wait or land (m)."""
+    poses = [drone.estimate for drone in state.drones]
+    return resting_places(state.settings, state.pillars, poses)
+
+
+def _pushed(place, other, distance, share=1.0) -> Vector:
+    """The place (x, y, z) moved on its level by a share of what it lacks of a distance from
+    another.
+    """
+    dx = place[0] - other[0]
+    dy = place[1] - other[1]
+    apart = math.hypot(dx, dy)
+    if apart >= distance:
+        return place
+    dx, dy = (dx / apart, dy / apart) if apart > 1e-6 else (1.0, 0.0)
+    lack = share * (distance - apart)
+    return place[0] + lack * dx, place[1] + lack * dy, place[2]

@@ -18,7 +18,7 @@ from openjax.flying.keys import Operator
 from openjax.flying.links import Links
 from openjax.flying.loop import Flight, measured_times
 from openjax.flying.motion_capture import MotionCaptured
-from openjax.flying.preflight import faults, poses_arriving, sole_command
+from openjax.flying.preflight import faults, poses_arriving
 from openjax.flying.state import Request, State
 
 FRESH = 0.05
@@ -66,7 +66,6 @@ class Session:
     def __enter__(self) -> Session:
         settings = self._settings
         with self._stack as stack:
-            stack.enter_context(sole_command(settings.uris))
             self.links.board.enter(Role.LOOP)
             stack.callback(self.links.close)
             self.links.connect()

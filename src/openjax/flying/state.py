@@ -1,21 +1,84 @@
-"""What is known and wanted of the vehicles of a flight: modes, requests, samples of poses, and the
-state of all.
+"""What is known and wanted of the vehicles of a flight: limits, modes, requests, samples of poses,
+and the state of all.
 """
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from enum import StrEnum
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 from openjax.flying.controller import Airframe, Pose, Vector, nominal_airframe
 from openjax.flying.crtp import Supervisor
 from openjax.flying.judge import PoseLimits, Track, pose_limits
-from openjax.flying.limits import SafetySettings, resting_places
 from openjax.flying.set_point import MOTORS_OFF, SetPoint
+from openjax.ranges import Interval, check_intervals
+from openjax.vehicle.arena import Arena
 
 SPIN_UP = 0.3
 """A vehicle that lifts off may stand still for so long (s)."""
 _NOTHING_SEEN = Track()
+
+
+@dataclass(frozen=True)
+class SafetySettings:
+    """Limits of a flight."""
+
+    arena_radius: Annotated[float, Interval("[0.3, 1000]")] = Arena.radius
+    """No vehicle is let out of a cylinder of this radius (m)."""
+    arena_height: Annotated[float, Interval("[0.6, 1000]")] = Arena.height
+    """Nor above this (m)."""
+    floor: Annotated[float, Interval("[0, 100]")] = 0.12
+    """Nor, in pursuit, below this (m)."""
+    outside: Annotated[float, Interval("[0, 100]")] = 0.3
+    """Farther out than this (m) something is wrong: all land."""
+    separation: Annotated[float, Interval("[0, 10]")] = 0.16
+    """Vehicles in pursuit that couldn't stop at this distance (m) any more brake and part. 0
+    switches it off.
+    """
+    speed_limit: Annotated[float, Interval("(0, 100]")] = 2.5
+    """Faster than this (m/s) something is wrong: all land."""
+    tilt_limit: Annotated[float, Interval("(0, 180]")] = 50.0
+    """More tilted than this (degrees) something is wrong: all land."""
+    tumble_time: Annotated[float, Interval("[0, 10]")] = 0.1
+    """Upside down for longer (s): motors off."""
+    braking: Annotated[float, Interval("(0, 100]")] = 5.0
+    """Deceleration that is counted on to stop within the arena (m/s^2)."""
+    reaction: Annotated[float, Interval("(0, 10]")] = 0.12
+    """Time constant with which the acceleration follows what is asked for (s)."""
+    pose_timeout: Annotated[float, Interval("(0, 60]")] = 0.06
+    """Without a good pose for longer (s) a vehicle is flown by reckoning no more: it lands."""
+    link_timeout: Annotated[float, Interval("(0, 60]")] = 0.3
+    """A link silent for longer (s) is gone."""
+    action_timeout: Annotated[float, Interval("(0, 60]")] = 0.035
+    """Without a new action of the policy for longer (s): all stop where they are."""
+    battery_low: Annotated[float, Interval("[0, 100]")] = 3.2
+    """Voltage under load, for `battery_time`, at which a vehicle lands (V)."""
+    battery_time: Annotated[float, Interval("[0, 60]")] = 0.5
+    battery_start: Annotated[float, Interval("[0, 100]")] = 3.7
+    """No vehicle takes off with less, measured without load (V)."""
+    stand: Annotated[float, Interval("(0, 1000]")] = 0.15
+    """No vehicle takes off farther than this (m) from below its start."""
+    lift: Annotated[float, Interval("(0, 1]")] = 0.1
+    """Height of the test lift (m)."""
+    lift_time: Annotated[float, Interval("(0, 60]")] = 2.0
+    """It must be done by then (s)."""
+    hold_time: Annotated[float, Interval("[0, 600]")] = 0.5
+    """How long vehicles wait after a trouble before they land (s)."""
+    transfer_speed: Annotated[float, Interval("(0, 10]")] = 0.5
+    """On the way to the start (m/s)."""
+    landing_speed: Annotated[float, Interval("(0, 10]")] = 0.4
+    """m/s."""
+
+    def __post_init__(self):
+        check_intervals(self, "safety.")
+
+    @property
+    def landing_time(self) -> float:
+        """A landing that takes longer (s) ends with the motors off: by then a vehicle that began at
+        the highest place that is allowed is near the floor, whatever its pose says.
+        """
+        return (self.arena_height + self.outside) / self.landing_speed
 
 
 class Mode(StrEnum):
@@ -137,12 +200,6 @@ class State(NamedTuple):
     def all_in(self, *modes: Mode) -> bool:
         """Whether every vehicle is in one of these modes."""
         return all(drone.mode in modes for drone in self.drones)
-
-    def resting_places(self) -> list[Vector]:
-        """Where the vehicles may wait or land (m); see `openjax.flying.limits.resting_places`."""
-        return resting_places(
-            self.settings, self.pillars, [drone.estimate for drone in self.drones]
-        )
 
 
 def initial_state(
