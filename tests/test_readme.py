@@ -36,6 +36,17 @@ def test_every_command_and_target_of_the_readme_exists():
     assert commands == set(COMMANDS), commands ^ set(COMMANDS)
 
 
+def test_what_the_readmes_commands_write_is_ignored():
+    """Nobody who tries them finds his outputs among the changes of the repository."""
+    ignored = (ROOT / ".gitignore").read_text(encoding="utf-8").splitlines()
+    pages = README + (ROOT / "docs" / "commands.md").read_text(encoding="utf-8")
+    written = set(re.findall(r"(?:--out|sample_flights) ([a-z][\w/.]+)", pages))
+    assert {"runs/mine", "flights"} <= written
+    for path in written:
+        first = path.partition("/")[0]
+        assert {f"/{first}/", f"/{first}"} & set(ignored), path
+
+
 def test_modules_that_the_pages_run_are_there():
     for page in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *PAGES):
         for name in re.findall(r"python -m ([a-z_.]+)", page.read_text(encoding="utf-8")):
