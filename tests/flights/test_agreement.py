@@ -2,9 +2,12 @@
 numbers. That good flights pass is tested with the other checks.
 """
 
+import itertools
+
 import numpy as np
 import pytest
 from scipy.signal import butter, sosfilt
+from scipy.spatial.transform import Rotation
 
 from openjax.errors import UserError
 from openjax.flights.case import load_case
@@ -159,3 +162,76 @@ def test_what_most_flights_contradict_the_calm_ones_must_show_to_be_right(
     write_csv(case_folder / "flight_a.csv.gz", log_of([calm], "flight_a"))
     with pytest.raises(UserError, match="no flight can be used"):
         load_case(case_folder)
+
+
+def scaled(names, factor):
+    return lambda c: c | {n: factor * c[n] for n in names.split()}
+
+
+def swapped(a, b):
+    return lambda c: c | {a: c[b], b: c[a]}
+
+
+PATHS = {
+    "z negated": (scaled("z", -1.0), "z "),
+    "x at zero": (scaled("x", 0.0), "x "),
+    "y negated": (scaled("y", -1.0), "y "),
+    "y twice as large": (scaled("y", 2.0), "y moves by 2.0"),
+    "z half as large": (scaled("z", 0.5), "z moves by 0.5"),
+    "all twice as large": (scaled("x y z", 2.0), "x moves by 2.0"),
+    "vx at zero": (scaled("vx", 0.0), "x"),
+    "velocity twice as large": (scaled("vx vy vz", 2.0), "moves by 0.5"),
+    "z and vz negated": (scaled("z vz", -1.0), "z"),
+}
+
+
+@pytest.mark.parametrize("imu", [True, False])
+@pytest.mark.parametrize("fault", PATHS)
+def test_a_position_moves_as_its_velocity_says_however_slowly(fault, imu, sample_columns):
+    """A figure of some decimetres in ten seconds is below the band of the other comparisons."""
+    damage, words = PATHS[fault]
+    columns = damage(sample_columns["flight_b"])
+    if not imu:
+        columns = {n: v for n, v in columns.items() if n[0] not in "aw"}
+    kept, found = refusals(columns)
+    assert kept is None and words in found[0].issue
+
+
+def test_a_velocity_that_drifts_is_no_contradiction(sample_columns):
+    """As estimators' do by some centimetres a second."""
+    for columns in sample_columns.values():
+        drift = {n: columns[n] + 0.03 for n in ("vx", "vy", "vz")}
+        assert refusals(columns | drift)[0] is not None
+
+
+PARTS = ("qw", "qx", "qy", "qz")
+
+
+@pytest.mark.parametrize("pair", list(itertools.combinations(PARTS, 2)), ids="-".join)
+@pytest.mark.parametrize("name", ["flight_b", "flight_c"])
+def test_parts_of_a_quaternion_that_are_swapped_are_named(pair, name, sample_columns):
+    """In a single flight, where no other tells what is right."""
+    columns = swapped(*pair)(sample_columns[name])
+    order = [dict(zip(pair, pair[::-1], strict=True)).get(part, part)[1] for part in PARTS]
+    kept, found = refusals(columns)
+    assert kept is None
+    if pair != ("qw", "qz"):  # a level vehicle's yaw: other axes of the world do the same
+        assert f"in the order {', '.join(order)}" in found[0].issue
+
+
+@pytest.mark.parametrize("name", ["flight_a", "flight_c"])
+def test_what_hovers_upside_down_is_refused_without_an_imu_too(name, sample_columns):
+    columns = swapped("qw", "qx")(sample_columns[name])
+    kept, found = refusals({n: v for n, v in columns.items() if n[0] not in "aw"})
+    assert kept is None and found[0].kind == "quaternion"
+
+
+@pytest.mark.parametrize("angle", ["roll", "pitch"])
+def test_an_angle_with_the_other_sign_is_named(angle, sample_columns):
+    columns = sample_columns["flight_a"]
+    quaternion = np.stack([columns[n] for n in PARTS], 1)
+    angles = Rotation.from_quat(quaternion, scalar_first=True).as_euler("ZYX")
+    angles[:, {"pitch": 1, "roll": 2}[angle]] *= -1.0
+    other = Rotation.from_euler("ZYX", angles).as_quat(scalar_first=True)
+    kept, found = refusals(columns | dict(zip(PARTS, other.T, strict=True)))
+    assert kept is None and f"{angle} has the other sign: scale = -1" in found[0].issue

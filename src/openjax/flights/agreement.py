@@ -11,11 +11,12 @@ import itertools
 from collections.abc import Iterator, Sequence
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from openjax.flights.flight import CHANNEL_COLUMNS, Flight, Issue
-from openjax.flights.pairs import AGREE, Pair, Signals, pairs_of
-from openjax.flights.signals import RATE, clock_of, first_order, in_band
-from openjax.flights.track import to_body
+from openjax.flights.pairs import AGREE, WIDE, Pair, Signals, pairs_of
+from openjax.flights.signals import RATE, clock_of, first_order, in_band, rates_of
+from openjax.flights.track import rotation, to_body
 
 TURNING = (0.7, 8.0)  # Hz, where motors turn the vehicle
 UNIT = 2.5  # factor about a unit's, within which a gain is that unit
@@ -39,13 +40,22 @@ RELABELLINGS = [
     for order in itertools.permutations(range(3))
     for signs in itertools.product((1.0, -1.0), repeat=3)
 ]
+
+WANTED = "the log format wants w, x, y, z from body to world"
+INVERSE = np.array([1.0, -1.0, -1.0, -1.0])
 QUATERNIONS = {
-    "in the order x, y, z, w": lambda q: q[:, [3, 0, 1, 2]],
-    "from world to body": lambda q: q * [1.0, -1.0, -1.0, -1.0],
-    "in the order x, y, z, w and from world to body": lambda q: (
-        q[:, [3, 0, 1, 2]] * [1.0, -1.0, -1.0, -1.0]
+    f"the quaternion is in the order x, y, z, w; {WANTED}": lambda q: q[:, [3, 0, 1, 2]],
+    f"the quaternion is from world to body; {WANTED}": lambda q: q * INVERSE,
+    f"the quaternion is in the order x, y, z, w and from world to body; {WANTED}": lambda q: (
+        q[:, [3, 0, 1, 2]] * INVERSE
     ),
 }
+UPRIGHT = 0.5  # mean cosine of the tilt of whatever flies by thrust
+FOLLOWED = 0.7  # correlation of turning and gyroscope from which an attitude is tried in full
+MOVES = 0.05  # m, which a path must do for a velocity to contradict it
+DRIFT = 0.03  # m/s by which an estimated velocity may be off on the mean
+PATH_ERROR = 0.03  # m by which an estimated path may be off
+GAINS = (0.7, 1.4)  # of a path over what its velocity adds up to: beyond, one isn't the other
 Finding = tuple[str, str, Sequence[str]]  # kind, words and the comparisons that fail
 
 
@@ -57,7 +67,13 @@ def check_agreement(flight: Flight, vehicle) -> list[Issue]:
     grid = clock_of(flight)
     if grid is not None and not found:
         signals = Signals.of(flight, grid)
-        found = _gravity(signals.force) or _contradictions(signals) or _motors(signals, vehicle)
+        found = (
+            _gravity(signals.force)
+            or _inverted(signals)
+            or _contradictions(signals)
+            or list(_paths(signals))
+            or _motors(signals, vehicle)
+        )
     return [Issue(flight.name, text, True, kind, tuple(against)) for kind, text, against in found]
 
 
@@ -99,13 +115,10 @@ def _mended(signals: Signals, bad: list[Pair]) -> tuple[str, str] | None:
     agree.
     """
     if signals.quaternion is not None:
-        for name, convert in QUATERNIONS.items():
+        for words, convert in QUATERNIONS.items():
             other = dataclasses.replace(signals, quaternion=convert(signals.quaternion))
             if _agrees(other, bad):
-                text = (
-                    f"the quaternion is {name}; the log format wants w, x, y, z from body to world"
-                )
-                return "quaternion", text
+                return "quaternion", words
     if signals.velocity is not None and signals.quaternion is not None:
         world = to_body(signals.quaternion * [1.0, -1.0, -1.0, -1.0], signals.velocity)
         if _agrees(dataclasses.replace(signals, velocity=world), bad):
@@ -113,7 +126,93 @@ def _mended(signals: Signals, bad: list[Pair]) -> tuple[str, str] | None:
     for pair in bad:
         if pair.holds and (words := _relabelled(signals, pair, bad)):
             return "axes", words
+    if any(pair.holds == "body_rates" for pair in bad):
+        for words, attitude in _attitudes(signals):
+            if _agrees(dataclasses.replace(signals, quaternion=attitude), bad):
+                return "quaternion", words
     return None
+
+
+def _attitudes(signals: Signals) -> Iterator[tuple[str, np.ndarray]]:
+    """(what is wrong, the attitude (T, 4) without it): the usual conventions, other signs of the
+    angles, and any order of the quaternion, where the gyroscope says how it must turn.
+    """
+    for words, convert in QUATERNIONS.items():
+        yield words, convert(signals.quaternion)
+    angles = Rotation.from_quat(signals.quaternion, scalar_first=True).as_euler("ZYX")
+    for k, name in ((1, "pitch"), (2, "roll"), (0, "yaw")):
+        signs = np.where(np.arange(3) == k, -1.0, 1.0)
+        mirrored = Rotation.from_euler("ZYX", angles * signs).as_quat(scalar_first=True)
+        words = f"{name} has the other sign: scale = -1 for {name} in columns.toml"
+        yield f"{words}, or the quaternion of the angle that it should be", mirrored
+    for order in itertools.permutations(range(4)):
+        for way, sign in (("", 1.0), (" and from world to body", INVERSE)):
+            attitude = signals.quaternion[:, order] * sign
+            if _turns_with(signals, attitude):
+                # quaternion[:, order[i]] is what should stand at i
+                held = ", ".join("wxyz"[order.index(i)] for i in range(4))
+                yield f"the quaternion is in the order {held}{way}; {WANTED}", attitude
+
+
+def _turns_with(signals: Signals, attitude: np.ndarray) -> bool:
+    """Whether an attitude (T, 4) is upright and turns as the gyroscope says."""
+    if rotation(attitude)[:, 2, 2].mean() < UPRIGHT:
+        return False
+    if signals.body_rates is None:
+        return True
+    turned = in_band(rates_of(attitude), WIDE)
+    felt = in_band(signals.body_rates, WIDE)
+    power = max(float(np.sqrt((turned**2).sum() * (felt**2).sum())), 1e-12)
+    return float((turned * felt).sum()) > FOLLOWED * power
+
+
+def _inverted(signals: Signals) -> list[Finding]:
+    """What flies by its thrust is upright on the mean."""
+    if signals.quaternion is None:
+        return []
+    upright = float(rotation(signals.quaternion)[:, 2, 2].mean())
+    if upright >= UPRIGHT:
+        return []
+    for words, attitude in _attitudes(signals):
+        other = dataclasses.replace(signals, quaternion=attitude)
+        if rotation(attitude)[:, 2, 2].mean() > UPRIGHT and _agrees(other, []):
+            return [("quaternion", words, ["the attitude's thrust"])]
+    text = f"by its attitude the vehicle flies upside down (mean cosine of its tilt {upright:.2f})"
+    return [
+        ("quaternion", f"{text}: qw, qx, qy, qz hold something else", ["the attitude's thrust"])
+    ]
+
+
+def _paths(signals: Signals) -> Iterator[Finding]:
+    """Axes on which the position doesn't move as the velocity says, however slowly."""
+    if signals.position is None or signals.velocity is None:
+        return
+    along = np.cumsum(signals.velocity, 0) / RATE
+    for k, axis in enumerate("xyz"):
+        gain = _gain(along[:, k], signals.position[:, k])
+        back = _gain(signals.position[:, k], along[:, k])
+        if gain is not None and not GAINS[0] < gain < GAINS[1]:
+            text = f"{axis} moves by {gain:.2f} times what v{axis} adds up to"
+        elif back is not None and not 1.0 / GAINS[1] < back < 1.0 / GAINS[0]:
+            text = f"v{axis} adds up to {back:.2f} times what {axis} moves by"
+        else:
+            continue
+        yield "garbage", f"contradictory: {text}", ["the position's rate"]
+
+
+def _gain(path: np.ndarray, other: np.ndarray) -> float | None:
+    """How far another path (T,) m moves where this one does, a steady drift aside; None where this
+    one hardly moves.
+    """
+    time = np.arange(len(path)) / RATE
+    columns = np.stack([path - path.mean(), time - time.mean()], 1)
+    # Errors of a path last: each second says one thing.
+    weight = 1.0 / (PATH_ERROR**2 * RATE)
+    normal = weight * columns.T @ columns + np.diag([0.0, 1.0 / DRIFT**2])
+    moved = normal[0, 0] - normal[0, 1] ** 2 / normal[1, 1]
+    if moved * PATH_ERROR**2 < MOVES**2 * len(path) / RATE:
+        return None
+    return float(np.linalg.solve(normal, weight * columns.T @ (other - other.mean()))[0])
 
 
 def _relabelled(signals: Signals, pair: Pair, bad: list[Pair]) -> str:

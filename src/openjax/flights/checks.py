@@ -13,6 +13,7 @@ from openjax.flights.sampling import drop_frozen, drop_repeats, put_in_step, run
 
 SHORTEST = 2.0  # s airborne: windows of 0.5 s, and a few of them
 SLOWEST = 0.05  # s between rows
+BELOW = 0.3  # m below the floor, where nothing flies: more than an origin on a table is off by
 GROUND_CLEARANCE = 0.02  # m above the floor
 
 
@@ -41,7 +42,9 @@ def check_flight(
         checked = _in_range(checked, note)
         checked = derive_velocity(mend_velocity(checked, note), note)
         checked = derive_rates(checked, note)
-        checked = _airborne(checked, (log or {}).get("floor_z"), note, comparison)
+        floor = (log or {}).get("floor_z")
+        checked = _airborne(checked, floor, note, comparison)
+        _above_floor(checked, 0.0 if floor is None else float(floor))
         _has_what_is_needed(checked, comparison)
     except Refused as refused:
         return None, [*issues, Issue(flight.name, str(refused), refused=True, kind=refused.kind)]
@@ -248,6 +251,17 @@ def _airborne(flight: Flight, floor_z: float | None, note, every: bool = False) 
                        f"to {flight.time[stop - 1]:.2f})")  # fmt: skip
         flight = flight.rows(slice(start, stop))
     return flight
+
+
+def _above_floor(flight: Flight, floor: float) -> None:
+    """Nothing flies below the floor."""
+    if flight.position is None:
+        return
+    height = float(np.nanmedian(flight.position[:, 2])) - floor
+    if height < -BELOW:
+        text = f"z is {height + floor:.2f} m in flight, below the floor at {floor:g}"
+        raise Refused("axes", f"{text}: z points up (scale = -1 in columns.toml), or floor_z is "
+                              "what z reads on the floor")  # fmt: skip
 
 
 def _long_runs(flags: np.ndarray, time: np.ndarray, shortest: float = 0.5) -> np.ndarray:

@@ -173,7 +173,7 @@ def _turning(track: Track, vehicle, gyroscope: bool) -> tuple[Track, np.ndarray,
     rates = track.body_rates
     if not gyroscope or rates is None:
         turned = turn_increments(track.quaternion) / track.dt
-        rates = np.concatenate([turned, turned[-1:]])
+        rates = 0.5 * (np.concatenate([turned[:1], turned]) + np.concatenate([turned, turned[-1:]]))
     return track, np.diff(rates, axis=0) / track.dt, _torques(track, vehicle)[:-1]
 
 

@@ -74,7 +74,11 @@ def _motors(case: Case, tracks, vehicles, sensors: Kinematics) -> tuple[list[Tra
     if apart := read_command_clock(tracks, row):
         sensors = replace(sensors, findings=sensors.findings | {"command clock": apart})
         tracks = [t if t.motor is None else replace(t, command=None) for t in tracks]
-    clock = read_motor_clock(tracks, vehicles, row, motor_rows(case), sensors.one_clock)
+    clock = read_motor_clock(tracks, vehicles, row, motor_rows(case))
+    if not sensors.one_clock:
+        # Forces are compared with the pose: motors are put on its clock.
+        pose = read_motor_clock(tracks, vehicles, row, motor_rows(case), gyroscope=False)
+        clock = replace(pose, one_clock=pose.one_clock and clock.one_clock)
     findings = sensors.findings | clock.findings
     sensors = replace(sensors, findings=findings, motor_clock=clock.one_clock)
     return [on_gyroscope_clock(t, clock) for t in tracks], sensors
