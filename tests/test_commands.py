@@ -246,7 +246,7 @@ def test_nan_stops_the_run_and_leaves_the_state(tmp_path, monkeypatch, capsys, t
         def step(carry):
             update = carry.update + 1
             broken = jax.tree.map(lambda leaf: leaf + (0.0 / (update != 4)), carry.policy.actor)
-            carry = carry.with_policy(carry.policy.replace(actor=broken))
+            carry = carry.replace(policy=carry.policy.replace(actor=broken))
             return carry.replace(update=update), {"reward": 0.0 * update}
 
         return step

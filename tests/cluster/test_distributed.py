@@ -60,7 +60,7 @@ jax.monitoring.register_event_duration_secs_listener(
 
 
 def step_on(number):
-    same, step = everywhere(number), guarded(make_device_step(settings, environment, number))
+    same, step = everywhere(number), guarded(make_device_step(settings, parts, number))
     return jax.jit(step, donate_argnums=0, out_shardings=(carry_shardings(number), same, same))
 
 
@@ -84,7 +84,7 @@ def assert_close(path, other):
 
 last = f"{UPDATES:09d}"
 one, four = (Checkpoints(directory / name, keep_last=UPDATES) for name in ("one", "four"))
-step_one, carry = step_on(1), place(make_start(settings, environment)(jax.random.key(settings.seed)))
+step_one, carry = step_on(1), place(make_start(settings, parts)(jax.random.key(settings.seed)))
 for update in range(1, UPDATES + 1):
     carry, metrics, broken = step_one(carry)
     one.save(update, carry)

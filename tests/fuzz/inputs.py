@@ -36,7 +36,7 @@ def fuzz_train(rng: random.Random, folder: Path):
         if membership(arguments) is not None:
             return None  # of several processes; whether they meet is not asked here
         job, _, _ = prepare(read_command(arguments), arguments, 0.0, Processes())
-        start = make_start(job.settings, job.environment)
+        start = make_start(job.settings, job.parts)
         jax.eval_shape(start, jax.random.key(0))  # what was accepted can be built
     return job.settings
 

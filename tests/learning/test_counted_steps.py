@@ -42,7 +42,7 @@ def test_a_training_step_simulates_exactly_the_steps_that_are_counted():
     environment = Watched(TINY.environment)
     parts = build(TINY, environment)
     carry = jax.eval_shape(lambda key: initial_carry(TINY, parts, key), jax.random.key(0))
-    jaxpr = jax.make_jaxpr(make_training_step(TINY, environment))(carry)
+    jaxpr = jax.make_jaxpr(make_training_step(TINY, parts))(carry)
     assert len(calls) == 1
     lengths = [
         (eqn.params["length"], [v.aval.shape for v in eqn.outvars])

@@ -7,21 +7,14 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 import pytest
 
 from openjax.errors import UserError
-from openjax.learning.mappo import (
-    every_nth,
-    follow_kl,
-    initial_value_scale,
-    make_optimiser,
-    update_policy,
-)
+from openjax.learning.learners.learner import Flown
+from openjax.learning.learners.mappo import Mappo, every_nth, follow_kl, make_optimiser
 from openjax.learning.presets import preset
 from openjax.learning.rollout import Rollout
 from openjax.learning.settings import MappoSettings
-from openjax.learning.train_state import Optimisers
 from openjax.policy import NetworkSettings, Policy, PredictorSettings, gaussian_log_prob
 from openjax.pursuit import Observation
 
@@ -64,16 +57,17 @@ def flags(key, length):
     return jnp.where(jax.random.bernoulli(key, 0.5, (length, WORLDS)), 1.0, -1.0)
 
 
-def one_update(settings, policy, optimisers, probe, carry, key):
-    """The update after a rollout of one probe; carry: actor, critic, value scale. Also its
+def one_update(learner, probe, carry, key):
+    """The update after a rollout of one probe; carry: MAPPO's state and the parameters. Also its
     metrics.
     """
-    actor, critic, scale = carry
+    state, parameters = carry
+    policy = learner.policy
     flag_key, noise_key, shuffle_key = jax.random.split(key, 3)
     flag = flags(flag_key, STEPS + 1)
     late = jnp.broadcast_to(jnp.arange(STEPS, dtype=jnp.float32)[:, None], (STEPS, WORLDS))
     observation = observation_of(flag[:-1], late)
-    mean, log_std = policy.distribution(actor.parameters, observation, None)
+    mean, log_std = policy.distribution(parameters.actor, observation, None)
     action = mean + jnp.exp(log_std) * jax.random.normal(noise_key, mean.shape)
     miss = (policy.action(action)[..., 0, 0] - 0.5 * flag[:-1]) ** 2
     reward = (
@@ -92,10 +86,10 @@ def one_update(settings, policy, optimisers, probe, carry, key):
         truncated=jnp.broadcast_to(probe["truncated"][:, None], (STEPS, WORLDS)),
         evader=jnp.zeros((STEPS, WORLDS, 3)),
     )
-    networks = policy, optimisers, actor, critic, scale
     last = observation_of(flag[-1], jnp.ones(WORLDS))
-    *carry, metrics = update_policy(settings, *networks, rollout, last, None, shuffle_key, None)
-    return tuple(carry), metrics
+    flown = Flown(rollout, frames=None, observation=last, state=None, predicted=None)
+    state, parameters, metrics = learner.learn(state, parameters, flown, shuffle_key)
+    return (state, parameters), metrics
 
 
 CORNERS = (
@@ -106,17 +100,15 @@ CORNERS = (
 
 
 def trained(settings, policy, updates):
-    """`train(probe)`: actor, critic and value scale after `updates`, and metrics (updates,)."""
-    optimisers = Optimisers(*make_optimiser(settings, updates), predictor=optax.identity())
+    """`train(probe)`: MAPPO's state and the parameters after `updates`, metrics (updates,)."""
+    learner = Mappo(settings, policy, updates)
 
     @jax.jit
     def train(probe):
-        states = optimisers.start(
-            policy.init(jax.random.key(0), observation_of(*map(jnp.array, CORNERS)))
-        )
+        parameters = policy.init(jax.random.key(0), observation_of(*map(jnp.array, CORNERS)))
         return jax.lax.scan(
-            lambda carry, key: one_update(settings, policy, optimisers, probe, carry, key),
-            (states["actor"], states["critic"], initial_value_scale()),
+            lambda carry, key: one_update(learner, probe, carry, key),
+            (learner.start(parameters, jax.random.key(0)), parameters),
             jax.random.split(jax.random.key(1), updates),
         )
 
@@ -146,15 +138,13 @@ def learn():
 
     @jax.jit
     def call(probe):
-        (actor, critic, scale), _ = train(probe)
-        mean, std = scale.moments
+        (state, parameters), _ = train(probe)
+        actor = parameters.actor
+        critic = parameters.critic
+        mean, std = state.value_scale.moments
         corners = observation_of(*map(jnp.array, CORNERS))
-        value = (
-            mean + std * POLICY.value(actor.parameters, critic.parameters, corners, None)[..., 0]
-        )
-        return value, POLICY.action(POLICY.distribution(actor.parameters, corners, None)[0])[
-            ..., 0, :
-        ]
+        value = mean + std * POLICY.value(actor, critic, corners, None)[..., 0]
+        return value, POLICY.action(POLICY.distribution(actor, corners, None)[0])[..., 0, :]
 
     return lambda **probe: jax.device_get(call(probe_of(**probe)))
 

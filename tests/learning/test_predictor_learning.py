@@ -5,18 +5,23 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 import pytest
 
-from openjax.learning.predictor_update import (
+from openjax.learning.learners.learner import Flown
+from openjax.learning.learners.predictor_update import (
+    PredictorLearner,
     make_predictor_optimiser,
     prediction_loss,
-    update_predictor,
     windows_and_labels,
 )
-from openjax.learning.rollout import Rollout, collect
-from openjax.learning.train_state import TrainState
-from openjax.policy import NetworkSettings, Policy, PredictorSettings, gaussian_log_prob
+from openjax.learning.rollout import Noise, Players, Rollout, collect
+from openjax.policy import (
+    NetworkSettings,
+    Policy,
+    PolicyParameters,
+    PredictorSettings,
+    gaussian_log_prob,
+)
 from openjax.pursuit import Observation, Pursuit, PursuitSettings
 
 WORLDS = 2
@@ -47,9 +52,8 @@ def recorded():
     @jax.jit
     def play(parameters, observation, state, key, share):
         noise = jax.random.normal(key, (STEPS, WORLDS, GAME.num_pursuers, 4))
-        rollout, last, after = collect(
-            environment, policy, parameters, observation, state, noise, share
-        )
+        players = Players(environment, policy, parameters)
+        rollout, last, after = collect(players, (observation, state), Noise(noise), share)
 
         def one(carry, action):
             observation, state = carry
@@ -137,8 +141,11 @@ def test_learns_a_circling_evader():
     steps = 20
     span = 10
     radius = 0.5
-    policy = Policy(predictor=PredictorSettings(units=32, horizons=(1, 5), windows=8, steps=4))
-    optimiser = optax.adam(3e-3)
+    settings = PredictorSettings(
+        units=32, horizons=(1, 5), windows=8, steps=4, learning_rate=3e-3, decay=False
+    )
+    policy = Policy(predictor=settings)
+    learner = PredictorLearner(policy, PursuitSettings(), total_updates=150)
     time = jnp.arange(-span, steps + 1)
 
     def circle(key):
@@ -169,7 +176,7 @@ def test_learns_a_circling_evader():
         )
         rollout = Rollout(
             observation,
-            None,
+            jnp.zeros((steps, worlds, 2, 3)),
             *[nothing] * 3,
             terminated=None,
             truncated=None,
@@ -177,19 +184,13 @@ def test_learns_a_circling_evader():
         )
         return jnp.swapaxes(frames[1 : span + 1], 0, 1), rollout
 
-    def update(predictor, key):
+    def update(carry, key):
+        state, parameters = carry
         data_key, window_key = jax.random.split(key)
         earlier, rollout = rollout_of(data_key)
-        return update_predictor(
-            policy,
-            optimiser,
-            PursuitSettings(),
-            predictor,
-            earlier,
-            rollout,
-            jax.random.split(window_key, worlds),
-            None,
-        )
+        flown = Flown(rollout, earlier, observation=None, state=None, predicted=None)
+        state, parameters, metrics = learner.learn(state, parameters, flown, window_key)
+        return (state, parameters), metrics["predictor_loss"]
 
     def errors(parameters, key):
         earlier, rollout = rollout_of(key)
@@ -205,9 +206,10 @@ def test_learns_a_circling_evader():
     def train(key):
         earlier, rollout = rollout_of(key)
         parameters = policy._predictor.init(key, earlier, rollout.observation.last_seen[0])
-        predictor = TrainState(parameters, optimiser.init(parameters))
-        predictor, loss = jax.lax.scan(update, predictor, jax.random.split(key, 150))
-        return loss, errors(predictor.parameters, jax.random.key(99))
+        parameters = PolicyParameters(actor={}, critic={}, predictor=parameters)
+        start = learner.start(parameters, key), parameters
+        (_, parameters), loss = jax.lax.scan(update, start, jax.random.split(key, 150))
+        return loss, errors(parameters.predictor, jax.random.key(99))
 
     loss, (learnt, kept) = train(jax.random.key(0))
     np.testing.assert_allclose(kept, [0.013, 0.065], rtol=0.02)

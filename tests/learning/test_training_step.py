@@ -157,7 +157,10 @@ def test_what_an_update_changes(run):
             )
             assert any(jax.tree.leaves(moved)), name
         assert np.any(before.key != after.key) and after.update == before.update + 1
-    assert carries[-1].value_scale.weight > carries[0].value_scale.weight
+    assert (
+        carries[-1].learners["policy"].value_scale.weight
+        > carries[0].learners["policy"].value_scale.weight
+    )
 
 
 def test_same_seed_same_run(run):

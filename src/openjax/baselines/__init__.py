@@ -7,8 +7,7 @@ from openjax.baselines.dacoop import DacoopPolicy
 from openjax.baselines.heuristic import METHODS, Heuristic
 from openjax.baselines.velocity_controller import velocity_action
 from openjax.baselines.velocity_policy import VelocityPolicy
-from openjax.policy import NetworkSettings, Policy, PredictorSettings
-from openjax.pursuit import Pursuit
+from openjax.policy import register_output
 
 __all__ = [
     "METHODS",
@@ -16,14 +15,8 @@ __all__ = [
     "DacoopPolicy",
     "Heuristic",
     "VelocityPolicy",
-    "make_policy",
     "velocity_action",
 ]
 
-
-def make_policy(
-    environment: Pursuit, network: NetworkSettings, predictor: PredictorSettings
-) -> Policy:
-    """The policy for an environment, of the kind that `network.output` says."""
-    kinds = {"commands": Policy, "velocity": VelocityPolicy, "field": DacoopPolicy}
-    return kinds[network.output].for_environment(environment, network, predictor)
+register_output("velocity", VelocityPolicy)
+register_output("field", DacoopPolicy)

@@ -16,9 +16,8 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from openjax.errors import UserError
-from openjax.learning import TrainCarry, TrainSettings, make_training_step
+from openjax.learning import Parts, TrainCarry, TrainSettings, make_training_step
 from openjax.learning.first_flights import FirstCarry, FirstFlights, make_first_flights
-from openjax.pursuit import Pursuit
 
 AXIS = "devices"
 _SHARED_OUT = ("observation", "state")
@@ -106,11 +105,11 @@ def own_copy(tree: Any) -> Any:
     return jax.tree.map(lambda leaf: jax.device_put(leaf.addressable_data(0), device), tree)
 
 
-def make_device_step(settings: TrainSettings, environment: Pursuit, number: int) -> Callable:
+def make_device_step(settings: TrainSettings, parts: Parts, number: int) -> Callable:
     """The training step `carry -> (carry, metrics)` on `number` devices, not yet compiled."""
     if number == 1:
-        return make_training_step(settings, environment)
-    step = make_training_step(settings, environment, axis=AXIS)
+        return make_training_step(settings, parts)
+    step = make_training_step(settings, parts, axis=AXIS)
     carry = _carry_of(PartitionSpec(AXIS), PartitionSpec())
     same = PartitionSpec()
     return _shared_out(number, step, (carry,), (carry, same))

@@ -65,7 +65,8 @@ class Validation:
         self.number = number
         slots = layout_slots(drawn)
         game = dataclasses.replace(drawn, max_pillars=slots, evaders=evaders or drawn.evaders)
-        wide = dataclasses.replace(environment, settings=game, dynamics=None)
+        changes = {"evaders": None} if evaders else {}
+        wide = dataclasses.replace(environment, settings=game, dynamics=None, **changes)
         self.evaluator = Evaluator(wide, policy, 2 * number)
         self.tasks: dict[str, Task] = {
             "validation": uniform_tasks(drawn, self.number, slots),

@@ -19,7 +19,7 @@ import numpy as np
 import optax
 from flax import struct
 
-from openjax.baselines import make_policy
+import openjax.baselines  # noqa: F401  registers its policies
 from openjax.evaluation.episodes import Evaluation, make_evaluate
 from openjax.learning.analytic_gradient import (
     breach_share,
@@ -29,7 +29,7 @@ from openjax.learning.analytic_gradient import (
     nearest_gap,
 )
 from openjax.learning.settings import AdaptSettings, TrainSettings
-from openjax.policy import Policy, PolicyParameters
+from openjax.policy import Policy, PolicyParameters, make_policy
 from openjax.policy.growth import with_longer_history
 from openjax.pursuit import (
     Pursuit,

@@ -1,11 +1,14 @@
 """Rollouts: the policy acts in all worlds for some steps."""
 
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
 import chex
 import jax
 import jax.numpy as jnp
 from flax import struct
 
-from openjax.learning.evader_learning import EvaderLearning, EvaderSamples, LearningEvaders
 from openjax.policy import Policy, PolicyParameters, gaussian_log_prob
 from openjax.pursuit import Observation, Pursuit, PursuitState
 
@@ -26,9 +29,8 @@ class Rollout:
     terminated: jax.Array  # (T, E) bool
     truncated: jax.Array  # (T, E) bool
     evader: jax.Array  # (T, E, 3) m, true position after the step
-    learning: EvaderSamples | None = (
-        None  # (T, E, ...), of the evaders that learn; None where none does
-    )
+    learning: Any = None
+    """Samples (T, E, ...) of the evaders that learn; None where none does."""
 
 
 def newest_frame(observation: Observation) -> Observation:
@@ -36,57 +38,82 @@ def newest_frame(observation: Observation) -> Observation:
     return observation.replace(frames=observation.frames[..., -1:, :])
 
 
+@dataclass(frozen=True)
+class Players:
+    """Who flies in a rollout."""
+
+    environment: Pursuit
+    policy: Policy
+    parameters: PolicyParameters
+    evaders: Callable[[PursuitState, jax.Array], tuple[jax.Array, Any]] | None = None
+    """worlds (E, ...), noise (E, 3) -> desired velocities (E, 3) of evaders that learn, and their
+    samples; None: none learns
+    """
+
+
+@struct.dataclass
+class Noise:
+    """What a rollout's exploration draws, standard normal, ahead in one go."""
+
+    pursuers: jax.Array  # (T, E, N, A)
+    evaders: jax.Array | None = None  # (T, E, 3)
+
+
 def collect(
-    environment: Pursuit,
-    policy: Policy,
-    parameters: PolicyParameters,
-    observation: Observation,
-    state: PursuitState,
-    noise: jax.Array,
+    players: Players,
+    world: tuple[Observation, PursuitState],
+    noise: Noise,
     penalty_share: jax.Array | float = 1.0,
-    learning: tuple[EvaderLearning, LearningEvaders, jax.Array] | None = None,
 ) -> tuple[Rollout, Observation, PursuitState]:
     """Act with exploration for T steps in E worlds.
 
     Args:
-      environment: the game.
-      policy: the networks.
-      parameters: theirs.
-      observation: (E, ...) of `state`.
-      state: (E, ...).
-      noise: (T, E, N, A) standard normal, drawn ahead in one go.
+      players: who flies.
+      world: observation and state (E, ...) before.
+      noise: of all steps.
       penalty_share: () share of the reward's penalties that counts.
-      learning: how evaders learn, who they are, and noise (T, E, 3) for them; None: none learns.
 
     Returns:
       the rollout, and observation and state after it.
     """
-    chex.assert_shape(noise, (None, None, environment.settings.num_pursuers, policy.sample_size))
-    chex.assert_tree_shape_prefix((observation, state), noise.shape[1:2])
-    step = jax.vmap(environment.step, in_axes=(None, 0, 0, 0 if learning else None))
-    how, evaders, evader_noise = learning or (None, None, None)
+    environment = players.environment
+    policy = players.policy
+    pursuers = environment.settings.num_pursuers
+    chex.assert_shape(noise.pursuers, (None, None, pursuers, policy.sample_size))
+    chex.assert_tree_shape_prefix(world, noise.pursuers.shape[1:2])
+    step = jax.vmap(environment.step, in_axes=(None, 0, 0, 0 if players.evaders else None))
 
     def one(carry, noise):
-        (observation, state), (noise, evader_noise) = carry, noise
-        wish, samples = how.act(evaders, state, evader_noise) if learning else (None, None)
-        predicted = policy.predict(parameters, observation)
-        mean, log_std = policy.distribution(parameters.actor, observation, predicted)
-        action = mean + jnp.exp(log_std) * noise
-        log_prob = gaussian_log_prob(action, mean, log_std)
-        acted = policy.action(action, observation)
-        following, state, reward, *ends, info = step(jax.random.key(0), state, acted, wish)
+        observation, state = carry
+        desired = samples = None
+        if players.evaders:
+            desired, samples = players.evaders(state, noise.evaders)
+        predicted, action, log_prob = _sample(players, observation, noise.pursuers)
+        command = policy.action(action, observation)
+        following, state, reward, terminated, truncated, info = step(
+            jax.random.key(0), state, command, desired
+        )
         record = Rollout(
             observation=newest_frame(observation),
             predicted=predicted,
             action=action,
             log_prob=log_prob,
             reward=reward - (1.0 - penalty_share) * info.penalty,
-            terminated=ends[0],
-            truncated=ends[1],
+            terminated=terminated,
+            truncated=truncated,
             evader=state.evader_position,
             learning=samples,
         )
         return (following, state), record
 
-    (observation, state), rollout = jax.lax.scan(one, (observation, state), (noise, evader_noise))
+    (observation, state), rollout = jax.lax.scan(one, world, noise)
     return rollout, observation, state
+
+
+def _sample(players, observation, noise):
+    """Predictions, samples of the policy and their log probabilities."""
+    policy = players.policy
+    predicted = policy.predict(players.parameters, observation)
+    mean, log_std = policy.distribution(players.parameters.actor, observation, predicted)
+    action = mean + jnp.exp(log_std) * noise
+    return predicted, action, gaussian_log_prob(action, mean, log_std)

@@ -1,13 +1,11 @@
 """A network while it learns: its parameters and its optimiser's state, side by side."""
 
 import re
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import optax
 from flax import struct
-
-from openjax.policy import PolicyParameters
 
 
 @struct.dataclass
@@ -51,31 +49,16 @@ def shuffled(key: jax.Array, epochs: int, minibatches: int) -> jax.Array:
     return jax.vmap(lambda key: jax.random.permutation(key, minibatches))(keys).ravel()
 
 
-class Optimisers(NamedTuple):
-    """One for each network."""
-
-    actor: optax.GradientTransformation
-    critic: optax.GradientTransformation
-    predictor: optax.GradientTransformation
-
-    def start(self, parameters: PolicyParameters) -> dict[str, TrainState]:
-        """The networks before their first step, by name."""
-        return {
-            name: TrainState(getattr(parameters, name), optimiser.init(getattr(parameters, name)))
-            for name, optimiser in self._asdict().items()
-        }
-
-
 _NETWORK = "(actor|critic|predictor)"
-_OF_POLICY = re.compile(f"{_NETWORK}/parameters/(.+)"), re.compile(f"policy/{_NETWORK}/(.+)")
+_OF_POLICY = re.compile(f"policy/{_NETWORK}/(.+)"), re.compile(f"{_NETWORK}/parameters/(.+)")
 
 
 def policy_leaf(name: str) -> str | None:
     """The path in `PolicyParameters` of a leaf of a training carry: `actor/params/x` for
-    `actor/parameters/params/x`.
-
-    None for one that isn't of the policy. In carries from before networks had a `TrainState` it is
     `policy/actor/params/x`.
+
+    None for one that isn't of the policy. In carries from when each network lay beside its
+    optimiser it is `actor/parameters/params/x`.
     """
     for pattern in _OF_POLICY:
         if found := pattern.fullmatch(name):

@@ -3,25 +3,28 @@ function of one carry.
 """
 
 import functools
-from collections.abc import Callable
+import zlib
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from openjax.baselines import make_policy
+import openjax.baselines  # noqa: F401  registers its policies
 from openjax.learning.archive import TaskArchive, empty_archive
 from openjax.learning.collectives import gather_over_devices, mean_over_devices, own_keys
-from openjax.learning.evader_learning import EvaderLearning, LearningEvaders
+from openjax.learning.evader_learning import EvaderLearning
 from openjax.learning.generator import generate_task, select, successes, task_like
-from openjax.learning.mappo import ValueScale, initial_value_scale, make_optimiser, update_policy
-from openjax.learning.predictor_update import make_predictor_optimiser, update_predictor
-from openjax.learning.rollout import Rollout, collect
+from openjax.learning.learners.evasion import EvaderLearner
+from openjax.learning.learners.learner import Flown, Learner
+from openjax.learning.learners.mappo import Mappo
+from openjax.learning.learners.predictor_update import PredictorLearner
+from openjax.learning.rollout import Noise, Players, collect
 from openjax.learning.settings import TrainSettings
-from openjax.learning.train_state import Optimisers, TrainState
-from openjax.policy import Policy, PolicyParameters
+from openjax.policy import Policy, PolicyParameters, make_policy
 from openjax.pursuit import Observation, Pursuit, PursuitState
 from openjax.pursuit.evaders import learned_place
 from openjax.vehicle.family import narrowed_bounds
@@ -31,81 +34,80 @@ from openjax.vehicle.family import narrowed_bounds
 class TrainCarry:
     """Everything that a run is. Saved whole, it goes on as if nothing had happened."""
 
-    actor: TrainState
-    critic: TrainState
-    predictor: TrainState
-    value_scale: ValueScale
+    policy: PolicyParameters
+    """The parameters that act."""
+    learners: dict[str, Any]
+    """The state of each learner, by name."""
     observation: Observation  # (E, ...)
     state: PursuitState  # (E, ...)
-    evaders: LearningEvaders | None
-    """Those that learn; None where none does."""
     archive: TaskArchive
     key: jax.Array
     update: jax.Array  # () int32, training steps done
 
-    @property
-    def policy(self) -> PolicyParameters:
-        """The parameters that act."""
-        return PolicyParameters(
-            actor=self.actor.parameters,
-            critic=self.critic.parameters,
-            predictor=self.predictor.parameters,
-        )
-
-    def with_policy(self, policy: PolicyParameters) -> "TrainCarry":
-        """The carry with other parameters, its optimisers as they are."""
-        return self.replace(
-            actor=self.actor.replace(parameters=policy.actor),
-            critic=self.critic.replace(parameters=policy.critic),
-            predictor=self.predictor.replace(parameters=policy.predictor),
-        )
-
 
 @dataclass(frozen=True)
-class Building:
-    """What a training step is made of: environment, networks and optimisers of a run's settings."""
+class Parts:
+    """What a training step is made of. Each part may be one's own."""
 
     environment: Pursuit
     policy: Policy
-    optimisers: Optimisers
-    evaders: EvaderLearning
+    """Whatever has `init`, `predict`, `distribution`, `action`, `value` and `evaluate`; see
+    `openjax.policy.Policy`.
+    """
+    learners: Mapping[str, Learner]
+    """By name, in the order in which they learn."""
 
 
-def build(settings: TrainSettings, environment: Pursuit | None = None) -> Building:
-    """Environment, networks and optimisers of a run. `environment` overrides the nominal one
-    (effects, vehicle).
+def build(
+    settings: TrainSettings,
+    environment: Pursuit | None = None,
+    policy: Policy | None = None,
+    learners: Mapping[str, Learner] | None = None,
+) -> Parts:
+    """The parts of a run; those that aren't given are the ones that the settings name.
+
+    Own `learners` stand beside the shipped ones, or in the place of the one whose name they have:
+    `predictor`, `evaders`, `policy` (which is MAPPO).
     """
     environment = environment or Pursuit(settings.environment)
-    return Building(
-        environment=environment,
-        evaders=EvaderLearning(settings.evader_learning, environment, settings.total_updates),
-        policy=make_policy(environment, settings.network, settings.predictor),
-        optimisers=Optimisers(
-            *make_optimiser(settings.mappo, settings.total_updates),
-            predictor=make_predictor_optimiser(settings.predictor, settings.total_updates),
-        ),
-    )
+    policy = policy or make_policy(environment, settings.network, settings.predictor)
+    shipped = shipped_learners(settings, environment, policy)
+    return Parts(environment, policy, {**shipped, **(learners or {})})
+
+
+def shipped_learners(
+    settings: TrainSettings, environment: Pursuit, policy: Policy
+) -> dict[str, Learner]:
+    """The learners that a run's settings name, in the order in which they learn."""
+    learners = {}
+    updates = settings.total_updates
+    if policy.predictor.enabled:
+        learners["predictor"] = PredictorLearner(policy, environment.settings, updates)
+    evaders = EvaderLearning(settings.evader_learning, environment, updates)
+    if evaders.number:
+        learners["evaders"] = EvaderLearner(evaders)
+    return {**learners, "policy": Mappo(settings.mappo, policy, updates)}
 
 
 def make_start(
-    settings: TrainSettings, environment: Pursuit | None = None
+    settings: TrainSettings, parts: Parts | None = None
 ) -> Callable[[jax.Array], TrainCarry]:
     """The start of a run, key -> carry, by `jax.jit`: fresh networks, uniform tasks, an empty
     archive, staggered starts.
 
     `jax.eval_shape` of it tells the carry's shapes; it is traced once for both.
     """
-    parts = build(settings, environment)
-    return jax.jit(functools.partial(initial_carry, settings, parts))
+    return jax.jit(functools.partial(initial_carry, settings, parts or build(settings)))
 
 
-def initial_carry(settings: TrainSettings, parts: Building, key: jax.Array) -> TrainCarry:
+def initial_carry(settings: TrainSettings, parts: Parts, key: jax.Array) -> TrainCarry:
     """The carry of a run's start; `parts` are what `build` gives."""
     environment = _starting(settings, parts.environment, 0.0)
-    archive = empty_archive(task_like(settings.environment), settings.generator.capacity)
+    archive = empty_archive(task_like(parts.environment.settings), settings.generator.capacity)
     key, policy_key, task_key, reset_key = jax.random.split(key, 4)
     tasks = _tasks(
         settings,
+        environment,
         archive,
         jax.random.split(task_key, settings.num_envs // settings.episodes_per_task),
     )
@@ -116,27 +118,28 @@ def initial_carry(settings: TrainSettings, parts: Building, key: jax.Array) -> T
     state = state.replace(step=settings.schedule.age(settings.num_envs) * settings.rollout_length)
     observation = jax.vmap(environment.observe)(state)
     policy = parts.policy.init(policy_key, jax.tree.map(lambda x: x[0], observation))
+    learners = {
+        name: learner.start(policy, _start_key(name, policy_key))
+        for name, learner in parts.learners.items()
+    }
     return TrainCarry(
-        **parts.optimisers.start(policy),
-        value_scale=initial_value_scale(),
+        policy=policy,
+        learners=learners,
         observation=observation,
         state=state,
-        evaders=parts.evaders.start(jax.random.fold_in(policy_key, 1))
-        if parts.evaders.number
-        else None,
         archive=archive,
         key=key,
         update=jnp.zeros((), jnp.int32),
     )
 
 
-@struct.dataclass
-class Flown:
-    """What a training step learns from: a rollout, and what it needs of before and after it."""
+def _number_of(name):
+    """A number for a learner of one's own, by which its keys differ from those of others."""
+    return zlib.crc32(name.encode())
 
-    rollout: Rollout  # (T, E, ...)
-    frames: jax.Array  # (E, H, F), the history before
-    predicted: jax.Array | None  # (E, K, 3) m, predicted after it
+
+def _start_key(name, policy_key):
+    return jax.random.fold_in(policy_key, 1 if name == "evaders" else _number_of(name))
 
 
 @dataclass(frozen=True)
@@ -149,9 +152,7 @@ class Phases:
     fly: Callable[[TrainCarry], tuple[TrainCarry, Flown, dict[str, jax.Array]]]
     """carry -> carry after a rollout, what is learnt from it, metrics"""
     learn: tuple[Callable[[TrainCarry, Flown], tuple[TrainCarry, dict[str, jax.Array]]], ...]
-    """(carry, flown) -> carry after an update, metrics; one for each network that learns on its
-    own
-    """
+    """(carry, flown) -> carry after an update, metrics; one for each learner"""
     renew: Callable[[TrainCarry], tuple[TrainCarry, dict[str, jax.Array]]]
     """carry -> carry whose worlds have new tasks where their episodes have just ended, metrics of
     these episodes
@@ -174,26 +175,29 @@ def _named(phase):
 
 
 def make_phases(
-    settings: TrainSettings, environment: Pursuit | None = None, axis: str | None = None
+    settings: TrainSettings, parts: Parts | None = None, axis: str | None = None
 ) -> Phases:
     """The parts of the training step; `axis` names the axis of devices when they run under
     `shard_map`.
     """
-    step = _Step(settings, build(settings, environment), axis)
-    learn = (step.learn_predictor,) if settings.predictor.enabled else ()
-    learn += (step.learn_evaders,) if step.parts.evaders.number else ()
-    return Phases(step.fly, (*learn, step.learn_policy), step.renew)
+    step = _Step(settings, parts or build(settings), axis)
+    learn = tuple(step.learning(name) for name in step.parts.learners)
+    return Phases(step.fly, learn, step.renew)
 
 
 def make_training_step(
-    settings: TrainSettings, environment: Pursuit | None = None, axis: str | None = None
+    settings: TrainSettings, parts: Parts | None = None, axis: str | None = None
 ) -> Callable[[TrainCarry], tuple[TrainCarry, dict[str, jax.Array]]]:
     """The training step `carry -> (carry, metrics)` as one function; compile it with `jax.jit(step,
     donate_argnums=0)`.
 
-    `axis` names the axis of devices when it runs under `shard_map` (see `openjax.cluster.devices`).
+    Args:
+      settings: of the run.
+      parts: environment, policy and learners; None: those that the settings name.
+      axis: name of the axis of devices when it runs under `shard_map` (see
+      `openjax.cluster.devices`).
     """
-    phases = make_phases(settings, environment, axis)
+    phases = make_phases(settings, parts, axis)
     # a function by its name, as the compiler's cache knows programs by theirs
     return lambda carry: phases(carry)
 
@@ -203,66 +207,62 @@ class _Step:
     """What the phases have in common."""
 
     settings: TrainSettings
-    parts: Building
+    parts: Parts
     axis: str | None
 
     def fly(self, carry):
         settings = self.settings
         axis = self.axis
-        environment = self.parts.environment
         policy = self.parts.policy
-        shape = (settings.rollout_length, settings.environment.num_pursuers, policy.sample_size)
+        steps = settings.rollout_length
+        pursuers = self.parts.environment.settings.num_pursuers
+        shape = (steps, pursuers, policy.sample_size)
         keys = own_keys(self._key(carry, 1), carry.state.step.shape[0], axis)
         noise = jax.vmap(lambda k: jax.random.normal(k, shape))(keys)
-        world = (carry.observation, carry.state)
-        share = penalty_share_at(settings, self._progress(carry))
-        learning = None
-        if carry.evaders is not None:
-            draws = jax.vmap(lambda k: jax.random.normal(jax.random.fold_in(k, 1), (shape[0], 3)))(
+        noise = Noise(jnp.moveaxis(noise, 1, 0))
+        act = self._evaders(carry)
+        if act is not None:
+            draws = jax.vmap(lambda k: jax.random.normal(jax.random.fold_in(k, 1), (steps, 3)))(
                 keys
             )
-            learning = self.parts.evaders, carry.evaders, jnp.moveaxis(draws, 1, 0)
-        rollout, observation, state = collect(
-            environment, policy, carry.policy, *world, jnp.moveaxis(noise, 1, 0), share, learning
+            noise = noise.replace(evaders=jnp.moveaxis(draws, 1, 0))
+        players = Players(self.parts.environment, policy, carry.policy, act)
+        world = (carry.observation, carry.state)
+        progress = self._progress(carry)
+        share = penalty_share_at(settings, progress)
+        rollout, observation, state = collect(players, world, noise, share)
+        flown = Flown(
+            rollout=rollout,
+            frames=carry.state.frames,
+            observation=observation,
+            state=state,
+            predicted=policy.predict(carry.policy, observation),
+            progress=progress,
+            axis=axis,
         )
-        flown = Flown(rollout, carry.state.frames, policy.predict(carry.policy, observation))
         metrics = {"reward": mean_over_devices(jnp.mean(rollout.reward), axis)}
         return carry.replace(observation=observation, state=state), flown, metrics
 
-    def learn_predictor(self, carry, flown):
-        rollout = flown.rollout
-        axis = self.axis
-        keys = own_keys(self._key(carry, 2), flown.frames.shape[0], axis)
-        how = self.parts.policy, self.parts.optimisers.predictor, self.parts.environment.settings
-        predictor, loss = update_predictor(*how, carry.predictor, flown.frames, rollout, keys, axis)
-        error = jnp.linalg.norm(rollout.predicted[:, :, 0] - rollout.evader, axis=-1)
-        metrics = {
-            "predictor_loss": loss,
-            "prediction_error": mean_over_devices(jnp.mean(error), axis),
-        }
-        return carry.replace(predictor=predictor), metrics
+    def _evaders(self, carry):
+        """How evaders that learn fly, (worlds, noise) -> desired velocities, samples; None where
+        none does.
+        """
+        for name, learner in self.parts.learners.items():
+            if hasattr(learner, "act"):
+                return functools.partial(learner.act, carry.learners[name])
+        return None
 
-    def learn_policy(self, carry, flown):
-        before = (carry.actor, carry.critic, carry.value_scale)
-        last = (carry.observation, flown.predicted)
-        how = self.settings.mappo, self.parts.policy, self.parts.optimisers
-        actor, critic, scale, metrics = update_policy(
-            *how,
-            *before,
-            flown.rollout,
-            *last,
-            self._key(carry, 3),
-            self.axis,
-            self._progress(carry),
-        )
-        return carry.replace(actor=actor, critic=critic, value_scale=scale), metrics
+    def learning(self, name):
+        """The phase in which the learner of that name learns."""
+        learner = self.parts.learners[name]
 
-    def learn_evaders(self, carry, flown):
-        key = jax.random.fold_in(self._key(carry, 3), 1)
-        evaders = self.parts.evaders.learn(
-            carry.evaders, flown.rollout.learning, carry.state, key, self.axis
-        )
-        return carry.replace(evaders=evaders), {"evader_noise": jnp.mean(evaders.log_std)}
+        def learn(carry, flown):
+            key = self._learner_key(carry, name)
+            state, policy, metrics = learner.learn(carry.learners[name], carry.policy, flown, key)
+            return carry.replace(policy=policy, learners={**carry.learners, name: state}), metrics
+
+        learn.__name__ = f"learn_{name}"
+        return learn
 
     def renew(self, carry):
         settings = self.settings
@@ -279,22 +279,56 @@ class _Step:
         # other groups
         numbers = ended.step.shape[0], schedule.restarts(carry.state.step.shape[0])
         keys = self._key(carry, 4), self._key(carry, 5)
-        fresh = _fresh(settings, starting, archive, *keys, numbers, axis)
-        worlds = schedule.renewed((carry.observation, carry.state), fresh, group)
+        fresh = self._fresh(starting, archive, keys, numbers)
+        observation, state = schedule.renewed((carry.observation, carry.state), fresh, group)
         carry = carry.replace(
-            observation=worlds[0],
-            state=worlds[1],
+            observation=observation,
+            state=state,
             archive=archive,
             key=self._key(carry, 0),
             update=carry.update + 1,
         )
         return carry, metrics
 
+    def _fresh(self, environment, archive, keys, numbers):
+        """Observations and states of worlds of this device at the start of newly drawn tasks, of both
+        `numbers` in one; `keys` of tasks and resets.
+
+        Of the second ones some pursuers start close to something. All are drawn at once, by a program
+        half as large.
+        """
+        settings = self.settings
+        share = settings.episodes_per_task
+        close = jnp.repeat(jnp.array([0.0, settings.restart_close]), np.array(numbers) // share)
+
+        task_key, reset_key = keys
+
+        def of_worlds(key, numbers):
+            parts = (
+                own_keys(jax.random.fold_in(key, i), number, self.axis)
+                for i, number in enumerate(numbers)
+                if number
+            )
+            return jnp.concatenate(list(parts))
+
+        task_keys = of_worlds(task_key, [number // share for number in numbers])
+        tasks = _tasks(settings, environment, archive, task_keys, close)
+        return jax.vmap(environment.reset_to)(of_worlds(reset_key, numbers), tasks)
+
     def _key(self, carry, number):
         """One of the keys of this step: of the next step, noise, windows, shuffling, tasks,
         resets.
         """
         return jax.random.split(carry.key, 6)[number]
+
+    def _learner_key(self, carry, name):
+        """The key of a learner in this step; shipped ones have the windows' and the shuffling's."""
+        if name == "predictor":
+            return self._key(carry, 2)
+        key = self._key(carry, 3)
+        if name == "policy":
+            return key
+        return jax.random.fold_in(key, 1 if name == "evaders" else _number_of(name))
 
     def _progress(self, carry):
         """() share of the run that is done."""
@@ -319,7 +353,7 @@ def _starting(settings, environment, progress):
     def grown(start, ramp):
         return jnp.clip((progress - start) / max(ramp, 1e-6), 0.0, 1.0)
 
-    family = settings.environment.vehicles
+    family = environment.settings.vehicles
     if family and (settings.vehicles_start or settings.vehicles_ramp):
         share = grown(settings.vehicles_start, settings.vehicles_ramp)
         environment = environment.with_bounds(narrowed_bounds(family, share))
@@ -329,37 +363,13 @@ def _starting(settings, environment, progress):
     return environment
 
 
-def _tasks(settings, archive, keys, close=None):
+def _tasks(settings, environment, archive, keys, close=None):
     """One task per key, repeated for the environments that share it; shares `close` of pursuers
     start close to something.
     """
-    draw = functools.partial(generate_task, settings.generator, settings.environment, archive)
+    draw = functools.partial(generate_task, settings.generator, environment.settings, archive)
     tasks = jax.vmap(draw)(keys, close if settings.restart_close else None)
     return jax.tree.map(lambda x: jnp.repeat(x, settings.episodes_per_task, axis=0), tasks)
-
-
-def _fresh(settings, environment, archive, task_key, reset_key, numbers, axis):
-    """Observations and states of worlds of this device at the start of newly drawn tasks, of both
-    `numbers` in one.
-
-    Of the second ones some pursuers start close to something. All are drawn at once, by a program
-    half as large.
-    """
-    share = settings.episodes_per_task
-    close = jnp.repeat(jnp.array([0.0, settings.restart_close]), np.array(numbers) // share)
-
-    def keys(key, numbers):
-        parts = (
-            own_keys(jax.random.fold_in(key, i), number, axis)
-            for i, number in enumerate(numbers)
-            if number
-        )
-        return jnp.concatenate(list(parts))
-
-    tasks = _tasks(
-        settings, archive, keys(task_key, [number // share for number in numbers]), close
-    )
-    return jax.vmap(environment.reset_to)(keys(reset_key, numbers), tasks)
 
 
 def _selection(settings, archive, ended, penalty_share, axis):

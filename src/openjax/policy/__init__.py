@@ -5,6 +5,7 @@ from openjax.lazy import lazy_names
 __getattr__, __dir__, __all__ = lazy_names(
     __name__,
     {
+        "outputs": "make_policy register_output",
         "policy": "Policy PolicyParameters gaussian_entropy gaussian_log_prob",
         "settings": "NetworkSettings PredictorSettings",
     },

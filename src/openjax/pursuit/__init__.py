@@ -7,9 +7,10 @@ from openjax.lazy import lazy_names
 __getattr__, __dir__, __all__ = lazy_names(
     __name__,
     {
-        "environment": "Dynamics Pursuit action_to_command hover_action make",
+        "environment": "Dynamics Observer Pursuit action_to_command hover_action make",
         "info": "StepInfo",
-        "observation": "Observation",
+        "observation": "Observation observe",
+        "reward": "Term Transition default_reward",
         "scenarios": "SCENARIOS Scenario find_scenario scenario_settings scenario_task",
         "settings": "PursuitSettings RewardSettings",
         "state": "PursuitState",

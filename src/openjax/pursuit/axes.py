@@ -1,7 +1,15 @@
-"""Axes of one's own: upright, turned about the vertical."""
+"""Axes: a body's in the world, and upright ones of one's own, turned about the vertical."""
 
 import jax
 import jax.numpy as jnp
+
+
+def rotation_axes(quaternion: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Body x and z axes in the world, (..., 3) each, of (..., 4) unit quaternions wxyz."""
+    w, x, y, z = jnp.moveaxis(quaternion, -1, 0)
+    body_x = jnp.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], axis=-1)
+    body_z = jnp.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=-1)
+    return body_x, body_z
 
 
 def turned_back(heading: jax.Array | None, vector: jax.Array) -> jax.Array:

@@ -9,11 +9,26 @@ import jax
 import jax.numpy as jnp
 
 from openjax.errors import UserError
+from openjax.pursuit.axes import rotation_axes
 from openjax.pursuit.collisions import breaches, crashed
-from openjax.pursuit.evaders import draw_evader, evader_velocity
+from openjax.pursuit.evaders import (
+    Evader,
+    EvaderKind,
+    draw_row,
+    evader_rows,
+    evader_velocity,
+    handed_in,
+)
 from openjax.pursuit.info import StepInfo
-from openjax.pursuit.observation import Observation, frame, observe, own_frame, rotation_axes
-from openjax.pursuit.reward import captures, over_speed, reward
+from openjax.pursuit.observation import Observation, frame, observe, own_frame
+from openjax.pursuit.reward import (
+    Term,
+    Transition,
+    captures,
+    default_reward,
+    over_speed,
+    total_reward,
+)
 from openjax.pursuit.sensing import line_of_sight
 from openjax.pursuit.settings import PursuitSettings
 from openjax.pursuit.spaces import Box
@@ -72,6 +87,17 @@ class Dynamics(Protocol):
         """The drones as their sensors tell."""
 
 
+class Observer(Protocol):
+    """What pursuers observe; `openjax.pursuit.observe` is the game's own."""
+
+    def __call__(
+        self, settings: PursuitSettings, state: PursuitState, seen_drones: DroneState
+    ) -> Observation:
+        """The observation of all N pursuers; `seen_drones` is what sensors tell of them. The
+        shapes of `self_state`, `others`, `pillars` and `privileged` are free but for N.
+        """
+
+
 @dataclass(frozen=True, eq=False)
 class Pursuit:
     """Pursuit-evasion by N quadrotors, as pure functions: map them with `jax.vmap`, compile them
@@ -98,10 +124,24 @@ class Pursuit:
     """
     dynamics: Dynamics | None = None
     """What moves the pursuers; None: the physics that the settings name, with the effects."""
+    evaders: tuple[Evader, ...] | None = None
+    """Who flies away, one of them in each episode: names, rows, or functions of one's own
+    (`openjax.pursuit.evaders.EvaderKind`); they go before those that the settings name. None: these.
+    """
+    reward: tuple[Term, ...] | None = None
+    """The reward's terms; None: `openjax.pursuit.default_reward(settings.reward)`."""
+    observer: Observer | None = None
+    """What pursuers observe; None: `openjax.pursuit.observe`."""
 
     def __post_init__(self):
         settings = self.settings or PursuitSettings()
+        evaders = self.evaders
+        if evaders is not None:
+            names, rows = handed_in(evaders)
+            settings = dataclasses.replace(settings, evaders=names)
+            evaders = evaders if rows else None  # names alone are the settings'
         complete = {
+            "evaders": evaders,
             "settings": settings,
             "vehicle": load_vehicle(settings.airframe) if self.vehicle is None else self.vehicle,
             "effects": tuple(self.effects),
@@ -117,9 +157,23 @@ class Pursuit:
             ),
         }
         for name, value in complete.items():
-            object.__setattr__(
-                self, name, value
-            )  # the one moment at which a frozen object is filled
+            # the one moment at which a frozen object is filled
+            object.__setattr__(self, name, value)
+        _ = self.evader_rows  # raises where settings name one that isn't here
+
+    @property
+    def _handed_in(self) -> tuple[EvaderKind, ...]:
+        return () if self.evaders is None else handed_in(self.evaders)[1]
+
+    @property
+    def evader_rows(self) -> tuple[EvaderKind, ...]:
+        """What each of `settings.evaders` is."""
+        return evader_rows(self.settings.evaders, self._handed_in)
+
+    @property
+    def terms(self) -> tuple[Term, ...]:
+        """The reward's terms."""
+        return default_reward(self.settings.reward) if self.reward is None else self.reward
 
     @property
     def action_space(self) -> Box:
@@ -198,8 +252,8 @@ class Pursuit:
             vehicles=vehicles,
             evader_position=task.evader_position,
             evader_velocity=still,
-            evader=draw_evader(
-                settings,
+            evader=draw_row(
+                self.evader_rows,
                 jax.random.fold_in(key, 3),
                 task.pursuer_position,
                 self.evader_share,
@@ -227,7 +281,10 @@ class Pursuit:
         """The observation of a state; effects on the sensors act on what a pursuer knows of all
         pursuers.
         """
-        return observe(self.settings, state, self._seen(state.drones, state.vehicles))
+        return self._observe(state, self._seen(state.drones, state.vehicles))
+
+    def _observe(self, state, seen_drones):
+        return (self.observer or observe)(self.settings, state, seen_drones)
 
     def _parameters(self, vehicles):
         """Parameters of all effects: those drawn for the episode, and this environment's own, which
@@ -292,7 +349,9 @@ class Pursuit:
         task = state.task
         before = state
         pillars = (task.pillar_position, task.pillar_active)
-        velocity, evader_state = evader_velocity(settings, before, self.evader_networks, wish)
+        velocity, evader_state = evader_velocity(
+            settings, self.evader_rows, before, self.evader_networks, wish
+        )
         evader = before.evader_position + settings.time_step * velocity
         step = before.step + 1
         position = drones.position
@@ -326,7 +385,8 @@ class Pursuit:
             ),
             penalty=jnp.zeros(settings.num_pursuers, jnp.float32),
         )
-        rewards, penalty = reward(settings, before, state, info)
+        transition = Transition(settings, before, state, info)
+        rewards, penalty = total_reward(self.terms, transition)
         info = info.replace(penalty=penalty)
         state = state.replace(statistics=count(before.statistics, step, info, rewards))
         over = step >= settings.episode_length
@@ -334,15 +394,18 @@ class Pursuit:
         # an observed horizon is part of the task, so its end is terminal; an unobserved one only
         # cuts the episode
         terminated, truncated = (over, never) if settings.observe_time else (never, over)
-        return observe(settings, state, seen_drones), state, rewards, terminated, truncated, info
+        return self._observe(state, seen_drones), state, rewards, terminated, truncated, info
 
 
-def make(settings: PursuitSettings | None = None, evader: str | None = None, **changes) -> Pursuit:
+def make(
+    settings: PursuitSettings | None = None, evader: Evader | None = None, **changes
+) -> Pursuit:
     """An environment.
 
     Args:
       settings: the game; None is the paper's.
-      evader: a name in `openjax.pursuit.evaders.EVADERS`, short for `evaders=(name,)`.
+      evader: a name in `openjax.pursuit.evaders.EVADERS`, short for `evaders=(name,)`; a row, or a
+      function of one's own.
       changes: fields of `PursuitSettings`: `make(num_pursuers=4, reward=dict(crash=20.0))`.
 
     Raises:
@@ -356,6 +419,5 @@ def make(settings: PursuitSettings | None = None, evader: str | None = None, **c
             "openjax.evaluate, "
             "the --opponent of commands"
         )
-    if evader is not None:
-        changes["evaders"] = (evader,)
-    return Pursuit(changed(settings or PursuitSettings(), **changes))
+    game = changed(settings or PursuitSettings(), **changes)
+    return Pursuit(game, evaders=None if evader is None else (evader,))

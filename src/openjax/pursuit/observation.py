@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from openjax.pursuit.axes import turned_back
+from openjax.pursuit.axes import rotation_axes, turned_back
 from openjax.pursuit.collisions import pillar_distance
 from openjax.pursuit.settings import HIDDEN, PursuitSettings
 from openjax.pursuit.state import PursuitState
@@ -44,14 +44,6 @@ class Observation:
     """(N, 2) cosine and sine of the yaw by which each pursuer's vectors are turned back, all but
     `position`; None: by none
     """
-
-
-def rotation_axes(quaternion: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Body x and z axes in the world, (..., 3) each, of (..., 4) unit quaternions wxyz."""
-    w, x, y, z = jnp.moveaxis(quaternion, -1, 0)
-    body_x = jnp.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], axis=-1)
-    body_z = jnp.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=-1)
-    return body_x, body_z
 
 
 def frame(

@@ -1,12 +1,21 @@
-"""The reward (the paper's section IV-A, and what was added to it)."""
+"""The reward: terms with weights, those of the paper's section IV-A and what was added to them.
+
+A term of one's own is a function of a `Transition`; `Pursuit(settings, reward=(...))` takes it.
+"""
+
+import functools
+import operator
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
+from flax import struct
 
+from openjax.pursuit.axes import rotation_axes
 from openjax.pursuit.collisions import breaches, crashed
 from openjax.pursuit.info import StepInfo
-from openjax.pursuit.observation import rotation_axes
-from openjax.pursuit.settings import PursuitSettings
+from openjax.pursuit.settings import PursuitSettings, RewardSettings
 from openjax.pursuit.state import PursuitState
 
 OVER_SPEED = 1.01
@@ -29,47 +38,128 @@ def over_speed(settings: PursuitSettings, velocity: jax.Array) -> jax.Array:
     return jnp.sum(velocity**2, axis=-1) > (OVER_SPEED * settings.max_speed) ** 2
 
 
-def reward(
-    settings: PursuitSettings, before: PursuitState, state: PursuitState, info: StepInfo
-) -> tuple[jax.Array, jax.Array]:
-    """(N,) reward of each pursuer for a step from `before` to `state`, and (N,) the penalties in it
-    (at most 0).
+@struct.dataclass
+class Transition:
+    """One control step of N pursuers, as reward terms see it."""
+
+    settings: PursuitSettings = struct.field(pytree_node=False)
+    before: PursuitState
+    state: PursuitState
+    """After the step."""
+    info: StepInfo
+    """What happened in it; its `penalty` isn't known yet."""
+
+    @property
+    def pillars(self) -> tuple[jax.Array, jax.Array]:
+        """(P, 2) m, axes of the pillars; (P,) bool, which slots are in use."""
+        return self.state.task.pillar_position, self.state.task.pillar_active
+
+
+@dataclass(frozen=True)
+class Term:
+    """A part of the reward: what it counts, times its weight."""
+
+    function: Callable[[Transition], jax.Array]
+    """(N,), of each pursuer, or (), of all."""
+    weight: float
+    penalty: bool = False
+    """A training may let penalties grow (`mappo.penalty_start`); never positive."""
+
+
+def total_reward(terms: tuple[Term, ...], transition: Transition) -> tuple[jax.Array, jax.Array]:
+    """(N,) reward of each pursuer, the sum of the terms in their order, penalties last; and (N,)
+    the sum of its penalties.
+    """
+    nothing = jnp.zeros(transition.settings.num_pursuers, jnp.float32)
+
+    def total(is_penalty):
+        values = [
+            term.weight * term.function(transition) for term in terms if term.penalty == is_penalty
+        ]
+        return functools.reduce(operator.add, values) if values else nothing
+
+    penalty = jnp.broadcast_to(total(True), nothing.shape)
+    return jnp.broadcast_to(total(False) + penalty, nothing.shape), penalty
+
+
+def default_reward(weights: RewardSettings) -> tuple[Term, ...]:
+    """The game's own terms, those that have a weight.
 
     A capture by any rewards all; distance to the evader, breaches, speed, crashes and the change of
     the squashed command count for each.
     """
-    weights = settings.reward
-    breach, crash = _counted(settings, state, info)
-    first_crash = info.crashed & ~before.statistics.crashed
-    penalty = -weights.collision * breach.total - weights.over_speed * info.over_speed
-    penalty = penalty - weights.crash * crash - weights.first_crash * first_crash
-    distance = jnp.sqrt(
-        jnp.sum((state.drones.position - state.evader_position) ** 2, axis=-1) + 1e-12
+    terms = (
+        Term(captured, weights.capture),
+        Term(evader_distance, -weights.distance),
+        Term(first_capture, weights.first_capture),
+        Term(steadiness, weights.smoothness),
+        Term(breach_number, -weights.collision, penalty=True),
+        Term(speeding, -weights.over_speed, penalty=True),
+        Term(crashing, -weights.crash, penalty=True),
+        Term(first_crash, -weights.first_crash, penalty=True),
     )
-    change = jnp.sqrt(
-        jnp.sum((state.previous_action - before.previous_action) ** 2, axis=-1) + 1e-12
-    )
-    captured = jnp.any(info.captured)
-    task = weights.capture * captured - weights.distance * distance
-    task = task + weights.first_capture * (captured & ~before.statistics.captured)
-    return task + weights.smoothness * jnp.exp(-change) + penalty, penalty
+    return tuple(term for term in terms if term.weight != 0.0)
 
 
-def _counted(settings, state, info):
-    """The breaches (N,) and crashes (N,) that the reward counts: those of the metrics, early by
-    margin and lookahead.
-    """
+def captured(transition: Transition) -> jax.Array:
+    """() whether any pursuer has the evader."""
+    return jnp.any(transition.info.captured)
+
+
+def first_capture(transition: Transition) -> jax.Array:
+    """() whether this is the first such step of the episode."""
+    return captured(transition) & ~transition.before.statistics.captured
+
+
+def evader_distance(transition: Transition) -> jax.Array:
+    """(N,) m to the evader."""
+    offset = transition.state.drones.position - transition.state.evader_position
+    return jnp.sqrt(jnp.sum(offset**2, axis=-1) + 1e-12)
+
+
+def steadiness(transition: Transition) -> jax.Array:
+    """(N,) from one, where the squashed command stays, to zero."""
+    change = transition.state.previous_action - transition.before.previous_action
+    return jnp.exp(-jnp.sqrt(jnp.sum(change**2, axis=-1) + 1e-12))
+
+
+def breach_number(transition: Transition) -> jax.Array:
+    """(N,) breaches of safety distances and bounds, early by the reward's margin and lookahead."""
+    settings = transition.settings
     weights = settings.reward
-    drones = state.drones
-    breach = info.breaches
-    crash = info.crashed
-    pillars = (state.task.pillar_position, state.task.pillar_active)
-    body_z_up = rotation_axes(drones.quaternion)[1][:, 2]
+    drones = transition.state.drones
+    breach = transition.info.breaches
     if weights.margin != 0.0:
-        breach = breaches(settings, drones.position, *pillars, weights.margin)
-        crash = crashed(settings, drones.position, body_z_up, *pillars, weights.margin)
+        breach = breaches(settings, drones.position, *transition.pillars, weights.margin)
     if weights.lookahead != 0.0:
         ahead = drones.position + weights.lookahead * drones.velocity
-        breach = jax.tree.map(jnp.maximum, breach, breaches(settings, ahead, *pillars))
-        crash = crash | crashed(settings, ahead, body_z_up, *pillars)
-    return breach, crash
+        soon = breaches(settings, ahead, *transition.pillars)
+        breach = jax.tree.map(jnp.maximum, breach, soon)
+    return breach.total
+
+
+def speeding(transition: Transition) -> jax.Array:
+    """(N,) whether each is above 1.01 times the maximal speed."""
+    return transition.info.over_speed
+
+
+def crashing(transition: Transition) -> jax.Array:
+    """(N,) whether each touches something or tips over, early by the reward's margin and
+    lookahead.
+    """
+    settings = transition.settings
+    weights = settings.reward
+    drones = transition.state.drones
+    upright = rotation_axes(drones.quaternion)[1][:, 2]
+    crash = transition.info.crashed
+    if weights.margin != 0.0:
+        crash = crashed(settings, drones.position, upright, *transition.pillars, weights.margin)
+    if weights.lookahead != 0.0:
+        ahead = drones.position + weights.lookahead * drones.velocity
+        crash = crash | crashed(settings, ahead, upright, *transition.pillars)
+    return crash
+
+
+def first_crash(transition: Transition) -> jax.Array:
+    """(N,) whether each crashes now, in an episode without a crash before; never early."""
+    return transition.info.crashed & ~transition.before.statistics.crashed

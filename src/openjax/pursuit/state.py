@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from openjax.pursuit.evaders.evader import EvaderState
+from openjax.pursuit.evaders.evader_state import EvaderState
 from openjax.pursuit.statistics import EpisodeStatistics
 from openjax.pursuit.task import Task
 from openjax.vehicle import DroneState

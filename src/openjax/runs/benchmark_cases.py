@@ -15,7 +15,7 @@ from openjax.cluster.devices import carry_shardings, check_devices, make_device_
 from openjax.errors import UserError
 from openjax.evaluation.validation import uniform_tasks
 from openjax.learning import TrainSettings, build, make_start, training_step
-from openjax.learning.rollout import collect
+from openjax.learning.rollout import Noise, Players, collect
 from openjax.pursuit import Pursuit, hover_action
 from openjax.pursuit.environment import action_to_command
 from openjax.store.leaves import place
@@ -52,7 +52,7 @@ def _training(settings, devices):
     """
     carry = make_start(settings)(jax.random.key(0))
     if devices > 1:
-        step = make_device_step(settings, Pursuit(settings.environment), devices)
+        step = make_device_step(settings, build(settings), devices)
         yield f"training, {devices} devices", step, (place(carry, carry_shardings(devices)),)
         return
     phases = training_step.make_phases(settings)
@@ -139,9 +139,8 @@ def _rollout(settings, num_envs, steps):
 
     def run(parameters, observation, state, key):
         shape = (steps, num_envs, settings.environment.num_pursuers, parts.policy.sample_size)
-        return collect(
-            environment, parts.policy, parameters, observation, state, jax.random.normal(key, shape)
-        )
+        players = Players(environment, parts.policy, parameters)
+        return collect(players, (observation, state), Noise(jax.random.normal(key, shape)))
 
     return run, (parameters, observation, state, jax.random.key(2))
 

@@ -31,7 +31,7 @@ from openjax.evaluation.episodes import summarise
 from openjax.evaluation.validation import Validation, flat_metrics, selection_score
 from openjax.files import write_json
 from openjax.interruption import StopRequest
-from openjax.learning import TrainSettings, build, make_start
+from openjax.learning import Parts, TrainSettings, build, make_start
 from openjax.learning.train_state import policy_leaf
 from openjax.policy import PolicyParameters
 from openjax.policy.growth import with_longer_history
@@ -81,6 +81,11 @@ class TrainingJob:
     traced: Path | None = None
     """Folder in which traced programs are kept; None: they aren't."""
 
+    @functools.cached_property
+    def parts(self) -> Parts:
+        """Environment, policy and learners."""
+        return build(self.settings, self.environment)
+
     @property
     def made_from(self) -> str:
         """What the run's programs depend on, beside the package's sources; the seed comes in as a
@@ -105,9 +110,7 @@ class TrainingJob:
         check_devices(self.settings, self.devices)
         check_memory(self.settings, self.devices)
         if self.start_from is not None:
-            abstract = abstract_parameters(
-                self.environment, build(self.settings, self.environment).policy
-            )
+            abstract = abstract_parameters(self.environment, self.parts.policy)
             _start_parameters(self, abstract)
         if self.compare_with is not None:
             other = load_policy(self.compare_with)
@@ -305,7 +308,7 @@ class _Run:
             return carry, record.update, float(record.notes.get("seconds", 0.0))
         carry = start(jax.random.key(settings.seed))
         if job.start_from is not None:
-            carry = carry.with_policy(_start_parameters(job, carry.policy))
+            carry = carry.replace(policy=_start_parameters(job, carry.policy))
         if self.processes.is_first:
             save_policy_file(
                 self.directory.start_policy,
@@ -324,7 +327,7 @@ class _Run:
             self.progress.phase("learning to fly by the gradient through the simulation")
             policy = learn(carry.policy, jax.random.fold_in(jax.random.key(settings.seed), 1))
             self.taught = policy is not None
-            carry = carry.with_policy(policy) if self.taught else carry
+            carry = carry.replace(policy=policy) if self.taught else carry
         return place(carry, carry_shardings(job.devices)), 0, 0.0
 
     def _metrics(self):
@@ -363,9 +366,11 @@ class _Run:
         """
         load_orbax()
         settings, environment = self.settings, self.job.environment
-        policy = build(settings, environment).policy
         validation = Validation(
-            environment, policy, settings.validation_episodes, settings.evaders_validation
+            environment,
+            self.job.parts.policy,
+            settings.validation_episodes,
+            settings.evaders_validation,
         )
         tasks = validation.tasks["validation"]
         validation.evaluator.compile_ahead(abstract_like(self.abstract.policy), tasks)()
@@ -401,10 +406,10 @@ def _programs(job):
     """
     settings = job.settings
     shardings = carry_shardings(job.devices)
-    start = make_start(settings, job.environment)
+    start = make_start(settings, job.parts)
     abstract = abstract_like(jax.eval_shape(start, jax.random.key(settings.seed)), shardings)
     same = everywhere(job.devices)
-    step = guarded(make_device_step(settings, job.environment, job.devices))
+    step = guarded(make_device_step(settings, job.parts, job.devices))
     tried = job.devices == 1 or (jax.default_backend() == "cpu" and jax.process_count() == 1)
     if tried and (keep := job.keep):
         step = keep("step", step, lambda: (abstract,), carry=abstract)

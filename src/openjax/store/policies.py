@@ -8,14 +8,20 @@ from pathlib import Path
 
 import jax
 
-from openjax.baselines import METHODS, CraftPolicy, Heuristic, make_policy
+from openjax.baselines import METHODS, CraftPolicy, Heuristic
 from openjax.baselines.surroundings import Craft
 from openjax.baselines.velocity_controller import check_flyable
 from openjax.errors import UserError, suggestion
 from openjax.learning import TrainSettings
 from openjax.learning.train_state import policy_leaf
 from openjax.plain import from_plain
-from openjax.policy import NetworkSettings, Policy, PolicyParameters, PredictorSettings
+from openjax.policy import (
+    NetworkSettings,
+    Policy,
+    PolicyParameters,
+    PredictorSettings,
+    make_policy,
+)
 from openjax.pursuit import Observation, Pursuit, PursuitSettings
 from openjax.pursuit.evaders import SCRIPTED
 from openjax.store import DEFAULT_POLICY

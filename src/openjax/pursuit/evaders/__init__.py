@@ -8,9 +8,11 @@ from openjax.lazy import lazy_names
 __getattr__, __dir__, __all__ = lazy_names(
     __name__,
     {
-        "evader": "EvaderState draw_evader evader_velocity scene_of",
+        "behaviours": "Scene",
+        "evader": "draw_evader draw_row evader_velocity scene_of",
+        "evader_state": "EvaderState",
         "field": "field_velocity",
-        "kinds": "EVADERS HELD_OUT SCRIPTED TRAINED VALIDATED EvaderKind check_evaders",
+        "kinds": "EVADERS HELD_OUT SCRIPTED TRAINED VALIDATED Evader EvaderKind check_evaders evader_rows handed_in",
         "learned": "init_network learned_place",
     },
 )

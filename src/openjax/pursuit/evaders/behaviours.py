@@ -14,13 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from openjax.pursuit.axes import rotation_axes
+from openjax.pursuit.evaders.kinds import MEMORY as MEMORY
 from openjax.pursuit.sensing import line_of_sight
 from openjax.pursuit.settings import PursuitSettings
+from openjax.vehicle import DroneState
 
-MEMORY = 4
-"""Numbers that a scripted evader remembers; drawn uniformly from 0 to 1 at the start of an
-episode.
-"""
 DIRECTIONS = 64
 """That a greedy evader tries; one that looks two steps ahead tries half as many at each."""
 MARGIN = 0.02
@@ -53,6 +52,22 @@ class Scene:
     look_ahead: jax.Array  # () s
     hiding: jax.Array  # () m
     reach: jax.Array  # () m/s, its speed
+    drones: DroneState | None = None
+    """the pursuers' whole state, leading axis N, whether it knows of them or not"""
+    key: jax.Array | None = None
+    """() another one in each step; None where no evader of the game is one's own"""
+
+    @property
+    def pursuer_velocity(self) -> jax.Array:
+        """(N, 3) m/s, world."""
+        return self.drones.velocity
+
+    @property
+    def thrust_direction(self) -> jax.Array:
+        """(N, 3) unit vectors, world: where each pursuer's rotors pull, and so what it is about to
+        do.
+        """
+        return rotation_axes(self.drones.quaternion)[1]
 
     @property
     def nearest(self) -> jax.Array:

@@ -3,30 +3,20 @@ velocity in each step.
 """
 
 import functools
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
 
+from openjax.errors import UserError
 from openjax.pursuit.evaders.behaviours import BEHAVIOURS, MEMORY, Scene, into_free_space
+from openjax.pursuit.evaders.evader_state import EvaderState
 from openjax.pursuit.evaders.field import field_velocity
-from openjax.pursuit.evaders.kinds import EVADERS, NUMBERS, UNBOUNDED
+from openjax.pursuit.evaders.kinds import NUMBERS, UNBOUNDED, EvaderKind, evader_rows
 from openjax.pursuit.evaders.learned import STEPS, learned, learned_place, learning
 from openjax.pursuit.settings import PursuitSettings
-
-if TYPE_CHECKING:
-    from openjax.pursuit.state import PursuitState
-
-
-@struct.dataclass
-class EvaderState:
-    """Which evader a world has, and what it remembers."""
-
-    kind: jax.Array  # () int32, place in `settings.evaders`
-    numbers: dict[str, jax.Array]  # those of `EvaderKind`, () each, float32
-    memory: jax.Array  # (M,)
+from openjax.pursuit.state import PursuitState
 
 
 def draw_evader(
@@ -36,37 +26,60 @@ def draw_evader(
     share: jax.Array | None = None,
     kind: jax.Array | None = None,
 ) -> EvaderState | None:
+    """`draw_row` of the shipped evaders that the settings name."""
+    return draw_row(evader_rows(settings.evaders), key, pursuers, share, kind)
+
+
+def draw_row(
+    rows: tuple[EvaderKind, ...],
+    key: jax.Array,
+    pursuers: jax.Array,
+    share: jax.Array | None = None,
+    kind: jax.Array | None = None,
+) -> EvaderState | None:
     """The evader of an episode; None for the paper's, which has nothing to draw.
 
     Args:
-      settings: their `evaders` are drawn with equal odds.
+      rows: evaders, drawn with equal odds.
       key: ().
       pursuers: (N, 3) m, their starts, for the memory of a learned evader.
       share: () from 0 to 1, how far a curriculum has come; None is 1. At 0 all worlds have the
       first of the evaders; from
         there the others' odds grow to the equal ones, and their speed from half to the whole.
-      kind: () int32, the place in `settings.evaders` of the one it is; None draws it.
+      kind: () int32, the place in `rows` of the one it is; None draws it.
+
+    Raises:
+      UserError: one's own remembers more than fits beside a learned one's memory.
     """
-    names = settings.evaders
-    if set(names) == {"field"}:
+    behaviours = [row.behaviour for row in rows]
+    if set(behaviours) == {"field"}:
         return None
     kind_key, number_key, memory_key = jax.random.split(key, 3)
     if kind is None:
-        kind = jax.random.randint(kind_key, (), 0, len(names))
+        kind = jax.random.randint(kind_key, (), 0, len(rows))
     slow = jnp.ones(())
     if share is not None:
         kind = jnp.where(jax.random.uniform(jax.random.fold_in(kind_key, 1)) < share, kind, 0)
         slow = jnp.where(kind == 0, 1.0, 0.5 + 0.5 * share)
     draws = jax.random.uniform(number_key, (len(NUMBERS),))
     numbers = {
-        number: _drawn([getattr(EVADERS[name], number) for name in names], kind, draw)
+        number: _drawn([getattr(row, number) for row in rows], kind, draw)
         for number, draw in zip(NUMBERS, draws, strict=True)
     }
     numbers["speed"] = numbers["speed"] * slow
     memory = jax.random.uniform(memory_key, (MEMORY,))
-    if "learned" in names:
+    more = max(row.memory for row in rows) - MEMORY
+    if "learned" in behaviours:
+        if more:
+            raise UserError(
+                f"evaders: beside learned ones, one's own remembers {MEMORY} numbers, not "
+                f"{MEMORY + more}"
+            )
         memory = jnp.concatenate([memory, jnp.tile(pursuers.ravel(), STEPS)])
-    return EvaderState(kind=kind, numbers=numbers, memory=memory)
+    elif more:
+        memory = jnp.concatenate([memory, jnp.zeros(more)])
+    draws_itself = any(map(callable, behaviours))
+    return EvaderState(kind, numbers, memory, memory_key if draws_itself else None)
 
 
 def _drawn(values, kind, draw):
@@ -79,7 +92,8 @@ def _drawn(values, kind, draw):
 
 def evader_velocity(
     settings: PursuitSettings,
-    world: "PursuitState",
+    rows: tuple[EvaderKind, ...],
+    world: PursuitState,
     networks: Any = None,
     wish: jax.Array | None = None,
 ) -> tuple[jax.Array, EvaderState | None]:
@@ -90,6 +104,7 @@ def evader_velocity(
 
     Args:
       settings: the game.
+      rows: its evaders.
       world: before this step.
       networks: parameters of the learned evaders among the settings', their axis first; None: they
       do as the greedy one.
@@ -101,13 +116,14 @@ def evader_velocity(
     world = jax.lax.stop_gradient(world)
     state = world.evader
     if state is None:
-        return _flown(settings, world, settings.evader_speed, UNBOUNDED, wish), None
-    own, memory = _wish(settings, world, networks)
+        velocity = _flown(settings, world, settings.evader_speed, UNBOUNDED, wish)
+        return jnp.where(jnp.any(jnp.isnan(wish)), _field(settings, world), velocity), None
+    own, memory = _wish(settings, rows, world, networks)
     is_own = jnp.ones((), bool) if wish is None else jnp.any(jnp.isnan(wish))
     speed = state.numbers["speed"] * settings.evader_speed
     wish = own if wish is None else jnp.where(is_own, own, wish)
     velocity = _flown(settings, world, speed, state.numbers["acceleration"], wish)
-    is_field = np.array([EVADERS[name].behaviour == "field" for name in settings.evaders])
+    is_field = np.array([row.behaviour == "field" for row in rows])
     if is_field.any():
         velocity = jnp.where(
             is_own & jnp.asarray(is_field)[state.kind], _field(settings, world), velocity
@@ -115,9 +131,10 @@ def evader_velocity(
     return velocity, state.replace(memory=memory)
 
 
-def scene_of(settings: PursuitSettings, world: "PursuitState") -> Scene:
+def scene_of(settings: PursuitSettings, world: PursuitState) -> Scene:
     """What the evader of a world knows of it."""
     numbers = world.evader.numbers
+    key = world.evader.key
     return Scene(
         settings=settings,
         position=world.evader_position,
@@ -129,6 +146,8 @@ def scene_of(settings: PursuitSettings, world: "PursuitState") -> Scene:
         look_ahead=numbers["look_ahead"],
         hiding=numbers["hiding"],
         reach=numbers["speed"] * settings.evader_speed,
+        drones=world.drones,
+        key=None if key is None else jax.random.fold_in(key, world.step),
     )
 
 
@@ -141,13 +160,14 @@ def _field(settings, world):
     return field_velocity(settings, *places, world.in_sight, *_pillars(world))
 
 
-def _wish(settings, world, networks):
+def _wish(settings, rows, world, networks):
     """Wish (3,) and memory of an evader with a behaviour; of the paper's something finite."""
     state = world.evader
     which = learned_place(settings.evaders, state.kind)
     by_network = learning if networks is None else functools.partial(learned, networks, which)
-    known = {**BEHAVIOURS, "learned": by_network}
-    behaviours = [EVADERS[name].behaviour for name in settings.evaders]
+    behaviours = [row.behaviour for row in rows]
+    own = {row.behaviour: _of_own(row) for row in rows if callable(row.behaviour)}
+    known = {**BEHAVIOURS, "learned": by_network, **own}
     used = [name for name in known if name in behaviours]
     place = np.array([used.index(name) if name in used else 0 for name in behaviours], np.int32)
     # mapped over worlds, a switch works all of them out and selects: each behaviour stands in it
@@ -158,6 +178,19 @@ def _wish(settings, world, networks):
         scene_of(settings, world),
         state.memory,
     )
+
+
+def _of_own(row):
+    """A behaviour like the shipped ones, of a row whose function gives m/s and has a memory of its
+    own size.
+    """
+
+    def behaviour(scene, memory):
+        velocity, kept = row.behaviour(scene, memory[: row.memory])
+        kept = jnp.concatenate([kept, memory[row.memory :]])
+        return velocity / jnp.maximum(scene.reach, 1e-6), kept
+
+    return behaviour
 
 
 def _flown(settings, world, speed, acceleration, wish):

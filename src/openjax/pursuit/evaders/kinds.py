@@ -2,11 +2,16 @@
 world.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 from openjax.errors import UserError, suggestion
 
+MEMORY = 4
+"""Numbers that a scripted evader remembers; drawn uniformly from 0 to 1 at the start of an
+episode.
+"""
 UNBOUNDED = 1e6
 """An acceleration (m/s^2) that bounds nothing."""
 
@@ -17,13 +22,14 @@ class EvaderKind:
     odds.
     """
 
-    behaviour: str
+    behaviour: str | Callable[[Any, Any], tuple[Any, Any]]
     """A name in `openjax.pursuit.evaders.behaviours.BEHAVIOURS`; "field" is the paper's, which has
-    none of these numbers.
+    none of these numbers. Or a function of one's own, velocity(scene, memory) -> velocity (3,) in
+    m/s in the world, memory: `Scene` says what it knows, `memory` has as many numbers.
     """
-    of: Literal["train", "validation", "held out", "file"]
+    of: Literal["train", "validation", "held out", "file"] = "train"
     """What it may be used for: held-out ones are never trained on, nor are checkpoints chosen by
-    them. "file": it is read from one.
+    them. "file": it comes from one, or is handed in.
     """
     look_ahead: tuple[float, ...] = (0.15,)
     """Seconds after which it looks at where a direction leads."""
@@ -35,6 +41,10 @@ class EvaderKind:
     """How fast its velocity changes at most where nothing is in its way (m/s^2)."""
     speed: tuple[float, ...] = (1.0,)
     """Its speed, as a share of the game's `evader_speed`."""
+    memory: int = MEMORY
+    """Numbers that a function of one's own remembers: the first four are drawn as `MEMORY` says,
+    others begin as zeros.
+    """
 
 
 NUMBERS = ("look_ahead", "hiding", "sees_all", "acceleration", "speed")
@@ -64,6 +74,8 @@ EVADERS = {
     "way_points": EvaderKind("way_points", "held out"),
     "frozen": EvaderKind("frozen", "held out"),
     "learned": EvaderKind("learned", "file"),
+    # the name, in settings, of one that is handed in: Pursuit(settings, evaders=(...))
+    "own": EvaderKind("own", "file"),
 }
 SCRIPTED = tuple(name for name, kind in EVADERS.items() if kind.of != "file")
 
@@ -75,6 +87,34 @@ def _of(split):
 TRAINED = _of("train")
 VALIDATED = _of("validation")
 HELD_OUT = _of("held out")
+
+
+Evader = str | EvaderKind | Callable[[Any, Any], tuple[Any, Any]]
+"""What may be handed in as an evader: a name, a row, or a row's behaviour alone."""
+
+
+def evader_rows(
+    names: tuple[str, ...], handed_in: tuple[EvaderKind, ...] = ()
+) -> tuple[EvaderKind, ...]:
+    """The row of each name; those called "own" are the ones that were `handed_in`, in their order.
+
+    Raises:
+      UserError: settings name one that wasn't handed in.
+    """
+    if names.count("own") != len(handed_in):
+        raise UserError(
+            "evader own: a name isn't enough; Pursuit(settings, evaders=(...)) takes a function, or "
+            "--opponent FILE.py:function"
+        )
+    rest = iter(handed_in)
+    return tuple(next(rest) if name == "own" else EVADERS[name] for name in names)
+
+
+def handed_in(evaders: tuple[Evader, ...]) -> tuple[tuple[str, ...], tuple[EvaderKind, ...]]:
+    """Names of evaders for the settings, and the rows of those that have none."""
+    rows = [EvaderKind(one, "file") if callable(one) else one for one in evaders]
+    names = tuple(one if isinstance(one, str) else "own" for one in rows)
+    return names, tuple(one for one in rows if isinstance(one, EvaderKind))
 
 
 def check_evaders(names: tuple[str, ...]) -> None:

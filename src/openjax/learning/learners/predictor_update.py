@@ -1,13 +1,18 @@
 """Supervised training of the evader predictor on the rollout (the paper's section IV-B1)."""
 
+import functools
+from dataclasses import dataclass
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import optax
 
-from openjax.learning.collectives import mean_over_devices
+from openjax.learning.collectives import own_keys
+from openjax.learning.learners.learner import Flown
 from openjax.learning.rollout import Rollout
 from openjax.learning.train_state import TrainState
-from openjax.policy import Policy, PredictorSettings
+from openjax.policy import Policy, PolicyParameters, PredictorSettings
 from openjax.pursuit import PursuitSettings
 
 
@@ -75,51 +80,74 @@ def prediction_loss(
     return jnp.mean(was_seen[..., None, None] * (error / flown[:, None]) ** 2)
 
 
-def update_predictor(
-    policy: Policy,
-    optimiser: optax.GradientTransformation,
-    game: PursuitSettings,
-    predictor: TrainState,
-    earlier: jax.Array,
-    rollout: Rollout,
-    keys: jax.Array,
-    axis: str | None,
-) -> tuple[TrainState, jax.Array]:
-    """A few gradient steps on random windows of each environment.
-
-    Args:
-      policy: for the predictor's network and settings.
-      optimiser: from `make_predictor_optimiser`.
-      game: the evader's speed and the history's spacing.
-      predictor: before this update.
-      earlier: (E, H, F), see `windows_and_labels`.
-      rollout: T steps of E worlds.
-      keys: (E,), draw the windows.
-      axis: name of the devices' axis.
-
-    Returns:
-      predictor, mean loss ().
+@dataclass(frozen=True)
+class PredictorLearner:
+    """The evader predictor as a learner (`openjax.learning.learners.Learner`): a few gradient
+    steps on random windows of each world.
     """
-    settings = policy.predictor
-    room = rollout.reward.shape[0] - settings.horizons[-1] + 1
-    times = jax.vmap(lambda key: jax.random.permutation(key, room)[: settings.windows])(keys)
-    data = windows_and_labels(policy, game.history_spacing, earlier, rollout, times)
-    # (steps, E, windows / steps, ...): every gradient step sees other windows of every environment
-    data = jax.tree.map(
-        lambda x: jnp.moveaxis(x.reshape(x.shape[0], settings.steps, -1, *x.shape[2:]), 1, 0), data
-    )
 
-    def loss(parameters, frames, last_seen, positions):
-        predicted = policy.predict_from(parameters, frames, last_seen)
-        return prediction_loss(settings, game, predicted, last_seen, positions)
+    policy: Policy
+    """For the predictor's network and settings."""
+    game: PursuitSettings
+    total_updates: int
+    """Of the run: the learning rate may fall over it."""
 
-    def one(predictor, batch):
-        value, gradient = jax.value_and_grad(loss)(predictor.parameters, *batch)
-        value, gradient = mean_over_devices((value, gradient), axis)
-        return predictor.updated(optimiser, gradient), value
+    @functools.cached_property
+    def optimiser(self) -> optax.GradientTransformation:
+        """See `make_predictor_optimiser`."""
+        return make_predictor_optimiser(self.policy.predictor, self.total_updates)
 
-    predictor, values = jax.lax.scan(one, predictor, data)
-    return predictor, jnp.mean(values)
+    def start(self, parameters: PolicyParameters, key: jax.Array) -> Any:
+        """The optimiser's state."""
+        return self.optimiser.init(parameters.predictor)
+
+    def learn(
+        self, state: Any, parameters: PolicyParameters, flown: Flown, key: jax.Array
+    ) -> tuple[Any, PolicyParameters, dict[str, jax.Array]]:
+        """After the gradient steps on one rollout; `key` draws the windows."""
+        rollout = flown.rollout
+        data = self._windows(flown, key)
+
+        def loss(parameters, frames, last_seen, positions):
+            predicted = self.policy.predict_from(parameters, frames, last_seen)
+            return prediction_loss(
+                self.policy.predictor, self.game, predicted, last_seen, positions
+            )
+
+        def gradient_step(predictor, batch):
+            frames, last_seen, positions = batch
+            value, gradient = jax.value_and_grad(loss)(
+                predictor.parameters, frames, last_seen, positions
+            )
+            value, gradient = flown.mean((value, gradient))
+            return predictor.updated(self.optimiser, gradient), value
+
+        predictor = TrainState(parameters.predictor, state)
+        predictor, values = jax.lax.scan(gradient_step, predictor, data)
+        error = jnp.linalg.norm(rollout.predicted[:, :, 0] - rollout.evader, axis=-1)
+        metrics = {
+            "predictor_loss": jnp.mean(values),
+            "prediction_error": flown.mean(jnp.mean(error)),
+        }
+        parameters = parameters.replace(predictor=predictor.parameters)
+        return predictor.optimiser, parameters, metrics
+
+    def _windows(self, flown, key):
+        """Windows of frames, last seen and true positions, (steps, E, windows / steps, ...): every
+        gradient step sees other windows of every world.
+        """
+        settings = self.policy.predictor
+        rollout = flown.rollout
+        keys = own_keys(key, flown.frames.shape[0], flown.axis)
+        room = rollout.reward.shape[0] - settings.horizons[-1] + 1
+        times = jax.vmap(lambda key: jax.random.permutation(key, room)[: settings.windows])(keys)
+        data = windows_and_labels(
+            self.policy, self.game.history_spacing, flown.frames, rollout, times
+        )
+        return jax.tree.map(
+            lambda x: jnp.moveaxis(x.reshape(x.shape[0], settings.steps, -1, *x.shape[2:]), 1, 0),
+            data,
+        )
 
 
 def _take(values: jax.Array, index: jax.Array) -> jax.Array:

@@ -1,0 +1,39 @@
+"""The evaders that learn while the pursuers do, as a learner of the training step."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from openjax.learning.evader_learning import EvaderLearning, EvaderSamples, LearningEvaders
+from openjax.learning.learners.learner import Flown
+from openjax.policy import PolicyParameters
+from openjax.pursuit import PursuitState
+
+
+@dataclass(frozen=True)
+class EvaderLearner:
+    """A learner that also flies the worlds of its evaders, by samples of their policies."""
+
+    learning: EvaderLearning
+
+    def start(self, parameters: PolicyParameters, key: jax.Array) -> LearningEvaders:
+        """Evaders that do as greedy ones."""
+        return self.learning.start(key)
+
+    def act(
+        self, state: LearningEvaders, worlds: PursuitState, noise: jax.Array
+    ) -> tuple[jax.Array, EvaderSamples]:
+        """Desired velocities (E, 3) in worlds (E, ...) as shares of the speed, NaN where none of
+        these evaders flies, and the samples; noise (E, 3).
+        """
+        return self.learning.act(state, worlds, noise)
+
+    def learn(
+        self, state: LearningEvaders, parameters: PolicyParameters, flown: Flown, key: jax.Array
+    ) -> tuple[LearningEvaders, PolicyParameters, dict[str, Any]]:
+        """After all epochs on the samples of a rollout."""
+        samples = flown.rollout.learning
+        state = self.learning.learn(state, samples, flown.state, key, flown.axis)
+        return state, parameters, {"evader_noise": jnp.mean(state.log_std)}

@@ -1,0 +1,319 @@
+"""Multi-agent PPO (Yu et al., 2022): shared actor, clipped ratio, normalised values."""
+
+import functools
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+from jax.flatten_util import ravel_pytree
+
+from openjax.learning.advantages import generalised_advantages
+from openjax.learning.collectives import joint_moments, minibatches
+from openjax.learning.learners.learner import Flown
+from openjax.learning.settings import MappoSettings
+from openjax.learning.train_state import TrainState, clipped_adam, shuffled
+from openjax.policy import Policy, PolicyParameters, gaussian_entropy, gaussian_log_prob
+from openjax.pursuit import Observation
+
+
+@struct.dataclass
+class ValueScale:
+    """Running mean and mean square of the returns, for value normalisation."""
+
+    mean: jax.Array  # ()
+    square: jax.Array  # ()
+    weight: jax.Array  # () sum of weights so far, to remove the bias of the start
+
+    @property
+    def moments(self) -> tuple[jax.Array, jax.Array]:
+        """Mean () and standard deviation () of the returns; 0 and 1 before the first update."""
+        weight = jnp.maximum(self.weight, 1e-6)
+        mean = self.mean / weight
+        variance = self.square / weight - mean**2
+        std = jnp.where(self.weight > 0, jnp.sqrt(jnp.maximum(variance, 1e-4)), 1.0)
+        return mean, std
+
+
+def initial_value_scale() -> ValueScale:
+    """No returns seen."""
+    zero = jnp.zeros((), jnp.float32)
+    return ValueScale(mean=zero, square=zero, weight=zero)
+
+
+@struct.dataclass
+class Batch:
+    """Samples of the policy update; leading axes alike."""
+
+    observation: Observation
+    predicted: jax.Array | None  # (..., K, 3)
+    action: jax.Array  # (..., N, A)
+    log_prob: jax.Array  # (..., N)
+    advantage: jax.Array  # (..., N)
+    target: jax.Array  # (..., N) normalised returns
+
+
+WATCHED = ("policy_loss", "value_loss", "kl", "clipped", "entropy", "actor_gradient")
+"""Of gradient steps."""
+
+LEAST_SCALE = 1e-4
+"""Of a step, as a share of the schedule's: the first one, and none is smaller."""
+
+
+class StepScale(NamedTuple):
+    """State of `follow_kl`."""
+
+    scale: jax.Array  # () of the last step, as a share of the schedule's
+
+
+def follow_kl(target: float) -> optax.GradientTransformationExtraArgs:
+    """Scale steps so that the policy's divergence from the one that flew stays near `target`
+    (nats).
+
+    Its `update` takes `kl` (), that divergence before the step: above twice the target the step is
+    divided by 1.5, below half of it multiplied, never past the schedule's (the adaptive rule of
+    Schulman et al., 2017, section 4, on the step size as in Rudin et al., 2022). From a policy
+    whose noise is small, a step of fixed size leads far outside the ratio's clip range, where the
+    clipped loss has no gradient that would lead back.
+    """
+
+    def init(parameters):
+        return StepScale(jnp.full((), LEAST_SCALE, jnp.float32))
+
+    def update(change, state, parameters=None, *, kl, **others):
+        # an actor that doesn't learn yet says nothing about the size of its steps
+        grows = (kl < target / 2) & jnp.any(change != 0.0)
+        # a divergence that isn't finite is too large, too
+        factor = jnp.where(kl <= 2 * target, jnp.where(grows, 1.5, 1.0), 1 / 1.5)
+        scale = jnp.clip(state.scale * factor, LEAST_SCALE, 1.0)
+        return scale * change, StepScale(scale)
+
+    return optax.GradientTransformationExtraArgs(init, update)
+
+
+def make_optimiser(
+    settings: MappoSettings, total_updates: int
+) -> tuple[optax.GradientTransformationExtraArgs, optax.GradientTransformationExtraArgs]:
+    """Optimisers of actor and critic; the step size falls linearly to zero over the run, the
+    actor's may start late.
+
+    With a `target_kl` the actor's update takes `kl`; see `follow_kl`.
+    """
+    steps = total_updates * settings.epochs * settings.minibatches
+    schedule = optax.linear_schedule(settings.learning_rate, 0.0, steps)
+
+    def late(count):
+        return jnp.where(count < settings.actor_start * steps, 0.0, schedule(count))
+
+    after = (follow_kl(settings.target_kl),) if settings.target_kl else ()
+    most = settings.max_grad_norm
+    actor = clipped_adam(most, late if settings.actor_start else schedule, *after)
+    return actor, clipped_adam(most, schedule)
+
+
+def loss(
+    settings: MappoSettings,
+    policy: Policy,
+    parameters: tuple[Any, Any],
+    batch: Batch,
+    clip: jax.Array,
+) -> tuple[jax.Array, dict[str, jax.Array]]:
+    """Sum of actor's and critic's () loss, `parameters` (actor, critic); and what to watch.
+
+    The actor's is the surrogate, its ratio clipped to 1 +- `clip` (), minus the entropy bonus; the
+    critic's the Huber loss of normalised values. Unless they share an encoder, neither's gradient
+    knows of the other.
+    """
+    mean, log_std, value = policy.evaluate(*parameters, batch.observation, batch.predicted)
+    log_ratio = gaussian_log_prob(batch.action, mean, log_std) - batch.log_prob
+    ratio = jnp.exp(log_ratio)
+    clipped = jnp.clip(ratio, 1.0 - clip, 1.0 + clip)
+    surrogate = jnp.mean(jnp.minimum(ratio * batch.advantage, clipped * batch.advantage))
+    entropy = gaussian_entropy(log_std)
+    policy_loss = -surrogate - settings.entropy_coefficient * entropy
+    value_loss = jnp.mean(optax.huber_loss(value, batch.target, delta=settings.huber))
+    watch = {
+        "kl": jnp.mean(ratio - 1.0 - log_ratio),
+        "clipped": jnp.mean(jnp.abs(ratio - 1.0) > clip),
+        "entropy": entropy,
+        "policy_loss": policy_loss,
+        "value_loss": value_loss,
+    }
+    return policy_loss + settings.value_coefficient * value_loss, watch
+
+
+class Estimates(NamedTuple):
+    """What the critic makes of a rollout of T steps in E worlds."""
+
+    advantage: jax.Array  # (T, E, N)
+    returns: jax.Array  # (T, E, N)
+    explained_variance: jax.Array  # (), of the returns by the values
+
+
+@struct.dataclass
+class MappoState:
+    """What MAPPO is between two updates, beside the policy's parameters."""
+
+    actor: Any
+    """State of the actor's optimiser."""
+    critic: Any
+    """State of the critic's."""
+    value_scale: ValueScale
+
+
+@dataclass(frozen=True)
+class Mappo:
+    """Multi-agent PPO as a learner (`openjax.learning.learners.Learner`) of actor and critic."""
+
+    settings: MappoSettings
+    policy: Policy
+    """Whatever has `distribution`, `value` and `evaluate`."""
+    total_updates: int
+    """Of the run: learning rates fall over it."""
+
+    @functools.cached_property
+    def optimisers(self) -> tuple[optax.GradientTransformationExtraArgs, ...]:
+        """The actor's and the critic's."""
+        return make_optimiser(self.settings, self.total_updates)
+
+    def start(self, parameters: PolicyParameters, key: jax.Array) -> MappoState:
+        """Before the first update: no steps taken, no returns seen."""
+        actor, critic = self.optimisers
+        return MappoState(
+            actor.init(parameters.actor), critic.init(parameters.critic), initial_value_scale()
+        )
+
+    def learn(
+        self, state: MappoState, parameters: PolicyParameters, flown: Flown, key: jax.Array
+    ) -> tuple[MappoState, PolicyParameters, dict[str, jax.Array]]:
+        """All epochs of the policy update on one rollout; `key` shuffles."""
+        estimates = self._estimates(state.value_scale, parameters, flown)
+        scale = self._renewed_scale(state.value_scale, estimates.returns, flown)
+        batch = self._batch(scale, estimates, flown)
+
+        actor = TrainState(parameters.actor, state.actor)
+        critic = TrainState(parameters.critic, state.critic)
+        (actor, critic), metrics = self._epochs((actor, critic), batch, flown, key)
+        parameters = parameters.replace(actor=actor.parameters, critic=critic.parameters)
+        metrics["explained_variance"] = estimates.explained_variance
+        metrics["value_scale"] = scale.moments[1]
+        return MappoState(actor.optimiser, critic.optimiser, scale), parameters, metrics
+
+    def _estimates(self, scale, parameters, flown):
+        """Advantages and returns of a rollout, by the critic as it was."""
+        settings = self.settings
+        rollout = flown.rollout
+        mean, std = scale.moments
+        # the history's frames are the predictor's; the policy sees the prediction
+        before = rollout.observation.replace(frames=None), rollout.predicted
+        after = flown.observation.replace(frames=None), flown.predicted
+        # before and after all steps by one program: one for what comes last would be as large
+        observation, predicted = jax.tree.map(
+            lambda x, last: jnp.concatenate([x, last[None]]), before, after
+        )
+        values = self.policy.value(parameters.actor, parameters.critic, observation, predicted)
+        values = mean + std * values
+        value = values[:-1]
+        following = values[1:]
+        per_pursuer = value.shape
+        advantage = generalised_advantages(
+            settings.reward_scale * rollout.reward,
+            value,
+            following,
+            jnp.broadcast_to(rollout.terminated[..., None], per_pursuer),
+            jnp.broadcast_to(rollout.truncated[..., None], per_pursuer),
+            settings.discount,
+            settings.gae_lambda,
+        )
+        returns = advantage + value
+        explained = 1.0 - joint_moments(advantage, flown.axis)[1] ** 2 / (
+            joint_moments(returns, flown.axis)[1] ** 2 + 1e-8
+        )
+        return Estimates(advantage, returns, explained)
+
+    def _renewed_scale(self, scale, returns, flown):
+        """The running moments after these returns."""
+        kept = self.settings.value_norm_decay
+        mean, square = flown.mean((jnp.mean(returns), jnp.mean(returns**2)))
+        return ValueScale(
+            mean=kept * scale.mean + (1 - kept) * mean,
+            square=kept * scale.square + (1 - kept) * square,
+            weight=kept * scale.weight + (1 - kept),
+        )
+
+    def _batch(self, scale, estimates, flown):
+        """The rollout's samples, minibatch by minibatch, (M, W, T, ...)."""
+        rollout = flown.rollout
+        mean, std = scale.moments
+        advantage_mean, advantage_std = joint_moments(estimates.advantage, flown.axis)
+        batch = Batch(
+            observation=rollout.observation.replace(frames=None),
+            predicted=rollout.predicted,
+            action=rollout.action,
+            log_prob=rollout.log_prob,
+            advantage=(estimates.advantage - advantage_mean) / (advantage_std + 1e-8),
+            target=(estimates.returns - mean) / std,
+        )
+        return minibatches(batch, self.settings.minibatches)
+
+    def _epochs(self, networks, batch, flown, key):
+        """Actor and critic (`TrainState`s) after all gradient steps, and the means of what was
+        watched.
+        """
+        settings = self.settings
+        actor, critic = networks
+        change = settings.clip_epsilon_end - settings.clip_epsilon
+        clip = settings.clip_epsilon + change * flown.progress
+        # each network as one vector while it learns: leaf by leaf, a step on a GPU is forty kernels
+        # more
+        actor_vector, to_actor = ravel_pytree(actor.parameters)
+        critic_vector, to_critic = ravel_pytree(critic.parameters)
+
+        def gradient_step(carry, chosen):
+            actor, critic = carry
+            index, first = chosen
+            part = jax.tree.map(
+                lambda x: every_nth(x[index], first, settings.step_subsampling), batch
+            )
+
+            def part_loss(actor, critic):
+                parameters = (to_actor(actor), to_critic(critic))
+                return loss(settings, self.policy, parameters, part, clip)
+
+            gradient = jax.grad(part_loss, argnums=(0, 1), has_aux=True)(
+                actor.parameters, critic.parameters
+            )
+            (actor_gradient, critic_gradient), watch = flown.mean(gradient)
+            watch |= {"actor_gradient": jnp.linalg.norm(actor_gradient)}
+            actor = actor.updated(self.optimisers[0], actor_gradient, kl=watch["kl"])
+            critic = critic.updated(self.optimisers[1], critic_gradient)
+            return (actor, critic), jnp.stack([watch[name] for name in WATCHED])
+
+        start = actor.replace(parameters=actor_vector), critic.replace(parameters=critic_vector)
+        steps = self._order(key)
+        (actor, critic), watched = jax.lax.scan(gradient_step, start, steps)
+        actor = actor.replace(parameters=to_actor(actor.parameters))
+        critic = critic.replace(parameters=to_critic(critic.parameters))
+        metrics = dict(zip(WATCHED, jnp.mean(watched, axis=0), strict=True))
+        return (actor, critic), metrics
+
+    def _order(self, key):
+        """The minibatches of all gradient steps, and the first of the trajectory's steps that each
+        sees; None: it sees all.
+        """
+        settings = self.settings
+        order = shuffled(key, settings.epochs, settings.minibatches)
+        if settings.step_subsampling == 1:
+            return order, None
+        draw = jax.random.fold_in(key, 1)
+        return order, jax.random.randint(draw, order.shape, 0, settings.step_subsampling)
+
+
+def every_nth(x, first, number):
+    """(E, T, ...) to (E, T / number, ...): every `number`-th step from `first` on."""
+    if number == 1:
+        return x
+    x = x.reshape(x.shape[0], -1, number, *x.shape[2:])
+    return jax.lax.dynamic_index_in_dim(x, first, axis=2, keepdims=False)
