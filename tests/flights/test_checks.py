@@ -72,6 +72,10 @@ REFUSED = {
     "quaternion not unit": (scaled("qw qx qy qz", 0.5), "quaternion", "aren't unit"),
     "motor order": (renamed("m1 m2 m3 m4", "m2 m3 m4 m1"), "motors", "m1 rear_right"),
     "two motors swapped": (renamed("m1 m2", "m2 m1"), "motors", "motor order"),
+    "x at zero": (scaled("x", 0.0), "corrupt", "x: the same value 0 in every row"),
+    "z at one": (lambda c: c | {"z": 0 * c["z"] + 1}, "corrupt", "z: the same value 1"),
+    "vy at zero": (scaled("vy", 0.0), "corrupt", "vy: the same value"),
+    "z negated": (scaled("z", -1.0), "axes", "below the floor at 0: z points up"),
     "dead gyroscope axis": (frozen("wy"), "corrupt", "wy: the same value"),
     "motor column corrupt": (
         lambda c: c | {"m2": c["m2"] - 1.0},
@@ -85,7 +89,7 @@ REFUSED = {
         "repeat the time",
     ),
     "no commands": (without("m1", "m2", "m3", "m4", "cmd_thrust"), "columns", "no commands"),
-    "no state": (without("x", "ax"), "columns", "needs position and orientation"),
+    "no state": (without("x", "wx"), "columns", "needs position and orientation"),
     "too short": (lambda c: {k: v[:150] for k, v in c.items()}, "short", "at least 2 s"),
     "never took off": (scaled("m1 m2 m3 m4 cmd_thrust", 0.0), "corrupt", "same value"),
 }

@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 
 from openjax.flights.agreement import check_agreement
+from openjax.flights.attitude import derive_attitude
 from openjax.flights.derived import derive_rates, derive_velocity, mend_velocity
 from openjax.flights.flight import Flight, Issue, Refused
 from openjax.flights.sampling import drop_frozen, drop_repeats, put_in_step, runs_of
@@ -41,7 +42,7 @@ def check_flight(
         checked = put_in_step(drop_repeats(drop_frozen(checked, note), note), note)
         checked = _in_range(checked, note)
         checked = derive_velocity(mend_velocity(checked, note), note)
-        checked = derive_rates(checked, note)
+        checked = derive_attitude(derive_rates(checked, note), note)
         floor = (log or {}).get("floor_z")
         checked = _airborne(checked, floor, note, comparison)
         _above_floor(checked, 0.0 if floor is None else float(floor))

@@ -78,6 +78,7 @@ class Flight:
     body_rates_derived: bool = (
         False  # True: differentiated from the attitude by the reader, no gyroscope
     )
+    attitude_derived: bool = False  # True: of gyroscope, accelerometer and path by the reader
     pose_age: float = (
         0.0  # s by which a pose may be older than its row, because the log held the last one
     )

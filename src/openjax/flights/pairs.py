@@ -58,7 +58,11 @@ class Signals:
     @classmethod
     def of(cls, flight: Flight, grid: np.ndarray) -> Signals:
         """The logged channels; what the reader derived says nothing of its own."""
-        derived = {"velocity": flight.velocity_derived, "body_rates": flight.body_rates_derived}
+        derived = {
+            "velocity": flight.velocity_derived,
+            "body_rates": flight.body_rates_derived,
+            "quaternion": flight.attitude_derived,
+        }
         channels = ("position", "quaternion", "velocity", "body_rates", "specific_force")
         channels += ("motor_command", "command_thrust", "command_body_rates")
         return cls(*(None if derived.get(c) else on_clock(flight, c, grid) for c in channels))

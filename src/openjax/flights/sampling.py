@@ -41,7 +41,9 @@ def _standing_still(flight: Flight, channel: str, rows, note) -> np.ndarray:
     table = values.reshape(len(values), -1)
     changed = np.diff(table[rows], axis=0) != 0
     together = channel in ("position", "quaternion", "velocity")
-    dead = [] if together and changed.any() else np.flatnonzero(~changed.any(0))
+    dead = np.flatnonzero(~changed.any(0))
+    if together and changed.any():
+        dead = [k for k in dead if not _may_stand_still(flight, channel, k)]
     if len(dead):
         names = ", ".join(columns[i] for i in dead)
         raise Refused(
@@ -56,6 +58,17 @@ def _standing_still(flight: Flight, channel: str, rows, note) -> np.ndarray:
             raise Refused("corrupt", f"{words}: frozen for {share:.0%} of the flight")
         note("corrupt", f"{words}; taken as not sampled there")
     return frozen
+
+
+def _may_stand_still(flight: Flight, channel: str, column: int) -> bool:
+    """Whether one column may hold one value while the others of its channel change, as where a
+    simulated vehicle stays in a plane: what follows from it then stands still, too.
+    """
+    other = {"position": "velocity", "velocity": "position"}.get(channel)
+    if other is None:
+        return True
+    values = getattr(flight, other)
+    return values is not None and not np.ptp(flight.sampled(other)[1], axis=0)[column]
 
 
 def _name_hole(time, rows, names: str, note) -> None:

@@ -46,6 +46,7 @@ class Track:
     motors_logged: bool = True  # False: made by the nominal rate controller from the commands
     # of logs faster than the grid: times (S,) s, mean of the motors (S,)
     fast_thrust: tuple[Array, Array] | None = None
+    attitude_derived: bool = False  # of gyroscope, accelerometer and path, not measured
     ceiling_z: float | None = None  # m, what z reads at the ceiling; None: no ceiling is known
     missing: Array | None = None  # (T,) rows that weren't logged: lines between their neighbours
 
@@ -121,6 +122,7 @@ def _on_grid(part: Flight, flight: Flight, case: Case, name: str) -> Track:
         voltage=None if voltage is None else smooth(voltage, 0.3, period),
         neighbours=np.array(neighbours) if neighbours else np.zeros((0, count, 3)),
         pose_age=part.pose_age,
+        attitude_derived=part.attitude_derived,
         ceiling_z=case.vehicle_file.log.get("ceiling_z"),
         fast_thrust=fast_thrust,
         missing=_missing(part.time, grid, period),
