@@ -1,0 +1,65 @@
+"""What an identification says in the diagnosis' words: values of effects with their covariance."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from openjax.flights.flight import Case
+from openjax.gap.identification.records import Record, records_of
+from openjax.gap.identification.torques import TorqueFit, identify_torques
+
+
+@dataclass(frozen=True, eq=False)
+class EffectEstimates:
+    """`value` (n,) and `covariance` (n, n) of effects' parameters `names`: (effect, parameter).
+    `clock`: s by which motors answer later than logged, and its standard deviation; a delay in
+    the vehicle and clocks that are off look alike.
+    """
+
+    names: tuple[tuple[str, str], ...]
+    value: np.ndarray
+    covariance: np.ndarray
+    clock: tuple[float, float]
+    fit: TorqueFit
+
+    def of(self, effect: str, parameter: str) -> tuple[float, float]:
+        """Value and standard deviation of one parameter."""
+        place = self.names.index((effect, parameter))
+        return float(self.value[place]), float(np.sqrt(self.covariance[place, place]))
+
+
+ESTIMATED = (
+    ("motor_lag", "extra_up"),
+    ("motor_lag", "extra_down"),
+    ("inertia", "xx"),
+    ("inertia", "yy"),
+    ("yaw_torque", "ratio"),
+)
+"""Yaw tells the ratio of torque to the inertia about z, so that inertia is taken as it stands."""
+
+
+def effect_estimates(case: Case) -> EffectEstimates | None:
+    """What the torques of a case's flights say of motor lag, inertia and yaw torque, with nothing
+    taken for granted of the loop around them; None where no flight has motors and body rates.
+
+    A slow motor and a large inertia both weaken the response, and only the lag turns its phase:
+    the covariance says how well these flights tell them apart.
+    """
+    records = records_of(case)
+    return of_fit(identify_torques(records), records) if records else None
+
+
+def of_fit(fit: TorqueFit, records: list[Record]) -> EffectEstimates:
+    """The estimates of a fit, in the coordinates of the effects."""
+    vehicle = records[0].vehicle
+    up = float(vehicle.motor_time_constant)
+    down = up * float(vehicle.motor_slowdown_ratio)
+    roll, pitch, yaw = fit.value[3:6]
+    value = np.array([fit.value[0] - up, fit.value[1] - down, 1 / roll, 1 / pitch, yaw])
+    slopes = np.zeros((5, len(fit.value)))
+    slopes[0, 0] = slopes[1, 1] = slopes[4, 5] = 1.0
+    slopes[2, 3] = -1.0 / roll**2
+    slopes[3, 4] = -1.0 / pitch**2
+    covariance = slopes @ fit.covariance @ slopes.T
+    clock = float(fit.value[2]), float(np.sqrt(fit.covariance[2, 2]))
+    return EffectEstimates(ESTIMATED, value, covariance, clock, fit)

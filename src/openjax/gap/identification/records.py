@@ -1,0 +1,107 @@
+"""Stretches of flights at the log's own rate, as an identification needs them.
+
+The replay of the diagnosis runs on a grid of 10 ms. What motors do is seen best at the rate of the
+loop that commands them, so here faster logs keep their rows, down to 2 ms.
+"""
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from openjax.flights.flight import Case, Flight
+from openjax.flights.track import MAX_GAP, MIN_DURATION, held_means, pwm_thrust, smooth
+from openjax.vehicle.parameters import hover_share
+
+SHORTEST = 0.002  # s, the period of the firmware's rate loop: faster rows hold nothing new
+CARRIED = 0.5  # of the hovering thrust: below, the floor carries
+TAKE_OFF = 1.0  # s
+LOOP_ROWS = 0.003  # s: rows as short show every cycle of the rate loop
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """T rows of `dt` s. `motor` (T, 4): thrust commanded, as shares of the largest, held from a
+    row's time to the next; channels that weren't logged are None.
+    """
+
+    flight: str
+    dt: float
+    rates: np.ndarray  # (T, 3) rad/s
+    motor: np.ndarray  # (T, 4)
+    force: np.ndarray | None  # (T, 3) m/s^2, body
+    velocity: np.ndarray | None  # (T, 3) m/s, world
+    quaternion: np.ndarray | None  # (T, 4)
+    voltage: np.ndarray | None  # (T,) V
+    vehicle: object
+    samples: bool  # a row's motors are one sample of a faster loop, not the mean over the row
+
+    def rows(self, rows: slice) -> "Record":
+        """The record with some of its rows."""
+        cut = {
+            f.name: getattr(self, f.name)[rows]
+            for f in fields(self)
+            if isinstance(getattr(self, f.name), np.ndarray)
+        }
+        return replace(self, **cut)
+
+    @property
+    def hidden(self) -> bool:
+        """Whether the rate loop ran several times within a row."""
+        return self.dt > LOOP_ROWS
+
+
+def records_of(case: Case) -> list[Record]:
+    """All stretches of a case's flights with body rates and motor commands."""
+    found = []
+    for flight in case.flights:
+        if not flight.has_motors or flight.body_rates is None or flight.body_rates_derived:
+            continue
+        for rows in flight.stretches(max(MAX_GAP, 3 * flight.row_period), MIN_DURATION):
+            found += _in_the_air(_record(flight.rows(rows), flight, case))
+    return found
+
+
+def _in_the_air(record: Record) -> list[Record]:
+    """The parts of a record in which the motors carry the vehicle, without its take-off and
+    landing.
+    """
+    hover = float(hover_share(record.vehicle))
+    carried = smooth(record.motor.mean(1), 0.5, record.dt) > CARRIED * hover
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], carried, [False]]).astype(int)))
+    away = round(TAKE_OFF / record.dt)
+    parts = []
+    for begin, end in edges.reshape(-1, 2):
+        begin += away * (begin > 0)
+        end -= away * (end < len(carried))
+        if (end - begin) * record.dt >= MIN_DURATION:
+            parts.append(record.rows(slice(begin, end)))
+    return parts
+
+
+def _record(part: Flight, flight: Flight, case: Case) -> Record:
+    dt = max(round(flight.row_period, 4), SHORTEST)
+    grid = np.arange(part.time[0], part.time[-1] - dt, dt)
+    at, motors = part.sampled("motor_command")
+    motor = np.stack([held_means(at, column, grid, dt) for column in motors.T], 1)
+    voltage = None
+    if part.battery_voltage is not None:
+        voltage = smooth(part.interpolated("battery_voltage", grid), 0.3, dt)
+    vehicle = case.vehicle_of(flight)
+    if case.vehicle_file.motor.command == "pwm":
+        motor = pwm_thrust(motor, voltage, vehicle)
+
+    def channel(name):
+        return None if getattr(part, name) is None else part.interpolated(name, grid)
+
+    return Record(
+        flight=flight.log,
+        dt=dt,
+        rates=channel("body_rates"),
+        motor=motor,
+        force=channel("specific_force"),
+        velocity=channel("velocity"),
+        quaternion=channel("quaternion"),
+        voltage=voltage,
+        vehicle=vehicle,
+        samples=case.vehicle_file.log.get("motor_rows", "mean") == "sample",
+    )

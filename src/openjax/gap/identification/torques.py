@@ -1,0 +1,316 @@
+"""Numbers of the vehicle's torques by prediction errors, in closed loop.
+
+Body rates follow R = rates - model(parameters, motors) = noise of a high-order autoregression, whose
+coefficients are concentrated out: the direct method of Ljung, System Identification, chapter 13,
+with a model of the ARARX kind. All of the motors' signal counts, as the loop has a delay.
+
+Rows that are means over several cycles of the rate loop hide that delay: within a row motors
+answer the gust that the row's end shows. So what is new in a row of motors, given everything
+before, is free to act on the row's end (a control function: Wooldridge, Econometric Analysis of
+Cross Section and Panel Data, chapter 6); the parameters are told by what could be foreseen.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from scipy.signal import lfilter
+
+from openjax.gap.identification.records import Record
+from openjax.gap.identification.rotor_rows import rotor_rows
+
+NAMES = (
+    *("spin_up", "spin_down", "delay"),
+    *("roll_gain", "pitch_gain", "yaw_gain"),
+    *("damping", "yaw_damping", "propellers"),
+)
+"""s, s, s; torque per angular acceleration over the nominal one; 1/s; share of the inertia about
+z."""
+LOGARITHMS = [0, 1, 3, 4, 5]
+"""Of these the search runs in the logarithm, so that none leaves what is possible."""
+SPREAD = np.array([1.0, 1.0, 0.1, 0.7, 0.7, 0.7, 4.0, 4.0, 0.003])
+"""Weak priors, several times the spread of such vehicles; logarithms where they are searched."""
+UNEQUAL = 0.4  # spread of the logarithm of slowing down over speeding up
+STEP = np.array([2e-4, 2e-4, 1e-4])  # s, of the difference quotients of lags
+SEARCHED = np.array([[0.002, 0.3], [0.05, 5.0]])
+"""Time constants, s, and gains beyond which nothing is looked for."""
+EARLIEST = -0.002  # s, a cycle of the rate loop: when within it motors answer is convention
+MEMORY = 0.25  # s of the noise's autoregression, within so many rows:
+ROWS = (15, 50)
+ITERATIONS = 25
+SMALL = 0.02  # nats that end the search
+BLOCK = 1.0  # s over which errors may hang together
+AHEAD = (0.0, 0.01, 0.02, 0.04, 0.08)  # s by which motors are tried earlier than logged
+LATE = (0.002, 0.03)  # s, starts of the delay
+CLEARLY = 10.0  # nats by which motors logged too late must be better
+HIDDEN = 1  # rows whose surprise in the motors is free to act: the loop answers within them
+
+HIDDEN_LAG = 0.05
+HIDDEN_GAIN = 0.05
+HIDDEN_DAMPING = 0.5
+SAMPLED_LAG = 0.35
+SAMPLED_GAIN = 0.45
+"""Errors of lags and gains, as logarithms, and of damping, 1/s, that rows of 100 Hz leave whatever
+a fit says: means hide how a row's command is spread over it, samples miss most of what the loop
+does. Root mean squares in simulated flights with gusts, `experiments/diagnosis/rate_flights.py`.
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class TorqueFit:
+    """`value` (9,) and `covariance` (9, 9) of `NAMES`; `loss` nats; `noise` {axis: coefficients
+    (p,)}; `whole` innovations' variances (3,).
+    """
+
+    value: np.ndarray
+    covariance: np.ndarray
+    loss: float
+    noise: list
+    whole: np.ndarray
+
+    @property
+    def clock(self) -> float:
+        """s by which motors act later than logged."""
+        return float(self.value[2])
+
+
+def identify_torques(records: list[Record]) -> TorqueFit:
+    """The most likely fit of records with body rates, over the motors' clock as well."""
+    fits = []
+    problems = []
+    for ahead in AHEAD:
+        rows = round(ahead / records[0].dt)
+        if ahead and rows * records[0].dt < 0.5 * ahead:
+            continue
+        problem = _Problem([_earlier(r, rows) for r in records])
+        problems.append(problem)
+        tries = [problem.fit(late) for late in (LATE if not rows else LATE[:1])]
+        best = min(tries, key=lambda f: f.loss)
+        value = best.value.copy()
+        value[2] -= rows * records[0].dt
+        whole = (best.loss + problem.surprise) * problems[0].count / problem.count
+        loss = whole + (CLEARLY if rows else 0.0)
+        fits.append(replace(best, value=value, loss=loss))
+    return min(fits, key=lambda f: f.loss)
+
+
+def _earlier(record: Record, rows: int) -> Record:
+    """The record as if its motors had acted `rows` earlier than logged."""
+    count = len(record.rates) - rows
+    return replace(record, rates=record.rates[:count], motor=record.motor[rows:])
+
+
+def _lagged(x: np.ndarray, order: int) -> np.ndarray:
+    """x(k), then differences x(k) - x(k - 1) and before, (T - order, order): rows k = order - 1 up
+    to T - 2, which foretell the next.
+    """
+    windows = sliding_window_view(x, order)[:-1, ::-1]
+    return np.concatenate([windows[:, :1], windows[:, :-1] - windows[:, 1:]], 1)
+
+
+class _Problem:
+    """Records with all that doesn't depend on the parameters."""
+
+    def __init__(self, records: list[Record]):
+        self.records = records
+        self.dt = records[0].dt
+        self.order = int(np.clip(round(MEMORY / self.dt), *ROWS))
+        vehicle = records[0].vehicle
+        self.inertia = np.asarray(vehicle.inertia, float)
+        thrust = float(vehicle.thrust_constant) * float(vehicle.max_rotor_speed) ** 2
+        x, y = np.asarray(vehicle.rotor_position, float)[:, :2].T
+        self.spin = np.asarray(vehicle.rotor_spin, float)
+        reaction = float(vehicle.torque_constant / vehicle.thrust_constant) * self.spin
+        self.base = thrust * np.stack([y, -x, reaction]) / self.inertia[:, None]
+        self.top_speed = float(vehicle.max_rotor_speed)
+        up = float(vehicle.motor_time_constant)
+        down = up * float(vehicle.motor_slowdown_ratio)
+        self.start = np.array([np.log(up), np.log(down), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+        self.precision = np.diag(SPREAD**-2.0)
+        self.precision[:2, :2] += np.array([[1.0, -1.0], [-1.0, 1.0]]) / UNEQUAL**2
+        self.new = [self._new(r) if r.hidden else None for r in records]
+        self.count = sum(len(r.rates) - self.order - 1 for r in records)
+        self.surprise = 0.0
+        if records[0].hidden:
+            every = np.concatenate(self.new)
+            self.surprise = 0.5 * len(every) * float(np.log(every.var(0)).sum())
+
+    def _new(self, record: Record) -> np.ndarray:
+        """(T - order - 1, 3) what is new in the motors' shares of each axis in the rows from
+        `order` on, given rates until then and motors before.
+        """
+        shares = record.motor @ np.sign(self.base).T / 4.0
+        out = []
+        for axis in range(3):
+            rates = _lagged(record.rates[1:, axis], self.order)
+            before = _lagged(shares[:-1, axis], self.order)
+            past = np.concatenate([rates, before, np.ones((len(rates), 1))], 1)
+            present = shares[self.order : -1, axis]
+            out.append(present - past @ _solve(past, present))
+        return np.stack(out, 1)
+
+    def _modelled(self, record: Record, place: np.ndarray):
+        """Rates less the model's (T, 3) at a place (9,) of the search, and their derivatives
+        (9, T, 3).
+        """
+        value = _value(place)
+        lags = np.repeat(value[None, :3], 4, 0)
+        lags[[1, 2, 3], [0, 1, 2]] += STEP
+        square, speed = rotor_rows(record.motor, self.dt, lags)
+        unit = square @ self.base.T
+        sped = self.top_speed * np.diff(speed, axis=1, prepend=speed[:, :1]) @ self.spin
+        gyroscopic = np.cross(record.rates, self.inertia * record.rates) / self.inertia
+        gains = value[3:6]
+        damping = value[[6, 6, 7]]
+        grown = self.dt * (gains * unit - damping * record.rates - gyroscopic)
+        grown[..., 2] += value[8] * sped
+        slope = np.zeros((len(NAMES), *record.rates.shape))
+        slope[:3] = (grown[1:] - grown[0]) / STEP[:, None, None]
+        slope[[3, 4, 5], :, [0, 1, 2]] = self.dt * unit[0].T
+        slope[6, :, :2] = -self.dt * record.rates[:, :2]
+        slope[7, :, 2] = -self.dt * record.rates[:, 2]
+        slope[8, :, 2] = sped[0]
+
+        def whole(rows):
+            return np.cumsum(rows, -2) - rows
+
+        slope[LOGARITHMS] *= value[LOGARITHMS, None, None]
+        return record.rates - whole(grown[0]), whole(slope)
+
+    def solve(self, value: np.ndarray) -> tuple[float, list]:
+        """Loss at a place (9,) of the search, and of each axis: innovations (N,), their derivatives (N, 9) less what the noise
+        model takes, and its coefficients.
+        """
+        modelled = [self._modelled(r, value) for r in self.records]
+        axes = [self._axis(axis, modelled) for axis in range(3)]
+        off = value - self.start
+        loss = 0.5 * off @ self.precision @ off
+        loss += sum(0.5 * len(e) * np.log(e.var()) for e, _, _ in axes)
+        return float(loss), axes
+
+    def _axis(self, axis: int, modelled: list):
+        order = self.order
+        steady = 2 * len(modelled)
+        pasts = []
+        nexts = []
+        for number, (left, _) in enumerate(modelled):
+            x = left[:, axis]
+            line = np.stack([np.ones(len(x)), np.linspace(-1.0, 1.0, len(x))], 1)
+            x = x - line @ _solve(line, x)
+            flat = np.zeros((len(x) - order - 1, steady))
+            flat[:, 2 * number : 2 * number + 2] = line[order + 1 :]
+            parts = [_lagged(x, order)[1:], flat]
+            if self.new[number] is not None:
+                parts += self._answers(self.new[number][:, axis])
+            pasts.append(np.concatenate(parts, 1))
+            nexts.append(x[order + 1 :])
+        past = np.concatenate(pasts)
+        following = np.concatenate(nexts)
+        taken = _solve(past, following)
+        errors = following - past @ taken
+        whitening = _polynomial(taken[:order])
+        slopes = [-lfilter(whitening, [1.0], s[:, :, axis], axis=1) for _, s in modelled]
+        slopes = np.concatenate([s[:, order + 1 :] for s in slopes], 1).T
+        return errors, slopes - past @ _solve(past, slopes), taken[:order]
+
+    def _model_error(self) -> np.ndarray:
+        """Covariance (9, 9) of what rows hide, at a place of the search."""
+        out = np.zeros(len(NAMES))
+        if self.records[0].hidden:
+            samples = any(r.samples for r in self.records)
+            out[[0, 1]] = SAMPLED_LAG if samples else HIDDEN_LAG
+            out[[3, 4, 5]] = SAMPLED_GAIN if samples else HIDDEN_GAIN
+            out[[6, 7]] = HIDDEN_DAMPING
+        return np.diag(out**2)
+
+    @staticmethod
+    def _answers(new: np.ndarray) -> list[np.ndarray]:
+        """Columns (N, 1) of what was new in the last rows of motors; before the first nothing."""
+        return [
+            np.concatenate([np.zeros(row), new[: len(new) - row]])[:, None] for row in range(HIDDEN)
+        ]
+
+    def fit(self, late: float) -> TorqueFit:
+        """Gauss-Newton from the nominal vehicle with motors `late` s."""
+        value = self.start.copy()
+        value[2] = late
+        loss, axes = self.solve(value)
+        for _ in range(ITERATIONS):
+            hessian, push = self._normal(value, axes)
+            step = np.linalg.solve(hessian, -push)
+            share = 1.0
+            while share > 0.02:
+                ahead = self._bounded(value + share * step)
+                reached, there = self.solve(ahead)
+                if reached < loss:
+                    break
+                share *= 0.4
+            else:
+                break
+            gained = loss - reached
+            value, loss, axes = ahead, reached, there
+            if gained < SMALL:
+                break
+        scale = np.ones(len(value))
+        scale[LOGARITHMS] = _value(value)[LOGARITHMS]
+        return TorqueFit(
+            _value(value),
+            (self._covariance(value, axes) + self._model_error()) * np.outer(scale, scale),
+            loss,
+            [a[2] for a in axes],
+            np.array([a[0].var() for a in axes]),
+        )
+
+    def _bounded(self, value: np.ndarray) -> np.ndarray:
+        out = value.copy()
+        out[:2] = np.clip(out[:2], *np.log(SEARCHED[0]))
+        out[2] = max(out[2], EARLIEST if self.records[0].hidden else 0.0)
+        out[3:6] = np.clip(out[3:6], *np.log(SEARCHED[1]))
+        return out
+
+    def _normal(self, value, axes):
+        hessian = self.precision.copy()
+        push = self.precision @ (value - self.start)
+        for errors, slopes, _ in axes:
+            hessian += slopes.T @ slopes / errors.var()
+            push += slopes.T @ errors / errors.var()
+        return hessian, push
+
+    def _covariance(self, value, axes) -> np.ndarray:
+        """Of the parameters, widened where errors hang together over seconds (a sandwich's)."""
+        hessian, _ = self._normal(value, axes)
+        inverse = np.linalg.inv(hessian)
+        scores = np.zeros_like(hessian)
+        for errors, slopes, _ in axes:
+            pieces = np.arange(0, len(errors), max(int(BLOCK / self.dt), 1))
+            sums = np.add.reduceat(slopes * errors[:, None], pieces, 0) / errors.var()
+            scores += sums.T @ sums
+        wider = np.trace(scores @ inverse) / len(hessian)
+        return inverse * max(1.0, wider)
+
+
+def _value(place: np.ndarray) -> np.ndarray:
+    """The parameters (9,) at a place of the search."""
+    out = place.copy()
+    out[LOGARITHMS] = np.exp(place[LOGARITHMS])
+    return out
+
+
+def _polynomial(taken: np.ndarray) -> np.ndarray:
+    """1 - a_1 q^-1 - ... of coefficients on the last value and on differences before it."""
+    out = np.zeros(len(taken) + 1)
+    out[0] = 1.0
+    out[1] -= taken[0]
+    out[1:-1] -= taken[1:]
+    out[2:] += taken[1:]
+    return out
+
+
+def _solve(columns: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Least squares by normal equations of scaled columns."""
+    scale = np.sqrt((columns * columns).sum(0)) + 1e-30
+    scaled = columns / scale
+    gram = scaled.T @ scaled
+    gram[np.diag_indices(len(gram))] += 1e-10
+    solved = np.linalg.solve(gram, scaled.T @ target)
+    return (solved.T / scale).T

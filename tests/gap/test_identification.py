@@ -1,0 +1,60 @@
+"""Identification: truths of flights whose plant isn't openjax are within its intervals."""
+
+import numpy as np
+import pytest
+
+from experiments.diagnosis.rate_flights import Truth, fly, rows_of, vehicle_of
+from openjax.gap.identification.estimates import of_fit
+from openjax.gap.identification.records import Record
+from openjax.gap.identification.torques import NAMES, identify_torques
+from openjax.vehicle import load_vehicle
+
+TRUTHS = {
+    "nominal": Truth(gust=8.0),
+    "slow motors": Truth(up=0.075, down=0.075, delay=0.004, gust=8.0),
+    "inertia": Truth(inertia=1.3, gust=8.0),
+    "damped": Truth(damping=4.0, gust=8.0),
+}
+
+
+@pytest.fixture(scope="module")
+def records():
+    vehicle = vehicle_of(load_vehicle())
+    seen, motors = fly(list(TRUTHS.values()), 20.0)
+    found = {}
+    for name, *flight in zip(TRUTHS, seen, motors, strict=True):
+        rates, motor = rows_of(*flight, 100, samples=False)
+        rest = dict.fromkeys(("force", "velocity", "quaternion", "voltage"))
+        found[name] = Record(
+            flight=name, dt=0.01, rates=rates, motor=motor, vehicle=vehicle, samples=False, **rest
+        )
+    return found
+
+
+@pytest.mark.parametrize("name", TRUTHS)
+def test_truth_lies_within_three_deviations_in_gusts(records, name):
+    truth = TRUTHS[name]
+    fit = identify_torques([records[name]])
+    gain = 1.0 / truth.inertia
+    right = [truth.up, truth.down, truth.delay, gain, gain, gain, truth.damping, truth.damping, 0.0]
+    off = (fit.value - right) / np.sqrt(np.diag(fit.covariance))
+    assert np.abs(off[:-1]).max() < 3.0, dict(zip(NAMES, off, strict=True))
+
+
+def test_slow_motors_are_lag_and_not_inertia(records):
+    record = records["slow motors"]
+    found = of_fit(identify_torques([record]), [record])
+    lag, lag_error = found.of("motor_lag", "extra_up")
+    inertia, inertia_error = found.of("inertia", "xx")
+    assert abs(lag - 0.05) < 3.0 * lag_error < 0.045
+    assert abs(inertia - 1.0) < 3.0 * inertia_error < 0.4
+
+
+def test_motors_logged_late_are_a_clock(records):
+    record = records["nominal"]
+    rows = 4
+    cut = len(record.rates) - rows
+    late = Record(**{**vars(record), "rates": record.rates[rows:], "motor": record.motor[:cut]})
+    fit = identify_torques([late])
+    assert abs(fit.clock + rows * record.dt) < 0.005
+    assert abs(fit.value[0] - 0.025) < 0.006
