@@ -16,6 +16,7 @@ from openjax.command_line import one_line, one_thread_for_matrices, output_conso
 from openjax.errors import UserError
 from openjax.files import check_output, check_output_folder, replacing, write_json
 from openjax.show.progress import Steps
+from openjax.store.compiled_programs import cache_programs
 from openjax.vehicle.effect_names import effect_names
 
 PROGRAM = "openjax diagnose"
@@ -36,9 +37,9 @@ class Options:
     cases: Annotated[tuple[Path, ...], tyro.conf.Positional]
     """Folders of flight logs, each with a vehicle.toml."""
     reference: tuple[Path, ...] = ()
-    """Folders of earlier flights of the same vehicle: report what changed since instead
-    (changes.html and changes.json); one folder per day tells how far days differ. Motor commands
-    alone are enough.
+    """Folders of earlier flights of the same vehicle, one for each day: the vehicle is learnt from
+    them first, and report.html says what changed since; changes.html holds trims and rotors, for
+    which motor commands alone are enough.
     """
     out: Path = Path("diagnosis")
     """Where the reports go, one folder per case."""
@@ -61,6 +62,7 @@ def run(options: Options) -> int:
     UserError for bad options.
     """
     one_thread_for_matrices()
+    cache_programs()
     console = output_console()
     names = _checked_names(options)
     answer = _changes if options.reference else _diagnosis
@@ -145,14 +147,36 @@ def _changes(
     """As `_diagnosis`, of what changed since the reference."""
     from openjax import comparison
     from openjax.comparison import report
+    from openjax.gap.report import write_report
 
     change = comparison.compare(folder, options.reference)
+    found = _since(options, folder, tell)
     with replacing(options.out / name) as partial_folder:
         partial_folder.mkdir()
         report.write(change, partial_folder, options.html)
+        if found is not None:
+            write_report(found, partial_folder, options.html)
     written = options.out / name / f"changes.{'html' if options.html else 'json'}"
-    title = "changed" if change.changed else "no change"
-    return title, [*report.in_words(change), f"({written})"], report.prediction(change)
+    if found is None:
+        title = "changed" if change.changed else "no change"
+        return title, [*report.in_words(change), f"({written})"], report.prediction(change)
+    trims = [f"Trims: {line}" for line in report.in_words(change)[:1]]
+    lines = [*found.in_words(), *trims, f"({found.seconds:.1f} s; {written})"]
+    return ", ".join(found.effects) or "no change", lines, found.prediction()
+
+
+def _since(options: Options, folder: Path, tell: Callable[[str], None]):
+    """The report of what changed since the reference; None where the logs hold too little for a
+    diagnosis, so that trims alone are compared.
+    """
+    from openjax.flights.case import load_case
+    from openjax.gap.diagnosis import diagnose_case
+
+    try:
+        reference = [load_case(r) for r in options.reference]
+        return diagnose_case(load_case(folder), options.without, tell, reference)
+    except UserError:
+        return None
 
 
 def _unforeseen(name: str, error: Exception) -> str:

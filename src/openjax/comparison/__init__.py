@@ -12,7 +12,13 @@ from pathlib import Path
 import numpy as np
 
 from openjax.comparison.causes import CAUSES, ROTOR_PLACES, SIDES, hypotheses_of
-from openjax.comparison.days import battery_of, by_day, days_told_apart, spread_of_days
+from openjax.comparison.days import (
+    battery_of,
+    by_day,
+    days_told_apart,
+    spread_of_charge,
+    spread_of_days,
+)
 from openjax.comparison.figures import FIGURES, TRIMS, FlightFigures, figures_of, mixer_of
 from openjax.comparison.result import SHOWN, Change, Interval
 from openjax.comparison.weigh import least_shown, weigh
@@ -77,7 +83,8 @@ def change_between(
     spread, freedom = spread_of_days(before, after)
     difference = after.mean - before.mean
     days = 1 / np.maximum(before.count, 1) + 1 / np.maximum(after.count, 1)
-    scale = np.sqrt(spread**2 * days + before.error**2 + after.error**2)
+    charge = spread_of_charge([*new, *old])
+    scale = np.sqrt(spread**2 * days + before.error**2 + after.error**2 + charge**2)
     trims = before.mean[: len(TRIMS)]
     hypotheses = hypotheses_of(mixer, trims)
     evidence = weigh(hypotheses, difference, scale, freedom)

@@ -21,7 +21,13 @@ DAY_SPREAD, WITHIN_DAY = np.array([(figure.day, figure.within) for figure in FIG
 HOVER = PLACES["hover"]
 PRIOR_DAYS = 6.0  # days of experience that this prior is worth
 SAME_DAY = 0.012  # of hover: roll and pitch trims further apart were flown on different days
-VOLTAGE_SLOPE = (0.0, 0.15)  # 1/V of hover, prior mean and standard deviation
+# 1/V of hover, prior mean and standard deviation: thrust commands are what the firmware's battery
+# compensation makes of them, and duty cycles with their voltage are turned into thrust by its map.
+VOLTAGE_SLOPE = (0.0, 0.05)
+# By what the logarithm of thrust per duty cycle differs between two days whose voltage isn't known:
+# the map's 1.4 times that of the voltage at hover, of batteries of 3.4 to 4.1 V under load.
+CHARGE = 1.4 * 0.2 / 3.7
+CHARGED = ("hover", "torque_gain")
 VOLTAGE_SPREAD = 0.1  # V, by which flights without a logged voltage may differ
 
 
@@ -120,6 +126,16 @@ def _at_voltage(flight: FlightFigures, battery: Battery) -> tuple[np.ndarray, np
         unsure = battery.error * (flight.voltage - battery.voltage)
     error[HOVER] = np.hypot(error[HOVER], unsure)
     return value, error
+
+
+def spread_of_charge(figures: Sequence[FlightFigures]) -> np.ndarray:
+    """Standard deviation (F,) of the difference of two days that a battery's unknown charge makes:
+    of duty cycles without a voltage.
+    """
+    silent = any(f.duty and f.voltage is None for f in figures)
+    out = np.zeros(len(FIGURES))
+    out[[PLACES[name] for name in CHARGED]] = 2**0.5 * CHARGE * silent
+    return out
 
 
 def spread_of_days(*sets: Days) -> tuple[np.ndarray, np.ndarray]:

@@ -75,6 +75,7 @@ class FlightFigures:
     day: str
     values: dict[str, tuple[float, float]]
     voltage: float | None  # V, mean
+    duty: bool = False  # motors are duty cycles
 
     def all(self) -> tuple[np.ndarray, np.ndarray]:
         """Values and standard errors (F,) in the order of FIGURES, NaN where the log gives none."""
@@ -106,7 +107,8 @@ def figures_of(flight: Flight, case: Case, day: str) -> FlightFigures | str:
         motor = pwm_thrust(motor, voltage, vehicle)
     values = _trims(flight, motor, rows, mixer_of(vehicle)) | _dynamics(flight, case, vehicle)
     mean = None if voltage is None else float(voltage[rows].mean())
-    return FlightFigures(flight.name, day, values, mean)
+    duty = case.vehicle_file.motor.command == "pwm"
+    return FlightFigures(flight.name, day, values, mean, duty)
 
 
 def _in_the_air(flight: Flight, case: Case) -> np.ndarray:

@@ -86,6 +86,11 @@ def in_words(change: Change) -> list[str]:
             for n in moved
             if n in change.figures
         ]
+    if change.charge_unknown:
+        lines.append(
+            "What may differ is the battery: an emptier one makes less thrust of a duty cycle. Log "
+            "vbat, and thrust can be compared."
+        )
     differences = ", ".join(
         f"{n} {100 * v.value:+z.1f} % [{100 * v.low:+z.1f}, {100 * v.high:+z.1f}]"
         for n, v in change.figures.items()

@@ -48,6 +48,11 @@ class Change:
     spread: dict[str, float]  # of normal days, as estimated
 
     @property
+    def charge_unknown(self) -> bool:
+        """Whether a battery's charge may differ unseen: duty cycles without a voltage."""
+        return any(f.duty and f.voltage is None for f in (*self.reference, *self.flights))
+
+    @property
     def days(self) -> int:
         """Days that the reference holds."""
         return len({f.day for f in self.reference})

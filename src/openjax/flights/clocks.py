@@ -132,7 +132,11 @@ def _offsets(signals) -> dict[str, float]:
             likeness.setdefault(_flight_of(track), []).append((found, track.dt / FINER))
     out = {}
     for flight, parts in likeness.items():
-        whole = sum(part for part, _ in parts) / len(parts)
+        # Stretches of one flight may have rows of another length: all on the grid of the shortest.
+        reach = min(len(part) // 2 * step for part, step in parts)
+        step = parts[0][1]
+        grid = step * np.arange(-int(reach / step), int(reach / step) + 1)
+        whole = sum(_on(grid, *part) for part in parts) / len(parts)
         best = int(np.argmax(whole))
         middle = len(whole) // 2
         if whole[best] < FOLLOWS:
@@ -143,6 +147,11 @@ def _offsets(signals) -> dict[str, float]:
             best = int(high[np.argmin(np.abs(high - middle))])
         out[flight] = (best - middle) * parts[0][1]
     return out
+
+
+def _on(grid: np.ndarray, values: np.ndarray, step: float) -> np.ndarray:
+    """Values (N,) at steps around zero, on another grid."""
+    return np.interp(grid, step * (np.arange(len(values)) - len(values) // 2), values)
 
 
 def _likeness(late: np.ndarray, early: np.ndarray, dt: float) -> np.ndarray | None:

@@ -10,7 +10,7 @@ from openjax.flights.flight import Case
 from openjax.gap.evidence import Evidence, gather
 from openjax.gap.intervals import estimates
 from openjax.gap.model.bounds import BOUND
-from openjax.gap.model.library import CARDS, library, path_of
+from openjax.gap.model.library import CARDS, PLACE, library, path_of
 from openjax.gap.probabilities import probabilities
 from openjax.gap.reference import differs, joined, read_reference
 from openjax.gap.report import Report
@@ -106,15 +106,41 @@ def _report(
             f"{i.flight}: {i.issue}" for i in evidence.case.quality if i.kind == "garbage"
         ),
         nuisances=_nuisances(evidence, selection),
+        reference=_reference_in_words(evidence, named),
         residual={"p_value": check.p_value} | check.measures,
         plots={"evidence": evidence, "selection": selection},
     )
+
+
+def _reference_in_words(evidence: Evidence, named) -> str:
+    """What the named effects' parameters were in the reference flights, and what may differ between
+    days that nothing tells.
+    """
+    if evidence.baseline is None:
+        return ""
+    before = [
+        f"{e} {p} {evidence.baseline.theta[PLACE[e, p]]:.4g}"
+        for e in named
+        for p in (f.name for f in CARDS[e].fitted)
+        if (e, p) in PLACE
+    ]
+    told = "Held against the reference flights of the same vehicle"
+    told += f": {', '.join(before)} there." if before else "."
+    silent = any(t.voltage is None for t in evidence.tracks)
+    pwm = evidence.case.vehicle_file.motor.command == "pwm"
+    battery = (
+        "The battery's charge may differ between the days, which changes what thrust a duty cycle "
+        "makes: log vbat, and thrust can be compared."
+    )
+    return f"{told} {battery}" if pwm and silent else told
 
 
 def _nuisances(evidence: Evidence, selection: Selection) -> dict[str, str]:
     """What the vehicle's numbers and the sensors' mounting took, in usual sizes; a number at its
     bound says so.
     """
+    if evidence.baseline is not None:  # mixed, as the reference knows them together
+        return {}
     names = np.array(evidence.replay.nuisance_names)[evidence.replay.shared]
     taken = selection.chosen.judged.taken.mean(0)
 

@@ -12,10 +12,9 @@ from openjax.gap.evidence import Evidence
 from openjax.gap.model.hypotheses import SetFit
 from openjax.gap.model.library import CARDS, PLACE, path_of
 from openjax.gap.report import Estimate
+from openjax.gap.selection import REACH
 from openjax.vehicle.effects import EFFECTS
 from openjax.vehicle.effects.effect import Parameter
-
-REACH = 1.645  # standard deviations of a 90 % interval
 
 
 def estimates(evidence: Evidence, fit: SetFit, named) -> dict[str, dict[str, Estimate]]:
@@ -43,6 +42,19 @@ def _estimate(v: Estimated, parameter: Parameter, vehicle) -> Estimate:
     value, *interval = np.clip((v.value, *ends), *parameter.limits(vehicle)).tolist()
     may_be_none = bool(ends[0] <= parameter.none <= ends[1])
     return Estimate(value, parameter.unit, tuple(interval), parameter.prior, may_be_none)
+
+
+def interval(told: Estimated, parameter) -> tuple[float, float]:
+    """The 90 % interval. A number that multiplies something (it does nothing at 1) stays positive:
+    its logarithm is normal.
+    """
+    below, above = REACH * told.below, REACH * told.above
+    if parameter.none == 1.0 and told.value > 0.0:
+        return (
+            told.value * float(np.exp(-below / told.value)),
+            told.value * float(np.exp(above / told.value)),
+        )
+    return told.value - below, told.value + above
 
 
 def _of_physics(fit: SetFit, effect: str, parameter) -> Estimated:

@@ -4,6 +4,7 @@ of a case is a change since then.
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from openjax.flights.flight import Case
 from openjax.gap.channels import Channel
 from openjax.gap.decision import DECISION
 from openjax.gap.evidence import gather
-from openjax.gap.model.baseline import FORM, Baseline, joint, moved
+from openjax.gap.model.baseline import FORM, Baseline, day_of, joint, moved
 from openjax.gap.model.hypotheses import UNEXPOSED, fit_set
 from openjax.gap.model.library import CARDS, library
 from openjax.gap.model.table import build, with_effects
@@ -26,12 +27,14 @@ def read_reference(case: Case, progress=None) -> Baseline:
     evidence = gather(case, library(), progress, reference=True)
     exposure = evidence.motion.exposure
     shown = [e for e in FORM if exposure.get(e, 0.0) >= UNEXPOSED]
-    shown = [e for e in CARDS if e in shown]
     fit = fit_set(evidence.replay, shown, rounds=ROUNDS)
     measures, _ = measure(evidence, residuals_of(fit))
     table = build(fit, None)
     names = [n for n, s in zip(fit.replay.nuisance_names, fit.replay.shared, strict=True) if s]
-    found, covariance, known = joint(table, with_effects(table), names, evidence.vehicles[0])
+    volts = all(t.voltage is not None for t in evidence.tracks)
+    silent = case.vehicle_file.motor.command == "pwm" and not volts
+    day = partial(day_of, vehicle=evidence.vehicles[0], silent=silent)
+    found, covariance, known = joint(table, with_effects(table), names, day)
     count = len(fit.index)
     mean = dict(zip(names, found[count:].tolist(), strict=True))
     return Baseline(

@@ -22,7 +22,7 @@ from openjax.gap.decision import DECISION
 from openjax.gap.evidence import Evidence
 from openjax.gap.model.cross_validation import Judged, judge, promise, screened
 from openjax.gap.model.hypotheses import SetFit, fit_set
-from openjax.gap.model.library import CARDS, places
+from openjax.gap.model.library import CARDS, PLACE, places
 from openjax.gap.model.table import Model, Table, build, with_effects
 
 # Nats that an effect of usual size must promise: its gain is then expected at two standard errors,
@@ -30,6 +30,7 @@ from openjax.gap.model.table import Model, Table, build, with_effects
 # square's root.
 DETECTABLE = 2.0 * DECISION.standard_errors**2
 NOTHING = frozenset()
+REACH = 1.645  # standard deviations of a 90 % interval
 LARGEST = 3  # effects of a set
 # Sets that are fitted in full, of those that the model promises as linearised around nothing, and
 # then around the best of these.
@@ -147,6 +148,22 @@ def log_odds(effects) -> float:
     return sum(CARDS[e].log_odds for e in effects)
 
 
+def practical(fit: SetFit) -> bool:
+    """Whether every effect of a set is clearly of a size that matters in practice: of some parameter
+    the 90 % interval is further from doing nothing than its card says (a region of practical
+    equivalence on the parameter, Kruschke 2018).
+    """
+    found = fit.parameters()
+    return all(
+        not CARDS[e].practical
+        or any(
+            abs(found[e][p][0] - fit.replay.absent[PLACE[e, p]]) - REACH * found[e][p][1] > size
+            for p, size in CARDS[e].practical.items()
+        )
+        for e in fit.effects
+    )
+
+
 def possible(fit: SetFit) -> bool:
     """Whether all fitted parameters lie within physical bounds."""
     found = fit.parameters()
@@ -254,7 +271,7 @@ class Search:
         density, worth as many nats as blocks bear out (Pauli, Racugno, Ventura 2011), less what its
         parameters cost (Occam's factor).
         """
-        sets = [h for h in self.visited.values() if possible(h.fit)]
+        sets = [h for h in self.visited.values() if possible(h.fit) and practical(h.fit)]
         odds, costs = np.array([(h.log_odds, h.fit.cost) for h in sets]).T
         pairs = [[difference(a.judged, b.judged) for b in sets] for a in sets]
         _, errors, trust = np.moveaxis(np.array(pairs), 2, 0)

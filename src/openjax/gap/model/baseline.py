@@ -11,25 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from openjax.gap.decision import DECISION
-from openjax.gap.model.library import CARDS, PLACE, THETA
+from openjax.gap.model.library import CARDS, PHYSICS_EFFECTS, PLACE, THETA
 from openjax.gap.model.table import Model, Table
 
-# Effects that every vehicle has to some degree: what a simulator gets wrong of it on any day.
-FORM = (
-    "thrust_scale",
-    "battery_sag",
-    "thrust_curve",
-    "rotor_drag",
-    "blade_flapping",
-    "motor_lag",
-    "motor_imbalance",
-    "com_offset",
-    "inertia",
-    "yaw_torque",
-)
-# Standard deviations over the days of one vehicle: trims of 1 to 2.5 % of hover, measured on
-# published flights of two Crazyflies; a rotor's share of a trim is half of it.
-DAYS = {"motor_imbalance": 0.03, "thrust_scale": 0.012}
+# Effects that every vehicle has to some degree: what a simulator gets wrong of it on any day. Trims
+# of 1 to 2.5 % of hover were measured over days on published flights of two Crazyflies.
+FORM = tuple(e for e in PHYSICS_EFFECTS if CARDS[e].days is not None)
 NUISANCE_DAYS = 0.3  # of a nuisance's usual size: markers and chips are mounted once
 # Of a number's usual spread, by which two sets of flights of one vehicle tell it differently: the
 # size by which an effect's form may be wrong (`decision.toml`), and half of what the number is
@@ -75,20 +62,21 @@ class Baseline:
         return out
 
 
-def _day(effect: str, parameter: str, vehicle) -> float:
-    """Standard deviation over days of a number."""
+def day_of(effect: str, parameter: str, vehicle, silent: bool) -> float:
+    """Standard deviation over days of a number; `silent`: motors are duty cycles whose battery
+    nobody logged.
+    """
     card = CARDS[effect]
     usual = card.nuisance.get(parameter, 0.0)
     usual = float(usual(vehicle) if callable(usual) else usual)
     spread = np.hypot(next(p.spread for p in card.fitted if p.name == parameter), card.common)
-    return max(DAYS.get(effect, 0.0), FORM_DAYS * usual, DECISION.form_error * float(spread))
+    charge = card.nuisance_duty.get(parameter, 0.0) if silent and card.thrust_map else 0.0
+    return max(charge, card.days or 0.0, FORM_DAYS * usual, DECISION.form_error * float(spread))
 
 
-def joint(
-    table: Table, model: Model, names, vehicle
-) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
+def joint(table: Table, model: Model, names, day) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
     """Mean and covariance of the numbers of the table's set and of the nuisances `names` (N,) that
-    are shared, and what they are called.
+    are shared, and what they are called. `day(effect, parameter)`: the spread of a number over days.
     """
     from openjax.gap.model.cross_validation import Equations
 
@@ -96,7 +84,7 @@ def joint(
     hessian, _, found = equations.solve(table.total)
     inside = [f"{e} {p}" for e, p in (THETA[i] for i in table.fit.index)]
     called = (*inside, *names)
-    days = [_day(*n.split(" "), vehicle) if n in inside else NUISANCE_DAYS for n in called]
+    days = [day(*n.split(" ")) if n in inside else NUISANCE_DAYS for n in called]
     kept = [k for k, n in enumerate(called) if not n.startswith(OF_A_DAY)]
     covariance = COLOURED * np.linalg.inv(hessian) + np.diag(np.square(days))
     return found, covariance[np.ix_(kept, kept)], tuple(called[k] for k in kept)

@@ -17,6 +17,12 @@ VERDICTS = {
     "unknown": "The simulator misses something that no known effect explains.",
     "not_testable": "No effect is seen, but these flights couldn't show most of those that are usual.",
 }
+# The same where a reference of the vehicle was given.
+VERDICTS_SINCE = {
+    "none": "The vehicle is as in its reference flights, to within what a day changes.",
+    "unknown": "The vehicle changed in a way that no known effect explains.",
+    "not_testable": "No change is seen, but these flights couldn't show most of those that are usual.",
+}
 
 
 @dataclass(frozen=True)
@@ -69,6 +75,7 @@ class Report:
     contradictions: tuple[str, ...] = ()
     nuisances: dict[str, str] = field(default_factory=dict)
     residual: dict[str, float] = field(default_factory=dict)
+    reference: str = ""  # what the reference flights say of the vehicle; none was given
     seconds: float = 0.0
     plots: dict = field(default_factory=dict, repr=False)
 
@@ -126,18 +133,22 @@ class Report:
         rest = f"sensors and clocks {_short(self.shares.sensors.value)}; unexplained {_short(self.shares.unexplained.value)}"
         return f"Shares of the gap: {parts}; {rest}." if parts else f"Shares of the gap: {rest}."
 
+    def verdict_in_words(self) -> str:
+        """What a verdict that names nothing means, and how probable it is."""
+        sure = self.probabilities.get(self.verdict)
+        meaning = (VERDICTS_SINCE if self.reference else VERDICTS).get(self.verdict, "")
+        return meaning + (f" Probability {sure:.2f}." if sure is not None else "")
+
     def in_words(self) -> list[str]:
         """The shares, then what they mean, in a few plain sentences."""
-        sure = self.probabilities.get(self.verdict)
-        verdict = VERDICTS.get(self.verdict, "") + (
-            f" Probability {sure:.2f}." if sure is not None else ""
-        )
+        verdict = self.verdict_in_words()
         lines = [
             *(f"Left out: {text}." for text in self.left_out),
             self.shares_in_words() if self.effects or self.sensors else "",
             verdict if not self.parameters else "",
             *(f"Sensors: {text}." for text in self.sensors),
             self.rest,
+            self.reference,
             f"Where: {in_words(self.where)}." if self.effects else "",
             *(
                 f"{e}: {', '.join(v.in_words(p) for p, v in of.items())}."

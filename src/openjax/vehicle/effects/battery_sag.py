@@ -64,6 +64,8 @@ EFFECT = Effect(
         log_odds=RARE,
         at_voltage=frozen,
         sample={"exponent": 1.0},
+        practical={"exponent": 0.1},
+        days=0.0,
         next_flight="the same hover on a full and on a nearly empty battery.",
     ),
 )

@@ -44,6 +44,7 @@ EFFECT = Effect(
         coordinate="height",
         impossible=above,
         sample={"strength": 0.6, "offset": 0.01},
+        practical={"strength": 0.08},
         next_flight="slow passes just below the ceiling.",
     ),
 )

@@ -31,6 +31,8 @@ EFFECT = Effect(
             Fitted("y", mean=0.0, spread=0.002, start=0.0003, step=2e-05),
         ),
         sample={"x": 0.003, "y": -0.002},
+        practical={"x": 4e-05, "y": 4e-05},
+        days=0.0,
         next_flight="hover and climbs at several thrusts, with yaw free.",
     ),
 )

@@ -138,7 +138,10 @@ class Card:
     nuisance_duty, nuisance_samples: the same where motor commands are duty cycles, or single
     samples whose rows hide the rest. weighed: whether a weighed vehicle rules it out.
     at_voltage(values, intervals, voltage): both as they are at one voltage, for simulators that
-    know none. sample: a strength within its usual range to fly with, strong enough to see.
+    know none. practical: {parameter: how far one of them must be
+    from doing nothing before anybody would change a simulator for it}. days: of an effect that
+    every vehicle has to some degree, the standard deviation of its parameters over a vehicle's
+    days; None for others. sample: a strength within its usual range to fly with, strong enough to see.
     impossible(position): whether a flight along position (T, 3), m, rules it out. next_flight: what
     would show it, in words.
     """
@@ -162,6 +165,8 @@ class Card:
     at_voltage: Callable[[dict, dict, float], tuple[dict, dict]] | None = None
     impossible: Callable[[Any], bool] | None = None
     sample: Mapping[str, float] = field(default_factory=dict)
+    practical: Mapping[str, float] = field(default_factory=dict)
+    days: float | None = None
     next_flight: str = ""
 
 

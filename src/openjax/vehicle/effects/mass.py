@@ -35,6 +35,7 @@ EFFECT = Effect(
         thrust_map=True,
         weighed=True,
         sample={"extra": 0.003},
+        practical={"extra": 0.0003},
         next_flight="weigh the vehicle, then hover and climb hard: a weighed mass leaves only the thrust.",
     ),
 )

@@ -74,6 +74,8 @@ EFFECT = Effect(
         nuisance_duty={"extra_up": 0.01, "extra_down": 0.01},
         nuisance_samples={"extra_up": 0.01, "extra_down": 0.01},
         sample={"extra_up": 0.02, "extra_down": 0.03},
+        practical={"extra_up": 0.0025, "extra_down": 0.004},
+        days=0.0,
         next_flight="roll, pitch and thrust doublets, as short as the vehicle allows.",
     ),
 )

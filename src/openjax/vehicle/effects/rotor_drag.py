@@ -52,6 +52,8 @@ EFFECT = Effect(
         coordinate="body velocity",
         possible=brakes,
         sample={"d_xy": 0.015, "d_z": 0.005},
+        practical={"d_xy": 0.002, "d_z": 0.003},
+        days=0.0,
         next_flight="fast straight passes in two headings, nose and side first.",
     ),
 )

@@ -52,6 +52,8 @@ EFFECT = Effect(
         possible=rises,
         nuisance_duty={"offset": 0.15, "curvature": 0.3},
         sample={"curvature": 0.25},
+        practical={"offset": 0.01, "slope": 0.02, "curvature": 0.05},
+        days=0.0,
         next_flight="steps of collective thrust between 40 and 90 %.",
     ),
 )

@@ -33,6 +33,8 @@ EFFECT = Effect(
         nuisance_duty={"scale": 0.3},
         thrust_map=True,
         sample={"scale": -0.08},
+        practical={"scale": 0.01},
+        days=0.012,
         next_flight="weigh the vehicle, then hover and climb hard: a weighed mass leaves only the thrust.",
     ),
 )
