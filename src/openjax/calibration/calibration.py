@@ -131,7 +131,7 @@ def calibrate(case: Case) -> Calibration:
     own = len(evidence.replay.numbers)
     replay = dataclasses.replace(
         replay,
-        nuisances=[n[own:] for n in replay.nuisances],
+        columns=[c[own:] for c in replay.columns],
         nuisance_names=replay.nuisance_names[own:],
         sizes=[s[own:] for s in replay.sizes],
         numbers=(),
