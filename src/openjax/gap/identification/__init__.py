@@ -1,3 +1,19 @@
 """What a vehicle does, before anything is said of why: the response of its torques and of its
 thrust, and the numbers of a model of them, from flights in closed loop.
 """
+
+import importlib
+
+_ELSEWHERE = {
+    "Identification": "openjax.gap.identification.result",
+    "identify": "openjax.gap.identification.result",
+    "effect_estimates": "openjax.gap.identification.estimates",
+}
+
+__all__ = list(_ELSEWHERE)
+
+
+def __getattr__(name: str):  # identifying pulls in the vehicle (and JAX)
+    if name in _ELSEWHERE:
+        return getattr(importlib.import_module(_ELSEWHERE[name]), name)
+    raise AttributeError(name)

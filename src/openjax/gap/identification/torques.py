@@ -40,11 +40,13 @@ ROWS = (15, 50)
 ITERATIONS = 25
 SMALL = 0.02  # nats that end the search
 BLOCK = 1.0  # s over which errors may hang together
-AHEAD = (0.0, 0.01, 0.02, 0.04, 0.08)  # s by which motors are tried earlier than logged
+AHEAD = (0.01, 0.02, 0.04, 0.08)  # s by which motors are tried earlier than logged
 LATE = (0.002, 0.03)  # s, starts of the delay
+STRONG = 0.6  # of the nominal gain; the heaviest decks leave about as much
 CLEARLY = 10.0  # nats by which motors logged too late must be better
 HIDDEN = 1  # rows whose surprise in the motors is free to act: the loop answers within them
 
+HALF_CYCLE = 0.001  # s of the rate loop: when within one motors get their command is convention
 HIDDEN_LAG = 0.05
 HIDDEN_GAIN = 0.05
 HIDDEN_DAMPING = 0.5
@@ -76,28 +78,34 @@ class TorqueFit:
 
 def identify_torques(records: list[Record]) -> TorqueFit:
     """The most likely fit of records with body rates, over the motors' clock as well."""
-    fits = []
-    problems = []
-    for ahead in AHEAD:
-        rows = round(ahead / records[0].dt)
-        if ahead and rows * records[0].dt < 0.5 * ahead:
-            continue
-        problem = _Problem([_earlier(r, rows) for r in records])
-        problems.append(problem)
-        tries = [problem.fit(late) for late in (LATE if not rows else LATE[:1])]
-        best = min(tries, key=lambda f: f.loss)
-        value = best.value.copy()
-        value[2] -= rows * records[0].dt
-        whole = (best.loss + problem.surprise) * problems[0].count / problem.count
-        loss = whole + (CLEARLY if rows else 0.0)
-        fits.append(replace(best, value=value, loss=loss))
+    base = Problem(records)
+    first = base.fit(LATE[0])
+    if _clear(first):
+        return first
+    fits = [first, base.fit(LATE[1])]
+    for rows in {round(ahead / base.dt): None for ahead in AHEAD}:
+        if rows:
+            problem = Problem([earlier(r, rows) for r in records])
+            fit = problem.fit(LATE[0])
+            value = fit.value.copy()
+            value[2] -= rows * base.dt
+            # Per row, as the shifted log has fewer.
+            loss = (fit.loss + problem.surprise) * base.count / problem.count - base.surprise
+            fits.append(replace(fit, value=value, loss=loss + CLEARLY))
     return min(fits, key=lambda f: f.loss)
 
 
-def _earlier(record: Record, rows: int) -> Record:
+def _clear(fit: TorqueFit) -> bool:
+    """Whether roll and pitch answer as strongly as those of any such vehicle: then the rows'
+    clock is right to a few milliseconds, and no other need be tried.
+    """
+    return bool(fit.value[3:5].min() > STRONG)
+
+
+def earlier(record: Record, rows: int) -> Record:
     """The record as if its motors had acted `rows` earlier than logged."""
     count = len(record.rates) - rows
-    return replace(record, rates=record.rates[:count], motor=record.motor[rows:])
+    return replace(record.rows(slice(0, count)), motor=record.motor[rows:])
 
 
 def _lagged(x: np.ndarray, order: int) -> np.ndarray:
@@ -108,7 +116,7 @@ def _lagged(x: np.ndarray, order: int) -> np.ndarray:
     return np.concatenate([windows[:, :1], windows[:, :-1] - windows[:, 1:]], 1)
 
 
-class _Problem:
+class Problem:
     """Records with all that doesn't depend on the parameters."""
 
     def __init__(self, records: list[Record]):
@@ -146,10 +154,10 @@ class _Problem:
             before = _lagged(shares[:-1, axis], self.order)
             past = np.concatenate([rates, before, np.ones((len(rates), 1))], 1)
             present = shares[self.order : -1, axis]
-            out.append(present - past @ _solve(past, present))
+            out.append(present - past @ solve(past, present))
         return np.stack(out, 1)
 
-    def _modelled(self, record: Record, place: np.ndarray):
+    def modelled(self, record: Record, place: np.ndarray):
         """Rates less the model's (T, 3) at a place (9,) of the search, and their derivatives
         (9, T, 3).
         """
@@ -177,11 +185,25 @@ class _Problem:
         slope[LOGARITHMS] *= value[LOGARITHMS, None, None]
         return record.rates - whole(grown[0]), whole(slope)
 
+    @staticmethod
+    def values(place: np.ndarray) -> np.ndarray:
+        """The parameters (9,) at a place of the search."""
+        return _value(place)
+
+    def at_once(self, value: np.ndarray, axis: int) -> float:
+        """rad/s at a row's end per unit of an axis' motors in the row itself: what a delay and a
+        lag leave of it, for parameters (9,).
+        """
+        lag = value[:2].mean()
+        acts = max(self.dt - value[2], 0.0)
+        effect = acts - lag * (1.0 - np.exp(-acts / lag))
+        return float(value[3 + axis] * np.abs(self.base[axis]).sum() * effect)
+
     def solve(self, value: np.ndarray) -> tuple[float, list]:
         """Loss at a place (9,) of the search, and of each axis: innovations (N,), their derivatives (N, 9) less what the noise
         model takes, and its coefficients.
         """
-        modelled = [self._modelled(r, value) for r in self.records]
+        modelled = [self.modelled(r, value) for r in self.records]
         axes = [self._axis(axis, modelled) for axis in range(3)]
         off = value - self.start
         loss = 0.5 * off @ self.precision @ off
@@ -196,7 +218,7 @@ class _Problem:
         for number, (left, _) in enumerate(modelled):
             x = left[:, axis]
             line = np.stack([np.ones(len(x)), np.linspace(-1.0, 1.0, len(x))], 1)
-            x = x - line @ _solve(line, x)
+            x = x - line @ solve(line, x)
             flat = np.zeros((len(x) - order - 1, steady))
             flat[:, 2 * number : 2 * number + 2] = line[order + 1 :]
             parts = [_lagged(x, order)[1:], flat]
@@ -206,16 +228,17 @@ class _Problem:
             nexts.append(x[order + 1 :])
         past = np.concatenate(pasts)
         following = np.concatenate(nexts)
-        taken = _solve(past, following)
+        taken = solve(past, following)
         errors = following - past @ taken
         whitening = _polynomial(taken[:order])
         slopes = [-lfilter(whitening, [1.0], s[:, :, axis], axis=1) for _, s in modelled]
         slopes = np.concatenate([s[:, order + 1 :] for s in slopes], 1).T
-        return errors, slopes - past @ _solve(past, slopes), taken[:order]
+        return errors, slopes - past @ solve(past, slopes), taken[:order]
 
     def _model_error(self) -> np.ndarray:
         """Covariance (9, 9) of what rows hide, at a place of the search."""
         out = np.zeros(len(NAMES))
+        out[2] = HALF_CYCLE
         if self.records[0].hidden:
             samples = any(r.samples for r in self.records)
             out[[0, 1]] = SAMPLED_LAG if samples else HIDDEN_LAG
@@ -306,7 +329,7 @@ def _polynomial(taken: np.ndarray) -> np.ndarray:
     return out
 
 
-def _solve(columns: np.ndarray, target: np.ndarray) -> np.ndarray:
+def solve(columns: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Least squares by normal equations of scaled columns."""
     scale = np.sqrt((columns * columns).sum(0)) + 1e-30
     scaled = columns / scale

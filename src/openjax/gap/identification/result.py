@@ -1,0 +1,197 @@
+"""What flights say of a vehicle: numbers beside the simulator's, and responses."""
+
+from dataclasses import asdict, dataclass, field
+
+import numpy as np
+
+from openjax.flights.flight import Case
+from openjax.gap.identification.estimates import EffectEstimates, of_fit
+from openjax.gap.identification.forces import identify_forces, trims
+from openjax.gap.identification.records import Record, records_of
+from openjax.gap.identification.responses import Pair, responses
+from openjax.gap.identification.torques import NAMES, SEARCHED, TorqueFit, identify_torques
+
+REACH = 1.645  # standard deviations of a 90 % interval
+TALKED_OF = 5.0  # Hz: where rate loops of such vehicles work
+ALIKE = (0.8, 1.25)  # ratios of gains that nobody would feel
+ALIKE_PHASE = 10.0  # degrees, the same
+CLOCK = 0.010  # s: rows off by more are worth a sentence
+POSITIVE = ("spin_up", "spin_down", "roll_gain", "pitch_gain", "yaw_gain")
+UNITS = {
+    **dict.fromkeys(("spin_up", "spin_down", "delay"), "s"),
+    **dict.fromkeys(("damping", "yaw_damping"), "1/s"),
+    **dict.fromkeys(("drag_xy", "drag_z"), "N s/m"),
+    "sag": "1/V",
+}
+EFFECTS_OF = {
+    **dict.fromkeys(("spin_up", "spin_down", "delay"), "motor_lag"),
+    **dict.fromkeys(("inertia_roll", "inertia_pitch"), "inertia"),
+    **dict.fromkeys(("drag_xy", "drag_z"), "rotor_drag"),
+    **dict.fromkeys(("roll_trim", "pitch_trim", "yaw_trim"), "motor_imbalance"),
+    "yaw_ratio": "yaw_torque",
+    "thrust_level": "thrust_scale",
+    "thrust_slope": "thrust_curve",
+    "sag": "battery_sag",
+}
+"""The effect in whose share of the gap a number has its part."""
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A number with its 90 % interval, beside the nominal simulator's. `effect`: whose share of the
+    gap it has a part in; `at_bound`: the search ended where nothing is looked for beyond.
+    """
+
+    value: float
+    interval90: tuple[float, float]
+    simulator: float
+    unit: str = "1"
+    effect: str = ""
+    at_bound: bool = False
+
+    @property
+    def differs(self) -> bool:
+        """Whether the interval leaves the simulator's value out."""
+        return not self.interval90[0] <= self.simulator <= self.interval90[1]
+
+
+@dataclass(frozen=True, eq=False)
+class Identification:
+    """`quantities` {name: quantity}, `responses` {axis: measured and simulated}, `remarks`: what to
+    think of when reading them; `estimates` are for the diagnosis.
+    """
+
+    quantities: dict[str, Quantity]
+    responses: dict[str, Pair]
+    remarks: tuple[str, ...]
+    estimates: EffectEstimates
+    trusted: bool = True
+    rows: dict = field(default_factory=dict)
+
+    def to_dict(self, shares: dict[str, float] | None = None) -> dict:
+        """As it stands in `report.json`; `shares` of the gap {effect: share}."""
+        shares = shares or {}
+        quantities = {
+            name: asdict(q) | {"differs": q.differs, "share_of_gap": shares.get(q.effect)}
+            for name, q in self.quantities.items()
+        }
+        return {
+            "sentence": self.sentence(),
+            "trusted": self.trusted,
+            "remarks": list(self.remarks),
+            "quantities": quantities,
+            "responses": {axis: asdict(pair) for axis, pair in self.responses.items()},
+        }
+
+    def sentence(self) -> str:
+        """What the vehicle does, in one sentence."""
+        if not self.trusted:
+            return f"How torques answer can't be told from these logs: {self.remarks[0]}."
+        ratio, later = self.at(TALKED_OF)
+        lag = self.quantities["spin_up"]
+        if ALIKE[0] < ratio < ALIKE[1] and abs(later) < ALIKE_PHASE:
+            return (
+                f"At {TALKED_OF:g} Hz this vehicle turns as the simulator does: gain × {ratio:.2f},"
+                f" phase {later:+.0f}°."
+            )
+        text = (
+            f"At {TALKED_OF:g} Hz this vehicle turns with {ratio:.2f} of the simulator's "
+            f"acceleration, {abs(later):.0f}° {'later' if later < 0.0 else 'earlier'}"
+        )
+        if lag.differs:
+            low, high = (1e3 * v for v in lag.interval90)
+            text += (
+                f": its motors take {1e3 * lag.value:.0f} ms [{low:.0f}, {high:.0f}] to speed up, "
+                f"the simulator's {1e3 * lag.simulator:.0f} ms"
+            )
+        return text + "."
+
+    def at(self, frequency: float) -> tuple[float, float]:
+        """Gain as a share of the simulator's, and phase beyond it in degrees: means of roll and
+        pitch.
+        """
+        pairs = [self.responses[axis] for axis in ("roll", "pitch")]
+        points = [(p.measured.at(frequency), p.simulated.at(frequency)) for p in pairs]
+        ratio = np.mean([m[0] / s[0] for m, s in points])
+        later = np.mean([(m[1] - s[1] + 180.0) % 360.0 - 180.0 for m, s in points])
+        return float(ratio), float(later)
+
+
+def identify(case: Case, one_clock: bool = True) -> Identification | None:
+    """What the flights of a case say of the vehicle; None where none has motors and body rates.
+    Without `one_clock` streams were found to be apart by times that wander: what is said of torques
+    then isn't trusted.
+    """
+    records = records_of(case)
+    if not records:
+        return None
+    fit = identify_torques(records)
+    return Identification(
+        _quantities(records, fit),
+        responses(records, fit),
+        _remarks(records, fit, one_clock),
+        of_fit(fit, records),
+        trusted=one_clock and not any(r.hidden and r.samples for r in records),
+    )
+
+
+def _quantities(records: list[Record], fit: TorqueFit) -> dict[str, Quantity]:
+    vehicle = records[0].vehicle
+    up = float(vehicle.motor_time_constant)
+    usual = dict.fromkeys(NAMES, 0.0) | {
+        "spin_up": up,
+        "spin_down": up * float(vehicle.motor_slowdown_ratio),
+    }
+    deviation = np.sqrt(np.diag(fit.covariance))
+    numbers = dict(zip(NAMES, zip(fit.value, deviation, strict=True), strict=True))
+    found = {
+        "inertia_roll": _inverse(*numbers.pop("roll_gain")),
+        "inertia_pitch": _inverse(*numbers.pop("pitch_gain")),
+        "yaw_ratio": numbers.pop("yaw_gain"),
+    }
+    numbers.pop("propellers")
+    numbers |= found | identify_forces(records, np.maximum(fit.value[:3], [1e-3, 1e-3, 0.0]))
+    usual |= dict.fromkeys((*found, "thrust_level", "thrust_slope"), 1.0)
+    # Trims hold against what else acts too: they belong to no simulator's number but zero.
+    numbers |= trims(records)
+    return {
+        name: _quantity(name, float(v), float(e), usual.get(name, 0.0))
+        for name, (v, e) in numbers.items()
+    }
+
+
+def _inverse(value: float, deviation: float) -> tuple[float, float]:
+    return 1.0 / value, deviation / value**2
+
+
+def _quantity(name: str, value: float, deviation: float, simulator: float) -> Quantity:
+    if name in POSITIVE or name.startswith("inertia") or name == "yaw_ratio":
+        reach = float(np.exp(REACH * deviation / value))
+        interval = (value / reach, value * reach)
+    else:
+        interval = (value - REACH * deviation, value + REACH * deviation)
+    if name == "delay":
+        value = max(value, -1.0)
+    bounds = SEARCHED[0] if name.startswith("spin") else SEARCHED[1]
+    searched = name.startswith(("spin", "inertia")) or name == "yaw_ratio"
+    tried = 1.0 / value if name.startswith("inertia") else value
+    ends = searched and bool(np.isclose(bounds, tried, rtol=0.02).any())
+    effect = EFFECTS_OF.get(name, "")
+    return Quantity(value, interval, simulator, UNITS.get(name, "1"), effect, ends)
+
+
+def _remarks(records: list[Record], fit: TorqueFit, one_clock: bool) -> tuple[str, ...]:
+    found = []
+    if not one_clock:
+        found.append("the streams of motors and sensors are apart by times that wander")
+    if any(r.hidden and r.samples for r in records):
+        found.append(
+            "a row's motors are one sample of a loop that runs several times within it; log their "
+            "means at 100 Hz, or every sample at 500 Hz"
+        )
+    clock = fit.clock
+    error = float(np.sqrt(fit.covariance[2, 2]))
+    if abs(clock) > CLOCK + 2.0 * error:
+        when = "later" if clock > 0.0 else "earlier"
+        found.append(f"motors answer {1e3 * abs(clock):.0f} ms {when} than logged")
+    return tuple(found)
