@@ -4,9 +4,13 @@ import numpy as np
 import pytest
 
 from experiments.diagnosis.rate_flights import Truth, fly, rows_of, vehicle_of
+from openjax.gap.identification.corrections import corrections
 from openjax.gap.identification.estimates import of_fit
+from openjax.gap.identification.quantities import Identification, quantities_of
 from openjax.gap.identification.records import Record
+from openjax.gap.identification.responses import responses
 from openjax.gap.identification.torques import NAMES, identify_torques
+from openjax.gap.report.response import response_of
 from openjax.vehicle import load_vehicle
 
 TRUTHS = {
@@ -58,3 +62,24 @@ def test_motors_logged_late_are_a_clock(records):
     fit = identify_torques([late])
     assert abs(fit.clock + rows * record.dt) < 0.005
     assert abs(fit.value[0] - 0.025) < 0.006
+
+
+def test_the_first_sentence_and_the_training_know_slow_motors(records):
+    record = records["slow motors"]
+    fit = identify_torques([record])
+    found = Identification(
+        quantities_of([record], fit), responses([record], fit), (), of_fit(fit, [record])
+    )
+    values, intervals = corrections(found, named=())
+    assert set(values) == {"motor_lag"}
+    low, high = intervals["motor_lag"]["extra_up"]
+    assert low < 0.05 < high
+    assert "later: its motors take" in found.sentence()
+    # A lag of 75 instead of 25 ms and 4 ms of delay, at 5 Hz.
+    ratio = (1 + 2j * np.pi * 5.0 * 0.025) / (1 + 2j * np.pi * 5.0 * 0.075)
+    gain, later = found.at(5.0)
+    assert gain == pytest.approx(abs(ratio), rel=0.15)
+    assert later == pytest.approx(np.rad2deg(np.angle(ratio)) - 360.0 * 5.0 * 0.004, abs=8.0)
+    page = response_of(found)
+    assert page["picture"].startswith("<svg")
+    assert found.to_dict({"motor_lag": 0.5})["quantities"]["spin_up"]["share_of_gap"] == 0.5

@@ -8,6 +8,7 @@ import numpy as np
 
 from openjax.flights.flight import Case
 from openjax.gap.evidence import Evidence, gather
+from openjax.gap.identification.quantities import identify
 from openjax.gap.intervals import estimates
 from openjax.gap.model.bounds import BOUND
 from openjax.gap.model.library import CARDS, PLACE, library, path_of
@@ -33,7 +34,12 @@ def diagnose_case(
     evidence = gather(case, library(without), progress, baseline)
     if progress:
         progress("trying every effect that the flights can show")
-    return replace(conclude(evidence), seconds=time.perf_counter() - begin)
+    report = conclude(evidence)
+    if progress:
+        progress("identifying what the vehicle does")
+    identification = identify(case, evidence.sensors.one_clock)
+    seconds = time.perf_counter() - begin
+    return replace(report, identification=identification, seconds=seconds)
 
 
 def conclude(evidence: Evidence) -> Report:

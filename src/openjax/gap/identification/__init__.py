@@ -5,8 +5,8 @@ thrust, and the numbers of a model of them, from flights in closed loop.
 import importlib
 
 _ELSEWHERE = {
-    "Identification": "openjax.gap.identification.result",
-    "identify": "openjax.gap.identification.result",
+    "Identification": "openjax.gap.identification.quantities",
+    "identify": "openjax.gap.identification.quantities",
     "effect_estimates": "openjax.gap.identification.estimates",
 }
 

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from openjax.gap.identification.result import REACH, Identification
+from openjax.gap.identification.quantities import REACH, Identification
+from openjax.vehicle.effects import EFFECTS
 
 CLEAR = 3.0  # standard deviations from the simulator's value
 MATTERS = {"motor_lag": 0.006, "inertia": 0.15, "yaw_torque": 0.2}
@@ -33,6 +34,8 @@ def corrections(found: Identification, named) -> tuple[dict, dict]:
             reach = REACH * float(deviation[i])
             low = value - reach if effect == "motor_lag" else value * np.exp(-reach / value)
             high = value + reach if effect == "motor_lag" else value * np.exp(reach / value)
-            values.setdefault(effect, {})[parameter] = value
-            intervals.setdefault(effect, {})[parameter] = (float(low), float(high))
+            least, most = EFFECTS[effect].parameters[parameter].limits()
+            ends = (float(np.clip(end, least, most)) for end in (value, low, high))
+            values.setdefault(effect, {})[parameter] = next(ends)
+            intervals.setdefault(effect, {})[parameter] = tuple(ends)
     return values, intervals

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
+from openjax.gap.identification.corrections import corrections
+from openjax.gap.identification.quantities import Identification
 from openjax.gap.model.library import CARDS
 from openjax.gap.shares import Gap, Split
 from openjax.gap.where import Place, in_words
@@ -76,6 +78,7 @@ class Report:
     nuisances: dict[str, str] = field(default_factory=dict)
     residual: dict[str, float] = field(default_factory=dict)
     reference: str = ""  # what the reference flights say of the vehicle; none was given
+    identification: Identification | None = None  # what the vehicle does; None: no motors logged
     seconds: float = 0.0
     plots: dict = field(default_factory=dict, repr=False)
 
@@ -113,8 +116,11 @@ class Report:
         found = {
             f.name: getattr(self, f.name)
             for f in fields(self)
-            if f.name not in ("case", "plots", "seconds")
+            if f.name not in ("case", "plots", "seconds", "identification")
         }
+        if self.identification is not None:
+            of_gap = {e: share.value for e, share in self.shares.effects.items()}
+            found["identification"] = self.identification.to_dict(of_gap)
         return _plain(found | {"shares": shares, "parameters": estimates})
 
     def class_of(self, effect: str) -> str:
@@ -142,8 +148,10 @@ class Report:
     def in_words(self) -> list[str]:
         """The shares, then what they mean, in a few plain sentences."""
         verdict = self.verdict_in_words()
+        does = self.identification
         lines = [
             *(f"Left out: {text}." for text in self.left_out),
+            *([does.sentence()] if does is not None and does.trusted else []),
             self.shares_in_words() if self.effects or self.sensors else "",
             verdict if not self.parameters else "",
             *(f"Sensors: {text}." for text in self.sensors),
@@ -197,6 +205,10 @@ def to_fly(report: Report) -> tuple[dict, dict]:
     intervals = {
         e: {p: v.interval90 for p, v in found.items()} for e, found in report.parameters.items()
     }
+    if report.identification is not None:
+        better, narrower = corrections(report.identification, report.named)
+        values |= {e: values.get(e, {}) | found for e, found in better.items()}
+        intervals |= {e: intervals.get(e, {}) | found for e, found in narrower.items()}
     # What wasn't fitted keeps the value at which it does nothing.
     values = {e: EFFECTS[e].none() | found for e, found in values.items()}
     evidence = report.plots.get("evidence")

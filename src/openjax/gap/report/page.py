@@ -5,6 +5,7 @@ from pathlib import Path
 
 from openjax.gap.report import VERDICTS, Report
 from openjax.gap.report.figures import figures
+from openjax.gap.report.response import response_of
 from openjax.show.pages import filled
 from openjax.vehicle.effects import EFFECTS
 
@@ -18,6 +19,7 @@ def page_of(report: Report) -> str:
         "page.html.jinja",
         Path(__file__).parent,
         report=report,
+        does=response_of(report.identification),
         facts=facts(report),
         sentence=sentence(report),
         shares=shares(report),

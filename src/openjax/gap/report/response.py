@@ -3,8 +3,8 @@
 import numpy as np
 from matplotlib import rc_context
 
-from openjax.gap.identification.result import Identification
-from openjax.show.pages import AFTER, BEFORE, STYLE, add_legend, as_svg
+from openjax.gap.identification.quantities import Identification
+from openjax.show.pages import AFTER, BEFORE, STYLE, as_svg
 
 TITLE = "What the vehicle does"
 WORDS = {
@@ -69,8 +69,11 @@ def _picture(found: Identification) -> str:
                     axes.plot(response.frequency, middle, color=color, label=name)
                     axes.fill_between(response.frequency, low, high, color=color, alpha=0.25)
             unit = "m/s² per unit" if axis == "thrust" else "rad/s² per unit"
-            grid[0, column].set(title=axis, ylabel=unit, xscale="log", ylim=(0.0, None))
-            grid[1, column].set(xlabel="frequency, Hz", ylabel="phase, °")
+            grid[0, column].set(title=axis, xscale="log", ylim=(0.0, None))
+            grid[1, column].set(xlabel="frequency, Hz")
+            if axis in ("roll", "thrust"):
+                grid[0, column].set(ylabel=unit)
+                grid[1, column].set(ylabel="phase, °")
             grid[1, column].set_xticks([1, 2, 5, 10], ["1", "2", "5", "10"])
-        add_legend(grid[0, 0])
+        figure.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside upper left", ncols=2)
         return as_svg(figure, TITLE)

@@ -127,7 +127,7 @@ def identify(case: Case, one_clock: bool = True) -> Identification | None:
         return None
     fit = identify_torques(records)
     return Identification(
-        _quantities(records, fit),
+        quantities_of(records, fit),
         responses(records, fit),
         _remarks(records, fit, one_clock),
         of_fit(fit, records),
@@ -135,7 +135,7 @@ def identify(case: Case, one_clock: bool = True) -> Identification | None:
     )
 
 
-def _quantities(records: list[Record], fit: TorqueFit) -> dict[str, Quantity]:
+def quantities_of(records: list[Record], fit: TorqueFit) -> dict[str, Quantity]:
     vehicle = records[0].vehicle
     up = float(vehicle.motor_time_constant)
     usual = dict.fromkeys(NAMES, 0.0) | {
