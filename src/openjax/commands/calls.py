@@ -87,10 +87,9 @@ def evaluate(
 
     Args:
       policy: a loaded policy, what `openjax.load_policy` takes, or a pure function from the
-      `Observation` of one world
-        to actions (N, 4) in -1..1, which flies the nominal game.
-      scenario: a layout's name, a TOML file with an own one, "uniform", or "all" (see `openjax
-      evaluate --help`).
+        `Observation` of one world to actions (N, 4) in -1..1, which flies the nominal game.
+      scenario: a layout's name, a TOML file with an own one, "uniform", or "all"; see
+        `openjax evaluate --help`.
       episodes: per layout.
       seed: draws the start attitudes.
       vehicle, effects: files to fly with, vehicle.toml and effects.toml.
