@@ -60,16 +60,19 @@ def diagnose(job: tuple) -> dict:
     report = None
     error = None
     trace = None
+    broken = []
     try:
         from openjax.errors import UserError
         from openjax.flights.case import load_case
         from openjax.gap.diagnosis import diagnose_case
+        from openjax.gap.report.rules import broken_rules
 
         try:
             if healthy:
                 options["reference"] = [load_case(healthy_beside(folder.parent) / folder.name)]
             made = diagnose_case(load_case(folder), **options)
             report = made.to_dict()
+            broken = broken_rules(made)
         except UserError as refusal:
             error = str(refusal).replace(f"{folder.parent}/", "")[
                 :500
@@ -85,6 +88,7 @@ def diagnose(job: tuple) -> dict:
     line |= {"right_names": sorted(right)}
     line |= {"top": truth.top_probability(right, (report or {}).get("probabilities", {}))}
     line |= {"severity": answer.get("severity"), "magnitudes": parameters(answer, report)}
+    line |= {"broken_rules": broken}
     line |= {"seconds": seconds, "first": _done == 1, "error": error, "traceback": trace}
     if kept and report:
         decisions.keep(made, line, Path(kept))

@@ -24,6 +24,7 @@ FIGURES = {
     "real": "real: first name as expected",
     "coverage": "90 % intervals that hold the truth",
     "shares": "shares add up, in bounds, intervals ordered",
+    "rules": "reports without a contradiction",
     "calibration": "calibration error of the top class",
     "seconds": "seconds a case after the first, median",
     "seconds_first": "seconds of a process' first case, median",
@@ -83,6 +84,10 @@ def figures(lines: list[dict]) -> dict[str, tuple[int, int] | float]:
         "real": count(real, lambda r: r["right"]),
         "coverage": count(
             [c for r in named for m in r.get("magnitudes", ()) for c in m["covered"]], bool
+        ),
+        "rules": count(
+            [r for r in lines if "broken_rules" in r and "shares" in r],
+            lambda r: not r["broken_rules"],
         ),
         "shares": count(
             [r for r in lines if "shares" in r], lambda r: shares_in_bounds(r["shares"])

@@ -4,10 +4,14 @@ case.
 
 import dataclasses
 import inspect
+import shlex
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from openjax.gap.report import Estimate, Report
+from openjax.gap.report.figures import Course, rms
 from openjax.gap.report.page import next_steps, page_of, sentence, shares
 from openjax.gap.shares import Gap, Share, Split
 
@@ -64,6 +68,48 @@ def test_next_steps_depend_on_the_case():
     assert "It follows the height" in told["unknown"]
     assert "wouldn't show y, z. Next flight: slow passes" in told["not testable"]
     assert len(set(told.values())) == len(CASES)
+
+
+def test_the_flight_that_tells_causes_apart_comes_first_then_adapting_then_training():
+    case = report("effect", ["mass", "x"], ["mass", "x"], equivalent={"mass": ["thrust_scale"]})
+    whys, commands = zip(*next_steps(case), strict=True)
+    assert "can't tell mass from thrust_scale. Next flight: weigh the vehicle" in whys[0]
+    assert [c.split()[1] for c in commands[1:3]] == ["adapt", "train"] and not commands[0]
+
+
+@pytest.mark.parametrize("verdict", ["none", "unknown", "effect"])
+@pytest.mark.parametrize("place", ["flights/tuesday", "my flights/a b"])
+def test_commands_find_their_files_from_the_folder_of_the_page(verdict, place, tmp_path):
+    """Capitals stand for folders that only the reader knows."""
+    case = tmp_path / place
+    page = tmp_path / "diagnosis" / case.name
+    case.mkdir(parents=True)
+    page.mkdir(parents=True)
+    (page / "effects.toml").write_text("")
+    names = {"none": [], "unknown": ["unknown"], "effect": ["x"]}[verdict]
+    evidence = SimpleNamespace(case=SimpleNamespace(path=case))
+    made = report(verdict, names, [n for n in names if n != "unknown"])
+    made = dataclasses.replace(made, plots={"evidence": evidence})
+    commands = [shlex.split(command) for _, command in next_steps(made, page) if command]
+    assert commands and all(command[0] == "openjax" for command in commands)
+    named = {w for c in commands for w in c[2:] if "/" in w or w.endswith(".toml")}
+    assert named and all((page / word).exists() for word in named)
+
+
+def test_a_headline_says_what_its_chart_shows():
+    small = report("effect", ["rotor_x"], ["rotor_x"])
+    rest = {"effects": {"rotor_x": Share(0.03, (0.02, 0.05))}, "sensors": Share(0.04, (0.0, 0.1))}
+    parts = dataclasses.replace(small.shares, **rest, unexplained=Share(0.93, (0.9, 0.95)))
+    words = sentence(dataclasses.replace(small, shares=parts))
+    assert "is 93 % unexplained; named is rotor x (3 %)" in words and "mostly" not in words
+
+
+def test_a_constant_error_counts_whole():
+    time = 0.01 * np.arange(300)
+    course = Course("a", 0.01, time, 2.0 * time, 0.0 * time + 1e-3, "roll rate", "rad/s", True)
+    assert rms(course.errors(0.25)[0]) == pytest.approx(0.5)
+    late = Course("a", 0.01, time, 1.0 + 0 * time, 0.1 + 0 * time, "motors all", "", False)
+    assert late.ratio == pytest.approx(10.0) and rms(late.errors(0.25)[1]) == pytest.approx(0.1)
 
 
 def test_a_normal_flight_is_not_charted_as_a_gap():

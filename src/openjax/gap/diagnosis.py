@@ -1,7 +1,8 @@
 """The whole diagnosis of one case: evidence, selection, shares, words, report."""
 
 import time
-from collections.abc import Iterable, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,9 +13,10 @@ from openjax.gap.identification.quantities import identify
 from openjax.gap.intervals import estimates
 from openjax.gap.model.bounds import BOUND
 from openjax.gap.model.library import CARDS, PLACE, library, path_of
-from openjax.gap.probabilities import probabilities
+from openjax.gap.probabilities import agreeing, probabilities
 from openjax.gap.reference import differs, joined, read_reference
 from openjax.gap.report import Report
+from openjax.gap.report.rules import LEAST_SHARE
 from openjax.gap.residual import Check, check_residual
 from openjax.gap.selection import DETECTABLE, Selection, select
 from openjax.gap.shares import Split, split
@@ -53,10 +55,33 @@ def conclude(evidence: Evidence) -> Report:
         if differs(channel, e, evidence.baseline)
     }
     check = check_residual(evidence, selection.fit)
-    parts = split(evidence, selection, check.predicted, [e for e, p in acting.items() if p >= 0.5])
+    likely = [e for e, p in acting.items() if p >= 0.5]
+    parts = worth_naming(lambda named: split(evidence, selection, check.predicted, named), likely)
     present = {e: acting[e] for e in parts.effects}
-    chances = probabilities(present, parts.largest, check.probability, selection.weights)
+    unnamed = set(likely) - set(present)
+    weights = Counter()
+    for effects, weight in selection.weights.items():
+        weights[effects - unnamed] += weight
+    chances = probabilities(present, parts.largest, check.probability, weights)
+    sure = max((share.interval90[0] for share in parts.effects.values()), default=0.0)
+    chances = agreeing(chances, words(check, parts) or ("none",), sure)
     return _report(evidence, selection, check, parts, chances)
+
+
+def worth_naming(shares_of: Callable[[list[str]], Split], named: list[str]) -> Split:
+    """The shares of those of the effects `named` that have one, and that make held-out predictions
+    no worse; `shares_of` splits the gap.
+    """
+    parts = shares_of(named)
+    while named:
+        gone = [e for e in named if parts.effects[e].interval90[1] < LEAST_SHARE]
+        if not gone and parts.gap.reduction < 0.0:
+            gone = [min(named, key=lambda e: parts.effects[e].value)]
+        if not gone:
+            break
+        named = [e for e in named if e not in gone]
+        parts = shares_of(named)
+    return parts
 
 
 def words(check: Check, parts: Split) -> tuple[str, ...]:
@@ -80,15 +105,16 @@ def _report(
     evidence: Evidence, selection: Selection, check: Check, parts: Split, chances
 ) -> Report:
     effects = words(check, parts)
-    missing = not_testable(evidence)
+    missing = [e for e in not_testable(evidence) if e not in effects]
     nothing = "not_testable" if len(missing) >= len(evidence.library.effects) // 2 else "none"
     named = [e for e in effects if e != "unknown"]
     equivalent = {e: selection.equivalent[e] for e in named if e in selection.equivalent}
     ranked = sorted(chances, key=lambda e: -chances[e])
-    second = next((e for e in ranked if e not in (effects or ("none",))), "")
-    splitter = next(
-        (o for e in named for o in equivalent.get(e, ())), missing[0] if missing else second
-    )
+    alike = {o for others in equivalent.values() for o in others}
+    second = next((e for e in ranked if e not in (effects or ("none",)) and e not in alike), "")
+    others = [o for e in named for o in equivalent.get(e, ())]
+    wanted = (e for e in (*others, *missing, second) if _can_be_flown(evidence, e))
+    splitter = next(wanted, "")
     return Report(
         case=evidence.case.name,
         verdict=nothing if not effects else "unknown" if effects[0] == "unknown" else "effect",
@@ -139,6 +165,16 @@ def _reference_in_words(evidence: Evidence, named) -> str:
         "makes: log vbat, and thrust can be compared."
     )
     return f"{told} {battery}" if pwm and silent else told
+
+
+def _can_be_flown(evidence: Evidence, effect: str) -> bool:
+    """Whether a next flight for an effect is within reach of who logged these: nobody is sent for a
+    second vehicle.
+    """
+    if effect not in CARDS:
+        return False
+    needs_two = CARDS[effect].coordinate == "height below a neighbour"
+    return not needs_two or any(len(t.neighbours) for t in evidence.tracks)
 
 
 def _nuisances(evidence: Evidence, selection: Selection) -> dict[str, str]:

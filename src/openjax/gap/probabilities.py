@@ -6,6 +6,7 @@ sets chosen otherwise, to nothing and to the unknown.
 """
 
 from openjax.gap.decision import DECISION
+from openjax.gap.report.rules import NOTHING, SURE_SHARE
 from openjax.vehicle.effects import EFFECTS
 
 
@@ -17,10 +18,12 @@ def probabilities(present, largest, unknown: float, weights) -> dict[str, float]
     {effects: how often that set was chosen}.
     """
     chance = dict.fromkeys((*EFFECTS, "none", "unknown"), 0.0)
-    sure = (1.0 - unknown) if present else 1.0
+    rest = largest.get("unexplained", 0.0) if present else 1.0
     for effect, p in present.items():
-        chance[effect] = p * sure * largest.get(effect, 0.0)
-    chance["unknown"] = unknown * (largest.get("unexplained", 0.0) if present else 1.0)
+        share = largest.get(effect, 0.0)
+        # What isn't explained may be real and not the largest part: then an effect still is.
+        chance[effect] = p * share * (unknown + (1.0 - unknown) / max(1.0 - rest, share, 1e-12))
+    chance["unknown"] = unknown * rest
     left = 1.0 - sum(chance.values())
     shared = {"none": 1e-3, **dict.fromkeys(present, 1e-3)}
     for effects, w in weights.items():
@@ -31,6 +34,23 @@ def probabilities(present, largest, unknown: float, weights) -> dict[str, float]
     for name, weight in shared.items():
         chance[name] += left * weight / total
     return tempered(chance, DECISION.temperature)
+
+
+def agreeing(chance: dict[str, float], said, sure: float) -> dict[str, float]:
+    """Probabilities that agree with the words `said`. Where draws of blocks choose nothing, though
+    a share's interval begins at `sure`, they say that an effect is weak in some flights, not that
+    none acts. What isn't named is at most as likely as what is.
+    """
+    chance = dict(chance)
+    named = max(said, key=lambda name: chance[name])
+    if sure > SURE_SHARE and chance["none"] > NOTHING:
+        chance[named] += chance["none"] - NOTHING
+        chance["none"] = NOTHING
+    for rival in sorted(set(chance) - set(said), key=lambda name: -chance[name]):
+        if chance[rival] <= chance[named]:
+            break
+        chance[rival] = chance[named] = 0.5 * (chance[rival] + chance[named])
+    return chance
 
 
 def tempered(chance: dict[str, float], temperature: float) -> dict[str, float]:

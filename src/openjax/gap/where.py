@@ -10,6 +10,7 @@ from openjax.flights.regimes import REGIMES, regimes_of
 from openjax.flights.track import smooth
 from openjax.gap.evidence import Evidence
 from openjax.gap.model.hypotheses import SetFit
+from openjax.gap.model.library import ABSENT, places
 from openjax.gap.model.replay import SKIP
 from openjax.gap.residual import disturbances, residuals_of
 
@@ -46,11 +47,14 @@ def locate(evidence: Evidence, fit: SetFit, named=()) -> list[Place]:
     """The table, largest share first. `fit` is the physics part of the verdict, `named` all named
     effects.
     """
+    names = [e for e in named if e in fit.effects]
     masks = [{r: m[int(SKIP / t.dt) :] for r, m in regimes_of(t).items()} for t in evidence.tracks]
     inside = {r: np.concatenate([m[r] for m in masks]) for r in REGIMES}
     seconds = {r: int(m.sum()) * evidence.tracks[0].dt for r, m in inside.items()}
     places = []
-    for channel, powers in (_motion_powers(evidence, fit) | _other_powers(evidence, named)).items():
+    for channel, powers in (
+        _motion_powers(evidence, fit, names) | _other_powers(evidence, named)
+    ).items():
         floor = powers[2].mean() + 1e-18
         for regime in (r for r in REGIMES if seconds[r] >= LEAST_TIME):
             b, a = (float(p[inside[regime]].mean() / floor) for p in powers[:2])
@@ -60,12 +64,24 @@ def locate(evidence: Evidence, fit: SetFit, named=()) -> list[Place]:
     return sorted((replace(p, share=p.share / total) for p in places), key=lambda p: -p.share)
 
 
-def _motion_powers(evidence: Evidence, fit: SetFit) -> dict[str, list[np.ndarray]]:
+def before_and_after(fit: SetFit, named) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Residuals (T, 9) of each track without the `named` effects of a fit, all else as with them,
+    and with them: the same before as the gap's.
+    """
+    after = residuals_of(fit)
+    without = fit.theta.copy()
+    own = places(named)
+    without[own] = ABSENT[own]
+    moved = fit.replay.predict(np.stack([fit.theta, without]))
+    return [a + m[0] - m[1] for a, m in zip(after, moved, strict=True)], after
+
+
+def _motion_powers(evidence: Evidence, fit: SetFit, named) -> dict[str, list[np.ndarray]]:
     """{channel: squared smoothed disturbances (rows,) before, after and at the floor}."""
     both = []
-    for of in (evidence.motion.nothing, fit):
+    for residuals in before_and_after(fit, named):
         rows = []
-        for track, residual in zip(evidence.tracks, residuals_of(of), strict=True):
+        for track, residual in zip(evidence.tracks, residuals, strict=True):
             rest = disturbances(track, residual)
             force = rest[:, 3:6] if evidence.replay.usable[3] else rest[:, 6:9]
             calm = smooth(np.concatenate([force, rest[:, :3]], 1), CALM, track.dt)

@@ -239,4 +239,4 @@ def write_report(report: Report, folder: Path, pictures: bool = True) -> None:
     if pictures:
         from openjax.gap.report.page import page_of
 
-        (folder / "report.html").write_text(page_of(report), encoding="utf-8")
+        (folder / "report.html").write_text(page_of(report, folder), encoding="utf-8")

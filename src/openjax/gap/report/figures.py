@@ -1,6 +1,7 @@
 """Figures of a report."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from matplotlib import rc_context
@@ -10,8 +11,8 @@ from openjax.gap.model.library import CARDS
 from openjax.gap.model.replay import SKIP
 from openjax.gap.model.table import HORIZONS
 from openjax.gap.report import Report
-from openjax.gap.residual import disturbances, residuals_of
-from openjax.gap.where import CALM
+from openjax.gap.residual import disturbances
+from openjax.gap.where import CALM, before_and_after
 from openjax.show.pages import AFTER, BEFORE, GREY, STYLE, add_legend, as_svg, small_figure
 
 HORIZONS_SHOWN = (0.02, 0.05, 0.1, 0.25, 0.5, 1.0)  # s
@@ -30,10 +31,11 @@ def figures(report: Report) -> list[tuple[str, str, str]]:
 
 
 def _residuals(report: Report) -> tuple[list, list]:
-    """Residuals of each track of the nominal simulator, and with the named effects."""
-    return residuals_of(report.plots["evidence"].motion.nothing), residuals_of(
-        report.plots["selection"].fit
-    )
+    """Residuals of each track of the nominal simulator, sensors and clocks as with the named
+    effects, and with those.
+    """
+    fit = report.plots["selection"].fit
+    return before_and_after(fit, [e for e in report.named if e in fit.effects])
 
 
 def _places(report: Report):
@@ -62,23 +64,66 @@ def _places(report: Report):
     )
 
 
-def _worst(report: Report) -> tuple:
-    """(track, its residuals before and after, axis): where the nominal simulator errs most, against
-    what is left.
+@dataclass(frozen=True, eq=False)
+class Course:
+    """What is drawn of one channel of one flight: `before` and `after` (T,), in `unit`; `adds_up`:
+    errors of a prediction are differences of these, else these are the errors.
     """
+
+    flight: str
+    dt: float
+    time: np.ndarray
+    before: np.ndarray
+    after: np.ndarray
+    name: str
+    unit: str
+    adds_up: bool
+
+    def errors(self, seconds: float) -> tuple[np.ndarray, np.ndarray]:
+        """Errors of predictions so far ahead, before and after."""
+        if not self.adds_up:
+            return self.before, self.after
+        step = max(round(seconds / self.dt), 1)
+        return tuple(v[step:] - v[:-step] for v in (self.before, self.after))
+
+    @property
+    def ratio(self) -> float:
+        """By how much the error is larger before."""
+        before, after = (rms(e) for e in self.errors(HORIZONS["velocity"]))
+        return before / max(after, 1e-12)
+
+
+def rms(values: np.ndarray) -> float:
+    """Root of the mean square: a constant error counts whole."""
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def _courses(report: Report) -> Iterator[Course]:
+    """Every channel of every flight."""
     evidence = report.plots["evidence"]
     axes = (*range(3), *range(3, 6)) if evidence.replay.usable[3] else range(3)
-    before, after = _residuals(report)
+    axes = [axis for axis in axes if evidence.replay.usable[axis]]
+    for track, before, after in zip(evidence.tracks, *_residuals(report), strict=True):
+        skip = int(SKIP / track.dt)
+        for axis in axes:
+            both = (before[skip:, axis], after[skip:, axis])
+            yield Course(track.name, track.dt, track.time[skip:], *both, *_axis_name(axis), True)
+    for channel in evidence.channels:
+        without = channel.residuals(())
+        floor = channel.residuals(evidence.library.of(channel.path))
+        for name, series in channel.residuals(report.named).items():
+            scale = max(rms(np.concatenate(floor[name])), 1e-12)
+            for track, before, after in zip(evidence.tracks, without[name], series, strict=True):
+                # of some channels one number is known of a whole flight
+                skip = int(SKIP / track.dt) if len(after) > 1 else 0
+                both = (np.resize(v, len(track))[skip:] / scale for v in (before, after))
+                time = track.time[skip:]
+                yield Course(track.name, track.dt, time, *both, name, "of the noise", False)
 
-    def ratio(number, axis):
-        step = max(round(HORIZONS["velocity"] / evidence.tracks[number].dt), 1)
-        errors = [np.std(r[number][step:, axis] - r[number][:-step, axis]) for r in (before, after)]
-        return errors[0] / errors[1]
 
-    number, axis = max(
-        ((n, a) for n in range(len(before)) for a in axes), key=lambda place: ratio(*place)
-    )
-    return evidence.tracks[number], before[number], after[number], axis
+def _worst(report: Report) -> Course:
+    """Where the nominal simulator errs most, against what is left."""
+    return max(_courses(report), key=lambda course: course.ratio)
 
 
 def _axis_name(axis: int) -> tuple[str, str]:
@@ -90,28 +135,23 @@ def _axis_name(axis: int) -> tuple[str, str]:
 
 def _course(report: Report):
     """Errors of short predictions along the flight where they are largest."""
-    track, before, after, axis = _worst(report)
-    step = max(round(HORIZONS["velocity"] / track.dt), 1)
-    name, unit = _axis_name(axis)
+    course = _worst(report)
+    before, after = course.errors(HORIZONS["velocity"])
     figure, axes = small_figure(2.6)
-    time = track.time[step:] - track.time[0]
-    band = 1.645 * np.std(after[step:, axis] - after[:-step, axis])
+    time = course.time[-len(after) :] - course.time[0]
+    band = 1.645 * rms(after)
     label = "90 % of what is left" if report.parameters else "90 % of all errors"
     axes.axhspan(-band, band, color=GREY, alpha=0.25, linewidth=0, label=label)
-    for residual, colour, label in _lines(report, before, after):
-        error = residual[step:, axis] - residual[:-step, axis]
+    for error, colour, label in _lines(report, before, after):
         axes.plot(time, error, color=colour, linewidth=1.1, label=label)
     axes.set(
         xlabel="time in the flight [s]",
-        ylabel=f"error of {name} [{unit}]",
+        ylabel=f"error of {course.name} [{course.unit}]",
         xlim=(time[0], time[-1]),
     )
     add_legend(axes)
-    return (
-        "One flight",
-        f"{track.name}: error of predictions {HORIZONS['velocity']} s ahead.",
-        figure,
-    )
+    ahead = f" of predictions {HORIZONS['velocity']} s ahead" if course.adds_up else ""
+    return ("One flight", f"{course.flight}: error of {course.name}{ahead}.", figure)
 
 
 def _lines(report: Report, before, after) -> Sequence[tuple]:
@@ -125,24 +165,25 @@ def _lines(report: Report, before, after) -> Sequence[tuple]:
 
 def _horizons(report: Report):
     """How errors grow with the time that is predicted."""
-    track, before, after, axis = _worst(report)
-    name, unit = _axis_name(axis)
-    rows = sorted({max(round(horizon / track.dt), 1) for horizon in HORIZONS_SHOWN})
+    course = _worst(report)
+    if not course.adds_up:
+        return None
+    ahead = sorted({max(round(h / course.dt), 1) * course.dt for h in HORIZONS_SHOWN})
     figure, axes = small_figure(2.6)
-    most = 0.0
-    for residual, colour, label in _lines(report, before, after):
-        errors = [np.std(residual[r:, axis] - residual[:-r, axis]) for r in rows]
-        most = max(most, *errors)
-        axes.semilogx(
-            [r * track.dt for r in rows], errors, "o-", color=colour, markersize=5, label=label
-        )
-    axes.set(xlabel="time ahead [s]", ylabel=f"rms error of {name} [{unit}]", ylim=(0, 1.1 * most))
+    sizes = np.array([[rms(error) for error in course.errors(h)] for h in ahead])
+    for size, colour, label in _lines(report, *sizes.T):
+        axes.semilogx(ahead, size, "o-", color=colour, markersize=5, label=label)
+    axes.set(
+        xlabel="time ahead [s]",
+        ylabel=f"rms error of {course.name} [{course.unit}]",
+        ylim=(0, 1.1 * sizes.max()),
+    )
     axes.set_xticks(HORIZONS_SHOWN, [f"{horizon:g}" for horizon in HORIZONS_SHOWN])
     axes.minorticks_off()
     add_legend(axes)
     return (
         "How far ahead",
-        f"{track.name}: the error grows with the time that is predicted.",
+        f"{course.flight}: the error grows with the time that is predicted.",
         figure,
     )
 

@@ -1,18 +1,24 @@
 """The report as one HTML file, nothing to fetch from elsewhere."""
 
 import datetime
+import os
+import shlex
+from collections.abc import Sequence
 from pathlib import Path
 
+from openjax.gap.model.library import CARDS
 from openjax.gap.report import VERDICTS, Report
 from openjax.gap.report.figures import figures
 from openjax.gap.report.response import response_of
 from openjax.show.pages import filled
 from openjax.vehicle.effects import EFFECTS
 
+MOST = 0.5  # of the gap: what is named isn't most of it below
 
-def page_of(report: Report) -> str:
+
+def page_of(report: Report, folder: Path | None = None) -> str:
     """The whole page as text: the answer and what to type next, figures, values, and folded what is
-    rarely asked.
+    rarely asked. `folder`: where it is written.
     """
     ranked = sorted(report.probabilities.items(), key=lambda item: -item[1])
     return filled(
@@ -23,7 +29,7 @@ def page_of(report: Report) -> str:
         facts=facts(report),
         sentence=sentence(report),
         shares=shares(report),
-        steps=next_steps(report),
+        steps=next_steps(report, folder),
         figures=figures(report),
         meanings={e: EFFECTS[e].description for e in report.parameters if e in EFFECTS},
         ranked=[(name, p) for name, p in ranked[:8] if p > 5e-4],
@@ -48,16 +54,25 @@ def facts(report: Report) -> list[tuple[str, str]]:
 
 
 def sentence(report: Report) -> str:
-    """What was found, in one plain sentence."""
+    """What was found, in one plain sentence that says what the chart of shares shows."""
     named = report.named
     if not named:
         return VERDICTS[report.verdict]
+    found = {e: report.shares.effects[e].value for e in named}
     parts = " and ".join(
-        f"{report.class_of(e).replace('_', ' ')} ({100 * report.shares.effects[e].value:.0f} %)"
-        for e in named
+        f"{report.class_of(e).replace('_', ' ')} ({100 * share:.0f} %)"
+        for e, share in found.items()
     )
-    whole = sum(report.shares.effects[e].value for e in named) > 0.995  # 100 %, as it is shown
-    text = f"What the simulator misses is {'' if whole else 'mostly '}{parts}"
+    whole = sum(found.values())
+    if whole < MOST:
+        rest = {
+            "unexplained": report.shares.unexplained.value,
+            "of sensors and clocks": report.shares.sensors.value,
+        }
+        other = max(rest, key=rest.get)
+        text = f"What the simulator misses is {100 * rest[other]:.0f} % {other}; named is {parts}"
+    else:
+        text = f"What the simulator misses is {'' if whole > 0.995 else 'mostly '}{parts}"
     if report.parameters:
         those = "it" if len(named) == 1 else "them"
         text += f"; with {those}, errors on held-out flights shrink by {100 * report.gap.reduction:.0f} %"
@@ -88,37 +103,50 @@ def shares(report: Report) -> list[dict]:
     return [row(*entry) for entry in rows]
 
 
-def next_steps(report: Report) -> list[tuple[str, str]]:
-    """(why, command or empty) of what to do next; commands are typed in the folder of this page."""
+def next_steps(report: Report, folder: Path | None = None) -> list[tuple[str, str]]:
+    """(why, command or empty) of what to do next: first the flight that tells confounded causes
+    apart, then adapting, then training. Commands are typed in the page's `folder`.
+    """
     steps = []
+    for name, others in report.equivalent.items():
+        told = f"These flights can't tell {name} from {', '.join(others)}. {_fly(report, others)}"
+        steps.append((told, ""))
     if report.parameters:
         names = ", ".join(effect.replace("_", " ") for effect in report.parameters)
         tune = "openjax adapt effects.toml --policy flight"
         train = "openjax train --preset flight --effects effects.toml"
         steps.append((f"Fine-tune shipped weights to a vehicle with {names}:", tune))
         steps.append(("Or train from scratch in the corrected simulator:", train))
-    for name, others in report.equivalent.items():
-        steps.append(
-            (f"These flights can't tell {name} from {', '.join(others)}. {_fly(report)}", "")
-        )
     if report.left_out:
         why = "Mend the logs that were left out, and diagnose again: each says above what is wrong."
         steps.append((why, ""))
+    case = _case_from(report, folder)
     if report.verdict == "none":
         why = "Nothing needs correcting. Keep these flights as the reference for later ones:"
-        steps.append((why, f"openjax diagnose NEW_FLIGHTS --reference {report.case}"))
+        steps.append((why, f"openjax diagnose NEW_FLIGHTS --reference {case}"))
     if "unknown" in report.effects:
         follows = f" {report.rest}" if report.rest else ""
         why = f"Look for what is not on the list of effects.{follows} Did anything change since it flew well?"
-        steps.append((why, f"openjax diagnose {report.case} --reference EARLIER_FLIGHTS"))
+        steps.append((why, f"openjax diagnose {case} --reference EARLIER_FLIGHTS"))
     if report.not_testable and not report.equivalent and report.next_flight:
         missing = ", ".join(effect.replace("_", " ") for effect in report.not_testable)
         steps.append((f"These flights wouldn't show {missing}. {_fly(report)}", ""))
     return steps
 
 
-def _fly(report: Report) -> str:
-    text = report.next_flight.strip().rstrip(".")
+def _case_from(report: Report, folder: Path | None) -> str:
+    """The case's folder as it is typed in the page's folder."""
+    evidence = report.plots.get("evidence")
+    path = None if evidence is None else evidence.case.path
+    if path is None or folder is None:
+        return shlex.quote(report.case)
+    return shlex.quote(os.path.relpath(path.resolve(), folder.resolve()))
+
+
+def _fly(report: Report, others: Sequence[str] = ()) -> str:
+    """The next flight, of the first of `others` that has one."""
+    found = next((CARDS[o].next_flight for o in others if o in CARDS), report.next_flight)
+    text = found.strip().rstrip(".")
     return (
         f"Next flight: {text[:1].lower()}{text[1:]}; then diagnose all of them again."
         if text

@@ -1,0 +1,105 @@
+"""The rules that every report keeps: each is broken by what it forbids alone, and what a diagnosis
+says is brought to keep them.
+"""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from openjax.gap.diagnosis import worth_naming
+from openjax.gap.probabilities import agreeing, probabilities
+from openjax.gap.report import Estimate, Report
+from openjax.gap.report.rules import broken_rules
+from openjax.gap.shares import Gap, Share, Split
+from openjax.vehicle.effects import EFFECTS
+
+GAP = Gap("rms", 4.0, 1.2, 1.0, 0.7, (0.6, 0.8))
+
+
+def split(shares, gap=GAP):
+    found = {e: Share(*share) for e, share in shares.items()}
+    rest = {"sensors": Share(0.1, (0.0, 0.2)), "unexplained": Share(0.0, (0.0, 0.1))}
+    return Split(gap, found, **rest, largest=dict.fromkeys(found, 1.0))
+
+
+GOOD = Report(
+    case="tuesday", verdict="effect", effects=("inertia",), shares=split({"inertia": (0.8, (0.77, 0.82))}),
+    probabilities={"inertia": 0.8, "none": 0.1, "unknown": 0.1}, equivalent={}, where=[], gap=GAP,
+    parameters={"inertia": {"xx": Estimate(0.4, "1", (0.1, 0.7), (0.7, 1.6))}},
+    not_testable=["downwash"], next_flight="", quality=[], runner_up="none (0.10)",
+)  # fmt: skip
+
+
+def inertia(low, value, high):
+    return {"parameters": {"inertia": {"xx": Estimate(value, "1", (low, high), (0.7, 1.6))}}}
+
+
+BROKEN = {
+    "named and not testable": {"not_testable": ["downwash", "inertia"]},
+    "named with a share of 0.000": {"shares": split({"inertia": (0.0, (0.0, 0.0))})},
+    "predictions get worse": {"gap": dataclasses.replace(GAP, reduction=-0.01)},
+    "inertia.xx = 0.33 [-0.31, 0.97] leaves": inertia(-0.31, 0.33, 0.97),
+    "inertia.xx = 0.3 [0, 0.97] leaves": inertia(0.0, 0.3, 0.97),
+    "inertia.xx = 0.9 [0.2, 0.7] leaves": inertia(0.2, 0.9, 0.7),
+    "runner-up unknown (0.50) is likelier": {
+        "probabilities": {"inertia": 0.4, "none": 0.1, "unknown": 0.5},
+        "runner_up": "unknown (0.50)",
+    },
+    "none (0.32) beside a share of at least 0.77": {
+        "probabilities": {"inertia": 0.68, "none": 0.32}
+    },
+}
+
+
+def test_a_good_report_breaks_no_rule():
+    assert broken_rules(GOOD) == []
+    nothing = {"effects": (), "parameters": {}, "verdict": "none", "shares": split({})}
+    said = {"probabilities": {"none": 0.9, "unknown": 0.1}, "runner_up": "unknown (0.10)"}
+    assert broken_rules(dataclasses.replace(GOOD, **nothing, **said)) == []
+
+
+@pytest.mark.parametrize("words", BROKEN)
+def test_each_rule_is_told_alone(words):
+    (broken,) = broken_rules(dataclasses.replace(GOOD, **BROKEN[words]))
+    assert broken.startswith("tuesday: ") and words in broken
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_probabilities_agree_with_what_is_named(seed):
+    """Whatever draws of blocks chose, and however sure the unknown is."""
+    rng = np.random.default_rng(seed)
+    names = [str(e) for e in rng.permutation(list(EFFECTS))]
+    present = {e: float(p) for e, p in zip(names[:2], rng.uniform(0.5, 1.0, 2), strict=True)}
+    first, second, rest = (float(v) for v in rng.dirichlet([2.0, 1.0, 0.5]))
+    largest = {names[0]: first, names[1]: second, "unexplained": rest}
+    alone, pair, nothing, other = (float(v) for v in rng.dirichlet(np.ones(4)))
+    weights = {frozenset(names[:1]): alone, frozenset(names[:2]): pair}
+    weights |= {frozenset(): nothing, frozenset(names[3:4]): other}
+    chance = probabilities(present, largest, float(rng.uniform()), weights)
+    assert sum(chance.values()) == pytest.approx(1.0) and min(chance.values()) >= 0.0
+    sure = float(rng.uniform())
+    agreed = agreeing(chance, names[:2], sure)
+    assert sum(agreed.values()) == pytest.approx(1.0) and min(agreed.values()) >= 0.0
+    named = max(agreed[e] for e in names[:2])
+    assert named >= max(p for e, p in agreed.items() if e not in names[:2]) - 1e-12
+    assert sure < 0.5 or agreed["none"] <= 0.2 + 1e-12
+
+
+def test_an_unknown_that_may_act_and_isnt_the_largest_makes_nothing_likelier_than_the_named():
+    """The strongest is then named, whether or not something unknown acts as well."""
+    chance = probabilities({"rotor_drag": 1.0}, {"rotor_drag": 1.0}, 0.6, {})
+    assert chance["rotor_drag"] > 0.95
+
+
+def test_what_has_no_share_or_makes_predictions_worse_is_not_named():
+    shares = {"mass": (0.7, (0.6, 0.8)), "inertia": (0.2, (0.1, 0.3)), "wind": (0.0, (0.0, 0.001))}
+
+    def shares_of(named):
+        worse = {"mass", "inertia"} <= set(named)
+        gap = dataclasses.replace(GAP, reduction=-0.1 if worse else 0.5)
+        return split({e: shares[e] for e in named}, gap)
+
+    assert set(worth_naming(shares_of, list(shares)).effects) == {"mass"}
+    assert set(worth_naming(shares_of, ["inertia"]).effects) == {"inertia"}
+    assert worth_naming(shares_of, ["wind"]).effects == {}
