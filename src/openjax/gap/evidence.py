@@ -101,9 +101,13 @@ def _sensors(tracks: list[Track], library: Library) -> tuple[list[Track], Pose |
     """
     pose = read_pose(tracks, library)
     moved = pose is not None and pose.names and pose.late
+    logged = tracks
     if moved:
-        tracks = [undelayed(t, pose.fit.value) for t in tracks]
+        tracks = [undelayed(t, pose.fit.value) for t in logged]
     sensors = read_kinematics(tracks, DECISION)
+    if moved and not sensors.one_clock:  # then it isn't the pose's delay that was found
+        tracks = logged
+        sensors = read_kinematics(tracks, DECISION)
     tracks = [corrected(t, sensors) for t in tracks]
     if pose is not None and not moved:
         pose = read_pose(tracks, library)

@@ -59,7 +59,7 @@ def _places(report: Report):
     add_legend(axes)
     return (
         "Where the gap lies",
-        f"Forces and torques, averaged over {CALM} s, by part of the flight.",
+        f"Forces and torques, averaged over {CALM} s, estimator and firmware, by part of the flight.",
         figure,
     )
 
@@ -118,7 +118,8 @@ def _courses(report: Report) -> Iterator[Course]:
                 skip = int(SKIP / track.dt) if len(after) > 1 else 0
                 both = (np.resize(v, len(track))[skip:] / scale for v in (before, after))
                 time = track.time[skip:]
-                yield Course(track.name, track.dt, time, *both, name, "of the noise", False)
+                said = "mean motor command" if name == "motors all" else name
+                yield Course(track.name, track.dt, time, *both, said, "times the noise", False)
 
 
 def _worst(report: Report) -> Course:
