@@ -3,11 +3,12 @@ says is brought to keep them.
 """
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from openjax.gap.diagnosis import worth_naming
+from openjax.gap.diagnosis import _next_flight, _runner_up, worth_naming
 from openjax.gap.probabilities import agreeing, probabilities
 from openjax.gap.report import Estimate, Report
 from openjax.gap.report.rules import broken_rules
@@ -103,3 +104,16 @@ def test_what_has_no_share_or_makes_predictions_worse_is_not_named():
     assert set(worth_naming(shares_of, list(shares)).effects) == {"mass"}
     assert set(worth_naming(shares_of, ["inertia"]).effects) == {"inertia"}
     assert worth_naming(shares_of, ["wind"]).effects == {}
+
+
+def test_nobody_who_logged_one_vehicle_is_sent_for_a_second():
+    one, two = (SimpleNamespace(tracks=[SimpleNamespace(neighbours=[0] * n)]) for n in (0, 1))
+    assert "vehicle" not in _next_flight(one, ("downwash", "rate_gains", ""))
+    assert _next_flight(one, ("downwash", "none")) == ""
+    assert "the other" in _next_flight(two, ("downwash", "rate_gains"))
+
+
+def test_the_runner_up_is_no_part_of_what_is_named():
+    chances = {"rotor_drag": 0.5, "wind": 0.3, "none": 0.15, "mass": 0.05}
+    assert _runner_up(chances, ("rotor_drag",), {"rotor_drag": ["wind"]}) == "none"
+    assert _runner_up({"none": 0.995, "unknown": 0.005}, (), {}) == ""

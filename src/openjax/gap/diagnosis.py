@@ -109,12 +109,8 @@ def _report(
     nothing = "not_testable" if len(missing) >= len(evidence.library.effects) // 2 else "none"
     named = [e for e in effects if e != "unknown"]
     equivalent = {e: selection.equivalent[e] for e in named if e in selection.equivalent}
-    ranked = sorted(chances, key=lambda e: -chances[e])
-    alike = {o for others in equivalent.values() for o in others}
-    second = next((e for e in ranked if e not in (effects or ("none",)) and e not in alike), "")
+    second = _runner_up(chances, effects, equivalent)
     others = [o for e in named for o in equivalent.get(e, ())]
-    wanted = (e for e in (*others, *missing, second) if _can_be_flown(evidence, e))
-    splitter = next(wanted, "")
     return Report(
         case=evidence.case.name,
         verdict=nothing if not effects else "unknown" if effects[0] == "unknown" else "effect",
@@ -126,12 +122,12 @@ def _report(
         where=locate(evidence, selection.fit, named),
         gap=parts.gap,
         not_testable=missing,
-        next_flight=CARDS[splitter].next_flight if splitter in CARDS else "",
+        next_flight=_next_flight(evidence, (*others, *missing, second)),
         quality=[
             {"flight": i.flight, "issue": i.issue, "left_out": i.refused}
             for i in evidence.case.quality
         ],
-        runner_up=f"{second} ({chances[second]:.2f})" if second and chances[second] > 0.01 else "",
+        runner_up=f"{second} ({chances[second]:.2f})" if second else "",
         rest=check.in_words(),
         sensors=tuple(evidence.sensors.findings.values()),
         contradictions=tuple(
@@ -167,14 +163,22 @@ def _reference_in_words(evidence: Evidence, named) -> str:
     return f"{told} {battery}" if pwm and silent else told
 
 
-def _can_be_flown(evidence: Evidence, effect: str) -> bool:
-    """Whether a next flight for an effect is within reach of who logged these: nobody is sent for a
-    second vehicle.
+def _runner_up(chances, effects, equivalent) -> str:
+    """The likeliest cause that is neither named nor would do as well; empty if hardly likely."""
+    said = {*(effects or ("none",)), *(o for others in equivalent.values() for o in others)}
+    second = max((e for e in chances if e not in said), key=chances.get, default="")
+    return second if second and chances[second] > 0.01 else ""
+
+
+def _next_flight(evidence: Evidence, wanted) -> str:
+    """What to fly for the first of the effects `wanted` within reach of who logged these flights:
+    nobody is sent for a second vehicle.
     """
-    if effect not in CARDS:
-        return False
-    needs_two = CARDS[effect].coordinate == "height below a neighbour"
-    return not needs_two or any(len(t.neighbours) for t in evidence.tracks)
+    alone = not any(len(t.neighbours) for t in evidence.tracks)
+    for effect in (e for e in wanted if e in CARDS):
+        if not (alone and CARDS[effect].coordinate == "height below a neighbour"):
+            return CARDS[effect].next_flight
+    return ""
 
 
 def _nuisances(evidence: Evidence, selection: Selection) -> dict[str, str]:
