@@ -46,13 +46,14 @@ def slower(track: Track, time: float) -> Track:
     return dataclasses.replace(track, body_rates=rates)
 
 
-def read(tracks, **said):
-    return read_motor_clock(tracks, [VEHICLE] * len(tracks), 0.01, **said)
+def read(tracks, row=0.01, **said):
+    return read_motor_clock(tracks, [VEHICLE] * len(tracks), row, **said)
 
 
 def test_motors_that_act_from_their_row_on_are_no_finding(tracks):
     assert read(tracks) == clocks.MotorClock({}, True, {})
     assert read([moved(t, 0.005) for t in tracks], rows="sample") == read(tracks)
+    assert read([moved(t, 0.004) for t in tracks], row=0.001) == read(tracks)
 
 
 @pytest.mark.parametrize("time", [0.02, 0.05, 0.095])

@@ -9,6 +9,7 @@ import sys
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from openjax.command_line import one_line
 from openjax.commands import diagnose
@@ -71,6 +72,34 @@ def _late(columns):
     return {n: np.interp(t - 0.004, t, v) if n in pose else v for n, v in columns.items()}
 
 
+MOTORS = ("m1", "m2", "m3", "m4")
+
+
+def _motors_late(rows):
+    """Motor commands stand so many rows after they acted."""
+
+    def logged(columns):
+        place = np.maximum(np.arange(len(columns["t"])) - rows, 0)
+        return {n: v[place] if n in MOTORS else v for n, v in columns.items()}
+
+    return logged
+
+
+def _without(*names):
+    return lambda columns: {n: v for n, v in columns.items() if n not in names}
+
+
+def _leaning(columns):
+    """No position, in a world that leans by two degrees about x."""
+    lean = Rotation.from_rotvec([np.radians(2.0), 0.0, 0.0])
+    pose = np.stack([columns[n] for n in ("qw", "qx", "qy", "qz")], 1)
+    turned = (lean * Rotation.from_quat(pose, scalar_first=True)).as_quat(scalar_first=True)
+    velocity = lean.apply(np.stack([columns[n] for n in ("vx", "vy", "vz")], 1))
+    both = np.concatenate([turned, velocity], 1).T
+    names = ("qw", "qx", "qy", "qz", "vx", "vy", "vz")
+    return _without("x", "y", "z")(columns) | dict(zip(names, both, strict=True))
+
+
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory):
     root = tmp_path_factory.mktemp("cases")
@@ -111,6 +140,27 @@ def test_a_known_cause_is_named_with_its_size(reports):
     assert share.value > 0.9 and share.interval90[0] > 0.8 and report.shares.unexplained.value < 0.1
     # At the hubs drag turns the vehicle as well.
     assert any(p.channel.startswith("force") and p.after < p.before for p in report.where[:4])
+
+
+@pytest.mark.parametrize(
+    "logged",
+    [_motors_late(14), _without("qw", "qx", "qy", "qz"), _leaning],
+    ids=["motors on another clock", "no attitude", "no position"],
+)
+def test_drag_is_named_from_the_logs_that_there_are(logged, tmp_path):
+    """And no torque from motors that share no clock with the gyroscope."""
+    folder = _case(tmp_path / "case", {"rotor_drag": DRAG}, weighed=True, logged=logged)
+    report = diagnose_case(load_case(folder))
+    assert report.effects == ("rotor_drag",) and report.shares.effects["rotor_drag"].value > 0.6
+    assert report.parameters["rotor_drag"]["d_xy"].value == pytest.approx(DRAG["d_xy"], rel=0.1)
+    if any("share a clock" in text for text in report.sensors):
+        hidden = {"inertia", "motor_lag", "yaw_torque", "com_offset", "rate_gains"}
+        assert hidden | {"command_latency"} <= set(report.not_testable)
+
+
+def test_motors_that_were_averaged_before_their_row_are_found_and_name_nothing(tmp_path):
+    report = diagnose_case(load_case(_case(tmp_path / "mean", {}, logged=_motors_late(1))))
+    assert report.effects == () and "one row earlier" in report.sensors[0]
 
 
 def test_nothing_is_named_where_nothing_is_wrong(reports):

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import butter, find_peaks, lfilter, sosfiltfilt
 
-from openjax.flights.track import Track, earlier, turn_increments
+from openjax.flights.track import GRID_PERIOD, Track, earlier, turn_increments
 
 # What a row of motor commands may hold: their mean from its time until the next row, their mean
 # since the last row, or a single one.
@@ -60,7 +60,9 @@ def read_motor_clock(
     by_a_row = dict.fromkeys(map(_flight_of, tracks), row)
     late = {flight: -d for flight, d in _offsets(turning).items()}
     usual = float(np.median(list(late.values()))) if late else said
-    least = 0.5 * row + EARLY + (0.5 * row if rows == "sample" else 0.0)
+    # half a row, of the grid's where the log's own are shorter
+    least = 0.5 * (row if row >= SLOWEST_ROW else GRID_PERIOD) + EARLY
+    least += 0.5 * row if rows == "sample" else 0.0
     alike = not late or max(late.values()) - min(late.values()) < APART
     if alike and -LATE < usual - said <= least:
         return MotorClock(by_a_row if said else {}, True, {})
@@ -79,6 +81,8 @@ def read_motor_clock(
         f"motors and gyroscope don't share a clock: motor commands are {words}; they are moved by "
         "that, and torques, lags and latencies can't be told from these logs"
     )
+    if alike:  # what tells no clock has that of the others
+        late = dict.fromkeys(by_a_row, usual) | late
     return MotorClock(late, False, {"motor clock": text})
 
 
