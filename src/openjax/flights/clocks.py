@@ -60,9 +60,7 @@ def read_motor_clock(
     by_a_row = dict.fromkeys(map(_flight_of, tracks), row)
     late = {flight: -d for flight, d in _offsets(turning).items()}
     usual = float(np.median(list(late.values()))) if late else said
-    # half a row, of the grid's where the log's own are shorter
-    least = 0.5 * (row if row >= SLOWEST_ROW else GRID_PERIOD) + EARLY
-    least += 0.5 * row if rows == "sample" else 0.0
+    least = _least(row, rows)
     alike = not late or max(late.values()) - min(late.values()) < APART
     if alike and -LATE < usual - said <= least:
         return MotorClock(by_a_row if said else {}, True, {})
@@ -72,11 +70,7 @@ def read_motor_clock(
             "the last one, and are read one row earlier"
         )
         return MotorClock(by_a_row, True, {"motor rows": text})
-    words = ", ".join(
-        f"{1e3 * abs(time):.0f} ms {'late' if time > 0 else 'early'} in {flight}"
-        for flight, time in late.items()
-        if abs(time) > least
-    )
+    words = _in_words({flight: time for flight, time in late.items() if abs(time) > least})
     text = (
         f"motors and gyroscope don't share a clock: motor commands are {words}; they are moved by "
         "that, and torques, lags and latencies can't be told from these logs"
@@ -84,6 +78,22 @@ def read_motor_clock(
     if alike:  # what tells no clock has that of the others
         late = dict.fromkeys(by_a_row, usual) | late
     return MotorClock(late, False, {"motor clock": text})
+
+
+def _least(row: float, rows: str) -> float:
+    """s by which motors may seem early: half a row, of the grid's where the log's own are shorter,
+    and another half where rows are single samples.
+    """
+    half = 0.5 * (row if row >= SLOWEST_ROW else GRID_PERIOD)
+    return half + EARLY + (0.5 * row if rows == "sample" else 0.0)
+
+
+def _in_words(late: dict[str, float]) -> str:
+    """How late each flight is."""
+    return ", ".join(
+        f"{1e3 * abs(time):.0f} ms {'late' if time > 0 else 'early'} in {flight}"
+        for flight, time in late.items()
+    )
 
 
 def on_gyroscope_clock(track: Track, clock: MotorClock) -> Track:
@@ -108,15 +118,11 @@ def read_command_clock(tracks: Sequence[Track], row: float) -> str:
     """
     both = [t for t in tracks if t.command is not None and t.motor is not None]
     pairs = ((t, t.motor.mean(1)[:, None], t.command[:, :1]) for t in both)
-    early = {f: d for f, d in _offsets(pairs).items() if not -1.5 * row - EARLY < d < LINK}
-    words = ", ".join(
-        f"{1e3 * abs(time):.0f} ms {'early' if time > 0 else 'late'} in {flight}"
-        for flight, time in early.items()
-    )
+    late = {f: -d for f, d in _offsets(pairs).items() if not -1.5 * row - EARLY < d < LINK}
     return (
-        f"commands and motors don't share a clock: commands are {words}; they aren't used, and "
-        "link and rate controller can't be told from these logs"
-        if early
+        f"commands and motors don't share a clock: commands are {_in_words(late)}; they aren't "
+        "used, and link and rate controller can't be told from these logs"
+        if late
         else ""
     )
 
