@@ -14,6 +14,7 @@ COMMANDS = {
     "exploit": "train an evader against a policy, and see how well the policy holds",
     "sample_flights": "write logs of a simulated vehicle with an effect, to try the diagnosis on",
     "diagnose": "say from flight logs what causes the sim-to-real gap, or what changed",
+    "plan": "say which flight would tell a diagnosis' causes apart, and write its set-points",
     "calibrate": "fit thrust, torque, motor lag and inertia of the nominal vehicle to flights",
     "adapt": "diagnose flights and fine-tune a policy to the vehicle that flew them",
     "fly": "fly a policy on Crazyflies, virtual or real",

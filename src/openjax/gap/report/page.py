@@ -110,7 +110,7 @@ def next_steps(report: Report, folder: Path | None = None) -> list[tuple[str, st
     steps = []
     for name, others in report.equivalent.items():
         told = f"These flights can't tell {name} from {', '.join(others)}. {_fly(report, others)}"
-        steps.append((told, ""))
+        steps.append((told, "openjax plan . --out next_flight"))
     if report.parameters:
         names = ", ".join(effect.replace("_", " ") for effect in report.parameters)
         tune = "openjax adapt effects.toml --policy flight"

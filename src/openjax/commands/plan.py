@@ -1,0 +1,84 @@
+"""`openjax plan DIAGNOSIS`: the next flight, by what it is expected to tell."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from openjax.command_line import one_thread_for_matrices, output_console, parse
+from openjax.errors import UserError
+from openjax.files import check_new_folder, replacing, write_json
+
+PROGRAM = "openjax plan"
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Rank segments of flight by what they are expected to tell about a diagnosis' causes.
+
+    Writes OUT/plan.csv, set-points for openjax fly --plan and for Crazyswarm2, and OUT/plan.json.
+    """
+
+    diagnosis: Annotated[str, tyro.conf.Positional]
+    """Folder of a report of openjax diagnose; or identify: the standard plan of two minutes."""
+    out: Path = Path("plan")
+    """Folder to write to; must not exist or be empty."""
+    vehicle: str | None = None
+    """What flies (crazyflie, brushless, or a vehicle.toml)."""
+
+
+def main(arguments: Sequence[str]) -> None:
+    """The command. Raises UserError for a folder that holds no report."""
+    one_thread_for_matrices()
+    parsed = parse(Arguments, Arguments(diagnosis=tyro.MISSING), arguments, PROGRAM)
+    check_new_folder(parsed.out, "--out")
+    console = output_console()
+    for line in make_plan(parsed):
+        console.print(line, soft_wrap=True)
+
+
+def make_plan(arguments: Arguments) -> list[str]:
+    """Write the plan; what to say of it."""
+    from openjax.flights.plans import STANDARD, plan_of, write_plan
+    from openjax.flights.segments import SEGMENTS
+
+    promises: list[dict] = []
+    if arguments.diagnosis == STANDARD and not Path(STANDARD).exists():
+        chosen = list(SEGMENTS)
+        said = "The standard plan: it shows every effect that one vehicle can show."
+    else:
+        said, promises, chosen = _advised(arguments)
+    plan = plan_of(chosen)
+    with replacing(arguments.out) as folder:
+        folder.mkdir()
+        write_plan(folder / "plan.csv", plan)
+        write_json(folder / "plan.json", {"sentence": said, "segments": promises, "fly": chosen})
+    rows = [
+        f"  {p['segment']:6} {p['value']:.3f}  {SEGMENTS[p['segment']].shows}" for p in promises
+    ]
+    file = arguments.out / "plan.csv"
+    return [
+        said,
+        *rows,
+        f"{file}: {', '.join(chosen)}; {len(plan) / 100:.0f} s. "
+        f"Next, openjax fly --plan {file} --uri ...",
+    ]
+
+
+def _advised(arguments: Arguments) -> tuple[str, list[dict], list[str]]:
+    """The sentence, the promises of all segments, and those to fly, for a diagnosis."""
+    from openjax.gap.planning.beliefs import beliefs_of, read_report, sentence
+    from openjax.gap.planning.information import advise
+    from openjax.vehicle.vehicle_file import load_vehicle_file
+
+    report = read_report(Path(arguments.diagnosis))
+    vehicle_file = load_vehicle_file(arguments.vehicle)
+    beliefs = beliefs_of(report)
+    if len(beliefs) < 2:
+        raise UserError(
+            f"{arguments.diagnosis}: one cause is left, no flight is needed to tell it from others"
+        )
+    advice = advise(beliefs, vehicle_file)
+    return sentence(advice, report), [asdict(p) for p in advice.promises], list(advice.chosen)

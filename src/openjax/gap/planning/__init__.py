@@ -1,0 +1,1 @@
+"""Which flight to fly next: the one that tells the likeliest causes apart."""

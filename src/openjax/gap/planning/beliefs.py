@@ -1,0 +1,88 @@
+"""What is believed after a diagnosis, from its `report.json`."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from openjax.errors import UserError
+from openjax.gap.model.library import ABSENT, CARDS, PLACE, places
+from openjax.gap.planning.information import TELLS, Advice, Belief
+
+LEAST = 0.02  # probability below which a cause isn't asked for
+UNTESTED = 0.05  # of each effect that the flights couldn't show
+SCALE_ONLY = {"mass", "thrust_scale", "thrust_curve"}
+"""A scale tells these apart, no flight."""
+
+
+def read_report(folder: Path) -> dict:
+    """The `report.json` of a diagnosis. Raises UserError where there is none that can be read."""
+    path = folder / "report.json" if folder.is_dir() else folder
+    if not path.is_file():
+        raise UserError(
+            f"{folder}: holds no report.json; openjax diagnose FLIGHTS writes one into diagnosis/"
+        )
+    try:
+        report = json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, UnicodeDecodeError):
+        raise UserError(f"{path}: isn't JSON; diagnose the flights again") from None
+    if not isinstance(report, dict) or not {"probabilities", "parameters"} <= set(report):
+        raise UserError(f"{path}: not a report of openjax diagnose")
+    return report
+
+
+def beliefs_of(report: dict) -> list[Belief]:
+    """The likeliest causes of a report and what these flights couldn't show, normalised. Only what
+    acts between motors and motion: other effects are read from the commands' own columns.
+    """
+    chances = report["probabilities"]
+    named = [e for e in report.get("effects", ()) if _flown(e)]
+    found: dict[tuple[str, ...], float] = {(): max(chances.get("none", 0.0), UNTESTED)}
+    if named:
+        sure = max(chances.get(e, 0.0) for e in named)
+        found[tuple(named)] = max(sure, UNTESTED)
+        for effect in named:
+            for other in filter(_flown, report.get("equivalent", {}).get(effect, ())):
+                # As likely as the one that it would do as well as.
+                rest = tuple(e for e in named if e != effect)
+                found[(*rest, other)] = max(chances.get(effect, 0.0), UNTESTED)
+    for effect, chance in chances.items():
+        if _flown(effect) and effect not in named and chance > LEAST:
+            found.setdefault((effect,), chance)
+    for effect in filter(_flown, report.get("not_testable", ())):
+        found.setdefault((effect,), UNTESTED)
+    whole = sum(found.values())
+    return [Belief(e, _theta(e, report["parameters"]), p / whole) for e, p in found.items()]
+
+
+def _flown(effect: str) -> bool:
+    """Whether an effect acts in the physics, and needs no second vehicle."""
+    return effect in CARDS and CARDS[effect].path == "physics" and effect != "downwash"
+
+
+def _theta(effects, parameters: dict) -> np.ndarray:
+    """(P,) with the report's values, or an effect's usual start where the report has none."""
+    theta = ABSENT.copy()
+    for effect in effects:
+        theta[places((effect,))] = [p.start for p in CARDS[effect].fitted]
+        for name, estimate in parameters.get(effect, {}).items():
+            if (effect, name) in PLACE:
+                theta[PLACE[effect, name]] = estimate["value"]
+    return theta
+
+
+def sentence(advice: Advice, report: dict) -> str:
+    """What to do next, and why."""
+    best = advice.promises[0]
+    hopeless = [pair for pair, nats in advice.nats.items() if nats < TELLS]
+    weigh = [pair for pair in hopeless if set(pair) <= SCALE_ONLY]
+    told = f"Fly {best.segment!r} next: in 10 s it tells {best.pair[0]} from {best.pair[1]} "
+    told += f"by {best.nats:.0f} nats."
+    if best.nats < TELLS:
+        told = f"No segment tells {best.pair[0]} from {best.pair[1]}."
+    if weigh:
+        told += f" No flight tells {weigh[0][0]} from {weigh[0][1]}: weigh the vehicle."
+    remarks = report.get("identification", {}).get("remarks", ())
+    if any("sample" in remark for remark in remarks):
+        told += " Before that, log the motors' means at 100 Hz."
+    return told.replace("_", " ")

@@ -1,0 +1,142 @@
+"""What each segment of flight is expected to tell.
+
+A segment is flown by the nominal simulator. Of two causes i and j it then shows d_ij = 1/2 |f_i -
+f_j|^2 nats, in units of the noise, less what nuisances and the parameters of j can take. Its value
+is sum_ij p_i p_j (1 - exp(-d_ij / 2)): the probability that two causes drawn from what is believed
+are told apart (T-optimal design: Atkinson, Fedorov 1975; the bound is Bhattacharyya's).
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from openjax.flights.flight import Case
+from openjax.flights.reading import flights_of
+from openjax.flights.samples import fly, log_of
+from openjax.flights.segments import SEGMENTS
+from openjax.gap.evidence import gather
+from openjax.gap.model.library import library, places, prior
+from openjax.gap.model.replay import Replay
+from openjax.vehicle.vehicle_file import VehicleFile
+
+SECONDS = 10.0  # of each segment that are simulated
+ENOUGH = 0.98  # of what all segments tell together
+TELLS = 2.0  # nats: less says nothing
+
+
+@dataclass(frozen=True, eq=False)
+class Belief:
+    """A cause, or several at once: `effects`, where their parameters are, `theta` (P,), and how
+    probable it is.
+    """
+
+    effects: tuple[str, ...]
+    theta: np.ndarray
+    probability: float
+
+    @property
+    def name(self) -> str:
+        return " and ".join(self.effects) or "nothing"
+
+
+@dataclass(frozen=True)
+class Promise:
+    """What a segment promises: its `value`, and the pair of causes that it tells best, for what
+    they are worth, with the nats of one segment.
+    """
+
+    segment: str
+    value: float
+    pair: tuple[str, str]
+    nats: float
+
+
+@dataclass(frozen=True, eq=False)
+class Advice:
+    """`promises`, best first; `chosen`: the fewest segments that together tell nearly what all do;
+    `nats` {(cause, other): nats of the best segment}.
+    """
+
+    promises: tuple[Promise, ...]
+    chosen: tuple[str, ...]
+    nats: dict[tuple[str, str], float]
+
+
+def advise(beliefs: list[Belief], vehicle_file: VehicleFile) -> Advice:
+    """Rank all segments by what they are expected to tell."""
+    replay = _simulated(vehicle_file)
+    apart = _distances(replay, beliefs)
+    weights = np.array([b.probability for b in beliefs])
+    together = np.outer(weights, weights)
+    promises = []
+    for number, name in enumerate(replay.flights):
+        told = together * (1.0 - np.exp(-0.5 * apart[number]))
+        i, j = np.unravel_index(int(np.argmax(np.triu(told, 1))), told.shape)
+        pair = (beliefs[i].name, beliefs[j].name)
+        promises.append(
+            Promise(name.split(".")[0], float(told.sum()), pair, float(apart[number, i, j]))
+        )
+    chosen = _fewest(apart, together)
+    best = apart.max(0)
+    nats = {
+        (a.name, b.name): float(best[i, j])
+        for i, a in enumerate(beliefs)
+        for j, b in enumerate(beliefs)
+        if i < j
+    }
+    ranked = tuple(sorted(promises, key=lambda p: -p.value))
+    names = [name.split(".")[0] for name in replay.flights]
+    return Advice(ranked, tuple(names[k] for k in chosen), nats)
+
+
+def _fewest(apart: np.ndarray, together: np.ndarray) -> list[int]:
+    """Segments, each adding most to those before, until they tell nearly what all do (nats of
+    flights add up).
+    """
+
+    def told(nats):
+        return float((together * (1.0 - np.exp(-0.5 * nats))).sum())
+
+    everything = told(apart.sum(0))
+    chosen: list[int] = []
+    known = np.zeros_like(together)
+    while told(known) < ENOUGH * everything and len(chosen) < len(apart):
+        rest = [k for k in range(len(apart)) if k not in chosen]
+        chosen.append(max(rest, key=lambda k: told(known + apart[k])))
+        known = known + apart[chosen[-1]]
+    return chosen or [int(np.argmax([told(a) for a in apart]))]
+
+
+def _simulated(vehicle_file: VehicleFile) -> Replay:
+    """The replay of every segment, flown by the nominal vehicle."""
+    vehicle = vehicle_file.vehicle
+    described = replace(vehicle_file, log={"motor_rows": "mean"})
+    flights = []
+    for number, (name, segment) in enumerate(SEGMENTS.items()):
+        columns = fly(vehicle, vehicle, segment.reference(SECONDS), seed=number)
+        found, _ = flights_of(log_of(columns, name), (0, 1, 2, 3))
+        flights += found
+    case = Case("segments", tuple(flights), described)
+    return gather(case, library()).motion.replay
+
+
+def _distances(replay: Replay, beliefs: list[Belief]) -> np.ndarray:
+    """(F, B, B) nats by which each flight tells a cause from another."""
+    predicted = replay.predict(np.array([b.theta for b in beliefs]))
+    out = np.zeros((len(replay.flights), len(beliefs), len(beliefs)))
+    for j, belief in enumerate(beliefs):
+        index = places(belief.effects)
+        slopes = [c[1:] for c in replay.linearised(belief.theta, index)]
+        columns = [
+            np.concatenate([p - p[j][None], s]) for p, s in zip(predicted, slopes, strict=True)
+        ]
+        grams = replay.grams(columns)
+        count = len(beliefs)
+        _, _, precision = prior(belief.effects)
+        for flight, gram in enumerate(grams):
+            inside = gram[count:, count:] + precision
+            taken = np.linalg.solve(inside, gram[count:, :count])
+            left = np.diag(gram[:count, :count] - gram[:count, count:] @ taken)
+            out[flight, :, j] = 0.5 * np.maximum(left, 0.0)
+    # A cause is told from another only if neither can imitate the other.
+    return np.minimum(out, np.swapaxes(out, 1, 2))

@@ -1,0 +1,60 @@
+"""The next flight: what tells two causes apart is flown, and what no flight tells is weighed."""
+
+import numpy as np
+import pytest
+
+from openjax.errors import UserError
+from openjax.flights.plans import plan_of, read_plan, write_plan
+from openjax.flights.segments import LOWEST, SEGMENTS
+from openjax.gap.planning.beliefs import beliefs_of, sentence
+from openjax.gap.planning.information import advise
+from openjax.vehicle.arena import Arena
+from openjax.vehicle.vehicle_file import load_vehicle_file
+
+
+def between(*effects):
+    """A report that can't tell these effects apart."""
+    return {
+        "effects": effects[:1],
+        "probabilities": dict.fromkeys(effects, 0.95 / len(effects)) | {"none": 0.0},
+        "equivalent": {effects[0]: list(effects[1:])},
+        "parameters": {},
+        "not_testable": [],
+    }
+
+
+def test_beliefs_are_probabilities_of_what_the_report_left_open():
+    beliefs = beliefs_of(between("rotor_drag", "wind"))
+    assert [b.name for b in beliefs] == ["nothing", "rotor_drag", "wind"]
+    assert sum(b.probability for b in beliefs) == pytest.approx(1.0)
+
+
+@pytest.mark.slow
+def test_passes_tell_ground_effect_and_a_scale_tells_mass():
+    vehicle = load_vehicle_file()
+    ground = advise(beliefs_of(between("ground_effect")), vehicle)
+    assert ground.promises[0].segment == "low"
+    report = between("mass", "thrust_scale")
+    weighed = advise(beliefs_of(report), vehicle)
+    assert "weigh the vehicle" in sentence(weighed, report)
+
+
+def test_the_standard_plan_stays_in_the_box_for_two_minutes():
+    plan = plan_of()
+    assert len(plan) == 12_000
+    assert set(plan.segment) == set(SEGMENTS)
+    assert np.linalg.norm(plan.position[:, :2], axis=1).max() < Arena.radius - 0.1
+    assert LOWEST <= plan.position[:, 2].min() < plan.position[:, 2].max() < Arena.height
+    assert np.linalg.norm(plan.velocity, axis=1).max() < 2.0
+    assert np.linalg.norm(plan.acceleration, axis=1).max() < 7.0
+
+
+def test_a_plan_is_read_as_it_was_written(tmp_path):
+    path = tmp_path / "plan.csv"
+    write_plan(path, plan_of(["hover"]))
+    assert np.allclose(read_plan(path).position, plan_of(["hover"]).position, atol=1e-4)
+    lines = path.read_text().splitlines()
+    for broken in (lines[:1], [lines[0], lines[1].replace("0.6000", "nan")], ["t,x", "0,1"]):
+        path.write_text("\n".join(broken))
+        with pytest.raises(UserError, match=str(path)):
+            read_plan(path)
