@@ -34,6 +34,10 @@ class Arguments:
 
     policy: str = DEFAULT_POLICY
     """A run's directory, a policy file (.npz), or the name of a policy in the package."""
+    plan: str | None = None
+    """Fly a plan instead, with one vehicle: identify (two minutes by which a vehicle shows what it
+    does), or a CSV of openjax plan.
+    """
     uri: tuple[str, ...] = tuple(f"udp://127.0.0.1:{UDP_PORT + i}" for i in range(3))
     """One vehicle per pursuer: udp://HOST:PORT (virtual), radio://0/80/2M/E7E7E7E7E7 (real)."""
     evader_uri: str | None = None
@@ -143,29 +147,23 @@ def prepare(arguments: Arguments) -> Prepared:
     from openjax.flying.controller import airframe_of
     from openjax.flying.game import Game
     from openjax.flying.loop import flight_state
-    from openjax.flying.motion_capture import find_feed
-    from openjax.flying.session import SessionSettings
     from openjax.pursuit import find_scenario, scenario_task
     from openjax.store.policies import load_policy
     from openjax.vehicle.vehicle_file import load_vehicle_file
 
     real_time.prepare()
+    if arguments.plan is not None:
+        return _planned(arguments)
     policy = load_policy(arguments.policy)
     settings = policy.settings.environment
     scenario = find_scenario(arguments.scenario, settings)
     _check_numbers(arguments, len(scenario.pursuers), settings.num_pursuers)
-    feed = find_feed(arguments.motion_capture) if arguments.motion_capture else None
     vehicle = load_vehicle_file(arguments.vehicle or settings.airframe)
     slots = max(settings.max_pillars, len(scenario.pillars))
     game = Game(policy, scenario_task(dataclasses.replace(settings, max_pillars=slots), scenario))
     game.airframe = airframe_of(vehicle.vehicle)
     uris = uris_of(arguments)
-    body_logs = arguments.body_logs
-    if body_logs is None:
-        body_logs = 5 if all(uri.startswith("udp:") for uri in uris) else 1
-    session = SessionSettings(
-        uris, body_logs, arguments.watchdog, arguments.guard, arguments.guard_after, feed
-    )
+    session = _session(arguments)
     state = flight_state(game, len(uris), arguments.safety)
     remarks = ()
     if vehicle.airframe != settings.airframe:
@@ -174,6 +172,37 @@ def prepare(arguments: Arguments) -> Prepared:
         )
     about = {"policy": policy.source, "scenario": scenario.name, "uris": uris}
     return Prepared(game, state, session, vehicle, about, remarks)
+
+
+def _planned(arguments: Arguments) -> Prepared:
+    """A plan in a policy's place."""
+    from openjax.flights.plans import read_plan
+    from openjax.flying.controller import airframe_of
+    from openjax.flying.loop import flight_state
+    from openjax.flying.planned import PlannedFlight
+    from openjax.vehicle.vehicle_file import load_vehicle_file
+
+    vehicle = load_vehicle_file(arguments.vehicle)
+    game = PlannedFlight(read_plan(arguments.plan), airframe_of(vehicle.vehicle))
+    state = flight_state(game, 1, arguments.safety)
+    source = f"plan {arguments.plan}"
+    about = {"policy": source, "scenario": source, "uris": arguments.uri}
+    return Prepared(game, state, _session(arguments), vehicle, about)
+
+
+def _session(arguments: Arguments):
+    """The session's settings."""
+    from openjax.flying.motion_capture import find_feed
+    from openjax.flying.session import SessionSettings
+
+    feed = find_feed(arguments.motion_capture) if arguments.motion_capture else None
+    uris = uris_of(arguments)
+    body_logs = arguments.body_logs
+    if body_logs is None:
+        body_logs = 5 if all(uri.startswith("udp:") for uri in uris) else 1
+    return SessionSettings(
+        uris, body_logs, arguments.watchdog, arguments.guard, arguments.guard_after, feed
+    )
 
 
 def _write(out, flown, flight, samples, scheduler):
@@ -214,6 +243,13 @@ def uris_of(arguments: Arguments) -> tuple[str, ...]:
 
 def checked(arguments: Arguments) -> Arguments:
     """The arguments, their URIs as `cflib` wants them. Raises UserError."""
+    if arguments.plan is not None:
+        if arguments.uri == Arguments.uri:  # as many as a policy has pursuers
+            arguments = dataclasses.replace(arguments, uri=Arguments.uri[:1])
+        if len(uris_of(arguments)) != 1:
+            raise UserError(
+                f"--plan flies one vehicle, {len(uris_of(arguments))} are named: name one --uri"
+            )
     uris = [endpoint.uri for endpoint in endpoints_of(uris_of(arguments))]
     number = len(arguments.uri)
     evader = None if arguments.evader_uri is None else uris[-1]
