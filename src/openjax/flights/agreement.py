@@ -13,6 +13,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from openjax.flights.conventions import BODY, CONVENTIONS, FRAMES, upright
 from openjax.flights.flight import CHANNEL_COLUMNS, Flight, Issue
 from openjax.flights.pairs import AGREE, WIDE, Pair, Signals, pairs_of
 from openjax.flights.signals import RATE, clock_of, first_order, in_band, rates_of
@@ -68,7 +69,8 @@ def check_agreement(flight: Flight, vehicle) -> list[Issue]:
     if grid is not None and not found:
         signals = Signals.of(flight, grid)
         found = (
-            _gravity(signals.force)
+            _upside_down(signals)
+            or _gravity(signals.force)
             or _inverted(signals)
             or _contradictions(signals)
             or list(_paths(signals))
@@ -114,6 +116,10 @@ def _mended(signals: Signals, bad: list[Pair]) -> tuple[str, str] | None:
     """Kind and words of a convention or labelling of one channel that makes the disagreeing pairs
     agree.
     """
+    for convention in CONVENTIONS:
+        other = convention.convert(signals)
+        if upright(other) and _agrees(other, bad):
+            return "axes", convention.words
     if signals.quaternion is not None:
         for words, convert in QUATERNIONS.items():
             other = dataclasses.replace(signals, quaternion=convert(signals.quaternion))
@@ -257,6 +263,33 @@ def _unit(pair: Pair) -> list[Finding]:
                 text = f"{columns}: in {unit} ({times:.0f} times too large); the log format wants {wanted}"
                 return [("units", text, [pair.what])]
     return []
+
+
+def _upside_down(signals: Signals) -> list[Finding]:
+    """Axes of world and body by which gravity points the right way, and nothing disagrees."""
+    if signals.force is None or np.median(signals.force[:, 2]) > 0.0:
+        return []
+    words = _frames(signals)
+    return [("axes", words, ())] if words else []
+
+
+def other_frames(flight: Flight) -> str:
+    """In what other axes of world and body the rows of a flight are, in words; nothing where no
+    others agree.
+    """
+    grid = clock_of(flight)
+    return "" if grid is None else _frames(Signals.of(flight, grid))
+
+
+def _frames(signals: Signals) -> str:
+    """See `other_frames`. Without an attitude gravity alone tells, of the body's axes."""
+    if signals.quaternion is None and signals.force is None:
+        return ""
+    for convention in FRAMES if signals.quaternion is not None else (BODY,):
+        other = convention.convert(signals)
+        if upright(other) and not _gravity(other.force) and _agrees(other, []):
+            return convention.words
+    return ""
 
 
 def _gravity(force: np.ndarray | None) -> list[Finding]:

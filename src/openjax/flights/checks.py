@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 
-from openjax.flights.agreement import check_agreement
+from openjax.flights.agreement import check_agreement, other_frames
 from openjax.flights.attitude import derive_attitude
 from openjax.flights.derived import derive_rates, derive_velocity, mend_velocity
 from openjax.flights.flight import Flight, Issue, Refused
@@ -260,6 +260,8 @@ def _above_floor(flight: Flight, floor: float) -> None:
         return
     height = float(np.nanmedian(flight.position[:, 2])) - floor
     if height < -BELOW:
+        if words := other_frames(flight):
+            raise Refused("axes", words)
         text = f"z is {height + floor:.2f} m in flight, below the floor at {floor:g}"
         raise Refused("axes", f"{text}: z points up (scale = -1 in columns.toml), or floor_z is "
                               "what z reads on the floor")  # fmt: skip
