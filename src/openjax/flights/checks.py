@@ -33,12 +33,7 @@ def check_flight(
 
     try:
         _has_what_is_needed(flight, comparison)
-        if not (flight.has_pose or flight.has_imu):
-            note(
-                "columns",
-                "no accelerometer, nor a pose: torques alone can be told (log ax, ay, az)",
-            )
-        checked = _in_time(flight, note)
+        checked = _in_time(_with_forces(flight, note), note)
         checked = put_in_step(drop_repeats(drop_frozen(checked, note), note), note)
         checked = _in_range(checked, note)
         checked = derive_velocity(mend_velocity(checked, note), note)
@@ -78,6 +73,13 @@ def _has_what_is_needed(flight: Flight, comparison: bool) -> None:
         raise Refused(
             "columns", "holds no commands: needs m1..m4, or cmd_thrust and cmd_wx, cmd_wy, cmd_wz"
         )
+
+
+def _with_forces(flight: Flight, note) -> Flight:
+    """The flight, noted where it holds nothing that a force moves."""
+    if not (flight.has_pose or flight.has_imu):
+        note("columns", "no accelerometer, nor a pose: torques alone can be told; log ax, ay, az")
+    return flight
 
 
 def _in_time(flight: Flight, note) -> Flight:
