@@ -116,10 +116,8 @@ def _mended(signals: Signals, bad: list[Pair]) -> tuple[str, str] | None:
     """Kind and words of a convention or labelling of one channel that makes the disagreeing pairs
     agree.
     """
-    for convention in CONVENTIONS:
-        other = convention.convert(signals)
-        if upright(other) and _agrees(other, bad):
-            return "axes", convention.words
+    if words := _convention(signals, bad):
+        return "axes", words
     if signals.quaternion is not None:
         for words, convert in QUATERNIONS.items():
             other = dataclasses.replace(signals, quaternion=convert(signals.quaternion))
@@ -137,6 +135,12 @@ def _mended(signals: Signals, bad: list[Pair]) -> tuple[str, str] | None:
             if _agrees(dataclasses.replace(signals, quaternion=attitude), bad):
                 return "quaternion", words
     return None
+
+
+def _convention(signals: Signals, bad: list[Pair]) -> str:
+    """Of another program's conventions one that makes the disagreeing pairs agree, in words."""
+    others = ((c.words, c.convert(signals)) for c in CONVENTIONS)
+    return next((w for w, other in others if upright(other) and _agrees(other, bad)), "")
 
 
 def _attitudes(signals: Signals) -> Iterator[tuple[str, np.ndarray]]:
