@@ -98,7 +98,8 @@ def _contradictions(signals: Signals) -> list[Finding]:
     bad = [pair for pair in pairs if pair.bad.any()]
     if not bad:
         return [finding for pair in pairs for finding in _unit(pair)][:1]
-    mended = _mended(signals, bad)
+    words = _convention(signals, bad)
+    mended = ("axes", words) if words else _mended(signals, bad)
     if mended is not None:
         return [(*mended, [pair.what for pair in bad])]
     return [("garbage", pair.in_words(), [pair.what]) for pair in bad]
@@ -116,8 +117,6 @@ def _mended(signals: Signals, bad: list[Pair]) -> tuple[str, str] | None:
     """Kind and words of a convention or labelling of one channel that makes the disagreeing pairs
     agree.
     """
-    if words := _convention(signals, bad):
-        return "axes", words
     if signals.quaternion is not None:
         for words, convert in QUATERNIONS.items():
             other = dataclasses.replace(signals, quaternion=convert(signals.quaternion))
