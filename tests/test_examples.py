@@ -2,12 +2,14 @@
 
 import dataclasses
 import runpy
+import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
 import openjax
+from openjax.show.metrics import read_metrics
 
 pytestmark = pytest.mark.slow
 
@@ -33,7 +35,11 @@ def test_own_controller_is_flown_like_a_policy(capsys):
     assert captured["chase"] < captured["open"]  # running after a faster one isn't enough
 
 
-def test_training_from_python_gives_a_policy(tmp_path, monkeypatch, capsys):
+@pytest.fixture
+def tiny_preset(tmp_path, monkeypatch):
+    """`openjax.preset` gives a run of two updates, whatever it is asked for; in a folder of its
+    own.
+    """
     tiny = openjax.preset("quick")
     tiny = dataclasses.replace(
         tiny,
@@ -49,12 +55,43 @@ def test_training_from_python_gives_a_policy(tmp_path, monkeypatch, capsys):
         total_steps=640,
         validation_episodes=8,
     )
-    monkeypatch.setattr(openjax, "preset", lambda name: tiny, raising=False)
-    monkeypatch.setattr(sys, "argv", ["train_from_python.py"])
+    monkeypatch.setattr(openjax, "preset", lambda name, **changes: tiny, raising=False)
+    monkeypatch.setattr(sys, "argv", ["example.py"])
     monkeypatch.chdir(tmp_path)
+
+
+@pytest.mark.parametrize("part", ["reward", "network", "observation", "learner"])
+def test_a_part_of_ones_own_is_trained(part, tiny_preset, tmp_path, capsys):
+    runpy.run_path(str(EXAMPLES / f"own_{part}.py"))
+    printed = capsys.readouterr().out
+    assert part == "learner" or "captured in" in printed
+    run = tmp_path / "runs" / f"own_{part}"
+    metrics = list(read_metrics(run / "metrics.jsonl", "train"))
+    assert len(metrics) == 2 and (run / "chase.gif").is_file() and (run / "policy.npz").is_file()
+    assert ("reinforce_loss" in metrics[0]) == (part == "learner")
+    with pytest.raises(openjax.UserError, match="was begun with"):
+        openjax.train(resume=run)
+
+
+def test_an_evader_of_ones_own_is_flown(capsys):
+    runpy.run_path(str(EXAMPLES / "own_evader.py"), run_name="__main__")
+    rows = [line.split() for line in capsys.readouterr().out.splitlines() if "caught in" in line]
+    assert [row[0] for row in rows] == ["field", "foresee"]
+    assert float(rows[0][3]) == 1.0
+
+
+def test_training_from_python_gives_a_policy(tiny_preset, tmp_path, capsys):
     runpy.run_path(str(EXAMPLES / "train_from_python.py"))
     assert "distances to the evader" in capsys.readouterr().out
     assert (tmp_path / "runs/from_python/policy.npz").is_file()
+
+
+def test_an_effect_of_ones_own_is_flown_and_named():
+    """In a process of its own: effects are registered before the diagnosis is loaded."""
+    command = [sys.executable, str(EXAMPLES / "own_effect.py")]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert not done.returncode, done.stderr
+    assert "tether" in done.stdout
 
 
 def test_diagnosis_names_drag(capfd):

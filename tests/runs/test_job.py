@@ -1,6 +1,7 @@
 """What a run flies with, and its last stage, which keeps what validates best."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -45,7 +46,9 @@ def test_last_stage_keeps_what_validates_best_and_ends_when_asked(
     environment = Pursuit(settings.environment)
     observation = jax.eval_shape(lambda key: environment.reset(key)[0], jax.random.key(0))
     observation = jax.tree.map(lambda kind: jnp.zeros(kind.shape, kind.dtype), observation)
-    before = jax.jit(build(settings, environment).policy.init)(jax.random.key(1), observation)
+    parts = build(settings, environment)
+    job = SimpleNamespace(settings=settings, parts=parts)
+    before = jax.jit(parts.policy.init)(jax.random.key(1), observation)
     directory = RunDirectory(tmp_path)
     save_policy_file(directory.policy, before, settings, {"update": 7}, storage="float32")
 
@@ -63,7 +66,7 @@ def test_last_stage_keeps_what_validates_best_and_ends_when_asked(
     def validate(parameters):
         return GOOD | {"crash_rate": next(rates)}
 
-    message = keep_best(directory, learn, validate, settings, lambda: len(updates) >= asked_after)
+    message = keep_best(directory, learn, validate, job, lambda: len(updates) >= asked_after)
     assert len(updates) == min(asked_after, 10) and next(rates, None) is None
     leaves, _, notes = load_policy_file(directory.policy)
     first = named_leaves(before)

@@ -7,41 +7,13 @@ neither was trained on. Writes DIR/policy.npz, adapt.json and adapt.html.
 
 import dataclasses
 from collections.abc import Sequence
-from pathlib import Path
-from typing import Annotated
-
-import tyro
 
 from openjax.command_line import output_console, parse
 from openjax.errors import UserError
 from openjax.files import check_output_folder
-from openjax.learning.settings import AdaptSettings
-from openjax.ranges import Interval, Seed
+from openjax.runs.options import AdaptCommand
 from openjax.show.progress import Steps
-from openjax.store import DEFAULT_POLICY
 from openjax.store.compiled_programs import cache_programs
-
-
-@dataclasses.dataclass(frozen=True)
-class AdaptCommand:
-    """Diagnose flights and fine-tune a policy to the vehicle that flew them."""
-
-    flights: Annotated[Path, tyro.conf.Positional] = Path("flights")
-    """Folder of flight logs with a vehicle.toml, or an effects.toml of a diagnosis made before."""
-    policy: str = DEFAULT_POLICY
-    """A run, a policy file or the name of a policy in the package."""
-    out: Path = Path("adapted")
-    """Directory for what is found."""
-    episodes: Annotated[int | None, Interval("[1, 1000000]")] = None
-    """Episodes by which the policies are measured; by default 1024 on an accelerator, 128 on a
-    CPU.
-    """
-    seed: Seed = 0
-    overwrite: bool = False
-    """Replace what --out already holds."""
-    compilation_cache: bool = True
-    """Keep compiled programs in the user's cache folder."""
-    training: AdaptSettings = dataclasses.field(default_factory=AdaptSettings)
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -9,54 +9,18 @@ devices, with `--devices 1 2 4`. Same command on CPU and GPU.
 import dataclasses
 import importlib
 from collections.abc import Sequence
-from pathlib import Path
-from typing import Annotated, Literal, get_args
-
-import tyro
 
 from openjax.command_line import output_console, parse, peek
 from openjax.errors import UserError
 from openjax.files import check_output, write_json
 from openjax.learning.presets import preset
-from openjax.learning.settings import TrainSettings
-from openjax.ranges import Interval
+from openjax.runs.options import PARTS, BenchmarkCommand
 from openjax.show.progress import Steps
 
 PROGRAM = "openjax benchmark"
 PHYSICS = ("rigid_free", "rigid", "mjx_free", "mjx")
-Part = Literal["rigid_free", "rigid", "mjx_free", "mjx", "environment", "rollout", "training"]
-PARTS = get_args(Part)
 SECONDS = dict(zip(PARTS, (4.0, 5.0, 13.0, 25.0, 10.0, 15.0, 110.0), strict=True))
 """That each part takes to compile on two cores, about."""
-
-
-@dataclasses.dataclass(frozen=True)
-class BenchmarkCommand:
-    """Measure steps per second of each layer, from the physics to the whole training step."""
-
-    preset: str | None = None
-    """quick, paper, flight, mappo or dacoop: networks and learner; by default what fits the
-    machine.
-    """
-    envs: Annotated[tuple[int, ...], Interval("[1, 16777216]")] = ()
-    """Environment counts; by default a sweep that fits the machine."""
-    training_envs: Annotated[tuple[int, ...], Interval("[1, 16777216]")] = ()
-    """Environment counts of the training step; by default those that fit the machine."""
-    devices: Annotated[tuple[int, ...], Interval("[1, 65536]")] = (1,)
-    """Numbers of devices on which the training step is measured; its worlds are shared out to
-    them.
-    """
-    parts: tuple[Part, ...] = PARTS
-    """What to measure."""
-    steps: Annotated[int, Interval("[1, 100000]")] = 50
-    """Control steps per call of physics, environment and rollout."""
-    seconds: Annotated[float, Interval("(0, 3600]")] = 1.0
-    """Shortest time to measure each."""
-    json: Path = Path("benchmark.json")
-    """File of the results."""
-    settings: Annotated[tyro.conf.FlagConversionOff[TrainSettings], tyro.conf.arg(name="")] = (
-        dataclasses.field(default_factory=TrainSettings)
-    )
 
 
 def main(arguments: Sequence[str]) -> int:

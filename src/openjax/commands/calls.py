@@ -2,7 +2,7 @@
 
 import dataclasses
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +13,15 @@ from openjax.background import quiet_compiler
 from openjax.baselines.heuristic import WithoutNetwork
 from openjax.cluster.processes import Processes
 from openjax.errors import UserError
-from openjax.learning import TrainSettings, preset
-from openjax.policy import PolicyParameters
-from openjax.pursuit import Observation, PursuitSettings
+from openjax.learning import Learner, TrainSettings, preset
+from openjax.policy import Network, Policy, PolicyParameters
+from openjax.pursuit import Observation, Pursuit, PursuitSettings
+from openjax.pursuit.evaders import Evader
 from openjax.ranges import changed
-from openjax.runs.start import TrainCommand, default_preset, start
+from openjax.runs.job import OwnParts
+from openjax.runs.start import TrainCommand, check_resumed, default_preset, start
 from openjax.store.policies import LoadedPolicy, load_policy
+from openjax.store.run_directory import open_run
 
 
 def train(
@@ -32,6 +35,10 @@ def train(
     vehicle: str | Path | None = None,
     effects: str | Path | None = None,
     overwrite: bool = False,
+    resume: str | Path | None = None,
+    environment: Pursuit | None = None,
+    policy: Policy | Network | None = None,
+    learners: Mapping[str, Learner] | None = None,
 ) -> LoadedPolicy:
     """Train as `openjax train` does, with its progress, checkpoints and pictures.
 
@@ -44,6 +51,13 @@ def train(
       devices: how many, or "all".
       vehicle, effects: files to fly with, vehicle.toml and effects.toml.
       overwrite: replace a run that `out` already holds.
+      resume: directory of a run to go on with, in place of `out`; `settings` are its own by
+      default, and parts of one's own are to be the same.
+      environment: a game of one's own, with its evaders, reward, observations; its settings go
+      before those of the run.
+      policy: a network of one's own (`openjax.policy.Network`), or a whole policy.
+      learners: of one's own by name (`openjax.learning.Learner`), beside the shipped ones, or in
+      the place of `predictor`, `evaders` or `policy`, which is MAPPO.
 
     Returns:
       The best policy of the run.
@@ -51,25 +65,39 @@ def train(
     Raises:
       UserError: settings or files that can't be used, or a run that ended by a NaN.
     """
-    settings = settings or preset(default_preset())
-    out = Path(out) if out is not None else Path("runs") / time.strftime("%Y%m%d-%H%M%S")
+    resumed = None if resume is None else open_run(Path(resume)).read_settings()
+    if resume is None and out is None:
+        out = Path("runs") / time.strftime("%Y%m%d-%H%M%S")
     command = TrainCommand(
-        out=out,
+        out=_path(out),
+        resume=_path(resume),
         minutes=minutes,
         start_from=start_from,
         compare_with=compare_with or "none",
         devices=str(devices),
-        vehicle=None if vehicle is None else Path(vehicle),
-        effects=None if effects is None else Path(effects),
+        vehicle=_path(vehicle),
+        effects=_path(effects),
         overwrite=overwrite,
         traced_programs=False,  # a caller may have changed functions since they were loaded
-        settings=settings,
+        settings=settings or resumed or preset(default_preset()),
     )
+    if resumed is not None:
+        check_resumed(command, resumed)
+    return _trained(command, OwnParts(environment, policy, learners))
+
+
+def _trained(command, own):
+    """The policy of a run, as `train` gives it."""
     with quiet_compiler():
-        status = start(command, ["(called from Python)"], time.monotonic(), Processes())
+        status = start(command, ["(called from Python)"], time.monotonic(), Processes(), own)
+    run = command.resume or command.out
     if status:
-        raise UserError(f"training in {out} stopped at a NaN; what is left to look at lies there")
-    return load_policy(out)
+        raise UserError(f"training in {run} stopped at a NaN; what is left to look at lies there")
+    return load_policy(run, own.environment, own.policy)
+
+
+def _path(name):
+    return None if name is None else Path(name)
 
 
 def evaluate(
@@ -80,7 +108,7 @@ def evaluate(
     seed: int = 0,
     vehicle: str | Path | None = None,
     effects: str | Path | None = None,
-    opponent: str | Path | None = None,
+    opponent: str | Path | Evader | None = None,
     **changes,
 ) -> dict | list[dict]:
     """Fly a policy's mean on layouts as `openjax evaluate` does.
@@ -93,8 +121,9 @@ def evaluate(
       episodes: per layout.
       seed: draws the start attitudes.
       vehicle, effects: files to fly with, vehicle.toml and effects.toml.
-      opponent: evader to fly against, a name in `openjax.pursuit.evaders.SCRIPTED` or a file; None:
-      those of the policy's game.
+      opponent: evader to fly against: a name in `openjax.pursuit.evaders.SCRIPTED`, a file, or a
+      function of one's own, velocity(scene, memory) -> velocity (3,) in m/s, memory
+      (`openjax.pursuit.evaders.EvaderKind`); None: those of the policy's game.
       changes: of the game that the policy was trained in, for example speed_limit="none".
 
     Returns:
@@ -124,9 +153,9 @@ def evaluate(
         scenario=str(scenario),
         episodes=episodes,
         seed=seed,
-        vehicle=None if vehicle is None else Path(vehicle),
-        effects=None if effects is None else Path(effects),
-        opponent=None if opponent is None else str(opponent),
+        vehicle=_path(vehicle),
+        effects=_path(effects),
+        opponent=str(opponent) if isinstance(opponent, Path) else opponent,
         environment=changed(policy.settings.environment, **changes),
     )
     records, _ = fly_scenarios(command, policy, {})

@@ -49,8 +49,8 @@ class FlightOptions:
     """Draws the start attitudes."""
     opponent: str | None = None
     """Evader to fly against: field, greedy, wall_runner, slow_hugger, heavy, pillar_hugger,
-    greedy_far, greedy_near, two_step, safe_place, way_points, frozen, or a file that openjax
-    exploit wrote; by default those of the policy's game.
+    greedy_far, greedy_near, two_step, safe_place, way_points, frozen, a file that openjax exploit
+    wrote, or a function of one's own, FILE.py:function; by default those of the policy's game.
     """
     compilation_cache: bool = True
     """Keep compiled programs in the user's cache folder."""
@@ -142,6 +142,9 @@ def fly_scenarios(command: EvaluateCommand, loaded, evaluators: dict) -> tuple[l
     from openjax.evaluation.validation import uniform_tasks
 
     game, loaded, layouts = _game(command, loaded)
+    if words := loaded.outside_of_training(game):
+        note = f"note: {loaded.source} was never trained for this: {'; '.join(words)}"
+        output_console().print(note, soft_wrap=True)
     tasks = layout_tasks(game.settings, layouts, command.episodes)
     if not layouts:
         tasks["uniform"] = uniform_tasks(
@@ -168,7 +171,6 @@ def _game(command, loaded):
     """The game of a command, the policy in it, and the layouts; none: uniform tasks."""
     from openjax.evaluation.evaluator import layout_slots
     from openjax.pursuit.scenarios import SCENARIOS, find_scenario
-    from openjax.store.environments import make_environment
 
     settings = command.environment
     if "learned" in settings.evaders and command.opponent is None:
@@ -191,8 +193,22 @@ def _game(command, loaded):
         )
     slots = max([layout_slots(settings), *(len(layout.pillars) for layout in layouts)])
     game = dataclasses.replace(settings, max_pillars=slots, num_pursuers=there)
-    environment = make_environment(game, command.vehicle, command.effects, command.opponent)
+    environment = _environment(command, game, loaded)
     return environment, loaded.in_game(environment), layouts
+
+
+def _environment(command, game, loaded):
+    """The game with all that the command, or a policy of a game of one's own, adds to it."""
+    from openjax.store.environments import make_environment
+
+    trained_in = loaded.environment
+    if trained_in is None:
+        return make_environment(game, command.vehicle, command.effects, command.opponent)
+    if trained_in.evaders and not command.opponent:
+        game = dataclasses.replace(game, evaders=PursuitSettings().evaders)  # these come below
+    environment = make_environment(game, command.vehicle, command.effects, command.opponent)
+    evaders = environment.evaders if command.opponent else trained_in.evaders
+    return dataclasses.replace(environment, observer=trained_in.observer, evaders=evaders)
 
 
 def _show(command, results):

@@ -58,9 +58,8 @@ def make_case(arguments: Arguments) -> list[Path]:
     weighed = arguments.effect == "none" or not EFFECTS[arguments.effect].card.weighed
     described = dataclasses.replace(load_vehicle_file(), mass_weighed=weighed, log=log)
     decimals = {c: DECIMALS.get(c, _REST) for c in LOG_COLUMNS}
-    flights = references(
-        arguments.seed, arguments.duration, neighbour=arguments.effect == "downwash"
-    )
+    of_others = arguments.effect != "none" and EFFECTS[arguments.effect].card.of_others
+    flights = references(arguments.seed, arguments.duration, neighbour=of_others)
     with replacing(arguments.out) as folder:
         folder.mkdir()
         for number, (name, reference) in enumerate(flights.items()):

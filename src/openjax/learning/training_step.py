@@ -24,7 +24,7 @@ from openjax.learning.learners.mappo import Mappo
 from openjax.learning.learners.predictor_update import PredictorLearner
 from openjax.learning.rollout import Noise, Players, collect
 from openjax.learning.settings import TrainSettings
-from openjax.policy import Policy, PolicyParameters, make_policy
+from openjax.policy import Network, OwnPolicy, Policy, PolicyParameters, make_policy
 from openjax.pursuit import Observation, Pursuit, PursuitState
 from openjax.pursuit.evaders import learned_place
 from openjax.vehicle.family import narrowed_bounds
@@ -61,16 +61,19 @@ class Parts:
 def build(
     settings: TrainSettings,
     environment: Pursuit | None = None,
-    policy: Policy | None = None,
+    policy: Policy | Network | None = None,
     learners: Mapping[str, Learner] | None = None,
 ) -> Parts:
     """The parts of a run; those that aren't given are the ones that the settings name.
 
-    Own `learners` stand beside the shipped ones, or in the place of the one whose name they have:
-    `predictor`, `evaders`, `policy` (which is MAPPO).
+    A `policy` may be a network alone (`openjax.policy.Network`). Own `learners` stand beside the
+    shipped ones, or in the place of the one whose name they have: `predictor`, `evaders`, `policy`
+    (which is MAPPO).
     """
     environment = environment or Pursuit(settings.environment)
     policy = policy or make_policy(environment, settings.network, settings.predictor)
+    if not hasattr(policy, "evaluate"):
+        policy = OwnPolicy(policy)
     shipped = shipped_learners(settings, environment, policy)
     return Parts(environment, policy, {**shipped, **(learners or {})})
 

@@ -6,6 +6,7 @@ __getattr__, __dir__, __all__ = lazy_names(
     __name__,
     {
         "outputs": "make_policy register_output",
+        "own_network": "Network OwnPolicy",
         "policy": "Policy PolicyParameters gaussian_entropy gaussian_log_prob",
         "settings": "NetworkSettings PredictorSettings",
     },

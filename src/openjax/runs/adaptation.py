@@ -11,7 +11,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -26,13 +26,11 @@ from openjax.flights.case import load_case
 from openjax.interruption import cleaning
 from openjax.learning.adaptation import bounds_of, fine_tune, make_adaptation, starting_parameters
 from openjax.runs.machine import describe_machine
+from openjax.runs.options import AdaptCommand
 from openjax.store.policies import load_policy
 from openjax.store.policy_files import save_policy_file
 from openjax.vehicle.effects.effects_file import load_effects, load_intervals
 from openjax.vehicle.family import adapted_family
-
-if TYPE_CHECKING:
-    from openjax.commands.adapt import AdaptCommand
 
 STEPS = {"diagnosing and compiling": 60.0, "fine-tuning": 90.0, "measuring": 10.0}
 ON_CPU = {"diagnosing and compiling": 80.0, "fine-tuning": 240.0, "measuring": 25.0}
@@ -47,7 +45,7 @@ episodes.
 """
 
 
-def check(command: "AdaptCommand") -> None:
+def check(command: AdaptCommand) -> None:
     """What can be wrong with flights and policy is told before anything is compiled. Raises
     UserError.
     """
@@ -56,7 +54,7 @@ def check(command: "AdaptCommand") -> None:
     (load_case if command.flights.is_dir() else load_effects)(command.flights)
 
 
-def adapt(command: "AdaptCommand", tell: Callable[[str], None] = lambda step: None) -> dict:
+def adapt(command: AdaptCommand, tell: Callable[[str], None] = lambda step: None) -> dict:
     """Do all of it and write it down; `tell` hears the steps. Raises UserError for flights that
     can't be diagnosed or an unusable policy.
     """
@@ -99,7 +97,7 @@ def _found(effects: Path, airframe: str) -> _Found:
 class _Bench:
     """A policy, and the compiled programs that fine-tune and measure it."""
 
-    def __init__(self, command: "AdaptCommand"):
+    def __init__(self, command: AdaptCommand):
         self.loaded = load_policy(command.policy)
         self._training = command.training
         self.adaptation = make_adaptation(self.loaded.settings, command.training)
@@ -208,7 +206,7 @@ def won_back(flown: dict) -> dict[str, float | None]:
 
 
 @contextlib.contextmanager
-def _diagnosis(command: "AdaptCommand") -> Iterator[Callable[[], Path]]:
+def _diagnosis(command: AdaptCommand) -> Iterator[Callable[[], Path]]:
     """A diagnosis that runs beside the compiler; what is given waits for the effects file that it
     writes.
     """

@@ -5,7 +5,6 @@ each as one function.
 import dataclasses
 import time
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -18,15 +17,13 @@ from openjax.learning import TrainSettings, build, make_start, training_step
 from openjax.learning.rollout import Noise, Players, collect
 from openjax.pursuit import Pursuit, hover_action
 from openjax.pursuit.environment import action_to_command
+from openjax.runs.options import BenchmarkCommand
 from openjax.store.leaves import place
 from openjax.vehicle import hover_state, load_vehicle, make_drones_step
 
-if TYPE_CHECKING:
-    from openjax.commands.benchmark import BenchmarkCommand
-
 
 def cases(
-    command: "BenchmarkCommand", part: str, num_envs: int
+    command: BenchmarkCommand, part: str, num_envs: int
 ) -> Iterator[tuple[str, int, int, Callable, tuple]]:
     """(name, environments, control steps per call, function, its arguments) of a part, made one at
     a time.

@@ -4,7 +4,7 @@ import contextlib
 import dataclasses
 import functools
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 import jax
@@ -31,9 +31,9 @@ from openjax.evaluation.episodes import summarise
 from openjax.evaluation.validation import Validation, flat_metrics, selection_score
 from openjax.files import write_json
 from openjax.interruption import StopRequest
-from openjax.learning import Parts, TrainSettings, build, make_start
+from openjax.learning import Learner, Parts, TrainSettings, build, make_start
 from openjax.learning.train_state import policy_leaf
-from openjax.policy import PolicyParameters
+from openjax.policy import Network, Policy, PolicyParameters
 from openjax.policy.growth import with_longer_history
 from openjax.pursuit import Pursuit
 from openjax.runs.gradient_stages import (
@@ -59,6 +59,24 @@ _SOON = 3.0
 
 
 @dataclasses.dataclass(frozen=True)
+class OwnParts:
+    """Parts of a run that were handed in from Python; see `openjax.learning.build`."""
+
+    environment: Pursuit | None = None
+    policy: Policy | Network | None = None
+    learners: Mapping[str, Learner] | None = None
+
+    @property
+    def names(self) -> list[str]:
+        """What they are: a run that was begun with them goes on with the same ones only."""
+        given = [field.name for field in dataclasses.fields(self) if getattr(self, field.name)]
+        return given + [f"learner {name}" for name in self.learners or ()]
+
+
+ALL_SHIPPED = OwnParts()
+
+
+@dataclasses.dataclass(frozen=True)
 class TrainingJob:
     """What to train and how to go about it."""
 
@@ -80,11 +98,12 @@ class TrainingJob:
     """`time.monotonic()` when the command started."""
     traced: Path | None = None
     """Folder in which traced programs are kept; None: they aren't."""
+    own: OwnParts = ALL_SHIPPED
 
     @functools.cached_property
     def parts(self) -> Parts:
         """Environment, policy and learners."""
-        return build(self.settings, self.environment)
+        return build(self.settings, self.environment, self.own.policy, self.own.learners)
 
     @property
     def made_from(self) -> str:
@@ -114,7 +133,14 @@ class TrainingJob:
             _start_parameters(self, abstract)
         if self.compare_with is not None:
             other = load_policy(self.compare_with)
-            other.in_game(Pursuit(game_for(self.settings.environment, other)))
+            other.in_game(game_for(self.environment, other))
+        if self.own.policy is not None:
+            stages = self.settings.first_flights.updates or self.settings.analytic.updates
+            if stages:
+                raise UserError(
+                    "first_flights.updates and analytic.updates must be 0 for a policy of one's "
+                    "own: these stages need the shipped networks"
+                )
 
 
 def run_job(job: TrainingJob, directory: RunDirectory, console: Console) -> int:
@@ -261,7 +287,7 @@ class _Run:
         learn = self.last_stage()
         with self.stop.while_learning():
             return keep_best(
-                self.directory, learn, validate, self.settings, lambda: self.stop.name is not None
+                self.directory, learn, validate, self.job, lambda: self.stop.name is not None
             )
 
     def _await_validation(self):
@@ -456,7 +482,7 @@ def keep_best(
     directory: RunDirectory,
     learn: Callable[[PolicyParameters, jax.Array], Iterator[tuple[PolicyParameters, dict]]],
     validate: Callable[[PolicyParameters], dict],
-    settings: TrainSettings,
+    job: TrainingJob,
     over: Callable[[], bool],
 ) -> str:
     """Take a run's policy through the last stage, and keep the best of what it becomes and what it
@@ -466,15 +492,16 @@ def keep_best(
       directory: the run's; `policy.npz` is what the stage starts from, and what it writes.
       learn: (parameters, key) -> after each update the parameters and its metrics.
       validate: parameters -> summary of validation tasks by which no checkpoint was chosen.
-      settings: of the run.
+      job: the run's; its settings and parts are looked at.
       over: is asked after each update whether to stop.
 
     Returns:
       what to tell of it.
     """
     began = time.monotonic()
+    settings = job.settings
     before, _, notes = load_policy_file(directory.policy)
-    abstract = abstract_parameters(Pursuit(settings.environment), build(settings).policy)
+    abstract = abstract_parameters(job.parts.environment, job.parts.policy)
     # where the validation, too, was compiled for
     before = place(fill(abstract, before, str(directory.policy)))
     length = settings.environment.episode_length

@@ -1,13 +1,18 @@
-"""Options of `openjax train`, without JAX, so that its help comes at once."""
+"""Options of the commands whose work is done in this room, without JAX, so that their help comes
+at once.
+"""
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal, get_args
 
 import tyro
 
-from openjax.learning.settings import TrainSettings
-from openjax.ranges import Interval
+from openjax.learning.best_response_settings import BestResponseSettings
+from openjax.learning.settings import AdaptSettings, TrainSettings
+from openjax.pursuit.settings import PursuitSettings
+from openjax.ranges import Interval, Seed
+from openjax.store import DEFAULT_POLICY
 
 PROGRAM = "openjax train"
 
@@ -52,7 +57,7 @@ class TrainCommand:
     """
     opponent: str | None = None
     """Evader to train against: field, greedy, wall_runner and others (openjax evaluate --help), or
-    a file that openjax exploit wrote; short for --environment.evaders.
+    a file that openjax exploit wrote, or FILE.py:function; short for --environment.evaders.
     """
     devices: str | None = None
     """Number of devices to train on, or all (of all processes); by default one accelerator, or up
@@ -76,6 +81,99 @@ class TrainCommand:
     """Policy (a name, a file, a run) that the final table and the animation show beside the trained
     one, or none; by default open after the preset quick.
     """
+    settings: Annotated[tyro.conf.FlagConversionOff[TrainSettings], tyro.conf.arg(name="")] = (
+        dataclasses.field(default_factory=TrainSettings)
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class ExploitCommand:
+    """Train an evader against a fixed policy, and count the captures of it and of all scripted
+    evaders.
+    """
+
+    policy: str = DEFAULT_POLICY
+    """A run's directory, a policy file (.npz), a checkpoint, or the name of a policy in the package
+    or of a heuristic.
+    """
+    out: Path = Path("evader.npz")
+    """File to write the strongest learned evader to."""
+    json: Path | None = None
+    """File to write the records to."""
+    episodes: Annotated[int, Interval("[1, 1000000]")] = 100
+    """Episodes per layout and evader; by default 8 on a CPU."""
+    uniform: Annotated[int, Interval("[1, 1000000]")] = 4096
+    """Uniform tasks per evader; by default 64 on a CPU."""
+    seed: Seed = 0
+    """Draws the evaders' first parameters, their tasks and the start attitudes."""
+    minutes: Annotated[float | None, Interval("(0, 100000]")] = None
+    """Stop learning after this time, which begins when all is compiled; by default only when all
+    steps are done.
+    """
+    compilation_cache: bool = True
+    """Keep compiled programs in the user's cache folder."""
+    vehicle: Path | None = None
+    """Vehicle to fly (vehicle.toml); by default the nominal Crazyflie."""
+    effects: Path | None = None
+    """Physical effects to fly with (effects.toml)."""
+    learning: Annotated[BestResponseSettings, tyro.conf.arg(name="")] = dataclasses.field(
+        default_factory=BestResponseSettings
+    )
+    environment: tyro.conf.FlagConversionOff[PursuitSettings] = dataclasses.field(
+        default_factory=PursuitSettings
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class AdaptCommand:
+    """Diagnose flights and fine-tune a policy to the vehicle that flew them."""
+
+    flights: Annotated[Path, tyro.conf.Positional] = Path("flights")
+    """Folder of flight logs with a vehicle.toml, or an effects.toml of a diagnosis made before."""
+    policy: str = DEFAULT_POLICY
+    """A run, a policy file or the name of a policy in the package."""
+    out: Path = Path("adapted")
+    """Directory for what is found."""
+    episodes: Annotated[int | None, Interval("[1, 1000000]")] = None
+    """Episodes by which the policies are measured; by default 1024 on an accelerator, 128 on a
+    CPU.
+    """
+    seed: Seed = 0
+    overwrite: bool = False
+    """Replace what --out already holds."""
+    compilation_cache: bool = True
+    """Keep compiled programs in the user's cache folder."""
+    training: AdaptSettings = dataclasses.field(default_factory=AdaptSettings)
+
+
+Part = Literal["rigid_free", "rigid", "mjx_free", "mjx", "environment", "rollout", "training"]
+PARTS = get_args(Part)
+
+
+@dataclasses.dataclass(frozen=True)
+class BenchmarkCommand:
+    """Measure steps per second of each layer, from the physics to the whole training step."""
+
+    preset: str | None = None
+    """quick, paper, flight, mappo or dacoop: networks and learner; by default what fits the
+    machine.
+    """
+    envs: Annotated[tuple[int, ...], Interval("[1, 16777216]")] = ()
+    """Environment counts; by default a sweep that fits the machine."""
+    training_envs: Annotated[tuple[int, ...], Interval("[1, 16777216]")] = ()
+    """Environment counts of the training step; by default those that fit the machine."""
+    devices: Annotated[tuple[int, ...], Interval("[1, 65536]")] = (1,)
+    """Numbers of devices on which the training step is measured; its worlds are shared out to
+    them.
+    """
+    parts: tuple[Part, ...] = PARTS
+    """What to measure."""
+    steps: Annotated[int, Interval("[1, 100000]")] = 50
+    """Control steps per call of physics, environment and rollout."""
+    seconds: Annotated[float, Interval("(0, 3600]")] = 1.0
+    """Shortest time to measure each."""
+    json: Path = Path("benchmark.json")
+    """File of the results."""
     settings: Annotated[tyro.conf.FlagConversionOff[TrainSettings], tyro.conf.arg(name="")] = (
         dataclasses.field(default_factory=TrainSettings)
     )

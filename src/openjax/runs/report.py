@@ -12,7 +12,7 @@ from rich.table import Table
 from openjax.evaluation.evaluator import Evaluator, layout_slots, layout_tasks
 from openjax.evaluation.validation import Validation, uniform_tasks
 from openjax.files import write_json
-from openjax.pursuit import Pursuit, PursuitSettings, Scenario
+from openjax.pursuit import Pursuit, Scenario
 from openjax.runs.loop import Outcome
 from openjax.runs.words import layouts_like
 from openjax.show.metrics import METRICS_FILE
@@ -43,17 +43,19 @@ _OF_THE_POLICY = (
 """Settings that are how a policy sees and steers, and not what game it plays."""
 
 
-def game_for(settings: PursuitSettings, policy: LoadedPolicy) -> PursuitSettings:
-    """The game of `settings` for another policy, which sees and steers as it was trained to;
+def game_for(environment: Pursuit, policy: LoadedPolicy) -> Pursuit:
+    """A game for another policy than it was made for, which sees and steers as it was trained to;
     episodes last as long.
     """
+    settings = environment.settings
     own = policy.settings.environment
-    return dataclasses.replace(
+    settings = dataclasses.replace(
         settings,
         **{name: getattr(own, name) for name in _OF_THE_POLICY},
         episode_length=round(settings.episode_length * settings.time_step / own.time_step),
         max_pillars=layout_slots(settings),
     )
+    return dataclasses.replace(environment, settings=settings, dynamics=None, observer=None)
 
 
 def compare(
@@ -79,8 +81,8 @@ def compare(
     Raises:
       UserError: the policy can't play this game.
     """
-    settings = game_for(environment.settings, policy)
-    game = dataclasses.replace(environment, settings=settings, dynamics=None)
+    game = game_for(environment, policy)
+    settings = game.settings
     policy = policy.in_game(game)
     tasks = {"validation": uniform_tasks(environment.settings, validation, settings.max_pillars)}
     tasks |= layout_tasks(settings, scenarios, episodes)

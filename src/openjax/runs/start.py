@@ -18,7 +18,7 @@ from openjax.command_line import output_console, parse, peek
 from openjax.errors import UserError
 from openjax.files import remove_unfinished, to_plain
 from openjax.learning import TrainSettings, preset
-from openjax.runs.job import TrainingJob, run_job
+from openjax.runs.job import ALL_SHIPPED, OwnParts, TrainingJob, run_job
 from openjax.runs.machine import describe_machine
 from openjax.runs.options import MAY_CHANGE, PROGRAM, TrainCommand
 from openjax.runs.words import different_settings, opening_words
@@ -48,7 +48,7 @@ def read_command(arguments: Sequence[str]) -> TrainCommand:
         default = preset(name or default_preset())
     command = parse(TrainCommand, TrainCommand(settings=default), arguments, PROGRAM)
     if resume is not None:
-        _check_resumed(command, default)
+        check_resumed(command, default)
     if command.steps is not None:
         settings = dataclasses.replace(command.settings, total_steps=command.steps)
         command = dataclasses.replace(command, settings=settings)
@@ -84,11 +84,15 @@ def default_preset() -> str:
 
 
 def start(
-    command: TrainCommand, arguments: Sequence[str], started: float, processes: Processes
+    command: TrainCommand,
+    arguments: Sequence[str],
+    started: float,
+    processes: Processes,
+    own: OwnParts = ALL_SHIPPED,
 ) -> int:
     """Make the run's directory, or open it, and train. Returns the exit status."""
     cache = cache_programs() if command.compilation_cache else None
-    job, directory, files = prepare(command, arguments, started, processes)
+    job, directory, files = prepare(command, arguments, started, processes, own)
     if command.traced_programs and cache is not None:
         job = dataclasses.replace(job, traced=cache / "traced")
     _check_same(job.settings, processes)  # a mistake shows before any process changes a file
@@ -114,7 +118,11 @@ def start(
 
 
 def prepare(
-    command: TrainCommand, arguments: Sequence[str], started: float, processes: Processes
+    command: TrainCommand,
+    arguments: Sequence[str],
+    started: float,
+    processes: Processes,
+    own: OwnParts = ALL_SHIPPED,
 ) -> tuple[TrainingJob, RunDirectory, dict[str, Path]]:
     """What to train, where, and the files to copy there, by their names; nothing is changed yet.
 
@@ -124,16 +132,13 @@ def prepare(
     resumed = None if command.resume is None else open_run(command.resume)
     known = {} if resumed is None else resumed.read_facts()
     files = _files(command, resumed)
-    environment = make_environment(command.settings.environment, *files.values())
-    # a scripted evader, or a vehicle that is known by name, is in the settings
-    if environment.evader_networks is None:
-        files["evader.npz"] = None
-    if files["vehicle.toml"] and load_vehicle_file(files["vehicle.toml"]).path is None:
-        files["vehicle.toml"] = None
+    _check_own(own, files, known)
+    environment = own.environment or _environment(command.settings.environment, files)
     settings = dataclasses.replace(command.settings, environment=environment.settings)
     directory = resumed or RunDirectory(_free_directory(command, processes))
     started_from = _lasting(command.start_from) or known.get("start_from")
     facts = {
+        **({"own_parts": own.names} if own.names else {}),
         "command": " ".join([PROGRAM, *arguments]),
         "machine": describe_machine(),
         "devices": _devices(command.devices, settings, known.get("devices")),
@@ -143,11 +148,8 @@ def prepare(
     job = TrainingJob(
         settings=settings,
         environment=environment,
-        # what a run started from is needed again only where it was killed before its first
-        # checkpoint
-        start_from=None
-        if resumed and Checkpoints(resumed.checkpoints).any_finished()
-        else started_from,
+        # needed again only where a run was killed before its first checkpoint
+        start_from=None if _has_begun(resumed) else started_from,
         devices=facts["devices"],
         processes=processes,
         time_limit=float("inf") if command.minutes is None else 60.0 * command.minutes,
@@ -155,9 +157,25 @@ def prepare(
         compare_with=facts["compare_with"],
         facts=facts,
         started=started,
+        own=own,
     )
     job.check()
     return job, directory, {name: path for name, path in files.items() if path is not None}
+
+
+def _has_begun(run):
+    return run is not None and Checkpoints(run.checkpoints).any_finished()
+
+
+def _environment(game, files):
+    """The game with what `files` say; those that needn't be kept become None."""
+    environment = make_environment(game, *files.values())
+    # a scripted evader, or a vehicle that is known by name, is in the settings
+    if environment.evader_networks is None:
+        files["evader.npz"] = None
+    if files["vehicle.toml"] and load_vehicle_file(files["vehicle.toml"]).path is None:
+        files["vehicle.toml"] = None
+    return environment
 
 
 def other_compiler(facts: dict) -> str | None:
@@ -185,6 +203,20 @@ def _files(command, resumed):
         "evader.npz": command.opponent,
     }
     return {name: path or (resumed and resumed.optional(name)) for name, path in given.items()}
+
+
+def _check_own(own, files, known):
+    """Raises UserError for parts of one's own that don't go with files, or with the run that is
+    resumed.
+    """
+    if own.environment is not None and any(files.values()):
+        raise UserError("an environment of one's own has its vehicle, effects and evader already")
+    before = known.get("own_parts", own.names if not known else [])
+    if before != own.names:
+        raise UserError(
+            f"the run was begun with {', '.join(before) or 'no part'} of one's own, here are "
+            f"{', '.join(own.names) or 'none'}; openjax.train(resume=...) takes the same ones"
+        )
 
 
 def _free_directory(command, processes):
@@ -237,7 +269,7 @@ def _check_same(settings, processes):
             )
 
 
-def _check_resumed(command, stored):
+def check_resumed(command: TrainCommand, stored: TrainSettings) -> None:
     """Raises UserError for options that don't go with --resume, and settings that a run can't take
     up in its middle.
     """

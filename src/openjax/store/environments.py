@@ -1,6 +1,7 @@
 """The game with what files add to it: a vehicle, physical effects, an evader."""
 
 import dataclasses
+import importlib.util
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ import jax
 from openjax.errors import UserError
 from openjax.files import to_plain
 from openjax.pursuit import Pursuit, PursuitSettings
-from openjax.pursuit.evaders import SCRIPTED, init_network
+from openjax.pursuit.evaders import SCRIPTED, Evader, EvaderKind, init_network
 from openjax.store.policy_files import fill, load_policy_file, save_policy_file
 from openjax.vehicle.effects import load_effects
 from openjax.vehicle.family import vehicle_family
@@ -48,16 +49,20 @@ def make_environment(
     settings: PursuitSettings,
     vehicle: Path | None,
     effects: Path | None,
-    opponent: str | Path | None = None,
+    opponent: str | Path | Evader | None = None,
 ) -> Pursuit:
     """The game with the vehicle of a vehicle.toml, or of an airframe's name, the effects of an
-    effects.toml, and one evader (`find_opponent`), where given.
+    effects.toml, and one evader (`find_opponent`, or one's own), where given.
 
     Raises:
       UserError: a file that can't be used, or an evader that nobody knows.
     """
-    network = None
-    if opponent is not None:
+    network = evaders = None
+    if is_own_code(opponent):
+        opponent = own_evader(opponent)
+    if opponent is not None and not isinstance(opponent, str | Path):
+        evaders = (opponent,)
+    elif opponent is not None:
         settings, network = find_opponent(opponent, settings)
     names, parameters = load_effects(effects) if effects else ((), {})
     return Pursuit(
@@ -65,8 +70,39 @@ def make_environment(
         vehicle=load_vehicle_file(vehicle).vehicle if vehicle else None,
         effects=names,
         effect_parameters=parameters,
+        evaders=evaders,
         evader_networks=None if network is None else jax.tree.map(lambda leaf: leaf[None], network),
     )
+
+
+def is_own_code(name: Any) -> bool:
+    """Whether it names a function in a Python file, `FILE.py:function`."""
+    return isinstance(name, str) and ".py:" in name
+
+
+def own_evader(name: str) -> Evader:
+    """The function, or the row, that `FILE.py:function` names; the file is run.
+
+    Raises:
+      UserError: no such file, it doesn't run, or it has nothing of that name.
+    """
+    file, _, attribute = name.rpartition(":")
+    path = Path(file)
+    if not path.is_file():
+        raise UserError(f"--opponent {name}: there is no file {file}")
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    module = importlib.util.module_from_spec(spec)
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:  # whatever the file does
+        raise UserError(f"--opponent {name}: {path} doesn't run: {error}") from error
+    found = getattr(module, attribute, None)
+    if not callable(found) and not isinstance(found, EvaderKind):
+        raise UserError(
+            f"--opponent {name}: {path} has no function {attribute}(scene, memory) that gives a "
+            "velocity and the memory"
+        )
+    return found
 
 
 def save_evader(path: Path, network: Any, game: PursuitSettings, notes: dict) -> None:

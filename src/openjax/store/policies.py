@@ -12,11 +12,13 @@ from openjax.baselines import METHODS, CraftPolicy, Heuristic
 from openjax.baselines.surroundings import Craft
 from openjax.baselines.velocity_controller import check_flyable
 from openjax.errors import UserError, suggestion
-from openjax.learning import TrainSettings
+from openjax.learning import TrainSettings, build
 from openjax.learning.train_state import policy_leaf
 from openjax.plain import from_plain
 from openjax.policy import (
+    Network,
     NetworkSettings,
+    OwnPolicy,
     Policy,
     PolicyParameters,
     PredictorSettings,
@@ -28,7 +30,18 @@ from openjax.store import DEFAULT_POLICY
 from openjax.store.checkpoint_files import is_checkpoint, load_arrays
 from openjax.store.checkpoints import Checkpoints
 from openjax.store.policy_files import WEIGHTS, fill, load_policy_file, shipped_policies
-from openjax.store.run_directory import RunDirectory, is_run
+from openjax.store.run_directory import RunDirectory, is_run, open_run
+
+_OF_THE_WORLD = (
+    "arena_radius",
+    "arena_height",
+    "pillar_radius",
+    "capture_radius",
+    "evader_speed",
+    "max_speed",
+    "time_step",
+)
+"""Settings that a policy can't see, and is used to."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -44,6 +57,8 @@ class LoadedPolicy:
     settings: TrainSettings
     """What it was trained with; of a heuristic, the game's defaults."""
     source: str
+    environment: Pursuit | None = None
+    """Its game, where that has parts of one's own; None: the one that the settings name."""
 
     def in_game(self, environment: Pursuit) -> "LoadedPolicy":
         """The policy for another game than its own: another arena, vehicle or number of pillars.
@@ -72,6 +87,25 @@ class LoadedPolicy:
             return dataclasses.replace(self, policy=dataclasses.replace(self.policy, craft=craft))
         return self
 
+    def outside_of_training(self, environment: Pursuit) -> list[str]:
+        """In words, how a game differs from all that the policy was trained in: arena, radii,
+        speeds, steps and vehicle. A heuristic, and a controller of one's own, learned in none.
+        """
+        if not isinstance(self.policy, Policy | OwnPolicy):
+            return []
+        game = environment.settings
+        trained = self.settings.environment
+        words = [
+            f"{name} {getattr(game, name):g} instead of {getattr(trained, name):g}"
+            for name in _OF_THE_WORLD
+            if getattr(game, name) != getattr(trained, name)
+        ]
+        if game.airframe != trained.airframe:
+            words.append(f"the {game.airframe} instead of the {trained.airframe}")
+        elif environment.effects and not trained.vehicles:
+            words.append(f"{', '.join(environment.effects)}, which no vehicle in training had")
+        return words
+
     def __call__(self, observation: Observation) -> jax.Array:
         """The mean policy's action (..., N, 4) in -1..1: collective thrust, roll, pitch and yaw
         rate.
@@ -80,6 +114,8 @@ class LoadedPolicy:
           UserError: the observation is that of another game.
         """
         game = self.settings.environment
+        if self.environment is not None:  # what it observes may be anything
+            return self.policy.act(self.parameters, observation)
         axes = "world" if observation.heading is None else "heading"
         given = (observation.self_state.shape[-1], *observation.frames.shape[-2:], axes)
         expected = (game.self_size, game.history_length, game.frame_size, game.observe_in)
@@ -91,19 +127,27 @@ class LoadedPolicy:
         return self.policy.act(self.parameters, observation)
 
 
-def load_policy(name_or_path: str | Path = DEFAULT_POLICY) -> LoadedPolicy:
+def load_policy(
+    name_or_path: str | Path = DEFAULT_POLICY,
+    environment: Pursuit | None = None,
+    policy: Policy | Network | None = None,
+) -> LoadedPolicy:
     """Load a policy.
 
     Args:
       name_or_path: a name from `known_policies()` (`DEFAULT_POLICY` if none is given), a policy
       file (.npz), a run's directory
         (its best policy) or a checkpoint's directory inside a run.
+      environment, policy: those of one's own that a run was trained with (`openjax.train`), as its
+      files hold numbers alone.
 
     Raises:
       UserError: nothing of that kind is there, or it's of another shape than its settings say.
     """
     path = Path(name_or_path)
     source = str(name_or_path)
+    if environment is not None or policy is not None:
+        return _own(open_run(path), source, environment, policy)
     if source in METHODS:
         return _heuristic(source)
     if str(name_or_path) in shipped_policies():
@@ -147,6 +191,15 @@ def abstract_parameters(environment: Pursuit, policy: Policy) -> PolicyParameter
 def _from_file(path, source):
     leaves, settings, _ = load_policy_file(path)
     return _build(from_plain(TrainSettings, settings, f"{path}: "), leaves, source)
+
+
+def _own(run, source, environment, policy):
+    """The best policy of a run with parts of one's own."""
+    settings = run.read_settings()
+    parts = build(settings, environment, policy)
+    abstract = abstract_parameters(parts.environment, parts.policy)
+    parameters = fill(abstract, load_policy_file(run.policy)[0], source)
+    return LoadedPolicy(parts.policy, parameters, settings, source, parts.environment)
 
 
 def _from_run(run, source):

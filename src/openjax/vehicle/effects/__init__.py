@@ -19,7 +19,7 @@ from openjax.vehicle.effects.composition import (
 )
 from openjax.vehicle.effects.effect import Card, Context, Effect, Fitted, Parameter, make_context
 from openjax.vehicle.effects.effects_file import load_effects, save_effects
-from openjax.vehicle.effects.registry import EFFECTS
+from openjax.vehicle.effects.registry import EFFECTS, register_effect
 
 __all__ = [
     "EFFECTS",
@@ -32,6 +32,7 @@ __all__ = [
     "initial_memory",
     "load_effects",
     "make_context",
+    "register_effect",
     "resolve",
     "save_effects",
     "seen_state",

@@ -64,6 +64,7 @@ EFFECT = Effect(
             (0.05, 0.5, 0.12, 0.1),
         ),
         needs="position",
+        of_others=True,
         coordinate="height below a neighbour",
         sample={"force": 0.05, "length": 0.5, "width": 0.06, "spread": 0.1},
         practical={"force": 0.003},

@@ -137,6 +137,7 @@ class Card:
         every hypothesis, never a cause.
     nuisance_duty, nuisance_samples: the same where motor commands are duty cycles, or single
     samples whose rows hide the rest. weighed: whether a weighed vehicle rules it out.
+    of_others: whether it acts near other vehicles alone.
     at_voltage(values, intervals, voltage): both as they are at one voltage, for simulators that
     know none. practical: {parameter: how far one of them must be
     from doing nothing before anybody would change a simulator for it}. days: of an effect that
@@ -162,6 +163,7 @@ class Card:
     nuisance_duty: Mapping[str, float] = field(default_factory=dict)
     nuisance_samples: Mapping[str, float] = field(default_factory=dict)
     weighed: bool = False
+    of_others: bool = False
     at_voltage: Callable[[dict, dict, float], tuple[dict, dict]] | None = None
     impossible: Callable[[Any], bool] | None = None
     sample: Mapping[str, float] = field(default_factory=dict)
