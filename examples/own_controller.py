@@ -32,5 +32,5 @@ def chase(observation):
 
 
 for name, policy in (("chase", chase), ("apf", "apf"), ("open", "open")):
-    record = openjax.evaluate(policy, "empty", episodes=16, start_attitude="level", physics="rigid")
+    record = openjax.evaluate(policy, "empty", episodes=16, start_attitude="level")
     print(f"{name:6} captured {record['capture_rate']:.2f}, crashed {record['crash_rate']:.2f}")

@@ -11,7 +11,7 @@ from openjax.pursuit import hover_action
 
 WORLDS = 64
 STEPS = 500  # of 10 ms
-game = openjax.make(num_pursuers=3, evader_speed=0.6, max_pillars=3, min_pillars=3, physics="rigid")
+game = openjax.make(num_pursuers=3, evader_speed=0.6, max_pillars=3, min_pillars=3)
 
 
 def controller(state):

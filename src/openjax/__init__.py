@@ -2,7 +2,7 @@
 of the sim-to-real gap.
 
 import jax, openjax
-environment = openjax.make(physics="rigid")
+environment = openjax.make()
 observation, state = jax.jit(environment.reset)(jax.random.key(0))
 policy = openjax.load_policy("open")
 observation, state, reward, terminated, truncated, info = jax.jit(environment.step)(

@@ -7,11 +7,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from gymnasium.utils.env_checker import check_env
 from pettingzoo.test import parallel_api_test, parallel_seed_test
 
 import openjax
+from openjax.errors import UserError
+from openjax.interfaces import ENVIRONMENT
 from openjax.interfaces.flat import flat_observation, flat_size
-from openjax.interfaces.gymnasium import PursuitVectorEnv
+from openjax.interfaces.gymnasium import PursuitEnv, PursuitVectorEnv
 from openjax.interfaces.jaxmarl import PursuitMultiAgentEnv
 from openjax.interfaces.pettingzoo import PursuitParallelEnv
 
@@ -107,3 +110,48 @@ def test_jaxmarl_interface_is_the_game_and_starts_anew(game):
         jax.random.split(key, 2), jax.vmap(adapter.reset)(jax.random.split(key, 2))[1], actions
     )
     assert state.step.tolist() == [1, 1]
+
+
+def test_gymnasium_knows_the_game_by_name_and_its_checker_passes():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", message=".*Box observation space.*infinity")
+        env = gymnasium.make(ENVIRONMENT, episode_length=LENGTH, num_pursuers=2)
+        check_env(env.unwrapped, skip_render_check=True)
+    first, _ = env.reset(seed=7)
+    for step in range(1, LENGTH + 1):
+        observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
+        assert terminated == (step == LENGTH) and not truncated
+    assert isinstance(reward, float) and info == {"captured": False, "crashed": False}
+    assert not np.allclose(first, observation)
+    np.testing.assert_array_equal(env.reset(seed=7)[0], first)
+    worlds = gymnasium.make_vec(
+        ENVIRONMENT, num_envs=3, vectorization_mode="vector_entry_point", num_pursuers=2
+    )
+    assert worlds.reset(seed=0)[0].shape == (3, *first.shape)
+
+
+def test_settings_beside_an_environment_are_refused(game):
+    with pytest.raises(UserError, match="num_pursuers"):
+        PursuitEnv(game, num_pursuers=2)
+
+
+@pytest.mark.parametrize("observe_time", [True, False])
+def test_jaxmarl_interface_keeps_a_time_limit_and_what_it_hides(observe_time):
+    game = openjax.make(episode_length=2, observe_time=observe_time)
+    adapter = PursuitMultiAgentEnv(game)
+    observations, state = adapter.reset(jax.random.key(0))
+    actions = {agent: jnp.zeros(4) for agent in adapter.agents}
+    for step in (1, 2):
+        before = state
+        observations, state, _, dones, infos = adapter.step(jax.random.key(step), state, actions)
+        assert infos["truncated"].tolist() == [step == 2 and not observe_time] * 3
+    assert bool(dones["__all__"])
+    assert ("final_obs" in infos) != observe_time
+    # IPPO makes one number for each agent of each leaf
+    assert not observe_time or {leaf.shape for leaf in jax.tree.leaves(infos)} == {(3,)}
+    if not observe_time:
+        last = adapter.step_env(jax.random.key(2), before, actions)[0]
+        for agent in adapter.agents:
+            np.testing.assert_allclose(infos["final_obs"][agent], last[agent], atol=1e-6)
+            assert not np.allclose(observations[agent], last[agent])

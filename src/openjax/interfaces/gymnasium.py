@@ -1,16 +1,92 @@
-"""Many worlds as a Gymnasium `VectorEnv` in which one agent flies the whole team (`pip install
-gymnasium pettingzoo`).
+"""One world as a Gymnasium `Env`, many as a `VectorEnv`; one agent flies the whole team (`pip
+install gymnasium`).
 """
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from gymnasium import spaces
+from gymnasium import Env, spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
+from openjax.errors import UserError
 from openjax.interfaces.flat import ACTION_SIZE, flat_observation, flat_size, to_numpy
-from openjax.pursuit import Pursuit
+from openjax.pursuit import Pursuit, make
+
+
+class _Team:
+    """The team as one agent: flat observation and action, spaces and pure functions of one
+    world.
+    """
+
+    def __init__(self, environment: Pursuit | None, changes: dict):
+        if environment is not None and changes:
+            raise UserError(
+                f"{', '.join(changes)} beside an environment: settings are given to the "
+                "environment, or alone"
+            )
+        self.environment = environment or make(**changes)
+        settings = self.environment.settings
+        self._number = settings.num_pursuers
+        size = (self._number * flat_size(settings),)
+        self.observation_space = spaces.Box(-np.inf, np.inf, size, np.float32)
+        self.action_space = spaces.Box(-1.0, 1.0, (self._number * ACTION_SIZE,), np.float32)
+
+    def reset(self, key):
+        observation, state = self.environment.reset(key)
+        return flat_observation(observation).ravel(), state
+
+    def step(self, state, action):
+        action = action.reshape(self._number, ACTION_SIZE)
+        # the game draws nothing after its reset: the key is for the interface only
+        observation, state, reward, terminated, truncated, info = self.environment.step(
+            jax.random.key(0), state, action
+        )
+        events = {"captured": jnp.any(info.captured), "crashed": jnp.any(info.crashed)}
+        observation = flat_observation(observation).ravel()
+        return observation, state, jnp.mean(reward), terminated, truncated, events
+
+
+class PursuitEnv(Env):
+    """One world in which one agent flies the whole team: `gymnasium.make("openjax/Pursuit-v0")`.
+
+    Observation (N * D,) float32: all pursuers' vectors (`flat_observation`). Action (N * 4,) in
+    -1..1: theirs. The reward is their mean. `info` says whether somebody captured or crashed.
+
+    Args:
+      environment: the game; None is the nominal one.
+      changes: settings of the nominal game, as for `openjax.make`.
+
+    Raises:
+      UserError: both are given, or there is no such setting.
+    """
+
+    metadata = {"render_modes": []}  # noqa: RUF012
+
+    def __init__(self, environment: Pursuit | None = None, **changes):
+        team = _Team(environment, changes)
+        self.environment = team.environment
+        self.observation_space = team.observation_space
+        self.action_space = team.action_space
+        self.render_mode = None
+        self._state = None
+        self._reset = jax.jit(team.reset)
+        self._step = jax.jit(team.step)
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None):
+        """Start an episode; `seed` determines it and those that follow. `options` are ignored."""
+        super().reset(seed=seed)
+        key = jax.random.key(int(self.np_random.integers(2**31)))
+        observation, self._state = self._reset(key)
+        return np.array(observation), {}
+
+    def step(self, action):
+        """One control step."""
+        action = jnp.asarray(action, jnp.float32)
+        observation, self._state, *rest = self._step(self._state, action)
+        reward, terminated, truncated, events = jax.device_get(rest)
+        info = {name: bool(value) for name, value in events.items()}
+        return np.array(observation), float(reward), bool(terminated), bool(truncated), info
 
 
 class PursuitVectorEnv(VectorEnv):
@@ -23,26 +99,27 @@ class PursuitVectorEnv(VectorEnv):
     Args:
       num_envs: worlds E.
       environment: the game; None is the nominal one.
+      changes: settings of the nominal game, as for `openjax.make`.
+
+    Raises:
+      UserError: both are given, or there is no such setting.
     """
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}  # noqa: RUF012
 
-    def __init__(self, num_envs: int, environment: Pursuit | None = None):
-        self.environment = environment or Pursuit()
-        settings = self.environment.settings
+    def __init__(self, num_envs: int = 1, environment: Pursuit | None = None, **changes):
+        team = _Team(environment, changes)
+        self.environment = team.environment
         self.num_envs = num_envs
         self.render_mode = None
-        team = settings.num_pursuers
-        self.single_observation_space = spaces.Box(
-            -np.inf, np.inf, (team * flat_size(settings),), np.float32
-        )
-        self.single_action_space = spaces.Box(-1.0, 1.0, (team * ACTION_SIZE,), np.float32)
+        self.single_observation_space = team.observation_space
+        self.single_action_space = team.action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._key = jax.random.key(0)
         self._state = None
-        self._reset = jax.jit(jax.vmap(self._pure_reset))
-        self._step = jax.jit(jax.vmap(self._pure_step))
+        self._reset = jax.jit(jax.vmap(team.reset))
+        self._step = jax.jit(jax.vmap(team.step))
 
     def reset(self, *, seed: int | None = None, options: dict | None = None):
         """Start all worlds anew; `seed` determines them and what follows. `options` are ignored."""
@@ -75,23 +152,3 @@ class PursuitVectorEnv(VectorEnv):
     def _keys(self):
         self._key, key = jax.random.split(self._key)
         return jax.random.split(key, self.num_envs)
-
-    def _pure_reset(self, key):
-        observation, state = self.environment.reset(key)
-        return flat_observation(observation).ravel(), state
-
-    def _pure_step(self, state, action):
-        action = action.reshape(self.environment.settings.num_pursuers, ACTION_SIZE)
-        # the game draws nothing after its reset: the key is for the interface only
-        observation, state, reward, terminated, truncated, info = self.environment.step(
-            jax.random.key(0), state, action
-        )
-        told = {"captured": jnp.any(info.captured), "crashed": jnp.any(info.crashed)}
-        return (
-            flat_observation(observation).ravel(),
-            state,
-            jnp.mean(reward),
-            terminated,
-            truncated,
-            told,
-        )

@@ -73,6 +73,11 @@ class PursuitMultiAgentEnv:
     def step_env(self, key: jax.Array, state: PursuitState, actions: dict[str, jax.Array]):
         """One control step: observations, state, rewards, dones (with `__all__`), infos, all by
         agent.
+
+        `infos` say of each agent (N,) whether it captured or crashed, and whether the end is a time
+        limit that nobody observes (`truncated`). Such an end is no end to a value: where the
+        settings don't observe time, `infos["final_obs"]` has this step's observations by agent, as
+        `step` returns those of the next start.
         """
         action = jnp.stack([actions[agent] for agent in self.agents])
         observation, state, reward, terminated, truncated, info = self.environment.step(
@@ -80,14 +85,12 @@ class PursuitMultiAgentEnv:
         )
         over = terminated | truncated
         dones = {agent: over for agent in self.agents} | {"__all__": over}
-        infos = {"captured": info.captured, "crashed": info.crashed}  # (N,) each
-        return (
-            self._by_agent(flat_observation(observation)),
-            state,
-            self._by_agent(reward),
-            dones,
-            infos,
-        )
+        observations = self._by_agent(flat_observation(observation))
+        cut = jnp.broadcast_to(truncated, info.captured.shape)
+        infos = {"captured": info.captured, "crashed": info.crashed, "truncated": cut}  # (N,) each
+        if not self.environment.settings.observe_time:
+            infos["final_obs"] = observations
+        return observations, state, self._by_agent(reward), dones, infos
 
     def get_obs(self, state: PursuitState) -> dict[str, jax.Array]:
         """Observations of a state."""

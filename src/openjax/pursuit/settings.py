@@ -102,9 +102,9 @@ class PursuitSettings:
     """Control step (s)."""
     substeps: Annotated[int, Interval("[1, 100]")] = 1
     """Physics (and rate controller) steps per control step."""
-    physics: Literal["mjx", "rigid", "stops"] = "mjx"
-    """"mjx": MuJoCo MJX, the reference; "rigid": the same equations written out, contacts included,
-    many times faster; "stops": free flight, and drones are put back out of floor, pillars and one
+    physics: Literal["rigid", "mjx", "stops"] = "rigid"
+    """"rigid": MuJoCo's equations written out, contacts included; "mjx": MuJoCo MJX, the reference,
+    many times slower; "stops": free flight, and drones are put back out of floor, pillars and one
     another once per control step.
     """
     contacts: bool = True
