@@ -87,14 +87,14 @@ OUTSIDE = read("evaders_outside")["rows"]
 
 @pytest.mark.parametrize("row", OUTSIDE, ids=[row["evader"] for row in OUTSIDE])
 def test_evaders_from_outside(row):
-    """The least capture rates that somebody else measured, in the README and on the page of evaders,
-    before everything else that either says of results.
+    """The least capture rates that somebody else measured: in the README before all other results,
+    on the page of evaders and on the policy's card.
     """
     rates = [short(row["capture_rate"][place], 2) for place in (*SCENARIOS, "uniform")]
     assert cells(row["evader"]) == rates
-    page = (ROOT / "experiments" / "results" / "evaders.md").read_text(encoding="utf-8")
     line = f"| {row['evader']} | {' | '.join(rates)} |"
-    assert line in page
+    for page in ("experiments/results/evaders.md", "docs/model_cards.md"):
+        assert line in (ROOT / page).read_text(encoding="utf-8"), page
     results = README[README.index("## Results") :]
     assert results.index(line) < results.index("| layout |")
 
