@@ -101,7 +101,8 @@ def _fly(arguments: Arguments, prepared: Prepared | None) -> None:
     from openjax.flying.session import Session
 
     if prepared is None:
-        console.print("loading the policy, compiling the tick ...")
+        what = "the policy" if arguments.plan is None else "the plan"
+        console.print(f"loading {what}, compiling the tick ...")
     flown = prepared or prepare(arguments)
     for line in flown.remarks:
         console.print(line, soft_wrap=True)
@@ -119,7 +120,7 @@ def _fly(arguments: Arguments, prepared: Prepared | None) -> None:
             _write(arguments.out, flown, flight, samples, session.scheduler)
         except OSError as error:
             complaint = "; ".join(filter(None, (complaint, f"no log: {one_line(error)}")))
-    _show(console, flight)
+    _show(console, flight, arguments.plan is not None)
     if session.scheduler != "real time":
         console.print(
             "no real-time scheduler: on a busy machine deadlines are missed (docs/flying.md)"
@@ -258,7 +259,7 @@ def checked(arguments: Arguments) -> Arguments:
     return dataclasses.replace(arguments, uri=tuple(uris[:number]), evader_uri=evader)
 
 
-def _show(console, flight):
+def _show(console, flight, planned):
     record = flight.record
     timing = record.timing()
     if not timing["ticks"]:
@@ -270,7 +271,7 @@ def _show(console, flight):
         f"{age['p99']:.2f} ms p99; {timing['missed_deadlines']} missed deadlines "
         f"({timing['missed_share']:.2%})"
     )
-    for number, game in enumerate(record.episodes):
+    for number, game in enumerate(() if planned else record.episodes):
         caught = f"caught at step {game['capture_step']}" if game["capture_step"] else "not caught"
         console.print(
             f"game {number}: {caught}, {game['steps']} steps, {game['breaches']} with a breach"

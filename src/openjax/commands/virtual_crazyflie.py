@@ -20,6 +20,8 @@ from openjax.ranges import Interval
 from openjax.virtual_crazyflie.link import BASE_PORT, LinkFaults
 
 PROGRAM = "openjax virtual_crazyflie"
+MIDDLE = "middle"
+"""In a layout's place: the first stands in the middle, where plans begin."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +36,7 @@ class Arguments:
     """UDP port of the first; cflib's scan looks at 19850 to 19859."""
     scenario: str = "wall"
     """They stand below the pursuers' starts of this layout (a name or a TOML file); more of them in
-    a row behind.
+    a row behind. middle: the first in the middle, where the plans of openjax fly --plan begin.
     """
     vehicle: Path | None = None
     """The vehicle inside: crazyflie, brushless, or a vehicle.toml; by default the Crazyflie 2.1."""
@@ -59,8 +61,10 @@ def make(arguments: Arguments):
     from openjax.virtual_crazyflie.process import VirtualCrazyflies
     from openjax.virtual_crazyflie.vehicles import VirtualVehicles
 
-    scenario = find_scenario(arguments.scenario, PursuitSettings())
-    stands = [start[:2] for start in scenario.pursuers][: arguments.number]
+    starts = ((0.0, 0.0, 0.0),)
+    if arguments.scenario != MIDDLE:
+        starts = find_scenario(arguments.scenario, PursuitSettings()).pursuers
+    stands = [start[:2] for start in starts][: arguments.number]
     stands += [(0.2 * i, -1.4) for i in range(arguments.number - len(stands))]
     effects = load_effects(arguments.effects)[1] if arguments.effects else {}
     vehicle = load_vehicle_file(arguments.vehicle).vehicle
