@@ -202,24 +202,6 @@ def test_signal_before_the_first_update_ends_at_once_and_loses_nothing(
         np.testing.assert_array_equal(array, policy[name], err_msg=name)
 
 
-def test_a_start_that_is_validated_only_when_resumed_ships_the_same_policy(
-    whole_run, tmp_path, train_arguments
-):
-    out = tmp_path / "short"
-    limit = ["--minutes", "0.0001"]  # over as soon as the first flights are
-    finish(start([*train_arguments, *ALONE, *limit, "--out", str(out)]))
-    assert Checkpoints(out / "checkpoints").latest().update == 0
-    finish(start(["openjax.train", "--resume", str(out)]))
-    scores = [
-        [
-            (row["update"], row["score"])
-            for row in read_metrics(path / "metrics.jsonl", "validation")
-        ]
-        for path in (whole_run[0], out)
-    ]
-    assert scores[0] == scores[1] and scores[0][0][0] == 0
-
-
 def _printed(output):
     """What a process has written so far to its file, whose place is left alone."""
     return os.pread(output.fileno(), 1 << 24, 0).decode(errors="replace")

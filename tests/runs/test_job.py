@@ -12,9 +12,10 @@ from openjax.cluster.processes import Processes
 from openjax.files import read_json
 from openjax.learning import build, preset
 from openjax.pursuit import Pursuit
-from openjax.runs.job import keep_best
+from openjax.runs.job import awaits_validation, keep_best
 from openjax.runs.options import TrainCommand
 from openjax.runs.start import other_compiler, prepare
+from openjax.store.checkpoints import CheckpointRecord
 from openjax.store.leaves import named_leaves
 from openjax.store.policy_files import load_policy_file, save_policy_file
 from openjax.store.run_directory import RunDirectory
@@ -93,3 +94,14 @@ def test_a_run_that_another_jax_goes_on_with_says_so():
     assert other_compiler(facts(jax.__version__)) is None
     assert other_compiler({}) is None
     assert f"JAX 0.9.1 so far; JAX {jax.__version__} goes on" in other_compiler(facts("0.9.1"))
+
+
+def test_a_start_that_was_never_validated_is_when_the_run_goes_on():
+    settings = preset("quick")
+    unscored = CheckpointRecord(Path("000000000"), 0, None, {})
+    assert awaits_validation(unscored, settings, None)
+    assert not awaits_validation(unscored, settings, "open")
+    assert not awaits_validation(unscored, preset("quick", first_flights=dict(updates=0)), None)
+    scored = CheckpointRecord(Path("000000000"), 0, 0.5, {})
+    later = CheckpointRecord(Path("000000007"), 7, None, {})
+    assert not any(awaits_validation(record, settings, None) for record in (scored, later))

@@ -4,9 +4,12 @@ import math
 from collections.abc import Sequence
 
 from openjax.flying.controller import Pose, level_acceleration, moved_on
+from openjax.flying.innovations import Innovations
 from openjax.flying.judge import Track, Verdict, agree, at_one_time, follows
 from openjax.flying.state import FLYING, SPIN_UP, Drone, Mode, PoseSample, State
 
+CHECKED = (Mode.TRANSFER, Mode.READY, Mode.PURSUIT, Mode.HOLD, Mode.LAND)
+"""Modes in which nothing but air carries a vehicle, so that thrust tells its acceleration."""
 SMOOTHING = 0.02
 """Time constant of the low-pass of velocities from motion capture (s)."""
 
@@ -30,11 +33,13 @@ def _seen(state, drone, sample) -> Drone:
     limits = state.limits
     moving = drone.mode in FLYING and not (drone.mode is Mode.LIFT and now - drone.since < SPIN_UP)
     by_capture = sample.captured is not None and not drone.distrusted
-    drone = drone._replace(own=_own(state, drone, sample, by_capture, moving))
-    if by_capture:
+    own = _own(state, drone, sample, by_capture, moving)
+    drone = _consistent(state, drone, own)
+    if by_capture and not drone.distrusted:
         drone = _captured(state, drone, sample, moving)
     source = drone.captured if by_capture and not drone.distrusted else drone.own
-    if source.fresh(now, limits):
+    contradicted = source is drone.own and drone.contradiction
+    if source.fresh(now, limits) and not contradicted:
         estimate = moved_on(source.pose, max(now, source.pose.time))
         level = level_acceleration(estimate.quaternion)
         return drone._replace(estimate=estimate, seen=source.pose.time, acceleration=level)
@@ -45,6 +50,38 @@ def _seen(state, drone, sample) -> Drone:
     velocity = tuple(v + dt * a for v, a in zip(old.velocity, drone.acceleration, strict=True))
     position = tuple(p + dt * v for p, v in zip(old.position, velocity, strict=True))
     return drone._replace(estimate=old._replace(time=now, position=position, velocity=velocity))
+
+
+def _consistent(state, drone, own) -> Drone:
+    """The drone after its newest own estimate. If its innovations contradict that, none is believed
+    any more in this flight, nor motion capture where it tells the same: what the estimator on board
+    follows can't confirm it.
+    """
+    if drone.contradiction:
+        return drone._replace(own=drone.own._replace(verdict=drone.contradiction))
+    if drone.mode not in CHECKED:
+        return drone._replace(own=own, innovations=Innovations())
+    if own.pose is drone.own.pose:
+        # what told nothing but wrong poses until it was lost may tell believable ones, of another
+        # place, once anything can have happened
+        lost = own.verdict and not any(
+            track.fresh(state.time, state.limits) for track in (own, drone.captured)
+        )
+        return drone._replace(own=own, contradiction=own.verdict if lost else Verdict.GOOD)
+    refused = bool(drone.own.verdict)
+    innovations = drone.innovations.after(own.pose, drone.sent, state.airframe, refused)
+    verdict = innovations.verdict()
+    seen = drone.captured
+    if not verdict:
+        return drone._replace(own=own, innovations=innovations)
+    drone = drone._replace(
+        own=drone.own._replace(verdict=verdict), innovations=innovations, contradiction=verdict
+    )
+    if seen.pose is not None and not follows(*at_one_time(seen.pose, own.pose), state.limits):
+        return drone
+    return drone._replace(
+        estimate=moved_on(innovations.corrected(), state.time), distrusted=verdict
+    )
 
 
 def _own(state, drone, sample, by_capture, moving) -> Track:
@@ -79,9 +116,20 @@ def _captured(state, drone, sample, moving) -> Drone:
         drone = drone._replace(told=both is None or follows(*both, limits))
         if both and own.fresh(now, limits) and (verdict := agree(*both, limits)):
             captured = captured._replace(pose=drone.captured.pose, verdict=verdict)
-    if moving and not captured.fresh(now, limits):
+    innovations = drone.captured_innovations
+    if drone.mode not in CHECKED:
+        innovations = Innovations()
+    elif captured.pose is seen and seen is not drone.captured.pose:
+        refused = bool(drone.captured.verdict)
+        innovations = innovations.after(seen, drone.sent, state.airframe, refused)
+        distrusted = innovations.verdict()
+    if distrusted:
+        captured = captured._replace(pose=drone.captured.pose, verdict=distrusted)
+    elif moving and not captured.fresh(now, limits):
         distrusted = captured.verdict or "pose lost"
-    return drone._replace(captured=captured, distrusted=distrusted)
+    return drone._replace(
+        captured=captured, captured_innovations=innovations, distrusted=distrusted
+    )
 
 
 def _with_motion(pose, last, own) -> Pose:

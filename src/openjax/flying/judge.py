@@ -25,6 +25,10 @@ class Verdict(StrEnum):
     TOO_FAST = "velocity jumped"
     SPUN = "body rates jumped"
     APART = "motion capture and the vehicle's own estimate disagree"
+    NOT_ITS_WAY = "estimated position and velocity disagree"
+    NOT_ITS_THRUST = "estimated velocity disagrees with thrust and attitude"
+    NOT_ITS_TURN = "estimated attitude disagrees with the gyroscope"
+    NOT_ITS_RATES = "the gyroscope disagrees with the body rates that were sent"
 
 
 @dataclass(frozen=True)

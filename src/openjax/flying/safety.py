@@ -199,6 +199,8 @@ def _unfit(state, drone) -> str:
     now = state.time
     if drone.low_since is not None and now - drone.low_since > settings.battery_time:
         return "battery low"
+    if drone.alone_since is not None and now - drone.alone_since > settings.alone_time:
+        return f"{settings.alone_time:g} s by its own estimate alone"
     if drone.own.pose is not None and now - drone.own.pose.time > settings.link_timeout:
         return f"own estimate lost ({drone.own.verdict or 'silent'})"
     x, y, z = drone.estimate.position
@@ -277,8 +279,12 @@ def _watched(state, drone, sample) -> Drone:
 
     low = sample.voltage < state.settings.battery_low  # an unknown voltage is not low
     over = drone.estimate is not None and up(drone.estimate.quaternion) < 0.0
+    confirmed = drone.captured.pose is not None and not drone.distrusted
+    alone = drone.mode in FLYING and not confirmed
     return drone._replace(
-        low_since=since(drone.low_since, low), over_since=since(drone.over_since, over)
+        alone_since=since(drone.alone_since, alone),
+        low_since=since(drone.low_since, low),
+        over_since=since(drone.over_since, over),
     )
 
 

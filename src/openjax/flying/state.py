@@ -10,7 +10,8 @@ from typing import Annotated, NamedTuple
 
 from openjax.flying.controller import Airframe, Pose, Vector, nominal_airframe
 from openjax.flying.crtp import Supervisor
-from openjax.flying.judge import PoseLimits, Track, pose_limits
+from openjax.flying.innovations import Innovations
+from openjax.flying.judge import PoseLimits, Track, Verdict, pose_limits
 from openjax.flying.set_point import MOTORS_OFF, SetPoint
 from openjax.ranges import Interval, check_intervals
 from openjax.vehicle.arena import Arena
@@ -18,6 +19,7 @@ from openjax.vehicle.arena import Arena
 SPIN_UP = 0.3
 """A vehicle that lifts off may stand still for so long (s)."""
 _NOTHING_SEEN = Track()
+_NOTHING_SUMMED = Innovations()
 
 
 @dataclass(frozen=True)
@@ -50,6 +52,10 @@ class SafetySettings:
     """Without a good pose for longer (s) a vehicle is flown by reckoning no more: it lands."""
     link_timeout: Annotated[float, Interval("(0, 60]")] = 0.3
     """A link silent for longer (s) is gone."""
+    alone_time: Annotated[float, Interval("(0, 1e9]")] = 40.0
+    """All land after so long in the air by the vehicles' own estimates alone (s): nothing tells a
+    slow drift of theirs.
+    """
     action_timeout: Annotated[float, Interval("(0, 60]")] = 0.035
     """Without a new action of the policy for longer (s): all stop where they are."""
     battery_low: Annotated[float, Interval("[0, 100]")] = 3.2
@@ -146,6 +152,9 @@ class Drone(NamedTuple):
     since: float = 0.0  # s, when the mode began
     estimate: Pose | None = None  # now; reckoned on where no pose is fresh
     own: Track = _NOTHING_SEEN  # its own estimates
+    innovations: Innovations = _NOTHING_SUMMED  # of its own estimates ...
+    captured_innovations: Innovations = _NOTHING_SUMMED  # ... and of motion capture
+    contradiction: Verdict = Verdict.GOOD  # why those aren't believed any more in this flight
     captured: Track = _NOTHING_SEEN  # motion capture, with velocity and rates
     told: bool = True  # whether the estimator on board is to follow the newest of it
     seen: float = -math.inf  # s, when the pose that it is flown by was measured
@@ -157,6 +166,7 @@ class Drone(NamedTuple):
     acceleration: Vector = (0.0, 0.0, 0.0)  # m/s^2, what dead reckoning takes it to be
     anchor: Vector = (0.0, 0.0, 0.0)  # where it waits or lands
     trim: float = 0.0  # of the hover thrust
+    alone_since: float | None = None  # s, when its own estimate became all that there is
     low_since: float | None = None  # battery
     over_since: float | None = None  # upside down
     reason: str = ""  # why it left the pursuit

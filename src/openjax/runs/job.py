@@ -47,7 +47,7 @@ from openjax.runs.words import closing_words
 from openjax.show.metrics import MetricsWriter
 from openjax.show.progress import Progress
 from openjax.store.checkpoint_files import load_orbax
-from openjax.store.checkpoints import Checkpoints
+from openjax.store.checkpoints import CheckpointRecord, Checkpoints
 from openjax.store.leaves import abstract_like, named_leaves, place
 from openjax.store.policies import abstract_parameters, load_policy
 from openjax.store.policy_files import fill, load_policy_file, save_policy_file
@@ -322,14 +322,7 @@ class _Run:
         checkpoints.remove_unfinished()
         if self.processes.of_first(checkpoints.any_finished()):
             carry, record = checkpoints.restore_latest(self.abstract, self.progress.message)
-            # a run that was stopped before its start was validated does that now: what it starts
-            # from may be the best there will be
-            self.taught = (
-                record.update == 0
-                and record.score is None
-                and settings.first_flights.updates > 0
-                and job.facts["start_from"] is None
-            )
+            self.taught = awaits_validation(record, settings, job.facts["start_from"])
             self.progress.message(f"resumed at update {record.update} of {settings.total_updates}")
             return carry, record.update, float(record.notes.get("seconds", 0.0))
         carry = start(jax.random.key(settings.seed))
@@ -424,6 +417,21 @@ class _Run:
         }
         parameters = fill(self.abstract.policy, leaves, str(record.path))
         save_policy_file(self.directory.policy, parameters, self.settings, notes, storage="float32")
+
+
+def awaits_validation(
+    record: CheckpointRecord, settings: TrainSettings, started_from: str | None
+) -> bool:
+    """Whether a run was stopped after its first flights and before its start was validated: that
+    comes when it is resumed, as what a run starts from may be the best there will be.
+
+    Args:
+      record: of the checkpoint that it goes on from.
+      settings: of the run.
+      started_from: the policy that it began with, which had no first flights.
+    """
+    unscored = record.update == 0 and record.score is None
+    return unscored and settings.first_flights.updates > 0 and started_from is None
 
 
 def _programs(job):

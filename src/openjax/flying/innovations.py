@@ -1,0 +1,182 @@
+"""Whether a vehicle's own estimate agrees with itself, with its gyroscope, and with what was sent.
+
+A single pose says little: a drift of .3 m/s moves it by 3 mm. So what a pose adds to the last one
+is compared with what it should add, and the differences, the innovations, are summed up with a
+forgetting time (Mehra and Peschon 1971, "An innovations approach to fault detection and diagnosis
+in dynamic systems", Automatica 7):
+
+* the way, with the velocity that the same estimate tells;
+* the change of velocity, with thrust and attitude;
+* the turn, with the gyroscope;
+* the gyroscope, with the body rates that were sent.
+
+A drift of position and velocity together that sets in gently passes all of them: only a second
+source tells it.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from openjax.flying.controller import Airframe, Pose, Vector, lift_acceleration
+from openjax.flying.judge import Verdict
+from openjax.flying.set_point import RATES, SetPoint
+
+ZERO = (0.0, 0.0, 0.0)
+
+
+class Memory(NamedTuple):
+    """How an innovation is summed up, and how large it may get."""
+
+    forgetting: float
+    """Time constant (s)."""
+    bound: float
+    """In the innovation's unit."""
+
+
+WAY = Memory(1.0, 0.08)
+"""Of position against velocity (m): one is off the other by .08 m/s."""
+SPEED = Memory(0.1, 0.2)
+"""Of velocity against thrust (m/s): a disturbance of 2 m/s^2 that sets in at once, as no drag does."""
+RISING = 0.3
+SINKING = 0.7
+"""The same upwards (m/s), where the floor's cushion pushes, and downwards, where the wake of another
+vehicle does: .2 N (Shi et al. 2020) on 30 g.
+"""
+STEP = 0.2
+"""Of one pose's velocity against thrust (m/s): no wake pushes so much between two poses."""
+TURN = Memory(1.0, 0.08)
+"""Of attitude against gyroscope (rad): one is off the other by .08 rad/s."""
+RATE = Memory(0.2, 1.5)
+"""Mean difference of the gyroscope from the body rates that were sent (rad/s)."""
+SETTLED = 0.3
+"""Before (s) velocity isn't judged: until then it is learnt what thrust doesn't explain, drag, wind
+or a weight that isn't known ..."""
+BIAS = 3.0
+"""... and then only with this time constant (s)."""
+RECENT = 0.5
+"""For so long (s) the velocity is remembered that thrust explains, to fly on by it."""
+RATE_LAG = 0.04
+"""Time constant of the rate loop (s)."""
+LONGEST = 0.025
+"""After a longer pause (s) between two poses nobody knows what happened: no innovation."""
+
+
+class Innovations(NamedTuple):
+    """The sums of one source of a vehicle's poses, and what the next ones are made of."""
+
+    pose: Pose | None = None
+    way: Vector = ZERO  # m, world
+    step: Vector = ZERO  # m/s, world: what the newest pose adds to the next one
+    speed: Vector = ZERO  # m/s, world
+    recent: Vector = ZERO  # m/s, world: the same, remembered for longer
+    turn: Vector = ZERO  # rad, body
+    rate: Vector = ZERO  # rad/s, body
+    bias: Vector = ZERO  # m/s^2, world: what thrust and attitude don't explain
+    age: float = 0.0  # s, for how long that is learnt
+    thrust: float = 0.0  # share of the maximum that the motors have reached
+    rates: Vector = ZERO  # rad/s, that the rate loop should have reached
+
+    def after(
+        self, pose: Pose, sent: SetPoint, airframe: Airframe, refused: bool = False
+    ) -> "Innovations":
+        """With the next pose; `sent` has acted since the last one.
+
+        `refused`: whether poses between them came and weren't believed. Then this one must follow
+        from the last believable one, however long that is ago.
+        """
+        last = self.pose
+        longest = math.inf if refused else LONGEST
+        if last is None or not 0.0 < pose.time - last.time <= longest:
+            return self._replace(pose=pose, thrust=sent.thrust, rates=pose.body_rates)
+        dt = pose.time - last.time
+        reached = _share(dt, airframe.motor_time_constant)
+        thrust = self.thrust + reached * (sent.thrust - self.thrust)
+        asked = (sent.roll, sent.pitch, sent.yaw_rate) if sent.mode == RATES else pose.body_rates
+        rates = _towards(self.rates, asked, _share(dt, RATE_LAG))
+        mean = _towards(last.velocity, pose.velocity, 0.5)
+        way = _difference(_difference(pose.position, last.position), _times(dt, mean))
+        lift = lift_acceleration(pose.quaternion, thrust / airframe.hover_thrust)
+        gain = _times(1.0 / dt, _difference(pose.velocity, last.velocity))
+        unexplained = _difference(_difference(gain, lift), self.bias)
+        step = _times(dt, unexplained)
+        turn = _difference(
+            turn_between(last.quaternion, pose.quaternion),
+            _times(dt, _towards(last.body_rates, pose.body_rates, 0.5)),
+        )
+        error = _difference(pose.body_rates, rates)
+        age = self.age + dt
+        return Innovations(
+            pose=pose,
+            way=_summed(self.way, way, dt, WAY.forgetting),
+            step=step,
+            speed=_summed(self.speed, step, dt, SPEED.forgetting),
+            recent=_summed(self.recent, step, dt, RECENT),
+            turn=_summed(self.turn, turn, dt, TURN.forgetting),
+            rate=_towards(self.rate, error, _share(dt, RATE.forgetting)),
+            bias=_sum(self.bias, _times(dt / min(age, BIAS), unexplained)),
+            age=age,
+            thrust=thrust,
+            rates=rates,
+        )
+
+    def corrected(self) -> Pose:
+        """The newest pose without what was summed up: where the vehicle is if what it is compared
+        with is right.
+        """
+        return self.pose._replace(
+            position=_difference(self.pose.position, self.way),
+            velocity=_difference(self.pose.velocity, self.recent),
+        )
+
+    def verdict(self) -> Verdict:
+        """What the estimate contradicts; good if nothing."""
+        *level, rise = self.speed
+        pushed = math.hypot(*level) > SPEED.bound or not -SINKING < rise < RISING
+        if math.hypot(*self.way) > WAY.bound:
+            return Verdict.NOT_ITS_WAY
+        if self.age > SETTLED and (pushed or math.hypot(*self.step) > STEP):
+            return Verdict.NOT_ITS_THRUST
+        if math.hypot(*self.turn) > TURN.bound:
+            return Verdict.NOT_ITS_TURN
+        if math.hypot(*self.rate) > RATE.bound:
+            return Verdict.NOT_ITS_RATES
+        return Verdict.GOOD
+
+
+def turn_between(before: Sequence[float], after: Sequence[float]) -> Vector:
+    """The small rotation (rad, body) from one attitude wxyz to another."""
+    a, b, c, d = before
+    w, x, y, z = after
+    scalar = a * w + b * x + c * y + d * z
+    sign = math.copysign(2.0, scalar)
+    return (
+        sign * (a * x - b * w - c * z + d * y),
+        sign * (a * y + b * z - c * w - d * x),
+        sign * (a * z - b * y + c * x - d * w),
+    )
+
+
+def _share(dt: float, time_constant: float) -> float:
+    """Of the way to its input that a low-pass goes in `dt` (s)."""
+    return -math.expm1(-dt / time_constant)
+
+
+def _summed(total: Vector, part: Vector, dt: float, forgetting: float) -> Vector:
+    return _sum(_times(math.exp(-dt / forgetting), total), part)
+
+
+def _sum(a: Vector, b: Vector) -> Vector:
+    return tuple(p + q for p, q in zip(a, b, strict=True))
+
+
+def _difference(a: Vector, b: Vector) -> Vector:
+    return tuple(p - q for p, q in zip(a, b, strict=True))
+
+
+def _times(number: float, a: Vector) -> Vector:
+    return tuple(number * p for p in a)
+
+
+def _towards(a: Vector, b: Vector, share: float) -> Vector:
+    return tuple(p + share * (q - p) for p, q in zip(a, b, strict=True))
