@@ -13,6 +13,7 @@ from __future__ import annotations
 import functools
 import math
 import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -127,12 +128,18 @@ def compiled_game(policy_name: str):
 class Worlds:
     """Flights side by side, one fault each."""
 
-    def __init__(self, faults: list[Fault], layout: str, policy_name: str):
+    def __init__(
+        self,
+        faults: list[Fault],
+        layout: str,
+        policy_name: str,
+        damage: Callable[[Fault], Callable] = PoseDamage,
+    ):
         task_of, self.game, self.airframe, self._first, self._tick = compiled_game(policy_name)
         scenario, self._task = task_of(layout)
         self.faults, self.n, self._layout = faults, len(scenario.pursuers), layout
         starts = np.array(scenario.pursuers)
-        self._damage = [PoseDamage(fault) for fault in faults]
+        self._damage = [damage(fault) for fault in faults]
         vehicles = VirtualVehicles(load_vehicle(), np.tile(starts, (len(faults), 1)))
         self._vehicles = vehicles
         following = [fault.kind != "camera drifts" for fault in faults for _ in range(self.n)]

@@ -166,11 +166,7 @@ def prepare(arguments: Arguments) -> Prepared:
     uris = uris_of(arguments)
     session = _session(arguments)
     state = flight_state(game, len(uris), arguments.safety)
-    remarks = ()
-    if vehicle.airframe != settings.airframe:
-        remarks = (
-            f"the policy was trained for {settings.airframe}; what flies is {vehicle.airframe}",
-        )
+    remarks = _remarks(arguments, game, vehicle)
     about = {"policy": policy.source, "scenario": scenario.name, "uris": uris}
     return Prepared(game, state, session, vehicle, about, remarks)
 
@@ -204,6 +200,26 @@ def _session(arguments: Arguments):
     return SessionSettings(
         uris, body_logs, arguments.watchdog, arguments.guard, arguments.guard_after, feed
     )
+
+
+def _remarks(arguments: Arguments, game, vehicle) -> tuple[str, ...]:
+    """What somebody should know before the vehicles rise."""
+    settings = game.settings
+    remarks = []
+    if vehicle.airframe != settings.airframe:
+        remarks.append(
+            f"the policy was trained for {settings.airframe}; what flies is {vehicle.airframe}"
+        )
+    length = min(
+        settings.episode_length * settings.time_step, arguments.episode_seconds or math.inf
+    )
+    limit = arguments.safety.alone_time
+    if arguments.motion_capture is None and arguments.episodes * length > limit:
+        remarks.append(
+            f"without --motion_capture all land after {limit:g} s in the air "
+            "(--safety.alone_time): these games take longer"
+        )
+    return tuple(remarks)
 
 
 def _write(out, flown, flight, samples, scheduler):

@@ -21,6 +21,7 @@ from openjax.flying.motion_capture import MotionCaptured
 from openjax.flying.preflight import faults, poses_arriving
 from openjax.flying.state import Request, State
 
+STILL_ARMED = "a vehicle doesn't say that it is disarmed: keep away, and switch it off"
 FRESH = 0.05
 """No flight begins with poses older than this (s)."""
 ARMING = 1.0
@@ -114,8 +115,9 @@ class Session:
                 flight.run()
             except Exception as error:  # whatever it is, vehicles are in the air
                 complaint = f"{error}; {self._left_to_others()}"
-            with contextlib.suppress(UserError):
-                self.links.disarm()
+            with contextlib.suppress(UserError):  # the links are gone: the guard disarms
+                if not self.links.disarm():
+                    complaint = "; ".join(filter(None, (complaint, STILL_ARMED)))
                 samples = self.links.samples()
         return samples, complaint
 

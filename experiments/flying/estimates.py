@@ -1,0 +1,234 @@
+"""Estimates that go wrong so gently that no single pose shows it: `python -m
+experiments.flying.estimates [--each 6]`.
+
+Three vehicles hunt in simulated time, as in `experiments.flying.simulated`, by their own estimates
+alone or, where a camera goes wrong, by its poses, which the estimators on board follow. Kinds that
+nothing on board can tell are flown, too, and counted apart.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from experiments.flying.faults import ENDING, MARGIN, Fault, finite
+from experiments.flying.simulated import LATEST, SECONDS, Worlds
+from experiments.flying.single_thread import use_single_thread
+from experiments.table import RESULTS, Page, Table, facts, write_page
+from openjax.files import read_json, write_json
+from openjax.flying.controller import Pose
+
+ALONE = 4.0
+CAPTURED = 1.0
+"""Directions (rad) that say whether there is motion capture, see `Fault.captured`."""
+AMOUNTS = (0.1, 0.2, 0.3, 0.5)
+
+
+class EstimateDamage:
+    """What is received in place of a vehicle's true poses."""
+
+    def __init__(self, fault: Fault):
+        self._fault = fault
+        self._random = random.Random(fault.time)
+        self._held: Pose | None = None
+
+    def __call__(self, source: str, i: int, now: float, pose: Pose, others) -> Pose:
+        """As `PoseDamage`."""
+        fault = self._fault
+        damaged = "camera" if fault.captured else "radio"
+        if source != damaged or i != fault.vehicle:
+            return pose
+        if self._held is None or not fault.on(now):
+            self._held = pose
+            return pose
+        return DAMAGES[fault.kind](self, pose, now - fault.time)
+
+    def noisy(self, values, deviation: float) -> tuple[float, ...]:
+        """Values with noise."""
+        return tuple(value + self._random.gauss(0.0, deviation) for value in values)
+
+    def moved(self, pose: Pose, way: float, speed: float = 0.0, height: bool = False) -> Pose:
+        """A pose shifted by `way`, its velocity by `speed`, each times the fault's amount."""
+        fault = self._fault
+        angle = 40.0 * fault.time  # drawn
+        level = (math.cos(angle), math.sin(angle), 0.0)
+        axis = (0.0, 0.0, math.copysign(1.0, level[0])) if height else level
+        away = [fault.amount * part for part in axis]
+        return pose._replace(
+            position=tuple(p + way * a for p, a in zip(pose.position, away, strict=True)),
+            velocity=tuple(v + speed * a for v, a in zip(pose.velocity, away, strict=True)),
+        )
+
+    def frozen(self, pose: Pose, gyroscope: bool, velocity: bool) -> Pose:
+        """The pose as it was, with 2 mm of noise; the gyroscope may live, the velocity be zero."""
+        held = self._held
+        rates = pose.body_rates if gyroscope else self.noisy(held.body_rates, 0.02)
+        return held._replace(
+            time=pose.time,
+            position=self.noisy(held.position, 0.002),
+            velocity=self.noisy(held.velocity if velocity else (0.0, 0.0, 0.0), 0.005),
+            quaternion=_unit(self.noisy(held.quaternion, 0.001)),
+            body_rates=rates,
+        )
+
+    def blended(self, pose: Pose, t: float) -> Pose:
+        """From the true pose to the one that is held, within 1.2 to 2 s."""
+        share = min(t / (1.0 + 2.0 * self._fault.amount), 1.0)
+        parts = {
+            name: tuple(
+                a + share * (b - a)
+                for a, b in zip(getattr(pose, name), getattr(self._held, name), strict=True)
+            )
+            for name in ("position", "velocity", "quaternion")
+        }
+        return pose._replace(**{**parts, "quaternion": _unit(parts["quaternion"])})
+
+    def scaled(self, pose: Pose) -> Pose:
+        """Ways that are too long."""
+        share = self._fault.amount
+        away = zip(pose.position, self._held.position, strict=True)
+        return pose._replace(position=tuple(p + share * (p - h) for p, h in away))
+
+
+def _unit(quaternion) -> tuple[float, ...]:
+    size = math.hypot(*quaternion)
+    return tuple(q / size for q in quaternion)
+
+
+def _gently(t: float) -> tuple[float, float]:
+    """Way (s) and speed of a drift that sets in within 2 s."""
+    return (0.25 * t * t, 0.5 * t) if t < 2.0 else (t - 1.0, 1.0)
+
+
+SWING = 2.0
+"""rad/s"""
+DAMAGES = {
+    "position drifts": lambda d, pose, t: d.moved(pose, t),
+    "height drifts": lambda d, pose, t: d.moved(pose, t, height=True),
+    "position wanders": lambda d, pose, t: d.moved(pose, math.sin(SWING * t)),
+    "ways are too long": lambda d, pose, t: d.scaled(pose),
+    "velocity is held": lambda d, pose, t: pose._replace(velocity=d._held.velocity),
+    "velocity is zero": lambda d, pose, t: pose._replace(velocity=d.noisy((0.0,) * 3, 0.01)),
+    "frozen, 2 mm of noise": lambda d, pose, t: d.frozen(pose, False, True),
+    "frozen, the gyroscope lives": lambda d, pose, t: d.frozen(pose, True, True),
+    "frozen, at rest": lambda d, pose, t: d.frozen(pose, False, False),
+    "blends into a held pose": lambda d, pose, t: d.blended(pose, t),
+    "camera blends into a held pose": lambda d, pose, t: d.blended(pose, t),
+    "drifts with its velocity": lambda d, pose, t: d.moved(pose, t, 1.0),
+    "height drifts with its velocity": lambda d, pose, t: d.moved(pose, t, 1.0, height=True),
+    "drifts gently with its velocity": lambda d, pose, t: d.moved(pose, *_gently(t)),
+    "height drifts gently with its velocity": lambda d, pose, t: d.moved(
+        pose, *_gently(t), height=True
+    ),
+}
+"""(damage, true pose, seconds since it began) -> what is received, by kind."""
+UNTOLD = tuple(kind for kind in DAMAGES if "with its velocity" in kind)
+"""What nothing on board can tell where it is small, or sets in gently."""
+TOLD = tuple(kind for kind in DAMAGES if kind not in UNTOLD)
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Fly estimates that go wrong."""
+
+    each: int = 6
+    """Flights of each kind and layout."""
+    policy: str = "flight"
+    layouts: tuple[str, ...] = ("wall", "random", "passage")
+    seed: int = 0
+    kinds: tuple[str, ...] = tuple(DAMAGES)
+    out: Path = RESULTS / "flying_estimates.json"
+    commit: str | None = None
+    """Where git can't tell it."""
+
+
+def draw(kind: str, seed: int) -> Fault:
+    """A fault of a kind."""
+    rng = random.Random(f"{kind} {seed}")
+    return Fault(
+        kind,
+        rng.uniform(0.3, LATEST),
+        rng.randrange(3),
+        amount=rng.choice(AMOUNTS),
+        direction=CAPTURED if kind.startswith("camera") else ALONE,
+    )
+
+
+def fly(kinds, seeds, layout: str, policy: str) -> list[dict]:
+    """Fly one fault of each kind for each seed, side by side; a record of each."""
+    faults = [draw(kind, seed) for seed in seeds for kind in kinds]
+    worlds = Worlds(faults, layout, policy, EstimateDamage)
+    for _ in range(round((SECONDS + ENDING) / 0.01)):
+        if not worlds.tick():
+            break
+    return worlds.records([seed for seed in seeds for _ in kinds])
+
+
+def well(row: dict) -> bool:
+    """Whether a flight ended as it must; a small drift may take its time."""
+    return row["out"] <= MARGIN and not (row["fell"] or row["hard"] or row["armed"])
+
+
+def main() -> None:
+    arguments = tyro.cli(Arguments)
+    use_single_thread()
+    begin = time.time()
+    records = []
+    for k, layout in enumerate(arguments.layouts):
+        first = arguments.seed + k * arguments.each
+        seeds = range(first, first + arguments.each)
+        records += fly(arguments.kinds, seeds, layout, arguments.policy)
+        write_json(
+            arguments.out,
+            {
+                **facts(arguments.commit),
+                "policy": arguments.policy,
+                "seconds": round(time.time() - begin),
+                "summary": [_summary(kind, records) for kind in arguments.kinds],
+                "not_well": [finite(row) for row in records if not well(row)],
+            },
+        )
+    write_page(arguments.out, page, read_json(arguments.out))
+
+
+def _summary(kind, records) -> dict:
+    mine = [row for row in records if row["kind"] == kind]
+    return {
+        "kind": kind,
+        "flights": len(mine),
+        "well": sum(map(well, mine)),
+        "landed": sum(row["ended"] for row in mine),
+        "farthest": max(row["out"] for row in mine),
+        "fell": sum(row["fell"] for row in mine),
+        "armed": sum(row["armed"] for row in mine),
+    }
+
+
+def page(results) -> Page:
+    """The page of the results."""
+    prose = (
+        "Does a flight end well when a vehicle's own estimate, or a camera, goes wrong so gently "
+        "that no single pose shows it? Flights that end well stay within 10 cm of the arena, and "
+        "nothing falls. The last four kinds move position and velocity together: where they are "
+        "small or set in gently, nothing on board tells them, and only the time limit ends the "
+        "flight (`docs/flying.md`)."
+    )
+    columns = {
+        "what goes wrong": "kind",
+        "flights": "flights:d",
+        "well": "well:d",
+        "landed by themselves": "landed:d",
+        "farthest out (m)": "farthest:.2f",
+        "fell": "fell:d",
+        "on at the end": "armed:d",
+    }
+    return Page("Estimates that go wrong gently", prose, Table(columns, results["summary"]))
+
+
+if __name__ == "__main__":
+    main()
