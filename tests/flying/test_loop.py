@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from openjax.flying import loop
-from openjax.flying.controller import Pose, nominal_airframe
+from openjax.flying.controller import GRAVITY, Pose, nominal_airframe
 from openjax.flying.game import Play
 from openjax.flying.loop import PATIENCE, Flight, Plan, Record, await_poses, flight_state
 from openjax.flying.state import Mode, PoseSample, SafetySettings
@@ -18,8 +18,8 @@ STARTS = ((0.5, 0.3, 0.5), (0.5, 0.0, 0.5), (0.5, -0.3, 0.5))
 
 
 class Hovering:
-    """Links to three vehicles that rise as soon as they are asked to, and a game whose policy
-    hovers.
+    """Links to three level vehicles that rise and sink as their thrust has it, and a game whose
+    policy hovers.
     """
 
     airframe = nominal_airframe()
@@ -32,13 +32,16 @@ class Hovering:
     def __init__(self):
         self.now = 0.0
         self.height = 0.0
+        self.climb = 0.0
         self._nothing = np.zeros(3)
         self._action = np.array([[2 * self.airframe.hover_thrust - 1, 0.0, 0.0, 0.0]] * 3)
 
     def observe(self):
         shake = 1e-4 * np.sin(1e3 * self.now)
         poses = [
-            Pose(self.now, (x + shake, y, self.height), (0.0,) * 3, (1.0, 0.0, 0.0, 0.0))
+            Pose(
+                self.now, (x + shake, y, self.height), (0.0, 0.0, self.climb), (1.0, 0.0, 0.0, 0.0)
+            )
             for x, y, _ in STARTS
         ]
         return tuple(PoseSample(pose, self.now, 4.0) for pose in poses)
@@ -47,7 +50,9 @@ class Hovering:
         return (self.now,) * 3
 
     def send(self, set_points):
-        self.height = min(self.height + 0.001 * any(s.mode for s in set_points), 0.5)
+        lift = set_points[0].thrust / self.airframe.hover_thrust
+        self.climb = max(self.climb + 0.01 * GRAVITY * (lift - 1.0), -1e3 * self.height)
+        self.height = max(self.height + 0.01 * self.climb, 0.0)
         return self.now + 1e-3
 
     def start(self, poses):
