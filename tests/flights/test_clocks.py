@@ -9,7 +9,13 @@ import pytest
 
 from openjax.flights import clocks
 from openjax.flights.case import load_case
-from openjax.flights.clocks import on_gyroscope_clock, read_command_clock, read_motor_clock
+from openjax.flights.clocks import (
+    case_on_gyroscope_clock,
+    on_gyroscope_clock,
+    read_command_clock,
+    read_motor_clock,
+)
+from openjax.flights.flight import Case, Flight
 from openjax.flights.track import Track, tracks_of
 from openjax.vehicle import load_vehicle
 
@@ -87,6 +93,14 @@ def test_motors_on_another_clock_are_a_finding(tracks, late, which):
         name = mixed[number].name
         assert found.late[name] == pytest.approx(late, abs=0.0076)
         assert not on_gyroscope_clock(mixed[number], found).motors_logged
+
+
+def test_flights_are_put_in_time_as_their_tracks_are(tracks):
+    flight = Flight("a", "a", "0", tracks[0].time, motor_command=tracks[0].motor)
+    case = Case("case", (flight, dataclasses.replace(flight, name="b")), None)
+    first, second = case_on_gyroscope_clock(case, {"a": 0.02}).flights
+    np.testing.assert_allclose(first.motor_command[:-2], flight.motor_command[2:], atol=1e-9)
+    assert second.motor_command is flight.motor_command
 
 
 @pytest.mark.parametrize("late", [-0.25, -0.14, -0.05, 0.0, 0.01, 0.05, 0.14, 0.25])

@@ -7,12 +7,13 @@ a row of commands holds what acted before it, or the two streams are on differen
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.signal import butter, find_peaks, lfilter, sosfiltfilt
 
+from openjax.flights.flight import Case
 from openjax.flights.track import GRID_PERIOD, Track, earlier, turn_increments
 
 # What a row of motor commands may hold: their mean from its time until the next row, their mean
@@ -110,6 +111,18 @@ def on_gyroscope_clock(track: Track, clock: MotorClock) -> Track:
         fast_thrust=None if fast is None else (fast[0] - late, fast[1]),
         motors_logged=track.motors_logged and clock.one_clock,
     )
+
+
+def case_on_gyroscope_clock(case: Case, late: Mapping[str, float]) -> Case:
+    """A case whose flights hold their motor commands when they act, see `MotorClock.late`."""
+    flights = []
+    for flight in case.flights:
+        moved = late.get(flight.name, 0.0)
+        if moved and flight.motor_command is not None:
+            motor = flight.interpolated("motor_command", flight.time + moved)
+            flight = dataclasses.replace(flight, motor_command=motor)
+        flights.append(flight)
+    return dataclasses.replace(case, flights=tuple(flights))
 
 
 def read_command_clock(tracks: Sequence[Track], row: float) -> str:

@@ -8,7 +8,8 @@ corrected before the physics is read, and is no cause.
 """
 
 import dataclasses
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.signal import butter, sosfiltfilt
@@ -31,7 +32,7 @@ class Kinematics:
     """`gain` of the gyroscope, 1 where it isn't clearly another; `tilt` (2,) rad by which the world
     leans about its x and y axes, None where that isn't clear; `one_clock`: whether attitude and
     gyroscope can be compared sample by sample: what their streams leave of each other is noise, not
-    time; `motor_clock`: the same of motors and gyroscope (`clocks`); `findings`: what is off by
+    time; `motor_clock`, `motors_late`: the same of motors and gyroscope (see `MotorClock`); `findings`: what is off by
     more than usual, in words, by name.
     """
 
@@ -40,6 +41,7 @@ class Kinematics:
     one_clock: bool
     findings: dict[str, str]
     motor_clock: bool = True
+    motors_late: Mapping[str, float] = field(default_factory=dict)
 
 
 def read_kinematics(tracks: list[Track], limits) -> Kinematics:

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from openjax.flights.clocks import case_on_gyroscope_clock
 from openjax.flights.flight import Case
 from openjax.gap.evidence import Evidence, gather
 from openjax.gap.identification.quantities import identify
@@ -39,7 +40,9 @@ def diagnose_case(
     report = conclude(evidence)
     if progress:
         progress("identifying what the vehicle does")
-    identification = identify(case, evidence.sensors.one_clock)
+    sensors = evidence.sensors
+    in_time = case_on_gyroscope_clock(case, sensors.motors_late)
+    identification = identify(in_time, sensors.one_clock and sensors.motor_clock)
     seconds = time.perf_counter() - begin
     return replace(report, identification=identification, seconds=seconds)
 

@@ -80,7 +80,9 @@ def _motors(case: Case, tracks, vehicles, sensors: Kinematics) -> tuple[list[Tra
         pose = read_motor_clock(tracks, vehicles, row, motor_rows(case), gyroscope=False)
         clock = replace(pose, one_clock=pose.one_clock and clock.one_clock)
     findings = sensors.findings | clock.findings
-    sensors = replace(sensors, findings=findings, motor_clock=clock.one_clock)
+    sensors = replace(
+        sensors, findings=findings, motor_clock=clock.one_clock, motors_late=clock.late
+    )
     return [on_gyroscope_clock(t, clock) for t in tracks], sensors
 
 

@@ -18,12 +18,10 @@ def probabilities(present, largest, unknown: float, weights) -> dict[str, float]
     {effects: how often that set was chosen}.
     """
     chance = dict.fromkeys((*EFFECTS, "none", "unknown"), 0.0)
-    rest = largest.get("unexplained", 0.0) if present else 1.0
+    sure = (1.0 - unknown) if present else 1.0
     for effect, p in present.items():
-        share = largest.get(effect, 0.0)
-        # What isn't explained may be real and not the largest part: then an effect still is.
-        chance[effect] = p * share * (unknown + (1.0 - unknown) / max(1.0 - rest, share, 1e-12))
-    chance["unknown"] = unknown * rest
+        chance[effect] = p * sure * largest.get(effect, 0.0)
+    chance["unknown"] = unknown * (largest.get("unexplained", 0.0) if present else 1.0)
     left = 1.0 - sum(chance.values())
     shared = {"none": 1e-3, **dict.fromkeys(present, 1e-3)}
     for effects, w in weights.items():

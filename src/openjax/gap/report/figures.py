@@ -122,9 +122,11 @@ def _courses(report: Report) -> Iterator[Course]:
                 yield Course(track.name, track.dt, time, *both, said, "times the noise", False)
 
 
-def _worst(report: Report) -> Course:
-    """Where the nominal simulator errs most, against what is left."""
-    return max(_courses(report), key=lambda course: course.ratio)
+def _worst(report: Report) -> Course | None:
+    """Where the nominal simulator errs most, against what is left; None where no channel of motion
+    or firmware was logged.
+    """
+    return max(_courses(report), key=lambda course: course.ratio, default=None)
 
 
 def _axis_name(axis: int) -> tuple[str, str]:
@@ -137,6 +139,8 @@ def _axis_name(axis: int) -> tuple[str, str]:
 def _course(report: Report):
     """Errors of short predictions along the flight where they are largest."""
     course = _worst(report)
+    if course is None:
+        return None
     before, after = course.errors(HORIZONS["velocity"])
     figure, axes = small_figure(2.6)
     time = course.time[-len(after) :] - course.time[0]
@@ -167,7 +171,7 @@ def _lines(report: Report, before, after) -> Sequence[tuple]:
 def _horizons(report: Report):
     """How errors grow with the time that is predicted."""
     course = _worst(report)
-    if not course.adds_up:
+    if course is None or not course.adds_up:
         return None
     ahead = sorted({max(round(h / course.dt), 1) * course.dt for h in HORIZONS_SHOWN})
     figure, axes = small_figure(2.6)
