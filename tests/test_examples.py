@@ -1,11 +1,13 @@
 """The examples run, are short, and end with what they promise."""
 
 import dataclasses
+import json
 import runpy
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import openjax
@@ -97,3 +99,34 @@ def test_an_effect_of_ones_own_is_flown_and_named():
 def test_diagnosis_names_drag(capfd):
     runpy.run_path(str(EXAMPLES / "diagnose_flights.py"))
     assert "drag" in capfd.readouterr().out
+
+
+def test_own_importer_reads_a_format_of_its_own(tmp_path, sample_columns):
+    """A log of JSON lines becomes a flight of a case, once the example has registered its
+    importer.
+    """
+    from openjax.flights.case import load_case
+    from openjax.flights.importers import importer
+
+    shipped = list(importer._IMPORTERS)
+    try:
+        example = runpy.run_path(str(EXAMPLES / "own_importer.py"))
+        columns = sample_columns["flight_b"]
+        rows = [
+            {"ms": round(1e3 * float(columns["t"][k]))}
+            | {
+                key: [float(columns[n][k]) for n in names.split()]
+                for key, names in example["COLUMNS"].items()
+            }
+            for k in range(300)
+        ]
+        text = "\n".join(json.dumps(row) for row in rows)
+        (tmp_path / "first.flight.jsonl").write_text(text)
+        (tmp_path / "empty.flight.jsonl").write_text("")
+        (tmp_path / "vehicle.toml").write_text("")
+        case = load_case(tmp_path)
+    finally:
+        importer._IMPORTERS[:] = shipped
+    assert [flight.name for flight in case.flights] == ["first.flight.jsonl"]
+    assert [issue.issue for issue in case.left_out()] == ["holds no row"]
+    np.testing.assert_allclose(case.flights[0].body_rates[:, 1], columns["wy"][:300], atol=1e-9)

@@ -51,7 +51,7 @@ def sample_records(work: Path, seeds: list[int]) -> list[dict]:
         for effect in EFFECTS:
             folder = work / f"{effect}_{seed}"
             if not folder.exists():
-                make_case(Arguments(folder, effect=effect, seed=seed))
+                make_case(Arguments(folder, effect=(effect,), seed=seed))
     out = []
     for effect in EFFECTS:
         for seed, other in zip(seeds, [*seeds[1:], seeds[0]], strict=True):

@@ -72,8 +72,30 @@ def test_a_sample_says_weighed_only_where_its_effect_can_still_be_named(
     assert effect == "none" or not (case.vehicle_file.mass_weighed and CARDS[effect].weighed)
 
 
+def test_two_effects_act_at_once(tmp_path, monkeypatch, sample_columns):
+    flown = []
+
+    def fly(plant, assumed, reference, seed, effects):
+        flown.append(effects)
+        return [sample_columns["flight_b"]]
+
+    monkeypatch.setattr(samples, "fly", fly)
+    main([str(tmp_path / "case"), "--effect", "rotor_drag", "motor_lag"])
+    wanted = {name: EFFECTS[name].card.sample for name in ("rotor_drag", "motor_lag")}
+    assert flown == [wanted] * 3
+    source = load_case(tmp_path / "case").vehicle_file.log["source"]
+    assert source.endswith("effect: rotor_drag, motor_lag")
+
+
 @pytest.mark.parametrize(
-    "arguments", [["--effect", "gremlins"], ["--duration", "1"], ["--colour", "red"]]
+    "arguments",
+    [
+        ["--effect", "gremlins"],
+        ["--effect", "none", "inertia"],
+        ["--effect", "inertia", "inertia"],
+        ["--duration", "1"],
+        ["--colour", "red"],
+    ],
 )
 def test_bad_arguments_are_one_line(tmp_path, arguments):
     with pytest.raises(UserError) as caught:

@@ -2,7 +2,7 @@
 diagnosis on."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -18,7 +18,10 @@ from openjax.vehicle.effect_names import effect_names
 PROGRAM = "openjax sample_flights"
 DECIMALS = {"t": 2, "vbat": 3} | dict.fromkeys("x y z qw qx qy qz m1 m2 m3 m4".split(), 5)
 _REST = 4
-_EFFECT_HELP = f"What the vehicle suffers from that the simulator doesn't know: none, {', '.join(effect_names())}."
+_EFFECT_HELP = (
+    "What the vehicle suffers from that the simulator doesn't know, one effect or several at once: "
+    f"none, {', '.join(effect_names())}."
+)
 
 
 @dataclass(frozen=True)
@@ -27,7 +30,7 @@ class Arguments:
 
     out: Annotated[Path, tyro.conf.Positional]
     """Folder to write the case to; must not exist or be empty."""
-    effect: Annotated[str, tyro.conf.arg(help=_EFFECT_HELP)] = "none"
+    effect: Annotated[tuple[str, ...], tyro.conf.arg(help=_EFFECT_HELP)] = ("none",)
     duration: Annotated[float, Interval("[3, 120]")] = 10.0
     """Seconds per flight."""
     seed: Seed = 0
@@ -43,22 +46,19 @@ def make_case(arguments: Arguments) -> list[Path]:
     from openjax.vehicle.effects import EFFECTS
     from openjax.vehicle.vehicle_file import load_vehicle_file, save_vehicle_file
 
-    if arguments.effect not in ("none", *EFFECTS):
-        hint = suggestion(arguments.effect, ("none", *EFFECTS))
-        raise UserError(f"--effect {arguments.effect}: no such effect; {hint}")
+    names = _checked_effects(arguments.effect, EFFECTS)
     check_new_folder(arguments.out, "OUT")
-    effects = (
-        {}
-        if arguments.effect == "none"
-        else {arguments.effect: EFFECTS[arguments.effect].card.sample}
+    effects = {name: EFFECTS[name].card.sample for name in names}
+    source = (
+        f"simulated: openjax.sample_flights, seed {arguments.seed}, "
+        f"effect: {', '.join(arguments.effect)}"
     )
-    source = f"simulated: openjax.sample_flights, seed {arguments.seed}, effect: {arguments.effect}"
     log = {"source": source, "motor_rows": "mean", "floor_z": 0.0}
     # On a scale a vehicle that weighs more would have shown it.
-    weighed = arguments.effect == "none" or not EFFECTS[arguments.effect].card.weighed
+    weighed = not any(EFFECTS[name].card.weighed for name in names)
     described = dataclasses.replace(load_vehicle_file(), mass_weighed=weighed, log=log)
     decimals = {c: DECIMALS.get(c, _REST) for c in LOG_COLUMNS}
-    of_others = arguments.effect != "none" and EFFECTS[arguments.effect].card.of_others
+    of_others = any(EFFECTS[name].card.of_others for name in names)
     flights = references(arguments.seed, arguments.duration, neighbour=of_others)
     with replacing(arguments.out) as folder:
         folder.mkdir()
@@ -75,13 +75,28 @@ def make_case(arguments: Arguments) -> list[Path]:
     return sorted(arguments.out.iterdir())
 
 
+def _checked_effects(given: tuple[str, ...], known: Collection[str]) -> tuple[str, ...]:
+    """The effects that act. Raises UserError for one that there isn't, twice the same, or none
+    beside others.
+    """
+    for name in given:
+        if name not in ("none", *known):
+            raise UserError(f"--effect {name}: no such effect; {suggestion(name, known)}")
+    twice = next((name for name in given if given.count(name) > 1), None)
+    if twice is not None or not given or ("none" in given and len(given) > 1):
+        said = " ".join(given) or "nothing"
+        raise UserError(f"--effect {said}: name none alone, or each effect that acts once")
+    return tuple(name for name in given if name != "none")
+
+
 def main(arguments: Sequence[str]) -> None:
     """The command. Raises UserError for an unknown effect or an unusable folder."""
     parsed = parse(Arguments, Arguments(out=tyro.MISSING), arguments, PROGRAM)
     files = make_case(parsed)
     console = output_console()
     console.print(
-        f"[bold]{parsed.out}[/]: three flights of {parsed.duration:g} s, effect: {parsed.effect}"
+        f"[bold]{parsed.out}[/]: three flights of {parsed.duration:g} s, "
+        f"effect{'s' * (len(parsed.effect) > 1)}: {', '.join(parsed.effect)}"
     )
     for file in files:
         console.print(f"  {file.name}  {file.stat().st_size / 1024:.1f} KiB")
