@@ -187,7 +187,7 @@ class Worlds:
                 samples[first : first + self.n] = [s._replace(captured=None) for s in seen]
             self.states[w] = see(self.states[w], now, samples[first : first + self.n])
             for i, (drone, old) in enumerate(zip(self.states[w].drones, before, strict=True)):
-                if drone.captured.pose is not old.captured.pose and drone.told:
+                if drone.captured.pose is not old.captured.pose and drone.feeds_estimator:
                     self.swarm.believed(first + i, drone.captured.pose)
         if any(Mode.PURSUIT in state.modes for state in self.states):
             self._play_on()

@@ -281,7 +281,7 @@ def test_motion_capture_is_seen_here_and_on_board():
                 )
                 (sample,) = captured.observe()
                 state = see(state, 100.0 + 0.01 * k, (sample,))
-                captured.believed(0, state.drones[0].captured.pose, told=True)
+                captured.believed(0, state.drones[0].captured.pose, feeds_estimator=True)
             assert captured.arrivals() == (100.0 + 0.01 * 39,)
             np.testing.assert_allclose(
                 state.drones[0].estimate.velocity, (0.5, 0.0, 0.0), atol=1e-3

@@ -216,7 +216,7 @@ def test_an_own_estimate_that_is_elsewhere_is_not_believed_for_having_waited():
         sample = PoseSample(own, now, 4.0, captured=still(now, PLACES[0]))
         state, _ = step(state, event(now, s0=sample))
         estimate = state.drones[0].estimate
-        assert math.dist(estimate.position, PLACES[0]) < 0.05 and not state.drones[0].distrusted
+        assert math.dist(estimate.position, PLACES[0]) < 0.05 and not state.drones[0].capture_fault
 
 
 def test_the_estimator_on_board_is_told_what_is_near_it_and_no_more():
@@ -228,7 +228,7 @@ def test_the_estimator_on_board_is_told_what_is_near_it_and_no_more():
         seen = still(time, (place[0] + 0.0012 * k, *place[1:]))
         sample = PoseSample(still(time, place), time, 4.0, captured=seen)
         state, _ = step(state, event(time, _1=sample))
-        told.append(state.drones[1].told)
+        told.append(state.drones[1].feeds_estimator)
     assert state.all_in(Mode.PURSUIT) and all(told[:15]) and not any(told[-10:])
 
 

@@ -32,12 +32,12 @@ def _seen(state, drone, sample) -> Drone:
     now = state.time
     limits = state.limits
     moving = drone.mode in FLYING and not (drone.mode is Mode.LIFT and now - drone.since < SPIN_UP)
-    by_capture = sample.captured is not None and not drone.distrusted
+    by_capture = sample.captured is not None and not drone.capture_fault
     own = _own(state, drone, sample, by_capture, moving)
     drone = _consistent(state, drone, own)
-    if by_capture and not drone.distrusted:
+    if by_capture and not drone.capture_fault:
         drone = _captured(state, drone, sample, moving)
-    source = drone.captured if by_capture and not drone.distrusted else drone.own
+    source = drone.captured if by_capture and not drone.capture_fault else drone.own
     contradicted = source is drone.own and drone.contradiction
     if source.fresh(now, limits) and not contradicted:
         estimate = moved_on(source.pose, max(now, source.pose.time))
@@ -80,7 +80,7 @@ def _consistent(state, drone, own) -> Drone:
     if seen.pose is not None and not follows(*at_one_time(seen.pose, own.pose), state.limits):
         return drone
     return drone._replace(
-        estimate=moved_on(innovations.corrected(), state.time), distrusted=verdict
+        estimate=moved_on(innovations.corrected(), state.time), capture_fault=verdict
     )
 
 
@@ -110,10 +110,10 @@ def _captured(state, drone, sample, moving) -> Drone:
     own = drone.own
     seen = _with_motion(sample.captured, drone.captured.pose, sample.own)
     captured = drone.captured.after(seen, now, limits, moving, drone.estimate)
-    distrusted = ""
+    capture_fault = ""
     if captured.pose is seen:
         both = at_one_time(seen, own.pose) if moving and own.pose is not None else None
-        drone = drone._replace(told=both is None or follows(*both, limits))
+        drone = drone._replace(feeds_estimator=both is None or follows(*both, limits))
         if both and own.fresh(now, limits) and (verdict := agree(*both, limits)):
             captured = captured._replace(pose=drone.captured.pose, verdict=verdict)
     innovations = drone.captured_innovations
@@ -122,13 +122,13 @@ def _captured(state, drone, sample, moving) -> Drone:
     elif captured.pose is seen and seen is not drone.captured.pose:
         refused = bool(drone.captured.verdict)
         innovations = innovations.after(seen, drone.sent, state.airframe, refused)
-        distrusted = innovations.verdict()
-    if distrusted:
-        captured = captured._replace(pose=drone.captured.pose, verdict=distrusted)
+        capture_fault = innovations.verdict()
+    if capture_fault:
+        captured = captured._replace(pose=drone.captured.pose, verdict=capture_fault)
     elif moving and not captured.fresh(now, limits):
-        distrusted = captured.verdict or "pose lost"
+        capture_fault = captured.verdict or "pose lost"
     return drone._replace(
-        captured=captured, captured_innovations=innovations, distrusted=distrusted
+        captured=captured, captured_innovations=innovations, capture_fault=capture_fault
     )
 
 

@@ -129,7 +129,8 @@ class RawLinks:
 
     def __init__(self, uris: Sequence[str], pose_blocks: Sequence[int], watchdog: bool = True):
         self._members: list[Member] = []
-        self._blocks, self._links = tuple(pose_blocks), dict.fromkeys(uris)
+        self._blocks = tuple(pose_blocks)
+        self._links = dict.fromkeys(uris)
         self._watchdog = watchdog
         self._fed = -math.inf
         self._names = [name for name, _ in POSE_BLOCK]

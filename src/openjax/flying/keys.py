@@ -35,7 +35,8 @@ class Operator:
 
     def __init__(self, terminal: int | None = None):
         self._terminal = terminal
-        self._signalled, self._restore = False, contextlib.ExitStack()
+        self._signalled = False
+        self._restore = contextlib.ExitStack()
 
     def __enter__(self) -> Operator:
         for name in DEAF:

@@ -20,6 +20,7 @@ import sys
 import threading
 import time
 from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -42,6 +43,29 @@ _POSE = struct.Struct(
 _NUMBER = struct.Struct("<q")
 _SET_POINT = struct.Struct("<i4d")
 _SENT = struct.Struct("<qd")  # number of the set-points, when the last one had left
+
+
+class Connection(NamedTuple):
+    """What the links' process connects to, and how."""
+
+    uris: tuple[str, ...]
+    body_logs: int
+    watchdog: bool
+    timeout: float
+    """For each vehicle (s)."""
+
+
+class Ends(NamedTuple):
+    """The links' process' ends of all that leads to the loop."""
+
+    contacts: Any
+    """Shared memory: when anything was heard of each vehicle (s)."""
+    stream: socket.socket
+    """Poses go up."""
+    commands: socket.socket
+    """Set-points come down."""
+    control: Any
+    """A pipe for all else, by calls."""
 
 
 class LinksGone(UserError):
@@ -68,7 +92,8 @@ class Links:
         silence: float = SILENCE,
     ):
         self._uris = tuple(uris)
-        self._options = (body_logs, watchdog)
+        self._body_logs = body_logs
+        self._watchdog = watchdog
         self._state = state
         n = len(self._uris)
         self._context = multiprocessing.get_context("spawn")
@@ -80,7 +105,8 @@ class Links:
         self._rest = b""
         self._count = 0
         self._calls = 0
-        self._process, self._lock = None, threading.Lock()
+        self._process = None
+        self._lock = threading.Lock()
         self._blocks: tuple[int, ...] = ()
 
     def connect(self, timeout: float = 20.0) -> None:
@@ -99,13 +125,12 @@ class Links:
         self._control, control = context.Pipe()
         self._stream.setblocking(False)
         self._commands.settimeout(1.5 * self.board.silence)
-        ends = (stream, commands, control)
-        options = (self._uris, *self._options)
-        given = (self._contacts, *ends)
-        arguments = ((options, timeout), given, self.board, os.getpid(), self._state)
+        connection = Connection(self._uris, self._body_logs, self._watchdog, timeout)
+        ends = Ends(self._contacts, stream, commands, control)
+        arguments = (connection, ends, self.board, os.getpid(), self._state)
         self._process = context.Process(target=_serve, args=arguments, name="openjax links")
         self._process.start()
-        for end in ends:
+        for end in (stream, commands, control):
             end.close()
         complaint = "the links' process doesn't answer"
         try:
@@ -202,7 +227,7 @@ class Links:
         with self._lock:
             self._control.send((0, "send_pose", (i, pose.position, pose.quaternion)))
 
-    def believed(self, vehicle: int, pose: Pose, told: bool) -> None:
+    def believed(self, vehicle: int, pose: Pose, feeds_estimator: bool) -> None:
         """There is no motion capture here."""
 
     def arm(self) -> None:
@@ -244,34 +269,35 @@ class Links:
             end.close()
 
 
-def _serve(connecting, ends, board: Board, parent: int, state: State | None) -> None:
+def _serve(
+    connection: Connection, ends: Ends, board: Board, parent: int, state: State | None
+) -> None:
     """The links' process. Should the loop stop, it lands the vehicles; with nothing in the air it
     ends with the loop.
     """
-    (options, timeout), (contacts, stream, commands, control) = connecting, ends
     stand_alone()
     board.enter(Role.LINKS)
     sys.setswitchinterval(5e-4)  # cflib's threads and the one that passes on set-points
     threading.excepthook = lambda _: None  # cflib's threads, when their socket goes
     real_time.hurry()
-    swarm = Swarm(*options)
+    swarm = Swarm(connection.uris, connection.body_logs, connection.watchdog)
     threading.Thread(
         target=_watch, args=(swarm, board, parent, state), daemon=True, name="watch"
     ).start()
-    _pass_on(swarm, contacts, stream)
+    _pass_on(swarm, ends.contacts, ends.stream)
     try:
-        swarm.connect(timeout)
+        swarm.connect(connection.timeout)
     except Exception as error:  # whatever cflib raises, too
-        control.send((" ".join(str(error).split()) or type(error).__name__, ()))
+        ends.control.send((" ".join(str(error).split()) or type(error).__name__, ()))
         os._exit(0)  # cflib's threads may hang
     gc.collect()
     gc.disable()
     threading.Thread(
-        target=_send_on, args=(swarm, commands, board), daemon=True, name="set-points"
+        target=_send_on, args=(swarm, ends.commands, board), daemon=True, name="set-points"
     ).start()
-    control.send((None, swarm.pose_blocks()))
+    ends.control.send((None, swarm.pose_blocks()))
     with contextlib.suppress(EOFError, OSError):
-        _answer(swarm, control, board)
+        _answer(swarm, ends.control, board)
     threading.Event().wait()  # the loop is gone: the watch ends the process
 
 

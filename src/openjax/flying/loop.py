@@ -104,7 +104,7 @@ def _percentiles(values) -> dict:
     return {n: round(float(v), 3) for n, v in zip(("p50", "p99", "p99.9", "max"), at, strict=True)}
 
 
-class Pace:
+class TickSchedule:
     """When the ticks are due: every 10 ms, just after the moments at which poses are measured.
 
     Those moments are regular, unlike arrivals: the vehicles send by clocks of their own, which
@@ -228,12 +228,12 @@ class Flight:
         """Fly it. Returns when all motors are off."""
         gc.disable()
         try:
-            pace = Pace(perf_counter())
+            schedule = TickSchedule(perf_counter())
             self._since = perf_counter()
             while not self.over:
-                self.tick(perf_counter(), pace.due)
-                due = pace.next(perf_counter(), measured_times(self.vehicles.observe()))
-                self.record.skipped = pace.skipped
+                self.tick(perf_counter(), schedule.due)
+                due = schedule.next(perf_counter(), measured_times(self.vehicles.observe()))
+                self.record.skipped = schedule.skipped
                 await_poses(self.vehicles, due)
         finally:
             gc.enable()
@@ -256,7 +256,7 @@ class Flight:
         self.state = see(self.state, now, samples)
         for i, (drone, old) in enumerate(zip(self.state.drones, before, strict=True)):
             if drone.captured.pose is not old.captured.pose:
-                self.vehicles.believed(i, drone.captured.pose, drone.told)
+                self.vehicles.believed(i, drone.captured.pose, drone.feeds_estimator)
         request = self._requests() or (Request.LAND if self._alarm else self._planned(now))
         actions = None
         if self._episode >= 0 or request is Request.PURSUE:

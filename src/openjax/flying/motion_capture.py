@@ -55,7 +55,8 @@ class MotionCaptured(Links):
         super().__init__(*arguments, **options)
         self._captured: list[Pose | None] = [None] * len(self.counts)
         self._seen = [array("d") for _ in self.counts]
-        self._recording, self._arrived = False, threading.Event()
+        self._recording = False
+        self._arrived = threading.Event()
 
     def feed(self, function: Callable) -> None:
         """Let `function(update)` run in a thread of its own."""
@@ -75,11 +76,13 @@ class MotionCaptured(Links):
         self._captured[vehicle] = Pose(at, position, (0.0, 0.0, 0.0), quaternion)
         self._arrived.set()
 
-    def believed(self, vehicle: int, pose: Pose, told: bool) -> None:
-        """This pose of motion capture was judged good: it is kept, and `told` to the vehicle."""
+    def believed(self, vehicle: int, pose: Pose, feeds_estimator: bool) -> None:
+        """This pose of motion capture was judged good: it is kept, and sent to the vehicle if it
+        `feeds_estimator`.
+        """
         if self._recording:
             self._seen[vehicle].extend(numbers_of(pose))
-        if told:
+        if feeds_estimator:
             self.send_pose(vehicle, pose)
 
     def record(self) -> None:

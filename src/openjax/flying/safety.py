@@ -81,7 +81,9 @@ def decide(state: State, event: Event) -> tuple[State, tuple[SetPoint, ...]]:
     finite = actions is not None and all(math.isfinite(x) for action in actions for x in action)
     action_time = now if finite else state.action_time
     drones = _requested(state, event)
-    troubles = [_trouble(state, *of) for of in zip(drones, event.samples, strict=True)]
+    troubles = [
+        _trouble(state, drone, sample) for drone, sample in zip(drones, event.samples, strict=True)
+    ]
     if any(d.mode is Mode.PURSUIT for d in drones) and event.request is not Request.PURSUE:
         if now - action_time > state.settings.action_timeout:
             reason = "no action in time" if actions is None else "action not finite"
@@ -180,7 +182,7 @@ def _trouble(state, drone, sample) -> tuple[Mode, str] | None:
         return (Mode.STOPPED, fault) if fault else None
     if drone.over_since is not None and state.time - drone.over_since > state.settings.tumble_time:
         return Mode.STOPPED, "tumbled"
-    ill = lost or (drone.mode is not Mode.LAND and (drone.distrusted or _unfit(state, drone)))
+    ill = lost or (drone.mode is not Mode.LAND and (drone.capture_fault or _unfit(state, drone)))
     return (Mode.LAND, ill) if ill else None
 
 
@@ -279,7 +281,7 @@ def _watched(state, drone, sample) -> Drone:
 
     low = sample.voltage < state.settings.battery_low  # an unknown voltage is not low
     over = drone.estimate is not None and up(drone.estimate.quaternion) < 0.0
-    confirmed = drone.captured.pose is not None and not drone.distrusted
+    confirmed = drone.captured.pose is not None and not drone.capture_fault
     alone = drone.mode in FLYING and not confirmed
     return drone._replace(
         alone_since=since(drone.alone_since, alone),

@@ -156,9 +156,9 @@ class Drone(NamedTuple):
     captured_innovations: Innovations = _NOTHING_SUMMED  # ... and of motion capture
     contradiction: Verdict = Verdict.GOOD  # why those aren't believed any more in this flight
     captured: Track = _NOTHING_SEEN  # motion capture, with velocity and rates
-    told: bool = True  # whether the estimator on board is to follow the newest of it
+    feeds_estimator: bool = True  # whether the estimator on board is to follow the newest of it
     seen: float = -math.inf  # s, when the pose that it is flown by was measured
-    distrusted: str = ""  # why motion capture isn't believed any more in this flight
+    capture_fault: str = ""  # why motion capture isn't believed any more in this flight
     stand: tuple[Vector | None, Vector | None] = (
         None,
         None,

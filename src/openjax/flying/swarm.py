@@ -92,7 +92,8 @@ class Member:
     """One vehicle of the swarm."""
 
     def __init__(self, uri: str):
-        self.uri, self._onboard = uri, _Clock()
+        self.uri = uri
+        self._onboard = _Clock()
         self.pose: Pose | None = None
         self.arrival = -math.inf  # host s, of the newest pose
         self.last_contact = perf_counter()

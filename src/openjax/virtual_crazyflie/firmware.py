@@ -119,7 +119,9 @@ class VirtualFirmware:
         self._disarm()
 
     def _disarm(self):
-        self.armed, self._set_point, self._set_point_time = self.auto_arm, SetPoint(), None
+        self.armed = self.auto_arm
+        self._set_point = SetPoint()
+        self._set_point_time = None
 
     # -- packets in
 

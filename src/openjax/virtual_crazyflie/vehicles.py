@@ -74,7 +74,8 @@ class VirtualVehicles:
         battery: float = 1.0,
         endurance: float = 420.0,
     ):
-        self._vehicle, self._parameters = vehicle, dict(effects or {})
+        self._vehicle = vehicle
+        self._parameters = dict(effects or {})
         names = tuple(sorted(self._parameters))
         self._step = make_drones_step("rigid", dt=STEP, effects=names, contacts=False)
         for effect in self._step.effects:
@@ -92,14 +93,16 @@ class VirtualVehicles:
         flat, self._unflatten = ravel_pytree(drones)
         nothing = np.zeros((self.number, 5), np.float32)
         self._advance = compile_in_line(jax.jit(self._advanced).lower(flat, nothing, np.int32(1)))
-        self._charge, self._endurance = float(battery), float(endurance)
+        self._charge = float(battery)
+        self._endurance = float(endurance)
         self._begin = np.asarray(flat)
         self._hover = airframe_of(vehicle).hover_thrust
         self.reset()
 
     def reset(self) -> None:
         """As at the beginning."""
-        self._state, self.battery = self._begin, np.full(self.number, self._charge)
+        self._state = self._begin
+        self.battery = np.full(self.number, self._charge)
         self.report = self.advance(np.zeros((self.number, 5), np.float32), 0)
 
     def advance(self, set_points: np.ndarray, steps: int) -> Report:
