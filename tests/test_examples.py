@@ -64,7 +64,7 @@ def tiny_preset(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("part", ["reward", "network", "observation", "learner"])
 def test_a_part_of_ones_own_is_trained(part, tiny_preset, tmp_path, capsys):
-    runpy.run_path(str(EXAMPLES / f"own_{part}.py"))
+    example = runpy.run_path(str(EXAMPLES / f"own_{part}.py"))
     printed = capsys.readouterr().out
     assert part == "learner" or "captured in" in printed
     run = tmp_path / "runs" / f"own_{part}"
@@ -73,6 +73,11 @@ def test_a_part_of_ones_own_is_trained(part, tiny_preset, tmp_path, capsys):
     assert ("reinforce_loss" in metrics[0]) == (part == "learner")
     with pytest.raises(openjax.UserError, match="was begun with"):
         openjax.train(resume=run)
+    if part == "learner":
+        longer = dataclasses.replace(example["settings"], total_steps=960)
+        openjax.train(longer, resume=run, learners=example["learners"])
+        metrics = list(read_metrics(run / "metrics.jsonl", "train"))
+        assert [row["update"] for row in metrics] == [1, 2, 3]
 
 
 def test_an_evader_of_ones_own_is_flown(capsys):

@@ -25,8 +25,17 @@ from openjax.learning.analytic_gradient import (
     breach_share,
     crash_share,
     draw_start,
-    finite_or_zero,
     nearest_gap,
+)
+from openjax.learning.gradient_step import (
+    END,
+    FASTEST,
+    LOWEST,
+    clipped_descent,
+    falling_rate,
+    finite_or_zero,
+    mean_step,
+    weighted_sum,
 )
 from openjax.learning.settings import AdaptSettings, TrainSettings
 from openjax.policy import Policy, PolicyParameters, make_policy
@@ -132,10 +141,7 @@ def make_adaptation(trained: TrainSettings, settings: AdaptSettings) -> Adaptati
     policy = make_policy(Pursuit(game), trained.network, trained.predictor)
     worlds = settings.worlds or (8 if jax.default_backend() == "cpu" else 320)
     nominal = bounds_of({}, {}, rest=0.0)
-    step_size = optax.linear_schedule(
-        settings.learning_rate, 0.05 * settings.learning_rate, settings.updates
-    )
-    optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(step_size))
+    optimiser = clipped_descent(falling_rate(settings.learning_rate, settings.updates))
 
     def environment(settings, bounds):
         return Pursuit(settings, vehicle, vehicle_bounds=bounds)
@@ -147,7 +153,7 @@ def make_adaptation(trained: TrainSettings, settings: AdaptSettings) -> Adaptati
         tasks = jax.vmap(lambda key: _task(free, key))(jax.random.split(task_key, number))
         _, state = jax.vmap(pursuit.reset_to)(jax.random.split(reset_key, number), tasks)
         moment = jax.random.randint(moment_key, (number,), SETTLE, FLIGHT - STEPS)
-        fly_on = _stepper(pursuit, policy, parameters)
+        fly_on = mean_step(pursuit, policy, parameters)
 
         def one(carry, step):
             observation, state, before, kept = carry
@@ -169,7 +175,7 @@ def make_adaptation(trained: TrainSettings, settings: AdaptSettings) -> Adaptati
         )(jax.random.split(vehicle_key, number))
         pursuit = environment(free, bounds)
         settled = before.replace(vehicles=drawn)
-        fly_on = _stepper(pursuit, policy, parameters)
+        fly_on = mean_step(pursuit, policy, parameters)
         settled, _ = jax.lax.scan(
             lambda carry, _: (fly_on(parameters.actor, *carry), None),
             (jax.vmap(pursuit.observe)(settled), settled),
@@ -193,7 +199,7 @@ def make_adaptation(trained: TrainSettings, settings: AdaptSettings) -> Adaptati
 
     def loss(actor, parameters, flights, key, bounds):
         pursuit, state, position, velocity = begin(flights, key, bounds)
-        fly_on = jax.checkpoint(_stepper(pursuit, policy, parameters))
+        fly_on = jax.checkpoint(mean_step(pursuit, policy, parameters))
 
         def one(carry, _):
             observation, state, least, breach = carry
@@ -214,23 +220,17 @@ def make_adaptation(trained: TrainSettings, settings: AdaptSettings) -> Adaptati
         )
         (_, end, least, breach), (flown, speed) = jax.lax.scan(one, first, None, length=STEPS)
         crash = jnp.mean(crash_share(least), axis=-1)
-        fast = jnp.sqrt(jnp.sum(end.drones.velocity[:worlds] ** 2, axis=-1) + 1e-9) - 1.0
-        low = 0.35 - end.drones.position[:worlds, :, 2]
+        fast = jnp.sqrt(jnp.sum(end.drones.velocity[:worlds] ** 2, axis=-1) + 1e-9) - FASTEST
+        low = LOWEST - end.drones.position[:worlds, :, 2]
         off = off_the_flight(flown[:, worlds:], speed[:, worlds:], position, velocity)
-        watch = {
-            "crashes_from_starts": jnp.mean(crash[:worlds]),
-            "crashes_in_flight": jnp.mean(crash[worlds:]),
-            "breaches": jnp.mean(breach),
-            "ends": jnp.mean(jax.nn.relu(fast)) + jnp.mean(jax.nn.relu(low)),
-            "off_the_nominal_flight": jnp.mean(off),
+        parts = {
+            "crashes_from_starts": (1.0, crash[:worlds]),
+            "crashes_in_flight": (1.0, crash[worlds:]),
+            "breaches": (1.0, breach),
+            "ends": (END, jnp.mean(jax.nn.relu(fast)) + jnp.mean(jax.nn.relu(low))),
+            "off_the_nominal_flight": (settings.follow, off),
         }
-        whole = (
-            watch["crashes_from_starts"]
-            + watch["crashes_in_flight"]
-            + watch["breaches"]
-            + 0.2 * watch["ends"]
-        )
-        return whole + settings.follow * watch["off_the_nominal_flight"], watch
+        return weighted_sum(parts)
 
     def update(actor, state, parameters, flights, key, bounds):
         gradient, watch = jax.grad(loss, has_aux=True)(actor, parameters, flights, key, bounds)
@@ -241,21 +241,6 @@ def make_adaptation(trained: TrainSettings, settings: AdaptSettings) -> Adaptati
         return make_evaluate(environment(game, bounds), policy)(parameters, tasks, key)
 
     return Adaptation(game, policy, optimiser, jax.jit(fly), jax.jit(update), jax.jit(evaluate))
-
-
-def _stepper(pursuit, policy, parameters):
-    """A control step of worlds (W, ...): (actor, observation, state) -> observation, state; the
-    prediction has no gradient.
-    """
-    step = jax.vmap(pursuit.step, in_axes=(None, 0, 0))
-
-    def fly_on(actor, observation, state):
-        predicted = jax.lax.stop_gradient(policy.predict(parameters, observation))
-        action = policy.action(policy.distribution(actor, observation, predicted)[0], observation)
-        observation, state, *_ = step(jax.random.key(0), state, action)
-        return observation, state
-
-    return fly_on
 
 
 def off_the_flight(position, velocity, wanted, wanted_velocity) -> jax.Array:

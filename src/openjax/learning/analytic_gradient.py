@@ -20,6 +20,16 @@ import jax.numpy as jnp
 import optax
 
 from openjax.background import in_background
+from openjax.learning.gradient_step import (
+    END,
+    FASTEST,
+    LOWEST,
+    clipped_descent,
+    falling_rate,
+    finite_or_zero,
+    mean_step,
+    weighted_sum,
+)
 from openjax.learning.settings import AnalyticSettings
 from openjax.learning.ways import Ways, way_length, ways_of
 from openjax.policy import Policy, PolicyParameters
@@ -60,9 +70,6 @@ BREACH_AT_START = 0.5
 """Weights beside the crashes from starts: an episode has one start, and many half seconds after
 it.
 """
-LOWEST = 0.35
-FASTEST = 1.0
-"""Height (m) below, and speed (m/s) above which the end of a start costs."""
 REST = 0.9
 """Share of the capture radius within which a pursuer needn't come nearer to the evader."""
 CLOSE = 0.45
@@ -163,7 +170,7 @@ class AnalyticGradient:
 
     def fly(self, actor: Any, parameters: PolicyParameters, world, steps: int) -> tuple[Any, "Way"]:
         """Worlds some steps later, and what their pursuers met on the way."""
-        step = jax.vmap(self.environment.step, in_axes=(None, 0, 0))
+        fly_on = mean_step(self.environment, self.policy, parameters)
         limit = self.how.speed_from * self.game.max_speed
         rest = REST * self.game.capture_radius
         ways = jax.vmap(functools.partial(ways_of, self.game))(world[1].task)
@@ -171,9 +178,7 @@ class AnalyticGradient:
         @jax.checkpoint
         def moved(world):
             observation, state = world
-            inputs = self.inputs(parameters, observation)
-            action = self.policy.action(self.policy.distribution(actor, *inputs)[0], observation)
-            return step(jax.random.key(0), state, action)[:2]
+            return fly_on(actor, observation, state)
 
         def one(carry, _):
             way = carry[1]
@@ -242,14 +247,13 @@ class AnalyticGradient:
             "breaches_from_starts": (BREACH_AT_START, way.breach[:number]),
             # a dive saves some of those that start tilted towards something, so there the speed is
             # free but for its end
-            "ends": (0.2, jax.nn.relu(fast) + jax.nn.relu(low)),
+            "ends": (END, jax.nn.relu(fast) + jax.nn.relu(low)),
             "crashes_in_flight": (CRASH_IN_FLIGHT, crash_share(way.least[number:])),
             "breaches_in_flight": (how.breach, way.breach[number:]),
             "speed_in_flight": (how.speed, way.excess[number:]),
             "change": (how.hold, jnp.sum(change**2, axis=-1)),
         }
-        means = {name: jnp.mean(value) for name, (_, value) in parts.items()}
-        return sum(weight * means[name] for name, (weight, _) in parts.items()), means
+        return weighted_sum(parts)
 
     def update(self, actor: Any, state: Any, parameters: PolicyParameters, flights, key: jax.Array):
         """The actor and its optimiser's state after an update, and the loss's parts."""
@@ -274,9 +278,7 @@ class AnalyticGradient:
     @functools.cached_property
     def optimiser(self) -> optax.GradientTransformation:
         """Adam with clipped gradients; its step size falls linearly to a twentieth."""
-        rate = self.how.learning_rate
-        schedule = optax.linear_schedule(rate, 0.05 * rate, max(self.how.updates, 1))
-        return optax.chain(optax.clip_by_global_norm(1.0), optax.adam(schedule))
+        return clipped_descent(falling_rate(self.how.learning_rate, self.how.updates))
 
 
 def free_flight(environment: Pursuit) -> Pursuit:
@@ -288,14 +290,6 @@ def free_flight(environment: Pursuit) -> Pursuit:
     )
     by_default = {"vehicle_bounds": None, "evader_share": None, "dynamics": None}
     return dataclasses.replace(environment, settings=free, **by_default)
-
-
-def finite_or_zero(gradient: Any) -> Any:
-    """A gradient through the simulation, zero where it isn't finite: a world that tumbles may have
-    none.
-    """
-    finite = jnp.isfinite(optax.global_norm(gradient))
-    return jax.tree.map(lambda leaf: jnp.where(finite, leaf, 0.0), gradient)
 
 
 def nearest_gap(game: PursuitSettings, state: PursuitState) -> jax.Array:

@@ -21,13 +21,18 @@ from flax import struct
 from openjax.learning.analytic_gradient import (
     AnalyticGradient,
     crash_share,
-    finite_or_zero,
     free_flight,
     nearest_gap,
     tip_share,
 )
 from openjax.learning.collectives import mean_over_devices, own_share
 from openjax.learning.generator import vary_pillars
+from openjax.learning.gradient_step import (
+    SLOWEST_RATE,
+    clipped_descent,
+    finite_or_zero,
+    weighted_sum,
+)
 from openjax.learning.settings import AnalyticSettings, FirstFlightsSettings, GeneratorSettings
 from openjax.policy import Policy, PolicyParameters
 from openjax.pursuit import Pursuit, scatter_starts, turn_task, uniform_task
@@ -133,8 +138,8 @@ class FirstFlights:
             "speed": (how.speed * (self.environment.settings.speed_limit == "none"), way.excess),
             "low": (1.0, jax.nn.relu(LOW - end[1].drones.position[..., 2])),
         }
-        means = {name: jnp.mean(value) for name, (_, value) in parts.items()}
-        return sum(weight * means[name] for name, (weight, _) in parts.items()), (end, means)
+        total, means = weighted_sum(parts)
+        return total, (end, means)
 
     def update(self, carry: FirstCarry, key: jax.Array) -> tuple[FirstCarry, dict[str, jax.Array]]:
         """The carry after an update, and the parts of the loss."""
@@ -176,9 +181,9 @@ class FirstFlights:
     def optimiser(self) -> optax.GradientTransformation:
         """Adam with clipped gradients; its step size falls to a twentieth."""
         schedule = optax.cosine_decay_schedule(
-            self.how.learning_rate, max(self.how.updates, 1), 0.05
+            self.how.learning_rate, max(self.how.updates, 1), SLOWEST_RATE
         )
-        return optax.chain(optax.clip_by_global_norm(1.0), optax.adam(schedule))
+        return clipped_descent(schedule)
 
     def begin(self, parameters: PolicyParameters, key: jax.Array) -> FirstCarry:
         """The carry of `update` before the first one."""

@@ -1,0 +1,69 @@
+"""What the three stages by the gradient through the simulation have in common: before MAPPO
+(`first_flights`), after it (`analytic_gradient`), and for a diagnosed vehicle (`adaptation`).
+
+Each flies the policy's mean for some steps, adds up weighted parts of what its pursuers met, and
+lets the actor follow the gradient.
+"""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from openjax.policy import Policy, PolicyParameters
+from openjax.pursuit import Observation, Pursuit, PursuitState
+
+LOWEST = 0.35
+FASTEST = 1.0
+"""Height (m) below, and speed (m/s) above which the end of a start costs."""
+END = 0.2
+"""Weight of that, beside the share of pursuers that touch something."""
+SLOWEST_RATE = 0.05
+"""Share of the step size that is left at a stage's end."""
+MOST_NORM = 1.0
+"""Norm at which gradients are cut."""
+
+
+def clipped_descent(rate: optax.ScalarOrSchedule) -> optax.GradientTransformation:
+    """Adam with gradients cut at `MOST_NORM`."""
+    return optax.chain(optax.clip_by_global_norm(MOST_NORM), optax.adam(rate))
+
+
+def falling_rate(rate: float, updates: int) -> optax.Schedule:
+    """From `rate` linearly to a twentieth over so many updates."""
+    return optax.linear_schedule(rate, SLOWEST_RATE * rate, max(updates, 1))
+
+
+def finite_or_zero(gradient: Any) -> Any:
+    """A gradient through the simulation, zero where it isn't finite: a world that tumbles may have
+    none.
+    """
+    finite = jnp.isfinite(optax.global_norm(gradient))
+    return jax.tree.map(lambda leaf: jnp.where(finite, leaf, 0.0), gradient)
+
+
+def weighted_sum(
+    parts: Mapping[str, tuple[float | jax.Array, jax.Array]],
+) -> tuple[jax.Array, dict[str, jax.Array]]:
+    """() sum of the weighted means of a loss's parts, {name: (weight, values)}; and the means."""
+    means = {name: jnp.mean(values) for name, (_, values) in parts.items()}
+    return sum(weight * means[name] for name, (weight, _) in parts.items()), means
+
+
+def mean_step(
+    environment: Pursuit, policy: Policy, parameters: PolicyParameters
+) -> Callable[[Any, Observation, PursuitState], tuple[Observation, PursuitState]]:
+    """A control step of worlds (W, ...) by the policy's mean: (actor, observation, state) ->
+    observation, state; the predictor of `parameters` has no gradient.
+    """
+    step = jax.vmap(environment.step, in_axes=(None, 0, 0))
+
+    def fly_on(actor, observation, state):
+        predicted = jax.lax.stop_gradient(policy.predict(parameters, observation))
+        action = policy.action(policy.distribution(actor, observation, predicted)[0], observation)
+        observation, state, *_ = step(jax.random.key(0), state, action)
+        return observation, state
+
+    return fly_on
