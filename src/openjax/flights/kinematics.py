@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.optimize import nnls
 from scipy.signal import butter, sosfiltfilt
 from scipy.spatial.transform import Rotation
 
@@ -23,6 +24,7 @@ EDGE = 0.3  # s at either end that a filter spoils
 SLOW = 2.0  # Hz, below which path and accelerometer are compared
 CLEAR = 5.0  # jackknife standard errors by which a finding must exceed nothing
 LEAST = 0.1  # rad/s or m/s^2 rms in the band: an axis that hardly moves shows no gain
+WANDER = 0.015  # s: clocks that are less apart cost no correlation worth mentioning at 2 Hz
 COHERENT = 0.97  # correlation below which the two streams don't fit well enough to compare gains
 ONE_CLOCK = 0.93  # below which they don't share a clock
 
@@ -48,9 +50,11 @@ def read_kinematics(tracks: list[Track], limits) -> Kinematics:
     """Compare the sensors of all tracks of one case. `limits`: `gyroscope_gain` that a sensor may
     be off by, `world_tilt` in degrees, and the `standard_errors` from which a tilt is clear.
     """
-    gain, error, coherence, turning = _gains(_streams(tracks, _turning, BAND))
+    streams = _streams(tracks, _turning, BAND)
+    gain, error, coherence, turning = _gains(streams)
     apart = turning & (coherence < ONE_CLOCK)
-    one_clock = int(apart.sum()) < 2
+    # An estimator's noise costs correlation as well, and is no matter of time.
+    one_clock = int(apart.sum()) < 2 or _wander(streams) < WANDER
     tilt = None
     findings = {}
     if words := _unusual(gain, error, limits.gyroscope_gain):
@@ -188,6 +192,25 @@ def _gains(streams) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     # The quieter of the two: noise alone is no motion.
     moving = np.sqrt(np.minimum(total[0], total[2]) / total[3]) > LEAST
     return np.where(moving & (coherence > COHERENT), gain, np.nan), error, coherence, moving
+
+
+def _wander(streams) -> float:
+    """s (rms) by which the clocks of two signals are apart: an error of time grows with how fast a
+    signal changes, noise doesn't. Least squares over granules, each axis with a noise of its own.
+    """
+    found = []
+    left = []
+    for dt, a, b in streams:
+        size = max(int(BLOCK / dt), 1)
+        slope = np.gradient(a, dt, axis=0)
+        for k in range(0, len(a) - size // 2, size):
+            for axis in range(3):
+                part = slice(k, k + size)
+                noise = np.zeros(3)
+                noise[axis] = len(a[part])
+                found.append([*noise, (slope[part, axis] ** 2).sum()])
+                left.append(((a - b)[part, axis] ** 2).sum())
+    return float(np.sqrt(nnls(np.array(found), np.array(left))[0][-1])) if found else 0.0
 
 
 def _jackknife(sums: np.ndarray, statistic) -> np.ndarray:

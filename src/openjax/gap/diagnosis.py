@@ -157,13 +157,11 @@ def _reference_in_words(evidence: Evidence, named) -> str:
     ]
     told = "Held against the reference flights of the same vehicle"
     told += f": {', '.join(before)} there." if before else "."
-    silent = any(t.voltage is None for t in evidence.tracks)
-    pwm = evidence.case.vehicle_file.motor.command == "pwm"
     battery = (
         "The battery's charge may differ between the days, which changes what thrust a duty cycle "
         "makes: log vbat, and thrust can be compared."
     )
-    return f"{told} {battery}" if pwm and silent else told
+    return f"{told} {battery}" if evidence.charge_unknown else told
 
 
 def _runner_up(chances, effects, equivalent) -> str:

@@ -37,6 +37,14 @@ class Evidence:
     def replay(self) -> Replay:
         return self.motion.replay
 
+    @property
+    def charge_unknown(self) -> bool:
+        """Whether a battery's charge acts unseen: motors are duty cycles, and no voltage was
+        logged.
+        """
+        silent = any(t.voltage is None for t in self.tracks)
+        return silent and self.case.vehicle_file.motor.command == "pwm"
+
 
 def gather(
     case: Case, library: Library, progress=None, baseline: Baseline | None = None, reference=False

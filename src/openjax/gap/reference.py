@@ -31,9 +31,7 @@ def read_reference(case: Case, progress=None) -> Baseline:
     measures, _ = measure(evidence, residuals_of(fit))
     table = build(fit, None)
     names = [n for n, s in zip(fit.replay.nuisance_names, fit.replay.shared, strict=True) if s]
-    volts = all(t.voltage is not None for t in evidence.tracks)
-    silent = case.vehicle_file.motor.command == "pwm" and not volts
-    day = partial(day_of, vehicle=evidence.vehicles[0], silent=silent)
+    day = partial(day_of, vehicle=evidence.vehicles[0], silent=evidence.charge_unknown)
     found, covariance, known = joint(table, with_effects(table), names, day)
     count = len(fit.index)
     mean = dict(zip(names, found[count:].tolist(), strict=True))
