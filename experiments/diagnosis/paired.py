@@ -40,14 +40,17 @@ def fly(seed: int, options) -> tuple[Path, str]:
 def diagnose(name: str, engine: str, sets: list[str], options) -> list[dict]:
     """The lines of all cases by one engine."""
     source, _, reference = engine.partition("+")
-    out = options.work / f"{name}.jsonl"
+    older = Path(source).resolve().parent / "experiments"  # an older engine runs its own runner
+    here = ROOT if ROOT / "experiments" == older or not older.exists() else older.parent
+    out = options.work.resolve() / f"{name}.jsonl"
     command = [sys.executable, "-m", "experiments.diagnosis.development", "--sets", *sets]
     command += ["--cores", str(options.cores), "--out", str(out)]
     command += ["--healthy"] if reference else []
-    command += ["--kept", str(options.kept / name)] if options.kept else []
+    keep = options.kept and here == ROOT
+    command += ["--kept", str(options.kept.resolve() / name)] if keep else []
     command += ["--seconds", str(options.seconds)] if options.seconds else []
     environment = dict(os.environ, PYTHONPATH=str(Path(source).resolve()))
-    subprocess.run(command, cwd=ROOT, check=True, env=environment)
+    subprocess.run(command, cwd=here, check=True, env=environment)
     return read_lines([out])
 
 
@@ -68,6 +71,8 @@ def mcnemar(one: list[dict], other: list[dict]) -> dict[str, dict]:
     return out
 
 
+# What days move as well: of these a reference of one other day tells only what is larger.
+DRIFTING = ("com_offset", "motor_imbalance", "mass", "thrust_scale")
 LEFT_OUT = ("quality", "not_testable", "rest", "parameters", "gap", "probabilities")
 
 
@@ -75,7 +80,7 @@ def study(options) -> dict:
     """Fly, diagnose by every engine, compare."""
     options.work.mkdir(parents=True, exist_ok=True)
     flown = [fly(seed, options) for seed in options.seeds]
-    sets = [str(logs) for logs, _ in flown] + options.sets
+    sets = [str(logs.resolve()) for logs, _ in flown] + options.sets
     engines = dict(entry.split("=", 1) for entry in options.engines)
     lines = {n: diagnose(n, engine, sets, options) for n, engine in engines.items()}
     for name, found in lines.items():
@@ -92,12 +97,19 @@ def study(options) -> dict:
             n: {s: stored_figures([r for r in found if r["set"] == s]) for s in _sets(found)}
             for n, found in lines.items()
         },
+        "beyond_days": {n: beyond_days(found) for n, found in lines.items()},
         "compared": compared,
         "cases": {
             n: [{k: v for k, v in r.items() if k not in LEFT_OUT} for r in found]
             for n, found in lines.items()
         },
     }
+
+
+def beyond_days(lines: list[dict]) -> dict:
+    """First names of single causes that a day's drift of trims and thrust can't make."""
+    asked = [r for r in lines if r["category"] == "single" and not set(r["truth"]) & set(DRIFTING)]
+    return {"hits": sum(r["right"] for r in asked), "n": len(asked)}
 
 
 def _sets(lines: list[dict]) -> list[str]:

@@ -146,11 +146,14 @@ def _path_against_accelerometer(track: Track) -> np.ndarray:
 
 def _comparable(evidence: Evidence) -> dict[str, float]:
     """The reference's measures, of which those of forces and torques say nothing where a battery
-    that nobody logged makes another thrust of every duty cycle.
+    that nobody logged makes another thrust of every duty cycle, and those of the pose nothing where
+    it was moved in time.
     """
     before = evidence.baseline.measures
-    driven = ("velocity", "rates") if evidence.charge_unknown else ()
-    return {n: v for n, v in before.items() if n not in driven}
+    silent = ("velocity", "rates") if evidence.charge_unknown else ()
+    moved = any(c.path == "estimator" and c.acting() for c in evidence.channels)
+    silent += ("estimator", "position") if moved else ()
+    return {n: v for n, v in before.items() if n not in silent}
 
 
 def changed_p(measured: dict[str, float], before: dict[str, float]) -> tuple[float, str]:
