@@ -37,7 +37,7 @@ LARGEST = 3  # effects of a set
 FITTED = 10
 FITTED_AGAIN = 6
 SCREENED = 4  # times as many are weighed with bounded nuisances before that
-SIMPLER = 2  # of the best sets, those without one of their effects are fitted as well
+SIMPLER = 3  # of the best sets, those without one of their effects are fitted as well
 DRAWS = 400  # of the bootstrap
 ROUNDS = 10  # of the chosen set's last fit, between which nuisances are worked out anew
 
@@ -86,8 +86,9 @@ class Selection:
 def select(evidence: Evidence) -> Selection:
     """Choose among the physics effects that the flights can show."""
     search = Search(evidence, testable(evidence))
+    search.alone()
     search.enumerate(search.nothing, FITTED)
-    search.enumerate(search.best, FITTED_AGAIN)
+    search.enumerate(search.best, FITTED_AGAIN, search.beyond_bounds())
     weights = search.weights()
     chosen = search.visited[max(weights, key=weights.get)]
     without = {e: search.of_set(set(chosen.effects) - {e}, chosen.fit) for e in chosen.effects}
@@ -166,9 +167,14 @@ def practical(fit: SetFit) -> bool:
 
 def possible(fit: SetFit) -> bool:
     """Whether all fitted parameters lie within physical bounds."""
-    found = fit.parameters()
-    told = {e: [{p: v[k] for p, v in found[e].items()} for k in (0, 1)] for e in fit.effects}
-    return all(CARDS[e].possible is None or CARDS[e].possible(*both) for e, both in told.items())
+    return all(within_bounds(fit, e) for e in fit.effects)
+
+
+def within_bounds(fit: SetFit, effect: str) -> bool:
+    """Whether the parameters of one effect do."""
+    found = fit.parameters()[effect]
+    both = ({p: v[k] for p, v in found.items()} for k in (0, 1))
+    return CARDS[effect].possible is None or bool(CARDS[effect].possible(*both))
 
 
 @dataclass(eq=False)
@@ -203,13 +209,24 @@ class Search:
             start[places((new,))] = self.singles[new].theta[places((new,))]
         return self.of_fit(fit_set(near.replay, [e for e in CARDS if e in key], start))
 
-    def enumerate(self, near: Hypothesis, most: int) -> None:
+    def alone(self) -> None:
+        """Judge the effects that explain most alone."""
+        best = sorted(self.singles, key=lambda e: -self.singles[e].score)[:SIMPLER]
+        for effect in best:
+            self.of_set({effect}, self.nothing.fit)
+
+    def beyond_bounds(self) -> frozenset:
+        """Effects that leave their physical bounds in the visited set of the largest score."""
+        best = max(self.visited.values(), key=lambda h: h.score).fit
+        return frozenset(e for e in best.effects if not within_bounds(best, e))
+
+    def enumerate(self, near: Hypothesis, most: int, without: frozenset = NOTHING) -> None:
         """Fit and judge the most promising sets of up to LARGEST effects that weren't visited yet,
         by the model linearised around the hypothesis `near`, and what is left of each when one of
-        its effects goes.
+        its effects goes; sets with an effect of `without` aside.
         """
         table = build(near.fit, self.singles)
-        models = {key: self._model(table, key) for key in self.sets()}
+        models = {key: self._model(table, key) for key in self.sets() if not key & without}
 
         def ranked(keys, promise_of):
             score = {
