@@ -111,3 +111,16 @@ def test_streams_on_clocks_that_wander_tell_no_gain():
     assert set(read_kinematics([dataclasses.replace(track, body_rates=rates)]).findings) == {
         "clocks"
     }
+
+
+def test_noise_of_an_attitude_is_no_matter_of_clocks():
+    rng = np.random.default_rng(3)
+    time = 0.01 * np.arange(3000)
+
+    def signal(at):
+        return np.stack([np.sin(2 * np.pi * f * at) * np.sin(0.3 * at) for f in (0.9, 1.3, 0.6)], 1)
+
+    noisy = signal(time) + 0.5 * rng.standard_normal((3000, 3))
+    apart = signal(time + 0.04 * np.sign(np.sin(2.0 * time)))
+    assert kinematics._wander([(0.01, signal(time), noisy)]) < 0.01
+    assert kinematics._wander([(0.01, signal(time), apart)]) > 0.03

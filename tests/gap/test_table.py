@@ -7,8 +7,9 @@ import pytest
 from scipy.optimize import minimize
 
 from openjax.gap.model.bounds import BOUND
-from openjax.gap.model.cross_validation import Equations
+from openjax.gap.model.cross_validation import Equations, judge, promise, screened
 from openjax.gap.model.hypotheses import _loudness
+from openjax.gap.model.library import ABSENT
 from openjax.gap.model.table import Model, Table, _errors
 
 
@@ -82,3 +83,29 @@ def test_nuisances_of_the_vehicle_are_alike_on_all_blocks_and_bounded_and_a_bloc
         objective(np.array([*found, *(-u for u in own)])), best.fun, rtol=1e-6
     )
     assert np.abs(found[1:]).max() <= BOUND
+
+
+def test_a_block_left_out_is_judged_by_its_marginal_density(columns):
+    """-1/2 y'(I + NN')^-1 y: what a block's own nuisances take of it costs."""
+    rows = [x[[0, 7]] for x in columns]
+    white = np.array([x @ x.T for x in rows])
+    shared = np.array([False])
+    fit = SimpleNamespace(effects=(), replay=SimpleNamespace(absent=ABSENT), theta=ABSENT)
+    error = np.zeros((2, 1, 2, 2))
+    table = Table(fit, white, error, None, np.arange(2), {}, {}, {}, shared, rows)
+    model = Model((), np.array([], int), np.zeros(0), np.zeros((0, 0)))
+    for (y, n), nats in zip(rows, judge(table, model).nats, strict=True):
+        expected = -0.5 * y @ np.linalg.solve(np.eye(len(y)) + np.outer(n, n), y)
+        assert nats == pytest.approx(expected, rel=1e-9)
+
+
+def test_screening_promises_what_a_fit_does_where_no_nuisance_is_at_its_bound(columns):
+    rows = [np.concatenate([x[:3], 0.2 * x[5:7]]) for x in columns]
+    white = np.array([x @ x.T for x in rows])
+    shared = np.array([True, True])
+    table = Table(None, white, None, None, np.arange(2), {}, {}, {}, shared, rows)
+    model = Model((), np.array([1, 2]), np.array([0.1, -0.2]), np.diag([4.0, 9.0]))
+    nothing = Model((), np.array([], int), np.zeros(0), np.zeros((0, 0)))
+    gains = [f(table, model) - f(table, nothing) for f in (screened, promise)]
+    assert np.abs(Equations(table, model).solve(table.total)[2][2:]).max() < BOUND
+    assert gains[0] == pytest.approx(gains[1], rel=1e-6)
