@@ -117,6 +117,7 @@ STUDIES = {
     "changes": "experiments.diagnosis.changes",
     "evaders": "experiments.evaders.cross_play",
     "exam": "experiments.diagnosis.run",
+    "flying_estimates": "experiments.flying.estimates",
     "flying_faults": "experiments.flying.simulated",
     "flying_real_time": "experiments.flying.real_time",
     "quick": "experiments.paper.quick",

@@ -7,6 +7,7 @@ import math
 
 import pytest
 
+from experiments.flying import estimates
 from experiments.flying.faults import BEYOND, FALL, KINDS, finite
 from experiments.flying.simulated import fly, well
 from experiments.flying.single_thread import share_out
@@ -21,6 +22,12 @@ from openjax.virtual_crazyflie.vehicles import VirtualVehicles
 def test_nothing_that_goes_wrong_costs_a_vehicle():
     seeds = [kind for kind, name in enumerate(KINDS) if name not in BEYOND]
     assert not [row for row in fly(seeds, "passage", "flight") if not well(row)]
+
+
+@pytest.mark.slow
+def test_no_estimate_that_contradicts_what_is_known_costs_a_vehicle():
+    rows = estimates.fly(estimates.TOLD, [7], "passage", "flight")
+    assert not [row for row in rows if not estimates.well(row)]
 
 
 @pytest.mark.slow

@@ -174,17 +174,20 @@ def prepare(arguments: Arguments) -> Prepared:
 def _planned(arguments: Arguments) -> Prepared:
     """A plan in a policy's place."""
     from openjax.flights.plans import read_plan
+    from openjax.flights.samples import PERIOD
     from openjax.flying.controller import airframe_of
     from openjax.flying.loop import flight_state
     from openjax.flying.planned import PlannedFlight
     from openjax.vehicle.vehicle_file import load_vehicle_file
 
     vehicle = load_vehicle_file(arguments.vehicle)
-    game = PlannedFlight(read_plan(arguments.plan), airframe_of(vehicle.vehicle))
+    plan = read_plan(arguments.plan)
+    game = PlannedFlight(plan, airframe_of(vehicle.vehicle))
     state = flight_state(game, 1, arguments.safety)
     source = f"plan {arguments.plan}"
     about = {"policy": source, "scenario": source, "uris": arguments.uri}
-    return Prepared(game, state, _session(arguments), vehicle, about)
+    remarks = _time_remark(arguments, len(plan) * PERIOD)
+    return Prepared(game, state, _session(arguments), vehicle, about, remarks)
 
 
 def _session(arguments: Arguments):
@@ -205,21 +208,25 @@ def _session(arguments: Arguments):
 def _remarks(arguments: Arguments, game, vehicle) -> tuple[str, ...]:
     """What somebody should know before the vehicles rise."""
     settings = game.settings
-    remarks = []
-    if vehicle.airframe != settings.airframe:
-        remarks.append(
-            f"the policy was trained for {settings.airframe}; what flies is {vehicle.airframe}"
-        )
     length = min(
         settings.episode_length * settings.time_step, arguments.episode_seconds or math.inf
     )
+    remarks = _time_remark(arguments, arguments.episodes * length)
+    if vehicle.airframe == settings.airframe:
+        return remarks
+    other = f"the policy was trained for {settings.airframe}; what flies is {vehicle.airframe}"
+    return (other, *remarks)
+
+
+def _time_remark(arguments: Arguments, seconds: float) -> tuple[str, ...]:
+    """That a flight of so many seconds will be cut short, where it will."""
     limit = arguments.safety.alone_time
-    if arguments.motion_capture is None and arguments.episodes * length > limit:
-        remarks.append(
-            f"without --motion_capture all land after {limit:g} s in the air "
-            "(--safety.alone_time): these games take longer"
-        )
-    return tuple(remarks)
+    if arguments.motion_capture is not None or seconds < limit:
+        return ()
+    return (
+        f"without --motion_capture all land after {limit:g} s in the air (--safety.alone_time); "
+        f"this flight takes {seconds:.0f} s",
+    )
 
 
 def _write(out, flown, flight, samples, scheduler):

@@ -11,9 +11,11 @@ import os
 import select
 import signal
 from enum import IntEnum
+from multiprocessing import resource_tracker
 
 from openjax.flying.controller import moved_on, numbers_of, pose_of
 from openjax.flying.state import Mode, State
+from openjax.interruption import SIGNALS
 
 SILENCE = 0.1
 """Silence of a process after which the next one flies (s): ten ticks."""
@@ -123,6 +125,18 @@ class Board:
             pose = moved_on(pose_of(numbers), now) if known else None
             drones.append(drone._replace(mode=_MODES[int(mode)], trim=trim, estimate=pose))
         return state._replace(drones=tuple(drones), time=now, action_time=now)
+
+
+def start_deaf(process) -> None:
+    """Start a process of multiprocessing that no Ctrl-C ends, in many lines, while it loads what it
+    needs: signals that are blocked here are blocked there until it can `stand_alone`.
+    """
+    resource_tracker.ensure_running()  # which would unblock them
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
+    try:
+        process.start()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def stand_alone() -> None:

@@ -19,7 +19,7 @@ import time
 from collections.abc import Callable, Sequence
 
 from openjax.flying import real_time
-from openjax.flying.board import Board, Role, say, stand_alone
+from openjax.flying.board import Board, Role, say, stand_alone, start_deaf
 from openjax.flying.crtp import LOG_TYPES, Port, Supervisor, SupervisorCommand
 from openjax.flying.safety import resting_places_of, step
 from openjax.flying.set_point import SetPoint
@@ -210,7 +210,7 @@ class Guard:
         self._process = context.Process(
             target=watch, args=(board, os.getpid(), own, state), name="openjax guard"
         )
-        self._process.start()
+        start_deaf(self._process)
 
     def wait(self, timeout: float = 20.0) -> None:
         """Return once it watches, which takes a second, or doesn't by then (s)."""

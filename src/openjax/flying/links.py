@@ -26,7 +26,7 @@ import numpy as np
 
 from openjax.errors import UserError
 from openjax.flying import real_time
-from openjax.flying.board import SILENCE, Board, Role, say, stand_alone
+from openjax.flying.board import SILENCE, Board, Role, say, stand_alone, start_deaf
 from openjax.flying.controller import Pose, numbers_of, pose_of
 from openjax.flying.guard import CHECK, disarm, fly_down
 from openjax.flying.set_point import SetPoint
@@ -129,7 +129,7 @@ class Links:
         ends = Ends(self._contacts, stream, commands, control)
         arguments = (connection, ends, self.board, os.getpid(), self._state)
         self._process = context.Process(target=_serve, args=arguments, name="openjax links")
-        self._process.start()
+        start_deaf(self._process)
         for end in (stream, commands, control):
             end.close()
         complaint = "the links' process doesn't answer"
