@@ -223,7 +223,7 @@ def page(results) -> Page:
         "flights": "flights:d",
         "well": "well:d",
         "landed by themselves": "landed:d",
-        "farthest out (m)": "farthest:.2f",
+        "beyond the arena by (m)": "farthest:.2f",
         "fell": "fell:d",
         "on at the end": "armed:d",
     }
