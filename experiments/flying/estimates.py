@@ -127,6 +127,23 @@ DAMAGES = {
     ),
 }
 """(damage, true pose, seconds since it began) -> what is received, by kind."""
+GROUPS = {
+    "position or height drifts": ("position drifts", "height drifts", "position wanders"),
+    "ways are too long": ("ways are too long",),
+    "velocity is held or zero": ("velocity is held", "velocity is zero"),
+    "all freezes": tuple(kind for kind in DAMAGES if kind.startswith("frozen")),
+    "all blends into a held pose": ("blends into a held pose",),
+    "a camera does": ("camera blends into a held pose",),
+    "position and velocity drift at once": (
+        "drifts with its velocity",
+        "height drifts with its velocity",
+    ),
+    "they drift gently": (
+        "drifts gently with its velocity",
+        "height drifts gently with its velocity",
+    ),
+}
+"""The rows of the page."""
 UNTOLD = tuple(kind for kind in DAMAGES if "with its velocity" in kind)
 """What nothing on board can tell where it is small, or sets in gently."""
 TOLD = tuple(kind for kind in DAMAGES if kind not in UNTOLD)
@@ -227,7 +244,16 @@ def page(results) -> Page:
         "fell": "fell:d",
         "on at the end": "armed:d",
     }
-    return Page("Estimates that go wrong gently", prose, Table(columns, results["summary"]))
+    rows = {row["kind"]: row for row in results["summary"]}
+    grouped = [_together(name, [rows[kind] for kind in kinds]) for name, kinds in GROUPS.items()]
+    return Page("Estimates that go wrong gently", prose, Table(columns, grouped))
+
+
+def _together(name, rows) -> dict:
+    """One row of several."""
+    counted = ("flights", "well", "landed", "fell", "armed")
+    numbers = {column: sum(row[column] for row in rows) for column in counted}
+    return {"kind": name, "farthest": max(row["farthest"] for row in rows), **numbers}
 
 
 if __name__ == "__main__":
