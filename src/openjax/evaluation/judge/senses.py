@@ -1,0 +1,106 @@
+"""What a judge's evader knows: all of the world's state, as numbers in axes of its own.
+
+The x axis points away from the arena's axis, so that a game that is turned looks the same; with
+`world_axes` it is the world's. Pursuers and pillars are sorted by their distance.
+"""
+
+import jax
+import jax.numpy as jnp
+
+from openjax.pursuit import PursuitSettings, PursuitState
+from openjax.pursuit.observation import rotation_axes
+
+TINY = 1e-9
+ABSENT = 4.0
+"""Distance (in the arena's radii) at which a pillar slot that isn't in use is sensed."""
+
+
+def sense(settings: PursuitSettings, state: PursuitState, world_axes: jax.Array) -> jax.Array:
+    """(F,) float32, of the order of one, of one world.
+
+    Args:
+      settings: the game.
+      state: of one world.
+      world_axes: () bool.
+    """
+    turned = _axes(state.evader_position, world_axes)
+    parts = [
+        _evader(settings, state, turned),
+        _pursuers(settings, state, turned).ravel(),
+        _pillars(settings, state, turned).ravel(),
+    ]
+    return jnp.concatenate(parts)
+
+
+def to_world(velocity: jax.Array, state: PursuitState, world_axes: jax.Array) -> jax.Array:
+    """(3,) in the world of a velocity (3,) in the evader's axes."""
+    turned = _axes(state.evader_position, world_axes)
+    return velocity @ turned
+
+
+def _axes(position, world_axes):
+    """(3, 3) rows: the evader's axes in the world."""
+    radius = jnp.sqrt(jnp.sum(position[:2] ** 2) + TINY)
+    # on the axis there is no outward direction
+    outward = jnp.where(world_axes | (radius < 1e-3), jnp.array([1.0, 0.0]), position[:2] / radius)
+    cos, sin = outward
+    return jnp.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _length(vector):
+    return jnp.sqrt(jnp.sum(vector**2, axis=-1, keepdims=True) + TINY)
+
+
+def _evader(settings, state, turned):
+    """(14,) own place and velocity, the time, and where the pursuers saw it last."""
+    position = state.evader_position
+    radius = _length(position[:2])
+    middle = jnp.array(settings.middle, jnp.float32)
+    time = state.step / settings.episode_length
+    return jnp.concatenate(
+        [
+            turned @ (position - middle) / settings.arena_radius,
+            1.0 - radius / settings.arena_radius,
+            position[2:] / settings.arena_height,
+            turned @ state.evader_velocity / settings.evader_speed,
+            turned @ (state.last_seen - position),
+            jnp.stack([state.seen.astype(jnp.float32), time, 1.0 - time]),
+        ]
+    )
+
+
+def _pursuers(settings, state, turned):
+    """(N, 13), the nearest first: where each is, how it flies, where its rotors pull, if it sees
+    the evader.
+    """
+    offset = state.drones.position - state.evader_position
+    distance = _length(offset)
+    thrust = rotation_axes(state.drones.quaternion)[1]
+    velocity = state.drones.velocity / settings.max_speed
+    closing = -jnp.sum(offset / distance * velocity, axis=-1, keepdims=True)
+    rows = jnp.concatenate(
+        [
+            offset @ turned.T / settings.arena_radius,
+            distance / settings.arena_radius,
+            settings.capture_radius / jnp.maximum(distance, settings.capture_radius / 2),
+            velocity @ turned.T,
+            closing,
+            thrust @ turned.T,
+            state.in_sight[:, None].astype(jnp.float32),
+        ],
+        axis=-1,
+    )
+    return rows[jnp.argsort(distance[:, 0])]
+
+
+def _pillars(settings, state, turned):
+    """(P, 4), the nearest first: where each is, how far its surface, if it is there."""
+    task = state.task
+    offset = task.pillar_position - state.evader_position[:2]
+    active = task.pillar_active[:, None]
+    gap = _length(offset) - settings.pillar_radius
+    near = jnp.exp(-jnp.maximum(gap, 0.0) / settings.pillar_radius)
+    rows = jnp.concatenate([offset @ turned[:2, :2].T / settings.arena_radius, near], axis=-1)
+    absent = jnp.array([ABSENT, 0.0, 0.0])
+    rows = jnp.concatenate([jnp.where(active, rows, absent), active.astype(jnp.float32)], axis=-1)
+    return rows[jnp.argsort(jnp.where(active, gap, jnp.inf)[:, 0])]

@@ -1,0 +1,69 @@
+"""Settings of the judges, without JAX, so that a command's help comes at once."""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from openjax.errors import UserError
+from openjax.ranges import Interval, check_intervals
+
+
+@dataclass(frozen=True)
+class JudgeSettings:
+    """How the learners of a judge learn."""
+
+    learners: Annotated[int, Interval("[1, 64]")] = 8
+    """That learn side by side; every second one in the world's axes."""
+    total_steps: Annotated[int, Interval("[1, 1e15]")] = 800_000_000
+    """Environment steps of all learners."""
+    num_envs: Annotated[int, Interval("[1, 16777216]")] = 1024
+    """Worlds of each learner."""
+    hold: Annotated[int, Interval("[1, 1000]")] = 4
+    """Control steps for which a decision is flown: 40 ms, in which an evader moves 5 cm."""
+    rollout_length: Annotated[int, Interval("[1, 100000]")] = 25
+    """Decisions per iteration: a second of the game."""
+    foresight: tuple[float, ...] = (4.0, 4.0, 2.0, 2.0)
+    """Seconds after which what comes counts 1/e, of learner after learner: traps take one to
+    three.
+    """
+    gae_lambda: Annotated[float, Interval("[0, 1]")] = 0.95
+    learning_rate: Annotated[float, Interval("(0, 1]")] = 5e-4
+    """Adam step size at the start; falls linearly to zero."""
+    epochs: Annotated[int, Interval("[1, 1000]")] = 4
+    minibatches: Annotated[int, Interval("[1, 100000]")] = 4
+    clip_epsilon: Annotated[float, Interval("(0, 10]")] = 0.2
+    entropy_coefficient: Annotated[float, Interval("[0, 10]")] = 2e-3
+    value_coefficient: Annotated[float, Interval("(0, 1000]")] = 10.0
+    """Weight of the squared error of values, which are at most one."""
+    initial_log_std: Annotated[float, Interval("[-10, 2]")] = 0.0
+    least_log_std: Annotated[float, Interval("[-10, 2]")] = -2.0
+    layouts: Annotated[float, Interval("[0, 1]")] = 0.5
+    """Share of the episodes that begin among a layout's pillars, turned and with starts moved; the
+    others are uniform tasks, turned.
+    """
+
+    def __post_init__(self):
+        check_intervals(self)
+        if not self.foresight or min(self.foresight) <= 0.0:
+            raise UserError(f"foresight {self.foresight}: seconds above zero are needed")
+        if self.num_envs * self.rollout_length % self.minibatches:
+            raise UserError(
+                f"num_envs {self.num_envs} times rollout_length {self.rollout_length} must be a "
+                f"multiple of minibatches {self.minibatches}"
+            )
+
+    @property
+    def total_updates(self) -> int:
+        """Iterations of the run."""
+        steps = self.learners * self.num_envs * self.rollout_length * self.hold
+        return max(1, -(-self.total_steps // steps))
+
+    @property
+    def gradient_steps(self) -> int:
+        """Of each learner in the whole run."""
+        return self.total_updates * self.epochs * self.minibatches
+
+    def discounts(self, time_step: float) -> list[float]:
+        """Of a decision, of each learner; `time_step` of the game in seconds."""
+        decision = self.hold * time_step
+        seconds = (self.foresight[i % len(self.foresight)] for i in range(self.learners))
+        return [1.0 - decision / (decision + second) for second in seconds]
