@@ -2,6 +2,9 @@
 a world.
 """
 
+import dataclasses
+
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -138,6 +141,15 @@ def test_every_place_flies_its_own_network(worlds):
             )
 
 
+def turned_drones(drones, turn, half):
+    """Drones, each with its velocity and attitude turned by the quaternion `half` about z."""
+    w, x, y, z = np.asarray(drones.quaternion).T
+    c = half[0]
+    s = half[3]
+    product = np.stack([c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w], axis=-1)
+    return drones.replace(velocity=drones.velocity @ turn.T, quaternion=jnp.asarray(product))
+
+
 @pytest.mark.parametrize("own_axes", [True, False])
 def test_in_its_own_axes_a_turned_game_is_the_same(worlds, own_axes):
     network = init_network(jax.random.key(5), own_axes=own_axes)
@@ -153,6 +165,9 @@ def test_in_its_own_axes_a_turned_game_is_the_same(worlds, own_axes):
     scene = scene.replace(known=jnp.zeros(3, bool))
     moved = {name: getattr(scene, name) @ turn.T for name in ("position", "velocity", "pursuers")}
     turned = scene.replace(**moved, pillar_position=scene.pillar_position @ turn[:2, :2].T)
+    # about half an angle, as quaternions turn
+    half = np.array([np.cos(0.35), 0.0, 0.0, np.sin(0.35)], np.float32)
+    turned = turned.replace(drones=turned_drones(scene.drones, turn, half))
     before = scene.pursuers + 0.1 * jax.random.normal(jax.random.key(7), (STEPS, 3, 3))
 
     @jax.jit
@@ -164,3 +179,34 @@ def test_in_its_own_axes_a_turned_game_is_the_same(worlds, own_axes):
 
     gap = jnp.abs(wish(turned, before @ turn.T) - wish(scene, before) @ turn.T).max()
     assert gap < 1e-4 if own_axes else gap > 0.1
+
+
+def test_earlier_selves_fly_and_learn_nothing(worlds):
+    """Of two learned evaders the second is an earlier self: its samples change nobody, and it
+    becomes what the first was when it was drawn.
+    """
+    how = dataclasses.replace(HOW, past=1, pool=2, pool_every=1)
+    learning = EvaderLearning(how, ENVIRONMENT, updates=4)
+    start = jax.jit(learning.start)(jax.random.key(1))
+
+    @jax.jit
+    def improve(evaders, key, shift):
+        samples = learning.act(evaders, worlds, jax.random.normal(key, (WORLDS, 3)))[1]
+        of_past = (samples.which == 1)[:, None]
+        samples = samples.replace(sample=samples.sample + shift * of_past)
+        samples = jax.tree.map(lambda leaf: leaf[None], samples)
+        caught = samples.sample[0, :, 0] < 0.0
+        last = worlds.replace(statistics=worlds.statistics.replace(captured=caught))
+        return learning.learn(evaders, samples, last, key)
+
+    assert learning.number == 1
+    evaders = start
+    for key in jax.random.split(jax.random.key(2), 4):
+        other = improve(evaders, key, 5.0)
+        evaders = improve(evaders, key, 0.0)
+        chex.assert_trees_all_equal(evaders.actor, other.actor)
+    first, second = (jax.tree.map(lambda leaf, i=i: leaf[i], evaders.flying) for i in (0, 1))
+    drawn = jax.tree.map(lambda leaf: leaf[evaders.past[0]], evaders.pool)
+    chex.assert_trees_all_equal(second, drawn)
+    moved = jnp.abs(first["output"]["kernel"] - start.actor["output"]["kernel"][0]).max()
+    assert moved > 0.0

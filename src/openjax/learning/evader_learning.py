@@ -37,6 +37,19 @@ class LearningEvaders:
     critic: Any
     log_std: jax.Array  # (K, 3)
     optimiser: Any
+    pool: Any
+    """(P, ...) actors as they once were"""
+    past: jax.Array  # (S,) int32, places in the pool of those that fly
+    update: jax.Array  # () int32
+
+    @property
+    def flying(self) -> Any:
+        """(K + S, ...) the actors, and the earlier selves."""
+
+        def joined(actor, pool):
+            return jnp.concatenate([actor, pool[self.past]])
+
+        return jax.tree.map(joined, self.actor, self.pool)
 
     @property
     def networks(self) -> tuple[Any, Any, jax.Array]:
@@ -68,7 +81,8 @@ class EvaderLearning:
     def number(self) -> int:
         """Networks; 0: none learns, as the game names none, or brings their networks with it."""
         brought = self.environment.evader_networks is not None
-        return 0 if brought else self.environment.settings.evaders.count("learned")
+        named = self.environment.settings.evaders.count("learned")
+        return 0 if brought or not named else named - self.how.past
 
     @functools.cached_property
     def optimiser(self) -> optax.GradientTransformation:
@@ -84,7 +98,14 @@ class EvaderLearning:
         log_std = jnp.full((self.number, 3), self.how.initial_log_std, jnp.float32)
         init = jax.vmap(functools.partial(init_network, own_axes=self.how.own_axes))
         networks = *(init(own, jnp.arange(self.number)) for own in keys), log_std
-        return LearningEvaders(*networks, jax.vmap(self.optimiser.init)(networks))
+        places = jnp.arange(self.how.pool) % self.number
+        return LearningEvaders(
+            *networks,
+            optimiser=jax.vmap(self.optimiser.init)(networks),
+            pool=jax.tree.map(lambda leaf: leaf[places], networks[0]),
+            past=jnp.arange(self.how.past, dtype=jnp.int32) % self.how.pool,
+            update=jnp.zeros((), jnp.int32),
+        )
 
     def see(self, networks: Any, state: PursuitState) -> tuple[jax.Array, dict[str, jax.Array]]:
         """Of worlds (E, ...) which of the networks acts, (E,), and what it sees."""
@@ -102,9 +123,13 @@ class EvaderLearning:
         """Wishes (E, 3) in worlds (E, ...), NaN where none of the networks acts, and the samples;
         noise (E, 3).
         """
-        which, seen = self.see(evaders.actor, state)
-        mean = outputs_of(evaders.actor, which, seen)[0]
-        log_std = self._by_network(which) @ evaders.log_std
+        flying = evaders.flying
+        which, seen = self.see(flying, state)
+        mean = outputs_of(flying, which, seen)[0]
+        # earlier selves tremble as much as the others do on average
+        usual = jnp.mean(evaders.log_std, 0)
+        spread = [evaders.log_std, jnp.broadcast_to(usual, (self.how.past, 3))]
+        log_std = jax.nn.one_hot(which, self.number + self.how.past) @ jnp.concatenate(spread)
         sample = mean + jnp.exp(log_std) * noise
         log_prob = jax.vmap(gaussian_log_prob)(sample, mean, log_std)
         samples = EvaderSamples(seen, which, sample, log_prob, ~state.statistics.captured)
@@ -139,7 +164,29 @@ class EvaderLearning:
         start = evaders.networks, evaders.optimiser
         order = shuffled(key, how.epochs, how.minibatches)
         (networks, state), _ = jax.lax.scan(step, start, order)
-        return LearningEvaders(*networks, state)
+        actor, critic, log_std = networks
+        evaders = evaders.replace(
+            actor=actor,
+            critic=critic,
+            log_std=log_std,
+            optimiser=state,
+            update=evaders.update + 1,
+        )
+        return self._remember(evaders, jax.random.fold_in(key, 1)) if self.how.past else evaders
+
+    def _remember(self, evaders, key):
+        """Now and then one of the actors takes a place in the pool, and other earlier selves fly."""
+        due = evaders.update % self.how.pool_every == 0
+        network_key, place_key, past_key = jax.random.split(key, 3)
+        network = jax.random.randint(network_key, (), 0, self.number)
+        place = jax.random.randint(place_key, (), 0, self.how.pool)
+        drawn = jax.random.randint(past_key, (self.how.past,), 0, self.how.pool)
+
+        def kept(pool, actor):
+            return pool.at[place].set(jnp.where(due, actor[network], pool[place]))
+
+        pool = jax.tree.map(kept, evaders.pool, evaders.actor)
+        return evaders.replace(pool=pool, past=jnp.where(due, drawn, evaders.past))
 
     def _by_network(self, which):
         """(..., K) of (...,): one for the network, zero for the others."""
@@ -187,7 +234,7 @@ class EvaderLearning:
         how = self.how
         critic = evaders.critic
         value = outputs_of(critic, samples.which, samples.seen)[1]
-        last_value = outputs_of(critic, *self.see(evaders.actor, last))[1]
+        last_value = outputs_of(critic, *self.see(evaders.flying, last))[1]
         caught = jnp.concatenate([~samples.flying[1:], last.statistics.captured[None]])
         advantage = generalised_advantages(
             REWARD * (~caught).astype(jnp.float32),

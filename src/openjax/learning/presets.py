@@ -141,23 +141,23 @@ def flight() -> TrainSettings:
 
 def evaders() -> TrainSettings:
     """Policies to be flown after evaders that fight back: first the paper's, then scripted ones,
-    slow at first, and three that learn while the pursuers do. One run for one large accelerator;
-    how far it has been flown: experiments/results/evaders.md.
+    slow at first, and some that learn while the pursuers do, beside their earlier selves. One run
+    for one large accelerator; how far it has been flown: experiments/results/evaders.md.
     """
     return changed(
         flight(),
         environment=dict(
             evaders=(
                 "field",
-                "field",
-                "greedy",
                 "greedy",
                 "wall_runner",
                 "slow_hugger",
-                *["learned"] * 3,
+                *["learned"] * 10,
             ),
             observe_in="heading",
             min_pillars=0,
+            # an evader that learns finds the pockets between pillars and the wall
+            max_pillars=7,
             # The distance pays for going near a pillar, the first capture for the last centimetres:
             # a step of it alone costs too much. Breaches that count .02 m early make a way between
             # pillars .4 m apart cost as much as a capture pays
@@ -169,12 +169,14 @@ def evaders() -> TrainSettings:
         # from beyond the wall
         mappo=dict(target_kl=0.02, step_subsampling=2, entropy_coefficient=2e-3, penalty_ramp=0.5),
         analytic=dict(updates=100, look_every=20, hold=0.2),
+        evader_learning=dict(past=4),
         vehicles_start=0.08,
         vehicles_ramp=0.08,
         evaders_start=0.09,
         evaders_ramp=0.12,
         evaders_validation=("field", "heavy", "pillar_hugger"),
-        total_steps=750_000_000,
+        validation_start=0.9,
+        total_steps=800_000_000,
     )
 
 

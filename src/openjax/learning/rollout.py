@@ -30,7 +30,7 @@ class Rollout:
     truncated: jax.Array  # (T, E) bool
     evader: jax.Array  # (T, E, 3) m, true position after the step
     learning: Any = None
-    """Samples (T, E, ...) of the evaders that learn; None where none does."""
+    """Samples (T / hold, E, ...) of the evaders that learn; None where none does."""
 
 
 def newest_frame(observation: Observation) -> Observation:
@@ -49,6 +49,8 @@ class Players:
     """worlds (E, ...), noise (E, 3) -> desired velocities (E, 3) of evaders that learn, and their
     samples; None: none learns
     """
+    hold: int = 1
+    """Steps for which an evader that learns flies a decision."""
 
 
 @struct.dataclass
@@ -56,7 +58,7 @@ class Noise:
     """What a rollout's exploration draws, standard normal, ahead in one go."""
 
     pursuers: jax.Array  # (T, E, N, A)
-    evaders: jax.Array | None = None  # (T, E, 3)
+    evaders: jax.Array | None = None  # (T / hold, E, 3)
 
 
 def collect(
@@ -83,12 +85,9 @@ def collect(
     chex.assert_tree_shape_prefix(world, noise.pursuers.shape[1:2])
     step = jax.vmap(environment.step, in_axes=(None, 0, 0, 0 if players.evaders else None))
 
-    def one(carry, noise):
+    def one(carry, noise, desired=None):
         observation, state = carry
-        desired = samples = None
-        if players.evaders:
-            desired, samples = players.evaders(state, noise.evaders)
-        predicted, action, log_prob = _sample(players, observation, noise.pursuers)
+        predicted, action, log_prob = _sample(players, observation, noise)
         command = policy.action(action, observation)
         following, state, reward, terminated, truncated, info = step(
             jax.random.key(0), state, command, desired
@@ -102,12 +101,24 @@ def collect(
             terminated=terminated,
             truncated=truncated,
             evader=state.evader_position,
-            learning=samples,
         )
         return (following, state), record
 
-    (observation, state), rollout = jax.lax.scan(one, world, noise)
-    return rollout, observation, state
+    if not players.evaders:
+        (observation, state), rollout = jax.lax.scan(one, world, noise.pursuers)
+        return rollout, observation, state
+
+    def decide(carry, noise):
+        desired, samples = players.evaders(carry[1], noise.evaders)
+        carry, record = jax.lax.scan(lambda *step: one(*step, desired), carry, noise.pursuers)
+        return carry, (record, samples)
+
+    held = noise.pursuers.reshape(-1, players.hold, *noise.pursuers.shape[1:])
+    (observation, state), (record, samples) = jax.lax.scan(
+        decide, world, noise.replace(pursuers=held)
+    )
+    rollout = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), record)
+    return rollout.replace(learning=samples), observation, state
 
 
 def _sample(players, observation, noise):

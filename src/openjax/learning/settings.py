@@ -122,11 +122,24 @@ class EvaderLearningSettings:
     minibatches: Annotated[int, Interval("[1, 100000]")] = 4
     clip_epsilon: Annotated[float, Interval("(0, 10]")] = 0.2
     entropy_coefficient: Annotated[float, Interval("[0, 10]")] = 1e-3
-    discount: Annotated[float, Interval("[0, 1]")] = 0.995
+    hold: Annotated[int, Interval("[1, 1000]")] = 4
+    """Control steps for which a decision is flown while it is learnt; divides `rollout_length`.
+    Noise that is new in each step averages out before an evader has moved 2 cm.
+    """
+    discount: Annotated[float, Interval("[0, 1]")] = 0.99
+    """Of a decision: where one holds for 40 ms, it sees 4 s ahead. A trap takes one to three."""
     gae_lambda: Annotated[float, Interval("[0, 1]")] = 0.95
-    initial_log_std: Annotated[float, Interval("[-10, 2]")] = -1.0
+    initial_log_std: Annotated[float, Interval("[-10, 2]")] = -0.5
     own_axes: bool = False
     """Evaders see in axes of their own, x away from the arena's axis."""
+    past: Annotated[int, Interval("[0, 64]")] = 0
+    """The last ones of a game's learned evaders are earlier selves of the others: who only meets
+    the newest ones unlearns what beat the older ones. Each is drawn ...
+    """
+    pool: Annotated[int, Interval("[1, 1000]")] = 32
+    """... from as many networks that are kept ..."""
+    pool_every: Annotated[int, Interval("[1, 1000000]")] = 10
+    """... one of which is replaced, and all drawn anew, after as many updates."""
 
     def __post_init__(self):
         check_intervals(self)
@@ -283,6 +296,10 @@ class TrainSettings:
     """... and have their whole odds and speed after this share of the run."""
     evaders_validation: tuple[str, ...] = ()
     """Evaders of the validation; none: those of the training."""
+    validation_start: Annotated[float, Interval("[0, 1]")] = 0.0
+    """Share of the run before which a checkpoint ranks behind all later ones: the validation's
+    evaders are scripted, and who beats them early hasn't met what others learn late.
+    """
     validation_interval: Annotated[int, Interval("[1, 1000000]")] = 50
     """Iterations between validations, on uniform tasks that are never trained on."""
     validation_episodes: Annotated[int, Interval("[1, 1000000]")] = 256
@@ -315,6 +332,11 @@ class TrainSettings:
         yield (
             self.restart_steps >= rollout and self.restart_steps % rollout == 0,
             f"restart_steps {self.restart_steps} must be a multiple of rollout_length {rollout}",
+        )
+        hold = self.evader_learning.hold
+        yield (
+            "learned" not in self.environment.evaders or rollout % hold == 0,
+            f"evader_learning.hold {hold} must divide rollout_length {rollout}",
         )
         yield (
             self.restart_every or not self.restart_close,

@@ -224,12 +224,12 @@ class _Step:
         noise = jax.vmap(lambda k: jax.random.normal(k, shape))(keys)
         noise = Noise(jnp.moveaxis(noise, 1, 0))
         act = self._evaders(carry)
+        hold = settings.evader_learning.hold
         if act is not None:
-            draws = jax.vmap(lambda k: jax.random.normal(jax.random.fold_in(k, 1), (steps, 3)))(
-                keys
-            )
+            decisions = (steps // hold, 3)
+            draws = jax.vmap(lambda k: jax.random.normal(jax.random.fold_in(k, 1), decisions))(keys)
             noise = noise.replace(evaders=jnp.moveaxis(draws, 1, 0))
-        players = Players(self.parts.environment, policy, carry.policy, act)
+        players = Players(self.parts.environment, policy, carry.policy, act, hold)
         world = (carry.observation, carry.state)
         progress = self._progress(carry)
         share = penalty_share_at(settings, progress)

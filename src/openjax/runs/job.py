@@ -54,6 +54,8 @@ from openjax.store.policy_files import fill, load_policy_file, save_policy_file
 from openjax.store.run_directory import RunDirectory
 from openjax.store.traced_programs import recalled
 
+EARLY = 10.0
+"""Taken from the score of a checkpoint before `validation_start`: no policy's score is as low."""
 _SOON = 3.0
 """Seconds after which a training step that isn't ready doesn't come from the cache."""
 
@@ -402,7 +404,10 @@ class _Run:
         uniform, far = (
             summarise(kind.evaluation) for kind in self._await_validation()(own_copy(carry.policy))
         )
-        score = selection_score(uniform, self.settings.environment.episode_length)
+        settings = self.settings
+        score = selection_score(uniform, settings.environment.episode_length)
+        if int(carry.update) < settings.validation_start * settings.total_updates:
+            score -= EARLY
         return self.processes.of_first((score, {**flat_metrics(uniform, far), "score": score}))
 
     def _save_best(self):

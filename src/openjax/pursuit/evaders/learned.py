@@ -25,7 +25,7 @@ LOOK_AHEAD = (0.15, 0.5, 0.3)
 response to who is caught out by a far-sighted one isn't found from a short-sighted one.
 """
 _OWN = 9
-_PURSUER = 10
+_PURSUER = 16
 _PILLAR = 4
 
 
@@ -61,8 +61,10 @@ def init_network(
     return {
         **layers,
         "output": {"kernel": jnp.zeros((WIDTH, 4)), "bias": jnp.zeros(4)},
-        # these two go with them, and have no gradient
+        # these three go with them, and have no gradient
         "look_ahead": jnp.asarray(LOOK_AHEAD)[number % len(LOOK_AHEAD)],
+        # every third starts as a greedy evader, a local optimum that others find no way out of
+        "scripted": jnp.float32(number % 3 == 2),
         "own_axes": jnp.float32(own_axes),
     }
 
@@ -86,7 +88,7 @@ def features(
     in_use = scene.pillar_active[:, None]
     size = np.array([settings.arena_radius] * 2 + [settings.arena_height / 2], np.float32)
     middle = np.array(settings.middle, np.float32)
-    wish = greedy(scene, memory)[0]
+    wish = networks["scripted"][which] * greedy(scene, memory)[0]
     outward = scene.position[:2] / jnp.sqrt(jnp.sum(scene.position[:2] ** 2) + 1e-6)
     outward = jnp.where(networks["own_axes"][which] > 0, outward, np.array([1.0, 0.0], np.float32))
     own = functools.partial(turned_back, outward)
@@ -95,7 +97,8 @@ def features(
         own(scene.velocity / settings.evader_speed),
         own(wish),
     )
-    moved = [own(relative), distance, own(2.0 * half / scale), own(whole / scale)]
+    flown = [own(scene.pursuer_velocity / settings.max_speed), own(scene.thrust_direction)]
+    moved = [own(relative), distance, own(2.0 * half / scale), own(whole / scale), *flown]
     seen = {
         "own": jnp.concatenate(vectors),
         "pursuers": jnp.concatenate(moved, axis=-1),

@@ -12,27 +12,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from openjax.evaluation.judge.learner import fly_decision
-from openjax.policy import Policy, PolicyParameters
-from openjax.pursuit import EpisodeStatistics, Observation, Pursuit, PursuitState, Task
-
-
-@dataclass(frozen=True)
-class PlannerSettings:
-    """How the planner plans."""
-
-    plans: int = 48
-    """That are tried each time."""
-    pieces: int = 4
-    """Velocities of a plan, one after the other."""
-    hold: int = 20
-    """Control steps of each velocity: .2 s, so that four see .8 s ahead."""
-    replan: int = 10
-    """Control steps after which it plans anew; divides the episode's length and `hold`."""
-    ahead: float = 0.15
-    """Seconds after which pursuers are thought to be where their velocity leads, at a plan's end:
-    about the time in which a vehicle turns its velocity round.
-    """
+from openjax.evaluation.judges.duel import Duel, World
+from openjax.evaluation.judges.settings import PlannerSettings
+from openjax.policy import PolicyParameters
+from openjax.pursuit import EpisodeStatistics, PursuitState
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,51 +23,35 @@ class Planner:
     """The planner against a policy's mean."""
 
     settings: PlannerSettings
-    environment: Pursuit
-    policy: Policy
+    duel: Duel
 
-    def fly(
-        self, parameters: PolicyParameters, tasks: Task, key: jax.Array
-    ) -> EpisodeStatistics:
-        """Statistics (B,) of one episode on each of B tasks."""
-        number = tasks.evader_position.shape[0]
-        key, reset_key = jax.random.split(key)
-        reset = jax.vmap(self.environment.reset_to)
-        world = reset(jax.random.split(reset_key, number), tasks)
-        plan = jnp.zeros((number, self.settings.pieces, 3))
-        length = self.environment.settings.episode_length
+    def fly(self, parameters: PolicyParameters, start: World, key: jax.Array) -> EpisodeStatistics:
+        """Statistics (B,) of one episode from each of B starts."""
+        settings = self.settings
+        plan = jnp.zeros((start[1].step.size, settings.pieces, 3))
 
         def one(carry, key):
             world, plan = carry
             plan = self._best(parameters, world, plan, key)
-            world = fly_decision(
-                self.environment, self.policy, parameters, world, plan[:, 0], self.settings.replan
-            )
-            return (world, plan), None
+            return (self.duel.fly(parameters, world, plan[:, 0], settings.replan), plan), None
 
-        keys = jax.random.split(key, length // self.settings.replan)
-        (_, state), _ = jax.lax.scan(one, (world, plan), keys)[0]
+        episode = self.duel.environment.settings.episode_length
+        keys = jax.random.split(key, episode // settings.replan)
+        (_, state), _ = jax.lax.scan(one, (start, plan), keys)[0]
         return state.statistics
 
     def _best(self, parameters, world, plan, key):
         """(B, pieces, 3) the plan of those tried that promises most in each world (B, ...)."""
-        number = plan.shape[0]
+        settings = self.settings
         tried = self._candidates(key, plan)  # (B, M, pieces, 3)
-
-        def copies(leaf):
-            return jnp.repeat(leaf, self.settings.plans, axis=0)
-
-        copied = jax.tree.map(copies, world)
+        copied = jax.tree.map(lambda leaf: jnp.repeat(leaf, settings.plans, axis=0), world)
         pieces = jnp.moveaxis(tried.reshape(-1, *tried.shape[2:]), 1, 0)
 
-        def piece(world, wish):
-            flown = fly_decision(
-                self.environment, self.policy, parameters, world, wish, self.settings.hold
-            )
-            return flown, None
+        def piece(world, velocity):
+            return self.duel.fly(parameters, world, velocity, settings.piece_steps), None
 
         (_, end), _ = jax.lax.scan(piece, copied, pieces)
-        score = jax.vmap(self._promise)(world_states(copied), end).reshape(number, -1)
+        score = jax.vmap(self._promise)(copied[1], end).reshape(plan.shape[0], -1)
         best = jnp.argmax(score, axis=1)
         return jnp.take_along_axis(tried, best[:, None, None, None], axis=1)[:, 0]
 
@@ -105,8 +72,8 @@ class Planner:
 
         def follow(before, piece):
             way, turn = piece
-            now = jnp.where(turn[..., None], way, before)
-            return now, now
+            kept = jnp.where(turn[..., None], way, before)
+            return kept, kept
 
         pieces = (jnp.moveaxis(drawn, 2, 0), jnp.moveaxis(turns, 2, 0))
         bent = jnp.moveaxis(jax.lax.scan(follow, drawn[:, :, 0], pieces)[1], 0, 2)
@@ -114,18 +81,13 @@ class Planner:
 
     def _promise(self, start: PursuitState, end: PursuitState) -> jax.Array:
         """() how good the end of a plan is: steps free first, then the room that is left."""
-        game = self.environment.settings
+        game = self.duel.environment.settings
         newly = end.statistics.captured & ~start.statistics.captured
-        horizon = self.settings.pieces * self.settings.hold
+        horizon = self.settings.pieces * self.settings.piece_steps
         free = jnp.where(newly, end.statistics.capture_step - start.step, horizon)
         ahead = end.drones.position + self.settings.ahead * end.drones.velocity
         room = jnp.min(jnp.linalg.norm(ahead - end.evader_position, axis=-1))
         return free + room / game.arena_radius
-
-
-def world_states(world: tuple[Observation, PursuitState]) -> PursuitState:
-    """The states of worlds (B, ...)."""
-    return world[1]
 
 
 def _unit(vector):

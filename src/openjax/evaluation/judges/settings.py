@@ -8,8 +8,8 @@ from openjax.ranges import Interval, check_intervals
 
 
 @dataclass(frozen=True)
-class JudgeSettings:
-    """How the learners of a judge learn."""
+class BestResponseSettings:
+    """How evaders learn against fixed pursuers."""
 
     learners: Annotated[int, Interval("[1, 64]")] = 8
     """That learn side by side; every second one in the world's axes."""
@@ -67,3 +67,24 @@ class JudgeSettings:
         decision = self.hold * time_step
         seconds = (self.foresight[i % len(self.foresight)] for i in range(self.learners))
         return [1.0 - decision / (decision + second) for second in seconds]
+
+
+@dataclass(frozen=True)
+class PlannerSettings:
+    """How an evader plans."""
+
+    plans: Annotated[int, Interval("[3, 10000]")] = 48
+    """That are tried each time."""
+    pieces: Annotated[int, Interval("[1, 100]")] = 4
+    """Velocities of a plan, one after the other."""
+    piece_steps: Annotated[int, Interval("[1, 1000]")] = 20
+    """Control steps of each velocity: .2 s, so that four see .8 s ahead."""
+    replan: Annotated[int, Interval("[1, 1000]")] = 10
+    """Control steps after which it plans anew."""
+    ahead: Annotated[float, Interval("[0, 10]")] = 0.15
+    """Seconds after which pursuers are thought to be where their velocity leads, at a plan's end:
+    about the time in which a vehicle turns its velocity round.
+    """
+
+    def __post_init__(self):
+        check_intervals(self, "planner.")

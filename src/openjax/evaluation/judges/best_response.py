@@ -19,11 +19,12 @@ import numpy as np
 import optax
 from flax import struct
 
-from openjax.evaluation.judge.networks import apply_network, init_network
-from openjax.evaluation.judge.senses import sense, to_world
-from openjax.evaluation.judge.settings import JudgeSettings
-from openjax.policy import Policy, PolicyParameters
-from openjax.pursuit import Observation, Pursuit, PursuitState, Task
+from openjax.evaluation.judges.duel import Duel, World, copies
+from openjax.evaluation.judges.networks import apply_network, init_network
+from openjax.evaluation.judges.senses import sense, to_world
+from openjax.evaluation.judges.settings import BestResponseSettings
+from openjax.policy import PolicyParameters
+from openjax.pursuit import EpisodeStatistics, PursuitSettings, Task
 
 
 @struct.dataclass
@@ -43,13 +44,12 @@ class Evaders:
 
 
 @struct.dataclass
-class JudgeCarry:
-    """Everything that a judge's run is; E worlds of each learner."""
+class ResponseCarry:
+    """Everything that a run is; E worlds of each learner."""
 
     evaders: Evaders
     optimiser: Any
-    observation: Observation  # (L * E, ...), learner by learner
-    state: PursuitState  # (L * E, ...)
+    world: World  # (L * E, ...), learner by learner
     key: jax.Array
 
 
@@ -62,15 +62,15 @@ class Decisions:
     log_prob: jax.Array  # (T, L * E)
     free: jax.Array  # (T, L * E), share of the decision's steps in which the evader was free
     over: jax.Array  # (T, L * E) bool, caught or out of time at its end
+    caught: jax.Array  # (T, L * E) bool
 
 
 @dataclass(frozen=True, eq=False)
-class Judge:
-    """The learners against a policy's mean, as pure functions of a `JudgeCarry`."""
+class BestResponse:
+    """The learners against a policy's mean, as pure functions of a `ResponseCarry`."""
 
-    settings: JudgeSettings
-    environment: Pursuit
-    policy: Policy
+    settings: BestResponseSettings
+    duel: Duel
     draw_task: Callable[[jax.Array], Task]
     """key -> a task to learn on"""
 
@@ -81,42 +81,47 @@ class Judge:
         rate = optax.linear_schedule(settings.learning_rate, 0.0, settings.gradient_steps)
         return optax.chain(optax.clip_by_global_norm(1.0), optax.adam(rate, eps=1e-5))
 
-    def start(self, key: jax.Array) -> JudgeCarry:
+    @property
+    def game(self) -> PursuitSettings:
+        """The game's settings."""
+        return self.duel.environment.settings
+
+    def start(self, key: jax.Array) -> ResponseCarry:
         """Evaders that do nothing but tremble, and worlds at their starts."""
         key, actor_key, critic_key, world_key = jax.random.split(key, 4)
         learners = self.settings.learners
-        observation, state = self._fresh(world_key)
-        one = jax.tree.map(lambda leaf: leaf[0], state)
-        inputs = sense(self.environment.settings, one, jnp.bool_(False)).size
+        world = self._fresh(world_key)
+        one = jax.tree.map(lambda leaf: leaf[0], world[1])
+        inputs = sense(self.game, one, jnp.bool_(False)).size
+        log_std = jnp.full((learners, 3), self.settings.initial_log_std, jnp.float32)
         evaders = Evaders(
             actor=init_network(actor_key, learners, inputs, 3),
             critic=init_network(critic_key, learners, inputs, 1),
-            log_std=jnp.full((learners, 3), self.settings.initial_log_std, jnp.float32),
+            log_std=log_std,
             world_axes=jnp.arange(learners) % 2 == 1,
-            discount=jnp.asarray(self.settings.discounts(self.environment.settings.time_step)),
+            discount=jnp.asarray(self.settings.discounts(self.game.time_step), jnp.float32),
         )
-        state_of = jax.vmap(self.optimiser.init)
-        return JudgeCarry(evaders, state_of(evaders.networks), observation, state, key)
+        return ResponseCarry(evaders, jax.vmap(self.optimiser.init)(evaders.networks), world, key)
 
     def step(
-        self, parameters: PolicyParameters, carry: JudgeCarry
-    ) -> tuple[JudgeCarry, dict[str, jax.Array]]:
+        self, parameters: PolicyParameters, carry: ResponseCarry
+    ) -> tuple[ResponseCarry, dict[str, jax.Array]]:
         """One rollout and one update; metrics (L,): share of the time free, episodes that ended,
         share of them that ended with a capture.
         """
         key, noise_key, world_key, order_key = jax.random.split(carry.key, 4)
-        observation, state, decisions, captures = self._collect(
-            parameters, carry, noise_key, self._fresh(world_key)
-        )
-        evaders, optimiser = self._learn(carry, decisions, state, order_key)
-        ended = self._by_learner(decisions.over).astype(jnp.float32)
+        keys = jax.random.split(noise_key, self.settings.rollout_length)
+        decide = functools.partial(self._decide, parameters, carry.evaders, self._fresh(world_key))
+        world, decisions = jax.lax.scan(decide, carry.world, keys)
+        evaders, optimiser = self._learn(carry, decisions, world[1], order_key)
+        episodes = jnp.sum(self._by_learner(decisions.over), (0, 2))
         metrics = {
             "free": jnp.mean(self._by_learner(decisions.free), (0, 2)),
-            "episodes": jnp.sum(ended, (0, 2)),
-            "capture_rate": jnp.sum(self._by_learner(captures), (0, 2))
-            / jnp.maximum(jnp.sum(ended, (0, 2)), 1.0),
+            "episodes": episodes,
+            "capture_rate": jnp.sum(self._by_learner(decisions.caught), (0, 2))
+            / jnp.maximum(episodes, 1),
         }
-        return JudgeCarry(evaders, optimiser, observation, state, key), metrics
+        return ResponseCarry(evaders, optimiser, world, key), metrics
 
     def _by_learner(self, values):
         """(T, L, E, ...) of (T, L * E, ...)."""
@@ -124,76 +129,50 @@ class Judge:
         return values.reshape(values.shape[0], learners, -1, *values.shape[2:])
 
     def _fresh(self, key):
-        """Observations and states of all worlds at the start of an episode."""
-
-        def begin(key):
-            task_key, reset_key = jax.random.split(key)
-            return self.environment.reset_to(reset_key, self.draw_task(task_key))
-
+        """All worlds at the start of an episode."""
+        task_key, reset_key = jax.random.split(key)
         number = self.settings.learners * self.settings.num_envs
-        return jax.vmap(begin)(jax.random.split(key, number))
+        tasks = jax.vmap(self.draw_task)(jax.random.split(task_key, number))
+        return self.duel.start(tasks, reset_key)
 
     def _sense(self, evaders, state):
         """(L, E, F) of worlds (L * E, ...)."""
         axes = jnp.repeat(evaders.world_axes, self.settings.num_envs)
-        sensed = jax.vmap(functools.partial(sense, self.environment.settings))(state, axes)
+        sensed = jax.vmap(functools.partial(sense, self.game))(state, axes)
         return sensed.reshape(self.settings.learners, self.settings.num_envs, -1)
 
-    def _collect(self, parameters, carry, key, fresh):
-        """Worlds after T decisions, the decisions, and (T, L * E) whether one ended in a capture.
+    def _decide(self, parameters, evaders, fresh, world, key):
+        """Worlds after a decision, and the decision.
 
         A world whose evader is caught goes on at once, at the start that `fresh` has for it: where
         it is caught twice in a rollout, at the same one again.
         """
-        settings = self.settings
-        evaders = carry.evaders
-        worlds = settings.learners * settings.num_envs
+        hold = self.settings.hold
+        sensed = self._sense(evaders, world[1])
+        mean = apply_network(evaders.actor, sensed)
         log_std = evaders.log_std[:, None]
-        axes = jnp.repeat(evaders.world_axes, settings.num_envs)
-
-        def decide(world, key):
-            observation, state = world
-            sensed = self._sense(evaders, state)
-            mean = apply_network(evaders.actor, sensed)
-            sample = mean + jnp.exp(log_std) * jax.random.normal(key, mean.shape)
-            log_prob = _log_prob(sample, mean, log_std)
-            wish = jax.vmap(to_world)(sample.reshape(worlds, 3), state, axes)
-            observation, state = self.fly(parameters, observation, state, wish)
-            statistics = state.statistics
-            # of a decision in which it was caught, the steps before that
-            late = jnp.maximum(state.step - statistics.capture_step + 1, 0) / settings.hold
-            free = jnp.where(statistics.captured, 1.0 - jnp.minimum(late, 1.0), 1.0)
-            over = statistics.captured | (state.step >= self.environment.settings.episode_length)
-
-            def renew(new, old):
-                return jnp.where(over.reshape(-1, *[1] * (old.ndim - 1)), new, old)
-
-            world = jax.tree.map(renew, fresh, (observation, state))
-            decisions = Decisions(
-                sensed.reshape(worlds, -1),
-                sample.reshape(worlds, 3),
-                log_prob.reshape(worlds),
-                free,
-                over,
-            )
-            return world, (decisions, statistics.captured)
-
-        keys = jax.random.split(key, settings.rollout_length)
-        start = (carry.observation, carry.state)
-        (observation, state), (decisions, captures) = jax.lax.scan(decide, start, keys)
-        return observation, state, decisions, captures
-
-    def fly(
-        self,
-        parameters: PolicyParameters,
-        observation: Observation,
-        state: PursuitState,
-        wish: jax.Array,
-    ) -> tuple[Observation, PursuitState]:
-        """Worlds (B, ...) after the `hold` control steps of a decision (B, 3)."""
-        return fly_decision(
-            self.environment, self.policy, parameters, (observation, state), wish, self.settings.hold
+        sample = mean + jnp.exp(log_std) * jax.random.normal(key, mean.shape)
+        axes = jnp.repeat(evaders.world_axes, self.settings.num_envs)
+        velocity = jax.vmap(to_world)(sample.reshape(-1, 3), world[1], axes)
+        world = self.duel.fly(parameters, world, velocity, hold)
+        state = world[1]
+        caught = state.statistics.captured
+        # of a decision in which it was caught, the steps before that
+        late = jnp.maximum(state.step - state.statistics.capture_step + 1, 0) / hold
+        over = caught | (state.step >= self.game.episode_length)
+        decision = Decisions(
+            sensed=sensed.reshape(over.size, -1),
+            sample=sample.reshape(over.size, 3),
+            log_prob=_log_prob(sample, mean, log_std).ravel(),
+            free=jnp.where(caught, 1.0 - jnp.minimum(late, 1.0), 1.0),
+            over=over,
+            caught=caught,
         )
+
+        def renew(new, old):
+            return jnp.where(over.reshape(-1, *[1] * (old.ndim - 1)), new, old)
+
+        return jax.tree.map(renew, fresh, world), decision
 
     def _learn(self, carry, decisions, state, key):
         """The evaders and their optimiser after all epochs."""
@@ -280,39 +259,23 @@ class Judge:
         return jnp.sum(jnp.mean(error - surrogate, axis=1) - entropy)
 
 
-def fly_decision(
-    environment: Pursuit,
-    policy: Policy,
-    parameters: PolicyParameters,
-    world: tuple[Observation, PursuitState],
-    wish: jax.Array,
-    hold: int,
-) -> tuple[Observation, PursuitState]:
-    """Worlds (B, ...) after `hold` control steps against the mean policy, the evader at `wish`
-    (B, 3), shares of its speed.
-    """
-    key = jax.random.key(0)
-    step = jax.vmap(environment.step, in_axes=(None, 0, 0, 0))
+def fly_learners(
+    duel: Duel, hold: int, evaders: Evaders, parameters: PolicyParameters, start: World
+) -> EpisodeStatistics:
+    """Statistics (L, B): an episode of each learner, without noise, from each of B starts."""
+    game = duel.environment.settings
+    learners = evaders.world_axes.size
+    axes = jnp.repeat(evaders.world_axes, start[1].step.size)
 
     def one(world, _):
-        observation, state = world
-        action = policy.act(parameters, observation)
-        observation, state, *_ = step(key, state, action, wish)
-        return (observation, state), None
+        sensed = jax.vmap(functools.partial(sense, game))(world[1], axes)
+        mean = apply_network(evaders.actor, sensed.reshape(learners, -1, sensed.shape[-1]))
+        velocity = jax.vmap(to_world)(mean.reshape(-1, 3), world[1], axes)
+        return duel.fly(parameters, world, velocity, hold), None
 
-    return jax.lax.scan(one, world, length=hold)[0]
-
-
-def decide(
-    settings: Any, evaders: Evaders, state: PursuitState, place: jax.Array
-) -> jax.Array:
-    """(B, 3) wishes, without noise, of the learners at `place` (B,) in worlds (B, ...)."""
-    axes = evaders.world_axes[place]
-    sensed = jax.vmap(functools.partial(sense, settings))(state, axes)
-    everyone = jnp.broadcast_to(sensed, (evaders.world_axes.size, *sensed.shape))
-    means = apply_network(evaders.actor, everyone)
-    chosen = jax.nn.one_hot(place, means.shape[0], axis=0)
-    return jax.vmap(to_world)(jnp.sum(chosen[..., None] * means, axis=0), state, axes)
+    world = copies(start, learners)
+    statistics = jax.lax.scan(one, world, length=game.episode_length // hold)[0][1].statistics
+    return jax.tree.map(lambda leaf: leaf.reshape(learners, -1), statistics)
 
 
 def _log_prob(sample, mean, log_std):

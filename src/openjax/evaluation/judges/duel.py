@@ -1,0 +1,52 @@
+"""A policy against an evader that is told where to fly."""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+
+from openjax.policy import Policy, PolicyParameters
+from openjax.pursuit import Observation, Pursuit, PursuitState, Task
+
+World = tuple[Observation, PursuitState]
+"""Worlds (B, ...) on their way."""
+
+
+@dataclass(frozen=True, eq=False)
+class Duel:
+    """A game, and the policy whose mean flies its pursuers."""
+
+    environment: Pursuit
+    policy: Policy
+
+    def start(self, tasks: Task, key: jax.Array) -> World:
+        """Worlds at the start of tasks (B, ...)."""
+        keys = jax.random.split(key, tasks.evader_position.shape[0])
+        return jax.vmap(self.environment.reset_to)(keys, tasks)
+
+    def fly(
+        self, parameters: PolicyParameters, world: World, velocity: jax.Array, steps: int
+    ) -> World:
+        """Worlds (B, ...) after control steps in which the evader flies `velocity` (B, 3), as
+        shares of its speed in the world's axes.
+        """
+        # a game of the library draws nothing after its reset
+        key = jax.random.key(0)
+        step = jax.vmap(self.environment.step, in_axes=(None, 0, 0, 0))
+
+        def one(world, _):
+            observation, state = world
+            action = self.policy.act(parameters, observation)
+            observation, state, *_ = step(key, state, action, velocity)
+            return (observation, state), None
+
+        return jax.lax.scan(one, world, length=steps)[0]
+
+
+def copies(world: World, number: int) -> World:
+    """(number * B, ...): all worlds (B, ...) again and again."""
+
+    def tiled(leaf):
+        return jnp.tile(leaf, (number, *[1] * (leaf.ndim - 1)))
+
+    return jax.tree.map(tiled, world)

@@ -1,0 +1,28 @@
+"""The tasks that a judge's evaders learn on, and those by which a policy is judged."""
+
+import jax
+import jax.numpy as jnp
+
+from openjax.pursuit import PursuitSettings, Task, expand_task, turn_task, uniform_task
+
+JUDGE_KEY = 70_000_009
+"""The tasks by which a policy is judged are drawn from this key: neither those by which runs choose
+their checkpoints nor any that was trained on.
+"""
+MOVES = 4
+"""Local expansions of a layout's starts: some .1 m along each axis."""
+
+
+def draw_task(settings: PursuitSettings, layouts: Task, share: float, key: jax.Array) -> Task:
+    """A task to learn on: uniform and turned, or a layout (L, ...) whose starts are moved."""
+    keys = jax.random.split(key, 5)
+    uniform = turn_task(keys[0], uniform_task(settings, keys[1]))
+    which = jax.random.randint(keys[2], (), 0, layouts.evader_position.shape[0])
+    task = jax.tree.map(lambda leaf: leaf[which], layouts)
+
+    def move(task, key):
+        return expand_task(settings, key, task), None
+
+    moved = jax.lax.scan(move, task, jax.random.split(keys[3], MOVES))[0]
+    on_layout = jax.random.uniform(keys[4]) < share
+    return jax.tree.map(lambda a, b: jnp.where(on_layout, a, b), moved, uniform)
