@@ -20,9 +20,13 @@ nothing stops them.
 """
 
 
-def uniform_tasks(settings: PursuitSettings, number: int, slots: int) -> Task:
-    """The first `number` validation uniform tasks, with `slots` pillar slots."""
-    keys = jax.random.split(jax.random.key(VALIDATION_KEY), number)
+def uniform_tasks(
+    settings: PursuitSettings, number: int, slots: int, seed: int = VALIDATION_KEY
+) -> Task:
+    """The first `number` uniform tasks of a seed, with `slots` pillar slots; by default those of
+    the validation.
+    """
+    keys = jax.random.split(jax.random.key(seed), number)
     tasks = jax.jit(jax.vmap(lambda key: uniform_task(settings, key)))(keys)
     return _with_slots(tasks, slots)
 

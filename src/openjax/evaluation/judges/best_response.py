@@ -37,6 +37,12 @@ class Evaders:
     world_axes: jax.Array  # (L,) bool
     discount: jax.Array  # (L,), of a decision
 
+    def one(self, place: int) -> tuple[dict[str, jax.Array], jax.Array]:
+        """The actor of one learner, without an axis of learners, and () whether it sees in the
+        world's axes.
+        """
+        return jax.tree.map(lambda leaf: leaf[place], (self.actor, self.world_axes))
+
     @property
     def networks(self) -> tuple[Any, Any, jax.Array]:
         """What learns."""

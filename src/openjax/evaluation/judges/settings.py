@@ -52,10 +52,14 @@ class BestResponseSettings:
             )
 
     @property
+    def steps_per_update(self) -> int:
+        """Environment steps of an iteration, of all learners."""
+        return self.learners * self.num_envs * self.rollout_length * self.hold
+
+    @property
     def total_updates(self) -> int:
         """Iterations of the run."""
-        steps = self.learners * self.num_envs * self.rollout_length * self.hold
-        return max(1, -(-self.total_steps // steps))
+        return max(1, -(-self.total_steps // self.steps_per_update))
 
     @property
     def gradient_steps(self) -> int:

@@ -1,8 +1,11 @@
 """The tasks that a judge's evaders learn on, and those by which a policy is judged."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 
+from openjax.evaluation.validation import uniform_tasks
 from openjax.pursuit import PursuitSettings, Task, expand_task, turn_task, uniform_task
 
 JUDGE_KEY = 70_000_009
@@ -26,3 +29,12 @@ def draw_task(settings: PursuitSettings, layouts: Task, share: float, key: jax.A
     moved = jax.lax.scan(move, task, jax.random.split(keys[3], MOVES))[0]
     on_layout = jax.random.uniform(keys[4]) < share
     return jax.tree.map(lambda a, b: jnp.where(on_layout, a, b), moved, uniform)
+
+
+def judging_tasks(settings: PursuitSettings, number: int) -> Task:
+    """(number, ...) uniform tasks of the paper's four or five pillars, in the game's slots."""
+    paper = PursuitSettings()
+    drawn = dataclasses.replace(
+        settings, min_pillars=paper.min_pillars, max_pillars=paper.max_pillars
+    )
+    return uniform_tasks(drawn, number, settings.max_pillars, JUDGE_KEY)

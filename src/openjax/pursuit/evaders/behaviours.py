@@ -54,6 +54,8 @@ class Scene:
     reach: jax.Array  # () m/s, its speed
     drones: DroneState | None = None
     """the pursuers' whole state, leading axis N, whether it knows of them or not"""
+    world: Any = None
+    """the whole state of the world, `openjax.pursuit.PursuitState`"""
     key: jax.Array | None = None
     """() another one in each step; None where no evader of the game is one's own"""
 

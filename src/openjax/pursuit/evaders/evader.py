@@ -147,6 +147,7 @@ def scene_of(settings: PursuitSettings, world: PursuitState) -> Scene:
         hiding=numbers["hiding"],
         reach=numbers["speed"] * settings.evader_speed,
         drones=world.drones,
+        world=world,
         key=None if key is None else jax.random.fold_in(key, world.step),
     )
 
