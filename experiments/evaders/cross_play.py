@@ -22,9 +22,10 @@ from experiments.flying.vehicles import vehicles
 from experiments.table import RESULTS, Page, Table, page_parser, publish
 from openjax.command_line import run_command
 from openjax.evaluation.evaluator import layout_slots, layout_tasks, stacked
-from openjax.evaluation.validation import uniform_tasks
+from openjax.evaluation.judges.duel import Duel
+from openjax.evaluation.judges.scripted import fly_scripted
+from openjax.evaluation.judges.tasks import judging_tasks
 from openjax.files import read_json
-from openjax.learning.best_response import make_duel
 from openjax.pursuit import (
     SCENARIOS,
     EpisodeStatistics,
@@ -48,8 +49,13 @@ GAMES = {
 
 @functools.cache
 def program(settings: PursuitSettings, policy):
-    """Compiled episodes; see `make_duel`."""
-    return jax.jit(make_duel(Pursuit(settings), policy))
+    """Compiled episodes of vehicles within bounds (R, 4); see `fly_scripted`."""
+
+    def run(vehicle_bounds, *arguments):
+        duel = Duel(Pursuit(settings, vehicle_bounds=vehicle_bounds), policy)
+        return fly_scripted(duel, *arguments)
+
+    return jax.jit(run)
 
 
 def game_of(loaded: LoadedPolicy, game: str, physics: str) -> PursuitSettings:
@@ -72,9 +78,8 @@ def game_of(loaded: LoadedPolicy, game: str, physics: str) -> PursuitSettings:
 
 def kinds_of(settings: PursuitSettings, layouts: int, uniform: int) -> dict[str, Task]:
     """Each kind of tasks by name."""
-    drawn = dataclasses.replace(settings, max_pillars=5)
     tasks = layout_tasks(settings, SCENARIOS.values(), layouts)
-    return {**tasks, "uniform": uniform_tasks(drawn, uniform, settings.max_pillars)}
+    return {**tasks, "uniform": judging_tasks(settings, uniform)}
 
 
 def fly(name: str, options) -> list[dict]:
@@ -85,9 +90,9 @@ def fly(name: str, options) -> list[dict]:
     run = program(settings, loaded.in_game(Pursuit(settings)).policy)
     records = []
     for vehicle in options.vehicles:
-        changes = {"vehicle_bounds": jnp.asarray(vehicles()[vehicle])}
+        bounds = jnp.asarray(vehicles()[vehicle])
         for i, evader in enumerate(SCRIPTED):  # one at a time: no other is worked out
-            flown = run(loaded.parameters, tasks, jnp.int32(i), jax.random.key(0), changes)
+            flown = run(bounds, loaded.parameters, tasks, jnp.int32(i), jax.random.key(0))
             for kind, own in part(jax.tree.map(np.asarray, flown)).items():
                 case = {"policy": name, "game": options.game, "vehicle": vehicle, "evader": evader}
                 records.append({**case, "tasks": kind, **summary(own)})

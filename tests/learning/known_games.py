@@ -7,15 +7,16 @@ optimal control problem, solved from each start by itself. Prints a record.
 """
 
 import argparse
+import functools
 import json
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from openjax.baselines.surroundings import length
-from openjax.learning.best_response import BestResponse, make_duel
-from openjax.learning.best_response_settings import BestResponseSettings
+from openjax.evaluation.judges.best_response import BestResponse, fly_learners
+from openjax.evaluation.judges.duel import Duel
+from openjax.evaluation.judges.settings import BestResponseSettings
 from openjax.pursuit import Pursuit, PursuitSettings, Task, uniform_task
 from tests.baselines.points import Team, game_of_points, stack_team
 
@@ -23,48 +24,33 @@ STARTS = 128
 
 
 def learn(environment: Pursuit, team: Team, draw, steps: int, **changes):
-    """Statistics (S, STARTS) of the S evaders of a game that learned, and (1, STARTS) of the greedy
-    one; the starts, which `draw` (key -> Task) gave to none of them before.
+    """Statistics (L, STARTS) of the L evaders that learned, and the starts, which `draw`
+    (key -> Task) gave to none of them before. `steps` are each learner's.
     """
-    seeds = environment.settings.evaders.count("learned")
-    how = dict(total_steps=steps, seeds=seeds, num_envs=256, layouts=1.0) | changes
-    drawn = [
-        jax.vmap(draw)(jax.random.split(jax.random.key(i), n)) for i, n in enumerate((1024, STARTS))
-    ]
-    response = BestResponse(BestResponseSettings(**how), environment, team, drawn[0])
+    settings = dict(learners=3, num_envs=256, foresight=(4.0,)) | changes
+    settings = BestResponseSettings(total_steps=settings["learners"] * steps, **settings)
+    duel = Duel(environment, team)
+    response = BestResponse(settings, duel, draw)
     carry = jax.jit(response.start)(jax.random.key(2))
     step = jax.jit(response.step, donate_argnums=1)
-    for _ in range(response.how.total_updates):
-        carry, _ = jax.block_until_ready(
-            step({}, carry)
-        )  # a CPU with dozens under way waits for ever
-    duel = jax.jit(make_duel(environment, team))
-    networks = [
-        jax.tree.map(lambda leaf, i=i: leaf[i : i + 1], carry.evaders.actor) for i in range(seeds)
-    ]
-
-    def fly(network):
-        return duel({}, drawn[1], jnp.int32(0), jax.random.key(3), {"evader_networks": network})
-
-    flown = [fly(network) for network in networks]
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *flown), fly(None), drawn[1]
+    for _ in range(settings.total_updates):
+        # a CPU with dozens under way waits for ever
+        carry, _ = jax.block_until_ready(step({}, carry))
+    tasks = jax.vmap(draw)(jax.random.split(jax.random.key(1), STARTS))
+    fly = jax.jit(functools.partial(fly_learners, duel, settings.hold))
+    return fly(carry.evaders, {}, duel.start(tasks, jax.random.key(3))), tasks
 
 
 def against_stack(radius: float, steps: int, seeds: int = 1) -> dict:
     """Captures by stack with this radius (m) within 4 s."""
-    evaders = ("learned",) * seeds
-    environment = game_of_points(evaders=evaders, capture_radius=radius, episode_length=400)
+    environment = game_of_points(evaders=("field",), capture_radius=radius, episode_length=400)
 
     def draw(key):
         task = uniform_task(environment.settings, key)
         return task.replace(pillar_active=jnp.zeros_like(task.pillar_active))
 
-    learned, greedy, _ = learn(environment, stack_team(environment), draw, steps)
-    captured = {
-        "learned": learned.captured.mean(-1).tolist(),
-        "greedy": float(greedy.captured.mean()),
-    }
-    return {"radius": radius, "steps": steps, **captured}
+    learned, _ = learn(environment, stack_team(environment), draw, steps, learners=seeds)
+    return {"radius": radius, "steps": steps, "learned": learned.captured.mean(-1).tolist()}
 
 
 def straight(observation):
@@ -74,25 +60,23 @@ def straight(observation):
 
 
 def two_against_one(steps: int, seeds: int = 1) -> dict:
-    """Mean seconds to the capture."""
+    """Mean seconds to the capture, as a share of the longest possible ones."""
     environment = game_of_points(
         num_pursuers=2,
         max_speed=1.0,
         evader_speed=0.8,
         arena_radius=10.0,
         arena_height=10.0,
-        evaders=("learned",) * seeds,
-        episode_length=250,
+        evaders=("field",),
+        episode_length=248,
     )
     settings = environment.settings
-    learned, greedy, starts = learn(
-        environment, Team(straight), draw_between, steps, own_axes=False
-    )
+    learned, starts = learn(environment, Team(straight), draw_between, steps, learners=seeds)
     apart = starts.pursuer_position - starts.evader_position[:, None]
     exact = longest(settings, apart[..., :2])
-    seconds = [statistics.capture_step * settings.time_step for statistics in (learned, greedy)]
-    share = [(s / exact).mean(-1).tolist() for s in seconds]
-    return {"steps": steps, "exact": float(exact.mean()), "learned": share[0], "greedy": share[1]}
+    seconds = learned.capture_step * settings.time_step
+    share = (seconds / exact).mean(-1).tolist()
+    return {"steps": steps, "exact": float(exact.mean()), "learned": share}
 
 
 def draw_between(key) -> Task:

@@ -3,8 +3,8 @@
 Payoff is the time to the capture and not whether there is one: where captures are forced, every
 evader would be as good as any other. A game names `learned` among its evaders as often as there are
 networks; the world of one of them is flown by its samples, and it learns from these until it is
-caught. `openjax.learning.training_step` has them learn while the pursuers do,
-`openjax.learning.best_response` against fixed ones.
+caught. `openjax.learning.training_step` has them learn while the pursuers do. They judge nobody:
+`openjax.evaluation.judges` shares nothing with them.
 """
 
 import functools

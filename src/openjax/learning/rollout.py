@@ -78,18 +78,38 @@ def collect(
     Returns:
       the rollout, and observation and state after it.
     """
-    environment = players.environment
-    policy = players.policy
-    pursuers = environment.settings.num_pursuers
-    chex.assert_shape(noise.pursuers, (None, None, pursuers, policy.sample_size))
+    pursuers = players.environment.settings.num_pursuers
+    chex.assert_shape(noise.pursuers, (None, None, pursuers, players.policy.sample_size))
     chex.assert_tree_shape_prefix(world, noise.pursuers.shape[1:2])
-    step = jax.vmap(environment.step, in_axes=(None, 0, 0, 0 if players.evaders else None))
+    step = _step(players, penalty_share)
+    if not players.evaders:
+        (observation, state), rollout = jax.lax.scan(step, world, noise.pursuers)
+        return rollout, observation, state
 
-    def one(carry, noise, desired=None):
-        observation, state = carry
+    def decide(world, noise):
+        desired, samples = players.evaders(world[1], noise.evaders)
+        world, record = jax.lax.scan(lambda *args: step(*args, desired), world, noise.pursuers)
+        return world, (record, samples)
+
+    held = noise.pursuers.reshape(-1, players.hold, *noise.pursuers.shape[1:])
+    noise = noise.replace(pursuers=held)
+    (observation, state), (record, samples) = jax.lax.scan(decide, world, noise)
+    rollout = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), record)
+    return rollout.replace(learning=samples), observation, state
+
+
+def _step(players, penalty_share):
+    """A control step of worlds (E, ...): worlds, noise (E, N, A) and desired velocities of evaders
+    that learn -> worlds after it, record.
+    """
+    policy = players.policy
+    move = jax.vmap(players.environment.step, in_axes=(None, 0, 0, 0 if players.evaders else None))
+
+    def step(world, noise, desired=None):
+        observation, state = world
         predicted, action, log_prob = _sample(players, observation, noise)
         command = policy.action(action, observation)
-        following, state, reward, terminated, truncated, info = step(
+        following, state, reward, terminated, truncated, info = move(
             jax.random.key(0), state, command, desired
         )
         record = Rollout(
@@ -104,21 +124,7 @@ def collect(
         )
         return (following, state), record
 
-    if not players.evaders:
-        (observation, state), rollout = jax.lax.scan(one, world, noise.pursuers)
-        return rollout, observation, state
-
-    def decide(carry, noise):
-        desired, samples = players.evaders(carry[1], noise.evaders)
-        carry, record = jax.lax.scan(lambda *step: one(*step, desired), carry, noise.pursuers)
-        return carry, (record, samples)
-
-    held = noise.pursuers.reshape(-1, players.hold, *noise.pursuers.shape[1:])
-    (observation, state), (record, samples) = jax.lax.scan(
-        decide, world, noise.replace(pursuers=held)
-    )
-    rollout = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), record)
-    return rollout.replace(learning=samples), observation, state
+    return step
 
 
 def _sample(players, observation, noise):

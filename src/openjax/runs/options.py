@@ -8,7 +8,7 @@ from typing import Annotated, Literal, get_args
 
 import tyro
 
-from openjax.learning.best_response_settings import BestResponseSettings
+from openjax.evaluation.judges.settings import BestResponseSettings, PlannerSettings
 from openjax.learning.settings import AdaptSettings, TrainSettings
 from openjax.pursuit.settings import PursuitSettings
 from openjax.ranges import Interval, Seed
@@ -88,7 +88,7 @@ class TrainCommand:
 
 @dataclasses.dataclass(frozen=True)
 class ExploitCommand:
-    """Train an evader against a fixed policy, and count the captures of it and of all scripted
+    """Train evaders against a fixed policy, and count the captures of them and of all scripted
     evaders.
     """
 
@@ -102,7 +102,7 @@ class ExploitCommand:
     """File to write the records to."""
     episodes: Annotated[int, Interval("[1, 1000000]")] = 100
     """Episodes per layout and evader; by default 8 on a CPU."""
-    uniform: Annotated[int, Interval("[1, 1000000]")] = 4096
+    uniform: Annotated[int, Interval("[1, 1000000]")] = 256
     """Uniform tasks per evader; by default 64 on a CPU."""
     seed: Seed = 0
     """Draws the evaders' first parameters, their tasks and the start attitudes."""
@@ -116,6 +116,9 @@ class ExploitCommand:
     """Vehicle to fly (vehicle.toml); by default the nominal Crazyflie."""
     effects: Path | None = None
     """Physical effects to fly with (effects.toml)."""
+    planner: tyro.conf.FlagConversionOff[bool] = True
+    """Fly an evader that plans in the true simulation, too."""
+    planning: PlannerSettings = dataclasses.field(default_factory=PlannerSettings)
     learning: Annotated[BestResponseSettings, tyro.conf.arg(name="")] = dataclasses.field(
         default_factory=BestResponseSettings
     )

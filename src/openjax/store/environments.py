@@ -6,11 +6,15 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 
 from openjax.errors import UserError
+from openjax.evaluation.judges.networks import init_network
+from openjax.evaluation.judges.opponent import opponent as learned_opponent
+from openjax.evaluation.judges.senses import number_of_senses
 from openjax.files import to_plain
 from openjax.pursuit import Pursuit, PursuitSettings
-from openjax.pursuit.evaders import SCRIPTED, Evader, EvaderKind, init_network
+from openjax.pursuit.evaders import SCRIPTED, Evader, EvaderKind
 from openjax.store.policy_files import fill, load_policy_file, save_policy_file
 from openjax.vehicle.effects import load_effects
 from openjax.vehicle.family import vehicle_family
@@ -52,18 +56,16 @@ def make_environment(
     opponent: str | Path | Evader | None = None,
 ) -> Pursuit:
     """The game with the vehicle of a vehicle.toml, or of an airframe's name, the effects of an
-    effects.toml, and one evader (`find_opponent`, or one's own), where given.
+    effects.toml, and one evader, where given: a scripted one's name, or see `find_opponent`.
 
     Raises:
       UserError: a file that can't be used, or an evader that nobody knows.
     """
-    network = evaders = None
-    if is_own_code(opponent):
-        opponent = own_evader(opponent)
-    if opponent is not None and not isinstance(opponent, str | Path):
-        evaders = (opponent,)
+    evaders = None
+    if isinstance(opponent, str | Path) and str(opponent) in SCRIPTED:
+        settings = dataclasses.replace(settings, evaders=(str(opponent),))
     elif opponent is not None:
-        settings, network = find_opponent(opponent, settings)
+        evaders = (find_opponent(opponent, settings),)
     names, parameters = load_effects(effects) if effects else ((), {})
     return Pursuit(
         with_airframe(settings, vehicle),
@@ -71,7 +73,6 @@ def make_environment(
         effects=names,
         effect_parameters=parameters,
         evaders=evaders,
-        evader_networks=None if network is None else jax.tree.map(lambda leaf: leaf[None], network),
     )
 
 
@@ -105,36 +106,42 @@ def own_evader(name: str) -> Evader:
     return found
 
 
-def save_evader(path: Path, network: Any, game: PursuitSettings, notes: dict) -> None:
-    """Write a learned evader and the game that it learned."""
-    game = dataclasses.replace(game, evaders=("learned",))
-    save_policy_file(path, {"evader": network}, {"environment": game}, notes, storage="float32")
+def save_evader(
+    path: Path, evader: tuple[Any, jax.Array], hold: int, game: PursuitSettings, notes: dict
+) -> None:
+    """Write a learned evader, its actor and whether it sees in the world's axes, how many control
+    steps it holds a decision, and the game that it learned.
+    """
+    actor, world_axes = evader
+    stored = {"evader": {"actor": actor, "world_axes": world_axes, "hold": jnp.int32(hold)}}
+    save_policy_file(path, stored, {"environment": game}, notes, storage="float32")
 
 
-def find_opponent(name_or_path: str | Path, game: PursuitSettings) -> tuple[PursuitSettings, Any]:
-    """A game with one evader, and the network of that where it is learned (else None).
+def find_opponent(evader: str | Path | Evader, game: PursuitSettings) -> Evader:
+    """An evader that isn't one of the library's.
 
     Args:
-      name_or_path: a scripted evader's name, or a file that `openjax exploit` wrote.
-      game: the game otherwise.
+      evader: a function or row of one's own, or `FILE.py:function`, or a file that `openjax
+        exploit` wrote.
+      game: that it shall play.
 
     Raises:
       UserError: nobody of that name, no such file, or an evader of another game.
     """
-    if str(name_or_path) in SCRIPTED:
-        return dataclasses.replace(game, evaders=(str(name_or_path),)), None
-    path = Path(name_or_path)
+    if not isinstance(evader, str | Path):
+        return evader
+    if is_own_code(evader):
+        return own_evader(evader)
+    path = Path(evader)
     if not path.is_file():
         raise UserError(
-            f"--opponent {str(name_or_path)[:60]}: no such evader or file; possible are "
-            f"{', '.join(SCRIPTED)} or a file "
-            "written by openjax exploit"
+            f"--opponent {str(evader)[:60]}: no such evader or file; possible are "
+            f"{', '.join(SCRIPTED)}, FILE.py:function, or a file written by openjax exploit"
         )
     leaves, settings, _ = load_policy_file(path, "evader's file", "openjax exploit")
-    if not any(name.startswith("evader/") for name in leaves):
+    if "evader/hold" not in leaves:
         raise UserError(
-            f"--opponent {path}: holds a policy of pursuers; an evader's file comes from openjax "
-            "exploit"
+            f"--opponent {path}: holds no evader of this version; openjax exploit writes one"
         )
     learned_in = settings["environment"]
     plain = to_plain(game)
@@ -144,7 +151,16 @@ def find_opponent(name_or_path: str | Path, game: PursuitSettings) -> tuple[Purs
                 f"--opponent {path}: learned in a game with {name} {learned_in.get(name)}, here "
                 f"it's {plain[name]}"
             )
-    abstract = {"evader": jax.eval_shape(init_network, jax.random.key(0))}
-    return dataclasses.replace(game, evaders=("learned",)), fill(abstract, leaves, str(path))[
-        "evader"
-    ]
+    slots = learned_in["max_pillars"]
+    if game.max_pillars > slots:
+        raise UserError(
+            f"--opponent {path}: senses {slots} pillars at most, the game has up to "
+            f"{game.max_pillars}; environment.max_pillars {slots} would be right"
+        )
+    inputs = number_of_senses(game.num_pursuers, slots)
+    actor = jax.eval_shape(lambda key: init_network(key, 1, inputs, 3), jax.random.key(0))
+    one = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), actor)
+    scalar = {"world_axes": jnp.bool_, "hold": jnp.int32}
+    abstract = {name: jax.ShapeDtypeStruct((), kind) for name, kind in scalar.items()}
+    stored = fill({"evader": {"actor": one, **abstract}}, leaves, str(path))["evader"]
+    return learned_opponent(stored["actor"], stored["world_axes"], int(stored["hold"]), slots)

@@ -7,18 +7,23 @@ import jax.numpy as jnp
 
 from openjax.evaluation.judges.networks import apply_network
 from openjax.evaluation.judges.senses import sense, to_world
-from openjax.pursuit.evaders import MEMORY, EvaderKind
+from openjax.pursuit.evaders.kinds import MEMORY, EvaderKind
 
 
-def opponent(actor: Any, world_axes: jax.Array, hold: int) -> EvaderKind:
-    """The evader of one `actor`, without an axis of learners, that decides every `hold` control
-    steps, () bool in the world's axes or its own.
+def opponent(actor: Any, world_axes: jax.Array, hold: int, slots: int) -> EvaderKind:
+    """The evader of one actor.
+
+    Args:
+      actor: parameters, without an axis of learners.
+      world_axes: () bool, whether it sees in the world's axes.
+      hold: control steps for which it flies a decision.
+      slots: of pillars that it senses.
     """
     network = jax.tree.map(lambda leaf: leaf[None], actor)
 
     def velocity(scene, memory):
         world = scene.world
-        sensed = sense(scene.settings, world, world_axes)
+        sensed = sense(scene.settings, world, world_axes, slots)
         decided = to_world(apply_network(network, sensed[None, None])[0, 0], world, world_axes)
         decided = jnp.where(world.step % hold == 0, decided, memory[MEMORY:])
         return scene.reach * decided, memory.at[MEMORY:].set(decided)

@@ -16,7 +16,6 @@ def fly_scripted(
     tasks: Task,
     place: jax.Array,
     key: jax.Array,
-    vehicle_bounds: jax.Array | None = None,
 ) -> EpisodeStatistics:
     """Statistics (B,): an episode of one evader on each of tasks (B, ...).
 
@@ -26,12 +25,9 @@ def fly_scripted(
       tasks: (B, ...)
       place: () int32 in `openjax.pursuit.evaders.SCRIPTED`.
       key: draws attitudes, vehicles and the evaders' numbers.
-      vehicle_bounds: (R, 4), see `Pursuit.vehicle_bounds`; None: the game's own.
     """
     settings = dataclasses.replace(duel.environment.settings, evaders=SCRIPTED)
     game = dataclasses.replace(duel.environment, settings=settings, evaders=None, dynamics=None)
-    if vehicle_bounds is not None:
-        game = game.with_bounds(vehicle_bounds)
 
     def begin(key, task):
         observation, state = game.reset_to(key, task)

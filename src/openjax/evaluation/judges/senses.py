@@ -11,25 +11,43 @@ from openjax.pursuit import PursuitSettings, PursuitState
 from openjax.pursuit.observation import rotation_axes
 
 TINY = 1e-9
-ABSENT = 4.0
-"""Distance (in the arena's radii) at which a pillar slot that isn't in use is sensed."""
+NEAR = 3.0
+"""Capture radii by which offsets are measured: what matters is near, however wide the arena is."""
+_EVADER = 14
+_PURSUER = 13
+_NO_PILLAR = (4.0, 0.0, 0.0, 0.0)
+"""What is sensed of a slot that isn't in use: a pillar far away."""
 
 
-def sense(settings: PursuitSettings, state: PursuitState, world_axes: jax.Array) -> jax.Array:
+def sense(
+    settings: PursuitSettings,
+    state: PursuitState,
+    world_axes: jax.Array,
+    slots: int | None = None,
+) -> jax.Array:
     """(F,) float32, of the order of one, of one world.
 
     Args:
       settings: the game.
       state: of one world.
       world_axes: () bool.
+      slots: of pillars that are sensed, at least the game's; None: as many.
     """
     turned = _axes(state.evader_position, world_axes)
+    pillars = _pillars(settings, state, turned)
+    missing = (slots or len(pillars)) - len(pillars)
+    absent = jnp.broadcast_to(jnp.array(_NO_PILLAR), (missing, len(_NO_PILLAR)))
     parts = [
         _evader(settings, state, turned),
         _pursuers(settings, state, turned).ravel(),
-        _pillars(settings, state, turned).ravel(),
+        jnp.concatenate([pillars, absent]).ravel(),
     ]
     return jnp.concatenate(parts)
+
+
+def number_of_senses(pursuers: int, slots: int) -> int:
+    """F for as many pursuers and pillar slots."""
+    return _EVADER + _PURSUER * pursuers + len(_NO_PILLAR) * slots
 
 
 def to_world(velocity: jax.Array, state: PursuitState, world_axes: jax.Array) -> jax.Array:
@@ -63,7 +81,7 @@ def _evader(settings, state, turned):
             1.0 - radius / settings.arena_radius,
             position[2:] / settings.arena_height,
             turned @ state.evader_velocity / settings.evader_speed,
-            turned @ (state.last_seen - position),
+            turned @ (state.last_seen - position) / settings.arena_radius,
             jnp.stack([state.seen.astype(jnp.float32), time, 1.0 - time]),
         ]
     )
@@ -73,6 +91,7 @@ def _pursuers(settings, state, turned):
     """(N, 13), the nearest first: where each is, how it flies, where its rotors pull, if it sees
     the evader.
     """
+    near = NEAR * settings.capture_radius
     offset = state.drones.position - state.evader_position
     distance = _length(offset)
     thrust = rotation_axes(state.drones.quaternion)[1]
@@ -80,8 +99,8 @@ def _pursuers(settings, state, turned):
     closing = -jnp.sum(offset / distance * velocity, axis=-1, keepdims=True)
     rows = jnp.concatenate(
         [
-            offset @ turned.T / settings.arena_radius,
-            distance / settings.arena_radius,
+            offset @ turned.T / near,
+            distance / near,
             settings.capture_radius / jnp.maximum(distance, settings.capture_radius / 2),
             velocity @ turned.T,
             closing,
@@ -100,7 +119,9 @@ def _pillars(settings, state, turned):
     active = task.pillar_active[:, None]
     gap = _length(offset) - settings.pillar_radius
     near = jnp.exp(-jnp.maximum(gap, 0.0) / settings.pillar_radius)
-    rows = jnp.concatenate([offset @ turned[:2, :2].T / settings.arena_radius, near], axis=-1)
-    absent = jnp.array([ABSENT, 0.0, 0.0])
-    rows = jnp.concatenate([jnp.where(active, rows, absent), active.astype(jnp.float32)], axis=-1)
+    rows = jnp.concatenate(
+        [offset @ turned[:2, :2].T / (NEAR * settings.capture_radius), near], axis=-1
+    )
+    rows = jnp.concatenate([rows, jnp.ones_like(near)], axis=-1)
+    rows = jnp.where(active, rows, jnp.array(_NO_PILLAR))
     return rows[jnp.argsort(jnp.where(active, gap, jnp.inf)[:, 0])]

@@ -35,7 +35,7 @@ class BestResponseSettings:
     value_coefficient: Annotated[float, Interval("(0, 1000]")] = 10.0
     """Weight of the squared error of values, which are at most one."""
     initial_log_std: Annotated[float, Interval("[-10, 2]")] = 0.0
-    least_log_std: Annotated[float, Interval("[-10, 2]")] = -2.0
+    least_log_std: Annotated[float, Interval("[-10, 2]")] = -2.5
     layouts: Annotated[float, Interval("[0, 1]")] = 0.5
     """Share of the episodes that begin among a layout's pillars, turned and with starts moved; the
     others are uniform tasks, turned.
