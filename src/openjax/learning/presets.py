@@ -156,8 +156,6 @@ def evaders() -> TrainSettings:
             ),
             observe_in="heading",
             min_pillars=0,
-            # an evader that learns finds the pockets between pillars and the wall
-            max_pillars=7,
             # The distance pays for going near a pillar, the first capture for the last centimetres:
             # a step of it alone costs too much. Breaches that count .02 m early make a way between
             # pillars .4 m apart cost as much as a capture pays
