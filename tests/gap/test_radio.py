@@ -14,7 +14,8 @@ from openjax.gap.model.library import library
 
 BOTH = ("command_latency", "packet_loss")
 CASE = SimpleNamespace(
-    vehicle_file=SimpleNamespace(motor=SimpleNamespace(command="thrust")), others=lambda flight: ()
+    vehicle_file=SimpleNamespace(motor=SimpleNamespace(command="thrust"), log={}),
+    others=lambda flight: (),
 )
 
 

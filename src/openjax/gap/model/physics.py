@@ -63,14 +63,8 @@ def _channels(effects, parameters, theta, vehicle, path: Path):
 
     def context(position, quaternion, velocity, rates, voltage, others, speed):
         state = DroneState(position, quaternion, velocity, rates, speed, rates, rates, ())
-        return make_context(
-            flown,
-            state,
-            others_position=others,
-            battery_voltage=voltage,
-            ceiling_height=path.ceiling,
-            dt=step,
-        )
+        room = {"others_position": others, "ceiling_height": path.ceiling}
+        return make_context(flown, state, battery_voltage=voltage, dt=step, **room)
 
     along = (
         path.position,
