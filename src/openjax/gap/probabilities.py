@@ -31,7 +31,14 @@ def probabilities(present, largest, unknown: float, weights) -> dict[str, float]
     total = sum(shared.values())
     for name, weight in shared.items():
         chance[name] += left * weight / total
-    return tempered(chance, DECISION.temperature)
+    return reliable(tempered(chance, DECISION.temperature), DECISION.reliability)
+
+
+def reliable(chance: dict[str, float], share: float) -> dict[str, float]:
+    """Probabilities of a choice that is right in no more than a `share` of the cases, however often
+    draws repeat it: what is left goes to all causes alike.
+    """
+    return {name: share * p + (1.0 - share) / len(chance) for name, p in chance.items()}
 
 
 def agreeing(chance: dict[str, float], said, sure: float) -> dict[str, float]:
