@@ -1,5 +1,7 @@
 """Each effect shows its own signature, does nothing at "no effect" and works beside all others."""
 
+import dataclasses
+
 import chex
 import jax
 import jax.numpy as jnp
@@ -17,7 +19,13 @@ from openjax.vehicle import (
     rotor_thrust,
     total_wrench,
 )
-from openjax.vehicle.effects import EFFECTS, Effect, Parameter, make_context
+from openjax.vehicle.effects import (
+    EFFECTS,
+    Effect,
+    Parameter,
+    make_context,
+    register_effect,
+)
 from openjax.vehicle.rate_controller import rate_controller
 
 pytestmark = pytest.mark.slow
@@ -435,3 +443,11 @@ def test_rate_gains_act_in_the_controller(vehicle):
     )
     np.testing.assert_allclose(halved, 0.5 * nominal, rtol=1e-4)
     assert float(4 * max_rotor_thrust(soft)) == pytest.approx(float(4 * max_rotor_thrust(vehicle)))
+
+
+def test_an_effect_of_ones_own_has_a_name_of_its_own():
+    other = dataclasses.replace(EFFECTS["wind"], description="another one")
+    with pytest.raises(UserError, match="'wind': there is one of that name already"):
+        register_effect(other)
+    register_effect(EFFECTS["wind"])  # the same one again is nothing new
+    assert EFFECTS["wind"].description != "another one"
