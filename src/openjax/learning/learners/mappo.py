@@ -191,14 +191,16 @@ class Mappo:
         """All epochs of the policy update on one rollout; `key` shuffles."""
         estimates = self._estimates(state.value_scale, parameters, flown)
         scale = self._renewed_scale(state.value_scale, estimates.returns, flown)
-        batch = self._batch(scale, estimates, flown)
+        mean, std = scale.moments
+        targets = (estimates.returns - mean) / std
+        batch = self._batch(estimates.advantage, targets, flown)
 
         actor = TrainState(parameters.actor, state.actor)
         critic = TrainState(parameters.critic, state.critic)
         (actor, critic), metrics = self._epochs((actor, critic), batch, flown, key)
         parameters = parameters.replace(actor=actor.parameters, critic=critic.parameters)
         metrics["explained_variance"] = estimates.explained_variance
-        metrics["value_scale"] = scale.moments[1]
+        metrics["value_scale"] = std
         return MappoState(actor.optimiser, critic.optimiser, scale), parameters, metrics
 
     def _estimates(self, scale, parameters, flown):
@@ -243,18 +245,19 @@ class Mappo:
             weight=kept * scale.weight + (1 - kept),
         )
 
-    def _batch(self, scale, estimates, flown):
-        """The rollout's samples, minibatch by minibatch, (M, W, T, ...)."""
+    def _batch(self, advantage, targets, flown):
+        """The rollout's samples with advantages and targets (T, E, N), minibatch by minibatch, (M,
+        W, T, ...).
+        """
         rollout = flown.rollout
-        mean, std = scale.moments
-        advantage_mean, advantage_std = joint_moments(estimates.advantage, flown.axis)
+        mean, std = joint_moments(advantage, flown.axis)
         batch = Batch(
             observation=rollout.observation.replace(frames=None),
             predicted=rollout.predicted,
             action=rollout.action,
             log_prob=rollout.log_prob,
-            advantage=(estimates.advantage - advantage_mean) / (advantage_std + 1e-8),
-            target=(estimates.returns - mean) / std,
+            advantage=(advantage - mean) / (std + 1e-8),
+            target=targets,
         )
         return minibatches(batch, self.settings.minibatches)
 
@@ -291,8 +294,8 @@ class Mappo:
             critic = critic.updated(self.optimisers[1], critic_gradient)
             return (actor, critic), jnp.stack([watch[name] for name in WATCHED])
 
-        start = actor.replace(parameters=actor_vector), critic.replace(parameters=critic_vector)
         steps = self._order(key)
+        start = actor.replace(parameters=actor_vector), critic.replace(parameters=critic_vector)
         (actor, critic), watched = jax.lax.scan(gradient_step, start, steps)
         actor = actor.replace(parameters=to_actor(actor.parameters))
         critic = critic.replace(parameters=to_critic(critic.parameters))
