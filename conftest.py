@@ -17,7 +17,8 @@ from jaxtyping import install_import_hook
 _networks = [
     f"openjax.policy.{name}" for name in ("actor_critic", "encoder", "policy", "predictor")
 ]
-install_import_hook([*_networks, "openjax.learning.advantages"], "beartype.beartype")
+_drone = [f"openjax.vehicle.{name}" for name in ("rigid_body", "rate_controller", "stops")]
+install_import_hook([*_networks, *_drone, "openjax.learning.advantages"], "beartype.beartype")
 
 _flags = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
 # workers are the parallel part: more threads would only wait for each other's cores
