@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from openjax.flying.controller import Pose, level_acceleration, moved_on
 from openjax.flying.innovations import Innovations
 from openjax.flying.judge import Track, Verdict, agree, at_one_time, follows
+from openjax.flying.set_point import as_sent
 from openjax.flying.state import FLYING, SPIN_UP, Drone, Mode, PoseSample, State
 
 CHECKED = (Mode.TRANSFER, Mode.READY, Mode.PURSUIT, Mode.HOLD, Mode.LAND)
@@ -69,7 +70,7 @@ def _consistent(state, drone, own) -> Drone:
         )
         return drone._replace(own=own, contradiction=own.verdict if lost else Verdict.GOOD)
     refused = bool(drone.own.verdict)
-    innovations = drone.innovations.after(own.pose, drone.sent, state.airframe, refused)
+    innovations = drone.innovations.after(own.pose, as_sent(drone.sent), state.airframe, refused)
     verdict = innovations.verdict()
     seen = drone.captured
     if not verdict:
@@ -121,7 +122,7 @@ def _captured(state, drone, sample, moving) -> Drone:
         innovations = Innovations()
     elif captured.pose is seen and seen is not drone.captured.pose:
         refused = bool(drone.captured.verdict)
-        innovations = innovations.after(seen, drone.sent, state.airframe, refused)
+        innovations = innovations.after(seen, as_sent(drone.sent), state.airframe, refused)
         capture_fault = innovations.verdict()
     if capture_fault:
         captured = captured._replace(pose=drone.captured.pose, verdict=capture_fault)
