@@ -15,9 +15,10 @@ from typing import Annotated
 import tyro
 
 from openjax.command_line import output_console, parse
+from openjax.flying.endpoints import UDP_PORT
 from openjax.interruption import as_exception
 from openjax.ranges import Interval
-from openjax.virtual_crazyflie.link import BASE_PORT, LinkFaults
+from openjax.virtual_crazyflie.link import LinkFaults
 
 PROGRAM = "openjax virtual_crazyflie"
 MIDDLE = "middle"
@@ -32,7 +33,7 @@ class Arguments:
     """How many."""
     host: str = "127.0.0.1"
     """Address to listen at."""
-    port: Annotated[int, Interval("[0, 65535]")] = BASE_PORT
+    port: Annotated[int, Interval("[0, 65535]")] = UDP_PORT
     """UDP port of the first; cflib's scan looks at 19850 to 19859."""
     scenario: str = "wall"
     """They stand below the pursuers' starts of this layout (a name or a TOML file); more of them in

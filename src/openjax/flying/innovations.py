@@ -36,7 +36,7 @@ class Memory(NamedTuple):
 
 WAY = Memory(1.2, 0.095)
 """Of position against velocity (m): one is off the other by .08 m/s. Errors of 8 mm and 4 cm/s that
-have nothing to do with each other reach .085.
+have nothing to do with each other reach .09.
 """
 SPEED = Memory(0.1, 0.2)
 """Of velocity against thrust (m/s): a disturbance of 2 m/s^2 that sets in at once, as no drag does."""

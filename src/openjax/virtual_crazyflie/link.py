@@ -13,9 +13,6 @@ from openjax.errors import UserError
 from openjax.flying.crtp import Port
 from openjax.ranges import Interval, Seed, check_intervals
 
-BASE_PORT = 19850
-"""`cflib` scans this port and the nine after it."""
-
 
 @dataclass(frozen=True)
 class LinkFaults:

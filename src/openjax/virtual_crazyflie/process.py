@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from openjax.flying.endpoints import UDP_PORT
 from openjax.virtual_crazyflie.firmware import VirtualFirmware
 from openjax.virtual_crazyflie.link import LinkFaults, VirtualLink
 from openjax.virtual_crazyflie.vehicles import STEP, VirtualVehicles
@@ -31,7 +32,7 @@ class VirtualCrazyflies:
         self,
         vehicles: VirtualVehicles,
         host: str = "127.0.0.1",
-        port: int = 19850,
+        port: int = UDP_PORT,
         faults: LinkFaults | None = None,
         needs_arming: bool = True,
     ):
