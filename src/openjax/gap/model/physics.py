@@ -51,6 +51,33 @@ def compiled_physics(names: tuple[str, ...], parameters: tuple[tuple[str, str], 
     return jax.jit(jax.vmap(partial(_channels, resolve(names), parameters)))
 
 
+def _rotors(flown, wanted, given, dt, late):
+    """Rotor speeds (T, 4) whose square is the row's mean, and their change (T, 4), 1/s^2, of wanted
+    speeds (T, TICKS, 4) under the motors' lag, `late` s later.
+    """
+    step = dt / wanted.shape[1]
+    # As `rotor_speed_step`, with what doesn't change outside the loop.
+    faster = -jnp.expm1(-step / flown.motor_time_constant)
+    slower = -jnp.expm1(-step / (flown.motor_time_constant * flown.motor_slowdown_ratio))
+
+    def row(speed, targets):
+        total = 0.0
+        before = speed
+        for tick in range(len(targets)):
+            target = targets[tick]
+            after = speed + (target - speed) * jnp.where(target < speed, slower, faster)
+            # Mean of the square over a tick, in which the speed is nearly straight.
+            total = total + (speed * speed + speed * after + after * after) / 3.0
+            speed = after
+        return speed, (total / len(targets), (speed - before) / dt)
+
+    start = jnp.sqrt(jnp.clip(given[0, 0], 1e-6, None)) * flown.max_rotor_speed
+    _, driven = jax.lax.scan(row, start, wanted)
+    square, sped_up = (v - late * jnp.gradient(v, dt, axis=0) for v in driven)
+    speed = jnp.sqrt(jnp.maximum(square, 0.0))
+    return speed, sped_up
+
+
 def _channels(effects, parameters, theta, vehicle, path: Path):
     """(T, 9) of one track with parameters theta (P,)."""
     values = {
@@ -81,26 +108,7 @@ def _channels(effects, parameters, theta, vehicle, path: Path):
 
     given = jax.vmap(demanded)(path.motor, still)
 
-    wanted = commanded_rotor_speed(flown, given)
-    # As `rotor_speed_step`, with what doesn't change outside the loop.
-    faster = -jnp.expm1(-step / flown.motor_time_constant)
-    slower = -jnp.expm1(-step / (flown.motor_time_constant * flown.motor_slowdown_ratio))
-
-    def row(speed, targets):
-        total = 0.0
-        before = speed
-        for tick in range(len(targets)):
-            target = targets[tick]
-            after = speed + (target - speed) * jnp.where(target < speed, slower, faster)
-            # Mean of the square over a tick, in which the speed is nearly straight.
-            total = total + (speed * speed + speed * after + after * after) / 3.0
-            speed = after
-        return speed, (total / len(targets), (speed - before) / path.dt)
-
-    start = jnp.sqrt(jnp.clip(given[0, 0], 1e-6, None)) * flown.max_rotor_speed
-    _, driven = jax.lax.scan(row, start, wanted)
-    square, sped_up = (v - theta[-1] * jnp.gradient(v, path.dt, axis=0) for v in driven)
-    speed = jnp.sqrt(jnp.maximum(square, 0.0))
+    speed, sped_up = _rotors(flown, commanded_rotor_speed(flown, given), given, path.dt, theta[-1])
     spun_up = theta[-2] * (sped_up @ flown.rotor_spin)
 
     def wrench(position, quaternion, velocity, rates, voltage, others, speed, spun_up):
