@@ -1,5 +1,6 @@
 """What a run flies with, and its last stage, which keeps what validates best."""
 
+import dataclasses
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -105,3 +106,16 @@ def test_a_start_that_was_never_validated_is_when_the_run_goes_on():
     scored = CheckpointRecord(Path("000000000"), 0, 0.5, {})
     later = CheckpointRecord(Path("000000007"), 7, None, {})
     assert not any(awaits_validation(record, settings, None) for record in (scored, later))
+
+
+def test_a_program_with_a_function_of_ones_own_is_never_recalled(tmp_path):
+    """Its text may have changed since it was kept, under the same name in the same settings."""
+    settings = preset("quick")
+    command = TrainCommand(out=tmp_path / "run", devices="1", settings=settings)
+    job, _, _ = prepare(command, [], 0.0, Processes())
+    kept = dataclasses.replace(job, traced=tmp_path)
+    assert kept.keep is not None
+    game = Pursuit(
+        settings.environment, evaders=(lambda scene, memory: (0.0 * memory[:3], memory),)
+    )
+    assert dataclasses.replace(kept, environment=game).keep is None

@@ -121,8 +121,11 @@ class TrainingJob:
 
     @property
     def keep(self) -> Callable | None:
-        """`recalled` for the run's programs; None where traces aren't kept."""
-        if self.traced is None:
+        """`recalled` for the run's programs; None where traces aren't kept, or where functions of
+        one's own are in them, whose text nobody knows.
+        """
+        game = self.environment
+        if self.traced is None or self.own.names or game.evaders or game.reward or game.observer:
             return None
         return functools.partial(recalled, made_from=self.made_from, folder=self.traced)
 

@@ -278,7 +278,9 @@ def check_resumed(command: TrainCommand, stored: TrainSettings) -> None:
         raise UserError(f"--resume {resume} writes there; leave --out away")
     if command.overwrite:
         raise UserError("--resume and --overwrite exclude each other")
-    options = ("start_from", "effects", "vehicle", "opponent")
+    options = ["start_from", "effects", "vehicle", "opponent"]
+    if "own" in stored.environment.evaders:
+        options.remove("opponent")  # a function isn't in the run's files
     given = [name for name in options if getattr(command, name) is not None]
     for name in (*given, *different_settings(command.settings, stored)):
         if name not in MAY_CHANGE:
