@@ -34,7 +34,7 @@ def test_own_controller_is_flown_like_a_policy(capsys):
     rows = {line.split()[0]: line.split() for line in capsys.readouterr().out.splitlines()}
     captured = {name: float(row[2].rstrip(",")) for name, row in rows.items()}
     assert captured["open"] == 1.0  # the shipped policy, in the same game
-    assert captured["chase"] < captured["open"]  # running after a faster one isn't enough
+    assert captured["slower"] > 0.9 > captured["faster"]  # running after a faster one isn't enough
 
 
 @pytest.fixture

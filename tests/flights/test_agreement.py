@@ -174,7 +174,7 @@ def swapped(a, b):
 
 PATHS = {
     "z negated": (scaled("z", -1.0), "z "),
-    "x at zero": (scaled("x", 0.0), "x "),
+    "x at zero": (scaled("x", 0.0), "x: the same value 0"),
     "y negated": (scaled("y", -1.0), "y "),
     "y twice as large": (scaled("y", 2.0), "y moves by 2.0"),
     "z half as large": (scaled("z", 0.5), "z moves by 0.5"),
