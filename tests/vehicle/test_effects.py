@@ -451,3 +451,21 @@ def test_an_effect_of_ones_own_has_a_name_of_its_own():
         register_effect(other)
     register_effect(EFFECTS["wind"])  # the same one again is nothing new
     assert EFFECTS["wind"].description != "another one"
+
+
+def test_usual_ranges_grow_with_the_vehicle_and_stay_for_a_crazyflie():
+    from openjax.vehicle.effects.effect import growth
+
+    small = load_vehicle()
+    heavy = small.replace(mass=40.0 * small.mass, rotor_position=6.0 * small.rotor_position)
+    loaded = small.replace(mass=1.5 * small.mass)
+    grown = {"kg": 40.0, "N": 40.0, "N s/m": 40.0, "m": 6.0, "N m s/m": 240.0, "s": 1.0, "1": 1.0}
+    for unit, factor in grown.items():
+        assert growth(unit, heavy) == pytest.approx(factor), unit
+        assert growth(unit, loaded) == 1.0, unit
+    known = {p.unit for e in EFFECTS.values() for p in e.parameters.values()}
+    # a unit with a kilogram, newton or metre in it that nobody thought of
+    assert {u for u in known if "N" in u or "kg" in u or u == "m"} <= set(grown)
+    drag = EFFECTS["rotor_drag"].parameters["d_xy"]
+    assert drag.usual(small) == drag.prior
+    assert drag.usual(heavy) == pytest.approx((40 * drag.prior[0], 40 * drag.prior[1]))

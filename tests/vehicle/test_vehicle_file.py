@@ -175,3 +175,35 @@ def test_a_slip_is_one_clear_line(tmp_path, text, reason):
     with pytest.raises(UserError, match=reason) as caught:
         load_vehicle_file(path)
     assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_heavy_vehicle_by_its_mass_and_inertia_has_the_airframes_shape(tmp_path):
+    """1.5 kg, moments of inertia as of a frame with arms of a quarter of a metre."""
+    path = tmp_path / "vehicle.toml"
+    path.write_text("[vehicle]\nmass = 1.5\n")
+    with pytest.raises(UserError, match=r"above 1 kg give vehicle\.inertia .*MJCF"):
+        load_vehicle_file(path)
+    path.write_text("[vehicle]\nmass = 11.0\ninertia = [0.1, 0.1, 0.2]\n")
+    with pytest.raises(UserError, match=r"\[0\.005, 10\] kg"):
+        load_vehicle_file(path)
+    small = load_vehicle_file().vehicle
+    heavier = 1.5 / float(small.mass)
+    longer = 7.0
+    inertia = (np.asarray(small.inertia) * heavier * longer**2).tolist()
+    path.write_text(f"[vehicle]\nmass = 1.5\ninertia = {inertia}\n")
+    vehicle = load_vehicle_file(path).vehicle
+    np.testing.assert_allclose(vehicle.inertia, inertia, rtol=1e-6)
+    np.testing.assert_allclose(vehicle.rotor_position, longer * small.rotor_position, rtol=1e-5)
+    # hover at the same share of the largest thrust, roll torque per inertia as geometry says
+    weight = [float(v.mass / v.thrust_constant) for v in (small, vehicle)]
+    assert weight[1] == pytest.approx(weight[0], rel=1e-5)
+
+
+def test_a_crazyflies_inertia_leaves_its_rotors_alone(tmp_path):
+    path = tmp_path / "vehicle.toml"
+    path.write_text("[vehicle]\nmass = 0.04\ninertia = [2e-5, 2e-5, 3e-5]\n")
+    small = load_vehicle_file().vehicle
+    vehicle = load_vehicle_file(path).vehicle
+    np.testing.assert_allclose(vehicle.inertia, [2e-5, 2e-5, 3e-5], rtol=1e-6)
+    assert float(vehicle.thrust_constant) == float(small.thrust_constant)
+    np.testing.assert_array_equal(vehicle.rotor_position, small.rotor_position)

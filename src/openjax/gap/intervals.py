@@ -41,7 +41,8 @@ def _estimate(v: Estimated, parameter: Parameter, vehicle) -> Estimate:
     ends = (v.value - REACH * v.below, v.value + REACH * v.above)
     value, *interval = np.clip((v.value, *ends), *parameter.limits(vehicle)).tolist()
     may_be_none = bool(ends[0] <= parameter.none <= ends[1])
-    return Estimate(value, parameter.unit, tuple(interval), parameter.prior, may_be_none)
+    usual = parameter.usual(vehicle)
+    return Estimate(value, parameter.unit, tuple(interval), usual, may_be_none)
 
 
 def interval(told: Estimated, parameter) -> tuple[float, float]:

@@ -158,7 +158,8 @@ def practical(fit: SetFit) -> bool:
     return all(
         not CARDS[e].practical
         or any(
-            abs(found[e][p][0] - fit.replay.absent[PLACE[e, p]]) - REACH * found[e][p][1] > size
+            abs(found[e][p][0] - fit.replay.absent[PLACE[e, p]]) - REACH * found[e][p][1]
+            > size * fit.replay.grown[PLACE[e, p]]
             for p, size in CARDS[e].practical.items()
         )
         for e in fit.effects

@@ -37,6 +37,14 @@ CALIBRATED_UNITS = MappingProxyType({
 FAR = 100.0
 """A calibrated value may be this many times the nominal one, or this part of it."""
 
+HEAVY = 1.0
+"""kg, above which the Crazyflie's moments of inertia say nothing of a vehicle."""
+
+SAME_ROTORS = 2.0
+"""A vehicle up to so many times as heavy still flies with the airframe's rotors: they lift twice
+its weight.
+"""
+
 Place = Literal[*NOMINAL_ORDER]
 Spin = Literal["cw", "ccw"]
 Quantity = Literal[*CALIBRATED_UNITS]
@@ -47,9 +55,8 @@ class Overrides:
     """`[vehicles.<id>]`: in what one of a flight's vehicles differs."""
 
     name: str | None = None
-    mass: Annotated[float | None, Interval("[0.005, 1]", "kg")] = (
-        None  # the lightest frame weighs twice that
-    )
+    mass: Annotated[float | None, Interval("[0.005, 10]", "kg")] = None
+    """The lightest frame weighs twice the least; the most is what one person still carries."""
     mass_weighed: bool | None = None
 
 
@@ -58,6 +65,8 @@ class _Vehicle(Overrides):
     """`[vehicle]`."""
 
     airframe: str = NOMINAL
+    inertia: Annotated[tuple[float, float, float] | None, Interval("(0, 10]", "kg m^2")] = None
+    """About the body's x, y and z."""
 
 
 @dataclass(frozen=True)
@@ -256,7 +265,9 @@ def _from_tables(plain: dict, path: Path, dtype) -> VehicleFile:
         for name, entry in tables.calibrated.items()
     }
     return VehicleFile(
-        vehicle=_as_told(nominal, told.mass, replace(motor, spin=spin), calibrated),
+        vehicle=_as_told(
+            _sized(nominal, told, mjcf, root), told.mass, replace(motor, spin=spin), calibrated
+        ),
         name=told.name or _usual_name(told.airframe),
         airframe=told.airframe,
         mass_weighed=bool(told.mass_weighed),
@@ -267,6 +278,32 @@ def _from_tables(plain: dict, path: Path, dtype) -> VehicleFile:
         path=path if path.exists() else None,
         mjcf=mjcf,
     )
+
+
+def _sized(nominal: Vehicle, told: _Vehicle, mjcf: Path | None, root: str) -> Vehicle:
+    """The nominal vehicle with the moments of inertia that the file gives. One that is far heavier
+    or lighter and has no MJCF is taken to be of the same shape: its rotors lift the same multiple
+    of its weight, and its arms are longer as its radius of gyration is. Raises UserError for a
+    heavy one of which the mass alone is known.
+    """
+    if mjcf is None and told.inertia is None and told.mass is not None and told.mass > HEAVY:
+        raise UserError(
+            f"{root}vehicle.mass is {told.mass:g} kg on the airframe {told.airframe!r}: above "
+            f"{HEAVY:g} kg give vehicle.inertia (kg m^2 about x, y, z), or an MJCF as the airframe"
+        )
+    if told.inertia is None:
+        return nominal
+    changes: dict[str, Any] = {"inertia": told.inertia}
+    heavier = 1.0 if told.mass is None else told.mass / float(np.asarray(nominal.mass))
+    if mjcf is None and not 1.0 / SAME_ROTORS <= heavier <= SAME_ROTORS:
+        wider = np.mean(np.asarray(told.inertia) / np.asarray(nominal.inertia)) / heavier
+        longer = float(np.sqrt(wider))
+        changes |= {
+            "rotor_position": longer * np.asarray(nominal.rotor_position),
+            "thrust_constant": heavier * float(np.asarray(nominal.thrust_constant)),
+            "torque_constant": heavier * longer * float(np.asarray(nominal.torque_constant)),
+        }
+    return _changed(nominal, **changes)
 
 
 def _as_told(nominal: Vehicle, mass: float | None, motor: Motor, calibrated: dict) -> Vehicle:

@@ -82,7 +82,7 @@ def fit_set(
     theta = replay.absent.copy()  # what isn't in the set is absent
     for effect in effects:
         own = places((effect,))
-        theta[own] = (_starts(effect, replay.absent)[0] if start is None else start)[own]
+        theta[own] = (_starts(effect, replay)[0] if start is None else start)[own]
     fit = _at(replay, effects, theta)
     for _ in range(rounds if effects else 0):
         before = fit
@@ -95,7 +95,7 @@ def fit_set(
 
 def _at(replay: Replay, effects, theta: np.ndarray, columns=None) -> SetFit:
     """The set with these parameters (P,), linearised there."""
-    index, mean, precision = prior(effects, replay.absent)
+    index, mean, precision = prior(effects, replay.absent, replay.grown)
     columns = replay.linearised(theta, index) if columns is None else columns
     grams = replay.grams(columns)
     off = theta[index] - mean
@@ -105,7 +105,7 @@ def _at(replay: Replay, effects, theta: np.ndarray, columns=None) -> SetFit:
 
 def _descend(fit: SetFit, iterations: int) -> SetFit:
     """Steps of Gauss and Newton, half of one that overshoots, while they gain anything."""
-    index, mean, precision = prior(fit.effects, fit.replay.absent)
+    index, mean, precision = prior(fit.effects, fit.replay.absent, fit.replay.grown)
     reach = 3.0 * np.sqrt(np.diag(np.linalg.inv(precision)))
     share = 1.0
     for _ in range(iterations):
@@ -128,10 +128,8 @@ def model_noise(replay: Replay, library: Library) -> tuple[Replay, dict[str, flo
     once, and what each effect would show if it acted as at its start (nats, nuisances
     marginalised): its exposure.
     """
-    starts = [
-        (effect, theta) for effect in library.physics for theta in _starts(effect, replay.absent)
-    ]
-    index, _, precision = prior(library.physics)
+    starts = [(effect, theta) for effect in library.physics for theta in _starts(effect, replay)]
+    index, _, precision = prior(library.physics, grown=replay.grown)
     columns = replay.linearised(replay.absent, index)
     ahead = np.array([theta for _, theta in starts])
     moved = replay.predict(ahead) if starts else [np.zeros((0, *n.shape)) for n in replay.nominal]
@@ -200,18 +198,21 @@ def fit_singles(replay: Replay, library: Library, exposure) -> dict[str, SetFit]
     return {effect: fit_set(replay, (effect,), _best_start(replay, effect)) for effect in shown}
 
 
-def _starts(effect: str, absent: np.ndarray) -> np.ndarray:
-    """The starts (S, P) of an effect's search, as far from `absent` (P,) as its card says."""
+def _starts(effect: str, replay: Replay) -> np.ndarray:
+    """The starts (S, P) of an effect's search, as far from what the vehicle has while nothing acts
+    as its card says, for a vehicle of this size.
+    """
+    absent = replay.absent
     starts = np.repeat(absent[None], 1 + len(CARDS[effect].others), 0)
     at = places((effect,))
     starts[:, at] = [[p.start for p in CARDS[effect].fitted], *CARDS[effect].others]
-    starts[:, at] += (absent - ABSENT)[at]
+    starts[:, at] = starts[:, at] * replay.grown[at] + (absent - ABSENT)[at]
     return starts
 
 
 def _best_start(replay: Replay, effect: str) -> np.ndarray:
     """Of an effect's starts the one that explains most by itself."""
-    starts = _starts(effect, replay.absent)
+    starts = _starts(effect, replay)
     if len(starts) == 1:
         return starts[0]
     left = [y[None] - p for y, p in zip(replay.measured, replay.predict(starts), strict=True)]

@@ -11,6 +11,7 @@ from scipy.linalg import block_diag
 
 from openjax.errors import UserError, suggestion
 from openjax.vehicle.effects import EFFECTS, Card
+from openjax.vehicle.effects.effect import growth
 
 # {effect: its card}: what can be diagnosed.
 CARDS: dict[str, Card] = {
@@ -76,9 +77,17 @@ def places(effects) -> np.ndarray:
     return np.array([PLACE[e, p.name] for e in effects for p in CARDS[e].fitted], int)
 
 
-def prior(effects, absent: np.ndarray = ABSENT) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def growths(vehicle) -> np.ndarray:
+    """(P,) by what usual sizes of the parameters are multiplied for a vehicle of another size."""
+    own = [growth(EFFECTS[e].parameters[p].unit, vehicle) for e, p in THETA]
+    return np.array([*own, 1.0, 1.0])
+
+
+def prior(
+    effects, absent: np.ndarray = ABSENT, grown: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Indices (p,), mean (p,) and precision (p, p) of the parameters of a set of physics effects,
-    for a vehicle that has `absent` (P,) while nothing acts.
+    for a vehicle that has `absent` (P,) while nothing acts and sizes that are `grown` (P,).
     """
     index = []
     mean = []
@@ -91,4 +100,6 @@ def prior(effects, absent: np.ndarray = ABSENT) -> tuple[np.ndarray, np.ndarray,
         blocks.append(block - BALANCE * block.mean() if card.balanced else block)
     precision = np.linalg.inv(block_diag(*blocks)) if blocks else np.zeros((0, 0))
     index = np.array(index, int)
-    return index, np.array(mean) + (absent - ABSENT)[index], precision
+    size = np.ones(len(index)) if grown is None else grown[index]
+    mean = size * np.array(mean) + (absent - ABSENT)[index]
+    return index, mean, precision / np.outer(size, size)

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from openjax.flights.track import Track
-from openjax.gap.model.library import ABSENT, PLACE, STEP
+from openjax.gap.model.library import ABSENT, PLACE, STEP, growths
 from openjax.gap.model.nuisances import OF_A_BLOCK, SIZE, columns_of
 from openjax.gap.model.prediction import FORCE, RATES, VELOCITY, Physics, make_physics
 from openjax.gap.model.whitening import Noise, first_noise, whiten
@@ -67,6 +67,11 @@ class Replay:
         if self.mixing is None:
             return self.columns
         return [np.tensordot(self.mixing, c, 1) for c in self.columns]
+
+    @cached_property
+    def grown(self) -> np.ndarray:
+        """(P,) by what usual sizes of parameters are multiplied for a vehicle of this size."""
+        return growths(self.physics.vehicles[0])
 
     @cached_property
     def flights(self) -> tuple[str, ...]:
@@ -149,7 +154,7 @@ class Replay:
         theta[index].
         """
         count = len(index)
-        steps = STEP[np.asarray(index, int)]
+        steps = (STEP * self.grown)[np.asarray(index, int)]
         batch = np.repeat(theta[None], count + 1, 0)
         batch[np.arange(count) + 1, index] += steps
         return [

@@ -164,7 +164,7 @@ def with_effects(table: Table, add=(), drop=()) -> Model:
     or go.
     """
     kept = tuple(e for e in table.fit.effects if e not in drop)
-    index, mean, precision = prior(kept, table.fit.replay.absent)
+    index, mean, precision = prior(kept, table.fit.replay.absent, table.fit.replay.grown)
     own = np.array([table.derivative[int(i)] for i in index], int)
     # The set's parameters: coefficients count from where they were fitted.
     mean = mean - table.fit.theta[index] if len(index) else mean
@@ -177,6 +177,7 @@ def with_effects(table: Table, add=(), drop=()) -> Model:
             means.append(np.array([0.0]))
             blocks.append(np.eye(1))
         spread = np.array([p.spread for p in CARDS[effect].fitted])
+        spread = spread * table.fit.replay.grown[places((effect,))]
         inside = [k for k, i in enumerate(places((effect,))) if table.derivative[int(i)] not in own]
         free.append(np.array([table.derivative[int(places((effect,))[k])] for k in inside], int))
         means.append(np.zeros(len(inside)))

@@ -72,6 +72,43 @@ NOT_NEGATIVE: Domain = (0.0, np.inf)
 RATIO: Domain = (0.05, np.inf)
 
 
+# By which powers of the vehicle's mass and of its arm what is usual of a parameter grows, by its
+# unit: forces are shares of the weight, drag over mass is alike (rotors of larger vehicles push
+# more air at the same speed), places of things on a vehicle are shares of its arm. Speeds of the
+# air, times, voltages and shares don't grow.
+GROWTH = {
+    "kg": (1, 0),
+    "N": (1, 0),
+    "N s/m": (1, 0),
+    "N m s/m": (1, 1),
+    "m": (0, 1),
+}
+ALIKE = 2.0  # factor of mass or arm within which a vehicle is a Crazyflie, whose ranges are meant
+
+
+def growth(unit: str, vehicle: Vehicle) -> float:
+    """By what the usual range of a parameter in `unit` is multiplied for a vehicle; 1 for those of
+    about a Crazyflie's size.
+    """
+    if unit not in GROWTH:
+        return 1.0
+    factor = 1.0
+    for power, size in zip(GROWTH[unit], (_mass, _arm), strict=True):
+        ratio = size(vehicle) / size(load_vehicle())
+        factor *= 1.0 if 1.0 / ALIKE <= ratio <= ALIKE else ratio**power
+    return factor
+
+
+def _mass(vehicle: Vehicle) -> float:
+    """kg."""
+    return float(np.asarray(vehicle.mass))
+
+
+def _arm(vehicle: Vehicle) -> float:
+    """m, from the centre of mass to a rotor, on the mean."""
+    return float(np.linalg.norm(np.asarray(vehicle.rotor_position)[:, :2], axis=1).mean())
+
+
 @dataclass(frozen=True)
 class Parameter:
     """A scalar parameter of an effect.
@@ -87,6 +124,12 @@ class Parameter:
     source: str
     meaning: str = ""
     domain: Domain | Callable[[Vehicle], Domain] = (-np.inf, np.inf)
+
+    def usual(self, vehicle: Vehicle) -> tuple[float, float]:
+        """The usual range for a vehicle: what differs from `none` grows with it."""
+        factor = growth(self.unit, vehicle)
+        low, high = (self.none + factor * (end - self.none) for end in self.prior)
+        return (low, high) if factor != 1.0 else self.prior
 
     def limits(self, vehicle: Vehicle | None = None) -> Domain:
         """The domain for a vehicle, by default the nominal one."""
