@@ -4,11 +4,13 @@ here by rotation matrices, independently of the module.
 
 import dataclasses
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from openjax.flights.case import load_case
 from openjax.flights.checks import check_flight
 from openjax.flights.conventions import CONVENTIONS
 from openjax.flights.flight import CHANNEL_COLUMNS
@@ -92,3 +94,31 @@ def test_conventions_leave_what_was_not_logged():
     nothing = Signals(**{f.name: None for f in dataclasses.fields(Signals)})
     for convention in CONVENTIONS:
         assert set(vars(convention.convert(nothing)).values()) == {None}
+
+
+def test_the_pages_recipe_turns_rows_in_ned(tmp_path, sample_columns):
+    """The lines under Rows in NED, on a log in NED with angles."""
+    page = (Path(__file__).parents[2] / "docs" / "log_format.md").read_text(encoding="utf-8")
+    recipe = page.split("### Rows in NED")[1].split("```toml")[1].split("```")[0]
+    (tmp_path / "columns.toml").write_text(recipe)
+    (tmp_path / "vehicle.toml").write_text("")
+    columns = {n: v[:400] for n, v in sample_columns["flight_b"].items() if n != "vbat"}
+    other = into(columns, WORLD, BODY)
+    quaternion = np.stack([other[f"q{a}"] for a in "wxyz"], 1)
+    angles = Rotation.from_quat(quaternion, scalar_first=True).as_euler("ZYX").T
+    names = dict(zip("xyz", ("ned_x", "ned_y", "ned_z"), strict=True))
+    names |= {f"v{a}": f"ned_v{a}" for a in "xyz"} | {f"a{a}": f"frd_a{a}" for a in "xyz"}
+    names |= {"wx": "frd_p", "wy": "frd_q", "wz": "frd_r"}
+    table = {"t": other["t"]} | {new: other[old] for old, new in names.items()}
+    table |= dict(zip(("frd_yaw", "frd_pitch", "frd_roll"), angles, strict=True))
+    table |= {f"m{i}": other[f"m{i}"] for i in (1, 2, 3, 4)}
+    lines = [
+        ",".join(table),
+        *(",".join(f"{v:.9g}" for v in row) for row in zip(*table.values(), strict=True)),
+    ]
+    (tmp_path / "flight.csv").write_text("\n".join(lines))
+    (flight,) = load_case(tmp_path).flights
+    own = flight_of(columns)
+    np.testing.assert_allclose(flight.position, own.position, atol=1e-6)
+    np.testing.assert_allclose(flight.specific_force, own.specific_force, atol=1e-6)
+    np.testing.assert_allclose(np.abs((flight.quaternion * own.quaternion).sum(1)), 1.0, atol=1e-6)
