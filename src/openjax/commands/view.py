@@ -34,6 +34,10 @@ class ViewCommand(FlightOptions):
     """Write the page to this file, to send to somebody, instead of serving it."""
     gif: Path | None = None
     """Write an animation to this file instead, of the first layout with the first policy."""
+    mcap: Path | None = None
+    """Write an MCAP file for Foxglove instead (pip install mcap)."""
+    flights: Path | None = None
+    """A folder of flight logs to write with --mcap, in place of flying policies."""
     port: Annotated[int, Interval("[0, 65535]")] = 8080
     """Where the page is served, on this machine only."""
     browser: bool = True
@@ -47,8 +51,20 @@ def main(arguments: Sequence[str]) -> int:
     command = parse(ViewCommand, ViewCommand(), arguments, PROGRAM)
     check_output(command.html, "--html")
     check_output(command.gif, "--gif")
-    flights = fly_all(command)
+    check_output(command.mcap, "--mcap")
     console = output_console()
+    if command.flights is not None:
+        write_flights(command)
+        console.print(_written(command.mcap))
+        return 0
+    flights = fly_all(command)
+    if command.mcap is not None:
+        from openjax.show.foxglove import trajectory_channels, write_mcap
+
+        names = [f"{Path(policy).name}/{flight.title}" for policy, flight in flights]
+        episodes = zip(names, flights, strict=True)
+        write_mcap(command.mcap, (c for n, f in episodes for c in trajectory_channels(n, f[1])))
+        console.print(_written(command.mcap))
     if command.gif is not None:
         from openjax.show.videos import animate
 
@@ -59,7 +75,7 @@ def main(arguments: Sequence[str]) -> int:
         console.print(
             f"{command.html}: {command.html.stat().st_size / 1e3:,.0f} kB, opens in any browser"
         )
-    if command.gif is None and command.html is None:
+    if command.gif is None and command.html is None and command.mcap is None:
         with page_server(replay_page(flights), command.port) as server:
             address = f"http://localhost:{server.server_port}"
             print(f"{address} (Ctrl-C ends)", flush=True)
@@ -67,6 +83,25 @@ def main(arguments: Sequence[str]) -> int:
                 webbrowser.open(address)
             server.serve_forever()
     return 0
+
+
+def _written(path: Path) -> str:
+    return f"{path}: {path.stat().st_size / 1e3:,.0f} kB, opens in Foxglove"
+
+
+def write_flights(command: ViewCommand) -> None:
+    """Write the flights of a case as MCAP. Raises UserError for an unusable case, or without a
+    file to write to.
+    """
+    from openjax.flights.case import load_case
+    from openjax.flights.foxglove import flight_channels
+    from openjax.show.foxglove import write_mcap
+
+    if command.mcap is None:
+        raise UserError("--flights shows logs in Foxglove: name the file to write, --mcap FILE")
+    nameless = not (command.flights / "vehicle.toml").exists()
+    case = load_case(command.flights, comparison=nameless)  # to look at, any vehicle will do
+    write_mcap(command.mcap, (c for flight in case.flights for c in flight_channels(flight)))
 
 
 def fly_all(command: ViewCommand) -> list[tuple[str, Trajectory]]:
