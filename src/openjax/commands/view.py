@@ -94,7 +94,7 @@ def write_flights(command: ViewCommand) -> None:
     file to write to.
     """
     from openjax.flights.case import load_case
-    from openjax.flights.foxglove import flight_channels
+    from openjax.flights.flight_channels import flight_channels
     from openjax.show.foxglove import write_mcap
 
     if command.mcap is None:
