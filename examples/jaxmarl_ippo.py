@@ -6,9 +6,10 @@ python examples/jaxmarl_ippo.py JaxMARL/baselines/IPPO/ippo_ff_mabrax.py [hydra'
 import runpy
 import sys
 
-import jaxmarl
-
 from openjax.interfaces.jaxmarl import PursuitMultiAgentEnv
+
+# isort: split
+import jaxmarl  # computes while it is imported, so openjax comes first
 
 
 def make(name, **settings):
