@@ -9,7 +9,8 @@ import pytest
 
 from openjax import comparison
 from openjax.commands.diagnose import main
-from openjax.comparison.figures import FlightFigures, mixer_of
+from openjax.comparison.days import spread_of_charge
+from openjax.comparison.figures import PLACES, FlightFigures, mixer_of
 from openjax.comparison.report import in_words, prediction, to_dict
 from openjax.errors import UserError
 from openjax.flights.case import load_case
@@ -226,3 +227,13 @@ def test_the_command_writes_page_and_numbers_and_spares_the_others(folders, tmp_
     assert "<svg" in page and "src=" not in page
     assert "holds no flight log" in capsys.readouterr().err and not (out / "empty").exists()
     assert json.dumps(to_dict(comparison.compare(folders / "rotor", [folders / "monday"])))
+
+
+def test_a_battery_that_nobody_logged_hides_a_tenth_of_hover():
+    def spread(voltage, duty):
+        return spread_of_charge([FlightFigures("a", "monday", {}, voltage, duty)])
+
+    silent = spread(None, True)
+    assert silent[PLACES["hover"]] == pytest.approx(0.1, abs=0.02)
+    assert silent[PLACES["roll"]] == 0.0
+    assert not spread(3.7, True).any() and not spread(None, False).any()

@@ -5,8 +5,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from openjax.commands.sample_flights import Arguments, make_case
+from openjax.flights.case import load_case
 from openjax.gap.channels import Estimated
 from openjax.gap.decision import DECISION
+from openjax.gap.diagnosis import diagnose_case
 from openjax.gap.model.baseline import Baseline, day_of
 from openjax.gap.model.library import ABSENT
 from openjax.gap.reference import differs
@@ -54,3 +57,20 @@ def test_what_is_left_beyond_the_reference_is_judged_by_the_measure_that_grew_mo
     assert changed_p(grown, before) == (pytest.approx(DECISION.unknown), "velocity")
     assert changed_p(before, before)[0] == 1.0
     assert changed_p({"position": 1.0}, before) == (1.0, "")
+
+
+@pytest.mark.slow
+def test_a_slower_motor_is_named_and_one_that_was_as_slow_before_is_no_change(tmp_path):
+    def flown(name, seed, effects):
+        arguments = Arguments(tmp_path / name, effect=effects or ("none",), seed=seed)
+        make_case(arguments)
+        return load_case(tmp_path / name)
+
+    slow = flown("slow", 2, ("motor_lag",))
+    for name, seed, effects, expected in (
+        ("healthy", 1, (), ("motor_lag",)),
+        ("as slow", 3, ("motor_lag",), ()),
+    ):
+        report = diagnose_case(slow, reference=[flown(name, seed, effects)])
+        assert report.effects == expected
+    assert "reference" in report.reference
