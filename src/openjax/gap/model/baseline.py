@@ -13,8 +13,6 @@ import numpy as np
 from openjax.gap.decision import DECISION
 from openjax.gap.model.library import CARDS, PHYSICS_EFFECTS, PLACE, THETA
 from openjax.gap.model.table import Model, Table
-from openjax.vehicle.effects import EFFECTS
-from openjax.vehicle.effects.effect import growth
 
 # Effects that every vehicle has to some degree: what a simulator gets wrong of it on any day. Trims
 # of 1 to 2.5 % of hover were measured over days on published flights of two Crazyflies.
@@ -72,7 +70,6 @@ def day_of(effect: str, parameter: str, vehicle, silent: bool) -> float:
     usual = card.nuisance.get(parameter, 0.0)
     usual = float(usual(vehicle) if callable(usual) else usual)
     spread = np.hypot(next(p.spread for p in card.fitted if p.name == parameter), card.common)
-    spread *= growth(EFFECTS[effect].parameters[parameter].unit, vehicle)
     if card.thrust_map:  # of thrust, all that a day moves is its size
         charge = card.nuisance_duty.get(parameter, 0.0) if silent else 0.0
         return max(charge, card.days or 0.0)

@@ -1,0 +1,76 @@
+"""Seconds that `environment.step` takes to compile, and its speed: `python -m
+experiments.speed.environment_step [--source SRC ...]`.
+
+Each SRC is a folder that holds a package `openjax`, timed in a process of its own and in turns, so
+that two versions are compared on one machine: `git archive COMMIT src assets | tar -x -C DIR`. The
+step is vmapped and runs in a scan, as in anybody's program. Prints a line of JSON for each.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+REPEATS = 3
+"""Runs after the first, of which the fastest counts."""
+
+
+def measure(worlds: int, steps: int, contacts: bool) -> dict:
+    """In this process: seconds to compile, and drone steps a second."""
+    import jax
+
+    import openjax
+
+    jax.config.update("jax_enable_compilation_cache", False)
+    environment = openjax.make(physics="rigid", contacts=contacts)
+    key = jax.random.key(0)
+    state = jax.jit(jax.vmap(environment.reset))(jax.random.split(key, worlds))[1]
+    pursuers = environment.settings.num_pursuers
+    action = 0.1 * jax.random.normal(key, (worlds, pursuers, 4))
+    step = jax.vmap(environment.step, in_axes=(None, 0, 0))
+
+    def fly(state):
+        return jax.lax.scan(lambda s, _: (step(key, s, action)[1], None), state, length=steps)[0]
+
+    began = time.perf_counter()
+    program = jax.jit(fly).lower(state).compile()
+    compiling = time.perf_counter() - began
+    jax.block_until_ready(program(state))
+    seconds = []
+    for _ in range(REPEATS):
+        began = time.perf_counter()
+        jax.block_until_ready(program(state))
+        seconds.append(time.perf_counter() - began)
+    return {
+        "device": jax.devices()[0].device_kind,
+        "compile_seconds": compiling,
+        "drone_steps_a_second": worlds * pursuers * steps / min(seconds),
+    }
+
+
+def main(arguments: list[str]) -> None:
+    """The command."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--source", nargs="+", default=[str(ROOT / "src")])
+    parser.add_argument("--worlds", type=int, default=131_072)
+    parser.add_argument("--steps", type=int, default=50)
+    parser.add_argument("--free", action="store_true", help="without contacts")
+    parser.add_argument("--here", action="store_true", help=argparse.SUPPRESS)
+    options = parser.parse_args(arguments)
+    if options.here:
+        print(json.dumps(measure(options.worlds, options.steps, not options.free)))
+        return
+    for _ in range(2):  # in turns: a machine warms up
+        for source in options.source:
+            command = [sys.executable, __file__, "--here", *arguments]
+            environment = os.environ | {"PYTHONPATH": str(Path(source).resolve())}
+            print(source, flush=True)
+            subprocess.run(command, env=environment, check=True)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
