@@ -240,7 +240,7 @@ def test_nan_stops_the_run_and_leaves_the_state(tmp_path, monkeypatch, capsys, t
     assert status == 1
     report = json.loads((out / "not_finite" / "report.json").read_text())
     assert report["update"] == 4 and all(
-        name.startswith("actor/parameters/") for name in report["leaves"]
+        name.startswith("policy/actor/") for name in report["leaves"]
     )
     assert is_checkpoint(out / "not_finite" / "000000004")
     assert Checkpoints(out / "checkpoints").latest().update == 3
