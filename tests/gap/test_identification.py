@@ -9,7 +9,9 @@ from openjax.gap.identification.estimates import of_fit
 from openjax.gap.identification.quantities import Identification, quantities_of
 from openjax.gap.identification.records import Record
 from openjax.gap.identification.responses import responses
+from openjax.gap.identification.support import support
 from openjax.gap.identification.torques import NAMES, identify_torques
+from openjax.gap.model.library import ABSENT, PLACE
 from openjax.gap.report.response import response_of
 from openjax.vehicle import load_vehicle
 
@@ -52,6 +54,25 @@ def test_slow_motors_are_lag_and_not_inertia(records):
     inertia, inertia_error = found.of("inertia", "xx")
     assert abs(lag - 0.05) < 3.0 * lag_error < 0.045
     assert abs(inertia - 1.0) < 3.0 * inertia_error < 0.4
+
+
+def test_the_search_hears_that_slow_motors_are_no_inertia(records):
+    record = records["slow motors"]
+    found = of_fit(identify_torques([record]), [record])
+
+    def speaks_for(**values):
+        theta = ABSENT.copy()
+        for (effect, parameter), place in PLACE.items():
+            theta[place] = values.get(f"{effect}_{parameter}", theta[place])
+        return support(found, theta, pwm=False)
+
+    lag = speaks_for(motor_lag_extra_up=0.05, motor_lag_extra_down=0.05)
+    assert lag > -3.0
+    assert speaks_for() < lag - 8.0
+    assert speaks_for(inertia_xx=3.0, inertia_yy=3.0) < lag - 8.0
+    # A weaker thrust would turn it less, too.
+    both = {"inertia_xx": 0.8, "inertia_yy": 0.8, "inertia_zz": 0.8, "thrust_scale_scale": -0.2}
+    assert speaks_for(motor_lag_extra_up=0.05, motor_lag_extra_down=0.05, **both) > -5.0
 
 
 def test_motors_logged_late_are_a_clock(records):

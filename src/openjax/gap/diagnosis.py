@@ -36,15 +36,16 @@ def diagnose_case(
     baseline = read_reference(joined(reference), progress) if reference else None
     evidence = gather(case, library(without), progress, baseline)
     if progress:
-        progress("trying every effect that the flights can show")
-    report = conclude(evidence)
-    if progress:
         progress("identifying what the vehicle does")
     sensors = evidence.sensors
     in_time = case_on_gyroscope_clock(case, sensors.motors_late)
-    identification = identify(in_time, sensors.one_clock and sensors.motor_clock)
+    found = identify(in_time, sensors.one_clock and sensors.motor_clock)
+    evidence = replace(evidence, identification=found)
+    if progress:
+        progress("trying every effect that the flights can show")
+    report = conclude(evidence)
     seconds = time.perf_counter() - begin
-    return replace(report, identification=identification, seconds=seconds)
+    return replace(report, identification=found, seconds=seconds)
 
 
 def conclude(evidence: Evidence) -> Report:

@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from openjax.errors import UserError
 from openjax.flights.clocks import on_gyroscope_clock, read_command_clock, read_motor_clock
 from openjax.flights.flight import Case
@@ -13,6 +15,8 @@ from openjax.gap.channels.pose import Pose, read_pose
 from openjax.gap.channels.radio import read_radio
 from openjax.gap.channels.rate_loop import read_rate_loop, with_motors
 from openjax.gap.decision import DECISION
+from openjax.gap.identification.quantities import Identification
+from openjax.gap.identification.support import support
 from openjax.gap.model.baseline import Baseline
 from openjax.gap.model.library import CARDS, Library
 from openjax.gap.model.replay import Replay
@@ -21,7 +25,7 @@ from openjax.gap.model.replay import Replay
 @dataclass(frozen=True, eq=False)
 class Evidence:
     """What was read. `channels`: of pose, radio and rate loop those that were logged; `motion`: the
-    physics.
+    physics; `identification`: what the torques do in closed loop.
     """
 
     case: Case
@@ -32,6 +36,7 @@ class Evidence:
     channels: tuple[Channel, ...]
     motion: Motion
     baseline: Baseline | None = None
+    identification: Identification | None = None
 
     @property
     def replay(self) -> Replay:
@@ -44,6 +49,16 @@ class Evidence:
         """
         silent = any(t.voltage is None for t in self.tracks)
         return silent and self.case.vehicle_file.motor.command == "pwm"
+
+    def support(self, theta: np.ndarray) -> float:
+        """Nats by which the identified torques speak for parameters theta (P,); 0 where they
+        aren't trusted.
+        """
+        found = self.identification
+        if found is None or not found.trusted:
+            return 0.0
+        pwm = self.case.vehicle_file.motor.command == "pwm"
+        return support(found.estimates, theta, pwm)
 
 
 def gather(

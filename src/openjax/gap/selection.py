@@ -44,11 +44,14 @@ ROUNDS = 10  # of the chosen set's last fit, between which nuisances are worked 
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """A fitted set of effects, judged on stretches left out."""
+    """A fitted set of effects, judged on stretches left out; `support`: nats by which the torques'
+    response in closed loop speaks for it.
+    """
 
     fit: SetFit
     judged: Judged
     log_odds: float
+    support: float = 0.0
 
     @property
     def effects(self) -> tuple[str, ...]:
@@ -56,7 +59,7 @@ class Hypothesis:
 
     @property
     def score(self) -> float:
-        return float(self.judged.nats.sum()) + self.log_odds
+        return float(self.judged.nats.sum()) + self.log_odds + self.support
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,7 +198,9 @@ class Search:
         key = frozenset(fit.effects)
         if key not in self.visited:
             table = build(fit, None)
-            self.visited[key] = Hypothesis(fit, judge(table, with_effects(table)), log_odds(key))
+            judged = judge(table, with_effects(table))
+            support = self.evidence.support(fit.theta)
+            self.visited[key] = Hypothesis(fit, judged, log_odds(key), support)
         return self.visited[key]
 
     def of_set(self, effects, near: SetFit) -> Hypothesis:
@@ -264,6 +269,8 @@ class Search:
         """
         gain, error, _ = difference(best.judged, other.judged)
         gaps = (h.judged.squares.sum(0) for h in (other, best, self.nothing))
+        if best.support - other.support > DETECTABLE:
+            return True
         return gain > DECISION.standard_errors * error and bool(matters(*gaps))
 
     def equivalents(self, chosen: Hypothesis, named) -> dict[str, list[str]]:
@@ -293,7 +300,8 @@ class Search:
         odds, costs = np.array([(h.log_odds, h.fit.cost) for h in sets]).T
         pairs = [[difference(a.judged, b.judged) for b in sets] for a in sets]
         _, errors, trust = np.moveaxis(np.array(pairs), 2, 0)
-        density = weights @ np.array([h.judged.nats for h in sets]).T  # (D, sets)
+        response = np.array([h.support for h in sets])
+        density = weights @ np.array([h.judged.nats for h in sets]).T + response  # (D, sets)
         nothing = sets.index(self.nothing)
         chosen = []
         squares = np.einsum("db,sbc->dsc", weights, np.array([h.judged.squares for h in sets]))
@@ -301,6 +309,8 @@ class Search:
             best = int(np.argmax(nats + odds))
             large = matters(square, square[best], square[nothing])
             worse = (nats[best] - nats > DECISION.standard_errors * errors[best]) & large
+            # The response judges by itself: it counts no blocks, and its intervals hold the forms'.
+            worse |= response[best] - response > DETECTABLE
             usual = ~worse & (odds == odds[~worse].max())
             first = int(np.argmax(np.where(usual, nats, -np.inf)))
             evidence = trust[first] * (nats - nats[first]) - costs

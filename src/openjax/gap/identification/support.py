@@ -1,0 +1,54 @@
+"""How well a set of effects agrees with the identified response of the torques.
+
+The replay of the motion gives up what feedback does within a block, and with it most of what a lag
+shows. The identification keeps it. So its estimates count as a measurement of lag, inertia and yaw
+torque beside the replay's, as exact as their intervals and what such vehicles usually differ by.
+"""
+
+import numpy as np
+
+from openjax.gap.identification.estimates import EffectEstimates
+from openjax.gap.model.library import PLACE
+
+USUAL = {"motor_lag": 0.007, "inertia": 0.25, "yaw_torque": 0.3}
+"""s, and as logarithms: what other effects (a used battery, limits of the motors, the floor) do to
+lags and gains, and what vehicles that nobody would call faulty differ by.
+"""
+UNKNOWN_MAP = 0.5
+"""The same of gains where motor commands are duty cycles: the map's slope isn't known."""
+LEAST = 0.05  # of a gain
+HOVER = 0.62  # of the largest thrust, where the slope of a thrust curve is taken
+FARTHEST = 40.0  # nats: no response says more, as forms are never quite the model's
+
+
+def support(estimates: EffectEstimates, theta: np.ndarray, pwm: bool) -> float:
+    """Log density, up to a constant and at most FARTHEST below the best, of the estimates for
+    parameters theta (P,) of the replay.
+    """
+    expected = _expected(estimates, theta)
+    usual = np.array([USUAL[e] for e, _ in estimates.names])
+    gains = np.array([e != "motor_lag" for e, _ in estimates.names])
+    if pwm:
+        usual = np.where(gains, np.hypot(usual, UNKNOWN_MAP), usual)
+    off = estimates.value - expected
+    off[gains] = np.log(estimates.value[gains] / np.maximum(expected[gains], LEAST))
+    scale = np.where(gains, estimates.value, 1.0)
+    covariance = estimates.covariance / np.outer(scale, scale) + np.diag(usual**2)
+    return -min(0.5 * float(off @ np.linalg.solve(covariance, off)), FARTHEST)
+
+
+def _expected(estimates: EffectEstimates, theta: np.ndarray) -> np.ndarray:
+    """What the estimates would be: a weaker thrust turns the vehicle as a larger inertia does."""
+
+    def of(effect, parameter):
+        return float(theta[PLACE[effect, parameter]])
+
+    slope = of("thrust_curve", "slope") + 2.0 * HOVER * of("thrust_curve", "curvature")
+    thrust = max(slope * (1.0 + of("thrust_scale", "scale")), 0.1)
+    out = np.array([of(*name) for name in estimates.names])
+    for number, (effect, _) in enumerate(estimates.names):
+        if effect == "inertia":
+            out[number] /= thrust
+        elif effect == "yaw_torque":
+            out[number] *= thrust / of("inertia", "zz")
+    return out
