@@ -51,9 +51,10 @@ GAMES = {
 def program(settings: PursuitSettings, policy):
     """Compiled episodes of vehicles within bounds (R, 4); see `fly_scripted`."""
 
+    game = Pursuit(settings)
+
     def run(vehicle_bounds, *arguments):
-        duel = Duel(Pursuit(settings, vehicle_bounds=vehicle_bounds), policy)
-        return fly_scripted(duel, *arguments)
+        return fly_scripted(Duel(game.with_bounds(vehicle_bounds), policy), *arguments)
 
     return jax.jit(run)
 

@@ -152,7 +152,7 @@ def evaders() -> TrainSettings:
                 "greedy",
                 "wall_runner",
                 "slow_hugger",
-                *["learned"] * 10,
+                *["learned"] * 8,
             ),
             observe_in="heading",
             min_pillars=0,
@@ -167,14 +167,14 @@ def evaders() -> TrainSettings:
         # from beyond the wall
         mappo=dict(target_kl=0.02, step_subsampling=2, entropy_coefficient=2e-3, penalty_ramp=0.5),
         analytic=dict(updates=100, look_every=20, hold=0.2),
-        evader_learning=dict(past=4),
+        evader_learning=dict(past=3),
         vehicles_start=0.08,
         vehicles_ramp=0.08,
         evaders_start=0.09,
         evaders_ramp=0.12,
         evaders_validation=("field", "heavy", "pillar_hugger"),
-        validation_start=0.9,
-        total_steps=800_000_000,
+        validation_start=1.0,
+        total_steps=450_000_000,
     )
 
 
