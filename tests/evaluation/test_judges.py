@@ -1,0 +1,84 @@
+"""Judges: what their evaders sense, and that one that plans gets away where it can."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from openjax.evaluation.judges.duel import Duel
+from openjax.evaluation.judges.planner import Planner
+from openjax.evaluation.judges.senses import number_of_senses, sense, to_world
+from openjax.evaluation.judges.settings import PlannerSettings
+from openjax.pursuit import turn_task, uniform_task
+from tests.baselines.points import Team, game_of_points
+
+GAME = game_of_points(max_pillars=3, episode_length=80)
+
+
+def straight(observation):
+    """At the evader."""
+    to_evader = -observation.self_state[..., :3]
+    return to_evader / jnp.linalg.norm(to_evader, axis=-1, keepdims=True)
+
+
+def state_of(task):
+    """At the start of a task, everything level and the evader on its way outwards."""
+    state = GAME.reset_to(jax.random.key(1), task)[1]
+    level = jnp.broadcast_to(jnp.array([1.0, 0.0, 0.0, 0.0]), (3, 4))
+    outward = jnp.pad(task.evader_position[:2], (0, 1))
+    drones = state.drones.replace(quaternion=level, velocity=0.1 * task.pursuer_position)
+    # what was seen turns with the world
+    return state.replace(
+        drones=drones, evader_velocity=outward, last_seen=task.evader_position, step=jnp.int32(7)
+    )
+
+
+@pytest.mark.parametrize("world_axes", [True, False])
+def test_in_its_own_axes_a_turned_world_is_the_same(world_axes):
+    task = uniform_task(GAME.settings, jax.random.key(0))
+    # heights turn with nothing: a velocity that has one would tell the worlds apart
+    task = task.replace(pursuer_position=task.pursuer_position.at[:, 2].set(0.5))
+    states = [state_of(task), state_of(turn_task(jax.random.key(2), task))]
+    axes = jnp.bool_(world_axes)
+    sensed = [sense(GAME.settings, state, axes) for state in states]
+    assert sensed[0].size == number_of_senses(3, 3)
+    same = np.allclose(*sensed, atol=1e-5)
+    assert same != world_axes
+    # ahead in its own axes is outwards in the world
+    outward = to_world(jnp.array([1.0, 0.0, 0.0]), states[1], jnp.bool_(False))
+    position = states[1].evader_position
+    np.testing.assert_allclose(outward[:2], position[:2] / jnp.linalg.norm(position[:2]), atol=1e-5)
+
+
+def test_more_slots_sense_pillars_that_are_not_there():
+    state = state_of(uniform_task(GAME.settings, jax.random.key(0)))
+    few = sense(GAME.settings, state, jnp.bool_(False))
+    many = sense(GAME.settings, state, jnp.bool_(False), slots=5)
+    np.testing.assert_array_equal(many[: few.size], few)
+    blind = dataclasses.replace(state.task, pillar_active=jnp.zeros(3, bool))
+    absent = sense(GAME.settings, state.replace(task=blind), jnp.bool_(False))
+    np.testing.assert_array_equal(many[few.size :], absent[-8:])
+
+
+def test_who_plans_gets_away_from_slower_points_in_the_open():
+    """One that hovers is caught by points that fly straight at it; one that plans isn't."""
+    game = game_of_points(
+        arena_radius=10.0, arena_height=10.0, max_speed=1.0, evader_speed=1.3, episode_length=80
+    )
+    duel = Duel(game, Team(straight))
+    task = uniform_task(game.settings, jax.random.key(3))
+    middle = jnp.array([0.0, 0.0, 5.0])
+    around = middle + 0.6 * jnp.array([[1.0, 0.0, 0.0], [-0.5, 0.8, 0.0], [-0.5, -0.8, 0.0]])
+    task = task.replace(
+        evader_position=middle,
+        pursuer_position=around,
+        pillar_active=jnp.zeros_like(task.pillar_active),
+    )
+    start = duel.start(jax.tree.map(lambda leaf: leaf[None], task), jax.random.key(4))
+    still = jax.jit(lambda world: duel.fly({}, world, jnp.zeros((1, 3)), 80))(start)
+    assert still[1].statistics.captured[0]
+    planner = Planner(PlannerSettings(plans=24, piece_steps=10), duel)
+    planned = jax.jit(planner.fly)({}, start, jax.random.key(5))
+    assert not planned.captured[0]
