@@ -37,7 +37,7 @@ def test_days_move_the_trims_and_an_unlogged_battery_moves_the_map_of_thrust():
     vehicle = load_vehicle()
     assert day_of("motor_imbalance", "m1", vehicle, silent=False) > 0.01
     loud, silent = (day_of("thrust_curve", "curvature", vehicle, silent=s) for s in (False, True))
-    assert loud == 0.0 and silent > 0.1
+    assert loud < 0.05 and silent > 0.1
 
 
 @pytest.mark.parametrize(("before", "changed"), [(0.0, True), (0.019, False), (0.04, True)])

@@ -13,6 +13,8 @@ import numpy as np
 from openjax.gap.decision import DECISION
 from openjax.gap.model.library import CARDS, PHYSICS_EFFECTS, PLACE, THETA
 from openjax.gap.model.table import Model, Table
+from openjax.vehicle.effects import EFFECTS
+from openjax.vehicle.effects.effect import growth
 
 # Effects that every vehicle has to some degree: what a simulator gets wrong of it on any day. Trims
 # of 1 to 2.5 % of hover were measured over days on published flights of two Crazyflies.
@@ -70,10 +72,9 @@ def day_of(effect: str, parameter: str, vehicle, silent: bool) -> float:
     usual = card.nuisance.get(parameter, 0.0)
     usual = float(usual(vehicle) if callable(usual) else usual)
     spread = np.hypot(next(p.spread for p in card.fitted if p.name == parameter), card.common)
-    if card.thrust_map:  # of thrust, all that a day moves is its size
-        charge = card.nuisance_duty.get(parameter, 0.0) if silent else 0.0
-        return max(charge, card.days or 0.0)
-    return max(card.days or 0.0, FORM_DAYS * usual, DECISION.form_error * float(spread))
+    spread *= growth(EFFECTS[effect].parameters[parameter].unit, vehicle)
+    charge = card.nuisance_duty.get(parameter, 0.0) if silent and card.thrust_map else 0.0
+    return max(charge, card.days or 0.0, FORM_DAYS * usual, DECISION.form_error * float(spread))
 
 
 def joint(table: Table, model: Model, names, day) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
@@ -89,9 +90,6 @@ def joint(table: Table, model: Model, names, day) -> tuple[np.ndarray, np.ndarra
     days = [day(*n.split(" ")) if n in inside else NUISANCE_DAYS for n in called]
     kept = [k for k, n in enumerate(called) if not n.startswith(OF_A_DAY)]
     covariance = COLOURED * np.linalg.inv(hessian) + np.diag(np.square(days))
-    for effect in (e for e in table.fit.effects if CARDS[e].balanced):  # their mean is thrust's
-        own = [k for k, n in enumerate(called) if n.startswith(f"{effect} ")]
-        covariance[np.ix_(own, own)] -= np.square(days[own[0]]) / len(own)
     return found, covariance[np.ix_(kept, kept)], tuple(called[k] for k in kept)
 
 
