@@ -132,7 +132,7 @@ def _distances(replay: Replay, beliefs: list[Belief]) -> np.ndarray:
         ]
         grams = replay.grams(columns)
         count = len(beliefs)
-        _, _, precision = prior(belief.effects)
+        _, _, precision = prior(belief.effects, grown=replay.grown)
         for flight, gram in enumerate(grams):
             inside = gram[count:, count:] + precision
             taken = np.linalg.solve(inside, gram[count:, :count])
