@@ -66,7 +66,8 @@ def conclude(evidence: Evidence) -> Report:
     weights = Counter()
     for effects, weight in selection.weights.items():
         weights[effects - unnamed] += weight
-    chances = probabilities(present, parts.largest, check.probability, weights)
+    possible = evidence.library.effects
+    chances = probabilities(present, parts.largest, check.probability, weights, possible)
     sure = max((share.interval90[0] for share in parts.effects.values()), default=0.0)
     chances = agreeing(chances, words(check, parts) or ("none",), sure)
     return _report(evidence, selection, check, parts, chances)

@@ -5,17 +5,22 @@ chosen, `selection`), and which part is the largest (the shares' bootstrap). Wha
 sets chosen otherwise, to nothing and to the unknown.
 """
 
+from collections.abc import Collection
+
 from openjax.gap.decision import DECISION
 from openjax.gap.report.rules import NOTHING, SURE_SHARE
 from openjax.vehicle.effects import EFFECTS
 
 
-def probabilities(present, largest, unknown: float, weights) -> dict[str, float]:
+def probabilities(
+    present, largest, unknown: float, weights, possible: Collection[str] = tuple(EFFECTS)
+) -> dict[str, float]:
     """{cause, "none", "unknown": probability of being the strongest}, whose sum is one.
 
     present: {named effect: probability that it acts}. largest: {effect or "unexplained": how often
     it is the largest part}. unknown: probability that what is unexplained is real. weights:
-    {effects: how often that set was chosen}.
+    {effects: how often that set was chosen}. possible: effects that may act; a mass that was
+    weighed may not.
     """
     chance = dict.fromkeys((*EFFECTS, "none", "unknown"), 0.0)
     sure = (1.0 - unknown) if present else 1.0
@@ -31,14 +36,16 @@ def probabilities(present, largest, unknown: float, weights) -> dict[str, float]
     total = sum(shared.values())
     for name, weight in shared.items():
         chance[name] += left * weight / total
-    return reliable(tempered(chance, DECISION.temperature), DECISION.reliability)
+    causes = {*possible, "none", "unknown"}
+    return reliable(tempered(chance, DECISION.temperature), DECISION.reliability, causes)
 
 
-def reliable(chance: dict[str, float], share: float) -> dict[str, float]:
+def reliable(chance: dict[str, float], share: float, causes: Collection[str]) -> dict[str, float]:
     """Probabilities of a choice that is right in no more than a `share` of the cases, however often
-    draws repeat it: what is left goes to all causes alike.
+    draws repeat it: what is left goes to all `causes` alike.
     """
-    return {name: share * p + (1.0 - share) / len(chance) for name, p in chance.items()}
+    alike = (1.0 - share) / len(causes)
+    return {name: share * p + alike * (name in causes) for name, p in chance.items()}
 
 
 def agreeing(chance: dict[str, float], said, sure: float) -> dict[str, float]:
