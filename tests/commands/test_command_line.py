@@ -76,10 +76,10 @@ def test_a_terminal_that_lacks_characters_and_a_full_disk_for_the_output(monkeyp
     [
         ("--num_envs abc", "--num_envs is 'abc'; expected a whole number"),
         ("--minutes soon", "--minutes is 'soon'; expected a number"),
-        ("--learning.seeds 2", "unknown setting --learning.seeds; did you mean --seeds?"),
+        ("--learning.learners 2", "unknown setting --learning.learners; did you mean --learners?"),
         ("--capture_radius 1", "did you mean --environment.capture_radius?"),
         ("--environment.physics bullet", "Expected one of"),
-        ("--seeds 65", "seeds is 65; it must be a whole number in"),
+        ("--learners 65", "learners is 65; it must be a whole number in"),
     ],
 )
 def test_a_mistyped_option_is_told_what_would_be_right(typed, told):

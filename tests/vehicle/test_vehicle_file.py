@@ -156,7 +156,7 @@ def test_an_mjcf_of_ones_own_goes_where_its_vehicle_file_goes(tmp_path):
             "motor.order",
         ),
         ("[motor]\nspin = ['cw', 'cw', 'cw', 'ccw']", "motor.spin"),
-        ("[vehicle]\nmass = 32.1", "it must be in .0.005, 1. kg"),
+        ("[vehicle]\nmass = 32.1", "it must be in .0.005, 10. kg"),
         ("[vehicle]\nmass = -1", "it must be in"),
         ("[vehicle]\nmass = nan", "finite number"),
         ("[vehicle]\nmass_weighed = 'yes'", "expected true or false"),
