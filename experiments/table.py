@@ -1,16 +1,17 @@
 """One manner for all studies: measure, store what was found as JSON, make the page from what is
 stored.
 
-from experiments.table import Page, Table, page_parser, publish
+    from experiments.table import Page, Table, page_parser, publish
 
-def study(options) -> dict: ...            # what is stored, beside command, machine, commit and
-seconds
-def page(results) -> Page:                         # what is read from there
-    columns = {"policy": "name", "capture": "summary.capture_rate:.3f", "step": "capture_step:.0f"}
-    return Page("Policies on other vehicles", "No clamp, drawn starts.", Table(columns,
-    results["records"]))
+    def study(options) -> dict:  # what is stored, beside command, machine, commit and seconds
+        ...
 
-publish(page_parser(__doc__, "vehicles").parse_args(arguments), study, page)
+    def page(results) -> Page:  # what is read from there
+        columns = {"policy": "name", "capture": "summary.capture_rate:.3f"}
+        records = Table(columns, results["records"])
+        return Page("Policies on other vehicles", "No clamp, drawn starts.", records)
+
+    publish(page_parser(__doc__, "vehicles").parse_args(arguments), study, page)
 
 `--report` prints every table of what is stored. A page of results has one of them, between two
 marks, in words that somebody wrote: those stay, and the table between the marks is made anew.

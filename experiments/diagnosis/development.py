@@ -1,8 +1,8 @@
 """Diagnose sets of cases with known answers, in parallel processes: one JSON line a case, and one
 table.
 
-    python -m experiments.diagnosis.development --sets DIR DIR=ANSWERS.json … --cores 2 --out
-    cases.jsonl python -m experiments.diagnosis.development --report cases.jsonl …
+    python -m experiments.diagnosis.development --sets DIR DIR=ANSWERS.json … --out cases.jsonl
+    python -m experiments.diagnosis.development --report cases.jsonl …
 
 A set is a folder of cases (folders of logs with a vehicle.toml); its answers lie in
 DIR/answers.json, in DIR_answers.json beside it or are named. Lines are written as cases end, so

@@ -145,8 +145,6 @@ def page(results: dict) -> Page:
     for name, own in by_policy.items():
         if name[0] == DEFAULT_POLICY:
             parts.append(by_evader(own, f"{name[0]}, {name[1]} game, {name[2]} vehicle"))
-    if "responses" in results:
-        parts.append(learned_ones(results["responses"]))
     if "runs" in results:
         parts.append(whole_runs(results["runs"]))
     parts += told(results, "tried", "What else was tried") + told(
@@ -275,38 +273,6 @@ def whole_runs(runs: list[dict]) -> Table:
     prose = "Tasks of the validation, never trained on, with drawn vehicles: a run's best and its last. s counts compilation."
     title = f"Training, validated against field, {', '.join(VALIDATED)}"
     return Table(columns, rows, title=title, prose=prose)
-
-
-def learned_ones(responses: list[dict]) -> Table:
-    """What `openjax exploit --json` wrote of each policy: the least captures of a scripted and of a
-    learned evader.
-    """
-    rows = []
-    for response in responses:
-        last = response["curve"][-1]
-        row = {"policy": response["policy"], "millions": last["steps"] / 1e6}
-        row["own"] = ", ".join(f"{rate:.3f}" for rate in last["capture_rate"])
-        for kind in dict.fromkeys(record["scenario"] for record in response.get("records", ())):
-            own = [record for record in response["records"] if record["scenario"] == kind]
-            rates = [(r["evader"].startswith("learned"), r["capture_rate"]) for r in own]
-            least = [min(rate for by, rate in rates if by == learned) for learned in (False, True)]
-            row[kind] = ", ".join(f"{rate:.3f}" for rate in least)
-        rows.append(row)
-    columns = {
-        "policy": "policy",
-        "M steps a seed": "millions:.0f",
-        "at last, while they learned": "own",
-    }
-    columns |= {name: name for name in [*SCENARIOS, "uniform"]}
-    prose = (
-        "Captures of each of three evaders in the last episodes of their training, half of them on "
-        "the layouts (`openjax "
-        "exploit`); then of the worst scripted evader, of the best of the learned ones, with the "
-        "vehicles that the policy was "
-        "trained on. A learned evader that is caught more often than a scripted one is no best "
-        "response."
-    )
-    return Table(columns, rows, title="Against evaders that learned", prose=prose)
 
 
 def main(arguments: list[str]) -> int:

@@ -2,7 +2,7 @@
 
 Each FILE is what `openjax exploit --policy NAME --json FILE` wrote: evaders that learned against
 the policy, one that plans in the true simulation, and the scripted ones. None of them trained the
-pursuers. Stores the least capture rate of each kind, and makes the table of evaders.md.
+pursuers. Stores the least capture rate of each kind, and makes the table of judged.md.
 """
 
 from collections.abc import Callable, Mapping

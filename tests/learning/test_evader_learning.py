@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 
 from openjax import make
+from openjax.errors import UserError
 from openjax.learning.evader_learning import EvaderLearning
+from openjax.learning.presets import preset
 from openjax.learning.settings import EvaderLearningSettings
 from openjax.pursuit import uniform_task
 from openjax.pursuit.evaders import init_network, scene_of
@@ -210,3 +212,8 @@ def test_earlier_selves_fly_and_learn_nothing(worlds):
     chex.assert_trees_all_equal(second, drawn)
     moved = jnp.abs(first["output"]["kernel"] - start.actor["output"]["kernel"][0]).max()
     assert moved > 0.0
+
+
+def test_somebody_has_to_learn():
+    with pytest.raises(UserError, match=r"past 2 leaves none of 2 .* at most 1"):
+        preset("evaders", environment={"evaders": ("learned",) * 2}, evader_learning={"past": 2})

@@ -142,7 +142,7 @@ def flight() -> TrainSettings:
 def evaders() -> TrainSettings:
     """Policies to be flown after evaders that fight back: first the paper's, then scripted ones,
     slow at first, and some that learn while the pursuers do, beside their earlier selves. One run
-    for one large accelerator; how far it has been flown: experiments/results/evaders.md.
+    for one large accelerator; how far it has been flown: experiments/results/judged.md.
     """
     return changed(
         flight(),

@@ -334,9 +334,16 @@ class TrainSettings:
             f"restart_steps {self.restart_steps} must be a multiple of rollout_length {rollout}",
         )
         hold = self.evader_learning.hold
+        learned = self.environment.evaders.count("learned")
         yield (
-            "learned" not in self.environment.evaders or rollout % hold == 0,
+            not learned or rollout % hold == 0,
             f"evader_learning.hold {hold} must divide rollout_length {rollout}",
+        )
+        past = self.evader_learning.past
+        yield (
+            not learned or past < learned,
+            f"evader_learning.past {past} leaves none of {learned} learned evaders that learns; at "
+            f"most {learned - 1} would be right",
         )
         yield (
             self.restart_every or not self.restart_close,

@@ -24,7 +24,7 @@ from openjax.runs.options import MAY_CHANGE, PROGRAM, TrainCommand
 from openjax.runs.words import different_settings, opening_words
 from openjax.store.checkpoints import Checkpoints
 from openjax.store.compiled_programs import cache_programs
-from openjax.store.environments import make_environment
+from openjax.store.environments import is_evader_file, make_environment
 from openjax.store.policies import known_policies
 from openjax.store.run_directory import RunDirectory, check_free, create_run, locked, open_run
 from openjax.vehicle.vehicle_file import copy_vehicle_file, load_vehicle_file
@@ -170,8 +170,9 @@ def _has_begun(run):
 def _environment(game, files):
     """The game with what `files` say; those that needn't be kept become None."""
     environment = make_environment(game, *files.values())
-    # a scripted evader, or a vehicle that is known by name, is in the settings
-    if environment.evader_networks is None:
+    # a scripted evader, or a vehicle that is known by name, is in the settings; a function isn't in
+    # any file of the run
+    if not is_evader_file(files["evader.npz"]):
         files["evader.npz"] = None
     if files["vehicle.toml"] and load_vehicle_file(files["vehicle.toml"]).path is None:
         files["vehicle.toml"] = None
@@ -279,7 +280,7 @@ def check_resumed(command: TrainCommand, stored: TrainSettings) -> None:
     if command.overwrite:
         raise UserError("--resume and --overwrite exclude each other")
     options = ["start_from", "effects", "vehicle", "opponent"]
-    if "own" in stored.environment.evaders:
+    if "own" in stored.environment.evaders and open_run(resume).optional("evader.npz") is None:
         options.remove("opponent")  # a function isn't in the run's files
     given = [name for name in options if getattr(command, name) is not None]
     for name in (*given, *different_settings(command.settings, stored)):

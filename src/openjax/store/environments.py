@@ -76,6 +76,12 @@ def make_environment(
     )
 
 
+def is_evader_file(opponent: Any) -> bool:
+    """Whether it is a file that `openjax exploit` wrote, neither a scripted evader's name nor code."""
+    named = isinstance(opponent, str | Path) and str(opponent) not in SCRIPTED
+    return named and not is_own_code(opponent)
+
+
 def is_own_code(name: Any) -> bool:
     """Whether it names a function in a Python file, `FILE.py:function`."""
     return isinstance(name, str) and ".py:" in name

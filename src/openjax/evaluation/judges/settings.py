@@ -91,4 +91,4 @@ class PlannerSettings:
     """
 
     def __post_init__(self):
-        check_intervals(self, "planner.")
+        check_intervals(self, "planning.")
