@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.diagnosis import decisions, truth
+from experiments.diagnosis import truth
 from experiments.diagnosis.figures import figures_table, misses
 from experiments.diagnosis.healthy import healthy_beside
 from experiments.diagnosis.magnitudes import parameters
@@ -53,7 +53,6 @@ def diagnose(job: tuple) -> dict:
     global _done
     place, folder, answer, options = job
     options = dict(options)
-    kept = options.pop("kept", None)
     healthy = options.pop("healthy", False)
     true = truth.truth_of(answer)
     start = time.perf_counter()
@@ -90,8 +89,6 @@ def diagnose(job: tuple) -> dict:
     line |= {"severity": answer.get("severity"), "magnitudes": parameters(answer, report)}
     line |= {"broken_rules": broken}
     line |= {"seconds": seconds, "first": _done == 1, "error": error, "traceback": trace}
-    if kept and report:
-        decisions.keep(made, line, Path(kept))
     fields = (
         "probabilities",
         "shares",
@@ -146,16 +143,14 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--seconds", type=float, help="stop then; what is done counts")
     parser.add_argument("--report", nargs="+", type=Path, default=[], help="tables of stored lines")
     parser.add_argument("--healthy", action="store_true", help="use DIR_healthy as references")
-    parser.add_argument("--kept", type=Path, help="where `decisions` are stored")
     options = parser.parse_args(arguments)
-    more = {"healthy": options.healthy, "kept": str(options.kept) if options.kept else None}
     if options.sets:
         done = (
             {(r["set"], r["case"]) for r in read_lines([options.out])}
             if options.out.exists()
             else ()
         )
-        jobs = find_jobs(options.sets, options.engine_options | more)
+        jobs = find_jobs(options.sets, options.engine_options | {"healthy": options.healthy})
         jobs = [job for job in jobs if (job[0], job[1].name) not in done]
         if jobs:
             run(jobs, options.cores, options.out, options.seconds)

@@ -6,8 +6,7 @@
 Cases of one column are flown anew from the seeds, beside the sets that are given. An engine is a
 folder that holds the package `openjax`; `NAME=FOLDER+reference` gives it the flights of the same
 vehicle while nothing was wrong with it, flown with `--healthy`. Differences of two engines are
-tested by McNemar's exact test on the cases that only one of them has right. `--kept FOLDER` stores
-what each decision was made of, for trying other rules on development cases.
+tested by McNemar's exact test on the cases that only one of them has right.
 """
 
 import argparse
@@ -46,8 +45,6 @@ def diagnose(name: str, engine: str, sets: list[str], options) -> list[dict]:
     command = [sys.executable, "-m", "experiments.diagnosis.development", "--sets", *sets]
     command += ["--cores", str(options.cores), "--out", str(out)]
     command += ["--healthy"] if reference else []
-    keep = options.kept and here == ROOT
-    command += ["--kept", str(options.kept.resolve() / name)] if keep else []
     command += ["--seconds", str(options.seconds)] if options.seconds else []
     environment = dict(os.environ, PYTHONPATH=str(Path(source).resolve()))
     subprocess.run(command, cwd=here, check=True, env=environment)
@@ -129,7 +126,6 @@ def main() -> None:
     parser.add_argument("--cores", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--seconds", type=float, help="for each engine; what is done counts")
     parser.add_argument("--work", type=Path, default=Path("runs/paired"))
-    parser.add_argument("--kept", type=Path)
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()
     found = study(options)
