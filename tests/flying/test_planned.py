@@ -10,7 +10,7 @@ from openjax.flying.estimation import see
 from openjax.flying.planned import PlannedFlight
 from openjax.flying.safety import decide
 from openjax.flying.set_point import from_action
-from openjax.flying.state import Drone, Event, Mode, Request, initial_state
+from openjax.flying.state import Drone, Event, Mode, Request, SafetySettings, initial_state
 from openjax.pursuit.environment import THRUST_LIMIT
 from openjax.vehicle import load_vehicle
 from openjax.virtual_crazyflie.simulated import SimulatedSwarm
@@ -25,7 +25,8 @@ def flown(segments, effects=None):
     vehicles = VirtualVehicles(vehicle, plan.position[:1], effects)
     swarm = SimulatedSwarm(vehicles, [True], lambda i, t, p: p, lambda i, t, p: None)
     start = tuple(plan.position[0].tolist())
-    state = initial_state([start], [], game.airframe)
+    # the simulated estimate is the truth, so nothing has to end a flight of two minutes
+    state = initial_state([start], [], game.airframe, SafetySettings(alone_time=1e9))
     state = state._replace(drones=(Drone(Mode.PURSUIT),))
     positions = []
     play = None

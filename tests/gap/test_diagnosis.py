@@ -18,6 +18,7 @@ from openjax.flights.case import load_case
 from openjax.flights.reading import write_csv
 from openjax.flights.regimes import REGIMES
 from openjax.flights.samples import fly, log_of, references
+from openjax.gap.decision import DECISION
 from openjax.gap.diagnosis import diagnose_case, not_testable
 from openjax.gap.evidence import gather
 from openjax.gap.model.library import library
@@ -129,7 +130,8 @@ def test_a_pose_some_milliseconds_late_is_a_nuisance(reports):
 def test_a_known_cause_is_named_with_its_size(reports):
     report = reports["drag"]
     assert report.verdict == "effect" and report.effects == ("rotor_drag",)
-    assert report.probabilities["rotor_drag"] > 0.8
+    # no name is surer than stable choices are right
+    assert report.probabilities["rotor_drag"] > 0.9 * DECISION.reliability
     estimate = report.parameters["rotor_drag"]["d_xy"]
     assert estimate.value == pytest.approx(DRAG["d_xy"], rel=0.1)
     # 90 % intervals may miss; three half-widths may not.
