@@ -141,12 +141,6 @@ class BestResponse:
         tasks = jax.vmap(self.draw_task)(jax.random.split(task_key, number))
         return self.duel.start(tasks, reset_key)
 
-    def _sense(self, evaders, state):
-        """(L, E, F) of worlds (L * E, ...)."""
-        axes = jnp.repeat(evaders.world_axes, self.settings.num_envs)
-        sensed = jax.vmap(functools.partial(sense, self.game))(state, axes)
-        return sensed.reshape(self.settings.learners, self.settings.num_envs, -1)
-
     def _decide(self, parameters, evaders, fresh, world, key):
         """Worlds after a decision, and the decision.
 
@@ -154,12 +148,11 @@ class BestResponse:
         it is caught twice in a rollout, at the same one again.
         """
         hold = self.settings.hold
-        sensed = self._sense(evaders, world[1])
+        sensed = _sense(self.game, evaders, world[1])
         mean = apply_network(evaders.actor, sensed)
         log_std = evaders.log_std[:, None]
         sample = mean + jnp.exp(log_std) * jax.random.normal(key, mean.shape)
-        axes = jnp.repeat(evaders.world_axes, self.settings.num_envs)
-        velocity = jax.vmap(to_world)(sample.reshape(-1, 3), world[1], axes)
+        velocity = _in_world(evaders, sample, world[1])
         world = self.duel.fly(parameters, world, velocity, hold)
         state = world[1]
         caught = state.statistics.captured
@@ -216,7 +209,7 @@ class BestResponse:
         sensed = self._by_learner(decisions.sensed)  # (T, L, E, F)
         of_steps = jax.vmap(lambda sensed: apply_network(evaders.critic, sensed)[..., 0])
         value = of_steps(sensed)  # (T, L, E)
-        last = apply_network(evaders.critic, self._sense(evaders, state))[..., 0]
+        last = apply_network(evaders.critic, _sense(self.game, evaders, state))[..., 0]
         discount = evaders.discount[:, None]
         free = self._by_learner(decisions.free)
         over = self._by_learner(decisions.over)
@@ -271,17 +264,32 @@ def fly_learners(
     """Statistics (L, B): an episode of each learner, without noise, from each of B starts."""
     game = duel.environment.settings
     learners = evaders.world_axes.size
-    axes = jnp.repeat(evaders.world_axes, start[1].step.size)
 
     def one(world, _):
-        sensed = jax.vmap(functools.partial(sense, game))(world[1], axes)
-        mean = apply_network(evaders.actor, sensed.reshape(learners, -1, sensed.shape[-1]))
-        velocity = jax.vmap(to_world)(mean.reshape(-1, 3), world[1], axes)
+        mean = apply_network(evaders.actor, _sense(game, evaders, world[1]))
+        velocity = _in_world(evaders, mean, world[1])
         return duel.fly(parameters, world, velocity, hold), None
 
     world = copies(start, learners)
     statistics = jax.lax.scan(one, world, length=game.episode_length // hold)[0][1].statistics
     return jax.tree.map(lambda leaf: leaf.reshape(learners, -1), statistics)
+
+
+def _axes(evaders, state):
+    """(L * B,) whether the evader of each world (L * B, ...) sees in the world's axes."""
+    learners = evaders.world_axes.size
+    return jnp.repeat(evaders.world_axes, state.step.size // learners)
+
+
+def _sense(game, evaders, state):
+    """(L, B, F) what each learner's evaders sense in worlds (L * B, ...)."""
+    sensed = jax.vmap(functools.partial(sense, game))(state, _axes(evaders, state))
+    return sensed.reshape(evaders.world_axes.size, -1, sensed.shape[-1])
+
+
+def _in_world(evaders, decided, state):
+    """(L * B, 3) decisions (L, B, 3) in the axes of worlds (L * B, ...)."""
+    return jax.vmap(to_world)(decided.reshape(-1, 3), state, _axes(evaders, state))
 
 
 def _log_prob(sample, mean, log_std):
