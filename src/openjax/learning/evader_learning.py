@@ -79,10 +79,9 @@ class EvaderLearning:
 
     @property
     def number(self) -> int:
-        """Networks; 0: none learns, as the game names none, or brings their networks with it."""
-        brought = self.environment.evader_networks is not None
+        """Networks; 0: none learns, as the game names none."""
         named = self.environment.settings.evaders.count("learned")
-        return 0 if brought or not named else named - self.how.past
+        return named - self.how.past if named else 0
 
     @functools.cached_property
     def optimiser(self) -> optax.GradientTransformation:

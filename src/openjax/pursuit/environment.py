@@ -2,7 +2,7 @@
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import chex
 import jax
@@ -117,10 +117,6 @@ class Pursuit:
     evader_share: jax.Array | None = None
     """() from 0 to 1, how far a curriculum over `settings.evaders` has come; None is 1. See
     `openjax.pursuit.evaders`.
-    """
-    evader_networks: Any = None
-    """Parameters of the learned evaders (`openjax.pursuit.evaders.learned`) that the settings name,
-    with their axis first; None: they do as the greedy one.
     """
     dynamics: Dynamics | None = None
     """What moves the pursuers; None: the physics that the settings name, with the effects."""
@@ -349,9 +345,7 @@ class Pursuit:
         task = state.task
         before = state
         pillars = (task.pillar_position, task.pillar_active)
-        velocity, evader_state = evader_velocity(
-            settings, self.evader_rows, before, self.evader_networks, wish
-        )
+        velocity, evader_state = evader_velocity(settings, self.evader_rows, before, wish)
         evader = before.evader_position + settings.time_step * velocity
         step = before.step + 1
         position = drones.position

@@ -114,7 +114,7 @@ class TrainingJob:
         """
         game = self.environment
         settings = dataclasses.replace(self.settings, seed=0)
-        arrays = jax.tree.leaves((game.vehicle, game.effect_parameters, game.evader_networks))
+        arrays = jax.tree.leaves((game.vehicle, game.effect_parameters))
         arrays = [np.asarray(leaf).tolist() for leaf in arrays]
         names = str(jax.tree.structure(game.effect_parameters))
         return repr((self.devices, settings, game.settings, game.effects, names, arrays))

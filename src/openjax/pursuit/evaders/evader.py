@@ -2,9 +2,6 @@
 velocity in each step.
 """
 
-import functools
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,7 +11,7 @@ from openjax.pursuit.evaders.behaviours import BEHAVIOURS, MEMORY, Scene, into_f
 from openjax.pursuit.evaders.evader_state import EvaderState
 from openjax.pursuit.evaders.field import field_velocity
 from openjax.pursuit.evaders.kinds import NUMBERS, UNBOUNDED, EvaderKind, evader_rows
-from openjax.pursuit.evaders.learned import STEPS, learned, learned_place, learning
+from openjax.pursuit.evaders.learned import STEPS, learning
 from openjax.pursuit.settings import PursuitSettings
 from openjax.pursuit.state import PursuitState
 
@@ -94,7 +91,6 @@ def evader_velocity(
     settings: PursuitSettings,
     rows: tuple[EvaderKind, ...],
     world: PursuitState,
-    networks: Any = None,
     wish: jax.Array | None = None,
 ) -> tuple[jax.Array, EvaderState | None]:
     """(3,) velocity (m/s, world) of the evader of a world in this step, and its state after it.
@@ -106,8 +102,6 @@ def evader_velocity(
       settings: the game.
       rows: its evaders.
       world: before this step.
-      networks: parameters of the learned evaders among the settings', their axis first; None: they
-      do as the greedy one.
       wish: (3,) a velocity, as a share of its speed, that is flown in place of its own; None or NaN
       is its own.
     """
@@ -118,7 +112,7 @@ def evader_velocity(
     if state is None:
         velocity = _flown(settings, world, settings.evader_speed, UNBOUNDED, wish)
         return jnp.where(jnp.any(jnp.isnan(wish)), _field(settings, world), velocity), None
-    own, memory = _wish(settings, rows, world, networks)
+    own, memory = _wish(settings, rows, world)
     is_own = jnp.ones((), bool) if wish is None else jnp.any(jnp.isnan(wish))
     speed = state.numbers["speed"] * settings.evader_speed
     wish = own if wish is None else jnp.where(is_own, own, wish)
@@ -161,14 +155,12 @@ def _field(settings, world):
     return field_velocity(settings, *places, world.in_sight, *_pillars(world))
 
 
-def _wish(settings, rows, world, networks):
+def _wish(settings, rows, world):
     """Wish (3,) and memory of an evader with a behaviour; of the paper's something finite."""
     state = world.evader
-    which = learned_place(settings.evaders, state.kind)
-    by_network = learning if networks is None else functools.partial(learned, networks, which)
     behaviours = [row.behaviour for row in rows]
     own = {row.behaviour: _of_own(row) for row in rows if callable(row.behaviour)}
-    known = {**BEHAVIOURS, "learned": by_network, **own}
+    known = {**BEHAVIOURS, "learned": learning, **own}
     used = [name for name in known if name in behaviours]
     place = np.array([used.index(name) if name in used else 0 for name in behaviours], np.int32)
     # mapped over worlds, a switch works all of them out and selects: each behaviour stands in it

@@ -150,12 +150,3 @@ def learning(scene: Scene, memory: jax.Array) -> tuple[jax.Array, jax.Array]:
     memory goes on.
     """
     return greedy(scene, memory)[0], remember(scene, memory)
-
-
-def learned(
-    networks: dict[str, Any], which: jax.Array, scene: Scene, memory: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """The behaviour of the network that `which` () names, without exploration."""
-    wish = outputs_of(networks, which, features(networks, which, scene, memory))[0]
-    size = jnp.sqrt(jnp.sum(wish**2) + 1e-12)
-    return wish / jnp.maximum(size, 1.0), remember(scene, memory)
