@@ -13,9 +13,19 @@ from openjax.errors import UserError
 from openjax.flights.agreement import shown_right
 from openjax.flights.checks import check_flight, duplicates
 from openjax.flights.flight import Case, Flight, Issue
-from openjax.flights.importers import MAPPING_FILE, ColumnMapping, find_logs, load_mapping, read_log
+from openjax.flights.importers import (
+    MAPPING_FILE,
+    ColumnMapping,
+    find_logs,
+    importers,
+    load_mapping,
+    read_log,
+)
 from openjax.flights.reading import LogError, flights_of
 from openjax.vehicle.vehicle_file import VehicleFile, load_vehicle_file
+
+NO_LOGS = ("vehicle.toml", MAPPING_FILE)
+SHOWN = 3  # files that are named where none is a log
 
 
 def load_case(path: str | Path, dtype=jnp.float32, comparison: bool = False) -> Case:
@@ -32,10 +42,7 @@ def load_case(path: str | Path, dtype=jnp.float32, comparison: bool = False) -> 
         raise UserError(f"{path}: {what}; a case is a folder of flight logs with a vehicle.toml")
     logs = find_logs(path)
     if not logs:
-        raise UserError(
-            f"{path}: holds no flight log (.csv, .csv.gz, micro-SD log or ROS 2 "
-            f"bag){_cases_inside(path)}"
-        )
+        raise UserError(f"{path}: holds no flight log{_held_instead(path)}{_cases_inside(path)}")
     described = (path / "vehicle.toml").exists()
     if not described and not comparison:
         raise UserError(f"{path}: no vehicle.toml; an empty one there means the nominal Crazyflie")
@@ -53,6 +60,14 @@ def load_case(path: str | Path, dtype=jnp.float32, comparison: bool = False) -> 
     weighed = all(vehicle_file.mass_weighed_of(flight.vehicle) for flight in kept)
     vehicle_file = dataclasses.replace(vehicle_file, mass_weighed=weighed)
     return Case(path.resolve().name, tuple(kept), vehicle_file, tuple(issues), path)
+
+
+def _held_instead(path: Path) -> str:
+    """What a folder without a log holds, in words, and what a log is."""
+    others = sorted(file.name for file in path.iterdir() if file.name not in NO_LOGS)
+    known = f"known are {', '.join(importer.name for importer in importers())}"
+    shown = ", ".join(others[:SHOWN]) + f" and {len(others) - SHOWN} more" * (len(others) > SHOWN)
+    return f": {known}; it holds {shown}" if others else f"; {known}"
 
 
 def _cases_inside(path):

@@ -9,7 +9,7 @@ import numpy as np
 from openjax.flights.agreement import check_agreement, other_frames
 from openjax.flights.attitude import derive_attitude
 from openjax.flights.derived import derive_rates, derive_velocity, mend_velocity
-from openjax.flights.flight import Flight, Issue, Refused
+from openjax.flights.flight import CHANNEL_COLUMNS, Flight, Issue, Refused
 from openjax.flights.sampling import drop_frozen, drop_repeats, put_in_step, runs_of
 
 SHORTEST = 2.0  # s airborne: windows of 0.5 s, and a few of them
@@ -91,8 +91,8 @@ def _in_time(flight: Flight, note) -> Flight:
         flight = flight.rows(finite)
         time = flight.time
     if len(time) < 20:
-        raise Refused("short", f"only {len(time)} rows")
-    flight = _sorted(flight, note)
+        raise Refused("short", f"only {len(time)} row{'s' * (len(time) != 1)}")
+    flight = _sorted(_written_once(flight, note), note)
     repeated = np.diff(flight.time) == 0
     if repeated.mean() > 0.2:
         text = f"{repeated.mean():.0%} of the rows repeat the time of the row before (frozen clock)"
@@ -112,19 +112,44 @@ def _in_time(flight: Flight, note) -> Flight:
 
 
 def _sorted(flight: Flight, note) -> Flight:
-    """A few rows out of order are sorted; more are several recordings."""
+    """Rows out of order are sorted: a few, or any number of one recording, whose rows are then
+    evenly apart. Others are several recordings.
+    """
     steps = np.diff(flight.time)
     backwards = int((steps < 0).sum())
     if not backwards:
         return flight
-    if (steps < -1.0).any() or backwards > 0.05 * len(flight.time):
+    few = (steps >= -1.0).all() and backwards <= 0.05 * len(flight.time)
+    in_order = _written_once(flight.rows(np.argsort(flight.time, kind="stable")), note)
+    if not few and not _even(in_order.time):
         at = flight.time[int(np.argmin(steps))]
         text = (
-            f"time runs backwards (after t = {at:g}): unsorted, or several recordings in one file"
+            f"time runs backwards (after t = {at:g}): several recordings in one file, or unsorted"
         )
-        raise Refused("time", text)
+        raise Refused("time", f"{text}; one flight, one file, by time")
     note("time", f"{backwards} rows out of order in time were sorted")
-    return flight.rows(np.argsort(flight.time, kind="stable"))
+    return in_order
+
+
+def _even(time: np.ndarray) -> bool:
+    """Whether times (T,), sorted, are those of one recording: two that were put together leave
+    steps of all lengths, or a gap between them.
+    """
+    steps = np.diff(time)
+    middle = float(np.median(steps))
+    return bool((steps > 0.5 * middle).mean() > 0.95 and steps.max() < max(5.0 * middle, 0.5))
+
+
+def _written_once(flight: Flight, note) -> Flight:
+    """Without rows that repeat the one before in every column, as where a log was written twice."""
+    logged = [getattr(flight, c) for c in CHANNEL_COLUMNS if getattr(flight, c) is not None]
+    table = np.column_stack([flight.time, *(v.reshape(len(v), -1) for v in logged)])
+    same = (table[1:] == table[:-1]) | (np.isnan(table[1:]) & np.isnan(table[:-1]))
+    again = np.r_[False, same.all(1)]
+    if not again.any():
+        return flight
+    note("time", f"{again.sum()} rows that stand twice were left out")
+    return flight.rows(~again)
 
 
 def _refuse_units(step: float) -> None:
@@ -145,6 +170,7 @@ def _refuse_units(step: float) -> None:
 def _of_unit_length(quaternion: np.ndarray, note) -> np.ndarray:
     """Quaternions (T, 4) normalised, without flips; those far from unit length are not sampled."""
     norm = np.linalg.norm(quaternion, axis=1)
+    norm[norm == 0.0] = np.nan
     off = np.abs(norm - 1.0)
     if np.nanmedian(off) > 0.05:
         text = f"quaternions aren't unit (norm {np.nanmedian(norm):.3g}): wrong columns or corrupt"
@@ -172,12 +198,13 @@ def _in_range(flight: Flight, note) -> Flight:
         _share_of_one(motor, "m1, m2, m3, m4")
     if flight.command_thrust is not None:
         _share_of_one(flight.command_thrust, "cmd_thrust")
+    flight = _without_lost_poses(flight, note)
     if flight.quaternion is not None:
         changes["quaternion"] = _of_unit_length(flight.quaternion, note)
     if flight.position is not None and np.nanmax(np.abs(flight.position)) > 100.0:
         span = np.nanmax(np.ptp(flight.position[np.isfinite(flight.position).all(1)], axis=0))
         if span > 20.0:
-            raise Refused("units", f"x, y, z span {span:.0f}: in mm? The log format wants m")
+            raise Refused("units", f"x, y, z span {span:.0f}: in cm or mm? The log format wants m")
     if flight.body_rates is not None and np.nanmax(np.abs(flight.body_rates)) > 60.0:
         raise Refused("units", f"wx, wy, wz reach {np.nanmax(np.abs(flight.body_rates)):.0f}: in deg/s? "
                                 "The log format wants rad/s")  # fmt: skip
@@ -190,6 +217,19 @@ def _in_range(flight: Flight, note) -> Flight:
             note("corrupt", f"vbat is {middle:.2g} V, which no battery in flight has; left out")
             changes["battery_voltage"] = None
     return dataclasses.replace(flight, **changes) if changes else flight
+
+
+def _without_lost_poses(flight: Flight, note) -> Flight:
+    """Cameras that lost a body write zeros: such a pose isn't sampled."""
+    if flight.quaternion is None:
+        return flight
+    lost = (flight.quaternion == 0.0).all(1)
+    if not lost.any():
+        return flight
+    note("corrupt", f"{lost.sum()} poses whose quaternion is zero are taken as not sampled")
+    channels = [c for c in ("position", "quaternion") if getattr(flight, c) is not None]
+    changes = {c: np.where(lost[:, None], np.nan, getattr(flight, c)) for c in channels}
+    return dataclasses.replace(flight, **changes)
 
 
 def _share_of_one(values: np.ndarray, columns: str) -> None:

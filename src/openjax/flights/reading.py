@@ -7,35 +7,33 @@ Importers of other formats make the same table, so that everything behind it is 
 import gzip
 import hashlib
 import math
-import re
-import zlib
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from openjax.errors import UserError
+from openjax.flights.csv_text import (
+    LETTER,
+    Header,
+    LogError,
+    find_header,
+    text_of,
+    unquoted,
+)
 from openjax.flights.flight import CHANNEL_COLUMNS, Flight
 
 LOG_COLUMNS = ("t", "vehicle", *(c for columns in CHANNEL_COLUMNS.values() for c in columns))
 
 WHOLE = ("quaternion", "motor_command")  # channels of which a part is a mistake, not a choice
-# What one log may hold: a quarter of an hour at 1 kHz is 256 MB of text and a million rows; the
-# micro-SD logger of the Crazyflie writes at most some hundred variables; swarms are of tens.
-LARGEST = 256 << 20  # bytes of text
-MOST_ROWS = 2_000_000
+# The micro-SD logger of the Crazyflie writes at most some hundred variables; swarms are of tens.
 MOST_COLUMNS = 2_000
 MOST_VEHICLES = 200
-CHUNK = 1 << 20  # bytes that are unpacked at once
 NAMES_SHOWN = 12  # of columns in one message
-QUOTED = re.compile('"([^"]*)"')
 LARGEST_VALUE = 1e6  # no sensor's reading in SI units is larger; squares of what is would overflow
-
-
-class LogError(UserError):
-    """This log can't be used; the message says why, without the log's name."""
+NOTHING = ("na", "n/a", "#n/a", "null", "none", "-", "--")
+"""What is written where there is no number, beside nan."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,50 +50,92 @@ class LogTable:
 
 def read_csv(
     path: str | Path,
-    delimiter: str = ",",
+    delimiter: str = "",
     known: tuple[str, ...] = LOG_COLUMNS,
     time: str = "t",
+    above: int = 0,
 ) -> LogTable:
     """Read a `.csv` or `.csv.gz` log. Columns outside `known` are left out with a remark, whatever
     they hold; the column `time` must be there.
+
+    Args:
+      path: the file.
+      delimiter: between cells; where it is empty, what the header shows.
+      known: columns that are read.
+      time: the one that must be there.
+      above: lines above the header that aren't the table's.
 
     Raises LogError if it isn't such a file: unreadable, no header, a cell of a known column that is
     no number.
     """
     path = Path(path)
-    header, *lines = _text(path).split("\n")
-    header = _unquoted(header, delimiter)
-    if header.count(delimiter) >= MOST_COLUMNS:
-        raise LogError(
-            f"the first row has {header.count(delimiter) + 1} cells, more than {MOST_COLUMNS} "
-            "columns: has the log lost its line ends?"
-        )
-    names = [name.strip().strip('"') for name in header.split(delimiter)]
-    _check_header(names, delimiter, time)
-    lines, remarks = _whole_lines(lines, delimiter, len(names))
+    lines = text_of(path).split("\n")
+    header = find_header(lines[above:], delimiter)
+    header = header._replace(line=above + header.line)
+    _check_header(header, time)
+    names = header.names
     kept = [i for i, name in enumerate(names) if name != "vehicle" and name in known]
+    numbered, remarks = _whole_lines(lines, header)
+    number = _number if header.delimiter == "," else _number_with_comma
+    numbered, found = _without_units(numbered, header, kept, number)
+    remarks += found
     unknown = [n for n in names if n and n not in known]
     if unknown:
         remarks.append(f"unknown column{'s' * (len(unknown) > 1)} left out: {_listed(unknown)}")
-    try:
-        values = np.loadtxt(
-            lines, delimiter=delimiter, usecols=kept, ndmin=2, comments=None, converters=_number
-        )
-    except (ValueError, OverflowError) as error:
-        raise LogError(_why_not(lines, delimiter, names, kept, error)) from error
-    columns = {}
-    for i, column in zip(kept, values.T, strict=True):
-        bad = np.isinf(column)
-        if bad.any():
-            column = np.where(bad, np.nan, column)
-            remarks.append(f"column {names[i]}: {bad.sum()} of {len(bad)} rows are NaN or infinite")
-        if not np.isnan(column).all():
-            columns[names[i]] = np.ascontiguousarray(column)
+    values = _numbers(numbered, header, kept, number)
+    remarks += _not_numbers(np.isinf(values), [names[i] for i in kept])
+    values[np.isinf(values)] = np.nan
+    columns = {
+        names[i]: np.ascontiguousarray(column)
+        for i, column in zip(kept, values.T, strict=True)
+        if not np.isnan(column).all()
+    }
     vehicle = np.full(len(values), "0")
     if "vehicle" in names:
-        k = names.index("vehicle")
-        vehicle = np.array([line.split(delimiter, k + 1)[k].strip(' \t"') or "0" for line in lines])
+        vehicle = _vehicles(numbered, header.delimiter, names.index("vehicle"))
     return LogTable(path.name, columns, vehicle, tuple(remarks))
+
+
+def _numbers(
+    numbered: list[tuple[int, str]],
+    header: Header,
+    kept: list[int],
+    number: Callable[[str], float],
+) -> np.ndarray:
+    """(R, columns) of the columns `kept`. Raises LogError where a cell is no number."""
+    lines = [line for _, line in numbered]
+    try:
+        return np.loadtxt(
+            lines,
+            delimiter=header.delimiter,
+            usecols=kept,
+            ndmin=2,
+            comments=None,
+            converters=number,
+        )
+    except (ValueError, OverflowError) as error:
+        raise LogError(_why_not(numbered, header, kept, number, error)) from error
+
+
+def _not_numbers(bad: np.ndarray, names: list[str]) -> list[str]:
+    """Remarks on the columns `names` in which some rows (R, columns) are written as no number; one
+    for columns of which it is as many.
+    """
+    columns_of: dict[int, list[str]] = {}
+    for name, count in zip(names, bad.sum(0).tolist(), strict=True):
+        columns_of.setdefault(count, []).append(name)
+    return [
+        f"column{'s' * (len(columns) > 1)} {_listed(columns)}: {count} of {len(bad)} rows are NaN "
+        "or infinite"
+        for count, columns in columns_of.items()
+        if count
+    ]
+
+
+def _vehicles(numbered: list[tuple[int, str]], delimiter: str, column: int) -> np.ndarray:
+    """(R,) ids of a column; "0" where it is empty."""
+    cells = (line.split(delimiter, column + 1)[column] for _, line in numbered)
+    return np.array([cell.strip(' \t"') or "0" for cell in cells])
 
 
 def flights_of(
@@ -186,48 +226,17 @@ def write_csv(path: str | Path, table: LogTable, decimals: dict[str, int] | None
     path.write_bytes(gzip.compress(data, 6, mtime=0) if path.suffix == ".gz" else data)
 
 
-def _text(path: Path) -> str:
-    """A file's text with line ends of one kind, without blank lines at its start. Stops unpacking
-    at LARGEST bytes or MOST_ROWS lines.
-    """
-    chunks = []
-    size = 0
-    lines = 0
-    try:
-        with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file:
-            while chunk := file.read(CHUNK):
-                chunks.append(chunk)
-                size += len(chunk)
-                lines += max(chunk.count(b"\n"), chunk.count(b"\r"))
-                if size > LARGEST:
-                    raise LogError(
-                        f"holds more than {LARGEST >> 20} MB of text: no log of a flight; cut it "
-                        "into flights"
-                    )
-                if lines > MOST_ROWS:
-                    raise LogError(
-                        f"holds more than {MOST_ROWS} lines: no log of a flight; cut it into "
-                        "flights"
-                    )
-    except (OSError, EOFError, zlib.error) as error:
-        raise LogError(f"can't be read: {error}") from error
-    data = b"".join(chunks)
-    if b"\0" in data:
-        raise LogError("not a text file in UTF-8")
-    try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise LogError("not a text file in UTF-8") from error
-    return text.replace("\r\n", "\n").replace("\r", "\n").lstrip("\n")
-
-
-def _check_header(names: list[str], delimiter: str, time: str) -> None:
-    if delimiter == "," and len(names) == 1 and ";" in names[0]:
+def _check_header(header: Header, time: str) -> None:
+    """Raises LogError for a header that is none, or that lacks the column `time`."""
+    names = header.names
+    if len(names) > MOST_COLUMNS:
         raise LogError(
-            "columns are separated by ';'; the log format wants ',' (or a columns.toml with its "
-            "delimiter)"
+            f"the first row has {len(names)} cells, more than {MOST_COLUMNS} "
+            "columns: has the log lost its line ends?"
         )
-    if not any(re.search("[A-Za-z]", name) for name in names):
+    if len(names) == 1 and len(names[0].split()) > 2 and time in names[0].split():
+        raise LogError("columns are separated by spaces; the log format wants ','")
+    if not any(map(LETTER.search, names)):
         raise LogError("the first row holds no column names")
     counts = Counter(names)
     repeated = [name for name in names if name and counts[name] > 1]
@@ -248,13 +257,17 @@ def _listed(names: Iterable[str], most: int = NAMES_SHOWN) -> str:
     return ", ".join(names[:most]) + more
 
 
-def _whole_lines(lines: list[str], delimiter: str, cells: int) -> tuple[list[str], list[str]]:
-    """The lines that aren't blank, and a remark where the last was cut off: power went while it was
-    written.
+def _whole_lines(lines: list[str], header: Header) -> tuple[list[tuple[int, str]], list[str]]:
+    """The lines below the header that aren't blank, each with its number in the file, and a remark
+    where the last was cut off: power went while it was written.
     """
-    numbered = [
-        (number, _unquoted(line, delimiter)) for number, line in enumerate(lines, 2) if line.strip()
-    ]
+    delimiter = header.delimiter
+    cells = len(header.names)
+    rows = enumerate(lines[header.line + 1 :], header.line + 2)
+    numbered = [(number, unquoted(line, delimiter)) for number, line in rows if line.strip()]
+    # a delimiter at the end of each line but the header's, as a loop in C writes it
+    if numbered and all(line.count(delimiter) == cells for _, line in numbered[:2]):
+        numbered = [(number, line.rstrip().removesuffix(delimiter)) for number, line in numbered]
     remarks = []
     if len(numbered) > 1 and numbered[-1][1].count(delimiter) + 1 < cells:
         del numbered[-1]
@@ -266,14 +279,23 @@ def _whole_lines(lines: list[str], delimiter: str, cells: int) -> tuple[list[str
             )
     if not numbered:
         raise LogError("no rows")
-    return [line for _, line in numbered], remarks
+    return numbered, remarks
 
 
-def _unquoted(line: str, delimiter: str) -> str:
-    """A line without quotes around its cells, and without the delimiters that stand in them."""
-    if '"' not in line:
-        return line
-    return QUOTED.sub(lambda cell: cell[1].replace(delimiter, " "), line)
+def _without_units(
+    numbered: list[tuple[int, str]],
+    header: Header,
+    kept: list[int],
+    number: Callable[[str], float],
+) -> tuple[list[tuple[int, str]], list[str]]:
+    """The lines without a first one that holds units or other words, and a remark on it."""
+    row, first = numbered[0]
+    cells = first.split(header.delimiter)
+    written = [cells[i] for i in kept if cells[i].strip()]
+    words = [cell for cell in written if not _is_number(cell, number)]
+    if len(numbered) < 2 or len(words) < 2 or 2 * len(words) <= len(written):
+        return numbered, []
+    return numbered[1:], [f"line {row} holds words, no numbers, and is left out"]
 
 
 def _number(cell: str) -> float:
@@ -284,29 +306,42 @@ def _number(cell: str) -> float:
         value = float(cell)
     except ValueError:
         text = cell.strip().lower()
-        if text and text not in ("na", "n/a", "null", "none"):
+        if text and text not in NOTHING:
             raise
         return math.inf if text else math.nan
     return math.inf if math.isnan(value) else value
 
 
-def _is_number(cell: str) -> bool:
+def _number_with_comma(cell: str) -> float:
+    """The same of a cell that may have a decimal comma, as beside semicolons."""
+    return _number(cell.replace(",", "."))
+
+
+def _is_number(cell: str, number: Callable[[str], float]) -> bool:
     try:
-        _number(cell)
+        number(cell)
     except ValueError:
         return False
     return True
 
 
 def _why_not(
-    lines: list[str], delimiter: str, names: list[str], kept: list[int], error: Exception
+    numbered: list[tuple[int, str]],
+    header: Header,
+    kept: list[int],
+    number: Callable[[str], float],
+    error: Exception,
 ) -> str:
-    """The first cell that is no number, in words. `lines` are those that aren't blank."""
-    for number, line in enumerate(lines, 2):
-        cells = line.split(delimiter)
+    """The first cell that is no number, in words."""
+    names = header.names
+    for row, line in numbered:
+        cells = line.split(header.delimiter)
         for i in kept:
-            if not _is_number(cells[i]):
-                return f"line {number}, column {names[i]}: {cells[i].strip()!r} is no number"
+            if _is_number(cells[i], number):
+                continue
+            if [cell.strip() for cell in cells] == names:
+                return f"line {row} is the header again: several recordings in one file"
+            return f"line {row}, column {names[i]}: {cells[i].strip()!r} is no number"
     return f"not a table of numbers ({error})"
 
 

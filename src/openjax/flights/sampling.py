@@ -18,6 +18,7 @@ def drop_frozen(flight: Flight, note) -> Flight:
     named.
     """
     changes = {}
+    holes: dict[str, list[str]] = {}
     for channel in (c for c in CHANNEL_COLUMNS if getattr(flight, c) is not None):
         values = getattr(flight, channel)
         names = ", ".join(CHANNEL_COLUMNS[channel])
@@ -29,8 +30,10 @@ def drop_frozen(flight: Flight, note) -> Flight:
             if frozen.any():
                 changes[channel] = _unsampled(values, frozen)
                 rows = rows[~frozen[rows]]
-        if channel != "battery_voltage" and len(rows) > 1:
-            _name_hole(flight.time, rows, names, note)
+        if channel != "battery_voltage" and len(rows) > 1 and (hole := _hole(flight.time, rows)):
+            holes.setdefault(hole, []).append(names)
+    for hole, names in holes.items():
+        note("gaps", f"{', '.join(names)}: {hole}")
     return dataclasses.replace(flight, **changes) if changes else flight
 
 
@@ -71,16 +74,15 @@ def _may_stand_still(flight: Flight, channel: str, column: int) -> bool:
     return values is not None and not np.ptp(flight.sampled(other)[1], axis=0)[column]
 
 
-def _name_hole(time, rows, names: str, note) -> None:
-    """Say where the longest stretch without samples is, if rows are there meanwhile: else it is a
-    gap in time, named already.
+def _hole(time: np.ndarray, rows: np.ndarray) -> str:
+    """Where the longest stretch without samples is, in words, if rows are there meanwhile: else it
+    is a gap in time, named already.
     """
     steps = np.diff(time[rows])
     hole = int(np.argmax(steps))
-    if rows[hole + 1] - rows[hole] > 1 and steps[hole] > max(0.2, 10 * np.median(steps)):
-        note(
-            "gaps", f"{names}: not sampled for {steps[hole]:.2f} s after t = {time[rows][hole]:.2f}"
-        )
+    if rows[hole + 1] - rows[hole] <= 1 or steps[hole] <= max(0.2, 10 * np.median(steps)):
+        return ""
+    return f"not sampled for {steps[hole]:.2f} s after t = {time[rows][hole]:.2f}"
 
 
 def drop_repeats(flight: Flight, note) -> Flight:

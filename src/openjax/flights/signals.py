@@ -8,23 +8,48 @@ from scipy.signal import butter, lfilter, sosfiltfilt
 from scipy.signal.windows import tukey
 from scipy.spatial.transform import Rotation
 
-from openjax.flights.flight import Flight
+from openjax.flights.flight import SENSORS, Flight
 
 RATE = 100.0  # Hz, common clock of the comparisons
 LONGEST = 30.0  # s, enough to tell
+SHORTEST = 1.5  # s, less tells nothing
+HOLE = 0.4  # s without a sample of a channel, over which no line may be drawn
+COMPARED = (*SENSORS, "motor_command", "command_body_rates")
 FADE = 0.5  # s
 
 
 def clock_of(flight: Flight) -> np.ndarray | None:
-    """The common clock over the longest stretch without gaps; None if that is too short to tell
-    anything.
+    """The common clock over the longest stretch without gaps, and without holes in a channel, over
+    which nothing may be drawn; None if that is too short to tell anything.
     """
-    stretch = max(flight.stretches(max(0.1, 5 * flight.row_period)), key=lambda s: s.stop - s.start)
-    start = flight.time[stretch.start]
-    stop = flight.time[stretch.stop - 1]
-    if stop - start < 1.5:
+    steps = np.diff(flight.time)
+    wide = np.flatnonzero(steps > max(0.1, 5 * flight.row_period))
+    gaps = np.stack([flight.time[wide], flight.time[wide + 1]], 1)
+    logged = [c for c in COMPARED if getattr(flight, c) is not None]
+    holes = [_holes(flight, channel) for channel in logged]
+    start, stop = _longest_without(np.concatenate([gaps, *holes]), flight.time)
+    if stop - start < SHORTEST:  # holes everywhere: lines over them are all there is
+        start, stop = _longest_without(gaps, flight.time)
+    if stop - start < SHORTEST:
         return None
     return np.arange(start, min(stop, start + LONGEST), 1 / RATE)
+
+
+def _holes(flight: Flight, channel: str) -> np.ndarray:
+    """(H, 2) s, begin and end of where a channel wasn't sampled for long."""
+    at = np.r_[flight.time[0], flight.sampled(channel)[0], flight.time[-1]]
+    steps = np.diff(at)
+    wide = np.flatnonzero(steps > max(HOLE, 10 * np.median(steps)))
+    return np.stack([at[wide], at[wide + 1]], 1)
+
+
+def _longest_without(gaps: np.ndarray, time: np.ndarray) -> tuple[float, float]:
+    """Begin and end (s) of the longest stretch of times (T,) outside gaps (G, 2)."""
+    gaps = gaps[np.argsort(gaps[:, 0])]
+    starts = np.maximum.accumulate(np.r_[time[0], gaps[:, 1]])
+    stops = np.r_[gaps[:, 0], time[-1]]
+    longest = int(np.argmax(stops - starts))
+    return float(starts[longest]), float(stops[longest])
 
 
 def on_clock(flight: Flight, channel: str, grid: np.ndarray) -> np.ndarray | None:

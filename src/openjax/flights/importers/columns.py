@@ -3,7 +3,7 @@
 A `columns.toml` in a case folder applies to all its logs. A CSV column that it doesn't name and
 that has a name of the log format is taken as it is:
 
-    delimiter = ";"                                        # CSV only; "," if left out
+    delimiter = ";"                                        # CSV only; by its header if left out
     [columns]
     t      = { from = "timestamp", unit = "ms" }
     x      = "pos_x"                                       # already in the log format's unit
@@ -84,12 +84,12 @@ class Stream:
 
 @dataclass(frozen=True, eq=False)
 class ColumnMapping:
-    """Sources of the log format's columns. `clocks`: the time stamps where there are several, of
-    which the first is `t`.
+    """Sources of the log format's columns. `delimiter`: between a CSV's cells, empty where its
+    header shows it. `clocks`: the time stamps where there are several, of which the first is `t`.
     """
 
     columns: dict[str, Source] = field(default_factory=dict)
-    delimiter: str = ","
+    delimiter: str = ""
     clocks: tuple[Clock, ...] = ()
 
     @property
@@ -148,8 +148,8 @@ def load_mapping(path: str | Path) -> ColumnMapping:
     if unknown or not isinstance(tables.get("columns"), dict):
         problem = f"unknown key {unknown[0]!r}" if unknown else "no table [columns]"
         raise UserError(f"{path}: {problem}; it may hold delimiter and must hold [columns]")
-    delimiter = tables.get("delimiter", ",")
-    if not isinstance(delimiter, str) or len(delimiter) != 1:
+    delimiter = tables.get("delimiter", "")
+    if not isinstance(delimiter, str) or len(delimiter) != ("delimiter" in tables):
         raise UserError(f"{path}: delimiter must be one character")
     entries = dict(tables["columns"])
     clocks = ()

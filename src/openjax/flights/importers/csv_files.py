@@ -1,15 +1,13 @@
 """What the importers of CSV layouts share."""
 
-import gzip
-import zlib
 from pathlib import Path
 
 import numpy as np
 
+from openjax.flights.csv_text import find_header, head_of
 from openjax.flights.importers.columns import ColumnMapping
 from openjax.flights.reading import LOG_COLUMNS, LogError, read_csv
 
-LONGEST_HEADER = 1 << 16  # characters: a header of a firmware's some hundred names has 10,000
 TIME_UNITS = {1.0: "s", 1e-3: "ms", 1e-6: "us", 1e-9: "ns"}
 USUAL_STEP = (
     0.01  # s between rows; units are a factor of a thousand apart, so this need not be near
@@ -18,20 +16,19 @@ USUAL_STEP = (
 
 def is_csv(path: Path) -> bool:
     """Whether a path is a CSV file by its name."""
-    return path.is_file() and path.name.endswith((".csv", ".csv.gz"))
+    return path.is_file() and path.name.lower().endswith((".csv", ".csv.gz"))
 
 
-def header_of(path: Path, delimiter: str = ",") -> list[str]:
-    """The names in a CSV file's first line; none where there is no such file, or it isn't text."""
+def header_of(path: Path, delimiter: str = "") -> list[str]:
+    """The names in a CSV file's header; none where there is no such file, or it isn't text.
+    Without a `delimiter`, what the header shows.
+    """
     if not is_csv(path):
         return []
     try:
-        with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file:
-            head = file.read(LONGEST_HEADER).decode("utf-8-sig", "replace")
-    except (OSError, EOFError, zlib.error):
+        return find_header(head_of(path), delimiter).names
+    except LogError:
         return []
-    line = next(iter(head.splitlines()), "")
-    return [name.strip().strip('"') for name in line.split(delimiter)]
 
 
 def is_log_format(names: list[str]) -> bool:
@@ -40,17 +37,17 @@ def is_log_format(names: list[str]) -> bool:
 
 
 def delimiter_of(mapping: ColumnMapping | None) -> str:
-    """What separates a CSV's cells."""
-    return "," if mapping is None else mapping.delimiter
+    """What separates a CSV's cells, where a `columns.toml` says so; else nothing."""
+    return "" if mapping is None else mapping.delimiter
 
 
 def raw_columns(
-    path: Path, names: tuple[str, ...], time: str, delimiter: str = ","
+    path: Path, names: tuple[str, ...], time: str, delimiter: str = "", above: int = 0
 ) -> tuple[dict[str, np.ndarray], list[str]]:
     """The columns `names` of a CSV, {name: (R,)}, and remarks; what else it holds is another's
     business. Raises LogError where the column `time` or a number is missing.
     """
-    table = read_csv(path, delimiter, names, time)
+    table = read_csv(path, delimiter, names, time, above)
     if time not in table.columns:
         raise LogError(f"column {time} holds no number")
     return table.columns, [r for r in table.remarks if not r.startswith("unknown column")]

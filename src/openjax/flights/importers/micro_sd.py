@@ -13,10 +13,11 @@ from zlib import crc32
 
 import numpy as np
 
+from openjax.flights.csv_text import LARGEST, LogError
 from openjax.flights.importers.columns import ColumnMapping, Stream, merge_streams
 from openjax.flights.importers.firmware import firmware_columns, with_mixer
 from openjax.flights.importers.importer import Importer
-from openjax.flights.reading import LARGEST, LogError, LogTable
+from openjax.flights.reading import LogTable
 
 MAGIC = 0xBC
 _VERSIONS = {1: ("<HI", 1e-3), 2: ("<HQ", 1e-6)}

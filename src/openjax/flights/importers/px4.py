@@ -14,9 +14,10 @@ from pathlib import Path
 import numpy as np
 
 from openjax.errors import UserError
+from openjax.flights.csv_text import LARGEST, LogError
 from openjax.flights.importers.columns import ColumnMapping, Source, Stream, merge_streams
 from openjax.flights.importers.importer import Importer
-from openjax.flights.reading import LARGEST, LogError, LogTable
+from openjax.flights.reading import LogTable
 
 MAGIC = b"ULog\x01\x12\x35"
 QUAD_X = ("front_right", "rear_left", "front_left", "rear_right")  # PX4's motors 1 to 4

@@ -63,8 +63,6 @@ def topic_of(name: str, topics) -> str | None:
 def has_topic_times(path: Path) -> bool:
     """Whether a CSV has several time stamps, and none for all."""
     names = header_of(path)
-    if len(names) == 1:  # separated by something else, as a columns.toml may say
-        names = header_of(path, ";")
     return len(stamps_of(names)) > 1 and not is_log_format(names)
 
 

@@ -1,0 +1,141 @@
+"""The text of a CSV log before its numbers are read: unpacked, decoded, and its header found.
+
+Loggers and spreadsheets put things around a table: comments above the header, Excel's `sep=;`,
+semicolons with decimal commas, UTF-16, a row of units, a comma at the end of each line.
+"""
+
+import gzip
+import re
+import zlib
+from contextlib import ExitStack
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+from openjax.errors import UserError
+
+# What one log may hold: a quarter of an hour at 1 kHz is 256 MB of text and a million rows.
+LARGEST = 256 << 20  # bytes of text
+MOST_ROWS = 2_000_000
+CHUNK = 1 << 20  # bytes that are unpacked at once
+LONGEST_HEADER = 1 << 16  # bytes: a header of a firmware's some hundred names has 10,000
+GZIP = b"\x1f\x8b"
+ZIP = b"PK\x03\x04"  # also of spreadsheets
+WIDE = (b"\xff\xfe", b"\xfe\xff")  # how a text in UTF-16 begins
+SEPARATORS = (",", ";", "\t")
+COMMENT = "#"
+MOST_ABOVE = 1_000  # lines among which the header is
+LETTER = re.compile(r"[^\W\d_]")
+NUMBERS = re.compile(r"nan|inf|\de", re.IGNORECASE)  # the letters of numbers
+
+
+class LogError(UserError):
+    """This log can't be used; the message says why, without the log's name."""
+
+
+class Header(NamedTuple):
+    """The names of a table's columns, what separates its cells, and in which of its lines, from 0
+    on, the names stand.
+    """
+
+    names: list[str]
+    delimiter: str
+    line: int
+
+
+def text_of(path: Path) -> str:
+    """A file's text with line ends of one kind. Stops unpacking at LARGEST bytes or MOST_ROWS
+    lines. Raises LogError for what is no text.
+    """
+    chunks = []
+    size = 0
+    lines = 0
+    try:
+        with ExitStack() as stack:
+            file = _opened(path, stack)
+            while chunk := file.read(CHUNK):
+                chunks.append(chunk)
+                size += len(chunk)
+                lines += max(chunk.count(b"\n"), chunk.count(b"\r"))
+                if size > LARGEST:
+                    raise LogError(
+                        f"holds more than {LARGEST >> 20} MB of text: no log of a flight; cut it "
+                        "into flights"
+                    )
+                if lines > MOST_ROWS:
+                    raise LogError(
+                        f"holds more than {MOST_ROWS} lines: no log of a flight; cut it into "
+                        "flights"
+                    )
+    except (OSError, EOFError, zlib.error) as error:
+        raise LogError(f"can't be read: {error}") from error
+    return _decoded(b"".join(chunks))
+
+
+def head_of(path: Path) -> list[str]:
+    """A file's first lines; none where they can't be read as text."""
+    try:
+        with ExitStack() as stack:
+            data = _opened(path, stack).read(LONGEST_HEADER)
+        return _decoded(data[: len(data) // 2 * 2], "replace").split("\n")
+    except (OSError, EOFError, zlib.error, LogError):
+        return []
+
+
+def find_header(lines: list[str], delimiter: str = "") -> Header:
+    """The header among a table's lines: the first that isn't blank and no comment.
+
+    Args:
+      lines: of the text.
+      delimiter: between cells; where it is empty, what the header's line shows.
+
+    Raises LogError where there is no text.
+    """
+    filled = [(i, line) for i, line in enumerate(lines[:MOST_ABOVE]) if line.strip()]
+    if not filled:
+        raise LogError("is empty: no column names")
+    (at, line), *below = filled
+    if len(line.strip()) == 5 and line.lower().startswith("sep=") and below:
+        delimiter = delimiter or line[4]
+        (at, line), *below = below
+    while line.startswith(COMMENT) and below and _holds_names(below[0][1]):
+        (at, line), *below = below
+    line = line.removeprefix(COMMENT)  # where numpy.savetxt puts the names
+    delimiter = delimiter or max(SEPARATORS, key=line.count)
+    names = [name.strip().strip('"') for name in unquoted(line, delimiter).split(delimiter)]
+    return Header(names, delimiter, at)
+
+
+def _holds_names(line: str) -> bool:
+    """Whether a line is a comment or a header, and no row of numbers."""
+    return line.startswith(COMMENT) or bool(LETTER.search(NUMBERS.sub("", line)))
+
+
+def unquoted(line: str, delimiter: str) -> str:
+    """A line without quotes around its cells, and without the delimiters that stand in them."""
+    if '"' not in line:
+        return line
+    parts = line.split('"')
+    parts[1::2] = [part.replace(delimiter, " ") for part in parts[1::2]]
+    return "".join(parts) if len(parts) % 2 else line
+
+
+def _opened(path: Path, stack: ExitStack) -> BinaryIO:
+    """A file for reading, unpacked if it is packed, whatever its name says."""
+    with path.open("rb") as file:
+        start = file.read(len(ZIP))
+    if start == ZIP:
+        raise LogError("is a zip archive or a spreadsheet: unpack it, or save it as CSV")
+    packed = start.startswith(GZIP)
+    return stack.enter_context(gzip.open(path) if packed else path.open("rb"))
+
+
+def _decoded(data: bytes, errors: str = "strict") -> str:
+    """Bytes as text with line ends of one kind. Raises LogError for what is no text."""
+    wide = data.startswith(WIDE)
+    if b"\0" in data and not wide:
+        raise LogError("not a text file in UTF-8")
+    try:
+        text = data.decode("utf-16" if wide else "utf-8-sig", errors)
+    except UnicodeDecodeError as error:
+        raise LogError("not a text file in UTF-8: save it as one") from error
+    return text.replace("\r\n", "\n").replace("\r", "\n")

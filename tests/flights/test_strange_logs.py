@@ -1,0 +1,134 @@
+"""Logs as spreadsheets, loops in C and tired people leave them: read as what they hold, or refused
+in one line.
+"""
+
+import gzip
+
+import numpy as np
+import pytest
+
+from openjax.errors import UserError
+from openjax.flights.case import load_case
+from openjax.flights.importers import find_logs, read_log
+from openjax.flights.reading import read_csv, write_csv
+from openjax.flights.samples import log_of
+
+
+@pytest.fixture(scope="module")
+def text(sample_columns, tmp_path_factory):
+    """A sample flight of four seconds as a CSV's text."""
+    path = tmp_path_factory.mktemp("log") / "flight.csv"
+    columns = {name: values[:400] for name, values in sample_columns["flight_b"].items()}
+    write_csv(path, log_of([columns], "flight"))
+    return path.read_text()
+
+
+def quoted(text):
+    lines = [",".join(f'"{cell}"' for cell in line.split(",")) for line in text.splitlines()]
+    return ("\ufeff" + "\r\n".join(lines)).encode()
+
+
+def with_units(text):
+    head, _, rows = text.partition("\n")
+    units = ",".join("s" if name == "t" else "m/s2" for name in head.split(","))
+    return f"{head}\n{units}\n{rows}"
+
+
+def ended(text, ends_in=","):
+    head, *rows = text.splitlines()
+    return "\n".join([head, *(row + ends_in for row in rows)])
+
+
+AROUND = {
+    "semicolons, decimal commas": lambda t: t.replace(",", ";").replace(".", ","),
+    "tabs in UTF-16": lambda t: t.replace(",", "\t").encode("utf-16"),
+    "a byte order mark and quotes": quoted,
+    "comments": lambda t: "# Monday, hall 3\n\n# 100 Hz\n" + t,
+    "a header as numpy.savetxt writes it": lambda t: "# " + t,
+    "Excel's line": lambda t: "sep=;\r\n" + t.replace(",", ";"),
+    "units": with_units,
+    "a comma at the end of each row": ended,
+    "two carriage returns": lambda t: t.replace("\n", "\r\r\n"),
+    "packed": lambda t: gzip.compress(t.encode()),
+}
+
+
+@pytest.mark.parametrize("name", ["flight.csv", "flight.csv.gz", "FLIGHT.CSV"])
+@pytest.mark.parametrize("around", AROUND)
+def test_what_stands_around_a_table_changes_nothing(tmp_path, text, around, name):
+    (tmp_path / "plain.csv").write_text(text)
+    plain = read_csv(tmp_path / "plain.csv")
+    data = AROUND[around](text)
+    folder = tmp_path / "case"
+    folder.mkdir()
+    (folder / name).write_bytes(data if isinstance(data, bytes) else data.encode())
+    assert find_logs(folder) == [folder / name]
+    read = read_log(folder / name)
+    assert read.columns.keys() == plain.columns.keys()
+    for column, values in plain.columns.items():
+        np.testing.assert_array_equal(read.columns[column], values, err_msg=column)
+    assert [r for r in read.remarks if "line 2 holds words" not in r] == []
+
+
+def case_of(folder, text):
+    (folder / "vehicle.toml").write_text("")
+    (folder / "flight.csv").write_text(text)
+    return load_case(folder)
+
+
+def test_rows_in_any_order_and_written_twice_are_one_flight(tmp_path, text):
+    head, *rows = text.splitlines()
+    twice = [*rows, *rows[100:200]]
+    np.random.default_rng(1).shuffle(twice)
+    (flight,) = case_of(tmp_path, "\n".join([head, *twice])).flights
+    (plain,) = case_of(tmp_path, text).flights
+    np.testing.assert_array_equal(flight.time, plain.time)
+    np.testing.assert_array_equal(flight.motor_command, plain.motor_command)
+
+
+@pytest.mark.parametrize("later", [0.0, 0.003, 3600.0])
+def test_two_recordings_in_one_file_are_none(tmp_path, text, later):
+    head, *rows = text.splitlines()
+    times, values = zip(*(row.split(",", 1) for row in rows), strict=True)
+    values = values[200:] + values[:200]
+    first = [f"{float(t) + later:.3f},{v}" for t, v in zip(times, values, strict=True)]
+    with pytest.raises(UserError, match="several recordings in one file"):
+        case_of(tmp_path, "\n".join([head, *first, *rows[50:350]]))
+
+
+def test_a_hole_in_every_channel_contradicts_nothing(tmp_path, sample_columns):
+    """A line drawn over it does: a velocity that wasn't measured leads nowhere."""
+    columns = {name: values.copy() for name, values in sample_columns["flight_a"].items()}
+    for name, values in columns.items():
+        if name != "t":
+            values[250:430] = np.nan
+    write_csv(tmp_path / "flight.csv", log_of([columns], "flight"))
+    (tmp_path / "vehicle.toml").write_text("")
+    case = load_case(tmp_path)
+    assert len(case.flights) == 1
+    (hole,) = [issue.issue for issue in case.quality if issue.kind == "gaps"]
+    assert "not sampled for 1.8" in hole
+
+
+def test_poses_of_a_camera_that_lost_the_body_are_not_sampled(tmp_path, sample_columns):
+    columns = {name: values.copy() for name, values in sample_columns["flight_a"].items()}
+    lost = np.arange(len(columns["t"])) // 37 % 4 == 2
+    for name in ("x", "y", "z", "qw", "qx", "qy", "qz"):
+        columns[name][lost] = 0.0
+    write_csv(tmp_path / "flight.csv", log_of([columns], "flight"))
+    (tmp_path / "vehicle.toml").write_text("")
+    (flight,) = load_case(tmp_path).flights
+    assert np.isnan(flight.position[:, 0]).sum() >= lost.sum() - 40
+    assert np.nanmin(flight.position[:, 2]) > 0.05
+
+
+def test_a_folder_without_a_log_says_what_is_in_it(tmp_path):
+    (tmp_path / "vehicle.toml").write_text("")
+    (tmp_path / "flight.txt").write_text("t,wx\n")
+    with pytest.raises(
+        UserError, match=r"PX4 ULog, .* CSV of the log format; it holds flight\.txt"
+    ):
+        load_case(tmp_path)
+    (tmp_path / "flight.csv").write_bytes(b"PK\x03\x04" + bytes(100))
+    with pytest.raises(UserError, match="is a zip archive or a spreadsheet"):
+        load_case(tmp_path)
