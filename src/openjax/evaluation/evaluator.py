@@ -17,6 +17,7 @@ from openjax.evaluation.episodes import Evaluation, make_evaluate, summarise
 from openjax.policy import Policy, PolicyParameters
 from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings, Scenario, Task, scenario_task
 from openjax.pursuit.statistics import EpisodeStatistics
+from openjax.pursuit.task import capture_radius
 from openjax.show.number_tables import numbers_table
 from openjax.show.trajectory import Trajectory
 
@@ -128,19 +129,20 @@ class Flown:
         batch, place = divmod(self.first + episode, self.evaluator.batch)
         record = jax.tree.map(lambda leaf: np.asarray(leaf[place]), self.records[batch])
         settings = self.evaluator.settings
-        active = np.asarray(self.tasks.pillar_active[episode])
+        task = jax.tree.map(lambda leaf: np.asarray(leaf[episode]), self.tasks)
+        there = slice(None) if task.active is None else task.active
         return Trajectory(
             title=title,
-            pursuer_position=record.pursuers,
-            pursuer_quaternion=record.quaternion,
+            pursuer_position=record.pursuers[:, there],
+            pursuer_quaternion=record.quaternion[:, there],
             evader_position=record.evader,
-            captured=record.captured,
-            crashed=record.crashed,
-            pillar_position=np.asarray(self.tasks.pillar_position[episode])[active],
+            captured=record.captured[:, there],
+            crashed=record.crashed[:, there],
+            pillar_position=task.pillar_position[task.pillar_active],
             arena_radius=settings.arena_radius,
             arena_height=settings.arena_height,
             pillar_radius=settings.pillar_radius,
-            capture_radius=settings.capture_radius,
+            capture_radius=float(capture_radius(settings, task)),
             time_step=settings.time_step,
             seen=record.seen,
             predicted=record.predicted,

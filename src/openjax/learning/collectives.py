@@ -8,6 +8,8 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
+from openjax.pursuit.teams import team_mean
+
 
 def mean_over_devices(tree, axis: str | None):
     """Mean of every leaf over all devices, by one collective.
@@ -59,8 +61,13 @@ def minibatches(tree, number: int):
     return jax.tree.map(split, tree)
 
 
-def joint_moments(x: jax.Array, axis: str | None) -> tuple[jax.Array, jax.Array]:
-    """Mean () and standard deviation () over all elements on all devices."""
-    mean = mean_over_devices(jnp.mean(x), axis)
-    variance = mean_over_devices(jnp.mean((x - mean) ** 2), axis)
+def joint_moments(
+    x: jax.Array, axis: str | None, counted: jax.Array | None = None
+) -> tuple[jax.Array, jax.Array]:
+    """Mean () and standard deviation () over all elements on all devices, or those `counted`, bool
+    like x.
+    """
+    # of `counted` all devices have about as many
+    mean = mean_over_devices(team_mean(counted, x), axis)
+    variance = mean_over_devices(team_mean(counted, (x - mean) ** 2), axis)
     return mean, jnp.sqrt(variance)

@@ -333,6 +333,17 @@ class TrainSettings:
             self.restart_steps >= rollout and self.restart_steps % rollout == 0,
             f"restart_steps {self.restart_steps} must be a multiple of rollout_length {rollout}",
         )
+        sizes = self.environment.team_sizes
+        yield (
+            not sizes or self.network.critic_encoder == "attention",
+            f"network.critic_encoder {self.network.critic_encoder} is for teams of one size; "
+            "attention would be right",
+        )
+        yield (
+            not sizes or not self.predictor.enabled or self.environment.history_pursuers != "each",
+            "predictor: frames of each pursuer are for teams of one size; "
+            "environment.history_pursuers pooled would be right",
+        )
         hold = self.evader_learning.hold
         learned = self.environment.evaders.count("learned")
         yield (

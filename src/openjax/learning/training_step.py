@@ -27,6 +27,7 @@ from openjax.learning.settings import TrainSettings
 from openjax.policy import Network, OwnPolicy, Policy, PolicyParameters, make_policy
 from openjax.pursuit import Observation, Pursuit, PursuitState
 from openjax.pursuit.evaders import learned_place
+from openjax.pursuit.teams import team_mean
 from openjax.vehicle.family import narrowed_bounds
 
 
@@ -243,7 +244,8 @@ class _Step:
             progress=progress,
             axis=axis,
         )
-        metrics = {"reward": mean_over_devices(jnp.mean(rollout.reward), axis)}
+        reward = team_mean(rollout.observation.active, rollout.reward)
+        metrics = {"reward": mean_over_devices(reward, axis)}
         return carry.replace(observation=observation, state=state), flown, metrics
 
     def _evaders(self, carry):

@@ -38,6 +38,7 @@ class Actor(nn.Module):
             observation.others,
             observation.pillars,
             observation.pillar_seen,
+            observation.others_there,
         )
         start = jnp.array(self.initial_action, jnp.float32)
         mean = nn.Dense(
@@ -98,7 +99,11 @@ class Critic(nn.Module):
         leading = own.shape[:-1]
         if settings.critic_encoder == "attention":
             return Encoder(settings.features, settings.heads, dtype, name="encoder")(
-                own, observation.others, observation.pillars, observation.pillar_seen
+                own,
+                observation.others,
+                observation.pillars,
+                observation.pillar_seen,
+                observation.others_there,
             )
         number = math.prod(leading)
         parts = [

@@ -30,10 +30,15 @@ class SelfAttention(nn.Module):
 
     @nn.compact
     def __call__(
-        self, own: jax.Array, others: jax.Array, pillars: jax.Array, pillar_seen: jax.Array
+        self,
+        own: jax.Array,
+        others: jax.Array,
+        pillars: jax.Array,
+        pillar_seen: jax.Array,
+        others_there: jax.Array | None = None,
     ) -> jax.Array:
         """own (B, F) embedded; others (B, A, O), pillars (B, k, 5) as observed; pillar_seen (B, k)
-        bool -> (B, F).
+        and others_there (B, A) bool, None: all are -> (B, F).
         """
         f = self.features
         h = self.heads
@@ -55,11 +60,11 @@ class SelfAttention(nn.Module):
         )
         embed = nn.initializers.orthogonal(2**0.5)
         seen = jnp.where(pillar_seen, 0.0, MASKED)
+        there = jnp.zeros(others.shape[:-1])
+        if others_there is not None:
+            there = jnp.where(others_there, 0.0, MASKED)
         entities = []
-        for name, x, bias in (
-            ("others", others, jnp.zeros(others.shape[:-1])),
-            ("pillars", pillars, seen),
-        ):
+        for name, x, bias in (("others", others, there), ("pillars", pillars, seen)):
             size = x.shape[-1]
             if x.shape[-2] == 0:
                 continue
@@ -161,10 +166,15 @@ class Encoder(nn.Module):
 
     @nn.compact
     def __call__(
-        self, self_state: jax.Array, others: jax.Array, pillars: jax.Array, pillar_seen: jax.Array
+        self,
+        self_state: jax.Array,
+        others: jax.Array,
+        pillars: jax.Array,
+        pillar_seen: jax.Array,
+        others_there: jax.Array | None = None,
     ) -> jax.Array:
-        """self_state (..., S), others (..., A, O), pillars (..., k, 5), pillar_seen (..., k) bool
-        -> (..., F).
+        """self_state (..., S), others (..., A, O), pillars (..., k, 5), pillar_seen (..., k) and
+        others_there (..., A) bool, None: all are -> (..., F).
         """
         leading = self_state.shape[:-1]
         rows = len(leading)
@@ -176,7 +186,8 @@ class Encoder(nn.Module):
         own = HiddenLayer(self.features, self.dtype, name="self_1")(flat(padded(self_state)))
         own = HiddenLayer(self.features, self.dtype, name="self_2")(own)
         attention = SelfAttention(self.features, self.heads, self.dtype, name="attention")
-        hidden = own + attention(own, flat(others), flat(pillars), flat(pillar_seen))
+        there = None if others_there is None else flat(others_there)
+        hidden = own + attention(own, flat(others), flat(pillars), flat(pillar_seen), there)
         hidden = normalise(hidden, affine_parameters(self, "norm", self.features), activate=False)
         hidden = HiddenLayer(self.features, self.dtype, name="hidden")(hidden)
         return hidden.reshape(*leading, self.features)

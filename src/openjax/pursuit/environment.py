@@ -20,7 +20,13 @@ from openjax.pursuit.evaders import (
     handed_in,
 )
 from openjax.pursuit.info import StepInfo
-from openjax.pursuit.observation import Observation, frame, observe, own_frame
+from openjax.pursuit.observation import (
+    Observation,
+    frame,
+    frame_pursuers,
+    observe,
+    own_frame,
+)
 from openjax.pursuit.reward import (
     Term,
     Transition,
@@ -35,6 +41,7 @@ from openjax.pursuit.spaces import Box
 from openjax.pursuit.state import PursuitState
 from openjax.pursuit.statistics import count, empty_statistics
 from openjax.pursuit.task import Task, start_attitude, uniform_task
+from openjax.pursuit.teams import held
 from openjax.ranges import changed
 from openjax.vehicle import (
     DroneState,
@@ -205,6 +212,7 @@ class Pursuit:
           observation, state, both of one world.
         """
         settings = self.settings
+        task = task.with_starts(task.pursuer_position)
         chex.assert_shape(task.pursuer_position, (settings.num_pursuers, 3))
         chex.assert_shape(task.evader_position, (3,))
         chex.assert_shape(task.pillar_position, (*task.pillar_active.shape, 2))
@@ -227,18 +235,13 @@ class Pursuit:
             own_history = own_frame(drones.quaternion, drones.velocity, action)
             steps = settings.observe_history * settings.observe_history_spacing
             own_history = jnp.broadcast_to(own_history, (steps, *own_history.shape))
-        in_sight = line_of_sight(
-            settings,
-            task.pursuer_position,
-            task.evader_position,
-            task.pillar_position,
-            task.pillar_active,
-        )
+        in_sight = self._in_sight(task, task.pursuer_position, task.evader_position)
         seen = jnp.any(in_sight)
         still = jnp.zeros(3, jnp.float32)
         step = jnp.zeros((), jnp.int32)
-        middle = jnp.array(settings.middle, jnp.float32)
-        first = frame(settings, step, task.pursuer_position, task.evader_position, still, seen)
+        last_seen = jnp.where(seen, task.evader_position, jnp.array(settings.middle, jnp.float32))
+        framed = frame_pursuers(settings, task.pursuer_position, last_seen, task.active)
+        first = frame(settings, step, framed, task.evader_position, still, seen)
         frames = jnp.broadcast_to(
             first, (settings.history_length * settings.history_spacing, settings.frame_size)
         )
@@ -255,7 +258,7 @@ class Pursuit:
                 self.evader_share,
                 task.evader,
             ),
-            last_seen=jnp.where(seen, task.evader_position, middle),
+            last_seen=last_seen,
             in_sight=in_sight,
             frames=frames,
             own_history=own_history,
@@ -287,6 +290,13 @@ class Pursuit:
         go first.
         """
         return {**vehicles, **self.effect_parameters}
+
+    def _in_sight(self, task, position, evader):
+        """(N,) which pursuers of a team at (N, 3) see the evader at (3,)."""
+        sees = line_of_sight(
+            self.settings, position, evader, task.pillar_position, task.pillar_active
+        )
+        return sees if task.active is None else sees & task.active
 
     def _seen(self, drones, vehicles):
         return self.dynamics.seen(drones, self._parameters(vehicles))
@@ -326,6 +336,7 @@ class Pursuit:
             drones = drones.replace(
                 velocity=drones.velocity * jnp.minimum(1.0, settings.max_speed / speed)
             )
+        drones = held(state.active, state.drones, drones)
         return self.follow(state, action, drones, wish)
 
     def follow(
@@ -349,10 +360,12 @@ class Pursuit:
         evader = before.evader_position + settings.time_step * velocity
         step = before.step + 1
         position = drones.position
-        in_sight = line_of_sight(settings, position, evader, *pillars)
+        in_sight = self._in_sight(task, position, evader)
         seen = jnp.any(in_sight)
+        last_seen = jnp.where(seen, evader, before.last_seen)
         seen_drones = self._seen(drones, before.vehicles)
-        newest = frame(settings, step, seen_drones.position, evader, velocity, seen)
+        framed = frame_pursuers(settings, seen_drones.position, last_seen, task.active)
+        newest = frame(settings, step, framed, evader, velocity, seen)
         own_history = before.own_history
         if settings.observe_history:
             now = own_frame(seen_drones.quaternion, seen_drones.velocity, action)
@@ -362,7 +375,7 @@ class Pursuit:
             evader_position=evader,
             evader_velocity=velocity,
             evader=evader_state,
-            last_seen=jnp.where(seen, evader, before.last_seen),
+            last_seen=last_seen,
             in_sight=in_sight,
             frames=jnp.concatenate([before.frames[1:], newest[None]]),
             own_history=own_history,
@@ -370,7 +383,7 @@ class Pursuit:
             step=step,
         )
         info = StepInfo(
-            captured=captures(settings, position, evader, in_sight),
+            captured=captures(settings, position, evader, in_sight, task.capture_radius),
             seen=seen,
             breaches=breaches(settings, position, *pillars),
             over_speed=over_speed(settings, drones.velocity),
@@ -378,11 +391,12 @@ class Pursuit:
                 settings, position, rotation_axes(drones.quaternion)[1][:, 2], *pillars
             ),
             penalty=jnp.zeros(settings.num_pursuers, jnp.float32),
-        )
+        ).of_team(task.active)
         transition = Transition(settings, before, state, info)
         rewards, penalty = total_reward(self.terms, transition)
         info = info.replace(penalty=penalty)
-        state = state.replace(statistics=count(before.statistics, step, info, rewards))
+        counted = count(before.statistics, step, info, rewards, task.active)
+        state = state.replace(statistics=counted)
         over = step >= settings.episode_length
         never = jnp.zeros((), bool)
         # an observed horizon is part of the task, so its end is terminal; an unobserved one only

@@ -4,6 +4,7 @@ import jax
 from flax import struct
 
 from openjax.pursuit.collisions import Breaches
+from openjax.pursuit.teams import of_team
 
 
 @struct.dataclass
@@ -22,3 +23,11 @@ class StepInfo:
     """(N,) bool: touches something, or has tipped over."""
     penalty: jax.Array
     """(N,) the reward's penalties, at most 0."""
+
+    def of_team(self, active: jax.Array | None) -> "StepInfo":
+        """The same, where nothing happens to empty slots: `active` (N,) says which aren't."""
+        each = {
+            name: of_team(active, getattr(self, name))
+            for name in ("captured", "breaches", "over_speed", "crashed")
+        }
+        return self.replace(**each)

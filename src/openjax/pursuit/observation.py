@@ -10,8 +10,13 @@ from openjax.pursuit.axes import rotation_axes, turned_back
 from openjax.pursuit.collisions import pillar_distance
 from openjax.pursuit.settings import HIDDEN, PursuitSettings
 from openjax.pursuit.state import PursuitState
+from openjax.pursuit.task import capture_radius, evader_speed
+from openjax.pursuit.teams import of_team
 from openjax.vehicle import DroneState
 from openjax.vehicle.family import standard_parameters
+
+PRESS = 0.2
+"""Distance (m) of a pursuer from which on it presses less than it would nearer still."""
 
 
 @struct.dataclass
@@ -22,7 +27,7 @@ class Observation:
 
     self_state: jax.Array
     """(N, S) evader, quaternion wxyz, velocity, body x, body z axis, t/T x 4 [, position] [,
-    history]
+    evader's speed and capture radius] [, history]
     """
     others: jax.Array
     """(N, N - 1, O) other pursuers: relative position [, relative velocity, body z axis]"""
@@ -44,6 +49,10 @@ class Observation:
     """(N, 2) cosine and sine of the yaw by which each pursuer's vectors are turned back, all but
     `position`; None: by none
     """
+    active: jax.Array | None = None
+    """(N,) bool, slots of pursuers in use, the others observe zeros; None: all are"""
+    others_there: jax.Array | None = None
+    """(N, N - 1) bool, the same of `others`"""
 
 
 def frame(
@@ -60,6 +69,26 @@ def frame(
     time = step.astype(jnp.float32)[None] / settings.episode_length
     evader = jnp.where(seen, jnp.concatenate([evader, velocity]), HIDDEN)
     return jnp.concatenate([time, evader, pursuers.ravel()])
+
+
+def frame_pursuers(
+    settings: PursuitSettings, position: jax.Array, evader: jax.Array, active: jax.Array | None
+) -> jax.Array:
+    """(M, 3) m, what a frame of the history holds of pursuers at (N, 3): all of them, or two.
+
+    Pooled, these are the nearest one's place relative to the evader, as far as one knows where that
+    is, and the sum of all such places, each divided by its squared distance: whence evaders that flee
+    feel pressed. `active` (N,) says which slots are in use.
+    """
+    if settings.history_pursuers == "each":
+        return position
+    offset = position - evader
+    squared = jnp.sum(offset**2, axis=-1)
+    if active is not None:
+        squared = jnp.where(active, squared, jnp.inf)
+    is_nearest = jnp.arange(squared.shape[0]) == jnp.argmin(squared)
+    weights = jnp.stack([is_nearest.astype(jnp.float32), 1.0 / (squared + PRESS**2)])
+    return jnp.sum(weights[..., None] * offset, axis=1)
 
 
 def own_frame(quaternion: jax.Array, velocity: jax.Array, action: jax.Array) -> jax.Array:
@@ -86,9 +115,16 @@ def observe(settings: PursuitSettings, state: PursuitState, seen_drones: DroneSt
     turned = functools.partial(turned_back, heading)
 
     # slices and no index: the gradient of an index is a scatter
-    others = jnp.stack(
-        [position[i] - jnp.concatenate([position[:i], position[i + 1 :]]) for i in range(n)]
+    others = turned(
+        jnp.stack(
+            [position[i] - jnp.concatenate([position[:i], position[i + 1 :]]) for i in range(n)]
+        )
     )
+    active = state.active
+    others_there = None
+    if active is not None:
+        others_there = jnp.stack([jnp.concatenate([active[:i], active[i + 1 :]]) for i in range(n)])
+        others = jnp.where(others_there[..., None], others, HIDDEN)
     pillars, pillar_seen = _nearest_pillars(
         settings, position, task.pillar_position, task.pillar_active
     )
@@ -104,16 +140,21 @@ def observe(settings: PursuitSettings, state: PursuitState, seen_drones: DroneSt
             turned(drones.velocity),
             standard_parameters(settings.vehicles, state.vehicles),
         ]
+    own = {
+        "self_state": _own_part(settings, state, seen_drones, turned),
+        "others": others,
+        "pillars": jnp.where(pillar_seen[..., None], turned(pillars), HIDDEN),
+        "privileged": jnp.concatenate(true_parts, axis=-1),
+        "position": position,
+    }
     return Observation(
-        self_state=_own_part(settings, state, seen_drones, turned),
-        others=turned(others),
-        pillars=jnp.where(pillar_seen[..., None], turned(pillars), HIDDEN),
+        **of_team(active, own),
         pillar_seen=pillar_seen,
-        privileged=jnp.concatenate(true_parts, axis=-1),
-        position=position,
         last_seen=state.last_seen,
         frames=state.frames[settings.history_spacing - 1 :: settings.history_spacing],
         heading=heading,
+        active=active,
+        others_there=others_there,
     )
 
 
@@ -131,6 +172,10 @@ def _own_part(settings, state, seen_drones, turned):
         parts.append(jnp.broadcast_to(time, (len(position), 4)))
     if settings.observe_position:
         parts.append(turned(position))
+    if settings.observe_game:
+        speed = evader_speed(settings, state.task) / settings.max_speed
+        numbers = jnp.stack([speed, capture_radius(settings, state.task)]).astype(jnp.float32)
+        parts.append(jnp.broadcast_to(numbers, (len(position), 2)))
     if settings.observe_history:
         spacing = settings.observe_history_spacing
         history = jnp.moveaxis(state.own_history[spacing - 1 :: spacing], 0, 1)

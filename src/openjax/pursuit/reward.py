@@ -17,18 +17,24 @@ from openjax.pursuit.collisions import breaches, crashed
 from openjax.pursuit.info import StepInfo
 from openjax.pursuit.settings import PursuitSettings, RewardSettings
 from openjax.pursuit.state import PursuitState
+from openjax.pursuit.teams import of_team
 
 OVER_SPEED = 1.01
 """Share of the maximal speed above which a step counts as over speed."""
 
 
 def captures(
-    settings: PursuitSettings, position: jax.Array, evader: jax.Array, in_sight: jax.Array
+    settings: PursuitSettings,
+    position: jax.Array,
+    evader: jax.Array,
+    in_sight: jax.Array,
+    radius: jax.Array | None = None,
 ) -> jax.Array:
     """(N,) whether each pursuer has the evader within the capture radius, with a clear line of
-    sight.
+    sight; `radius` () m goes before the settings' one.
     """
-    return in_sight & (jnp.sum((position - evader) ** 2, axis=-1) < settings.capture_radius**2)
+    radius = settings.capture_radius if radius is None else radius
+    return in_sight & (jnp.sum((position - evader) ** 2, axis=-1) < radius**2)
 
 
 def over_speed(settings: PursuitSettings, velocity: jax.Array) -> jax.Array:
@@ -68,7 +74,7 @@ class Term:
 
 def total_reward(terms: tuple[Term, ...], transition: Transition) -> tuple[jax.Array, jax.Array]:
     """(N,) reward of each pursuer, the sum of the terms in their order, penalties last; and (N,)
-    the sum of its penalties.
+    the sum of its penalties. Empty slots have none.
     """
     nothing = jnp.zeros(transition.settings.num_pursuers, jnp.float32)
 
@@ -79,7 +85,8 @@ def total_reward(terms: tuple[Term, ...], transition: Transition) -> tuple[jax.A
         return functools.reduce(operator.add, values) if values else nothing
 
     penalty = jnp.broadcast_to(total(True), nothing.shape)
-    return jnp.broadcast_to(total(False) + penalty, nothing.shape), penalty
+    reward = jnp.broadcast_to(total(False) + penalty, nothing.shape)
+    return of_team(transition.state.active, (reward, penalty))
 
 
 def default_reward(weights: RewardSettings) -> tuple[Term, ...]:

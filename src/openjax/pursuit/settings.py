@@ -64,7 +64,11 @@ class PursuitSettings:
     """
 
     num_pursuers: Annotated[int, Interval("[1, 8]")] = 3
-    """Number of pursuing quadrotors, 1 to 8."""
+    """Number of pursuing quadrotors, 1 to 8; with `team_sizes` the number of slots for them."""
+    team_sizes: Annotated[tuple[int, ...], Interval("[1, 8]")] = ()
+    """Sizes of teams, one of which is drawn for each uniform task with equal odds; the other slots
+    for pursuers stay empty. Empty: all are in use.
+    """
     min_pillars: Annotated[int, Interval("[0, 32]")] = 4
     """Fewest pillars of a uniform task."""
     max_pillars: Annotated[int, Interval("[0, 32]")] = 5
@@ -75,6 +79,12 @@ class PursuitSettings:
     capture_radius: Annotated[float, Interval("(0, 10]")] = 0.3
     evader_speed: Annotated[float, Interval("(0, 100]")] = 1.3
     """Speed of the evader (m/s)."""
+    evader_speeds: Annotated[tuple[float, ...], Interval("(0, 100]")] = ()
+    """Lowest and highest speed of the evader (m/s), between which that of each uniform task is drawn,
+    in place of `evader_speed`; empty: none is drawn.
+    """
+    capture_radii: Annotated[tuple[float, ...], Interval("(0, 10]")] = ()
+    """Smallest and largest capture radius (m), the same in place of `capture_radius`."""
     evader_norm: Literal["euclidean", "axis"] = "euclidean"
     """How the evader's force becomes a velocity; "axis" normalises by the largest component (up to
     3**0.5 faster).
@@ -130,6 +140,10 @@ class PursuitSettings:
     """Also observe the own position in the arena (not in the paper, where the arena's bounds stay
     unseen).
     """
+    observe_game: bool = False
+    """Also observe the evader's speed, as a multiple of the pursuers', and the capture radius in m
+    (not in the paper, where both are the same in all games).
+    """
     observe_in: Literal["world", "heading"] = "world"
     """Axes of what a pursuer observes. "heading": its own, but upright: a game turned about the
     arena's axis looks the same, at any yaw (not in the paper).
@@ -144,6 +158,10 @@ class PursuitSettings:
     """Frames that the evader predictor sees."""
     history_spacing: Annotated[int, Interval("[1, 1000]")] = 1
     """Control steps between two frames of the history."""
+    history_pursuers: Literal["each", "pooled"] = "each"
+    """What these frames hold of the pursuers. "each": all positions, as in the paper; "pooled": where
+    the nearest one is and whence all press, for teams of any size.
+    """
     reward: RewardSettings = field(default_factory=RewardSettings)
 
     def __post_init__(self):
@@ -160,6 +178,18 @@ class PursuitSettings:
                 f"radius {self.arena_radius}: "
                 f"less than {most:.3g} would be right, or environment.max_pillars 0"
             )
+        if self.team_sizes and max(self.team_sizes) > self.num_pursuers:
+            raise UserError(
+                f"environment.team_sizes {list(self.team_sizes)} need environment.num_pursuers "
+                f"{max(self.team_sizes)}, here it's {self.num_pursuers}"
+            )
+        for name in ("evader_speeds", "capture_radii"):
+            drawn = getattr(self, name)
+            if drawn and (len(drawn) != 2 or drawn[0] > drawn[1]):
+                raise UserError(
+                    f"environment.{name} {list(drawn)} must be two numbers, the lower one first, or "
+                    "none"
+                )
         if self.vehicles:
             from openjax.vehicle.family import (
                 check_ranges,
@@ -181,9 +211,10 @@ class PursuitSettings:
     @property
     def frame_size(self) -> int:
         """Numbers in one frame of the history: time, evader position and velocity, pursuer
-        positions.
+        positions, or what is pooled of them.
         """
-        return 1 + 3 + 3 + 3 * self.num_pursuers
+        pursuers = self.num_pursuers if self.history_pursuers == "each" else 2
+        return 1 + 3 + 3 + 3 * pursuers
 
     @property
     def self_size(self) -> int:
@@ -196,6 +227,7 @@ class PursuitSettings:
             + 3
             + (4 if self.observe_time else 0)
             + (3 if self.observe_position else 0)
+            + (2 if self.observe_game else 0)
         )
         return own + OWN_FRAME * self.observe_history
 

@@ -32,6 +32,11 @@ class PursuitState:
     statistics: EpisodeStatistics
 
     @property
+    def active(self) -> jax.Array | None:
+        """(N,) bool, the slots of pursuers in use; None: all are."""
+        return self.task.active
+
+    @property
     def seen(self) -> jax.Array:
         """() bool, some pursuer sees the evader."""
         return jnp.any(self.in_sight, axis=-1)

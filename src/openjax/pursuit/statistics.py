@@ -5,6 +5,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from openjax.pursuit.info import StepInfo
+from openjax.pursuit.teams import team_mean
 
 
 @struct.dataclass
@@ -53,9 +54,16 @@ def empty_statistics(episode_length: int) -> EpisodeStatistics:
 
 
 def count(
-    statistics: EpisodeStatistics, step: jax.Array, info: StepInfo, reward: jax.Array
+    statistics: EpisodeStatistics,
+    step: jax.Array,
+    info: StepInfo,
+    reward: jax.Array,
+    active: jax.Array | None = None,
 ) -> EpisodeStatistics:
-    """Add one step; `step` () is its number, counted from 1, `reward` (N,) is the pursuers'."""
+    """Add one step; `step` () is its number, counted from 1, `reward` (N,) is the pursuers'.
+
+    `active` (N,): slots in use, None: all; nothing of the others is in `info`.
+    """
     now = jnp.any(info.captured)
     first = now & ~statistics.captured
     breach = info.breaches
@@ -73,5 +81,5 @@ def count(
         bounds_steps=statistics.bounds_steps + any_of(breach.bounds),
         over_speed_steps=statistics.over_speed_steps + any_of(info.over_speed),
         crashed=statistics.crashed | jnp.any(info.crashed),
-        episode_return=statistics.episode_return + jnp.mean(reward),
+        episode_return=statistics.episode_return + team_mean(active, reward),
     )

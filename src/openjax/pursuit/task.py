@@ -7,6 +7,7 @@ from flax import struct
 
 from openjax.pursuit.collisions import breaches, drone_distance
 from openjax.pursuit.settings import PursuitSettings
+from openjax.pursuit.teams import draw_team, of_team, parked
 
 START_X = (0.1, 0.536)
 """Uniform tasks: pursuers start at x in this range, the evader at the mirrored one (m)."""
@@ -33,6 +34,8 @@ distance (m).
 """
 NEIGHBOURS = 0.75
 """Scattered pursuers start at most this far from their middle along x and y (m)."""
+OUTSIDE = 2.0
+"""Where an empty slot is taken to be when tasks are told apart (m, along each axis)."""
 CANDIDATES = 8
 """Draws of a start among which the first good one is taken; more for more than three pursuers."""
 
@@ -49,6 +52,26 @@ class Task:
     """() int32, the place of its evader in the settings' `evaders`; None: it is drawn at the
     reset.
     """
+    active: jax.Array | None = None
+    """(N,) bool, the slots of pursuers in use, the first ones; None: all are."""
+    evader_speed: jax.Array | None = None
+    """() m/s; None: the settings' one."""
+    capture_radius: jax.Array | None = None
+    """() m; None: the settings' one."""
+
+    def with_starts(self, position: jax.Array) -> "Task":
+        """The same with pursuers that start at (N, 3) m; empty slots stay where they're parked."""
+        return self.replace(pursuer_position=parked(position, self.active))
+
+
+def evader_speed(settings: PursuitSettings, task: Task) -> float | jax.Array:
+    """m/s, of the evader in a task."""
+    return settings.evader_speed if task.evader_speed is None else task.evader_speed
+
+
+def capture_radius(settings: PursuitSettings, task: Task) -> float | jax.Array:
+    """m, in a task."""
+    return settings.capture_radius if task.capture_radius is None else task.capture_radius
 
 
 def empty_task(settings: PursuitSettings) -> Task:
@@ -58,28 +81,39 @@ def empty_task(settings: PursuitSettings) -> Task:
         evader_position=jnp.zeros(3, jnp.float32),
         pillar_position=jnp.zeros((settings.max_pillars, 2), jnp.float32),
         pillar_active=jnp.zeros(settings.max_pillars, bool),
+        active=jnp.zeros(settings.num_pursuers, bool) if settings.team_sizes else None,
+        evader_speed=jnp.zeros((), jnp.float32) if settings.evader_speeds else None,
+        capture_radius=jnp.zeros((), jnp.float32) if settings.capture_radii else None,
     )
 
 
 def task_descriptor(tasks: Task) -> jax.Array:
-    """(M, D) what tells M tasks apart: all start positions and the pillars in use (m)."""
+    """(M, D) what tells M tasks apart: all start positions and the pillars in use (m), and the
+    numbers of its own that a task has.
+    """
     pillars = jnp.where(tasks.pillar_active[..., None], tasks.pillar_position, 0.0)
     m = pillars.shape[0]
-    return jnp.concatenate(
-        [
-            tasks.pursuer_position.reshape(m, -1),
-            tasks.evader_position.reshape(m, -1),
-            pillars.reshape(m, -1),
-        ],
-        axis=-1,
-    )
+    pursuers = tasks.pursuer_position
+    if tasks.active is not None:
+        pursuers = jnp.where(tasks.active[..., None], pursuers, OUTSIDE)
+    parts = [
+        pursuers.reshape(m, -1),
+        tasks.evader_position.reshape(m, -1),
+        pillars.reshape(m, -1),
+    ]
+    numbers = (tasks.evader_speed, tasks.capture_radius)
+    parts += [number[:, None] for number in numbers if number is not None]
+    return jnp.concatenate(parts, axis=-1)
 
 
 def starts_clear(settings: PursuitSettings, task: Task) -> jax.Array:
     """Whether no pursuer starts in a breach and the evader starts outside all pillars. () bool."""
     breach = breaches(settings, task.pursuer_position, task.pillar_position, task.pillar_active)
     clear_of_evader = _clear_of(settings, task.pillar_position, task.evader_position[None, :2])
-    return ~(jnp.any(breach.total > 0) | jnp.any(task.pillar_active & ~clear_of_evader))
+    return ~(
+        jnp.any(of_team(task.active, breach.total) > 0)
+        | jnp.any(task.pillar_active & ~clear_of_evader)
+    )
 
 
 def pillar_cells() -> np.ndarray:
@@ -105,8 +139,11 @@ def uniform_task(settings: PursuitSettings, key: jax.Array) -> Task:
     # each further pursuer about halves the chance that all are apart
     draws = CANDIDATES * 2 ** max(0, n - 3)
     candidates = jax.random.uniform(position_key, (draws, n, 3), jnp.float32, low, high)
-    apart = jax.vmap(lambda p: jnp.all(drone_distance(p) >= settings.drone_clearance))(candidates)
-    pursuers = candidates[jnp.argmax(apart)]
+    active = draw_team(settings, key)
+    apart = jax.vmap(
+        lambda p: jnp.all(drone_distance(parked(p, active)) >= settings.drone_clearance)
+    )(candidates)
+    pursuers = parked(candidates[jnp.argmax(apart)], active)
     mirrored = jnp.array([-1.0, 1.0, 1.0], jnp.float32)
     evader = jax.random.uniform(evader_key, (3,), jnp.float32, low, high) * mirrored
 
@@ -117,13 +154,23 @@ def uniform_task(settings: PursuitSettings, key: jax.Array) -> Task:
     rank = jnp.where(free, jax.random.uniform(cell_key, (cells.shape[0],)), -1.0)
     chosen = jax.lax.top_k(rank, settings.max_pillars)[1]
     number = jax.random.randint(number_key, (), settings.min_pillars, settings.max_pillars + 1)
-    active = (jnp.arange(settings.max_pillars) < number) & free[chosen]
+    in_use = (jnp.arange(settings.max_pillars) < number) & free[chosen]
     return Task(
         pursuer_position=pursuers,
         evader_position=evader,
-        pillar_position=jnp.where(active[:, None], cells[chosen], 0.0),
-        pillar_active=active,
+        pillar_position=jnp.where(in_use[:, None], cells[chosen], 0.0),
+        pillar_active=in_use,
+        active=active,
+        evader_speed=_between(settings.evader_speeds, key, 5),
+        capture_radius=_between(settings.capture_radii, key, 6),
     )
+
+
+def _between(ends, key, number):
+    """() drawn between two ends, by the `number`-th key folded from a task's; None without ends."""
+    if not ends:
+        return None
+    return jax.random.uniform(jax.random.fold_in(key, number), (), jnp.float32, *ends)
 
 
 def expand_task(
@@ -147,10 +194,8 @@ def expand_task(
             xy = moved[..., :2] * jnp.minimum(1.0, reach / jnp.maximum(radius, 1e-6))
             return jnp.concatenate([xy, _start_height(settings, moved[..., 2:])], axis=-1)
 
-        return task.replace(
-            pursuer_position=move(pursuer_key, task.pursuer_position),
-            evader_position=move(evader_key, task.evader_position),
-        )
+        moved = task.replace(evader_position=move(evader_key, task.evader_position))
+        return moved.with_starts(move(pursuer_key, task.pursuer_position))
 
     return _first_clear(settings, draw, key, task)
 
@@ -196,7 +241,7 @@ def close_starts(
         position = start
         for i, key in enumerate(jax.random.split(place_key, n)):
             position = jnp.where(moved[i], place(position, i, key), position)
-        return task.replace(pursuer_position=position)
+        return task.with_starts(position)
 
     return _first_clear(settings, draw, key, task)
 
@@ -226,10 +271,8 @@ def scatter_starts(settings: PursuitSettings, key: jax.Array, task: Task) -> Tas
         z = jax.random.uniform(
             height_key, (n + 1, 1), minval=middle - START_Z, maxval=middle + START_Z
         )
-        return task.replace(
-            pursuer_position=jnp.concatenate([pursuers, z[1:]], axis=-1),
-            evader_position=jnp.append(xy[:, 1], z[0]),
-        )
+        scattered = task.replace(evader_position=jnp.append(xy[:, 1], z[0]))
+        return scattered.with_starts(jnp.concatenate([pursuers, z[1:]], axis=-1))
 
     return _first_clear(settings, draw, key, task)
 
@@ -306,11 +349,10 @@ def turn_task(key: jax.Array, task: Task) -> Task:
         xy = jnp.stack([cosine * x - sine * y, sine * x + cosine * y], axis=-1)
         return jnp.concatenate([xy, position[..., 2:]], axis=-1)
 
-    return task.replace(
-        pursuer_position=turn(task.pursuer_position),
-        evader_position=turn(task.evader_position),
-        pillar_position=turn(task.pillar_position),
+    turned = task.replace(
+        evader_position=turn(task.evader_position), pillar_position=turn(task.pillar_position)
     )
+    return turned.with_starts(turn(task.pursuer_position))
 
 
 def start_attitude(settings: PursuitSettings, key: jax.Array) -> jax.Array:

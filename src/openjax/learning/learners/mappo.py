@@ -17,6 +17,7 @@ from openjax.learning.settings import MappoSettings
 from openjax.learning.train_state import TrainState, clipped_adam, shuffled
 from openjax.policy import Policy, PolicyParameters, gaussian_entropy, gaussian_log_prob
 from openjax.pursuit import Observation
+from openjax.pursuit.teams import team_mean
 
 
 @struct.dataclass
@@ -124,19 +125,20 @@ def loss(
 
     The actor's is the surrogate, its ratio clipped to 1 +- `clip` (), minus the entropy bonus; the
     critic's the Huber loss of normalised values. Unless they share an encoder, neither's gradient
-    knows of the other.
+    knows of the other. Means are those of pursuers that are there.
     """
     mean, log_std, value = policy.evaluate(*parameters, batch.observation, batch.predicted)
     log_ratio = gaussian_log_prob(batch.action, mean, log_std) - batch.log_prob
     ratio = jnp.exp(log_ratio)
     clipped = jnp.clip(ratio, 1.0 - clip, 1.0 + clip)
-    surrogate = jnp.mean(jnp.minimum(ratio * batch.advantage, clipped * batch.advantage))
+    mean_of = functools.partial(team_mean, batch.observation.active)
+    surrogate = mean_of(jnp.minimum(ratio * batch.advantage, clipped * batch.advantage))
     entropy = gaussian_entropy(log_std)
     policy_loss = -surrogate - settings.entropy_coefficient * entropy
-    value_loss = jnp.mean(optax.huber_loss(value, batch.target, delta=settings.huber))
+    value_loss = mean_of(optax.huber_loss(value, batch.target, delta=settings.huber))
     watch = {
-        "kl": jnp.mean(ratio - 1.0 - log_ratio),
-        "clipped": jnp.mean(jnp.abs(ratio - 1.0) > clip),
+        "kl": mean_of(ratio - 1.0 - log_ratio),
+        "clipped": mean_of(jnp.abs(ratio - 1.0) > clip),
         "entropy": entropy,
         "policy_loss": policy_loss,
         "value_loss": value_loss,
@@ -230,15 +232,17 @@ class Mappo:
             settings.gae_lambda,
         )
         returns = advantage + value
-        explained = 1.0 - joint_moments(advantage, flown.axis)[1] ** 2 / (
-            joint_moments(returns, flown.axis)[1] ** 2 + 1e-8
+        active = rollout.observation.active
+        explained = 1.0 - joint_moments(advantage, flown.axis, active)[1] ** 2 / (
+            joint_moments(returns, flown.axis, active)[1] ** 2 + 1e-8
         )
         return Estimates(advantage, returns, explained)
 
     def _renewed_scale(self, scale, returns, flown):
         """The running moments after these returns."""
         kept = self.settings.value_norm_decay
-        mean, square = flown.mean((jnp.mean(returns), jnp.mean(returns**2)))
+        active = flown.rollout.observation.active
+        mean, square = flown.mean((team_mean(active, returns), team_mean(active, returns**2)))
         return ValueScale(
             mean=kept * scale.mean + (1 - kept) * mean,
             square=kept * scale.square + (1 - kept) * square,
@@ -250,7 +254,7 @@ class Mappo:
         W, T, ...).
         """
         rollout = flown.rollout
-        mean, std = joint_moments(advantage, flown.axis)
+        mean, std = joint_moments(advantage, flown.axis, rollout.observation.active)
         batch = Batch(
             observation=rollout.observation.replace(frames=None),
             predicted=rollout.predicted,

@@ -46,7 +46,7 @@ class Scene:
     position: jax.Array  # (3,) m, its own
     velocity: jax.Array  # (3,) m/s, its own in the last step
     pursuers: jax.Array  # (N, 3) m
-    known: jax.Array  # (N,) bool, the pursuers that it knows of
+    known: jax.Array  # (N,) bool, the pursuers that it knows of; none of an empty slot
     pillar_position: jax.Array  # (P, 2) m
     pillar_active: jax.Array  # (P,) bool
     look_ahead: jax.Array  # () s
@@ -58,6 +58,8 @@ class Scene:
     """the whole state of the world, `openjax.pursuit.PursuitState`"""
     key: jax.Array | None = None
     """() another one in each step; None where no evader of the game is one's own"""
+    active: jax.Array | None = None
+    """(N,) bool, the slots of pursuers in use; None: all are"""
 
     @property
     def pursuer_velocity(self) -> jax.Array:

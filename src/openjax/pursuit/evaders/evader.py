@@ -14,6 +14,7 @@ from openjax.pursuit.evaders.kinds import NUMBERS, UNBOUNDED, EvaderKind, evader
 from openjax.pursuit.evaders.learned import STEPS, learning
 from openjax.pursuit.settings import PursuitSettings
 from openjax.pursuit.state import PursuitState
+from openjax.pursuit.task import evader_speed
 
 
 def draw_evader(
@@ -110,11 +111,11 @@ def evader_velocity(
     world = jax.lax.stop_gradient(world)
     state = world.evader
     if state is None:
-        velocity = _flown(settings, world, settings.evader_speed, UNBOUNDED, wish)
+        velocity = _flown(settings, world, evader_speed(settings, world.task), UNBOUNDED, wish)
         return jnp.where(jnp.any(jnp.isnan(wish)), _field(settings, world), velocity), None
     own, memory = _wish(settings, rows, world)
     is_own = jnp.ones((), bool) if wish is None else jnp.any(jnp.isnan(wish))
-    speed = state.numbers["speed"] * settings.evader_speed
+    speed = state.numbers["speed"] * evader_speed(settings, world.task)
     wish = own if wish is None else jnp.where(is_own, own, wish)
     velocity = _flown(settings, world, speed, state.numbers["acceleration"], wish)
     is_field = np.array([row.behaviour == "field" for row in rows])
@@ -129,20 +130,22 @@ def scene_of(settings: PursuitSettings, world: PursuitState) -> Scene:
     """What the evader of a world knows of it."""
     numbers = world.evader.numbers
     key = world.evader.key
+    known = world.in_sight | (numbers["sees_all"] > 0.5)
     return Scene(
         settings=settings,
         position=world.evader_position,
         velocity=world.evader_velocity,
         pursuers=world.drones.position,
-        known=world.in_sight | (numbers["sees_all"] > 0.5),
+        known=known if world.active is None else known & world.active,
         pillar_position=world.task.pillar_position,
         pillar_active=world.task.pillar_active,
         look_ahead=numbers["look_ahead"],
         hiding=numbers["hiding"],
-        reach=numbers["speed"] * settings.evader_speed,
+        reach=numbers["speed"] * evader_speed(settings, world.task),
         drones=world.drones,
         world=world,
         key=None if key is None else jax.random.fold_in(key, world.step),
+        active=world.active,
     )
 
 
@@ -152,7 +155,9 @@ def _pillars(world):
 
 def _field(settings, world):
     places = world.evader_position, world.drones.position
-    return field_velocity(settings, *places, world.in_sight, *_pillars(world))
+    velocity = field_velocity(settings, *places, world.in_sight, *_pillars(world))
+    own = world.task.evader_speed
+    return velocity if own is None else velocity * (own / settings.evader_speed)
 
 
 def _wish(settings, rows, world):

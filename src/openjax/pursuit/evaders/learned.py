@@ -16,6 +16,7 @@ import numpy as np
 from openjax.pursuit.axes import turned_back
 from openjax.pursuit.evaders.behaviours import MEMORY, Scene, greedy
 from openjax.pursuit.evaders.kinds import EVADERS
+from openjax.pursuit.teams import of_team
 
 STEPS = 10
 """Steps that it remembers."""
@@ -73,7 +74,7 @@ def features(
     networks: dict[str, Any], which: jax.Array, scene: Scene, memory: jax.Array
 ) -> dict[str, jax.Array]:
     """What the one of K networks that `which` () names sees: own (9,), pursuers (N, 10), pillars
-    (P, 4), in_use (P,), greedy (3,), outward (2,).
+    (P, 4), in_use (P,), greedy (3,), outward (2,), and active (N,) where slots may be empty.
     """
     settings = scene.settings
     scene = scene.replace(look_ahead=networks["look_ahead"][which])
@@ -107,6 +108,9 @@ def features(
         "greedy": wish,
         "outward": outward,
     }
+    if scene.active is not None:
+        seen["pursuers"] = of_team(scene.active, seen["pursuers"])
+        seen["active"] = scene.active
     # fused with what follows, the greedy evader in it takes a GPU's compiler minutes
     return jax.lax.optimization_barrier(seen)
 
@@ -119,7 +123,13 @@ def outputs(network: dict[str, Any], seen: dict[str, jax.Array]) -> tuple[jax.Ar
 
     pursuers = jnp.tanh(dense("pursuer", seen["pursuers"]))
     pillars = jnp.where(seen["in_use"][..., None], jnp.tanh(dense("pillar", seen["pillars"])), 0.0)
-    pooled = [jnp.mean(pursuers, axis=-2), jnp.max(pursuers, axis=-2), jnp.sum(pillars, axis=-2)]
+    if "active" in seen:
+        active = seen["active"][..., None]
+        mean = jnp.sum(active * pursuers, axis=-2) / jnp.maximum(jnp.sum(active, axis=-2), 1)
+        most = jnp.max(jnp.where(active, pursuers, -1.0), axis=-2)  # a tanh's least
+    else:
+        mean, most = jnp.mean(pursuers, axis=-2), jnp.max(pursuers, axis=-2)
+    pooled = [mean, most, jnp.sum(pillars, axis=-2)]
     hidden = jnp.tanh(dense("own", jnp.concatenate([seen["own"], *pooled], axis=-1)))
     out = dense("output", jnp.tanh(dense("hidden", hidden)))
     inverse = seen["outward"] * np.array([1.0, -1.0], np.float32)

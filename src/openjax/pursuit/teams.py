@@ -1,0 +1,66 @@
+"""Teams of different sizes in one batch: a world has N slots for pursuers, and some may be empty.
+
+An empty slot keeps a drone, as shapes are the same in all worlds. It is parked far from everything
+and held there, so that it is near nothing; what isn't told by distances is masked.
+"""
+
+from typing import TypeVar
+
+import jax
+import jax.numpy as jnp
+
+from openjax.pursuit.settings import PursuitSettings
+from openjax.vehicle import DroneState
+
+FAR = 1000.0
+"""Empty slots are parked at least this far from the arena's axis, and from each other a hundredth of
+it (m).
+"""
+T = TypeVar("T")
+
+
+def draw_team(settings: PursuitSettings, key: jax.Array) -> jax.Array | None:
+    """(N,) bool, the slots in use, the first ones: a team of one of `team_sizes`, with equal odds;
+    None where there are none of these, and all slots are in use. `key` is the task's.
+    """
+    if not settings.team_sizes:
+        return None
+    sizes = jnp.array(settings.team_sizes, jnp.int32)
+    size = jax.random.choice(jax.random.fold_in(key, 4), sizes)
+    return jnp.arange(settings.num_pursuers) < size
+
+
+def parked(position: jax.Array, active: jax.Array | None) -> jax.Array:
+    """Positions (N, 3) m with those of empty slots far away."""
+    if active is None:
+        return position
+    x = FAR * (1.0 + 0.01 * jnp.arange(position.shape[0]))
+    away = jnp.stack([x, jnp.zeros_like(x), jnp.ones_like(x)], axis=-1)
+    return jnp.where(active[:, None], position, away)
+
+
+def held(active: jax.Array | None, before: DroneState, after: DroneState) -> DroneState:
+    """The drones (leading axis N) after a step, those of empty slots as they were before it."""
+    return after if active is None else of_team(active, after, before)
+
+
+def of_team(active: jax.Array | None, value: T, otherwise: T | float = 0.0) -> T:
+    """A tree of (N, ...) arrays whose rows of empty slots are `otherwise`, a tree like it or a
+    number.
+    """
+    if active is None:
+        return value
+    if isinstance(otherwise, float):
+        otherwise = jax.tree.map(lambda x: jnp.full_like(x, otherwise), value)
+
+    def chosen(x, y):
+        return jnp.where(active.reshape(-1, *[1] * (x.ndim - 1)), x, y)
+
+    return jax.tree.map(chosen, value, otherwise)
+
+
+def team_mean(active: jax.Array | None, value: jax.Array) -> jax.Array:
+    """() mean of the numbers (..., N) of pursuers, without those of empty slots (..., N)."""
+    if active is None:
+        return jnp.mean(value)
+    return jnp.sum(jnp.where(active, value, 0.0)) / jnp.maximum(jnp.sum(active), 1)
