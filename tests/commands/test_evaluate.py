@@ -1,9 +1,13 @@
 """Which layouts a policy flies."""
 
+import jax
 import jax.numpy as jnp
 import pytest
 
 import openjax
+from openjax.policy import make_policy
+from openjax.store.policies import abstract_parameters
+from openjax.store.policy_files import save_policy_file
 
 
 def test_a_team_that_no_layout_was_made_for_flies_uniform_tasks():
@@ -52,3 +56,25 @@ def test_a_game_that_a_policy_was_never_trained_for_is_said():
         "the brushless instead of the crazyflie",
     ]
     assert openjax.load_policy("apf").outside_of_training(larger) == []
+
+
+def test_a_policy_for_teams_flies_with_any_number(tmp_path, capsys):
+    game = dict(physics="rigid", contacts=False, episode_length=5, evaders=("field",), substeps=1)
+    small = dict(
+        network=dict(features=8),
+        predictor=dict(units=4, horizons=(1, 2), windows=2, steps=1),
+        mappo=dict(step_subsampling=1),
+        rollout_length=5,
+        restart_steps=5,
+    )
+    settings = openjax.preset("teams", environment=game, **small)
+    environment = openjax.Pursuit(settings.environment)
+    policy = make_policy(environment, settings.network, settings.predictor)
+    kinds = abstract_parameters(environment, policy)
+    parameters = jax.tree.map(lambda kind: jnp.zeros(kind.shape), kinds)
+    save_policy_file(tmp_path / "teams.npz", parameters, settings, {}, storage="float32")
+    loaded = openjax.load_policy(tmp_path / "teams.npz")
+    record = openjax.evaluate(loaded, "uniform", episodes=2, num_pursuers=5, evader_speed=1.9)
+    assert record["episodes"] == 2 and record["crash_rate"] is not None
+    said = " ".join(capsys.readouterr().out.split())
+    assert "never trained for this: 5 pursuers, which no team in training had" in said

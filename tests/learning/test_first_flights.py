@@ -125,8 +125,8 @@ def test_an_evader_within_reach_is_not_free():
     far = distance(state)
     near = distance(near)
     assert near[:, 0] == pytest.approx(0.1, abs=1e-3)
-    assert (free_share(GAME, near) < 0.2).all() and (
-        free_share(GAME, near) < free_share(GAME, far)
+    assert (free_share(GAME.capture_radius, near) < 0.2).all() and (
+        free_share(GAME.capture_radius, near) < free_share(GAME.capture_radius, far)
     ).all()
 
 

@@ -148,10 +148,12 @@ def evaluate(
         )  # which fits all games
         settings = TrainSettings(environment=game, predictor=OwnController.predictor, **whole)
         policy = LoadedPolicy(OwnController(policy), nothing, settings, "own controller")
+    number = changes.pop("num_pursuers", None)
     command = EvaluateCommand(
         policy=(policy.source,),
         scenario=str(scenario),
         episodes=episodes,
+        num_pursuers=number,
         seed=seed,
         vehicle=_path(vehicle),
         effects=_path(effects),

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 PROGRAM = "openjax evaluate"
 COMPILING = 15.0
 """Seconds that a policy's game takes to compile on a laptop, about."""
+LAYOUT_PURSUERS = 3
+"""Pursuers of the six layouts."""
 LARGEST_BATCH = 1000
 """Episodes that are flown at once, whose paths are all kept."""
 
@@ -79,6 +81,10 @@ class EvaluateCommand(FlightOptions):
 
     episodes: Annotated[int, Interval("[1, 1000000]")] = 100
     """Episodes per scenario."""
+    num_pursuers: Annotated[int | None, Interval("[1, 8]")] = None
+    """Pursuers; by default as many as in training. A policy for teams of any size flies three by
+    default, all episodes with one --environment.evader_speed and one --environment.capture_radius.
+    """
     json: Path | None = None
     """File to write the records to: an object for one scenario, a list for all."""
     vehicle: Path | None = None
@@ -147,9 +153,8 @@ def fly_scenarios(command: EvaluateCommand, loaded, evaluators: dict) -> tuple[l
         output_console().print(note, soft_wrap=True)
     tasks = layout_tasks(game.settings, layouts, command.episodes)
     if not layouts:
-        tasks["uniform"] = uniform_tasks(
-            command.environment, command.episodes, game.settings.max_pillars
-        )
+        drawn = _settings(command)
+        tasks["uniform"] = uniform_tasks(drawn, command.episodes, game.settings.max_pillars)
     kind = (game.settings, loaded.policy, command.opponent)
     compiled = kind in evaluators
     if not compiled:
@@ -167,19 +172,28 @@ def fly_scenarios(command: EvaluateCommand, loaded, evaluators: dict) -> tuple[l
         return [kind.record() for kind in flown], [kind.trajectory(0, kind.name) for kind in flown]
 
 
+def _settings(command):
+    """The settings of the command's game, of one size of team."""
+    settings = command.environment
+    number = command.num_pursuers
+    if settings.team_sizes:
+        return settings.of_one_team(number or LAYOUT_PURSUERS)
+    return settings if number is None else dataclasses.replace(settings, num_pursuers=number)
+
+
 def _game(command, loaded):
     """The game of a command, the policy in it, and the layouts; none: uniform tasks."""
     from openjax.evaluation.evaluator import layout_slots
     from openjax.pursuit.scenarios import SCENARIOS, find_scenario
 
-    settings = command.environment
+    settings = _settings(command)
     if "learned" in settings.evaders and command.opponent is None:
         raise UserError(
             "--environment.evaders learned: a name isn't enough; --opponent takes a file of "
             "openjax exploit"
         )
     wanted = settings.num_pursuers
-    trained = loaded.settings.environment.num_pursuers
+    trained = wanted if loaded.any_number else loaded.settings.environment.num_pursuers
     if command.scenario == "all":
         layouts = [layout for layout in SCENARIOS.values() if len(layout.pursuers) == trained]
     else:
@@ -187,6 +201,11 @@ def _game(command, loaded):
             [] if command.scenario == "uniform" else [find_scenario(command.scenario, settings)]
         )
     there = len(layouts[0].pursuers) if layouts else wanted
+    if command.num_pursuers not in (None, there):
+        raise UserError(
+            f"--num_pursuers {command.num_pursuers}: layout {layouts[0].name} has {there}; "
+            "--scenario uniform flies any number"
+        )
     if wanted not in (trained, there):
         raise UserError(
             f"--environment.num_pursuers {wanted}: layout {layouts[0].name} has {there} pursuers"

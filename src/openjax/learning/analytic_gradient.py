@@ -45,6 +45,8 @@ from openjax.pursuit import (
 )
 from openjax.pursuit.collisions import TOUCH, drone_distance, pillar_distance
 from openjax.pursuit.observation import rotation_axes
+from openjax.pursuit.task import capture_radius
+from openjax.pursuit.teams import parked
 from openjax.vehicle.family import family_bounds, narrowed_bounds
 from openjax.vehicle.solids import DRONE_RADIUS
 
@@ -96,10 +98,13 @@ def side_by_side(settings: PursuitSettings, key: jax.Array, task: Task) -> Task:
         position = position.at[i].set(beside)
     pillars = jnp.linalg.norm(position[:, None, :2] - task.pillar_position[None], axis=-1)
     room = settings.pillar_radius + settings.pillar_clearance
+    if task.active is not None:
+        pillars = jnp.where(task.active[:, None], pillars, jnp.inf)
+        position = parked(position, task.active)
     clear = ~jnp.any(task.pillar_active & (pillars < room)) & jnp.all(
         drone_distance(position) >= settings.drone_clearance - 1e-4
     )
-    return task.replace(pursuer_position=jnp.where(clear, position, task.pursuer_position))
+    return task.with_starts(jnp.where(clear, position, task.pursuer_position))
 
 
 def draw_start(settings: PursuitSettings, key: jax.Array) -> Task:
@@ -172,7 +177,10 @@ class AnalyticGradient:
         """Worlds some steps later, and what their pursuers met on the way."""
         fly_on = mean_step(self.environment, self.policy, parameters)
         limit = self.how.speed_from * self.game.max_speed
-        rest = REST * self.game.capture_radius
+        radius = capture_radius(self.game, world[1].task)
+        rest = REST * radius
+        if jnp.ndim(rest):
+            rest = rest[:, None]
         ways = jax.vmap(functools.partial(ways_of, self.game))(world[1].task)
 
         @jax.checkpoint
@@ -191,7 +199,7 @@ class AnalyticGradient:
                 way.breach + breach_share(self.game, state) / steps,
                 way.excess + jax.nn.relu(_speed(state.drones) - limit) / FAST / steps,
                 way.distance + nearest_way(jax.nn.relu(distance - rest)) / steps,
-                way.free + free_share(self.game, distance) / steps,
+                way.free + free_share(radius, distance) / steps,
             )
             return (world, way), None
 
@@ -342,7 +350,8 @@ def breach_share(game: PursuitSettings, state: PursuitState) -> jax.Array:
         return jax.nn.sigmoid((SMOOTH_BREACH - distance) / SMOOTH_BREACH)
 
     total = jnp.sum(near(to_pillar), axis=-1) + jnp.sum(near(to_drone), axis=-1)
-    return total + near(to_wall) + near(to_ceiling)
+    total = total + near(to_wall) + near(to_ceiling)
+    return total if state.active is None else jnp.where(state.active, total, 0.0)
 
 
 def evader_distance(game: PursuitSettings, state: PursuitState, ways: Ways) -> jax.Array:
@@ -365,11 +374,11 @@ def nearest_way(distance: jax.Array) -> jax.Array:
     )
 
 
-def free_share(game: PursuitSettings, distance: jax.Array) -> jax.Array:
-    """(W,) how free the evader at distances (W, N) is, from 0 to 1: smooth, and felt from afar."""
-    return jax.nn.sigmoid(
-        (jnp.min(distance, axis=-1) - 0.95 * game.capture_radius) / SMOOTH_CAPTURE
-    )
+def free_share(radius: float | jax.Array, distance: jax.Array) -> jax.Array:
+    """(W,) how free the evader at distances (W, N) is, from 0 to 1: smooth, and felt from afar;
+    capture radius () or (W,) m.
+    """
+    return jax.nn.sigmoid((jnp.min(distance, axis=-1) - 0.95 * radius) / SMOOTH_CAPTURE)
 
 
 def _speed(drones):

@@ -172,10 +172,10 @@ class FirstFlights:
         position = state.drones.position
         outside = jnp.sum(position[..., :2] ** 2, axis=-1) > (OUTSIDE * game.arena_radius) ** 2
         outside |= position[..., 2] > OUTSIDE * game.arena_height
-        crashed = nearest_gap(game, state) < 0.0
-        return jnp.any(outside | crashed, axis=-1) | (
-            state.step > game.episode_length - self.how.steps
-        )
+        over = outside | (nearest_gap(game, state) < 0.0)
+        if state.active is not None:
+            over &= state.active
+        return jnp.any(over, axis=-1) | (state.step > game.episode_length - self.how.steps)
 
     @functools.cached_property
     def optimiser(self) -> optax.GradientTransformation:

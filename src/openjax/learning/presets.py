@@ -178,6 +178,37 @@ def evaders() -> TrainSettings:
     )
 
 
+def teams() -> TrainSettings:
+    """One policy for teams of one to eight pursuers, in honest physics: sizes, the evader's speed and
+    the capture radius are drawn for each task; two, five and seven pursuers are held out. Minutes on
+    one large accelerator.
+    """
+    return changed(
+        evaders(),
+        environment=dict(
+            num_pursuers=8,
+            team_sizes=(1, 3, 4, 6, 8),
+            evader_speeds=(0.8, 2.0),
+            capture_radii=(0.2, 0.4),
+            observe_game=True,
+            history_pursuers="pooled",
+            evaders=("field", "field", "greedy", "wall_runner", "slow_hugger"),
+            # every pursuer is the nominal vehicle, which shows in one frame how it answers
+            vehicles=(),
+            rare_vehicles=0.0,
+            observe_history=0,
+        ),
+        analytic=dict(updates=0),
+        vehicles_start=0.0,
+        vehicles_ramp=0.0,
+        validation_start=0.0,
+        # eight slots are two and a half times the samples of three; somewhat more than half are in
+        # use
+        num_envs=3840,
+        total_steps=300_000_000,
+    )
+
+
 def mappo() -> TrainSettings:
     """The paper's plain MAPPO, without predictor and generator, with penalties under which it
     learns to catch: where a first crash costs 5,000, only the generator's tasks lead past
@@ -201,7 +232,9 @@ def dacoop() -> TrainSettings:
     return changed(mappo(), network=dict(output="field"), total_steps=100_000_000)
 
 
-PRESETS = {recipe.__name__: recipe for recipe in (quick, paper, flight, evaders, mappo, dacoop)}
+PRESETS = {
+    recipe.__name__: recipe for recipe in (quick, paper, flight, evaders, teams, mappo, dacoop)
+}
 
 
 def preset(name: str, **changes) -> TrainSettings:

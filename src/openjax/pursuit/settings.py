@@ -1,5 +1,6 @@
 """Settings of the game: arena, vehicles' limits, evader, observation and reward."""
 
+import dataclasses
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
@@ -197,6 +198,11 @@ class PursuitSettings:
 
             check_ranges(self.vehicles)
         check_evaders(self.evaders)
+
+    def of_one_team(self, number: int) -> "PursuitSettings":
+        """The same game with one size of team, one speed of the evader and one capture radius."""
+        alike = {"team_sizes": (), "evader_speeds": (), "capture_radii": ()}
+        return dataclasses.replace(self, num_pursuers=number, **alike)
 
     @property
     def arena(self) -> Arena:

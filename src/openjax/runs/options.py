@@ -32,8 +32,9 @@ class TrainCommand:
     preset: str | None = None
     """quick: minutes on two CPU cores, coarser steps; paper: the paper's task on an accelerator;
     flight: policies to be flown, every pursuer another vehicle; evaders: the same against evaders
-    that fight back; mappo: without predictor and generator; dacoop: parameters of a potential
-    field. By default quick without an accelerator, else paper.
+    that fight back; teams: one policy for one to eight pursuers; mappo: without predictor and
+    generator; dacoop: parameters of a potential field. By default quick without an accelerator,
+    else paper.
     """
     out: Path | None = None
     """Directory of the run; by default runs/DATE-PRESET."""

@@ -42,6 +42,8 @@ _OF_THE_WORLD = (
     "time_step",
 )
 """Settings that a policy can't see, and is used to."""
+_DRAWN = {"evader_speed": "evader_speeds", "capture_radius": "capture_radii"}
+"""Those of them that a training may draw, and from where; a policy for teams sees them."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -60,6 +62,11 @@ class LoadedPolicy:
     environment: Pursuit | None = None
     """Its game, where that has parts of one's own; None: the one that the settings name."""
 
+    @property
+    def any_number(self) -> bool:
+        """Whether it flies with any number of pursuers."""
+        return bool(self.settings.environment.team_sizes)
+
     def in_game(self, environment: Pursuit) -> "LoadedPolicy":
         """The policy for another game than its own: another arena, vehicle or number of pillars.
 
@@ -72,7 +79,8 @@ class LoadedPolicy:
         game = environment.settings
         own = self.settings.environment
         seen = ("self_size", "observe_in", "observed_pillars", "history_length", "frame_size")
-        for name in ("num_pursuers", *seen):
+        number = () if self.any_number else ("num_pursuers",)
+        for name in (*number, *seen):
             if getattr(game, name) != getattr(own, name):
                 raise UserError(
                     f"policy {self.source} was trained with {name} {getattr(own, name)}, here it's "
@@ -95,11 +103,15 @@ class LoadedPolicy:
             return []
         game = environment.settings
         trained = self.settings.environment
-        words = [
-            f"{name} {getattr(game, name):g} instead of {getattr(trained, name):g}"
-            for name in _OF_THE_WORLD
-            if getattr(game, name) != getattr(trained, name)
-        ]
+        words = []
+        for name in _OF_THE_WORLD:
+            value = getattr(game, name)
+            ends = getattr(trained, _DRAWN.get(name, ""), ()) or (getattr(trained, name),)
+            if not ends[0] <= value <= ends[-1]:
+                span = " to ".join(f"{end:g}" for end in ends)
+                words.append(f"{name} {value:g} instead of {span}")
+        if self.any_number and game.num_pursuers not in trained.team_sizes:
+            words.append(f"{game.num_pursuers} pursuers, which no team in training had")
         if game.airframe != trained.airframe:
             words.append(f"the {game.airframe} instead of the {trained.airframe}")
         elif environment.effects and not trained.vehicles:
