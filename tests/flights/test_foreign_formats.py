@@ -343,35 +343,129 @@ def test_a_px4_log_without_a_flight_says_so(tmp_path, data):
 
 # --- Betaflight
 
+PID = [
+    f"axis{part}[{i}]"
+    for part, axes in (("P", 3), ("I", 3), ("D", 2), ("F", 3))
+    for i in range(axes)
+]
+ROUGH = {"w": 0.0088, "a": 0.0025, "m": 0.0003, "c": 0.0088}
+"""By the first letter of a column what whole numbers leave of it."""
 
-def blackbox(c, unit=""):
-    """A decoded blackbox: raw values, or with blackbox_decode's --unit-rotation and
-    --unit-acceleration.
+
+def blackbox(c, unit="", fine=1.0):
+    """A decoded blackbox, fields, order and whole numbers as `blackbox_decode` has them of a
+    flight with Betaflight 4; or with its --unit-rotation and --unit-acceleration.
     """
     force = G if unit else G / 2048
-    table = {"loopIteration": np.arange(len(c["t"])), "time (us)": 12_345 + c["t"] * 1e6}
-    table |= {f"setpoint[{i}]": c[f"cmd_w{a}"] * DEGREES for i, a in enumerate("xyz")}
-    table["setpoint[3]"] = c["cmd_thrust"] * 1000
-    table["vbatLatest (V)"] = np.full(len(c["t"]), 16.1)
-    rate = (DEGREES, "") if not unit else (1.0, " (rad/s)")
-    table |= {f"gyroADC[{i}]{rate[1]}": c[f"w{a}"] * rate[0] for i, a in enumerate("xyz")}
-    table |= {f"accSmooth[{i}]{unit}": c[f"a{a}"] / force for i, a in enumerate("xyz")}
+    whole = np.rint if not unit else np.asarray
+    rate = (DEGREES * fine, "") if not unit else (1.0, " (rad/s)")
+    zero = np.zeros(len(c["t"]))
+    table = {"loopIteration": np.arange(len(zero)), "time (us)": np.rint(55_158_008 + c["t"] * 1e6)}
+    table |= dict.fromkeys((*PID, *(f"rcCommand[{i}]" for i in range(4))), zero)
+    table |= {
+        f"setpoint[{i}]": np.rint(c[f"cmd_w{a}"] * DEGREES * fine) for i, a in enumerate("xyz")
+    }
+    table["setpoint[3]"] = np.rint(c["cmd_thrust"] * 1000)
+    table |= {"vbatLatest (V)": zero + 16.12, "amperageLatest (A)": zero + 15.2, "rssi": zero + 785}
+    table |= {f"gyroADC[{i}]{rate[1]}": whole(c[f"w{a}"] * rate[0]) for i, a in enumerate("xyz")}
+    table |= {f"accSmooth[{i}]{unit}": whole(c[f"a{a}"] / force) for i, a in enumerate("xyz")}
+    table |= {f"debug[{i}]": zero for i in range(4)}
     for number, column in enumerate(("m2", "m1", "m3", "m4")):
-        table[f"motor[{number}]"] = 48 + 1999 * c[column]
-    table["flightModeFlags (flags)"] = ["0", *["ANGLE_MODE|HORIZON_MODE"] * (len(c["t"]) - 1)]
-    return table
+        table[f"motor[{number}]"] = np.rint(48 + 1999 * c[column])
+    table["energyCumulative (mAh)"] = zero
+    table["flightModeFlags (flags)"] = ["0", *["ANGLE_MODE|HORIZON_MODE"] * (len(zero) - 1)]
+    table["stateFlags (flags)"] = ["0"] * len(zero)
+    table["failsafePhase (flags)"] = ["IDLE"] * len(zero)
+    return table | {"rxSignalReceived": zero, "rxFlightChannelsValid": zero}
+
+
+FROM_BLACKBOX = (*PX4_NAMES, "cmd_thrust", "cmd_wx", "cmd_wy", "cmd_wz")
+
+
+def assert_blackbox(read, columns, names=FROM_BLACKBOX):
+    for name in names:
+        assert_read(read, columns, (name,), ROUGH[name[0]])
+    assert_read(read, columns, ("t",), 1e-6)
 
 
 @pytest.mark.parametrize("unit", ["", " (g)"])
 def test_a_decoded_blackbox_is_read(tmp_path, columns, unit):
     path = tmp_path / "LOG00001.01.csv"
     write_table(path, blackbox(columns, unit), separator=", ")
+    (tmp_path / "LOG00001.01.gps.csv").write_text("time (us), GPS_numSat\n0, 9\n")
+    assert find_logs(tmp_path) == [path]
     read = read_log(path)
-    assert_read(read, columns, (*PX4_NAMES, "cmd_thrust", "cmd_wx", "cmd_wy", "cmd_wz"))
-    assert_read(read, columns, ("t",), 1e-6)
+    assert_blackbox(read, columns)
+    assert np.nanmedian(read.columns["vbat"]) == pytest.approx(16.12)
     (tmp_path / "vehicle.toml").write_text("")
     case = load_case(tmp_path)
     assert [f.name for f in case.flights] == [path.name], case.quality
+
+
+EXPLORER = """"Product","Blackbox flight data recorder by Nicholas Sherlock"
+"Data version",2
+"firmwareType",3
+"firmware",4.5
+"firmwarePatch",1
+"firmwareVersion","4.5.1"
+"Firmware revision","Betaflight 4.5.1 (77d01ba3b) STM32H743"
+"Log start datetime","0000-01-01T00:00:00.000+00:00"
+"Craft name",""
+"minthrottle",1070
+"maxthrottle",2000
+"gyroScale",1.7453292519943295e-8
+"motorOutput","48,2047"
+"acc_1G",4096
+"vbatref",1660
+"rollPID","45,80,40"
+"dterm_lpf_dyn_hz","75,150"
+"debug_mode",6
+"blackbox_high_resolution",{fine:d}
+"unknownHeaders",""
+"""
+
+
+def write_explorer(path, c, fine):
+    """The Explorer's export: a line for each header, then raw fields under names in quotes, with
+    what the Explorer computes itself, and NaN where there is nothing.
+    """
+    table = blackbox(c, fine=10.0 if fine else 1.0)
+    table = {name.partition(" (")[0]: values for name, values in table.items()}
+    table |= {name: np.zeros(len(c["t"])) for name in ("flightModeFlags", "stateFlags")}
+    table["failsafePhase"] = table["stateFlags"]
+    table["vbatLatest"] = table["vbatLatest"] * 100
+    table |= {f"accSmooth[{i}]": np.rint(c[f"a{a}"] / G * 4096) for i, a in enumerate("xyz")}
+    del table["energyCumulative"]
+    nothing = np.full(len(c["t"]), np.nan)
+    table |= {f"{name}[{i}]": nothing for name in ("heading", "axisSum") for i in range(3)}
+    quoted = {f'"{name}"': values for name, values in table.items()}
+    write_table(path, quoted, form="{:.10g}")
+    text = EXPLORER.format(fine=fine) + path.read_text().replace("nan", "NaN").rstrip("\n")
+    path.write_text(text)
+
+
+@pytest.mark.parametrize("fine", [False, True])
+def test_the_blackbox_explorers_export_is_read(tmp_path, columns, fine):
+    """Its headers say what 1 g and the battery's unit are, and whether rates are tenths."""
+    path = tmp_path / "btfl_001.bbl.csv"
+    write_explorer(path, columns, fine)
+    read = read_log(path)
+    assert_blackbox(read, columns)
+    assert np.nanmedian(read.columns["vbat"]) == pytest.approx(16.12)
+    rates = 0.1 * ROUGH["w"] if fine else ROUGH["w"]
+    assert_read(read, columns, ("wx", "wy", "wz", "cmd_wx"), rates)
+    (tmp_path / "vehicle.toml").write_text("")
+    case = load_case(tmp_path)
+    assert [f.name for f in case.flights] == [path.name], case.quality
+
+
+def test_headers_that_were_decoded_into_a_file_of_their_own_count(tmp_path, columns):
+    path = tmp_path / "btfl_001.01.csv"
+    write_table(path, blackbox(columns, fine=10.0), separator=", ")
+    headers = 'fieldname, fieldvalue\nacc_1G, "2048"\nblackbox_high_resolution, "1"\n'
+    (tmp_path / "btfl_001.01.headers.csv").write_text(headers)
+    assert find_logs(tmp_path) == [path]
+    assert_read(read_log(path), columns, ("wx", "wy", "wz"), 0.1 * ROUGH["w"])
 
 
 def test_a_blackbox_of_pulses_is_told_from_one_of_dshot(tmp_path, columns):
@@ -380,7 +474,7 @@ def test_a_blackbox_of_pulses_is_told_from_one_of_dshot(tmp_path, columns):
         table[f"motor[{number}]"] = 1000 + 1000 * columns[column]
     write_table(tmp_path / "log.csv", table, separator=", ")
     read = read_log(tmp_path / "log.csv")
-    assert_read(read, columns, ("m1", "m2", "m3", "m4"))
+    assert_blackbox(read, columns, ("m1", "m2", "m3", "m4"))
     assert any("pulses" in remark for remark in read.remarks)
 
 

@@ -6,12 +6,14 @@ import gzip
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from openjax.errors import UserError
 from openjax.flights.case import load_case
 from openjax.flights.importers import find_logs, read_log
 from openjax.flights.reading import read_csv, write_csv
 from openjax.flights.samples import log_of
+from openjax.flights.track import tracks_of
 
 
 @pytest.fixture(scope="module")
@@ -132,3 +134,58 @@ def test_a_folder_without_a_log_says_what_is_in_it(tmp_path):
     (tmp_path / "flight.csv").write_bytes(b"PK\x03\x04" + bytes(100))
     with pytest.raises(UserError, match="is a zip archive or a spreadsheet"):
         load_case(tmp_path)
+
+
+def write_case(folder, columns):
+    write_csv(folder / "flight.csv", log_of([columns], "flight"))
+    (folder / "vehicle.toml").write_text("")
+
+
+def changed(sample_columns, change):
+    """The columns of a sample flight, some of them changed."""
+    columns = sample_columns["flight_a"]
+    return columns | change(columns)
+
+
+def test_no_line_is_drawn_over_a_hole_in_the_motors(tmp_path, sample_columns):
+    hole = slice(300, 420)
+
+    def without_motors(columns):
+        motors = {f"m{i}": columns[f"m{i}"].copy() for i in (1, 2, 3, 4)}
+        for values in motors.values():
+            values[hole] = np.nan
+        return motors
+
+    columns = changed(sample_columns, without_motors)
+    write_case(tmp_path, columns)
+    first, second = tracks_of(load_case(tmp_path))
+    assert first.time[-1] < columns["t"][hole.start] <= columns["t"][hole.stop] <= second.time[0]
+
+
+def test_an_attitude_of_half_the_angles_is_refused(tmp_path, sample_columns):
+    """As where parts of a quaternion are taken for angles."""
+
+    def halved(columns):
+        attitude = Rotation.from_quat(
+            np.stack([columns[f"q{a}"] for a in "wxyz"], 1), scalar_first=True
+        )
+        half = Rotation.from_rotvec(0.5 * attitude.as_rotvec()).as_quat(scalar_first=True)
+        return dict(zip(("qw", "qx", "qy", "qz"), half.T, strict=True))
+
+    write_case(tmp_path, changed(sample_columns, halved))
+    with pytest.raises(UserError, match="wx, wy, wz are 2 times the attitude's rate"):
+        load_case(tmp_path)
+
+
+@pytest.mark.parametrize("share, words", [(0.02, "not sampled there"), (0.2, "left out")])
+def test_a_gyroscope_at_its_end_reads_nothing_there(tmp_path, sample_columns, share, words):
+    def clipped(columns):
+        rates = {name: columns[name] for name in ("wx", "wy", "wz")}
+        most = np.quantile(np.abs(np.stack(list(rates.values()))).max(0), 1 - share)
+        return {name: np.clip(values, -most, most) for name, values in rates.items()}
+
+    write_case(tmp_path, changed(sample_columns, clipped))
+    case = load_case(tmp_path)
+    (end,) = [i.issue for i in case.quality if "the sensor's end" in i.issue]
+    assert end.startswith("w") and end.endswith(words)
+    assert case.flights[0].body_rates_derived == (words == "left out")

@@ -15,6 +15,9 @@ from openjax.flights.sampling import drop_frozen, drop_repeats, put_in_step, run
 SHORTEST = 2.0  # s airborne: windows of 0.5 s, and a few of them
 SLOWEST = 0.05  # s between rows
 BELOW = 0.3  # m below the floor, where nothing flies: more than an origin on a table is off by
+SATURATED = 0.01  # share of rows at one largest value from which that is the sensor's end
+OFTEN = 0.05  # share from which the sensor is of no use
+LEAST_RANGE = {"body_rates": 0.3, "specific_force": 15.0}  # rad/s, m/s^2
 GROUND_CLEARANCE = 0.02  # m above the floor
 
 
@@ -198,7 +201,7 @@ def _in_range(flight: Flight, note) -> Flight:
         _share_of_one(motor, "m1, m2, m3, m4")
     if flight.command_thrust is not None:
         _share_of_one(flight.command_thrust, "cmd_thrust")
-    flight = _without_lost_poses(flight, note)
+    flight = _without_saturated(_without_lost_poses(flight, note), note)
     if flight.quaternion is not None:
         changes["quaternion"] = _of_unit_length(flight.quaternion, note)
     if flight.position is not None and np.nanmax(np.abs(flight.position)) > 100.0:
@@ -216,6 +219,36 @@ def _in_range(flight: Flight, note) -> Flight:
         if not 2.0 < middle < 30.0:
             note("corrupt", f"vbat is {middle:.2g} V, which no battery in flight has; left out")
             changes["battery_voltage"] = None
+    return dataclasses.replace(flight, **changes) if changes else flight
+
+
+def _without_saturated(flight: Flight, note) -> Flight:
+    """A sensor at the end of its range reads what it can, not what there is: not sampled, or of no
+    use where that is often so.
+    """
+    changes = {}
+    for channel in ("body_rates", "specific_force"):
+        values = getattr(flight, channel)
+        if values is None:
+            continue
+        size = np.abs(values)
+        most = float(np.nanmax(size))
+        # one noisy reading is the largest; many equal ones are the sensor's end
+        at_end = size == most
+        share = float(at_end.any(1).mean())
+        if share < SATURATED or most < LEAST_RANGE[channel]:
+            continue
+        columns = zip(CHANNEL_COLUMNS[channel], at_end.any(0), strict=True)
+        text = f"{', '.join(c for c, ends in columns if ends)} read {most:g} or -{most:g}"
+        text += f" in {share:.0%} of the rows, the sensor's end"
+        if share < OFTEN:
+            note("corrupt", f"{text}: taken as not sampled there")
+            changes[channel] = np.where(at_end.any(1)[:, None], np.nan, values)
+            continue
+        if channel == "body_rates" and flight.quaternion is None:
+            raise Refused("corrupt", f"{text}: a larger range is needed")
+        note("corrupt", f"{text}: left out")
+        changes[channel] = None
     return dataclasses.replace(flight, **changes) if changes else flight
 
 

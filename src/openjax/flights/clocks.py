@@ -73,8 +73,9 @@ def read_motor_clock(
         return MotorClock(by_a_row, True, {"motor rows": text})
     words = _in_words({flight: time for flight, time in late.items() if abs(time) > least})
     text = (
-        f"motors and gyroscope don't share a clock: motor commands are {words}; they are moved by "
-        "that, and torques, lags and latencies can't be told from these logs"
+        f"motors and {'gyroscope' if gyroscope else 'attitude'} don't share a clock: motor "
+        f"commands are {words}; they are moved by that, and torques, lags and latencies can't be "
+        "told from these logs"
     )
     if alike:  # what tells no clock has that of the others
         late = dict.fromkeys(by_a_row, usual) | late

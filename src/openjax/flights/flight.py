@@ -33,6 +33,7 @@ CHANNEL_COLUMNS = {
     "motor_command": ("m1", "m2", "m3", "m4"),
     "battery_voltage": ("vbat",),
 }
+HOLE = 0.5  # s, longest time without a sample over which a line is drawn
 SENSORS = ("position", "quaternion", "velocity", "body_rates", "specific_force")
 
 
@@ -124,6 +125,15 @@ class Flight:
             raise ValueError(f"{self.name}: no channel {channel}")
         rows = np.isfinite(values.reshape(len(values), -1)).all(1)
         return self.time[rows], values[rows]
+
+    def holes(self, channel: str) -> Array:
+        """(H, 2) s, begin and end of where `channel` wasn't sampled for so long that no line may
+        stand for it.
+        """
+        at = np.r_[self.time[0], self.sampled(channel)[0], self.time[-1]]
+        steps = np.diff(at)
+        wide = np.flatnonzero(steps > max(HOLE, 10.0 * np.median(steps)))
+        return np.stack([at[wide], at[wide + 1]], 1)
 
     def interpolated(self, channel: str, time: Array | None = None) -> Array:
         """`channel` at `time` (S,) (default: every row), linearly between its samples, held at the

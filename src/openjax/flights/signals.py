@@ -13,7 +13,6 @@ from openjax.flights.flight import SENSORS, Flight
 RATE = 100.0  # Hz, common clock of the comparisons
 LONGEST = 30.0  # s, enough to tell
 SHORTEST = 1.5  # s, less tells nothing
-HOLE = 0.4  # s without a sample of a channel, over which no line may be drawn
 COMPARED = (*SENSORS, "motor_command", "command_body_rates")
 FADE = 0.5  # s
 
@@ -26,21 +25,13 @@ def clock_of(flight: Flight) -> np.ndarray | None:
     wide = np.flatnonzero(steps > max(0.1, 5 * flight.row_period))
     gaps = np.stack([flight.time[wide], flight.time[wide + 1]], 1)
     logged = [c for c in COMPARED if getattr(flight, c) is not None]
-    holes = [_holes(flight, channel) for channel in logged]
+    holes = [flight.holes(channel) for channel in logged]
     start, stop = _longest_without(np.concatenate([gaps, *holes]), flight.time)
     if stop - start < SHORTEST:  # holes everywhere: lines over them are all there is
         start, stop = _longest_without(gaps, flight.time)
     if stop - start < SHORTEST:
         return None
     return np.arange(start, min(stop, start + LONGEST), 1 / RATE)
-
-
-def _holes(flight: Flight, channel: str) -> np.ndarray:
-    """(H, 2) s, begin and end of where a channel wasn't sampled for long."""
-    at = np.r_[flight.time[0], flight.sampled(channel)[0], flight.time[-1]]
-    steps = np.diff(at)
-    wide = np.flatnonzero(steps > max(HOLE, 10 * np.median(steps)))
-    return np.stack([at[wide], at[wide + 1]], 1)
 
 
 def _longest_without(gaps: np.ndarray, time: np.ndarray) -> tuple[float, float]:

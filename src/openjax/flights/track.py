@@ -60,14 +60,32 @@ def tracks_of(case: Case) -> list[Track]:
 
 
 def flight_tracks(flight: Flight, case: Case) -> list[Track]:
-    """The stretches of one flight without gaps, on a uniform grid."""
+    """The stretches of one flight without gaps, on a uniform grid. A long hole in a channel is one,
+    too, unless nothing is left without.
+    """
+    whole = flight.rows(~_in_holes(flight))
+    return _stretches(whole, flight, case) or _stretches(flight, flight, case)
+
+
+def _in_holes(flight: Flight) -> np.ndarray:
+    """(T,) rows in which a channel wasn't sampled for so long that no line may stand for it."""
+    inside = np.zeros(len(flight), bool)
+    for channel in (*SENSORS, "motor_command", "command_thrust", "command_body_rates"):
+        if getattr(flight, channel) is not None:
+            for begin, end in flight.holes(channel):
+                inside |= (flight.time > begin) & (flight.time < end)
+    return inside
+
+
+def _stretches(flight: Flight, logged: Flight, case: Case) -> list[Track]:
+    """Tracks of rows of a flight as it was `logged`."""
     found = []
     for number, stretch in enumerate(
         flight.stretches(max_step=max(MAX_GAP, 3 * flight.row_period), min_duration=MIN_DURATION)
     ):
         part = flight.rows(stretch)
         found.append(
-            _on_grid(part, flight, case, f"{flight.name}#{number}" if number else flight.name)
+            _on_grid(part, logged, case, f"{flight.name}#{number}" if number else flight.name)
         )
     return found
 

@@ -48,7 +48,8 @@ for _importer in (
 
 def find_logs(folder: Path) -> list[Path]:
     """The logs of a case folder, by name."""
-    return sorted(path for path in folder.iterdir() if importer_of(path) is not None)
+    files = (path for path in folder.iterdir() if not betaflight.is_beside(path))
+    return sorted(path for path in files if importer_of(path) is not None)
 
 
 def read_log(path: Path, mapping: ColumnMapping | None = None) -> LogTable:

@@ -1,10 +1,15 @@
-"""Betaflight's blackbox: CSV files as `blackbox_decode` writes them.
+"""Betaflight's blackbox: CSV files as `blackbox_decode` and the Blackbox Explorer write them.
 
-Fields and their units (blackbox-tools, blackbox_decode.c): a field's unit stands in brackets behind
-its name unless it is raw. Raw are degrees per second for `gyroADC` and `setpoint`, counts of the
+`blackbox_decode` (blackbox-tools, blackbox_decode.c) puts a field's unit in brackets behind its
+name unless the field is raw. Raw are degrees per second for `gyroADC` and `setpoint`, counts of the
 sensor for `accSmooth`, thousandths for the throttle, and for `motor` either pulses of 1000 to 2000
-us or DShot's 48 to 2047. Axes are forward, left, up, as here: the mixer's signs say so, in which a
-positive pitch raises the rear motors. Motors are rear right, front right, rear left, front left.
+us or DShot's 48 to 2047. The Explorer writes raw values only, and above the columns a line for each
+of the log's headers, which say their scale (blackbox-log-viewer, csv-export-worker.js and
+flightlog_fields_presenter.js). `blackbox_decode --save-headers` puts the same lines into a file of
+their own.
+
+Axes are forward, left, up, as here: the mixer's signs say so, in which a positive pitch raises the
+rear motors. Motors are rear right, front right, rear left, front left.
 """
 
 import re
@@ -12,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
+from openjax.flights.csv_text import find_header, head_of
 from openjax.flights.importers.columns import (
     UNITS,
     ColumnMapping,
@@ -19,7 +25,7 @@ from openjax.flights.importers.columns import (
     Stream,
     merge_streams,
 )
-from openjax.flights.importers.csv_files import delimiter_of, header_of, raw_columns
+from openjax.flights.importers.csv_files import delimiter_of, is_csv, raw_columns
 from openjax.flights.importers.importer import Importer
 from openjax.flights.reading import CHANNEL_COLUMNS, LogError, LogTable
 
@@ -28,14 +34,39 @@ DSHOT = (48.0, 2047.0)  # the least and the largest throttle value of the protoc
 PULSE = (1000.0, 2000.0)  # us
 # {nominal place's column: index of Betaflight's motor}, mixerQuadX in flight/mixer_init.c
 MOTOR_OF = {"m1": 1, "m2": 0, "m3": 2, "m4": 3}
+FIRST = "loopIteration"  # the name of the first column
+HEADERS_FILE = ".headers.csv"
+BESIDE = (HEADERS_FILE, ".gps.csv", ".event.csv")  # how else files are called that a decoder writes
+FINE = 10.0  # by which blackbox_high_resolution multiplies rates
 _UNIT_NAMES = {"m/s2": "m/s^2"}
 _FIELD = re.compile(r"(.*?)(?: \((.*)\))?")
 
 
 def is_blackbox_csv(path: Path) -> bool:
     """Whether a CSV is a decoded blackbox."""
-    names = header_of(path)
-    return "loopIteration" in names and any(n.startswith("gyroADC[0]") for n in names)
+    if not is_csv(path):
+        return False
+    lines = head_of(path)
+    above = _lines_above(lines)
+    return above is not None and "gyroADC[0]" in lines[above]
+
+
+def is_beside(path: Path) -> bool:
+    """Whether a file is no log of its own, but what a decoder wrote beside one."""
+    ending = next((end for end in BESIDE if path.name.endswith(end)), None)
+    return ending is not None and path.with_name(path.name.removesuffix(ending) + ".csv").exists()
+
+
+def _lines_above(lines: list[str]) -> int | None:
+    """How many lines stand above the columns' names; None where there are no such names."""
+    first = (line.lstrip(' "').startswith(FIRST) for line in lines)
+    return next((number for number, is_first in enumerate(first) if is_first), None)
+
+
+def _headers(lines: list[str]) -> dict[str, str]:
+    """{name: value} of the log's headers, one a line."""
+    pairs = (line.partition(",") for line in lines)
+    return {name.strip(' "'): value.strip(' "') for name, _, value in pairs}
 
 
 def is_blackbox_binary(path: Path) -> bool:
@@ -59,17 +90,23 @@ def read_blackbox_binary(path: Path, mapping: ColumnMapping | None = None) -> Lo
 def read_blackbox_csv(path: Path, mapping: ColumnMapping | None = None) -> LogTable:
     """A decoded blackbox. Raises LogError where it lacks what is needed."""
     delimiter = delimiter_of(mapping)
-    names = header_of(path, delimiter)
+    lines = head_of(path)
+    above = _lines_above(lines) or 0
+    names = find_header(lines[above:], delimiter).names
+    said = _headers(lines[:above])
+    decoded = path.with_name(path.name.removesuffix(".gz").removesuffix(".csv") + HEADERS_FILE)
+    if decoded.is_file():
+        said |= _headers(head_of(decoded))
     fields = {_FIELD.fullmatch(name)[1]: name for name in names}
-    usual = _usual(fields)
+    usual = _usual(fields, said)
     time = fields.get("time", "time")
     asked = {} if mapping is None else mapping.columns
     wanted = (time, *(source.name for source in (*usual.values(), *asked.values())))
-    raw, remarks = raw_columns(path, wanted, time, delimiter)
-    columns = usual | _force(raw, fields, remarks) | _motors(raw, fields, remarks)
+    raw, remarks = raw_columns(path, wanted, time, delimiter, above)
+    columns = usual | _force(raw, fields, said, remarks) | _motors(raw, fields, remarks)
     if mapping is not None:
         columns = mapping.over(columns)
-    seconds = raw[time] * (1.0 if time.endswith("(s)") else 1e-6)
+    seconds = raw[time] * UNITS.get(_FIELD.fullmatch(time)[2] or "us", UNITS["us"])
     merged = merge_streams([Stream(seconds, raw)], columns)
     merged["t"] = merged["t"] - merged["t"][0]
     for motor in set(CHANNEL_COLUMNS["motor_command"]) & set(merged) - set(asked):
@@ -77,18 +114,33 @@ def read_blackbox_csv(path: Path, mapping: ColumnMapping | None = None) -> LogTa
     return LogTable(path.name, merged, np.full(len(merged["t"]), "0"), tuple(remarks))
 
 
-def _usual(fields: dict[str, str]) -> dict[str, Source]:
-    """{column: source} of fields that are there. The force and the motors are raw as yet."""
-    wanted = {f"w{a}": (f"gyroADC[{i}]", UNITS["deg/s"]) for i, a in enumerate("xyz")}
-    wanted |= {f"cmd_w{a}": (f"setpoint[{i}]", UNITS["deg/s"]) for i, a in enumerate("xyz")}
+def _usual(fields: dict[str, str], said: dict[str, str]) -> dict[str, Source]:
+    """{column: source} of fields that are there, whose scale the log's headers have `said`. The
+    force and the motors are raw as yet.
+    """
+    fine = FINE if _number(said, "blackbox_high_resolution") else 1.0
+    # The Explorer's gyroScale is in rad/us a count.
+    count = 1e6 * (_number(said, "gyroScale") or UNITS["us"] * UNITS["deg/s"])
+    old = said.get("firmwareVersion", "4").startswith(("2.", "3."))
+    wanted = {f"w{a}": (f"gyroADC[{i}]", count / fine) for i, a in enumerate("xyz")}
+    wanted |= {f"cmd_w{a}": (f"setpoint[{i}]", UNITS["deg/s"] / fine) for i, a in enumerate("xyz")}
     wanted |= {f"a{a}": (f"accSmooth[{i}]", 1.0) for i, a in enumerate("xyz")}
     wanted |= {column: (f"motor[{i}]", 1.0) for column, i in MOTOR_OF.items()}
-    wanted |= {"cmd_thrust": ("setpoint[3]", 1e-3), "vbat": ("vbatLatest", 1.0)}
+    wanted |= {"cmd_thrust": ("setpoint[3]", 1e-3)}
+    wanted |= {"vbat": ("vbatLatest", 0.1 if old else 0.01)}
     return {
         column: Source(fields[field], _scale(fields[field], usual))
         for column, (field, usual) in wanted.items()
         if field in fields
     }
+
+
+def _number(said: dict[str, str], name: str) -> float:
+    """A header's number; 0 where there is none."""
+    try:
+        return float(said.get(name, 0.0))
+    except ValueError:
+        return 0.0
 
 
 def _scale(name: str, usual: float) -> float:
@@ -97,16 +149,21 @@ def _scale(name: str, usual: float) -> float:
     return usual if unit is None else UNITS.get(_UNIT_NAMES.get(unit, unit), usual)
 
 
-def _force(raw, fields: dict[str, str], remarks: list[str]) -> dict[str, Source]:
-    """The accelerometer's columns. Raw counts have no unit in the CSV: sensors have a power of two
-    for 1 g, and it is the one nearest to what was felt in the median.
+def _force(
+    raw, fields: dict[str, str], said: dict[str, str], remarks: list[str]
+) -> dict[str, Source]:
+    """The accelerometer's columns. Raw counts are as many a g as the header acc_1G says; without
+    it, sensors have a power of two for 1 g, and it is the one nearest to what was felt in the
+    median.
     """
     names = [fields.get(f"accSmooth[{i}]") for i in range(3)]
     if any(name is None or name not in raw for name in names) or "(" in names[0]:
         return {}
-    felt = np.nanmedian(np.linalg.norm([raw[name] for name in names], axis=0))
-    counts = 2.0 ** np.rint(np.log2(max(felt, 1.0)))
-    remarks.append(f"accSmooth is in the sensor's counts: {counts:g} are taken for 1 g")
+    counts = _number(said, "acc_1G")
+    if not counts:
+        felt = np.nanmedian(np.linalg.norm([raw[name] for name in names], axis=0))
+        counts = 2.0 ** np.rint(np.log2(max(felt, 1.0)))
+        remarks.append(f"accSmooth is in the sensor's counts: {counts:g} are taken for 1 g")
     return {
         f"a{a}": Source(name, UNITS["g"] / counts) for a, name in zip("xyz", names, strict=True)
     }
