@@ -179,9 +179,9 @@ def evaders() -> TrainSettings:
 
 
 def teams() -> TrainSettings:
-    """One policy for teams of one to eight pursuers, in honest physics: sizes, the evader's speed and
-    the capture radius are drawn for each task; two, five and seven pursuers are held out. Minutes on
-    one large accelerator.
+    """One policy for teams of one to eight pursuers, in honest physics: sizes, the evader's speed
+    and the capture radius are drawn for each task; two, five and seven pursuers are held out.
+    Minutes on one large accelerator.
     """
     return changed(
         evaders(),

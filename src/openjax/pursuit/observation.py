@@ -77,8 +77,8 @@ def frame_pursuers(
     """(M, 3) m, what a frame of the history holds of pursuers at (N, 3): all of them, or two.
 
     Pooled, these are the nearest one's place relative to the evader, as far as one knows where that
-    is, and the sum of all such places, each divided by its squared distance: whence evaders that flee
-    feel pressed. `active` (N,) says which slots are in use.
+    is, and the sum of all such places, each divided by its squared distance: whence evaders that
+    flee feel pressed. `active` (N,) says which slots are in use.
     """
     if settings.history_pursuers == "each":
         return position

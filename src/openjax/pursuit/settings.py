@@ -81,8 +81,8 @@ class PursuitSettings:
     evader_speed: Annotated[float, Interval("(0, 100]")] = 1.3
     """Speed of the evader (m/s)."""
     evader_speeds: Annotated[tuple[float, ...], Interval("(0, 100]")] = ()
-    """Lowest and highest speed of the evader (m/s), between which that of each uniform task is drawn,
-    in place of `evader_speed`; empty: none is drawn.
+    """Lowest and highest speed of the evader (m/s), between which that of each uniform task is
+    drawn, in place of `evader_speed`; empty: none is drawn.
     """
     capture_radii: Annotated[tuple[float, ...], Interval("(0, 10]")] = ()
     """Smallest and largest capture radius (m), the same in place of `capture_radius`."""
@@ -160,8 +160,8 @@ class PursuitSettings:
     history_spacing: Annotated[int, Interval("[1, 1000]")] = 1
     """Control steps between two frames of the history."""
     history_pursuers: Literal["each", "pooled"] = "each"
-    """What these frames hold of the pursuers. "each": all positions, as in the paper; "pooled": where
-    the nearest one is and whence all press, for teams of any size.
+    """What these frames hold of the pursuers. "each": all positions, as in the paper; "pooled":
+    where the nearest one is and whence all press, for teams of any size.
     """
     reward: RewardSettings = field(default_factory=RewardSettings)
 
@@ -188,8 +188,8 @@ class PursuitSettings:
             drawn = getattr(self, name)
             if drawn and (len(drawn) != 2 or drawn[0] > drawn[1]):
                 raise UserError(
-                    f"environment.{name} {list(drawn)} must be two numbers, the lower one first, or "
-                    "none"
+                    f"environment.{name} {list(drawn)} must be two numbers, the lower one first, "
+                    "or none"
                 )
         if self.vehicles:
             from openjax.vehicle.family import (

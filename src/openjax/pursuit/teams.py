@@ -13,8 +13,8 @@ from openjax.pursuit.settings import PursuitSettings
 from openjax.vehicle import DroneState
 
 FAR = 1000.0
-"""Empty slots are parked at least this far from the arena's axis, and from each other a hundredth of
-it (m).
+"""Empty slots are parked at least this far from the arena's axis, and from each other a hundredth
+of it (m).
 """
 T = TypeVar("T")
 

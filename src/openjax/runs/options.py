@@ -10,6 +10,7 @@ import tyro
 
 from openjax.evaluation.judges.settings import BestResponseSettings, PlannerSettings
 from openjax.learning.settings import AdaptSettings, TrainSettings
+from openjax.pursuit.evaders.kinds import HELD_OUT
 from openjax.pursuit.settings import PursuitSettings
 from openjax.ranges import Interval, Seed
 from openjax.store import DEFAULT_POLICY
@@ -126,6 +127,42 @@ class ExploitCommand:
     environment: tyro.conf.FlagConversionOff[PursuitSettings] = dataclasses.field(
         default_factory=PursuitSettings
     )
+
+
+@dataclasses.dataclass(frozen=True)
+class MapCommand:
+    """Map what a policy catches: over teams, speeds of the evader and capture radii."""
+
+    policy: str = DEFAULT_POLICY
+    """A run's directory, a policy file (.npz), a checkpoint, or the name of a policy in the
+    package; one of the preset teams flies with any number of pursuers.
+    """
+    out: Path = Path("map.png")
+    """File for the picture: a small map for each size of team."""
+    json: Path | None = None
+    """File to write all cells to."""
+    sizes: Annotated[tuple[int, ...], Interval("[1, 8]")] = (1, 2, 3, 4, 5, 6, 7, 8)
+    """Numbers of pursuers."""
+    speed_ratios: Annotated[tuple[float, ...], Interval("(0, 10]")] = (
+        *(0.8, 1.0, 1.2, 1.4, 1.6, 2.0, 2.5, 3.0),
+    )
+    """Speeds of the evader, as multiples of the pursuers' maximal one."""
+    radii: Annotated[tuple[float, ...], Interval("(0, 10]")] = (
+        *(0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.5),
+    )
+    """Capture radii (m)."""
+    scenario: Literal["empty", "uniform"] = "empty"
+    """Uniform tasks, with their pillars or without."""
+    evaders: tuple[str, ...] = HELD_OUT
+    """One of them is drawn for each episode; by default those that no preset trains with."""
+    episodes: Annotated[int, Interval("[1, 1000000]")] = 200
+    """Of each cell."""
+    batch: Annotated[int, Interval("[1, 1000000]")] = 8192
+    """Episodes that are flown at once."""
+    seed: Seed = 0
+    """Draws the tasks, which are the same in all cells, and the evaders."""
+    compilation_cache: bool = True
+    """Keep compiled programs in the user's cache folder."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -100,6 +100,52 @@ def draw_from_above(axes: Axes, trajectory: Trajectory) -> None:
     axes.set_title(f"{trajectory.title}: {outcome}", fontsize="medium")
 
 
+def plot_map(path: Path, cells: Sequence[dict], title: str) -> None:
+    """A small map for each size of team: captures over capture radius and speed ratio, and the line
+    below which a theorem forces one.
+
+    cells: records of `openjax.runs.catch_map.cell_record`.
+    """
+    sizes = sorted({cell["num_pursuers"] for cell in cells})
+    columns = min(4, len(sizes))
+    rows = -(-len(sizes) // columns)
+    figure = Figure(figsize=(3.1 * columns + 1.2, 3.0 * rows + 0.5), layout="constrained")
+    panels = figure.subplots(rows, columns, squeeze=False).ravel()
+    for axes, size in zip(panels, sizes, strict=False):
+        shown = _draw_map(axes, [cell for cell in cells if cell["num_pursuers"] == size])
+        axes.set_title(f"{size} pursuer{'s' if size > 1 else ''}", fontsize="medium")
+    for axes in panels[len(sizes) :]:
+        axes.set_axis_off()
+    figure.supxlabel("capture radius [m]", fontsize="medium")
+    figure.supylabel("evader's speed / pursuers'", fontsize="medium")
+    figure.suptitle(title, fontsize="medium")
+    figure.colorbar(shown, ax=panels.tolist(), label="captured", shrink=0.8)
+    _save(figure, path)
+
+
+def _draw_map(axes, cells):
+    """A team's map; returns the picture, for a colour bar."""
+    radii = sorted({cell["capture_radius"] for cell in cells})
+    ratios = sorted({cell["speed_ratio"] for cell in cells})
+    rates = np.full((len(ratios), len(radii)), np.nan)
+    forced = dict.fromkeys(radii, 0.0)
+    for cell in cells:
+        place = ratios.index(cell["speed_ratio"]), radii.index(cell["capture_radius"])
+        rates[place] = cell["capture_rate"]
+        forced[cell["capture_radius"]] = cell["forced_below"]
+        text = f"{cell['capture_rate']:.2f}".replace("0.", ".")
+        dark = cell["capture_rate"] < 0.5
+        color = "white" if dark else "black"
+        axes.text(*place[::-1], text, ha="center", va="center", fontsize=6, color=color)
+    shown = axes.imshow(rates, origin="lower", vmin=0, vmax=1, cmap="viridis", aspect="auto")
+    axes.set_xticks(range(len(radii)), [f"{radius:g}" for radius in radii], fontsize=7)
+    axes.set_yticks(range(len(ratios)), [f"{ratio:g}" for ratio in ratios], fontsize=7)
+    # between the middles of cells
+    height = np.interp(list(forced.values()), ratios, range(len(ratios)), left=-0.5)
+    axes.step(range(len(radii)), height, where="mid", color="red", linewidth=1.2)
+    return shown
+
+
 def plot_training(path: Path, metrics_path: Path) -> None:
     """Training curves and the validation results of a metrics file, over environment steps."""
     training = list(read_metrics(metrics_path, "train"))

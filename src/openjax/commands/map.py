@@ -1,0 +1,65 @@
+"""What a policy catches: `openjax map --policy RUN`.
+
+It flies with teams of each size, after evaders of each speed, with each capture radius, against
+scripted evaders. The picture shows the share of captures in each cell, and the line below which a
+theorem forces one for points without inertia (`openjax.baselines.stack`).
+"""
+
+import dataclasses
+from collections.abc import Sequence
+
+from openjax.command_line import output_console, parse
+from openjax.errors import UserError
+from openjax.files import check_output, write_json
+from openjax.pursuit.evaders.kinds import check_evaders
+from openjax.runs.options import MapCommand
+from openjax.store.compiled_programs import cache_programs
+
+PROGRAM = "openjax map"
+ON_CPU = {
+    "speed_ratios": (0.8, 1.3, 2.0),
+    "radii": (0.2, 0.3, 0.4),
+    "episodes": 4,
+    "batch": 96,
+}
+"""What is less by default without an accelerator: enough to see it work."""
+
+
+def main(arguments: Sequence[str]) -> int:
+    """The command; returns its exit status. Raises UserError for a policy or a file that can't be
+    used.
+    """
+    command = parse(MapCommand, MapCommand(), arguments, PROGRAM)
+    if command.compilation_cache:
+        cache_programs()
+    import jax
+
+    from openjax.runs.catch_map import draw_map, map_game
+    from openjax.show.plots import plot_map
+    from openjax.store.policies import load_policy
+
+    loaded = load_policy(command.policy)
+    trained = loaded.settings.environment
+    less = ON_CPU if jax.default_backend() == "cpu" else {}
+    sizes = {} if trained.team_sizes else {"sizes": (trained.num_pursuers,)}
+    default = dataclasses.replace(MapCommand(), **less, **sizes)
+    command = parse(MapCommand, default, arguments, PROGRAM)
+    check_output(command.out, "--out")
+    check_output(command.json, "--json")
+    if command.out.suffix not in (".png", ".svg", ".pdf"):
+        raise UserError(f"--out {command.out}: a picture ends in .png, .svg or .pdf")
+    check_evaders(command.evaders)
+    map_game(command, trained)
+    console = output_console()
+    found = draw_map(command, loaded, lambda text: console.print(text, soft_wrap=True))
+    if command.json is not None:
+        write_json(command.json, found)
+    plot_map(command.out, found["cells"], f"{command.policy}: captures, {command.scenario}")
+    least = min(found["cells"], key=lambda cell: cell["capture_rate"])
+    console.print(
+        f"{command.out}: {len(found['cells'])} cells of {command.episodes} episodes; the least is "
+        f"{least['capture_rate']:.2f}, with {least['num_pursuers']} pursuers, "
+        f"{least['speed_ratio']:g} times their speed and {least['capture_radius']:g} m",
+        soft_wrap=True,
+    )
+    return 0
