@@ -118,3 +118,32 @@ def test_a_term_of_ones_own_counts_nothing_for_empty_slots():
 def test_impossible_teams_are_refused(changes):
     with pytest.raises(UserError, match=next(iter(changes))):
         dataclasses.replace(TEAMS, **changes)
+
+
+def test_one_falls_out_and_the_others_fly_on_as_a_smaller_team():
+    """From its last step on nothing of it is left, and what the others see is what two would."""
+    settings = dataclasses.replace(ALONE, fall_outs=1.0, fall_out_seconds=(0.03, 0.03))
+    task = uniform_task(settings, jax.random.key(3)).replace(evader=jnp.int32(0))
+    game = Pursuit(settings)
+
+    @jax.jit
+    def fly(key):
+        def one(state, _):
+            observation, state, reward, *_ = game.step(None, state, jnp.zeros((3, 4)))
+            return state, (observation, reward, state.active)
+
+        return jax.lax.scan(one, game.reset_to(key, task)[1], None, length=6)
+
+    fallen = set()
+    for key in range(6):
+        state, (observation, reward, active) = fly(jax.random.key(key))
+        gone = int(np.argmin(active[-1]))
+        fallen.add(gone)
+        np.testing.assert_array_equal(active[:, gone], [1, 1, 1, 0, 0, 0])
+        assert np.all(np.delete(active, gone, axis=1))
+        np.testing.assert_array_equal(
+            np.any(observation.self_state[:, gone], axis=1), active[:, gone]
+        )
+        assert np.all(reward[:3, gone] != 0.0) and not np.any(reward[3:, gone])
+        assert state.drones.position[gone, 0] > 500.0
+    assert len(fallen) > 1

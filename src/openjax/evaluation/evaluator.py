@@ -18,6 +18,7 @@ from openjax.policy import Policy, PolicyParameters
 from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings, Scenario, Task, scenario_task
 from openjax.pursuit.statistics import EpisodeStatistics
 from openjax.pursuit.task import capture_radius
+from openjax.pursuit.teams import FAR
 from openjax.show.number_tables import numbers_table
 from openjax.show.trajectory import Trajectory
 
@@ -133,7 +134,7 @@ class Flown:
         there = slice(None) if task.active is None else task.active
         return Trajectory(
             title=title,
-            pursuer_position=record.pursuers[:, there],
+            pursuer_position=_on_the_floor(record.pursuers[:, there]),
             pursuer_quaternion=record.quaternion[:, there],
             evader_position=record.evader,
             captured=record.captured[:, there],
@@ -147,6 +148,16 @@ class Flown:
             seen=record.seen,
             predicted=record.predicted,
         )
+
+
+def _on_the_floor(position):
+    """Paths (T, N, 3) on which pursuers that have fallen out lie below where they did."""
+    position = np.array(position)
+    for path in position.swapaxes(0, 1):
+        is_gone = path[:, 0] > FAR / 2
+        if is_gone.any():
+            path[is_gone] = (*path[~is_gone][-1, :2], 0.0)
+    return position
 
 
 def episode_figures(statistics: EpisodeStatistics) -> dict[str, np.ndarray]:

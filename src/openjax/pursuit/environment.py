@@ -41,7 +41,7 @@ from openjax.pursuit.spaces import Box
 from openjax.pursuit.state import PursuitState
 from openjax.pursuit.statistics import count, empty_statistics
 from openjax.pursuit.task import Task, start_attitude, uniform_task
-from openjax.pursuit.teams import held
+from openjax.pursuit.teams import draw_fall_out, held, still_there
 from openjax.ranges import changed
 from openjax.vehicle import (
     DroneState,
@@ -235,7 +235,8 @@ class Pursuit:
             own_history = own_frame(drones.quaternion, drones.velocity, action)
             steps = settings.observe_history * settings.observe_history_spacing
             own_history = jnp.broadcast_to(own_history, (steps, *own_history.shape))
-        in_sight = self._in_sight(task, task.pursuer_position, task.evader_position)
+        gone_after = draw_fall_out(settings, jax.random.fold_in(key, 4), task.active)
+        in_sight = self._in_sight(task, task.active, task.pursuer_position, task.evader_position)
         seen = jnp.any(in_sight)
         still = jnp.zeros(3, jnp.float32)
         step = jnp.zeros((), jnp.int32)
@@ -265,6 +266,7 @@ class Pursuit:
             previous_action=action,
             step=step,
             statistics=empty_statistics(settings.episode_length),
+            gone_after=gone_after,
         )
         return self.observe(state), state
 
@@ -291,12 +293,18 @@ class Pursuit:
         """
         return {**vehicles, **self.effect_parameters}
 
-    def _in_sight(self, task, position, evader):
-        """(N,) which pursuers of a team at (N, 3) see the evader at (3,)."""
+    def _active_after(self, state):
+        """(N,) which slots are in use after a step that begins with `state`; None: all are."""
+        if state.gone_after is None:
+            return state.active
+        return still_there(state.task.active, state.gone_after, state.step + 1)
+
+    def _in_sight(self, task, active, position, evader):
+        """(N,) which of the pursuers at (N, 3) see the evader at (3,)."""
         sees = line_of_sight(
             self.settings, position, evader, task.pillar_position, task.pillar_active
         )
-        return sees if task.active is None else sees & task.active
+        return sees if active is None else sees & active
 
     def _seen(self, drones, vehicles):
         return self.dynamics.seen(drones, self._parameters(vehicles))
@@ -336,7 +344,7 @@ class Pursuit:
             drones = drones.replace(
                 velocity=drones.velocity * jnp.minimum(1.0, settings.max_speed / speed)
             )
-        drones = held(state.active, state.drones, drones)
+        drones = held(self._active_after(state), state.drones, drones)
         return self.follow(state, action, drones, wish)
 
     def follow(
@@ -360,11 +368,12 @@ class Pursuit:
         evader = before.evader_position + settings.time_step * velocity
         step = before.step + 1
         position = drones.position
-        in_sight = self._in_sight(task, position, evader)
+        active = self._active_after(before)
+        in_sight = self._in_sight(task, active, position, evader)
         seen = jnp.any(in_sight)
         last_seen = jnp.where(seen, evader, before.last_seen)
         seen_drones = self._seen(drones, before.vehicles)
-        framed = frame_pursuers(settings, seen_drones.position, last_seen, task.active)
+        framed = frame_pursuers(settings, seen_drones.position, last_seen, active)
         newest = frame(settings, step, framed, evader, velocity, seen)
         own_history = before.own_history
         if settings.observe_history:
@@ -391,11 +400,11 @@ class Pursuit:
                 settings, position, rotation_axes(drones.quaternion)[1][:, 2], *pillars
             ),
             penalty=jnp.zeros(settings.num_pursuers, jnp.float32),
-        ).of_team(task.active)
+        ).of_team(active)
         transition = Transition(settings, before, state, info)
         rewards, penalty = total_reward(self.terms, transition)
         info = info.replace(penalty=penalty)
-        counted = count(before.statistics, step, info, rewards, task.active)
+        counted = count(before.statistics, step, info, rewards, active)
         state = state.replace(statistics=counted)
         over = step >= settings.episode_length
         never = jnp.zeros((), bool)

@@ -84,6 +84,11 @@ class PursuitSettings:
     """Lowest and highest speed of the evader (m/s), between which that of each uniform task is
     drawn, in place of `evader_speed`; empty: none is drawn.
     """
+    fall_outs: Annotated[float, Interval("[0, 1]")] = 0.0
+    """Share of the episodes of two or more pursuers in which one of them falls out, and is gone ...
+    """
+    fall_out_seconds: Annotated[tuple[float, ...], Interval("[0, 1000]")] = (0.5, 4.0)
+    """... after a time between these (s)."""
     capture_radii: Annotated[tuple[float, ...], Interval("(0, 10]")] = ()
     """Smallest and largest capture radius (m), the same in place of `capture_radius`."""
     evader_norm: Literal["euclidean", "axis"] = "euclidean"
@@ -184,9 +189,10 @@ class PursuitSettings:
                 f"environment.team_sizes {list(self.team_sizes)} need environment.num_pursuers "
                 f"{max(self.team_sizes)}, here it's {self.num_pursuers}"
             )
-        for name in ("evader_speeds", "capture_radii"):
+        for name in ("evader_speeds", "capture_radii", "fall_out_seconds"):
             drawn = getattr(self, name)
-            if drawn and (len(drawn) != 2 or drawn[0] > drawn[1]):
+            needed = name == "fall_out_seconds" and self.fall_outs
+            if (drawn or needed) and (len(drawn) != 2 or drawn[0] > drawn[1]):
                 raise UserError(
                     f"environment.{name} {list(drawn)} must be two numbers, the lower one first, "
                     "or none"

@@ -7,6 +7,7 @@ from flax import struct
 from openjax.pursuit.evaders.evader_state import EvaderState
 from openjax.pursuit.statistics import EpisodeStatistics
 from openjax.pursuit.task import Task
+from openjax.pursuit.teams import still_there
 from openjax.vehicle import DroneState
 
 
@@ -30,11 +31,13 @@ class PursuitState:
     previous_action: jax.Array  # (N, 4) squashed command of the last step
     step: jax.Array  # () int32, control steps since the start
     statistics: EpisodeStatistics
+    gone_after: jax.Array | None = None
+    """(N,) int32, the last step in which each pursuer is there; None: nobody falls out"""
 
     @property
     def active(self) -> jax.Array | None:
         """(N,) bool, the slots of pursuers in use; None: all are."""
-        return self.task.active
+        return still_there(self.task.active, self.gone_after, self.step)
 
     @property
     def seen(self) -> jax.Array:

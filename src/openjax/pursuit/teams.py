@@ -30,6 +30,42 @@ def draw_team(settings: PursuitSettings, key: jax.Array) -> jax.Array | None:
     return jnp.arange(settings.num_pursuers) < size
 
 
+def draw_fall_out(
+    settings: PursuitSettings, key: jax.Array, active: jax.Array | None
+) -> jax.Array | None:
+    """(N,) int32, the last step in which each pursuer of a team is there; None where the settings
+    have nobody fall out. `active` (N,): slots in use.
+    """
+    if not settings.fall_outs:
+        return None
+    number = settings.num_pursuers
+    active = jnp.ones(number, bool) if active is None else active
+    whether_key, which_key, when_key = jax.random.split(key, 3)
+    chosen = jnp.argmax(jnp.where(active, jax.random.uniform(which_key, (number,)), -1.0))
+    low, high = settings.fall_out_seconds
+    seconds = jax.random.uniform(when_key, minval=low, maxval=high)
+    last = jnp.round(seconds / settings.time_step).astype(jnp.int32)
+    falls = jax.random.bernoulli(whether_key, settings.fall_outs) & (jnp.sum(active) > 1)
+    is_gone = falls & (jnp.arange(number) == chosen)
+    return jnp.where(is_gone, last, settings.episode_length)
+
+
+def still_there(
+    active: jax.Array | None, gone_after: jax.Array | None, step: jax.Array
+) -> jax.Array | None:
+    """(N,) bool, slots in use at a step ().
+
+    Args:
+      active: (N,) bool, those in use at the start; None: all.
+      gone_after: (N,) int32, the last step of each; None: nobody falls out.
+      step: () int32.
+    """
+    if gone_after is None:
+        return active
+    there = step <= gone_after
+    return there if active is None else there & active
+
+
 def parked(position: jax.Array, active: jax.Array | None) -> jax.Array:
     """Positions (N, 3) m with those of empty slots far away."""
     if active is None:
@@ -40,8 +76,13 @@ def parked(position: jax.Array, active: jax.Array | None) -> jax.Array:
 
 
 def held(active: jax.Array | None, before: DroneState, after: DroneState) -> DroneState:
-    """The drones (leading axis N) after a step, those of empty slots as they were before it."""
-    return after if active is None else of_team(active, after, before)
+    """The drones (leading axis N) after a step, those of empty slots as they were before it, and
+    parked.
+    """
+    if active is None:
+        return after
+    drones = of_team(active, after, before)
+    return drones.replace(position=parked(drones.position, active))
 
 
 def of_team(active: jax.Array | None, value: T, otherwise: T | float = 0.0) -> T:

@@ -222,11 +222,16 @@ class Mappo:
         value = values[:-1]
         following = values[1:]
         per_pursuer = value.shape
+        terminated = jnp.broadcast_to(rollout.terminated[..., None], per_pursuer)
+        active = observation.active
+        if active is not None:
+            # for who falls out nothing comes after
+            terminated |= active[:-1] & ~active[1:]
         advantage = generalised_advantages(
             settings.reward_scale * rollout.reward,
             value,
             following,
-            jnp.broadcast_to(rollout.terminated[..., None], per_pursuer),
+            terminated,
             jnp.broadcast_to(rollout.truncated[..., None], per_pursuer),
             settings.discount,
             settings.gae_lambda,
