@@ -2,6 +2,8 @@
 it.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -67,3 +69,21 @@ def test_faster_logs_become_means_over_the_rows_of_the_grid(rate):
     np.testing.assert_allclose(
         track.body_rates[rows], np.outer(track.time, [1, 2, -1])[rows], atol=1e-9
     )
+
+
+@pytest.mark.parametrize("below", [0.0, -1.3, 0.4])
+def test_heights_of_tracks_are_above_the_floor(below):
+    """Wherever a lab's z begins: ground and ceiling effect ask for the distance to them."""
+    time = np.arange(0.0, 4.0, 0.01)
+    path = np.stack([time, 0 * time, 0.5 + 0.1 * np.sin(time)], 1)
+    shift = np.array([0.0, 0.0, below])
+    logged = {"motor_command": np.full((400, 4), 0.5), "body_rates": np.zeros((400, 3))}
+    flights = [
+        Flight("log.csv:" + name, "log.csv", name, time, position=place + shift, **logged)
+        for name, place in (("low", path), ("high", path + np.array([0.0, 0.0, 0.4])))
+    ]
+    file = replace(load_vehicle_file(), log={"floor_z": below, "ceiling_z": 2.0 + below})
+    (track,) = flight_tracks(flights[0], Case("case", tuple(flights), file))
+    np.testing.assert_allclose(track.position, path[: len(track)], atol=1e-9)
+    np.testing.assert_allclose(track.neighbours[0, :, 2] - track.position[:, 2], 0.4)
+    assert track.ceiling == pytest.approx(2.0)

@@ -45,12 +45,12 @@ def test_tracks_and_parameters_that_share_a_call_are_not_mixed_up():
     assert len(np.unique(together[0][:, -1, 5])) == len(theta)
 
 
-def below(height: float, ceiling_z: float | None) -> np.ndarray:
+def below(height: float, ceiling: float | None) -> np.ndarray:
     """Specific force (T, 3) of a vehicle at a height, m, with downwash of one .4 m above."""
     track = track_of(200, 0)
     track.position[:] = [0.0, 0.0, height]
     over = np.tile([[[0.0, 0.0, height + 0.4]]], (1, 200, 1))
-    track = dataclasses.replace(track, neighbours=over, ceiling_z=ceiling_z)
+    track = dataclasses.replace(track, neighbours=over, ceiling=ceiling)
     theta = ABSENT.copy()
     for (effect, parameter), place in PLACE.items():
         if effect in ("downwash", "ceiling_effect"):

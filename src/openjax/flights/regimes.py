@@ -27,7 +27,7 @@ def regimes_of(track: Track) -> dict[str, np.ndarray]:
         masks["climb"] = np.abs(track.velocity[:, 2]) > 0.3
     if track.position is not None:
         masks["low"] = track.position[:, 2] < 0.15
-        ceiling = ARENA_CEILING if track.ceiling_z is None else track.ceiling_z
+        ceiling = ARENA_CEILING if track.ceiling is None else track.ceiling
         masks["high"] = track.position[:, 2] > ceiling - NEAR_CEILING
         for other in track.neighbours:
             gap = other - track.position

@@ -33,7 +33,7 @@ class Track:
     flight: str  # name of the flight it comes from: the unit that is held out
     dt: float
     time: Array  # (T,)
-    position: Array | None  # (T, 3)
+    position: Array | None  # (T, 3), z above the floor
     quaternion: Array | None  # (T, 4)
     velocity: Array | None  # (T, 3)
     body_rates: Array  # (T, 3)
@@ -47,7 +47,7 @@ class Track:
     # of logs faster than the grid: times (S,) s, mean of the motors (S,)
     fast_thrust: tuple[Array, Array] | None = None
     attitude_derived: bool = False  # of gyroscope, accelerometer and path, not measured
-    ceiling_z: float | None = None  # m, what z reads at the ceiling; None: no ceiling is known
+    ceiling: float | None = None  # m above the floor; None: no ceiling is known
     missing: Array | None = None  # (T,) rows that weren't logged: lines between their neighbours
 
     def __len__(self) -> int:
@@ -124,24 +124,30 @@ def _on_grid(part: Flight, flight: Flight, case: Case, name: str) -> Track:
         command = np.concatenate(
             [take("command_thrust", True)[:, None], take("command_body_rates", True)], 1
         )
+    log = case.vehicle_file.log
+    floor = np.array([0.0, 0.0, log.get("floor_z", 0.0)])
+    ceiling = log.get("ceiling_z")
     neighbours = [
-        other.interpolated("position", grid)
+        other.interpolated("position", grid) - floor
         for other in case.others(flight)
         if other.position is not None
     ]
+    sensors = {sensor: take(sensor) for sensor in SENSORS}
+    if sensors["position"] is not None:
+        sensors["position"] = sensors["position"] - floor
     return Track(
         name=name,
         flight=flight.log,
         dt=period,
         time=grid,
-        **{sensor: take(sensor) for sensor in SENSORS},
+        **sensors,
         command=command,
         motor=motor,
         voltage=None if voltage is None else smooth(voltage, 0.3, period),
         neighbours=np.array(neighbours) if neighbours else np.zeros((0, count, 3)),
         pose_age=part.pose_age,
         attitude_derived=part.attitude_derived,
-        ceiling_z=case.vehicle_file.log.get("ceiling_z"),
+        ceiling=None if ceiling is None else ceiling - floor[2],
         fast_thrust=fast_thrust,
         missing=_missing(part.time, grid, period),
     )

@@ -181,5 +181,5 @@ def _hidden(card, reading: Reading) -> bool:
     if (reading.blind and card.torque_axes) or (reading.unmapped and card.thrust_map):
         return True
     return card.impossible is not None and any(
-        t.ceiling_z is None and card.impossible(t.position) for t in reading.tracks
+        t.ceiling is None and card.impossible(t.position) for t in reading.tracks
     )

@@ -95,7 +95,7 @@ def _path(track: Track, ticks: np.ndarray, size: int, neighbours: int) -> Path:
     quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
     # Without a pose the vehicle is taken to be in mid-air, far from everything.
     position = track.position if track.position is not None else unknown + np.array([0.0, 0.0, 0.6])
-    position, *neighbours_at = (_inside(p, track.ceiling_z) for p in (position, *track.neighbours))
+    position, *neighbours_at = (_inside(p, track.ceiling) for p in (position, *track.neighbours))
     velocity = track.velocity if track.velocity is not None else unknown
     # Who didn't fly along is far away.
     others = [middle(p) for p in neighbours_at]
@@ -109,25 +109,25 @@ def _path(track: Track, ticks: np.ndarray, size: int, neighbours: int) -> Path:
         padded(ticks, size),
         voltage,
         np.stack(others, 1),
-        np.float32(_ceiling(position, track.ceiling_z)),
+        np.float32(_ceiling(position, track.ceiling)),
         np.float32(track.dt),
     )
 
 
-def _inside(position: np.ndarray, ceiling_z: float | None) -> np.ndarray:
+def _inside(position: np.ndarray, ceiling: float | None) -> np.ndarray:
     """Positions (T, 3) in the room. Neither floor nor a known ceiling can be entered: a log that
     says so has an offset in height.
     """
-    highest = np.inf if ceiling_z is None else ceiling_z
+    highest = np.inf if ceiling is None else ceiling
     return np.concatenate([position[:, :2], np.clip(position[:, 2:], 0.0, highest)], 1)
 
 
-def _ceiling(position: np.ndarray, ceiling_z: float | None) -> float:
+def _ceiling(position: np.ndarray, ceiling: float | None) -> float:
     """Height (m) of the ceiling whose effect is tried: where none is known, the arena's, unless the
     vehicle flew above it.
     """
-    if ceiling_z is not None:
-        return ceiling_z
+    if ceiling is not None:
+        return ceiling
     return ARENA_CEILING if (position[:, 2] <= ARENA_CEILING).all() else FAR
 
 
