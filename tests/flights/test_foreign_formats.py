@@ -6,6 +6,7 @@ import struct
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from openjax.flights.case import load_case
 from openjax.flights.importers import find_logs, load_mapping, read_log
@@ -216,30 +217,44 @@ def test_one_named_time_does_not_take_the_others_away(tmp_path, columns):
 # --- PX4
 
 
+LETTERS = {
+    **{"float": "f", "double": "d", "bool": "?", "uint64_t": "Q", "uint32_t": "I"},
+    **{"int32_t": "i", "uint16_t": "H", "uint8_t": "B"},
+}
+
+
 def ulog(topics, parameters):
-    """A ULog as PX4 writes it: {topic: (times in s, {field: (type, values)})}, {name: float}."""
+    """A ULog as PX4 writes it: {topic: (times in s, {field: (type, values)})}, {name: number};
+    whole numbers are int32_t. Padding at the end of a message is in its format, not in the data.
+    """
 
     def message(kind, data):
         return struct.pack("<HB", len(data), ord(kind)) + data
 
+    def keyed(kind, key, data):
+        return message(kind, bytes([len(key)]) + key.encode() + data)
+
     out = b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 1_000_000)
     out += message("B", bytes(40))
-    letters = {"float": "f", "uint64_t": "Q"}
+    out += keyed("I", "char[3] sys_name", b"PX4") + keyed("I", "char[5] ver_hw", b"FMUV6")
     for topic, (_, fields) in topics.items():
-        kinds = {name: kind for name, (kind, _) in fields.items()}
-        text = "".join(f"{kind} {name};" for name, kind in kinds.items())
-        out += message("F", f"{topic}:uint64_t timestamp;{text}".encode())
+        text = "".join(f"{kind} {name};" for name, (kind, _) in fields.items())
+        out += message("F", f"{topic}:uint64_t timestamp;{text}uint8_t[6] _padding0;".encode())
     for name, value in parameters.items():
-        key = f"float {name}".encode()
-        out += message("P", bytes([len(key)]) + key + struct.pack("<f", value))
-    records = []
+        kind, form = ("int32_t", "<i") if isinstance(value, int) else ("float", "<f")
+        out += keyed("P", f"{kind} {name}", struct.pack(form, value))
+    records = [(0.0, message("L", struct.pack("<BQ", 54, 1_400_000) + b"[logger] Start file log"))]
     for number, (topic, (times, fields)) in enumerate(topics.items()):
         out += message("A", struct.pack("<BH", 0, number) + topic.encode())
         for row, time in enumerate(times):
             data = struct.pack("<HQ", number, 1_500_000 + round(time * 1e6))
             for kind, values in fields.values():
-                cells = np.atleast_1d(values[row])
-                data += struct.pack(f"<{len(cells)}{letters[kind.partition('[')[0]]}", *cells)
+                cells = np.atleast_1d(values[row]).tolist()
+                letter = LETTERS[kind.partition("[")[0]]
+                whole = letter not in "fd"
+                data += struct.pack(
+                    f"<{len(cells)}{letter}", *(map(int, cells) if whole else cells)
+                )
             records.append((time, message("D", data)))
     return out + b"".join(data for _, data in sorted(records, key=lambda r: r[0]))
 
@@ -261,25 +276,37 @@ def px4_topics(c, order=("m1", "m3", "m4", "m2")):
     motors[:, :4] = np.stack([c[m] for m in order], 1)
     rates = frame(c["wx"], c["wy"], c["wz"])
     force = frame(c["ax"], c["ay"], c["az"])
+    sampled = 1_500_000 + np.rint(1e6 * t)
+    zero = np.zeros(len(t))
+    local = {
+        **{"timestamp_sample": ("uint64_t", sampled[slow]), "ref_timestamp": ("uint64_t", zero)},
+        **{"ref_lat": ("double", zero + 47.4), "ref_lon": ("double", zero + 8.5)},
+        **{"x": ("float", c["y"][slow]), "y": ("float", c["x"][slow])},
+        **{"z": ("float", -c["z"][slow]), "delta_z": ("float", zero)},
+        **{"vx": ("float", c["vy"][slow]), "vy": ("float", c["vx"][slow])},
+        **{"vz": ("float", -c["vz"][slow]), "z_deriv": ("float", zero), "heading": ("float", zero)},
+        **{"xy_valid": ("bool", zero + 1), "z_valid": ("bool", zero + 1)},
+    }
+    combined = {
+        **{"gyro_rad": ("float[3]", rates), "gyro_integral_dt": ("uint32_t", zero + 4000)},
+        **{"accelerometer_timestamp_relative": ("int32_t", zero)},
+        **{"accelerometer_m_s2": ("float[3]", force)},
+        **{"accelerometer_integral_dt": ("uint32_t", zero + 4000)},
+        **{"accelerometer_clipping": ("uint8_t", zero), "gyro_clipping": ("uint8_t", zero)},
+    }
+    attitude = {
+        **{"timestamp_sample": ("uint64_t", sampled[slow]), "q": ("float[4]", turned[slow])},
+        **{"delta_q_reset": ("float[4]", turned[slow]), "quat_reset_counter": ("uint8_t", zero)},
+    }
+    control = {"timestamp_sample": ("uint64_t", sampled), "control": ("float[12]", motors)}
+    rare = t[::50]
+    battery = {"voltage_v": ("float", np.full(len(rare), 15.2)), "id": ("uint8_t", zero)}
     return {
-        "vehicle_attitude": (t[slow], {"q": ("float[4]", turned[slow])}),
-        "vehicle_local_position": (
-            t[slow],
-            {
-                "x": ("float", c["y"][slow]),
-                "y": ("float", c["x"][slow]),
-                "z": ("float", -c["z"][slow]),
-                "vx": ("float", c["vy"][slow]),
-                "vy": ("float", c["vx"][slow]),
-                "vz": ("float", -c["vz"][slow]),
-            },
-        ),
-        "sensor_combined": (
-            t,
-            {"gyro_rad": ("float[3]", rates), "accelerometer_m_s2": ("float[3]", force)},
-        ),
-        "actuator_motors": (t, {"control": ("float[12]", motors)}),
-        "battery_status": (t[::50], {"voltage_v": ("float", np.full(len(t[::50]), 15.2))}),
+        "vehicle_attitude": (t[slow], attitude),
+        "vehicle_local_position": (t[slow], local),
+        "sensor_combined": (t, combined),
+        "actuator_motors": (t, control | {"reversible_flags": ("uint16_t", zero)}),
+        "battery_status": (rare, battery),
     }
 
 
@@ -318,16 +345,19 @@ def test_a_px4_airframe_is_taken_from_its_parameters(tmp_path, columns):
     signal = (-(1 - curve) + np.sqrt((1 - curve) ** 2 + 4 * curve * thrust)) / (2 * curve)
     pulses = np.full((len(thrust), 16), 900.0)
     pulses[:, :4] = 1100 + 800 * signal
-    topics["actuator_outputs"] = (columns["t"], {"output": ("float[16]", pulses)})
-    parameters = {"THR_MDL_FAC": curve, "CA_ROTOR_COUNT": 4.0, "PWM_MIN": 1100, "PWM_MAX": 1900}
+    number = np.full(len(thrust), 16)
+    outputs = {"noutputs": ("uint32_t", number), "output": ("float[16]", pulses)}
+    topics["actuator_outputs"] = (columns["t"], outputs)
+    parameters = {"THR_MDL_FAC": curve, "CA_ROTOR_COUNT": 4, "PWM_MIN": 1100, "PWM_MAX": 1900}
     for i, (x, y, spin) in enumerate(places.values()):
-        parameters |= {f"CA_ROTOR{i}_PX": x, f"CA_ROTOR{i}_PY": y, f"CA_ROTOR{i}_KM": 0.05 * spin}
+        parameters |= {f"CA_ROTOR{i}_PX": 0.1 * x, f"CA_ROTOR{i}_PY": 0.1 * y}
+        parameters |= {f"CA_ROTOR{i}_KM": 0.05 * spin}
     parameters |= {f"PWM_MAIN_FUNC{o}": 101 + m for m, o in enumerate((3, 4, 1, 2))}
     (tmp_path / "flight.ulg").write_bytes(ulog(topics, parameters))
     read = read_log(tmp_path / "flight.ulg")
     assert_read(read, columns, PX4_NAMES, 2e-4)
     assert any('"ccw", "cw", "ccw", "cw"' in remark for remark in read.remarks)
-    parameters["CA_ROTOR_COUNT"] = 6.0
+    parameters["CA_ROTOR_COUNT"] = 6
     (tmp_path / "flight.ulg").write_bytes(ulog(topics, parameters))
     with pytest.raises(LogError, match="6 rotors"):
         read_log(tmp_path / "flight.ulg")
@@ -561,3 +591,77 @@ def test_crazyswarms_topics_are_named_by_its_yaml(tmp_path, columns):
     (tmp_path / "crazyflies.yaml").write_text(SWARM_YAML % '"gyro.x"')
     with pytest.raises(LogError, match=r"/cf1/mixer hold 4 values, but crazyflies\.yaml names 1"):
         read_log(tmp_path / "bag")
+
+
+def swarm_store():
+    """Message types of a bag of Crazyswarm2."""
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    from openjax.flights.importers.crazyswarm import DEFINITIONS
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    for name, text in DEFINITIONS.items():
+        store.register(get_types_from_msg(text, name))
+    return store
+
+
+def add_pose_topics(writer, store, c, without):
+    """The default topics `pose` and `odom` of a vehicle at 50 Hz, as Crazyswarm2's server with
+    cflib sends them, `odom` with the firmware's sign of pitch; and `/poses` of motion capture at
+    100 Hz, of two vehicles and a wand.
+    """
+    m = {name.rpartition("/")[2]: kind for name, kind in store.types.items()}
+    capture = "motion_capture_tracking_interfaces/msg/NamedPoseArray"
+    kinds = {"/cf1/pose": "geometry_msgs/msg/PoseStamped", "/cf1/odom": "nav_msgs/msg/Odometry"}
+    kinds["/poses"] = capture
+    kinds = {name: kind for name, kind in kinds.items() if name not in without}
+    topics = {n: writer.add_connection(n, k, typestore=store) for n, k in kinds.items()}
+    roll, pitch, yaw = euler(c)
+    wrong = Rotation.from_euler("ZYX", np.stack([yaw, -pitch, roll], 1)).as_quat()
+    zero = m["Vector3"](0.0, 0.0, 0.0)
+    twist = m["TwistWithCovariance"](m["Twist"](zero, zero), np.zeros(36))
+    for k, time in enumerate(c["t"]):
+        at = 1_700_000_040_000_000_000 + round(float(time) * 1e9)
+        header = m["Header"](m["Time"](at // 10**9, at % 10**9), "world")
+        place = m["Point"](c["x"][k], c["y"][k], c["z"][k])
+        pose = m["Pose"](place, m["Quaternion"](*(c[f"q{a}"][k] for a in "xyzw")))
+        lying = m["Pose"](m["Point"](0.0, 0.0, 0.0), m["Quaternion"](*[np.nan] * 4))
+        bodies = [m["NamedPose"]("cf1", pose), m["NamedPose"]("wand", lying)]
+        messages = {"/poses": m["NamedPoseArray"](header, bodies)}
+        if k % 2 == 0:
+            messages["/cf1/pose"] = m["PoseStamped"](header, pose)
+            odom = m["Pose"](place, m["Quaternion"](*wrong[k]))
+            both = m["PoseWithCovariance"](odom, np.zeros(36))
+            messages["/cf1/odom"] = m["Odometry"](header, "cf1", both, twist)
+        for name in messages.keys() & topics.keys():
+            writer.write(topics[name], at, store.serialize_cdr(messages[name], kinds[name]))
+
+
+@pytest.mark.parametrize("without, tolerance", [((), 2e-3), (("/poses",), 2e-2)])
+def test_crazyswarms_poses_are_the_fastest_with_the_right_sign(
+    tmp_path, columns, without, tolerance
+):
+    pytest.importorskip("rosbags")
+    from rosbags.rosbag2 import Reader, StoragePlugin, Writer
+
+    write_swarm_bag(tmp_path / "logs", columns)
+    store = swarm_store()
+    with (
+        Reader(tmp_path / "logs") as logs,
+        Writer(tmp_path / "bag", version=8, storage_plugin=StoragePlugin.SQLITE3) as writer,
+    ):
+        add_pose_topics(writer, store, columns, without)
+        copies = {
+            c.topic: writer.add_connection(c.topic, c.msgtype, typestore=store)
+            for c in logs.connections
+        }
+        for connection, at, data in logs.messages():
+            writer.write(copies[connection.topic], at, data)
+    names = ", ".join(f'"{name}"' for name in mixer_inputs(columns))
+    (tmp_path / "crazyflies.yaml").write_text(SWARM_YAML % names)
+    read = read_log(tmp_path / "bag")
+    assert without or any("nothing but poses was logged of wand" in r for r in read.remarks)
+    rows = np.flatnonzero(read.vehicle == "cf1")[10:380]
+    for name in ("x", "z", "qw", "qx", "qy", "qz"):
+        values = read.columns[name][rows]
+        np.testing.assert_allclose(values, columns[name][10:380], atol=tolerance, err_msg=name)

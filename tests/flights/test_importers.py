@@ -327,3 +327,61 @@ def test_a_damaged_bag_is_refused_and_the_csv_beside_it_is_used(tmp_path, column
     case = load_case(tmp_path)
     assert [f.name for f in case.flights] == ["flight.csv"]
     assert [(i.flight, i.refused) for i in case.quality] == [("bag", True)]
+
+
+@pytest.mark.parametrize("storage", ["SQLITE3", "MCAP"])
+def test_a_bag_without_its_metadata_is_read_by_its_files(tmp_path, columns, storage):
+    """As where recording was killed, or one file of a bag was handed on."""
+    pytest.importorskip("rosbags")
+    columns = {n: v[:300] for n, v in columns.items()}
+    write_bag(tmp_path / "bag", columns, storage)
+    whole = read_log(tmp_path / "bag")
+    (tmp_path / "bag" / "metadata.yaml").unlink()
+    (file,) = (tmp_path / "bag").iterdir()
+    for path in (tmp_path / "bag", file):
+        assert find_logs(path.parent) == [path]
+        table = read_log(path)
+        assert_same(table, whole.columns, 1e-9, skip=())
+        np.testing.assert_array_equal(table.vehicle, whole.vehicle)
+
+
+def test_a_bag_of_ros_1_is_read(tmp_path, columns):
+    pytest.importorskip("rosbags")
+    from rosbags.rosbag1 import Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC)
+    kind = {name.rpartition("/")[2]: message for name, message in store.types.items()}
+    stamp = store.types["builtin_interfaces/msg/Time"]
+    with Writer(tmp_path / "flight.bag") as writer:
+        imu = writer.add_connection("/cf1/imu", "sensor_msgs/msg/Imu", typestore=store)
+        still = kind["Quaternion"](0.0, 0.0, 0.0, 1.0)
+        for k, time in enumerate(columns["t"][:300]):
+            at = 1_700_000_000_000_000_000 + round(float(time) * 1e9)
+            header = kind["Header"](k, stamp(at // 10**9, at % 10**9), "cf1")
+            rates = kind["Vector3"](*(columns[f"w{a}"][k] for a in "xyz"))
+            force = kind["Vector3"](*(columns[f"a{a}"][k] for a in "xyz"))
+            message = kind["Imu"](
+                header, still, np.zeros(9), rates, np.zeros(9), force, np.zeros(9)
+            )
+            writer.write(imu, at, store.serialize_ros1(message, imu.msgtype))
+    assert find_logs(tmp_path) == [tmp_path / "flight.bag"]
+    table = read_log(tmp_path / "flight.bag")
+    assert_same(table, {n: columns[n][:300] for n in ("t", "wx", "wz", "ax", "az")})
+
+
+def test_what_foxglove_is_given_is_no_log(tmp_path, columns):
+    """`openjax view --mcap` may write into the folder of the flights."""
+    pytest.importorskip("mcap")
+    from openjax.show.foxglove import write_mcap
+
+    write_mcap(tmp_path / "flight.mcap", [])
+    assert find_logs(tmp_path) == []
+
+
+def test_a_px4_log_with_flipped_bits_is_read_quietly(tmp_path, capsys):
+    pytest.importorskip("pyulog")
+    (tmp_path / "log.ulg").write_bytes(b"ULog\x01\x12\x35\x01" + bytes(8) + b"\xff" * 300)
+    with pytest.raises(LogError):
+        read_log(tmp_path / "log.ulg")
+    assert capsys.readouterr() == ("", "")

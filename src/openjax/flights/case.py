@@ -29,7 +29,7 @@ SHOWN = 3  # files that are named where none is a log
 
 
 def load_case(path: str | Path, dtype=jnp.float32, comparison: bool = False) -> Case:
-    """Read a case folder: its `vehicle.toml` and its logs (CSV, micro-SD logs, ROS 2 bags). For a
+    """Read a case folder: its `vehicle.toml` and its logs (of any format that is known). For a
     `comparison` with other flights motor commands alone are enough, and without a vehicle file the
     nominal vehicle is taken.
 

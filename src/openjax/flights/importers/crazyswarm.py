@@ -1,6 +1,7 @@
-"""Topics of Crazyswarm2: log blocks of the firmware as `LogDataGeneric`, an array of values.
+"""Topics of Crazyswarm2: log blocks of the firmware as `LogDataGeneric`, an array of values, and the
+poses of all bodies that motion capture sees as one `NamedPoseArray`.
 
-The message doesn't say what its values are. The `crazyflies.yaml` with which the server was started
+A log block's message doesn't say what its values are. The `crazyflies.yaml` with which the server was started
 does, under `firmware_logging.custom_topics` of `all`, of a robot's type, or of the robot; it is
 looked for beside the bag and in it.
 """
@@ -14,13 +15,25 @@ from openjax.flights.importers.firmware import with_mixer
 from openjax.flights.reading import LogError
 
 LOG_TYPE = "crazyflie_interfaces/msg/LogDataGeneric"
-# Of bags that don't hold them themselves (crazyswarm2, crazyflie_interfaces/msg).
+_CAPTURE = "motion_capture_tracking_interfaces/msg"
+POSES_TYPES = (f"{_CAPTURE}/NamedPoseArray", f"{_CAPTURE}/NamedPoseArrayV2")
+POSE_FIELDS = {f"{a}": f"position.{a}" for a in "xyz"} | {
+    f"q{a}": f"orientation.{a}" for a in "wxyz"
+}
+# Of bags that don't hold them themselves (crazyswarm2's crazyflie_interfaces/msg, and
+# motion_capture_tracking's), each after those that it is made of.
 DEFINITIONS = {
+    f"{_CAPTURE}/NamedPose": "string name\ngeometry_msgs/Pose pose\n",
+    f"{_CAPTURE}/LatencyInfo": "string source\nuint32 latency\n",
+    POSES_TYPES[0]: "std_msgs/Header header\nNamedPose[] poses\n",
+    POSES_TYPES[1]: (
+        "std_msgs/Header header\nuint64 timestamp\nLatencyInfo[] latencies\nNamedPose[] poses\n"
+    ),
     LOG_TYPE: "std_msgs/Header header\nuint32 timestamp\nfloat32[] values\n",
     "crazyflie_interfaces/msg/Status": (
         "std_msgs/Header header\nuint16 supervisor_info\nfloat32 battery_voltage\nuint8 pm_state\n"
         "uint8 rssi\nuint32 num_rx_broadcast\nuint32 num_tx_broadcast\nuint32 num_rx_unicast\n"
-        "uint32 num_tx_unicast\n"
+        "uint32 num_tx_unicast\nuint16 latency_unicast\n"
     ),
 }
 LARGEST_YAML = 1 << 20  # bytes
@@ -34,7 +47,9 @@ def custom_topics(bag: Path) -> list[dict]:
     from ruamel.yaml.error import YAMLError
 
     found = []
-    for path in sorted(p for folder in (bag, bag.parent) for p in folder.glob("*.y*ml")):
+    for path in sorted(
+        p for folder in (bag, bag.parent) if folder.is_dir() for p in folder.glob("*.y*ml")
+    ):
         if not path.is_file() or path.stat().st_size > LARGEST_YAML:
             continue
         try:
@@ -82,3 +97,29 @@ def log_stream(topic: str, variables: tuple[str, ...], messages) -> tuple[Stream
     ahead = float(np.min(np.array([stamp for stamp, _ in messages], float) * 1e-9 - ticks))
     named = dict(zip(variables, values.T, strict=True))
     return with_mixer(Stream(ticks, named)), ahead
+
+
+def pose_streams(topic: str, messages) -> dict[str, Stream]:
+    """{body's name: stream of its poses}, named "TOPIC:NAME:x" and so on, of a topic's messages
+    [(stamp in ns, message)]. A body that isn't seen is missing in a message, and one without an
+    attitude has NaN there.
+    """
+    seen: dict[str, list] = {}
+    for stamp, message in messages:
+        for body in message.poses:
+            row = [stamp * 1e-9]
+            for path in POSE_FIELDS.values():
+                part, _, axis = path.partition(".")
+                row.append(getattr(getattr(body.pose, part), axis))
+            seen.setdefault(body.name, []).append(row)
+    streams = {}
+    for name, rows in seen.items():
+        time, *values = np.array(rows, float).T
+        named = {pose_source(topic, name, c): v for c, v in zip(POSE_FIELDS, values, strict=True)}
+        streams[name] = Stream(time, named)
+    return streams
+
+
+def pose_source(topic: str, name: str, column: str) -> str:
+    """How a column of a body's pose is called among a bag's sources."""
+    return f"{topic}:{name}:{column}"

@@ -9,6 +9,8 @@ taken between its least and largest value, and turned into thrust by PX4's own c
 thrust = f s^2 + (1 - f) s with f = THR_MDL_FAC (FunctionMotors.hpp).
 """
 
+import contextlib
+import io
 from pathlib import Path
 
 import numpy as np
@@ -98,6 +100,8 @@ def read_ulog(path: Path, mapping: ColumnMapping | None = None) -> LogTable:
     if log.dropouts:
         lost = sum(dropout.duration for dropout in log.dropouts)
         remarks.append(f"{len(log.dropouts)} dropouts of {lost} ms in all while it was logged")
+    if log.file_corruption:
+        remarks.append("the log is corrupt in places: what can be read of it is")
     merged = merge_streams(fastest_first, columns)
     merged["t"] = merged["t"] - merged["t"][0]
     return LogTable(path.name, merged, np.full(len(merged["t"]), "0"), tuple(remarks))
@@ -115,7 +119,8 @@ def _parsed(path: Path, more: set[str]):
         raise LogError(f"holds more than {LARGEST >> 20} MB: cut it into flights")
     wanted = {*TOPICS, ATTITUDE, MOTORS, OUTPUTS, *more}
     try:
-        log = ULog(str(path), sorted(wanted))
+        with contextlib.redirect_stdout(io.StringIO()):  # it warns of damages there
+            log = ULog(str(path), sorted(wanted))
     except Exception as error:  # damaged logs raise many kinds; all mean the same here
         words = (str(error).splitlines() or [type(error).__name__])[0]
         raise LogError(f"PX4 log can't be read: {words}") from error

@@ -1,4 +1,5 @@
-"""ROS 2 bags (SQLite or MCAP), through the `rosbags` library; no ROS installation is needed.
+"""Bags of ROS 2 (SQLite or MCAP) and ROS 1, through the `rosbags` library; no ROS installation is
+needed.
 
 Without a column mapping, topics are recognised by their message types, and a topic's namespace
 ("/cf1" of "/cf1/imu") is the vehicle. Times are the messages' header stamps where they have one,
@@ -12,12 +13,22 @@ from pathlib import Path
 import numpy as np
 
 from openjax.errors import UserError
-from openjax.flights.importers.columns import ColumnMapping, Source, Stream, merge_streams
+from openjax.flights.importers.columns import (
+    EULER,
+    ColumnMapping,
+    Source,
+    Stream,
+    merge_streams,
+)
 from openjax.flights.importers.crazyswarm import (
     DEFINITIONS,
     LOG_TYPE,
+    POSE_FIELDS,
+    POSES_TYPES,
     custom_topics,
     log_stream,
+    pose_source,
+    pose_streams,
     variables_of,
 )
 from openjax.flights.importers.firmware import firmware_columns
@@ -26,6 +37,7 @@ from openjax.flights.reading import CHANNEL_COLUMNS, LogError, LogTable
 
 _POSITION = CHANNEL_COLUMNS["position"]
 _QUATERNION = CHANNEL_COLUMNS["quaternion"]
+_POSE = (*_POSITION, *_QUATERNION, *EULER)
 
 
 def _pose(position: str, orientation: str) -> dict[str, str]:
@@ -36,8 +48,12 @@ def _pose(position: str, orientation: str) -> dict[str, str]:
 _RATES = {f"w{a}": f"angular_velocity.{a}" for a in "xyz"}
 _FORCE = {f"a{a}": f"linear_acceleration.{a}" for a in "xyz"}
 
+# By suffix how a bag's file begins.
+STORAGE = {".mcap": b"\x89MCAP0", ".db3": b"SQLite format 3", ".bag": b"#ROSBAG V2.0"}
+ODOMETRY = "nav_msgs/msg/Odometry"
 # Fields of the message types that say what they hold: column -> field. An odometry's twist is left
-# out: it is in the body frame, and velocity can be derived from position.
+# out: it is in the body frame, and velocity can be derived from position. Its pose goes behind
+# others: Crazyswarm2's with cflib has the firmware's legacy sign of pitch.
 KNOWN_TYPES = {
     "sensor_msgs/msg/Imu": _RATES | _FORCE,
     "geometry_msgs/msg/PoseStamped": _pose("pose.position", "pose.orientation"),
@@ -45,7 +61,7 @@ KNOWN_TYPES = {
         "pose.pose.position", "pose.pose.orientation"
     ),
     "geometry_msgs/msg/TransformStamped": _pose("transform.translation", "transform.rotation"),
-    "nav_msgs/msg/Odometry": _pose("pose.pose.position", "pose.pose.orientation"),
+    ODOMETRY: _pose("pose.pose.position", "pose.pose.orientation"),
     "sensor_msgs/msg/BatteryState": {"vbat": "voltage"},
     "crazyflie_interfaces/msg/Status": {"vbat": "battery_voltage"},
     "mavros_msgs/msg/AttitudeTarget": {"cmd_thrust": "thrust"}
@@ -62,12 +78,35 @@ _ARRAY_NAMES = {
 
 
 def is_bag(path: Path) -> bool:
-    """Whether a folder is a ROS 2 bag."""
-    return path.is_dir() and (path / "metadata.yaml").is_file()
+    """Whether a path is a bag: a folder, with its `metadata.yaml` or without, or a single file."""
+    return bool(_files_of(path))
+
+
+def _files_of(path: Path) -> list[Path]:
+    """What a bag's reader is to be given; nothing where a path is no bag."""
+    if path.is_file():
+        return [path] if _is_storage(path) else []
+    if not path.is_dir() or (path / "metadata.yaml").is_file():
+        return [path] if path.is_dir() else []
+    files = sorted(path.iterdir())
+    return files if files and all(map(_is_storage, files)) else []
+
+
+def _is_storage(path: Path) -> bool:
+    """Whether a file holds messages of ROS, by its first bytes; an MCAP file of others may lie
+    beside flights, too.
+    """
+    start = STORAGE.get(path.suffix)
+    if start is None or not path.is_file():
+        return False
+    with path.open("rb") as file:
+        head = file.read(64)
+    profiled = path.suffix != ".mcap" or any(p in head for p in (b"ros1", b"ros2"))
+    return head.startswith(start) and profiled
 
 
 def read_bag(path: str | Path, mapping: ColumnMapping | None = None) -> LogTable:
-    """Read a ROS 2 bag. With a mapping, sources are "TOPIC:FIELD" ("/cf1/imu:angular_velocity.x",
+    """Read a bag. With a mapping, sources are "TOPIC:FIELD" ("/cf1/imu:angular_velocity.x",
     "/m:data[0]").
 
     Raises LogError if the bag can't be read or holds nothing known, UserError without the rosbags
@@ -78,34 +117,58 @@ def read_bag(path: str | Path, mapping: ColumnMapping | None = None) -> LogTable
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
     except ImportError as error:
         raise UserError(
-            f"{path}: reading ROS 2 bags needs the rosbags library: pip install rosbags"
+            f"{path}: reading ROS bags needs the rosbags library: pip install rosbags"
         ) from error
     path = Path(path)
     store = get_typestore(Stores.ROS2_HUMBLE)
     for name, text in DEFINITIONS.items():
         store.register(get_types_from_msg(text, name))
     try:
-        with AnyReader([path], default_typestore=store) as reader:
+        with AnyReader(_files_of(path), default_typestore=store) as reader:
             vehicles, remarks = _vehicles(reader, mapping, path)
     except LogError:
         raise
     except Exception as error:  # the library raises many kinds for a damaged bag; all mean the same
         raise LogError(
-            f"ROS 2 bag can't be read: {str(error).splitlines()[0] if str(error) else type(error)}"
+            f"ROS bag can't be read: {str(error).splitlines()[0] if str(error) else type(error)}"
         ) from error
     return _joined(path.name, *_merged(vehicles, remarks, mapping))
 
 
 @dataclass(eq=False)
 class _Recording:
-    """What a bag holds of one vehicle: streams of topics, sources of columns that their types name,
-    and streams of log variables on the firmware's clock, which is `ahead` s behind the bag's.
+    """What a bag holds of one vehicle: streams of topics, for each of them its rank and the sources
+    of columns that its type names, and streams of log variables on the firmware's clock, which is
+    `ahead` s behind the bag's.
     """
 
     streams: list[Stream] = field(default_factory=list)
-    columns: dict[str, Source] = field(default_factory=dict)
+    sources: list[tuple[int, dict[str, Source]]] = field(default_factory=list)
     log_streams: list[Stream] = field(default_factory=list)
     ahead: list[float] = field(default_factory=list)
+
+    def add(self, stream: Stream, columns: dict[str, Source], rank: int = 0) -> None:
+        """One more topic. What a topic of a lower `rank`, or a faster one, holds goes before."""
+        self.streams.append(stream)
+        self.sources.append((rank, columns))
+
+    def columns(self) -> tuple[dict[str, Source], list[str]]:
+        """Where each column comes from, and remarks. Log variables are on the vehicle's own clock
+        and go before topics, but for a pose that a topic has more than twice as often.
+        """
+        by_name, remarks = firmware_columns(self.log_streams)
+        both = zip(self.sources, self.streams, strict=True)
+        ranked = [(rank, _period(stream), columns) for (rank, columns), stream in both]
+        ranked.sort(key=lambda topic: topic[:2], reverse=True)
+        columns = {c: source for *_, own in ranked for c, source in own.items()}
+        poses = [topic for topic in ranked if "x" in topic[2]]
+        if "x" in by_name and poses:
+            logged = next(s for s in self.log_streams if by_name["x"].name in s.values)
+            if 2 * poses[-1][1] < _period(logged):
+                by_name = {c: source for c, source in by_name.items() if c not in _POSE}
+        if set(EULER) <= set(by_name):
+            columns = {c: source for c, source in columns.items() if c not in _QUATERNION}
+        return columns | by_name, remarks
 
     def all_streams(self) -> list[Stream]:
         """On one clock. The radio delays a message, never hastens it, so that the least that a
@@ -129,8 +192,9 @@ def _vehicles(
         vehicle = "" if mapping is not None else topic.rpartition("/")[0]
         if topic in wanted:
             recording = vehicles.setdefault(vehicle, _Recording())
-            recording.streams.append(_stream(reader, connection, wanted[topic]))
-            recording.columns |= {c: Source(f"{topic}:{f}") for c, f in wanted[topic].items()}
+            columns = {c: Source(f"{topic}:{f}") for c, f in wanted[topic].items()}
+            rank = int(connection.msgtype == ODOMETRY)
+            recording.add(_stream(reader, connection, wanted[topic]), columns, rank)
         elif mapping is None and connection.msgtype == LOG_TYPE:
             variables = variables_of(topic, files)
             if variables is None:
@@ -145,7 +209,29 @@ def _vehicles(
                 recording = vehicles.setdefault(vehicle, _Recording())
                 recording.log_streams.append(stream)
                 recording.ahead.append(ahead)
+    if mapping is None:
+        remarks += _add_captured(reader, vehicles)
     return vehicles, remarks
+
+
+def _add_captured(reader, vehicles: dict[str, _Recording]) -> list[str]:
+    """Give each vehicle its poses of motion capture; remarks on bodies of which nothing else was
+    logged.
+    """
+    others = []
+    for connection in reader.connections:
+        if connection.msgtype not in POSES_TYPES:
+            continue
+        topic = connection.topic
+        for name, stream in pose_streams(topic, _messages(reader, connection)).items():
+            columns = {c: Source(pose_source(topic, name, c)) for c in POSE_FIELDS}
+            if f"/{name}" in vehicles:
+                vehicles[f"/{name}"].add(stream, columns)
+            else:
+                others.append(name)
+    if not others:
+        return []
+    return [f"nothing but poses was logged of {', '.join(others)}: left out"]
 
 
 def _merged(
@@ -159,8 +245,7 @@ def _merged(
         if mapping is not None:
             columns = {c: s for c, s in mapping.columns.items() if c not in ("t", "vehicle")}
         else:
-            by_name, found = firmware_columns(recording.log_streams)
-            columns = recording.columns | by_name
+            columns, found = recording.columns()
             remarks += found
         try:
             tables[vehicle.strip("/") or "0"] = merge_streams(recording.all_streams(), columns)
@@ -207,6 +292,11 @@ def _stream(reader, connection, fields: dict[str, str]) -> Stream:
     return Stream(np.asarray(times, float) * 1e-9, named)
 
 
+def _period(stream: Stream) -> float:
+    """s between a stream's samples."""
+    return float(np.median(np.diff(np.sort(stream.time)))) if len(stream.time) > 1 else np.inf
+
+
 def _messages(reader, connection):
     """(stamp, message) of a topic: integer nanoseconds since the bag's start, which keep their
     resolution as floats of seconds; the header's where there is one, else when it was received.
@@ -240,4 +330,4 @@ def _joined(name: str, tables: dict[str, dict[str, np.ndarray]], remarks: list[s
     return LogTable(name, columns, vehicle, tuple(remarks))
 
 
-IMPORTER = Importer("ROS 2 bag", is_bag, read_bag)
+IMPORTER = Importer("ROS bag", is_bag, read_bag)
