@@ -1,83 +1,159 @@
 """Does the advised flight tell more than a random one? Two hovers that say little, a diagnosis, its
-advice, the advised segments flown, a second diagnosis; beside it as many random segments.
+advice, the advised segments flown, the next diagnosis, twice; beside it as many random segments.
 
-    python -m experiments.diagnosis.closed_loop --cases 6 --out experiments/results/closed_loop.json
+    python -m experiments.diagnosis.closed_loop --cases 48 --jobs 32 --out
+    experiments/results/closed_loop.json
 
 The plant is openjax' own vehicle with one effect of its sample strength, so this asks for the
-advice, not for the diagnosis' strength on foreign vehicles.
+advice, not for the diagnosis' strength on foreign vehicles. `--each` also diagnoses the hovers with
+each segment alone: which segment shows which cause.
 """
 
 import argparse
 import json
-from dataclasses import replace
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from openjax.flights.flight import Case
-from openjax.flights.reading import flights_of
-from openjax.flights.samples import fly, log_of
-from openjax.flights.segments import SEGMENTS
-from openjax.gap.diagnosis import diagnose_case
-from openjax.gap.planning.beliefs import beliefs_of
-from openjax.gap.planning.information import SECONDS, advise
-from openjax.vehicle.effects import EFFECTS
-from openjax.vehicle.vehicle_file import load_vehicle_file
+from experiments.diagnosis.generate import in_processes
+from experiments.flying.single_thread import use_single_thread
 
-CAUSES = ("rotor_drag", "ground_effect", "wind", "com_offset", "blade_flapping", "thrust_curve")
-FLOWN = 2  # segments after the first diagnosis
+CAUSES = (
+    *("rotor_drag", "ground_effect", "wind", "com_offset", "blade_flapping", "thrust_curve"),
+    *("motor_lag", "inertia", "yaw_torque", "battery_sag", "ceiling_effect", "motor_imbalance"),
+)
+FLOWN = 2  # segments in a round
+ROUNDS = 2
 
 
-def flights_along(names, effects, seed: int, described):
-    """Flights of segments, flown by a vehicle with effects."""
-    found = []
-    for number, name in enumerate(names):
-        reference = SEGMENTS[name].reference(SECONDS)
-        columns = fly(described.vehicle, described.vehicle, reference, 100 * seed + number, effects)
-        found += flights_of(log_of(columns, f"{seed}_{number}_{name}"), (0, 1, 2, 3))[0]
+@dataclass(frozen=True)
+class Case:
+    """A vehicle with one cause, whose number also seeds its flights."""
+
+    number: int
+
+    @property
+    def cause(self) -> str:
+        return CAUSES[self.number % len(CAUSES)]
+
+    def fly(self, segments, round_number: int) -> list:
+        """Flights of segments in a round."""
+        from openjax.flights.reading import flights_of
+        from openjax.flights.samples import fly, log_of
+        from openjax.flights.segments import SEGMENTS
+        from openjax.gap.planning.information import SECONDS
+        from openjax.vehicle.effects import EFFECTS
+
+        effects = {self.cause: EFFECTS[self.cause].card.sample}
+        vehicle = described().vehicle
+        found = []
+        for place, name in enumerate(segments):
+            reference = SEGMENTS[name].reference(SECONDS)
+            seed = 1000 * self.number + 100 * round_number + place
+            columns = fly(vehicle, vehicle, reference, seed, effects)
+            log = log_of(columns, f"{round_number}_{place}_{name}")
+            found += flights_of(log, (0, 1, 2, 3))[0]
+        return found
+
+
+def described():
+    """What the diagnosis is told of the vehicle."""
+    from openjax.vehicle.vehicle_file import load_vehicle_file
+
+    return replace(load_vehicle_file(), mass_weighed=True, log={"motor_rows": "mean"})
+
+
+def diagnose(case: Case, flights: list) -> tuple[dict, dict]:
+    """What is kept of a diagnosis, and its report as JSON has it."""
+    from openjax.flights import flight
+    from openjax.gap.diagnosis import diagnose_case
+
+    report = diagnose_case(flight.Case("closed loop", tuple(flights), described()))
+    named = (report.effects or (report.verdict,))[0]
+    likely = {e: round(p, 3) for e, p in report.probabilities.items() if p > 0.03}
+    kept = {
+        "named": named,
+        "right": named == case.cause,
+        "also": list(report.effects[1:]),
+        "equivalent": report.equivalent.get(named, []),
+        "not_testable": case.cause in report.not_testable,
+        "probabilities": likely,
+    }
+    return kept, report.to_dict()
+
+
+def advised(report: dict, flown: list[str]) -> tuple[list[str], list[dict]]:
+    """The segments that the advice would fly, and what it promises."""
+    from openjax.gap.planning.beliefs import beliefs_of
+    from openjax.gap.planning.information import advise
+
+    advice = advise(beliefs_of(report), described())
+    chosen = list(advice.chosen)
+    chosen += [p.segment for p in advice.promises if p.segment not in chosen]
+    return chosen[:FLOWN], [asdict(p) for p in advice.promises]
+
+
+def rounds(case: Case, hovers: list, report: dict, choose) -> list[dict]:
+    """Each round's segments and diagnosis; `choose(report, flown)` names the segments."""
+    out = []
+    flights = list(hovers)
+    flown: list[str] = []
+    for number in range(1, ROUNDS + 1):
+        segments, promises = choose(report, flown)
+        flights += case.fly(segments, number)
+        flown += segments
+        kept, report = diagnose(case, flights)
+        out.append({"segments": segments, "promises": promises} | kept)
+    return out
+
+
+def closed_loop(number: int, each: bool = False) -> dict:
+    """One case: names before, after advised and after random segments."""
+    from openjax.flights.segments import SEGMENTS
+
+    case = Case(number)
+    hovers = case.fly(("hover", "hover"), 0)
+    before, report = diagnose(case, hovers)
+    rng = np.random.default_rng(number)
+
+    def drawn(report, flown):
+        return [str(n) for n in rng.choice(list(SEGMENTS), FLOWN, replace=False)], []
+
+    found = {"number": number, "cause": case.cause, "before": before}
+    found["advised"] = rounds(case, hovers, report, advised)
+    found["random"] = rounds(case, hovers, report, drawn)
+    if each:
+        found["each"] = {n: diagnose(case, hovers + case.fly((n,), 1))[0] for n in SEGMENTS}
+    print(json.dumps(found), flush=True)
     return found
 
 
-def answer(flights, described):
-    """What the diagnosis names first, and its report as JSON has it."""
-    report = diagnose_case(Case("closed loop", tuple(flights), described))
-    return (report.effects or (report.verdict,))[0], report.to_dict()
-
-
-def closed_loop(number: int) -> dict:
-    """One case: names before, after advised and after random segments."""
-    cause = CAUSES[number % len(CAUSES)]
-    effects = {cause: EFFECTS[cause].card.sample}
-    described = replace(load_vehicle_file(), mass_weighed=True, log={"motor_rows": "mean"})
-    hovers = flights_along(("hover", "hover"), effects, 3 * number, described)
-    before, report = answer(hovers, described)
-    advice = advise(beliefs_of(report), described)
-    chosen = list(advice.chosen)
-    chosen += [p.segment for p in advice.promises if p.segment not in chosen]
-    chosen = chosen[:FLOWN]
-    rng = np.random.default_rng(number)
-    drawn = [str(n) for n in rng.choice(list(SEGMENTS), FLOWN, replace=False)]
-    out = {"cause": cause, "before": before}
-    for kind, names in (("advised", chosen), ("random", drawn)):
-        more = flights_along(names, effects, 3 * number + 1, described)
-        out[kind] = {"segments": names, "named": answer(hovers + more, described)[0]}
-    print(out, flush=True)
+def figures(cases: list[dict]) -> dict:
+    """How often the cause is named first: before, and after each round."""
+    out = {"before": sum(c["before"]["right"] for c in cases)}
+    for kind in ("advised", "random"):
+        out[kind] = [sum(c[kind][r]["right"] for c in cases) for r in range(ROUNDS)]
     return out
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--first", type=int, default=0, help="number of the first case")
     parser.add_argument("--cases", type=int, default=len(CAUSES))
+    parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--each", action="store_true")
     parser.add_argument("--out", type=Path, default=Path("closed_loop.json"))
     arguments = parser.parse_args()
-    cases = [closed_loop(number) for number in range(arguments.cases)]
-    right = {
-        "before": sum(c["before"] == c["cause"] for c in cases),
-        "advised": sum(c["advised"]["named"] == c["cause"] for c in cases),
-        "random": sum(c["random"]["named"] == c["cause"] for c in cases),
-    }
-    command = f"python -m experiments.diagnosis.closed_loop --cases {arguments.cases}"
-    found = {"command": command, "of": len(cases), "right": right, "cases": cases}
+    use_single_thread()
+    numbers = list(range(arguments.first, arguments.first + arguments.cases))
+    study = partial(closed_loop, each=arguments.each)
+    cases = sorted(in_processes(study, numbers, arguments.jobs), key=lambda c: c["number"])
+    command = "python -m experiments.diagnosis.closed_loop"
+    command += f" --first {arguments.first} --cases {len(cases)}"
+    command += " --each" if arguments.each else ""
+    found = {"command": command, "of": len(cases), "right": figures(cases), "cases": cases}
     arguments.out.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
 
 

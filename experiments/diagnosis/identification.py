@@ -54,7 +54,7 @@ def fitted(record: Record, free: bool) -> TorqueFit:
         return identify_torques([record])
     problem = Problem([record])
     problem.new = [None]
-    return problem.fit(0.002)
+    return problem.fit(problem.begin(0.002))
 
 
 def truth_of(truth: Truth) -> np.ndarray:

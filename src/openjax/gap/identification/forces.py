@@ -33,7 +33,7 @@ def identify_forces(records: list[Record], lags: np.ndarray) -> Numbers:
     vehicle = known[0].vehicle
     mass = float(vehicle.mass)
     full = 4.0 * float(vehicle.thrust_constant * vehicle.max_rotor_speed**2) / mass
-    thrusts = [full * _thrust(r, lags) for r in known]
+    thrusts = [full * t for t in _thrusts(known, lags)]
     forces = [_force(r) for r in known]
     level = np.array([f[:, 2].mean() / t.mean() for f, t in zip(forces, thrusts, strict=True)])
     spread = level.std() / np.sqrt(len(level))
@@ -81,10 +81,10 @@ def _force(record: Record) -> np.ndarray | None:
     return specific_force_of(record.quaternion, record.velocity, record.dt)
 
 
-def _thrust(record: Record, lags: np.ndarray) -> np.ndarray:
-    """(T,) thrust at each row's time, as a share of the largest."""
-    _, speed = rotor_rows(record.motor, record.dt, np.asarray(lags, float)[None])
-    return (np.concatenate([speed[0, :1], speed[0, :-1]]) ** 2).mean(1)
+def _thrusts(records: list[Record], lags: np.ndarray) -> list[np.ndarray]:
+    """(T,) thrust at each row's time, as a share of the largest, of each record."""
+    rotors = rotor_rows([r.motor for r in records], records[0].dt, np.asarray(lags, float)[None])
+    return [(np.concatenate([s[0, :1], s[0, :-1]]) ** 2).mean(1) for _, s in rotors]
 
 
 def _regression(outputs: list, columns: dict[str, list], dt: float) -> Numbers:

@@ -59,7 +59,10 @@ def responses(records: list[Record], fit: TorqueFit) -> dict[str, Pair]:
     real[2] += ahead * problem.dt
     found = {}
     rng = np.random.default_rng(0)
-    simulated = [_simulated(problem, r, rng) for r in problem.records]
+    modelled = problem.modelled(nominal)
+    simulated = [
+        _simulated(r, left, rng) for r, (left, _) in zip(problem.records, modelled, strict=True)
+    ]
     for axis in range(3):
         measured = [r.rates[:, axis] for r in problem.records]
         replay = [s[:, axis] for s in simulated]
@@ -72,9 +75,10 @@ def responses(records: list[Record], fit: TorqueFit) -> dict[str, Pair]:
     return found
 
 
-def _simulated(problem: Problem, record: Record, rng) -> np.ndarray:
-    """Rates (T, 3) of the nominal vehicle under the record's motors, as a gyroscope shows them."""
-    left, _ = problem.modelled(record, problem.start)
+def _simulated(record: Record, left: np.ndarray, rng) -> np.ndarray:
+    """Rates (T, 3) of the nominal vehicle, from what they leave of the record's, as a gyroscope
+    shows them.
+    """
     return record.rates - left + GYROSCOPE * rng.standard_normal(left.shape)
 
 
@@ -92,8 +96,7 @@ def _of_thrust(problem: Problem, rng) -> Pair:
     full = 4.0 * float(vehicle.thrust_constant * vehicle.max_rotor_speed**2 / vehicle.mass)
     lags = problem.values(problem.start)[None, :3]
     simulated = []
-    for record in problem.records:
-        _, speed = rotor_rows(record.motor, problem.dt, lags)
+    for _, speed in rotor_rows([r.motor for r in problem.records], problem.dt, lags):
         force = full * (np.concatenate([speed[0, :1], speed[0, :-1]]) ** 2).mean(1)
         simulated.append(force + ACCELEROMETER * rng.standard_normal(len(force)))
 

@@ -3,58 +3,102 @@
 The rotor model is the simulator's (`openjax.vehicle.rotors`): T dw/dt = w_commanded - w, thrust in
 proportion to w^2, T different for speeding up and slowing down. A row's command holds until the
 next row.
+
+Rotors forget where they came from within some time constants. So flights are cut into lanes, each
+begun a while earlier, that run side by side: the loop is over the rows of one lane, and nothing has
+to be compiled for a flight's length.
 """
 
-import jax
-import jax.numpy as jnp
+from collections.abc import Sequence
+
 import numpy as np
 
-SMALLEST = 1e-8  # of a command: the square root's slope stays finite
+SMALLEST = 1e-8  # of a command: dead motors have a speed, too
+LANE = 600  # rows
+FORGOTTEN = 10.0  # time constants
 
 
-@jax.jit
-def _scan(first, second, up, down, spans):
-    """Speeds, as shares of the largest, whose targets in the two parts of a row, `spans` (2,) s
-    long, are `first` and `second` (T, 4): mean square over each row, and speed at its end.
-    """
-
-    def part(speed, target, span):
-        constant = jnp.where(target < speed, down, up)
-        kept = jnp.exp(-span / constant)
-        off = speed - target
-        square = target * target * span + off * constant * (
-            2.0 * target * (1.0 - kept) + 0.5 * off * (1.0 - kept * kept)
-        )
-        return target + off * kept, square
-
-    def row(speed, targets):
-        speed, before = part(speed, targets[0], spans[0])
-        speed, after = part(speed, targets[1], spans[1])
-        return speed, ((before + after) / spans.sum(), speed)
-
-    return jax.lax.scan(row, first[0], (first, second))[1]
-
-
-_batched = jax.jit(jax.vmap(_scan))
-
-
-def rotor_rows(commands: np.ndarray, dt: float, lags: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def rotor_rows(
+    commands: Sequence[np.ndarray], dt: float, lags: np.ndarray
+) -> list[tuple[np.ndarray, np.ndarray]]:
     """Mean thrust of each row (B, T, 4) and speed at its end (B, T, 4), as shares of the largest,
-    for commands (T, 4) in rows of dt s and B `lags` (B, 3): time constants of speeding up and of
-    slowing down, and delay, s.
+    for each of some flights' commands (T, 4) in rows of dt s, with B `lags` (B, 3): time constants
+    of speeding up and of slowing down, and delay, s.
     """
-    wanted = np.sqrt(np.clip(commands, SMALLEST, None))
-    rows = np.arange(len(wanted))
+    lanes = _Lanes([len(c) for c in commands], int(np.ceil(FORGOTTEN * lags[:, :2].max() / dt)))
+    wanted = [np.sqrt(np.clip(c, SMALLEST, None)) for c in commands]
     whole = np.floor(lags[:, 2] / dt).astype(int)
     late = lags[:, 2] - whole * dt
-    size = 1 << (len(wanted) - 1).bit_length()  # few lengths, few compilations
-    padded = np.minimum(np.arange(size), len(wanted) - 1)
-    first, second = (
-        np.stack([wanted[np.clip(rows - w, 0, len(rows) - 1)][padded] for w in whole + more])
-        for more in (1, 0)
-    )
-    spans = np.stack([late, dt - late], 1)
-    arrays = (first, second, lags[:, 0], lags[:, 1], spans)
-    square, speed = _batched(*(a.astype(np.float32) for a in arrays))
+    # A row begins with the command before, as long as it is late.
+    parts = [_Part(*lags[:, :2].T, late), _Part(*lags[:, :2].T, dt - late)]
+    targets = [[_delayed(w, whole + more) for w in wanted] for more in (1, 0)]
+    begins = lanes.run(parts, *targets)
+
+    out = []
+    for begin, first, second in zip(begins, *targets, strict=True):
+        middle = parts[0].after(begin, first)
+        square = parts[0].square(begin, first) + parts[1].square(middle, second)
+        out.append((square / dt, parts[1].after(middle, second)))
+    return out
+
+
+def _delayed(wanted: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Wanted speeds (T, 4) so many `rows` (B,) later: (B, T, 4)."""
     count = len(wanted)
-    return np.asarray(square, float)[:, :count], np.asarray(speed, float)[:, :count]
+    return wanted[np.clip(np.arange(count) - rows[:, None], 0, count - 1)]
+
+
+class _Part:
+    """A part of a row, `span` (B,) s long, in which commands hold; `up` and `down` (B,) s."""
+
+    def __init__(self, up: np.ndarray, down: np.ndarray, span: np.ndarray):
+        self.up, self.down, self.span = (v[:, None, None] for v in (up, down, span))
+        self.kept_up = np.exp(-self.span / self.up)
+        self.kept_down = np.exp(-self.span / self.down)
+
+    def after(self, speed: np.ndarray, target: np.ndarray) -> np.ndarray:
+        """Speed at the part's end (B, ..., 4)."""
+        off = speed - target
+        return target + off * np.where(off > 0.0, self.kept_down, self.kept_up)
+
+    def square(self, speed: np.ndarray, target: np.ndarray) -> np.ndarray:
+        """Integral of the square of the speed over the part, s (B, ..., 4)."""
+        off = speed - target
+        falls = off > 0.0
+        kept = np.where(falls, self.kept_down, self.kept_up)
+        moving = 2.0 * target * (1.0 - kept) + 0.5 * off * (1.0 - kept * kept)
+        return target * target * self.span + off * np.where(falls, self.down, self.up) * moving
+
+
+class _Lanes:
+    """Flights of `counts` rows cut into lanes that begin `early` rows before what they are for."""
+
+    def __init__(self, counts: list[int], early: int):
+        self.counts = counts
+        self.early = early
+        firsts = np.cumsum([0, *counts[:-1]])
+        rows = []
+        for first, count in zip(firsts, counts, strict=True):
+            begins = np.arange(0, count, LANE)[:, None] - early
+            # Before a flight its first command held; what a lane has beyond the end is left out.
+            rows.append(first + np.clip(begins + np.arange(early + LANE), 0, count - 1))
+        self.rows = np.concatenate(rows).T  # (early + LANE, lanes)
+
+    def run(self, parts: list[_Part], *targets: list[np.ndarray]) -> list[np.ndarray]:
+        """Speeds (B, T, 4) at the rows' begin, for targets (B, T, 4) in the two parts of a row."""
+        taken = [np.moveaxis(np.concatenate(t, 1)[:, self.rows], 1, 0) for t in targets]
+        speed = taken[0][0]  # (B, lanes, 4)
+        begin = np.empty_like(taken[0])
+        for row, (first, second) in enumerate(zip(*taken, strict=True)):
+            begin[row] = speed
+            speed = parts[1].after(parts[0].after(speed, first), second)
+
+        found = np.moveaxis(begin[self.early :], 0, 2)  # (B, lanes, LANE, 4)
+        out = []
+        lane = 0
+        for count in self.counts:
+            lanes = -(-count // LANE)
+            flight = found[:, lane : lane + lanes].reshape(len(found), -1, 4)
+            out.append(flight[:, :count])
+            lane += lanes
+        return out

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from scipy.signal import lfilter
+from scipy.signal import butter, lfilter
 
 from openjax.gap.identification.records import Record
 from openjax.gap.identification.rotor_rows import rotor_rows
@@ -30,22 +30,34 @@ NAMES = (
 z."""
 LOGARITHMS = [0, 1, 3, 4, 5]
 """Of these the search runs in the logarithm, so that none leaves what is possible."""
-SPREAD = np.array([1.0, 1.0, 0.1, 0.7, 0.7, 0.7, 4.0, 4.0, 0.003])
-"""Weak priors, several times the spread of such vehicles; logarithms where they are searched."""
+SPREAD = np.array([1.0, 1.0, 0.1, 0.7, 0.7, 0.7, 2.5, 2.5, 0.003])
+"""Weak priors, several times the spread of such vehicles; logarithms where they are searched. Of the
+damping twice what the rotors' inflow makes (.015 N s/m of thrust per climbing speed, on arms of .03
+m): a lag and a damping are two poles of one response, and nothing but their usual sizes says which
+is which.
+"""
 UNEQUAL = 0.4  # spread of the logarithm of slowing down over speeding up
 STEP = np.array([2e-4, 2e-4, 1e-4])  # s, of the difference quotients of lags
-SEARCHED = np.array([[0.002, 0.3], [0.05, 5.0]])
+SEARCHED = np.array([[0.002, 0.15], [0.02, 5.0]])
 """Time constants, s, and gains beyond which nothing is looked for."""
 EARLIEST = -0.002  # s, a cycle of the rate loop: when within it motors answer is convention
+GYROSCOPE_FILTER = 80.0  # Hz, of second order: the Crazyflie's firmware, sensors_bmi088_bmp3xx.c
+FAST_ROWS = 0.005  # s: slower rows show 2 ms of delay in its place
 MEMORY = 0.25  # s of the noise's autoregression, within so many rows:
 ROWS = (15, 50)
 ITERATIONS = 25
+LARGEST_STEP = np.array([0.8, 0.8, 0.01, 1.2, 1.2, 1.2, 8.0, 8.0, 0.003])
+"""Of the search, in one step: logarithms, s, 1/s, share."""
+LEAST_STEP = 0.003  # of that, at which a step that gains nothing isn't halved further
 TINY = 1e-12  # rad^2/s^2: rates that never change
-SMALL = 0.02  # nats that end the search
+SMALL = 0.05  # nats that end the search
 BLOCK = 1.0  # s over which errors may hang together
 AHEAD = (0.01, 0.02, 0.04, 0.08)  # s by which motors are tried earlier than logged
 LATE = (0.002, 0.03)  # s, starts of the delay
-STRONG = 0.6  # of the nominal gain; the heaviest decks leave about as much
+LAGS = (0.025, 0.07)  # s, starts of the lags
+SWEEPS = 2
+STRONG = 0.45  # of the nominal gain; the heaviest decks and duty cycles leave about as much
+SOON = 0.12  # s; the slowest motors that fly
 CLEARLY = 10.0  # nats by which motors logged too late must be better
 HIDDEN = 1  # rows whose surprise in the motors is free to act: the loop answers within them
 
@@ -84,27 +96,38 @@ class TorqueFit:
 def identify_torques(records: list[Record]) -> TorqueFit:
     """The most likely fit of records with body rates, over the motors' clock as well."""
     base = Problem(records)
-    first = base.fit(LATE[0])
+    begun = base.begin(LATE[0])
+    if base.dt < FAST_ROWS:
+        # Whether such rows are of the filtered gyroscope nobody says, but they show it.
+        filtered = Problem(records, filtered=True)
+        other = filtered.begin(LATE[0])
+        if filtered.solve(other)[0] < base.solve(begun)[0]:
+            base, begun = filtered, other
+    first = base.fit(begun)
     if _clear(first):
         return first
-    fits = [first, base.fit(LATE[1])]
+    fits = [first, base.fit(base.begin(LATE[1]))]
     for rows in {round(ahead / base.dt): None for ahead in AHEAD}:
         if rows:
-            problem = Problem([earlier(r, rows) for r in records])
-            fit = problem.fit(LATE[0])
+            problem = Problem([earlier(r, rows) for r in records], base.filtered)
+            fit = problem.fit(problem.begin(LATE[0]))
             value = fit.value.copy()
             value[2] -= rows * base.dt
-            # Per row, as the shifted log has fewer.
-            loss = (fit.loss + problem.surprise) * base.count / problem.count - base.surprise
-            fits.append(replace(fit, value=value, loss=loss + CLEARLY))
+            loss = _comparable(fit.loss, problem, base) + CLEARLY
+            fits.append(replace(fit, value=value, loss=loss))
     return min(fits, key=lambda f: f.loss)
 
 
+def _comparable(loss: float, problem: "Problem", base: "Problem") -> float:
+    """A shifted log's loss as if it had as many rows as the whole one."""
+    return (loss + problem.surprise) * base.count / problem.count - base.surprise
+
+
 def _clear(fit: TorqueFit) -> bool:
-    """Whether roll and pitch answer as strongly as those of any such vehicle: then the rows'
-    clock is right to a few milliseconds, and no other need be tried.
+    """Whether roll and pitch answer as strongly and as soon as those of any such vehicle: then the
+    rows' clock is right to a few milliseconds, and no other need be tried.
     """
-    return bool(fit.value[3:5].min() > STRONG)
+    return bool(fit.value[3:5].min() > STRONG and fit.value[:2].max() < SOON)
 
 
 def earlier(record: Record, rows: int) -> Record:
@@ -122,11 +145,14 @@ def _lagged(x: np.ndarray, order: int) -> np.ndarray:
 
 
 class Problem:
-    """Records with all that doesn't depend on the parameters."""
+    """Records with all that doesn't depend on the parameters. `filtered`: rates went through the
+    firmware's filter of the gyroscope.
+    """
 
-    def __init__(self, records: list[Record]):
+    def __init__(self, records: list[Record], filtered: bool = False):
         self.records = records
         self.dt = records[0].dt
+        self.filtered = filtered
         self.order = int(np.clip(round(MEMORY / self.dt), *ROWS))
         vehicle = records[0].vehicle
         self.inertia = np.asarray(vehicle.inertia, float)
@@ -162,33 +188,44 @@ class Problem:
             out.append(present - past @ solve(past, present))
         return np.stack(out, 1)
 
-    def modelled(self, record: Record, place: np.ndarray):
-        """Rates less the model's (T, 3) at a place (9,) of the search, and their derivatives
-        (9, T, 3).
+    def modelled(self, place: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Of each record its rates less the model's (T, 3) at a place (9,) of the search, and their
+        derivatives (9, T, 3).
         """
         value = _value(place)
         lags = np.repeat(value[None, :3], 4, 0)
         lags[[1, 2, 3], [0, 1, 2]] += STEP
-        square, speed = rotor_rows(record.motor, self.dt, lags)
+        rotors = rotor_rows([r.motor for r in self.records], self.dt, lags)
+        both = zip(self.records, rotors, strict=True)
+        return [self._left(value, record.rates, *rotor) for record, rotor in both]
+
+    def _left(self, value: np.ndarray, rates: np.ndarray, square: np.ndarray, speed: np.ndarray):
+        """`modelled` of one record, whose rotors turned so."""
         unit = square @ self.base.T
         sped = self.top_speed * np.diff(speed, axis=1, prepend=speed[:, :1]) @ self.spin
-        gyroscopic = np.cross(record.rates, self.inertia * record.rates) / self.inertia
+        gyroscopic = np.cross(rates, self.inertia * rates) / self.inertia
         gains = value[3:6]
         damping = value[[6, 6, 7]]
-        grown = self.dt * (gains * unit - damping * record.rates - gyroscopic)
+        grown = self.dt * (gains * unit - damping * rates - gyroscopic)
         grown[..., 2] += value[8] * sped
-        slope = np.zeros((len(NAMES), *record.rates.shape))
+        slope = np.zeros((len(NAMES), *rates.shape))
         slope[:3] = (grown[1:] - grown[0]) / STEP[:, None, None]
         slope[[3, 4, 5], :, [0, 1, 2]] = self.dt * unit[0].T
-        slope[6, :, :2] = -self.dt * record.rates[:, :2]
-        slope[7, :, 2] = -self.dt * record.rates[:, 2]
+        slope[6, :, :2] = -self.dt * rates[:, :2]
+        slope[7, :, 2] = -self.dt * rates[:, 2]
         slope[8, :, 2] = sped[0]
 
         def whole(rows):
             return np.cumsum(rows, -2) - rows
 
         slope[LOGARITHMS] *= value[LOGARITHMS, None, None]
-        return record.rates - whole(grown[0]), whole(slope)
+        model = whole(grown[0])
+        slope = whole(slope)
+        if self.filtered:
+            low = butter(2, GYROSCOPE_FILTER, fs=1.0 / self.dt)
+            model = lfilter(*low, model, axis=0)
+            slope = lfilter(*low, slope, axis=1)
+        return rates - model, slope
 
     @staticmethod
     def values(place: np.ndarray) -> np.ndarray:
@@ -208,7 +245,7 @@ class Problem:
         """Loss at a place (9,) of the search, and of each axis: innovations (N,), their derivatives (N, 9) less what the noise
         model takes, and its coefficients.
         """
-        modelled = [self.modelled(r, value) for r in self.records]
+        modelled = self.modelled(value)
         axes = [self._axis(axis, modelled) for axis in range(3)]
         off = value - self.start
         loss = 0.5 * off @ self.precision @ off
@@ -233,12 +270,13 @@ class Problem:
             nexts.append(x[order + 1 :])
         past = np.concatenate(pasts)
         following = np.concatenate(nexts)
-        taken = solve(past, following)
+        regression = Regression(past)
+        taken = regression.solve(following)
         errors = following - past @ taken
         whitening = _polynomial(taken[:order])
         slopes = [-lfilter(whitening, [1.0], s[:, :, axis], axis=1) for _, s in modelled]
         slopes = np.concatenate([s[:, order + 1 :] for s in slopes], 1).T
-        return errors, slopes - past @ solve(past, slopes), taken[:order]
+        return errors, slopes - past @ regression.solve(slopes), taken[:order]
 
     def _model_error(self) -> np.ndarray:
         """Covariance (9, 9) of what rows hide, at a place of the search."""
@@ -260,24 +298,49 @@ class Problem:
             np.concatenate([np.zeros(row), new[: len(new) - row]])[:, None] for row in range(HIDDEN)
         ]
 
-    def fit(self, late: float) -> TorqueFit:
-        """Gauss-Newton from the nominal vehicle with motors `late` s."""
-        value = self.start.copy()
-        value[2] = late
+    def begin(self, late: float) -> np.ndarray:
+        """A place (9,) to search from, with motors `late` s: of some lags that of the least loss,
+        once gains, in which the model is linear, are fitted to it.
+        """
+        begun = []
+        for lag in LAGS:
+            place = self.start.copy()
+            place[:3] = np.log(lag), np.log(lag), late
+            for _ in range(SWEEPS):
+                place = self._swept(place)
+            begun.append((self.solve(place)[0], place))
+        return min(begun, key=lambda b: b[0])[1]
+
+    def _swept(self, place: np.ndarray) -> np.ndarray:
+        """The place with gains as of least squares, for the noise as it is."""
+        gains = np.exp(place[3:6])
+        _, axes = self.solve(place)
+        hessian = self.precision[3:6, 3:6] / gains**2
+        push = np.zeros(3)
+        for errors, slopes, _ in axes:
+            linear = slopes[:, 3:6] / gains
+            hessian += linear.T @ linear / (errors.var() + TINY)
+            push += linear.T @ errors / (errors.var() + TINY)
+        found = gains - np.linalg.solve(hessian, push)
+        out = place.copy()
+        out[3:6] = np.log(np.maximum(found, SEARCHED[1][0]))
+        return self._bounded(out)
+
+    def fit(self, place: np.ndarray) -> TorqueFit:
+        """Gauss-Newton from a place (9,), in steps no larger than its linearisation is good for."""
+        value = place
         loss, axes = self.solve(value)
         for _ in range(ITERATIONS):
-            hessian, push = self._normal(value, axes)
-            step = np.linalg.solve(hessian, -push)
-            share = 1.0
-            while share > 0.02:
-                ahead = self._bounded(value + share * step)
+            step = self._step(value, axes)
+            while True:
+                ahead = self._bounded(value + step)
                 reached, there = self.solve(ahead)
-                if reached < loss:
+                if reached < loss or np.abs(step / LARGEST_STEP).max() < LEAST_STEP:
                     break
-                share *= 0.4
-            else:
-                break
+                step = 0.3 * step
             gained = loss - reached
+            if gained <= 0.0:
+                break
             value, loss, axes = ahead, reached, there
             if gained < SMALL:
                 break
@@ -290,6 +353,17 @@ class Problem:
             [a[2] for a in axes],
             np.array([a[0].var() for a in axes]),
         )
+
+    def _step(self, value: np.ndarray, axes: list) -> np.ndarray:
+        """Gauss-Newton's step (9,), of at most LARGEST_STEP; what stands at a bound and is pushed
+        beyond stays.
+        """
+        hessian, push = self._normal(value, axes)
+        tried = self._bounded(value - 1e-6 * np.sign(push))
+        free = np.flatnonzero(tried != value)
+        step = np.zeros(len(value))
+        step[free] = np.linalg.solve(hessian[np.ix_(free, free)], -push[free])
+        return step / max(np.abs(step / LARGEST_STEP).max(), 1.0)
 
     def _bounded(self, value: np.ndarray) -> np.ndarray:
         out = value.copy()
@@ -336,11 +410,22 @@ def _polynomial(taken: np.ndarray) -> np.ndarray:
     return out
 
 
+class Regression:
+    """Least squares on columns (N, P), by normal equations of scaled columns."""
+
+    def __init__(self, columns: np.ndarray):
+        gram = columns.T @ columns
+        self.columns = columns
+        self.scale = np.sqrt(np.diag(gram)) + 1e-30
+        self.gram = gram / np.outer(self.scale, self.scale)
+        self.gram[np.diag_indices(len(gram))] += 1e-10
+
+    def solve(self, target: np.ndarray) -> np.ndarray:
+        """Coefficients (P, ...) of targets (N, ...)."""
+        products = (self.columns.T @ target).T / self.scale
+        return (np.linalg.solve(self.gram, products.T).T / self.scale).T
+
+
 def solve(columns: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Least squares by normal equations of scaled columns."""
-    scale = np.sqrt((columns * columns).sum(0)) + 1e-30
-    scaled = columns / scale
-    gram = scaled.T @ scaled
-    gram[np.diag_indices(len(gram))] += 1e-10
-    solved = np.linalg.solve(gram, scaled.T @ target)
-    return (solved.T / scale).T
+    """Least squares coefficients (P, ...) of columns (N, P) for targets (N, ...)."""
+    return Regression(columns).solve(target)
