@@ -44,10 +44,8 @@ TWICE = {
     *("exploit", "adaptation", "loop"),
 }
 """Module names that more than one room has."""
-CIRCLES = {"openjax.gap.report", "openjax.runs.job", "openjax.runs.report"}
-"""Packages in which a class draws the page that is drawn from it, and the two that know a run's job
-by its type.
-"""
+CIRCLES = {"openjax.gap.report"}
+"""Packages in which a class draws the page that is drawn from it."""
 MOST = {"pairs": 52, "starred": 95, "columns": 78, "adverbs": 145, "effects": 36}
 """Places of each kind of hard reading that are left; these numbers only get smaller. Pairs: a tuple
 written out and bound to several names. Starred: a tuple that an own function takes apart again.

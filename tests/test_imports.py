@@ -14,7 +14,7 @@ import pytest
         (("openjax.learning.advantages", "openjax.learning.archive", "openjax.learning.schedule"), "mujoco flax.linen"),
         (("openjax.policy.predictor", "openjax.kernels.attention"), "mujoco openjax.pursuit"),
         (("openjax.files", "openjax.ranges", "openjax.errors"), "jax numpy"),
-        (("openjax.runs.job",), "orbax matplotlib tensorboardX torch PIL"),
+        (("openjax.runs.training",), "orbax matplotlib tensorboardX torch PIL"),
     ],
 )  # fmt: skip
 def test_modules_load_without_what_they_do_not_need(modules, unwanted):

@@ -35,7 +35,7 @@ def writing(folder):
         compile()
 
 def compiling(folder):
-    with StopRequest(), interruption.telling(lambda: "saved at update 3"):
+    with StopRequest(), interruption.last_words(lambda: "saved at update 3"):
         compile()
 
 def waiting_for_a_program(folder):
@@ -54,12 +54,12 @@ def learning_for_ever(folder):
         compile()
 
 def tidying(folder):
-    with interruption.cleaning((folder / "tidied").touch):
+    with interruption.clean_up((folder / "tidied").touch):
         compile()
 
 def hanging(folder):
     interruption.PATIENCE = 0.1
-    with interruption.cleaning(lambda: compile()):
+    with interruption.clean_up(lambda: compile()):
         compile()
 
 moment = globals()[sys.argv[1]]

@@ -32,7 +32,7 @@ class _Watch:
         self.descriptor: int | None = None
         self.deciding = threading.Lock()
         self.patience = math.inf
-        self.unfinished: set[Path] = set()
+        self.unfinished: list[Path] = []
         self.clean_ups: list[Callable[[], None]] = []
         self.last_words: list[Callable[[], str]] = []
         self.undivided = threading.RLock()
@@ -105,13 +105,28 @@ def patience(signals: int) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def unfinished(path: Path) -> Iterator[None]:
-    """A file or folder that is removed should the process end inside."""
-    _watch.unfinished.add(path)
+def _inside(entries: list, entry: object) -> Iterator[None]:
+    """Among the watch's entries while the caller is inside."""
+    entries.append(entry)
     try:
         yield
     finally:
-        _watch.unfinished.discard(path)
+        entries.remove(entry)
+
+
+def unfinished(path: Path) -> contextlib.AbstractContextManager[None]:
+    """A file or folder that is removed should the process end inside."""
+    return _inside(_watch.unfinished, path)
+
+
+def clean_up(function: Callable[[], None]) -> contextlib.AbstractContextManager[None]:
+    """Something to be called, in another thread, should the process end inside."""
+    return _inside(_watch.clean_ups, function)
+
+
+def last_words(words: Callable[[], str]) -> contextlib.AbstractContextManager[None]:
+    """What the line says after the signal's name, should the process end inside."""
+    return _inside(_watch.last_words, words)
 
 
 @contextlib.contextmanager
@@ -119,26 +134,6 @@ def undivided() -> Iterator[None]:
     """A few steps between which the process doesn't end."""
     with _watch.undivided:
         yield
-
-
-@contextlib.contextmanager
-def cleaning(function: Callable[[], None]) -> Iterator[None]:
-    """Something to be called, in another thread, should the process end inside."""
-    _watch.clean_ups.append(function)
-    try:
-        yield
-    finally:
-        _watch.clean_ups.remove(function)
-
-
-@contextlib.contextmanager
-def telling(words: Callable[[], str]) -> Iterator[None]:
-    """What the line says after the signal's name, should the process end inside."""
-    _watch.last_words.append(words)
-    try:
-        yield
-    finally:
-        _watch.last_words.remove(words)
 
 
 @contextlib.contextmanager
@@ -184,7 +179,7 @@ def _clean_up() -> None:
         with contextlib.suppress(Exception):
             function()
     # twice: a thread may have been about to put one more file into a folder
-    for path in 2 * tuple(_watch.unfinished):
+    for path in 2 * _watch.unfinished:
         with contextlib.suppress(OSError):
             shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
 

@@ -13,7 +13,8 @@ from openjax.cluster.processes import Processes
 from openjax.files import read_json
 from openjax.learning import build, preset
 from openjax.pursuit import Pursuit
-from openjax.runs.job import awaits_validation, keep_best
+from openjax.runs.last_stage import keep_best
+from openjax.runs.training import awaits_validation
 from openjax.runs.options import TrainCommand
 from openjax.runs.start import other_compiler, prepare
 from openjax.store.checkpoints import CheckpointRecord

@@ -7,7 +7,7 @@ import pytest
 
 import openjax
 from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings
-from openjax.runs.report import compare, game_for
+from openjax.runs.other_policy import compare, game_for
 
 
 @pytest.mark.slow

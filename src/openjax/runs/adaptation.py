@@ -23,7 +23,7 @@ from openjax.evaluation.evaluator import episode_figures
 from openjax.evaluation.validation import selection_score, uniform_tasks
 from openjax.files import write_json, write_text
 from openjax.flights.case import load_case
-from openjax.interruption import cleaning
+from openjax.interruption import clean_up
 from openjax.learning.adaptation import bounds_of, fine_tune, make_adaptation, starting_parameters
 from openjax.runs.machine import describe_machine
 from openjax.runs.options import AdaptCommand
@@ -232,7 +232,7 @@ def _diagnosis(command: AdaptCommand) -> Iterator[Callable[[], Path]]:
         return out / name / "effects.toml"
 
     try:
-        with cleaning(process.terminate):
+        with clean_up(process.terminate):
             yield effects
     finally:
         process.terminate()

@@ -4,100 +4,29 @@ table and pictures.
 
 import dataclasses
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import jax
 from rich.table import Table
 
-from openjax.evaluation.evaluator import Evaluator, layout_slots, layout_tasks
-from openjax.evaluation.validation import Validation, uniform_tasks
+from openjax.evaluation.evaluator import layout_tasks
+from openjax.evaluation.validation import Validation
 from openjax.files import write_json
-from openjax.pursuit import Pursuit, Scenario
+from openjax.runs.job import TrainingJob
 from openjax.runs.loop import Outcome
+from openjax.runs.other_policy import compare
 from openjax.runs.words import layouts_like
 from openjax.show.metrics import METRICS_FILE
 from openjax.show.number_tables import numbers_table
 from openjax.show.progress import Progress
-from openjax.show.trajectory import Trajectory
-from openjax.store.policies import LoadedPolicy, load_policy
+from openjax.store.policies import load_policy
 from openjax.store.policy_files import fill, load_policy_file
 from openjax.store.run_directory import RunDirectory
 
-if TYPE_CHECKING:
-    from openjax.runs.job import TrainingJob
-
 _BESIDE_RECORD = ("episode_return", "last_seen_error")
-
-_OF_THE_POLICY = (
-    "time_step",
-    "substeps",
-    "observed_pillars",
-    "observe_time",
-    "observe_position",
-    "observe_in",
-    "observe_history",
-    "observe_history_spacing",
-    "history_length",
-    "history_spacing",
-)
-"""Settings that are how a policy sees and steers, and not what game it plays."""
-
-
-def game_for(environment: Pursuit, policy: LoadedPolicy) -> Pursuit:
-    """A game for another policy than it was made for, which sees and steers as it was trained to;
-    episodes last as long.
-    """
-    settings = environment.settings
-    own = policy.settings.environment
-    settings = dataclasses.replace(
-        settings,
-        **{name: getattr(own, name) for name in _OF_THE_POLICY},
-        episode_length=round(settings.episode_length * settings.time_step / own.time_step),
-        max_pillars=layout_slots(settings),
-    )
-    return dataclasses.replace(environment, settings=settings, dynamics=None, observer=None)
-
-
-def compare(
-    policy: LoadedPolicy,
-    environment: Pursuit,
-    scenarios: Sequence[Scenario],
-    episodes: int,
-    validation: int,
-) -> tuple[list[dict], list[Trajectory]]:
-    """Fly a policy in the game of a run: `validation` of the uniform validation tasks, and layouts.
-
-    Args:
-      policy: another one than the run's.
-      environment: the run's.
-      scenarios: the layouts.
-      episodes: of each layout.
-      validation: number of tasks.
-
-    Returns:
-      records as of `Flown.record`, that of the validation tasks first, their capture steps in steps
-      of the run; and the first episode of each.
-
-    Raises:
-      UserError: the policy can't play this game.
-    """
-    game = game_for(environment, policy)
-    settings = game.settings
-    policy = policy.in_game(game)
-    tasks = {"validation": uniform_tasks(environment.settings, validation, settings.max_pillars)}
-    tasks |= layout_tasks(settings, scenarios, episodes)
-    evaluator = Evaluator(game, policy.policy, validation + episodes * len(scenarios))
-    flown = evaluator.fly(policy.parameters, tasks, jax.random.key(0))
-    longer = settings.time_step / environment.settings.time_step
-    rows = [
-        row | {"capture_step": longer * row["capture_step"]}
-        for row in (kind.record() for kind in flown)
-    ]
-    return rows, [kind.trajectory(0, f"{kind.name}, {policy.source}") for kind in flown]
 
 
 def report(
-    job: "TrainingJob",
+    job: TrainingJob,
     directory: RunDirectory,
     validation: Validation,
     outcome: Outcome,

@@ -18,9 +18,10 @@ from openjax.command_line import output_console, parse, peek
 from openjax.errors import UserError
 from openjax.files import remove_unfinished, to_plain
 from openjax.learning import TrainSettings, preset
-from openjax.runs.job import ALL_SHIPPED, OwnParts, TrainingJob, run_job
+from openjax.runs.job import ALL_SHIPPED, OwnParts, TrainingJob
 from openjax.runs.machine import describe_machine
 from openjax.runs.options import MAY_CHANGE, PROGRAM, TrainCommand
+from openjax.runs.training import run_job
 from openjax.runs.words import different_settings, opening_words
 from openjax.store.checkpoints import Checkpoints
 from openjax.store.compiled_programs import cache_programs

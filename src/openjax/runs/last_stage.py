@@ -1,0 +1,76 @@
+"""The stage after MAPPO of a run: its policy may become better by it, and can't become worse."""
+
+import time
+from collections.abc import Callable, Iterator
+
+import jax
+
+from openjax.evaluation.validation import selection_score
+from openjax.files import write_json
+from openjax.policy import PolicyParameters
+from openjax.runs.job import TrainingJob
+from openjax.store.leaves import place
+from openjax.store.policies import abstract_parameters
+from openjax.store.policy_files import fill, load_policy_file, save_policy_file
+from openjax.store.run_directory import RunDirectory
+
+
+def keep_best(
+    directory: RunDirectory,
+    learn: Callable[[PolicyParameters, jax.Array], Iterator[tuple[PolicyParameters, dict]]],
+    validate: Callable[[PolicyParameters], dict],
+    job: TrainingJob,
+    over: Callable[[], bool],
+) -> str:
+    """Take a run's policy through the last stage, and keep the best of what it becomes and what it
+    was.
+
+    Args:
+      directory: the run's; `policy.npz` is what the stage starts from, and what it writes.
+      learn: (parameters, key) -> after each update the parameters and its metrics.
+      validate: parameters -> summary of validation tasks by which no checkpoint was chosen.
+      job: the run's; its settings and parts are looked at.
+      over: is asked after each update whether to stop.
+
+    Returns:
+      what to tell of it.
+    """
+    began = time.monotonic()
+    settings = job.settings
+    before, _, notes = load_policy_file(directory.policy)
+    abstract = abstract_parameters(job.parts.environment, job.parts.policy)
+    # where the validation, too, was compiled for
+    before = place(fill(abstract, before, str(directory.policy)))
+    length = settings.environment.episode_length
+    looks = [{"update": 0, **validate(before)}]
+    history = []
+    kept = 0
+    scores = [selection_score(looks[0], length)]
+    for after, parts in learn(before, jax.random.key(settings.seed)):
+        history.append(parts)
+        if over():
+            break
+        if (
+            len(history) % settings.analytic.look_every
+            and len(history) != settings.analytic.updates
+        ):
+            continue
+        looks.append({"update": len(history), **validate(after)})
+        scores.append(selection_score(looks[-1], length))
+        if scores[-1] > scores[kept]:
+            kept = len(looks) - 1
+            better = {"far_validation_score": scores[kept], "analytic_updates": len(history)}
+            # at once: a stage that is ended early leaves the best of what it was
+            save_policy_file(
+                directory.policy, after, settings, {**notes, **better}, storage="float32"
+            )
+    seconds = round(time.monotonic() - began, 1)
+    updates = looks[kept]["update"]
+    facts = {"seconds": seconds, "kept": updates, "validation_scores": scores}
+    write_json(directory.path / "analytic.json", {**facts, "validation": looks, "history": history})
+    told = f"{scores[0]:.4f} -> {scores[kept]:.4f} after {updates} of {len(history)} updates"
+    if not kept:
+        told = (
+            f"{scores[0]:.4f}, at most {max(scores[1:], default=scores[0]):.4f} after it, not kept"
+        )
+    return f"by the gradient through the simulation: score on far validation tasks {told}, {seconds:.0f} s"
