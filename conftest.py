@@ -9,16 +9,30 @@ from importlib.metadata import version
 from pathlib import Path
 
 import pytest
+from beartype import BeartypeConf, beartype
 from hypothesis import HealthCheck, settings
 from jaxtyping import install_import_hook
 
+_beartype = beartype(conf=BeartypeConf(is_pep484_tower=True))  # an int is a float, too
+
+
+def check_types(function):
+    """A function that raises where an argument or a result isn't of its type.
+
+    Structures are left alone: JAX puts into their fields whatever a transformation needs, axes or
+    nothing at all. Settings check themselves.
+    """
+    return function if function.__name__ == "__init__" else _beartype(function)
+
+
 # shapes and types of arrays in signatures are checked at each call, which is when a function is
-# traced; settings check themselves
+# traced
 _networks = [
     f"openjax.policy.{name}" for name in ("actor_critic", "encoder", "policy", "predictor")
 ]
 _drone = [f"openjax.vehicle.{name}" for name in ("rigid_body", "rate_controller", "stops")]
-install_import_hook([*_networks, *_drone, "openjax.learning.advantages"], "beartype.beartype")
+_rooms = ["openjax.pursuit", "openjax.learning.advantages"]
+install_import_hook([*_networks, *_drone, *_rooms], "conftest.check_types")
 
 _flags = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
 # workers are the parallel part: more threads would only wait for each other's cores

@@ -152,7 +152,7 @@ def test_order_within_a_step_and_history():
         np.asarray, play(KEY)
     )
     np.testing.assert_allclose(evader[0], start.evader_position + 0.01 * velocity[0], atol=1e-6)
-    pillars = start.task.pillar_position, start.task.pillar_active
+    pillars = jax.tree.map(jnp.asarray, (start.task.pillar_position, start.task.pillar_active))
 
     @jax.jit
     @jax.vmap

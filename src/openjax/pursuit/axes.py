@@ -1,10 +1,12 @@
 """Axes: a body's in the world, and upright ones of one's own, turned about the vertical."""
 
-import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 
-def rotation_axes(quaternion: jax.Array) -> tuple[jax.Array, jax.Array]:
+def rotation_axes(
+    quaternion: Float[Array, "*batch 4"],
+) -> tuple[Float[Array, "*batch 3"], Float[Array, "*batch 3"]]:
     """Body x and z axes in the world, (..., 3) each, of (..., 4) unit quaternions wxyz."""
     w, x, y, z = jnp.moveaxis(quaternion, -1, 0)
     body_x = jnp.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], axis=-1)
@@ -12,7 +14,9 @@ def rotation_axes(quaternion: jax.Array) -> tuple[jax.Array, jax.Array]:
     return body_x, body_z
 
 
-def turned_back(heading: jax.Array | None, vector: jax.Array) -> jax.Array:
+def turned_back(
+    heading: Float[Array, "*batch 2"] | None, vector: Float[Array, "..."]
+) -> Float[Array, "..."]:
     """Vectors (..., N, ..., 2 or more) turned about the vertical by minus the yaw with cosine and
     sine `heading` (..., N, 2).
     """

@@ -3,8 +3,10 @@
 import jax
 import jax.numpy as jnp
 from flax import struct
+from jaxtyping import Array, Float
 
 from openjax.pursuit.settings import PursuitSettings
+from openjax.pursuit.shapes import Active, Each, Pillars, Team, Which
 from openjax.vehicle.solids import DRONE_RADIUS
 
 TOUCH = 1e-3
@@ -26,14 +28,14 @@ class Breaches:
 
 
 def pillar_distance(
-    settings: PursuitSettings, position: jax.Array, pillar_position: jax.Array
-) -> jax.Array:
+    settings: PursuitSettings, position: Team, pillar_position: Pillars
+) -> Float[Array, "drones pillars"]:
     """(N, P) distance (m) between (N, 3) centres and the surfaces of (P, 2) pillars."""
     offset = position[:, None, :2] - pillar_position[None]
     return jnp.sqrt(jnp.sum(offset**2, axis=-1) + 1e-12) - settings.pillar_radius
 
 
-def drone_distance(position: jax.Array) -> jax.Array:
+def drone_distance(position: Team) -> Float[Array, "drones drones"]:
     """(N, N) distance (m) between (N, 3) centres; infinite on the diagonal."""
     n = position.shape[0]
     offset = position[:, None] - position[None]
@@ -43,9 +45,9 @@ def drone_distance(position: jax.Array) -> jax.Array:
 
 def breaches(
     settings: PursuitSettings,
-    position: jax.Array,
-    pillar_position: jax.Array,
-    pillar_active: jax.Array,
+    position: Team,
+    pillar_position: Pillars,
+    pillar_active: Active,
     margin: float = 0.0,
 ) -> Breaches:
     """Count the breaches of each of N pursuers at (N, 3) positions; `margin` (m) widens every
@@ -65,12 +67,12 @@ def breaches(
 
 def crashed(
     settings: PursuitSettings,
-    position: jax.Array,
-    body_z_up: jax.Array,
-    pillar_position: jax.Array,
-    pillar_active: jax.Array,
+    position: Team,
+    body_z_up: Each,
+    pillar_position: Pillars,
+    pillar_active: Active,
     margin: float = 0.0,
-) -> jax.Array:
+) -> Which:
     """(N,) whether each pursuer touches the floor or anything solid, or is tilted beyond 90
     degrees.
 

@@ -7,6 +7,7 @@ from typing import Protocol
 import chex
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from openjax.errors import UserError
 from openjax.pursuit.axes import rotation_axes
@@ -37,6 +38,7 @@ from openjax.pursuit.reward import (
 )
 from openjax.pursuit.sensing import line_of_sight
 from openjax.pursuit.settings import PursuitSettings
+from openjax.pursuit.shapes import Actions, Active, Commands, Each, Flag, Pillars, Scalar, Vector
 from openjax.pursuit.spaces import Box
 from openjax.pursuit.state import PursuitState
 from openjax.pursuit.statistics import count, empty_statistics
@@ -59,12 +61,12 @@ so).
 """
 
 
-def hover_action(vehicle: Vehicle) -> jax.Array:
+def hover_action(vehicle: Vehicle) -> Float[Array, "4"]:
     """(4,) action [thrust, roll, pitch, yaw rate] in -1..1 that hovers."""
     return jnp.zeros(4, jnp.float32).at[0].set(2.0 * hover_share(vehicle) - 1.0)
 
 
-def action_to_command(action: jax.Array) -> jax.Array:
+def action_to_command(action: Float[Array, "*drones 4"]) -> Float[Array, "*drones 4"]:
     """(..., 4) action in -1..1 to command: collective thrust 0..0.9 of the maximum, body rates up
     to pi rad/s.
     """
@@ -76,16 +78,16 @@ def action_to_command(action: jax.Array) -> jax.Array:
 class Dynamics(Protocol):
     """What moves the pursuers: `openjax.vehicle.DronesStep`, or a world outside."""
 
-    def reset(self, vehicle: Vehicle, drones: DroneState, key: jax.Array) -> DroneState:
+    def reset(self, vehicle: Vehicle, drones: DroneState, key: PRNGKeyArray) -> DroneState:
         """The drones (leading axis N) at the start of an episode."""
 
     def __call__(
         self,
         vehicle: Vehicle,
         drones: DroneState,
-        command: jax.Array,
-        pillar_position: jax.Array,
-        pillar_active: jax.Array,
+        command: Commands,
+        pillar_position: Pillars,
+        pillar_active: Active,
         effect_parameters: dict,
     ) -> DroneState:
         """The drones a control step later; see `openjax.vehicle.DronesStep`."""
@@ -189,7 +191,7 @@ class Pursuit:
         kinds = jax.eval_shape(lambda key: self.reset(key)[0], jax.random.key(0))
         return jax.tree.map(lambda kind: Box(-jnp.inf, jnp.inf, kind.shape, kind.dtype), kinds)
 
-    def reset(self, key: jax.Array) -> tuple[Observation, PursuitState]:
+    def reset(self, key: PRNGKeyArray) -> tuple[Observation, PursuitState]:
         """Start an episode of a uniformly drawn task.
 
         Args:
@@ -201,7 +203,7 @@ class Pursuit:
         task_key, reset_key = jax.random.split(key)
         return self.reset_to(reset_key, uniform_task(self.settings, task_key))
 
-    def reset_to(self, key: jax.Array, task: Task) -> tuple[Observation, PursuitState]:
+    def reset_to(self, key: PRNGKeyArray, task: Task) -> tuple[Observation, PursuitState]:
         """Start an episode of `task`.
 
         Args:
@@ -270,11 +272,11 @@ class Pursuit:
         )
         return self.observe(state), state
 
-    def with_bounds(self, vehicle_bounds: jax.Array) -> "Pursuit":
+    def with_bounds(self, vehicle_bounds: Float[Array, "ranges 4"]) -> "Pursuit":
         """The same game with vehicles drawn within these bounds (R, 4)."""
         return dataclasses.replace(self, vehicle_bounds=vehicle_bounds)
 
-    def with_evader_share(self, share: jax.Array) -> "Pursuit":
+    def with_evader_share(self, share: Scalar) -> "Pursuit":
         """The same game at this share () of its curriculum over evaders."""
         return dataclasses.replace(self, evader_share=share)
 
@@ -310,8 +312,8 @@ class Pursuit:
         return self.dynamics.seen(drones, self._parameters(vehicles))
 
     def step(
-        self, key: jax.Array, state: PursuitState, action: jax.Array, wish: jax.Array | None = None
-    ) -> tuple[Observation, PursuitState, jax.Array, jax.Array, jax.Array, StepInfo]:
+        self, key: PRNGKeyArray, state: PursuitState, action: Actions, wish: Vector | None = None
+    ) -> tuple[Observation, PursuitState, Each, Flag, Flag, StepInfo]:
         """One control step.
 
         Args:
@@ -350,10 +352,10 @@ class Pursuit:
     def follow(
         self,
         state: PursuitState,
-        action: jax.Array,
+        action: Actions,
         drones: DroneState,
-        wish: jax.Array | None = None,
-    ) -> tuple[Observation, PursuitState, jax.Array, jax.Array, jax.Array, StepInfo]:
+        wish: Vector | None = None,
+    ) -> tuple[Observation, PursuitState, Each, Flag, Flag, StepInfo]:
         """The game's part of a step that began at `state` with `action` and ended with the pursuers
         as `drones`.
 

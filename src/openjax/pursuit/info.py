@@ -4,6 +4,7 @@ import jax
 from flax import struct
 
 from openjax.pursuit.collisions import Breaches
+from openjax.pursuit.shapes import Which
 from openjax.pursuit.teams import of_team
 
 
@@ -24,7 +25,7 @@ class StepInfo:
     penalty: jax.Array
     """(N,) the reward's penalties, at most 0."""
 
-    def of_team(self, active: jax.Array | None) -> "StepInfo":
+    def of_team(self, active: Which | None) -> "StepInfo":
         """The same, where nothing happens to empty slots: `active` (N,) says which aren't."""
         each = {
             name: of_team(active, getattr(self, name))

@@ -5,10 +5,12 @@ import functools
 import jax
 import jax.numpy as jnp
 from flax import struct
+from jaxtyping import Array, Float
 
 from openjax.pursuit.axes import rotation_axes, turned_back
 from openjax.pursuit.collisions import pillar_distance
 from openjax.pursuit.settings import HIDDEN, PursuitSettings
+from openjax.pursuit.shapes import Actions, Count, Flag, Quaternions, Team, Vector, Which
 from openjax.pursuit.state import PursuitState
 from openjax.pursuit.task import capture_radius, evader_speed
 from openjax.pursuit.teams import of_team
@@ -57,12 +59,12 @@ class Observation:
 
 def frame(
     settings: PursuitSettings,
-    step: jax.Array,
-    pursuers: jax.Array,
-    evader: jax.Array,
-    velocity: jax.Array,
-    seen: jax.Array,
-) -> jax.Array:
+    step: Count,
+    pursuers: Float[Array, "kept 3"],
+    evader: Vector,
+    velocity: Vector,
+    seen: Flag,
+) -> Float[Array, " frame"]:
     """(F,) one frame of the predictor's history: t/T, evader position and velocity (-5 where
     unseen), pursuers.
     """
@@ -72,8 +74,8 @@ def frame(
 
 
 def frame_pursuers(
-    settings: PursuitSettings, position: jax.Array, evader: jax.Array, active: jax.Array | None
-) -> jax.Array:
+    settings: PursuitSettings, position: Team, evader: Vector, active: Which | None
+) -> Float[Array, "kept 3"]:
     """(M, 3) m, what a frame of the history holds of pursuers at (N, 3): all of them, or two.
 
     Pooled, these are the nearest one's place relative to the evader, as far as one knows where that
@@ -91,7 +93,9 @@ def frame_pursuers(
     return jnp.sum(weights[..., None] * offset, axis=1)
 
 
-def own_frame(quaternion: jax.Array, velocity: jax.Array, action: jax.Array) -> jax.Array:
+def own_frame(
+    quaternion: Quaternions, velocity: Team, action: Actions
+) -> Float[Array, "drones own_frame"]:
     """(N, OWN_FRAME) what N pursuers remember of a moment: (N, 3) velocity, body x and z axes, the
     action before it.
     """

@@ -16,6 +16,7 @@ from openjax.pursuit.axes import rotation_axes
 from openjax.pursuit.collisions import breaches, crashed
 from openjax.pursuit.info import StepInfo
 from openjax.pursuit.settings import PursuitSettings, RewardSettings
+from openjax.pursuit.shapes import Active, Each, Flag, Pillars, Scalar, Team, Vector, Which
 from openjax.pursuit.state import PursuitState
 from openjax.pursuit.teams import of_team
 
@@ -25,11 +26,11 @@ OVER_SPEED = 1.01
 
 def captures(
     settings: PursuitSettings,
-    position: jax.Array,
-    evader: jax.Array,
-    in_sight: jax.Array,
-    radius: jax.Array | None = None,
-) -> jax.Array:
+    position: Team,
+    evader: Vector,
+    in_sight: Which,
+    radius: float | Scalar | None = None,
+) -> Which:
     """(N,) whether each pursuer has the evader within the capture radius, with a clear line of
     sight; `radius` () m goes before the settings' one.
     """
@@ -37,7 +38,7 @@ def captures(
     return in_sight & (jnp.sum((position - evader) ** 2, axis=-1) < radius**2)
 
 
-def over_speed(settings: PursuitSettings, velocity: jax.Array) -> jax.Array:
+def over_speed(settings: PursuitSettings, velocity: Team) -> Which:
     """(N,) whether each pursuer of (N, 3) velocities is faster than 1.01 times the maximal
     speed.
     """
@@ -56,7 +57,7 @@ class Transition:
     """What happened in it; its `penalty` isn't known yet."""
 
     @property
-    def pillars(self) -> tuple[jax.Array, jax.Array]:
+    def pillars(self) -> tuple[Pillars, Active]:
         """(P, 2) m, axes of the pillars; (P,) bool, which slots are in use."""
         return self.state.task.pillar_position, self.state.task.pillar_active
 
@@ -72,7 +73,7 @@ class Term:
     """A training may let penalties grow (`mappo.penalty_start`); never positive."""
 
 
-def total_reward(terms: tuple[Term, ...], transition: Transition) -> tuple[jax.Array, jax.Array]:
+def total_reward(terms: tuple[Term, ...], transition: Transition) -> tuple[Each, Each]:
     """(N,) reward of each pursuer, the sum of the terms in their order, penalties last; and (N,)
     the sum of its penalties. Empty slots have none.
     """
@@ -108,29 +109,29 @@ def default_reward(weights: RewardSettings) -> tuple[Term, ...]:
     return tuple(term for term in terms if term.weight != 0.0)
 
 
-def captured(transition: Transition) -> jax.Array:
+def captured(transition: Transition) -> Flag:
     """() whether any pursuer has the evader."""
     return jnp.any(transition.info.captured)
 
 
-def first_capture(transition: Transition) -> jax.Array:
+def first_capture(transition: Transition) -> Flag:
     """() whether this is the first such step of the episode."""
     return captured(transition) & ~transition.before.statistics.captured
 
 
-def evader_distance(transition: Transition) -> jax.Array:
+def evader_distance(transition: Transition) -> Each:
     """(N,) m to the evader."""
     offset = transition.state.drones.position - transition.state.evader_position
     return jnp.sqrt(jnp.sum(offset**2, axis=-1) + 1e-12)
 
 
-def steadiness(transition: Transition) -> jax.Array:
+def steadiness(transition: Transition) -> Each:
     """(N,) from one, where the squashed command stays, to zero."""
     change = transition.state.previous_action - transition.before.previous_action
     return jnp.exp(-jnp.sqrt(jnp.sum(change**2, axis=-1) + 1e-12))
 
 
-def breach_number(transition: Transition) -> jax.Array:
+def breach_number(transition: Transition) -> Each:
     """(N,) breaches of safety distances and bounds, early by the reward's margin and lookahead."""
     settings = transition.settings
     weights = settings.reward
@@ -145,12 +146,12 @@ def breach_number(transition: Transition) -> jax.Array:
     return breach.total
 
 
-def speeding(transition: Transition) -> jax.Array:
+def speeding(transition: Transition) -> Which:
     """(N,) whether each is above 1.01 times the maximal speed."""
     return transition.info.over_speed
 
 
-def crashing(transition: Transition) -> jax.Array:
+def crashing(transition: Transition) -> Which:
     """(N,) whether each touches something or tips over, early by the reward's margin and
     lookahead.
     """
@@ -167,6 +168,6 @@ def crashing(transition: Transition) -> jax.Array:
     return crash
 
 
-def first_crash(transition: Transition) -> jax.Array:
+def first_crash(transition: Transition) -> Which:
     """(N,) whether each crashes now, in an episode without a crash before; never early."""
     return transition.info.crashed & ~transition.before.statistics.crashed

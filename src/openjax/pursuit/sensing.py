@@ -1,18 +1,19 @@
 """Who sees the evader: line of sight past the pillars, shared by the team."""
 
-import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
 
 from openjax.pursuit.settings import PursuitSettings
+from openjax.pursuit.shapes import Active, Pillars, Vector
 
 
 def line_of_sight(
     settings: PursuitSettings,
-    position: jax.Array,
-    target: jax.Array,
-    pillar_position: jax.Array,
-    pillar_active: jax.Array,
-) -> jax.Array:
+    position: Float[Array, "places 3"],
+    target: Vector,
+    pillar_position: Pillars,
+    pillar_active: Active,
+) -> Bool[Array, " places"]:
     """(N,) whether the segment from each (N, 3) position to the (3,) target is clear of pillars,
     seen from above.
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, PRNGKeyArray, Shaped
 
 
 @dataclass(frozen=True)
@@ -16,7 +17,7 @@ class Box:
     shape: tuple[int, ...]
     dtype: type = jnp.float32
 
-    def sample(self, key: jax.Array) -> jax.Array:
+    def sample(self, key: PRNGKeyArray) -> Shaped[Array, "..."]:
         """Uniform between finite bounds, else normal; booleans by a fair coin."""
         if self.dtype == jnp.bool_:
             return jax.random.bernoulli(key, 0.5, self.shape)

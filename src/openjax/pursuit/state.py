@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 from flax import struct
+from jaxtyping import Array, Bool
 
 from openjax.pursuit.evaders.evader_state import EvaderState
 from openjax.pursuit.statistics import EpisodeStatistics
@@ -35,11 +36,11 @@ class PursuitState:
     """(N,) int32, the last step in which each pursuer is there; None: nobody falls out"""
 
     @property
-    def active(self) -> jax.Array | None:
+    def active(self) -> Bool[Array, "*worlds drones"] | None:
         """(N,) bool, the slots of pursuers in use; None: all are."""
         return still_there(self.task.active, self.gone_after, self.step)
 
     @property
-    def seen(self) -> jax.Array:
+    def seen(self) -> Bool[Array, "*worlds"]:
         """() bool, some pursuer sees the evader."""
         return jnp.any(self.in_sight, axis=-1)

@@ -3,8 +3,10 @@
 import jax
 import jax.numpy as jnp
 from flax import struct
+from jaxtyping import Array, Float
 
 from openjax.pursuit.info import StepInfo
+from openjax.pursuit.shapes import Count, Each, Which
 from openjax.pursuit.teams import team_mean
 
 
@@ -26,12 +28,12 @@ class EpisodeStatistics:
     episode_return: jax.Array  # float32, sum of rewards, mean over pursuers
 
     @property
-    def collision_rate(self) -> jax.Array:
+    def collision_rate(self) -> Float[Array, "*worlds"]:
         """() share of steps in which any pursuer breached any limit."""
         return self.collision_steps / jnp.maximum(self.steps, 1)
 
     @property
-    def over_speed_rate(self) -> jax.Array:
+    def over_speed_rate(self) -> Float[Array, "*worlds"]:
         """() share of steps with any pursuer above 1.01 times the maximal speed."""
         return self.over_speed_steps / jnp.maximum(self.steps, 1)
 
@@ -55,10 +57,10 @@ def empty_statistics(episode_length: int) -> EpisodeStatistics:
 
 def count(
     statistics: EpisodeStatistics,
-    step: jax.Array,
+    step: Count,
     info: StepInfo,
-    reward: jax.Array,
-    active: jax.Array | None = None,
+    reward: Each,
+    active: Which | None = None,
 ) -> EpisodeStatistics:
     """Add one step; `step` () is its number, counted from 1, `reward` (N,) is the pursuers'.
 

@@ -4,9 +4,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from openjax.pursuit.collisions import breaches, drone_distance
 from openjax.pursuit.settings import PursuitSettings
+from openjax.pursuit.shapes import Flag, Quaternions, Scalar, Team
 from openjax.pursuit.teams import draw_team, of_team, parked
 
 START_X = (0.1, 0.536)
@@ -59,17 +61,17 @@ class Task:
     capture_radius: jax.Array | None = None
     """() m; None: the settings' one."""
 
-    def with_starts(self, position: jax.Array) -> "Task":
+    def with_starts(self, position: Team) -> "Task":
         """The same with pursuers that start at (N, 3) m; empty slots stay where they're parked."""
         return self.replace(pursuer_position=parked(position, self.active))
 
 
-def evader_speed(settings: PursuitSettings, task: Task) -> float | jax.Array:
+def evader_speed(settings: PursuitSettings, task: Task) -> float | Float[Array, "*worlds"]:
     """m/s, of the evader in a task."""
     return settings.evader_speed if task.evader_speed is None else task.evader_speed
 
 
-def capture_radius(settings: PursuitSettings, task: Task) -> float | jax.Array:
+def capture_radius(settings: PursuitSettings, task: Task) -> float | Float[Array, "*worlds"]:
     """m, in a task."""
     return settings.capture_radius if task.capture_radius is None else task.capture_radius
 
@@ -87,7 +89,7 @@ def empty_task(settings: PursuitSettings) -> Task:
     )
 
 
-def task_descriptor(tasks: Task) -> jax.Array:
+def task_descriptor(tasks: Task) -> Float[Array, "tasks features"]:
     """(M, D) what tells M tasks apart: all start positions and the pillars in use (m), and the
     numbers of its own that a task has.
     """
@@ -106,7 +108,7 @@ def task_descriptor(tasks: Task) -> jax.Array:
     return jnp.concatenate(parts, axis=-1)
 
 
-def starts_clear(settings: PursuitSettings, task: Task) -> jax.Array:
+def starts_clear(settings: PursuitSettings, task: Task) -> Flag:
     """Whether no pursuer starts in a breach and the evader starts outside all pillars. () bool."""
     breach = breaches(settings, task.pursuer_position, task.pillar_position, task.pillar_active)
     clear_of_evader = _clear_of(settings, task.pillar_position, task.evader_position[None, :2])
@@ -116,7 +118,7 @@ def starts_clear(settings: PursuitSettings, task: Task) -> jax.Array:
     )
 
 
-def pillar_cells() -> np.ndarray:
+def pillar_cells() -> Float[np.ndarray, "cells 2"]:
     """(cells, 2) centres of the grid cells on which a uniform task may put a pillar (m)."""
     steps = np.arange(-4, 5) * PILLAR_GRID
     x, y = np.meshgrid(steps, steps, indexing="ij")
@@ -124,7 +126,7 @@ def pillar_cells() -> np.ndarray:
     return cells[np.linalg.norm(cells, axis=-1) < PILLAR_REACH - 1e-6]
 
 
-def uniform_task(settings: PursuitSettings, key: jax.Array) -> Task:
+def uniform_task(settings: PursuitSettings, key: PRNGKeyArray) -> Task:
     """Draw a task uniformly: the paper's global exploration.
 
     Pursuers on one side, the evader on the other, pillars on distinct free cells of a grid. Among a
@@ -174,7 +176,7 @@ def _between(ends, key, number):
 
 
 def expand_task(
-    settings: PursuitSettings, key: jax.Array, task: Task, wall_distance: float = WALL_DISTANCE
+    settings: PursuitSettings, key: PRNGKeyArray, task: Task, wall_distance: float = WALL_DISTANCE
 ) -> Task:
     """Move every vehicle of a task a little and keep its pillars: the paper's local expansion.
 
@@ -201,7 +203,7 @@ def expand_task(
 
 
 def close_starts(
-    settings: PursuitSettings, key: jax.Array, task: Task, share: float | jax.Array
+    settings: PursuitSettings, key: PRNGKeyArray, task: Task, share: float | Scalar
 ) -> Task:
     """Put a `share` (0 to 1) of the pursuers next to a pillar or another pursuer: starts that leave
     the least room.
@@ -246,7 +248,7 @@ def close_starts(
     return _first_clear(settings, draw, key, task)
 
 
-def scatter_starts(settings: PursuitSettings, key: jax.Array, task: Task) -> Task:
+def scatter_starts(settings: PursuitSettings, key: PRNGKeyArray, task: Task) -> Task:
     """Start evader and pursuers anywhere up to `WALL_DISTANCE` from the arena's wall, the pursuers
     more or less together.
 
@@ -293,7 +295,7 @@ def _first_clear(settings, draw, key, task):
     )
 
 
-def shift_pillars(settings: PursuitSettings, key: jax.Array, task: Task, reach: float) -> Task:
+def shift_pillars(settings: PursuitSettings, key: PRNGKeyArray, task: Task, reach: float) -> Task:
     """Move each pillar by up to `reach` (m) along x and y; those that would come too close to a
     start stay.
     """
@@ -301,7 +303,7 @@ def shift_pillars(settings: PursuitSettings, key: jax.Array, task: Task, reach: 
     return _move_pillars(settings, task, task.pillar_position + offset)
 
 
-def line_up_pillars(settings: PursuitSettings, key: jax.Array, task: Task) -> Task:
+def line_up_pillars(settings: PursuitSettings, key: PRNGKeyArray, task: Task) -> Task:
     """Put the pillars of a uniform task in a row across the arena, between the pursuers' side and
     the evader's.
 
@@ -335,7 +337,7 @@ def _clear_of(settings, pillars, vehicles):
     return jnp.all(distance >= settings.pillar_radius + settings.pillar_clearance, axis=-1)
 
 
-def turn_task(key: jax.Array, task: Task) -> Task:
+def turn_task(key: PRNGKeyArray, task: Task) -> Task:
     """Turn a whole task about the arena's axis by a random angle: the game looks the same from
     every side.
     """
@@ -355,7 +357,7 @@ def turn_task(key: jax.Array, task: Task) -> Task:
     return turned.with_starts(turn(task.pursuer_position))
 
 
-def start_attitude(settings: PursuitSettings, key: jax.Array) -> jax.Array:
+def start_attitude(settings: PursuitSettings, key: PRNGKeyArray) -> Quaternions:
     """(N, 4) start quaternions wxyz: roll and pitch within 36 degrees, yaw in 0 to 36 degrees; or
     all level.
     """

@@ -8,8 +8,10 @@ from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, Int32, PRNGKeyArray, Shaped
 
 from openjax.pursuit.settings import PursuitSettings
+from openjax.pursuit.shapes import Count, Scalar, Team, Which
 from openjax.vehicle import DroneState
 
 FAR = 1000.0
@@ -19,7 +21,7 @@ of it (m).
 T = TypeVar("T")
 
 
-def draw_team(settings: PursuitSettings, key: jax.Array) -> jax.Array | None:
+def draw_team(settings: PursuitSettings, key: PRNGKeyArray) -> Which | None:
     """(N,) bool, the slots in use, the first ones: a team of one of `team_sizes`, with equal odds;
     None where there are none of these, and all slots are in use. `key` is the task's.
     """
@@ -31,8 +33,8 @@ def draw_team(settings: PursuitSettings, key: jax.Array) -> jax.Array | None:
 
 
 def draw_fall_out(
-    settings: PursuitSettings, key: jax.Array, active: jax.Array | None
-) -> jax.Array | None:
+    settings: PursuitSettings, key: PRNGKeyArray, active: Which | None
+) -> Int32[Array, " drones"] | None:
     """(N,) int32, the last step in which each pursuer of a team is there; None where the settings
     have nobody fall out. `active` (N,): slots in use.
     """
@@ -51,8 +53,8 @@ def draw_fall_out(
 
 
 def still_there(
-    active: jax.Array | None, gone_after: jax.Array | None, step: jax.Array
-) -> jax.Array | None:
+    active: Which | None, gone_after: Int32[Array, " drones"] | None, step: Count
+) -> Which | None:
     """(N,) bool, slots in use at a step ().
 
     Args:
@@ -66,7 +68,7 @@ def still_there(
     return there if active is None else there & active
 
 
-def parked(position: jax.Array, active: jax.Array | None) -> jax.Array:
+def parked(position: Team, active: Which | None) -> Team:
     """Positions (N, 3) m with those of empty slots far away."""
     if active is None:
         return position
@@ -75,7 +77,7 @@ def parked(position: jax.Array, active: jax.Array | None) -> jax.Array:
     return jnp.where(active[:, None], position, away)
 
 
-def held(active: jax.Array | None, before: DroneState, after: DroneState) -> DroneState:
+def held(active: Which | None, before: DroneState, after: DroneState) -> DroneState:
     """The drones (leading axis N) after a step, those of empty slots as they were before it, and
     parked.
     """
@@ -85,7 +87,7 @@ def held(active: jax.Array | None, before: DroneState, after: DroneState) -> Dro
     return drones.replace(position=parked(drones.position, active))
 
 
-def of_team(active: jax.Array | None, value: T, otherwise: T | float = 0.0) -> T:
+def of_team(active: Which | None, value: T, otherwise: T | float = 0.0) -> T:
     """A tree of (N, ...) arrays whose rows of empty slots are `otherwise`, a tree like it or a
     number.
     """
@@ -100,7 +102,9 @@ def of_team(active: jax.Array | None, value: T, otherwise: T | float = 0.0) -> T
     return jax.tree.map(chosen, value, otherwise)
 
 
-def team_mean(active: jax.Array | None, value: jax.Array) -> jax.Array:
+def team_mean(
+    active: Bool[Array, "*steps drones"] | None, value: Shaped[Array, "*steps drones"]
+) -> Scalar:
     """() mean of the numbers (..., N) of pursuers, without those of empty slots (..., N)."""
     if active is None:
         return jnp.mean(value)

@@ -13,11 +13,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
+from jaxtyping import Array, Float
 
 from openjax.pursuit.axes import rotation_axes
 from openjax.pursuit.evaders.kinds import MEMORY as MEMORY
 from openjax.pursuit.sensing import line_of_sight
 from openjax.pursuit.settings import PursuitSettings
+from openjax.pursuit.shapes import Active, Memory, Pillars, Team, Vector
 from openjax.vehicle import DroneState
 
 DIRECTIONS = 64
@@ -62,19 +64,19 @@ class Scene:
     """(N,) bool, the slots of pursuers in use; None: all are"""
 
     @property
-    def pursuer_velocity(self) -> jax.Array:
+    def pursuer_velocity(self) -> Team:
         """(N, 3) m/s, world."""
         return self.drones.velocity
 
     @property
-    def thrust_direction(self) -> jax.Array:
+    def thrust_direction(self) -> Team:
         """(N, 3) unit vectors, world: where each pursuer's rotors pull, and so what it is about to
         do.
         """
         return rotation_axes(self.drones.quaternion)[1]
 
     @property
-    def nearest(self) -> jax.Array:
+    def nearest(self) -> Vector:
         """(3,) m, the nearest pursuer that it knows of."""
         distance = jnp.sum((self.pursuers - self.position) ** 2, axis=-1)
         chosen = jnp.argmin(jnp.where(self.known, distance, jnp.inf))
@@ -83,7 +85,7 @@ class Scene:
         )
 
 
-def directions(number: int) -> np.ndarray:
+def directions(number: int) -> Float[np.ndarray, "{number} 3"]:
     """(number, 3) unit vectors spread evenly over the sphere: a Fibonacci lattice."""
     i = np.arange(number) + 0.5
     z = 1.0 - 2.0 * i / number
@@ -94,10 +96,10 @@ def directions(number: int) -> np.ndarray:
 
 def into_free_space(
     settings: PursuitSettings,
-    place: jax.Array,
-    pillar_position: jax.Array,
-    pillar_active: jax.Array,
-) -> jax.Array:
+    place: Float[Array, "*places 3"],
+    pillar_position: Pillars,
+    pillar_active: Active,
+) -> Float[Array, "*places 3"]:
     """(..., 3) the points nearest to `place` (..., 3) that keep their distance from bounds and one
     pillar.
     """
@@ -111,7 +113,7 @@ def into_free_space(
     return jnp.concatenate([xy, jnp.clip(z, MARGIN, settings.arena_height - MARGIN)], axis=-1)
 
 
-def greedy(scene: Scene, memory: jax.Array) -> tuple[jax.Array, jax.Array]:
+def greedy(scene: Scene, memory: Memory) -> tuple[Vector, Memory]:
     """Fly to where, after the look-ahead, the nearest pursuer is farthest away."""
     tried = directions(DIRECTIONS)
     ends, open_way = _ends(scene, scene.position, tried)
@@ -119,7 +121,7 @@ def greedy(scene: Scene, memory: jax.Array) -> tuple[jax.Array, jax.Array]:
     return _chosen(tried, score) * jnp.any(scene.known), memory
 
 
-def two_step(scene: Scene, memory: jax.Array) -> tuple[jax.Array, jax.Array]:
+def two_step(scene: Scene, memory: Memory) -> tuple[Vector, Memory]:
     """The same over two steps; after the first the pursuers have come closer, each straight to
     where it went.
     """
@@ -138,7 +140,7 @@ def two_step(scene: Scene, memory: jax.Array) -> tuple[jax.Array, jax.Array]:
     return _chosen(tried, score) * jnp.any(scene.known), memory
 
 
-def wall_runner(scene: Scene, memory: jax.Array) -> tuple[jax.Array, jax.Array]:
+def wall_runner(scene: Scene, memory: Memory) -> tuple[Vector, Memory]:
     """Run along the wall, round the arena and up or down, away from the nearest pursuer."""
     settings = scene.settings
     threat = scene.nearest
@@ -152,7 +154,7 @@ def wall_runner(scene: Scene, memory: jax.Array) -> tuple[jax.Array, jax.Array]:
     return _unit(jnp.concatenate([side * left + outward * out, climb])), memory
 
 
-def pillar_hugger(scene: Scene, memory: jax.Array) -> tuple[jax.Array, jax.Array]:
+def pillar_hugger(scene: Scene, memory: Memory) -> tuple[Vector, Memory]:
     """Stay behind a pillar, as seen by the nearest pursuer; where there is none, fly straight away
     from it.
     """
@@ -169,7 +171,7 @@ def pillar_hugger(scene: Scene, memory: jax.Array) -> tuple[jax.Array, jax.Array
     return jnp.where(jnp.any(scene.pillar_active), hidden, away), memory
 
 
-def safe_place(scene: Scene, memory: jax.Array) -> tuple[jax.Array, jax.Array]:
+def safe_place(scene: Scene, memory: Memory) -> tuple[Vector, Memory]:
     """Fly to the place, of many all over the arena, that it would reach the longest before any
     pursuer; none behind a pillar.
     """
@@ -186,7 +188,7 @@ def safe_place(scene: Scene, memory: jax.Array) -> tuple[jax.Array, jax.Array]:
     return chosen / jnp.maximum(_length(chosen), MARGIN), memory
 
 
-def way_points(scene: Scene, memory: jax.Array) -> tuple[jax.Array, jax.Array]:
+def way_points(scene: Scene, memory: Memory) -> tuple[Vector, Memory]:
     """Fly from point to point, whatever the pursuers do. The points are a sequence of low
     discrepancy from a drawn one on.
     """
@@ -203,7 +205,7 @@ def way_points(scene: Scene, memory: jax.Array) -> tuple[jax.Array, jax.Array]:
     return _unit(to_goal), jnp.concatenate([own, rest])
 
 
-def frozen(scene: Scene, memory: jax.Array) -> tuple[jax.Array, jax.Array]:
+def frozen(scene: Scene, memory: Memory) -> tuple[Vector, Memory]:
     """Stay where it is."""
     return jnp.zeros_like(scene.position), memory
 

@@ -5,6 +5,7 @@ velocity in each step.
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PRNGKeyArray
 
 from openjax.errors import UserError
 from openjax.pursuit.evaders.behaviours import BEHAVIOURS, MEMORY, Scene, into_free_space
@@ -13,16 +14,17 @@ from openjax.pursuit.evaders.field import field_velocity
 from openjax.pursuit.evaders.kinds import NUMBERS, UNBOUNDED, EvaderKind, evader_rows
 from openjax.pursuit.evaders.learned import STEPS, learning
 from openjax.pursuit.settings import PursuitSettings
+from openjax.pursuit.shapes import Count, Scalar, Team, Vector
 from openjax.pursuit.state import PursuitState
 from openjax.pursuit.task import evader_speed
 
 
 def draw_evader(
     settings: PursuitSettings,
-    key: jax.Array,
-    pursuers: jax.Array,
-    share: jax.Array | None = None,
-    kind: jax.Array | None = None,
+    key: PRNGKeyArray,
+    pursuers: Team,
+    share: Scalar | None = None,
+    kind: Count | None = None,
 ) -> EvaderState | None:
     """`draw_row` of the shipped evaders that the settings name."""
     return draw_row(evader_rows(settings.evaders), key, pursuers, share, kind)
@@ -30,10 +32,10 @@ def draw_evader(
 
 def draw_row(
     rows: tuple[EvaderKind, ...],
-    key: jax.Array,
-    pursuers: jax.Array,
-    share: jax.Array | None = None,
-    kind: jax.Array | None = None,
+    key: PRNGKeyArray,
+    pursuers: Team,
+    share: Scalar | None = None,
+    kind: Count | None = None,
 ) -> EvaderState | None:
     """The evader of an episode; None for the paper's, which has nothing to draw.
 
@@ -92,8 +94,8 @@ def evader_velocity(
     settings: PursuitSettings,
     rows: tuple[EvaderKind, ...],
     world: PursuitState,
-    wish: jax.Array | None = None,
-) -> tuple[jax.Array, EvaderState | None]:
+    wish: Vector | None = None,
+) -> tuple[Vector, EvaderState | None]:
     """(3,) velocity (m/s, world) of the evader of a world in this step, and its state after it.
 
     Evaders other than the paper's neither leave the arena nor enter a pillar, and no gradient goes

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from openjax.pursuit.settings import PursuitSettings
+from openjax.pursuit.shapes import Active, Pillars, Team, Vector, Which
 
 EPSILON = 1e-5
 INWARD = 1e5
@@ -14,12 +15,12 @@ INWARD = 1e5
 
 def field_velocity(
     settings: PursuitSettings,
-    evader: jax.Array,
-    pursuers: jax.Array,
-    in_sight: jax.Array,
-    pillar_position: jax.Array,
-    pillar_active: jax.Array,
-) -> jax.Array:
+    evader: Vector,
+    pursuers: Team,
+    in_sight: Which,
+    pillar_position: Pillars,
+    pillar_active: Active,
+) -> Vector:
     """(3,) velocity (m/s, world) of the evader at (3,), memoryless, of constant speed.
 
     `pursuers` (N, 3) repel as 1/distance where `in_sight` (N,); bounds and pillars as 1/distance to

@@ -12,10 +12,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float, Int32, PRNGKeyArray
 
 from openjax.pursuit.axes import turned_back
 from openjax.pursuit.evaders.behaviours import MEMORY, Scene, greedy
 from openjax.pursuit.evaders.kinds import EVADERS
+from openjax.pursuit.shapes import Count, Memory, Vector
 from openjax.pursuit.teams import of_team
 
 STEPS = 10
@@ -30,7 +32,7 @@ _PURSUER = 16
 _PILLAR = 4
 
 
-def learned_place(names: tuple[str, ...], kind: jax.Array) -> jax.Array:
+def learned_place(names: tuple[str, ...], kind: Int32[Array, "*worlds"]) -> Int32[Array, "*worlds"]:
     """The place among the learned evaders of those at the places `kind` (...) in `names`; -1 for
     others.
     """
@@ -39,7 +41,7 @@ def learned_place(names: tuple[str, ...], kind: jax.Array) -> jax.Array:
 
 
 def init_network(
-    key: jax.Array, number: int | jax.Array = 0, own_axes: bool = False
+    key: PRNGKeyArray, number: int | Count = 0, own_axes: bool = False
 ) -> dict[str, Any]:
     """Parameters of a network (actor and critic alike) whose output, three numbers and one, is
     zero; `number` among others.
@@ -71,7 +73,7 @@ def init_network(
 
 
 def features(
-    networks: dict[str, Any], which: jax.Array, scene: Scene, memory: jax.Array
+    networks: dict[str, Any], which: Count, scene: Scene, memory: Memory
 ) -> dict[str, jax.Array]:
     """What the one of K networks that `which` () names sees: own (9,), pursuers (N, 10), pillars
     (P, 4), in_use (P,), greedy (3,), outward (2,), and active (N,) where slots may be empty.
@@ -115,7 +117,9 @@ def features(
     return jax.lax.optimization_barrier(seen)
 
 
-def outputs(network: dict[str, Any], seen: dict[str, jax.Array]) -> tuple[jax.Array, jax.Array]:
+def outputs(
+    network: dict[str, Any], seen: dict[str, jax.Array]
+) -> tuple[Float[Array, "*batch 3"], Float[Array, "*batch"]]:
     """Mean wish (..., 3) and value (...,) for features with leading axes."""
 
     def dense(name, x):
@@ -136,7 +140,7 @@ def outputs(network: dict[str, Any], seen: dict[str, jax.Array]) -> tuple[jax.Ar
     return seen["greedy"] + turned_back(inverse, out[..., :3]), out[..., 3]
 
 
-def remember(scene: Scene, memory: jax.Array) -> jax.Array:
+def remember(scene: Scene, memory: Memory) -> Memory:
     """The memory after this step."""
     return jnp.concatenate(
         [memory[:MEMORY], memory[MEMORY + scene.pursuers.size :], scene.pursuers.ravel()]
@@ -144,8 +148,8 @@ def remember(scene: Scene, memory: jax.Array) -> jax.Array:
 
 
 def outputs_of(
-    networks: dict[str, Any], which: jax.Array, seen: dict[str, jax.Array]
-) -> tuple[jax.Array, jax.Array]:
+    networks: dict[str, Any], which: Int32[Array, "*batch"], seen: dict[str, jax.Array]
+) -> tuple[Float[Array, "*batch 3"], Float[Array, "*batch"]]:
     """`outputs` of the one of K networks, every leaf with their axis first, that `which` (...)
     names for each of the features.
     """
@@ -155,7 +159,7 @@ def outputs_of(
     return jnp.sum(chosen[..., None] * wishes, axis=0), jnp.sum(chosen * values, axis=0)
 
 
-def learning(scene: Scene, memory: jax.Array) -> tuple[jax.Array, jax.Array]:
+def learning(scene: Scene, memory: Memory) -> tuple[Vector, Memory]:
     """The behaviour without a network, whose wishes come from outside: the greedy one's, and the
     memory goes on.
     """
