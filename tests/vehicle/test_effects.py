@@ -27,6 +27,7 @@ from openjax.vehicle.effects import (
     register_effect,
 )
 from openjax.vehicle.rate_controller import rate_controller
+from tests.vehicle.typical import typical
 
 pytestmark = pytest.mark.slow
 
@@ -78,7 +79,7 @@ def test_the_library_is_complete_and_documented():
     assert sorted(EFFECTS) == sorted(VOCABULARY)
     for name, effect in EFFECTS.items():
         assert effect.name == name and effect.description and effect.parameters
-        assert effect.typical() != effect.none()
+        assert typical(effect) != effect.none()
         for parameter in effect.parameters.values():
             low, high = parameter.prior
             assert low < high and parameter.unit and parameter.source
@@ -343,14 +344,14 @@ def test_no_effect_means_none(nominal, fly):
 @pytest.mark.parametrize("name", sorted(VOCABULARY))
 def test_each_effect_alone_changes_the_flight(fly, name):
     """And only what it may change: latencies of what is seen leave the flight itself alone."""
-    (nominal, nominal_seen), (changed, seen) = fly(), fly(**{name: EFFECTS[name].typical()})
+    (nominal, nominal_seen), (changed, seen) = fly(), fly(**{name: typical(EFFECTS[name])})
     moved = max(
         float(np.abs(changed.position - nominal.position).max()),
         float(np.abs(changed.body_rates - nominal.body_rates).max()),
     )
     if name == "state_latency":
         assert moved == 0
-        delay = EFFECTS[name].typical()["delay"]
+        delay = typical(EFFECTS[name])["delay"]
         expected = nominal.position[-1] - delay * nominal.velocity[-1]
         np.testing.assert_allclose(seen.position, expected, atol=2e-3)
         assert np.abs(seen.position - nominal_seen.position).max() > 5e-3
@@ -377,7 +378,7 @@ def test_all_effects_together_have_finite_gradients(vehicle):
         seen = step.seen(drones, parameters)
         return jnp.sum(seen.position) + jnp.sum(drones.body_rates**2) + jnp.sum(drones.velocity**2)
 
-    for parameters in (NONE, {name: effect.typical() for name, effect in EFFECTS.items()}):
+    for parameters in (NONE, {name: typical(effect) for name, effect in EFFECTS.items()}):
         value, slope = loss(jax.tree.map(jnp.float32, parameters))
         assert np.isfinite(value)
         assert np.isfinite(jax.tree.leaves(slope)).all()

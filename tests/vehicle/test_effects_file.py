@@ -8,11 +8,12 @@ import pytest
 from openjax.errors import UserError
 from openjax.vehicle.effects import EFFECTS, load_effects, save_effects
 from openjax.vehicle.effects.effects_file import load_intervals
+from tests.vehicle.typical import typical
 
 
 def test_everything_comes_back(tmp_path):
     path = tmp_path / "effects.toml"
-    written = {name: effect.typical() for name, effect in EFFECTS.items()}
+    written = {name: typical(effect) for name, effect in EFFECTS.items()}
     save_effects(
         path, written, intervals={"rotor_drag": {"d_xy": (0.01, 0.02)}}, notes="three flights"
     )

@@ -11,7 +11,7 @@ __getattr__, __dir__, __all__ = lazy_names(
         "info": "StepInfo",
         "observation": "Observation observe",
         "reward": "Term Transition default_reward",
-        "scenarios": "SCENARIOS Scenario find_scenario scenario_settings scenario_task",
+        "scenarios": "SCENARIOS Scenario find_scenario scenario_task",
         "settings": "PursuitSettings RewardSettings",
         "state": "PursuitState",
         "statistics": "EpisodeStatistics",

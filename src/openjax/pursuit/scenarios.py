@@ -81,19 +81,6 @@ SCENARIOS: dict[str, Scenario] = {
 }
 
 
-def scenario_settings(settings: PursuitSettings, scenario: Scenario) -> PursuitSettings:
-    """The settings with as many pursuers and pillar slots as the scenario has (at least one
-    slot).
-    """
-    slots = max(1, len(scenario.pillars))
-    return dataclasses.replace(
-        settings,
-        num_pursuers=len(scenario.pursuers),
-        max_pillars=slots,
-        min_pillars=min(settings.min_pillars, slots),
-    )
-
-
 def scenario_task(settings: PursuitSettings, scenario: Scenario) -> Task:
     """The scenario as a task with `settings.max_pillars` slots.
 

@@ -24,9 +24,3 @@ class Box:
         if np.isfinite(self.low) and np.isfinite(self.high):
             return jax.random.uniform(key, self.shape, self.dtype, self.low, self.high)
         return jax.random.normal(key, self.shape, self.dtype)
-
-    def contains(self, x: jax.Array) -> bool:
-        """Whether an array is of this kind, on the host."""
-        x = np.asarray(x)
-        fits = x.shape == self.shape and np.can_cast(x.dtype, np.dtype(self.dtype), "same_kind")
-        return bool(fits and np.all(x >= self.low) and np.all(x <= self.high))

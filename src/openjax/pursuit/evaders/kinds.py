@@ -84,7 +84,6 @@ def _of(split):
     return tuple(name for name, kind in EVADERS.items() if kind.of == split)
 
 
-TRAINED = _of("train")
 VALIDATED = _of("validation")
 HELD_OUT = _of("held out")
 

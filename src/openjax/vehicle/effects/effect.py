@@ -263,8 +263,3 @@ class Effect:
     def none(self) -> dict[str, float]:
         """Parameters at which the effect is absent."""
         return {name: parameter.none for name, parameter in self.parameters.items()}
-
-    def typical(self) -> dict[str, float]:
-        """Parameters three quarters up their priors, where every effect acts."""
-        priors = {name: parameter.prior for name, parameter in self.parameters.items()}
-        return {name: low + 0.75 * (high - low) for name, (low, high) in priors.items()}
