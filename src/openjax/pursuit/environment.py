@@ -312,13 +312,17 @@ class Pursuit:
         return self.dynamics.seen(drones, self._parameters(vehicles))
 
     def step(
-        self, key: PRNGKeyArray, state: PursuitState, action: Actions, wish: Vector | None = None
+        self,
+        key: PRNGKeyArray | None,
+        state: PursuitState,
+        action: Actions,
+        wish: Vector | None = None,
     ) -> tuple[Observation, PursuitState, Each, Flag, Flag, StepInfo]:
         """One control step.
 
         Args:
           key: for an interface like other environments'; the game itself draws nothing after its
-          reset.
+          reset, and None will do.
           state: of this step's start.
           action: (N, 4) in -1..1: collective thrust, roll, pitch and yaw rate; see
           `action_to_command`.
