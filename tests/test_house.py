@@ -39,7 +39,7 @@ FLOORS = (
 )
 """Rooms from the ground up: each may import those below it."""
 TWICE = {
-    *("settings", "state", "parameters", "figures", "report", "firmware", "replay"),
+    *("settings", "state", "shapes", "parameters", "figures", "report", "firmware", "replay"),
     *("policy", "calibration", "export", "virtual_crazyflie", "model"),
     *("exploit", "adaptation", "loop"),
 }
