@@ -1,5 +1,6 @@
 """A policy against an evader that is told where to fly."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import jax
@@ -30,14 +31,26 @@ class Duel:
         """Worlds (B, ...) after control steps in which the evader flies `velocity` (B, 3), as
         shares of its speed in the world's axes.
         """
+
+        def act(observation, state):
+            return self.policy.act(parameters, observation)
+
+        return self.fly_actions(act, world, velocity, steps)
+
+    def fly_actions(
+        self,
+        act: Callable[[Observation, PursuitState], jax.Array],
+        world: World,
+        velocity: jax.Array,
+        steps: int,
+    ) -> World:
+        """The same with pursuers that do what `act` says: (B, N, 4) of worlds (B, ...)."""
         # a game of the library draws nothing after its reset
         key = jax.random.key(0)
         step = jax.vmap(self.environment.step, in_axes=(None, 0, 0, 0))
 
         def one(world, _):
-            observation, state = world
-            action = self.policy.act(parameters, observation)
-            observation, state, *_ = step(key, state, action, velocity)
+            observation, state, *_ = step(key, world[1], act(*world), velocity)
             return (observation, state), None
 
         return jax.lax.scan(one, world, length=steps)[0]

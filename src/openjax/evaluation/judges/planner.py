@@ -43,7 +43,7 @@ class Planner:
     def _best(self, parameters, world, plan, key):
         """(B, pieces, 3) the plan of those tried that promises most in each world (B, ...)."""
         settings = self.settings
-        tried = self._candidates(key, plan)  # (B, M, pieces, 3)
+        tried = self.candidates(key, plan)  # (B, M, pieces, 3)
         copied = jax.tree.map(lambda leaf: jnp.repeat(leaf, settings.plans, axis=0), world)
         pieces = jnp.moveaxis(tried.reshape(-1, *tried.shape[2:]), 1, 0)
 
@@ -51,23 +51,23 @@ class Planner:
             return self.duel.fly(parameters, world, velocity, settings.piece_steps), None
 
         (_, end), _ = jax.lax.scan(piece, copied, pieces)
-        score = jax.vmap(self._promise)(copied[1], end).reshape(plan.shape[0], -1)
+        score = jax.vmap(self.promise)(copied[1], end).reshape(plan.shape[0], -1)
         best = jnp.argmax(score, axis=1)
         return jnp.take_along_axis(tried, best[:, None, None, None], axis=1)[:, 0]
 
-    def _candidates(self, key, plan):
-        """The last best plan, the same shifted by a piece, straight ways, and random ones that turn
-        as often as not.
+    def candidates(self, key: jax.Array, plan: jax.Array) -> jax.Array:
+        """(B, plans, pieces, 3) the last best plan (B, pieces, 3), the same shifted by a piece,
+        straight ways, and random ones that turn as often as not.
         """
         settings = self.settings
         number = plan.shape[0]
         straight = (settings.plans - 2) // 3
         turn_key, way_key, spin_key = jax.random.split(key, 3)
         shifted = jnp.concatenate([plan[:, 1:], plan[:, -1:]], axis=1)
-        ways = _unit(jax.random.normal(spin_key, (number, straight, 1, 3)))
+        ways = unit(jax.random.normal(spin_key, (number, straight, 1, 3)))
         ways = jnp.broadcast_to(ways, (number, straight, settings.pieces, 3))
         others = settings.plans - 2 - straight
-        drawn = _unit(jax.random.normal(way_key, (number, others, settings.pieces, 3)))
+        drawn = unit(jax.random.normal(way_key, (number, others, settings.pieces, 3)))
         turns = jax.random.uniform(turn_key, drawn.shape[:3]) < 0.5
 
         def follow(before, piece):
@@ -79,7 +79,7 @@ class Planner:
         bent = jnp.moveaxis(jax.lax.scan(follow, drawn[:, :, 0], pieces)[1], 0, 2)
         return jnp.concatenate([plan[:, None], shifted[:, None], ways, bent], axis=1)
 
-    def _promise(self, start: PursuitState, end: PursuitState) -> jax.Array:
+    def promise(self, start: PursuitState, end: PursuitState) -> jax.Array:
         """() how good the end of a plan is: steps free first, then the room that is left."""
         game = self.duel.environment.settings
         newly = end.statistics.captured & ~start.statistics.captured
@@ -90,5 +90,6 @@ class Planner:
         return free + room / game.arena_radius
 
 
-def _unit(vector):
+def unit(vector: jax.Array) -> jax.Array:
+    """(..., 3) of length one."""
     return vector / jnp.sqrt(jnp.sum(vector**2, axis=-1, keepdims=True) + np.float32(1e-12))

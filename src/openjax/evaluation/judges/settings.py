@@ -92,3 +92,24 @@ class PlannerSettings:
 
     def __post_init__(self):
         check_intervals(self, "planning.")
+
+
+@dataclass(frozen=True)
+class MatrixGameSettings:
+    """How both sides plan. All pairs of plans are flown: of 16 each and .8 s, every .1 s, 2,048
+    steps for one of the game.
+    """
+
+    pursuers_last: bool = True
+    """Whether the pursuers choose knowing the evader's plan, or the evader knowing theirs."""
+    evader_plans: Annotated[int, Interval("[3, 1000]")] = 16
+    team_plans: Annotated[int, Interval("[5, 1000]")] = 16
+    pieces: Annotated[int, Interval("[1, 100]")] = 4
+    """Of a plan, one after the other."""
+    piece_steps: Annotated[int, Interval("[1, 1000]")] = 20
+    """Control steps of each piece."""
+    replan: Annotated[int, Interval("[1, 1000]")] = 10
+    """Control steps after which both sides plan anew."""
+
+    def __post_init__(self):
+        check_intervals(self)

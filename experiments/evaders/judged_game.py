@@ -1,0 +1,71 @@
+"""The game and the tasks by which a policy is judged, for programs beside `openjax exploit`."""
+
+import argparse
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from openjax.evaluation.evaluator import layout_slots, layout_tasks, stacked
+from openjax.evaluation.judges.tasks import judging_tasks
+from openjax.pursuit import SCENARIOS, Pursuit, RewardSettings, Task
+from openjax.runs.exploit import record
+from openjax.store.compiled_programs import cache_programs
+from openjax.store.environments import make_environment
+from openjax.store.policies import LoadedPolicy, load_policy
+
+
+@dataclass(frozen=True)
+class JudgedGame:
+    """A policy in its game, on the judge's tasks."""
+
+    environment: Pursuit
+    loaded: LoadedPolicy
+    tasks: Task  # (B, ...), of all kinds
+    part: Callable[[Any], dict[str, Any]]
+    """(B, ...) to the same by kinds"""
+    seed: int
+
+    def records(self, name: str, fly: Callable) -> list[dict]:
+        """Records of one evader; `fly` (parameters, tasks, key) -> statistics (B,), traceable."""
+        key = jax.random.key(self.seed)
+        flown = jax.jit(fly)(self.loaded.parameters, self.tasks, key)
+        parts = self.part(jax.tree.map(np.asarray, flown))
+        return [record(name, kind, own) for kind, own in parts.items()]
+
+
+def game_parser(doc: str | None, episodes: int, uniform: int) -> argparse.ArgumentParser:
+    """The options of `judged_game`."""
+    parser = argparse.ArgumentParser(description=doc)
+    parser.add_argument("--policy", default="evaders")
+    parser.add_argument("--vehicle", type=Path, help="vehicle.toml; by default the nominal one")
+    parser.add_argument("--episodes", type=int, default=episodes, help="of each layout")
+    parser.add_argument("--uniform", type=int, default=uniform, help="uniform tasks")
+    parser.add_argument("--steps", type=int, help="of an episode, to try it")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--json", type=Path, required=True)
+    return parser
+
+
+def judged_game(options: argparse.Namespace) -> JudgedGame:
+    """As `openjax exploit` has it: one vehicle, honest physics, the reward counts for nothing."""
+    cache_programs()
+    loaded = load_policy(options.policy)
+    own = loaded.settings.environment
+    game = dataclasses.replace(
+        own,
+        vehicles=(),
+        rare_vehicles=0.0,
+        max_pillars=layout_slots(own),
+        evaders=("field",),
+        reward=RewardSettings(),
+        episode_length=options.steps or own.episode_length,
+    )
+    environment = make_environment(game, options.vehicle, None)
+    kinds = layout_tasks(game, list(SCENARIOS.values()), options.episodes)
+    kinds["uniform"] = judging_tasks(game, options.uniform)
+    return JudgedGame(environment, loaded.in_game(environment), *stacked(kinds), options.seed)

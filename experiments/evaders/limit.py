@@ -1,0 +1,44 @@
+"""What can be held at all: `python -m experiments.evaders.limit --json FILE`.
+
+Both sides plan in the true simulation, the pursuers with the policy among their plans; records as
+`openjax exploit --json` writes them, of the game in which the pursuers choose last, which bounds
+the captures from above, and of the one in which the evader does.
+"""
+
+import time
+
+from experiments.evaders.judged_game import game_parser, judged_game
+from openjax.evaluation.judges.duel import Duel
+from openjax.evaluation.judges.matrix_game import MatrixGame, vehicles_flight
+from openjax.evaluation.judges.settings import MatrixGameSettings
+from openjax.files import write_json
+
+LAST = {"both plan, pursuers last": True, "both plan, evader last": False}
+
+
+def main() -> None:
+    """The command."""
+    parser = game_parser(__doc__, episodes=16, uniform=48)
+    parser.add_argument("--plans", type=int, default=16, help="of each side")
+    options = parser.parse_args()
+    game = judged_game(options)
+    duel = Duel(game.environment, game.loaded.policy)
+    found = {"policy": game.loaded.source, "records": [], "seconds": {}}
+    for name, pursuers_last in LAST.items():
+        settings = MatrixGameSettings(pursuers_last, options.plans, options.plans)
+        both = MatrixGame(settings, duel, vehicles_flight(game.environment))
+
+        def fly(parameters, tasks, key, both=both):
+            return both.fly(parameters, duel.start(tasks, key), key)
+
+        began = time.monotonic()
+        own = game.records(name, fly)
+        found["seconds"][name] = time.monotonic() - began
+        found["records"] += own
+        rates = ", ".join(f"{one['scenario']} {one['capture_rate']:.2f}" for one in own)
+        print(f"{name}, {found['seconds'][name]:.0f} s: {rates}", flush=True)
+        write_json(options.json, found)
+
+
+if __name__ == "__main__":
+    main()
