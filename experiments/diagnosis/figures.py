@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from experiments.table import Table, table
+from openjax.evaluation.episodes import wilson
 
 # figure -> what it says
 FIGURES = {
@@ -29,17 +30,6 @@ FIGURES = {
     "seconds": "seconds a case after the first, median",
     "seconds_first": "seconds of a process' first case, median",
 }
-
-
-def wilson(hits: int, n: int) -> tuple[float, float]:
-    """95 % interval of a proportion (Wilson 1927), by the quantile 1.96 that all pages of the
-    benchmark have.
-    """
-    p = hits / n
-    z = 1.96
-    centre = p + z * z / (2 * n)
-    half = z * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
-    return max(0.0, (centre - half) / (1 + z * z / n)), min(1.0, (centre + half) / (1 + z * z / n))
 
 
 def calibration_error(pairs: list, bins: int = 10) -> float:

@@ -17,10 +17,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.diagnosis.figures import wilson
 from experiments.flying.vehicles import vehicles
 from experiments.table import RESULTS, Page, Table, page_parser, publish
 from openjax.command_line import run_command
+from openjax.evaluation.episodes import wilson
 from openjax.evaluation.evaluator import layout_slots, layout_tasks, stacked
 from openjax.evaluation.judges.duel import Duel
 from openjax.evaluation.judges.scripted import fly_scripted

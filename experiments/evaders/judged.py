@@ -1,48 +1,55 @@
 """Policies before the second judge: `python -m experiments.evaders.judged NAME=FILE ...`.
 
 Each FILE is what `openjax exploit --policy NAME --json FILE` wrote: evaders that learned against
-the policy, one that plans in the true simulation, and the scripted ones. None of them trained the
-pursuers. Stores the least capture rate of each kind, and makes the table of judged.md.
+the policy, one that plans in the true simulation, and the scripted ones; or what
+`python -m experiments.evaders.apart` wrote. None of them trained the pursuers; the slower vehicle
+is `--effects experiments/flying/slower.toml`. Stores the least capture rate of each kind, and makes the table of judged.md.
 """
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from experiments.diagnosis.figures import wilson
+from experiments.flying.vehicles import SLOWER
 from experiments.table import Page, Table, page_parser, publish
 from openjax.command_line import run_command
 from openjax.files import read_json
 from openjax.pursuit import SCENARIOS
 from openjax.pursuit.evaders import HELD_OUT
+from openjax.runs.exploit_report import verdict
+from openjax.vehicle.effects import load_effects
+from openjax.vehicle.parameters import NOMINAL
 
 PLACES = (*SCENARIOS, "uniform")
 JUDGES: Mapping[str, Callable[[str], bool]] = {
     "evaders that learn": lambda evader: evader.startswith("learned"),
     "a planner": lambda evader: evader == "planner",
+    "splitting, kept apart": lambda evader: evader == "splitting",
     "scripted ones, held out": lambda evader: evader in HELD_OUT,
     "the paper's": lambda evader: evader == "field",
 }
 """Kinds of evaders, and who belongs to them."""
 
 
-def row(policy: str, judge: str, records: list[dict]) -> dict:
+def row(policy: str, vehicle: str, judge: str, records: list[dict]) -> dict:
     """The evader of a kind that is caught least in each kind of tasks, with intervals of 95 %."""
-    least, interval, crash = {}, {}, {}
-    for place in PLACES:
-        here = [record for record in records if record["scenario"] == place]
-        worst = min(here, key=lambda record: record["capture_rate"])
-        least[place] = worst["capture_rate"]
-        captures = round(worst["capture_rate"] * worst["episodes"])
-        interval[place] = wilson(captures, worst["episodes"])
-        crash[place] = max(record["crash_rate"] for record in here)
+    worst = verdict(records)
+    figures = ("capture_rate", "interval", "crash_rate")
     return {
         "policy": policy,
+        "vehicle": vehicle,
         "judge": judge,
         "evaders": len({record["evader"] for record in records}),
-        "capture_rate": least,
-        "interval": interval,
-        "crash_rate": crash,
+        **{figure: {own["scenario"]: own[figure] for own in worst} for figure in figures},
     }
+
+
+def vehicle_of(found: Mapping) -> str:
+    """Its name in the table."""
+    effects = found.get("effects")
+    if not effects:
+        name = Path(found.get("vehicle", NOMINAL)).stem
+        return "nominal" if name == NOMINAL else name
+    return "slower" if effects == load_effects(SLOWER)[1] else "with effects"
 
 
 def rows_of(policy: str, found: Mapping) -> list[dict]:
@@ -51,21 +58,27 @@ def rows_of(policy: str, found: Mapping) -> list[dict]:
     for judge, belongs in JUDGES.items():
         records = [record for record in found["records"] if belongs(record["evader"])]
         if records:
-            rows.append(row(policy, judge, records))
+            rows.append(row(policy, vehicle_of(found), judge, records))
     return rows
+
+
+def identity(row: Mapping) -> tuple[str, str, str]:
+    """What a row is of; a newer one takes its place."""
+    return row["policy"], row["vehicle"], row["judge"]
 
 
 def study(options) -> dict:
     """The rows of all files, after those stored of other policies."""
     data = options.out.with_suffix(".json")
     stored = read_json(data) if data.exists() else {"rows": [], "runs": {}}
-    new = dict(item.split("=", 1) for item in options.exploited)
-    rows = [old for old in stored["rows"] if old["policy"] not in new]
-    runs = {name: run for name, run in stored["runs"].items() if name not in new}
-    for policy, file in new.items():
+    rows, runs = stored["rows"], stored["runs"]
+    for policy, file in (item.split("=", 1) for item in options.exploited):
         found = read_json(Path(file))
-        rows += rows_of(policy, found)
-        runs[policy] = {name: found[name] for name in ("curve", "seconds") if name in found}
+        new = rows_of(policy, found)
+        again = {identity(own) for own in new}
+        rows = [old for old in rows if identity(old) not in again] + new
+        run = {name: found[name] for name in ("curve", "seconds") if name in found}
+        runs[f"{policy}, {vehicle_of(found)}"] = run
     return {"rows": rows, "runs": runs}
 
 
@@ -76,7 +89,9 @@ def page(results: Mapping) -> Page:
         return lambda row: f"{row['capture_rate'][place]:.2f}"
 
     columns = {
-        "policy": "policy",
+        "policy": lambda row: (
+            row["policy"] + ("" if row["vehicle"] == "nominal" else f", {row['vehicle']} vehicle")
+        ),
         "caught least among": "judge",
         **{place: rate(place) for place in PLACES},
         "most crashes": lambda row: f"{max(row['crash_rate'].values()):.2f}",

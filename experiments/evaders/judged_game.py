@@ -43,6 +43,7 @@ def game_parser(doc: str | None, episodes: int, uniform: int) -> argparse.Argume
     parser = argparse.ArgumentParser(description=doc)
     parser.add_argument("--policy", default="evaders")
     parser.add_argument("--vehicle", type=Path, help="vehicle.toml; by default the nominal one")
+    parser.add_argument("--effects", type=Path, help="effects.toml")
     parser.add_argument("--episodes", type=int, default=episodes, help="of each layout")
     parser.add_argument("--uniform", type=int, default=uniform, help="uniform tasks")
     parser.add_argument("--steps", type=int, help="of an episode, to try it")
@@ -65,7 +66,7 @@ def judged_game(options: argparse.Namespace) -> JudgedGame:
         reward=RewardSettings(),
         episode_length=options.steps or own.episode_length,
     )
-    environment = make_environment(game, options.vehicle, None)
+    environment = make_environment(game, options.vehicle, options.effects)
     kinds = layout_tasks(game, list(SCENARIOS.values()), options.episodes)
     kinds["uniform"] = judging_tasks(game, options.uniform)
     return JudgedGame(environment, loaded.in_game(environment), *stacked(kinds), options.seed)

@@ -9,6 +9,7 @@ by the layouts. Writes experiments/results/vehicles.json and .md (`--out`: other
 
 import dataclasses
 import functools
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -21,13 +22,17 @@ from openjax.evaluation.validation import uniform_tasks
 from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings, RewardSettings
 from openjax.store.policies import load_policy
 from openjax.vehicle import load_vehicle
+from openjax.vehicle.effects.effects_file import load_effects
 from openjax.vehicle.family import family_bounds, find_parameter, vehicle_family
 from openjax.vehicle.parameters import AIRFRAMES, NOMINAL
 
+SLOWER = Path(__file__).with_name("slower.toml")
+"""The slower vehicle's effects, for `--effects` of commands."""
 TABLE = {
-    "motor_lag.extra_up": 0.04, "motor_lag.extra_down": 0.04, "command_latency.delay": 0.015, "state_latency.delay": 0.01,
-    "rotor_drag.d_xy": 0.0125, "rotor_drag.d_z": 0.0125,
-}  # fmt: skip
+    f"{effect}.{parameter}": value
+    for effect, parameters in load_effects(SLOWER)[1].items()
+    for parameter, value in parameters.items()
+}
 FIGURES = {
     "capture": "capture_rate:.3f", "step": "capture_step:.0f", "collision": "collision_rate:.4f",
     "crash": "crash_rate:.4f", "over speed": "over_speed_rate:.4f",

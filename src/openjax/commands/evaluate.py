@@ -145,6 +145,7 @@ def fly_scenarios(command: EvaluateCommand, loaded, evaluators: dict) -> tuple[l
     import jax
 
     from openjax.evaluation.evaluator import Evaluator, layout_tasks
+    from openjax.evaluation.judges.tasks import JUDGE_KEY
     from openjax.evaluation.validation import uniform_tasks
 
     game, loaded, layouts = _game(command, loaded)
@@ -154,7 +155,9 @@ def fly_scenarios(command: EvaluateCommand, loaded, evaluators: dict) -> tuple[l
     tasks = layout_tasks(game.settings, layouts, command.episodes)
     if not layouts:
         drawn = _settings(command)
-        tasks["uniform"] = uniform_tasks(drawn, command.episodes, game.settings.max_pillars)
+        slots = game.settings.max_pillars
+        # not those by which runs choose their checkpoints
+        tasks["uniform"] = uniform_tasks(drawn, command.episodes, slots, JUDGE_KEY)
     kind = (game.settings, loaded.policy, command.opponent)
     compiled = kind in evaluators
     if not compiled:

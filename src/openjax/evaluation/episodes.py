@@ -1,5 +1,6 @@
 """Evaluation: whole episodes of the mean policy on given tasks."""
 
+import math
 from collections.abc import Callable
 
 import jax
@@ -120,3 +121,14 @@ def summarise(evaluation: Evaluation) -> dict[str, float]:
         "last_seen_error": mean(evaluation.last_seen_error),
         "episode_return": mean(statistics.episode_return),
     }
+
+
+def wilson(hits: int, n: int) -> tuple[float, float]:
+    """95 % interval of a proportion (Wilson 1927), by the quantile 1.96 that all pages of results
+    have.
+    """
+    p = hits / n
+    z = 1.96
+    centre = p + z * z / (2 * n)
+    half = z * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
+    return max(0.0, (centre - half) / (1 + z * z / n)), min(1.0, (centre + half) / (1 + z * z / n))

@@ -103,9 +103,9 @@ class ExploitCommand:
     json: Path | None = None
     """File to write the records to."""
     episodes: Annotated[int, Interval("[1, 1000000]")] = 100
-    """Episodes per layout and evader; by default 8 on a CPU."""
+    """Episodes per layout and evader; by default 2 on a CPU."""
     uniform: Annotated[int, Interval("[1, 1000000]")] = 256
-    """Uniform tasks per evader; by default 64 on a CPU."""
+    """Uniform tasks per evader; by default 8 on a CPU."""
     seed: Seed = 0
     """Draws the evaders' first parameters, their tasks and the start attitudes."""
     minutes: Annotated[float | None, Interval("(0, 100000]")] = None

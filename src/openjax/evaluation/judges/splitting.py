@@ -72,7 +72,7 @@ class Splitting:
             turn_key, split_key = jax.random.split(key)
             heading = self._turned(turn_key, heading)
             worlds = self._flown(parameters, worlds, heading)
-            source = _sources(split_key, worlds[1])
+            source = sources(split_key, worlds[1])
             return jax.tree.map(lambda leaf: leaf[source], (worlds, heading)), None
 
         length = self.environment.settings.episode_length // self.settings.piece_steps
@@ -118,7 +118,7 @@ def _directions(key, number):
     return vector / jnp.linalg.norm(vector, axis=-1, keepdims=True)
 
 
-def _sources(key: jax.Array, state: PursuitState) -> jax.Array:
+def sources(key: jax.Array, state: PursuitState) -> jax.Array:
     """(C,) which of the copies (C, ...) each goes on as: a free one as itself, a caught one as the
     better of two free ones; all as they are where none is free.
     """
