@@ -46,7 +46,8 @@ def test_a_slower_evader_is_free_nearly_as_long_as_it_can_be():
 
 def test_the_caught_go_on_as_the_free():
     game, tasks = in_the_open(speed=1.3)
-    state = jax.vmap(game.reset_to)(jax.random.split(jax.random.key(0), 1), tasks)[1]
+    keys = jax.random.split(jax.random.key(0), 1)
+    state = jax.jit(jax.vmap(game.reset_to))(keys, tasks)[1]
     state = jax.tree.map(lambda leaf: jnp.repeat(leaf, 6, axis=0), state)
     caught = jnp.array([True, False, True, False, True, True])
     state = state.replace(statistics=state.statistics.replace(captured=caught))
