@@ -7,13 +7,35 @@ the captures from above, and of the one in which the evader does.
 
 import time
 
+import jax
+import jax.numpy as jnp
+
 from experiments.evaders.judged_game import game_parser, judged_game
+from openjax.baselines.surroundings import Craft
+from openjax.baselines.velocity_controller import velocity_action
 from openjax.evaluation.judges.duel import Duel
-from openjax.evaluation.judges.matrix_game import MatrixGame, vehicles_flight
+from openjax.evaluation.judges.matrix_game import MatrixGame, VelocityFlight
 from openjax.evaluation.judges.settings import MatrixGameSettings
 from openjax.files import write_json
+from openjax.pursuit import Pursuit
+from openjax.vehicle import hover_share
 
 LAST = {"both plan, pursuers last": True, "both plan, evader last": False}
+
+
+def vehicles_flight(environment: Pursuit) -> VelocityFlight:
+    """How quadrotors fly velocities, from their true state."""
+    settings = environment.settings
+    with jax.ensure_compile_time_eval():  # it may be made inside a compiled program
+        hover = float(hover_share(environment.vehicle))
+    craft = Craft(settings.arena_radius, settings.arena_height, hover_thrust=hover)
+
+    def action(observation, state, velocity):
+        drones = state.drones
+        known = jnp.concatenate([drones.position, drones.quaternion, drones.velocity], axis=-1)
+        return velocity_action(craft, observation.replace(self_state=known), velocity)
+
+    return action
 
 
 def main() -> None:

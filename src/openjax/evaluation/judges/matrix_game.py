@@ -17,14 +17,11 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from openjax.baselines.surroundings import Craft
-from openjax.baselines.velocity_controller import velocity_action
 from openjax.evaluation.judges.duel import Duel, World
 from openjax.evaluation.judges.planner import Planner, unit
 from openjax.evaluation.judges.settings import MatrixGameSettings, PlannerSettings
 from openjax.policy import PolicyParameters
-from openjax.pursuit import EpisodeStatistics, Observation, Pursuit, PursuitState
-from openjax.vehicle import hover_share
+from openjax.pursuit import EpisodeStatistics, Observation, PursuitState
 
 BESIDE = 0.4
 """Places beside the evader to which a pursuer is sent are at most so far from it (m)."""
@@ -32,6 +29,8 @@ LEAD = 0.15
 """Seconds that a vehicle takes to fly what it is told: it is sent to where the evader will be."""
 REACTION = 0.1
 """Seconds in which a pursuer would reach its place, were it fast enough."""
+SPEED = 0.98
+"""Share of the pursuers' speed at which they fly to it: short of what a controller overshoots."""
 CRASH = 2.0
 """What a crash costs the pursuers, in horizons that the evader is free."""
 
@@ -46,21 +45,6 @@ class TeamPlans:
 
 VelocityFlight = Callable[[Observation, PursuitState, jax.Array], jax.Array]
 """observation, state of one world and desired velocities (N, 3) m/s -> actions (N, 4)."""
-
-
-def vehicles_flight(environment: Pursuit) -> VelocityFlight:
-    """How quadrotors fly velocities, from their true state."""
-    settings = environment.settings
-    with jax.ensure_compile_time_eval():  # it may be made inside a compiled program
-        hover = float(hover_share(environment.vehicle))
-    craft = Craft(settings.arena_radius, settings.arena_height, hover_thrust=hover)
-
-    def action(observation, state, velocity):
-        drones = state.drones
-        known = jnp.concatenate([drones.position, drones.quaternion, drones.velocity], axis=-1)
-        return velocity_action(craft, observation.replace(self_state=known), velocity)
-
-    return action
 
 
 def choose(payoff: jax.Array, pursuers_last: bool) -> tuple[jax.Array, jax.Array]:
@@ -140,7 +124,7 @@ class MatrixGame:
 
     def _fly_piece(self, parameters, world, velocity, team, steps):
         """Worlds (B, ...) after control steps of one piece of both plans."""
-        speed = Craft.speed * self.duel.environment.settings.max_speed
+        speed = SPEED * self.duel.environment.settings.max_speed
 
         def action(observation, state, by_policy, team):
             place = state.evader_position + LEAD * state.evader_velocity + team.beside
