@@ -78,3 +78,6 @@ def test_a_policy_for_teams_flies_with_any_number(tmp_path, capsys):
     assert record["episodes"] == 2 and record["crash_rate"] is not None
     said = " ".join(capsys.readouterr().out.split())
     assert "never trained for this: 5 pursuers, which no team in training had" in said
+    pair = loaded.of_team(2)
+    seen = jax.eval_shape(openjax.make(pair.settings.environment).reset, jax.random.key(0))[0]
+    assert jax.eval_shape(pair, seen).shape == (2, 4)

@@ -158,6 +158,8 @@ def prepare(arguments: Arguments) -> Prepared:
     policy = load_policy(arguments.policy)
     settings = policy.settings.environment
     scenario = find_scenario(arguments.scenario, settings)
+    policy = policy.of_team(len(scenario.pursuers))
+    settings = policy.settings.environment
     _check_numbers(arguments, len(scenario.pursuers), settings.num_pursuers)
     vehicle = load_vehicle_file(arguments.vehicle or settings.airframe)
     slots = max(settings.max_pillars, len(scenario.pillars))

@@ -67,6 +67,15 @@ class LoadedPolicy:
         """Whether it flies with any number of pursuers."""
         return bool(self.settings.environment.team_sizes)
 
+    def of_team(self, number: int) -> "LoadedPolicy":
+        """The policy in the game of so many pursuers; itself where it flies with one number only."""
+        if not self.any_number:
+            return self
+        game = self.settings.environment.of_one_team(number)
+        return dataclasses.replace(
+            self, settings=dataclasses.replace(self.settings, environment=game)
+        )
+
     def in_game(self, environment: Pursuit) -> "LoadedPolicy":
         """The policy for another game than its own: another arena, vehicle or number of pillars.
 
