@@ -15,6 +15,7 @@ import tyro
 
 from openjax.command_line import output_console, parse
 from openjax.errors import UserError
+from openjax.evaluation.message_settings import MessageSettings
 from openjax.files import check_output, write_json
 from openjax.pursuit.settings import PursuitSettings
 from openjax.ranges import Interval, Seed
@@ -85,6 +86,7 @@ class EvaluateCommand(FlightOptions):
     """Pursuers; by default as many as in training. A policy for teams of any size flies three by
     default, all episodes with one --environment.evader_speed and one --environment.capture_radius.
     """
+    messages: MessageSettings = dataclasses.field(default_factory=MessageSettings)
     json: Path | None = None
     """File to write the records to: an object for one scenario, a list for all."""
     vehicle: Path | None = None
@@ -158,10 +160,11 @@ def fly_scenarios(command: EvaluateCommand, loaded, evaluators: dict) -> tuple[l
         slots = game.settings.max_pillars
         # not those by which runs choose their checkpoints
         tasks["uniform"] = uniform_tasks(drawn, command.episodes, slots, JUDGE_KEY)
-    kind = (game.settings, loaded.policy, command.opponent)
+    kind = (game.settings, loaded.policy, command.opponent, command.messages)
     compiled = kind in evaluators
     if not compiled:
-        evaluators[kind] = Evaluator(game, loaded.policy, min(command.episodes, LARGEST_BATCH))
+        batch = min(command.episodes, LARGEST_BATCH)
+        evaluators[kind] = Evaluator(game, loaded.policy, batch, command.messages)
     expected = dict.fromkeys(tasks, 0.02 * command.episodes)
     first = next(iter(tasks))
     if not compiled:
@@ -194,6 +197,11 @@ def _game(command, loaded):
         raise UserError(
             "--environment.evaders learned: a name isn't enough; --opponent takes a file of "
             "openjax exploit"
+        )
+    if not command.messages.perfect and loaded.is_heuristic:
+        raise UserError(
+            f"--messages: {loaded.source} flies the team as one; policies that were trained fly "
+            "each pursuer by what it knows"
         )
     wanted = settings.num_pursuers
     trained = wanted if loaded.any_number else loaded.settings.environment.num_pursuers

@@ -7,6 +7,8 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from openjax.evaluation.message_settings import MessageSettings
+from openjax.evaluation.messages import Hearsay
 from openjax.policy import Policy, PolicyParameters
 from openjax.pursuit import EpisodeStatistics, Pursuit, Task
 
@@ -35,13 +37,19 @@ class EpisodeRecord:
 
 
 def make_evaluate(
-    environment: Pursuit, policy: Policy, trajectory: bool = False
+    environment: Pursuit,
+    policy: Policy,
+    trajectory: bool = False,
+    messages: MessageSettings | None = None,
 ) -> Callable[[PolicyParameters, Task, jax.Array], Evaluation | tuple[Evaluation, EpisodeRecord]]:
     """`evaluate(parameters, tasks, key)`: one episode per task (leading axis B), to be compiled by
     the caller.
 
-    With `trajectory` it returns positions of every step as well.
+    With `trajectory` it returns positions of every step as well. Where `messages` get lost or are
+    late, each pursuer flies by what it believes, and prediction errors aren't told.
     """
+    imperfect = messages is not None and not messages.perfect
+    hearsay = Hearsay(messages, environment) if imperfect else None
     step = jax.vmap(environment.step, in_axes=(None, 0, 0))
 
     def evaluate(parameters: PolicyParameters, tasks: Task, key: jax.Array):
@@ -51,14 +59,23 @@ def make_evaluate(
             jax.random.split(reset_key, number), tasks
         )
 
-        def one(carry, step_key):
-            observation, state, errors = carry
+        def decide(observation, state, beliefs):
+            """Actions, and the positions predicted for the evader."""
+            if hearsay is not None:
+                views = jax.vmap(hearsay.observations)(beliefs, state)
+                return policy.act(parameters, views)[..., 0, :], None
             predicted = policy.predict(parameters, observation)
             mean, _ = policy.distribution(parameters.actor, observation, predicted)
+            return policy.action(mean, observation), predicted
+
+        def one(carry, step_key):
+            observation, state, beliefs, errors = carry
+            action, predicted = decide(observation, state, beliefs)
             last_seen = observation.last_seen
-            observation, state, _, _, _, info = step(
-                step_key, state, policy.action(mean, observation)
-            )
+            observation, state, _, _, _, info = step(step_key, state, action)
+            if hearsay is not None:
+                keys = jax.random.split(step_key, number)
+                beliefs = jax.vmap(hearsay.after)(beliefs, state, keys)
             guesses = [last_seen if predicted is None else predicted[:, 0], last_seen]
             errors = errors + jnp.stack(
                 [jnp.linalg.norm(guess - state.evader_position, axis=-1) for guess in guesses]
@@ -74,16 +91,17 @@ def make_evaluate(
                     crashed=info.crashed,
                     predicted=predicted,
                 )
-            return (observation, state, errors), record
+            return (observation, state, beliefs, errors), record
 
         length = environment.settings.episode_length
-        start = (observation, state, jnp.zeros((2, number), jnp.float32))
-        (_, state, errors), record = jax.lax.scan(one, start, jax.random.split(step_key, length))
+        beliefs = None if hearsay is None else jax.vmap(hearsay.start)(state)
+        start = (observation, state, beliefs, jnp.zeros((2, number), jnp.float32))
+        (_, state, _, errors), record = jax.lax.scan(one, start, jax.random.split(step_key, length))
         errors = errors / length
         evaluation = Evaluation(
             statistics=state.statistics,
             prediction_error=errors[0]
-            if policy.predictor.enabled
+            if policy.predictor.enabled and hearsay is None
             else jnp.full_like(errors[0], jnp.nan),
             last_seen_error=errors[1],
         )

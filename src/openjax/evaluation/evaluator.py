@@ -14,6 +14,7 @@ from rich.table import Table
 
 from openjax.background import compile_ahead
 from openjax.evaluation.episodes import Evaluation, make_evaluate, summarise
+from openjax.evaluation.message_settings import MessageSettings
 from openjax.policy import Policy, PolicyParameters
 from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings, Scenario, Task, scenario_task
 from openjax.pursuit.statistics import EpisodeStatistics
@@ -44,12 +45,19 @@ class Evaluator:
       environment: its settings say how many pursuers and pillar slots the tasks have.
       policy: the networks.
       batch: episodes per call of the compiled function.
+      messages: how well pursuers hear each other; None: perfectly.
     """
 
-    def __init__(self, environment: Pursuit, policy: Policy, batch: int):
+    def __init__(
+        self,
+        environment: Pursuit,
+        policy: Policy,
+        batch: int,
+        messages: MessageSettings | None = None,
+    ):
         self.settings = environment.settings
         self.batch = batch
-        self._evaluate = jax.jit(make_evaluate(environment, policy, trajectory=True))
+        self._evaluate = jax.jit(make_evaluate(environment, policy, True, messages))
 
     def fly(
         self,

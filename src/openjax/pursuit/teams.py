@@ -77,13 +77,13 @@ def parked(position: Team, active: Which | None) -> Team:
     return jnp.where(active[:, None], position, away)
 
 
-def held(active: Which | None, before: DroneState, after: DroneState) -> DroneState:
+def held(active: Which | None, old: DroneState, new: DroneState) -> DroneState:
     """The drones (leading axis N) after a step, those of empty slots as they were before it, and
     parked.
     """
     if active is None:
-        return after
-    drones = of_team(active, after, before)
+        return new
+    drones = of_team(active, new, old)
     return drones.replace(position=parked(drones.position, active))
 
 

@@ -63,12 +63,19 @@ class LoadedPolicy:
     """Its game, where that has parts of one's own; None: the one that the settings name."""
 
     @property
+    def is_heuristic(self) -> bool:
+        """Whether it was written and not trained."""
+        return isinstance(self.policy, Heuristic)
+
+    @property
     def any_number(self) -> bool:
         """Whether it flies with any number of pursuers."""
         return bool(self.settings.environment.team_sizes)
 
     def of_team(self, number: int) -> "LoadedPolicy":
-        """The policy in the game of so many pursuers; itself where it flies with one number only."""
+        """The policy in the game of so many pursuers; itself where it flies with one number
+        only.
+        """
         if not self.any_number:
             return self
         game = self.settings.environment.of_one_team(number)

@@ -1,0 +1,26 @@
+"""How well pursuers hear each other."""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from openjax.ranges import Interval, check_intervals
+
+
+@dataclass(frozen=True)
+class MessageSettings:
+    """Messages between pursuers. In every control step each sends to every other where it is, and
+    where the evader is if it sees it.
+    """
+
+    lost: Annotated[float, Interval("[0, 1]")] = 0.0
+    """Share of the messages that are lost, each on its own."""
+    late: Annotated[float, Interval("[0, 10]")] = 0.0
+    """How late the others arrive (s)."""
+
+    def __post_init__(self):
+        check_intervals(self, "messages.")
+
+    @property
+    def perfect(self) -> bool:
+        """Whether all know at once what one knows."""
+        return not (self.lost or self.late)

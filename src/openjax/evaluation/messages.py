@@ -1,0 +1,170 @@
+"""A team whose messages are lost or late: each pursuer flies the policy by what it believes.
+
+A pursuer knows where it is itself, what it sees, and of the others what it was told last. It takes
+the teammates to be where they told, and the evader to be where it saw it, or where the newest
+report has it; without a report in this step the evader counts as hidden. So each has its own view
+of the world, in which the policy acts for it alone. With perfect messages all views are the same,
+and those of a game in which what one sees is seen by all.
+"""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from openjax.evaluation.message_settings import MessageSettings
+from openjax.pursuit import Observation, Pursuit, PursuitState
+from openjax.pursuit.observation import frame, frame_pursuers
+
+
+@struct.dataclass
+class Sent:
+    """What the N pursuers of a world send in a step."""
+
+    position: jax.Array  # (N, 3) m, their own
+    sees: jax.Array  # (N,) bool, whether the evader is in it
+    evader: jax.Array  # (3,) m
+    evader_velocity: jax.Array  # (3,) m/s
+    step: jax.Array  # () int32
+
+
+@struct.dataclass
+class Beliefs:
+    """What each of the N pursuers of a world takes it to be."""
+
+    position: jax.Array  # (N, N, 3) m, of each pursuer (second axis)
+    evader: jax.Array  # (N, 3) m, by the newest report
+    evader_velocity: jax.Array  # (N, 3) m/s
+    reported: jax.Array  # (N,) int32, the step of that report; -1: none yet
+    seen: jax.Array  # (N,) bool, whether there was one in this step
+    last_seen: jax.Array  # (N, 3) m
+    frames: jax.Array  # (N, H, F)
+    on_the_way: Sent
+    """(D, ...) what is sent in the last D steps, oldest first"""
+
+
+@dataclass(frozen=True)
+class Hearsay:
+    """The messages of one world's pursuers, as pure functions to be mapped."""
+
+    settings: MessageSettings
+    environment: Pursuit
+
+    @property
+    def delay(self) -> int:
+        """Control steps by which messages are late."""
+        return round(self.settings.late / self.environment.settings.time_step)
+
+    def start(self, state: PursuitState) -> Beliefs:
+        """At an episode's start all know where all start, and who sees the evader tells it."""
+        number = state.drones.position.shape[0]
+
+        def each(leaf):
+            return jnp.broadcast_to(leaf, (number, *leaf.shape))
+
+        now = _sent(state)
+        on_the_way = jax.tree.map(
+            lambda leaf: jnp.broadcast_to(leaf, (self.delay, *leaf.shape)), now
+        )
+        return Beliefs(
+            position=each(state.drones.position),
+            evader=each(state.evader_position),
+            evader_velocity=each(state.evader_velocity),
+            reported=jnp.where(each(state.seen), state.step, -1),
+            seen=each(state.seen),
+            last_seen=each(state.last_seen),
+            frames=each(state.frames),
+            on_the_way=on_the_way,
+        )
+
+    def after(self, beliefs: Beliefs, state: PursuitState, key: jax.Array) -> Beliefs:
+        """Beliefs after a step that ended with `state`; `key` draws which messages are lost."""
+        number = state.drones.position.shape[0]
+        now = _sent(state)
+        line = jax.tree.map(
+            lambda old, new: jnp.concatenate([old, new[None]]), beliefs.on_the_way, now
+        )
+        heard = jax.tree.map(lambda leaf: leaf[0], line)
+        own = jnp.eye(number, dtype=bool)
+        arrives = jax.random.uniform(key, (number, number)) >= self.settings.lost
+        position = jnp.where((arrives & ~own)[..., None], heard.position, beliefs.position)
+        position = jnp.where(own[..., None], state.drones.position, position)
+
+        told = jnp.any(arrives & ~own & heard.sees, axis=-1) & (heard.step > beliefs.reported)
+        sees = state.in_sight
+
+        def newest(of_own, of_others, earlier):
+            reported = jnp.where(told[:, None], of_others, earlier)
+            return jnp.where(sees[:, None], of_own, reported)
+
+        evader = newest(now.evader, heard.evader, beliefs.evader)
+        velocity = newest(now.evader_velocity, heard.evader_velocity, beliefs.evader_velocity)
+        reported = jnp.where(told, heard.step, beliefs.reported)
+        seen = sees | told
+        beliefs = beliefs.replace(
+            position=position,
+            evader=evader,
+            evader_velocity=velocity,
+            reported=jnp.where(sees, state.step, reported),
+            seen=seen,
+            last_seen=jnp.where(seen[:, None], evader, beliefs.last_seen),
+            on_the_way=jax.tree.map(lambda leaf: leaf[1:], line),
+        )
+        return beliefs.replace(frames=self._frames(beliefs, state))
+
+    def _frames(self, beliefs, state):
+        settings = self.environment.settings
+
+        def newest(position, evader, velocity, seen, last_seen):
+            framed = frame_pursuers(settings, position, last_seen, state.active)
+            return frame(settings, state.step, framed, evader, velocity, seen)
+
+        frames = jax.vmap(newest)(
+            beliefs.position,
+            beliefs.evader,
+            beliefs.evader_velocity,
+            beliefs.seen,
+            beliefs.last_seen,
+        )
+        return jnp.concatenate([beliefs.frames[:, 1:], frames[:, None]], axis=1)
+
+    def observations(self, beliefs: Beliefs, state: PursuitState) -> Observation:
+        """What each pursuer observes in its own view: observations (N, ...) of one pursuer each."""
+
+        def view(i, belief):
+            believed = state.replace(
+                drones=state.drones.replace(position=belief.position),
+                evader_position=belief.evader,
+                evader_velocity=belief.evader_velocity,
+                in_sight=jnp.broadcast_to(belief.seen, state.in_sight.shape),
+                last_seen=belief.last_seen,
+                frames=belief.frames,
+            )
+            return _of_one(self.environment.observe(believed), i)
+
+        number = beliefs.seen.shape[0]
+        return jax.vmap(view)(jnp.arange(number), beliefs.replace(on_the_way=None))
+
+
+def _sent(state):
+    return Sent(
+        position=state.drones.position,
+        sees=state.in_sight,
+        evader=state.evader_position,
+        evader_velocity=state.evader_velocity,
+        step=state.step,
+    )
+
+
+WHOLE = ("last_seen", "frames")
+"""Fields of an observation that a team has in common."""
+
+
+def _of_one(observation, i):
+    """The observation of pursuer i alone, which keeps the pursuers' axis."""
+    common = {name: None for name in WHOLE}
+    own = jax.tree.map(
+        lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, i, 1), observation.replace(**common)
+    )
+    return own.replace(**{name: getattr(observation, name) for name in WHOLE})
