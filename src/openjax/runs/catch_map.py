@@ -21,6 +21,8 @@ from openjax.pursuit import EpisodeStatistics, Pursuit, PursuitSettings, Task, u
 from openjax.runs.options import MapCommand
 from openjax.store.policies import LoadedPolicy
 
+FALL_OUT = 2.0
+"""Seconds after which a pursuer falls out."""
 NORMAL_QUANTILE = 1.96
 """Standard deviations of a normal distribution within which 95 % lie."""
 
@@ -63,6 +65,8 @@ def map_game(command: MapCommand, trained: PursuitSettings) -> PursuitSettings:
         evaders=command.evaders,
         vehicles=(),
         rare_vehicles=0.0,
+        fall_outs=command.fall_outs,
+        fall_out_seconds=(FALL_OUT, FALL_OUT),
     )
 
 
@@ -105,6 +109,8 @@ def draw_map(command: MapCommand, loaded: LoadedPolicy, tell: Callable[[str], No
         "policy": loaded.source,
         "evaders": list(command.evaders),
         "scenario": command.scenario,
+        "messages": dataclasses.asdict(command.messages),
+        "fall_outs": command.fall_outs,
         "trained_with": list(loaded.settings.environment.team_sizes),
         "cells": [cell_record(game, *pair) for pair in zip(cells, flown, strict=True)],
         "seconds": time.monotonic() - began,
@@ -113,7 +119,7 @@ def draw_map(command: MapCommand, loaded: LoadedPolicy, tell: Callable[[str], No
 
 def _fly(command, environment, loaded, cells, tell):
     """The statistics (episodes,) of each cell."""
-    evaluate = make_evaluate(environment, loaded.policy)
+    evaluate = make_evaluate(environment, loaded.policy, messages=command.messages)
     game = environment.settings
 
     @jax.jit

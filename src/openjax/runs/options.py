@@ -9,6 +9,7 @@ from typing import Annotated, Literal, get_args
 import tyro
 
 from openjax.evaluation.judges.settings import BestResponseSettings, PlannerSettings
+from openjax.evaluation.message_settings import MessageSettings
 from openjax.learning.settings import AdaptSettings, TrainSettings
 from openjax.pursuit.evaders.kinds import HELD_OUT
 from openjax.pursuit.settings import PursuitSettings
@@ -157,6 +158,9 @@ class MapCommand:
     """One of them is drawn for each episode; by default those that no preset trains with."""
     episodes: Annotated[int, Interval("[1, 1000000]")] = 200
     """Of each cell."""
+    messages: MessageSettings = dataclasses.field(default_factory=MessageSettings)
+    fall_outs: Annotated[float, Interval("[0, 1]")] = 0.0
+    """Share of the episodes of two or more pursuers in which one of them is gone after 2 s."""
     batch: Annotated[int, Interval("[1, 1000000]")] = 8192
     """Episodes that are flown at once."""
     seed: Seed = 0
