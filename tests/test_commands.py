@@ -194,12 +194,59 @@ def test_signal_before_the_first_update_ends_at_once_and_loses_nothing(
     assert printed.splitlines()[-1].startswith("SIGTERM: ")
     if not (out / "settings.json").exists():
         return
-    assert "go on with openjax train --resume" in printed and not list(out.glob(".writing-*"))
+    assert "openjax train --resume" in printed and not list(out.glob(".writing-*"))
     finish(start(["openjax.train", "--resume", str(out)]))
     expected, _, _ = load_policy_file(whole_run[0] / "policy.npz")
     policy, _, _ = load_policy_file(out / "policy.npz")
     for name, array in expected.items():
         np.testing.assert_array_equal(array, policy[name], err_msg=name)
+
+
+LAST_STAGE = ["--analytic.updates", "3", "--analytic.look_every", "1"]
+LAST_STAGE += ["--analytic.worlds", "2", "--analytic.draws", "1"]
+
+
+@pytest.fixture(scope="session")
+def ended_run(tmp_path_factory, train_arguments):
+    """A run with a last stage, whole."""
+    out = tmp_path_factory.mktemp("runs") / "ended"
+    finish(start([*train_arguments, *LAST_STAGE, *ALONE, "--out", str(out)]))
+    return out
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize(
+    "line", ["learning by the gradient", "evaluating the policy after", "drawing"]
+)
+def test_signal_after_the_last_update_loses_nothing(
+    line, number, ended_run, tmp_path, train_arguments
+):
+    """In the last stage and in the report: one line, whole files, and a resumed run ends as one
+    that nobody stopped.
+    """
+    out = tmp_path / "stopped"
+    process, output = start([*train_arguments, *LAST_STAGE, *ALONE, "--out", str(out)])
+    while process.poll() is None and line not in _printed(output):
+        time.sleep(0.01)
+    process.send_signal(number)
+    process.wait(timeout=300)
+    printed = _printed(output)
+    # between two updates of the stage the run ends by itself, with what it has learnt
+    assert process.returncode in (0, 128 + number), printed
+    name = signal.Signals(number).name
+    assert printed.splitlines()[-1].startswith(f"{name}: saved at update {UPDATES}"), printed
+    assert printed.count(f"{name}: ") == 1 and "Traceback" not in printed
+    assert not list(out.rglob(".writing-*"))
+    for file in out.glob("*.json"):
+        json.loads(file.read_text())
+    load_policy_file(out / "policy.npz")
+    finish(start(["openjax.train", "--resume", str(out)]))
+    expected, _, _ = load_policy_file(ended_run / "policy.npz")
+    policy, _, _ = load_policy_file(out / "policy.npz")
+    for leaf, array in expected.items():
+        np.testing.assert_array_equal(array, policy[leaf], err_msg=leaf)
+    whole, resumed = (json.loads((d / "layouts.json").read_text()) for d in (ended_run, out))
+    assert whole["after"] == resumed["after"]
 
 
 def _printed(output):

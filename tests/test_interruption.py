@@ -38,6 +38,26 @@ def compiling(folder):
     with StopRequest(), interruption.last_words(lambda: "saved at update 3"):
         compile()
 
+def tracing(folder):
+    import jax
+    def forever(x):
+        print("now", flush=True)
+        while True:
+            pass
+    with StopRequest(), interruption.last_words(lambda: "saved at update 3"):
+        jax.jit(forever)(1.0)
+
+def tracing_behind(folder):  # as a validation is, or a last stage, while updates are learnt
+    import jax
+    from openjax.background import in_background
+    def forever(x):
+        print("now", flush=True)
+        while True:
+            pass
+    ready = in_background(lambda: jax.jit(forever).lower(1.0))
+    with StopRequest() as stop, stop.while_learning(), stop.while_compiling():
+        ready()
+
 def waiting_for_a_program(folder):
     with StopRequest() as stop, stop.while_learning(), stop.while_compiling():
         compile()
@@ -93,6 +113,8 @@ def stopped(moment, folder, *numbers):
         ("importing", "stopped"),
         ("writing", "stopped"),
         ("compiling", "saved at update 3"),
+        ("tracing", "saved at update 3"),
+        ("tracing_behind", "stopped"),
         ("waiting_for_a_program", "stopped"),
         ("hanging", "stopped"),
     ],

@@ -11,10 +11,12 @@ import itertools
 import logging
 import os
 import re
+import shutil
 import sys
 import typing
 import warnings
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import TypeVar
 
 from rich.console import Console
@@ -36,6 +38,18 @@ KINDS = {
     "float": "a number",
 }
 """What an option wants, by what tyro says where it gets something else."""
+
+
+def typed(command: str) -> str:
+    """`openjax NAME ...` as it can be typed here: where its environment isn't active, as after
+    `make train`, by the path of its script.
+    """
+    script = Path(sys.executable).with_name("openjax")
+    if shutil.which("openjax") or not script.exists():
+        return command
+    here = Path.cwd()
+    path = script.relative_to(here) if script.is_relative_to(here) else script
+    return f"{path}{command.removeprefix('openjax')}"
 
 
 def parse(

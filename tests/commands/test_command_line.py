@@ -9,7 +9,7 @@ import sys
 
 import pytest
 
-from openjax.command_line import LONGEST, parse, run_command
+from openjax.command_line import LONGEST, parse, run_command, typed
 from openjax.commands.exploit import ExploitCommand
 from openjax.errors import UserError
 
@@ -94,3 +94,17 @@ def test_numbers_and_truths_may_be_written_as_people_do():
     settings = command.learning
     game = command.environment
     assert (settings.total_steps, game.observe_position, command.minutes) == (2_000_000, True, 10.0)
+
+
+def test_what_to_type_next_can_be_typed_where_the_environment_isnt_active(tmp_path, monkeypatch):
+    """As after `make train`, which installs into `.venv` and activates nothing."""
+    scripts = tmp_path / ".venv" / "bin"
+    scripts.mkdir(parents=True)
+    for name in ("python", "openjax"):
+        (scripts / name).touch(0o755)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "executable", str(scripts / "python"))
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert typed("openjax view --policy runs/a") == ".venv/bin/openjax view --policy runs/a"
+    monkeypatch.setenv("PATH", str(scripts))
+    assert typed("openjax view --policy runs/a") == "openjax view --policy runs/a"

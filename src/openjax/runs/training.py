@@ -17,6 +17,7 @@ from openjax.cluster.devices import (
     make_device_step,
     own_copy,
 )
+from openjax.command_line import typed
 from openjax.evaluation.episodes import summarise
 from openjax.evaluation.validation import Validation, flat_metrics, selection_score
 from openjax.interruption import StopRequest
@@ -146,7 +147,7 @@ class _Run:
         """What there is of the run, and how it goes on, should it end now."""
         update = self.checkpoints.last_finished()
         saved = "nothing was learnt yet" if update is None else f"saved at update {update}"
-        return f"{saved}; go on with openjax train --resume {self.directory.path}"
+        return f"{saved}; go on with {typed(f'openjax train --resume {self.directory.path}')}"
 
     def _plan(self, seconds):
         """What the loop is to do after so many seconds of earlier processes."""

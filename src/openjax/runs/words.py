@@ -6,6 +6,7 @@ from pathlib import Path
 
 from flax.traverse_util import flatten_dict
 
+from openjax.command_line import typed
 from openjax.files import to_plain
 from openjax.learning import TrainSettings
 from openjax.learning.presets import PRESETS
@@ -67,13 +68,11 @@ def closing_words(settings: TrainSettings, run: Path, on_cpu: bool) -> list[str]
     view = f"openjax view --policy {run}"
     if layouts := layouts_like(game):
         view += f" --scenario {layouts[-1].name}"
-    steps = [f"{view} (in a browser)"]
+    steps = [f"{typed(view)} (in a browser)"]
     if on_cpu:
-        steps.append("openjax train --preset paper (the real game, two minutes on a GPU)")
-    steps.append(
-        "openjax sample_flights flights, then openjax diagnose flights (from flight logs to a "
-        "cause)"
-    )
+        steps.append(typed("openjax train --preset paper (the real game, two minutes on a GPU)"))
+    steps.append(f"{typed('openjax sample_flights flights')}, then")
+    steps.append(typed("openjax diagnose flights (from flight logs to a cause)"))
     return [*lines, "\n  ".join(["Next:", *steps])]
 
 
