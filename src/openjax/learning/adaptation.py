@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from flax import struct
+from jaxtyping import Array, Float, PRNGKeyArray
 
 import openjax.baselines  # noqa: F401  registers its policies
 from openjax.evaluation.episodes import Evaluation, make_evaluate
@@ -243,7 +244,12 @@ def make_adaptation(trained: TrainSettings, settings: AdaptSettings) -> Adaptati
     return Adaptation(game, policy, optimiser, jax.jit(fly), jax.jit(update), jax.jit(evaluate))
 
 
-def off_the_flight(position, velocity, wanted, wanted_velocity) -> jax.Array:
+def off_the_flight(
+    position: Float[Array, "steps worlds pursuers 3"],
+    velocity: Float[Array, "steps worlds pursuers 3"],
+    wanted: Float[Array, "all worlds pursuers 3"],
+    wanted_velocity: Float[Array, "all worlds pursuers 3"],
+) -> Float[Array, "steps worlds pursuers"]:
     """(T, W, N) how far flights (T, W, N, 3) are from those that are wanted (LAG + T, W, N, 3), at
     the lag that suits best.
 
@@ -314,9 +320,9 @@ class Tuned:
 def fine_tune(
     adaptation: Adaptation,
     parameters: PolicyParameters,
-    bounds: jax.Array,
+    bounds: Float[Array, "ranges 4"],
     training: AdaptSettings,
-    key: jax.Array,
+    key: PRNGKeyArray,
     score: Callable[[PolicyParameters], np.ndarray],
     tell: Callable[[int, dict[str, jax.Array]], Any] = lambda update, metrics: None,
 ) -> Tuned:
@@ -355,7 +361,11 @@ def fine_tune(
     return Tuned(*best, history, looks)
 
 
-def clearly_better(before: np.ndarray, after: np.ndarray, errors: float = 2.0) -> bool:
+def clearly_better(
+    before: Float[np.ndarray, " episodes"],
+    after: Float[np.ndarray, " episodes"],
+    errors: float = 2.0,
+) -> bool:
     """Whether the scores (B,) of the same episodes rose by more than so many standard errors of
     their differences.
     """
@@ -363,7 +373,9 @@ def clearly_better(before: np.ndarray, after: np.ndarray, errors: float = 2.0) -
     return bool(gain.mean() > errors * gain.std() / np.sqrt(len(gain)))
 
 
-def bounds_of(values, intervals, rest: float = REST, airframe: str = NOMINAL) -> jax.Array:
+def bounds_of(
+    values, intervals, rest: float = REST, airframe: str = NOMINAL
+) -> Float[Array, "ranges 4"]:
     """(R, 4) bounds of the family of a diagnosed vehicle; see `adapted_family`. Of nothing found
     and no rest: nominal.
     """

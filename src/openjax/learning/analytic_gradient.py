@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import optax
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from openjax.background import in_background
 from openjax.learning.gradient_step import (
@@ -45,10 +46,18 @@ from openjax.pursuit import (
 )
 from openjax.pursuit.collisions import TOUCH, drone_distance, pillar_distance
 from openjax.pursuit.observation import rotation_axes
+from openjax.pursuit.shapes import Scalar
 from openjax.pursuit.task import capture_radius
 from openjax.pursuit.teams import parked
 from openjax.vehicle.family import family_bounds, narrowed_bounds
 from openjax.vehicle.solids import DRONE_RADIUS
+
+Worlds = Float[Array, "worlds"]
+"""A number of each world."""
+Pursuers = Float[Array, "worlds pursuers"]
+"""A number of each pursuer of each world."""
+Bounds = Float[Array, "worlds ranges 4"]
+"""Of each world's vehicles; see `openjax.vehicle.family`."""
 
 HORIZON = 0.5
 """Seconds that are learnt at once."""
@@ -83,7 +92,7 @@ APART = 0.1
 """Farthest gap beyond the safety distance of pursuers side by side (m)."""
 
 
-def side_by_side(settings: PursuitSettings, key: jax.Array, task: Task) -> Task:
+def side_by_side(settings: PursuitSettings, key: PRNGKeyArray, task: Task) -> Task:
     """A task whose pursuers all start beside one before them; as it was where that would breach
     something.
     """
@@ -107,7 +116,7 @@ def side_by_side(settings: PursuitSettings, key: jax.Array, task: Task) -> Task:
     return task.with_starts(jnp.where(clear, position, task.pursuer_position))
 
 
-def draw_start(settings: PursuitSettings, key: jax.Array) -> Task:
+def draw_start(settings: PursuitSettings, key: PRNGKeyArray) -> Task:
     """A task to learn from: close to something, side by side, or any."""
     task_key, turn_key, start_key, choice_key = jax.random.split(key, 4)
     task = turn_task(turn_key, uniform_task(settings, task_key))
@@ -207,7 +216,7 @@ class AnalyticGradient:
         first = world, Way(zeros + jnp.inf, zeros + 1.0, zeros, zeros, zeros[:, 0], zeros[:, 0])
         return jax.lax.scan(one, first, None, length=steps)[0]
 
-    def starts(self, key: jax.Array, bounds: jax.Array):
+    def starts(self, key: PRNGKeyArray, bounds: Bounds):
         """Worlds to learn from, at their starts; bounds (B, R, 4)."""
 
         def one(task_key, key, bounds):
@@ -219,7 +228,7 @@ class AnalyticGradient:
             *(jax.random.split(k, bounds.shape[0]) for k in jax.random.split(key)), bounds
         )
 
-    def flights(self, parameters: PolicyParameters, key: jax.Array, bounds: jax.Array):
+    def flights(self, parameters: PolicyParameters, key: PRNGKeyArray, bounds: Bounds):
         """Worlds (`moments` * B, ...) along the policy's flights."""
 
         def segment(world, _):
@@ -229,7 +238,7 @@ class AnalyticGradient:
         worlds = jax.lax.scan(segment, self.starts(key, bounds), None, length=self.moments)[1]
         return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), worlds)
 
-    def hard_starts(self, actor: Any, parameters: PolicyParameters, key: jax.Array):
+    def hard_starts(self, actor: Any, parameters: PolicyParameters, key: PRNGKeyArray):
         """Of `how.draws` times as many starts those with the least gaps on the actor's way: few of
         all come near a crash.
         """
@@ -238,7 +247,9 @@ class AnalyticGradient:
         hardest = jax.lax.top_k(-least, self.how.worlds)[1]
         return jax.tree.map(lambda leaf: leaf[hardest], starts)
 
-    def loss(self, actor: Any, parameters: PolicyParameters, starts, flying):
+    def loss(
+        self, actor: Any, parameters: PolicyParameters, starts, flying
+    ) -> tuple[Scalar, dict[str, Scalar]]:
         """What is learnt (), and its parts. `parameters` are the policy's before."""
         how = self.how
         number = starts[1].step.shape[0]
@@ -263,7 +274,9 @@ class AnalyticGradient:
         }
         return weighted_sum(parts)
 
-    def update(self, actor: Any, state: Any, parameters: PolicyParameters, flights, key: jax.Array):
+    def update(
+        self, actor: Any, state: Any, parameters: PolicyParameters, flights, key: PRNGKeyArray
+    ):
         """The actor and its optimiser's state after an update, and the loss's parts."""
         start_key, choice_key = jax.random.split(key)
         moments = flights[1].step.shape[0]
@@ -274,7 +287,7 @@ class AnalyticGradient:
         change, state = self.optimiser.update(finite_or_zero(gradient), state)
         return optax.apply_updates(actor, change), state, parts
 
-    def bounds(self) -> jax.Array:
+    def bounds(self) -> Bounds:
         """(B, R, 4) of each world's vehicles: the game's family, and a share of nominal ones."""
         family = self.game.vehicles
         worlds = self.how.worlds
@@ -300,7 +313,7 @@ def free_flight(environment: Pursuit) -> Pursuit:
     return dataclasses.replace(environment, settings=free, **by_default)
 
 
-def nearest_gap(game: PursuitSettings, state: PursuitState) -> jax.Array:
+def nearest_gap(game: PursuitSettings, state: PursuitState) -> Pursuers:
     """(W, N) m, from each pursuer of worlds (W, ...) to the nearest solid thing: pillar, pursuer or
     floor.
     """
@@ -315,26 +328,26 @@ def nearest_gap(game: PursuitSettings, state: PursuitState) -> jax.Array:
     return jnp.minimum(gap, position[..., 2] - DRONE_RADIUS)
 
 
-def crash_share(gap: jax.Array, smooth: float = SMOOTH) -> jax.Array:
+def crash_share(gap: Float[Array, "*worlds"], smooth: float = SMOOTH) -> Float[Array, "*worlds"]:
     """How much of a crash a least gap (m) counts as, from 1 to 0 over `smooth` (m): it has a
     gradient before a touch.
     """
     return jax.nn.sigmoid((3 * TOUCH - gap) / smooth)
 
 
-def crash_depth(gap: jax.Array) -> jax.Array:
+def crash_depth(gap: Float[Array, "*worlds"]) -> Float[Array, "*worlds"]:
     """The same that goes on to grow, by 1 every `SMOOTH`: what would crash by far is learnt from,
     too.
     """
     return jax.nn.softplus((3 * TOUCH - gap) / SMOOTH)
 
 
-def tip_share(upright: jax.Array) -> jax.Array:
+def tip_share(upright: Float[Array, "*worlds"]) -> Float[Array, "*worlds"]:
     """The same of a least cosine of the tilt."""
     return jax.nn.sigmoid((2 * SMOOTH_TILT - upright) / SMOOTH_TILT)
 
 
-def breach_share(game: PursuitSettings, state: PursuitState) -> jax.Array:
+def breach_share(game: PursuitSettings, state: PursuitState) -> Pursuers:
     """(W, N) smooth number of breaches of each pursuer in worlds (W, ...);
     `openjax.pursuit.collisions.breaches`.
     """
@@ -354,7 +367,7 @@ def breach_share(game: PursuitSettings, state: PursuitState) -> jax.Array:
     return total if state.active is None else jnp.where(state.active, total, 0.0)
 
 
-def evader_distance(game: PursuitSettings, state: PursuitState, ways: Ways) -> jax.Array:
+def evader_distance(game: PursuitSettings, state: PursuitState, ways: Ways) -> Pursuers:
     """(W, N) m, ways from pursuers of worlds (W, ...) to the evader, whose flight has no gradient:
     its answers are a cliff.
     """
@@ -364,7 +377,7 @@ def evader_distance(game: PursuitSettings, state: PursuitState, ways: Ways) -> j
     )
 
 
-def nearest_way(distance: jax.Array) -> jax.Array:
+def nearest_way(distance: Pursuers) -> Worlds:
     """(W,) m, a smooth least of distances (W, N): where one pursuer is near, others needn't be, and
     may go round.
     """
@@ -374,7 +387,7 @@ def nearest_way(distance: jax.Array) -> jax.Array:
     )
 
 
-def free_share(radius: float | jax.Array, distance: jax.Array) -> jax.Array:
+def free_share(radius: float | jax.Array, distance: Pursuers) -> Worlds:
     """(W,) how free the evader at distances (W, N) is, from 0 to 1: smooth, and felt from afar;
     capture radius () or (W,) m.
     """

@@ -7,6 +7,7 @@ these functions do nothing. Everything else (parameters, archive, keys) is the s
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float, Key, PRNGKeyArray, Shaped
 
 from openjax.pursuit.teams import team_mean
 
@@ -31,7 +32,7 @@ def gather_over_devices(tree, axis: str | None):
     )
 
 
-def own_share(x: jax.Array, axis: str | None) -> jax.Array:
+def own_share(x: Shaped[Array, " whole *rest"], axis: str | None) -> Shaped[Array, " share *rest"]:
     """This device's part of an array that all devices have whole."""
     if axis is None:
         return x
@@ -39,7 +40,7 @@ def own_share(x: jax.Array, axis: str | None) -> jax.Array:
     return jax.lax.dynamic_slice_in_dim(x, jax.lax.axis_index(axis) * number, number)
 
 
-def own_keys(key: jax.Array, number: int, axis: str | None) -> jax.Array:
+def own_keys(key: PRNGKeyArray, number: int, axis: str | None) -> Key[Array, " {number}"]:
     """This device's (number,) keys out of one split for all devices: the same ones however many
     devices there are.
     """
@@ -62,8 +63,8 @@ def minibatches(tree, number: int):
 
 
 def joint_moments(
-    x: jax.Array, axis: str | None, counted: jax.Array | None = None
-) -> tuple[jax.Array, jax.Array]:
+    x: Float[Array, "..."], axis: str | None, counted: jax.Array | None = None
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Mean () and standard deviation () over all elements on all devices, or those `counted`, bool
     like x.
     """

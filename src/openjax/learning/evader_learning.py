@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import optax
 from flax import struct
+from jaxtyping import Array, Float, Int32, PRNGKeyArray
 
 from openjax.learning.advantages import generalised_advantages
 from openjax.learning.collectives import mean_over_devices, minibatches
@@ -91,7 +92,7 @@ class EvaderLearning:
         rate = optax.linear_schedule(how.learning_rate, how.learning_rate_end, steps)
         return clipped_adam(1.0, rate)
 
-    def start(self, key: jax.Array) -> LearningEvaders:
+    def start(self, key: PRNGKeyArray) -> LearningEvaders:
         """Evaders that do as greedy ones."""
         keys = jax.vmap(lambda key: jax.random.split(key, self.number))(jax.random.split(key))
         log_std = jnp.full((self.number, 3), self.how.initial_log_std, jnp.float32)
@@ -106,7 +107,9 @@ class EvaderLearning:
             update=jnp.zeros((), jnp.int32),
         )
 
-    def see(self, networks: Any, state: PursuitState) -> tuple[jax.Array, dict[str, jax.Array]]:
+    def see(
+        self, networks: Any, state: PursuitState
+    ) -> tuple[Int32[Array, " worlds"], dict[str, Array]]:
         """Of worlds (E, ...) which of the networks acts, (E,), and what it sees."""
         settings = self.environment.settings
         which = learned_place(settings.evaders, state.evader.kind)
@@ -117,8 +120,8 @@ class EvaderLearning:
         return which, jax.vmap(one)(which, state)
 
     def act(
-        self, evaders: LearningEvaders, state: PursuitState, noise: jax.Array
-    ) -> tuple[jax.Array, EvaderSamples]:
+        self, evaders: LearningEvaders, state: PursuitState, noise: Float[Array, "worlds 3"]
+    ) -> tuple[Float[Array, "worlds 3"], EvaderSamples]:
         """Wishes (E, 3) in worlds (E, ...), NaN where none of the networks acts, and the samples;
         noise (E, 3).
         """
@@ -141,7 +144,7 @@ class EvaderLearning:
         evaders: LearningEvaders,
         samples: EvaderSamples,
         last: PursuitState,
-        key: jax.Array,
+        key: PRNGKeyArray,
         axis: str | None = None,
     ) -> LearningEvaders:
         """The evaders after all epochs on samples (T, E, ...), which ended in worlds `last` (E,

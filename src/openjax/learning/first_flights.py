@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import optax
 from flax import struct
+from jaxtyping import PRNGKeyArray
 
 from openjax.learning.analytic_gradient import (
     AnalyticGradient,
@@ -36,6 +37,7 @@ from openjax.learning.gradient_step import (
 from openjax.learning.settings import AnalyticSettings, FirstFlightsSettings, GeneratorSettings
 from openjax.policy import Policy, PolicyParameters
 from openjax.pursuit import Pursuit, scatter_starts, turn_task, uniform_task
+from openjax.pursuit.shapes import Scalar
 from openjax.vehicle.family import narrowed_bounds
 
 OUTSIDE = 1.2
@@ -100,7 +102,7 @@ class FirstFlights:
         """What flies, and measures."""
         return AnalyticGradient(AnalyticSettings(), self.environment, self.policy)
 
-    def start(self, key: jax.Array):
+    def start(self, key: PRNGKeyArray):
         """Worlds at the starts of uniform tasks and of scattered ones, their vehicles nominal."""
         game = self.environment.settings
 
@@ -122,7 +124,7 @@ class FirstFlights:
             environment = environment.with_bounds(narrowed_bounds(game.vehicles, 0.0))
         return jax.vmap(environment.reset_to)(reset_key, tasks)
 
-    def loss(self, actor: Any, parameters: PolicyParameters, world, risen: jax.Array):
+    def loss(self, actor: Any, parameters: PolicyParameters, world, risen: Scalar):
         """What is learnt (); worlds after it and its parts. `risen` () is how far the penalties
         have risen, 0 to 1.
         """
@@ -141,7 +143,7 @@ class FirstFlights:
         total, means = weighted_sum(parts)
         return total, (end, means)
 
-    def update(self, carry: FirstCarry, key: jax.Array) -> tuple[FirstCarry, dict[str, jax.Array]]:
+    def update(self, carry: FirstCarry, key: PRNGKeyArray) -> tuple[FirstCarry, dict[str, Scalar]]:
         """The carry after an update, and the parts of the loss."""
         parameters = carry.parameters
         world = carry.world
@@ -185,7 +187,7 @@ class FirstFlights:
         )
         return clipped_descent(schedule)
 
-    def begin(self, parameters: PolicyParameters, key: jax.Array) -> FirstCarry:
+    def begin(self, parameters: PolicyParameters, key: PRNGKeyArray) -> FirstCarry:
         """The carry of `update` before the first one."""
         return FirstCarry(
             parameters, self.optimiser.init(parameters.actor), self.start(key), jnp.zeros(())

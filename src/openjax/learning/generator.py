@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from openjax.learning.archive import TaskArchive, draw, insert
 from openjax.learning.settings import GeneratorSettings
@@ -18,6 +19,7 @@ from openjax.pursuit import (
     turn_task,
     uniform_task,
 )
+from openjax.pursuit.shapes import Scalar
 
 
 def task_like(environment: PursuitSettings) -> Task:
@@ -32,8 +34,8 @@ def generate_task(
     settings: GeneratorSettings,
     environment: PursuitSettings,
     archive: TaskArchive,
-    key: jax.Array,
-    close: jax.Array | None = None,
+    key: PRNGKeyArray,
+    close: Scalar | None = None,
 ) -> Task:
     """Draw one task: with probability p an archived one, expanded, else a uniform one.
 
@@ -70,8 +72,8 @@ def _archived_or_uniform(settings, environment, archive, key):
 def successes(
     settings: GeneratorSettings,
     statistics: EpisodeStatistics,
-    penalty_share: jax.Array | float = 1.0,
-) -> jax.Array:
+    penalty_share: Scalar | float = 1.0,
+) -> Bool[Array, "*worlds"]:
     """Whether episodes count as solved: captured, and (by setting) with few collisions. Any leading
     axes.
 
@@ -88,8 +90,8 @@ def select(
     settings: GeneratorSettings,
     archive: TaskArchive,
     tasks: Task,
-    success: jax.Array,
-    complete: jax.Array,
+    success: Float[Array, " tasks"],
+    complete: Bool[Array, " tasks"],
 ) -> TaskArchive:
     """Keep the tasks that are neither solved nor hopeless.
 

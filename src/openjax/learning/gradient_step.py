@@ -11,9 +11,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import optax
+from jaxtyping import Array, Float
 
 from openjax.policy import Policy, PolicyParameters
 from openjax.pursuit import Observation, Pursuit, PursuitState
+from openjax.pursuit.shapes import Scalar
 
 LOWEST = 0.35
 FASTEST = 1.0
@@ -45,8 +47,8 @@ def finite_or_zero(gradient: Any) -> Any:
 
 
 def weighted_sum(
-    parts: Mapping[str, tuple[float | jax.Array, jax.Array]],
-) -> tuple[jax.Array, dict[str, jax.Array]]:
+    parts: Mapping[str, tuple[float | Scalar, Float[Array, "..."]]],
+) -> tuple[Scalar, dict[str, Scalar]]:
     """() sum of the weighted means of a loss's parts, {name: (weight, values)}; and the means."""
     means = {name: jnp.mean(values) for name, (_, values) in parts.items()}
     return sum(weight * means[name] for name, (weight, _) in parts.items()), means

@@ -11,6 +11,7 @@ from flax import struct
 
 from openjax.policy import Policy, PolicyParameters, gaussian_log_prob
 from openjax.pursuit import Observation, Pursuit, PursuitState
+from openjax.pursuit.shapes import Scalar
 
 
 @struct.dataclass
@@ -65,7 +66,7 @@ def collect(
     players: Players,
     world: tuple[Observation, PursuitState],
     noise: Noise,
-    penalty_share: jax.Array | float = 1.0,
+    penalty_share: Scalar | float = 1.0,
 ) -> tuple[Rollout, Observation, PursuitState]:
     """Act with exploration for T steps in E worlds.
 

@@ -8,6 +8,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool, Int32
+
+from openjax.pursuit.shapes import Count
 
 
 @dataclass(frozen=True)
@@ -35,15 +38,15 @@ class Schedule:
 
         return jax.tree.map(spread, tasks)
 
-    def age(self, number: int) -> jax.Array:
+    def age(self, number: int) -> Int32[Array, " {number}"]:
         """(number,) int32 rollouts that each world has behind it at the start of a run."""
         return jnp.arange(number, dtype=jnp.int32) % self.groups
 
-    def ending(self, update: jax.Array) -> jax.Array:
+    def ending(self, update: Count) -> Count:
         """() the group whose episodes end with this training step."""
         return (self.groups - 1 - update) % self.groups
 
-    def members(self, worlds: Any, group: jax.Array) -> Any:
+    def members(self, worlds: Any, group: Count) -> Any:
         """The worlds of a group, of every leaf's leading axis."""
 
         def take(x):
@@ -60,7 +63,7 @@ class Schedule:
             return 0
         return number // self.groups // self.restart_every * len(self.restart_ages)
 
-    def renewed(self, worlds: Any, fresh: Any, ending: jax.Array) -> Any:
+    def renewed(self, worlds: Any, fresh: Any, ending: Count) -> Any:
         """`worlds` (E, ...) with `fresh` ones in place of the group `ending`, and then of those
         that start anew.
         """
@@ -80,7 +83,7 @@ class Schedule:
         source = jnp.where(behind == 0, number + member, source)
         return jax.tree.map(lambda x, new: jnp.concatenate([x, new])[source], worlds, fresh)
 
-    def lasting(self, number: int) -> np.ndarray:
+    def lasting(self, number: int) -> Bool[np.ndarray, " {number}"]:
         """(number,) bool of a group's members: those that are never started anew within an
         episode.
         """

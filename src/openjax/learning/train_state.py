@@ -6,6 +6,7 @@ from typing import Any
 import jax
 import optax
 from flax import struct
+from jaxtyping import Array, Int32, PRNGKeyArray
 
 
 @struct.dataclass
@@ -41,7 +42,9 @@ def clipped_adam(
     )
 
 
-def shuffled(key: jax.Array, epochs: int, minibatches: int) -> jax.Array:
+def shuffled(
+    key: PRNGKeyArray, epochs: int, minibatches: int
+) -> Int32[Array, " {epochs*minibatches}"]:
     """(epochs * minibatches,) the minibatches in the order in which they are learnt from, each once
     in an epoch.
     """

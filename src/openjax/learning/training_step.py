@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
+from jaxtyping import PRNGKeyArray
 
 import openjax.baselines  # noqa: F401  registers its policies
 from openjax.learning.archive import TaskArchive, empty_archive
@@ -27,6 +28,7 @@ from openjax.learning.settings import TrainSettings
 from openjax.policy import Network, OwnPolicy, Policy, PolicyParameters, make_policy
 from openjax.pursuit import Observation, Pursuit, PursuitState
 from openjax.pursuit.evaders import learned_place
+from openjax.pursuit.shapes import Scalar
 from openjax.pursuit.teams import team_mean
 from openjax.vehicle.family import narrowed_bounds
 
@@ -104,7 +106,7 @@ def make_start(
     return jax.jit(functools.partial(initial_carry, settings, parts or build(settings)))
 
 
-def initial_carry(settings: TrainSettings, parts: Parts, key: jax.Array) -> TrainCarry:
+def initial_carry(settings: TrainSettings, parts: Parts, key: PRNGKeyArray) -> TrainCarry:
     """The carry of a run's start; `parts` are what `build` gives."""
     environment = _starting(settings, parts.environment, 0.0)
     archive = empty_archive(task_like(parts.environment.settings), settings.generator.capacity)
@@ -162,7 +164,7 @@ class Phases:
     these episodes
     """
 
-    def __call__(self, carry: TrainCarry) -> tuple[TrainCarry, dict[str, jax.Array]]:
+    def __call__(self, carry: TrainCarry) -> tuple[TrainCarry, dict[str, Scalar]]:
         """The whole step; its operations bear the parts' names, by which a profile tells them
         apart.
         """

@@ -12,6 +12,7 @@ import numpy as np
 from flax import struct
 
 from openjax.pursuit import PursuitSettings, Task
+from openjax.pursuit.shapes import Each, Team, Vector
 
 CORNERS = 6
 """Of the polygon about each pillar."""
@@ -58,8 +59,8 @@ def ways_of(settings: PursuitSettings, task: Task) -> Ways:
 
 
 def way_length(
-    settings: PursuitSettings, task: Task, ways: Ways, position: jax.Array, target: jax.Array
-) -> jax.Array:
+    settings: PursuitSettings, task: Task, ways: Ways, position: Team, target: Vector
+) -> Each:
     """(N,) m, of the shortest way from each of (N, 3) positions to (3,) a target; its gradient
     points along the way.
     """

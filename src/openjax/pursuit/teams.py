@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int32, PRNGKeyArray, Shaped
 
 from openjax.pursuit.settings import PursuitSettings
-from openjax.pursuit.shapes import Count, Scalar, Team, Which
+from openjax.pursuit.shapes import Scalar, Team, Which
 from openjax.vehicle import DroneState
 
 FAR = 1000.0
@@ -53,18 +53,20 @@ def draw_fall_out(
 
 
 def still_there(
-    active: Which | None, gone_after: Int32[Array, " drones"] | None, step: Count
-) -> Which | None:
-    """(N,) bool, slots in use at a step ().
+    active: Bool[Array, "*worlds drones"] | None,
+    gone_after: Int32[Array, "*worlds drones"] | None,
+    step: Int32[Array, "*worlds"],
+) -> Bool[Array, "*worlds drones"] | None:
+    """(..., N) bool, slots in use at a step (...).
 
     Args:
-      active: (N,) bool, those in use at the start; None: all.
-      gone_after: (N,) int32, the last step of each; None: nobody falls out.
-      step: () int32.
+      active: (..., N) bool, those in use at the start; None: all.
+      gone_after: (..., N) int32, the last step of each; None: nobody falls out.
+      step: (...) int32.
     """
     if gone_after is None:
         return active
-    there = step <= gone_after
+    there = step[..., None] <= gone_after
     return there if active is None else there & active
 
 

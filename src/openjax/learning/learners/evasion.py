@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 from typing import Any
 
-import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from openjax.learning.evader_learning import EvaderLearning, EvaderSamples, LearningEvaders
 from openjax.learning.learners.learner import Flown
@@ -18,20 +18,20 @@ class EvaderLearner:
 
     learning: EvaderLearning
 
-    def start(self, parameters: PolicyParameters, key: jax.Array) -> LearningEvaders:
+    def start(self, parameters: PolicyParameters, key: PRNGKeyArray) -> LearningEvaders:
         """Evaders that do as greedy ones."""
         return self.learning.start(key)
 
     def act(
-        self, state: LearningEvaders, worlds: PursuitState, noise: jax.Array
-    ) -> tuple[jax.Array, EvaderSamples]:
+        self, state: LearningEvaders, worlds: PursuitState, noise: Float[Array, "worlds 3"]
+    ) -> tuple[Float[Array, "worlds 3"], EvaderSamples]:
         """Desired velocities (E, 3) in worlds (E, ...) as shares of the speed, NaN where none of
         these evaders flies, and the samples; noise (E, 3).
         """
         return self.learning.act(state, worlds, noise)
 
     def learn(
-        self, state: LearningEvaders, parameters: PolicyParameters, flown: Flown, key: jax.Array
+        self, state: LearningEvaders, parameters: PolicyParameters, flown: Flown, key: PRNGKeyArray
     ) -> tuple[LearningEvaders, PolicyParameters, dict[str, Any]]:
         """After all epochs on the samples of a rollout."""
         samples = flown.rollout.learning

@@ -4,11 +4,13 @@ from typing import Any, Protocol
 
 import jax
 from flax import struct
+from jaxtyping import PRNGKeyArray
 
 from openjax.learning.collectives import mean_over_devices
 from openjax.learning.rollout import Rollout
 from openjax.policy import PolicyParameters
 from openjax.pursuit import Observation, PursuitState
+from openjax.pursuit.shapes import Scalar
 
 
 @struct.dataclass
@@ -42,12 +44,12 @@ class Learner(Protocol):
     flies the evaders; see `openjax.learning.learners.evasion`.
     """
 
-    def start(self, parameters: PolicyParameters, key: jax.Array) -> Any:
+    def start(self, parameters: PolicyParameters, key: PRNGKeyArray) -> Any:
         """Its state before the first update of a policy with fresh `parameters`."""
 
     def learn(
-        self, state: Any, parameters: PolicyParameters, flown: Flown, key: jax.Array
-    ) -> tuple[Any, PolicyParameters, dict[str, jax.Array]]:
+        self, state: Any, parameters: PolicyParameters, flown: Flown, key: PRNGKeyArray
+    ) -> tuple[Any, PolicyParameters, dict[str, Scalar]]:
         """After a rollout: its state, the policy's parameters, and () metrics by name.
 
         `key` is the same on all devices.

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 from jax.flatten_util import ravel_pytree
+from jaxtyping import PRNGKeyArray
 
 from openjax.learning.advantages import generalised_advantages
 from openjax.learning.collectives import joint_moments, minibatches
@@ -17,6 +18,7 @@ from openjax.learning.settings import MappoSettings
 from openjax.learning.train_state import TrainState, clipped_adam, shuffled
 from openjax.policy import Policy, PolicyParameters, gaussian_entropy, gaussian_log_prob
 from openjax.pursuit import Observation
+from openjax.pursuit.shapes import Scalar
 from openjax.pursuit.teams import team_mean
 
 
@@ -29,7 +31,7 @@ class ValueScale:
     weight: jax.Array  # () sum of weights so far, to remove the bias of the start
 
     @property
-    def moments(self) -> tuple[jax.Array, jax.Array]:
+    def moments(self) -> tuple[Scalar, Scalar]:
         """Mean () and standard deviation () of the returns; 0 and 1 before the first update."""
         weight = jnp.maximum(self.weight, 1e-6)
         mean = self.mean / weight
@@ -180,7 +182,7 @@ class Mappo:
         """The actor's and the critic's."""
         return make_optimiser(self.settings, self.total_updates)
 
-    def start(self, parameters: PolicyParameters, key: jax.Array) -> MappoState:
+    def start(self, parameters: PolicyParameters, key: PRNGKeyArray) -> MappoState:
         """Before the first update: no steps taken, no returns seen."""
         actor, critic = self.optimisers
         return MappoState(
@@ -188,8 +190,8 @@ class Mappo:
         )
 
     def learn(
-        self, state: MappoState, parameters: PolicyParameters, flown: Flown, key: jax.Array
-    ) -> tuple[MappoState, PolicyParameters, dict[str, jax.Array]]:
+        self, state: MappoState, parameters: PolicyParameters, flown: Flown, key: PRNGKeyArray
+    ) -> tuple[MappoState, PolicyParameters, dict[str, Scalar]]:
         """All epochs of the policy update on one rollout; `key` shuffles."""
         estimates = self._estimates(state.value_scale, parameters, flown)
         scale = self._renewed_scale(state.value_scale, estimates.returns, flown)

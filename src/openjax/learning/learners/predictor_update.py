@@ -7,6 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import optax
+from jaxtyping import Array, Float, Int32, PRNGKeyArray
 
 from openjax.learning.collectives import own_keys
 from openjax.learning.learners.learner import Flown
@@ -14,6 +15,7 @@ from openjax.learning.rollout import Rollout
 from openjax.learning.train_state import TrainState
 from openjax.policy import Policy, PolicyParameters, PredictorSettings
 from openjax.pursuit import PursuitSettings
+from openjax.pursuit.shapes import Scalar
 
 
 def make_predictor_optimiser(
@@ -27,8 +29,16 @@ def make_predictor_optimiser(
 
 
 def windows_and_labels(
-    policy: Policy, history_spacing: int, earlier: jax.Array, rollout: Rollout, times: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array]:
+    policy: Policy,
+    history_spacing: int,
+    earlier: Float[Array, "worlds span frame"],
+    rollout: Rollout,
+    times: Int32[Array, "worlds windows"],
+) -> tuple[
+    Float[Array, "worlds windows length frame"],
+    Float[Array, "worlds windows 3"],
+    Float[Array, "worlds windows horizons 3"],
+]:
     """Windows of frames that end at the given steps, and the true positions to be predicted.
 
     Episodes start and end between rollouts only and the history is cleared at a reset, so no window
@@ -61,10 +71,10 @@ def windows_and_labels(
 def prediction_loss(
     settings: PredictorSettings,
     game: PursuitSettings,
-    predicted: jax.Array,
-    last_seen: jax.Array,
-    positions: jax.Array,
-) -> jax.Array:
+    predicted: Float[Array, "*windows horizons 3"],
+    last_seen: Float[Array, "*windows 3"],
+    positions: Float[Array, "*windows horizons 3"],
+) -> Scalar:
     """() loss of predictions (..., K, 3), given last_seen (..., 3) and the true positions (..., K,
     3).
 
@@ -97,13 +107,13 @@ class PredictorLearner:
         """See `make_predictor_optimiser`."""
         return make_predictor_optimiser(self.policy.predictor, self.total_updates)
 
-    def start(self, parameters: PolicyParameters, key: jax.Array) -> Any:
+    def start(self, parameters: PolicyParameters, key: PRNGKeyArray) -> Any:
         """The optimiser's state."""
         return self.optimiser.init(parameters.predictor)
 
     def learn(
-        self, state: Any, parameters: PolicyParameters, flown: Flown, key: jax.Array
-    ) -> tuple[Any, PolicyParameters, dict[str, jax.Array]]:
+        self, state: Any, parameters: PolicyParameters, flown: Flown, key: PRNGKeyArray
+    ) -> tuple[Any, PolicyParameters, dict[str, Scalar]]:
         """After the gradient steps on one rollout; `key` draws the windows."""
         rollout = flown.rollout
         data = self._windows(flown, key)

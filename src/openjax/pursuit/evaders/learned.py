@@ -73,7 +73,7 @@ def init_network(
 
 
 def features(
-    networks: dict[str, Any], which: Count, scene: Scene, memory: Memory
+    networks: dict[str, Any], which: int | Count, scene: Scene, memory: Memory
 ) -> dict[str, jax.Array]:
     """What the one of K networks that `which` () names sees: own (9,), pursuers (N, 10), pillars
     (P, 4), in_use (P,), greedy (3,), outward (2,), and active (N,) where slots may be empty.
