@@ -126,12 +126,13 @@ def identify(case: Case, one_clock: bool = True) -> Identification | None:
     if not records:
         return None
     fit = identify_torques(records)
+    untrusted = _doubts(records, fit, one_clock)
     return Identification(
         quantities_of(records, fit),
         responses(records, fit),
-        _remarks(records, fit, one_clock),
+        (*untrusted, *_remarks(fit)),
         of_fit(fit, records),
-        trusted=one_clock and not any(r.hidden and r.samples for r in records),
+        trusted=not untrusted,
     )
 
 
@@ -180,7 +181,8 @@ def _quantity(name: str, value: float, deviation: float, simulator: float) -> Qu
     return Quantity(value, interval, simulator, UNITS.get(name, "1"), effect, ends)
 
 
-def _remarks(records: list[Record], fit: TorqueFit, one_clock: bool) -> tuple[str, ...]:
+def _doubts(records: list[Record], fit: TorqueFit, one_clock: bool) -> tuple[str, ...]:
+    """Why what is said of torques isn't to be trusted."""
     found = []
     if not one_clock:
         found.append("the streams of motors and sensors are apart by times that wander")
@@ -189,6 +191,13 @@ def _remarks(records: list[Record], fit: TorqueFit, one_clock: bool) -> tuple[st
             "a row's motors are one sample of a loop that runs several times within it; log their "
             "means at 100 Hz, or every sample at 500 Hz"
         )
+    if np.isclose(fit.value[3:6], SEARCHED[1][0], rtol=0.02).any() and not found:
+        found.append("the body hardly answers the motors as they are logged")
+    return tuple(found)
+
+
+def _remarks(fit: TorqueFit) -> tuple[str, ...]:
+    found = []
     clock = fit.clock
     error = float(np.sqrt(fit.covariance[2, 2]))
     if abs(clock) > CLOCK + 2.0 * error:

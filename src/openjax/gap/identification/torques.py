@@ -59,19 +59,22 @@ SWEEPS = 2
 STRONG = 0.45  # of the nominal gain; the heaviest decks and duty cycles leave about as much
 SOON = 0.12  # s; the slowest motors that fly
 CLEARLY = 10.0  # nats by which motors logged too late must be better
-HIDDEN = 1  # rows whose surprise in the motors is free to act: the loop answers within them
+FREE = 0.01  # s of rows whose surprise in the motors is free to act: the loop answers within them
 
 HALF_CYCLE = 0.001  # s of the rate loop: when within one motors get their command is convention
-HIDDEN_LAG = 0.08
-HIDDEN_GAIN = 0.1
-HIDDEN_DAMPING = 0.5
+HIDDEN = 0.22  # 1/sqrt(s)
+"""What rows of means hide biases a fit by so much of its standard deviation for a second of flight:
+noise that loops answer within a row looks like the motors' doing. It doesn't shrink as flights get
+longer, and grows with gusts as the deviation does.
+"""
+LEAST_LAG = 0.03
+LEAST_GAIN = 0.01
+"""Errors of lags and gains, as logarithms, that such rows leave in still air."""
 SAMPLED_LAG = 0.3
 SAMPLED_GAIN = 0.45
-SLOW_ROWS = 0.01  # s
-"""Errors of lags and gains, as logarithms, and of damping, 1/s, that rows of 10 ms leave whatever a
-fit says, and shorter rows in proportion: means hide how a row's command is spread over it, samples
-miss most of what the loop does. Root mean squares of simulated flights in calm and gusty air,
-`experiments/results/identification.json`.
+SAMPLED_DAMPING = 0.5  # 1/s
+"""The same of single samples, which miss most of what the loop does. Root mean squares of simulated
+flights in calm and gusty air, `experiments/results/identification.json`.
 """
 
 
@@ -96,14 +99,13 @@ class TorqueFit:
 def identify_torques(records: list[Record]) -> TorqueFit:
     """The most likely fit of records with body rates, over the motors' clock as well."""
     base = Problem(records)
-    begun = base.begin(LATE[0])
+    first = base.fit(base.begin(LATE[0]))
     if base.dt < FAST_ROWS:
         # Whether such rows are of the filtered gyroscope nobody says, but they show it.
         filtered = Problem(records, filtered=True)
-        other = filtered.begin(LATE[0])
-        if filtered.solve(other)[0] < base.solve(begun)[0]:
-            base, begun = filtered, other
-    first = base.fit(begun)
+        other = filtered.fit(filtered.begin(LATE[0]))
+        if other.loss < first.loss - CLEARLY:
+            base, first = filtered, other
     if _clear(first):
         return first
     fits = [first, base.fit(base.begin(LATE[1]))]
@@ -278,24 +280,24 @@ class Problem:
         slopes = np.concatenate([s[:, order + 1 :] for s in slopes], 1).T
         return errors, slopes - past @ regression.solve(slopes), taken[:order]
 
-    def _model_error(self) -> np.ndarray:
-        """Covariance (9, 9) of what rows hide, at a place of the search."""
+    def _with_hidden(self, covariance: np.ndarray) -> np.ndarray:
+        """Covariance (9, 9) at a place of the search, with what rows hide."""
         out = np.zeros(len(NAMES))
         out[2] = HALF_CYCLE
+        wider = 1.0
         if self.records[0].hidden:
             samples = any(r.samples for r in self.records)
-            out[[0, 1]] = SAMPLED_LAG if samples else HIDDEN_LAG
-            out[[3, 4, 5]] = SAMPLED_GAIN if samples else HIDDEN_GAIN
-            out[[6, 7]] = HIDDEN_DAMPING
-            out[3:] *= min(self.dt / SLOW_ROWS, 1.0)
-            out[:2] *= min(self.dt / SLOW_ROWS, 1.0)
-        return np.diag(out**2)
+            out[[0, 1]] = SAMPLED_LAG if samples else LEAST_LAG
+            out[[3, 4, 5]] = SAMPLED_GAIN if samples else LEAST_GAIN
+            out[[6, 7]] = SAMPLED_DAMPING if samples else 0.0
+            wider += HIDDEN**2 * self.dt * sum(len(r.rates) for r in self.records)
+        return wider * covariance + np.diag(out**2)
 
-    @staticmethod
-    def _answers(new: np.ndarray) -> list[np.ndarray]:
+    def _answers(self, new: np.ndarray) -> list[np.ndarray]:
         """Columns (N, 1) of what was new in the last rows of motors; before the first nothing."""
+        free = max(round(FREE / self.dt), 1)
         return [
-            np.concatenate([np.zeros(row), new[: len(new) - row]])[:, None] for row in range(HIDDEN)
+            np.concatenate([np.zeros(row), new[: len(new) - row]])[:, None] for row in range(free)
         ]
 
     def begin(self, late: float) -> np.ndarray:
@@ -348,7 +350,7 @@ class Problem:
         scale[LOGARITHMS] = _value(value)[LOGARITHMS]
         return TorqueFit(
             _value(value),
-            (self._covariance(value, axes) + self._model_error()) * np.outer(scale, scale),
+            self._with_hidden(self._covariance(value, axes)) * np.outer(scale, scale),
             loss,
             [a[2] for a in axes],
             np.array([a[0].var() for a in axes]),
