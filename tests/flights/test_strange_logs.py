@@ -189,3 +189,21 @@ def test_a_gyroscope_at_its_end_reads_nothing_there(tmp_path, sample_columns, sh
     (end,) = [i.issue for i in case.quality if "the sensor's end" in i.issue]
     assert end.startswith("w") and end.endswith(words)
     assert case.flights[0].body_rates_derived == (words == "left out")
+
+
+def test_a_long_stand_before_the_flight_is_no_frozen_sensor(tmp_path, sample_columns):
+    """Where a simulator or an estimator stands still to the last digit."""
+    columns = sample_columns["flight_a"]
+    rest = {n: np.full(2000, np.nan if n == "vbat" else 0.0) for n in columns}
+    rest |= {"t": 0.01 * np.arange(2000), "qw": np.ones(2000)}
+    moved = columns | {"t": columns["t"] + 20.0}
+    write_case(tmp_path, {n: np.concatenate([rest[n], moved[n]]) for n in columns})
+    case = load_case(tmp_path)
+    assert len(case.flights[0]) > 0.9 * len(columns["t"])
+    assert "20.0 s with motors at rest are cut away" in [i.issue for i in case.quality]
+
+
+def test_a_separator_that_columns_toml_has_wrong_is_said(tmp_path, text):
+    (tmp_path / "columns.toml").write_text('delimiter = ","\n[columns]\nt = "t"\n')
+    with pytest.raises(UserError, match=r"separated by ';', and columns\.toml says ','"):
+        case_of(tmp_path, text.replace(",", ";"))

@@ -15,6 +15,8 @@ from openjax.flights.sampling import drop_frozen, drop_repeats, put_in_step, run
 SHORTEST = 2.0  # s airborne: windows of 0.5 s, and a few of them
 SLOWEST = 0.05  # s between rows
 BELOW = 0.3  # m below the floor, where nothing flies: more than an origin on a table is off by
+AT_REST = 0.02  # command below which a motor doesn't turn
+LONG_REST = 1.0  # s
 SATURATED = 0.01  # share of rows at one largest value from which that is the sensor's end
 OFTEN = 0.05  # share from which the sensor is of no use
 LEAST_RANGE = {"body_rates": 0.3, "specific_force": 15.0}  # rad/s, m/s^2
@@ -36,7 +38,7 @@ def check_flight(
 
     try:
         _has_what_is_needed(flight, comparison)
-        checked = _in_time(_with_forces(flight, note), note)
+        checked = _while_motors_turn(_in_time(_with_forces(flight, note), note), note)
         checked = put_in_step(drop_repeats(drop_frozen(checked, note), note), note)
         checked = _in_range(checked, note)
         checked = derive_velocity(mend_velocity(checked, note), note)
@@ -98,7 +100,7 @@ def _in_time(flight: Flight, note) -> Flight:
     flight = _sorted(_written_once(flight, note), note)
     repeated = np.diff(flight.time) == 0
     if repeated.mean() > 0.2:
-        text = f"{repeated.mean():.0%} of the rows repeat the time of the row before (frozen clock)"
+        text = f"{repeated.mean():.0%} of the rows repeat the time of the row before: the clock is frozen, or too coarse"
         raise Refused("time", text)
     if repeated.any():
         note("time", f"{repeated.sum()} rows repeat the time of the row before and are left out")
@@ -112,6 +114,24 @@ def _in_time(flight: Flight, note) -> Flight:
         note("gaps", f"{len(gaps)} gap{'s' * (len(gaps) > 1)} in time, the longest {steps[longest]:.2f} s "
                      f"after t = {flight.time[longest]:.2f}")  # fmt: skip
     return flight
+
+
+def _while_motors_turn(flight: Flight, note) -> Flight:
+    """Without the time before motors first turn and after they last do: what stands still there is
+    a vehicle on the ground, not a frozen sensor.
+    """
+    drive = flight.motor_command if flight.motor_command is not None else flight.command_thrust
+    if drive is None:
+        return flight
+    turning = np.flatnonzero((drive.reshape(len(drive), -1) > AT_REST).any(1))
+    if not len(turning):
+        return flight
+    part = slice(turning[0], turning[-1] + 1)
+    cut = flight.duration - (flight.time[part.stop - 1] - flight.time[part.start])
+    if cut < LONG_REST:
+        return flight
+    note("ground", f"{cut:.1f} s with motors at rest are cut away")
+    return flight.rows(part)
 
 
 def _sorted(flight: Flight, note) -> Flight:

@@ -16,6 +16,7 @@ import numpy as np
 
 from openjax.flights.csv_text import (
     LETTER,
+    SEPARATORS,
     Header,
     LogError,
     find_header,
@@ -234,8 +235,8 @@ def _check_header(header: Header, time: str) -> None:
             f"the first row has {len(names)} cells, more than {MOST_COLUMNS} "
             "columns: has the log lost its line ends?"
         )
-    if len(names) == 1 and len(names[0].split()) > 2 and time in names[0].split():
-        raise LogError("columns are separated by spaces; the log format wants ','")
+    if len(names) == 1:
+        _check_separator(names[0], header.delimiter, time)
     if not any(map(LETTER.search, names)):
         raise LogError("the first row holds no column names")
     counts = Counter(names)
@@ -248,6 +249,17 @@ def _check_header(header: Header, time: str) -> None:
             f"no column {asked}; the log has {_listed(n for n in names if n)}: say in columns.toml "
             "which is which"
         )
+
+
+def _check_separator(line: str, delimiter: str, time: str) -> None:
+    """Raises LogError where a header's cells are separated by something else than they are read
+    by.
+    """
+    other = max(SEPARATORS, key=line.count)
+    if line.count(other) > 1:
+        raise LogError(f"columns are separated by {other!r}, and columns.toml says {delimiter!r}")
+    if len(line.split()) > 2 and time in line.split():
+        raise LogError("columns are separated by spaces; the log format wants ','")
 
 
 def _listed(names: Iterable[str], most: int = NAMES_SHOWN) -> str:
