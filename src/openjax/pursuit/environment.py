@@ -350,7 +350,7 @@ class Pursuit:
             drones = drones.replace(
                 velocity=drones.velocity * jnp.minimum(1.0, settings.max_speed / speed)
             )
-        drones = held(self._active_after(state), state.drones, drones)
+        drones = held(self._active_after(state), drones)
         return self.follow(state, action, drones, wish)
 
     def follow(

@@ -79,14 +79,14 @@ def parked(position: Team, active: Which | None) -> Team:
     return jnp.where(active[:, None], position, away)
 
 
-def held(active: Which | None, old: DroneState, new: DroneState) -> DroneState:
-    """The drones (leading axis N) after a step, those of empty slots as they were before it, and
-    parked.
+def held(active: Which | None, drones: DroneState) -> DroneState:
+    """The drones (leading axis N), those of empty slots at rest where they are parked; how they
+    turn doesn't matter.
     """
     if active is None:
-        return new
-    drones = of_team(active, new, old)
-    return drones.replace(position=parked(drones.position, active))
+        return drones
+    velocity = jnp.where(active[:, None], drones.velocity, 0.0)
+    return drones.replace(position=parked(drones.position, active), velocity=velocity)
 
 
 def of_team(active: Which | None, value: T, otherwise: T | float = 0.0) -> T:
