@@ -5,11 +5,12 @@ semicolons with decimal commas, UTF-16, a row of units, a comma at the end of ea
 """
 
 import gzip
+import io
 import re
 import zlib
 from contextlib import ExitStack
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import NamedTuple
 
 from openjax.errors import UserError
 
@@ -119,7 +120,7 @@ def unquoted(line: str, delimiter: str) -> str:
     return "".join(parts) if len(parts) % 2 else line
 
 
-def _opened(path: Path, stack: ExitStack) -> BinaryIO:
+def _opened(path: Path, stack: ExitStack) -> io.BufferedIOBase:
     """A file for reading, unpacked if it is packed, whatever its name says."""
     with path.open("rb") as file:
         start = file.read(len(ZIP))

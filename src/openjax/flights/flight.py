@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Float
 
 if TYPE_CHECKING:
     from openjax.vehicle.vehicle_file import VehicleFile
@@ -118,7 +119,7 @@ class Flight:
         """Whether commanded thrust and body rates are logged."""
         return self.command_thrust is not None and self.command_body_rates is not None
 
-    def sampled(self, channel: str) -> tuple[Array, Array]:
+    def sampled(self, channel: str) -> tuple[Float[Array, " samples"], Float[Array, "samples ..."]]:
         """Times (S,) and values (S, ...) of the rows at which `channel` was sampled in full."""
         values = getattr(self, channel)
         if values is None:
@@ -126,7 +127,7 @@ class Flight:
         rows = np.isfinite(values.reshape(len(values), -1)).all(1)
         return self.time[rows], values[rows]
 
-    def holes(self, channel: str) -> Array:
+    def holes(self, channel: str) -> Float[Array, "holes 2"]:
         """(H, 2) s, begin and end of where `channel` wasn't sampled for so long that no line may
         stand for it.
         """
@@ -135,7 +136,9 @@ class Flight:
         wide = np.flatnonzero(steps > max(HOLE, 10.0 * np.median(steps)))
         return np.stack([at[wide], at[wide + 1]], 1)
 
-    def interpolated(self, channel: str, time: Array | None = None) -> Array:
+    def interpolated(
+        self, channel: str, time: Float[Array, " times"] | None = None
+    ) -> Float[Array, ...]:
         """`channel` at `time` (S,) (default: every row), linearly between its samples, held at the
         ends.
 

@@ -11,8 +11,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from jaxtyping import Bool
 
 from openjax.flights.flight import CHANNEL_COLUMNS, Flight
+from openjax.flights.shapes import Columns, Times, Vectors
 from openjax.flights.signals import RATE, in_band, on_clock, rates_of
 from openjax.flights.track import GRAVITY, rotation, to_body
 
@@ -56,7 +58,7 @@ class Signals:
     commands: np.ndarray | None
 
     @classmethod
-    def of(cls, flight: Flight, grid: np.ndarray) -> Signals:
+    def of(cls, flight: Flight, grid: Times) -> Signals:
         """The logged channels; what the reader derived says nothing of its own."""
         derived = {
             "velocity": flight.velocity_derived,
@@ -68,12 +70,12 @@ class Signals:
         return cls(*(None if derived.get(c) else on_clock(flight, c, grid) for c in channels))
 
     @cached_property
-    def rates(self) -> np.ndarray | None:
+    def rates(self) -> Vectors | None:
         """The gyroscope, or else the attitude's rate."""
         return self.attitude_rates if self.body_rates is None else self.body_rates
 
     @cached_property
-    def attitude_rates(self) -> np.ndarray | None:
+    def attitude_rates(self) -> Vectors | None:
         """Body rates (T, 3) rad/s by differences of the attitude."""
         return None if self.quaternion is None else rates_of(self.quaternion)
 
@@ -83,7 +85,7 @@ class Signals:
         return self.motor is not None and float((self.motor > FULL).any(1).mean()) > 0.2
 
     @cached_property
-    def acceleration(self) -> tuple[np.ndarray | None, int]:
+    def acceleration(self) -> tuple[Vectors | None, int]:
         """Of the path, m/s^2 in the world, and how many times what was logged of it was
         differentiated.
         """
@@ -118,12 +120,12 @@ class Pair:
         return agreement(self.measured, self.reference, self.band, self.derivatives)
 
     @property
-    def tells(self) -> np.ndarray:
+    def tells(self) -> Bool[np.ndarray, " columns"]:
         """(C,) whether the reference moves enough for a column to contradict it."""
         return (self.agreement.reference > self.least) & (self.agreement.expected > TELLS)
 
     @property
-    def bad(self) -> np.ndarray:
+    def bad(self) -> Bool[np.ndarray, " columns"]:
         """(C,) whether a column contradicts its reference."""
         return self.tells & (self.agreement.correlation < AGREE * self.agreement.expected)
 
@@ -235,8 +237,8 @@ class Agreement:
 
 
 def agreement(
-    measured: np.ndarray,
-    reference: np.ndarray,
+    measured: Columns,
+    reference: Columns,
     band: tuple[float, float],
     derivatives: tuple[int | None, int | None] = (0, 0),
 ) -> Agreement:

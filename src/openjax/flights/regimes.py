@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from openjax.flights.shapes import Chosen
 from openjax.flights.track import Track, smooth
 from openjax.vehicle.effects.effect import ARENA_CEILING
 
@@ -11,7 +12,7 @@ REGIMES = tuple(
 )
 
 
-def regimes_of(track: Track) -> dict[str, np.ndarray]:
+def regimes_of(track: Track) -> dict[str, Chosen]:
     """Masks (T,) of the regimes; a row may be in several."""
     rows = len(track)
     never = np.zeros(rows, bool)

@@ -14,6 +14,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Shaped
 
 from openjax.flights.reading import LogTable
 from openjax.vehicle import (
@@ -125,7 +126,7 @@ def fly(
     seed: int = 0,
     effects: Mapping[str, Mapping[str, float]] | None = None,
     sensors: SensorModel | None = None,
-) -> list[dict[str, np.ndarray]]:
+) -> list[dict[str, Shaped[np.ndarray, " rows"]]]:
     """Fly `plant` with `effects` ({name: {parameter: value}}) along `reference`, under a controller
     that assumes the vehicle `assumed`. Returns the columns of the log for each vehicle, {name:
     (T,)}.
@@ -147,7 +148,7 @@ def fly(
     ]
 
 
-def log_of(columns: list[dict[str, np.ndarray]], name: str) -> LogTable:
+def log_of(columns: list[dict[str, Shaped[np.ndarray, "..."]]], name: str) -> LogTable:
     """The vehicles' columns as one log in the long format, sorted by time; vehicles are "0", "1",
     ...
     """

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 
 from openjax.flights.flight import CHANNEL_COLUMNS, SENSORS, Flight, Refused
+from openjax.flights.shapes import Chosen
 
 FROZEN = 0.5  # s without a change of a sensor that has noise
 HELD = 0.1  # share of rows that repeat the one before, from which a sensor is slower than the rows
@@ -44,7 +45,7 @@ def _standing_still(flight: Flight, channel: str, rows, note) -> np.ndarray:
     table = values.reshape(len(values), -1)
     changed = np.diff(table[rows], axis=0) != 0
     together = channel in ("position", "quaternion", "velocity")
-    dead = np.flatnonzero(~changed.any(0))
+    dead = np.flatnonzero(~changed.any(0)).tolist()
     if together and changed.any():
         dead = [k for k in dead if not _may_stand_still(flight, channel, k)]
     if len(dead):
@@ -192,7 +193,7 @@ def _frozen(table: np.ndarray, rows: np.ndarray, time: np.ndarray, together: boo
     return frozen
 
 
-def runs_of(flags: np.ndarray) -> list[tuple[int, int]]:
+def runs_of(flags: Chosen) -> list[tuple[int, int]]:
     """First row and the one after the last of every stretch in which `flags` (T,) hold."""
     edges = np.flatnonzero(np.diff(np.r_[0, flags, 0]))
     return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))

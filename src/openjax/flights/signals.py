@@ -3,12 +3,14 @@
 from functools import lru_cache
 
 import numpy as np
+from jaxtyping import Float
 from scipy.ndimage import uniform_filter1d
 from scipy.signal import butter, lfilter, sosfiltfilt
 from scipy.signal.windows import tukey
 from scipy.spatial.transform import Rotation
 
 from openjax.flights.flight import SENSORS, Flight
+from openjax.flights.shapes import Columns, Quaternions, Times, Vectors
 
 RATE = 100.0  # Hz, common clock of the comparisons
 LONGEST = 30.0  # s, enough to tell
@@ -17,7 +19,7 @@ COMPARED = (*SENSORS, "motor_command", "command_body_rates")
 FADE = 0.5  # s
 
 
-def clock_of(flight: Flight) -> np.ndarray | None:
+def clock_of(flight: Flight) -> Times | None:
     """The common clock over the longest stretch without gaps, and without holes in a channel, over
     which nothing may be drawn; None if that is too short to tell anything.
     """
@@ -43,7 +45,7 @@ def _longest_without(gaps: np.ndarray, time: np.ndarray) -> tuple[float, float]:
     return float(starts[longest]), float(stops[longest])
 
 
-def on_clock(flight: Flight, channel: str, grid: np.ndarray) -> np.ndarray | None:
+def on_clock(flight: Flight, channel: str, grid: Times) -> Columns | None:
     """A channel (T, C) on the common clock; fast channels are averaged over the clock's period
     first.
     """
@@ -62,7 +64,7 @@ def on_clock(flight: Flight, channel: str, grid: np.ndarray) -> np.ndarray | Non
     return out / np.linalg.norm(out, axis=1, keepdims=True) if channel == "quaternion" else out
 
 
-def in_band(values: np.ndarray, band: tuple[float, float]) -> np.ndarray:
+def in_band(values: Columns, band: tuple[float, float]) -> Float[np.ndarray, "inner columns"]:
     """`values` (T, C) between two frequencies, without delay, and without the ends where that isn't
     right.
     """
@@ -84,14 +86,14 @@ def _fade(rows: int) -> np.ndarray:
     return tukey(rows, min(1.0, 2 * FADE * RATE / rows))
 
 
-def rates_of(quaternion: np.ndarray) -> np.ndarray:
+def rates_of(quaternion: Quaternions) -> Vectors:
     """Body rates (T, 3) rad/s of attitudes (T, 4) on the common clock, by central differences."""
     attitude = Rotation.from_quat(quaternion, scalar_first=True)
     rates = (attitude[:-2].inv() * attitude[2:]).as_rotvec() * RATE / 2
     return np.concatenate([rates[:1], rates, rates[-1:]])
 
 
-def first_order(values: np.ndarray, time_constant: float) -> np.ndarray:
+def first_order(values: Columns, time_constant: float) -> Columns:
     """`values` (T, C) behind a first-order lag of `time_constant` s, settled at the start."""
     blend = -np.expm1(-1 / (RATE * time_constant))
     start = (1.0 - blend) * values[:1]

@@ -8,10 +8,12 @@ tracks.
 from dataclasses import dataclass, replace
 
 import numpy as np
+from jaxtyping import Float
 from scipy.ndimage import convolve1d
 from scipy.spatial.transform import Rotation
 
 from openjax.flights.flight import SENSORS, Case, Flight
+from openjax.flights.shapes import Columns, Motors, Quaternions, Times, Vectors
 
 Array = np.ndarray
 GRAVITY = 9.81  # m/s^2
@@ -159,7 +161,12 @@ def _missing(logged: Array, grid: Array, period: float) -> Array:
     return np.minimum(np.abs(grid - logged[after - 1]), np.abs(logged[after] - grid)) > 0.6 * period
 
 
-def held_means(at: Array, values: Array, begin: Array, period: float) -> Array:
+def held_means(
+    at: Float[Array, " samples"],
+    values: Float[Array, " samples"],
+    begin: Float[Array, " periods"],
+    period: float,
+) -> Float[Array, " periods"]:
     """Means (G,) of values (S,) at times `at` (S,) s, each held until the next, over `period` s
     from `begin` (G,) s on.
     """
@@ -202,7 +209,7 @@ def _command_phase(part: Flight, period: float) -> float:
     return float((middle + np.percentile(late, EARLY)) % period)
 
 
-def pwm_thrust(duty: Array, voltage: Array | None, vehicle) -> Array:
+def pwm_thrust(duty: Motors, voltage: Times | None, vehicle) -> Motors:
     """Thrust fraction (T, 4) that a duty cycle gives: motor voltage U = duty x battery, and the
     public map of the Crazyflie firmware's battery compensation, U = -0.0006239 g^2 + 0.088 g for g
     grams of thrust of all four rotors.
@@ -213,7 +220,9 @@ def pwm_thrust(duty: Array, voltage: Array | None, vehicle) -> Array:
     return newtons / float(vehicle.thrust_constant * vehicle.max_rotor_speed**2)
 
 
-def smooth(values: Array, width: float, dt: float) -> Array:
+def smooth(
+    values: Float[Array, " rows *columns"], width: float, dt: float
+) -> Float[Array, " rows *columns"]:
     """`values` (T, ...) smoothed by a Hann window of `width` s, ends held."""
     n = max(round(width / dt), 1)
     if n < 2:
@@ -222,22 +231,22 @@ def smooth(values: Array, width: float, dt: float) -> Array:
     return convolve1d(values, window / window.sum(), axis=0, mode="nearest", origin=n % 2 - 1)
 
 
-def rotation(quaternion: Array) -> Array:
+def rotation(quaternion: Quaternions) -> Float[Array, "rows 3 3"]:
     """Rotation matrices (T, 3, 3), body to world, of quaternions (T, 4) wxyz."""
     return Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
 
 
-def to_body(quaternion: Array, vector: Array) -> Array:
+def to_body(quaternion: Quaternions, vector: Vectors) -> Vectors:
     """World vectors (T, 3) in the body frame of attitudes (T, 4)."""
     return np.einsum("tji,tj->ti", rotation(quaternion), vector)
 
 
-def to_world(quaternion: Array, vector: Array) -> Array:
+def to_world(quaternion: Quaternions, vector: Vectors) -> Vectors:
     """Body vectors (T, 3) in the world."""
     return np.einsum("tij,tj->ti", rotation(quaternion), vector)
 
 
-def specific_force_of(quaternion: Array, velocity: Array, period: float) -> Array:
+def specific_force_of(quaternion: Quaternions, velocity: Vectors, period: float) -> Vectors:
     """Force per mass (T, 3), m/s^2 in the body frame, that a path with velocities (T, 3) every
     `period` s needs.
     """
@@ -246,13 +255,13 @@ def specific_force_of(quaternion: Array, velocity: Array, period: float) -> Arra
     )
 
 
-def turn_increments(quaternion: np.ndarray) -> np.ndarray:
+def turn_increments(quaternion: Quaternions) -> Float[Array, "turns 3"]:
     """Rotation vectors (T - 1, 3), body frame, between successive attitudes (T, 4)."""
     attitude = Rotation.from_quat(quaternion, scalar_first=True)
     return (attitude[:-1].inv() * attitude[1:]).as_rotvec()
 
 
-def earlier(values: Array, delay: float, track: Track) -> Array:
+def earlier(values: Columns, delay: float, track: Track) -> Columns:
     """Rows (T, C) of a track as they were `delay` s earlier."""
     return np.stack([np.interp(track.time - delay, track.time, column) for column in values.T], 1)
 

@@ -28,6 +28,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Shaped
 from scipy.spatial.transform import Rotation
 
 from openjax.errors import UserError
@@ -175,7 +176,9 @@ def _clock(entry, path: Path) -> Clock:
     return Clock(source_of("t", rest, path), tuple(named))
 
 
-def merge_streams(streams: list[Stream], columns: dict[str, Source]) -> dict[str, np.ndarray]:
+def merge_streams(
+    streams: list[Stream], columns: dict[str, Source]
+) -> dict[str, Shaped[np.ndarray, " rows"]]:
     """Columns of the log format on one clock: that of the fastest stream with motion in it (`t` as
     in the stream).
 
@@ -229,7 +232,9 @@ def _without_attitude(columns: dict) -> dict:
     return {c: v for c, v in columns.items() if c not in CHANNEL_COLUMNS["quaternion"]}
 
 
-def with_quaternion(columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+def with_quaternion(
+    columns: dict[str, Shaped[np.ndarray, " rows"]],
+) -> dict[str, Shaped[np.ndarray, " rows"]]:
     """Roll, pitch, yaw replaced by the quaternion, unless that is there."""
     angles = [columns.get(name) for name in EULER]
     rest = {c: v for c, v in columns.items() if c not in EULER}

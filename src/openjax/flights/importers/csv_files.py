@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Shaped
 
 from openjax.flights.csv_text import find_header, head_of
 from openjax.flights.importers.columns import ColumnMapping
@@ -43,7 +44,7 @@ def delimiter_of(mapping: ColumnMapping | None) -> str:
 
 def raw_columns(
     path: Path, names: tuple[str, ...], time: str, delimiter: str = "", above: int = 0
-) -> tuple[dict[str, np.ndarray], list[str]]:
+) -> tuple[dict[str, Shaped[np.ndarray, " rows"]], list[str]]:
     """The columns `names` of a CSV, {name: (R,)}, and remarks; what else it holds is another's
     business. Raises LogError where the column `time` or a number is missing.
     """
@@ -53,7 +54,7 @@ def raw_columns(
     return table.columns, [r for r in table.remarks if not r.startswith("unknown column")]
 
 
-def seconds_per_unit(time: np.ndarray) -> float:
+def seconds_per_unit(time: Shaped[np.ndarray, " rows"]) -> float:
     """By what a clock's readings (R,) are multiplied to be seconds: the unit, of s, ms, us and ns,
     in which rows come nearest to a usual step.
     """
