@@ -13,6 +13,7 @@ from openjax.gap.model.prediction import LANES, RATES, make_physics
 from openjax.gap.model.replay import make_replay
 from openjax.vehicle import load_vehicle
 from openjax.vehicle.effects import EFFECTS
+from tests.vehicle.typical import typical
 
 
 def track_of(rows: int, seed: int) -> Track:
@@ -54,7 +55,7 @@ def below(height: float, ceiling: float | None) -> np.ndarray:
     theta = ABSENT.copy()
     for (effect, parameter), place in PLACE.items():
         if effect in ("downwash", "ceiling_effect"):
-            theta[place] = EFFECTS[effect].typical()[parameter]
+            theta[place] = typical(EFFECTS[effect])[parameter]
     ticks = [np.repeat(track.motor[:, None], TICKS, 1)]
     return make_physics([track], [load_vehicle()], ticks).predict(theta[None])[0][0, :, 6:]
 

@@ -21,6 +21,7 @@ from openjax.pursuit import (
 from openjax.pursuit.evaders import field_velocity
 from openjax.pursuit.sensing import line_of_sight
 from openjax.vehicle.effects import EFFECTS
+from tests.vehicle.typical import typical
 
 KEY = jax.random.key(0)
 TINY = PursuitSettings(physics="rigid", episode_length=3)
@@ -280,7 +281,7 @@ def test_physical_effects_act_in_the_game():
     episode.
     """
     names = ("rotor_drag", "state_latency", "packet_loss")
-    parameters = {name: EFFECTS[name].typical() for name in names}
+    parameters = {name: typical(EFFECTS[name]) for name in names}
     environment = Pursuit(TINY, effects=names, effect_parameters=parameters)
 
     @jax.jit
