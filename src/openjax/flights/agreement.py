@@ -21,6 +21,7 @@ from openjax.flights.track import rotation, to_body
 
 TURNING = (0.7, 8.0)  # Hz, where motors turn the vehicle
 UNIT = 2.5  # factor about a unit's, within which a gain is that unit
+CLEAR = 0.9  # correlation from which a gain is one
 SAME = 1.4  # factor by which two sensors of one rate may differ
 RANDOM = 0.5  # share of the variance from row to row at which a continuous signal has no order
 LEAST_ROWS = 100
@@ -266,12 +267,15 @@ def _unit(pair: Pair) -> list[Finding]:
                 wanted = "m" if pair.unit == "m/s^2" else pair.unit
                 text = f"{columns}: in {unit} ({times:.0f} times too large); the log format wants {wanted}"
                 return [("units", text, [pair.what])]
-    # rates by two sensors differ by a few per cent; lifts and air make more of a force
-    if pair.holds == "body_rates" and follows.all() and not 1 / SAME < gain < SAME:
-        columns = ", ".join(pair.names)
-        text = f"{columns} are {gain:.2g} times {pair.what}: one of them is something else"
-        return [("units", text, [pair.what])]
-    return []
+    # noise and an estimator's lag cost correlation, and change a gain of rms values by as much
+    clear = pair.tells & (found.correlation > CLEAR)
+    if pair.holds != "body_rates" or clear.sum() < 2:
+        return []
+    gains = found.measured[clear] / found.reference[clear]
+    if (gains < SAME).any() and (gains > 1 / SAME).any():
+        return []
+    text = f"{', '.join(pair.names)} are {np.median(gains):.2g} times {pair.what}"
+    return [("units", f"{text}: one of them is something else", [pair.what])]
 
 
 def _upside_down(signals: Signals) -> list[Finding]:
