@@ -344,6 +344,7 @@ def test_shipped_policies_act_in_their_game_and_refuse_another():
             policy  # seeds of one kind act by one program
         )
     for policy in kinds.values():
+        policy = policy.of_team(3)
         environment = openjax.make(policy.settings.environment, speed_limit="none")
         observation = jax.eval_shape(environment.reset, jax.random.key(0))[0]
         observation = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), observation)

@@ -248,8 +248,9 @@ def _show(command, results):
 
     console = output_console()
     for own, source, rows in results:
-        evaders = (own.opponent,) if own.opponent else own.environment.evaders
-        game = unlike_the_papers(dataclasses.replace(own.environment, evaders=evaders))
+        settings = _settings(own)
+        evaders = (own.opponent,) if own.opponent else settings.evaders
+        game = unlike_the_papers(dataclasses.replace(settings, evaders=evaders))
         console.print(results_table(f"{source}, mean policy, seed {command.seed}", rows, game))
     if len(results) > 1:
         console.print(spread_table([rows for *_, rows in results]))
