@@ -1,17 +1,19 @@
 """The page of teams: `python -m experiments.evaders.teams NAME=FILE ...`.
 
-Each FILE is what `openjax map --json FILE` wrote. Of maps that hold one cell for each size of team
-the table shows what a policy catches, alone and with what is taken from it; the others are drawn.
-The names of these maps are those of `KINDS`.
+Each FILE is what `openjax map --speed_ratios 1.3 --radii 0.3 --scenario uniform --json FILE` wrote:
+one cell for each size of team, by the names of `KINDS`. The table shows what a policy catches, alone
+and with what is taken from it.
 """
 
 from collections.abc import Mapping
 from pathlib import Path
 
+import numpy as np
+from matplotlib.figure import Figure
+
 from experiments.table import Page, Table, page_parser, publish
 from openjax.command_line import run_command
 from openjax.files import read_json
-from openjax.show.plots import plot_map
 
 KINDS = {
     "sizes": "one policy",
@@ -20,9 +22,7 @@ KINDS = {
     "fall_outs": "one gone",
     "all_three": "all of these",
 }
-"""Maps of one cell a team, and their heads in the table."""
-MAPS = ("empty", "uniform")
-"""Maps over speeds and radii."""
+"""Maps, and their heads in the table."""
 
 
 def study(options) -> dict:
@@ -58,12 +58,24 @@ def page(results: Mapping) -> Page:
 
 
 def draw(results: Mapping, path: Path) -> None:
-    """The map over speeds and radii, in the empty arena where there is that one."""
-    for name in MAPS:
-        if name in results["maps"]:
-            found = results["maps"][name]
-            plot_map(path, found["cells"], f"captures, {name}; red: forced by a theorem below")
-            return
+    """Captures, with intervals of 95 %, and crashes over the size of the team."""
+    figure = Figure(figsize=(9, 3.6), layout="constrained")
+    captures, crashes = figure.subplots(1, 2)
+    for (kind, head), marker in zip(KINDS.items(), "os^vD", strict=True):
+        cells = results["maps"].get(kind, {}).get("cells", [])
+        if not cells:
+            continue
+        sizes = [cell["num_pursuers"] for cell in cells]
+        rates = np.array([cell["capture_rate"] for cell in cells])
+        ends = np.array([cell["interval"] for cell in cells]).T
+        off = np.abs(ends - rates)
+        captures.errorbar(sizes, rates, off, marker=marker, capsize=3, linewidth=1, label=head)
+        crashed = [cell["crash_rate"] for cell in cells]
+        crashes.plot(sizes, crashed, marker=marker, linewidth=1, label=head)
+    captures.set(xlabel="pursuers", ylabel="episodes with a capture")
+    crashes.set(xlabel="pursuers", ylabel="episodes with a crash", ylim=(0, None))
+    captures.legend(fontsize="small")
+    figure.savefig(path, dpi=120)
 
 
 def main(arguments: list[str]) -> None:

@@ -18,6 +18,7 @@ from openjax.baselines.stack import stack_bound
 from openjax.errors import UserError
 from openjax.evaluation.episodes import make_evaluate
 from openjax.pursuit import EpisodeStatistics, Pursuit, PursuitSettings, Task, uniform_task
+from openjax.runs.machine import describe_machine
 from openjax.runs.options import MapCommand
 from openjax.store.policies import LoadedPolicy
 
@@ -94,7 +95,7 @@ def draw_map(command: MapCommand, loaded: LoadedPolicy, tell: Callable[[str], No
       tell: shows a line of progress.
 
     Returns:
-      policy, evaders, scenario, cells (see `cell_record`), seconds.
+      policy, evaders, scenario, what is taken away, cells (see `cell_record`), seconds, machine.
 
     Raises:
       UserError: a game that the policy can't play.
@@ -114,6 +115,7 @@ def draw_map(command: MapCommand, loaded: LoadedPolicy, tell: Callable[[str], No
         "trained_with": list(loaded.settings.environment.team_sizes),
         "cells": [cell_record(game, *pair) for pair in zip(cells, flown, strict=True)],
         "seconds": time.monotonic() - began,
+        "machine": describe_machine(),
     }
 
 

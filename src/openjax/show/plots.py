@@ -141,8 +141,10 @@ def _draw_map(axes, cells):
     axes.set_xticks(range(len(radii)), [f"{radius:g}" for radius in radii], fontsize=7)
     axes.set_yticks(range(len(ratios)), [f"{ratio:g}" for ratio in ratios], fontsize=7)
     # between the middles of cells
-    height = np.interp(list(forced.values()), ratios, range(len(ratios)), left=-0.5)
-    axes.step(range(len(radii)), height, where="mid", color="red", linewidth=1.2)
+    ends = {"left": -0.5, "right": len(ratios) - 0.5}
+    height = np.interp(list(forced.values()), ratios, range(len(ratios)), **ends)
+    edges = np.arange(len(radii) + 1) - 0.5
+    axes.stairs(height, edges, baseline=None, color="red", linewidth=1.5)
     return shown
 
 
