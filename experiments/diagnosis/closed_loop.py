@@ -41,7 +41,7 @@ class Case:
     def fly(self, segments, round_number: int) -> list:
         """Flights of segments in a round."""
         from openjax.flights.reading import flights_of
-        from openjax.flights.samples import fly, log_of
+        from openjax.flights.samples import Turbulence, fly, log_of
         from openjax.flights.segments import SEGMENTS
         from openjax.gap.planning.information import SECONDS
         from openjax.vehicle.effects import EFFECTS
@@ -52,7 +52,7 @@ class Case:
         for place, name in enumerate(segments):
             reference = SEGMENTS[name].reference(SECONDS)
             seed = 1000 * self.number + 100 * round_number + place
-            columns = fly(vehicle, vehicle, reference, seed, effects)
+            columns = fly(vehicle, vehicle, reference, seed, effects, air=Turbulence())
             log = log_of(columns, f"{round_number}_{place}_{name}")
             found += flights_of(log, (0, 1, 2, 3))[0]
         return found

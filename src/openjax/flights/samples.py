@@ -53,6 +53,30 @@ class SensorModel:
 
 
 @dataclass(frozen=True)
+class Turbulence:
+    """Forces and torques of uneven air, root mean squares per axis, each forgotten within a time.
+    The usual ones are those of a quiet hall.
+    """
+
+    force: float = 7e-4  # N
+    force_time: float = 0.35  # s
+    torque: float = 1e-5  # N m
+    torque_time: float = 0.08  # s
+
+    def drawn(self, rng: np.random.Generator, rows: int, count: int) -> np.ndarray:
+        """(T, N, 6) force in the world's axes and torque in the body's."""
+        sizes = np.repeat([self.force, self.torque], 3)
+        times = np.repeat([self.force_time, self.torque_time], 3)
+        kept = np.exp(-PERIOD / times)
+        white = rng.standard_normal((rows, count, 6))
+        out = np.empty_like(white)
+        out[0] = white[0]
+        for row in range(1, rows):
+            out[row] = kept * out[row - 1] + np.sqrt(1.0 - kept**2) * white[row]
+        return sizes * out
+
+
+@dataclass(frozen=True)
 class Reference:
     """What N vehicles are to fly, T rows at the row period."""
 
@@ -126,10 +150,11 @@ def fly(
     seed: int = 0,
     effects: Mapping[str, Mapping[str, float]] | None = None,
     sensors: SensorModel | None = None,
+    air: Turbulence | None = None,
 ) -> list[dict[str, Shaped[np.ndarray, " rows"]]]:
     """Fly `plant` with `effects` ({name: {parameter: value}}) along `reference`, under a controller
-    that assumes the vehicle `assumed`. Returns the columns of the log for each vehicle, {name:
-    (T,)}.
+    that assumes the vehicle `assumed`, in still air or turbulent `air`. Returns the columns of the
+    log for each vehicle, {name: (T,)}.
     """
     sensors = SensorModel() if sensors is None else sensors
     names = tuple(sorted(effects or {}))
@@ -139,13 +164,17 @@ def fly(
     wanted = (reference.position, velocity, acceleration, reference.yaw, reference.extra_command)
     wanted = tuple(jnp.asarray(w, jnp.float32) for w in wanted)
     start = jnp.float32(reference.open_circuit_voltage)
+    length, count = reference.position.shape[:2]
+    gusts = None
+    if air is not None:
+        drawn = air.drawn(np.random.default_rng([seed, 2]), length, count)
+        gusts = jnp.asarray(drawn, jnp.float32)
+    key = jax.random.key(seed)
     rows = jax.device_get(
-        _fly(plant, assumed, wanted, start, parameters, jax.random.key(seed), names, sensors)
+        _fly(plant, assumed, wanted, start, parameters, key, gusts, names, sensors)
     )
     rng = np.random.default_rng([seed, 1])
-    return [
-        _columns([r[:, n] for r in rows], rng, sensors) for n in range(reference.position.shape[1])
-    ]
+    return [_columns([r[:, n] for r in rows], rng, sensors) for n in range(count)]
 
 
 def log_of(columns: list[dict[str, Shaped[np.ndarray, "..."]]], name: str) -> LogTable:
@@ -161,7 +190,15 @@ def log_of(columns: list[dict[str, Shaped[np.ndarray, "..."]]], name: str) -> Lo
 
 @partial(jax.jit, static_argnames=("names", "sensors"))
 def _fly(
-    plant: Vehicle, assumed: Vehicle, wanted, voltage, parameters, key, names, sensors: SensorModel
+    plant: Vehicle,
+    assumed: Vehicle,
+    wanted,
+    voltage,
+    parameters,
+    key,
+    gusts,
+    names,
+    sensors: SensorModel,
 ):
     effects = composition.resolve(names)
     count = wanted[0].shape[1]
@@ -189,7 +226,7 @@ def _fly(
 
     def row(carry, inputs):
         drones, integral, force, load, key = carry
-        wanted_row, air_time = inputs
+        wanted_row, air_time, gust = inputs
         key, noise_key = jax.random.split(key)
         seen = jax.vmap(partial(composition.seen_state, effects, parameters))(drones)
         sent, integral = jax.vmap(_position_controller, (None, 0, 0, 0))(
@@ -212,7 +249,7 @@ def _fly(
             for _ in range(SUBSTEPS):
                 context, _ = contexts(drones, load, air_time, PERIOD / RATE_LOOPS / SUBSTEPS)
                 drones, force = jax.vmap(partial(_physics, flown, effects, parameters))(
-                    drones, motor, context
+                    drones, motor, context, gust
                 )
             return (drones, force), motor
 
@@ -230,18 +267,20 @@ def _fly(
     hover = jnp.zeros((count, 3)).at[:, 2].set(flown.mass * flown.gravity)
     load = jnp.full(count, 0.6)
     air_time = jnp.arange(wanted[0].shape[0], dtype=jnp.float32) * PERIOD
-    return jax.lax.scan(row, (drones, jnp.zeros((count, 3)), hover, load, key), (wanted, air_time))[
-        1
-    ]
+    start = (drones, jnp.zeros((count, 3)), hover, load, key)
+    return jax.lax.scan(row, start, (wanted, air_time, gusts))[1]
 
 
-def _physics(vehicle, effects, parameters, drone: DroneState, motor_command, context):
+def _physics(vehicle, effects, parameters, drone: DroneState, motor_command, context, gust):
     """One physics step of one drone; its state, and the force without gravity in the body frame
-    (3,) N.
+    (3,) N. `gust` (6,): force in the world's axes and torque of turbulent air, or None.
     """
     motor_command = composition.change_motor_command(effects, parameters, motor_command, context)
     speed = rotor_speed_step(vehicle, drone.rotor_speed, motor_command, context.dt)
     force, torque = composition.wrench(effects, parameters, vehicle, speed, context)
+    if gust is not None:
+        force = force + rotate_inverse(drone.quaternion, gust[:3])
+        torque = torque + gust[3:]
     drone = rigid_step(vehicle, drone, rotate(drone.quaternion, force), torque, context.dt)
     return drone.replace(rotor_speed=speed), force
 

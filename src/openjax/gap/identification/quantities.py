@@ -15,6 +15,7 @@ REACH = 1.645  # standard deviations of a 90 % interval
 TALKED_OF = 5.0  # Hz: where rate loops of such vehicles work
 ALIKE = (0.8, 1.25)  # ratios of gains that nobody would feel
 ALIKE_PHASE = 10.0  # degrees, the same
+TURNS = 8.0  # standard deviations of noise: below, rows show a loop that answers noise
 CLOCK = 0.010  # s: rows off by more are worth a sentence
 POSITIVE = ("spin_up", "spin_down", "roll_gain", "pitch_gain", "yaw_gain")
 UNITS = {
@@ -191,6 +192,8 @@ def _doubts(records: list[Record], fit: TorqueFit, one_clock: bool) -> tuple[str
             "a row's motors are one sample of a loop that runs several times within it; log their "
             "means at 100 Hz, or every sample at 500 Hz"
         )
+    if any(r.hidden for r in records) and fit.turning[:2].max() < TURNS:
+        found.append("the vehicle hardly turns; fly the segments yaw, agile or step")
     if np.isclose(fit.value[3:6], SEARCHED[1][0], rtol=0.02).any() and not found:
         found.append("the body hardly answers the motors as they are logged")
     return tuple(found)

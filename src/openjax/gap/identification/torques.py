@@ -62,14 +62,18 @@ CLEARLY = 10.0  # nats by which motors logged too late must be better
 FREE = 0.01  # s of rows whose surprise in the motors is free to act: the loop answers within them
 
 HALF_CYCLE = 0.001  # s of the rate loop: when within one motors get their command is convention
-HIDDEN = 0.22  # 1/sqrt(s)
-"""What rows of means hide biases a fit by so much of its standard deviation for a second of flight:
-noise that loops answer within a row looks like the motors' doing. It doesn't shrink as flights get
-longer, and grows with gusts as the deviation does.
+NOISE_IN_GAIN = 30.0
+NOISE_IN_LAG = 2.5
+QUICK = 0.03  # s
+"""What rows of means hide of a rate loop that answers noise weakens the response that they show.
+Errors of gains, as logarithms, are so much over the square of what an axis turns in standard
+deviations of its noise; errors of lags over that of what it turns within QUICK, beyond noise.
 """
+LARGEST_ERROR = 2.0  # as a logarithm: nothing is known
 LEAST_LAG = 0.03
 LEAST_GAIN = 0.01
-"""Errors of lags and gains, as logarithms, that such rows leave in still air."""
+LEAST_DAMPING = 0.25
+"""Errors of lags and gains, as logarithms, and of damping, 1/s, that such rows leave in still air."""
 SAMPLED_LAG = 0.3
 SAMPLED_GAIN = 0.45
 SAMPLED_DAMPING = 0.5  # 1/s
@@ -81,7 +85,8 @@ flights in calm and gusty air, `experiments/results/identification.json`.
 @dataclass(frozen=True, eq=False)
 class TorqueFit:
     """`value` (9,) and `covariance` (9, 9) of `NAMES`; `loss` nats; `noise` {axis: coefficients
-    (p,)}; `whole` innovations' variances (3,).
+    (p,)}; `whole` innovations' variances (3,); `turning` (3,): what each axis turns, in standard
+    deviations of its noise.
     """
 
     value: np.ndarray
@@ -89,6 +94,7 @@ class TorqueFit:
     loss: float
     noise: list
     whole: np.ndarray
+    turning: np.ndarray
 
     @property
     def clock(self) -> float:
@@ -280,18 +286,34 @@ class Problem:
         slopes = np.concatenate([s[:, order + 1 :] for s in slopes], 1).T
         return errors, slopes - past @ regression.solve(slopes), taken[:order]
 
-    def _with_hidden(self, covariance: np.ndarray) -> np.ndarray:
-        """Covariance (9, 9) at a place of the search, with what rows hide."""
+    def turning(self, axes: list) -> tuple[np.ndarray, np.ndarray]:
+        """What each axis (3,) turns, and what it turns within QUICK, in standard deviations of its
+        noise.
+        """
+        noise = np.array([e.var() for e, _, _ in axes]) + TINY
+        rows = max(round(QUICK / self.dt), 1)
+        whole = np.concatenate([r.rates for r in self.records])
+        quick = np.concatenate([r.rates[rows:] - r.rates[:-rows] for r in self.records])
+        return np.sqrt(whole.var(0) / noise), np.sqrt(0.5 * quick.var(0) / noise)
+
+    def _hidden(self, axes: list) -> np.ndarray:
+        """Standard deviations (9,) at a place of the search, of what rows hide."""
         out = np.zeros(len(NAMES))
         out[2] = HALF_CYCLE
-        wider = 1.0
-        if self.records[0].hidden:
-            samples = any(r.samples for r in self.records)
-            out[[0, 1]] = SAMPLED_LAG if samples else LEAST_LAG
-            out[[3, 4, 5]] = SAMPLED_GAIN if samples else LEAST_GAIN
-            out[[6, 7]] = SAMPLED_DAMPING if samples else 0.0
-            wider += HIDDEN**2 * self.dt * sum(len(r.rates) for r in self.records)
-        return wider * covariance + np.diag(out**2)
+        if not self.records[0].hidden:
+            return out
+        if any(r.samples for r in self.records):
+            out[[0, 1]] = SAMPLED_LAG
+            out[[3, 4, 5]] = SAMPLED_GAIN
+            out[[6, 7]] = SAMPLED_DAMPING
+            return out
+        turned, quick = self.turning(axes)
+        beyond = max(quick[:2].max() ** 2 - 1.0, NOISE_IN_LAG / LARGEST_ERROR)
+        out[[0, 1]] = np.hypot(LEAST_LAG, NOISE_IN_LAG / beyond)
+        gain = np.minimum(NOISE_IN_GAIN / turned**2, LARGEST_ERROR)
+        out[[3, 4, 5]] = np.hypot(LEAST_GAIN, gain)
+        out[[6, 7]] = LEAST_DAMPING
+        return out
 
     def _answers(self, new: np.ndarray) -> list[np.ndarray]:
         """Columns (N, 1) of what was new in the last rows of motors; before the first nothing."""
@@ -350,10 +372,12 @@ class Problem:
         scale[LOGARITHMS] = _value(value)[LOGARITHMS]
         return TorqueFit(
             _value(value),
-            self._with_hidden(self._covariance(value, axes)) * np.outer(scale, scale),
+            (self._covariance(value, axes) + np.diag(self._hidden(axes) ** 2))
+            * np.outer(scale, scale),
             loss,
             [a[2] for a in axes],
             np.array([a[0].var() for a in axes]),
+            self.turning(axes)[0],
         )
 
     def _step(self, value: np.ndarray, axes: list) -> np.ndarray:

@@ -7,7 +7,8 @@ import numpy as np
 
 from openjax.errors import UserError
 from openjax.gap.model.library import ABSENT, CARDS, PLACE, places
-from openjax.gap.planning.information import TELLS, Advice, Belief
+from openjax.gap.planning.information import Advice, Belief
+from openjax.gap.selection import DETECTABLE
 
 LEAST = 0.02  # probability below which a cause isn't asked for
 UNTESTED = 0.05  # of each effect that the flights couldn't show
@@ -74,11 +75,11 @@ def _theta(effects, parameters: dict) -> np.ndarray:
 def sentence(advice: Advice, report: dict) -> str:
     """What to do next, and why."""
     best = advice.promises[0]
-    hopeless = [pair for pair, nats in advice.nats.items() if nats < TELLS]
+    hopeless = [pair for pair, nats in advice.nats.items() if nats < DETECTABLE]
     weigh = [pair for pair in hopeless if set(pair) <= SCALE_ONLY]
     told = f"Fly {best.segment!r} next: in 10 s it tells {best.pair[0]} from {best.pair[1]} "
     told += f"by {best.nats:.0f} nats."
-    if best.nats < TELLS:
+    if best.nats < DETECTABLE:
         told = f"No segment tells {best.pair[0]} from {best.pair[1]}."
     if weigh:
         told += f" No flight tells {weigh[0][0]} from {weigh[0][1]}: weigh the vehicle."

@@ -2,8 +2,10 @@
 
 A segment is flown by the nominal simulator. Of two causes i and j it then shows d_ij = 1/2 |f_i -
 f_j|^2 nats, in units of the noise, less what nuisances and the parameters of j can take. Its value
-is sum_ij p_i p_j (1 - exp(-d_ij / 2)): the probability that two causes drawn from what is believed
-are told apart (T-optimal design: Atkinson, Fedorov 1975; the bound is Bhattacharyya's).
+is sum_ij p_i p_j (1 - exp(-(d_ij - 8) / 2)), for the 8 nats that a diagnosis asks for: the
+probability that two causes drawn from what is believed are told apart (T-optimal design: Atkinson,
+Fedorov 1975; the bound is Bhattacharyya's). The air is as uneven as in a quiet hall: in still air
+every segment would tell everything.
 """
 
 from dataclasses import dataclass, replace
@@ -12,16 +14,16 @@ import numpy as np
 
 from openjax.flights.flight import Case
 from openjax.flights.reading import flights_of
-from openjax.flights.samples import fly, log_of
+from openjax.flights.samples import Turbulence, fly, log_of
 from openjax.flights.segments import SEGMENTS
 from openjax.gap.evidence import gather
 from openjax.gap.model.library import library, places, prior
 from openjax.gap.model.replay import Replay
+from openjax.gap.selection import DETECTABLE
 from openjax.vehicle.vehicle_file import VehicleFile
 
 SECONDS = 10.0  # of each segment that are simulated
 ENOUGH = 0.98  # of what all segments tell together
-TELLS = 2.0  # nats: less says nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +72,7 @@ def advise(beliefs: list[Belief], vehicle_file: VehicleFile) -> Advice:
     together = np.outer(weights, weights)
     promises = []
     for number, name in enumerate(replay.flights):
-        told = together * (1.0 - np.exp(-0.5 * apart[number]))
+        told = together * _told(apart[number])
         i, j = np.unravel_index(int(np.argmax(np.triu(told, 1))), told.shape)
         pair = (beliefs[i].name, beliefs[j].name)
         promises.append(
@@ -89,13 +91,20 @@ def advise(beliefs: list[Belief], vehicle_file: VehicleFile) -> Advice:
     return Advice(ranked, tuple(names[k] for k in chosen), nats)
 
 
+def _told(nats: np.ndarray) -> np.ndarray:
+    """Probability that two causes so many nats apart are told from each other by a diagnosis that
+    asks for DETECTABLE of them.
+    """
+    return 1.0 - np.exp(-0.5 * np.maximum(nats - DETECTABLE, 0.0))
+
+
 def _fewest(apart: np.ndarray, together: np.ndarray) -> list[int]:
     """Segments, each adding most to those before, until they tell nearly what all do (nats of
     flights add up).
     """
 
     def told(nats):
-        return float((together * (1.0 - np.exp(-0.5 * nats))).sum())
+        return float((together * _told(nats)).sum())
 
     everything = told(apart.sum(0))
     chosen: list[int] = []
@@ -113,7 +122,8 @@ def _simulated(vehicle_file: VehicleFile) -> Replay:
     described = replace(vehicle_file, log={"motor_rows": "mean"})
     flights = []
     for number, (name, segment) in enumerate(SEGMENTS.items()):
-        columns = fly(vehicle, vehicle, segment.reference(SECONDS), seed=number)
+        air = Turbulence()
+        columns = fly(vehicle, vehicle, segment.reference(SECONDS), seed=number, air=air)
         found, _ = flights_of(log_of(columns, name), (0, 1, 2, 3))
         flights += found
     case = Case("segments", tuple(flights), described)
@@ -138,5 +148,17 @@ def _distances(replay: Replay, beliefs: list[Belief]) -> np.ndarray:
             taken = np.linalg.solve(inside, gram[count:, :count])
             left = np.diag(gram[:count, :count] - gram[:count, count:] @ taken)
             out[flight, :, j] = 0.5 * np.maximum(left, 0.0)
-    # A cause is told from another only if neither can imitate the other.
-    return np.minimum(out, np.swapaxes(out, 1, 2))
+    return _of_pairs(out, beliefs)
+
+
+def _of_pairs(nats: np.ndarray, beliefs: list[Belief]) -> np.ndarray:
+    """(F, B, B) nats of pairs, from those (F, B, B) by which what one cause does speaks against
+    another. A cause is told from another only if neither can imitate the other; but one that holds
+    the other's effects and more imitates it always, so there what it does more counts.
+    """
+    out = np.minimum(nats, np.swapaxes(nats, 1, 2))
+    for i, more in enumerate(beliefs):
+        for j, less in enumerate(beliefs):
+            if set(less.effects) < set(more.effects):
+                out[:, i, j] = out[:, j, i] = nats[:, i, j]
+    return out
