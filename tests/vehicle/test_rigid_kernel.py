@@ -12,7 +12,7 @@ import pytest
 
 from openjax.kernels.componentwise import evaluate, split
 from openjax.vehicle import hover_state, load_vehicle, make_drones_step
-from openjax.vehicle.rigid_kernel import WORLDS, WORTH, kernel_call, mapped_step
+from openjax.vehicle.rigid_kernel import DRONES, WORTH, kernel_call, mapped_step
 
 pytestmark = pytest.mark.slow
 
@@ -76,12 +76,12 @@ def freely(drones, command):
 
 
 def test_kernel_computes_the_step_of_each_drone():
-    drones, command = drawn(WORLDS + 5, 1)  # the last block is only partly filled
+    drones, command = drawn(DRONES + 5, 1)  # the last block is only partly filled
     assert_close(by_kernel(FREE.fused, drones, command), freely(drones, command))
 
 
 def test_kernel_computes_contacts():
-    drones, command, pillars = crowded(WORLDS + 5)
+    drones, command, pillars = crowded(DRONES + 5)
     among = AMONG_SOLIDS.fused
     stepped = by_kernel(among, drones, command, pillars)
     plainly = jax.jit(jax.vmap(lambda *world: mapped_step(among, VEHICLE, *world)))

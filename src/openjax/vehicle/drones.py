@@ -15,7 +15,7 @@ from openjax.vehicle.effects.effect import Context, Effect, make_context
 from openjax.vehicle.mjx_body import make_world
 from openjax.vehicle.parameters import Vehicle
 from openjax.vehicle.rate_controller import rate_controller
-from openjax.vehicle.rigid_body import rotate
+from openjax.vehicle.rigid_body import accelerations, rotate
 from openjax.vehicle.rigid_kernel import FusedStep, step_many
 from openjax.vehicle.rotors import rotor_speed_step
 from openjax.vehicle.shapes import Active, Command, Commands, Pillars, Seconds, Vector
@@ -117,7 +117,7 @@ class DronesStep:
     @property
     def fused(self) -> FusedStep:
         """`rigid` without effects, for `step_many`."""
-        return FusedStep(self._plain_substep, self.substeps)
+        return FusedStep(self._accelerate, self.arena, self._bodies.dt, self.substeps)
 
     def reset(self, vehicle: Vehicle, drones: DroneState, key=None) -> DroneState:
         """`drones` (leading axis N) with the effects' memory as at the start of an episode.
@@ -189,10 +189,10 @@ class DronesStep:
         drones, force, torque = turn(vehicle, parameters, drones, command, contexts)
         return self._bodies(vehicle, drones, force, torque, pillars)
 
-    def _plain_substep(self, vehicle, drone, command, around):
-        """One drone after a substep of `rigid` without effects."""
+    def _accelerate(self, vehicle, drone, command):
+        """One drone without effects up to its accelerations in free flight; see `FusedStep`."""
         drone, force, torque = motors((), vehicle, {}, drone, command, None, self._bodies.dt)
-        return self._bodies.rigid(vehicle, drone, force, torque, around)
+        return drone, *accelerations(vehicle, drone, force, torque)
 
     def _remember(self, drones):
         """The drones with the effects' memory at the end of a step."""

@@ -75,6 +75,20 @@ def euler_step(
     )
 
 
+def accelerations(
+    vehicle: Vehicle, drone: DroneState, force_world: Vector, torque_body: Vector
+) -> tuple[Vector, Vector]:
+    """Of one drone in free flight, by the Newton-Euler equations: (3,) m/s^2 world and (3,) rad/s^2
+    body.
+
+    force_world (3,) N without gravity, torque_body (3,) N m about the centre of mass.
+    """
+    up = jnp.array([0, 0, 1], force_world.dtype)
+    acceleration = force_world / vehicle.mass - vehicle.gravity * up
+    momentum = vehicle.inertia * drone.body_rates
+    return acceleration, (torque_body - cross(drone.body_rates, momentum)) / vehicle.inertia
+
+
 def rigid_step(
     vehicle: Vehicle,
     drone: DroneState,
@@ -85,16 +99,11 @@ def rigid_step(
 ) -> DroneState:
     """One drone after dt seconds, its rotors and controller as they are.
 
-    force_world (3,) N without gravity, torque_body (3,) N m about the centre of mass. Newton-Euler
-    equations. `contact`, if any, maps the acceleration (3,) m/s^2 that the drone would have in free
-    flight to what contacts add.
+    force_world and torque_body as for `accelerations`. `contact`, if any, maps the acceleration (3,)
+    m/s^2 that the drone would have in free flight to what contacts add.
     """
-    acceleration = force_world / vehicle.mass - vehicle.gravity * jnp.array(
-        [0, 0, 1], force_world.dtype
-    )
+    acceleration, angular_acceleration = accelerations(vehicle, drone, force_world, torque_body)
     if contact is not None:
         # as by MJX, gradients are those of free flight: what contacts add is a constant to them
         acceleration = acceleration + jax.lax.stop_gradient(contact(acceleration))
-    momentum = vehicle.inertia * drone.body_rates
-    angular_acceleration = (torque_body - cross(drone.body_rates, momentum)) / vehicle.inertia
     return euler_step(drone, acceleration, angular_acceleration, dt)

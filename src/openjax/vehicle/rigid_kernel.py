@@ -2,8 +2,8 @@
 
 XLA splits the step into some ten kernels (more with contacts), each of which reads and writes all
 drones' states; with tens of thousands of drones most of the time is spent on starting them. Here
-every drone's state is read once and written once. One thread holds all drones of a world, which
-therefore know of each other without a detour through memory.
+every drone's state is read once and written once. One thread holds one drone, and reads where the
+others of its world are; loops over pillars and other drones keep the program small.
 """
 
 import functools
@@ -12,33 +12,57 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton as pallas_triton
 
 from openjax.kernels.componentwise import evaluate, split
 from openjax.platform import on_platform, whole_blocks
+from openjax.vehicle.arena import Arena
 from openjax.vehicle.parameters import Vehicle
-from openjax.vehicle.solids import Surroundings, others, surroundings
+from openjax.vehicle.rigid_body import euler_step
+from openjax.vehicle.solids import (
+    Surroundings,
+    contact_acceleration,
+    floor,
+    looped_contact_acceleration,
+    other_drone,
+    pillar,
+    surroundings,
+)
 from openjax.vehicle.state import DroneState
 
 WORTH = 16384
-"""Worlds from which the kernel is taken: it saves microseconds a step, and the compiler needs half
-a minute for it.
+"""Worlds from which the kernel is taken: it saves microseconds a step, and takes the compiler
+seconds.
 """
-WORLDS = 128
-"""Worlds of one program."""
+DRONES = 128
+"""Drones of one program."""
 WARPS = 4
 
 
 class FusedStep(NamedTuple):
     """What a step does to one drone: hashable, since compiled code is kept for each."""
 
-    substep: Callable[[Vehicle, DroneState, jax.Array, Surroundings | None], DroneState]
-    """(vehicle, drone, command (4,), what is around it or None in free flight) -> the drone a
-    substep later.
+    accelerate: Callable[[Vehicle, DroneState, jax.Array], tuple[DroneState, jax.Array, jax.Array]]
+    """(vehicle, drone, command (4,)) -> the drone with its controller and rotors a substep later,
+    its accelerations (3,) m/s^2 world and (3,) rad/s^2 body in free flight.
     """
+    arena: Arena
+    dt: float
+    """Seconds of a substep."""
     substeps: int
+
+    def one(
+        self, vehicle: Vehicle, drone: DroneState, command, around: Surroundings | None
+    ) -> DroneState:
+        """One drone after a substep, in free flight if nothing is `around`."""
+        moved, acceleration, angular = self.accelerate(vehicle, drone, command)
+        if around is not None:
+            place = (self.arena, drone.position, drone.velocity)
+            extra = contact_acceleration(*place, acceleration, around, self.dt)
+            # as by MJX, gradients are those of free flight: what contacts add is a constant to them
+            acceleration = acceleration + jax.lax.stop_gradient(extra)
+        return euler_step(moved, acceleration, angular, self.dt)
 
 
 def step_many(
@@ -69,7 +93,7 @@ def mapped_step(
     """
     for _ in range(step.substeps):
         around = surroundings(drones.position, drones.velocity, *pillars) if pillars else None
-        drones = jax.vmap(step.substep, (None, 0, 0, 0))(vehicle, drones, command, around)
+        drones = jax.vmap(step.one, (None, 0, 0, 0))(vehicle, drones, command, around)
     return drones
 
 
@@ -132,65 +156,149 @@ def kernel_call(
 
     drones (W, n, ...), command (W, n, 4), pillars () or (W, P, 2) and (W, P).
     """
-    number, n = command.shape[:2]
-    if pillars:
-        pillars = (pillars[0], pillars[1].astype(jnp.float32))
-    leaves, structure = jax.tree.flatten((drones, command))
-    results = len(leaves) - 1
-    inputs = [leaf.reshape(number, -1) for leaf in (*leaves, *pillars)]
-    inputs = [whole_blocks(leaf, WORLDS, mode="edge") for leaf in inputs]
-    constants = jax.tree.leaves(vehicle)
-    packed = jnp.concatenate([jnp.ravel(leaf) for leaf in constants])
-    # a block's size is a power of two
-    packed = jnp.pad(packed, (0, (1 << (packed.shape[0] - 1).bit_length()) - packed.shape[0]))
+    if not pillars or step.substeps == 1:
+        return _one_call(step, vehicle, _Worlds(drones, command, pillars), interpret)
+    single = step._replace(substeps=1)  # drones see where the others are after each
 
-    drone, one_command = structure.unflatten([leaf[0, 0] for leaf in leaves])
-    around = None
-    if pillars:
-        first = jax.tree.map(lambda leaf: leaf[0], (drones, pillars))
-        around = surroundings(first[0].position, first[0].velocity, first[1][0], first[1][1] > 0)
-        around = jax.tree.map(lambda leaf: leaf[0], around)
-    traced = jax.make_jaxpr(step.substep)(vehicle, drone, one_command, around)
+    def substep(drones, _):
+        return _one_call(single, vehicle, _Worlds(drones, command, pillars), interpret), None
 
-    def kernel(packed_ref, *refs):
-        vehicle_parts = []
-        start = 0
-        for leaf in constants:
-            parts = split(packed_ref[start + i] for i in range(leaf.size))
-            vehicle_parts.append(parts.reshape(leaf.shape))
-            start += leaf.size
-        parts = [split(ref[:, i] for i in range(ref.shape[1])) for ref in refs[: len(inputs)]]
-        world = [
-            p.reshape(n, *leaf.shape[2:]) for p, leaf in zip(parts[:results], leaves, strict=False)
+    return jax.lax.scan(substep, drones, None, length=step.substeps)[0]
+
+
+class _Worlds(NamedTuple):
+    """What `kernel_call` is given of W worlds."""
+
+    drones: DroneState
+    command: jax.Array
+    pillars: tuple
+
+    def rows(self):
+        """Leaves of the drones and the commands, drones of all worlds one below the other, in whole
+        blocks.
+        """
+        number = self.command.shape[0] * self.command.shape[1]
+        leaves = jax.tree.leaves((self.drones, self.command))
+        return [whole_blocks(leaf.reshape(number, -1), DRONES, mode="edge") for leaf in leaves]
+
+    def around(self):
+        """What each drone looks up: where all drones and pillars are; nothing in free flight."""
+        if not self.pillars:
+            return []
+        position, active = self.pillars
+        return [
+            self.drones.position.reshape(-1, 3),
+            self.drones.velocity.reshape(-1, 3),
+            position.reshape(position.shape[0], -1),
+            active.astype(jnp.float32),
         ]
-        commands = parts[results].reshape(n, 4)
-        solids = []
-        if pillars:
-            position, active = parts[results + 1 :]
-            solids = [position.reshape(-1, 2), split(part > 0.5 for part in active)]
-        for _ in range(step.substeps):
-            now = structure.unflatten([*world, commands])[0]
-            moved = []
-            for i in range(n):
-                own = [leaf[i] for leaf in world]
-                seen = [now.position[others(n)[i]], now.velocity[others(n)[i]]] if pillars else []
-                moved.append(evaluate(traced, [*vehicle_parts, *own, commands[i], *solids, *seen]))
-            world = [np.stack(leaf) for leaf in zip(*moved, strict=True)]
-        for ref, values in zip(refs[len(inputs) :], world, strict=True):
-            for i, value in enumerate(values.ravel()):
-                ref[:, i] = jnp.broadcast_to(value, (WORLDS,))
 
-    blocks = [pl.BlockSpec((WORLDS, leaf.shape[1]), lambda i: (i, 0)) for leaf in inputs]
-    stepped = pl.pallas_call(
-        kernel,
-        out_shape=[jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in inputs[:results]],
-        grid=(inputs[0].shape[0] // WORLDS,),
-        in_specs=[pl.BlockSpec(packed.shape, lambda i: (0,)), *blocks],
-        out_specs=blocks[:results],
-        input_output_aliases={i + 1: i for i in range(results)},
+    def unpacked(self, rows):
+        """The drones again from their leaves' rows."""
+        leaves, structure = jax.tree.flatten(self.drones)
+        number = self.command.shape[0] * self.command.shape[1]
+        whole = [row[:number].reshape(leaf.shape) for row, leaf in zip(rows, leaves, strict=True)]
+        return structure.unflatten(whole)
+
+
+def _one_call(step, vehicle, worlds, interpret):
+    """One kernel; of several substeps only in free flight."""
+    rows = worlds.rows()
+    around = worlds.around()
+    constants = jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(vehicle)])
+    size = 1 << (constants.shape[0] - 1).bit_length()  # a block's size is a power of two
+    constants = jnp.pad(constants, (0, size - constants.shape[0]))
+    moved = rows[:-1]
+    blocks = [pl.BlockSpec((DRONES, leaf.shape[1]), lambda i: (i, 0)) for leaf in rows]
+    whole = [pl.BlockSpec(leaf.shape, lambda i: (0, 0)) for leaf in around]
+    # position and velocity, the first leaf and the third, aren't written over where others look
+    looked_up = {0, 2} if around else set()
+    moved = pl.pallas_call(
+        _kernel(step, vehicle, worlds),
+        out_shape=[jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in moved],
+        grid=(rows[0].shape[0] // DRONES,),
+        in_specs=[pl.BlockSpec(constants.shape, lambda i: (0,)), *blocks, *whole],
+        out_specs=blocks[:-1],
+        input_output_aliases={i + 1: i for i in range(len(moved)) if i not in looked_up},
         interpret=interpret,
         compiler_params=pallas_triton.CompilerParams(num_warps=WARPS, num_stages=1),
         name="rigid_step",
-    )(packed, *inputs)
-    stepped = [leaf[:number].reshape(old.shape) for leaf, old in zip(stepped, leaves, strict=False)]
-    return jax.tree.unflatten(jax.tree.structure(drones), stepped)
+    )(constants, *rows, *around)
+    return worlds.unpacked(moved)
+
+
+def _kernel(step, vehicle, worlds):
+    """The program of a block of drones, each of which is done component by component."""
+    drone, command = jax.tree.map(lambda leaf: leaf[0, 0], (worlds.drones, worlds.command))
+    leaves = jax.tree.leaves(drone)
+    accelerate = jax.make_jaxpr(step.accelerate)(vehicle, drone, command)
+    move = functools.partial(euler_step, dt=step.dt)
+    move = jax.make_jaxpr(move)(drone, drone.position, drone.position)
+
+    def kernel(constants_ref, *refs):
+        state = [[ref[:, i] for i in range(ref.shape[1])] for ref in refs[: len(leaves)]]
+        command = split(refs[len(leaves)][:, i] for i in range(4))
+        around = refs[len(leaves) + 1 : -len(leaves)]
+        constants = _numbers(constants_ref, jax.tree.leaves(vehicle))
+
+        def substep(_, state):
+            parts = [
+                split(row).reshape(leaf.shape) for row, leaf in zip(state, leaves, strict=True)
+            ]
+            *turned, free, angular = evaluate(accelerate, [*constants, *parts, command])
+            if around:
+                own = jax.tree.structure(drone).unflatten(parts)
+                free = free + _contacts(step, own, free, worlds.command.shape[:2], around)
+            moved = evaluate(move, [*turned, free, angular])
+            return [[jnp.broadcast_to(part, (DRONES,)) for part in leaf.ravel()] for leaf in moved]
+
+        if step.substeps == 1:  # not worth a loop
+            state = substep(0, state)
+        else:
+            state = jax.lax.fori_loop(0, step.substeps, substep, state)
+        for ref, values in zip(refs[-len(leaves) :], state, strict=True):
+            for i, value in enumerate(values):
+                ref[:, i] = value
+
+    return kernel
+
+
+def _numbers(constants_ref, leaves):
+    """The vehicle's numbers as arrays of objects of its leaves' shapes."""
+    parts = []
+    start = 0
+    for leaf in leaves:
+        numbers = split(constants_ref[start + i] for i in range(leaf.size))
+        parts.append(numbers.reshape(leaf.shape))
+        start += leaf.size
+    return parts
+
+
+def _contacts(step, drone, free, sizes, around):
+    """What contacts add to the accelerations in free flight of a block of drones, components (3,);
+    `sizes`: worlds, and drones in each.
+    """
+    position_ref, velocity_ref, pillar_ref, active_ref = around
+    worlds, n = sizes
+    number = pl.program_id(0) * DRONES + jnp.arange(DRONES)  # of a drone among those of all worlds
+    world = jnp.minimum(jax.lax.div(number, n), worlds - 1)  # the last block may be partly empty
+    index = jax.lax.rem(number, n)
+    place = tuple(drone.position)
+
+    def pillar_beside(k):
+        foot = tuple(pillar_ref[world, 2 * k + i] for i in range(2))
+        return pillar(step.arena, place, foot, active_ref[world, k] > 0.5)
+
+    def drone_beside(k):
+        row = world * n + k + (k >= index).astype(jnp.int32)  # all but oneself
+        where = tuple(position_ref[row, i] for i in range(3))
+        return other_drone(where, tuple(velocity_ref[row, i] for i in range(3)))
+
+    groups = (  # the loops first: what comes before one makes it larger for the compiler
+        (active_ref.shape[1], pillar_beside),
+        (n - 1, drone_beside),
+        (1, lambda _: floor(place)),
+    )
+    return split(
+        looped_contact_acceleration(place, tuple(drone.velocity), tuple(free), groups, step.dt)
+    )

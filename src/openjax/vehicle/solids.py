@@ -12,6 +12,8 @@ The same contacts are solved by MuJoCo MJX (`place_solids`, `mjx_body`) and, wri
 `contact_acceleration`.
 """
 
+from collections.abc import Callable, Sequence
+
 import flax.struct
 import jax
 import jax.numpy as jnp
@@ -45,6 +47,19 @@ class Surroundings:
 
 
 @flax.struct.dataclass
+class Thing:
+    """One solid thing beside a drone, or arrays over many; what doesn't vary is a float."""
+
+    place: Components  # m, where its shape stands
+    level: Gaps  # m, height of its point nearest to the drone
+    velocity: Components  # m/s
+    reach: Gaps  # m, between it and the drone's centre when their surfaces touch
+    stiffness: Gaps  # see `_FIXED`
+    damping: Gaps
+    impedance: Gaps
+
+
+@flax.struct.dataclass
 class Encounters:
     """One drone beside its solid things: floor, P pillars, K other drones, in this order (M = 1 + P
     + K).
@@ -53,7 +68,7 @@ class Encounters:
     of them at once.
     """
 
-    origin: Components  # m, where each shape stands; the floor's below the drone
+    things: Thing  # arrays over the things
     normal: Components  # unit vector from the nearest point of each thing to the drone
     gap: Gaps  # m, between the surfaces now
     shown: Gaps  # m, the gap that the solver of contacts is shown; < 0: it acts
@@ -67,6 +82,7 @@ class Encounters:
 # keeps their momentum; a low impedance, since the other gives way too.
 _FIXED = (0.4, 0.6, 0.99)
 _DRONE = (0.5, 0.0, 0.5)
+_STILL = (0.0, 0.0, 0.0)  # m/s
 
 _NEAR = 0.04  # m, gap within which a thing counts as near: the way of a fast drone in one step
 _TOUCHING = -1e-6  # m, gap at which a contact acts but doesn't push
@@ -128,46 +144,83 @@ def surroundings(
     )
 
 
+def floor(position: Components) -> Thing:
+    """The floor to drones at `position`: it stands below each of them."""
+    place = (position[0], position[1], jnp.zeros_like(position[2]))
+    return Thing(place, place[2], _STILL, DRONE_RADIUS, *_FIXED)
+
+
+def pillar(arena: Arena, position: Components, place: Sequence[jax.Array], active) -> Thing:
+    """A pillar at `place` (x, y) m to drones at `position`; where it isn't `active`, it stands far
+    below.
+    """
+    half = arena.height / 2
+    height = jnp.where(active, half, PARKED).astype(position[2].dtype)
+    level = jnp.clip(position[2] - height, -half, half) + height
+    return Thing((*place, height), level, _STILL, arena.pillar_radius + DRONE_RADIUS, *_FIXED)
+
+
+def other_drone(position: Components, velocity: Components) -> Thing:
+    """Another drone."""
+    return Thing(position, position[2], velocity, 2 * DRONE_RADIUS, *_DRONE)
+
+
+def _things(arena, position, around) -> Thing:
+    """All things around one drone at `position` (3,), in the order of `solids_xml`."""
+    here = tuple(position)
+    kinds = (
+        floor(tuple(part[None] for part in here)),
+        pillar(arena, here, tuple(around.pillar_position.T), around.pillar_active),
+        other_drone(tuple(around.other_position.T), tuple(around.other_velocity.T)),
+    )
+    sizes = [kind.level.shape[0] for kind in kinds]
+
+    def joined(*parts):
+        alike = [isinstance(part, float) for part in parts].count(True)  # the first ones, if any
+        constant = jnp.asarray(np.repeat(parts[:alike], sizes[:alike]), position.dtype)
+        arrays = parts[alike:]
+        if not arrays:
+            return constant
+        return jnp.concatenate([constant, *arrays] if alike else arrays)
+
+    return jax.tree.map(joined, *kinds)
+
+
 def encounters(
     arena: Arena, position: Vector, velocity: Vector, around: Surroundings, dt: Seconds
 ) -> Encounters:
     """One drone at `position` (3,) m with `velocity` (3,) m/s beside its solid things, for a step
     of dt seconds.
     """
-    dtype = position.dtype
-    half = arena.height / 2
-    p = around.pillar_position.shape[0]
-    k = around.other_position.shape[0]
-    height = jnp.where(around.pillar_active, half, PARKED).astype(dtype)
-    level = jnp.clip(position[2] - height, -half, half) + height
-    pillar = (*around.pillar_position.T, height)
-    below = (position[0], position[1], jnp.zeros((), dtype))
-    origin = tuple(
-        jnp.concatenate([one[None], *parts])
-        for one, *parts in zip(below, pillar, around.other_position.T, strict=True)
-    )
-    nearest = (*origin[:2], jnp.concatenate([below[2][None], level, around.other_position[:, 2]]))
-    moving = (jnp.concatenate([jnp.zeros(1 + p, dtype), part]) for part in around.other_velocity.T)
-    radius = np.r_[
-        DRONE_RADIUS, np.full(p, arena.pillar_radius + DRONE_RADIUS), np.full(k, 2 * DRONE_RADIUS)
-    ]
+    things = _things(arena, position, around)
+    normal, gap, gap_ahead = _approach(position, velocity, things, dt)
+    shown = _shown(gap, gap_ahead, jnp.any(gap_ahead < 0.0))
+    return Encounters(things, normal, gap, shown)
+
+
+def _approach(position, velocity, thing, dt):
+    """The normal of contact, the gap now, and at the end of the step if nothing intervened."""
+    nearest = (*thing.place[:2], thing.level)
     away = tuple(own - other for own, other in zip(position, nearest, strict=True))
     distance = jnp.sqrt(sum(part * part for part in away) + 1e-12)
     normal = tuple(part / distance for part in away)
-    gap = distance - jnp.asarray(radius, dtype)
-    approach = sum(
-        n * (own - other) for n, own, other in zip(normal, velocity, moving, strict=True)
+    gap = distance - thing.reach
+    speed = sum(
+        n * (own - other) for n, own, other in zip(normal, velocity, thing.velocity, strict=True)
     )
-    gap_ahead = gap + dt * approach
-    hit = jnp.any(gap_ahead < 0.0)
-    shown = jnp.where(hit & (gap < _NEAR) & (gap_ahead >= 0.0), _TOUCHING, gap_ahead)
-    return Encounters(origin, normal, gap, shown)
+    return normal, gap, gap + dt * speed
+
+
+def _shown(gap, gap_ahead, hit):
+    """The gap that the solver of contacts is shown, where something or nothing is hit."""
+    return jnp.where(hit & (gap < _NEAR) & (gap_ahead >= 0.0), _TOUCHING, gap_ahead)
 
 
 def place_solids(met: Encounters) -> Things:
     """Where one drone's shapes are shown to it, (M, 3) m, in the order of `solids_xml`."""
     shift = met.shown - met.gap
-    return jnp.stack([o - n * shift for o, n in zip(met.origin, met.normal, strict=True)], axis=-1)
+    places = zip(met.things.place, met.normal, strict=True)
+    return jnp.stack([place - n * shift for place, n in places], axis=-1)
 
 
 def contact_acceleration(
@@ -192,21 +245,82 @@ def contact_acceleration(
     the step brings in another contact.
     """
     met = encounters(arena, position, velocity, around, dt)
-    contacts = _contacts(around.pillar_position.shape[0], around.other_position.shape[0])
-    stiffness, damping, impedance = (jnp.asarray(column, velocity.dtype) for column in contacts.T)
-    x, y, z = met.normal
+    reference = _reference(met.things, met.normal, met.shown, velocity, dt)
+    lacking = _along(met.normal, acceleration) - reference
+    terms = _terms(met.things, met.normal, met.shown, lacking)
+    return jnp.stack(_newton_step(_sums(terms)))
 
-    def along(vector):
-        return x * vector[0] + y * vector[1] + z * vector[2]
 
-    reference = -(damping / dt * along(velocity) + stiffness / dt**2 * met.shown) / impedance
-    residual = along(acceleration) - reference
-    weight = jnp.where((met.shown < 0.0) & (residual < 0.0), impedance / (1.0 - impedance), 0.0)
-    pulls = (weight * residual * part for part in (x, y, z))
-    terms = (*pulls, *(weight * a * b for a, b in ((x, x), (y, y), (z, z), (x, y), (x, z), (y, z))))
-    *pull, xx, yy, zz, xy, xz, yz = _sums(terms)
+def looped_contact_acceleration(
+    position: Components,
+    velocity: Components,
+    acceleration: Components,
+    groups: Sequence[tuple[int, Callable[[jax.Array], Thing]]],
+    dt: Seconds,
+) -> Components:
+    """`contact_acceleration` of a block of drones, by loops over their things: a small program
+    where compiling an unrolled one would take half a minute.
 
-    # (1 + sum_i w_i n_i n_i^T) step = -pull, by an LDL^T factorisation
+    Vectors are their three components, each a block of drones. `groups`: (number, function of an
+    index that gives the thing beside each drone of the block).
+    """
+
+    def add(totals, thing):
+        least, sums = totals
+        normal, gap, gap_ahead = _approach(position, velocity, thing, dt)
+        shown = _shown(gap, gap_ahead, True)  # where nothing is hit, the sums aren't used
+        reference = _reference(thing, normal, shown, velocity, dt)
+        terms = _terms(thing, normal, shown, _along(normal, acceleration) - reference)
+        sums = tuple(a + b for a, b in zip(sums, terms, strict=True))
+        return jnp.minimum(least, gap_ahead), sums
+
+    nothing = jnp.full_like(position[0], jnp.inf), (jnp.zeros_like(position[0]),) * 9
+    least, sums = _fold(add, nothing, groups)
+    return _newton_step([jnp.where(least < 0.0, part, 0.0) for part in sums])
+
+
+def _fold(function, start, groups):
+    """`function` of what there is so far and each thing, one after the other."""
+    for number, thing in groups:
+        if number == 0:
+            continue
+
+        def one(k, value, thing=thing):
+            return function(value, thing(k))
+
+        start = one(0, start) if number == 1 else jax.lax.fori_loop(0, number, one, start)
+    return start
+
+
+def _along(normal, vector):
+    x, y, z = normal
+    return x * vector[0] + y * vector[1] + z * vector[2]
+
+
+def _reference(thing, normal, gap, velocity, dt):
+    """The acceleration along the normal that a contact asks for (m/s^2), shown a `gap`."""
+    # divided in the drones' precision, as what it is compared with
+    stiffness, damping, impedance = (
+        jnp.asarray(number, gap.dtype)
+        for number in (thing.stiffness, thing.damping, thing.impedance)
+    )
+    return -(damping / dt * _along(normal, velocity) + stiffness / dt**2 * gap) / impedance
+
+
+def _terms(thing, normal, gap, lacking):
+    """What one contact adds to the pull (3,) and to the matrix (xx, yy, zz, xy, xz, yz) of the
+    Newton step, where the free acceleration is `lacking` (< 0) against the reference.
+    """
+    x, y, z = normal
+    impedance = jnp.asarray(thing.impedance, gap.dtype)
+    weight = jnp.where((gap < 0.0) & (lacking < 0.0), impedance / (1.0 - impedance), 0.0)
+    pulls = (weight * lacking * part for part in normal)
+    return (*pulls, *(weight * a * b for a, b in ((x, x), (y, y), (z, z), (x, y), (x, z), (y, z))))
+
+
+def _newton_step(sums):
+    """The solution of (1 + sum_i w_i n_i n_i^T) step = -pull, by an LDL^T factorisation."""
+    *pull, xx, yy, zz, xy, xz, yz = sums
     xx = 1.0 + xx
     yy = 1.0 + yy
     zz = 1.0 + zz
@@ -219,7 +333,7 @@ def contact_acceleration(
     f_y = l_y * pull[0] - pull[1]
     step_z = (l_z * pull[0] - pull[2] - l_zy * f_y) / d_z
     step_y = f_y / d_y - l_zy * step_z
-    return jnp.stack([-pull[0] / xx - l_y * step_y - l_z * step_z, step_y, step_z])
+    return -pull[0] / xx - l_y * step_y - l_z * step_z, step_y, step_z
 
 
 def _sums(terms):
