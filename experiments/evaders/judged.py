@@ -6,20 +6,25 @@ the policy, one that plans in the true simulation, and the scripted ones; or wha
 is `--effects experiments/flying/slower.toml`. Stores the least capture rate of each kind, and makes the table of judged.md.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from experiments.flying.vehicles import SLOWER
-from experiments.table import Page, Table, page_parser, publish
+from experiments.table import RESULTS, Page, Table, page_parser, publish
 from openjax.command_line import run_command
-from openjax.files import read_json
+from openjax.files import read_json, write_text
 from openjax.pursuit import SCENARIOS
 from openjax.pursuit.evaders import HELD_OUT
 from openjax.runs.exploit_report import verdict
+from openjax.store import DEFAULT_POLICY
 from openjax.vehicle.effects import load_effects
 from openjax.vehicle.parameters import NOMINAL
 
+FACTS = ("command", "machine", "seconds")
+"""What is another in each run; the rest of what is stored is kept."""
 PLACES = (*SCENARIOS, "uniform")
+SUMMARIES = ("README.md", "docs/model_cards.md")
+"""Pages that show the rows of weights that ship."""
 JUDGES: Mapping[str, Callable[[str], bool]] = {
     "evaders that learn": lambda evader: evader.startswith("learned"),
     "a planner": lambda evader: evader == "planner",
@@ -39,6 +44,7 @@ def row(policy: str, vehicle: str, judge: str, records: list[dict]) -> dict:
         "vehicle": vehicle,
         "judge": judge,
         "evaders": len({record["evader"] for record in records}),
+        "shown": policy == DEFAULT_POLICY and vehicle == "nominal",
         **{figure: {own["scenario"]: own[figure] for own in worst} for figure in figures},
     }
 
@@ -79,7 +85,9 @@ def study(options) -> dict:
         rows = [old for old in rows if identity(old) not in again] + new
         run = {name: found[name] for name in ("curve", "seconds") if name in found}
         runs[f"{policy}, {vehicle_of(found)}"] = run
-    return {"rows": rows, "runs": runs}
+    kept = {name: value for name, value in stored.items() if name not in FACTS}
+    hidden = options.hide if options.hide is not None else stored.get("hidden", [])
+    return {**kept, "rows": rows, "runs": runs, "hidden": hidden}
 
 
 def page(results: Mapping) -> Page:
@@ -96,14 +104,41 @@ def page(results: Mapping) -> Page:
         **{place: rate(place) for place in PLACES},
         "most crashes": lambda row: f"{max(row['crash_rate'].values()):.2f}",
     }
-    return Page("The second judge", "Least capture rates.", Table(columns, results["rows"]))
+    rows = [row for row in results["rows"] if is_shown(row, results.get("hidden", []))]
+    return Page("The second judge", "Least capture rates.", Table(columns, rows))
+
+
+def is_shown(row: Mapping, hidden: Sequence[str]) -> bool:
+    """Whether the table has a row: of weights that don't ship, only what finds most."""
+    finds_most = row["judge"] in tuple(JUDGES)[:2]
+    return row["policy"] not in hidden and (finds_most or row["policy"] == DEFAULT_POLICY)
+
+
+def write_summaries(rows: Sequence[Mapping]) -> None:
+    """The rows of weights that ship, and of those before them, on the pages that users read."""
+    heads = ["policy", "caught least among", *PLACES]
+    lines = ["| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]
+    for row in rows:
+        if row["shown"]:
+            rates = (f"{row['capture_rate'][place]:.2f}".removeprefix("0") for place in PLACES)
+            lines.append(f"| {row['policy']} | {row['judge']} | {' | '.join(rates)} |")
+    for page in SUMMARIES:
+        path = RESULTS.parent.parent / page
+        before, begin, rest = path.read_text(encoding="utf-8").partition("<!-- judged -->")
+        after = rest.partition("<!-- end of judged -->")[2]
+        text = "\n".join([before + begin, *lines, "<!-- end of judged -->"])
+        write_text(path, text + after)
 
 
 def main(arguments: list[str]) -> None:
     """The command."""
     parser = page_parser(__doc__, "judged")
     parser.add_argument("exploited", nargs="*", metavar="NAME=FILE")
-    publish(parser.parse_args(arguments), study, page)
+    parser.add_argument("--hide", nargs="*", help="policies that stay out of the table")
+    options = parser.parse_args(arguments)
+    publish(options, study, page)
+    if options.out == RESULTS / "judged":
+        write_summaries(read_json(options.out.with_suffix(".json"))["rows"])
 
 
 if __name__ == "__main__":
