@@ -1,7 +1,7 @@
 """A network of one's own as a policy: three functions, the rest is said here once."""
 
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +11,7 @@ from openjax.policy.settings import NetworkSettings, PredictorSettings
 from openjax.pursuit import Observation
 
 
+@runtime_checkable
 class Network(Protocol):
     """What acts and what judges, as pure functions of their parameters. Observations have any
     leading axes.

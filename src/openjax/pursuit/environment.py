@@ -2,7 +2,7 @@
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import chex
 import jax
@@ -75,6 +75,7 @@ def action_to_command(action: Float[Array, "*drones 4"]) -> Float[Array, "*drone
     return jnp.concatenate([thrust, jnp.pi * action[..., 1:]], axis=-1)
 
 
+@runtime_checkable
 class Dynamics(Protocol):
     """What moves the pursuers: `openjax.vehicle.DronesStep`, or a world outside."""
 
@@ -96,6 +97,7 @@ class Dynamics(Protocol):
         """The drones as their sensors tell."""
 
 
+@runtime_checkable
 class Observer(Protocol):
     """What pursuers observe; `openjax.pursuit.observe` is the game's own."""
 

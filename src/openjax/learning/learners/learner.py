@@ -1,6 +1,6 @@
 """What a learner is, and what it learns from."""
 
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 from flax import struct
@@ -34,6 +34,7 @@ class Flown:
         return mean_over_devices(tree, self.axis)
 
 
+@runtime_checkable
 class Learner(Protocol):
     """What learns from each rollout: of the policy's parameters some, or something beside them.
 
