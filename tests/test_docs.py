@@ -5,11 +5,13 @@ pages of results have one form that reads at a glance.
 import importlib.util
 import json
 import re
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from openjax.__main__ import COMMANDS
 from openjax.pursuit import SCENARIOS
 from openjax.vehicle.effects import EFFECTS
 
@@ -23,6 +25,7 @@ MOST = {"words": 600, "rows": 10, "line": 400, "sentences": 3, "pictures": 1}
 """Of a page of results: words of prose, rows of its one table, characters of a line, sentences of
 the answer, pictures.
 """
+COMMIT = re.compile(r"\b(?=[a-f]*\d)(?=\d*[a-f])[0-9a-f]{7,40}\b")
 
 
 def prose_of(text: str) -> list[str]:
@@ -59,6 +62,37 @@ def test_results_have_one_form(path):
 def test_lines_of_prose_are_short(path):
     for line in prose_of(path.read_text(encoding="utf-8")):
         assert len(line) <= MOST["line"], line
+
+
+def texts_of(stored, record=None):
+    """Each text of what a JSON file holds, with the record that it stands in."""
+    if isinstance(stored, str):
+        yield stored, record
+    elif isinstance(stored, dict):
+        for value in stored.values():
+            yield from texts_of(value, stored)
+    elif isinstance(stored, list):
+        for value in stored:
+            yield from texts_of(value, record)
+
+
+@pytest.mark.parametrize(
+    "path",
+    [ROOT / "experiments" / "README.md", *sorted(RESULTS.rglob("*.md")), *RESULTS.rglob("*.json")],
+    ids=lambda path: path.name,
+)
+def test_programs_that_results_name_are_there(path):
+    """Or a commit that has them is named beside them: in the same paragraph, or as the record's
+    `program`, in the words of `git show`.
+    """
+    text = path.read_text(encoding="utf-8")
+    named = texts_of(json.loads(text)) if path.suffix == ".json" else texts_of(text.split("\n\n"))
+    for line, record in named:
+        assert set(re.findall(r"(?:^|`)openjax ([a-z_]+)(?= -)", line)) <= set(COMMANDS), line
+        for name in re.findall(r"python -m ((?:openjax|experiments|tests)\b[\w.]*)", line):
+            place = (record or {}).get("program", "").partition(":")[2]
+            moved = place.startswith(name.replace(".", "/"))
+            assert moved or COMMIT.search(line) or "NAME" in name or find_spec(name), name
 
 
 def test_page_of_the_effects_is_made_from_their_files():

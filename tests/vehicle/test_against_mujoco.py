@@ -62,12 +62,13 @@ def test_a_second_of_hard_manoeuvres(airframe, physics, contacts, substeps):
         )
         if substeps > 1:  # what goes on within a step isn't seen from outside
             thrust = inner_thrusts(vehicle, start, commands, substeps)
+        most = float(max_rotor_thrust(vehicle))
         flown = jax.tree.map(np.asarray, flown)
 
     model = mujoco.MjModel.from_xml_path(str(find_mjcf(airframe)))
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:] = np.r_[QPOS[:3], quaternion], QVEL
-    assert thrust.max() > 0.95 * max_rotor_thrust(vehicle), "the manoeuvres must reach saturation"
+    assert thrust.max() > 0.95 * most, "the manoeuvres must reach saturation"
     for k in range(STEPS):
         data.ctrl[:] = thrust[k]
         mujoco.mj_step(model, data)
