@@ -42,7 +42,9 @@ def main(arguments: Sequence[str]) -> None:
 def make_plan(arguments: Arguments) -> list[str]:
     """Write the plan; what to say of it."""
     from openjax.flights.plans import STANDARD, plan_of, write_plan
+    from openjax.flights.samples import PERIOD
     from openjax.flights.segments import SEGMENTS
+    from openjax.flying.state import SafetySettings
 
     promises: list[dict] = []
     if arguments.diagnosis == STANDARD and not Path(STANDARD).exists():
@@ -59,11 +61,14 @@ def make_plan(arguments: Arguments) -> list[str]:
         f"  {p['segment']:6} {p['value']:.3f}  {SEGMENTS[p['segment']].shows}" for p in promises
     ]
     file = arguments.out / "plan.csv"
+    seconds = len(plan) * PERIOD
+    limit = SafetySettings().alone_time
+    lands = "" if seconds < limit else f" Without --motion_capture it lands after {limit:g} s."
     return [
         said,
         *rows,
-        f"{file}: {', '.join(chosen)}; {len(plan) / 100:.0f} s. "
-        f"Next, openjax fly --plan {file} --uri ...",
+        f"{file}: {', '.join(chosen)}; {seconds:.0f} s. "
+        f"Next, openjax fly --plan {file} --uri ...{lands}",
     ]
 
 

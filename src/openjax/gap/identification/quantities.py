@@ -126,7 +126,7 @@ def identify(case: Case, one_clock: bool = True) -> Identification | None:
     records = records_of(case)
     if not records:
         return None
-    fit = identify_torques(records)
+    fit = identify_torques(records, one_clock)
     untrusted = _doubts(records, fit, one_clock)
     return Identification(
         quantities_of(records, fit),

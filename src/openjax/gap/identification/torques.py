@@ -102,8 +102,10 @@ class TorqueFit:
         return float(self.value[2])
 
 
-def identify_torques(records: list[Record]) -> TorqueFit:
-    """The most likely fit of records with body rates, over the motors' clock as well."""
+def identify_torques(records: list[Record], one_clock: bool = True) -> TorqueFit:
+    """The most likely fit of records with body rates, over the motors' clock as well; where streams
+    share no `one_clock`, none is looked for.
+    """
     base = Problem(records)
     first = base.fit(base.begin(LATE[0]))
     if base.dt < FAST_ROWS:
@@ -112,7 +114,7 @@ def identify_torques(records: list[Record]) -> TorqueFit:
         other = filtered.fit(filtered.begin(LATE[0]))
         if other.loss < first.loss - CLEARLY:
             base, first = filtered, other
-    if _clear(first):
+    if _clear(first) or not one_clock:
         return first
     fits = [first, base.fit(base.begin(LATE[1]))]
     for rows in {round(ahead / base.dt): None for ahead in AHEAD}:

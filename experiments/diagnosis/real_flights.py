@@ -1,0 +1,127 @@
+"""What the diagnosis says of folders of published flights whose causes nobody knows in full: names,
+sizes, and the response of the torques.
+
+    python -m experiments.diagnosis.real_flights FOLDER ... --separate FOLDER --jobs 2
+    --out experiments/results/real/real.json
+
+A folder is one case, or holds several. Of a folder after `--separate` each flight is a case, once
+with its own rows and once with rows of 100 Hz that hold the motors' means, as laboratories log them:
+both are of one vehicle, so that what rows hide shows as a difference.
+"""
+
+import argparse
+import json
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from experiments.diagnosis.generate import in_processes
+from experiments.flying.single_thread import use_single_thread
+
+PERIOD = 0.01  # s
+
+
+def cases_of(folder: Path) -> list[Path]:
+    """The cases that a folder is or holds."""
+    if (folder / "vehicle.toml").exists():
+        return [folder]
+    return sorted(path.parent for path in folder.glob("*/vehicle.toml"))
+
+
+def as_means(case):
+    """A case of fast rows with rows of PERIOD: sensors at a row's time, motors as means from there
+    to the next.
+    """
+    flights = []
+    for flight in case.flights:
+        grid = np.arange(flight.time[0], flight.time[-1] - PERIOD, PERIOD)
+        begin = np.searchsorted(flight.time, grid)
+        end = np.searchsorted(flight.time, grid + PERIOD)
+        whole = end - begin > 0.7 * np.median(end - begin)  # rows are missing now and then
+        begin = begin[whole]
+        end = end[whole]
+        motor = [flight.motor_command[i:j].mean(0) for i, j in zip(begin, end, strict=True)]
+        sensed = {name: getattr(flight, name)[begin] for name in ("body_rates", "specific_force")}
+        flights.append(replace(flight, time=grid[whole], motor_command=np.array(motor), **sensed))
+    log = case.vehicle_file.log | {"motor_rows": "mean"}
+    return replace(case, flights=tuple(flights), vehicle_file=replace(case.vehicle_file, log=log))
+
+
+def parts_of(folder: Path, separate: bool) -> list[tuple[Path, int | None, bool]]:
+    """(folder, number of its flight or None for all, whether as means) of each diagnosis."""
+    from openjax.flights.case import load_case
+
+    if not separate:
+        return [(folder, None, False)]
+    count = len(load_case(folder).flights)
+    return [(folder, n, means) for n in range(count) for means in (False, True)]
+
+
+def diagnose(part: tuple[Path, int | None, bool]) -> dict:
+    """What is kept of one diagnosis."""
+    from openjax.flights.case import load_case
+    from openjax.gap.diagnosis import diagnose_case
+
+    folder, number, means = part
+    case = load_case(folder)
+    name = f"{folder.parent.name}/{folder.name}"
+    if number is not None:
+        case = replace(case, flights=(case.flights[number],))
+        name = f"{folder.name}/{case.flights[0].name.split('.')[0]}"
+    if means:
+        case = as_means(case)
+        name += ", 100 Hz"
+    begin = time.process_time()
+    report = diagnose_case(case)
+    seconds = time.process_time() - begin
+    told = report.to_dict()
+    torques = report.identification
+    out = {"case": name, "named": list(report.effects) or [report.verdict]}
+    out["probabilities"] = {e: round(p, 3) for e, p in report.probabilities.items() if p > 0.03}
+    out["shares"] = told["shares"]["effects"]
+    out["parameters"] = {
+        effect: {p: [v["value"], *v["interval90"]] for p, v in found.items()}
+        for effect, found in told["parameters"].items()
+    }
+    out["not_testable"] = told["not_testable"]
+    out["sensors"] = list(report.sensors)
+    if torques is not None:
+        out["torques"] = {"sentence": torques.sentence(), "trusted": torques.trusted} | {
+            n: [q.value, *q.interval90] for n, q in torques.quantities.items()
+        }
+    out["cpu_seconds"] = round(seconds, 1)
+    print(json.dumps(out), flush=True)
+    return out
+
+
+def rounded(value, digits: int = 4):
+    """Numbers of a nested structure with so many significant digits."""
+    if isinstance(value, dict):
+        return {k: rounded(v, digits) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [rounded(v, digits) for v in value]
+    return float(f"{value:.{digits}g}") if isinstance(value, float) else value
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("folders", type=Path, nargs="*")
+    parser.add_argument("--separate", type=Path, nargs="*", default=[])
+    parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--out", type=Path, default=Path("real.json"))
+    arguments = parser.parse_args()
+    use_single_thread()
+    parts = [p for f in arguments.folders for c in cases_of(f) for p in parts_of(c, False)]
+    parts += [p for f in arguments.separate for p in parts_of(f, True)]
+    found = sorted(in_processes(diagnose, parts, arguments.jobs), key=lambda c: c["case"])
+    command = "python -m experiments.diagnosis.real_flights"
+    command += "".join(f" {f.name}" for f in arguments.folders)
+    command += "".join(f" --separate {f.name}" for f in arguments.separate)
+    text = json.dumps({"command": command, "cases": rounded(found)}, indent=1)
+    arguments.out.write_text(text + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
