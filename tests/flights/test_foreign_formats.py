@@ -665,3 +665,24 @@ def test_crazyswarms_poses_are_the_fastest_with_the_right_sign(
     for name in ("x", "z", "qw", "qx", "qy", "qz"):
         values = read.columns[name][rows]
         np.testing.assert_allclose(values, columns[name][10:380], atol=tolerance, err_msg=name)
+
+
+def test_columns_of_the_formats_own_names_have_their_time_too(tmp_path, columns):
+    """Where `columns.toml` names nothing but the times."""
+    table = topic_table(columns, "{column}", "{topic}_t")
+    table = {n.replace("_t", " clock") if n.endswith("_t") else n: v for n, v in table.items()}
+    write_table(tmp_path / "flight.csv", table)
+    groups = {"pose clock": "pose", "imu clock": "imu", "motor clock": "motor"}
+    clocks = ", ".join(
+        f'{{ from = "{stamp}", unit = "ns", of = {list(TOPICS[topic])} }}'
+        for stamp, topic in groups.items()
+    )
+    (tmp_path / "columns.toml").write_text(f"[columns]\nt = [{clocks}]\n")
+    read = read_log(tmp_path / "flight.csv", load_mapping(tmp_path / "columns.toml"))
+    first = _first(read, columns)
+    for column in ("x", "wx", "m1"):
+        assert_read(read, {column: columns[column][first:]}, (column,), 1e-3, slice(10, 300))
+    (tmp_path / "columns.toml").write_text('[columns]\nt = [{ from = "imu clock" }]\n')
+    write_table(tmp_path / "flight.csv", {"imu clock": table["imu clock"]})
+    with pytest.raises(LogError, match="no column that the log has beside them"):
+        read_log(tmp_path / "flight.csv", load_mapping(tmp_path / "columns.toml"))

@@ -32,6 +32,7 @@ WHOLE = ("quaternion", "motor_command")  # channels of which a part is a mistake
 MOST_COLUMNS = 2_000
 MOST_VEHICLES = 200
 NAMES_SHOWN = 12  # of columns in one message
+LONGEST_NAME = 40  # characters of a name or a cell in a message
 LARGEST_VALUE = 1e6  # no sensor's reading in SI units is larger; squares of what is would overflow
 NOTHING = ("na", "n/a", "#n/a", "null", "none", "-", "--")
 """What is written where there is no number, beside nan."""
@@ -264,7 +265,7 @@ def _check_separator(line: str, delimiter: str, time: str) -> None:
 
 def _listed(names: Iterable[str], most: int = NAMES_SHOWN) -> str:
     """The first names, and how many more there are."""
-    names = list(names)
+    names = [name[:LONGEST_NAME] for name in names]
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return ", ".join(names[:most]) + more
 
@@ -353,7 +354,9 @@ def _why_not(
                 continue
             if [cell.strip() for cell in cells] == names:
                 return f"line {row} is the header again: several recordings in one file"
-            return f"line {row}, column {names[i]}: {cells[i].strip()!r} is no number"
+            return (
+                f"line {row}, column {names[i]}: {cells[i].strip()[:LONGEST_NAME]!r} is no number"
+            )
     return f"not a table of numbers ({error})"
 
 

@@ -27,9 +27,10 @@ from openjax.flights.importers.csv_files import (
     seconds_per_unit,
 )
 from openjax.flights.importers.importer import Importer
-from openjax.flights.reading import LOG_COLUMNS, LogError, LogTable
+from openjax.flights.reading import LOG_COLUMNS, LONGEST_NAME, LogError, LogTable
 
 SEPARATORS = "./:"
+MOST_NAMES = 100  # of a header among which a name that isn't there is looked for
 _STAMP = re.compile(rf"(.+?)(?:[{SEPARATORS}]header)?[{SEPARATORS}_](time|timestamp|stamp|t)", re.I)
 # What the last part of a name holds by the topic that it stands in: "vel.x" is vx.
 GROUPS = {
@@ -71,7 +72,7 @@ def read_topic_times(path: Path, mapping: ColumnMapping | None = None) -> LogTab
     delimiter = delimiter_of(mapping)
     names = header_of(path, delimiter)
     stamps = _named_stamps(names, mapping)
-    sources = recognised(names, stamps) if mapping is None else mapping.over({})
+    sources = recognised(names, stamps) if mapping is None else _mapped(names, mapping)
     clock_of = _clocks(sources, stamps, mapping)
     wanted = (*stamps.values(), *(source.name for source in sources.values()))
     raw, remarks = raw_columns(path, wanted, next(iter(stamps.values())), delimiter)
@@ -84,6 +85,17 @@ def read_topic_times(path: Path, mapping: ColumnMapping | None = None) -> LogTab
     merged = merge_streams(streams, sources)
     merged["t"] = merged["t"] - merged["t"][0]
     return LogTable(path.name, merged, np.full(len(merged["t"]), "0"), tuple(remarks))
+
+
+def _mapped(names: list[str], mapping: ColumnMapping) -> dict[str, Source]:
+    """{column: source} of what a `columns.toml` names, and of columns that have names of the log
+    format already. Raises LogError for nothing.
+    """
+    usual = {name: Source(name) for name in names if name in LOG_COLUMNS[2:]}
+    sources = mapping.over(usual)
+    if not {source.name for source in sources.values()} & set(names):
+        raise LogError("columns.toml names times, and no column that the log has beside them")
+    return sources
 
 
 def recognised(names: list[str], stamps: dict[str, str]) -> dict[str, Source]:
@@ -113,7 +125,9 @@ def _named_stamps(names: list[str], mapping: ColumnMapping | None) -> dict[str, 
     for clock in () if mapping is None else mapping.clocks:
         name = clock.source.name
         if name not in names:
-            raise LogError(f"no column {name!r} for t; {suggestion(name, names)}")
+            raise LogError(
+                f"no column {name!r} for t; {suggestion(name, [n[:LONGEST_NAME] for n in names[:MOST_NAMES]])}"
+            )
         if name not in stamps.values():
             stamps[name] = name
     return stamps
