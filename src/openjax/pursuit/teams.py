@@ -89,19 +89,16 @@ def held(active: Which | None, drones: DroneState) -> DroneState:
     return drones.replace(position=parked(drones.position, active), velocity=velocity)
 
 
-def of_team(active: Which | None, value: T, otherwise: T | float = 0.0) -> T:
-    """A tree of (N, ...) arrays whose rows of empty slots are `otherwise`, a tree like it or a
-    number.
-    """
+def of_team(active: Which | None, value: T) -> T:
+    """A tree of (N, ...) arrays whose rows of empty slots are zeros."""
     if active is None:
         return value
-    if isinstance(otherwise, float):
-        otherwise = jax.tree.map(lambda x: jnp.full_like(x, otherwise), value)
 
-    def chosen(x, y):
-        return jnp.where(active.reshape(-1, *[1] * (x.ndim - 1)), x, y)
+    def without_empty(leaf):
+        there = active.reshape(-1, *[1] * (leaf.ndim - 1))
+        return jnp.where(there, leaf, jnp.zeros_like(leaf))
 
-    return jax.tree.map(chosen, value, otherwise)
+    return jax.tree.map(without_empty, value)
 
 
 def team_mean(
