@@ -2,13 +2,16 @@
 
 import numpy as np
 import pytest
+from scipy.signal import butter, lfilter
 
+from experiments.diagnosis import rate_flights
 from experiments.diagnosis.rate_flights import Truth, fly, rows_of, vehicle_of
 from openjax.gap.identification.corrections import corrections
 from openjax.gap.identification.estimates import of_fit
-from openjax.gap.identification.quantities import Identification, quantities_of
+from openjax.gap.identification.quantities import Identification, doubts, quantities_of
 from openjax.gap.identification.records import Record
 from openjax.gap.identification.responses import responses
+from openjax.gap.identification.rotor_rows import rotor_rows
 from openjax.gap.identification.support import support
 from openjax.gap.identification.torques import NAMES, identify_torques
 from openjax.gap.model.library import ABSENT, PLACE
@@ -23,18 +26,24 @@ TRUTHS = {
 }
 
 
+def record_of(name, seen, motors, rate) -> Record:
+    """A flight as rows of so many Hz, with motors as means."""
+    rates, motor = rows_of(seen, motors, rate, samples=False)
+    return Record(
+        flight=name,
+        dt=1.0 / rate,
+        rates=rates,
+        motor=motor,
+        vehicle=vehicle_of(load_vehicle()),
+        samples=False,
+        **dict.fromkeys(("force", "velocity", "quaternion", "voltage")),
+    )
+
+
 @pytest.fixture(scope="module")
 def records():
-    vehicle = vehicle_of(load_vehicle())
-    seen, motors = fly(list(TRUTHS.values()), 20.0)
-    found = {}
-    for name, *flight in zip(TRUTHS, seen, motors, strict=True):
-        rates, motor = rows_of(*flight, 100, samples=False)
-        rest = dict.fromkeys(("force", "velocity", "quaternion", "voltage"))
-        found[name] = Record(
-            flight=name, dt=0.01, rates=rates, motor=motor, vehicle=vehicle, samples=False, **rest
-        )
-    return found
+    flights = zip(TRUTHS, *fly(list(TRUTHS.values()), 20.0), strict=True)
+    return {name: record_of(name, *flight, 100) for name, *flight in flights}
 
 
 @pytest.mark.parametrize("name", TRUTHS)
@@ -104,3 +113,42 @@ def test_the_first_sentence_and_the_training_know_slow_motors(records):
     page = response_of(found)
     assert page["picture"].startswith("<svg")
     assert found.to_dict({"motor_lag": 0.5})["quantities"]["spin_up"]["share_of_gap"] == 0.5
+
+
+def test_rotors_in_lanes_turn_as_one_long_flight():
+    rng = np.random.default_rng(0)
+    commands = np.clip(0.5 + 0.2 * rng.standard_normal((700, 4)), 0.0, 1.0)
+    up, down, late, dt, fine = 0.03, 0.06, 0.004, 0.01, 50
+    (square, speed), _ = rotor_rows([commands, commands[:7]], dt, np.array([[up, down, late]]))
+    target = np.repeat(np.sqrt(commands), fine, 0)
+    target = np.concatenate([target[:1].repeat(round(late / dt * fine), 0), target])
+    now = target[0]
+    squares = np.zeros_like(commands)
+    ends = np.zeros_like(commands)
+    for step in range(len(commands) * fine):
+        after = target[step] + (now - target[step]) * np.exp(
+            -dt / fine / np.where(target[step] < now, down, up)
+        )
+        squares[step // fine] += 0.5 * (now**2 + after**2) / fine
+        now = ends[step // fine] = after
+    assert np.allclose(speed[0], ends, atol=2e-4)
+    assert np.allclose(square[0], squares, atol=2e-4)
+
+
+def test_the_filter_of_the_gyroscope_is_no_delay_of_the_motors():
+    truth = Truth(up=0.05, down=0.07, delay=0.004)
+    (seen,), (motors,) = fly([truth], 8.0)
+    low = butter(2, 80.0, fs=500.0)
+    for rates in (seen, lfilter(*low, seen, axis=0)):
+        fit = identify_torques([record_of("fast rows", rates, motors, 500)])
+        assert fit.clock == pytest.approx(truth.delay, abs=0.0015)
+        assert fit.value[:2] == pytest.approx([truth.up, truth.down], rel=0.1)
+
+
+def test_a_hover_that_hardly_turns_says_nothing_of_torques(monkeypatch, records):
+    monkeypatch.setattr(rate_flights, "COMMANDS", 0.0)
+    (seen,), (motors,) = fly([Truth(gust=0.3)], 8.0)
+    still = record_of("hover", seen, motors, 100)
+    assert doubts([still], identify_torques([still], one_clock=False), one_clock=True)
+    moving = records["nominal"]
+    assert not doubts([moving], identify_torques([moving]), one_clock=True)

@@ -6,8 +6,9 @@ import pytest
 from openjax.errors import UserError
 from openjax.flights.plans import plan_of, read_plan, write_plan
 from openjax.flights.segments import LOWEST, SEGMENTS
+from openjax.gap.model.library import ABSENT
 from openjax.gap.planning.beliefs import beliefs_of, sentence
-from openjax.gap.planning.information import advise
+from openjax.gap.planning.information import Belief, advise, of_pairs
 from openjax.vehicle.arena import Arena
 from openjax.vehicle.vehicle_file import load_vehicle_file
 
@@ -27,6 +28,18 @@ def test_beliefs_are_probabilities_of_what_the_report_left_open():
     beliefs = beliefs_of(between("rotor_drag", "wind"))
     assert [b.name for b in beliefs] == ["nothing", "rotor_drag", "wind"]
     assert sum(b.probability for b in beliefs) == pytest.approx(1.0)
+
+
+def test_an_effect_is_told_from_nothing_though_it_can_do_nothing():
+    effects = ((), ("rotor_drag",), ("wind",))
+    beliefs = [Belief(e, ABSENT, 1 / 3) for e in effects]
+    speaks = np.zeros((1, 3, 3))
+    speaks[0, 1, 0] = speaks[0, 2, 0] = 30.0  # what drag and wind do against nothing
+    speaks[0, 1, 2] = 1.0  # wind holds a drag of its own
+    speaks[0, 2, 1] = 20.0
+    apart = of_pairs(speaks, beliefs)[0]
+    assert apart[0, 1] == apart[1, 0] == 30.0
+    assert apart[1, 2] == apart[2, 1] == 1.0
 
 
 @pytest.mark.slow

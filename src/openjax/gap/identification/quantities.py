@@ -127,7 +127,7 @@ def identify(case: Case, one_clock: bool = True) -> Identification | None:
     if not records:
         return None
     fit = identify_torques(records, one_clock)
-    untrusted = _doubts(records, fit, one_clock)
+    untrusted = doubts(records, fit, one_clock)
     return Identification(
         quantities_of(records, fit),
         responses(records, fit),
@@ -182,7 +182,7 @@ def _quantity(name: str, value: float, deviation: float, simulator: float) -> Qu
     return Quantity(value, interval, simulator, UNITS.get(name, "1"), effect, ends)
 
 
-def _doubts(records: list[Record], fit: TorqueFit, one_clock: bool) -> tuple[str, ...]:
+def doubts(records: list[Record], fit: TorqueFit, one_clock: bool) -> tuple[str, ...]:
     """Why what is said of torques isn't to be trusted."""
     found = []
     if not one_clock:

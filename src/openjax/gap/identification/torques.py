@@ -62,8 +62,8 @@ CLEARLY = 10.0  # nats by which motors logged too late must be better
 FREE = 0.01  # s of rows whose surprise in the motors is free to act: the loop answers within them
 
 HALF_CYCLE = 0.001  # s of the rate loop: when within one motors get their command is convention
-NOISE_IN_GAIN = 30.0
-NOISE_IN_LAG = 2.5
+NOISE_IN_GAIN = 35.0
+NOISE_IN_LAG = 2.2
 QUICK = 0.03  # s
 """What rows of means hide of a rate loop that answers noise weakens the response that they show.
 Errors of gains, as logarithms, are so much over the square of what an axis turns in standard
@@ -72,7 +72,7 @@ deviations of its noise; errors of lags over that of what it turns within QUICK,
 LARGEST_ERROR = 2.0  # as a logarithm: nothing is known
 LEAST_LAG = 0.03
 LEAST_GAIN = 0.01
-LEAST_DAMPING = 0.25
+LEAST_DAMPING = 0.2
 """Errors of lags and gains, as logarithms, and of damping, 1/s, that such rows leave in still air."""
 SAMPLED_LAG = 0.3
 SAMPLED_GAIN = 0.45

@@ -148,10 +148,10 @@ def _distances(replay: Replay, beliefs: list[Belief]) -> np.ndarray:
             taken = np.linalg.solve(inside, gram[count:, :count])
             left = np.diag(gram[:count, :count] - gram[:count, count:] @ taken)
             out[flight, :, j] = 0.5 * np.maximum(left, 0.0)
-    return _of_pairs(out, beliefs)
+    return of_pairs(out, beliefs)
 
 
-def _of_pairs(nats: np.ndarray, beliefs: list[Belief]) -> np.ndarray:
+def of_pairs(nats: np.ndarray, beliefs: list[Belief]) -> np.ndarray:
     """(F, B, B) nats of pairs, from those (F, B, B) by which what one cause does speaks against
     another. A cause is told from another only if neither can imitate the other; but one that holds
     the other's effects and more imitates it always, so there what it does more counts.
