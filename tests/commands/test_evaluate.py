@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import pytest
 
 import openjax
+from openjax.commands import evaluate
 from openjax.policy import make_policy
 from openjax.store.policies import abstract_parameters
 from openjax.store.policy_files import save_policy_file
@@ -39,6 +40,9 @@ def test_an_evader_of_ones_own_is_flown_by_function_and_by_file(tmp_path, capsys
     assert record == openjax.evaluate(
         still, "uniform", episodes=1, opponent=f"{file}:frozen", **game
     )
+    command = evaluate.EvaluateCommand(opponent=f"{file}:frozen")
+    evaluate._show(command, [(command, "still", [record])])
+    assert "the evader is" in (said := capsys.readouterr().out) and "mine.py:frozen" in said
     for name, text in (
         (f"{file}:speed", "has no function speed"),
         (f"{tmp_path}/no.py:x", "there is no file"),

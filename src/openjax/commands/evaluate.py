@@ -250,7 +250,7 @@ def _show(command, results):
     for own, source, rows in results:
         settings = _settings(own)
         evaders = (own.opponent,) if own.opponent else settings.evaders
-        game = unlike_the_papers(dataclasses.replace(settings, evaders=evaders))
+        game = unlike_the_papers(settings, evaders)
         console.print(results_table(f"{source}, mean policy, seed {command.seed}", rows, game))
     if len(results) > 1:
         console.print(spread_table([rows for *_, rows in results]))

@@ -63,7 +63,7 @@ def closing_words(settings: TrainSettings, run: Path, on_cpu: bool) -> list[str]
         "time of "
         f"the {seconds:.0f} s, after the capture, too."
     ]
-    if differs := unlike_the_papers(game):
+    if differs := unlike_the_papers(game, game.evaders):
         lines.append(differs)
     view = f"openjax view --policy {run}"
     if layouts := layouts_like(game):
@@ -76,12 +76,14 @@ def closing_words(settings: TrainSettings, run: Path, on_cpu: bool) -> list[str]
     return [*lines, "\n  ".join(["Next:", *steps])]
 
 
-def unlike_the_papers(game: PursuitSettings) -> str:
-    """How a game differs from the paper's, as a sentence; empty where it doesn't."""
+def unlike_the_papers(game: PursuitSettings, evaders: tuple[str, ...]) -> str:
+    """How a game differs from the paper's, as a sentence; empty where it doesn't. `evaders`: names
+    or files of those who fly, its own or others.
+    """
     paper = PursuitSettings()
     words = []
-    if game.evaders != paper.evaders:
-        words.append(f"the evader is {' or '.join(dict.fromkeys(game.evaders))}")
+    if evaders != paper.evaders:
+        words.append(f"the evader is {' or '.join(dict.fromkeys(evaders))}")
     if game.vehicles:
         words.append("every pursuer is another vehicle")
     if game.speed_limit != paper.speed_limit:
