@@ -13,12 +13,14 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 from openjax.flights.track import Track, specific_force_of, to_body
 from openjax.gap.decision import DECISION
 from openjax.gap.evidence import Evidence
 from openjax.gap.model.hypotheses import SetFit, without_nuisances
 from openjax.gap.model.replay import FORCE, RATES, SKIP, VELOCITY
+from openjax.gap.shapes import Rows
 
 # s over which each residual is let add up, and what is said where it is large.
 HORIZONS = {
@@ -77,7 +79,7 @@ def check_residual(evidence: Evidence, fit: SetFit) -> Check:
     return Check(measured, HORIZONS.get(name, (0.0, ""))[1], p_value, predicted)
 
 
-def residuals_of(fit: SetFit) -> list[np.ndarray]:
+def residuals_of(fit: SetFit) -> list[Float[np.ndarray, "_ channels"]]:
     """Residual (T, 9) of each track under a fit, nuisances taken off."""
     return [
         without_nuisances(fit.replay, column[0], number)
@@ -85,7 +87,7 @@ def residuals_of(fit: SetFit) -> list[np.ndarray]:
     ]
 
 
-def disturbances(track: Track, residual: np.ndarray) -> np.ndarray:
+def disturbances(track: Track, residual: Rows) -> Rows:
     """A residual as accelerations (T, 9): angular (body), linear (body, from the velocity),
     specific force (body).
     """
@@ -98,7 +100,9 @@ def disturbances(track: Track, residual: np.ndarray) -> np.ndarray:
     return out
 
 
-def measure(evidence: Evidence, residuals: list[np.ndarray]) -> tuple[dict[str, float], np.ndarray]:
+def measure(
+    evidence: Evidence, residuals: list[Float[np.ndarray, "_ channels"]]
+) -> tuple[dict[str, float], Float[np.ndarray, " channels"]]:
     """{name: measure} of what is left, and (9,) by which share the motion channels' squares exceed
     what the calibration's cases leave at most.
     """

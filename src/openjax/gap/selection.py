@@ -17,6 +17,7 @@ from functools import cached_property
 from itertools import combinations
 
 import numpy as np
+from jaxtyping import Float
 
 from openjax.gap.decision import DECISION
 from openjax.gap.evidence import Evidence
@@ -24,6 +25,7 @@ from openjax.gap.model.cross_validation import Judged, judge, promise, screened
 from openjax.gap.model.hypotheses import SetFit, fit_set
 from openjax.gap.model.library import CARDS, PLACE, places
 from openjax.gap.model.table import Model, Table, build, with_effects
+from openjax.gap.shapes import Squares
 
 # Nats that an effect of usual size must promise: its gain is then expected at two standard errors,
 # as the gain of a true effect is half the square of what it does, and its standard error that
@@ -131,7 +133,7 @@ def difference(better: Judged, other: Judged) -> tuple[float, float, float]:
     return float((cross + 0.5 * energy).sum()), square**0.5, float(energy.sum()) / square
 
 
-def growth(squares: np.ndarray, floor: np.ndarray) -> np.ndarray:
+def growth(squares: Squares, floor: Float[np.ndarray, " channels"]) -> Float[np.ndarray, "*sets"]:
     """By how many floors a gap of squared errors (..., channels) is larger than one of the squares
     `floor` (channels,).
     """
@@ -290,7 +292,7 @@ class Search:
                 out[effect] = sorted(alike)
         return out
 
-    def choose(self, weights: np.ndarray) -> list[Hypothesis]:
+    def choose(self, weights: Float[np.ndarray, "draws blocks"]) -> list[Hypothesis]:
         """For each row of blocks' weights (D, B) the hypothesis of the largest prior odds that
         isn't clearly worse than the best. Of equal odds it is the one with the most evidence: its
         density, worth as many nats as blocks bear out (Pauli, Racugno, Ventura 2011), less what its

@@ -12,6 +12,7 @@ that of all parts, so that shares add up to one with what is unexplained.
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float
 
 from openjax.gap.decision import DECISION
 from openjax.gap.evidence import Evidence
@@ -85,7 +86,9 @@ class Split:
     largest: dict[str, float]
 
 
-def split(evidence: Evidence, selection: Selection, predicted: np.ndarray, named) -> Split:
+def split(
+    evidence: Evidence, selection: Selection, predicted: Float[np.ndarray, "9"], named
+) -> Split:
     """Shares of the `named` effects, of all paths. `predicted` (9,): share of each motion channel's
     squared error that the residual check finds in excess of noise.
     """
@@ -115,7 +118,11 @@ def split(evidence: Evidence, selection: Selection, predicted: np.ndarray, named
     )
 
 
-def shares_of_squares(squares: np.ndarray, weights: np.ndarray, left: np.ndarray):
+def shares_of_squares(
+    squares: Float[np.ndarray, "sets blocks channels"],
+    weights: Float[np.ndarray, "draws blocks"],
+    left: Float[np.ndarray, " channels"],
+):
     """Shares (draws, parts + 1), what is unexplained last, and the gap's square before and after
     (draws, 2).
 

@@ -5,6 +5,7 @@ effects.
 from dataclasses import dataclass, replace
 
 import numpy as np
+from jaxtyping import Float
 
 from openjax.flights.regimes import REGIMES, regimes_of
 from openjax.flights.track import smooth
@@ -64,7 +65,9 @@ def locate(evidence: Evidence, fit: SetFit, named=()) -> list[Place]:
     return sorted((replace(p, share=p.share / total) for p in places), key=lambda p: -p.share)
 
 
-def before_and_after(fit: SetFit, named) -> tuple[list[np.ndarray], list[np.ndarray]]:
+def before_and_after(
+    fit: SetFit, named
+) -> tuple[list[Float[np.ndarray, "_ channels"]], list[Float[np.ndarray, "_ channels"]]]:
     """Residuals (T, 9) of each track without the `named` effects of a fit, all else as with them,
     and with them: the same before as the gap's.
     """

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from jaxtyping import Float
 from scipy.stats import norm
 from scipy.stats import t as student
 
@@ -64,7 +65,10 @@ def few(count: int) -> float:
     return float(student.ppf(0.95, max(count - 1, 1)) / norm.ppf(0.95))
 
 
-def robust_deviation(covariance: np.ndarray, pushes: np.ndarray) -> np.ndarray:
+def robust_deviation(
+    covariance: Float[np.ndarray, "parameters parameters"],
+    pushes: Float[np.ndarray, "flights parameters"],
+) -> Float[np.ndarray, " parameters"]:
     """Standard deviations (p,) of parameters: those of `covariance` (p, p), or what flights differ
     by where that is more: the sandwich of their gradients `pushes` (F, p), widened where they are
     few (Liang, Zeger 1986).

@@ -10,6 +10,7 @@ apart; the second lets the feedback part do what it likes.
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float
 from scipy.signal import lfilter
 
 from openjax.flights.track import Track, smooth
@@ -38,12 +39,12 @@ class Feedback:
     quick: np.ndarray
 
 
-def outputs_of(vehicle) -> np.ndarray:
+def outputs_of(vehicle) -> Float[np.ndarray, "4 3"]:
     """(4, 3) that turns motor commands into the rate controller's outputs, roll, pitch, yaw."""
     return np.linalg.pinv(np.asarray(mixer(vehicle), float)).T
 
 
-def in_force(track: Track, arrived) -> np.ndarray:
+def in_force(track: Track, arrived) -> Float[np.ndarray, "rows ticks 4"]:
     """Command (T, TICKS, 4) that rules at each tick of the rate loop."""
     part, rows = arrived
     out = np.repeat(track.command[rows[:, 0]][:, None], TICKS, 1)
@@ -78,7 +79,9 @@ def read_feedback(tracks, vehicles, by_commands) -> list[Feedback]:
     ]
 
 
-def caused_by_commands(track: Track, vehicle, link) -> tuple[np.ndarray, np.ndarray]:
+def caused_by_commands(
+    track: Track, vehicle, link
+) -> tuple[Float[np.ndarray, "rows 4"], Float[np.ndarray, "rows 3"]]:
     """Motor commands (T, 4) and rates (T, 3) that the body-rate commands alone cause; `link`: what
     arrived of them, None where that wasn't read. Where none were logged, the nominal controller's
     law says which ones the motors and rates imply, slowly.

@@ -3,12 +3,17 @@ finding.
 """
 
 import numpy as np
+from jaxtyping import Float
 
 BOUND = 2.0  # usual sizes that a nuisance may take
 PATIENCE = 4
 
 
-def bounded(hessian, push, free: int = 0) -> np.ndarray:
+def bounded(
+    hessian: Float[np.ndarray, "entries entries"],
+    push: Float[np.ndarray, " entries"],
+    free: int = 0,
+) -> Float[np.ndarray, " entries"]:
     """Minimum of x'Hx/2 - push'x with |x| <= BOUND beyond the first `free` entries, H positive
     definite.
 

@@ -9,10 +9,12 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from jaxtyping import Float
 
 from openjax.gap.model.library import ABSENT, CARDS, PLACE, Library, places, prior
 from openjax.gap.model.replay import GROUPS, SKIP, Replay, block_count
 from openjax.gap.model.whitening import fit_noise
+from openjax.gap.shapes import Parameters, Rows
 
 ITERATIONS = 6
 SMALL_STEP = 0.05  # nats: an improvement below this ends the search
@@ -71,7 +73,7 @@ class SetFit:
 def fit_set(
     replay: Replay,
     effects,
-    start: np.ndarray | None = None,
+    start: Parameters | None = None,
     iterations: int = ITERATIONS,
     rounds: int = 1,
 ) -> SetFit:
@@ -158,7 +160,7 @@ def model_noise(replay: Replay, library: Library) -> tuple[Replay, dict[str, flo
     return replay, exposure
 
 
-def with_noise_of(replay: Replay, residuals: list[np.ndarray]) -> Replay:
+def with_noise_of(replay: Replay, residuals: list[Float[np.ndarray, "_ channels"]]) -> Replay:
     """The replay with noise models of residuals; channels that weren't logged keep the present
     ones.
     """
@@ -187,7 +189,7 @@ def _loudness(replay: Replay, residual: np.ndarray, track: int) -> np.ndarray:
     return np.sqrt(out)
 
 
-def without_nuisances(replay: Replay, residual: np.ndarray, track: int) -> np.ndarray:
+def without_nuisances(replay: Replay, residual: Rows, track: int) -> Rows:
     """A residual (T, 9) less the nuisances' most likely part."""
     return residual - np.tensordot(replay.taken(residual, track), replay.nuisances[track], 1)
 

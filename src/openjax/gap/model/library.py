@@ -7,9 +7,11 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from jaxtyping import Float, Int
 from scipy.linalg import block_diag
 
 from openjax.errors import UserError, suggestion
+from openjax.gap.shapes import Parameters
 from openjax.vehicle.effects import EFFECTS, Card
 from openjax.vehicle.effects.effect import growth
 
@@ -72,20 +74,20 @@ def library(without=()) -> Library:
     return Library(tuple(e for e in EFFECTS if e in CARDS and e not in without))
 
 
-def places(effects) -> np.ndarray:
+def places(effects) -> Int[np.ndarray, " own"]:
     """Indices in theta of the own parameters of physics effects."""
     return np.array([PLACE[e, p.name] for e in effects for p in CARDS[e].fitted], int)
 
 
-def growths(vehicle) -> np.ndarray:
+def growths(vehicle) -> Parameters:
     """(P,) by what usual sizes of the parameters are multiplied for a vehicle of another size."""
     own = [growth(EFFECTS[e].parameters[p].unit, vehicle) for e, p in THETA]
     return np.array([*own, 1.0, 1.0])
 
 
 def prior(
-    effects, absent: np.ndarray = ABSENT, grown: np.ndarray | None = None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    effects, absent: Parameters = ABSENT, grown: Parameters | None = None
+) -> tuple[Int[np.ndarray, " own"], Float[np.ndarray, " own"], Float[np.ndarray, "own own"]]:
     """Indices (p,), mean (p,) and precision (p, p) of the parameters of a set of physics effects,
     for a vehicle that has `absent` (P,) while nothing acts and sizes that are `grown` (P,).
     """

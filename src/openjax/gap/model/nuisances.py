@@ -6,10 +6,12 @@ import pathlib
 import tomllib
 
 import numpy as np
+from jaxtyping import Float
 
 from openjax.flights.track import GRAVITY, Track, smooth, specific_force_of, to_world
 from openjax.gap.model.physics import Path
 from openjax.gap.model.prediction import FORCE, RATES, VELOCITY
+from openjax.gap.shapes import Rows
 
 SIZE = {
     name: float(entry["size"])
@@ -24,7 +26,7 @@ FEEDBACK_ROWS, QUICK_ROWS = (0, 2), (0, 1, 2)  # rows of delay
 OF_A_BLOCK = ("feedback",)
 
 
-def columns_of(track: Track, path: Path, nominal, feedback, at_once: bool) -> dict[str, np.ndarray]:
+def columns_of(track: Track, path: Path, nominal, feedback, at_once: bool) -> dict[str, Rows]:
     """{name: column (T, 9)} of one track, of what doesn't depend on what acts; the arguments as in
     `make_replay`.
     """
@@ -109,7 +111,9 @@ def _late_torques(
     return columns
 
 
-def torque_channels(acceleration: np.ndarray, dt: float) -> np.ndarray:
+def torque_channels(
+    acceleration: Float[np.ndarray, "rows 3"], dt: float
+) -> Float[np.ndarray, "rows 9"]:
     """Channels (T, 9) of an angular acceleration (T, 3)."""
     column = np.zeros((len(acceleration), 9))
     column[1:, RATES] = np.cumsum(acceleration[:-1], 0) * dt

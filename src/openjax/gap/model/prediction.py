@@ -10,10 +10,12 @@ from functools import cached_property
 
 import jax
 import numpy as np
+from jaxtyping import Float, Shaped
 
 from openjax.flights.track import Track, smooth
 from openjax.gap.model.library import PHYSICS_EFFECTS, THETA
 from openjax.gap.model.physics import Path, compiled_physics
+from openjax.gap.shapes import Hypotheses
 from openjax.vehicle.effects.effect import ARENA_CEILING
 
 RATES = slice(0, 3)
@@ -29,7 +31,9 @@ def bucket(length: int) -> int:
     return next((b for b in BUCKETS if b >= length), length)
 
 
-def padded(values: np.ndarray, length: int) -> np.ndarray:
+def padded(
+    values: Shaped[np.ndarray, " rows *rest"], length: int
+) -> Float[np.ndarray, " {length} *rest"]:
     """float32, the last row repeated up to `length`."""
     values = np.asarray(values, np.float32)
     return np.concatenate([values, np.repeat(values[-1:], length - len(values), 0)])
@@ -43,7 +47,7 @@ class Physics:
     vehicles: tuple
     paths: tuple[Path, ...]
 
-    def predict(self, theta: np.ndarray) -> list[np.ndarray]:
+    def predict(self, theta: Hypotheses) -> list[Float[np.ndarray, "hypotheses _ channels"]]:
         """Channels (B, T, 9) of each track for parameter vectors theta (B, P)."""
         theta = np.asarray(theta, np.float32)
         run = compiled_physics(PHYSICS_EFFECTS, THETA)

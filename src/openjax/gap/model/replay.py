@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
+from jaxtyping import Float, Int
 from scipy.linalg import solve_triangular
 
 from openjax.flights.track import Track
@@ -18,6 +19,7 @@ from openjax.gap.model.library import ABSENT, PLACE, STEP, growths
 from openjax.gap.model.nuisances import OF_A_BLOCK, SIZE, columns_of
 from openjax.gap.model.prediction import FORCE, RATES, VELOCITY, Physics, make_physics
 from openjax.gap.model.whitening import Noise, first_noise, whiten
+from openjax.gap.shapes import Hypotheses, Nuisances, Parameters, Rows
 
 # Groups of channels that share a noise model: axes, whether integrated.
 GROUPS = (
@@ -102,11 +104,11 @@ class Replay:
     def _roots(self) -> list[np.ndarray]:
         return [np.linalg.cholesky(np.eye(len(g)) + g) for g in self.nuisance_grams]
 
-    def predict(self, theta: np.ndarray) -> list[np.ndarray]:
+    def predict(self, theta: Hypotheses) -> list[Float[np.ndarray, "hypotheses _ channels"]]:
         """Channels (B, T, 9) of each track for parameter vectors theta (B, P)."""
         return self.physics.predict(theta)
 
-    def around(self, theta: np.ndarray) -> Replay:
+    def around(self, theta: Parameters) -> Replay:
         """With the derivatives of a vehicle that has the effects theta (P,): a wrong moment of
         inertia scales the torques that are left once an effect is accounted for, not those of
         motors that hold against it.
@@ -119,7 +121,9 @@ class Replay:
             columns.append(np.concatenate([own, old[len(own) :]]))
         return replace(self, columns=columns)
 
-    def whiten(self, x: np.ndarray, track: int) -> np.ndarray:
+    def whiten(
+        self, x: Float[np.ndarray, "*sets rows channels"], track: int
+    ) -> Float[np.ndarray, "*sets later channels"]:
         """x (..., T, 9) of a track -> (..., T', 9) in units of the noise, without the first
         moments.
         """
@@ -128,7 +132,9 @@ class Replay:
         out = out[..., int(SKIP / self.tracks[track].dt) :, :]
         return out if self.loudness is None else out / self.loudness[track]
 
-    def grams(self, columns: list[np.ndarray]) -> np.ndarray:
+    def grams(
+        self, columns: list[Float[np.ndarray, "columns _ channels"]]
+    ) -> Float[np.ndarray, "flights columns columns"]:
         """Inner products (F, C, C) per flight of columns [(C, T, 9) per track], nuisances
         marginalised.
         """
@@ -141,7 +147,7 @@ class Replay:
             total[self.flight_of[number]] += w @ w.T - taken.T @ taken
         return total
 
-    def taken(self, residual: np.ndarray, track: int) -> np.ndarray:
+    def taken(self, residual: Rows, track: int) -> Nuisances:
         """(N,) the nuisances' most likely sizes, given a residual (T, 9) of a track."""
         gram = self.nuisance_grams[track]
         n = self.whitened_nuisances[track]
@@ -149,7 +155,7 @@ class Replay:
             np.eye(len(gram)) + gram, n.reshape(len(n), -1) @ self.whiten(residual, track).ravel()
         )
 
-    def linearised(self, theta: np.ndarray, index: np.ndarray) -> list[np.ndarray]:
+    def linearised(self, theta: Parameters, index: Int[np.ndarray, " free"]) -> list[np.ndarray]:
         """Residual and derivatives (1 + p, T, 9) of each track at theta (P,) with respect to
         theta[index].
         """

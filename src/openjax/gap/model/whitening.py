@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+from jaxtyping import Float
 from scipy.linalg import solve_discrete_are
 from scipy.signal import lfilter
 
@@ -34,12 +35,16 @@ class Noise:
     denominator: np.ndarray
     deviation: float
 
-    def whiten(self, x: np.ndarray) -> np.ndarray:
+    def whiten(
+        self, x: Float[np.ndarray, "*sets rows axes"]
+    ) -> Float[np.ndarray, "*sets later axes"]:
         """x (..., T, axes) in units of the innovation's standard deviation."""
         return lfilter(self.numerator / self.deviation, self.denominator, x, axis=-2)
 
 
-def whiten(noises, x: np.ndarray) -> np.ndarray:
+def whiten(
+    noises, x: Float[np.ndarray, "*sets rows channels"]
+) -> Float[np.ndarray, "*sets later channels"]:
     """x (..., T, C) channel by channel, each group of axes, which lie side by side, by its own
     noise model.
     """

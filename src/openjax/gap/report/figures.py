@@ -4,6 +4,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float
 from matplotlib import rc_context
 
 from openjax.flights.track import smooth, to_body
@@ -93,7 +94,7 @@ class Course:
         return before / max(after, 1e-12)
 
 
-def rms(values: np.ndarray) -> float:
+def rms(values: Float[np.ndarray, "..."]) -> float:
     """Root of the mean square: a constant error counts whole."""
     return float(np.sqrt(np.mean(np.square(values))))
 
