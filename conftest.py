@@ -31,7 +31,7 @@ _networks = [
     f"openjax.policy.{name}" for name in ("actor_critic", "encoder", "policy", "predictor")
 ]
 _drone = [f"openjax.vehicle.{name}" for name in ("rigid_body", "rate_controller", "stops")]
-_rooms = ["openjax.pursuit", "openjax.learning", "openjax.flights", "openjax.gap"]
+_rooms = ["openjax.pursuit", "openjax.learning", "openjax.flights"]
 install_import_hook([*_networks, *_drone, *_rooms], "conftest.check_types")
 
 _flags = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"

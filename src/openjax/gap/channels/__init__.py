@@ -3,7 +3,7 @@ same few methods.
 """
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -22,6 +22,7 @@ class Estimated:
     above: float
 
 
+@runtime_checkable
 class Channel(Protocol):
     """One way by which a log tells effects. `path` is the `Card.path` of those that it reads."""
 
