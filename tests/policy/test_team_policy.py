@@ -108,9 +108,9 @@ def test_nothing_is_learnt_from_empty_slots(networks):
             target=jnp.linspace(3.0, -1.0, SIZE)[:number],
         )
         networks = (parameters.actor, parameters.critic)
-        return jax.grad(lambda networks: loss(MappoSettings(), policy, networks, batch, 0.2)[0])(
-            networks
-        )
+        return jax.grad(
+            lambda networks: loss(MappoSettings(), policy, networks, batch, jnp.asarray(0.2))[0]
+        )(networks)
 
     action = 0.1 * jax.random.normal(jax.random.key(0), (SIZE, 4))
     of_three = jax.jit(gradient)(alone(observation), action[:TEAM])

@@ -1,0 +1,72 @@
+"""Training of teams of different sizes: everything that learns takes worlds with empty slots."""
+
+import chex
+import jax
+import jax.numpy as jnp
+
+from openjax.learning import TrainSettings, build, changed, make_start, make_training_step
+from openjax.learning.analytic_gradient import AnalyticGradient, free_flight
+from openjax.learning.first_flights import FirstFlights, first_game
+from openjax.learning.settings import AnalyticSettings, FirstFlightsSettings
+
+SETTINGS = changed(
+    TrainSettings(),
+    environment=dict(
+        num_pursuers=4,
+        team_sizes=(1, 2, 4),
+        evader_speeds=(0.8, 2.0),
+        capture_radii=(0.2, 0.4),
+        fall_outs=0.5,
+        observe_game=True,
+        history_pursuers="pooled",
+        evaders=("field", "greedy", "learned"),
+        physics="stops",
+        episode_length=8,
+        history_length=3,
+    ),
+    network=dict(features=8, heads=2, shared_encoder=True),
+    predictor=dict(units=4, windows=2, steps=1, horizons=(1, 2)),
+    mappo=dict(minibatches=2, epochs=1),
+    generator=dict(capacity=8, episodes_per_task=2),
+    num_envs=8,
+    rollout_length=4,
+    restart_every=2,
+    restart_steps=4,
+    restart_close=0.5,
+    total_steps=320,
+)
+
+
+def test_a_training_step_of_teams_keeps_its_carry():
+    start = make_start(SETTINGS)
+    carry = jax.eval_shape(start, jax.random.key(0))
+    after, metrics = jax.eval_shape(make_training_step(SETTINGS), carry)
+    chex.assert_trees_all_equal_shapes_and_dtypes(carry, after)
+    assert carry.observation.active.shape == (8, 4)
+    assert carry.archive.tasks.active.shape == (8, 4)
+    assert "learned_capture_rate" in metrics
+
+
+def test_stages_by_the_gradient_take_teams():
+    parts = build(SETTINGS)
+    worlds = FirstFlightsSettings(updates=1, worlds=4, steps=2)
+    flights = FirstFlights(worlds, first_game(parts.environment, worlds), parts.policy)
+
+    def first(key):
+        observation = parts.environment.reset(key)[0]
+        carry = flights.begin(parts.policy.init(key, observation), key)
+        return flights.update(carry, key)[1], carry.world
+
+    shares, world = jax.eval_shape(first, jax.random.key(0))
+    assert shares["breaches"].shape == () and world[1].task.active.shape == (4, 4)
+
+    how = AnalyticSettings(updates=1, worlds=4, draws=1)
+    stage = AnalyticGradient(how, free_flight(parts.environment), parts.policy)
+
+    def last(key):
+        parameters = parts.policy.init(key, parts.environment.reset(key)[0])
+        starts = stage.starts(key, stage.bounds())
+        return stage.loss(parameters.actor, parameters, starts, starts)
+
+    total, _ = jax.eval_shape(last, jax.random.key(0))
+    assert total.shape == () and total.dtype == jnp.float32
