@@ -1,5 +1,7 @@
 """Identification: truths of flights whose plant isn't openjax are within its intervals."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.signal import butter, lfilter
@@ -105,6 +107,8 @@ def test_the_first_sentence_and_the_training_know_slow_motors(records):
     low, high = intervals["motor_lag"]["extra_up"]
     assert low < 0.05 < high
     assert "later: its motors take" in found.sentence()
+    unmapped = replace(found, duty_cycles=True)
+    assert set(corrections(unmapped, named=("inertia", "motor_lag"))[0]) == {"motor_lag"}
     # A lag of 75 instead of 25 ms and 4 ms of delay, at 5 Hz.
     ratio = (1 + 2j * np.pi * 5.0 * 0.025) / (1 + 2j * np.pi * 5.0 * 0.075)
     gain, later = found.at(5.0)

@@ -13,7 +13,7 @@ MATTERS = {"motor_lag": 0.006, "inertia": 0.15, "yaw_torque": 0.2}
 def corrections(found: Identification, named) -> tuple[dict, dict]:
     """Values and 90 % intervals {effect: {parameter: ...}} of motor lag, inertia and yaw torque
     as identified: of those effects that are `named`, and of others that differ clearly and by as
-    much as matters.
+    much as matters. Of duty cycles only the lag: gains hold their map's slope.
     """
     if not found.trusted:
         return {}, {}
@@ -22,6 +22,8 @@ def corrections(found: Identification, named) -> tuple[dict, dict]:
     estimates = found.estimates
     deviation = np.sqrt(np.diag(estimates.covariance))
     for effect in dict.fromkeys(e for e, _ in estimates.names):
+        if found.duty_cycles and effect != "motor_lag":
+            continue
         places = [i for i, (e, _) in enumerate(estimates.names) if e == effect]
         none = 0.0 if effect == "motor_lag" else 1.0
         off = np.abs(estimates.value[places] - none)

@@ -1,6 +1,6 @@
 """What flights say of a vehicle: numbers beside the simulator's, and responses."""
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
@@ -15,6 +15,10 @@ REACH = 1.645  # standard deviations of a 90 % interval
 TALKED_OF = 5.0  # Hz: where rate loops of such vehicles work
 ALIKE = (0.8, 1.25)  # ratios of gains that nobody would feel
 ALIKE_PHASE = 10.0  # degrees, the same
+MAP = (
+    "motor commands are duty cycles: inertia and yaw ratio hold the unknown slope of their thrust, "
+    "too"
+)
 TURNS = 8.0  # standard deviations of noise: below, rows show a loop that answers noise
 CLOCK = 0.010  # s: rows off by more are worth a sentence
 POSITIVE = ("spin_up", "spin_down", "roll_gain", "pitch_gain", "yaw_gain")
@@ -59,7 +63,8 @@ class Quantity:
 @dataclass(frozen=True, eq=False)
 class Identification:
     """`quantities` {name: quantity}, `responses` {axis: measured and simulated}, `remarks`: what to
-    think of when reading them; `estimates` are for the diagnosis.
+    think of when reading them; `estimates` are for the diagnosis; `duty_cycles`: what thrust a
+    motor command makes isn't known, so that gains tell its map and the inertia together.
     """
 
     quantities: dict[str, Quantity]
@@ -67,7 +72,7 @@ class Identification:
     remarks: tuple[str, ...]
     estimates: EffectEstimates
     trusted: bool = True
-    rows: dict = field(default_factory=dict)
+    duty_cycles: bool = False
 
     def to_dict(self, shares: dict[str, float] | None = None) -> dict:
         """As it stands in `report.json`; `shares` of the gap {effect: share}."""
@@ -128,12 +133,15 @@ def identify(case: Case, one_clock: bool = True) -> Identification | None:
         return None
     fit = identify_torques(records, one_clock)
     untrusted = doubts(records, fit, one_clock)
+    duty_cycles = case.vehicle_file.motor.command == "pwm"
+    remarks = (*_remarks(fit), *([MAP] if duty_cycles else []))
     return Identification(
         quantities_of(records, fit),
         responses(records, fit),
-        (*untrusted, *_remarks(fit)),
+        (*untrusted, *remarks),
         of_fit(fit, records),
         trusted=not untrusted,
+        duty_cycles=duty_cycles,
     )
 
 

@@ -1,8 +1,8 @@
 """Numbers of the vehicle's torques by prediction errors, in closed loop.
 
-Body rates follow R = rates - model(parameters, motors) = noise of a high-order autoregression, whose
-coefficients are concentrated out: the direct method of Ljung, System Identification, chapter 13,
-with a model of the ARARX kind. All of the motors' signal counts, as the loop has a delay.
+Body rates follow R = rates - model(parameters, motors) = noise of a high-order autoregression,
+whose coefficients are concentrated out: the direct method of Ljung, System Identification, chapter
+13, with a model of the ARARX kind. All of the motors' signal counts, as the loop has a delay.
 
 Rows that are means over several cycles of the rate loop hide that delay: within a row motors
 answer the gust that the row's end shows. So what is new in a row of motors, given everything
@@ -31,10 +31,10 @@ z."""
 LOGARITHMS = [0, 1, 3, 4, 5]
 """Of these the search runs in the logarithm, so that none leaves what is possible."""
 SPREAD = np.array([1.0, 1.0, 0.1, 0.7, 0.7, 0.7, 2.5, 2.5, 0.003])
-"""Weak priors, several times the spread of such vehicles; logarithms where they are searched. Of the
-damping twice what the rotors' inflow makes (.015 N s/m of thrust per climbing speed, on arms of .03
-m): a lag and a damping are two poles of one response, and nothing but their usual sizes says which
-is which.
+"""Weak priors, several times the spread of such vehicles; logarithms where they are searched. Of
+the damping twice what the rotors' inflow makes (.015 N s/m of thrust per climbing speed, on arms of
+.03 m): a lag and a damping are two poles of one response, and nothing but their usual sizes says
+which is which.
 """
 UNEQUAL = 0.4  # spread of the logarithm of slowing down over speeding up
 STEP = np.array([2e-4, 2e-4, 1e-4])  # s, of the difference quotients of lags
@@ -73,7 +73,9 @@ LARGEST_ERROR = 2.0  # as a logarithm: nothing is known
 LEAST_LAG = 0.03
 LEAST_GAIN = 0.01
 LEAST_DAMPING = 0.2
-"""Errors of lags and gains, as logarithms, and of damping, 1/s, that such rows leave in still air."""
+"""Errors of lags and gains, as logarithms, and of damping, 1/s, that such rows leave in still
+air.
+"""
 SAMPLED_LAG = 0.3
 SAMPLED_GAIN = 0.45
 SAMPLED_DAMPING = 0.5  # 1/s
@@ -252,8 +254,8 @@ class Problem:
         return float(value[3 + axis] * np.abs(self.base[axis]).sum() * effect)
 
     def solve(self, value: np.ndarray) -> tuple[float, list]:
-        """Loss at a place (9,) of the search, and of each axis: innovations (N,), their derivatives (N, 9) less what the noise
-        model takes, and its coefficients.
+        """Loss at a place (9,) of the search, and of each axis: innovations (N,), their derivatives
+        (N, 9) less what the noise model takes, and its coefficients.
         """
         modelled = self.modelled(value)
         axes = [self._axis(axis, modelled) for axis in range(3)]
