@@ -2,7 +2,7 @@
 
 Each FILE is what `openjax exploit --policy NAME --json FILE` wrote: evaders that learned against
 the policy, one that plans in the true simulation, and the scripted ones; or what
-`python -m experiments.evaders.apart` wrote. None of them trained the pursuers; the slower vehicle
+`python -m experiments.evaders.apart` and `limit` wrote. None of them trained the pursuers; the slower vehicle
 is `--effects experiments/flying/slower.toml`. Stores the least capture rate of each kind, and makes the table of judged.md.
 """
 
@@ -29,6 +29,8 @@ JUDGES: Mapping[str, Callable[[str], bool]] = {
     "evaders that learn": lambda evader: evader.startswith("learned"),
     "a planner": lambda evader: evader == "planner",
     "splitting, kept apart": lambda evader: evader == "splitting",
+    "both plan, pursuers last": lambda evader: evader == "both plan, pursuers last",
+    "both plan, evader last": lambda evader: evader == "both plan, evader last",
     "scripted ones, held out": lambda evader: evader in HELD_OUT,
     "the paper's": lambda evader: evader == "field",
 }
@@ -105,20 +107,26 @@ def page(results: Mapping) -> Page:
         "most crashes": lambda row: f"{max(row['crash_rate'].values()):.2f}",
     }
     rows = [row for row in results["rows"] if is_shown(row, results.get("hidden", []))]
+    policies = [row["policy"] for row in rows]
+    order = tuple(JUDGES)
+    rows.sort(key=lambda row: (policies.index(row["policy"]), order.index(row["judge"])))
     return Page("The second judge", "Least capture rates.", Table(columns, rows))
 
 
 def is_shown(row: Mapping, hidden: Sequence[str]) -> bool:
     """Whether the table has a row: of weights that don't ship, only what finds most."""
     finds_most = row["judge"] in tuple(JUDGES)[:2]
-    return row["policy"] not in hidden and (finds_most or row["policy"] == DEFAULT_POLICY)
+    is_hidden = {row["policy"], f"{row['policy']}: {row['judge']}"} & set(hidden)
+    return not is_hidden and (finds_most or row["policy"] == DEFAULT_POLICY)
 
 
 def write_summaries(rows: Sequence[Mapping]) -> None:
     """The rows of weights that ship, and of those before them, on the pages that users read."""
     heads = ["policy", "caught least among", *PLACES]
     lines = ["| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]
-    for row in rows:
+    order = tuple(JUDGES)
+    policies = [row["policy"] for row in rows]
+    for row in sorted(rows, key=lambda r: (policies.index(r["policy"]), order.index(r["judge"]))):
         if row["shown"]:
             rates = (f"{row['capture_rate'][place]:.2f}".removeprefix("0") for place in PLACES)
             lines.append(f"| {row['policy']} | {row['judge']} | {' | '.join(rates)} |")
@@ -134,7 +142,7 @@ def main(arguments: list[str]) -> None:
     """The command."""
     parser = page_parser(__doc__, "judged")
     parser.add_argument("exploited", nargs="*", metavar="NAME=FILE")
-    parser.add_argument("--hide", nargs="*", help="policies that stay out of the table")
+    parser.add_argument("--hide", nargs="*", help="POLICY or 'POLICY: JUDGE': rows that stay out")
     options = parser.parse_args(arguments)
     publish(options, study, page)
     if options.out == RESULTS / "judged":

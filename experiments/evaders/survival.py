@@ -12,7 +12,6 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from experiments.evaders.judged import JUDGES, PLACES
-from experiments.evaders.limit import LAST
 from experiments.table import Page, Table, page_parser, publish
 from openjax.command_line import run_command
 from openjax.files import read_json, replacing
@@ -35,9 +34,8 @@ def survival(capture_steps: list[int]) -> list[float]:
 
 def curves_of(records: list[dict]) -> list[dict]:
     """One curve for each kind of evaders and of tasks."""
-    kinds = {**JUDGES, **{name: (lambda evader, name=name: evader == name) for name in LAST}}
     curves = []
-    for kind, belongs in kinds.items():
+    for kind, belongs in JUDGES.items():
         for place in PLACES:
             own = [r for r in records if r["scenario"] == place and belongs(r["evader"])]
             if own:

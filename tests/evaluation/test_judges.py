@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from openjax.evaluation.judges.duel import Duel
+from openjax.evaluation.judges.networks import likeliest, ways
 from openjax.evaluation.judges.planner import Planner
 from openjax.evaluation.judges.senses import number_of_senses, sense, to_world
 from openjax.evaluation.judges.settings import PlannerSettings
@@ -82,3 +83,13 @@ def test_who_plans_gets_away_from_slower_points_in_the_open():
     planner = Planner(PlannerSettings(plans=24, piece_steps=10), duel)
     planned = jax.jit(planner.fly)({}, start, jax.random.key(5))
     assert not planned.captured[0]
+
+
+def test_of_several_ways_the_likeliest_is_flown():
+    means = jnp.arange(6.0)
+    odds = jnp.array([0.1, 0.7])
+    np.testing.assert_array_equal(likeliest(jnp.concatenate([means, odds])), [3.0, 4.0, 5.0])
+    np.testing.assert_array_equal(likeliest(means[:3]), means[:3])
+    spread_out, log_odds = ways(jnp.concatenate([means, odds]))
+    assert spread_out.shape == (2, 3)
+    np.testing.assert_allclose(jnp.sum(jnp.exp(log_odds)), 1.0, rtol=1e-6)

@@ -145,7 +145,7 @@ def find_opponent(evader: str | Path | Evader, game: PursuitSettings) -> Evader:
             f"{', '.join(SCRIPTED)}, FILE.py:function, or a file written by openjax exploit"
         )
     leaves, settings, _ = load_policy_file(path, "evader's file", "openjax exploit")
-    if "evader/hold" not in leaves:
+    if not {"evader/hold", "evader/actor/bias_0", "evader/actor/bias_2"} <= set(leaves):
         raise UserError(
             f"--opponent {path}: holds no evader of this version; openjax exploit writes one"
         )
@@ -163,8 +163,9 @@ def find_opponent(evader: str | Path | Evader, game: PursuitSettings) -> Evader:
             f"--opponent {path}: senses {slots} pillars at most, the game has up to "
             f"{game.max_pillars}; environment.max_pillars {slots} would be right"
         )
-    inputs = number_of_senses(game.num_pursuers, slots)
-    actor = jax.eval_shape(lambda key: init_network(key, 1, inputs, 3), jax.random.key(0))
+    width, outputs = (leaves[f"evader/actor/bias_{layer}"].shape[-1] for layer in (0, 2))
+    sizes = (number_of_senses(game.num_pursuers, slots), width, outputs)
+    actor = jax.eval_shape(lambda key: init_network(key, 1, sizes), jax.random.key(0))
     one = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), actor)
     scalar = {"world_axes": jnp.bool_, "hold": jnp.int32}
     abstract = {name: jax.ShapeDtypeStruct((), kind) for name, kind in scalar.items()}

@@ -20,11 +20,14 @@ import optax
 from flax import struct
 
 from openjax.evaluation.judges.duel import Duel, World, copies
-from openjax.evaluation.judges.networks import apply_network, init_network
+from openjax.evaluation.judges.networks import apply_network, init_network, likeliest, of_way, ways
 from openjax.evaluation.judges.senses import sense, to_world
 from openjax.evaluation.judges.settings import BestResponseSettings
 from openjax.policy import PolicyParameters
 from openjax.pursuit import EpisodeStatistics, PursuitSettings, Task
+
+FIRST = 0.5
+"""Share of the speed that each way has at first."""
 
 
 @struct.dataclass
@@ -64,6 +67,7 @@ class Decisions:
     """T decisions in L * E worlds."""
 
     sensed: jax.Array  # (T, L * E, F)
+    way: jax.Array  # (T, L * E) int, which of the ways was chosen
     sample: jax.Array  # (T, L * E, 3)
     log_prob: jax.Array  # (T, L * E)
     free: jax.Array  # (T, L * E), share of the decision's steps in which the evader was free
@@ -100,9 +104,14 @@ class BestResponse:
         one = jax.tree.map(lambda leaf: leaf[0], world[1])
         inputs = sense(self.game, one, jnp.bool_(False)).size
         log_std = jnp.full((learners, 3), self.settings.initial_log_std, jnp.float32)
+        width, number = self.settings.width, self.settings.ways
+        actor = init_network(actor_key, learners, (inputs, width, 4 * number))
+        # at first one way in each direction, and all as likely
+        bias = np.concatenate([spread(number).ravel(), np.zeros(number)])
+        actor["bias_2"] = actor["bias_2"] + jnp.asarray(bias, jnp.float32)
         evaders = Evaders(
-            actor=init_network(actor_key, learners, inputs, 3),
-            critic=init_network(critic_key, learners, inputs, 1),
+            actor=actor,
+            critic=init_network(critic_key, learners, (inputs, width, 1)),
             log_std=log_std,
             world_axes=jnp.arange(learners) % 2 == 1,
             discount=jnp.asarray(self.settings.discounts(self.game.time_step), jnp.float32),
@@ -149,9 +158,12 @@ class BestResponse:
         """
         hold = self.settings.hold
         sensed = _sense(self.game, evaders, world[1])
-        mean = apply_network(evaders.actor, sensed)
+        way_key, noise_key = jax.random.split(key)
+        means, odds = ways(apply_network(evaders.actor, sensed))
+        way = jax.random.categorical(way_key, odds)
+        mean = of_way(means, way)
         log_std = evaders.log_std[:, None]
-        sample = mean + jnp.exp(log_std) * jax.random.normal(key, mean.shape)
+        sample = mean + jnp.exp(log_std) * jax.random.normal(noise_key, mean.shape)
         velocity = _in_world(evaders, sample, world[1])
         world = self.duel.fly(parameters, world, velocity, hold)
         state = world[1]
@@ -161,8 +173,9 @@ class BestResponse:
         over = caught | (state.step >= self.game.episode_length)
         decision = Decisions(
             sensed=sensed.reshape(over.size, -1),
+            way=way.ravel(),
             sample=sample.reshape(over.size, 3),
-            log_prob=_log_prob(sample, mean, log_std).ravel(),
+            log_prob=_log_prob(way, sample, means, odds, log_std).ravel(),
             free=jnp.where(caught, 1.0 - jnp.minimum(late, 1.0), 1.0),
             over=over,
             caught=caught,
@@ -229,6 +242,7 @@ class BestResponse:
         normal = centred / (jnp.std(advantage, (0, 2), keepdims=True) + 1e-8)
         rows = {
             "sensed": sensed,
+            "way": self._by_learner(decisions.way),
             "sample": self._by_learner(decisions.sample),
             "log_prob": self._by_learner(decisions.log_prob),
             "free": free,
@@ -246,15 +260,16 @@ class BestResponse:
         """(), the sum over learners: none's gradient knows of another."""
         settings = self.settings
         actor, critic, log_std = networks
-        mean = apply_network(actor, part["sensed"])
-        log_prob = _log_prob(part["sample"], mean, log_std[:, None])
+        means, odds = ways(apply_network(actor, part["sensed"]))
+        log_prob = _log_prob(part["way"], part["sample"], means, odds, log_std[:, None])
         ratio = jnp.exp(log_prob - part["log_prob"])
         clipped = jnp.clip(ratio, 1.0 - settings.clip_epsilon, 1.0 + settings.clip_epsilon)
         surrogate = jnp.minimum(ratio * part["advantage"], clipped * part["advantage"])
         value = apply_network(critic, part["sensed"])[..., 0]
         # a value is at most one, an advantage of one standard deviation some hundredths
         error = settings.value_coefficient * (value - part["target"]) ** 2
-        entropy = settings.entropy_coefficient * jnp.sum(log_std, -1)
+        spread_out = jnp.sum(log_std, -1) - jnp.mean(jnp.sum(jnp.exp(odds) * odds, -1), axis=1)
+        entropy = settings.entropy_coefficient * spread_out
         return jnp.sum(jnp.mean(error - surrogate, axis=1) - entropy)
 
 
@@ -266,8 +281,8 @@ def fly_learners(
     learners = evaders.world_axes.size
 
     def one(world, _):
-        mean = apply_network(evaders.actor, _sense(game, evaders, world[1]))
-        velocity = _in_world(evaders, mean, world[1])
+        decided = likeliest(apply_network(evaders.actor, _sense(game, evaders, world[1])))
+        velocity = _in_world(evaders, decided, world[1])
         return duel.fly(parameters, world, velocity, hold), None
 
     world = copies(start, learners)
@@ -292,6 +307,17 @@ def _in_world(evaders, decided, state):
     return jax.vmap(to_world)(decided.reshape(-1, 3), state, _axes(evaders, state))
 
 
-def _log_prob(sample, mean, log_std):
-    scaled = (sample - mean) * jnp.exp(-log_std)
-    return jnp.sum(-0.5 * scaled**2 - log_std - 0.5 * np.log(2 * np.pi), axis=-1)
+def spread(number: int) -> np.ndarray:
+    """(number, 3) ahead, back, to both sides, up, down, and so on, shares of the speed; a single
+    one stands still.
+    """
+    if number == 1:
+        return np.zeros((1, 3))
+    axes = np.concatenate([sign * np.eye(3) for sign in (1, -1)])[[0, 3, 1, 4, 2, 5]]
+    return FIRST * axes[np.arange(number) % len(axes)]
+
+
+def _log_prob(way, sample, means, odds, log_std):
+    scaled = (sample - of_way(means, way)) * jnp.exp(-log_std)
+    normal = jnp.sum(-0.5 * scaled**2 - log_std - 0.5 * np.log(2 * np.pi), axis=-1)
+    return normal + jnp.take_along_axis(odds, way[..., None], axis=-1)[..., 0]

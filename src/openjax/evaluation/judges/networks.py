@@ -3,15 +3,15 @@
 import jax
 import jax.numpy as jnp
 
-WIDTH = 256
-"""Of both hidden layers: 100 numbers are sensed, and two layers of 64 gave evaders that ran into
-corners.
-"""
+Network = dict[str, jax.Array]
 
 
-def init_network(key: jax.Array, learners: int, inputs: int, outputs: int) -> dict[str, jax.Array]:
-    """Parameters of L networks whose output is nearly zero at first."""
-    sizes = (inputs, WIDTH, WIDTH, outputs)
+def init_network(key: jax.Array, learners: int, sizes: tuple[int, int, int]) -> Network:
+    """Parameters of L networks whose output is nearly zero at first; of as many inputs, units in
+    both hidden layers, and outputs as `sizes` say.
+    """
+    inputs, width, outputs = sizes
+    sizes = (inputs, width, width, outputs)
     scales = (1.0, 1.0, 0.01)
     network = {}
     for i, scale in enumerate(scales):
@@ -22,7 +22,7 @@ def init_network(key: jax.Array, learners: int, inputs: int, outputs: int) -> di
     return network
 
 
-def apply_network(network: dict[str, jax.Array], sensed: jax.Array) -> jax.Array:
+def apply_network(network: Network, sensed: jax.Array) -> jax.Array:
     """(L, B, outputs) of inputs (L, B, F), each learner's own."""
     hidden = sensed
     for i in range(3):
@@ -30,3 +30,25 @@ def apply_network(network: dict[str, jax.Array], sensed: jax.Array) -> jax.Array
         if i < 2:
             hidden = jnp.tanh(hidden)
     return hidden
+
+
+def ways(outputs: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """(..., W, 3) means and (..., W) log odds of the ways that outputs (..., 4 W) say; three
+    outputs are one way.
+    """
+    number = outputs.shape[-1]
+    if number == 3:
+        return outputs[..., None, :], jnp.zeros((*outputs.shape[:-1], 1), outputs.dtype)
+    means, odds = outputs[..., : number // 4 * 3], outputs[..., number // 4 * 3 :]
+    return means.reshape(*odds.shape, 3), jax.nn.log_softmax(odds)
+
+
+def of_way(means: jax.Array, way: jax.Array) -> jax.Array:
+    """(..., 3) of means (..., W, 3) the one at `way` (...,), int."""
+    return jnp.take_along_axis(means, way[..., None, None], axis=-2)[..., 0, :]
+
+
+def likeliest(outputs: jax.Array) -> jax.Array:
+    """(..., 3) the mean of the way with the best odds."""
+    means, odds = ways(outputs)
+    return of_way(means, jnp.argmax(odds, axis=-1))

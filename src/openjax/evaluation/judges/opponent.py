@@ -5,7 +5,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from openjax.evaluation.judges.networks import apply_network
+from openjax.evaluation.judges.networks import apply_network, likeliest
 from openjax.evaluation.judges.senses import sense, to_world
 from openjax.pursuit.evaders.kinds import MEMORY, EvaderKind
 
@@ -24,7 +24,8 @@ def opponent(actor: Any, world_axes: jax.Array, hold: int, slots: int) -> Evader
     def velocity(scene, memory):
         world = scene.world
         sensed = sense(scene.settings, world, world_axes, slots)
-        decided = to_world(apply_network(network, sensed[None, None])[0, 0], world, world_axes)
+        decided = likeliest(apply_network(network, sensed[None, None]))[0, 0]
+        decided = to_world(decided, world, world_axes)
         decided = jnp.where(world.step % hold == 0, decided, memory[MEMORY:])
         return scene.reach * decided, memory.at[MEMORY:].set(decided)
 

@@ -19,6 +19,14 @@ class BestResponseSettings:
     """Worlds of each learner."""
     hold: Annotated[int, Interval("[1, 1000]")] = 4
     """Control steps for which a decision is flown: 40 ms, in which an evader moves 5 cm."""
+    ways: Annotated[int, Interval("[1, 64]")] = 1
+    """Velocities of which a decision chooses one: where left and right are equally good, the mean
+    of a single one leads into the middle.
+    """
+    width: Annotated[int, Interval("[1, 4096]")] = 256
+    """Of both hidden layers: 100 numbers are sensed, and two layers of 64 gave evaders that ran
+    into corners.
+    """
     rollout_length: Annotated[int, Interval("[1, 100000]")] = 25
     """Decisions per iteration: a second of the game."""
     foresight: tuple[float, ...] = (4.0, 4.0, 2.0, 2.0)
