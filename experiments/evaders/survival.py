@@ -2,7 +2,7 @@
 
 The files are those of `openjax exploit --json` and of `python -m experiments.evaders.limit --json`
 for one policy. Stores, of each kind of evaders, the share of episodes in which the one that is
-caught least is still free, over time, and draws it for each kind of tasks.
+caught least is still free, over time, and draws the picture of judged.md.
 """
 
 from collections.abc import Mapping
@@ -12,16 +12,14 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from experiments.evaders.judged import JUDGES, PLACES
-from experiments.table import Page, Table, page_parser, publish
+from experiments.table import facts, page_parser
 from openjax.command_line import run_command
-from openjax.files import read_json, replacing
+from openjax.files import read_json, replacing, write_json
 from openjax.pursuit import PursuitSettings
 
 STEPS = PursuitSettings().episode_length
 EVERY = 10
 """Control steps between two points of a curve."""
-SHOWN = (2.0, 4.0, 8.0)
-"""Seconds of the table."""
 
 
 def survival(capture_steps: list[int]) -> list[float]:
@@ -62,23 +60,6 @@ def study(options) -> dict:
     }
 
 
-def page(results: Mapping) -> Page:
-    """A table of the share that is free, the mean over the kinds of tasks."""
-    curves = results["curves"]
-    rows = []
-    for kind in dict.fromkeys(curve["evaders"] for curve in curves):
-        free = np.mean([curve["free"] for curve in curves if curve["evaders"] == kind], axis=0)
-        places = [round(second / results["seconds_between"]) for second in SHOWN]
-        rows.append({"evaders": kind} | {str(i): float(free[i]) for i in places})
-    columns = {"evaders": "evaders"} | {
-        f"free after {second:g} s": f"{round(second / results['seconds_between'])}:.2f"
-        for second in SHOWN
-    }
-    return Page(
-        "How long evaders are free", "Means over layouts and uniform tasks.", Table(columns, rows)
-    )
-
-
 def draw(results: Mapping, path: Path) -> None:
     """A panel for each kind of tasks, a line for each kind of evaders."""
     figure = Figure(figsize=(10, 4.6), layout="constrained")
@@ -108,7 +89,11 @@ def main(arguments: list[str]) -> None:
     """The command."""
     parser = page_parser(__doc__, "survival")
     parser.add_argument("found", nargs="*", metavar="FILE")
-    publish(parser.parse_args(arguments), study, page, draw)
+    options = parser.parse_args(arguments)
+    data = options.out.with_suffix(".json")
+    if not options.report:
+        write_json(data, {**facts(options.commit), **study(options)})
+    draw(read_json(data), options.out.with_suffix(".png"))
 
 
 if __name__ == "__main__":

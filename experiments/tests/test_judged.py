@@ -1,0 +1,58 @@
+"""Rows of the judges' table, and curves of how long evaders are free."""
+
+from experiments.evaders.judged import is_shown, rows_of, vehicle_of
+from experiments.evaders.survival import curves_of
+from experiments.flying.vehicles import SLOWER
+from openjax.runs.exploit_report import remark, verdict
+from openjax.vehicle.effects import load_effects
+
+
+def record(evader, scenario, steps):
+    """Of episodes that end at these steps; 800 is none."""
+    caught = [step < 800 for step in steps]
+    rates = {"capture_rate": sum(caught) / len(steps), "crash_rate": 0.25}
+    return {
+        "evader": evader,
+        "scenario": scenario,
+        "episodes": len(steps),
+        **rates,
+        "capture_steps": steps,
+    }
+
+
+PLACES = ("wall", "narrow_gap", "random", "passage", "empty", "hidden", "uniform")
+RECORDS = [
+    record(evader, place, steps)
+    for place in PLACES
+    for evader, steps in (
+        ("learned 0", [100, 200, 800, 800]),
+        ("learned 1", [100, 100, 100, 800]),
+        ("planner", [300, 800, 800, 800]),
+        ("field", [50, 50, 50, 50]),
+    )
+]
+
+
+def test_the_verdict_is_the_evader_that_is_caught_least():
+    row = verdict(RECORDS)[0]
+    assert (row["scenario"], row["evader"], row["capture_rate"]) == ("wall", "planner", 0.25)
+    low, high = row["interval"]
+    assert 0.0 < low < 0.25 < high < 1.0
+    assert "wall (planner)" in remark(RECORDS)[0]
+    assert not remark([r for r in RECORDS if r["evader"] != "planner"])
+
+
+def test_a_slower_vehicle_has_rows_of_its_own():
+    slower = {"records": RECORDS, "effects": load_effects(SLOWER)[1], "vehicle": "crazyflie"}
+    assert vehicle_of(slower) == "slower" and vehicle_of({"records": RECORDS}) == "nominal"
+    learned, planner, paper = rows_of("evaders", slower)
+    assert learned["capture_rate"]["random"] == 0.5 and not learned["shown"]
+    assert is_shown(paper, []) and not is_shown(paper, ["evaders: the paper's"])
+    assert is_shown(planner, ["evaders: the paper's"]) and not is_shown(planner, ["evaders"])
+
+
+def test_a_curve_is_of_the_strongest_evader_and_ends_where_it_is_free():
+    curve = next(c for c in curves_of(RECORDS) if c["evaders"] == "evaders that learn")
+    assert curve["strongest"] == "learned 0"
+    free = curve["free"]
+    assert (free[0], free[9], free[10], free[20], free[-1]) == (1.0, 1.0, 0.75, 0.5, 0.5)
