@@ -121,7 +121,7 @@ def loss(
     policy: Policy,
     parameters: tuple[Any, Any],
     batch: Batch,
-    clip: jax.Array,
+    clip: jax.Array | float,
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
     """Sum of actor's and critic's () loss, `parameters` (actor, critic); and what to watch.
 
