@@ -191,6 +191,22 @@ def test_a_gyroscope_at_its_end_reads_nothing_there(tmp_path, sample_columns, sh
     assert case.flights[0].body_rates_derived == (words == "left out")
 
 
+@pytest.mark.parametrize("step", [0.02, 0.1, 0.4])
+def test_a_coarse_gyroscope_at_the_peaks_of_a_motion_is_not_at_its_end(
+    tmp_path, sample_columns, step
+):
+    def coarse(columns):
+        return {n: np.round(columns[n] / step) * step for n in ("wx", "wy", "wz")}
+
+    for name in ("flight_a", "flight_b", "flight_c"):
+        write_case(tmp_path, sample_columns[name] | coarse(sample_columns[name]))
+        try:
+            issues = [issue.issue for issue in load_case(tmp_path).quality]
+        except UserError as error:  # too coarse to agree with anything
+            issues = [str(error)]
+        assert not any("the sensor's end" in issue for issue in issues)
+
+
 def test_a_long_stand_before_the_flight_is_no_frozen_sensor(tmp_path, sample_columns):
     """Where a simulator or an estimator stands still to the last digit."""
     columns = sample_columns["flight_a"]

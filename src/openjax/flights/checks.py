@@ -253,10 +253,9 @@ def _without_saturated(flight: Flight, note) -> Flight:
             continue
         size = np.abs(values)
         most = float(np.nanmax(size))
-        # one noisy reading is the largest; many equal ones are the sensor's end
         at_end = size == most
         share = float(at_end.any(1).mean())
-        if share < SATURATED or most < LEAST_RANGE[channel]:
+        if share < SATURATED or most < LEAST_RANGE[channel] or not _piled_up(size):
             continue
         columns = zip(CHANNEL_COLUMNS[channel], at_end.any(0), strict=True)
         text = f"{', '.join(c for c, ends in columns if ends)} read {most:g} or -{most:g}"
@@ -270,6 +269,14 @@ def _without_saturated(flight: Flight, note) -> Flight:
         note("corrupt", f"{text}: left out")
         changes[channel] = None
     return dataclasses.replace(flight, **changes) if changes else flight
+
+
+def _piled_up(size: np.ndarray) -> bool:
+    """Whether many more readings are the largest than the one below: else it is the peak of a
+    motion, which a coarse sensor reads often.
+    """
+    _, counts = np.unique(size[np.isfinite(size)], return_counts=True)
+    return len(counts) > 1 and bool(counts[-1] > 5 * counts[-2])
 
 
 def _without_lost_poses(flight: Flight, note) -> Flight:
