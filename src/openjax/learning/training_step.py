@@ -82,7 +82,7 @@ def build(
 
 
 def shipped_learners(
-    settings: TrainSettings, environment: Pursuit, policy: Policy
+    settings: TrainSettings, environment: Pursuit, policy: Policy | OwnPolicy
 ) -> dict[str, Learner]:
     """The learners that a run's settings name, in the order in which they learn."""
     learners = {}

@@ -16,7 +16,7 @@ from openjax.learning.collectives import joint_moments, minibatches
 from openjax.learning.learners.learner import Flown
 from openjax.learning.settings import MappoSettings
 from openjax.learning.train_state import TrainState, clipped_adam, shuffled
-from openjax.policy import Policy, PolicyParameters, gaussian_entropy, gaussian_log_prob
+from openjax.policy import OwnPolicy, Policy, PolicyParameters, gaussian_entropy, gaussian_log_prob
 from openjax.pursuit import Observation
 from openjax.pursuit.shapes import Scalar
 from openjax.pursuit.teams import team_mean
@@ -118,7 +118,7 @@ def make_optimiser(
 
 def loss(
     settings: MappoSettings,
-    policy: Policy,
+    policy: Policy | OwnPolicy,
     parameters: tuple[Any, Any],
     batch: Batch,
     clip: jax.Array | float,
