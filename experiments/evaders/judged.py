@@ -1,9 +1,10 @@
 """Policies before the second judge: `python -m experiments.evaders.judged NAME=FILE ...`.
 
 Each FILE is what `openjax exploit --policy NAME --json FILE` wrote: evaders that learned against
-the policy, one that plans in the true simulation, and the scripted ones; or what
-`python -m experiments.evaders.apart` and `limit` wrote. None of them trained the pursuers; the slower vehicle
-is `--effects experiments/flying/slower.toml`. Stores the least capture rate of each kind, and makes the table of judged.md.
+the policy, one that plans in the true simulation, and the scripted ones; or what the programs
+`limit` and `apart` beside this one wrote. None of them trained the pursuers. The slower vehicle is
+`--effects experiments/flying/slower.toml`. Stores the least capture rate of each kind, makes the
+table of judged.md, and writes the rows of weights that ship into README and model cards.
 """
 
 from collections.abc import Callable, Mapping, Sequence

@@ -28,11 +28,18 @@ class JudgedGame:
     tasks: Task  # (B, ...), of all kinds
     part: Callable[[Any], dict[str, Any]]
     """(B, ...) to the same by kinds"""
-    seed: int
+    options: argparse.Namespace
+
+    @property
+    def flown(self) -> dict:
+        """Whose game it was: policy, vehicle and effects, as `openjax exploit` stores them."""
+        vehicle = self.options.vehicle or self.environment.settings.airframe
+        effects = self.environment.effect_parameters
+        return {"policy": self.loaded.source, "vehicle": str(vehicle), "effects": effects}
 
     def records(self, name: str, fly: Callable) -> list[dict]:
         """Records of one evader; `fly` (parameters, tasks, key) -> statistics (B,), traceable."""
-        key = jax.random.key(self.seed)
+        key = jax.random.key(self.options.seed)
         flown = jax.jit(fly)(self.loaded.parameters, self.tasks, key)
         parts = self.part(jax.tree.map(np.asarray, flown))
         return [record(name, kind, own) for kind, own in parts.items()]
@@ -69,4 +76,4 @@ def judged_game(options: argparse.Namespace) -> JudgedGame:
     environment = make_environment(game, options.vehicle, options.effects)
     kinds = layout_tasks(game, list(SCENARIOS.values()), options.episodes)
     kinds["uniform"] = judging_tasks(game, options.uniform)
-    return JudgedGame(environment, loaded.in_game(environment), *stacked(kinds), options.seed)
+    return JudgedGame(environment, loaded.in_game(environment), *stacked(kinds), options)

@@ -45,7 +45,7 @@ def main() -> None:
     options = parser.parse_args()
     game = judged_game(options)
     duel = Duel(game.environment, game.loaded.policy)
-    found = {"policy": game.loaded.source, "records": [], "seconds": {}}
+    found = {**game.flown, "records": [], "seconds": {}}
     for name, pursuers_last in LAST.items():
         settings = MatrixGameSettings(pursuers_last, options.plans, options.plans)
         both = MatrixGame(settings, duel, vehicles_flight(game.environment))
