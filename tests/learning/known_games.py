@@ -41,7 +41,7 @@ def learn(environment: Pursuit, team: Team, draw, steps: int, **changes):
     settings = BestResponseSettings(total_steps=settings["learners"] * steps, **settings)
     duel = Duel(environment, team)
     response = BestResponse(settings, duel, draw)
-    carry = jax.jit(response.start)(jax.random.key(2))
+    carry = jax.jit(response.start)(jax.random.key(7))
     step = jax.jit(response.step, donate_argnums=1)
     for _ in range(settings.total_updates):
         # a CPU with dozens under way waits for ever
@@ -150,7 +150,7 @@ def longest(
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--radius", type=float, help="of a capture by stack, m")
-    parser.add_argument("--steps", type=int, default=4_000_000, help="of each seed")
+    parser.add_argument("--steps", type=int, default=8_000_000, help="of each seed")
     parser.add_argument("--seeds", dest="learners", type=int, default=3)
     parser.add_argument("--worlds", dest="num_envs", type=int, default=32, help="of each seed")
     parser.add_argument("--ways", type=int, default=SIZES["ways"])
