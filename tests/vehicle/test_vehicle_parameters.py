@@ -2,15 +2,19 @@
 reason.
 """
 
-import typing
-
 import jax
 import numpy as np
 import pytest
 
 from openjax.errors import UserError
-from openjax.pursuit import PursuitSettings
-from openjax.vehicle import hover_rotor_speed, hover_state, load_vehicle, max_rotor_thrust
+from openjax.pursuit import PursuitSettings, make
+from openjax.vehicle import (
+    hover_rotor_speed,
+    hover_state,
+    load_vehicle,
+    max_rotor_thrust,
+    register_airframe,
+)
 from openjax.vehicle.parameters import AIRFRAMES, assets_directory
 
 
@@ -52,7 +56,22 @@ def test_the_brushless_one_meets_its_sources():
     np.testing.assert_allclose(vehicle.thrust_constant * speed**2, thrust, rtol=0.015)
     np.testing.assert_allclose(vehicle.torque_constant * speed**2, torque, rtol=0.04)
     assert max_rotor_thrust(vehicle) == pytest.approx(0.2, rel=1e-5)
-    assert typing.get_args(typing.get_type_hints(PursuitSettings)["airframe"]) == tuple(AIRFRAMES)
+
+
+def test_an_airframe_is_registered_from_outside(tmp_path, monkeypatch):
+    monkeypatch.setattr("openjax.vehicle.parameters.AIRFRAMES", dict(AIRFRAMES))
+    with pytest.raises(UserError, match="airframe mine: unknown; there are crazyflie, brushless"):
+        PursuitSettings(airframe="mine")
+    mjcf = tmp_path / "heavy.xml"
+    shipped = (assets_directory() / "crazyflie.xml").read_text()
+    mass = float(load_vehicle().mass)
+    mjcf.write_text(shipped.replace(f'mass="{mass:g}"', f'mass="{2 * mass:g}"'))
+    register_airframe("mine", mjcf)
+    game = make(airframe="mine")
+    assert float(game.vehicle.mass) == pytest.approx(2 * mass)
+    register_airframe("mine", mjcf)  # a module that is loaded twice does no harm
+    with pytest.raises(UserError, match="there is one of that name"):
+        register_airframe("crazyflie", mjcf)
 
 
 @pytest.mark.parametrize(

@@ -127,9 +127,9 @@ class PursuitSettings:
     """Floor, pillars and other drones are solid; False: free flight, in which nothing is
     touched.
     """
-    airframe: Literal["crazyflie", "brushless"] = "crazyflie"
-    """The nominal vehicle: the Crazyflie 2.1, or the Crazyflie 2.1 Brushless; see
-    `openjax.vehicle.parameters`.
+    airframe: str = "crazyflie"
+    """The nominal vehicle: "crazyflie" is the Crazyflie 2.1, "brushless" the Crazyflie 2.1
+    Brushless; others after `openjax.vehicle.register_airframe`.
     """
     vehicles: tuple[tuple[str, float, float, float, float], ...] = ()
     """Family from which every pursuer's vehicle is drawn in each episode: parameters of effects
@@ -197,6 +197,11 @@ class PursuitSettings:
                     f"environment.{name} {list(drawn)} must be two numbers, the lower one first, "
                     "or none"
                 )
+        if self.airframe != PursuitSettings.airframe:
+            # only here: settings alone needn't wait for MuJoCo
+            from openjax.vehicle.parameters import check_airframe
+
+            check_airframe(self.airframe)
         if self.vehicles:
             from openjax.vehicle.family import (
                 check_ranges,

@@ -8,13 +8,17 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from openjax.errors import UserError
+from openjax.errors import UserError, suggestion
 from openjax.vehicle.shapes import Command, Hubs, Rotors, Scalar, Vector
 
 NOMINAL = "crazyflie"
-AIRFRAMES = {NOMINAL: "crazyflie.xml", "brushless": "crazyflie_brushless.xml"}
-"""Vehicles whose MJCF, and family beside it, the package has: the Crazyflie 2.1 and the Crazyflie
-2.1 Brushless.
+AIRFRAMES: dict[str, str | Path] = {
+    NOMINAL: "crazyflie.xml",
+    "brushless": "crazyflie_brushless.xml",
+}
+"""The MJCF of each airframe that settings and vehicle files may name, with its family beside it:
+the Crazyflie 2.1 and the Crazyflie 2.1 Brushless, in the package's assets, and what
+`register_airframe` put there.
 """
 
 ROTORS = ("rotor_1", "rotor_2", "rotor_3", "rotor_4")
@@ -122,6 +126,31 @@ def _number(model, path, name, size):
         raise UserError(f"{path}: numeric {name!r} holds {count} values, {size} would be right")
     values = np.array(model.numeric_data[start : start + count])
     return values[0] if size == 1 else values
+
+
+def register_airframe(name: str, mjcf: str | Path) -> None:
+    """From now on `name` is an airframe: settings, vehicle files and commands of this process may
+    name it. A run that was trained with it is resumed by a process that has registered it, too.
+
+    Args:
+      name: other than that of a shipped one.
+      mjcf: its file. Where vehicles are to be drawn from its family, STEM_family.toml lies beside
+      it (see `openjax.vehicle.family`).
+
+    Raises:
+      UserError: the name is taken by another file, or the file isn't a vehicle.
+    """
+    path = Path(mjcf).resolve()
+    if AIRFRAMES.get(name, path) != path:
+        raise UserError(f"airframe {name}: there is one of that name ({AIRFRAMES[name]})")
+    read_mjcf(str(path))  # says now what is wrong with it, and not when a game is made
+    AIRFRAMES[name] = path
+
+
+def check_airframe(name: str) -> None:
+    """Raises UserError for an airframe that nobody registered."""
+    if name not in AIRFRAMES:
+        raise UserError(f"airframe {name[:60]}: unknown; {suggestion(name, AIRFRAMES)}")
 
 
 def find_mjcf(name_or_path: str | Path) -> Path:
