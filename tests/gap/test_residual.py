@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 
 from openjax.gap.model.whitening import Noise
-from openjax.gap.residual import HORIZONS, calibration, conformal_p, measure, standing_out
+from openjax.gap.residual import (
+    HORIZONS,
+    beyond,
+    calibration,
+    conformal_p,
+    measure,
+    standing_out,
+)
 
 ROWS = 1500
 DT = 0.01
@@ -37,7 +44,9 @@ def left_over(push):
     residuals = [1e-3 * rng.standard_normal((ROWS, 9)) for _ in tracks]
     for residual in residuals:
         residual[:, 3] += np.cumsum(push) * DT
-    return measure(SimpleNamespace(replay=replay, tracks=tracks, channels=()), residuals)
+    made = SimpleNamespace(replay=replay, tracks=tracks, channels=())
+    measures, axes = measure(made, residuals)
+    return measures, beyond(axes, {})
 
 
 def test_a_push_is_left_in_its_channel_and_in_no_other():

@@ -2,18 +2,21 @@
 of form errors.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from openjax.gap.model.cross_validation import Judged
-from openjax.gap.selection import difference
+from openjax.gap.selection import difference, growth, worse
 
 
 def judged(left: np.ndarray, blocks: int) -> Judged:
     """A hypothesis that leaves whitened residuals `left` in equal blocks."""
     starts = np.arange(0, len(left), len(left) // blocks)
     nats = -0.5 * np.add.reduceat(left**2, starts)
-    return Judged(nats, np.ones((blocks, 6)), np.zeros((2, 1)), left, starts)
+    none = np.zeros((2, 1))
+    return Judged(nats, np.ones((blocks, 6)), none, left, starts, none, none, np.arange(0))
 
 
 def test_the_difference_of_two_hypotheses_has_the_error_that_repeated_noise_shows():
@@ -45,3 +48,26 @@ def test_one_hypothesis_is_as_good_as_itself():
     one = judged(np.random.default_rng(2).standard_normal(100), 5)
     gain, error, _ = difference(one, one)
     assert gain == 0.0 and error < 1e-3
+
+
+def test_an_effect_that_nuisances_take_on_matters_as_what_it_does():
+    """A residual y, an effect f that is there, and a nuisance that looks like f."""
+    rng = np.random.default_rng(3)
+    f = rng.standard_normal(500)
+    y = f + 0.5 * rng.standard_normal(500)
+    columns = np.array([y, f])  # with the effect, its column is taken off y and none is left
+    error = np.array([[columns @ columns.T]])
+
+    def of(taken):
+        found = np.array([[1.0, -taken]])
+        return replace(judged(y, 5), error=error, found=found, nuisances=np.array([1]))
+
+    absorbed, best = of(1.0), of(0.0)
+    floor = np.array([[0.25 * 500.0]])
+    inside = absorbed.squares_beside(absorbed)
+    assert growth(inside, floor) < 0.1  # the nuisance has taken all of it
+    beside = absorbed.squares_beside(best)
+    assert growth(beside, floor) == pytest.approx(np.sqrt(5.0) - 1.0, abs=0.2)
+    gaps, own = ((s[0], floor[0], s[0]) for s in (inside, beside))
+    assert worse(10.0, 5.0, gaps, own) and not worse(10.0, 5.0, gaps, gaps)
+    assert not worse(10.0, 7.0, gaps, own)  # and it isn't clear

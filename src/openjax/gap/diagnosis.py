@@ -15,7 +15,14 @@ from openjax.gap.intervals import estimates
 from openjax.gap.model.bounds import BOUND
 from openjax.gap.model.library import CARDS, PLACE, library, path_of
 from openjax.gap.probabilities import agreeing, probabilities
-from openjax.gap.reference import differs, joined, read_reference
+from openjax.gap.reference import (
+    OF_DAYS,
+    borne_out,
+    differs,
+    joined,
+    read_reference,
+    trimmed_before,
+)
 from openjax.gap.report import Report
 from openjax.gap.report.rules import LEAST_SHARE
 from openjax.gap.residual import Check, check_residual
@@ -35,6 +42,8 @@ def diagnose_case(
     begin = time.perf_counter()
     baseline = read_reference(joined(reference), progress) if reference else None
     evidence = gather(case, library(without), progress, baseline)
+    if baseline is not None and (both := borne_out(evidence)).effects != baseline.effects:
+        evidence = gather(case, library(without), progress, both)
     if progress:
         progress("identifying what the vehicle does")
     sensors = evidence.sensors
@@ -58,11 +67,16 @@ def conclude(evidence: Evidence) -> Report:
         for e, p in channel.named().items()
         if differs(channel, e, evidence.baseline)
     }
-    check = check_residual(evidence, selection.fit)
-    likely = [e for e, p in acting.items() if p >= 0.5]
+    check = check_residual(evidence, selection.fit, selection.search.nothing.fit)
+    old = trimmed_before(
+        selection.fit.theta, selection.effects, evidence.baseline, evidence.vehicles[0]
+    )
+    if check.mostly:  # what acts is something else
+        old |= set(selection.effects)
+    likely = [e for e, p in acting.items() if p >= 0.5 and e not in old]
     parts = worth_naming(lambda named: split(evidence, selection, check.predicted, named), likely)
     present = {e: acting[e] for e in parts.effects}
-    unnamed = set(likely) - set(present)
+    unnamed = (set(likely) | old) - set(present)
     weights = Counter()
     for effects, weight in selection.weights.items():
         weights[effects - unnamed] += weight
@@ -155,7 +169,7 @@ def _reference_in_words(evidence: Evidence, named) -> str:
         f"{e} {p} {evidence.baseline.theta[PLACE[e, p]]:.4g}"
         for e in named
         for p in (f.name for f in CARDS[e].fitted)
-        if (e, p) in PLACE
+        if (e, p) in PLACE and e not in OF_DAYS
     ]
     told = "Held against the reference flights of the same vehicle"
     told += f": {', '.join(before)} there." if before else "."
@@ -163,6 +177,9 @@ def _reference_in_words(evidence: Evidence, named) -> str:
         "The battery's charge may differ between the days, which changes what thrust a duty cycle "
         "makes: log vbat, and thrust can be compared."
     )
+    trims = "Days alone move trims by 1 to 2.5 % of hover: a change that small may be the day's."
+    if set(named) & set(OF_DAYS):
+        told = f"{told} {trims}"
     return f"{told} {battery}" if evidence.charge_unknown else told
 
 
@@ -188,15 +205,18 @@ def _nuisances(evidence: Evidence, selection: Selection) -> dict[str, str]:
     """What the vehicle's numbers and the sensors' mounting took, in usual sizes; a number at its
     bound says so.
     """
-    if evidence.baseline is not None:  # mixed, as the reference knows them together
-        return {}
     names = np.array(evidence.replay.nuisance_names)[evidence.replay.shared]
+    known = () if evidence.baseline is None else evidence.baseline.names
     taken = selection.chosen.judged.taken.mean(0)
 
     def at(v):
         return ", at its bound" if abs(v) > 0.99 * BOUND else ""
 
-    found = {n: f"{v:+.2f} of its usual size{at(v)}" for n, v in zip(names, taken, strict=True)}
+    found = {
+        n: f"{v:+.2f} of its usual size{at(v)}"
+        for n, v in zip(names, taken, strict=True)
+        if n not in known  # what the reference knows together has sizes of its own
+    }
     if evidence.sensors.gain != 1.0:
         found["gyroscope gain"] = f"{evidence.sensors.gain:.3f}"
     if "motor_rows" not in evidence.case.vehicle_file.log:

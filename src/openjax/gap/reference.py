@@ -4,45 +4,137 @@ of a case is a change since then.
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
+from itertools import combinations
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from openjax.errors import UserError
 from openjax.flights.flight import Case
 from openjax.gap.channels import Channel
 from openjax.gap.decision import DECISION
-from openjax.gap.evidence import gather
-from openjax.gap.model.baseline import FORM, Baseline, day_of, joint, moved
-from openjax.gap.model.hypotheses import UNEXPOSED, fit_set
-from openjax.gap.model.library import CARDS, library
+from openjax.gap.evidence import Evidence, gather
+from openjax.gap.model.baseline import COLOURED, FORM, Baseline, day_of, transferred
+from openjax.gap.model.cross_validation import Equations
+from openjax.gap.model.hypotheses import SetFit, fit_set
+from openjax.gap.model.library import ABSENT, CARDS, PLACE, THETA, Library, library, places
 from openjax.gap.model.table import build, with_effects
 from openjax.gap.residual import measure, residuals_of
+from openjax.gap.selection import searched
+from openjax.vehicle.effects import EFFECTS
+from openjax.vehicle.effects.effect import VERY_RARE
 
 ROUNDS = 3  # of the fit, between which nuisances are worked out anew
+# What trims of a day look like, and so nothing that another day has as well.
+OF_DAYS = tuple(e for e, card in CARDS.items() if card.trim is not None)
+# Rare names of what a vehicle with nothing wrong has as well, as flapping of drag.
+OTHER_NAMES = tuple(e for e in CARDS if CARDS[e].log_odds <= VERY_RARE and e not in FORM)
 
 
 def read_reference(case: Case, progress=None) -> Baseline:
-    """What the vehicle is like, by all flights of a reference case. Raises UserError as `gather`."""
-    evidence = gather(case, library(), progress, reference=True)
-    exposure = evidence.motion.exposure
-    shown = [e for e in FORM if exposure.get(e, 0.0) >= UNEXPOSED]
-    fit = fit_set(evidence.replay, shown, rounds=ROUNDS)
+    """What the vehicle is like, by all flights of a reference case: the effects that a diagnosis
+    would choose, of which those of the vehicle's form stay, and the numbers that every vehicle has.
+    Raises UserError as `gather`.
+    """
+    effects = Library(tuple(e for e in library().effects if e not in (*OF_DAYS, *OTHER_NAMES)))
+    evidence = gather(case, effects, progress, reference=True)
+    search = searched(evidence)
+    best = search.choose(np.ones((1, len(search.nothing.judged.nats))))[0].fit
+    fit = fit_set(best.replay, best.effects, best.theta, rounds=ROUNDS)
     measures, _ = measure(evidence, residuals_of(fit))
+    kept = tuple(e for e in fit.effects if e in FORM)
+    names, mean, covariance = _another_day(evidence, fit, kept)
+    theta = ABSENT.copy()
+    for name, moved in zip(names, mean, strict=True):
+        key = PLACE[tuple(name.split(" "))]
+        theta[key] = fit.theta[key] + moved
+    channels = {c.path: c for c in evidence.channels}
+    trim = _trim_of_a_day(fit, evidence.vehicles[0])
+    return Baseline(theta, kept, names, covariance, measures, channels, trim)
+
+
+def borne_out(evidence: Evidence) -> Baseline:
+    """The baseline of a case's evidence, with those of its effects that the case's flights bear out
+    as well: what the vehicle has it has in both, and what only the reference's flights made it look
+    like goes.
+    """
+    replay, baseline = evidence.replay, evidence.baseline
+    subsets = [
+        s for n in range(len(baseline.effects) + 1) for s in combinations(baseline.effects, n)
+    ]
+    thetas = np.array([_with(baseline, s).theta for s in subsets])
+    left = [y[None] - p for y, p in zip(replay.measured, replay.predict(thetas), strict=True)]
+    best = int(np.argmin(np.diag(replay.grams(left).sum(0))))
+    return _with(baseline, subsets[best])
+
+
+def _with(baseline: Baseline, effects) -> Baseline:
+    """A baseline with only these of its effects."""
+    theta = ABSENT.copy()
+    theta[places(effects)] = baseline.theta[places(effects)]
+    rows = [k for k, n in enumerate(baseline.names) if n.split(" ")[0] in effects]
+    names = tuple(baseline.names[k] for k in rows)
+    covariance = baseline.covariance[np.ix_(rows, rows)]
+    return replace(baseline, theta=theta, effects=effects, names=names, covariance=covariance)
+
+
+def trim_of(theta: np.ndarray, effects, vehicle) -> np.ndarray:
+    """(4,) by which share each rotor seems to push more than told, for those of the `effects` of
+    theta (P,) that trims of a day look like.
+    """
+    out = np.zeros(4)
+    for effect in (e for e in effects if e in OF_DAYS):
+        values = {p.name: float(theta[PLACE[effect, p.name]]) for p in CARDS[effect].fitted}
+        out += CARDS[effect].trim(values, vehicle)
+    return out
+
+
+def trimmed_before(theta: np.ndarray, named, baseline: Baseline | None, vehicle) -> set[str]:
+    """Those of the `named` effects that are no change: trims that are more the reference's than not,
+    though no day need have the trims of another one.
+    """
+    trims = set(named) & set(OF_DAYS)
+    if baseline is None or not trims:
+        return set()
+    now = trim_of(theta, trims, vehicle)
+    same = np.linalg.norm(now - baseline.trim) < 0.5 * np.linalg.norm(now)
+    return trims if same else set()
+
+
+def _trim_of_a_day(fit: SetFit, vehicle) -> np.ndarray:
+    """(4,) the trim, as `trim_of`, that the nuisances of a reference's fit say."""
     table = build(fit, None)
-    names = [n for n, s in zip(fit.replay.nuisance_names, fit.replay.shared, strict=True) if s]
-    day = partial(day_of, vehicle=evidence.vehicles[0], silent=evidence.charge_unknown)
-    found, covariance, known = joint(table, with_effects(table), names, day)
-    count = len(fit.index)
-    mean = dict(zip(names, found[count:].tolist(), strict=True))
-    return Baseline(
-        moved(fit.theta, known, found[:count]),
-        known,
-        covariance,
-        {n: v for n, v in mean.items() if n in known},
-        measures,
-        {c.path: c for c in evidence.channels},
-    )
+    equations = Equations(table, with_effects(table))
+    taken = equations.solve(table.total)[2][len(fit.index) :]
+    shared = [n for n, s in zip(fit.replay.nuisance_names, fit.replay.shared, strict=True) if s]
+    found = dict(zip(shared, taken.tolist(), strict=True))
+    theta = ABSENT.copy()
+    for e, p, size in fit.replay.numbers:
+        if e in OF_DAYS:
+            theta[PLACE[e, p]] += size * found[f"{e} {p}"]
+    return trim_of(theta, OF_DAYS, vehicle)
+
+
+def _another_day(evidence: Evidence, fit: SetFit, effects) -> tuple[tuple[str, ...], ...]:
+    """Names, mean and covariance of the numbers of the `effects` (away from the fit, in their
+    units), as they are on another day. The nuisances aren't transferred: what they take depends on
+    what is flown, as in closed loop they also take what feedback makes of gusts.
+    """
+    table = build(fit, None)
+    equations = Equations(table, with_effects(table))
+    columns, model = equations.columns, equations.model
+    keys = [THETA[i] for i in fit.index]
+    inside = len(keys)
+    hessian = table.total[np.ix_(columns, columns)] / COLOURED
+    precision = block_diag(model.precision, np.eye(len(columns) - inside))
+    around = np.concatenate([model.mean, np.zeros(len(columns) - inside)])
+    push = table.total[columns, 0] / COLOURED - hessian @ around
+    of_a_day = np.array([e not in effects for e, _ in keys] + [True] * (len(columns) - inside))
+    days = np.ones(len(columns))
+    days[:inside] = [day_of(*k, evidence.vehicles[0], evidence.charge_unknown) for k in keys]
+    found, covariance = transferred(hessian, push, precision, of_a_day, days)
+    names = tuple(" ".join(k) for k in keys if k[0] in effects)
+    return names, found + around[~of_a_day], covariance
 
 
 def joined(cases: Sequence[Case]) -> Case:
@@ -67,15 +159,19 @@ def joined(cases: Sequence[Case]) -> Case:
 
 def differs(channel: Channel, effect: str, baseline: Baseline | None) -> bool:
     """Whether a channel tells another size of an effect than the reference does: a parameter is
-    further away than the errors of both, and than forms may be wrong by.
+    further away than the errors of both, and than forms may be wrong by. A reference in which it
+    doesn't act says the same only where it is nearer to the case than to nothing.
     """
     before = baseline.channels.get(channel.path) if baseline is not None else None
     if before is None:
         return True
+    acted = effect in before.acting()
     for parameter in CARDS[effect].fitted:
         here, there = (c.estimate(effect, parameter.name) for c in (channel, before))
+        none = EFFECTS[effect].parameters[parameter.name].none
+        apart = abs(here.value - there.value)
         error = np.hypot(max(here.below, here.above), max(there.below, there.above))
         least = max(DECISION.standard_errors * error, DECISION.form_error * abs(here.value))
-        if abs(here.value - there.value) > least:
+        if apart > least or (not acted and apart > abs(there.value - none)):
             return True
     return False

@@ -30,6 +30,10 @@ HORIZONS = {
     "estimator": (0.1, "attitude and gyroscope disagree"),
     "position": (0.1, "position and velocity disagree"),
 }
+# By how much of its own size an effect may be left, where it isn't quite of the library's form: of
+# 51 development cases with a cause 4 are then called unknown, and 6 without (seed 886).
+FORM_LEFT = 0.3
+MOSTLY = 0.5  # share of what grew: an effect that explains less isn't what acts
 CALIBRATION = Path(__file__).with_name("residual.json")
 
 
@@ -37,13 +41,15 @@ CALIBRATION = Path(__file__).with_name("residual.json")
 class Check:
     """`measures` {name: value} and the one that stands out most, `where`; its `p_value` among cases
     without an unknown cause; `predicted` (9,): share of each motion channel's squared error beyond
-    what such cases leave, where the check rejects.
+    what such cases leave, where the check rejects; `mostly`: whether it does, and effects of the
+    motion explain little of what it finds.
     """
 
     measures: dict[str, float]
     where: str
     p_value: float
     predicted: np.ndarray
+    mostly: bool = False
 
     @property
     def rejects(self) -> bool:
@@ -66,17 +72,24 @@ class Check:
         )
 
 
-def check_residual(evidence: Evidence, fit: SetFit) -> Check:
-    """Whether a fit leaves no more than what cases without an unknown cause leave."""
-    residuals = residuals_of(fit)
-    measured, excess = measure(evidence, residuals)
-    p_value, name = (
-        conformal_p(measured)
-        if evidence.baseline is None
-        else changed_p(measured, _comparable(evidence))
-    )
-    predicted = excess if p_value <= DECISION.unknown else np.zeros(9)
-    return Check(measured, HORIZONS.get(name, (0.0, ""))[1], p_value, predicted)
+def check_residual(evidence: Evidence, fit: SetFit, nothing: SetFit) -> Check:
+    """Whether a fit leaves no more than what cases without an unknown cause leave; `nothing`: the
+    fit of no effect.
+    """
+    measured, axes = measure(evidence, residuals_of(fit))
+    before = {}
+    if evidence.baseline is None:
+        p_value, name = conformal_p(measured)
+        mostly = False
+    else:
+        before = _comparable(evidence)
+        unnamed, _ = measure(evidence, residuals_of(nothing))
+        p_value, name = changed_p(measured, before, unnamed)
+        mostly = bool(name) and unexplained(measured[name], before[name], unnamed[name]) > MOSTLY
+    rejects = p_value <= DECISION.unknown
+    predicted = beyond(axes, before) if rejects else np.zeros(9)
+    where = HORIZONS.get(name, (0.0, ""))[1]
+    return Check(measured, where, p_value, predicted, rejects and mostly)
 
 
 def residuals_of(fit: SetFit) -> list[Float[np.ndarray, "_ channels"]]:
@@ -102,25 +115,30 @@ def disturbances(track: Track, residual: Rows) -> Rows:
 
 def measure(
     evidence: Evidence, residuals: list[Float[np.ndarray, "_ channels"]]
-) -> tuple[dict[str, float], Float[np.ndarray, " channels"]]:
-    """{name: measure} of what is left, and (9,) by which share the motion channels' squares exceed
-    what the calibration's cases leave at most.
+) -> tuple[dict[str, float], dict[str, Float[np.ndarray, " 3"]]]:
+    """{name: measure} of what is left, and {name: (3,) the same by axis}, of which a measure is the
+    largest.
     """
     dt = evidence.tracks[0].dt
     skip = int(SKIP / dt)
-    out = {}
-    excess = np.zeros(9)
+    axes = {}
     for name, parts in _series(evidence, residuals).items():
         step = max(round(HORIZONS[name][0] / dt), 1)
-        size = np.concatenate([(p[step:] - p[:-step])[skip:] for p in parts]).std(0)
-        out[name] = float(size.max())
-        if name in ("rates", "velocity"):
-            most = np.quantile(
-                [c[name] for c in calibration() if name in c], 1.0 - DECISION.unknown
-            )
-            first = 0 if name == "rates" else 3
-            excess[first : first + 3] = 1.0 - np.minimum(most / size, 1.0) ** 2
-    return out, excess
+        axes[name] = np.concatenate([(p[step:] - p[:-step])[skip:] for p in parts]).std(0)
+    return {name: float(size.max()) for name, size in axes.items()}, axes
+
+
+def beyond(axes: dict[str, np.ndarray], reference: dict[str, float]) -> np.ndarray:
+    """(9,) by which share the motion channels' squares exceed what the same vehicle's
+    `reference` leaves, or else what the calibration's cases leave at most.
+    """
+    out = np.zeros(9)
+    for name, channels in (("rates", RATES), ("velocity", VELOCITY)):
+        if name in axes:
+            usual = [c[name] for c in calibration() if name in c]
+            most = reference.get(name, np.quantile(usual, 1.0 - DECISION.unknown))
+            out[channels] = 1.0 - np.minimum(most / axes[name], 1.0) ** 2
+    return out
 
 
 def _series(evidence: Evidence, residuals: list[np.ndarray]) -> dict[str, list[np.ndarray]]:
@@ -160,18 +178,29 @@ def _comparable(evidence: Evidence) -> dict[str, float]:
     return {n: v for n, v in before.items() if n not in silent}
 
 
-def changed_p(measured: dict[str, float], before: dict[str, float]) -> tuple[float, str]:
+def changed_p(
+    measured: dict[str, float], before: dict[str, float], unnamed: dict[str, float]
+) -> tuple[float, str]:
     """As `conformal_p`, against the same vehicle's reference: by the measure that grew most. What
-    known causes and other flights make it grow by has an exponential tail.
+    other flights make it grow by has an exponential tail. Effects that aren't quite of the
+    library's form leave a share of what they explain of the measures `unnamed` of no effect.
     """
-    grown = {
-        n: float(np.log(v / max(before[n], 1e-12))) for n, v in measured.items() if n in before
-    }
+    grown = {}
+    for name in (n for n in measured if n in before):
+        explained = max(unnamed[name] ** 2 - measured[name] ** 2, 0.0)
+        left = max(measured[name] ** 2 - FORM_LEFT**2 * explained, 1e-24)
+        grown[name] = float(0.5 * np.log(left / max(before[name], 1e-12) ** 2))
     if not grown:
         return 1.0, ""
     name = max(grown, key=lambda n: grown[n])
     rate = np.log(1.0 / DECISION.unknown) / DECISION.left_over
     return float(np.exp(-rate * max(grown[name], 0.0))), name
+
+
+def unexplained(measure: float, reference: float, unnamed: float) -> float:
+    """Share of what a measure's square has grown by since the reference that the fit leaves."""
+    left = measure**2 - reference**2
+    return left / max(unnamed**2 - reference**2, left, 1e-24)
 
 
 def conformal_p(measured: dict[str, float]) -> tuple[float, str]:

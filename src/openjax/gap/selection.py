@@ -4,7 +4,7 @@ fitted, then the most plausible set that isn't clearly worse.
 The score of a set of effects is its log predictive density on stretches left out (Vehtari, Gelman,
 Gabry 2017) plus the log prior odds of its effects. Chosen is the set of the
 largest prior odds among those that these flights can't tell from the best: the difference is within
-two standard errors, or too small to matter (the one-standard-error rule of Breiman et al. 1984,
+its standard errors, or too small to matter (the one-standard-error rule of Breiman et al. 1984,
 with a region of practical equivalence). How often each set is chosen when blocks of flight are
 weighed anew by a Bayesian bootstrap is its probability; named is the most probable one.
 """
@@ -90,10 +90,7 @@ class Selection:
 
 def select(evidence: Evidence) -> Selection:
     """Choose among the physics effects that the flights can show."""
-    search = Search(evidence, testable(evidence))
-    search.alone()
-    search.enumerate(search.nothing, FITTED)
-    search.enumerate(search.best, FITTED_AGAIN, search.beyond_bounds())
+    search = searched(evidence)
     weights = search.weights()
     chosen = search.visited[max(weights, key=weights.get)]
     without = {e: search.of_set(set(chosen.effects) - {e}, chosen.fit) for e in chosen.effects}
@@ -106,6 +103,15 @@ def select(evidence: Evidence) -> Selection:
     )
     table = build(chosen.fit, {})
     return Selection(chosen, table, ordered, weights, search.equivalents(chosen, ordered), search)
+
+
+def searched(evidence: Evidence) -> Search:
+    """The sets that were worth fitting."""
+    search = Search(evidence, testable(evidence))
+    search.alone()
+    search.enumerate(search.nothing, FITTED)
+    search.enumerate(search.best, FITTED_AGAIN, search.beyond_bounds())
+    return search
 
 
 def testable(evidence: Evidence) -> dict[str, SetFit]:
@@ -140,13 +146,24 @@ def growth(squares: Squares, floor: Float[np.ndarray, " channels"]) -> Float[np.
     return np.sqrt((squares / floor).mean(-1)) - 1.0
 
 
-def matters(squares: np.ndarray, floor: np.ndarray, nothing: np.ndarray):
-    """Whether a gap (..., channels) is so much larger than `floor` that it matters beside what
-    `nothing` (channels,) leaves.
+def matters(squares, floor, nothing, least: float = DECISION.least_gap):
+    """Whether a gap of squares (..., channels) is so much larger than `floor` that it matters beside
+    what `nothing` (channels,) leaves.
     """
-    return growth(squares, floor) > max(
-        DECISION.least_gap, DECISION.form_error * growth(nothing, floor)
-    )
+    return growth(squares, floor) > np.maximum(least, DECISION.form_error * growth(nothing, floor))
+
+
+def worse(gain, error, gaps, beside):
+    """Whether a set is clearly worse than the best: by so many nats `gain` with their standard
+    `error`, and so that it matters. `gaps` are squares of the set, the best and nothing.
+
+    Nuisances take a part of what an effect does, as a wrong moment of inertia looks like a nuisance
+    of some per cent. Whether an effect matters is also asked of `beside`, the same squares with
+    nuisances as the best set has them; whether it is needed, of the nats alone, in which nuisances
+    are free.
+    """
+    clear = (gain > DECISION.standard_errors * error) & matters(*gaps)
+    return clear | ((gain > REACH * error) & matters(*beside, DECISION.form_error))
 
 
 def log_odds(effects) -> float:
@@ -238,7 +255,8 @@ class Search:
 
         def ranked(keys, promise_of):
             score = {
-                k: promise_of(table, models[k]) - len(models[k].free) + log_odds(k) for k in keys
+                k: promise_of(table, models[k]) - len(models[k].free) + log_odds(k) + self.heard(k)
+                for k in keys
             }
             return [k for k in sorted(keys, key=lambda k: -score[k]) if score[k] > score[NOTHING]]
 
@@ -248,6 +266,14 @@ class Search:
         chosen += [key - {effect} for key in best[:SIMPLER] for effect in key]
         for key in dict.fromkeys(chosen):
             self.of_set(key, near.fit)
+
+    def heard(self, key: frozenset) -> float:
+        """Nats by which the torques' response speaks for a set with each effect as it was alone."""
+        theta = self.nothing.fit.theta.copy()
+        for effect in key:
+            own = places((effect,))
+            theta[own] = self.singles[effect].theta[own]
+        return self.evidence.support(theta)
 
     def _model(self, table: Table, key: frozenset) -> Model:
         """A set in the table of another one."""
@@ -270,10 +296,12 @@ class Search:
         that it matters.
         """
         gain, error, _ = difference(best.judged, other.judged)
-        gaps = (h.judged.squares.sum(0) for h in (other, best, self.nothing))
         if best.support - other.support > DETECTABLE:
             return True
-        return gain > DECISION.standard_errors * error and bool(matters(*gaps))
+        sets = (other, best, self.nothing)
+        gaps = [h.judged.squares.sum(0) for h in sets]
+        beside = [h.judged.squares_beside(best.judged).sum(0) for h in sets]
+        return bool(worse(gain, error, gaps, beside))
 
     def equivalents(self, chosen: Hypothesis, named) -> dict[str, list[str]]:
         """For each named effect those in whose place, of the sets visited, flights don't tell the
@@ -306,14 +334,18 @@ class Search:
         density = weights @ np.array([h.judged.nats for h in sets]).T + response  # (D, sets)
         nothing = sets.index(self.nothing)
         chosen = []
-        squares = np.einsum("db,sbc->dsc", weights, np.array([h.judged.squares for h in sets]))
-        for nats, square in zip(density, squares, strict=True):
+        squares = np.array([h.judged.squares for h in sets])
+        beside = {}  # of a best set: the squares of all sets, nuisances as it has them
+        for weight, nats in zip(weights, density, strict=True):
             best = int(np.argmax(nats + odds))
-            large = matters(square, square[best], square[nothing])
-            worse = (nats[best] - nats > DECISION.standard_errors * errors[best]) & large
+            if best not in beside:
+                beside[best] = np.array([h.judged.squares_beside(sets[best].judged) for h in sets])
+            gaps, own = (np.einsum("b,sbc->sc", weight, s) for s in (squares, beside[best]))
+            told = (nats[best] - nats, errors[best])
+            out = worse(*told, *((g, g[best], g[nothing]) for g in (gaps, own)))
             # The response judges by itself: it counts no blocks, and its intervals hold the forms'.
-            worse |= response[best] - response > DETECTABLE
-            usual = ~worse & (odds == odds[~worse].max())
+            out |= response[best] - response > DETECTABLE
+            usual = ~out & (odds == odds[~out].max())
             first = int(np.argmax(np.where(usual, nats, -np.inf)))
             evidence = trust[first] * (nats - nats[first]) - costs
             chosen.append(sets[int(np.argmax(np.where(usual, evidence, -np.inf)))])

@@ -15,7 +15,7 @@ from openjax.flights.kinematics import Kinematics
 from openjax.flights.track import GRID_PERIOD, Track
 from openjax.gap.channels.instruments import caused_by_commands, read_feedback
 from openjax.gap.channels.rate_loop import ROW_DELAY, RateLoop
-from openjax.gap.model.baseline import FORM, Baseline
+from openjax.gap.model.baseline import Baseline, with_days
 from openjax.gap.model.hypotheses import SetFit, fit_set, fit_singles, model_noise
 from openjax.gap.model.library import CARDS, Library, numbers_of
 from openjax.gap.model.observer import TICKS
@@ -58,8 +58,8 @@ class Reading:
             "nuisance_duty" if self.pwm else "nuisance_samples" if self.blind else "nuisance"
         )
         usual = numbers_of(situation, self.vehicles[0])
-        if self.reference:  # which fits them
-            return tuple(n for n in usual if n[0] not in FORM)
+        if self.reference:
+            return with_days(usual, self.vehicles[0])
         if self.baseline is None:
             return usual
         known = self.baseline.numbers

@@ -1,9 +1,9 @@
-"""What a vehicle is like while nothing is wrong with it, as its reference flights tell: one joint
-normal distribution of the numbers that every vehicle has and of the nuisances that the case's
-flights share.
+"""What a vehicle is like while nothing is wrong with it, as its reference flights tell: the effects
+that it always has, with one joint normal distribution of their numbers.
 
 In a diagnosis it takes the place of the nominal vehicle: effects start from there, and what is
-known together (a lag and a delay, drag and flapping) stays known together.
+known together (drag and flapping) stays known together. Nuisances aren't taken over: what they take
+depends on what is flown, as in closed loop they also take what feedback makes of gusts.
 """
 
 from dataclasses import dataclass
@@ -11,21 +11,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from openjax.gap.decision import DECISION
-from openjax.gap.model.library import CARDS, PHYSICS_EFFECTS, PLACE, THETA
-from openjax.gap.model.table import Model, Table
+from openjax.gap.model.library import CARDS, PHYSICS_EFFECTS, THETA
 from openjax.vehicle.effects import EFFECTS
 from openjax.vehicle.effects.effect import growth
 
 # Effects that every vehicle has to some degree: what a simulator gets wrong of it on any day. Trims
 # of 1 to 2.5 % of hover were measured over days on published flights of two Crazyflies.
 FORM = tuple(e for e in PHYSICS_EFFECTS if CARDS[e].days is not None)
-NUISANCE_DAYS = 0.3  # of a nuisance's usual size: markers and chips are mounted once
 # Of a number's usual spread, by which two sets of flights of one vehicle tell it differently: the
 # size by which an effect's form may be wrong (`decision.toml`), and half of what the number is
 # usually off by.
 FORM_DAYS = 0.5
-# Nuisances that a log has of its own.
-OF_A_DAY = ("trim", "motors within", "clock", "accelerometer bias")
 # Data that a nat is worth less than by white residuals: the median share of their variance that is
 # white was .38 over 650 pairs of sets.
 COLOURED = 2.6
@@ -33,28 +29,28 @@ COLOURED = 2.6
 
 @dataclass(frozen=True, eq=False)
 class Baseline:
-    """`theta` (P,) of the physics; `names` of the numbers ("effect parameter") and shared
-    nuisances whose joint `covariance` is known, in their units and usual sizes; `mean` of the
-    nuisances {name: usual sizes}; `measures` of what is left of the reference flights, as
-    `residual` has them; `channels` of the reference by path.
+    """`theta` (P,) of the physics; `effects` that act in the reference, of the vehicle's form;
+    `names` of their numbers ("effect parameter") whose joint `covariance` is known; `measures` of
+    what is left of the reference flights, as `residual` has them; `channels` of the reference by
+    path; `trim` (4,) of its rotors on that day, as `reference.trim_of`.
     """
 
     theta: np.ndarray
+    effects: tuple[str, ...]
     names: tuple[str, ...]
     covariance: np.ndarray
-    mean: dict[str, float]
     measures: dict[str, float]
     channels: dict[str, object]
+    trim: np.ndarray
 
     @property
     def numbers(self) -> tuple[tuple[str, str, float], ...]:
-        """Those of the vehicle, as `library.numbers_of` has them, in units of the parameter."""
-        inside = set(self.names)
-        return tuple((e, p, 1.0) for e, p in THETA if f"{e} {p}" in inside)
+        """Those of the effects, as `library.numbers_of` has them, in units of the parameter."""
+        return tuple((e, p, 1.0) for e, p in THETA if e in self.effects)
 
     def mixing(self, names) -> np.ndarray:
         """(N, N): columns of `names`, each of its usual size or unit -> columns of unit prior
-        variance. What the reference doesn't know stays as usual.
+        variance.
         """
         out = np.eye(len(names))
         rows = [k for k, n in enumerate(names) if n in self.names]
@@ -77,27 +73,38 @@ def day_of(effect: str, parameter: str, vehicle, silent: bool) -> float:
     return max(charge, card.days or 0.0, FORM_DAYS * usual, DECISION.form_error * float(spread))
 
 
-def joint(table: Table, model: Model, names, day) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
-    """Mean and covariance of the numbers of the table's set and of the nuisances `names` (N,) that
-    are shared, and what they are called. `day(effect, parameter)`: the spread of a number over days.
+def transferred(
+    hessian: np.ndarray,
+    push: np.ndarray,
+    prior: np.ndarray,
+    of_a_day: np.ndarray,
+    days: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and covariance, on another day, of the numbers that are not `of_a_day` (N,).
+
+    The reference's flights are a measurement of information `hessian` (N, N) and right side `push`
+    (N,), beside what such vehicles usually are: precision `prior` (N, N) around 0. What is of a day
+    is marginalised. Of the rest each number moves between two days by `days` (N,), so a measurement
+    of one day tells less of another. What the flights don't show stays as it usually is.
     """
-    from openjax.gap.model.cross_validation import Equations
+    own, rest = np.flatnonzero(of_a_day), np.flatnonzero(~of_a_day)
+    inside = hessian[np.ix_(own, own)] + prior[np.ix_(own, own)]
+    taken = np.linalg.solve(inside, np.column_stack([hessian[np.ix_(own, rest)], push[own]]))
+    data = hessian[np.ix_(rest, rest)] - hessian[np.ix_(rest, own)] @ taken[:, :-1]
+    right = push[rest] - hessian[np.ix_(rest, own)] @ taken[:, -1]
+    damped = np.eye(len(rest)) + data * np.square(days[rest])  # (I + D S) of information D
+    data, right = np.linalg.solve(damped, data), np.linalg.solve(damped, right)
+    covariance = np.linalg.inv(0.5 * (data + data.T) + prior[np.ix_(rest, rest)])
+    return covariance @ right, covariance
 
-    equations = Equations(table, model)
-    hessian, _, found = equations.solve(table.total)
-    inside = [f"{e} {p}" for e, p in (THETA[i] for i in table.fit.index)]
-    called = (*inside, *names)
-    days = [day(*n.split(" ")) if n in inside else NUISANCE_DAYS for n in called]
-    kept = [k for k, n in enumerate(called) if not n.startswith(OF_A_DAY)]
-    covariance = COLOURED * np.linalg.inv(hessian) + np.diag(np.square(days))
-    return found, covariance[np.ix_(kept, kept)], tuple(called[k] for k in kept)
 
-
-def moved(theta: np.ndarray, names, found) -> np.ndarray:
-    """theta (P,) with what was found of its numbers."""
-    out = theta.copy()
-    for name, value in zip(names, found, strict=False):
-        key = tuple(name.split(" "))
-        if key in PLACE:
-            out[PLACE[key]] += value
-    return out
+def with_days(usual, vehicle) -> tuple[tuple[str, str, float], ...]:
+    """The numbers of `library.numbers_of`, with what a day moves of each: how a vehicle is on the
+    day of its reference.
+    """
+    sizes = {(e, p): size for e, p, size in usual}
+    for effect in (e for e in FORM if CARDS[e].days):
+        for p in CARDS[effect].fitted:
+            key = effect, p.name
+            sizes[key] = float(np.hypot(sizes.get(key, 0.0), CARDS[effect].days))
+    return tuple((*key, size) for key, size in sizes.items())

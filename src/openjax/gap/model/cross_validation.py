@@ -1,5 +1,7 @@
 """What a model of a table's columns is worth: fitted to all blocks but one, judged on that one."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -15,7 +17,8 @@ from openjax.gap.model.table import Model, Table
 class Judged:
     """A model on stretches left out: `nats` (B,) minus half the whitened sum of squares, a block's
     own nuisances marginalised; `squares` (B, K) of the errors of logged channels, `taken` (B, N) of
-    the shared nuisances.
+    the shared nuisances. Errors are the quadratic forms `error` (B, K, C, C) of the coefficients
+    `found` (B, C), of which `nuisances` (N,) are the last.
     """
 
     nats: np.ndarray
@@ -23,6 +26,17 @@ class Judged:
     taken: np.ndarray
     left: np.ndarray  # (M,) whitened residuals and own nuisances, block after block
     starts: np.ndarray  # (B,) where each block begins
+    error: np.ndarray
+    found: np.ndarray
+    nuisances: np.ndarray
+
+    def squares_beside(self, other: Judged) -> np.ndarray:
+        """`squares` with the nuisances as another model has them: what nuisances take on themselves
+        in its place is an error as well, if that model is right.
+        """
+        found = self.found.copy()
+        found[:, self.nuisances] = other.found[:, other.nuisances]
+        return _squares(self.error, found)
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,16 +112,19 @@ def judge(table: Table, model: Model) -> Judged:
     ]
     return Judged(
         np.array([-0.5 * (r @ r) for r in left]),
-        _squares(table, found),
+        _squares(table.error, found),
         -found[:, table.nuisances[table.shared]],
         np.concatenate(left),
         np.cumsum([0, *map(len, left)])[:-1],
+        table.error.astype(np.float32),  # of all sets that are visited
+        found,
+        table.nuisances,
     )
 
 
-def _squares(table: Table, found: np.ndarray) -> np.ndarray:
-    """Squared errors (B, K) with coefficients (B, C)."""
-    return np.einsum("bkc,bc->bk", np.einsum("bkcd,bd->bkc", table.error, found), found)
+def _squares(error: np.ndarray, found: np.ndarray) -> np.ndarray:
+    """Squared errors (B, K) by their quadratic forms (B, K, C, C), with coefficients (B, C)."""
+    return np.einsum("bkc,bc->bk", np.einsum("bkcd,bd->bkc", error, found), found)
 
 
 def ablated(table: Table, found: np.ndarray, drop=(), off: np.ndarray | None = None) -> np.ndarray:
@@ -123,4 +140,4 @@ def ablated(table: Table, found: np.ndarray, drop=(), off: np.ndarray | None = N
         found[:, table.part[effect]] = 1.0
     if off is not None:
         found[:, table.nuisances[off]] = 0.0
-    return _squares(table, found)
+    return _squares(table.error, found)

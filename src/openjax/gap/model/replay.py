@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from scipy.linalg import solve_triangular
 
 from openjax.flights.track import Track
-from openjax.gap.model.library import ABSENT, PLACE, STEP, growths
+from openjax.gap.model.library import ABSENT, CARDS, PLACE, STEP, growths
 from openjax.gap.model.nuisances import OF_A_BLOCK, SIZE, columns_of
 from openjax.gap.model.prediction import FORCE, RATES, VELOCITY, Physics, make_physics
 from openjax.gap.model.whitening import Noise, first_noise, whiten
@@ -223,21 +223,10 @@ def make_replay(
         tuple(first_noise(a, i, d) for (a, i), d in zip(GROUPS, FIRST_NOISE, strict=True)),
         absent=absent.copy(),
     ).around(absent)
-    if baseline is None:
-        return replace(replay, columns=[_balanced(c, len(numbers)) for c in replay.columns])
-    return _known(replay, baseline)
-
-
-def _known(replay: Replay, baseline) -> Replay:
-    """With what the reference knows of the nuisances: taken off what was measured, and their joint
-    distribution.
-    """
-    names = replay.nuisance_names
-    mean = np.array([baseline.mean.get(n, 0.0) for n in names])
-    measured = [
-        y - np.tensordot(mean, c, 1) for y, c in zip(replay.measured, replay.columns, strict=True)
-    ]
-    return replace(replay, measured=measured, mixing=baseline.mixing(names))
+    if not any(CARDS[key[0]].balanced for key in numbers):  # trims are told otherwise
+        replay = replace(replay, columns=[_balanced(c, len(numbers)) for c in replay.columns])
+    mixing = None if baseline is None else baseline.mixing(replay.nuisance_names)
+    return replace(replay, mixing=mixing)
 
 
 def _balanced(nuisances: np.ndarray, count: int) -> np.ndarray:

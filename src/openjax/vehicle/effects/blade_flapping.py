@@ -51,7 +51,6 @@ EFFECT = Effect(
         possible=tilts_back,
         sample={"tilt": 0.02, "stiffness": 0.0002},
         practical={"tilt": 0.002, "stiffness": 1e-05},
-        days=0.0,
         next_flight="fast straight passes with sudden stops, to load roll and pitch.",
     ),
 )

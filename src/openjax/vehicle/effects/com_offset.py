@@ -1,6 +1,7 @@
 """The centre of mass isn't amid the rotors: thrust turns the body."""
 
 import jax.numpy as jnp
+import numpy as np
 
 from openjax.vehicle.effects.effect import Card, Effect, Fitted, Parameter
 
@@ -9,6 +10,12 @@ def body(parameters, vehicle):
     """Positions and velocities of the state are those of the centre of mass, wherever it is."""
     offset = jnp.stack([parameters["x"], parameters["y"], parameters["z"]])
     return vehicle.replace(rotor_position=vehicle.rotor_position - offset)
+
+
+def as_rotors(values, vehicle):
+    """(4,) shares of the rotors' thrust that turn the body as much."""
+    places = np.asarray(vehicle.rotor_position, float)[:, :2]
+    return -places @ (np.array([values["x"], values["y"]]) / np.mean(np.square(places), 0))
 
 
 _SOURCE = "battery and decks shift it by 0.05-8 mm"
@@ -33,6 +40,7 @@ EFFECT = Effect(
         sample={"x": 0.003, "y": -0.002},
         practical={"x": 4e-05, "y": 4e-05},
         days=0.0,
+        trim=as_rotors,
         next_flight="hover and climbs at several thrusts, with yaw free.",
     ),
 )

@@ -185,7 +185,9 @@ class Card:
     know none. practical: {parameter: how far one of them must be
     from doing nothing before anybody would change a simulator for it}. days: of an effect that
     every vehicle has to some degree, the standard deviation of its parameters over a vehicle's
-    days; None for others. sample: a strength within its usual range to fly with, strong enough to see.
+    days; None for others. trim({parameter: value}, vehicle) -> (4,): of an effect that a day's trims
+    look like, by which share each rotor seems to push more. sample: a strength within its usual
+    range to fly with, strong enough to see.
     impossible(position): whether a flight along position (T, 3), m, rules it out. next_flight: what
     would show it, in words.
     """
@@ -212,6 +214,7 @@ class Card:
     sample: Mapping[str, float] = field(default_factory=dict)
     practical: Mapping[str, float] = field(default_factory=dict)
     days: float | None = None
+    trim: Callable[[Mapping[str, float], Vehicle], Any] | None = None
     next_flight: str = ""
 
 

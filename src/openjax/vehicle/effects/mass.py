@@ -1,5 +1,7 @@
 """The vehicle weighs more or less than assumed."""
 
+import numpy as np
+
 from openjax.vehicle.effects.effect import RATIO, Card, Effect, Fitted, Parameter
 
 
@@ -36,6 +38,7 @@ EFFECT = Effect(
         weighed=True,
         sample={"extra": 0.003},
         practical={"extra": 0.0003},
+        trim=lambda values, vehicle: np.full(4, -values["extra"] / float(vehicle.mass)),
         next_flight="weigh the vehicle, then hover and climb hard: a weighed mass leaves only the thrust.",
     ),
 )

@@ -1,5 +1,7 @@
 """Every rotor pushes by the same factor more or less, its reaction torque with it."""
 
+import numpy as np
+
 from openjax.vehicle.effects.effect import RATIO, Card, Effect, Fitted, Parameter
 
 
@@ -35,6 +37,7 @@ EFFECT = Effect(
         sample={"scale": -0.08},
         practical={"scale": 0.01},
         days=0.012,
+        trim=lambda values, vehicle: np.full(4, values["scale"]),
         next_flight="weigh the vehicle, then hover and climb hard: a weighed mass leaves only the thrust.",
     ),
 )
