@@ -67,7 +67,7 @@ def test_surroundings_are_what_the_observation_says():
     (observation, state), _ = jax.jit(lambda start: jax.lax.scan(one, start, None, length=60))(
         start
     )
-    known = surroundings(craft, observation)
+    known = jax.jit(lambda observation: surroundings(craft, observation))(observation)
     velocity = np.asarray(state.drones.velocity)
     np.testing.assert_allclose(known.target_velocity[1], state.evader_velocity, atol=1e-6)
     np.testing.assert_allclose(
@@ -144,8 +144,13 @@ def test_dacoop_flies_the_field_that_its_network_sets():
     start = jnp.broadcast_to(jnp.tanh(jnp.array(policy.initial_action)), (3, policy.sample_size))
     fly = jax.jit(policy.action)
     action = fly(start, observation)
-    desired = apf(heuristic.craft, START, surroundings(heuristic.craft, observation))
-    expected = velocity_action(heuristic.craft, observation, desired)
+
+    @jax.jit
+    def follow(observation):
+        desired = apf(heuristic.craft, START, surroundings(heuristic.craft, observation))
+        return velocity_action(heuristic.craft, observation, desired)
+
+    expected = follow(observation)
     np.testing.assert_allclose(action, expected, atol=1e-3)
     # another balance, other commands: what the network puts out matters
     assert np.abs(fly(start.at[:, 1].add(-0.8), observation) - action).max() > 0.05

@@ -142,18 +142,19 @@ def test_settings_beside_an_environment_are_refused(game):
 def test_jaxmarl_interface_keeps_a_time_limit_and_what_it_hides(observe_time):
     game = openjax.make(episode_length=2, observe_time=observe_time)
     adapter = PursuitMultiAgentEnv(game)
-    observations, state = adapter.reset(jax.random.key(0))
+    advance = jax.jit(adapter.step)
+    observations, state = jax.jit(adapter.reset)(jax.random.key(0))
     actions = {agent: jnp.zeros(4) for agent in adapter.agents}
     for step in (1, 2):
         before = state
-        observations, state, _, dones, infos = adapter.step(jax.random.key(step), state, actions)
+        observations, state, _, dones, infos = advance(jax.random.key(step), state, actions)
         assert infos["truncated"].tolist() == [step == 2 and not observe_time] * 3
     assert bool(dones["__all__"])
     assert ("final_obs" in infos) != observe_time
     # IPPO makes one number for each agent of each leaf
     assert not observe_time or {leaf.shape for leaf in jax.tree.leaves(infos)} == {(3,)}
     if not observe_time:
-        last = adapter.step_env(jax.random.key(2), before, actions)[0]
+        last = jax.jit(adapter.step_env)(jax.random.key(2), before, actions)[0]
         for agent in adapter.agents:
             np.testing.assert_allclose(infos["final_obs"][agent], last[agent], atol=1e-6)
             assert not np.allclose(observations[agent], last[agent])
