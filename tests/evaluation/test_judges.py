@@ -24,6 +24,7 @@ def straight(observation):
     return to_evader / jnp.linalg.norm(to_evader, axis=-1, keepdims=True)
 
 
+@jax.jit
 def state_of(task):
     """At the start of a task, everything level and the evader on its way outwards."""
     state = GAME.reset_to(jax.random.key(1), task)[1]
@@ -38,12 +39,12 @@ def state_of(task):
 
 @pytest.mark.parametrize("world_axes", [True, False])
 def test_in_its_own_axes_a_turned_world_is_the_same(world_axes):
-    task = uniform_task(GAME.settings, jax.random.key(0))
+    task = jax.jit(lambda key: uniform_task(GAME.settings, key))(jax.random.key(0))
     # heights turn with nothing: a velocity that has one would tell the worlds apart
     task = task.replace(pursuer_position=task.pursuer_position.at[:, 2].set(0.5))
-    states = [state_of(task), state_of(turn_task(jax.random.key(2), task))]
-    axes = jnp.bool_(world_axes)
-    sensed = [sense(GAME.settings, state, axes) for state in states]
+    states = [state_of(task), state_of(jax.jit(turn_task)(jax.random.key(2), task))]
+    look = jax.jit(lambda state: sense(GAME.settings, state, jnp.bool_(world_axes)))
+    sensed = [look(state) for state in states]
     assert sensed[0].size == number_of_senses(3, 3)
     same = np.allclose(*sensed, atol=1e-5)
     assert same != world_axes
@@ -54,7 +55,7 @@ def test_in_its_own_axes_a_turned_world_is_the_same(world_axes):
 
 
 def test_more_slots_sense_pillars_that_are_not_there():
-    state = state_of(uniform_task(GAME.settings, jax.random.key(0)))
+    state = state_of(jax.jit(lambda key: uniform_task(GAME.settings, key))(jax.random.key(0)))
     few = sense(GAME.settings, state, jnp.bool_(False))
     many = sense(GAME.settings, state, jnp.bool_(False), slots=5)
     np.testing.assert_array_equal(many[: few.size], few)
@@ -69,7 +70,7 @@ def test_who_plans_gets_away_from_slower_points_in_the_open():
         arena_radius=10.0, arena_height=10.0, max_speed=1.0, evader_speed=1.3, episode_length=80
     )
     duel = Duel(game, Team(straight))
-    task = uniform_task(game.settings, jax.random.key(3))
+    task = jax.jit(lambda key: uniform_task(game.settings, key))(jax.random.key(3))
     middle = jnp.array([0.0, 0.0, 5.0])
     around = middle + 0.6 * jnp.array([[1.0, 0.0, 0.0], [-0.5, 0.8, 0.0], [-0.5, -0.8, 0.0]])
     task = task.replace(
@@ -77,7 +78,8 @@ def test_who_plans_gets_away_from_slower_points_in_the_open():
         pursuer_position=around,
         pillar_active=jnp.zeros_like(task.pillar_active),
     )
-    start = duel.start(jax.tree.map(lambda leaf: leaf[None], task), jax.random.key(4))
+    world = jax.tree.map(lambda leaf: leaf[None], task)
+    start = jax.jit(duel.start)(world, jax.random.key(4))
     still = jax.jit(lambda world: duel.fly({}, world, jnp.zeros((1, 3)), 80))(start)
     assert still[1].statistics.captured[0]
     planner = Planner(PlannerSettings(plans=24, piece_steps=10), duel)
