@@ -63,11 +63,11 @@ def test_an_effect_that_nuisances_take_on_matters_as_what_it_does():
         return replace(judged(y, 5), error=error, found=found, nuisances=np.array([1]))
 
     absorbed, best = of(1.0), of(0.0)
-    floor = np.array([[0.25 * 500.0]])
-    inside = absorbed.squares_beside(absorbed)
+    floor = np.array([0.25 * 500.0])
+    inside = absorbed.squares_beside(absorbed)[0]
     assert growth(inside, floor) < 0.1  # the nuisance has taken all of it
-    beside = absorbed.squares_beside(best)
+    beside = absorbed.squares_beside(best)[0]
     assert growth(beside, floor) == pytest.approx(np.sqrt(5.0) - 1.0, abs=0.2)
-    gaps, own = ((s[0], floor[0], s[0]) for s in (inside, beside))
+    gaps, own = ((s, floor, s) for s in (inside, beside))
     assert worse(10.0, 5.0, gaps, own) and not worse(10.0, 5.0, gaps, gaps)
     assert not worse(10.0, 7.0, gaps, own)  # and it isn't clear
