@@ -7,6 +7,7 @@ flight.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -155,7 +156,9 @@ class Replay:
             np.eye(len(gram)) + gram, n.reshape(len(n), -1) @ self.whiten(residual, track).ravel()
         )
 
-    def linearised(self, theta: Parameters, index: Int[np.ndarray, " free"]) -> list[np.ndarray]:
+    def linearised(
+        self, theta: Parameters, index: Int[np.ndarray, " free"] | Sequence[int]
+    ) -> list[np.ndarray]:
         """Residual and derivatives (1 + p, T, 9) of each track at theta (P,) with respect to
         theta[index].
         """
