@@ -70,12 +70,21 @@ def truth_of(truth: Truth) -> np.ndarray:
     )
 
 
+def flown() -> tuple[list[tuple], tuple]:
+    """(vehicle, gusts, number) of each flight, and all flights' gyroscopes and motors."""
+    cases = list(itertools.product(VEHICLES, GUSTS, range(SEEDS)))
+    # Each flight has air of its own, so that their errors are independent.
+    truths = [
+        dataclasses.replace(VEHICLES[name], gust=gust, seed=place)
+        for place, (name, gust, _) in enumerate(cases)
+    ]
+    return cases, fly(truths, SECONDS)
+
+
 def study() -> list[dict]:
     """One row for each kind of rows, vehicle and strength of gusts."""
     nominal = vehicle_of(load_vehicle())
-    cases = list(itertools.product(VEHICLES, GUSTS, range(SEEDS)))
-    truths = [dataclasses.replace(VEHICLES[n], gust=g, seed=s) for n, g, s in cases]
-    flights = fly(truths, SECONDS)
+    cases, flights = flown()
     out = []
     for kind, (rate, samples, free, seeds) in ROWS.items():
         for name, gust in itertools.product(VEHICLES, GUSTS):
