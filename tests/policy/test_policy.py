@@ -28,20 +28,21 @@ def observation_of(seed, n=N, pillars=3, batch=BATCH):
     draw = np.random.default_rng(seed)
 
     def normal(*shape):
-        return jnp.asarray(draw.normal(size=(batch, *shape)), jnp.float32)
+        return draw.normal(size=(batch, *shape)).astype(np.float32)
 
-    seen = jnp.asarray(draw.uniform(size=(batch, n, pillars)) < 0.6)
-    seen = seen.at[0].set(False).at[1].set(True)
-    return Observation(
+    seen = draw.uniform(size=(batch, n, pillars)) < 0.6
+    seen[:2] = [[[False]], [[True]]]
+    observation = Observation(
         self_state=normal(n, 20),
         others=normal(n, n - 1, 3),
-        pillars=jnp.where(seen[..., None], normal(n, pillars, 5), -5.0),
+        pillars=np.where(seen[..., None], normal(n, pillars, 5), np.float32(-5.0)),
         pillar_seen=seen,
         privileged=normal(n, 10),
         position=normal(n, 3),
         last_seen=0.3 * normal(3),
         frames=0.3 * normal(10, 7 + 3 * n),
     )
+    return jax.tree.map(jnp.asarray, observation)
 
 
 def functions(policy):
