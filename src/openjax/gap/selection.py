@@ -142,7 +142,9 @@ def difference(better: Judged, other: Judged) -> tuple[float, float, float]:
     return float((cross + 0.5 * energy).sum()), square**0.5, float(energy.sum()) / square
 
 
-def growth(squares: Squares, floor: Float[np.ndarray, " channels"]) -> Float[np.ndarray, "*sets"]:
+def growth(
+    squares: Squares, floor: Float[np.ndarray, " channels"]
+) -> Float[np.ndarray, "*sets"] | np.floating:
     """By how many floors a gap of squared errors (..., channels) is larger than one of the squares
     `floor` (channels,).
     """
