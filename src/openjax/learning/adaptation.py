@@ -247,8 +247,8 @@ def make_adaptation(trained: TrainSettings, settings: AdaptSettings) -> Adaptati
 def off_the_flight(
     position: Float[Array, "steps worlds pursuers 3"],
     velocity: Float[Array, "steps worlds pursuers 3"],
-    wanted: Float[Array, "all worlds pursuers 3"],
-    wanted_velocity: Float[Array, "all worlds pursuers 3"],
+    target: Float[Array, "all worlds pursuers 3"],
+    target_velocity: Float[Array, "all worlds pursuers 3"],
 ) -> Float[Array, "steps worlds pursuers"]:
     """(T, W, N) how far flights (T, W, N, 3) are from those that are wanted (LAG + T, W, N, 3), at
     the lag that suits best.
@@ -259,17 +259,17 @@ def off_the_flight(
 
     def at(lag):
         part = slice(LAG - lag, LAG - lag + position.shape[0])
-        off = jnp.sum(((position - wanted[part]) / NEAR) ** 2, axis=-1)
-        off = off + jnp.sum(((velocity - wanted_velocity[part]) / ALIKE) ** 2, axis=-1)
+        off = jnp.sum(((position - target[part]) / NEAR) ** 2, axis=-1)
+        off = off + jnp.sum(((velocity - target_velocity[part]) / ALIKE) ** 2, axis=-1)
         return jnp.sqrt(1.0 + off) - 1.0
 
     return functools.reduce(jnp.minimum, [at(lag) for lag in range(0, LAG + 1, 2)])
 
 
-def _kept(now, state, kept):
-    """States (W, ...) of which those whose moment is `now` (W,) take the place of what was kept."""
-    return jax.vmap(lambda now, a, b: jax.tree.map(lambda x, y: jnp.where(now, x, y), a, b))(
-        now, state, kept
+def _kept(is_now, state, kept):
+    """States (W, ...) kept of earlier steps, but those of worlds whose moment `is_now` (W,)."""
+    return jax.vmap(lambda is_now, a, b: jax.tree.map(lambda x, y: jnp.where(is_now, x, y), a, b))(
+        is_now, state, kept
     )
 
 

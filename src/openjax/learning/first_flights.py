@@ -54,18 +54,18 @@ LOW = 0.25
 """Height (m) below which the end of a moment costs: the gap to the floor is felt too late."""
 
 
-def first_game(environment: Pursuit, how: FirstFlightsSettings) -> Pursuit:
+def first_game(environment: Pursuit, stage: FirstFlightsSettings) -> Pursuit:
     """`environment` as it is learnt in: in free flight, with control steps of its own and episodes
     as long.
     """
     free = free_flight(environment)
     game = free.settings
-    ratio = max(1, round(how.time_step / game.time_step))
+    ratio = max(1, round(stage.time_step / game.time_step))
     game = dataclasses.replace(
         game,
         time_step=ratio * game.time_step,
         substeps=max(1, round(ratio * game.time_step / PHYSICS_STEP)),
-        episode_length=max(how.steps, game.episode_length // ratio),
+        episode_length=max(stage.steps, game.episode_length // ratio),
     )
     return dataclasses.replace(free, settings=game, dynamics=None)
 

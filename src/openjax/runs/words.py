@@ -34,9 +34,9 @@ def opening_words(settings: TrainSettings) -> str:
     )
 
 
-def different_settings(own: TrainSettings, other: TrainSettings) -> list[str]:
+def different_settings(settings: TrainSettings, other: TrainSettings) -> list[str]:
     """The dotted names of settings that have another value."""
-    mine, theirs = (flatten_dict(to_plain(settings), sep=".") for settings in (own, other))
+    mine, theirs = (flatten_dict(to_plain(one), sep=".") for one in (settings, other))
     return [name for name, value in mine.items() if value != theirs.get(name)]
 
 

@@ -91,13 +91,13 @@ class VirtualFirmware:
         bits = (*flies, self.crashed, self.emergency, self.crashed)
         return sum(int(bit) << i for i, bit in enumerate(bits))
 
-    def set_point(self, now: float) -> SetPoint:
-        """What the stabiliser is asked for at `now`, watchdogs and supervision included."""
-        if self._watchdog_time is not None and now - self._watchdog_time > WATCHDOG:
+    def set_point(self, time: float) -> SetPoint:
+        """What the stabiliser is asked for at `time`, watchdogs and supervision included."""
+        if self._watchdog_time is not None and time - self._watchdog_time > WATCHDOG:
             self.emergency = True
         if self._set_point_time is None or not self.armed or self.crashed or self.emergency:
             return SetPoint()
-        age = now - self._set_point_time
+        age = time - self._set_point_time
         if (
             self._set_point.mode == OFF
         ):  # nothing to time out: an armed vehicle waits for its first set-point
@@ -109,9 +109,9 @@ class VirtualFirmware:
             return SetPoint(ANGLES, 0.0, 0.0, 0.0, self._set_point.thrust)
         return self._set_point
 
-    def feed_watchdog(self, now: float) -> None:
+    def feed_watchdog(self, time: float) -> None:
         """Start or restart the emergency-stop watchdog."""
-        self._watchdog_time = now
+        self._watchdog_time = time
 
     def crash(self) -> None:
         """The vehicle hit something: motors off until a recovery is asked for."""
@@ -125,7 +125,7 @@ class VirtualFirmware:
 
     # -- packets in
 
-    def receive(self, raw: bytes, now: float) -> list[bytes]:
+    def receive(self, raw: bytes, time: float) -> list[bytes]:
         """Answers to one packet. What can't be understood is left without one, as on board."""
         if not raw:
             return []
@@ -150,17 +150,17 @@ class VirtualFirmware:
         if handler is None:
             return []
         try:
-            answers = handler(packet, now)
+            answers = handler(packet, time)
         except (struct.error, IndexError):  # shorter than its kind
             return []
         return [answer.encode() for answer in answers]
 
-    def _link(self, packet, now):
+    def _link(self, packet, time):
         if packet.channel == 0:  # echo
             return [packet]
         return [packet._replace(data=b"Bitcraze Crazyflie\0")] if packet.channel == 1 else []
 
-    def _platform(self, packet, now):
+    def _platform(self, packet, time):
         command = packet.data[0]
         if packet.channel == 1:
             answer = {0: bytes([PROTOCOL_VERSION]), 1: b"openjax virtual", 2: b"CF21"}.get(
@@ -181,7 +181,7 @@ class VirtualFirmware:
             self._disarm()
         return int(success), int(self.armed)
 
-    def _supervisor(self, packet, now):
+    def _supervisor(self, packet, time):
         command = packet.data[0]
         answer = None
         if packet.channel == 0 and command == 0x0C:
@@ -195,18 +195,18 @@ class VirtualFirmware:
             self.emergency = True
             answer = b""
         elif packet.channel == 1 and command == SupervisorCommand.FEED_WATCHDOG:
-            self.feed_watchdog(now)
+            self.feed_watchdog(time)
             answer = b""
         return [] if answer is None else [packet._replace(data=bytes([command | 0x80]) + answer)]
 
-    def _memory(self, packet, now):
+    def _memory(self, packet, time):
         return (
             [packet._replace(data=b"\x01\x00")]
             if packet.channel == 0 and packet.data[0] == 1
             else []
         )
 
-    def _localization(self, packet, now):
+    def _localization(self, packet, time):
         if packet.channel == 0:
             self.external_pose[:3] = struct.unpack("<3f", packet.data[:12])
             self.external_poses += 1
@@ -217,38 +217,38 @@ class VirtualFirmware:
         elif packet.data[0] == 3:
             self.emergency = True
         elif packet.data[0] == 4:
-            self.feed_watchdog(now)
+            self.feed_watchdog(time)
         return []
 
-    def _commander(self, packet, now):
+    def _commander(self, packet, time):
         *degrees, thrust = struct.unpack("<fffH", packet.data[:14])
         thrust = 0 if thrust < 1000 else min(thrust, THRUST_CUT)
         rates = self.parameters["flightmode.stabModeRoll"] == 0
-        self._accept(RATES if rates else ANGLES, degrees, thrust, now)
+        self._accept(RATES if rates else ANGLES, degrees, thrust, time)
         return []
 
-    def _generic(self, packet, now):
+    def _generic(self, packet, time):
         if packet.channel != 0:
             return []
         if packet.data[0] == 0:
             self._set_point = SetPoint()
-            self._set_point_time = now
+            self._set_point_time = time
             self.set_points += 1
         elif packet.data[0] == 11:
             *degrees, thrust, rates = struct.unpack("<fffHB", packet.data[1:16])
-            self._accept(RATES if rates else ANGLES, degrees, thrust, now)
+            self._accept(RATES if rates else ANGLES, degrees, thrust, time)
         return []
 
-    def _accept(self, mode, degrees, thrust, now):
+    def _accept(self, mode, degrees, thrust, time):
         """Roll, pitch, yaw rate in the firmware's frame, where pitch points the other way."""
         if np.isfinite(degrees).all():
             angles = (np.radians(degrees) * (1.0, -1.0, 1.0)).tolist()
-            self.accept(SetPoint(mode, *angles, thrust / (FULL_SCALE + 1)), now)
+            self.accept(SetPoint(mode, *angles, thrust / (FULL_SCALE + 1)), time)
 
-    def accept(self, set_point: SetPoint, now: float) -> None:
+    def accept(self, set_point: SetPoint, time: float) -> None:
         """Take a set-point as it comes out of a packet: no thrust means motors off."""
         self.set_points += 1
-        self._set_point_time = now
+        self._set_point_time = time
         self._set_point = SetPoint() if set_point.thrust == 0.0 else set_point
 
     # -- tables of contents
@@ -265,7 +265,7 @@ class VirtualFirmware:
             return [packet._replace(data=packet.data[:3] + bytes([type_of(names[ident])]) + name)]
         return []
 
-    def _log(self, packet, now):
+    def _log(self, packet, time):
         if packet.channel == 0:
             return self._contents(
                 packet,
@@ -280,11 +280,11 @@ class VirtualFirmware:
         ident = packet.data[1] if len(packet.data) > 1 else 0
         return [
             packet._replace(
-                data=bytes([command, ident, self.logs.control(command, ident, packet.data, now)])
+                data=bytes([command, ident, self.logs.control(command, ident, packet.data, time)])
             )
         ]
 
-    def _parameter(self, packet, now):
+    def _parameter(self, packet, time):
         if packet.channel == 0:
 
             def type_of(name):

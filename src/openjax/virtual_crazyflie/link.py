@@ -69,7 +69,7 @@ class VirtualLink:
         """Its UDP port."""
         return self.socket.getsockname()[1]
 
-    def poll(self, now: float) -> None:
+    def poll(self, time: float) -> None:
         """Take in what has arrived at the socket."""
         while True:
             try:
@@ -90,7 +90,7 @@ class VirtualLink:
                 jitter = self._random.random() * self.faults.jitter_ms
                 delay = 1e-3 * (self.faults.latency_ms + jitter)
             self._count += 1
-            heapq.heappush(self._incoming, (now + delay, self._count, raw, peer))
+            heapq.heappush(self._incoming, (time + delay, self._count, raw, peer))
 
     def next_due(self) -> float:
         """When the next packet in either direction is due; infinite if none waits."""
@@ -99,13 +99,13 @@ class VirtualLink:
             default=float("inf"),
         )
 
-    def received(self, now: float):
-        """The packets that have come through by `now`, in order: time, bytes, who sent them."""
-        while self._incoming and self._incoming[0][0] <= now:
+    def received(self, time: float):
+        """The packets that have come through by `time`, in order: time, bytes, who sent them."""
+        while self._incoming and self._incoming[0][0] <= time:
             due, _, raw, peer = heapq.heappop(self._incoming)
             yield due, raw, peer
 
-    def send(self, raw: bytes, now: float, peer=None) -> None:
+    def send(self, raw: bytes, time: float, peer=None) -> None:
         """Send an answer to who asked, log data to who set up log blocks or commanded last: a
         stranger gets none.
         """
@@ -114,11 +114,11 @@ class VirtualLink:
             return
         self._count += 1
         delay = 1e-3 * self.faults.pose_latency_ms if log_data else 0.0
-        heapq.heappush(self._outgoing, (now + delay, self._count, raw, peer or self._listener))
+        heapq.heappush(self._outgoing, (time + delay, self._count, raw, peer or self._listener))
 
-    def flush(self, now: float) -> None:
+    def flush(self, time: float) -> None:
         """Put on the wire what is due."""
-        while self._outgoing and self._outgoing[0][0] <= now:
+        while self._outgoing and self._outgoing[0][0] <= time:
             _, _, raw, peer = heapq.heappop(self._outgoing)
             if peer is not None:
                 with contextlib.suppress(OSError):  # nobody listens there any more

@@ -29,7 +29,7 @@ class LogBlocks:
     def __init__(self):
         self._blocks: dict[int, _Block] = {}
 
-    def control(self, command: int, ident: int, data: bytes, now: float) -> int:
+    def control(self, command: int, ident: int, data: bytes, time: float) -> int:
         """The status of a command on log blocks: 0 or an errno."""
         if command == 5:
             self._blocks.clear()
@@ -56,7 +56,7 @@ class LogBlocks:
             block.period = data[2] * 0.01
             if command == 8:
                 block.period = struct.unpack("<H", data[2:4])[0] * 1e-3
-            block.due = now + block.period
+            block.due = time + block.period
         return 0
 
     def _append(self, ident, data) -> int:
@@ -76,15 +76,15 @@ class LogBlocks:
         """When the next log packet is due (s); infinite if no block runs."""
         return min((b.due for b in self._blocks.values() if b.period > 0), default=np.inf)
 
-    def packets(self, firmware, now: float, sensors: Sensors) -> list[bytes]:
-        """The log packets due at `now`, stamped with it in milliseconds."""
+    def packets(self, firmware, time: float, sensors: Sensors) -> list[bytes]:
+        """The log packets due at `time`, stamped with it in milliseconds."""
         packets = []
         for ident, block in self._blocks.items():
-            if block.period <= 0 or now < block.due:
+            if block.period <= 0 or time < block.due:
                 continue
             # in step with its start; what came due in between is left out
-            block.due += block.period * (1 + int((now - block.due) / block.period))
-            stamp = struct.pack("<I", int(now * 1000) & 0xFFFFFF)[:3]
+            block.due += block.period * (1 + int((time - block.due) / block.period))
+            stamp = struct.pack("<I", int(time * 1000) & 0xFFFFFF)[:3]
             values = b"".join(
                 pack_number(fmt, LOG_VARIABLES[name][1](firmware, sensors))
                 for name, fmt in block.variables

@@ -71,22 +71,22 @@ class VirtualCrazyflies:
                 select.select(sockets, [], [], wait)
             self.catch_up(time.perf_counter() - start)
 
-    def catch_up(self, now: float) -> None:
-        """Take in what has arrived, advance everything to `now` (s), send what is due."""
+    def catch_up(self, until: float) -> None:
+        """Take in what has arrived, advance everything to `until` (s), send what is due."""
         packets = []
         for i, link in enumerate(self.links):
-            link.poll(now)
-            packets += [(due, i, raw, peer) for due, raw, peer in link.received(now)]
+            link.poll(until)
+            packets += [(due, i, raw, peer) for due, raw, peer in link.received(until)]
         for due, i, raw, peer in sorted(packets, key=lambda packet: packet[0]):
             self._advance(due)
             for answer in self.firmware[i].receive(raw, max(due, self.time)):
-                self.links[i].send(answer, now, peer)
-        self._advance(now)
+                self.links[i].send(answer, until, peer)
+        self._advance(until)
         for i, (firmware, link) in enumerate(zip(self.firmware, self.links, strict=True)):
             if firmware.logs.next() <= self.time:
                 for packet in firmware.logs.packets(firmware, self.time, self.vehicles.sensors(i)):
-                    link.send(packet, now)
-            link.flush(now)
+                    link.send(packet, until)
+            link.flush(until)
 
     def _advance(self, until: float) -> None:
         steps = int(until / STEP + 1e-6) - self._steps
