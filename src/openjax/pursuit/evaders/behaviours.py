@@ -176,14 +176,16 @@ def safe_place(scene: Scene, memory: Memory) -> tuple[Vector, Memory]:
     pursuer; none behind a pillar.
     """
     settings = scene.settings
-    pillars = (scene.pillar_position, scene.pillar_active)
     share = np.mod(0.5 + np.arange(PLACES)[:, None] * R_SEQUENCE[[1, 0, 2]], 1.0)
     places = _free_place(scene, jnp.asarray(share, jnp.float32))
     to_place = places - scene.position
     own = _length(to_place)[:, 0] / scene.reach
     theirs = _length(places[:, None] - scene.pursuers)[..., 0] / settings.max_speed
     lead = jnp.min(jnp.where(scene.known, theirs, FAR_AWAY), axis=-1) - own
-    lead = jnp.where(line_of_sight(settings, places, scene.position, *pillars), lead, -jnp.inf)
+    in_the_open = line_of_sight(
+        settings, places, scene.position, scene.pillar_position, scene.pillar_active
+    )
+    lead = jnp.where(in_the_open, lead, -jnp.inf)
     chosen = _chosen(to_place, lead)
     return chosen / jnp.maximum(_length(chosen), MARGIN), memory
 
@@ -242,10 +244,11 @@ def _ends(scene, start, tried):
     """(K, 3) where K directions lead within the look-ahead, and (K,) whether no pillar is in the
     way.
     """
-    pillars = scene.pillar_position, scene.pillar_active
+    pillars = scene.pillar_position
+    active = scene.pillar_active
     ends = start + scene.reach * scene.look_ahead * tried
-    ends = into_free_space(scene.settings, ends, *pillars)
-    return ends, line_of_sight(scene.settings, ends, start, *pillars)
+    ends = into_free_space(scene.settings, ends, pillars, active)
+    return ends, line_of_sight(scene.settings, ends, start, pillars, active)
 
 
 def _nearness(scene, ends, pursuers):

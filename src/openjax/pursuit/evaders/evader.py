@@ -151,13 +151,15 @@ def scene_of(settings: PursuitSettings, world: PursuitState) -> Scene:
     )
 
 
-def _pillars(world):
-    return world.task.pillar_position, world.task.pillar_active
-
-
 def _field(settings, world):
-    places = world.evader_position, world.drones.position
-    velocity = field_velocity(settings, *places, world.in_sight, *_pillars(world))
+    velocity = field_velocity(
+        settings,
+        world.evader_position,
+        world.drones.position,
+        world.in_sight,
+        world.task.pillar_position,
+        world.task.pillar_active,
+    )
     own = world.task.evader_speed
     return velocity if own is None else velocity * (own / settings.evader_speed)
 
@@ -205,10 +207,12 @@ def _flown(settings, world, speed, acceleration, wish):
     start = world.evader_position
     before = world.evader_velocity
     velocity = at_most(before + at_most(speed * wish - before, acceleration * dt), speed)
-    moved = into_free_space(settings, start + dt * velocity, *_pillars(world))
+    pillars = world.task.pillar_position
+    active = world.task.pillar_active
+    moved = into_free_space(settings, start + dt * velocity, pillars, active)
     velocity = at_most((moved - start) / dt, speed)
     # between pillars that touch, what leads out of one may lead into another
-    free = _is_free(settings, start + dt * velocity, *_pillars(world))
+    free = _is_free(settings, start + dt * velocity, pillars, active)
     return jnp.where(free, velocity, 0.0)
 
 
