@@ -13,7 +13,7 @@ pytestmark = pytest.mark.slow
 
 
 def test_outside_stacks_bound_one_learns_to_get_away():
-    found = against_stack(0.25, 1_000_000, learners=1)
+    found = against_stack(0.25, 2_000_000, learners=1)
     assert found["learned"][0] < 0.5, found
 
 
