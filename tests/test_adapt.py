@@ -6,6 +6,7 @@ import json
 from types import SimpleNamespace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -154,7 +155,8 @@ def test_moments_in_flight_are_the_nominal_vehicles_with_a_settled_other_one(
 
 
 def test_a_flight_may_come_late_but_not_elsewhere():
-    flown = np.cumsum(np.random.default_rng(0).normal(0.0, 0.05, (LAG + 12, 1, 2, 3)), axis=0)
+    steps = np.random.default_rng(0).normal(0.0, 0.05, (LAG + 12, 1, 2, 3))
+    flown = jnp.cumsum(jnp.asarray(steps, jnp.float32), axis=0)
     late = off_the_flight(flown[LAG - 4 : -4], flown[LAG - 4 : -4], flown, flown)
     np.testing.assert_allclose(late, 0.0, atol=1e-6)
     away = off_the_flight(flown[LAG:] + 0.1, flown[LAG:], flown, flown)

@@ -185,12 +185,10 @@ def test_a_strong_cause_outside_the_library_is_unknown_not_its_neighbour(tmp_pat
     assert report.verdict == "unknown" and report.effects[0] == "unknown"
 
 
-def test_mass_and_thrust_are_one_class_until_the_mass_is_weighed(reports):
-    assert reports["mass"].effects in (("mass",), ("thrust_scale",))
-    named = reports["mass"].effects[0]
-    assert {"mass": "thrust_scale", "thrust_scale": "mass"}[named] in reports["mass"].equivalent[
-        named
-    ]
+def test_a_mass_is_told_from_thrust_by_how_the_vehicle_turns(reports):
+    """Weaker rotors turn it more weakly, too, and a heavier vehicle turns as before: 400 nats."""
+    assert reports["mass"].effects == ("mass",)
+    assert "thrust_scale" not in reports["mass"].equivalent.get("mass", [])
     weighed = reports["weighed"]
     assert weighed.effects == ("thrust_scale",)
     assert "mass" not in weighed.equivalent.get("thrust_scale", [])
