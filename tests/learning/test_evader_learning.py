@@ -217,3 +217,36 @@ def test_earlier_selves_fly_and_learn_nothing(worlds):
 def test_somebody_has_to_learn():
     with pytest.raises(UserError, match=r"past 2 leaves none of 2 .* at most 1"):
         preset("evaders", environment={"evaders": ("learned",) * 2}, evader_learning={"past": 2})
+
+
+def test_those_that_restart_take_turns_and_leave_themselves_behind(worlds):
+    """After each restart one network is new and flies with fresh moments, its old self stands in the
+    pool, and who doesn't restart goes on.
+    """
+    how = dataclasses.replace(HOW, restarts=1, restart_every=3, past=0, pool=4, pool_every=1)
+    learning = EvaderLearning(how, ENVIRONMENT, updates=30)
+    np.testing.assert_array_equal(learning.lives, [3, 30])
+
+    @jax.jit
+    def update(evaders, key):
+        samples = learning.act(evaders, worlds, jax.random.normal(key, (WORLDS, 3)))[1]
+        last = worlds.replace(
+            statistics=worlds.statistics.replace(captured=samples.sample[:, 0] < 0.0)
+        )
+        samples = jax.tree.map(lambda leaf: leaf[None], samples)
+        return learning.learn(evaders, samples, last, key)
+
+    history = [jax.jit(learning.start)(jax.random.key(1))]
+    for key in jax.random.split(jax.random.key(2), 7):
+        history.append(update(history[-1], key))
+    kernel = [np.asarray(evaders.actor["output"]["kernel"]) for evaders in history]
+    born = np.asarray([evaders.born for evaders in history])
+    np.testing.assert_array_equal(born[:, 0], [0, 0, 0, 3, 3, 3, 6, 6])
+    np.testing.assert_array_equal(born[:, 1], 0)
+    # a network that has learnt nothing puts out zero
+    np.testing.assert_array_equal([not k[0].any() for k in kernel], born[:, 0] == range(8))
+    assert all(k[1].any() for k in kernel[1:])
+    pool = np.asarray(history[-1].pool["output"]["kernel"])
+    # its last update is missing in the history: it was restarted at the end of it
+    assert pool[0].any() and pool[1].any() and not np.array_equal(pool[0], pool[1])
+    np.testing.assert_allclose(pool[0], kernel[2][0], atol=0.05)

@@ -13,6 +13,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from flax import struct
 
@@ -41,6 +42,7 @@ class LearningEvaders:
     """(P, ...) actors as they once were"""
     past: jax.Array  # (S,) int32, places in the pool of those that fly
     update: jax.Array  # () int32
+    born: jax.Array  # (K,) int32, the update in which each began
 
     @property
     def flying(self) -> Any:
@@ -85,18 +87,24 @@ class EvaderLearning:
 
     @functools.cached_property
     def optimiser(self) -> optax.GradientTransformation:
-        """Of each network."""
+        """Of each network; its steps are scaled by `_rate`."""
+        return clipped_adam(1.0, 1.0)
+
+    @property
+    def lives(self) -> np.ndarray:
+        """(K,) updates for which each network learns."""
         how = self.how
-        steps = self.updates * self.how.epochs * self.how.minibatches
-        rate = optax.linear_schedule(how.learning_rate, how.learning_rate_end, steps)
-        return clipped_adam(1.0, rate)
+        restarted = np.arange(self.number) < how.restarts
+        return np.where(restarted, how.restarts * how.restart_every, self.updates)
+
+    def _rate(self, evaders):
+        """(K,) step sizes: they fall over each network's life."""
+        done = jnp.clip((evaders.update - evaders.born) / self.lives, 0.0, 1.0)
+        return self.how.learning_rate + done * (self.how.learning_rate_end - self.how.learning_rate)
 
     def start(self, key: jax.Array) -> LearningEvaders:
-        """Evaders that do as greedy ones."""
-        keys = jax.vmap(lambda key: jax.random.split(key, self.number))(jax.random.split(key))
-        log_std = jnp.full((self.number, 3), self.how.initial_log_std, jnp.float32)
-        init = jax.vmap(functools.partial(init_network, own_axes=self.how.own_axes))
-        networks = *(init(own, jnp.arange(self.number)) for own in keys), log_std
+        """Evaders that do as greedy ones, or nothing."""
+        networks = self._fresh(key)
         places = jnp.arange(self.how.pool) % self.number
         return LearningEvaders(
             *networks,
@@ -104,7 +112,15 @@ class EvaderLearning:
             pool=jax.tree.map(lambda leaf: leaf[places], networks[0]),
             past=jnp.arange(self.how.past, dtype=jnp.int32) % self.how.pool,
             update=jnp.zeros((), jnp.int32),
+            born=jnp.zeros(self.number, jnp.int32),
         )
+
+    def _fresh(self, key):
+        """Networks that have learnt nothing: actors, critics, spreads."""
+        keys = jax.vmap(lambda key: jax.random.split(key, self.number))(jax.random.split(key))
+        log_std = jnp.full((self.number, 3), self.how.initial_log_std, jnp.float32)
+        init = jax.vmap(functools.partial(init_network, own_axes=self.how.own_axes))
+        return *(init(own, jnp.arange(self.number)) for own in keys), log_std
 
     def see(self, networks: Any, state: PursuitState) -> tuple[jax.Array, dict[str, jax.Array]]:
         """Of worlds (E, ...) which of the networks acts, (E,), and what it sees."""
@@ -150,6 +166,10 @@ class EvaderLearning:
         `key` shuffles, the same on all devices; `axis` is the name of the devices' axis.
         """
         how, (worlds, batch) = self.how, self._batch(evaders, samples, last, axis)
+        rate = self._rate(evaders)
+
+        def scaled(change):
+            return jax.tree.map(lambda leaf: jax.vmap(jnp.multiply)(rate, leaf), change)
 
         def step(carry, index):
             networks, state = carry
@@ -158,7 +178,7 @@ class EvaderLearning:
             )
             gradient = mean_over_devices(gradient, axis)
             change, state = jax.vmap(self.optimiser.update)(gradient, state, networks)
-            return (optax.apply_updates(networks, change), state), None
+            return (optax.apply_updates(networks, scaled(change)), state), None
 
         start = evaders.networks, evaders.optimiser
         order = shuffled(key, how.epochs, how.minibatches)
@@ -171,7 +191,44 @@ class EvaderLearning:
             optimiser=state,
             update=evaders.update + 1,
         )
-        return self._remember(evaders, jax.random.fold_in(key, 1)) if self.how.past else evaders
+        if how.restarts:
+            return self._restart(evaders, jax.random.fold_in(key, 1))
+        return self._remember(evaders, jax.random.fold_in(key, 1)) if how.past else evaders
+
+    def _restart(self, evaders, key):
+        """Now and then the oldest of those that restart takes a place in the pool, and one that has
+        learnt nothing its own; now and then other earlier selves fly.
+        """
+        how = self.how
+        turn, rest = jnp.divmod(evaders.update, how.restart_every)
+        due = (rest == 0) & (turn > 0)
+        network, place = (turn - 1) % how.restarts, (turn - 1) % how.pool
+        fresh = self._fresh(jax.random.fold_in(key, 0))
+        fresh = fresh, jax.vmap(self.optimiser.init)(fresh)
+        mine = due & (jnp.arange(self.number) == network)
+
+        def begun(fresh, old):
+            return jax.vmap(jnp.where)(mine, fresh, old)
+
+        (actor, critic, log_std), optimiser = jax.tree.map(
+            begun, fresh, (evaders.networks, evaders.optimiser)
+        )
+        pool = jax.tree.map(
+            lambda pool, old: pool.at[place].set(jnp.where(due, old[network], pool[place])),
+            evaders.pool,
+            evaders.actor,
+        )
+        filled = jnp.clip(turn, 1, how.pool)
+        drawn = jax.random.randint(jax.random.fold_in(key, 1), (how.past,), 0, filled)
+        return evaders.replace(
+            actor=actor,
+            critic=critic,
+            log_std=log_std,
+            optimiser=optimiser,
+            pool=pool,
+            past=jnp.where(evaders.update % how.pool_every == 0, drawn, evaders.past),
+            born=jnp.where(mine, evaders.update, evaders.born),
+        )
 
     def _remember(self, evaders, key):
         """Now and then one of the actors takes a place in the pool, and other earlier selves fly."""

@@ -140,6 +140,13 @@ class EvaderLearningSettings:
     """... from as many networks that are kept ..."""
     pool_every: Annotated[int, Interval("[1, 1000000]")] = 10
     """... one of which is replaced, and all drawn anew, after as many updates."""
+    restarts: Annotated[int, Interval("[0, 64]")] = 0
+    """As many of those that learn begin again from nothing, one after the other: who learnt
+    beside the pursuers from the start looks for escapes where it once found one, and a judge
+    looks anywhere. The pool then holds what they were at the end of their lives.
+    """
+    restart_every: Annotated[int, Interval("[1, 1000000]")] = 300
+    """Updates between one's restart and the next one's."""
 
     def __post_init__(self):
         check_intervals(self)
@@ -355,6 +362,12 @@ class TrainSettings:
             not learned or past < learned,
             f"evader_learning.past {past} leaves none of {learned} learned evaders that learns; at "
             f"most {learned - 1} would be right",
+        )
+        restarts = self.evader_learning.restarts
+        yield (
+            not learned or restarts <= learned - past,
+            f"evader_learning.restarts {restarts}: only {learned - past} of the learned evaders "
+            "learn, so at most as many can begin again",
         )
         yield (
             self.restart_every or not self.restart_close,
