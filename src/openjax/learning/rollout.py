@@ -51,6 +51,12 @@ class Players:
     """
     hold: int = 1
     """Steps for which an evader that learns flies a decision."""
+    planned: Callable[[PolicyParameters, Any, jax.Array], jax.Array] | None = None
+    """parameters, worlds (E, ...), keys (E,) -> desired velocities (E, 3) of evaders that plan, NaN
+    of the others; None: none plans
+    """
+    plan_every: int = 1
+    """Steps for which one that plans flies the beginning of its plan."""
 
 
 @struct.dataclass
@@ -59,6 +65,7 @@ class Noise:
 
     pursuers: jax.Array  # (T, E, N, A)
     evaders: jax.Array | None = None  # (T / hold, E, 3)
+    plans: jax.Array | None = None  # (T / plan_every, E) keys
 
 
 def collect(
@@ -86,16 +93,39 @@ def collect(
         (observation, state), rollout = jax.lax.scan(step, world, noise.pursuers)
         return rollout, observation, state
 
-    def decide(world, noise):
+    def decide(world, noise, planned=None):
         desired, samples = players.evaders(world[1], noise.evaders)
+        if planned is not None:
+            plans = ~jnp.isnan(planned)
+            desired = jnp.where(plans, planned, desired)
+            # what a network would have done there was not flown
+            samples = samples.replace(which=jnp.where(plans[:, 0], -1, samples.which))
         world, record = jax.lax.scan(lambda *args: step(*args, desired), world, noise.pursuers)
         return world, (record, samples)
 
-    held = noise.pursuers.reshape(-1, players.hold, *noise.pursuers.shape[1:])
-    noise = noise.replace(pursuers=held)
-    (observation, state), (record, samples) = jax.lax.scan(decide, world, noise)
+    def plan(world, noise):
+        planned = players.planned(players.parameters, world, noise.plans)
+        noise = noise.replace(plans=None)
+        return jax.lax.scan(lambda *args: decide(*args, planned), world, noise)
+
+    noise = noise.replace(pursuers=_in_pieces(noise.pursuers, players.hold))
+    if players.planned is None:
+        (observation, state), (record, samples) = jax.lax.scan(decide, world, noise)
+    else:
+        decisions = players.plan_every // players.hold
+        noise = noise.replace(
+            pursuers=_in_pieces(noise.pursuers, decisions),
+            evaders=_in_pieces(noise.evaders, decisions),
+        )
+        (observation, state), flown = jax.lax.scan(plan, world, noise)
+        record, samples = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), flown)
     rollout = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), record)
     return rollout.replace(learning=samples), observation, state
+
+
+def _in_pieces(noise, length):
+    """(T / length, length, ...) of (T, ...)."""
+    return noise.reshape(-1, length, *noise.shape[1:])
 
 
 def _step(players, penalty_share):

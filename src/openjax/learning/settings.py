@@ -147,6 +147,16 @@ class EvaderLearningSettings:
     """
     restart_every: Annotated[int, Interval("[1, 1000000]")] = 300
     """Updates between one's restart and the next one's."""
+    planned: Annotated[float, Interval("[0, 1]")] = 0.0
+    """Share of the worlds whose evaders plan against the policy, in copies of their world; see
+    `openjax.learning.planned_evaders`.
+    """
+    plans: Annotated[int, Interval("[2, 10000]")] = 16
+    """That each of them tries ..."""
+    plan_every: Annotated[int, Interval("[4, 1000]")] = 20
+    """... in as many control steps, three times as far ahead; a multiple of `hold` and of four that
+    divides `rollout_length`.
+    """
 
     def __post_init__(self):
         check_intervals(self)
@@ -368,6 +378,13 @@ class TrainSettings:
             not learned or restarts <= learned - past,
             f"evader_learning.restarts {restarts}: only {learned - past} of the learned evaders "
             "learn, so at most as many can begin again",
+        )
+        every = self.evader_learning.plan_every
+        yield (
+            not self.evader_learning.planned
+            or (learned and every % hold == 0 and every % 4 == 0 and rollout % every == 0),
+            f"evader_learning.plan_every {every} must be a multiple of hold {hold} and of 4 that "
+            f"divides rollout_length {rollout}, in a game with learned evaders",
         )
         yield (
             self.restart_every or not self.restart_close,

@@ -22,6 +22,7 @@ from openjax.learning.learners.evasion import EvaderLearner
 from openjax.learning.learners.learner import Flown, Learner
 from openjax.learning.learners.mappo import Mappo
 from openjax.learning.learners.predictor_update import PredictorLearner
+from openjax.learning.planned_evaders import PlannedEvaders
 from openjax.learning.rollout import Noise, Players, collect
 from openjax.learning.settings import TrainSettings
 from openjax.policy import Network, OwnPolicy, Policy, PolicyParameters, make_policy
@@ -225,12 +226,27 @@ class _Step:
         noise = jax.vmap(lambda k: jax.random.normal(k, shape))(keys)
         noise = Noise(jnp.moveaxis(noise, 1, 0))
         act = self._evaders(carry)
-        hold = settings.evader_learning.hold
+        how = settings.evader_learning
+        planned = None
         if act is not None:
-            decisions = (steps // hold, 3)
+            decisions = (steps // how.hold, 3)
             draws = jax.vmap(lambda k: jax.random.normal(jax.random.fold_in(k, 1), decisions))(keys)
             noise = noise.replace(evaders=jnp.moveaxis(draws, 1, 0))
-        players = Players(self.parts.environment, policy, carry.policy, act, hold)
+        if act is not None and how.planned:
+            planned = PlannedEvaders(how, self.parts.environment, policy).wishes
+            plans = jax.vmap(
+                lambda k: jax.random.split(jax.random.fold_in(k, 2), steps // how.plan_every)
+            )
+            noise = noise.replace(plans=jnp.moveaxis(plans(keys), 1, 0))
+        players = Players(
+            self.parts.environment,
+            policy,
+            carry.policy,
+            act,
+            how.hold,
+            planned=planned,
+            plan_every=how.plan_every,
+        )
         world = (carry.observation, carry.state)
         progress = self._progress(carry)
         share = penalty_share_at(settings, progress)
