@@ -7,7 +7,8 @@ chooses weights by it has a judge less. Records as `openjax exploit --json` writ
 import time
 
 from experiments.evaders.judged_game import game_parser, judged_game
-from openjax.evaluation.judges.splitting import Splitting, SplittingSettings
+from openjax.evaluation.judges.settings import SplittingSettings
+from openjax.evaluation.judges.splitting import Splitting
 from openjax.files import write_json
 
 NAME = "splitting"

@@ -4,7 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from openjax.evaluation.judges.splitting import Splitting, SplittingSettings, sources
+from openjax.evaluation.judges.settings import SplittingSettings
+from openjax.evaluation.judges.splitting import Splitting, sources
 from openjax.pursuit import Task
 from tests.baselines.points import Team, game_of_points
 

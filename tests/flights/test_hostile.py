@@ -39,14 +39,6 @@ CELLS = st.sampled_from(
 EDITS = st.lists(st.tuples(st.floats(0, 1), st.integers(0, 40), CELLS), min_size=1, max_size=12)
 
 
-@pytest.fixture(scope="module")
-def text(sample_columns, tmp_path_factory):
-    path = tmp_path_factory.mktemp("log") / "flight.csv"
-    columns = {n: v[:400] for n, v in sample_columns["flight_b"].items()}
-    write_csv(path, log_of([columns], "flight"))
-    return path.read_text()
-
-
 @settings(
     max_examples=25,
     deadline=None,

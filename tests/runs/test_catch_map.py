@@ -8,10 +8,11 @@ from scipy.stats import binomtest
 
 import openjax
 from openjax.commands.calls import OwnController
+from openjax.evaluation.episodes import wilson
 from openjax.learning import TrainSettings
 from openjax.policy import PolicyParameters
 from openjax.pursuit import PursuitSettings
-from openjax.runs.catch_map import draw_map, map_game, proportion_interval
+from openjax.runs.catch_map import draw_map, map_game
 from openjax.runs.options import MapCommand
 from openjax.store.policies import LoadedPolicy
 
@@ -55,7 +56,7 @@ def test_cells_are_games_of_their_own():
 def test_intervals_of_proportions_are_wilsons():
     for hits, number in ((0, 9), (3, 10), (200, 200)):
         theirs = binomtest(hits, number).proportion_ci(method="wilson")
-        assert proportion_interval(hits, number) == pytest.approx(tuple(theirs), abs=1e-4)
+        assert wilson(hits, number) == pytest.approx(tuple(theirs), abs=1e-4)
 
 
 def test_a_policy_for_three_has_one_map():

@@ -17,7 +17,7 @@ from openjax.command_line import output_console, parse
 from openjax.errors import UserError
 from openjax.evaluation.message_settings import MessageSettings
 from openjax.files import check_output, write_json
-from openjax.pursuit.settings import PursuitSettings
+from openjax.pursuit.settings import LAYOUT_PURSUERS, PursuitSettings
 from openjax.ranges import Interval, Seed
 from openjax.show.progress import Steps
 from openjax.store import DEFAULT_POLICY
@@ -29,8 +29,6 @@ if TYPE_CHECKING:
 PROGRAM = "openjax evaluate"
 COMPILING = 15.0
 """Seconds that a policy's game takes to compile on a laptop, about."""
-LAYOUT_PURSUERS = 3
-"""Pursuers of the six layouts."""
 LARGEST_BATCH = 1000
 """Episodes that are flown at once, whose paths are all kept."""
 

@@ -15,6 +15,9 @@ HIDDEN = -5.0
 OWN_FRAME = 13
 """Numbers in a frame of the own history: velocity, body x and z axes, command."""
 
+LAYOUT_PURSUERS = 3
+"""Pursuers of the six layouts, and so of a policy for teams of any size by default."""
+
 
 @dataclass(frozen=True)
 class RewardSettings:

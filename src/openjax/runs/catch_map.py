@@ -5,7 +5,6 @@ forces.
 
 import dataclasses
 import itertools
-import math
 import time
 from collections.abc import Callable
 from typing import NamedTuple
@@ -16,7 +15,7 @@ import numpy as np
 
 from openjax.baselines.stack import stack_bound
 from openjax.errors import UserError
-from openjax.evaluation.episodes import make_evaluate
+from openjax.evaluation.episodes import make_evaluate, wilson
 from openjax.pursuit import EpisodeStatistics, Pursuit, PursuitSettings, Task, uniform_task
 from openjax.runs.machine import describe_machine
 from openjax.runs.options import MapCommand
@@ -24,8 +23,6 @@ from openjax.store.policies import LoadedPolicy
 
 FALL_OUT = 2.0
 """Seconds after which a pursuer falls out."""
-NORMAL_QUANTILE = 1.96
-"""Standard deviations of a normal distribution within which 95 % lie."""
 
 
 class Cell(NamedTuple):
@@ -164,17 +161,8 @@ def cell_record(game: PursuitSettings, cell: Cell, statistics: EpisodeStatistics
         **cell._asdict(),
         "episodes": episodes,
         "capture_rate": float(caught.mean()),
-        "interval": list(proportion_interval(int(caught.sum()), episodes)),
+        "interval": list(wilson(int(caught.sum()), episodes)),
         "capture_seconds": None if seconds is None else float(seconds),
         "crash_rate": float(statistics.crashed.mean()),
         "forced_below": float(stack_bound(points)),
     }
-
-
-def proportion_interval(hits: int, number: int) -> tuple[float, float]:
-    """95 % interval of a proportion (Wilson 1927)."""
-    square = NORMAL_QUANTILE**2
-    middle = (hits + square / 2) / (number + square)
-    half = NORMAL_QUANTILE / (number + square)
-    half *= math.sqrt(hits * (number - hits) / number + square / 4)
-    return max(0.0, middle - half), min(1.0, middle + half)
