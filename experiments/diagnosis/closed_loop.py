@@ -12,7 +12,6 @@ each segment alone: which segment shows which cause.
 import argparse
 import json
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -57,6 +56,10 @@ class Case:
             found += flights_of(log, (0, 1, 2, 3))[0]
         return found
 
+    def hovers(self) -> list:
+        """The flights that say little, with which every study begins."""
+        return self.fly(("hover", "hover"), 0)
+
 
 def described():
     """What the diagnosis is told of the vehicle."""
@@ -65,8 +68,8 @@ def described():
     return replace(load_vehicle_file(), mass_weighed=True, log={"motor_rows": "mean"})
 
 
-def diagnose(case: Case, flights: list) -> tuple[dict, dict]:
-    """What is kept of a diagnosis, and its report as JSON has it."""
+def diagnose(flights: list, cause: str) -> tuple[dict, dict]:
+    """What is kept of a diagnosis of a vehicle with one cause, and its report as JSON has it."""
     from openjax.flights import flight
     from openjax.gap.diagnosis import diagnose_case
 
@@ -75,16 +78,17 @@ def diagnose(case: Case, flights: list) -> tuple[dict, dict]:
     likely = {e: round(p, 3) for e, p in report.probabilities.items() if p > 0.03}
     kept = {
         "named": named,
-        "right": named == case.cause,
+        "right": named == cause,
         "also": list(report.effects[1:]),
         "equivalent": report.equivalent.get(named, []),
-        "not_testable": case.cause in report.not_testable,
+        "not_testable": cause in report.not_testable,
         "probabilities": likely,
+        "seconds": round(report.seconds, 1),
     }
     return kept, report.to_dict()
 
 
-def advised(report: dict, flown: list[str]) -> tuple[list[str], list[dict]]:
+def advised(report: dict) -> tuple[list[str], list[dict]]:
     """The segments that the advice would fly, and what it promises."""
     from openjax.gap.planning.beliefs import beliefs_of
     from openjax.gap.planning.information import advise
@@ -95,39 +99,62 @@ def advised(report: dict, flown: list[str]) -> tuple[list[str], list[dict]]:
     return chosen[:FLOWN], [asdict(p) for p in advice.promises]
 
 
-def rounds(case: Case, hovers: list, report: dict, choose) -> list[dict]:
-    """Each round's segments and diagnosis; `choose(report, flown)` names the segments."""
+def advised_rounds(case: Case) -> dict:
+    """The hovers' diagnosis, and each round's advice and diagnosis."""
+    flights = case.hovers()
+    before, report = diagnose(flights, case.cause)
     out = []
-    flights = list(hovers)
-    flown: list[str] = []
     for number in range(1, ROUNDS + 1):
-        segments, promises = choose(report, flown)
-        flights += case.fly(segments, number)
-        flown += segments
-        kept, report = diagnose(case, flights)
+        segments, promises = advised(report)
+        flights = flights + case.fly(segments, number)
+        kept, report = diagnose(flights, case.cause)
         out.append({"segments": segments, "promises": promises} | kept)
-    return out
+    return {"before": before, "advised": out}
 
 
-def closed_loop(number: int, each: bool = False) -> dict:
-    """One case: names before, after advised and after random segments."""
+def random_rounds(case: Case) -> dict:
+    """Each round's diagnosis after segments that nobody chose."""
+    rng = np.random.default_rng(case.number)
+    flights = case.hovers()
+    out = []
+    for number in range(1, ROUNDS + 1):
+        segments = [str(n) for n in rng.choice(segment_names(), FLOWN, replace=False)]
+        flights = flights + case.fly(segments, number)
+        out.append({"segments": segments} | diagnose(flights, case.cause)[0])
+    return {"random": out}
+
+
+def alone(case: Case, segment: str) -> dict:
+    """The diagnosis of the hovers and one segment."""
+    kept, _ = diagnose(case.hovers() + case.fly((segment,), 1), case.cause)
+    return {"each": {segment: kept}}
+
+
+def segment_names() -> list[str]:
     from openjax.flights.segments import SEGMENTS
 
+    return list(SEGMENTS)
+
+
+def studied(job: tuple[int, str]) -> tuple[int, dict]:
+    """One job: the number of a case and which of its parts, and what came of it."""
+    number, part = job
     case = Case(number)
-    hovers = case.fly(("hover", "hover"), 0)
-    before, report = diagnose(case, hovers)
-    rng = np.random.default_rng(number)
+    rounds = {"advised": advised_rounds, "random": random_rounds}
+    found = rounds[part](case) if part in rounds else alone(case, part)
+    print(json.dumps({"number": number, "part": part} | found), flush=True)
+    return number, found
 
-    def drawn(report, flown):
-        return [str(n) for n in rng.choice(list(SEGMENTS), FLOWN, replace=False)], []
 
-    found = {"number": number, "cause": case.cause, "before": before}
-    found["advised"] = rounds(case, hovers, report, advised)
-    found["random"] = rounds(case, hovers, report, drawn)
-    if each:
-        found["each"] = {n: diagnose(case, hovers + case.fly((n,), 1))[0] for n in SEGMENTS}
-    print(json.dumps(found), flush=True)
-    return found
+def study(numbers: list[int], jobs: int, each: bool) -> list[dict]:
+    """All cases. The longest jobs begin first, so that none is waited for at the end."""
+    parts = ["advised", "random", *(segment_names() if each else ())]
+    work = [(number, part) for part in parts for number in numbers]
+    cases: dict[int, dict] = {n: {"number": n, "cause": Case(n).cause} for n in numbers}
+    for number, found in in_processes(studied, work, jobs):
+        held = cases[number].get("each", {}) | found.get("each", {})
+        cases[number] |= found | ({"each": held} if held else {})
+    return list(cases.values())
 
 
 def figures(cases: list[dict]) -> dict:
@@ -148,8 +175,7 @@ def main() -> None:
     arguments = parser.parse_args()
     use_single_thread()
     numbers = list(range(arguments.first, arguments.first + arguments.cases))
-    study = partial(closed_loop, each=arguments.each)
-    cases = sorted(in_processes(study, numbers, arguments.jobs), key=lambda c: c["number"])
+    cases = study(numbers, arguments.jobs, arguments.each)
     command = "python -m experiments.diagnosis.closed_loop"
     command += f" --first {arguments.first} --cases {len(cases)}"
     command += " --each" if arguments.each else ""
