@@ -8,10 +8,12 @@ from scipy.signal import butter, lfilter
 
 from experiments.diagnosis import rate_flights
 from experiments.diagnosis.rate_flights import Truth, fly, rows_of, vehicle_of
+from openjax.flights.clocks import case_on_gyroscope_clock
+from openjax.flights.flight import Case, Flight
 from openjax.gap.identification.corrections import corrections
 from openjax.gap.identification.estimates import of_fit
 from openjax.gap.identification.quantities import Identification, doubts, quantities_of
-from openjax.gap.identification.records import Record
+from openjax.gap.identification.records import Record, records_of
 from openjax.gap.identification.responses import responses
 from openjax.gap.identification.rotor_rows import rotor_rows
 from openjax.gap.identification.support import support
@@ -19,6 +21,7 @@ from openjax.gap.identification.torques import NAMES, identify_torques
 from openjax.gap.model.library import ABSENT, PLACE
 from openjax.gap.report.response import response_of
 from openjax.vehicle import load_vehicle
+from openjax.vehicle.vehicle_file import load_vehicle_file
 
 TRUTHS = {
     "nominal": Truth(gust=8.0),
@@ -147,6 +150,26 @@ def test_the_filter_of_the_gyroscope_is_no_delay_of_the_motors():
         fit = identify_torques([record_of("fast rows", rates, motors, 500)])
         assert fit.clock == pytest.approx(truth.delay, abs=0.0015)
         assert fit.value[:2] == pytest.approx([truth.up, truth.down], rel=0.1)
+
+
+def test_no_line_stands_for_motors_that_were_not_logged():
+    rng = np.random.default_rng(0)
+    time = 0.01 * np.arange(960)
+    motor = 0.6 + 0.05 * rng.standard_normal((960, 4))
+
+    def case_without(lost):
+        logged = np.where(lost[:, None], np.nan, motor)
+        rates = rng.standard_normal((960, 3))
+        flight = Flight("a", "a", "0", time, body_rates=rates, motor_command=logged)
+        return Case("holes", (flight,), load_vehicle_file())
+
+    holes = (time % 3.0 > 2.7) | (time % 3.0 == 1.0)  # a single row is no hole
+    case = case_without(holes)
+    for moved in (case, case_on_gyroscope_clock(case, {"a": 0.02})):
+        parts = records_of(moved)
+        assert [len(r.rates) for r in parts] == pytest.approx([270] * 3, abs=3)
+        assert not any(r.drawn for r in parts)
+    assert all(r.drawn for r in records_of(case_without(time % 0.5 > 0.3)))
 
 
 def test_a_hover_that_hardly_turns_says_nothing_of_torques(monkeypatch, records):

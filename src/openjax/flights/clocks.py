@@ -14,7 +14,14 @@ import numpy as np
 from scipy.signal import butter, find_peaks, lfilter, sosfiltfilt
 
 from openjax.flights.flight import Case
-from openjax.flights.track import GRID_PERIOD, Track, earlier, turn_increments
+from openjax.flights.track import (
+    GRID_PERIOD,
+    MAX_GAP,
+    MISSED_SAMPLES,
+    Track,
+    earlier,
+    turn_increments,
+)
 
 # What a row of motor commands may hold: their mean from its time until the next row, their mean
 # since the last row, or a single one.
@@ -120,7 +127,10 @@ def case_on_gyroscope_clock(case: Case, late: Mapping[str, float]) -> Case:
     for flight in case.flights:
         moved = late.get(flight.name, 0.0)
         if moved and flight.motor_command is not None:
-            motor = flight.interpolated("motor_command", flight.time + moved)
+            acting = flight.time + moved
+            motor = flight.interpolated("motor_command", acting)
+            for begin, end in flight.holes("motor_command", MAX_GAP, MISSED_SAMPLES):
+                motor[(acting > begin) & (acting < end)] = np.nan
             flight = dataclasses.replace(flight, motor_command=motor)
         flights.append(flight)
     return dataclasses.replace(case, flights=tuple(flights))

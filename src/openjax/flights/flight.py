@@ -10,12 +10,13 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 if TYPE_CHECKING:
     from openjax.vehicle.vehicle_file import VehicleFile
@@ -127,14 +128,27 @@ class Flight:
         rows = np.isfinite(values.reshape(len(values), -1)).all(1)
         return self.time[rows], values[rows]
 
-    def holes(self, channel: str) -> Float[Array, "holes 2"]:
+    def holes(
+        self, channel: str, least: float = HOLE, samples: float = 10.0
+    ) -> Float[Array, "holes 2"]:
         """(H, 2) s, begin and end of where `channel` wasn't sampled for so long that no line may
-        stand for it.
+        stand for it: for more than `least` s, and more than so many of its `samples`.
         """
         at = np.r_[self.time[0], self.sampled(channel)[0], self.time[-1]]
         steps = np.diff(at)
-        wide = np.flatnonzero(steps > max(HOLE, 10.0 * np.median(steps)))
+        wide = np.flatnonzero(steps > max(least, samples * np.median(steps)))
         return np.stack([at[wide], at[wide + 1]], 1)
+
+    def in_holes(
+        self, channels: Iterable[str], least: float = HOLE, samples: float = 10.0
+    ) -> Bool[Array, " rows"]:
+        """(T,) which rows lie in a hole, see `holes`, of one of the channels that were logged."""
+        inside = np.zeros(len(self), bool)
+        for channel in channels:
+            if getattr(self, channel) is not None:
+                for begin, end in self.holes(channel, least, samples):
+                    inside |= (self.time > begin) & (self.time < end)
+        return inside
 
     def interpolated(
         self, channel: str, time: Float[Array, " times"] | None = None

@@ -19,7 +19,9 @@ Array = np.ndarray
 GRAVITY = 9.81  # m/s^2
 GRID_PERIOD = 0.01  # s, the step of the simulator
 MIN_DURATION = 2.0  # s, shorter stretches say next to nothing and are left out
+CHANNELS = (*SENSORS, "motor_command", "command_thrust", "command_body_rates")
 MAX_GAP = 0.05  # s, a longer step between rows splits the flight
+MISSED_SAMPLES = 3.0  # and a channel that misses more than so many has a hole
 RHYTHM = 50  # new commands from which their rhythm is looked for
 RHYTHMIC = 0.5  # concentration of their phases (0 to 1) from which they have one
 EARLY = 25.0  # per cent of them that may come before the rows that are made for them
@@ -65,18 +67,8 @@ def flight_tracks(flight: Flight, case: Case) -> list[Track]:
     """The stretches of one flight without gaps, on a uniform grid. A long hole in a channel is one,
     too, unless nothing is left without.
     """
-    whole = flight.rows(~_in_holes(flight))
+    whole = flight.rows(~flight.in_holes(CHANNELS))
     return _stretches(whole, flight, case) or _stretches(flight, flight, case)
-
-
-def _in_holes(flight: Flight) -> np.ndarray:
-    """(T,) rows in which a channel wasn't sampled for so long that no line may stand for it."""
-    inside = np.zeros(len(flight), bool)
-    for channel in (*SENSORS, "motor_command", "command_thrust", "command_body_rates"):
-        if getattr(flight, channel) is not None:
-            for begin, end in flight.holes(channel):
-                inside |= (flight.time > begin) & (flight.time < end)
-    return inside
 
 
 def _stretches(flight: Flight, logged: Flight, case: Case) -> list[Track]:

@@ -195,6 +195,11 @@ def doubts(records: list[Record], fit: TorqueFit, one_clock: bool) -> tuple[str,
     found = []
     if not one_clock:
         found.append("the streams of motors and sensors are apart by times that wander")
+    if any(r.drawn for r in records):
+        found.append(
+            "motors or body rates are missing so often that no second is whole; log them without "
+            "holes"
+        )
     if any(r.hidden and r.samples for r in records):
         found.append(
             "a row's motors are one sample of a loop that runs several times within it; log their "

@@ -9,12 +9,21 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from openjax.flights.flight import Case, Flight
-from openjax.flights.track import MAX_GAP, MIN_DURATION, held_means, pwm_thrust, smooth
+from openjax.flights.track import (
+    MAX_GAP,
+    MIN_DURATION,
+    MISSED_SAMPLES,
+    held_means,
+    pwm_thrust,
+    smooth,
+)
 from openjax.vehicle.parameters import hover_share
 
 SHORTEST = 0.002  # s, the period of the firmware's rate loop: faster rows hold nothing new
 CARRIED = 0.5  # of the hovering thrust: below, the floor carries
 TAKE_OFF = 1.0  # s
+TORQUES = ("motor_command", "body_rates")
+SHORTEST_PART = 1.0  # s between holes; its first quarter only tells what was before the rest
 LOOP_ROWS = 0.003  # s: rows as short show every cycle of the rate loop
 
 
@@ -34,6 +43,7 @@ class Record:
     voltage: np.ndarray | None  # (T,) V
     vehicle: object
     samples: bool  # a row's motors are one sample of a faster loop, not the mean over the row
+    drawn: bool = False  # lines stand for motors or body rates that weren't logged
 
     def rows(self, rows: slice) -> "Record":
         """The record with some of its rows."""
@@ -56,15 +66,28 @@ def records_of(case: Case) -> list[Record]:
     for flight in case.flights:
         if not flight.has_motors or flight.body_rates is None or flight.body_rates_derived:
             continue
-        for rows in flight.stretches(max(MAX_GAP, 3 * flight.row_period), MIN_DURATION):
-            found += _in_the_air(_record(flight.rows(rows), flight, case))
+        missed = flight.in_holes(TORQUES, MAX_GAP, MISSED_SAMPLES)
+        parts = _records(flight.rows(~missed), flight, case, SHORTEST_PART)
+        if not parts:
+            parts = [replace(r, drawn=bool(missed.any())) for r in _records(flight, flight, case)]
+        found += parts
     # One estimator reads rows of one period: the one that holds most of the flights.
     periods = [r.dt for r in found for _ in range(len(r.rates))]
     usual = max(set(periods), key=periods.count) if periods else 0.0
     return [r for r in found if r.dt == usual]
 
 
-def _in_the_air(record: Record) -> list[Record]:
+def _records(rows: Flight, flight: Flight, case: Case, least: float = MIN_DURATION):
+    """Records of the stretches, at least so many s long, of some `rows` of a flight. Lines over
+    longer gaps than these would make motors look quicker or slower, by a tenth to a fifth.
+    """
+    found = []
+    for stretch in rows.stretches(max(MAX_GAP, MISSED_SAMPLES * flight.row_period), least):
+        found += _in_the_air(_record(rows.rows(stretch), flight, case), least)
+    return found
+
+
+def _in_the_air(record: Record, least: float) -> list[Record]:
     """The parts of a record in which the motors carry the vehicle, without its take-off and
     landing.
     """
@@ -76,7 +99,7 @@ def _in_the_air(record: Record) -> list[Record]:
     for begin, end in edges.reshape(-1, 2):
         begin += away * (begin > 0)
         end -= away * (end < len(carried))
-        if (end - begin) * record.dt >= MIN_DURATION:
+        if (end - begin) * record.dt >= least:
             parts.append(record.rows(slice(begin, end)))
     return parts
 
