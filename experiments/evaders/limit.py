@@ -21,6 +21,8 @@ from openjax.pursuit import Pursuit
 from openjax.vehicle import hover_share
 
 LAST = {"both plan, pursuers last": True, "both plan, evader last": False}
+HONEST = ", honest sight"
+"""What is added to a name where pursuers that plan don't see through pillars."""
 
 
 def vehicles_flight(environment: Pursuit) -> VelocityFlight:
@@ -41,20 +43,29 @@ def vehicles_flight(environment: Pursuit) -> VelocityFlight:
 def main() -> None:
     """The command."""
     parser = game_parser(__doc__, episodes=16, uniform=48)
-    parser.add_argument("--plans", type=int, default=16, help="of each side")
+    parser.add_argument("--plans", type=int, default=16, help="of the pursuers")
+    parser.add_argument("--evader_plans", type=int, help="by default as many")
+    parser.add_argument(
+        "--sight", choices=("full", "honest"), default="full", help="of pursuers that plan"
+    )
     options = parser.parse_args()
     game = judged_game(options)
     duel = Duel(game.environment, game.loaded.policy)
-    found = {**game.flown, "records": [], "seconds": {}}
+    found = {**game.flown, "sight": options.sight, "records": [], "seconds": {}}
     for name, pursuers_last in LAST.items():
-        settings = MatrixGameSettings(pursuers_last, options.plans, options.plans)
+        settings = MatrixGameSettings(
+            pursuers_last,
+            evader_plans=options.evader_plans or options.plans,
+            team_plans=options.plans,
+            full_sight=options.sight == "full",
+        )
         both = MatrixGame(settings, duel, vehicles_flight(game.environment))
 
         def fly(parameters, tasks, key, both=both):
             return both.fly(parameters, duel.start(tasks, key), key)
 
         began = time.monotonic()
-        own = game.records(name, fly)
+        own = game.records(name + HONEST * (options.sight == "honest"), fly)
         found["seconds"][name] = time.monotonic() - began
         found["records"] += own
         rates = ", ".join(f"{one['scenario']} {one['capture_rate']:.2f}" for one in own)

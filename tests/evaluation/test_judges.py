@@ -87,6 +87,22 @@ def test_who_plans_gets_away_from_slower_points_in_the_open():
     assert not planned.captured[0]
 
 
+def test_plans_end_by_the_evaders_own_rule_and_refined_ones_keep_their_speed():
+    settings = PlannerSettings(plans=20, refined=0.5, own_rule=0.5)
+    planner = Planner(settings, Duel(GAME, Team(straight)))
+    last = jnp.broadcast_to(jnp.array([0.0, 0.6, 0.8]), (2, settings.pieces, 3))
+    plans = np.asarray(jax.jit(planner.candidates)(jax.random.key(0), last))
+    assert plans.shape == (2, 20, settings.pieces, 3)
+    is_own = np.isnan(plans).all(-1)
+    np.testing.assert_array_equal(is_own, np.isnan(plans).any(-1))
+    np.testing.assert_array_equal(is_own, np.maximum.accumulate(is_own, axis=-1))
+    assert is_own[:, :, 0].any(1).all()
+    np.testing.assert_allclose(np.linalg.norm(plans[~is_own], axis=-1), 1.0, rtol=1e-5)
+    # of the refined ones each is changed somewhere, and most not everywhere
+    same = (np.abs(plans[:, -9:] - last[:, None]) < 1e-5).all(-1)
+    assert not same.all(-1).any() and same.any()
+
+
 def test_of_several_ways_the_likeliest_is_flown():
     means = jnp.arange(6.0)
     odds = jnp.array([0.1, 0.7])

@@ -3,7 +3,7 @@
 Every few steps each side thinks of some plans, and all pairs of them are flown in copies of the
 world: a matrix game (von Neumann, 1928). Who chooses last knows what the other has chosen. So with
 the pursuers last the captures bound from above what a team of these plans can hold, and with the
-evader last from below; both sides see everything, pillars or not.
+evader last from below; both sides see everything, pillars or not, or the pursuers what the game lets them see.
 
 An evader's plan is a sequence of held velocities (`openjax.evaluation.judges.planner`). A plan of
 the pursuers says of each of them, piece by piece, that it flies as the policy does, or to a place
@@ -115,6 +115,9 @@ class MatrixGame:
         end = jax.lax.scan(piece, copied, pieces)[0][1]
         payoff = jax.vmap(self._payoff)(copied[1], end)
         payoff = payoff.reshape(-1, settings.evader_plans, settings.team_plans)
+        if not settings.full_sight:
+            # a team that doesn't see has one plan, the first: to fly as the policy does
+            payoff = jnp.where(world[1].seen[:, None, None], payoff, payoff[:, :, :1])
         mine, theirs = jax.vmap(lambda own: choose(own, settings.pursuers_last))(payoff)
 
         def chosen(leaf, place):
@@ -127,7 +130,10 @@ class MatrixGame:
         speed = SPEED * self.duel.environment.settings.max_speed
 
         def action(observation, state, by_policy, team):
-            place = state.evader_position + LEAD * state.evader_velocity + team.beside
+            place = state.evader_position + LEAD * state.evader_velocity
+            if not self.settings.full_sight:
+                place = jnp.where(state.seen, place, state.last_seen)
+            place = place + team.beside
             desired = (place - state.drones.position) / REACTION
             length = jnp.linalg.norm(desired, axis=-1, keepdims=True)
             desired = desired * jnp.minimum(1.0, speed / jnp.maximum(length, 1e-6))

@@ -17,6 +17,9 @@ from openjax.evaluation.judges.settings import PlannerSettings
 from openjax.policy import PolicyParameters
 from openjax.pursuit import EpisodeStatistics, PursuitState
 
+SPREAD = 0.6
+"""How far the pieces of a refined plan lead aside, a share of their length: some 40 degrees."""
+
 
 @dataclass(frozen=True, eq=False)
 class Planner:
@@ -56,19 +59,32 @@ class Planner:
         return jnp.take_along_axis(tried, best[:, None, None, None], axis=1)[:, 0]
 
     def candidates(self, key: jax.Array, plan: jax.Array) -> jax.Array:
-        """(B, plans, pieces, 3) the last best plan (B, pieces, 3), the same shifted by a piece,
-        straight ways, and random ones that turn as often as not.
+        """(B, plans, pieces, 3) the last best plan (B, pieces, 3), the same shifted by a piece, that
+        one refined, straight ways, and random ones. Pieces of NaN are the evader's own rule.
         """
         settings = self.settings
-        number = plan.shape[0]
-        straight = (settings.plans - 2) // 3
-        turn_key, way_key, spin_key = jax.random.split(key, 3)
+        near_key, straight_key, bent_key = jax.random.split(key, 3)
         shifted = jnp.concatenate([plan[:, 1:], plan[:, -1:]], axis=1)
-        ways = unit(jax.random.normal(spin_key, (number, straight, 1, 3)))
+        others = settings.plans - 2
+        near = int(settings.refined * others)
+        straight = (others - near) // 3
+        bent = others - near - straight
+        number = plan.shape[0]
+        ways = unit(jax.random.normal(straight_key, (number, straight, 1, 3)))
         ways = jnp.broadcast_to(ways, (number, straight, settings.pieces, 3))
-        others = settings.plans - 2 - straight
-        drawn = unit(jax.random.normal(way_key, (number, others, settings.pieces, 3)))
-        turns = jax.random.uniform(turn_key, drawn.shape[:3]) < 0.5
+        parts = [plan[:, None], shifted[:, None], ways, self._bent(bent_key, number, bent)]
+        if near:
+            parts.append(self._refined(near_key, shifted, near))
+        return jnp.concatenate(parts, axis=1)
+
+    def _bent(self, key, number, plans):
+        """(B, plans, pieces, 3) random ones that turn now and then; some of them end by the
+        evader's own rule.
+        """
+        settings = self.settings
+        way_key, turn_key, end_key = jax.random.split(key, 3)
+        drawn = unit(jax.random.normal(way_key, (number, plans, settings.pieces, 3)))
+        turns = jax.random.uniform(turn_key, drawn.shape[:3]) < settings.turn
 
         def follow(before, piece):
             way, turn = piece
@@ -77,7 +93,26 @@ class Planner:
 
         pieces = (jnp.moveaxis(drawn, 2, 0), jnp.moveaxis(turns, 2, 0))
         bent = jnp.moveaxis(jax.lax.scan(follow, drawn[:, :, 0], pieces)[1], 0, 2)
-        return jnp.concatenate([plan[:, None], shifted[:, None], ways, bent], axis=1)
+        left = int(settings.own_rule * plans)
+        if not left:
+            return bent
+        # the first flies by it from the beginning
+        end = jax.random.randint(end_key, (number, left), 0, settings.pieces).at[:, 0].set(0)
+        is_own = jnp.arange(settings.pieces) >= end[..., None]
+        return bent.at[:, :left].set(jnp.where(is_own[..., None], jnp.nan, bent[:, :left]))
+
+    def _refined(self, key, plan, plans):
+        """(B, plans, pieces, 3) a plan (B, pieces, 3), some pieces of which lead elsewhere."""
+        pieces = self.settings.pieces
+        shape = (plan.shape[0], plans)
+        first_key, last_key, way_key = jax.random.split(key, 3)
+        first = jax.random.randint(first_key, (*shape, 1), 0, pieces)
+        last = jax.random.randint(last_key, (*shape, 1), first, pieces)
+        place = jnp.arange(pieces)
+        changed = ((place >= first) & (place <= last))[..., None]
+        aside = SPREAD * jax.random.normal(way_key, (*shape, 1, 3))
+        plan = plan[:, None]
+        return jnp.where(changed, unit(plan + aside), jnp.broadcast_to(plan, (*shape, pieces, 3)))
 
     def promise(self, start: PursuitState, end: PursuitState) -> jax.Array:
         """() how good the end of a plan is: steps free first, then the room that is left."""

@@ -97,6 +97,14 @@ class PlannerSettings:
     """Seconds after which pursuers are thought to be where their velocity leads, at a plan's end:
     about the time in which a vehicle turns its velocity round.
     """
+    turn: Annotated[float, Interval("[0, 1]")] = 0.5
+    """Odds that a piece of a random plan leads elsewhere than the piece before."""
+    refined: Annotated[float, Interval("[0, 1]")] = 0.0
+    """Share of the plans that are the last best one with some pieces flown a little otherwise."""
+    own_rule: Annotated[float, Interval("[0, 1]")] = 0.0
+    """Share of the other random plans after whose first pieces, or none, the evader of the game
+    flies by its own rule: a learned one knows what comes after the horizon.
+    """
 
     def __post_init__(self):
         check_intervals(self, "planning.")
@@ -118,6 +126,10 @@ class MatrixGameSettings:
     """Control steps of each piece."""
     replan: Annotated[int, Interval("[1, 1000]")] = 10
     """Control steps after which both sides plan anew."""
+    full_sight: bool = True
+    """Whether pursuers that plan see through pillars. Without it, a team that doesn't see the evader
+    flies as its policy does, and to where the evader was last seen.
+    """
 
     def __post_init__(self):
         check_intervals(self)
