@@ -59,8 +59,8 @@ class Planner:
         return jnp.take_along_axis(tried, best[:, None, None, None], axis=1)[:, 0]
 
     def candidates(self, key: jax.Array, plan: jax.Array) -> jax.Array:
-        """(B, plans, pieces, 3) the last best plan (B, pieces, 3), the same shifted by a piece, that
-        one refined, straight ways, and random ones. Pieces of NaN are the evader's own rule.
+        """(B, plans, pieces, 3) the last best plan (B, pieces, 3), the same shifted by a piece,
+        straight ways, random ones, and the shifted one refined. Pieces of NaN are the evader's own rule.
         """
         settings = self.settings
         near_key, straight_key, bent_key = jax.random.split(key, 3)

@@ -127,8 +127,8 @@ class MatrixGameSettings:
     replan: Annotated[int, Interval("[1, 1000]")] = 10
     """Control steps after which both sides plan anew."""
     full_sight: bool = True
-    """Whether pursuers that plan see through pillars. Without it, a team that doesn't see the evader
-    flies as its policy does, and to where the evader was last seen.
+    """Whether pursuers that plan see through pillars. Without it, a team that doesn't see the
+    evader flies as its policy does, and to where the evader was last seen.
     """
 
     def __post_init__(self):
