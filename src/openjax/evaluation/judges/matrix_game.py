@@ -3,8 +3,8 @@
 Every few steps each side thinks of some plans, and all pairs of them are flown in copies of the
 world: a matrix game (von Neumann, 1928). Who chooses last knows what the other has chosen. So with
 the pursuers last the captures bound from above what a team of these plans can hold, and with the
-evader last from below. Both sides see everything, pillars or not, or the pursuers what the game lets
-them see.
+evader last from below. Both sides see everything, pillars or not; or the pursuers what the game
+lets them see.
 
 An evader's plan is a sequence of held velocities (`openjax.evaluation.judges.planner`). A plan of
 the pursuers says of each of them, piece by piece, that it flies as the policy does, or to a place

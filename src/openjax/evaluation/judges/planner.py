@@ -60,7 +60,7 @@ class Planner:
 
     def candidates(self, key: jax.Array, plan: jax.Array) -> jax.Array:
         """(B, plans, pieces, 3) the last best plan (B, pieces, 3), the same shifted by a piece,
-        straight ways, random ones, and the shifted one refined. Pieces of NaN are the evader's own rule.
+        straight ways, random ones, and the shifted one refined. NaN is the evader's own rule.
         """
         settings = self.settings
         near_key, straight_key, bent_key = jax.random.split(key, 3)
