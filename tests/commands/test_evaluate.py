@@ -40,6 +40,12 @@ def test_an_evader_of_ones_own_is_flown_by_function_and_by_file(tmp_path, capsys
     assert record == openjax.evaluate(
         still, "uniform", episodes=1, opponent=f"{file}:frozen", **game
     )
+    file.write_text(
+        f"{file.read_text()}\ndef still(observation):\n"
+        "    return 0.0 * observation.pillars[:, 0, :4]\n"
+    )
+    mine = openjax.load_policy(f"{file}:still")
+    assert record == openjax.evaluate(mine, "uniform", episodes=1, opponent="frozen", **game)
     command = evaluate.EvaluateCommand(opponent=f"{file}:frozen")
     evaluate._show(command, [(command, "still", [record])])
     # a long path is broken into lines

@@ -7,14 +7,11 @@ import pytest
 from scipy.stats import binomtest
 
 import openjax
-from openjax.commands.calls import OwnController
 from openjax.evaluation.episodes import wilson
-from openjax.learning import TrainSettings
-from openjax.policy import PolicyParameters
 from openjax.pursuit import PursuitSettings
 from openjax.runs.catch_map import draw_map, map_game
 from openjax.runs.options import MapCommand
-from openjax.store.policies import LoadedPolicy
+from openjax.store.policies import own_controller
 
 GAME = PursuitSettings(
     physics="rigid", contacts=False, episode_length=5, num_pursuers=3, team_sizes=(1, 3)
@@ -33,10 +30,7 @@ def test_cells_are_games_of_their_own():
     def still(observation):
         return jnp.zeros((observation.position.shape[0], 4))
 
-    whole = dict(rollout_length=5, restart_steps=5)
-    settings = TrainSettings(environment=GAME, predictor=OwnController.predictor, **whole)
-    nothing = PolicyParameters(actor={}, critic={}, predictor={})
-    policy = LoadedPolicy(OwnController(still), nothing, settings, "still")
+    policy = own_controller(still, GAME, "still")
     lines = []
     found = draw_map(COMMAND, policy, lines.append)
     assert len(lines) == 3 and lines[-1].startswith("24 of 24 episodes")

@@ -91,3 +91,19 @@ class Heuristic(WithoutNetwork):
         """Action (..., N, 4) in -1..1."""
         desired = METHODS[self.name].rule(self.craft, actor, surroundings(self.craft, observation))
         return velocity_action(self.craft, observation, desired)
+
+
+@dataclasses.dataclass(frozen=True)
+class OwnController(WithoutNetwork):
+    """A pure function from an `Observation` to actions (N, 4). It is mapped over worlds, so it sees
+    the observation of one.
+    """
+
+    function: Callable[[Observation], jax.Array]
+
+    def mean(self, actor: Any, observation: Observation) -> jax.Array:
+        """Actions (..., N, 4) in -1..1."""
+        function = self.function
+        for _ in range(observation.position.ndim - 2):
+            function = jax.vmap(function)
+        return jnp.clip(function(observation), -1.0, 1.0)

@@ -1,26 +1,22 @@
 """The commands as functions: what `openjax.train(...)` and `openjax.evaluate(...)` do in Python."""
 
-import dataclasses
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
 
 import jax
-import jax.numpy as jnp
 
 from openjax.background import quiet_compiler
-from openjax.baselines.heuristic import WithoutNetwork
 from openjax.cluster.processes import Processes
 from openjax.errors import UserError
 from openjax.learning import Learner, TrainSettings, preset
-from openjax.policy import Network, Policy, PolicyParameters
+from openjax.policy import Network, Policy
 from openjax.pursuit import Observation, Pursuit, PursuitSettings
 from openjax.pursuit.evaders import Evader
 from openjax.ranges import changed
 from openjax.runs.job import OwnParts
 from openjax.runs.start import TrainCommand, check_resumed, default_preset, start
-from openjax.store.policies import LoadedPolicy, load_policy
+from openjax.store.policies import LoadedPolicy, load_policy, own_controller
 from openjax.store.run_directory import open_run
 
 
@@ -141,13 +137,7 @@ def evaluate(
     if isinstance(policy, str | Path):
         policy = load_policy(policy)
     elif not isinstance(policy, LoadedPolicy):
-        nothing = PolicyParameters(actor={}, critic={}, predictor={})
-        game = changed(PursuitSettings(), **changes)
-        whole = dict.fromkeys(
-            ("rollout_length", "restart_steps"), game.episode_length
-        )  # which fits all games
-        settings = TrainSettings(environment=game, predictor=OwnController.predictor, **whole)
-        policy = LoadedPolicy(OwnController(policy), nothing, settings, "own controller")
+        policy = own_controller(policy, changed(PursuitSettings(), **changes), "own controller")
     number = changes.pop("num_pursuers", None)
     command = EvaluateCommand(
         policy=(policy.source,),
@@ -162,19 +152,3 @@ def evaluate(
     )
     records, _ = fly_scenarios(command, policy, {})
     return records if scenario == "all" else records[0]
-
-
-@dataclasses.dataclass(frozen=True)
-class OwnController(WithoutNetwork):
-    """A pure function from an `Observation` to actions (N, 4). It is mapped over worlds, so it sees
-    the observation of one.
-    """
-
-    function: Callable[[Observation], jax.Array]
-
-    def mean(self, actor: Any, observation: Observation) -> jax.Array:
-        """Actions (..., N, 4) in -1..1."""
-        function = self.function
-        for _ in range(observation.position.ndim - 2):
-            function = jax.vmap(function)
-        return jnp.clip(function(observation), -1.0, 1.0)

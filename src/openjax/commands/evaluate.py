@@ -39,7 +39,8 @@ class FlightOptions:
 
     policy: tuple[str, ...] = (DEFAULT_POLICY,)
     """Runs' directories, policy files (.npz), checkpoints, or names of policies in the package
-    (flight, open ...) or of heuristics: angelani, janosov, apf.
+    (flight, open ...) or of heuristics (angelani, janosov, apf, stack), or FILE.py:function for a
+    controller of one's own.
     """
     scenario: str = "all"
     """wall, narrow_gap, random, passage, empty, hidden, a TOML file with an own layout, uniform

@@ -96,8 +96,8 @@ class ExploitCommand:
     """
 
     policy: str = DEFAULT_POLICY
-    """A run's directory, a policy file (.npz), a checkpoint, or the name of a policy in the package
-    or of a heuristic.
+    """A run's directory, a policy file (.npz), a checkpoint, the name of a policy in the package
+    or of a heuristic, or FILE.py:function for a controller of one's own.
     """
     out: Path = Path("evader.npz")
     """File to write the strongest learned evader to."""

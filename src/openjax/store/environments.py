@@ -1,7 +1,6 @@
 """The game with what files add to it: a vehicle, physical effects, an evader."""
 
 import dataclasses
-import importlib.util
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ from openjax.evaluation.judges.senses import number_of_senses
 from openjax.files import to_plain
 from openjax.pursuit import Pursuit, PursuitSettings
 from openjax.pursuit.evaders import SCRIPTED, Evader, EvaderKind
+from openjax.store.own_code import is_own_code, own_code
 from openjax.store.policy_files import fill, load_policy_file, save_policy_file
 from openjax.vehicle.effects import load_effects
 from openjax.vehicle.family import vehicle_family
@@ -82,36 +82,6 @@ def is_evader_file(opponent: Any) -> bool:
     return named and not is_own_code(opponent)
 
 
-def is_own_code(name: Any) -> bool:
-    """Whether it names a function in a Python file, `FILE.py:function`."""
-    return isinstance(name, str) and ".py:" in name
-
-
-def own_evader(name: str) -> Evader:
-    """The function, or the row, that `FILE.py:function` names; the file is run.
-
-    Raises:
-      UserError: no such file, it doesn't run, or it has nothing of that name.
-    """
-    file, _, attribute = name.rpartition(":")
-    path = Path(file)
-    if not path.is_file():
-        raise UserError(f"--opponent {name}: there is no file {file}")
-    spec = importlib.util.spec_from_file_location(path.stem, path)
-    module = importlib.util.module_from_spec(spec)
-    try:
-        spec.loader.exec_module(module)
-    except Exception as error:  # whatever the file does
-        raise UserError(f"--opponent {name}: {path} doesn't run: {error}") from error
-    found = getattr(module, attribute, None)
-    if not callable(found) and not isinstance(found, EvaderKind):
-        raise UserError(
-            f"--opponent {name}: {path} has no function {attribute}(scene, memory) that gives a "
-            "velocity and the memory"
-        )
-    return found
-
-
 def save_evader(
     path: Path, evader: tuple[Any, jax.Array], hold: int, game: PursuitSettings, notes: dict
 ) -> None:
@@ -137,7 +107,8 @@ def find_opponent(evader: str | Path | Evader, game: PursuitSettings) -> Evader:
     if not isinstance(evader, str | Path):
         return evader
     if is_own_code(evader):
-        return own_evader(evader)
+        what = "function {}(scene, memory) that gives a velocity and the memory"
+        return own_code("--opponent", evader, (EvaderKind,), what)
     path = Path(evader)
     if not path.is_file():
         raise UserError(

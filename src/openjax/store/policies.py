@@ -4,11 +4,13 @@ package.
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from pathlib import Path
 
 import jax
 
 from openjax.baselines import METHODS, CraftPolicy, Heuristic
+from openjax.baselines.heuristic import OwnController
 from openjax.baselines.surroundings import Craft
 from openjax.baselines.velocity_controller import check_flyable
 from openjax.errors import UserError, suggestion
@@ -29,6 +31,7 @@ from openjax.pursuit.evaders import SCRIPTED
 from openjax.store import DEFAULT_POLICY
 from openjax.store.checkpoint_files import is_checkpoint, load_arrays
 from openjax.store.checkpoints import Checkpoints
+from openjax.store.own_code import is_own_code, own_code
 from openjax.store.policy_files import WEIGHTS, fill, load_policy_file, shipped_policies
 from openjax.store.run_directory import RunDirectory, is_run, open_run
 
@@ -54,7 +57,7 @@ class LoadedPolicy:
     It goes into `jax.jit` and `jax.vmap` as it is; two are the same only if they're one object.
     """
 
-    policy: Policy | Heuristic
+    policy: Policy | Heuristic | OwnController
     parameters: PolicyParameters
     settings: TrainSettings
     """What it was trained with; of a heuristic, the game's defaults."""
@@ -92,6 +95,8 @@ class LoadedPolicy:
         if isinstance(self.policy, Heuristic):
             policy = Heuristic.for_environment(self.policy.name, environment)
             return dataclasses.replace(self, policy=policy)
+        if isinstance(self.policy, OwnController):
+            return self  # it takes what it is given
         game = environment.settings
         own = self.settings.environment
         seen = ("self_size", "observe_in", "observed_pillars", "history_length", "frame_size")
@@ -165,7 +170,8 @@ def load_policy(
     Args:
       name_or_path: a name from `known_policies()` (`DEFAULT_POLICY` if none is given), a policy
       file (.npz), a run's directory
-        (its best policy) or a checkpoint's directory inside a run.
+        (its best policy) or a checkpoint's directory inside a run, or `FILE.py:function`, see
+        `own_controller`.
       environment, policy: those of one's own that a run was trained with (`openjax.train`), as its
       files hold numbers alone.
 
@@ -178,6 +184,9 @@ def load_policy(
         return _own(open_run(path), source, environment, policy)
     if source in METHODS:
         return _heuristic(source)
+    if is_own_code(source):
+        what = "function {}(observation) that gives actions (N, 4)"
+        return own_controller(own_code("--policy", source, (), what), PursuitSettings(), source)
     if str(name_or_path) in shipped_policies():
         return _from_file(WEIGHTS / f"{name_or_path}.npz", source)
     if is_run(path):
@@ -201,6 +210,19 @@ def load_policy(
 def known_policies() -> list[str]:
     """Names that `load_policy` knows: heuristics and the policies inside the package."""
     return [*METHODS, *shipped_policies()]
+
+
+def own_controller(
+    function: Callable[[Observation], jax.Array], game: PursuitSettings, source: str
+) -> LoadedPolicy:
+    """A pure function from the `Observation` of one world to actions (N, 4) in -1..1 as a policy
+    for this game.
+    """
+    nothing = PolicyParameters(actor={}, critic={}, predictor={})
+    # which fits all games
+    whole = dict.fromkeys(("rollout_length", "restart_steps"), game.episode_length)
+    settings = TrainSettings(environment=game, predictor=OwnController.predictor, **whole)
+    return LoadedPolicy(OwnController(function), nothing, settings, source)
 
 
 def _heuristic(name):
