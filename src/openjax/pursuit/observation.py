@@ -66,9 +66,10 @@ def frame(
     seen: Flag,
 ) -> Float[Array, " frame"]:
     """(F,) one frame of the predictor's history: t/T, evader position and velocity (-5 where
-    unseen), pursuers.
+    unseen), pursuers. Without `observe_time` t/T stays zero.
     """
-    time = step.astype(jnp.float32)[None] / settings.episode_length
+    elapsed = step if settings.observe_time else jnp.zeros_like(step)
+    time = elapsed.astype(jnp.float32)[None] / settings.episode_length
     evader = jnp.where(seen, jnp.concatenate([evader, velocity]), HIDDEN)
     return jnp.concatenate([time, evader, pursuers.ravel()])
 

@@ -24,6 +24,12 @@ OVER_SPEED = 1.01
 """Share of the maximal speed above which a step counts as over speed."""
 
 
+FREE = 1.0
+"""Seconds for which an evader has to be free before another capture of it counts: to let go of it
+for as long costs more than a capture pays, at the default weights and a `recapture` below 600.
+"""
+
+
 def captures(
     settings: PursuitSettings,
     position: Team,
@@ -99,7 +105,9 @@ def default_reward(weights: RewardSettings) -> tuple[Term, ...]:
     terms = (
         Term(captured, weights.capture),
         Term(evader_distance, -weights.distance),
+        Term(nearest_distance, -weights.nearest),
         Term(first_capture, weights.first_capture),
+        Term(recapture, weights.recapture),
         Term(steadiness, weights.smoothness),
         Term(breach_number, -weights.collision, penalty=True),
         Term(speeding, -weights.over_speed, penalty=True),
@@ -114,6 +122,13 @@ def captured(transition: Transition) -> Flag:
     return jnp.any(transition.info.captured)
 
 
+def nearest_distance(transition: Transition) -> Scalar:
+    """() m from the evader to the pursuer that is nearest to it."""
+    distance = evader_distance(transition)
+    active = transition.state.active
+    return jnp.min(distance if active is None else jnp.where(active, distance, jnp.inf))
+
+
 def first_capture(transition: Transition) -> Flag:
     """() whether this is the first such step of the episode."""
     return captured(transition) & ~transition.before.statistics.captured
@@ -123,6 +138,13 @@ def evader_distance(transition: Transition) -> Each:
     """(N,) m to the evader."""
     offset = transition.state.drones.position - transition.state.evader_position
     return jnp.sqrt(jnp.sum(offset**2, axis=-1) + 1e-12)
+
+
+def recapture(transition: Transition) -> Flag:
+    """() whether this is a later capture, of an evader that was free for `FREE` seconds."""
+    before = transition.before.statistics
+    was_free = before.free_steps * transition.settings.time_step >= FREE
+    return captured(transition) & before.captured & was_free
 
 
 def steadiness(transition: Transition) -> Each:

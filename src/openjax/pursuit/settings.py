@@ -31,8 +31,17 @@ class RewardSettings:
     """To every pursuer, once, at an episode's first capture: where the evader gets away again, a
     step in reach of it is worth less than closing in costs (not in the paper).
     """
+    recapture: Annotated[float, Interval("[0, 1e6]")] = 0.0
+    """The same for each later capture of an evader that was free for a second: most steps of a
+    training come after a capture, and who can't tell learns that there is little to win (not in the
+    paper).
+    """
     distance: Annotated[float, Interval("[0, 1e6]")] = 0.1
     """Subtracted per metre between pursuer and evader."""
+    nearest: Annotated[float, Interval("[0, 1e6]")] = 0.0
+    """Subtracted, of all pursuers, per metre between the evader and the nearest of them: who isn't
+    the nearest loses nothing by going round (not in the paper).
+    """
     collision: Annotated[float, Interval("[0, 1e6]")] = 10.0
     """Subtracted per breach of a safety distance or an arena bound."""
     over_speed: Annotated[float, Interval("[0, 1e6]")] = 10.0

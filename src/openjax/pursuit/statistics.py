@@ -19,6 +19,7 @@ class EpisodeStatistics:
         jax.Array
     )  # int32, first step with a capture, counted from 1; the episode's length if none
     captured: jax.Array  # bool
+    free_steps: jax.Array  # int32, steps since any pursuer last had the evader
     collision_steps: jax.Array  # float32, steps in which any pursuer breached any limit
     pillar_steps: jax.Array  # float32, the same by parts
     drone_steps: jax.Array
@@ -45,6 +46,7 @@ def empty_statistics(episode_length: int) -> EpisodeStatistics:
         steps=jnp.zeros((), jnp.int32),
         capture_step=jnp.full((), episode_length, jnp.int32),
         captured=jnp.zeros((), bool),
+        free_steps=jnp.zeros((), jnp.int32),
         collision_steps=zero,
         pillar_steps=zero,
         drone_steps=zero,
@@ -77,6 +79,7 @@ def count(
         steps=statistics.steps + 1,
         capture_step=jnp.where(first, step, statistics.capture_step),
         captured=statistics.captured | now,
+        free_steps=jnp.where(now, 0, statistics.free_steps + 1),
         collision_steps=statistics.collision_steps + any_of(breach.total),
         pillar_steps=statistics.pillar_steps + any_of(breach.pillar),
         drone_steps=statistics.drone_steps + any_of(breach.drone),
