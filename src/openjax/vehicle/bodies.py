@@ -39,23 +39,35 @@ class Bodies:
         drones: DroneState,
         force: Team,
         torque: Team,
-        pillars: tuple[Pillars, Active],
+        around: Surroundings | None,
     ) -> DroneState:
         """The drones (leading axis N) after `dt`; the leaves of `vehicle` are those of all drones
         or, with that axis, of each.
 
-        force (N, 3) N in the world without gravity, torque (N, 3) N m in the body frame, pillars'
-        positions (P, 2) m and which of them are in use (P,).
+        force (N, 3) N in the world without gravity, torque (N, 3) N m in the body frame; `around`
+        each drone is what `self.around` says.
         """
-        solid = self.contacts and self.physics != "stops"
-        around = surroundings(drones.position, drones.velocity, *pillars) if solid else None
         move = self.rigid
         if self.physics == "mjx":
-            sizes = (pillars[0].shape[0], drones.position.shape[0] - 1) if solid else (0, 0)
-            move = functools.partial(self._mjx, make_world(self.arena, *sizes, self.dt, solid))
-        return jax.vmap(move, (vehicles_axis(vehicle), 0, 0, 0, 0))(
-            vehicle, drones, force, torque, around
-        )
+            # a world without contacts holds no shapes, and is the same for any number of them
+            solid = around is not None
+            pillars = around.pillar_position.shape[1] if solid else 0
+            others = around.other_position.shape[1] if solid else 0
+            world = make_world(self.arena, pillars, others, self.dt, solid)
+            move = functools.partial(self._mjx, world)
+        step = jax.vmap(move, (vehicles_axis(vehicle), 0, 0, 0, 0))
+        return step(vehicle, drones, force, torque, around)
+
+    def around(
+        self, drones: DroneState, pillar_position: Pillars, pillar_active: Active
+    ) -> Surroundings | None:
+        """What each drone (leading axis N) may touch in this step; None where nothing is solid.
+
+        pillar_position (P, 2) m, pillar_active (P,): which of them are in use.
+        """
+        if not self.contacts or self.physics == "stops":
+            return None
+        return surroundings(drones.position, drones.velocity, pillar_position, pillar_active)
 
     def rigid(
         self,
@@ -72,16 +84,15 @@ class Bodies:
                 self.arena, drone.position, drone.velocity, free, around, self.dt
             )
 
-        return rigid_step(
-            vehicle, drone, force, torque, self.dt, None if around is None else contact
-        )
+        if around is None:
+            return rigid_step(vehicle, drone, force, torque, self.dt)
+        return rigid_step(vehicle, drone, force, torque, self.dt, contact)
 
     def _mjx(self, world, vehicle, drone, force, torque, around):
         shapes = None
         if around is not None:
-            shapes = place_solids(
-                encounters(self.arena, drone.position, drone.velocity, around, self.dt)
-            )
+            met = encounters(self.arena, drone.position, drone.velocity, around, self.dt)
+            shapes = place_solids(met)
         return mjx_step(world, vehicle, shapes, drone, force, torque, self.dt)
 
 

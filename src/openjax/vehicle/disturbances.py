@@ -12,10 +12,14 @@ from openjax.vehicle.effects.effect import Effect, Parameter
 from openjax.vehicle.parameters import hover_command
 from openjax.vehicle.rigid_body import quaternion_multiply, rotate_inverse
 
-LONGEST_JITTER = 0.01  # s, one control step
+LONGEST_JITTER = 0.01
+"""s, one control step: a command that comes later than the next one is lost rather than late."""
 
 
 def _draw(memory):
+    """A key to draw with, and the memory's next one. Keys are stored as plain numbers, so that a
+    state is arrays alone.
+    """
     draw, carry = jax.random.split(jax.random.wrap_key_data(memory["key"]))
     return draw, jax.random.key_data(carry)
 
@@ -56,9 +60,9 @@ COMMAND_JITTER = Effect(
 
 def _gust_wrench(parameters, context):
     """Forces in the world that rise and fall, at rates without a common period."""
-    angle = (
-        parameters["rate"] * context.air_time * jnp.array([1.0, 1.31, 0.77], context.velocity.dtype)
-    )
+    # no ratio of small whole numbers, so that no flight sees the three axes repeat together
+    ratios = jnp.array([1.0, 1.31, 0.77], context.velocity.dtype)
+    angle = parameters["rate"] * context.air_time * ratios
     size = jnp.stack([parameters["x"], parameters["y"], parameters["z"]])
     force = rotate_inverse(context.quaternion, size * jnp.sin(angle + parameters["phase"]))
     return force, jnp.zeros_like(force)
@@ -106,6 +110,7 @@ def _noise_sensor(parameters, memory, state):
     """
     position, velocity, angle = jnp.split(memory["noise"], 3)
     late = parameters["jitter"] * memory["late"]
+    # half of a small rotation vector is the vector part of its quaternion
     turn = 0.5 * (parameters["attitude"] * angle - late * state.body_rates)
     quaternion = quaternion_multiply(
         state.quaternion, jnp.concatenate([jnp.ones_like(turn[:1]), turn])

@@ -95,10 +95,10 @@ class DronesStep:
         dtype = drones.position.dtype
         vehicle = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), vehicle)
         command = jnp.asarray(command, dtype)
-        pillars = (pillar_position, pillar_active)
+        # the plain step of training has a kernel of its own; with effects it is put together below
         if self.physics == "rigid" and not self.effects:
             memory = drones.effect_memory  # of other effects than this step's, if any
-            around = pillars if self.contacts else None
+            around = (pillar_position, pillar_active) if self.contacts else None
             drones = step_many(
                 self.fused, vehicle, drones.replace(effect_memory=()), command, around
             )
@@ -107,11 +107,17 @@ class DronesStep:
         composition.check_memory(self.effects, drones.effect_memory)
         parameters = self._parameters(effect_parameters, drones)
         vehicle = self._body(vehicle, parameters)
+        # once per step, not per substep: a radio sends one command for all of them
         command, drones = self._receive(vehicle, parameters, drones, command)
-        substep = functools.partial(self._substep, vehicle, parameters, command, pillars)
+
+        def substep(drones):
+            drones, force, torque = self._turn_motors(vehicle, parameters, command, drones)
+            around = self._bodies.around(drones, pillar_position, pillar_active)
+            return self._bodies(vehicle, drones, force, torque, around)
+
         drones = _repeated(substep, drones, self.substeps)
         if self.physics == "stops":
-            drones = stop(self.arena, drones, *pillars)
+            drones = stop(self.arena, drones, pillar_position, pillar_active)
         return self._remember(drones)
 
     @property
@@ -128,8 +134,8 @@ class DronesStep:
         number = jnp.arange(drones.position.shape[0])
 
         def memory(drone, n):
-            own = None if key is None else jax.random.fold_in(key, n)
-            return composition.initial_memory(self.effects, vehicle, drone, self.dt, own)
+            drone_key = None if key is None else jax.random.fold_in(key, n)
+            return composition.initial_memory(self.effects, vehicle, drone, self.dt, drone_key)
 
         return drones.replace(effect_memory=jax.vmap(memory)(drones, number))
 
@@ -181,18 +187,19 @@ class DronesStep:
         command, memory = jax.vmap(change)(parameters, drones.effect_memory, command, contexts)
         return command, drones.replace(effect_memory=memory)
 
-    def _substep(self, vehicle, parameters, command, pillars, drones):
+    def _turn_motors(self, vehicle, parameters, command, drones):
+        """The drones with their rotors a substep later, and the force and torque on each."""
         dt = self.dt / self.substeps
         contexts = self._contexts(vehicle, drones, dt)
         turn = functools.partial(motors, self.effects, dt=dt)
         turn = jax.vmap(turn, (vehicles_axis(vehicle), 0, 0, 0, 0))
-        drones, force, torque = turn(vehicle, parameters, drones, command, contexts)
-        return self._bodies(vehicle, drones, force, torque, pillars)
+        return turn(vehicle, parameters, drones, command, contexts)
 
     def _accelerate(self, vehicle, drone, command):
         """One drone without effects up to its accelerations in free flight; see `FusedStep`."""
         drone, force, torque = motors((), vehicle, {}, drone, command, None, self._bodies.dt)
-        return drone, *accelerations(vehicle, drone, force, torque)
+        acceleration, angular = accelerations(vehicle, drone, force, torque)
+        return drone, acceleration, angular
 
     def _remember(self, drones):
         """The drones with the effects' memory at the end of a step."""
@@ -204,7 +211,8 @@ def _repeated(substep, drones, number):
     """`drones` after so many substeps; a single one isn't worth a loop."""
     if number == 1:
         return substep(drones)
-    return jax.lax.scan(lambda drones, _: (substep(drones), None), drones, None, length=number)[0]
+    drones, _ = jax.lax.scan(lambda drones, _: (substep(drones), None), drones, length=number)
+    return drones
 
 
 def make_drones_step(
@@ -219,16 +227,23 @@ def make_drones_step(
 ) -> DronesStep:
     """Make the step of N drones of one world.
 
-    physics "mjx": MuJoCo MJX; "rigid": the same equations written out, many times faster. In both
-    floor, pillars (sized by `arena`) and other drones are solid unless `contacts` is off. "stops":
-    free flight, and drones are put back out of solid things once per step. dt is the step in
-    seconds; `substeps` divide it, and the rate controller runs in each. `effects` (names, or of
-    type `Effect`) are modelled beyond the nominal vehicle. Within a substep: controller on the
-    present state, motors, rotor speeds, wrench from the updated rotor speeds, body.
+    Within a substep: controller on the present state, motors, rotor speeds, wrench from the updated
+    rotor speeds, body.
 
-    Sizes are those of the arrays that the step gets; with `max_pillars` and `num_drones` the MJX
-    model for them is built here instead of at the first step. Raises UserError for unknown physics
-    or effects and impossible steps.
+    Args:
+      physics: "mjx": MuJoCo MJX. "rigid": the same equations written out, many times faster. In
+      both floor, pillars and other drones are solid. "stops": free flight, and drones are put back
+      out of solid things once per step.
+      dt: seconds of a step.
+      substeps: by which it is divided; the rate controller runs in each.
+      effects: beyond the nominal vehicle, by name or of type `Effect`.
+      contacts: off: nothing is solid.
+      max_pillars, num_drones: with both, the MJX model for so many is built here instead of at the
+      first step. Sizes otherwise are those of the arrays that the step gets.
+      arena: sizes the pillars.
+
+    Raises:
+      UserError: unknown physics or effects, or an impossible step.
     """
     if physics not in PHYSICS:
         raise UserError(

@@ -48,12 +48,12 @@ def check_ranges(ranges: Sequence[VehicleRange]) -> None:
     """Raises UserError for unknown parameters, parameters that come twice and ranges that
     aren't.
     """
-    seen = set()
+    names = set()
     for name, low, high, rare_low, rare_high in ranges:
         _, parameter = find_parameter(name)
-        if name in seen:
+        if name in names:
             raise UserError(f"vehicles: {name} comes twice")
-        seen.add(name)
+        names.add(name)
         if not (
             np.isfinite([low, high, rare_low, rare_high]).all()
             and low <= high
@@ -73,7 +73,10 @@ def check_ranges(ranges: Sequence[VehicleRange]) -> None:
 
 def family_effects(ranges: Sequence[VehicleRange]) -> tuple[Effect, ...]:
     """The effects that a family's vehicles fly with, by name."""
-    effects = {find_parameter(entry[0])[0].name: find_parameter(entry[0])[0] for entry in ranges}
+    effects = {}
+    for entry in ranges:
+        effect, _ = find_parameter(entry.parameter)
+        effects[effect.name] = effect
     return tuple(effects[name] for name in sorted(effects))
 
 
@@ -86,7 +89,8 @@ def narrowed_bounds(ranges: Sequence[VehicleRange], share) -> jax.Array:
     """(R, 4) bounds of the family of which only this `share` () is left about the nominal
     vehicle.
     """
-    none = np.array([[find_parameter(entry[0])[1].none] for entry in ranges], np.float32)
+    parameters = [find_parameter(entry.parameter)[1] for entry in ranges]
+    none = np.array([[parameter.none] for parameter in parameters], np.float32)
     return none + share * (family_bounds(ranges) - none)
 
 
@@ -108,10 +112,11 @@ def draw_vehicles(
         return {}
     names = [effect.name for effect in family_effects(ranges)]
     bounds = family_bounds(ranges) if bounds is None else bounds
-    owner = np.array([names.index(entry[0].partition(".")[0]) for entry in ranges])
+    owner = np.array([names.index(entry.parameter.partition(".")[0]) for entry in ranges])
     value_key, chosen_key, rare_key = jax.random.split(key, 3)
     share = jax.random.uniform(value_key, (number, len(ranges)))
     chosen = jax.random.randint(chosen_key, (number,), 0, len(names))
+    # -1 is no effect's place: nothing of such a vehicle is out of the ordinary
     chosen = jnp.where(jax.random.uniform(rare_key, (number,)) < rare, chosen, -1)
     rarely = chosen[:, None] == owner
     low = jnp.where(rarely, bounds[:, 2], bounds[:, 0])
@@ -119,7 +124,7 @@ def draw_vehicles(
     values = low + share * (high - low)
     drawn: dict[str, dict[str, jax.Array]] = {name: {} for name in names}
     for i, entry in enumerate(ranges):
-        effect, _, parameter = entry[0].partition(".")
+        effect, _, parameter = entry.parameter.partition(".")
         drawn[effect][parameter] = values[:, i]
     return drawn
 
@@ -133,10 +138,10 @@ def standard_parameters(ranges: Sequence[VehicleRange], parameters: dict) -> jax
     """
     columns = []
     for entry in ranges:
-        effect, _, name = entry[0].partition(".")
-        usual = find_parameter(entry[0])[1]
-        half = 0.5 * (usual.prior[1] - usual.prior[0])
-        columns.append((parameters[effect][name] - usual.none) / half)
+        effect, _, name = entry.parameter.partition(".")
+        _, parameter = find_parameter(entry.parameter)
+        low, high = parameter.prior
+        columns.append((parameters[effect][name] - parameter.none) / (0.5 * (high - low)))
     return jnp.stack(columns, axis=-1)
 
 
@@ -147,23 +152,26 @@ def vehicle_family(airframe: str = NOMINAL) -> tuple[VehicleRange, ...]:
     Raises:
       UserError: no such airframe, or its file holds no ranges.
     """
-    path = find_mjcf(airframe).with_name(f"{find_mjcf(airframe).stem}_family.toml")
+    mjcf = find_mjcf(airframe)
+    path = mjcf.with_name(f"{mjcf.stem}_family.toml")
+    family = []
     try:
-        family = tuple(
-            VehicleRange(f"{effect}.{name}", *map(float, (*entry["range"], *entry["rare"])))
-            for effect, parameters in read_toml(path, "family of vehicles").items()
-            for name, entry in parameters.items()
-        )
+        for effect, parameters in read_toml(path, "family of vehicles").items():
+            for name, entry in parameters.items():
+                bounds = map(float, (*entry["range"], *entry["rare"]))
+                family.append(VehicleRange(f"{effect}.{name}", *bounds))
     except (AttributeError, KeyError, TypeError, ValueError):
         raise UserError(
             f"{path}: each [effect.parameter] needs range and rare, of two numbers each"
         ) from None
     check_ranges(family)
-    return family
+    return tuple(family)
 
 
 REST = 0.35
-"""The part of the family's ranges that remains for what a diagnosis didn't find."""
+"""The part of the family's ranges that remains for what a diagnosis didn't find: it can't rule out
+that a little of it acts.
+"""
 
 
 def adapted_family(
@@ -191,16 +199,16 @@ def adapted_family(
         found = values.get(effect.name)
         for key, parameter in effect.parameters.items():
             name = f"{effect.name}.{key}"
+            none = parameter.none
             if found is None:
-                _, low, high, *_ = usual.get(name, (name, parameter.none, parameter.none))
-                low, high = (
-                    parameter.none + rest * (bound - parameter.none) for bound in (low, high)
-                )
+                _, low, high, *_ = usual.get(name, (name, none, none))
+                low = none + rest * (low - none)
+                high = none + rest * (high - none)
             else:
-                value = found.get(key, parameter.none)
-                margin = 0.1 * abs(value - parameter.none)
-                low, high = intervals.get(effect.name, {}).get(
-                    key, (value - margin, value + margin)
-                )
+                value = found.get(key, none)
+                margin = 0.1 * abs(value - none)
+                about = (value - margin, value + margin)
+                low, high = intervals.get(effect.name, {}).get(key, about)
+            # one vehicle has no rare cousins: the wider range is the same
             family.append(VehicleRange(name, float(low), float(high), float(low), float(high)))
     return tuple(family)

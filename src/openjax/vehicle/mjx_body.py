@@ -85,7 +85,8 @@ def make_world(arena: Arena, n_pillars: int, n_others: int, dt: float, contacts:
 
     def build():
         mjx_model = _mjx().put_model(model, device, impl="jax")
-        return World(*jax.tree.map(np.asarray, (mjx_model, _mjx().make_data(mjx_model, device))))
+        mjx_data = _mjx().make_data(mjx_model, device)
+        return World(*jax.tree.map(np.asarray, (mjx_model, mjx_data)))
 
     # A thread of its own knows nothing of the caller's trace or mesh, which may span other
     # processes' devices.
@@ -95,6 +96,7 @@ def make_world(arena: Arena, n_pillars: int, n_others: int, dt: float, contacts:
 
 def _as_dtype(tree, dtype):
     def convert(leaf):
+        # indices and flags keep their types
         kind = dtype if np.issubdtype(leaf.dtype, np.floating) else leaf.dtype
         # empty arrays are made here: closed over by a shard_map, they crash the compiler of JAX
         # 0.11
@@ -139,9 +141,8 @@ def mjx_step(
     model = model.replace(
         body_mass=jnp.stack([jnp.zeros_like(vehicle.mass), vehicle.mass]),
         body_inertia=jnp.stack([jnp.zeros_like(vehicle.inertia), vehicle.inertia]),
-        body_invweight0=model.body_invweight0.at[1, 0].set(
-            1.0 / vehicle.mass
-        ),  # by which contacts are scaled
+        # by which MuJoCo scales the contacts
+        body_invweight0=model.body_invweight0.at[1, 0].set(1.0 / vehicle.mass),
         opt=model.opt.replace(gravity=gravity),
     )
     if shapes is not None:

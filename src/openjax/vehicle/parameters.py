@@ -86,23 +86,24 @@ def read_mjcf(path: str) -> dict[str, np.ndarray]:
             f"{path}: not a readable MJCF model ({str(error).splitlines()[0]})"
         ) from None
     body = _find(model, path, "body", BODY)
-    if not (
-        np.allclose(model.body_iquat[body], [1, 0, 0, 0]) and np.allclose(model.body_ipos[body], 0)
-    ):
+    # all equations here are about the centre of mass and the principal axes
+    turned = not np.allclose(model.body_iquat[body], [1, 0, 0, 0])
+    if turned or not np.allclose(model.body_ipos[body], 0):
         raise UserError(
             f"{path}: the inertial frame of {BODY!r} must lie in the body frame (pos 0, "
             "diaginertia only)"
         )
-    gear = np.array([model.actuator_gear[_find(model, path, "actuator", name)] for name in ROTORS])
+    actuators = [_find(model, path, "actuator", name) for name in ROTORS]
+    sites = [_find(model, path, "site", name) for name in ROTORS]
+    # of a gear's six numbers the last is the torque about z per thrust, signed by the rotor's spin
+    torque_per_thrust = model.actuator_gear[actuators, 5]
     numbers = {name: _number(model, path, name, size) for name, size in _NUMBERS.items()}
     return {
         "mass": model.body_mass[body],
         "inertia": model.body_inertia[body].copy(),
-        "rotor_position": np.array(
-            [model.site_pos[_find(model, path, "site", name)] for name in ROTORS]
-        ),
-        "rotor_spin": np.sign(gear[:, 5]),
-        "torque_constant": np.abs(gear[:, 5]).mean() * numbers["thrust_constant"],
+        "rotor_position": model.site_pos[sites],
+        "rotor_spin": np.sign(torque_per_thrust),
+        "torque_constant": np.abs(torque_per_thrust).mean() * numbers["thrust_constant"],
         "motor_slowdown_ratio": np.float64(1.0),
         "gravity": -model.opt.gravity[2],
         **numbers,
@@ -168,13 +169,8 @@ def load_vehicle(airframe: str | Path = NOMINAL, dtype=jnp.float32) -> Vehicle:
     Raises:
       UserError: the file is missing, isn't MJCF or lacks a part of a vehicle.
     """
-    path = find_mjcf(airframe)
-    return Vehicle(
-        **{
-            name: jnp.asarray(value, dtype)
-            for name, value in read_mjcf(str(path.resolve())).items()
-        }
-    )
+    numbers = read_mjcf(str(find_mjcf(airframe).resolve()))
+    return Vehicle(**{name: jnp.asarray(value, dtype) for name, value in numbers.items()})
 
 
 def hover_rotor_speed(vehicle: Vehicle) -> Scalar:

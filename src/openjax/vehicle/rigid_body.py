@@ -52,10 +52,12 @@ def quaternion_integrate(quaternion: Quaternion, body_rates: Vector, dt: Seconds
     half = 0.5 * dt * body_rates
     square = jnp.sum(half * half)
     tiny = square < 1e-12  # the series is exact to rounding there
+    # 1 in place of a tiny square: at zero the root's slope is infinite, also where it isn't used
     angle = jnp.sqrt(jnp.where(tiny, 1.0, square))
     cosine = jnp.where(tiny, 1.0 - square / 2, jnp.cos(angle))
     sinc = jnp.where(tiny, 1.0 - square / 6, jnp.sin(angle) / angle)
     turned = quaternion_multiply(quaternion, jnp.concatenate([cosine[None], sinc * half]))
+    # rounding would let the length drift over an episode
     return turned * jax.lax.rsqrt(jnp.sum(turned * turned))
 
 

@@ -58,8 +58,9 @@ class FusedStep(NamedTuple):
         """One drone after a substep, in free flight if nothing is `around`."""
         moved, acceleration, angular = self.accelerate(vehicle, drone, command)
         if around is not None:
-            place = (self.arena, drone.position, drone.velocity)
-            extra = contact_acceleration(*place, acceleration, around, self.dt)
+            extra = contact_acceleration(
+                self.arena, drone.position, drone.velocity, acceleration, around, self.dt
+            )
             # as by MJX, gradients are those of free flight: what contacts add is a constant to them
             acceleration = acceleration + jax.lax.stop_gradient(extra)
         return euler_step(moved, acceleration, angular, self.dt)
@@ -92,7 +93,10 @@ def mapped_step(
     flight.
     """
     for _ in range(step.substeps):
-        around = surroundings(drones.position, drones.velocity, *pillars) if pillars else None
+        around = None
+        if pillars:
+            position, active = pillars
+            around = surroundings(drones.position, drones.velocity, position, active)
         drones = jax.vmap(step.one, (None, 0, 0, 0))(vehicle, drones, command, around)
     return drones
 
@@ -110,7 +114,8 @@ def looped_step(
     def substep(drones, _):
         return mapped_step(step._replace(substeps=1), vehicle, drones, command, pillars), None
 
-    return jax.lax.scan(substep, drones, None, length=step.substeps)[0]
+    drones, _ = jax.lax.scan(substep, drones, length=step.substeps)
+    return drones
 
 
 @functools.lru_cache(maxsize=64)
@@ -122,12 +127,12 @@ def _many_worlds(step):
     def run(vehicle, drones, command, pillars):
         if command.shape[0] < WORTH:
             return mapped(vehicle, drones, command, pillars)
-        return on_platform(mapped, functools.partial(kernel_call, step))(
-            vehicle, drones, command, pillars
-        )
+        fastest = on_platform(mapped, functools.partial(kernel_call, step))
+        return fastest(vehicle, drones, command, pillars)
 
     @run.def_vmap
     def _(axis_size, in_batched, vehicle, *worlds):
+        # the kernel holds one vehicle's numbers: of many vehicles it isn't taken
         if any(jax.tree.leaves(in_batched[0])):
             axes = jax.tree.map(lambda batched: 0 if batched else None, tuple(in_batched))
             stepped = jax.vmap(mapped, axes)(vehicle, *worlds)
@@ -137,6 +142,7 @@ def _many_worlds(step):
                 leaf = leaf if batched else jnp.broadcast_to(leaf, (axis_size, *leaf.shape))
                 return leaf.reshape(-1, *leaf.shape[2:])
 
+            # two axes of worlds become one, and two again afterwards
             stepped = run(vehicle, *jax.tree.map(flat, worlds, tuple(in_batched[1:])))
             stepped = jax.tree.map(
                 lambda leaf: leaf.reshape(axis_size, -1, *leaf.shape[1:]), stepped
@@ -163,7 +169,8 @@ def kernel_call(
     def substep(drones, _):
         return _one_call(single, vehicle, _Worlds(drones, command, pillars), interpret), None
 
-    return jax.lax.scan(substep, drones, None, length=step.substeps)[0]
+    drones, _ = jax.lax.scan(substep, drones, length=step.substeps)
+    return drones
 
 
 class _Worlds(NamedTuple):
@@ -247,8 +254,8 @@ def _kernel(step, vehicle, worlds):
             ]
             *turned, free, angular = evaluate(accelerate, [*constants, *parts, command])
             if around:
-                own = jax.tree.structure(drone).unflatten(parts)
-                free = free + _contacts(step, own, free, worlds.command.shape[:2], around)
+                before = jax.tree.structure(drone).unflatten(parts)
+                free = free + _contacts(step, before, free, worlds.command.shape[:2], around)
             moved = evaluate(move, [*turned, free, angular])
             return [[jnp.broadcast_to(part, (DRONES,)) for part in leaf.ravel()] for leaf in moved]
 

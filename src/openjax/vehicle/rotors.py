@@ -5,8 +5,8 @@ import jax.numpy as jnp
 from openjax.vehicle.parameters import Vehicle
 from openjax.vehicle.shapes import Rotors, Seconds, Vector
 
-# Below this motor command a rotor is asked to stand still: keeps the slope of the square root
-# finite.
+# below this motor command a rotor is asked to stand still: keeps the slope of the square root
+# finite
 _SMALLEST_COMMAND = 1e-8
 
 
@@ -31,6 +31,7 @@ def rotor_speed_step(
     time_constant = vehicle.motor_time_constant * jnp.where(
         slowing, vehicle.motor_slowdown_ratio, 1.0
     )
+    # -expm1(-x) is 1 - exp(-x) without the digits that this loses at short steps
     return rotor_speed + (target - rotor_speed) * -jnp.expm1(-dt / time_constant)
 
 
@@ -54,5 +55,6 @@ def total_wrench(vehicle: Vehicle, thrust: Rotors, reaction: Rotors) -> tuple[Ve
     y = vehicle.rotor_position[:, 1]
     zero = jnp.zeros_like(thrust[0])
     force = jnp.stack([zero, zero, jnp.sum(thrust)])
+    # r x (0, 0, T) = (y T, -x T, 0)
     torque = jnp.stack([jnp.sum(y * thrust), -jnp.sum(x * thrust), jnp.sum(reaction)])
     return force, torque

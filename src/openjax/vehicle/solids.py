@@ -13,6 +13,7 @@ The same contacts are solved by MuJoCo MJX (`place_solids`, `mjx_body`) and, wri
 """
 
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import flax.struct
 import jax
@@ -46,6 +47,16 @@ class Surroundings:
     other_velocity: Others  # m/s
 
 
+class Contact(NamedTuple):
+    """A contact in MuJoCo's direct form: acceleration along the normal >= -stiffness * gap -
+    damping * speed, `gap` being the one at the end of the step.
+    """
+
+    stiffness: Gaps  # in 1/dt^2
+    damping: Gaps  # in 1/dt
+    impedance: Gaps  # the share of that which is enforced
+
+
 @flax.struct.dataclass
 class Thing:
     """One solid thing beside a drone, or arrays over many; what doesn't vary is a float."""
@@ -54,9 +65,7 @@ class Thing:
     level: Gaps  # m, height of its point nearest to the drone
     velocity: Components  # m/s
     reach: Gaps  # m, between it and the drone's centre when their surfaces touch
-    stiffness: Gaps  # see `_FIXED`
-    damping: Gaps
-    impedance: Gaps
+    contact: Contact
 
 
 @flax.struct.dataclass
@@ -74,14 +83,12 @@ class Encounters:
     shown: Gaps  # m, the gap that the solver of contacts is shown; < 0: it acts
 
 
-# Contacts in MuJoCo's direct form: acceleration along the normal >= -stiffness * gap - damping *
-# speed, `gap` being the one at the end of the step. (stiffness in 1/dt^2, damping in 1/dt,
-# impedance: the share of that which is enforced.) Fixed things: together they cancel the approach
-# in one step and close 0.4 of the gap, below the half at which a resting drone would chatter. Other
-# drones: each of the pair takes half of the approach, an inelastic impact of equal masses that
-# keeps their momentum; a low impedance, since the other gives way too.
-_FIXED = (0.4, 0.6, 0.99)
-_DRONE = (0.5, 0.0, 0.5)
+# Fixed things: stiffness and damping together cancel the approach in one step and close 0.4 of the
+# gap, below the half at which a resting drone would chatter.
+_FIXED = Contact(0.4, 0.6, 0.99)
+# Other drones: each of the pair takes half of the approach, an inelastic impact of equal masses
+# that keeps their momentum; a low impedance, since the other gives way too.
+_DRONE = Contact(0.5, 0.0, 0.5)
 _STILL = (0.0, 0.0, 0.0)  # m/s
 
 _NEAR = 0.04  # m, gap within which a thing counts as near: the way of a fast drone in one step
@@ -95,27 +102,24 @@ def solids_xml(arena: Arena, n_pillars: int, n_others: int, dt: float) -> tuple[
     shapes = ['<geom name="floor" type="plane" size="0 0 1"/>']
     pillar = f'type="capsule" size="{arena.pillar_radius} {arena.height / 2}"'
     shapes += [f'<geom name="pillar_{k}" {pillar}/>' for k in range(n_pillars)]
-    shapes += [
-        f'<geom name="other_{k}" type="sphere" size="{DRONE_RADIUS}"/>' for k in range(n_others)
-    ]
-    names = [
-        "floor",
-        *(f"pillar_{k}" for k in range(n_pillars)),
-        *(f"other_{k}" for k in range(n_others)),
-    ]
-    contacts = (
+    sphere = f'type="sphere" size="{DRONE_RADIUS}"'
+    shapes += [f'<geom name="other_{k}" {sphere}/>' for k in range(n_others)]
+
+    pairs = [_pair("floor", _FIXED, dt)]
+    pairs += [_pair(f"pillar_{k}", _FIXED, dt) for k in range(n_pillars)]
+    pairs += [_pair(f"other_{k}", _DRONE, dt) for k in range(n_others)]
+    return "".join(shapes), "".join(pairs)
+
+
+def _pair(name, contact, dt):
+    """MJCF of the contact with one shape. Negative numbers are MuJoCo's sign for its direct
+    form.
+    """
+    return (
         f'<pair geom1="drone" geom2="{name}" condim="1" '
-        f'solref="{-stiffness / dt**2} {-damping / dt}" solimp="{impedance} {impedance} 0.001"/>'
-        for name, (stiffness, damping, impedance) in zip(
-            names, _contacts(n_pillars, n_others), strict=True
-        )
+        f'solref="{-contact.stiffness / dt**2} {-contact.damping / dt}" '
+        f'solimp="{contact.impedance} {contact.impedance} 0.001"/>'
     )
-    return "".join(shapes), "".join(contacts)
-
-
-def _contacts(n_pillars, n_others):
-    """(M, 3) stiffness, damping and impedance of the contact with each thing."""
-    return np.array([_FIXED] * (1 + n_pillars) + [_DRONE] * n_others)
 
 
 def others(n: int) -> np.ndarray:
@@ -147,7 +151,7 @@ def surroundings(
 def floor(position: Components) -> Thing:
     """The floor to drones at `position`: it stands below each of them."""
     place = (position[0], position[1], jnp.zeros_like(position[2]))
-    return Thing(place, place[2], _STILL, DRONE_RADIUS, *_FIXED)
+    return Thing(place, place[2], _STILL, DRONE_RADIUS, _FIXED)
 
 
 def pillar(arena: Arena, position: Components, place: Sequence[jax.Array], active) -> Thing:
@@ -157,12 +161,12 @@ def pillar(arena: Arena, position: Components, place: Sequence[jax.Array], activ
     half = arena.height / 2
     height = jnp.where(active, half, PARKED).astype(position[2].dtype)
     level = jnp.clip(position[2] - height, -half, half) + height
-    return Thing((*place, height), level, _STILL, arena.pillar_radius + DRONE_RADIUS, *_FIXED)
+    return Thing((*place, height), level, _STILL, arena.pillar_radius + DRONE_RADIUS, _FIXED)
 
 
 def other_drone(position: Components, velocity: Components) -> Thing:
     """Another drone."""
-    return Thing(position, position[2], velocity, 2 * DRONE_RADIUS, *_DRONE)
+    return Thing(position, position[2], velocity, 2 * DRONE_RADIUS, _DRONE)
 
 
 def _things(arena, position, around) -> Thing:
@@ -176,7 +180,8 @@ def _things(arena, position, around) -> Thing:
     sizes = [kind.level.shape[0] for kind in kinds]
 
     def joined(*parts):
-        alike = [isinstance(part, float) for part in parts].count(True)  # the first ones, if any
+        # what doesn't vary is a float, and floor and pillars come before the drones
+        alike = [isinstance(part, float) for part in parts].count(True)
         constant = jnp.asarray(np.repeat(parts[:alike], sizes[:alike]), position.dtype)
         arrays = parts[alike:]
         if not arrays:
@@ -202,12 +207,12 @@ def _approach(position, velocity, thing, dt):
     """The normal of contact, the gap now, and at the end of the step if nothing intervened."""
     nearest = (*thing.place[:2], thing.level)
     away = tuple(own - other for own, other in zip(position, nearest, strict=True))
+    # the root keeps a slope where a drone is in the middle of a thing
     distance = jnp.sqrt(sum(part * part for part in away) + 1e-12)
     normal = tuple(part / distance for part in away)
     gap = distance - thing.reach
-    speed = sum(
-        n * (own - other) for n, own, other in zip(normal, velocity, thing.velocity, strict=True)
-    )
+    moving = zip(normal, velocity, thing.velocity, strict=True)
+    speed = sum(n * (own - other) for n, own, other in moving)
     return normal, gap, gap + dt * speed
 
 
@@ -300,10 +305,7 @@ def _along(normal, vector):
 def _reference(thing, normal, gap, velocity, dt):
     """The acceleration along the normal that a contact asks for (m/s^2), shown a `gap`."""
     # divided in the drones' precision, as what it is compared with
-    stiffness, damping, impedance = (
-        jnp.asarray(number, gap.dtype)
-        for number in (thing.stiffness, thing.damping, thing.impedance)
-    )
+    stiffness, damping, impedance = (jnp.asarray(number, gap.dtype) for number in thing.contact)
     return -(damping / dt * _along(normal, velocity) + stiffness / dt**2 * gap) / impedance
 
 
@@ -312,14 +314,17 @@ def _terms(thing, normal, gap, lacking):
     Newton step, where the free acceleration is `lacking` (< 0) against the reference.
     """
     x, y, z = normal
-    impedance = jnp.asarray(thing.impedance, gap.dtype)
+    impedance = jnp.asarray(thing.contact.impedance, gap.dtype)
     weight = jnp.where((gap < 0.0) & (lacking < 0.0), impedance / (1.0 - impedance), 0.0)
-    pulls = (weight * lacking * part for part in normal)
-    return (*pulls, *(weight * a * b for a, b in ((x, x), (y, y), (z, z), (x, y), (x, z), (y, z))))
+    pulls = [weight * lacking * part for part in normal]
+    # the matrix is symmetric: six of its nine entries
+    entries = ((x, x), (y, y), (z, z), (x, y), (x, z), (y, z))
+    return (*pulls, *(weight * a * b for a, b in entries))
 
 
 def _newton_step(sums):
     """The solution of (1 + sum_i w_i n_i n_i^T) step = -pull, by an LDL^T factorisation."""
+    # written out: a kernel knows no solver, and three unknowns aren't worth a call of LAPACK
     *pull, xx, yy, zz, xy, xz, yz = sums
     xx = 1.0 + xx
     yy = 1.0 + yy

@@ -42,10 +42,9 @@ def hover_state(
     """
     dtype = vehicle.mass.dtype
     position = jnp.asarray(position, dtype)
-    quaternion = (
-        jnp.array([1, 0, 0, 0], dtype) if quaternion is None else jnp.asarray(quaternion, dtype)
-    )
-    velocity = jnp.zeros(3, dtype) if velocity is None else jnp.asarray(velocity, dtype)
+    level = (1, 0, 0, 0)
+    quaternion = jnp.asarray(level if quaternion is None else quaternion, dtype)
+    velocity = jnp.asarray((0, 0, 0) if velocity is None else velocity, dtype)
     lead = jnp.broadcast_shapes(position.shape[:-1], quaternion.shape[:-1], velocity.shape[:-1])
     zeros = jnp.zeros((*lead, 3), dtype)
     return DroneState(

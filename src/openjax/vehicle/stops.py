@@ -21,6 +21,7 @@ def stop(
     """
     position = drones.position
     velocity = drones.velocity
+    # a pillar gives way to nobody, so the drone goes the whole depth; of two drones each goes half
     if pillar_position.shape[0]:
         away = position[:, None, :2] - pillar_position[None]
         position, velocity = _push(
@@ -31,6 +32,7 @@ def stop(
         others = ~jnp.eye(position.shape[0], dtype=bool)
         moving = velocity[:, None] - velocity[None]
         position, velocity = _push(position, velocity, apart, 2 * DRONE_RADIUS, others, 0.5, moving)
+    # the floor comes last: whatever pushed a drone before, it ends above it
     low = position[:, 2] < DRONE_RADIUS
     height = jnp.maximum(position[:, 2], DRONE_RADIUS)
     fall = jnp.where(low, jnp.maximum(velocity[:, 2], 0.0), velocity[:, 2])

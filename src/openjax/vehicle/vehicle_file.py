@@ -156,8 +156,8 @@ class VehicleFile:
         """Whether the mass of `vehicle_id` was weighed, so that a thrust error can't be explained
         by it.
         """
-        own = self.vehicles.get(vehicle_id, Overrides()).mass_weighed
-        return self.mass_weighed if own is None else own
+        weighed = self.vehicles.get(vehicle_id, Overrides()).mass_weighed
+        return self.mass_weighed if weighed is None else weighed
 
 
 def load_vehicle_file(path: str | Path | None = None, dtype=jnp.float32) -> VehicleFile:
@@ -197,10 +197,10 @@ def save_vehicle_file(path: str | Path, vehicle_file: VehicleFile) -> None:
             tables.add(name, _calibrated_table(name, entry))
         document.add("calibrated", tables)
     text = tomlkit.dumps(document)
+    # the MJCF first: without it the check would miss the airframe
     _copy_mjcf(vehicle_file, Path(path))
-    _from_tables(
-        tomllib.loads(text), Path(path), jnp.float32
-    )  # never write what can't be read back
+    # never write what can't be read back
+    _from_tables(tomllib.loads(text), Path(path), jnp.float32)
     write_text(path, text)
 
 
@@ -239,10 +239,11 @@ def _own_mjcf(name, path):
 
 
 def _from_tables(plain: dict, path: Path, dtype) -> VehicleFile:
-    tables = from_plain(_Tables, plain, f"{path}: ")
     root = f"{path}: "
-    told = tables.vehicle
+    tables = from_plain(_Tables, plain, root)
+    airframe = tables.vehicle
     motor = tables.motor
+    # [log] may hold anything: only what openjax reads of it is checked
     read = {f.name for f in fields(_Log)}
     from_plain(_Log, {k: v for k, v in tables.log.items() if k in read}, f"{root}log")
     if sorted(motor.order) != sorted(NOMINAL_ORDER):
@@ -250,28 +251,20 @@ def _from_tables(plain: dict, path: Path, dtype) -> VehicleFile:
             f"{root}motor.order is {list(motor.order)}; it must name each of "
             f"{', '.join(NOMINAL_ORDER)} once"
         )
-    mjcf = _own_mjcf(told.airframe, path)
-    nominal = load_vehicle(mjcf or told.airframe, dtype)
-    # of NumPy's, as going through one of JAX's compiles, which a flight that writes its log can't
-    # in a fork
-    usual = ["cw" if spin > 0 else "ccw" for spin in np.asarray(nominal.rotor_spin)]
-    spin = motor.spin or tuple(usual[NOMINAL_ORDER.index(place)] for place in motor.order)
-    if sorted(spin) != ["ccw", "ccw", "cw", "cw"]:
-        raise UserError(
-            f'{root}motor.spin is {list(spin)}; it must hold two "cw" and two "ccw", in the order m1..m4'
-        )
+    mjcf = _own_mjcf(airframe.airframe, path)
+    nominal = load_vehicle(mjcf or airframe.airframe, dtype)
+    motor = replace(motor, spin=_spins(motor, nominal, root))
     calibrated = {
         name: _calibrated(name, entry, nominal, f"{root}[calibrated.{name}]")
         for name, entry in tables.calibrated.items()
     }
+    sized = _sized(nominal, airframe, mjcf, root)
     return VehicleFile(
-        vehicle=_as_told(
-            _sized(nominal, told, mjcf, root), told.mass, replace(motor, spin=spin), calibrated
-        ),
-        name=told.name or _usual_name(told.airframe),
-        airframe=told.airframe,
-        mass_weighed=bool(told.mass_weighed),
-        motor=replace(motor, spin=spin),
+        vehicle=_with_numbers(sized, airframe.mass, motor, calibrated),
+        name=airframe.name or _usual_name(airframe.airframe),
+        airframe=airframe.airframe,
+        mass_weighed=bool(airframe.mass_weighed),
+        motor=motor,
         calibrated=calibrated,
         vehicles=tables.vehicles,
         log=tables.log,
@@ -280,23 +273,39 @@ def _from_tables(plain: dict, path: Path, dtype) -> VehicleFile:
     )
 
 
-def _sized(nominal: Vehicle, told: _Vehicle, mjcf: Path | None, root: str) -> Vehicle:
+def _spins(motor: Motor, nominal: Vehicle, root: str) -> tuple[Spin, ...]:
+    """How the motors m1 to m4 of the log spin. Raises UserError unless two spin either way."""
+    # an array of NumPy's: going through one of JAX's compiles, which a flight can't that writes its
+    # log in a fork
+    usual = ["cw" if spin > 0 else "ccw" for spin in np.asarray(nominal.rotor_spin)]
+    spins = motor.spin or tuple(usual[NOMINAL_ORDER.index(place)] for place in motor.order)
+    if sorted(spins) != ["ccw", "ccw", "cw", "cw"]:
+        raise UserError(
+            f'{root}motor.spin is {list(spins)}; it must hold two "cw" and two "ccw", in the order '
+            "m1..m4"
+        )
+    return spins
+
+
+def _sized(nominal: Vehicle, table: _Vehicle, mjcf: Path | None, root: str) -> Vehicle:
     """The nominal vehicle with the moments of inertia that the file gives. One that is far heavier
     or lighter and has no MJCF is taken to be of the same shape: its rotors lift the same multiple
     of its weight, and its arms are longer as its radius of gyration is. Raises UserError for a
     heavy one of which the mass alone is known.
     """
-    if mjcf is None and told.inertia is None and told.mass is not None and told.mass > HEAVY:
+    mass = table.mass
+    if mjcf is None and table.inertia is None and mass is not None and mass > HEAVY:
         raise UserError(
-            f"{root}vehicle.mass is {told.mass:g} kg on the airframe {told.airframe!r}: above "
+            f"{root}vehicle.mass is {mass:g} kg on the airframe {table.airframe!r}: above "
             f"{HEAVY:g} kg give vehicle.inertia (kg m^2 about x, y, z), or an MJCF as the airframe"
         )
-    if told.inertia is None:
+    if table.inertia is None:
         return nominal
-    changes: dict[str, Any] = {"inertia": told.inertia}
-    heavier = 1.0 if told.mass is None else told.mass / float(np.asarray(nominal.mass))
+    changes: dict[str, Any] = {"inertia": table.inertia}
+    heavier = 1.0 if mass is None else mass / float(np.asarray(nominal.mass))
     if mjcf is None and not 1.0 / SAME_ROTORS <= heavier <= SAME_ROTORS:
-        wider = np.mean(np.asarray(told.inertia) / np.asarray(nominal.inertia)) / heavier
+        # moments over mass are the squared radius of gyration, along which the arms grow
+        wider = np.mean(np.asarray(table.inertia) / np.asarray(nominal.inertia)) / heavier
         longer = float(np.sqrt(wider))
         changes |= {
             "rotor_position": longer * np.asarray(nominal.rotor_position),
@@ -306,18 +315,20 @@ def _sized(nominal: Vehicle, told: _Vehicle, mjcf: Path | None, root: str) -> Ve
     return _changed(nominal, **changes)
 
 
-def _as_told(nominal: Vehicle, mass: float | None, motor: Motor, calibrated: dict) -> Vehicle:
-    """The nominal vehicle with everything that the file says of it."""
+def _with_numbers(nominal: Vehicle, mass: float | None, motor: Motor, calibrated: dict) -> Vehicle:
+    """The nominal vehicle with everything that the file says of it; what a calibration found
+    counts most.
+    """
     spin = dict(zip(motor.order, motor.spin, strict=True))
     # in the nominal order; +1 where the reaction on the body is along +z (a cw rotor)
     changes: dict[str, Any] = {
         "rotor_spin": [1.0 if spin[name] == "cw" else -1.0 for name in NOMINAL_ORDER]
     }
-    changes |= {"mass": mass} if mass is not None else {}
-    changes |= {
-        name: entry.value if len(entry.value) > 1 else entry.value[0]
-        for name, entry in calibrated.items()
-    }
+    if mass is not None:
+        changes["mass"] = mass
+    for name, entry in calibrated.items():
+        changes[name] = entry.value if len(entry.value) > 1 else entry.value[0]
+    # last, since it multiplies the thrust constant, which a calibration may have changed
     if motor.torque_per_thrust is not None and "torque_constant" not in calibrated:
         thrust = changes.get("thrust_constant", float(nominal.thrust_constant))
         changes["torque_constant"] = motor.torque_per_thrust * thrust
@@ -325,9 +336,8 @@ def _as_told(nominal: Vehicle, mass: float | None, motor: Motor, calibrated: dic
 
 
 def _changed(vehicle: Vehicle, **values) -> Vehicle:
-    return vehicle.replace(
-        **{name: jnp.asarray(value, vehicle.mass.dtype) for name, value in values.items()}
-    )
+    dtype = vehicle.mass.dtype
+    return vehicle.replace(**{name: jnp.asarray(value, dtype) for name, value in values.items()})
 
 
 def _calibrated(name: str, entry: _Calibrated, nominal: Vehicle, where: str) -> CalibratedValue:
@@ -367,10 +377,13 @@ def _tables_of(vehicle_file: VehicleFile) -> dict[str, Any]:
 
 def _given(plain: dict) -> dict:
     """A tree of tables without empty ones and without None, which TOML hasn't."""
-    kept = {
-        name: _given(value) if isinstance(value, dict) else value for name, value in plain.items()
-    }
-    return {name: value for name, value in kept.items() if value is not None and value != {}}
+    kept = {}
+    for name, value in plain.items():
+        if isinstance(value, dict):
+            value = _given(value)  # which may be empty afterwards
+        if value is not None and value != {}:
+            kept[name] = value
+    return kept
 
 
 def _calibrated_table(name: str, entry: CalibratedValue) -> tomlkit.items.Table:

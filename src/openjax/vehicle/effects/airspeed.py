@@ -22,12 +22,11 @@ def hub_velocity(context: Context) -> jax.Array:
 
 def hub_height(context: Context) -> jax.Array:
     """World height of each hub, (4,) m."""
-    return (
-        jax.vmap(lambda r: rotate(context.quaternion, r))(context.rotor_position)[:, 2]
-        + context.position[2]
-    )
+    in_world = jax.vmap(lambda r: rotate(context.quaternion, r))(context.rotor_position)
+    return in_world[:, 2] + context.position[2]
 
 
 def hub_wrench(context: Context, force) -> tuple[jax.Array, jax.Array]:
     """Total force and torque of forces (4, 3) N at the hubs, body frame."""
-    return jnp.sum(force, axis=0), jnp.sum(jax.vmap(cross)(context.rotor_position, force), axis=0)
+    torque = jax.vmap(cross)(context.rotor_position, force)
+    return jnp.sum(force, axis=0), jnp.sum(torque, axis=0)

@@ -13,6 +13,7 @@ def voltage(parameters, context):
     """
     simulated = parameters["full"] - parameters["discharge"] * context.air_time
     known = ~jnp.isnan(context.battery_voltage)
+    # a linear discharge crosses zero some day, and a power of a negative ratio is no number
     return jnp.maximum(jnp.where(known, context.battery_voltage, simulated), 1.0)
 
 
@@ -26,7 +27,7 @@ _CELL = "one-cell LiPo: 4.2 V full, about 3.2 V empty under load, seven minutes 
 
 
 def frozen(values, intervals, voltage):
-    """The battery as it is at one voltage: nothing is discharged."""
+    """Values and intervals for a battery that stays at one voltage: nothing is discharged."""
     return values | {"full": voltage, "discharge": 0.0}, intervals
 
 

@@ -11,11 +11,14 @@ def wrench(parameters, context):
     in_plane = hub_velocity(context) * jnp.array([1, 1, 0], context.velocity.dtype)
     force, torque = hub_wrench(context, -parameters["tilt"] * context.thrust[:, None] * in_plane)
     vx, vy, _ = body_velocity(context)
+    # v x e3 = (vy, -vx, 0): flying forward pitches the nose up, which brakes
     return force, torque + parameters["stiffness"] * jnp.stack([vy, -vx, jnp.zeros_like(vx)])
 
 
 def tilts_back(value, deviation):
-    """Whether blades don't clearly tilt the thrust along the motion, and pitch the body back."""
+    """Whether blades don't clearly tilt the thrust along the motion (three standard deviations),
+    and pitch the body back.
+    """
     return bool(value["tilt"] > -3.0 * deviation["tilt"] and value["stiffness"] > 0.0)
 
 

@@ -19,7 +19,7 @@ def thrust(parameters, thrust, reaction, context):
 
 
 def above(position) -> bool:
-    """Whether a flight was where the ceiling should be: there is none."""
+    """Whether a flight (T, 3) m was higher than the paper's ceiling: then there is none."""
     return bool((position[:, 2] > ARENA_CEILING).any())
 
 

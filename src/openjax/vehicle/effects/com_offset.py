@@ -15,6 +15,7 @@ def body(parameters, vehicle):
 def as_rotors(values, vehicle):
     """(4,) shares of the rotors' thrust that turn the body as much."""
     places = np.asarray(vehicle.rotor_position, float)[:, :2]
+    # a centre of mass farther forward is as if the front rotors pushed less
     return -places @ (np.array([values["x"], values["y"]]) / np.mean(np.square(places), 0))
 
 

@@ -11,6 +11,8 @@ def initial_memory(vehicle, state, dt, key):
 
 
 def command(parameters, memory, command, context):
+    """The command of `delay` seconds ago."""
+    # pushed first: with no delay it is the new one that arrives
     memory = push(memory, command)
     return look_back(memory, parameters["delay"], context.dt), memory
 

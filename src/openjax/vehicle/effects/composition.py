@@ -3,7 +3,6 @@ in.
 """
 
 from collections.abc import Mapping
-from functools import reduce
 from typing import Any
 
 import jax
@@ -62,37 +61,39 @@ def initial_memory(effects, vehicle: Vehicle, state: DroneState, dt: float, key=
         if effect.random and key is None:
             raise UserError(f"effect {effect.name!r} is random: its memory needs a key")
         if effect.initial_memory is not None:
-            own = None if key is None else jax.random.fold_in(key, number)
-            memory[effect.name] = effect.initial_memory(vehicle, state, dt, own)
+            # a key of its own for each: two random effects mustn't draw the same numbers
+            effect_key = None if key is None else jax.random.fold_in(key, number)
+            memory[effect.name] = effect.initial_memory(vehicle, state, dt, effect_key)
     return memory
 
 
 def change_body(effects, parameters, vehicle: Vehicle) -> Vehicle:
     """The vehicle that really flies."""
-    hooks = [
-        (effect.body, parameters[effect.name]) for effect in effects if effect.body is not None
-    ]
-    return reduce(lambda vehicle, hook: hook[0](hook[1], vehicle), hooks, vehicle)
+    for effect in effects:
+        if effect.body is not None:
+            vehicle = effect.body(parameters[effect.name], vehicle)
+    return vehicle
 
 
 def change_command(effects, parameters, memory, command, context: Context):
     """The command (4,) that reaches the rate controller, and the memory after it."""
     for effect in effects:
         if effect.command is not None:
-            command, own = effect.command(
+            command, remembered = effect.command(
                 parameters[effect.name], memory[effect.name], command, context
             )
-            memory = {**memory, effect.name: own}
+            memory = {**memory, effect.name: remembered}
     return command, memory
 
 
 def change_motor_command(effects, parameters, motor_command, context: Context):
     """The motor command (4,) that the motors follow; negative thrust is beyond a rotor."""
-    hooks = [
-        (effect.motor, parameters[effect.name]) for effect in effects if effect.motor is not None
-    ]
-    changed = reduce(lambda command, hook: hook[0](hook[1], command, context), hooks, motor_command)
-    return jnp.maximum(changed, 0.0) if hooks else changed
+    changed = motor_command
+    for effect in effects:
+        if effect.motor is not None:
+            changed = effect.motor(parameters[effect.name], changed, context)
+    # what no effect changed is in 0..1 already, and is left as it is, bit for bit
+    return changed if changed is motor_command else jnp.maximum(changed, 0.0)
 
 
 def change_thrust(effects, parameters, thrust, reaction, context: Context):
@@ -127,6 +128,7 @@ def wrench(effects, parameters, vehicle: Vehicle, rotor_speed, context: Context 
     context = context.replace(rotor_speed=rotor_speed, thrust=thrust)
     thrust, reaction = change_thrust(effects, parameters, thrust, reaction, context)
     force, torque = total_wrench(vehicle, thrust, reaction)
+    # drag and flapping grow with the thrust that the rotors really give, ground effect included
     more_force, more_torque = added_wrench(effects, parameters, context.replace(thrust=thrust))
     return force + more_force, torque + more_torque
 

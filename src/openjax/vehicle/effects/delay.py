@@ -10,6 +10,7 @@ LONGEST_DELAY = 0.1  # s
 
 def buffer_length(dt: float) -> int:
     """Samples needed to look back by LONGEST_DELAY at steps of dt seconds."""
+    # one more for the newest sample, and one for the older end of the last interpolation
     return math.ceil(LONGEST_DELAY / dt) + 2
 
 
@@ -31,9 +32,12 @@ def look_back(buffer, delay, dt) -> jax.Array:
     """
     # not jnp.clip, which has half a slope at its bounds: a fit that starts from no delay needs the
     # whole
-    steps = jnp.where(delay < 0.0, 0.0, jnp.where(delay > LONGEST_DELAY, LONGEST_DELAY, delay)) / dt
+    too_long = delay > LONGEST_DELAY
+    steps = jnp.where(delay < 0.0, 0.0, jnp.where(too_long, LONGEST_DELAY, delay)) / dt
     whole = jax.lax.stop_gradient(jnp.floor(steps))
     part = steps - whole
+    # weights of all samples: in a mapped program each drone looks back by a delay of its own
     index = jnp.arange(buffer.shape[0], dtype=buffer.dtype)
-    weight = jnp.where(index == whole, 1.0 - part, 0.0) + jnp.where(index == whole + 1.0, part, 0.0)
-    return jnp.tensordot(weight, buffer, axes=1)
+    newer = jnp.where(index == whole, 1.0 - part, 0.0)
+    older = jnp.where(index == whole + 1.0, part, 0.0)
+    return jnp.tensordot(newer + older, buffer, axes=1)

@@ -12,11 +12,12 @@ def wrench(parameters, context):
     """-A exp(-dz / h) exp(-r^2 / 2 s^2), s = width + spread dz, along world z; a quarter of it at
     each hub.
     """
-    hubs = (
-        jax.vmap(lambda r: rotate(context.quaternion, r))(context.rotor_position) + context.position
-    )
+    in_world = jax.vmap(lambda r: rotate(context.quaternion, r))(context.rotor_position)
+    hubs = in_world + context.position
     separation = context.others_position[None] - hubs[:, None]  # (4, M, 3)
     above = separation[..., 2] > 0.0
+    # cut before the exponential as well: of a vehicle far below that could overflow, and the
+    # gradient through it be no number
     dz = jnp.where(above, separation[..., 2], 0.0)
     square = separation[..., 0] ** 2 + separation[..., 1] ** 2
     width = parameters["width"] + parameters["spread"] * dz

@@ -38,8 +38,8 @@ class Context:
 
 
 def make_context(vehicle: Vehicle, state: DroneState, **known) -> Context:
-    """The context of one drone in `state`, of which `known` are fields; others are usual, or not
-    known.
+    """The context of one drone in `state`. `known`: further fields of `Context`; those left out
+    are usual, or not known.
 
     For logged flights: map it over the samples, `jax.vmap(lambda state, v: make_context(vehicle,
     state, battery_voltage=v))(states, voltages)`, and map an effect's hooks over the result.
@@ -66,15 +66,13 @@ def make_context(vehicle: Vehicle, state: DroneState, **known) -> Context:
 
 
 Domain = tuple[float, float]
-# Of strengths, lengths and times; of multiples of what is assumed, less of which no vehicle flies
-# with.
 NOT_NEGATIVE: Domain = (0.0, np.inf)
+"""Of strengths, lengths and times."""
 RATIO: Domain = (0.05, np.inf)
+"""Of multiples of what is assumed: no vehicle flies with less than a twentieth of it."""
 
-
-# By which powers of the vehicle's mass and of its arm what is usual of a parameter grows, by its
-# unit: forces are shares of the weight, drag over mass is alike (rotors of larger vehicles push
-# more air at the same speed), places of things on a vehicle are shares of its arm. Speeds of the
+# Forces are shares of the weight; drag over mass is alike, since the rotors of larger vehicles push
+# more air at the same speed; places of things on a vehicle are shares of its arm. Speeds of the
 # air, times, voltages and shares don't grow.
 GROWTH = {
     "kg": (1, 0),
@@ -83,7 +81,13 @@ GROWTH = {
     "N m s/m": (1, 1),
     "m": (0, 1),
 }
-ALIKE = 2.0  # factor of mass or arm within which a vehicle is a Crazyflie, whose ranges are meant
+"""Unit of a parameter -> powers of the vehicle's mass and of its arm by which its usual range
+grows.
+"""
+ALIKE = 2.0
+"""Factor of mass or arm within which a vehicle counts as a Crazyflie, for which ranges are
+written.
+"""
 
 
 def growth(unit: str, vehicle: Vehicle) -> float:
@@ -92,10 +96,13 @@ def growth(unit: str, vehicle: Vehicle) -> float:
     """
     if unit not in GROWTH:
         return 1.0
+    nominal = load_vehicle()
     factor = 1.0
     for power, size in zip(GROWTH[unit], (_mass, _arm), strict=True):
-        ratio = size(vehicle) / size(load_vehicle())
-        factor *= 1.0 if 1.0 / ALIKE <= ratio <= ALIKE else ratio**power
+        ratio = size(vehicle) / size(nominal)
+        # another battery or frame guard mustn't shift the ranges of what is still a Crazyflie
+        if not 1.0 / ALIKE <= ratio <= ALIKE:
+            factor *= ratio**power
     return factor
 
 
@@ -111,25 +118,26 @@ def _arm(vehicle: Vehicle) -> float:
 
 @dataclass(frozen=True)
 class Parameter:
-    """A scalar parameter of an effect.
-
-    none: with every parameter of an effect at this value the effect is absent.
-    prior: the usual range (weak, not a bound), in the parameter's unit.
-    domain: the range in which it means anything, as numbers or by the vehicle.
-    """
+    """A scalar parameter of an effect."""
 
     unit: str
     none: float
+    """With every parameter of an effect at this value the effect is absent."""
     prior: tuple[float, float]
+    """The usual range in the parameter's unit: weak, not a bound."""
     source: str
+    """Where that range comes from."""
     meaning: str = ""
     domain: Domain | Callable[[Vehicle], Domain] = (-np.inf, np.inf)
+    """The range in which it means anything, as numbers or by the vehicle."""
 
     def usual(self, vehicle: Vehicle) -> tuple[float, float]:
         """The usual range for a vehicle: what differs from `none` grows with it."""
         factor = growth(self.unit, vehicle)
+        if factor == 1.0:  # the written numbers themselves, which arithmetic would round
+            return self.prior
         low, high = (self.none + factor * (end - self.none) for end in self.prior)
-        return (low, high) if factor != 1.0 else self.prior
+        return low, high
 
     def limits(self, vehicle: Vehicle | None = None) -> Domain:
         """The domain for a vehicle, by default the nominal one."""
@@ -140,82 +148,98 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Fitted:
-    """How one parameter is fitted: prior mean and standard deviation, start of the search, step of
-    the difference quotient, all in the parameter's unit. `error`: standard deviation that rows of a
-    log leave, whatever a fit says.
-    """
+    """How one parameter is fitted; all numbers are in its unit."""
 
     name: str
     mean: float
+    """Of the prior."""
     spread: float
+    """Standard deviation of the prior."""
     start: float
+    """Where the search starts."""
     step: float
+    """Of the difference quotient."""
     error: float = 0.0
+    """Standard deviation that the rows of a log leave, whatever a fit says."""
 
 
-# Log prior odds of effects, in round numbers: one vehicle in twenty, one in a hundred and fifty,
-# one in four hundred.
+# In round numbers: nobody has counted how often vehicles have an effect.
 UNCOMMON = -3.0
+"""Log prior odds of an effect that one vehicle in twenty has."""
 RARE = -5.0
+"""One in a hundred and fifty."""
 VERY_RARE = -6.0
+"""One in four hundred."""
 
 
 @dataclass(frozen=True)
 class Card:
-    """How an effect is told from flights.
-
-    fitted: its parameters; `common` is the spread that all share, `balanced`: their mean belongs to
-    another effect and is
-        held near zero, `others`: more starts of the search.
-    path: by which way of the log it is read: "physics" (motors to motion), "radio", "rate_loop",
-    "estimator". needs: the channel without which it can't be told, though it leaves a trace in
-    others. needs_force: whether it can't be told without a force, of the path or of an accelerometer.
-    coordinate: the variable that its force follows, for pictures; none where it makes
-    torques or delays. thrust_map: a map from duty cycles to thrust that isn't known can imitate it.
-    torque_axes: those of the torques by which it is told, which what motors do between two rows can
-    imitate. log_odds: log prior odds that it acts at a size that matters. possible({parameter:
-    value}, {parameter: deviation}): whether fitted values lie within physical bounds. nuisance:
-    {parameter: size, or a function of the vehicle that gives it} by which the vehicle's number is
-    usually off: free in
-        every hypothesis, never a cause.
-    nuisance_duty, nuisance_samples: the same where motor commands are duty cycles, or single
-    samples whose rows hide the rest. weighed: whether a weighed vehicle rules it out.
-    of_others: whether it acts near other vehicles alone.
-    at_voltage(values, intervals, voltage): both as they are at one voltage, for simulators that
-    know none. practical: {parameter: how far one of them must be
-    from doing nothing before anybody would change a simulator for it}. days: of an effect that
-    every vehicle has to some degree, the standard deviation of its parameters over a vehicle's
-    days; None for others. trim({parameter: value}, vehicle) -> (4,): of an effect that a day's trims
-    look like, by which share each rotor seems to push more. sample: a strength within its usual
-    range to fly with, strong enough to see.
-    impossible(position): whether a flight along position (T, 3), m, rules it out. next_flight: what
-    would show it, in words.
-    """
+    """How an effect is told from flights."""
 
     fitted: tuple[Fitted, ...]
+    """Its parameters."""
     path: str = "physics"
+    """By which way of the log it is read: "physics" (motors to motion), "radio", "rate_loop" or
+    "estimator".
+    """
     common: float = 0.0
+    """Spread that all its parameters share."""
     balanced: bool = False
+    """Whether the mean of its parameters belongs to another effect, and is held near zero."""
     others: tuple[tuple[float, ...], ...] = ()
+    """More starts of the search."""
     needs: str = ""
+    """The channel without which it can't be told, though it leaves a trace in others."""
     needs_force: bool = False
+    """Whether it can't be told without a force, of the path or of an accelerometer."""
     coordinate: str = ""
+    """The variable that its force follows, for pictures; none where it makes torques or delays."""
     thrust_map: bool = False
+    """Whether a map from duty cycles to thrust that isn't known can imitate it."""
     torque_axes: tuple[int, ...] = ()
+    """Axes of the torques by which it is told: what motors do between two rows can imitate
+    them.
+    """
     log_odds: float = UNCOMMON
+    """Log prior odds that it acts at a size that matters."""
     possible: Callable[[Mapping[str, float], Mapping[str, float]], bool] | None = None
+    """possible({parameter: value}, {parameter: deviation}): whether fitted values lie within
+    physical bounds.
+    """
     nuisance: Mapping[str, float | Callable[[Vehicle], float]] = field(default_factory=dict)
+    """{parameter: by how much the vehicle's number is usually off}, as a number or a function of
+    the vehicle: free in every hypothesis, never a cause.
+    """
     nuisance_duty: Mapping[str, float] = field(default_factory=dict)
+    """The same where motor commands are duty cycles."""
     nuisance_samples: Mapping[str, float] = field(default_factory=dict)
+    """The same where motor commands are single samples, whose rows hide the rest."""
     weighed: bool = False
+    """Whether a weighed vehicle rules it out."""
     of_others: bool = False
+    """Whether it acts near other vehicles alone."""
     at_voltage: Callable[[dict, dict, float], tuple[dict, dict]] | None = None
+    """at_voltage(values, intervals, voltage): both as they are at one voltage, for simulators that
+    know none.
+    """
     impossible: Callable[[Any], bool] | None = None
+    """impossible(position): whether a flight along position (T, 3) m rules it out."""
     sample: Mapping[str, float] = field(default_factory=dict)
+    """A strength within its usual range to fly with, strong enough to see."""
     practical: Mapping[str, float] = field(default_factory=dict)
+    """{parameter: how far it must be from doing nothing before anybody would change a simulator for
+    it}; one of them is enough.
+    """
     days: float | None = None
+    """Of an effect that every vehicle has to some degree: the standard deviation of its parameters
+    over a vehicle's days. None for others.
+    """
     trim: Callable[[Mapping[str, float], Vehicle], Any] | None = None
+    """trim({parameter: value}, vehicle) -> (4,): of an effect that a day's trims look like, by
+    which share each rotor seems to push more.
+    """
     next_flight: str = ""
+    """What flight would show it, in words."""
 
 
 # Hooks of one drone; `parameters` is {name: () array}, `memory` a pytree of arrays.
@@ -232,36 +256,42 @@ SensorHook = Callable[[Mapping[str, Any], Any, DroneState], DroneState]
 @dataclass(frozen=True)
 class Effect:
     """One physical effect that the nominal vehicle leaves out. Any subset of the hooks may be
-    given:
-
-    body(parameters, vehicle) -> vehicle: another vehicle; once per step. command(parameters,
-    memory, command (4,), context) -> command, memory: what reaches the rate controller of
-        what the off-board controller sent; once per step.
-    motor(parameters, motor_command (4,), context) -> motor_command: before the motors' lag.
-    thrust(parameters, thrust (4,) N, reaction (4,) N m, context) -> thrust, reaction: of each
-    rotor. wrench(parameters, context) -> force (3,) N, torque (3,) N m: added, body frame, about
-    the centre of mass. sensor(parameters, memory, state) -> state: what the off-board controller
-    sees of the present state. record(memory, state) -> memory: remembers the state at the end of a
-    step, for `sensor`. initial_memory(vehicle, state, dt, key) -> memory: needed where `command`,
-    `sensor` or `record` use one. random: whether `initial_memory` needs its key. formula: what it
-    changes, in LaTeX, for the documentation. card: how the diagnosis tells it; without one it can
-    be flown with, but not be diagnosed.
+    given; they stand in the order in which a step calls them.
     """
 
     name: str
     description: str
     parameters: Mapping[str, Parameter]
     body: BodyHook | None = None
+    """(parameters, vehicle) -> vehicle: another vehicle; once per step."""
     command: CommandHook | None = None
+    """(parameters, memory, command (4,), context) -> command, memory: what reaches the rate
+    controller of what the off-board controller sent; once per step.
+    """
     motor: MotorHook | None = None
+    """(parameters, motor_command (4,), context) -> motor_command: before the motors' lag."""
     thrust: ThrustHook | None = None
+    """(parameters, thrust (4,) N, reaction (4,) N m, context) -> thrust, reaction: of each
+    rotor.
+    """
     wrench: WrenchHook | None = None
+    """(parameters, context) -> force (3,) N, torque (3,) N m: added, body frame, about the centre
+    of mass.
+    """
     sensor: SensorHook | None = None
+    """(parameters, memory, state) -> state: what the off-board controller sees of the present
+    state; whenever it looks.
+    """
     record: Callable[[Any, DroneState], Any] | None = None
+    """(memory, state) -> memory: remembers the state at the end of a step, for `sensor`."""
     initial_memory: Callable[[Vehicle, DroneState, float, Any], Any] | None = None
+    """(vehicle, state, dt, key) -> memory: needed where `command`, `sensor` or `record` use one."""
     random: bool = False
+    """Whether `initial_memory` needs its key."""
     formula: str = ""
+    """What it changes, in LaTeX, for the documentation."""
     card: Card | None = None
+    """How the diagnosis tells it; without one it can be flown with, but not be diagnosed."""
 
     def none(self) -> dict[str, float]:
         """Parameters at which the effect is absent."""

@@ -42,21 +42,24 @@ def load_effects(path: str | Path) -> tuple[tuple[str, ...], dict[str, dict[str,
     Raises UserError for a missing or unreadable file, unknown names, wrong units and values that
     aren't numbers.
     """
-    entries = _read(Path(path))
-    return tuple(sorted(entries)), {
-        name: {key: entry.value for key, entry in own.items()} for name, own in entries.items()
+    effects = _read(Path(path))
+    values = {
+        name: {key: entry.value for key, entry in entries.items()}
+        for name, entries in effects.items()
     }
+    return tuple(sorted(effects)), values
 
 
 def load_intervals(path: str | Path) -> dict[str, dict[str, tuple[float, float]]]:
     """90 % intervals {effect: {parameter: (low, high)}} of an effects file, of those that have
     any.
     """
-    found = {
-        name: {key: entry.interval90 for key, entry in own.items() if entry.interval90 is not None}
-        for name, own in _read(Path(path)).items()
-    }
-    return {name: own for name, own in found.items() if own}
+    found = {}
+    for name, entries in _read(Path(path)).items():
+        intervals = {key: entry.interval90 for key, entry in entries.items() if entry.interval90}
+        if intervals:
+            found[name] = intervals
+    return found
 
 
 def _read(path: Path) -> dict[str, dict[str, _Entry]]:
@@ -72,10 +75,11 @@ def _read(path: Path) -> dict[str, dict[str, _Entry]]:
     return read
 
 
-def _entry(path: Path, name: str, key: str, told) -> _Entry:
+def _entry(path: Path, name: str, key: str, text) -> _Entry:
+    """One parameter's entry from what TOML reads, a number or a table."""
     where = f"{path}: {name}.{key}"
     parameter = find_effect(name, key, f"{path}: ").parameters[key]
-    entry = from_plain(_Entry, told if isinstance(told, dict) else {"value": told}, where)
+    entry = from_plain(_Entry, text if isinstance(text, dict) else {"value": text}, where)
     if entry.unit not in (None, parameter.unit):
         raise UserError(f"{where} is in {entry.unit!r}; {parameter.unit!r} would be right")
     if entry.interval90 is not None and not entry.interval90[0] <= entry.interval90[1]:

@@ -8,7 +8,9 @@ AXES = ("xx", "yy", "zz")
 
 
 def body(parameters, vehicle):
-    return vehicle.replace(inertia=vehicle.inertia * jnp.stack([parameters[axis] for axis in AXES]))
+    """Principal moments only: the axes stay those of the body."""
+    factor = jnp.stack([parameters[axis] for axis in AXES])
+    return vehicle.replace(inertia=vehicle.inertia * factor)
 
 
 def heavy_inside(value, deviation):

@@ -9,6 +9,7 @@ from openjax.vehicle.effects.effect import Card, Effect, Fitted, Parameter
 
 
 def thrust(parameters, thrust, reaction, context):
+    """Each rotor's own factor on both: a bent propeller changes thrust and torque alike."""
     factor = 1.0 + jnp.stack([parameters[name] for name in ("m1", "m2", "m3", "m4")])
     return thrust * factor, reaction * factor
 

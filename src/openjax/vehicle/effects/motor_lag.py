@@ -6,13 +6,16 @@ import numpy as np
 from openjax.vehicle.effects.effect import Card, Effect, Fitted, Parameter
 
 _SHORTEST = 1e-3  # s
-_SLOWEST = (
-    0.1  # s: small brushed motors were measured at up to 0.1 in all, and no loop flies through more
-)
-EARLY = 0.0025  # s: motors that seem earlier than this are not what they seem
+# small brushed motors were measured at up to 0.1 s in all, and no loop flies through more
+_SLOWEST = 0.1  # s
+# motors that seem earlier than this are not what they seem
+EARLY = 0.0025  # s
 
 
 def body(parameters, vehicle):
+    """Both time constants, of which the vehicle holds the first and the ratio of the second to
+    it.
+    """
     up = jnp.maximum(vehicle.motor_time_constant + parameters["extra_up"], _SHORTEST)
     down = vehicle.motor_time_constant * vehicle.motor_slowdown_ratio + parameters["extra_down"]
     return vehicle.replace(

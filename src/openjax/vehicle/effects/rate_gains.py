@@ -6,6 +6,7 @@ GAINS = ("p", "i", "d")
 
 
 def body(parameters, vehicle):
+    """Each gain's factor acts about all three axes."""
     return vehicle.replace(
         rate_kp=vehicle.rate_kp * parameters["p"],
         rate_ki=vehicle.rate_ki * parameters["i"],

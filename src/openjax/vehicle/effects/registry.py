@@ -40,9 +40,9 @@ def find_effect(
     """
     if name not in known:
         raise UserError(f"{where}effect {name!r} is unknown; {suggestion(name, known)}")
-    own = known[name].parameters
-    if parameter is not None and parameter not in own:
+    parameters = known[name].parameters
+    if parameter is not None and parameter not in parameters:
         raise UserError(
-            f"{where}effect {name!r} has no parameter {parameter!r}; it has {', '.join(own)}"
+            f"{where}effect {name!r} has no parameter {parameter!r}; it has {', '.join(parameters)}"
         )
     return known[name]

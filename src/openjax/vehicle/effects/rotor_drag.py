@@ -16,7 +16,7 @@ _SOURCE = "induced drag of small quadrotors (Foerster 2015 for the Crazyflie; Fa
 
 
 def brakes(value, deviation):
-    """Whether a fitted drag isn't clearly a push along the motion."""
+    """Whether a fitted drag isn't clearly a push along the motion: three standard deviations."""
     return bool(value["d_xy"] > -3.0 * deviation["d_xy"])
 
 

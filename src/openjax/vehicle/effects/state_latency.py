@@ -29,7 +29,9 @@ def record(memory, state):
 
 
 def sensor(parameters, memory, state):
+    """The state with the pose of `delay` seconds ago."""
     pose = look_back(memory["pose"], parameters["delay"], memory["dt"])
+    # the mean of two attitudes is shorter than either
     quaternion = pose[3:7] / jnp.linalg.norm(pose[3:7])
     return state.replace(position=pose[:3], quaternion=quaternion, velocity=pose[7:])
 

@@ -15,19 +15,18 @@ _SOURCE = (
     "spread of quadratic thrust maps published for the Crazyflie, as shares of the largest thrust"
 )
 
-
-_STEEPNESS = (
-    0.4,
-    2.2,
-)  # of the curve, where a straight line has 1: powers of the command from 0.6 to 1.9
+# A straight line rises by 1; these are what powers of the command from 0.6 to 1.9 rise by.
+_LEAST_SLOPE = 0.4
+_LARGEST_SLOPE = 2.2
+_USUAL_COMMANDS = np.array([0.45, 0.85])
 
 
 def rises(value, deviation):
     """Whether a fitted curve rises over the usual commands as a motor's does; if not, the motors
     don't make this force.
     """
-    steepness = value["slope"] + 2.0 * value["curvature"] * np.array([0.45, 0.85])
-    return bool(_STEEPNESS[0] < steepness.min() and steepness.max() < _STEEPNESS[1])
+    slope = value["slope"] + 2.0 * value["curvature"] * _USUAL_COMMANDS
+    return bool(_LEAST_SLOPE < slope.min() and slope.max() < _LARGEST_SLOPE)
 
 
 EFFECT = Effect(

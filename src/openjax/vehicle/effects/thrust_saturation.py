@@ -11,10 +11,10 @@ def motor(parameters, motor_command, context):
     """min(m, limit), before the motors' lag: a saturated motor leaves its limit as soon as the
     command does.
     """
-    missing = jnp.where(
-        jnp.isnan(context.battery_voltage), 0.0, context.battery_voltage - _REFERENCE_VOLTAGE
-    )
-    limit = parameters["limit"] * (1.0 + parameters["voltage_slope"] * missing)
+    # where nobody knows the voltage, the limit is that at the reference
+    voltage = context.battery_voltage
+    excess = jnp.where(jnp.isnan(voltage), 0.0, voltage - _REFERENCE_VOLTAGE)
+    limit = parameters["limit"] * (1.0 + parameters["voltage_slope"] * excess)
     return jnp.minimum(motor_command, limit)
 
 
@@ -60,6 +60,7 @@ EFFECT = Effect(
             Fitted("limit", mean=0.8, spread=0.12, start=0.8, step=0.002),
             Fitted("voltage_slope", mean=0.0, spread=0.1, start=0.0, step=0.01),
         ),
+        # a limit that no command reaches has no slope, so the search starts from many
         others=(
             (0.95, 0.0),
             (0.92, 0.0),

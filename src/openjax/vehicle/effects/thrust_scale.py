@@ -6,6 +6,7 @@ from openjax.vehicle.effects.effect import RATIO, Card, Effect, Fitted, Paramete
 
 
 def body(parameters, vehicle):
+    """Thrust and torque come from the same air, so the factor is the same."""
     factor = 1.0 + parameters["scale"]
     return vehicle.replace(
         thrust_constant=vehicle.thrust_constant * factor,

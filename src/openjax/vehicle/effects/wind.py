@@ -13,9 +13,8 @@ def wrench(parameters, context):
     """-drag (v - w) at the hubs, of which a share along the rotors' axes: rotor drag in air that
     moves.
     """
-    wind = rotate_inverse(
-        context.quaternion, jnp.stack([parameters["x"], parameters["y"], parameters["z"]])
-    )
+    in_world = jnp.stack([parameters["x"], parameters["y"], parameters["z"]])
+    wind = rotate_inverse(context.quaternion, in_world)
     drag = parameters["drag"] * jnp.stack([1.0, 1.0, parameters["along"]])
     return hub_wrench(context, -0.25 * drag * (hub_velocity(context) - wind))
 
