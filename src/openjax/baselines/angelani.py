@@ -43,15 +43,19 @@ def angelani(craft: Craft, parameters: AngelaniParameters, known: Surroundings) 
 
     distance = jnp.sqrt(jnp.sum(known.from_others**2, axis=-1) + 1e-12)
     apart = fermi(distance, parameters.repulsion_range)[..., None] * unit(known.from_others)
+
     near = fermi(known.obstacle_distance, parameters.obstacle_range)
-    obstacles = level(jnp.sum(near[..., None] * known.obstacle_normal, axis=-2)) + upward(
-        fermi(known.floor_distance, parameters.obstacle_range)
-        - fermi(known.ceiling_distance, parameters.obstacle_range)
-    )
+    sideways = jnp.sum(near[..., None] * known.obstacle_normal, axis=-2)
+    # the floor pushes up, the ceiling down
+    from_floor = fermi(known.floor_distance, parameters.obstacle_range)
+    from_ceiling = fermi(known.ceiling_distance, parameters.obstacle_range)
+    obstacles = level(sideways) + upward(from_floor - from_ceiling)
+
     force = (
         unit(known.target - known.position)
         + parameters.alignment * unit(known.team_velocity)
         + parameters.repulsion * jnp.sum(apart, axis=-2)
         + parameters.obstacle * obstacles
     )
+    # particles of constant speed: forces turn them, and never slow them down
     return craft.speed * unit(force)

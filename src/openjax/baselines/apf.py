@@ -56,17 +56,22 @@ def forces(parameters: ApfParameters, known: Surroundings) -> Forces:
         d = jnp.maximum(gap - margin, NEAREST)
         return jnp.where(d < rho, eta * (1.0 / d - 1.0 / rho) / d**2, 0.0)
 
-    scale = (parameters.repulsion, parameters.influence, parameters.margin)
-    each = push(known.obstacle_distance, *(jnp.asarray(x)[..., None] for x in scale))
-    vertical = push(known.floor_distance, *scale) - push(known.ceiling_distance, *scale)
+    eta = jnp.asarray(parameters.repulsion)
+    rho = jnp.asarray(parameters.influence)
+    margin = jnp.asarray(parameters.margin)
+    # an axis more: each pursuer's parameters hold for all of its obstacles
+    each = push(known.obstacle_distance, eta[..., None], rho[..., None], margin[..., None])
+    from_floor = push(known.floor_distance, eta, rho, margin)
+    from_ceiling = push(known.ceiling_distance, eta, rho, margin)
+
     distance = length(known.from_others)
     beyond = jnp.maximum(distance - SAFE_PURSUER, NEAREST)
     balance = jnp.asarray(parameters.balance)[..., None, None]
     pull = -known.from_others / distance * (0.5 - balance / beyond)
+    sideways = jnp.sum(each[..., None] * known.obstacle_normal, axis=-2)
     return Forces(
         attraction=unit(known.target - known.position),
-        repulsion=level(jnp.sum(each[..., None] * known.obstacle_normal, axis=-2))
-        + upward(vertical),
+        repulsion=level(sideways) + upward(from_floor - from_ceiling),
         individual=jnp.sum(pull, axis=-2) / max(known.from_others.shape[-2], 1),
         inside=jnp.min(known.obstacle_distance, axis=-1) < parameters.margin,
     )
@@ -77,12 +82,11 @@ def apf(craft: Craft, parameters: ApfParameters, known: Surroundings) -> jax.Arr
     the way.
     """
     field = forces(parameters, known)
-    total = field.attraction + field.repulsion + field.individual
-    blocked = (
-        jnp.sum((field.attraction + field.repulsion) * field.attraction, axis=-1, keepdims=True)
-        < 0.0
-    )
+    # without the force between pursuers: it alone never holds anybody in a local minimum
+    towards = field.attraction + field.repulsion
+    blocked = jnp.sum(towards * field.attraction, axis=-1, keepdims=True) < 0.0
     along = wall_following(field, known.velocity)
+    total = towards + field.individual
     return craft.speed * jnp.where(blocked, along, unit(total))
 
 
@@ -95,6 +99,7 @@ def wall_following(field: Forces, velocity: jax.Array) -> jax.Array:
     """
     away = unit(field.repulsion[..., :2])
     left = jnp.stack([-away[..., 1], away[..., 0]], axis=-1)
+    # 1 is the size of the attraction
     pushed = length(field.individual) > 1.0
     heading = jnp.where(pushed, field.individual, unit(velocity))[..., :2]
     side = jnp.where(jnp.sum(left * heading, axis=-1, keepdims=True) >= 0.0, 1.0, -1.0)

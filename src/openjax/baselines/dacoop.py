@@ -37,6 +37,7 @@ class DacoopPolicy(CraftPolicy):
     def start() -> tuple[float, ...]:
         """The field of `START`."""
         places = [_place(name, getattr(START, name)) for name in LEARNED]
+        # at the end of a range the tanh is flat: from there nothing would be learnt
         return tuple(math.atanh(min(max(place, -0.95), 0.95)) for place in places)
 
     def action(self, sample: jax.Array, observation: Observation) -> jax.Array:
@@ -62,5 +63,6 @@ def field_parameters(output: jax.Array) -> ApfParameters:
 
 
 def _place(name, value):
+    """Where a value lies in its range on the logarithmic scale, in -1..1."""
     low, high = ranges(ApfParameters)[name]
     return 2.0 * math.log(value / low) / math.log(high / low) - 1.0

@@ -43,10 +43,9 @@ def janosov(craft: Craft, parameters: JanosovParameters, known: Surroundings) ->
     speed.
     """
     to_target = known.target - known.position
-    ahead = jnp.minimum(
-        parameters.prediction_time,
-        length(to_target) / jnp.maximum(length(known.target_velocity), 1e-3),
-    )
+    # no farther ahead than the prey could come here itself
+    coming = length(to_target) / jnp.maximum(length(known.target_velocity), 1e-3)
+    ahead = jnp.minimum(parameters.prediction_time, coming)
     predicted = known.target + ahead * known.target_velocity
     relative = known.velocity - known.target_velocity
     # a prey that isn't seen has no velocity to be damped against
@@ -67,10 +66,12 @@ def janosov(craft: Craft, parameters: JanosovParameters, known: Surroundings) ->
         return 0.5 + 0.5 * jnp.cos(jnp.pi * jnp.clip(gap / parameters.wall_range, 0.0, 1.0))
 
     near = soft_wall(known.obstacle_distance)
-    walls = level(jnp.sum(near[..., None] * known.obstacle_normal, axis=-2)) + upward(
-        soft_wall(known.floor_distance) - soft_wall(known.ceiling_distance)
-    )
+    sideways = jnp.sum(near[..., None] * known.obstacle_normal, axis=-2)
+    # the floor pushes up, the ceiling down
+    vertical = soft_wall(known.floor_distance) - soft_wall(known.ceiling_distance)
+    walls = level(sideways) + upward(vertical)
     terms = (
         chase + parameters.interaction * unit(spread) + unit(avoidance) + parameters.wall * walls
     )
+    # cut, not normalised: a chaser whose terms cancel hovers
     return craft.speed * terms / jnp.maximum(length(terms), 1.0)

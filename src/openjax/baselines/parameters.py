@@ -35,7 +35,6 @@ def best(method: str, kind: type[Parameters]) -> Parameters:
     it.
     """
     found = json.loads(FOUND.read_text(encoding="utf-8"))
-    values = {field.name: field.default for field in dataclasses.fields(kind)} | found.get(
-        method, {}
-    )
+    values = {field.name: field.default for field in dataclasses.fields(kind)}
+    values |= found.get(method, {})
     return kind(**{name: jnp.float32(value) for name, value in values.items()})

@@ -56,6 +56,7 @@ def stack(craft: Craft, parameters: StackParameters, known: Surroundings) -> jax
     along = jnp.sum(place * out, axis=-1)
     across = jnp.sum(place * aside, axis=-1)
     ready = (jnp.abs(height) < parameters.tolerance) & (jnp.abs(across) < parameters.tolerance)
+    # all must stand before any moves: the bound holds for a whole stack only
     ready = jnp.all(ready & (along > -parameters.tolerance), axis=-1, keepdims=True)
 
     def cut(speed, left):
@@ -63,10 +64,13 @@ def stack(craft: Craft, parameters: StackParameters, known: Surroundings) -> jax
         speed = jnp.clip(speed, -left, left)
         return speed, jnp.sqrt(jnp.maximum(left**2 - speed**2, 0.0))
 
+    # what keeps the ray comes first, then the height; moving outwards gets what speed is left
     left = jnp.full_like(height, craft.speed)
     aside_speed, left = cut(-parameters.gain * across, left)
     up, left = cut(parameters.gain * height, left)
     forwards = out * left[..., None] + aside * aside_speed[..., None]
+
+    # before that each flies to its place on the axis
     gather = -parameters.gain * place
     size = jnp.sqrt(jnp.sum(gather**2, axis=-1) + (parameters.gain * height) ** 2 + 1e-12)
     gather = gather * jnp.minimum(1.0, craft.speed / size)[..., None]

@@ -71,18 +71,18 @@ class Surroundings:
 
     position: jax.Array  # (..., N, 3)
     velocity: jax.Array  # (..., N, 3)
-    target: (
-        jax.Array
-    )  # (..., N, 3) the evader; where it was last seen while it is hidden, the middle before
+    target: jax.Array
+    """(..., N, 3) the evader; while it is hidden where it was last seen, and the middle before."""
     target_velocity: jax.Array  # (..., N, 3) zero while it is hidden
     from_others: jax.Array  # (..., N, N - 1, 3) position relative to each other pursuer
     from_others_velocity: jax.Array  # (..., N, N - 1, 3) velocity relative to each other pursuer
     team_velocity: jax.Array  # (..., N, 3) mean velocity of all pursuers
     obstacle_normal: jax.Array
-    """(..., N, k + 1, 2) away from each pillar in sight and from the arena's wall, unit"""
-    obstacle_distance: (
-        jax.Array
-    )  # (..., N, k + 1) to their surface; infinite where there is no pillar
+    """(..., N, k + 1, 2) away from each pillar in sight and from the arena's wall, of unit
+    length.
+    """
+    obstacle_distance: jax.Array
+    """(..., N, k + 1) to their surface; infinite where there is no pillar."""
     floor_distance: jax.Array  # (..., N)
     ceiling_distance: jax.Array  # (..., N)
 
@@ -97,6 +97,7 @@ def surroundings(craft: Craft, observation: Observation) -> Surroundings:
     velocity = observation.self_state[..., VELOCITY]
     number = own.shape[-2]
     newest = observation.frames[..., -1, :]
+    # what is hidden is shown at HIDDEN exactly, far below any place; .9 allows for rounding
     seen = newest[..., 1:2] > 0.9 * HIDDEN
     per_pursuer = (*own.shape[:-2], number, 3)
 

@@ -48,8 +48,7 @@ def check_flyable(name: str, craft: Craft, time_step: float) -> None:
     if craft.hover_thrust > HEAVIEST:
         raise UserError(
             f"{name}: a vehicle that hovers at {craft.hover_thrust:.2f} of its thrust leaves its "
-            "velocity "
-            f"controller no room; at most {HEAVIEST} is possible"
+            f"velocity controller no room; at most {HEAVIEST} is possible"
         )
 
 
@@ -61,18 +60,21 @@ def velocity_action(craft: Craft, observation: Observation, desired: jax.Array) 
     body_x, body_z = rotation_axes(own[..., QUATERNION])
     thrust = VELOCITY_GAIN / GRAVITY * (desired - own[..., VELOCITY])  # in units of the weight
     rise = 1.0 + jnp.clip(thrust[..., 2:], *CLIMB_LIMITS)
+    # height before the rest: what a limited tilt can't do is left of the horizontal part
     lean = thrust[..., :2]
     lean = lean * jnp.minimum(1.0, LARGEST_TILT * rise / length(lean))
     thrust = jnp.concatenate([lean, rise], axis=-1)
+    # as much of it as the body's axis can do at present: who leans elsewhere turns first
     share = craft.hover_thrust * jnp.sum(thrust * body_z, axis=-1)
+    # the cross product is the axis about which to turn, as long as the sine of the angle
     turn = ATTITUDE_GAIN * jnp.cross(body_z, unit(thrust))
     yaw = jnp.arctan2(body_x[..., 1], body_x[..., 0])
     roll_rate = _dot(turn, body_x)
     pitch_rate = _dot(turn, jnp.cross(body_z, body_x))
     rates = jnp.stack([roll_rate, pitch_rate, -YAW_GAIN * yaw], axis=-1)
-    return jnp.clip(
-        jnp.concatenate([2.0 * share[..., None] - 1.0, rates / jnp.pi], axis=-1), -1.0, 1.0
-    )
+    # an action of -1 is no thrust, of 1 all of it; rates are in units of pi rad/s
+    action = jnp.concatenate([2.0 * share[..., None] - 1.0, rates / jnp.pi], axis=-1)
+    return jnp.clip(action, -1.0, 1.0)
 
 
 def _dot(a, b):

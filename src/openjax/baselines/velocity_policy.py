@@ -33,5 +33,6 @@ class VelocityPolicy(CraftPolicy):
         stands for.
         """
         velocity = self.craft.speed * super().action(sample, observation)
+        # components in -1..1 make a cube: its corners are cut to the largest speed
         velocity = velocity / jnp.maximum(length(velocity) / self.craft.speed, 1.0)
         return velocity_action(self.craft, observation, velocity)

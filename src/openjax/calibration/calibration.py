@@ -22,20 +22,15 @@ from openjax.gap.residual import residuals_of
 from openjax.vehicle.effects import EFFECTS
 from openjax.vehicle.vehicle_file import CALIBRATED_UNITS, CalibratedValue
 
-FITTED = (
-    "thrust_scale",
-    "yaw_torque",
-    "motor_lag",
-    "inertia",
-)  # whose parameters are the constants
-# what mustn't be taken for them
+# effects whose parameters are the constants
+FITTED = ("thrust_scale", "yaw_torque", "motor_lag", "inertia")
+# effects that usually act as well, and mustn't be taken for them
 BESIDE = ("rotor_drag", "com_offset", "ground_effect", "ceiling_effect", "downwash")
 ITERATIONS = 12
-# of the prior's standard deviation: a constant with a larger one isn't told by these flights
+# share of the prior's standard deviation: a constant with a larger one isn't told by these flights
 DETERMINED = 0.5
-LEAST_EXPLAINED = (
-    0.9  # share of the rates' changes; below, no constant that they tell can be trusted
-)
+# share of the rates' changes that motors explain: below, no constant that rates tell can be trusted
+LEAST_EXPLAINED = 0.9
 HORIZON = 0.25  # s over which changes are explained
 YAW_INERTIA_RANGE = (0.7, 1.6)  # of nominal; what it may be where it is assumed
 # Relative error (standard deviation) that remains however long one flies: commands and states are
@@ -50,21 +45,21 @@ MODEL_ERROR = {
 TOLD_BY_RATES = ("torque_constant", "motor_time_constant", "inertia")
 
 # What flights can't tell, in words.
-_YAW_CLASS = "yaw torque constant against yaw inertia: only their ratio shows in yaw; the inertia is assumed nominal"
+_YAW_CLASS = (
+    "yaw torque constant against yaw inertia: only their ratio shows in yaw; the inertia is "
+    "assumed nominal"
+)
 _NOT_WEIGHED = (
     "mass against thrust: the mass wasn't weighed, so thrust and torque constants and inertia hold "
-    "for the "
-    "assumed {grams:.1f} g; a mass off by 1 % moves them all by 1 %. Weigh the vehicle"
+    "for the assumed {grams:.1f} g; a mass off by 1 % moves them all by 1 %. Weigh the vehicle"
 )
 _UNKNOWN_MAP = (
     "the thrust constant: the commands are duty cycles whose map to thrust isn't known. Against "
-    "the public "
-    "map the flights' thrust per assumed mass is {scale:.3g}; torques were scaled alike"
+    "the public map the flights' thrust per assumed mass is {scale:.3g}; torques were scaled alike"
 )
 _NOT_EXPLAINED = (
     "inertia, torque constant, motor lag: motors explain only {share:.0%} of what the gyroscope "
-    "shows. "
-    "Their clocks may disagree, or something else acts: run openjax.diagnose"
+    "shows. Their clocks may disagree, or something else acts: run openjax.diagnose"
 )
 _ADVICE = {
     "thrust_constant": "climb and descend hard, or log the pose",
@@ -86,22 +81,26 @@ class Quantity:
     nominal: tuple[float, ...]
     unit: str
     determined: bool
+    """Whether these flights tell it: only then it goes into a vehicle file."""
     notes: str = ""
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """Result of a calibration. `cannot_tell` says in words what these flights leave open;
-    `nuisances` what was fitted beside, {name: (value, unit)}; `explained` the share of each
-    channel's changes that the nominal vehicle explains, and the fitted one.
-    """
+    """Result of a calibration."""
 
     quantities: dict[str, Quantity]
     cannot_tell: tuple[str, ...]
+    """What these flights leave open, in words."""
     nuisances: dict[str, tuple[float, str]] = field(default_factory=dict)
+    """What was fitted beside: {name: (value, unit)}."""
     explained: dict[str, tuple[float, float]] = field(default_factory=dict)
+    """{kind of channel: share of its changes that the nominal vehicle explains, and the fitted
+    one}.
+    """
     flights: tuple[str, ...] = ()
     seconds: float = 0.0
+    """Of all flights together."""
 
     def calibrated(self) -> dict[str, CalibratedValue]:
         """What goes into the vehicle file: determined quantities only."""
@@ -126,16 +125,7 @@ def calibrate(case: Case) -> Calibration:
     evidence = gather(dataclasses.replace(case, flights=usable), library())
     exposure = evidence.motion.exposure
     effects = [e for e in CARDS if e in FITTED or (e in BESIDE and exposure[e] >= UNEXPOSED)]
-    # The vehicle's numbers are what is fitted, and no nuisances.
-    replay = evidence.replay
-    own = len(evidence.replay.numbers)
-    replay = dataclasses.replace(
-        replay,
-        columns=[c[own:] for c in replay.columns],
-        nuisance_names=replay.nuisance_names[own:],
-        sizes=[s[own:] for s in replay.sizes],
-        numbers=(),
-    )
+    replay = _without_numbers(evidence.replay)
     fit = fit_set(replay, effects, iterations=ITERATIONS)
     nothing = fit_set(replay, ())
     explained = _explained(replay, nothing, fit)
@@ -154,6 +144,20 @@ def calibrate(case: Case) -> Calibration:
         explained=explained,
         flights=tuple(dict.fromkeys(t.flight for t in evidence.tracks)),
         seconds=float(sum(len(t) * t.dt for t in evidence.tracks)),
+    )
+
+
+def _without_numbers(replay):
+    """A replay in which the vehicle's numbers are what is fitted, and no nuisances. A diagnosis
+    lets them vary beside every effect; they come first among the nuisances.
+    """
+    vehicle = len(replay.numbers)
+    return dataclasses.replace(
+        replay,
+        columns=[c[vehicle:] for c in replay.columns],
+        nuisance_names=replay.nuisance_names[vehicle:],
+        sizes=[s[vehicle:] for s in replay.sizes],
+        numbers=(),
     )
 
 
@@ -179,28 +183,42 @@ def _quantities(evidence: Evidence, fit: SetFit, rates_fit: bool) -> dict[str, Q
     file = evidence.case.vehicle_file
     vehicle = evidence.vehicles[0]
     duty_cycles = file.motor.command == "pwm"
-    wider = robust_deviation(fit.covariance, fit.grams[:, 1:, 0]) / np.sqrt(np.diag(fit.covariance))
-    covariance = fit.covariance * np.outer(wider, wider)
-    before = np.linalg.inv(prior(fit.effects)[2])
-    at = logarithms(fit.theta, vehicle, duty_cycles)
-    slopes = {name: [] for name in at}
-    for place in fit.index:
-        step = np.where(np.arange(len(fit.theta)) == place, 1e-5, 0.0)
-        for name, value in logarithms(fit.theta + step, vehicle, duty_cycles).items():
-            slopes[name].append((value - at[name]) / 1e-5)
+    # where flights disagree by more than the noise explains, errors are as large as that
+    robust = robust_deviation(fit.covariance, fit.grams[:, 1:, 0])
+    wider = robust / np.sqrt(np.diag(fit.covariance))
+    posterior = fit.covariance * np.outer(wider, wider)
+    prior_covariance = np.linalg.inv(prior(fit.effects)[2])
+    values = logarithms(fit.theta, vehicle, duty_cycles)
+    slopes = _slopes(fit, vehicle, duty_cycles)
     out = {}
-    for name, value in at.items():
-        slope = np.array(slopes[name]).T
-        deviation, known = (np.sqrt(np.diag(slope @ c @ slope.T)) for c in (covariance, before))
-        told = bool((deviation < DETERMINED * known).all()) and (
-            rates_fit or name not in TOLD_BY_RATES
-        )
-        told &= not (duty_cycles and name == "thrust_constant")
-        out[name] = _quantity(name, vehicle, value, np.hypot(deviation, MODEL_ERROR[name]), told)
+    for name, value in values.items():
+        slope = slopes[name]
+        deviation = np.sqrt(np.diag(slope @ posterior @ slope.T))
+        before = np.sqrt(np.diag(slope @ prior_covariance @ slope.T))
+        determined = bool((deviation < DETERMINED * before).all())
+        determined &= rates_fit or name not in TOLD_BY_RATES
+        determined &= not (duty_cycles and name == "thrust_constant")
+        total = np.hypot(deviation, MODEL_ERROR[name])
+        out[name] = _quantity(name, vehicle, value, total, determined)
         if name in ("thrust_constant", "inertia") and not file.mass_weighed:
             notes = "; ".join(n for n in (out[name].notes, _ASSUMED_MASS) if n)
             out[name] = dataclasses.replace(out[name], notes=notes)
     return out
+
+
+def _slopes(fit: SetFit, vehicle, duty_cycles: bool) -> dict[str, np.ndarray]:
+    """{constant: (1 or 2, F) slopes of its logarithms in the F fitted parameters}, by difference
+    quotients.
+    """
+    step = 1e-5
+    here = logarithms(fit.theta, vehicle, duty_cycles)
+    slopes = {name: [] for name in here}
+    for place in fit.index:
+        theta = fit.theta.copy()
+        theta[place] += step
+        for name, value in logarithms(theta, vehicle, duty_cycles).items():
+            slopes[name].append((value - here[name]) / step)
+    return {name: np.array(columns).T for name, columns in slopes.items()}
 
 
 def _quantity(
@@ -208,25 +226,25 @@ def _quantity(
 ) -> Quantity:
     nominal = np.atleast_1d(np.asarray(getattr(vehicle, name), float))
     value = nominal.copy()
+    # of the inertia x and y are fitted; z stays nominal, in the range in which it may be
     value[: len(logs)] *= np.exp(logs)
     reach = np.exp(REACH * deviations)
-    pairs = [(float(v / r), float(v * r)) for v, r in zip(value, reach, strict=False)]
-    pairs += [
-        (low * nominal[2], high * nominal[2])
-        for low, high in [YAW_INERTIA_RANGE][: len(value) - len(logs)]
-    ]
+    fitted = zip(value[: len(logs)], reach, strict=True)
+    pairs = [(float(v / r), float(v * r)) for v, r in fitted]
+    if len(value) > len(logs):
+        low, high = YAW_INERTIA_RANGE
+        pairs.append((low * nominal[2], high * nominal[2]))
     notes = {
         "inertia": "zz is assumed nominal",
         "torque_constant": "for the nominal inertia about z",
     }
-    unit = CALIBRATED_UNITS[name]
     return Quantity(
-        tuple(value.tolist()),
-        tuple(pairs),
-        tuple(nominal.tolist()),
-        unit,
-        determined,
-        notes.get(name, ""),
+        value=tuple(value.tolist()),
+        interval90=tuple(pairs),
+        nominal=tuple(nominal.tolist()),
+        unit=CALIBRATED_UNITS[name],
+        determined=determined,
+        notes=notes.get(name, ""),
     )
 
 
@@ -265,11 +283,10 @@ def _explained(replay, nothing: SetFit, fit: SetFit) -> dict[str, tuple[float, f
         changes = (v[n:, channels] - v[:-n, channels] for v, n in zip(values, steps, strict=True))
         return float(sum((c**2).sum() for c in changes))
 
-    fits = residuals_of(nothing), residuals_of(fit)
-    return {
-        kind: tuple(
-            1.0 - square(left, channels) / square(replay.measured, channels) for left in fits
-        )
-        for kind, channels in kinds.items()
-        if replay.usable[channels].all()
-    }
+    residuals = (residuals_of(nothing), residuals_of(fit))
+    explained = {}
+    for kind, channels in kinds.items():
+        if replay.usable[channels].all():
+            whole = square(replay.measured, channels)
+            explained[kind] = tuple(1.0 - square(left, channels) / whole for left in residuals)
+    return explained
