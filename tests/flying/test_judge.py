@@ -14,7 +14,6 @@ from openjax.flying.judge import (
     Track,
     Verdict,
     agree,
-    at_one_time,
     follows,
     judge,
     pose_limits,
@@ -132,7 +131,7 @@ def test_a_refused_pose_leaves_the_last_good_one():
 def test_agreement_is_of_place_and_attitude_at_one_time():
     fast = replace_velocity(HERE, (2.0, 0.0, 0.0))
     later = moved_on(fast, 0.05)
-    assert agree(*at_one_time(fast, later), LIMITS) is Verdict.GOOD
+    assert agree(fast, later, LIMITS) is Verdict.GOOD
     assert agree(HERE, HERE._replace(position=(0.55, 0.0, 0.5)), LIMITS) is Verdict.APART
     assert agree(HERE, HERE._replace(quaternion=turned(math.pi)), LIMITS) is Verdict.APART
     scaled = replace(LIMITS, apart=0.05)
@@ -143,7 +142,7 @@ def test_the_estimator_on_board_isnt_told_what_it_cant_have_missed():
     near, far = (HERE._replace(position=(0.4 + d, 0.0, 0.5)) for d in (0.02, 0.06))
     assert follows(HERE, near, LIMITS) and not follows(HERE, far, LIMITS)
     assert agree(far, HERE, LIMITS) is Verdict.GOOD  # it is flown by all the same
-    assert follows(*at_one_time(HERE, moved_on(HERE, 0.2)), LIMITS)
+    assert follows(HERE, moved_on(HERE, 0.2), LIMITS)
 
 
 def replace_velocity(pose, velocity):

@@ -20,8 +20,12 @@ from openjax.interruption import SIGNALS
 SILENCE = 0.1
 """Silence of a process after which the next one flies (s): ten ticks."""
 _MODES = tuple(Mode)
-_HEAD, _EACH = 11, 17  # see Board; per vehicle mode, trim, known, 14 numbers of its pose
-_BEATS, _PIDS = 5, 8  # one each per role, after the five words
+# Where things stand in the page: five words, a beat and a process id of each of the three roles,
+# and then of each vehicle mode, trim, whether it has a pose, and the 14 numbers of that.
+_BEATS = 5
+_PIDS = 8
+_HEAD = 11
+_EACH = 17
 DEAF = ("SIGHUP", "SIGINT", "SIGTSTP", "SIGTERM", "SIGQUIT", "SIGTTOU", "SIGTTIN", "SIGPIPE")
 """Signals that a terminal, or its end, sends to all that it started."""
 
@@ -96,9 +100,8 @@ class Board:
         """
         pid = int(self._numbers[_PIDS + role])
         if pid:
-            with contextlib.suppress(
-                OSError, AttributeError
-            ):  # it has gone; only Linux tells when one goes
+            # it has gone already; and only Linux tells when one goes
+            with contextlib.suppress(OSError, AttributeError):
                 os.kill(pid, signal.SIGKILL)
                 process = os.pidfd_open(pid)
                 select.select([process], [], [], self.silence)
@@ -108,11 +111,12 @@ class Board:
         """`role` flew a tick at `now` (s), and this is what it knows."""
         numbers = []
         for drone in state.drones:
-            e = drone.estimate
-            pose = numbers_of(e) if e is not None else (0.0,) * 14
-            numbers += [float(_MODES.index(drone.mode)), drone.trim, float(e is not None), *pose]
+            known = drone.estimate is not None
+            pose = numbers_of(drone.estimate) if known else (0.0,) * 14
+            numbers += [float(_MODES.index(drone.mode)), drone.trim, float(known), *pose]
         self._numbers[_HEAD:] = numbers
         self.flying = state.flying
+        # the beat comes last: who takes over for a silent process finds a page that is whole
         self.beat(role, now)
 
     def read(self, state: State, now: float) -> State:
@@ -121,7 +125,8 @@ class Board:
         """
         drones = []
         for i, drone in enumerate(state.drones):
-            mode, trim, known, *numbers = self._numbers[_HEAD + _EACH * i : _HEAD + _EACH * (i + 1)]
+            start = _HEAD + _EACH * i
+            mode, trim, known, *numbers = self._numbers[start : start + _EACH]
             pose = moved_on(pose_of(numbers), now) if known else None
             drones.append(drone._replace(mode=_MODES[int(mode)], trim=trim, estimate=pose))
         return state._replace(drones=tuple(drones), time=now, action_time=now)
@@ -131,7 +136,8 @@ def start_deaf(process) -> None:
     """Start a process of multiprocessing that no Ctrl-C ends, in many lines, while it loads what it
     needs: signals that are blocked here are blocked there until it can `stand_alone`.
     """
-    resource_tracker.ensure_running()  # which would unblock them
+    # Python starts its resource tracker with the first process, and unblocks signals for it
+    resource_tracker.ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
     try:
         process.start()

@@ -16,6 +16,7 @@ from openjax.flying.set_point import ANGLES, RATES, SetPoint
 
 Vector = tuple[float, float, float]
 GRAVITY = 9.81
+"""m/s^2"""
 POSITION_GAIN = 2.5
 """Velocity asked for per position error (1/s)."""
 VELOCITY_GAIN = 5.0
@@ -23,7 +24,9 @@ VELOCITY_GAIN = 5.0
 ANGLE_GAIN = 8.0
 """Body rate asked for per angle error (1/s), where body rates are sent."""
 YAW_GAIN = 1.5
+"""Yaw rate asked for per yaw (1/s)."""
 TILT_LIMIT = math.radians(35.0)
+"""Of what is asked for (rad)."""
 CLIMB_LIMIT = 4.0
 """Largest vertical acceleration asked for (m/s^2)."""
 
@@ -45,8 +48,13 @@ def numbers_of(pose: Pose) -> tuple[float, ...]:
 
 def pose_of(numbers: Sequence[float]) -> Pose:
     """The pose of these 14 numbers."""
-    at, *rest = numbers
-    return Pose(at, *(tuple(rest[a:b]) for a, b in ((0, 3), (3, 6), (6, 10), (10, 13))))
+    return Pose(
+        time=numbers[0],
+        position=tuple(numbers[1:4]),
+        velocity=tuple(numbers[4:7]),
+        quaternion=tuple(numbers[7:11]),
+        body_rates=tuple(numbers[11:14]),
+    )
 
 
 @dataclass(frozen=True)
@@ -71,9 +79,10 @@ def airframe_of(vehicle) -> Airframe:
     thrust = float(vehicle.thrust_constant) * float(vehicle.max_rotor_speed) ** 2
     arm = float(abs(vehicle.rotor_position[:, :2]).min())
     return Airframe(
-        float(vehicle.mass * vehicle.gravity) / (4.0 * thrust),
-        2.0 * thrust * arm / float(min(vehicle.inertia[:2])),
-        float(vehicle.motor_time_constant),
+        hover_thrust=float(vehicle.mass * vehicle.gravity) / (4.0 * thrust),
+        # two rotors at full thrust, those on the other side at none
+        angular_acceleration=2.0 * thrust * arm / float(min(vehicle.inertia[:2])),
+        motor_time_constant=float(vehicle.motor_time_constant),
     )
 
 
@@ -109,6 +118,7 @@ def up(quaternion) -> float:
 
 def level_acceleration(quaternion) -> Vector:
     """The acceleration (m/s^2, world) of a vehicle at this attitude that holds its height."""
+    # at more than 72 degrees no rotor holds it; .3 keeps the number finite
     return lift_acceleration(quaternion, 1.0 / max(up(quaternion), 0.3))
 
 
@@ -122,16 +132,17 @@ def lift_acceleration(quaternion, lift: float) -> Vector:
 
 def moved_on(pose: Pose, now: float) -> Pose:
     """The pose at `now` (s) if velocity and body rates have stayed what they were."""
-    if (age := now - pose.time) == 0.0:
+    age = now - pose.time
+    if age == 0.0:
         return pose
     position = tuple(p + age * v for p, v in zip(pose.position, pose.velocity, strict=True))
-    return pose._replace(
-        time=now, position=position, quaternion=turned_on(pose.quaternion, pose.body_rates, age)
-    )
+    quaternion = turned_on(pose.quaternion, pose.body_rates, age)
+    return pose._replace(time=now, position=position, quaternion=quaternion)
 
 
 def turned_on(quaternion, rates: Vector, duration: float) -> tuple[float, float, float, float]:
     """The attitude, wxyz, after turning at body rates (rad/s) for `duration` (s)."""
+    # to first order: nothing turns far in the hundredths of a second between two poses
     w, x, y, z = quaternion
     a, b, c = (0.5 * duration * rate for rate in rates)
     turned = (
@@ -157,6 +168,7 @@ def wanted_acceleration(velocity: Vector, wanted: Vector) -> Vector:
     tilt limit.
     """
     ax, ay, az = (VELOCITY_GAIN * (w - v) for w, v in zip(wanted, velocity, strict=True))
+    # height first: the tilt that is left for the rest follows from the lift
     az = min(max(az, -CLIMB_LIMIT), CLIMB_LIMIT)
     level = math.hypot(ax, ay)
     most = (GRAVITY + az) * math.tan(TILT_LIMIT)
@@ -179,6 +191,7 @@ def accelerate(
     forward = ax * math.cos(yaw) + ay * math.sin(yaw)
     left = -ax * math.sin(yaw) + ay * math.cos(yaw)
     lift = math.sqrt((GRAVITY + az) ** 2 + forward**2 + left**2)
+    # a positive pitch leans the thrust forward, a positive roll to the right
     wanted_pitch = math.atan2(forward, GRAVITY + az)
     wanted_roll = math.asin(min(max(-left / lift, -1.0), 1.0))
     along = sum(a * b for a, b in zip(body_axis(quaternion), (ax, ay, GRAVITY + az), strict=True))

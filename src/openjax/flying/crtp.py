@@ -106,17 +106,18 @@ def compress_quaternion(wxyz) -> int:
     """A unit quaternion (4,) wxyz in 32 bits: which component is largest, then sign and 9 bits of
     the others.
     """
-    w, *xyz = map(float, wxyz)
-    xyzw = (*xyz, w)
+    w, x, y, z = map(float, wxyz)
+    xyzw = (x, y, z, w)
     size = math.hypot(*xyzw)
     largest = max(range(4), key=lambda i: abs(xyzw[i]))
     packed = largest
     for i, value in enumerate(xyzw):
         if i != largest:
+            # q and -q are one attitude: signs are those of the one whose largest is positive
             negative = int((value < 0) != (xyzw[largest] < 0))
-            packed = (
-                packed << 10 | negative << 9 | min(round(511 * abs(value) / size * 2**0.5), 511)
-            )
+            # a component that isn't the largest is at most 1 / sqrt(2), for which 511 stands
+            size_in_bits = min(round(511 * abs(value) / size * 2**0.5), 511)
+            packed = packed << 10 | negative << 9 | size_in_bits
     return packed
 
 
@@ -125,7 +126,7 @@ def expand_quaternion(packed: int) -> tuple[float, float, float, float]:
     xyzw = [0.0] * 4
     largest = packed >> 30
     square = 0.0
-    for i in (3, 2, 1, 0):
+    for i in (3, 2, 1, 0):  # the last one packed stands in the lowest bits
         if i != largest:
             value = (packed & 0x1FF) / 511 / 2**0.5
             xyzw[i] = -value if packed & 0x200 else value

@@ -30,8 +30,8 @@ class Endpoint(NamedTuple):
 def endpoint_of(uri: str) -> Endpoint:
     """The vehicle that a URI means. Raises UserError for none."""
     expected = UserError(
-        f"--uri {uri}: expected udp://HOST:PORT or radio://0/80/2M/E7E7E7E7E7 "
-        "(dongle, channel 0 to 125, rate, address)"
+        f"--uri {uri}: expected udp://HOST:PORT or radio://0/80/2M/E7E7E7E7E7 (dongle, channel 0 "
+        "to 125, rate, address)"
     )
     try:
         parts = urlsplit(uri.strip())
@@ -67,7 +67,8 @@ def _address(host: str) -> str:
 
 def _radio(parts) -> Endpoint:
     """The dongle is no part of the name: two dongles reach the same vehicle."""
-    channel, rate, address = (*parts.path.strip("/").split("/"), "", "", "")[:3]
+    given = parts.path.strip("/").split("/")
+    channel, rate, address = (*given, "", "", "")[:3]  # any of them may be left out
     number = int(channel) if channel else CHANNEL
     rate = rate.upper() or RATE
     address = (address or ADDRESS).upper().rjust(10, "0")

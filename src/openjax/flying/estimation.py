@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 from openjax.flying.controller import Pose, level_acceleration, moved_on
 from openjax.flying.innovations import Innovations
-from openjax.flying.judge import Track, Verdict, agree, at_one_time, follows
+from openjax.flying.judge import Track, Verdict, agree, follows
 from openjax.flying.set_point import as_sent
 from openjax.flying.state import FLYING, SPIN_UP, Drone, Mode, PoseSample, State
 
@@ -22,14 +22,15 @@ def see(state: State, time: float, samples: Sequence[PoseSample]) -> State:
     Motion capture is what a vehicle is flown by, until it is lost; from then on its own estimate
     is.
     """
+    # a loop that stood still mustn't be reckoned over in one step
     state = state._replace(time=time, dt=min(max(time - state.time, 0.0), 0.1))
-    drones = (
-        _seen(state, drone, sample) for drone, sample in zip(state.drones, samples, strict=True)
-    )
-    return state._replace(drones=tuple(drones))
+    both = zip(state.drones, samples, strict=True)
+    drones = tuple(_estimated(state, drone, sample) for drone, sample in both)
+    return state._replace(drones=drones)
 
 
-def _seen(state, drone, sample) -> Drone:
+def _estimated(state, drone, sample) -> Drone:
+    """The drone with its estimate now, after what was newly told of it."""
     now = state.time
     limits = state.limits
     moving = drone.mode in FLYING and not (drone.mode is Mode.LIFT and now - drone.since < SPIN_UP)
@@ -44,13 +45,17 @@ def _seen(state, drone, sample) -> Drone:
         estimate = moved_on(source.pose, max(now, source.pose.time))
         level = level_acceleration(estimate.quaternion)
         return drone._replace(estimate=estimate, seen=source.pose.time, acceleration=level)
-    if drone.estimate is None:
-        return drone
+    return drone if drone.estimate is None else _reckoned(state, drone)
+
+
+def _reckoned(state, drone) -> Drone:
+    """The drone a tick on by dead reckoning, its attitude as it was."""
     old = drone.estimate
     dt = state.dt
     velocity = tuple(v + dt * a for v, a in zip(old.velocity, drone.acceleration, strict=True))
     position = tuple(p + dt * v for p, v in zip(old.position, velocity, strict=True))
-    return drone._replace(estimate=old._replace(time=now, position=position, velocity=velocity))
+    estimate = old._replace(time=state.time, position=position, velocity=velocity)
+    return drone._replace(estimate=estimate)
 
 
 def _consistent(state, drone, own) -> Drone:
@@ -78,11 +83,10 @@ def _consistent(state, drone, own) -> Drone:
     drone = drone._replace(
         own=drone.own._replace(verdict=verdict), innovations=innovations, contradiction=verdict
     )
-    if seen.pose is not None and not follows(*at_one_time(seen.pose, own.pose), state.limits):
+    if seen.pose is not None and not follows(seen.pose, own.pose, state.limits):
         return drone
-    return drone._replace(
-        estimate=moved_on(innovations.corrected(), state.time), capture_fault=verdict
-    )
+    estimate = moved_on(innovations.corrected(), state.time)
+    return drone._replace(estimate=estimate, capture_fault=verdict)
 
 
 def _own(state, drone, sample, by_capture, moving) -> Track:
@@ -93,11 +97,12 @@ def _own(state, drone, sample, by_capture, moving) -> Track:
     limits = state.limits
     before = drone.own
     if by_capture and before.fresh(now, limits):
+        # what it is flown by is motion capture: that says nothing of where its own leads
         return before.after(sample.own, now, limits, moving, None)
     own = before.after(sample.own, now, limits, moving, drone.estimate)
     seen = drone.captured
     to_confirm = moving and by_capture and own.pose is not before.pose and seen.fresh(now, limits)
-    if to_confirm and agree(*at_one_time(seen.pose, own.pose), limits) is Verdict.APART:
+    if to_confirm and agree(seen.pose, own.pose, limits) is Verdict.APART:
         return own._replace(pose=before.pose, verdict=Verdict.JUMPED)
     return own
 
@@ -113,9 +118,14 @@ def _captured(state, drone, sample, moving) -> Drone:
     captured = drone.captured.after(seen, now, limits, moving, drone.estimate)
     capture_fault = ""
     if captured.pose is seen:
-        both = at_one_time(seen, own.pose) if moving and own.pose is not None else None
-        drone = drone._replace(feeds_estimator=both is None or follows(*both, limits))
-        if both and own.fresh(now, limits) and (verdict := agree(*both, limits)):
+        # on the ground, or with no pose of its own, there is nothing to compare it with
+        comparable = moving and own.pose is not None
+        feeds = not comparable or follows(seen, own.pose, limits)
+        drone = drone._replace(feeds_estimator=feeds)
+        verdict = Verdict.GOOD
+        if comparable and own.fresh(now, limits):
+            verdict = agree(seen, own.pose, limits)
+        if verdict:
             captured = captured._replace(pose=drone.captured.pose, verdict=verdict)
     innovations = drone.captured_innovations
     if drone.mode not in CHECKED:

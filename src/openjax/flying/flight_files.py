@@ -8,6 +8,7 @@ board. Commands are those in force at that moment, as sent: body rates and thrus
 import json
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,10 +22,11 @@ from openjax.vehicle.vehicle_file import VehicleFile, save_vehicle_file
 SHORTEST = 2.0
 """Shorter games (s) tell a diagnosis nothing and get no log."""
 DECIMALS = {"t": 4, "vbat": 3}
-_POSE = tuple(
-    c
-    for channel in ("position", "velocity", "quaternion", "body_rates")
-    for c in CHANNEL_COLUMNS[channel]
+_POSE = (
+    *CHANNEL_COLUMNS["position"],
+    *CHANNEL_COLUMNS["velocity"],
+    *CHANNEL_COLUMNS["quaternion"],
+    *CHANNEL_COLUMNS["body_rates"],
 )
 """Of a `Pose`'s 13 numbers, in their order."""
 _BODY = CHANNEL_COLUMNS["motor_command"] + CHANNEL_COLUMNS["specific_force"]
@@ -46,19 +48,20 @@ def write_case(
     table, vehicles = record.table()
     _, sent, episode = table.T
     commands = vehicles[..., 2:]
-    files = []
+    games = []
     for number in range(len(record.episodes)):
         ticks = np.flatnonzero(episode == number)
         if not len(ticks) or sent[ticks[-1]] - sent[ticks[0]] < SHORTEST:
             continue
-        files.append((folder / f"game_{number:02d}.csv.gz", ticks))
+        games.append((folder / f"game_{number:02d}.csv.gz", ticks))
 
-    def write(path, ticks):
+    def write(game):
+        path, ticks = game
         write_csv(path, _table(path.name, samples, sent[ticks], commands[ticks]), DECIMALS)
         return path
 
     with ThreadPoolExecutor(4) as pool:  # half of the time is zlib's, which lets others run
-        files = list(pool.map(lambda file: write(*file), files))
+        files = list(pool.map(write, games))
     save_vehicle_file(folder / "vehicle.toml", vehicle)
     text = json.dumps({**about, "timing": record.timing(), "games": record.episodes}, indent=1)
     (folder / "flight.json").write_text(text + "\n", encoding="utf-8")
@@ -74,36 +77,56 @@ def _table(name: str, samples, sent: np.ndarray, commands: np.ndarray) -> LogTab
       sent: (T,) s, when the set-points of each tick had left.
       commands: (T, N, 5) of them: mode, thrust, body rates.
     """
-    log = log_of([_rows(vehicle, sent, commands[:, i]) for i, vehicle in enumerate(samples)], name)
-    return LogTable(
-        name, {n: c for n, c in log.columns.items() if not np.isnan(c).all()}, log.vehicle
-    )
+    rows = [_rows(vehicle, sent, commands[:, i]) for i, vehicle in enumerate(samples)]
+    log = log_of(rows, name)
+    # a column that nobody filled in would say that there was such a sensor
+    filled = {n: column for n, column in log.columns.items() if not np.isnan(column).all()}
+    return LogTable(name, filled, log.vehicle)
+
+
+class _Source(NamedTuple):
+    """What one sensor or log block gave."""
+
+    when: np.ndarray
+    """(K,) s"""
+    names: tuple[str, ...]
+    """Columns."""
+    values: np.ndarray
+    """(K, columns)"""
+
+    def during(self, first: float, last: float) -> "_Source":
+        """What was measured from `first` to `last` (s), times as a log writes them."""
+        when = np.round(self.when, 4)
+        inside = (when >= first) & (when <= last)
+        return _Source(when[inside], self.names, self.values[inside])
+
+
+def _sources(vehicle: Samples) -> list[_Source]:
+    """All that was recorded of a vehicle; what comes later replaces what came before."""
+    own = np.column_stack([vehicle.poses[:, 3:], vehicle.poses[:, 1]])
+    poses = _Source(vehicle.poses[:, 2], (*_POSE, "vbat"), own)
+    bodies = _Source(vehicle.bodies[:, 0], _BODY, vehicle.bodies[:, 1:])
+    if not len(vehicle.seen):
+        return [poses, bodies]
+    # motion capture in place of the estimate on board, of which body rates and voltage stay
+    poses = _Source(poses.when, poses.names[10:], own[:, 10:])
+    seen = _Source(vehicle.seen[:, 0], _POSE[:10], vehicle.seen[:, 1:11])
+    return [poses, bodies, seen]
 
 
 def _rows(vehicle: Samples, sent, commands) -> dict[str, np.ndarray]:
     """The rows of one vehicle, by column: one for each moment at which something was measured."""
-    own = vehicle.poses[:, 3:]
-    seen = vehicle.seen[:, 1:]
-    sources = [  # when, columns, values; what comes later replaces what came before
-        (vehicle.poses[:, 2], (*_POSE, "vbat"), np.column_stack([own, vehicle.poses[:, 1]])),
-        (vehicle.bodies[:, 0], _BODY, vehicle.bodies[:, 1:]),
-    ]
-    if len(seen):  # motion capture in place of the estimate on board
-        sources[0] = (sources[0][0], (*_POSE[10:], "vbat"), sources[0][2][:, 10:])
-        sources.append((vehicle.seen[:, 0], _POSE[:10], seen[:, :10]))
-    inside = []
-    for when, names, values in sources:
-        when = np.round(when, 4)
-        during = (when >= sent[0]) & (when <= sent[-1])
-        inside.append((when[during], names, values[during]))
-    times = np.unique(np.concatenate([when for when, _, _ in inside]))
+    sources = [source.during(sent[0], sent[-1]) for source in _sources(vehicle)]
+    times = np.unique(np.concatenate([source.when for source in sources]))
     rows = {n: np.full(len(times), np.nan) for n in ("t", *_POSE, *_BODY, *_COMMAND, "vbat")}
     rows["t"] = times - sent[0]
-    for when, names, values in inside:
-        at = np.searchsorted(times, when)
-        for n, column in zip(names, values.T, strict=True):
+    for source in sources:
+        at = np.searchsorted(times, source.when)
+        for n, column in zip(source.names, source.values.T, strict=True):
             rows[n][at] = column
+    # in force at a moment is what left last before it
     command = commands[np.maximum(np.searchsorted(sent, times, side="right") - 1, 0)]
+    # angles and motors off are no commanded body rates: their cells stay empty
     rated = command[:, 0] == RATES
     for n, column in zip(_COMMAND, command[:, 1:].T, strict=True):
         rows[n][rated] = column[rated]

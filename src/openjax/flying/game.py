@@ -93,6 +93,7 @@ class Game:
     def __init__(self, policy, task: Task):
         self.task = jax.tree.map(np.asarray, task)
         self.settings, self.airframe, first, tick = game_functions(policy)
+        # apart, so that nothing is divided by a distance of zero
         poses = [
             Pose(0.0, (0.3 * i, 0.0, 0.5), (0.0,) * 3, (1.0, 0.0, 0.0, 0.0))
             for i in range(self.settings.num_pursuers)
@@ -110,7 +111,8 @@ class Game:
             return ravel_pytree((state, action))[0], action
 
         def move(flat, *seen):
-            state, *results = tick(*unflatten(flat), *seen)
+            state, action = unflatten(flat)
+            state, *results = tick(state, action, *seen)
             return ravel_pytree((state, results[0]))[0], results
 
         self._first = compile_in_line(jax.jit(begin).lower(example))
@@ -122,9 +124,14 @@ class Game:
         """Begin an episode with the pursuers at `poses`."""
         self._flat, action = self._first(pose_array(poses))
         n = self.settings.num_pursuers
-        evader = np.asarray(self.task.evader_position)
         return Play(
-            np.asarray(action), evader, np.zeros(3), False, False, np.zeros(n), np.zeros(n, bool)
+            action=np.asarray(action),
+            evader_position=np.asarray(self.task.evader_position),
+            evader_velocity=np.zeros(3),
+            captured=False,
+            over=False,
+            breaches=np.zeros(n),
+            crashed=np.zeros(n, bool),
         )
 
     def step(self, poses: list[Pose], evader: np.ndarray | None = None) -> Play:

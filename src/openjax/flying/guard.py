@@ -34,7 +34,7 @@ from openjax.flying.swarm import (
 )
 
 CHECK = 0.004
-"""s between two looks."""
+"""s between two looks: short beside the silence after which somebody else flies."""
 DISARMING = 1.0
 """A vehicle is asked to disarm until it says that it has, for so long (s)."""
 OPENING = 0.5
@@ -49,15 +49,16 @@ def take_over(state: State, now: float) -> State:
     land.
     """
 
-    def taken(drone, anchor):
+    def handed_over(drone, anchor):
         if drone.mode not in FLYING:
             return drone
+        # who lands goes on landing, and who had just lifted off is nearest to the floor
         mode = Mode.LAND if drone.mode in (*LANDING, Mode.LIFT) else Mode.HOLD
         # the estimate is as good as what the one before knew
         drone = drone._replace(seen=now)
         return drone.to(mode, now, anchor, "another process took over")
 
-    drones = tuple(map(taken, state.drones, resting_places_of(state)))
+    drones = tuple(map(handed_over, state.drones, resting_places_of(state)))
     return state._replace(drones=drones, time=now, action_time=now)
 
 
@@ -83,11 +84,11 @@ def fly_down(
     while state.flying and board.pilot is role:
         listen()
         request = Request.STOP if board.stopped else Request.NONE
-        state, set_points = step(
-            state, Event(time.perf_counter(), vehicles.observe(), request=request)
-        )
+        event = Event(time.perf_counter(), vehicles.observe(), request=request)
+        state, set_points = step(state, event)
         vehicles.send(set_points)
         board.write(role, time.perf_counter(), state)
+        # ticks that were missed aren't flown one after the other
         due = max(due + TICK, time.perf_counter() - TICK)
         time.sleep(max(due - time.perf_counter(), 0.0))
     if board.pilot is role:
@@ -111,11 +112,12 @@ def disarm(vehicles: Swarm | RawLinks, board: Board, role: Role) -> bool:
         vehicles.send([SetPoint()] * len(vehicles.observe()))
         vehicles.arm(False)
         time.sleep(0.03)
-        armed = [s.supervisor & (Supervisor.ARMED | Supervisor.AUTO_ARM) == Supervisor.ARMED
-                 for s in vehicles.observe()]  # fmt: skip
-        if not any(armed) or time.perf_counter() > deadline:
-            board.armed = any(armed)
-            return not any(armed)
+        # a vehicle that arms by itself always says that it is armed
+        either = Supervisor.ARMED | Supervisor.AUTO_ARM
+        armed = any(s.supervisor & either == Supervisor.ARMED for s in vehicles.observe())
+        if not armed or time.perf_counter() > deadline:
+            board.armed = armed
+            return not armed
 
 
 class RawLinks:
@@ -242,10 +244,9 @@ def watch(board: Board, parent: int, own: RawLinks, state: State) -> None:
         now = time.perf_counter()
         board.beat(Role.GUARD, now)
         links_silent = board.silent(Role.LINKS, now) > board.silence
-        # should the links live and not take over
-        loop_silent = (
-            board.pilot is Role.LOOP and board.silent(Role.LOOP, now) > 3.0 * board.silence
-        )
+        # three times as long as the links wait: should they live and not take over
+        loop_late = board.silent(Role.LOOP, now) > 3.0 * board.silence
+        loop_silent = board.pilot is Role.LOOP and loop_late
         if board.flying and (links_silent or loop_silent):
             board.pilot = Role.GUARD
             board.beat(Role.GUARD, now + OPENING)

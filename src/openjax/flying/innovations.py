@@ -92,6 +92,7 @@ class Innovations(NamedTuple):
         if last is None or not 0.0 < pose.time - last.time <= longest:
             return self._replace(pose=pose, thrust=sent.thrust, rates=pose.body_rates)
         dt = pose.time - last.time
+        # what motors and rate loop have made of what was sent, as two low-passes
         reached = _share(dt, airframe.motor_time_constant)
         thrust = self.thrust + reached * (sent.thrust - self.thrust)
         asked = (sent.roll, sent.pitch, sent.yaw_rate) if sent.mode == RATES else pose.body_rates
@@ -100,6 +101,7 @@ class Innovations(NamedTuple):
         way = _difference(_difference(pose.position, last.position), _times(dt, mean))
         lift = lift_acceleration(pose.quaternion, thrust / airframe.hover_thrust)
         gain = _times(1.0 / dt, _difference(pose.velocity, last.velocity))
+        # the bias is what thrust has not explained so far: drag, wind, an unknown weight
         unexplained = _difference(_difference(gain, lift), self.bias)
         step = _times(dt, unexplained)
         turn = _difference(
@@ -148,6 +150,8 @@ class Innovations(NamedTuple):
 
 def turn_between(before: Sequence[float], after: Sequence[float]) -> Vector:
     """The small rotation (rad, body) from one attitude wxyz to another."""
+    # the vector part of conj(before) * after, which is half of a small rotation; `sign` also
+    # chooses between q and -q
     a, b, c, d = before
     w, x, y, z = after
     scalar = a * w + b * x + c * y + d * z

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import NamedTuple
 
-from openjax.flying.controller import Airframe, Pose, moved_on
+from openjax.flying.controller import Airframe, Pose, moved_on, numbers_of
 
 
 class Verdict(StrEnum):
@@ -91,9 +91,8 @@ def judge(
       limits: bounds.
       expected: where reckoning has the vehicle by now; without it, where `last` leads.
     """
-    if not all(
-        map(math.isfinite, (*pose.position, *pose.velocity, *pose.quaternion, *pose.body_rates))
-    ):
+    # first what no comparison is true of: a NaN would pass all of the following
+    if not all(map(math.isfinite, numbers_of(pose)[1:])):
         return Verdict.NOT_FINITE
     if abs(math.hypot(*pose.quaternion) - 1.0) > limits.unit:
         return Verdict.NO_ATTITUDE
@@ -101,27 +100,23 @@ def judge(
         return Verdict.SPUN
     if last is None:
         return Verdict.GOOD
-    if (
-        pose[1:] == last[1:]
-    ):  # a measurement has noise: identical numbers are one measurement sent again
+    # a measurement has noise: identical numbers are one measurement sent again
+    if pose[1:] == last[1:]:
         return Verdict.FROZEN
     expected = expected or moved_on(last, pose.time)
     dt = pose.time - last.time
     sudden = min(dt, max(unseen, limits.horizon))
-    if math.dist(pose.position, expected.position) > (
-        limits.position + limits.drift * dt + 0.5 * limits.acceleration * sudden**2
-    ):
+    push = limits.acceleration
+    twist = limits.angular_acceleration
+    way = limits.position + limits.drift * dt + 0.5 * push * sudden**2
+    if math.dist(pose.position, expected.position) > way:
         return Verdict.JUMPED
-    if math.dist(pose.velocity, expected.velocity) > limits.velocity + limits.acceleration * sudden:
+    if math.dist(pose.velocity, expected.velocity) > limits.velocity + push * sudden:
         return Verdict.TOO_FAST
-    if angle_between(pose.quaternion, expected.quaternion) > (
-        limits.angle + 0.5 * limits.angular_acceleration * sudden**2
-    ):
+    turn = limits.angle + 0.5 * twist * sudden**2
+    if angle_between(pose.quaternion, expected.quaternion) > turn:
         return Verdict.TURNED
-    if (
-        math.dist(pose.body_rates, last.body_rates)
-        > limits.rate + limits.angular_acceleration * sudden
-    ):
+    if math.dist(pose.body_rates, last.body_rates) > limits.rate + twist * sudden:
         return Verdict.SPUN
     return Verdict.GOOD
 
@@ -166,22 +161,28 @@ def at_one_time(a: Pose, b: Pose) -> tuple[Pose, Pose]:
 
 
 def agree(captured: Pose, own: Pose, limits: PoseLimits) -> Verdict:
-    """Whether motion capture and the vehicle's own estimate, of one time, tell the same."""
+    """Whether motion capture and the vehicle's own estimate tell the same, at the later one's
+    time.
+    """
+    captured, own = at_one_time(captured, own)
     near = math.dist(captured.position, own.position) <= limits.apart
     turned = angle_between(captured.quaternion, own.quaternion) <= limits.turned
     return Verdict.GOOD if near and turned else Verdict.APART
 
 
 def follows(captured: Pose, own: Pose, limits: PoseLimits) -> bool:
-    """Whether the estimator on board may be told a pose of motion capture, both of one time: errors
-    explain the distance.
+    """Whether the estimator on board may be told a pose of motion capture: errors explain the
+    distance from its own, at the later one's time.
 
     An estimator that is told late or drifting poses takes their error for a velocity, by which it
     would have to land.
     """
+    captured, own = at_one_time(captured, own)
     return math.dist(own.position, captured.position) <= limits.position
 
 
 def angle_between(a, b) -> float:
     """The angle (rad) of the rotation between two unit quaternions wxyz."""
-    return 2.0 * math.acos(min(abs(sum(p * q for p, q in zip(a, b, strict=True))), 1.0))
+    # the absolute value, since q and -q are one attitude; cut, since rounding may leave more than 1
+    cosine = abs(sum(p * q for p, q in zip(a, b, strict=True)))
+    return 2.0 * math.acos(min(cosine, 1.0))

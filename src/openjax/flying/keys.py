@@ -58,6 +58,7 @@ class Operator:
         return self
 
     def __exit__(self, *_):
+        # what has come by now was this object's to hear, and mustn't be taken for an unheard signal
         settle()
         self._restore.close()
 

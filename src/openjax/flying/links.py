@@ -37,12 +37,14 @@ STARTING = 20.0
 """s until its interpreter has loaded `cflib`, on a busy machine."""
 CLOSING = 2.0
 """s that it has to disarm."""
-_POSE = struct.Struct(
-    "<iI16d"
-)  # vehicle, supervisor; arrival, voltage, time, position, velocity, quaternion, body rates
+_POSE = struct.Struct("<iI16d")
+"""Vehicle, supervisor; arrival, voltage, time, position, velocity, quaternion, body rates."""
 _NUMBER = struct.Struct("<q")
+"""Number of the set-points, before all of them."""
 _SET_POINT = struct.Struct("<i4d")
-_SENT = struct.Struct("<qd")  # number of the set-points, when the last one had left
+"""The five fields of a `SetPoint`."""
+_SENT = struct.Struct("<qd")
+"""Number of the set-points, when the last one had left."""
 
 
 class Connection(NamedTuple):
@@ -75,12 +77,13 @@ class LinksGone(UserError):
 class Links:
     """Crazyflies, real or virtual, over links in another process; to the loop what it flies.
 
-    Args: as `openjax.flying.swarm.Swarm`, and
+    Args:
+      uris, body_logs, watchdog: as of `openjax.flying.swarm.Swarm`.
       state: before the flight, from which the links' process lands all if the loop stops; without
-      them it doesn't.
-      silence: of the loop after which it does (s). If it doesn't pass on set-points for half as
-      long again it is taken for
-          dead: vehicles go on turning as they were told last.
+      it nobody does.
+      silence: of the loop, after which it does (s). If the links' process doesn't pass on
+      set-points for half as long again it is taken for dead: vehicles go on turning as they were
+      told last.
     """
 
     def __init__(
@@ -177,6 +180,7 @@ class Links:
                 return
             if not data:
                 return
+            # a stream keeps no records apart: the last one may have come in part
             data = self._rest + data
             whole = len(data) - len(data) % _POSE.size
             self._rest = data[whole:]
@@ -187,9 +191,9 @@ class Links:
 
     def wait(self, until: float) -> None:
         """Return at `until` (s), or as soon as a pose arrives."""
-        left = until - time.perf_counter()
-        if left > 0:
-            select.select([self._stream], [], [], left)
+        remaining = until - time.perf_counter()
+        if remaining > 0:
+            select.select([self._stream], [], [], remaining)
 
     def observe(self) -> tuple[PoseSample, ...]:
         """What is known of each vehicle now."""
@@ -211,11 +215,11 @@ class Links:
         if self.board.pilot is not Role.LOOP:
             raise LinksGone("another process flies")
         self._count += 1
+        packed = b"".join(_SET_POINT.pack(*s) for s in set_points)
         try:
-            self._commands.send(
-                _NUMBER.pack(self._count) + b"".join(_SET_POINT.pack(*s) for s in set_points)
-            )
+            self._commands.send(_NUMBER.pack(self._count) + packed)
             number = 0
+            # an answer that came too late for its tick may still be there
             while number != self._count:
                 number, sent = _SENT.unpack(self._commands.recv(_SENT.size))
         except OSError as error:
@@ -245,10 +249,11 @@ class Links:
 
     def samples(self) -> list[Samples]:
         """What was recorded of each vehicle."""
-        nothing = np.zeros((0, 14))
         return [
             Samples(
-                np.frombuffer(poses).reshape(-1, 16), np.frombuffer(bodies).reshape(-1, 8), nothing
+                poses=np.frombuffer(poses).reshape(-1, 16),
+                bodies=np.frombuffer(bodies).reshape(-1, 8),
+                seen=np.zeros((0, 14)),
             )
             for poses, bodies in self._call("samples")
         ]
@@ -278,7 +283,7 @@ def _serve(
     stand_alone()
     board.enter(Role.LINKS)
     sys.setswitchinterval(5e-4)  # cflib's threads and the one that passes on set-points
-    threading.excepthook = lambda _: None  # cflib's threads, when their socket goes
+    threading.excepthook = _say_nothing  # of cflib's threads, when their socket goes
     real_time.hurry()
     swarm = Swarm(connection.uris, connection.body_logs, connection.watchdog)
     threading.Thread(
@@ -290,6 +295,7 @@ def _serve(
     except Exception as error:  # whatever cflib raises, too
         ends.control.send((" ".join(str(error).split()) or type(error).__name__, ()))
         os._exit(0)  # cflib's threads may hang
+    # a search for garbage would keep poses and set-points waiting for milliseconds
     gc.collect()
     gc.disable()
     threading.Thread(
@@ -299,6 +305,10 @@ def _serve(
     with contextlib.suppress(EOFError, OSError):
         _answer(swarm, ends.control, board)
     threading.Event().wait()  # the loop is gone: the watch ends the process
+
+
+def _say_nothing(_) -> None:
+    """In place of the traceback of a thread."""
 
 
 def _pass_on(swarm: Swarm, contacts, stream: socket.socket) -> None:
@@ -311,10 +321,11 @@ def _pass_on(swarm: Swarm, contacts, stream: socket.socket) -> None:
     def pass_on(vehicle: int, member: Member, new_pose: bool) -> None:
         contacts[vehicle] = member.last_contact
         if new_pose:
-            seen = member.supervisor, member.arrival, member.voltage, *numbers_of(member.pose)
+            numbers = (member.arrival, member.voltage, *numbers_of(member.pose))
+            record = _POSE.pack(vehicle, member.supervisor, *numbers)
             # nobody reads any more: then there is no loop to tell
             with lock, contextlib.suppress(OSError):
-                stream.send(_POSE.pack(vehicle, *seen))
+                stream.send(record)
 
     for i, member in enumerate(swarm.members):
         member.listener = functools.partial(pass_on, i, member)

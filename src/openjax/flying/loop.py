@@ -22,19 +22,19 @@ from openjax.flying.state import Event, Mode, Request, SafetySettings, State, in
 from openjax.pursuit.environment import THRUST_LIMIT
 
 PERIOD = 0.01
-"""s"""
+"""Of the ticks (s)."""
 MARGIN = 2.0e-3
 """A tick is due this long after the newest poses were measured (s), as far as the fastest packets
 tell.
 """
 EARLY = 3.0e-3
+"""A tick begins as soon as all poses are there, up to this much before it is due (s)."""
 PATIENCE = 5.0e-3
-"""It begins as soon as all poses are there, up to this much before it is due or after it could
-begin (s).
-"""
+"""It begins without them this long after it could have begun (s)."""
 TRANSFER = 20.0
+"""All land if their starts aren't reached within this time (s)."""
 SETTLE = 0.3
-"""All land if their starts aren't reached within this time (s); there they wait for so long."""
+"""All wait for so long (s) at their starts before a game."""
 GONE = 0.1
 """A vehicle whose newest pose is older (s) isn't waited for."""
 
@@ -55,9 +55,12 @@ class Record:
         self.skipped = 0
 
     def keep(self, tick, arrivals, measured, set_points) -> None:
-        """A row: of the tick when it was due and its last set-point left (s), and the game (-1:
-        none); of each vehicle when its newest pose arrived and was measured (s), and its
-        set-point.
+        """Add a row.
+
+        Args:
+          tick: when it was due, when its last set-point left (s), and the game (-1: none).
+          arrivals, measured: when each vehicle's newest pose arrived and was measured (s).
+          set_points: each vehicle's.
         """
         self._rows.extend(tick)
         for arrival, seen, s in zip(arrivals, measured, set_points, strict=True):
@@ -83,6 +86,7 @@ class Record:
         if not len(ticks):
             return {"ticks": 0}
         due, sent, _ = ticks.T
+        # of each tick the vehicle with the oldest pose counts
         age, measured = 1e3 * (sent[:, None, None] - vehicles[..., :2]).max(1).T
         work = 1e3 * (sent - due)
         gaps = 1e3 * np.diff(sent)
@@ -124,9 +128,12 @@ class TickSchedule:
         shift = 0.0
         if ages:
             # poses come in a bunch: the newest of a bunch is the one after the longest pause
-            gaps = [ages[0] + PERIOD - ages[-1], *(b - a for a, b in itertools.pairwise(ages))]
-            newest = ages[max(range(len(gaps)), key=gaps.__getitem__)]
+            pauses = [ages[0] + PERIOD - ages[-1]]
+            pauses += [older - newer for newer, older in itertools.pairwise(ages)]
+            newest = ages[pauses.index(max(pauses))]
+            # the way round the period that is shorter
             error = (newest - MARGIN + PERIOD / 2) % PERIOD - PERIOD / 2
+            # slowly, once in step: one late packet mustn't move the ticks
             shift = min(max(0.02 * error, -1e-4), 1e-4) if self._in_step else error
             self._in_step = True
         self.due += PERIOD - shift
@@ -140,11 +147,15 @@ def await_poses(vehicles: Links, due: float) -> None:
     """Return around `due` (s): as soon as each vehicle's newest pose is there that was measured
     before.
     """
-    latest = max(due, begun := perf_counter()) + PATIENCE
-    while (now := perf_counter()) < latest or latest + PATIENCE < now < begun + GONE:
-        if (
-            now > latest
-        ):  # it stood still: so may the links have, which have first to pass on what came
+    begun = perf_counter()
+    latest = max(due, begun) + PATIENCE
+    while True:
+        now = perf_counter()
+        stood_still = latest + PATIENCE < now < begun + GONE
+        if now >= latest and not stood_still:
+            return
+        if stood_still:
+            # so may the links have, which have first to pass on what came
             due = now - PATIENCE
             latest = now + PATIENCE
         measured = measured_times(vehicles.observe())
@@ -169,11 +180,8 @@ def flight_state(game: Game, number: int, safety: SafetySettings) -> State:
     starts = [tuple(map(float, p)) for p in np.asarray(task.pursuer_position)]
     if number > settings.num_pursuers:
         starts.append(tuple(map(float, np.asarray(task.evader_position))))
-    pillars = [
-        (float(x), float(y), settings.pillar_radius)
-        for (x, y), active in zip(task.pillar_position, task.pillar_active, strict=True)
-        if active
-    ]
+    standing = np.asarray(task.pillar_position)[np.asarray(task.pillar_active)]
+    pillars = [(float(x), float(y), settings.pillar_radius) for x, y in standing]
     return initial_state(starts, pillars, game.airframe, safety)
 
 
@@ -226,7 +234,7 @@ class Flight:
 
     def run(self) -> Record:
         """Fly it. Returns when all motors are off."""
-        gc.disable()
+        gc.disable()  # a search for garbage would cost ticks
         try:
             schedule = TickSchedule(perf_counter())
             self._since = perf_counter()
@@ -257,6 +265,7 @@ class Flight:
         for i, (drone, old) in enumerate(zip(self.state.drones, before, strict=True)):
             if drone.captured.pose is not old.captured.pose:
                 self.vehicles.believed(i, drone.captured.pose, drone.feeds_estimator)
+        # the operator before the watch, the watch before the plan
         request = self._requests() or (Request.LAND if self._alarm else self._planned(now))
         actions = None
         if self._episode >= 0 or request is Request.PURSUE:
@@ -283,10 +292,8 @@ class Flight:
             if len(self.record.episodes) >= plan.episodes:
                 return Request.LAND
             return Request.PURSUE
-        if (
-            any(m in (Mode.GROUND, Mode.TRANSFER, Mode.READY) for m in state.modes)
-            and waited > TRANSFER
-        ):
+        underway = (Mode.GROUND, Mode.TRANSFER, Mode.READY)
+        if any(mode in underway for mode in state.modes) and waited > TRANSFER:
             self._alarm = f"not all at their starts after {TRANSFER:g} s"
             return Request.LAND
         if self._episode >= 0 and (self._play.over or now - self._begun > plan.episode_seconds):
@@ -304,38 +311,36 @@ class Flight:
             self._play = self.game.start(poses[: self._pursuers])
             self._episode = len(self.record.episodes)
             self._begun = now
-            self.record.episodes.append(
-                {
-                    "capture_step": None,
-                    "breaches": 0,
-                    "crash": False,
-                    "steps": 0,
-                    "end": "",
-                    "over_speed": 0,
-                }
-            )
+            notes = {"capture_step": None, "breaches": 0, "crash": False, "steps": 0, "end": ""}
+            self.record.episodes.append(notes | {"over_speed": 0})
         else:
             evader = np.array(poses[-1].position) if self._evader_flies else None
             self._play = self.game.step(poses[: self._pursuers], evader)
-            notes = self.record.episodes[-1]
-            notes["steps"] += 1
-            if self._play.captured and notes["capture_step"] is None:
-                notes["capture_step"] = notes["steps"]
-            notes["breaches"] += int(self._play.breaches.any())
-            notes["crash"] |= bool(self._play.crashed.any())
-            fastest = max(math.dist(p.velocity, (0, 0, 0)) for p in poses[: self._pursuers])
-            notes["over_speed"] += fastest > 1.01 * self.game.settings.max_speed
+            self._note(poses[: self._pursuers])
         set_points = [from_action(a, THRUST_LIMIT) for a in self._play.action]
         if self._evader_flies:
-            wanted = tuple(float(v) for v in self._play.evader_velocity)
-            acceleration = wanted_acceleration(poses[-1].velocity, wanted)
-            drone = self.state.drones[-1]
-            set_points.append(
-                accelerate(
-                    poses[-1].quaternion, acceleration, self.state.airframe, drone.trim, RATES
-                )
-            )
+            set_points.append(self._steer_evader(poses[-1]))
         return tuple(set_points)
+
+    def _note(self, pursuers):
+        """What happened in the game's newest step, with the pursuers at these poses."""
+        play = self._play
+        notes = self.record.episodes[-1]
+        notes["steps"] += 1
+        if play.captured and notes["capture_step"] is None:
+            notes["capture_step"] = notes["steps"]
+        notes["breaches"] += int(play.breaches.any())
+        notes["crash"] |= bool(play.crashed.any())
+        fastest = max(math.hypot(*pose.velocity) for pose in pursuers)
+        # a measured velocity has noise: a per cent more is no fault
+        notes["over_speed"] += fastest > 1.01 * self.game.settings.max_speed
+
+    def _steer_evader(self, pose):
+        """The set-point of an evader that is a vehicle, at `pose`: to the velocity of its rule."""
+        wanted = tuple(float(v) for v in self._play.evader_velocity)
+        acceleration = wanted_acceleration(pose.velocity, wanted)
+        trim = self.state.drones[-1].trim
+        return accelerate(pose.quaternion, acceleration, self.state.airframe, trim, RATES)
 
     def _end_episode(self, why):
         self.record.episodes[-1]["end"] = why

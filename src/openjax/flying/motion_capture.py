@@ -36,6 +36,7 @@ def find_feed(name: str) -> Callable:
     """The function MODULE:FUNCTION; modules in the present folder are found too. Raises
     UserError.
     """
+    # a console script's path begins with where it is installed, not with where it is called
     sys.path.insert(0, str(Path.cwd()))
     try:
         found = pkgutil.resolve_name(name)

@@ -21,11 +21,16 @@ from openjax.flying.controller import (
 from openjax.flying.game import Play
 from openjax.flying.set_point import RATES
 
-YAW_GAIN = 3.0  # 1/s
+YAW_GAIN = 3.0
+"""Yaw rate asked for per yaw error (1/s): twice the controller's, which only keeps the nose where
+it is.
+"""
 LIFT_GAIN = 0.05
 """Share of the hovering thrust by which a height error of 1 m for 1 s changes the trim."""
 MOST_TRIM = 0.1
-FASTEST = 10.0  # m/s; no plan is a game in which speed counts as a fault
+"""Largest trim, as a share of full thrust."""
+FASTEST = 10.0
+"""m/s; no plan is a game in which speed counts as a fault."""
 
 
 class PlannedFlight:
@@ -56,10 +61,15 @@ class PlannedFlight:
         return self._play(poses[0])
 
     def _play(self, pose: Pose) -> Play:
-        nothing = np.zeros(3)
-        over = self._row >= len(self._plan) - 1
-        action = self._action(pose)[None]
-        return Play(action, nothing, nothing, False, over, np.zeros(1), np.zeros(1, bool))
+        return Play(
+            action=self._action(pose)[None],
+            evader_position=np.zeros(3),
+            evader_velocity=np.zeros(3),
+            captured=False,
+            over=self._row >= len(self._plan) - 1,
+            breaches=np.zeros(1),
+            crashed=np.zeros(1, bool),
+        )
 
     def _action(self, pose: Pose) -> np.ndarray:
         """(4,) thrust and body rates of a controller that follows the row, and what the plan adds,
@@ -75,6 +85,7 @@ class PlannedFlight:
         sent = accelerate(pose.quaternion, tuple(pull), self.airframe, self._trim, RATES)
         yaw = roll_pitch_yaw(pose.quaternion)[2]
         turn = math.remainder(plan.yaw[row] - yaw, 2.0 * math.pi)
+        # what the plan itself turns until the next row is asked for beside the error's share
         ahead = plan.yaw[min(row + 1, len(plan) - 1)] - plan.yaw[row]
         rates = np.array([sent.roll, sent.pitch, YAW_GAIN * turn + ahead / PERIOD])
         thrust = sent.thrust + plan.extra[row, 0]

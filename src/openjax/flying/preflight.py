@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 
 from openjax.flying.controller import Vector, roll_pitch_yaw, up
 from openjax.flying.crtp import Supervisor
-from openjax.flying.judge import agree, at_one_time, judge
+from openjax.flying.judge import agree, judge
 from openjax.flying.state import PoseSample, State
 from openjax.flying.swarm import PERIOD_MS
 
@@ -28,11 +28,17 @@ FLOOR = 0.1
 
 def poses_arriving(links) -> list[float]:
     """Each vehicle's own estimates a second of its own time (Hz)."""
-    before = [s.own.time for s in links.observe()], list(links.counts)
+
+    def newest():
+        times = [sample.own.time for sample in links.observe()]
+        return list(zip(times, links.counts, strict=True))
+
+    before = newest()
     time.sleep(LOOK)
-    after = [s.own.time for s in links.observe()], list(links.counts)
+    # by the times at which poses were measured, since the sleep may have taken longer
     return [
-        (c - old) / max(t - since, LOOK) for t, c, since, old in zip(*after, *before, strict=True)
+        (count - old_count) / max(at - since, LOOK)
+        for (at, count), (since, old_count) in zip(newest(), before, strict=True)
     ]
 
 
@@ -48,11 +54,9 @@ def faults(
       rates: of each vehicle's poses (Hz).
       guarded: whether a guard watches, or none is wanted.
     """
-    lines = (
-        []
-        if guarded
-        else ["the guard's process isn't there; try again, with fewer programs running"]
-    )
+    lines = []
+    if not guarded:
+        lines.append("the guard's process isn't there; try again, with fewer programs running")
     for i, (sample, start, rate) in enumerate(zip(samples, state.starts, rates, strict=True)):
         found = [
             *_firmware_faults(state.settings, sample, rate),
@@ -63,6 +67,9 @@ def faults(
 
 
 def _firmware_faults(settings, sample, rate) -> Iterator[str]:
+    """What its firmware, battery and link say against it. Of the firmware's bits the first fault
+    only: the others follow from it.
+    """
     bits = sample.supervisor
     if bits & (Supervisor.TUMBLED | Supervisor.CRASHED):
         yield "its firmware says tumbled or crashed; look at it, put it upright, restart it"
@@ -72,13 +79,18 @@ def _firmware_faults(settings, sample, rate) -> Iterator[str]:
         yield "it is armed or flies already; end the program that commands it"
     elif not bits & (Supervisor.CAN_BE_ARMED | Supervisor.CAN_FLY):
         yield "its firmware can't be armed; look at its console"
-    if not sample.voltage >= settings.battery_start:
-        yield f"battery at {sample.voltage:.2f} V; charge it to {settings.battery_start:g} V or more"
+    if not sample.voltage >= settings.battery_start:  # true of an unknown voltage, too
+        least = f"{settings.battery_start:g} V"
+        yield f"battery at {sample.voltage:.2f} V; charge it to {least} or more"
     if rate < SHARE * RATE:
-        yield f"{rate:.0f} of {RATE:.0f} poses a second arrive; bring the antenna nearer or change the channel"
+        yield (
+            f"{rate:.0f} of {RATE:.0f} poses a second arrive; bring the antenna nearer or change "
+            "the channel"
+        )
 
 
 def _pose_faults(state, sample, start: Vector) -> Iterator[str]:
+    """What its poses say against it. A pose that can't be one hides all else."""
     pose = sample.captured or sample.own
     limits = state.limits
     for source in (sample.own, sample.captured):
@@ -90,20 +102,17 @@ def _pose_faults(state, sample, start: Vector) -> Iterator[str]:
     if math.dist((x, y), start[:2]) > state.settings.stand or abs(z) > FLOOR:
         yield (
             f"stands at {where} m, its start's mark is ({start[0]:.2f}, {start[1]:.2f}, 0): put it "
-            "there, "
-            "or mend the positioning system's axes, origin or unit"
+            "there, or mend the positioning system's axes, origin or unit"
         )
     if up(pose.quaternion) < math.cos(LEVEL):
         yield "doesn't stand level; put it upright, or mend the body's axes"
     elif abs(roll_pitch_yaw(pose.quaternion)[2]) > AHEAD:
         yield "doesn't face +x; turn it, or mend the body's axes"
-    if (
-        sample.captured is not None
-        and sample.own is not None
-        and agree(*at_one_time(sample.captured, sample.own), limits)
-    ):
+    if sample.captured is None or sample.own is None:
+        return
+    if agree(sample.captured, sample.own, limits):
+        own = ", ".join(f"{p:.2f}" for p in sample.own.position)
         yield (
-            f"motion capture sees it at {where} m, itself at "
-            f"({', '.join(f'{p:.2f}' for p in sample.own.position)}): "
-            "mend axes, unit or origin of one of them"
+            f"motion capture sees it at {where} m, itself at ({own}): mend axes, unit or origin of "
+            "one of them"
         )

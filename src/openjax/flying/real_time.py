@@ -10,7 +10,9 @@ The same for loop, links and virtual vehicles: with the loop first and the vehic
 made the commands older (14.7 ms at p99, not 6 to 8).
 """
 NICE = -10
+"""Of ordinary processes, where the real-time scheduler isn't granted: half of the way to first."""
 IN_LINE = {"xla_cpu_scheduler_type": "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED"}
+"""Options of XLA's CPU compiler, see `compile_in_line`."""
 
 
 def prepare() -> None:
@@ -50,20 +52,20 @@ def hurry() -> str:
     # a look through all of JAX's objects takes .1 s: for so long no virtual vehicle would say where
     # it is
     gc.freeze()
-    ways = {
-        "real time": lambda thread: os.sched_setscheduler(
-            thread, os.SCHED_RR, os.sched_param(PRIORITY)
-        ),
-        "nice": lambda thread: os.setpriority(
-            os.PRIO_PROCESS, thread, NICE
-        ),  # threads', too, on Linux
-    }
-    for name, ask in ways.items():
+    for name, ask in (("real time", _schedule_first), ("nice", _be_less_nice)):
         with contextlib.suppress(AttributeError, OSError):  # not on this system, or not ours to ask
             for thread in _threads():
                 ask(thread)
             return name
     return "ordinary"
+
+
+def _schedule_first(thread: int) -> None:
+    os.sched_setscheduler(thread, os.SCHED_RR, os.sched_param(PRIORITY))
+
+
+def _be_less_nice(thread: int) -> None:
+    os.setpriority(os.PRIO_PROCESS, thread, NICE)  # on Linux of a thread, too
 
 
 def _threads() -> list[int]:

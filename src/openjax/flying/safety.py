@@ -54,12 +54,15 @@ APART = 0.35
 LOW = 0.05
 """Below this height (m) a landing settles."""
 SETTLING = 0.75
-SETTLING_LIFT = 0.85
-"""A landing ends level, with this share of its weight, for so long (s): from .4 m it comes down at
-1.1 m/s. So far may the floor be from where it is thought.
+"""A landing ends level for so long (s): from .4 m it comes down at 1.1 m/s. So far may the floor be
+from where it is thought.
 """
+SETTLING_LIFT = 0.85
+"""It is then carried by this share of its weight."""
 TRIM_GAIN = 0.25
+"""Share of full thrust by which a climb that is off by 1 m/s for 1 s changes the trim."""
 TRIM_LIMIT = 0.15
+"""Largest trim, as a share of full thrust."""
 _DOWN = (Mode.GROUND, Mode.LANDED)
 _UNTROUBLED = (Mode.LIFT, Mode.TRANSFER, Mode.READY, Mode.PURSUIT)
 
@@ -80,15 +83,17 @@ def decide(state: State, event: Event) -> tuple[State, tuple[SetPoint, ...]]:
     actions = event.actions
     finite = actions is not None and all(math.isfinite(x) for action in actions for x in action)
     action_time = now if finite else state.action_time
+    # requests first, so that troubles have the last word
     drones = _requested(state, event)
-    troubles = [
-        _trouble(state, drone, sample) for drone, sample in zip(drones, event.samples, strict=True)
-    ]
-    if any(d.mode is Mode.PURSUIT for d in drones) and event.request is not Request.PURSUE:
+    both = zip(drones, event.samples, strict=True)
+    troubles = [_trouble(state, drone, sample) for drone, sample in both]
+    pursuing = any(d.mode is Mode.PURSUIT for d in drones)
+    if pursuing and event.request is not Request.PURSUE:
         if now - action_time > state.settings.action_timeout:
             reason = "no action in time" if actions is None else "action not finite"
             troubles = [t or (Mode.HOLD, reason) for t in troubles]
     else:
+        # the clock of the actions starts with the game
         action_time = now
     state = state._replace(drones=_react(state, drones, troubles), action_time=action_time)
     moved = tuple(
@@ -104,9 +109,8 @@ def _requested(state, event) -> tuple[Drone, ...]:
     now = event.time
     anchors = state.starts
     if event.request is Request.STOP:
-        return tuple(
-            d.to(Mode.STOPPED, now, reason=event.reason or "stopped by hand") for d in drones
-        )
+        reason = event.reason or "stopped by hand"
+        return tuple(d.to(Mode.STOPPED, now, reason=reason) for d in drones)
     if event.request is Request.PURSUE and state.all_in(Mode.READY):
         return tuple(d.to(Mode.PURSUIT, now) for d in drones)
     answer = {Request.LAND: _land, Request.HOLD: _hold}.get(event.request)
@@ -122,17 +126,19 @@ def _requested(state, event) -> tuple[Drone, ...]:
 
 
 def _land(state, event, drone, anchor) -> Drone:
+    """The drone on its way down to its anchor; one that lands already, or may not fly, stays as it
+    is.
+    """
     reason = event.reason or "asked to land"
     if drone.mode is Mode.GROUND:
         return drone.to(Mode.LANDED, event.time, reason=reason)
-    return (
-        drone.to(Mode.LAND, event.time, anchor, reason)
-        if drone.mode in (*_UNTROUBLED, Mode.HOLD)
-        else drone
-    )
+    if drone.mode in (*_UNTROUBLED, Mode.HOLD):
+        return drone.to(Mode.LAND, event.time, anchor, reason)
+    return drone
 
 
 def _hold(state, event, drone, anchor) -> Drone:
+    """The drone waiting at its anchor, if it flies and isn't in trouble."""
     return drone.to(Mode.HOLD, event.time, anchor) if drone.mode in _UNTROUBLED else drone
 
 
@@ -141,7 +147,8 @@ def _transfer(state, event, drone, start) -> Drone:
     if drone.mode not in _DOWN:
         return drone.to(Mode.TRANSFER, event.time, start)
     x, y, z = drone.estimate.position
-    stand = tuple(None if t.pose is None else t.pose.position for t in (drone.own, drone.captured))
+    tracks = (drone.own, drone.captured)
+    stand = tuple(None if track.pose is None else track.pose.position for track in tracks)
     return drone.to(Mode.LIFT, event.time, (x, y, z + state.settings.lift))._replace(stand=stand)
 
 
@@ -152,19 +159,22 @@ def lift_fault(state: State, drone: Drone) -> str:
     both by the same.
     """
     settings = state.settings
-    moves = [
-        tuple(p - s for p, s in zip(track.pose.position, stand, strict=True))
-        for track, stand in zip((drone.own, drone.captured), drone.stand, strict=True)
-        if stand is not None
-    ]
+    moves = []
+    for track, stand in zip((drone.own, drone.captured), drone.stand, strict=True):
+        if stand is not None:
+            moved = zip(track.pose.position, stand, strict=True)
+            moves.append(tuple(p - s for p, s in moved))
     if any(z > 2.0 * settings.lift for *_, z in moves):
         return "the test lift went too high: is it lighter, or another, than --vehicle says?"
     if any(math.hypot(x, y) > ASIDE for x, y, _ in moves):
         return "the test lift went sideways: do the poses' axes and yaw agree with the vehicle's?"
-    if len(moves) == 2 and math.dist(*moves) > ASIDE / 2:
+    if len(moves) == 2 and math.dist(moves[0], moves[1]) > ASIDE / 2:
         return "motion capture and own estimate rose differently: do axes and scale agree?"
     if state.time - drone.since > settings.lift_time:
-        return f"not {settings.lift:g} m up after {settings.lift_time:g} s: do the poses' z and the weight agree?"
+        return (
+            f"not {settings.lift:g} m up after {settings.lift_time:g} s: do the poses' z and the "
+            "weight agree?"
+        )
     return ""
 
 
@@ -182,8 +192,11 @@ def _trouble(state, drone, sample) -> tuple[Mode, str] | None:
         return (Mode.STOPPED, fault) if fault else None
     if drone.over_since is not None and state.time - drone.over_since > state.settings.tumble_time:
         return Mode.STOPPED, "tumbled"
-    ill = lost or (drone.mode is not Mode.LAND and (drone.capture_fault or _unfit(state, drone)))
-    return (Mode.LAND, ill) if ill else None
+    # who lands already goes on landing, whatever else is wrong with it
+    fault = lost
+    if not lost and drone.mode is not Mode.LAND:
+        fault = drone.capture_fault or _unfit(state, drone)
+    return (Mode.LAND, fault) if fault else None
 
 
 def _lost(state, drone, sample) -> str:
@@ -227,17 +240,15 @@ def _react(state, drones, troubles) -> tuple[Drone, ...]:
     risen = all(d.mode is Mode.LIFT and _risen(d, now) for d in drones) and not team
     reacted = []
     for drone, trouble, anchor, start in zip(drones, troubles, anchors, state.starts, strict=True):
+        waited = now - drone.since > state.settings.hold_time
         if trouble is not None and trouble[0] is not drone.mode:
-            drone = drone.to(trouble[0], now, anchor, trouble[1])
+            mode, reason = trouble
+            drone = drone.to(mode, now, anchor, reason)
         elif drone.mode is Mode.LIFT and team:
             drone = drone.to(Mode.STOPPED, now, reason="another is in trouble")
         elif team and not drone.reason and drone.mode in (*_UNTROUBLED, Mode.HOLD):
             drone = drone.to(Mode.HOLD, now, anchor, "another is in trouble")
-        elif (
-            drone.mode is Mode.HOLD
-            and drone.reason
-            and now - drone.since > state.settings.hold_time
-        ):
+        elif drone.mode is Mode.HOLD and drone.reason and waited:
             drone = drone.to(Mode.LAND, now)
         elif risen:
             drone = drone.to(Mode.TRANSFER, now, start)
@@ -246,6 +257,7 @@ def _react(state, drones, troubles) -> tuple[Drone, ...]:
 
 
 def _risen(drone, now) -> bool:
+    """Whether a test lift is over; not before its rotors must have turned up."""
     near = abs(drone.estimate.position[2] - drone.anchor[2]) < RISEN
     return near and now - drone.since > 2.0 * SPIN_UP
 
@@ -304,13 +316,13 @@ def _pursue(state, drone, i, action) -> SetPoint:
     if settings.separation > 0.0:
         poses = [d.estimate if d.mode in FLYING else None for d in state.drones]
         parting = parting_velocity(settings, i, poses)
+    # who makes room for another mustn't leave the arena for that
     aimed = estimate if parting is None else estimate._replace(velocity=parting)
     sent = state.drones[i].sent
     # until its motors have followed it turns on
     turned = turned_on(estimate.quaternion, estimate.body_rates, state.airframe.motor_time_constant)
-    present = lift_acceleration(
-        turned, max(sent.thrust, LEAST_THRUST) / state.airframe.hover_thrust
-    )
+    lift = max(sent.thrust, LEAST_THRUST) / state.airframe.hover_thrust
+    present = lift_acceleration(turned, lift)
     wanted = (
         fence_velocity(settings, estimate, present)
         or fence_velocity(settings, aimed, present)
@@ -332,12 +344,11 @@ def _go(state, drone, i) -> Drone:
     if state.time - drone.seen > state.settings.pose_timeout:
         # by reckoning: the vehicle does what it is asked for, and is level else
         share = min(state.dt / state.settings.reaction, 1.0)
-        lagged = tuple(
-            a + share * (b - a) for a, b in zip(drone.acceleration, acceleration, strict=True)
-        )
-        drone = drone._replace(acceleration=lagged)
+        change = zip(drone.acceleration, acceleration, strict=True)
+        drone = drone._replace(acceleration=tuple(a + share * (b - a) for a, b in change))
         attitude = _yaw_only(attitude)
     else:
+        # not lower: on the floor a vehicle that doesn't climb isn't too heavy
         if estimate.position[2] > (0.02 if drone.mode is Mode.LIFT else 0.1):
             error = min(max(wanted[2] - estimate.velocity[2], -0.3), 0.3)
             trim = min(max(drone.trim + TRIM_GAIN * state.dt * error, -TRIM_LIMIT), TRIM_LIMIT)
@@ -353,7 +364,8 @@ def _wanted(state, drone, i) -> Vector:
     settings = state.settings
     if drone.mode is Mode.LAND:
         x, y, _ = wanted_velocity(position, (*drone.anchor[:2], position[2]), 0.5)
-        return x, y, -(0.6 if position[2] < 0.2 else 1.0) * settings.landing_speed
+        slower = 0.6 if position[2] < 0.2 else 1.0
+        return x, y, -slower * settings.landing_speed
     x, y, z = wanted_velocity(position, drone.anchor, settings.transfer_speed)
     if drone.mode is not Mode.TRANSFER:
         return x, y, z
@@ -382,6 +394,7 @@ def _arrived(estimate, target) -> bool:
 
 
 def _yaw_only(quaternion):
+    """The attitude (4,) wxyz without roll and pitch."""
     w, _, _, z = quaternion
     size = math.hypot(w, z)
     return (w / size, 0.0, 0.0, z / size) if size > 1e-6 else (1.0, 0.0, 0.0, 0.0)
@@ -402,13 +415,11 @@ def stopping_point(
     """
     lag = settings.reaction
     present = acceleration or level_acceleration(pose.quaternion)
-    velocity = [
-        v + lag * a for v, a in zip(pose.velocity, present, strict=True)
-    ]  # once it has faded
+    # once the acceleration has faded
+    velocity = [v + lag * a for v, a in zip(pose.velocity, present, strict=True)]
     time = lag + math.hypot(*velocity) / (2.0 * settings.braking)
-    return tuple(
-        p + time * v - lag**2 * a for p, v, a in zip(pose.position, velocity, present, strict=True)
-    )
+    moving = zip(pose.position, velocity, present, strict=True)
+    return tuple(p + time * v - lag**2 * a for p, v, a in moving)
 
 
 def fence_velocity(
@@ -449,15 +460,13 @@ def parting_velocity(
         if distance < 1e-6:
             continue
         away = tuple((p - q) / distance for p, q in zip(own.position, other.position, strict=True))
-        closing = sum(
-            a * (w - v) for a, v, w in zip(away, own.velocity, other.velocity, strict=True)
-        )
-        stopping = max(closing, 0.0) * (
-            settings.reaction + max(closing, 0.0) / (4.0 * settings.braking)
-        )
+        approach = zip(away, own.velocity, other.velocity, strict=True)
+        closing = max(sum(a * (w - v) for a, v, w in approach), 0.0)
+        stopping = closing * (settings.reaction + closing / (4.0 * settings.braking))
         lack = settings.separation - (distance - stopping)
         if lack > 0.0:
-            push = 0.5 * max(closing, 0.0) + min(lack / settings.reaction, 0.5)
+            # half of the approach: the other brakes the other half
+            push = 0.5 * closing + min(lack / settings.reaction, 0.5)
             wanted = tuple(w + push * a for w, a in zip(wanted or own.velocity, away, strict=True))
     return wanted
 
@@ -473,17 +482,18 @@ def within_reach(action: SetPoint, sent: SetPoint, airframe: Airframe, dt: float
     def near(value, old, room):
         return min(max(value, old - room), old + room) if sent.mode == RATES else value
 
+    def rate(value, old):
+        return near(min(max(value, -math.pi), math.pi), old, turn)
+
     turn = airframe.angular_acceleration * dt
     lift = dt / airframe.motor_time_constant
-    rates = (
-        near(min(max(new, -math.pi), math.pi), old, turn)
-        for new, old in (
-            (action.roll, sent.roll),
-            (action.pitch, sent.pitch),
-            (action.yaw_rate, sent.yaw_rate),
-        )
+    return SetPoint(
+        mode=RATES,
+        roll=rate(action.roll, sent.roll),
+        pitch=rate(action.pitch, sent.pitch),
+        yaw_rate=rate(action.yaw_rate, sent.yaw_rate),
+        thrust=near(min(max(action.thrust, 0.0), 1.0), sent.thrust, lift),
     )
-    return SetPoint(RATES, *rates, near(min(max(action.thrust, 0.0), 1.0), sent.thrust, lift))
 
 
 def resting_places(
@@ -497,13 +507,14 @@ def resting_places(
       pillars: x, y, radius (m).
       poses: of the vehicles; None for one that was never seen.
     """
-    places = [
-        stopping_point(settings, pose) if pose is not None else (0.0, 0.0, 0.0) for pose in poses
-    ]
+    nowhere = (0.0, 0.0, 0.0)
+    stops = [nowhere if pose is None else stopping_point(settings, pose) for pose in poses]
+    # a hand's breadth from the wall, and well off floor and ceiling
     reach = settings.arena_radius - 0.15
     low = 0.3
     high = settings.arena_height - 0.3
-    places = [(x, y, min(max(z, low), high)) for x, y, z in places]
+    places = [(x, y, min(max(z, low), high)) for x, y, z in stops]
+    # each push may undo another, so all are repeated until nothing moves
     for _ in range(20):
         moved = []
         for i, place in enumerate(places):

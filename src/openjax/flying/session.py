@@ -25,8 +25,9 @@ STILL_ARMED = "a vehicle doesn't say that it is disarmed: keep away, and switch 
 FRESH = 0.05
 """No flight begins with poses older than this (s)."""
 ARMING = 1.0
+"""A vehicle has this long (s) to say that it is armed."""
 POSES = 5.0
-"""A vehicle has this long (s) to say that it is armed, and where it is."""
+"""And this long (s) to say where it is."""
 
 
 @dataclass(frozen=True)
@@ -66,6 +67,7 @@ class Session:
 
     def __enter__(self) -> Session:
         settings = self._settings
+        # what has begun by then is given back, in reverse, should any step here fail
         with self._stack as stack:
             self.links.board.enter(Role.LOOP)
             stack.callback(self.links.close)
@@ -74,6 +76,7 @@ class Session:
                 self.links.feed(settings.feed)
             self._wait_for_poses()
             blocks = self.links.pose_blocks()
+            # the loop's own, should links and guard both go; over a dongle they open only then
             self._own = RawLinks(settings.uris, blocks, settings.watchdog)
             if settings.guard:
                 self._guard = Guard(self.links.board, self._own, self._state)

@@ -6,18 +6,22 @@ import math
 from typing import NamedTuple
 
 OFF = 0
+"""Mode of a set-point: motors off."""
 RATES = 1
+"""Roll and pitch are body rates."""
 ANGLES = 2
-"""Modes of a set-point: motors off; roll and pitch as body rates; as angles."""
+"""Roll and pitch are angles."""
 
 _LEAST = 10001
+"""Thrust counts of 0 % in `send_setpoint_manual`."""
 _MOST = 60000
-"""Thrust counts of 0 and 100 % in `send_setpoint_manual`."""
+"""Those of 100 %."""
 _COUNTS = 65536
 """Motor counts of full thrust."""
 LEAST_THRUST = _LEAST / _COUNTS
+"""No set-point but "off" asks for less."""
 MOST_THRUST = _MOST / _COUNTS
-"""No set-point but "off" asks for less, none for more."""
+"""None asks for more."""
 
 
 class SetPoint(NamedTuple):
@@ -70,9 +74,9 @@ def from_action(action, thrust_limit: float) -> SetPoint:
         min(max(float(x), -1.0), 1.0) if math.isfinite(x) else math.nan for x in action
     )
     return SetPoint(
-        RATES,
-        math.pi * roll,
-        math.pi * pitch,
-        math.pi * yaw,
-        min(0.5 * (thrust + 1.0), thrust_limit),
+        mode=RATES,
+        roll=math.pi * roll,
+        pitch=math.pi * pitch,
+        yaw_rate=math.pi * yaw,
+        thrust=min(0.5 * (thrust + 1.0), thrust_limit),
     )

@@ -61,6 +61,7 @@ class SafetySettings:
     battery_low: Annotated[float, Interval("[0, 100]")] = 3.2
     """Voltage under load, for `battery_time`, at which a vehicle lands (V)."""
     battery_time: Annotated[float, Interval("[0, 60]")] = 0.5
+    """For so long (s): a sudden climb alone takes the voltage down for a moment."""
     battery_start: Annotated[float, Interval("[0, 100]")] = 3.7
     """No vehicle takes off with less, measured without load (V)."""
     stand: Annotated[float, Interval("(0, 1000]")] = 0.15
@@ -159,10 +160,8 @@ class Drone(NamedTuple):
     feeds_estimator: bool = True  # whether the estimator on board is to follow the newest of it
     seen: float = -math.inf  # s, when the pose that it is flown by was measured
     capture_fault: str = ""  # why motion capture isn't believed any more in this flight
-    stand: tuple[Vector | None, Vector | None] = (
-        None,
-        None,
-    )  # own and captured position before the lift
+    # own and captured position before the lift, where there is one
+    stand: tuple[Vector | None, Vector | None] = (None, None)
     acceleration: Vector = (0.0, 0.0, 0.0)  # m/s^2, what dead reckoning takes it to be
     anchor: Vector = (0.0, 0.0, 0.0)  # where it waits or lands
     trim: float = 0.0  # of the hover thrust
@@ -223,4 +222,11 @@ def initial_state(
     settings = settings or SafetySettings()
     limits = pose_limits(airframe, settings.pose_timeout)
     drones = tuple(Drone() for _ in starts)
-    return State(drones, tuple(starts), settings, limits, airframe, tuple(pillars))
+    return State(
+        drones=drones,
+        starts=tuple(starts),
+        settings=settings,
+        limits=limits,
+        airframe=airframe,
+        pillars=tuple(pillars),
+    )

@@ -45,8 +45,9 @@ BOOT = {"udp": 0.2, "radio": 5.0}
 TRIES = 5
 """To have the log blocks sampled at different moments."""
 DRIFT = 5e-5
-"""How fast two clocks may part (s/s)."""
+"""How fast two clocks may part (s/s): quartzes are good to some tens of ppm."""
 _WRAP = 1 << 24
+"""Milliseconds after which a time stamp of three bytes begins again."""
 
 
 class _Clock:
@@ -61,15 +62,18 @@ class _Clock:
         self._base = 0
 
     def host(self, stamp: int, arrival: float) -> float:
+        """Host seconds of a time stamp that came at `arrival` (s)."""
+        # only a step back by half of the range is a new turn: packets may overtake each other
         if self._stamp is not None and stamp < self._stamp - _WRAP // 2:
             self._base += _WRAP
         self._stamp = stamp
-        own = 1e-3 * (stamp + self._base)
+        on_board = 1e-3 * (stamp + self._base)
+        # the smallest difference so far, let up by as much as clocks may have parted since
         if math.isfinite(self.offset):
             self.offset += DRIFT * (arrival - self._last)
-        self.offset = min(self.offset, arrival - own)
+        self.offset = min(self.offset, arrival - on_board)
         self._last = arrival
-        return own + self.offset
+        return on_board + self.offset
 
 
 @dataclass(frozen=True)
@@ -100,11 +104,9 @@ class Member:
         self.voltage = math.nan
         self.supervisor = 0
         self.error: str | None = None
-        self.poses, self.bodies, self.recording = (
-            array("d"),
-            array("d"),
-            False,
-        )  # rows as in `Samples`
+        self.poses = array("d")  # rows as in `Samples`
+        self.bodies = array("d")
+        self.recording = False
         self.listener: Callable[[bool], None] = lambda new_pose: None
         self.crazyflie = None
         self.blocks: list = []
@@ -200,12 +202,11 @@ class Swarm:
     Args:
       uris: as `cflib` writes them: `radio://0/80/2M/E7E7E7E7E7`, `udp://127.0.0.1:19850`.
       body_logs: log blocks of motors and accelerometer for each vehicle, spread over the 10 ms;
-      more of them tell
-          the diagnosis more exactly when a command arrived, and take more of the link. 0 to 5.
+      more of them tell the diagnosis more exactly when a command arrived, and take more of the
+      link. 0 to 5.
       watchdog: feed the firmware's emergency-stop watchdog: motors stop 1 s after the last
-      set-point, instead of 2 s.
-          Once it was fed it bites, also after a normal flight, and the vehicle is locked; `connect`
-          restarts such vehicles.
+      set-point, instead of 2 s. Once it was fed it bites, also after a normal flight, and the
+      vehicle is locked; `connect` restarts such vehicles.
     """
 
     def __init__(self, uris: Sequence[str], body_logs: int = 1, watchdog: bool = True):
@@ -248,14 +249,11 @@ class Swarm:
                 if attempt or not member.crazyflie.supervisor.is_locked:
                     return
                 _restart(member.uri, member.crazyflie)
-        on = (
-            "does openjax virtual_crazyflie run"
-            if member.uri.startswith("udp:")
-            else "is the vehicle on"
-        )
-        raise UserError(
-            f"{member.uri}: no connection ({member.error or 'locked'}); {on}, is the URI right?"
-        )
+        question = "is the vehicle on"
+        if member.uri.startswith("udp:"):
+            question = "does openjax virtual_crazyflie run"
+        why = member.error or "locked"
+        raise UserError(f"{member.uri}: no connection ({why}); {question}, is the URI right?")
 
     def _answers(self, member, make, timeout) -> bool:
         """Whether the vehicle has told all that `cflib` asks for."""
@@ -278,6 +276,7 @@ class Swarm:
         return member.error is None
 
     def _start_logs(self, timeout):
+        """Set up and start each vehicle's log blocks, the pose's first."""
         from cflib.crazyflie.log import LogConfig
 
         kinds = [POSE_BLOCK] + [BODY_BLOCK] * self._body_logs
@@ -301,8 +300,8 @@ class Swarm:
             if perf_counter() > deadline:
                 raise UserError(f"the log blocks didn't start within {timeout:g} s")
             sleep(0.01)
-        # Once more, in step. A vehicle samples every 1 or 2 ms: blocks that share a sample leave a
-        # gap elsewhere.
+        # Once more, in step: a vehicle samples every 1 or 2 ms, and blocks that share a sample leave
+        # a gap elsewhere.
         for _ in range(TRIES):
             self._start_in_step()
             sleep(5e-3 * PERIOD_MS)

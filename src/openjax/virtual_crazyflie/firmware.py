@@ -17,6 +17,7 @@ from openjax.flying.crtp import (
     PROTOCOL_VERSION,
     READ_ONLY,
     Port,
+    Supervisor,
     SupervisorCommand,
     decode,
     pack_number,
@@ -56,6 +57,7 @@ class VirtualFirmware:
         """
         self.auto_arm = not needs_arming
         self.level_after = LEVEL_AFTER
+        # what a restart keeps is set above, all else by it
         self.restart()
 
     def restart(self) -> None:
@@ -81,15 +83,17 @@ class VirtualFirmware:
         locked, crashed.
         """
         ready = not (self.crashed or self.emergency)
-        flies = (
-            ready and not self.armed,
-            self.armed,
-            self.auto_arm,
-            ready and self.armed,
-            self.flying,
-        )
-        bits = (*flies, self.crashed, self.emergency, self.crashed)
-        return sum(int(bit) << i for i, bit in enumerate(bits))
+        holds = {
+            Supervisor.CAN_BE_ARMED: ready and not self.armed,
+            Supervisor.ARMED: self.armed,
+            Supervisor.AUTO_ARM: self.auto_arm,
+            Supervisor.CAN_FLY: ready and self.armed,
+            Supervisor.FLYING: self.flying,
+            Supervisor.TUMBLED: self.crashed,
+            Supervisor.LOCKED: self.emergency,
+            Supervisor.CRASHED: self.crashed,
+        }
+        return sum(int(bit) for bit, is_so in holds.items() if is_so)
 
     def set_point(self, time: float) -> SetPoint:
         """What the stabiliser is asked for at `time`, watchdogs and supervision included."""
@@ -98,9 +102,8 @@ class VirtualFirmware:
         if self._set_point_time is None or not self.armed or self.crashed or self.emergency:
             return SetPoint()
         age = time - self._set_point_time
-        if (
-            self._set_point.mode == OFF
-        ):  # nothing to time out: an armed vehicle waits for its first set-point
+        # nothing to time out: an armed vehicle waits for its first set-point
+        if self._set_point.mode == OFF:
             return SetPoint()
         if age > STOP_AFTER:
             self._disarm()
@@ -163,9 +166,8 @@ class VirtualFirmware:
     def _platform(self, packet, time):
         command = packet.data[0]
         if packet.channel == 1:
-            answer = {0: bytes([PROTOCOL_VERSION]), 1: b"openjax virtual", 2: b"CF21"}.get(
-                command, b""
-            )
+            answers = {0: bytes([PROTOCOL_VERSION]), 1: b"openjax virtual", 2: b"CF21"}
+            answer = answers.get(command, b"")
             return [packet._replace(data=bytes([command]) + answer)]
         if packet.channel == 0 and command == 1:
             return [packet._replace(data=bytes([command, *self._arm(bool(packet.data[1]))]))]
@@ -200,13 +202,15 @@ class VirtualFirmware:
         return [] if answer is None else [packet._replace(data=bytes([command | 0x80]) + answer)]
 
     def _memory(self, packet, time):
-        return (
-            [packet._replace(data=b"\x01\x00")]
-            if packet.channel == 0 and packet.data[0] == 1
-            else []
-        )
+        """How many memories there are: none."""
+        if packet.channel == 0 and packet.data[0] == 1:
+            return [packet._replace(data=b"\x01\x00")]
+        return []
 
     def _localization(self, packet, time):
+        """On channel 0 an external position; on the other, by the first byte: 8 an external pose, 3
+        an emergency stop, 4 a word to its watchdog.
+        """
         if packet.channel == 0:
             self.external_pose[:3] = struct.unpack("<3f", packet.data[:12])
             self.external_poses += 1
@@ -221,6 +225,7 @@ class VirtualFirmware:
         return []
 
     def _commander(self, packet, time):
+        """The legacy set-point, of which a parameter says whether it is angles."""
         *degrees, thrust = struct.unpack("<fffH", packet.data[:14])
         thrust = 0 if thrust < 1000 else min(thrust, THRUST_CUT)
         rates = self.parameters["flightmode.stabModeRoll"] == 0
@@ -228,6 +233,7 @@ class VirtualFirmware:
         return []
 
     def _generic(self, packet, time):
+        """By the first byte: 0 stop, 11 the set-point that `cflib` calls manual."""
         if packet.channel != 0:
             return []
         if packet.data[0] == 0:
@@ -242,8 +248,8 @@ class VirtualFirmware:
     def _accept(self, mode, degrees, thrust, time):
         """Roll, pitch, yaw rate in the firmware's frame, where pitch points the other way."""
         if np.isfinite(degrees).all():
-            angles = (np.radians(degrees) * (1.0, -1.0, 1.0)).tolist()
-            self.accept(SetPoint(mode, *angles, thrust / (FULL_SCALE + 1)), time)
+            roll, pitch, yaw_rate = np.radians(degrees).tolist()
+            self.accept(SetPoint(mode, roll, -pitch, yaw_rate, thrust / (FULL_SCALE + 1)), time)
 
     def accept(self, set_point: SetPoint, time: float) -> None:
         """Take a set-point as it comes out of a packet: no thrust means motors off."""
@@ -254,6 +260,7 @@ class VirtualFirmware:
     # -- tables of contents
 
     def _contents(self, packet, names, crc, limits, type_of):
+        """A table of contents: its size and checksum (command 3), or one of its entries (2)."""
         command = packet.data[0]
         if command == 3:
             return [packet._replace(data=struct.pack("<BHI", 3, len(names), crc) + limits)]
@@ -278,11 +285,8 @@ class VirtualFirmware:
             return []
         command = packet.data[0]
         ident = packet.data[1] if len(packet.data) > 1 else 0
-        return [
-            packet._replace(
-                data=bytes([command, ident, self.logs.control(command, ident, packet.data, time)])
-            )
-        ]
+        status = self.logs.control(command, ident, packet.data, time)
+        return [packet._replace(data=bytes([command, ident, status]))]
 
     def _parameter(self, packet, time):
         if packet.channel == 0:
@@ -301,9 +305,6 @@ class VirtualFirmware:
             if packet.channel == 2 and name.split(".")[0] != READ_ONLY_GROUP:
                 (self.parameters[name],) = struct.unpack("<" + fmt, packet.data[2:])
             status = b"\0" if packet.channel == 1 else b""
-            return [
-                packet._replace(
-                    data=packet.data[:2] + status + pack_number(fmt, self.parameters[name])
-                )
-            ]
+            value = pack_number(fmt, self.parameters[name])
+            return [packet._replace(data=packet.data[:2] + status + value)]
         return [packet._replace(data=packet.data[:3] + bytes([errno.ENOENT]))]

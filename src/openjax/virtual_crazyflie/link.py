@@ -44,22 +44,18 @@ class VirtualLink:
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             self.socket.bind((host, port))
-        except (
-            OSError,
-            OverflowError,
-            UnicodeError,
-        ) as error:  # taken, beyond 65535, no name of a host
+        # taken, beyond 65535, no name of a host
+        except (OSError, OverflowError, UnicodeError) as error:
             self.socket.close()
             reason = getattr(error, "strerror", None) or error
             raise UserError(
                 f"UDP port {port} of {host} can't be had ({reason}); choose another --port"
             ) from error
         self.socket.setblocking(False)
-        self.faults, self._random, self._listener = (
-            faults,
-            random.Random(1000 * faults.seed + i),
-            None,
-        )
+        self.faults = faults
+        # vehicles lose packets of their own, and seeds don't meet each other's vehicles
+        self._random = random.Random(1000 * faults.seed + i)
+        self._listener = None
         self._incoming: list = []
         self._outgoing: list = []
         self._count = 0
@@ -89,15 +85,14 @@ class VirtualLink:
                     continue
                 jitter = self._random.random() * self.faults.jitter_ms
                 delay = 1e-3 * (self.faults.latency_ms + jitter)
+            # the count keeps packets of one moment in order, and heaps from comparing peers
             self._count += 1
             heapq.heappush(self._incoming, (time + delay, self._count, raw, peer))
 
     def next_due(self) -> float:
         """When the next packet in either direction is due; infinite if none waits."""
-        return min(
-            (queue[0][0] for queue in (self._incoming, self._outgoing) if queue),
-            default=float("inf"),
-        )
+        waiting = [queue[0][0] for queue in (self._incoming, self._outgoing) if queue]
+        return min(waiting, default=float("inf"))
 
     def received(self, time: float):
         """The packets that have come through by `time`, in order: time, bytes, who sent them."""

@@ -11,10 +11,13 @@ from openjax.virtual_crazyflie.tables import LOG_NAMES, LOG_VARIABLES, Sensors
 
 MAX_BLOCKS = 16
 MAX_VARIABLES = 128
+"""In all blocks together; both as on board."""
 
 
 @dataclass
 class _Block:
+    """One block, stopped when it is made."""
+
     variables: list[tuple[str, str]] = field(default_factory=list)  # name, struct format
     period: float = 0.0  # s; 0 while stopped
     due: float = 0.0  # s
@@ -30,7 +33,10 @@ class LogBlocks:
         self._blocks: dict[int, _Block] = {}
 
     def control(self, command: int, ident: int, data: bytes, time: float) -> int:
-        """The status of a command on log blocks: 0 or an errno."""
+        """The status of a command on log blocks, 0 or an errno: 5 deletes all, 6 makes one, 7
+        appends variables to it, 2 deletes it, 4 stops it, 3 and 8 start it with a period in 10 ms
+        or in ms.
+        """
         if command == 5:
             self._blocks.clear()
             return 0

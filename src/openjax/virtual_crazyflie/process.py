@@ -40,11 +40,10 @@ class VirtualCrazyflies:
         self.late = 0
         self.firmware = [VirtualFirmware(needs_arming) for _ in range(vehicles.number)]
         self.links: list[VirtualLink] = []
+        faults = faults or LinkFaults()
         try:
             for i in range(vehicles.number):
-                self.links.append(
-                    VirtualLink(host, port + i if port else 0, faults or LinkFaults(), i)
-                )
+                self.links.append(VirtualLink(host, port + i if port else 0, faults, i))
         except BaseException:
             self.close()
             raise
@@ -77,6 +76,7 @@ class VirtualCrazyflies:
         for i, link in enumerate(self.links):
             link.poll(until)
             packets += [(due, i, raw, peer) for due, raw, peer in link.received(until)]
+        # in the order of all links: vehicles are in one air, and advance together up to each packet
         for due, i, raw, peer in sorted(packets, key=lambda packet: packet[0]):
             self._advance(due)
             for answer in self.firmware[i].receive(raw, max(due, self.time)):
@@ -93,9 +93,8 @@ class VirtualCrazyflies:
         if steps < 1:
             return
         self.late += steps * STEP > LATE + LONGEST_WAIT
-        set_points = np.array(
-            [firmware.set_point(self.time) for firmware in self.firmware], np.float32
-        )
+        asked = [firmware.set_point(self.time) for firmware in self.firmware]
+        set_points = np.array(asked, np.float32)
         report = self.vehicles.advance(set_points, steps)
         self._steps += steps
         for i, firmware in enumerate(self.firmware):

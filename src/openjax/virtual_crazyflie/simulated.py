@@ -50,8 +50,7 @@ class SimulatedSwarm:
     Args:
       vehicles: what flies.
       following: whether the estimator on board of each vehicle follows motion capture, as far as it
-      is believed, instead of
-        knowing its place by itself.
+      is believed, instead of knowing its place by itself.
       radio, camera: what is received of own estimates and of motion capture.
     """
 
@@ -67,9 +66,8 @@ class SimulatedSwarm:
         self.firmware = [VirtualFirmware(needs_arming=False) for _ in range(n)]
         self.uplinks = [Uplink() for _ in range(n)]
         self._random = random.Random(0)  # losses, noise
-        self._offsets = np.zeros(
-            (n, 2, 3)
-        )  # of the own estimates from the truth: position, velocity
+        # of the own estimates from the truth: position, velocity
+        self._offsets = np.zeros((n, 2, 3))
         self._samples = [PoseSample(None, 0.0, 4.0) for _ in range(n)]
         self._steps = 0
         self.asleep: set[int] = set()
@@ -129,14 +127,16 @@ class SimulatedSwarm:
             size = math.sqrt(sum(q * q for q in shaken))
             place = tuple(p + noise(0.0, CAMERA_NOISE) for p in position[i])
             seen = Pose(self.now, place, (0.0, 0.0, 0.0), tuple(q / size for q in shaken))
+            # as exact as a packet's 32 bits
             on_board = expand_quaternion(compress_quaternion(quaternion[i]))
-            told = self._radio(
-                i, self.now, Pose(self.now, *map(tuple, own[i]), on_board, tuple(rates[i]))
-            )
+            own_place, own_velocity = map(tuple, own[i])
+            sent = Pose(self.now, own_place, own_velocity, on_board, tuple(rates[i]))
+            received = self._radio(i, self.now, sent)
+            claimed = self.uplinks[i].voltage
             self._samples[i] = PoseSample(
-                told or old.own,
-                self.now if told else old.last_contact,
-                voltage[i] if self.uplinks[i].voltage is None else self.uplinks[i].voltage,
-                self.firmware[i].supervisor_info if told else old.supervisor,
-                self._camera(i, self.now, seen) or old.captured,
+                own=received or old.own,
+                last_contact=self.now if received else old.last_contact,
+                voltage=voltage[i] if claimed is None else claimed,
+                supervisor=self.firmware[i].supervisor_info if received else old.supervisor,
+                captured=self._camera(i, self.now, seen) or old.captured,
             )

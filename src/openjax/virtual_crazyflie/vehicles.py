@@ -26,16 +26,17 @@ ANGLE_GAIN = 6.0
 controller.
 """
 CRASH_SPEED = 1.5
+"""Touching the floor faster than this (m/s) is a crash."""
 CRASH_TILT = 0.5
-"""Touching the floor faster (m/s) or with body z lower (cosine) than this is a crash."""
+"""So is touching it with the body's z axis lower than this (cosine of the tilt)."""
 _NO_THRUST = -10.0
 """As a thrust set-point: whatever the rate controller adds, all motors stay off."""
 FULL_VOLTAGE = 4.15
+"""Of a full battery without load (V)."""
 SAG = 0.35
+"""By how much full thrust takes it down (V)."""
 SPENT = 0.9
-"""Battery: open circuit when full, drop at full thrust, fall from full to empty (V); empty is about
-3.25 V.
-"""
+"""By how much it falls from full to empty (V): empty is about 3.25 V."""
 
 
 class Report(NamedTuple):
@@ -119,7 +120,8 @@ class VirtualVehicles:
         """The flat state after `steps` steps, and what is sensed then."""
         vehicle = self._vehicle
         effects = self._step.effects
-        no_pillars = (jnp.zeros((1, 2)), jnp.zeros(1, bool))
+        no_pillar = jnp.zeros((1, 2))
+        inactive = jnp.zeros(1, bool)
         complete = composition.complete_parameters(effects, self._parameters, jnp.float32)
         flown = composition.change_body(effects, complete, vehicle)
 
@@ -127,7 +129,8 @@ class VirtualVehicles:
             drones, _, crashed = carry
             command = commands(drones.quaternion, set_points)
             motor, _ = jax.vmap(lambda d, c: rate_controller(flown, d, c, STEP))(drones, command)
-            moved = self._step(vehicle, drones, command, *no_pillars, self._parameters)
+            moved = self._step(vehicle, drones, command, no_pillar, inactive, self._parameters)
+            # from what the step did, so that the accelerometer feels every effect
             acceleration = (moved.velocity - drones.velocity) / STEP
             moved, on_floor, hit = _stand(moved)
             gravity = vehicle.gravity * jnp.array([0.0, 0.0, 1.0])
@@ -142,8 +145,17 @@ class VirtualVehicles:
         drones, (motor, force, on_floor), crashed = jax.lax.fori_loop(
             0, steps, step, (drones, nothing, no_one)
         )
-        moved = (drones.position, drones.velocity, drones.quaternion, drones.body_rates)
-        return ravel_pytree(drones)[0], Report(*moved, force, motor, on_floor, crashed)
+        report = Report(
+            position=drones.position,
+            velocity=drones.velocity,
+            quaternion=drones.quaternion,
+            body_rates=drones.body_rates,
+            specific_force=force,
+            motor_command=motor,
+            on_floor=on_floor,
+            crashed=crashed,
+        )
+        return ravel_pytree(drones)[0], report
 
     def voltage(self) -> np.ndarray:
         """(N,) V, of the batteries under their loads."""
@@ -151,8 +163,16 @@ class VirtualVehicles:
 
     def sensors(self, i: int) -> Sensors:
         """What vehicle i senses."""
-        r = self.report
-        return Sensors(*(array[i] for array in r[:5]), r.motor_command[i], self.voltage()[i])
+        report = self.report
+        return Sensors(
+            position=report.position[i],
+            velocity=report.velocity[i],
+            quaternion=report.quaternion[i],
+            body_rates=report.body_rates[i],
+            specific_force=report.specific_force[i],
+            motor_command=report.motor_command[i],
+            voltage=self.voltage()[i],
+        )
 
 
 def commands(quaternion, set_points):
@@ -179,6 +199,7 @@ def commands(quaternion, set_points):
 
 def _stand(drones):
     """The floor: a vehicle on it stands still and level, and leaves it as soon as it is lifted."""
+    # one that rises already isn't held, however low it is
     below = (drones.position[:, 2] <= 0.0) & (drones.velocity[:, 2] <= 0.0)
     up = jax.vmap(lambda q: rotate(q, jnp.array([0.0, 0.0, 1.0])))(drones.quaternion)[:, 2]
     hit = below & ((drones.velocity[:, 2] < -CRASH_SPEED) | (up < CRASH_TILT))
