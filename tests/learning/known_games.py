@@ -1,5 +1,5 @@
 """Evaders that learn, where the best response is known: `python -m tests.learning.known_games
-[--radius M]`.
+[--radius M] [--defaults]`.
 
 Stack with a capture radius forces a capture inside its bound and not outside. Without one: two
 points that fly straight at a slower evader in a wide plane; what it can reach at the best is an
@@ -37,7 +37,8 @@ def learn(environment: Pursuit, team: Team, draw, steps: int, **changes):
     """Statistics (L, STARTS) of the L evaders that learned, and the starts, which `draw`
     (key -> Task) gave to none of them before. `steps` are each learner's.
     """
-    settings = SIZES | changes
+    sizes = {"learners": SIZES["learners"]} if changes.pop("defaults", False) else SIZES
+    settings = sizes | changes
     settings = BestResponseSettings(total_steps=settings["learners"] * steps, **settings)
     duel = Duel(environment, team)
     response = BestResponse(settings, duel, draw)
@@ -151,9 +152,13 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--radius", type=float, help="of a capture by stack, m")
     parser.add_argument("--steps", type=int, default=8_000_000, help="of each seed")
-    parser.add_argument("--seeds", dest="learners", type=int, default=3)
-    parser.add_argument("--worlds", dest="num_envs", type=int, default=32, help="of each seed")
-    parser.add_argument("--ways", type=int, default=SIZES["ways"])
+    parser.add_argument(
+        "--defaults", action="store_true", help="an accelerator's: those of `openjax exploit`"
+    )
+    changes = {"seeds": "learners", "worlds": "num_envs"}
+    for name in ("seeds", "worlds", "ways", "minibatches"):
+        setting = changes.get(name, name)
+        parser.add_argument(f"--{name}", dest=setting, type=int, default=argparse.SUPPRESS)
     options = vars(parser.parse_args())
     radius = options.pop("radius")
     play = two_against_one if radius is None else functools.partial(against_stack, radius)
