@@ -34,6 +34,12 @@ JUDGES: Mapping[str, Callable[[str], bool]] = {
     "splitting, kept apart": lambda evader: evader == "splitting",
     "both plan, pursuers last": lambda evader: evader == "both plan, pursuers last",
     "both plan, evader last": lambda evader: evader == "both plan, evader last",
+    "both plan, pursuers last, as they see": lambda evader: (
+        evader == "both plan, pursuers last, honest sight"
+    ),
+    "both plan, evader last, as they see": lambda evader: (
+        evader == "both plan, evader last, honest sight"
+    ),
     "scripted ones, held out": lambda evader: evader in HELD_OUT,
     "the paper's": lambda evader: evader == "field",
 }

@@ -102,8 +102,8 @@ class PlannerSettings:
     refined: Annotated[float, Interval("[0, 1]")] = 0.0
     """Share of the plans that are the last best one with some pieces flown a little otherwise."""
     own_rule: Annotated[float, Interval("[0, 1]")] = 0.0
-    """Share of the other random plans after whose first pieces, or none, the evader of the game
-    flies by its own rule: a learned one knows what comes after the horizon.
+    """Share of the random plans that turn after whose first pieces, or none, the evader flies as
+    the strongest of those that learned: it knows what comes after the horizon.
     """
 
     def __post_init__(self):
