@@ -74,8 +74,9 @@ def check_ranges(ranges: Sequence[VehicleRange]) -> None:
 def family_effects(ranges: Sequence[VehicleRange]) -> tuple[Effect, ...]:
     """The effects that a family's vehicles fly with, by name."""
     effects = {}
-    for entry in ranges:
-        effect, _ = find_parameter(entry.parameter)
+    # a family from a file comes as plain tuples
+    for parameter, *_ in ranges:
+        effect, _ = find_parameter(parameter)
         effects[effect.name] = effect
     return tuple(effects[name] for name in sorted(effects))
 
