@@ -74,11 +74,15 @@ def check_ranges(ranges: Sequence[VehicleRange]) -> None:
 def family_effects(ranges: Sequence[VehicleRange]) -> tuple[Effect, ...]:
     """The effects that a family's vehicles fly with, by name."""
     effects = {}
-    # a family from a file comes as plain tuples
-    for parameter, *_ in ranges:
-        effect, _ = find_parameter(parameter)
+    for entry in _named(ranges):
+        effect, _ = find_parameter(entry.parameter)
         effects[effect.name] = effect
     return tuple(effects[name] for name in sorted(effects))
+
+
+def _named(ranges):
+    """The ranges with names for their numbers: those of a policy's file are plain tuples."""
+    return [VehicleRange(*entry) for entry in ranges]
 
 
 def family_bounds(ranges: Sequence[VehicleRange]) -> np.ndarray:
@@ -90,7 +94,7 @@ def narrowed_bounds(ranges: Sequence[VehicleRange], share) -> jax.Array:
     """(R, 4) bounds of the family of which only this `share` () is left about the nominal
     vehicle.
     """
-    parameters = [find_parameter(entry.parameter)[1] for entry in ranges]
+    parameters = [find_parameter(entry.parameter)[1] for entry in _named(ranges)]
     none = np.array([[parameter.none] for parameter in parameters], np.float32)
     return none + share * (family_bounds(ranges) - none)
 
@@ -113,7 +117,7 @@ def draw_vehicles(
         return {}
     names = [effect.name for effect in family_effects(ranges)]
     bounds = family_bounds(ranges) if bounds is None else bounds
-    owner = np.array([names.index(entry.parameter.partition(".")[0]) for entry in ranges])
+    owner = np.array([names.index(entry.parameter.partition(".")[0]) for entry in _named(ranges)])
     value_key, chosen_key, rare_key = jax.random.split(key, 3)
     share = jax.random.uniform(value_key, (number, len(ranges)))
     chosen = jax.random.randint(chosen_key, (number,), 0, len(names))
@@ -124,7 +128,7 @@ def draw_vehicles(
     high = jnp.where(rarely, bounds[:, 3], bounds[:, 1])
     values = low + share * (high - low)
     drawn: dict[str, dict[str, jax.Array]] = {name: {} for name in names}
-    for i, entry in enumerate(ranges):
+    for i, entry in enumerate(_named(ranges)):
         effect, _, parameter = entry.parameter.partition(".")
         drawn[effect][parameter] = values[:, i]
     return drawn
@@ -138,7 +142,7 @@ def standard_parameters(ranges: Sequence[VehicleRange], parameters: dict) -> jax
     be shown another.
     """
     columns = []
-    for entry in ranges:
+    for entry in _named(ranges):
         effect, _, name = entry.parameter.partition(".")
         _, parameter = find_parameter(entry.parameter)
         low, high = parameter.prior
