@@ -141,9 +141,7 @@ def studied(job: tuple[int, str]) -> tuple[int, dict]:
     number, part = job
     case = Case(number)
     rounds = {"advised": advised_rounds, "random": random_rounds}
-    found = rounds[part](case) if part in rounds else alone(case, part)
-    print(json.dumps({"number": number, "part": part} | found), flush=True)
-    return number, found
+    return number, rounds[part](case) if part in rounds else alone(case, part)
 
 
 def study(numbers: list[int], jobs: int, each: bool) -> list[dict]:
@@ -152,6 +150,7 @@ def study(numbers: list[int], jobs: int, each: bool) -> list[dict]:
     work = [(number, part) for part in parts for number in numbers]
     cases: dict[int, dict] = {n: {"number": n, "cause": Case(n).cause} for n in numbers}
     for number, found in in_processes(studied, work, jobs):
+        print(json.dumps({"number": number} | found), flush=True)
         held = cases[number].get("each", {}) | found.get("each", {})
         cases[number] |= found | ({"each": held} if held else {})
     return list(cases.values())

@@ -15,10 +15,12 @@ import numpy as np
 
 from experiments.diagnosis.rate_flights import Truth, fly, rows_of, vehicle_of
 from openjax.flights.case import load_case
+from openjax.gap.identification.prediction_errors import NAMES, Problem
 from openjax.gap.identification.quantities import identify
 from openjax.gap.identification.records import Record
 from openjax.gap.identification.responses import responses
-from openjax.gap.identification.torques import NAMES, Problem, TorqueFit, identify_torques
+from openjax.gap.identification.search import TorqueFit, begin, search
+from openjax.gap.identification.torques import identify_torques
 from openjax.vehicle import load_vehicle
 
 SECONDS = 20.0
@@ -59,7 +61,7 @@ def fitted(record: Record, free: bool) -> TorqueFit:
         return identify_torques([record])
     problem = Problem([record])
     problem.new = [None]
-    return problem.fit(problem.begin(0.002))
+    return search(problem, begin(problem, 0.002))
 
 
 def truth_of(truth: Truth) -> np.ndarray:

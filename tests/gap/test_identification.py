@@ -12,12 +12,13 @@ from openjax.flights.clocks import case_on_gyroscope_clock
 from openjax.flights.flight import Case, Flight
 from openjax.gap.identification.corrections import corrections
 from openjax.gap.identification.estimates import of_fit
+from openjax.gap.identification.prediction_errors import NAMES
 from openjax.gap.identification.quantities import Identification, doubts, quantities_of
 from openjax.gap.identification.records import Record, records_of
 from openjax.gap.identification.responses import responses
 from openjax.gap.identification.rotor_rows import rotor_rows
 from openjax.gap.identification.support import support
-from openjax.gap.identification.torques import NAMES, identify_torques
+from openjax.gap.identification.torques import identify_torques
 from openjax.gap.model.library import ABSENT, PLACE
 from openjax.gap.report.response import response_of
 from openjax.vehicle import load_vehicle

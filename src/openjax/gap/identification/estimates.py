@@ -6,7 +6,8 @@ import numpy as np
 
 from openjax.flights.flight import Case
 from openjax.gap.identification.records import Record, records_of
-from openjax.gap.identification.torques import TorqueFit, identify_torques
+from openjax.gap.identification.search import TorqueFit
+from openjax.gap.identification.torques import identify_torques
 
 
 @dataclass(frozen=True, eq=False)

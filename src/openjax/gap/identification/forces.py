@@ -11,8 +11,8 @@ from scipy.signal import lfilter
 
 from openjax.flights.track import specific_force_of, to_body
 from openjax.gap.identification.records import Record
+from openjax.gap.identification.regression import solve
 from openjax.gap.identification.rotor_rows import rotor_rows
-from openjax.gap.identification.torques import solve
 
 ORDER = 12  # rows of the noise's autoregression
 ROUNDS = 4

@@ -7,9 +7,11 @@ import numpy as np
 from openjax.flights.flight import Case
 from openjax.gap.identification.estimates import EffectEstimates, of_fit
 from openjax.gap.identification.forces import identify_forces, trims
+from openjax.gap.identification.prediction_errors import NAMES
 from openjax.gap.identification.records import Record, records_of
 from openjax.gap.identification.responses import Pair, responses
-from openjax.gap.identification.torques import NAMES, SEARCHED, TorqueFit, identify_torques
+from openjax.gap.identification.search import SEARCHED, TorqueFit
+from openjax.gap.identification.torques import identify_torques
 
 REACH = 1.645  # standard deviations of a 90 % interval
 TALKED_OF = 5.0  # Hz: where rate loops of such vehicles work

@@ -10,9 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from openjax.gap.identification.prediction_errors import Problem, earlier, value_at
 from openjax.gap.identification.records import Record
+from openjax.gap.identification.regression import solve
 from openjax.gap.identification.rotor_rows import rotor_rows
-from openjax.gap.identification.torques import EARLIEST, Problem, TorqueFit, earlier, solve
+from openjax.gap.identification.search import EARLIEST, TorqueFit
 
 AXES = ("roll", "pitch", "yaw", "thrust")
 FREQUENCIES = np.array([1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.5, 8.0, 10.0, 12.0, 15.0])  # Hz
@@ -68,7 +70,7 @@ def responses(records: list[Record], fit: TorqueFit) -> dict[str, Pair]:
         replay = [s[:, axis] for s in simulated]
         found[AXES[axis]] = Pair(
             _of_axis(problem, axis, measured, problem.at_once(real, axis)),
-            _of_axis(problem, axis, replay, problem.at_once(problem.values(nominal), axis)),
+            _of_axis(problem, axis, replay, problem.at_once(value_at(nominal), axis)),
         )
     if all(r.force is not None for r in records):
         found["thrust"] = _of_thrust(problem, rng)
@@ -94,7 +96,7 @@ def _of_thrust(problem: Problem, rng) -> Pair:
     measured = [r.force[:, 2] for r in problem.records]
     vehicle = problem.records[0].vehicle
     full = 4.0 * float(vehicle.thrust_constant * vehicle.max_rotor_speed**2 / vehicle.mass)
-    lags = problem.values(problem.start)[None, :3]
+    lags = value_at(problem.start)[None, :3]
     simulated = []
     for _, speed in rotor_rows([r.motor for r in problem.records], problem.dt, lags):
         force = full * (np.concatenate([speed[0, :1], speed[0, :-1]]) ** 2).mean(1)
