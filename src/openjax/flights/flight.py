@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -206,6 +206,10 @@ class Case:
         applied.
         """
         return self.vehicle_file.vehicle_of(flight.vehicle)
+
+
+Finding = tuple[str, str, Sequence[str]]
+"""Of a check of channels: kind, words, and the comparisons that fail."""
 
 
 class Refused(Exception):
