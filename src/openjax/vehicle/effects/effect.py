@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any
 
 import flax.struct
@@ -96,14 +97,21 @@ def growth(unit: str, vehicle: Vehicle) -> float:
     """
     if unit not in GROWTH:
         return 1.0
-    nominal = load_vehicle()
+    sizes = (_mass(vehicle), _arm(vehicle))
     factor = 1.0
-    for power, size in zip(GROWTH[unit], (_mass, _arm), strict=True):
-        ratio = size(vehicle) / size(nominal)
+    for power, size, usual in zip(GROWTH[unit], sizes, _usual_sizes(), strict=True):
+        ratio = size / usual
         # another battery or frame guard mustn't shift the ranges of what is still a Crazyflie
         if not 1.0 / ALIKE <= ratio <= ALIKE:
             factor *= ratio**power
     return factor
+
+
+@cache
+def _usual_sizes() -> tuple[float, float]:
+    """kg and m: the nominal vehicle's, which every parameter of every fit asks for."""
+    nominal = load_vehicle()
+    return _mass(nominal), _arm(nominal)
 
 
 def _mass(vehicle: Vehicle) -> float:
