@@ -22,10 +22,10 @@ DT = 0.01
 TICKS = 5
 
 
-def flown(seed, p=1.0, gust=0.0, noise=0.005, sampled=False):
+def flown(seed, p=1.0, gust=0.0, noise=0.005, sampled=False, commands=1.0):
     """A flight in which commands step every .3 s: rigid body, motors' lag, and the firmware's loop
     at 500 Hz with a P of `p` times the nominal one, gusts of `gust` rad/s^2 and `noise` rad/s in
-    the gyroscope.
+    the gyroscope; `commands` times as large.
     """
     vehicle = load_vehicle()
     rng = np.random.default_rng(seed)
@@ -50,6 +50,7 @@ def flown(seed, p=1.0, gust=0.0, noise=0.005, sampled=False):
     )
     command = np.repeat(0.6 * rng.standard_normal((ROWS // 30, 3)), 30, axis=0)
     command += 0.1 * rng.standard_normal((ROWS, 3))  # a position controller's own noise
+    command *= commands
     rates = np.zeros(3)
     integral = np.zeros(3)
     thrust = np.full(4, 0.6)
@@ -87,7 +88,21 @@ def flown(seed, p=1.0, gust=0.0, noise=0.005, sampled=False):
     ("p", "sampled"), [(1.0, False), (1.4, False), (0.7, False), (1.0, True), (1.4, True)]
 )
 def test_gains_are_what_the_loop_has_whatever_gusts_and_noise_do(p, sampled):
-    flights = [flown(seed, p, gust=5.0, sampled=sampled) for seed in range(3)]
+    found = read([flown(seed, p, gust=5.0, sampled=sampled) for seed in range(3)], sampled)
+    change = found.change
+    error = found.error
+    assert change[0] == pytest.approx(p - 1.0, abs=2.0 * error[0])
+    assert change[3] == pytest.approx(p - 1.0, abs=0.03)
+    assert bool(loop(change, error, p - 1.0).acting()) == (p != 1.0)
+
+
+def test_a_vehicle_that_hardly_turns_says_nothing_of_its_gains():
+    found = read([flown(seed, commands=0.02, noise=0.02) for seed in range(3)])
+    assert found.undetectable() == ["rate_gains"] and not found.acting()
+
+
+def read(flights, sampled=False) -> RateLoop:
+    """The rate loop of flights as `flown` gives them."""
     tracks, vehicles, links = zip(*flights, strict=True)
     commanded = [caused_by_commands(*f) for f in flights]
     reading = SimpleNamespace(
@@ -99,12 +114,7 @@ def test_gains_are_what_the_loop_has_whatever_gusts_and_noise_do(p, sampled):
         late=0.0005,
         library=Library(),
     )
-    found = read_rate_loop(reading)
-    change = found.change
-    error = found.error
-    assert change[0] == pytest.approx(p - 1.0, abs=2.0 * error[0])
-    assert change[3] == pytest.approx(p - 1.0, abs=0.03)
-    assert bool(loop(change, error, p - 1.0).acting()) == (p != 1.0)
+    return read_rate_loop(reading)
 
 
 def test_calm_flights_leave_all_of_the_motors_to_feedback():

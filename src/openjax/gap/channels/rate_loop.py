@@ -31,6 +31,11 @@ FILTER = 30.0  # Hz of the low-pass of the derivative that the firmware of the C
 ROW_DELAY = (0.0005, 0.0025)
 MARGIN = 0.05  # of a motor command: nearer to its limits some tick of the row was cut
 SEGMENT = 0.5  # s, unit of the errors
+# By how much what commands make of P's input must exceed the gyroscope's noise in it. The loop
+# answers the noise of ticks that no row shows, and what is commanded in a hover answers that, so
+# healthy gains look smaller: by a third at a fifth of the noise and in slow passes (2.5 times it),
+# by less than forms are wrong by from 5 times on, and not in quick turns (9 times).
+ABOVE_NOISE = 5.0
 LEAST_SECONDS = 6  # without a motor at its limit
 SMOOTH = 0.05  # s over which the outputs are compared
 GAINS = ("p", "i", "d")
@@ -169,17 +174,38 @@ def read_gains(reading, series, ticks) -> tuple[np.ndarray, np.ndarray]:
         1: [],
         2: [],
     }  # axis: [(moments (5, 1 + 5), track)] of every segment
-    for unit, (track, of, sent) in enumerate(zip(reading.heard, series, ticks, strict=True)):
+    power = np.zeros((2, 3))
+    flown = zip(reading.heard, reading.vehicles, series, ticks, strict=True)
+    for unit, (track, vehicle, of, sent) in enumerate(flown):
+        power += excitation(track, vehicle, of)
         for axis, part in _segments(of, sent, track.dt):
             moments[axis].append((part, unit))
     for group, axes in enumerate(((0, 1), (2,))):
         found = np.array([m for a in axes for m, _ in moments[a]])
         units = np.array([3 * u + a for a in axes for _, u in moments[a]])
-        if len(found) * SEGMENT >= LEAST_SECONDS * len(axes):
+        commanded, noise = power[:, axes].sum(1)
+        excited = commanded > ABOVE_NOISE**2 * noise
+        if excited and len(found) * SEGMENT >= LEAST_SECONDS * len(axes):
             own = slice(3 * group, 3 * group + 3)
             theta, deviation = _moments(found, units)
             change[own], error[own] = theta[:3], deviation[:3]
     return change, error
+
+
+def excitation(track: Track, vehicle, series: np.ndarray) -> np.ndarray:
+    """(2, 3) squares, summed over rows of a track and its `_series`, of P's input within BAND in
+    rad/s: what commands make of it, and the gyroscope's noise as rows show it beside smooth rates.
+    """
+    gain = np.asarray(vehicle.rate_kp, float) * COUNT
+    commanded = sosfiltfilt(_band(track.dt), series[6] / gain, axis=0)
+    bends = np.diff(track.body_rates, 2, axis=0)
+    share = 2.0 * track.dt * (min(BAND[1], 0.4 / track.dt) - BAND[0])
+    noise = share * bends.var(0) / 6.0
+    return np.stack([(commanded**2).sum(0), len(track) * noise])
+
+
+def _band(dt: float) -> np.ndarray:
+    return butter(2, (BAND[0], min(BAND[1], 0.4 / dt)), "bandpass", fs=1.0 / dt, output="sos")
 
 
 def _series(track: Track, vehicle, ruling: np.ndarray, drawn: np.ndarray, reading) -> np.ndarray:
@@ -231,8 +257,7 @@ def _segments(series: np.ndarray, ticks: np.ndarray, dt: float):
     size = max(int(SEGMENT / dt), 1)
     if series.shape[1] < 4 * edge + size:
         return
-    band = butter(2, (BAND[0], min(BAND[1], 0.4 / dt)), "bandpass", fs=1.0 / dt, output="sos")
-    passed = sosfiltfilt(band, series, axis=1)[:, edge:-edge]
+    passed = sosfiltfilt(_band(dt), series, axis=1)[:, edge:-edge]
     limited = (np.abs(ticks - 0.5) > 0.5 - MARGIN).any((1, 2))
     limited = np.convolve(limited, np.ones(2 * edge // 3 + 1), "same")[edge:-edge] > 0
     for k in range(0, passed.shape[1] - size // 2, size):
