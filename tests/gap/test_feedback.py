@@ -97,7 +97,7 @@ def test_gains_are_what_the_loop_has_whatever_gusts_and_noise_do(p, sampled):
 
 
 def test_a_vehicle_that_hardly_turns_says_nothing_of_its_gains():
-    found = read([flown(seed, commands=0.02, noise=0.02) for seed in range(3)])
+    found = read([flown(seed, commands=0.05, noise=0.02) for seed in range(3)])
     assert found.undetectable() == ["rate_gains"] and not found.acting()
 
 
