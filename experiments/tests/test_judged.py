@@ -1,8 +1,12 @@
 """Rows of the judges' table, and curves of how long evaders are free."""
 
+import numpy as np
+
+from experiments.evaders.escapes import Moment, summary
 from experiments.evaders.judged import is_shown, rows_of, vehicle_of
 from experiments.evaders.survival import curves_of
 from experiments.flying.vehicles import SLOWER
+from openjax.pursuit import PursuitSettings
 from openjax.runs.exploit_report import remark, verdict
 from openjax.vehicle.effects import load_effects
 
@@ -56,3 +60,27 @@ def test_a_curve_is_of_the_strongest_evader_and_ends_where_it_is_free():
     assert curve["strongest"] == "learned 0"
     free = curve["free"]
     assert (free[0], free[9], free[10], free[20], free[-1]) == (1.0, 1.0, 0.75, 0.5, 0.5)
+
+
+def test_a_team_that_stands_round_the_evader_leaves_a_third_of_the_circle_open():
+    """In the first second of the first of two episodes; then all fly beside each other above it,
+    and the other episode ends with a capture.
+    """
+    angle = 0.3 + np.array([0.0, 2.0, 4.0]) * np.pi / 3
+    around = np.stack([np.cos(angle), np.sin(angle), [-0.1, 0.0, 0.1]], axis=-1)
+    beside = np.array([[1.0, 0.0, 0.5], [1.0, 0.1, 0.5], [1.0, -0.1, 0.6]])
+    team = np.repeat(np.stack([around, beside]), 10, axis=0)[:, None]
+    captured = np.zeros((20, 2), bool)
+    captured[-1, 1] = True
+    moments = Moment(
+        pursuers=np.repeat(team, 2, axis=1),
+        velocity=np.full((20, 2, 3, 3), [0.0, 0.6, 0.8]),
+        evader=np.zeros((20, 2, 3)),
+        seen=~captured,
+        captured=captured,
+    )
+    found = summary(moments, PursuitSettings(), replan=10)
+    assert (found["episodes"], found["captures"], found["speed"]) == (2, 1, [1.0, 1.0])
+    assert found["open_angle"][0] == 120.0 and found["open_angle"][1] > 340.0
+    assert found["all_above_or_below"] == [0.0, 1.0] and found["seen"] == [1.0, 1.0]
+    np.testing.assert_allclose(found["spread_in_height"], [0.2, 0.1])

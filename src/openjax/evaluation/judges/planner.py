@@ -6,7 +6,9 @@ doesn't share the learner's blind spots: a learner that is caught sooner than th
 same tasks has not converged.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -30,18 +32,31 @@ class Planner:
 
     def fly(self, parameters: PolicyParameters, start: World, key: jax.Array) -> EpisodeStatistics:
         """Statistics (B,) of one episode from each of B starts."""
+        return self.fly_and_keep(parameters, start, key, lambda state: None)[0].statistics
+
+    def fly_and_keep(
+        self,
+        parameters: PolicyParameters,
+        start: World,
+        key: jax.Array,
+        keep: Callable[[PursuitState], Any],
+    ) -> tuple[PursuitState, Any]:
+        """The states (B, ...) at the end of one episode from each of B starts, and what `keep` says
+        of those after each time it plans (T, ...).
+        """
         settings = self.settings
         plan = jnp.zeros((start[1].step.size, settings.pieces, 3))
 
         def one(carry, key):
             world, plan = carry
             plan = self._best(parameters, world, plan, key)
-            return (self.duel.fly(parameters, world, plan[:, 0], settings.replan), plan), None
+            world = self.duel.fly(parameters, world, plan[:, 0], settings.replan)
+            return (world, plan), keep(world[1])
 
         episode = self.duel.environment.settings.episode_length
         keys = jax.random.split(key, episode // settings.replan)
-        (_, state), _ = jax.lax.scan(one, (start, plan), keys)[0]
-        return state.statistics
+        ((_, state), _), kept = jax.lax.scan(one, (start, plan), keys)
+        return state, kept
 
     def _best(self, parameters, world, plan, key):
         """(B, pieces, 3) the plan of those tried that promises most in each world (B, ...)."""
