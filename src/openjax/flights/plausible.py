@@ -20,6 +20,7 @@ MOVES = 0.05  # m, which a path must do for a velocity to contradict it
 DRIFT = 0.03  # m/s by which an estimated velocity may be off on the mean
 PATH_ERROR = 0.03  # m by which an estimated path may be off
 GAINS = (0.7, 1.4)  # of a path over what its velocity adds up to: beyond, one isn't the other
+CLEARLY = 2.0  # standard errors by which it must be: estimators of small moves drift
 
 
 def gravity_findings(force: np.ndarray | None) -> list[Finding]:
@@ -53,30 +54,36 @@ def path_findings(signals: Signals) -> Iterator[Finding]:
         return
     along = np.cumsum(signals.velocity, 0) / RATE
     for k, axis in enumerate("xyz"):
-        gain = _gain(along[:, k], signals.position[:, k])
-        back = _gain(signals.position[:, k], along[:, k])
-        if gain is not None and not GAINS[0] < gain < GAINS[1]:
+        gain, error = _gain(along[:, k], signals.position[:, k])
+        back, back_error = _gain(signals.position[:, k], along[:, k])
+        if _outside(gain, error, GAINS):
             text = f"{axis} moves by {gain:.2f} times what v{axis} adds up to"
-        elif back is not None and not 1.0 / GAINS[1] < back < 1.0 / GAINS[0]:
+        elif _outside(back, back_error, (1.0 / GAINS[1], 1.0 / GAINS[0])):
             text = f"v{axis} adds up to {back:.2f} times what {axis} moves by"
         else:
             continue
         yield "garbage", f"contradictory: {text}", ["the position's rate"]
 
 
-def _gain(path: np.ndarray, other: np.ndarray) -> float | None:
-    """How far another path (T,) m moves where this one does, a steady drift aside; None where this
-    one hardly moves.
+def _gain(path: np.ndarray, other: np.ndarray) -> tuple[float, float]:
+    """How far another path (T,) m moves where this one does, a steady drift aside, and the standard
+    error of that: infinite where this one hardly moves.
     """
     time = np.arange(len(path)) / RATE
     columns = np.stack([path - path.mean(), time - time.mean()], 1)
     # Errors of a path last: each second says one thing.
     weight = 1.0 / (PATH_ERROR**2 * RATE)
     normal = weight * columns.T @ columns + np.diag([0.0, 1.0 / DRIFT**2])
-    moved = normal[0, 0] - normal[0, 1] ** 2 / normal[1, 1]
+    moved = float(normal[0, 0] - normal[0, 1] ** 2 / normal[1, 1])
     if moved * PATH_ERROR**2 < MOVES**2 * len(path) / RATE:
-        return None
-    return float(np.linalg.solve(normal, weight * columns.T @ (other - other.mean()))[0])
+        return 1.0, np.inf
+    gain = np.linalg.solve(normal, weight * columns.T @ (other - other.mean()))[0]
+    return float(gain), moved**-0.5
+
+
+def _outside(gain: float, error: float, gains: tuple[float, float]) -> bool:
+    """Whether a gain is beyond these, whatever its error may be."""
+    return gain + CLEARLY * error < gains[0] or gain - CLEARLY * error > gains[1]
 
 
 def copied_columns(flight: Flight) -> Iterator[str]:
