@@ -7,8 +7,8 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from openjax.pursuit import PursuitSettings
-from openjax.pursuit.sensing import line_of_sight
+from openjax.pursuit import Pursuit, PursuitSettings
+from openjax.pursuit.sensing import line_of_sight, within_view
 
 RADIUS = PursuitSettings().pillar_radius
 
@@ -74,3 +74,39 @@ def test_against_walking_along_the_segment(sight, points):
     clear = not (0 < nearest < 4000 and distance[nearest] < RADIUS)
     arrays = [jnp.asarray(x, jnp.float32)[None] for x in (start, end, [pillar])]
     assert bool(sight(*arrays, jnp.ones((1, 1), bool))[0]) == clear
+
+
+@pytest.mark.parametrize(
+    ("target", "angle", "reach", "seen"),
+    [
+        ((1.0, 0.0, 0.0), 90, 1.1, True),
+        ((1.0, 0.0, 0.0), 90, 0.9, False),
+        ((0.0, 0.9, 0.0), 178, 1.0, False),  # beside it
+        ((0.0, 0.9, 0.0), 182, 1.0, True),
+        ((0.7, 0.0, 0.6), 80, 1.0, False),  # a cone is as high as it is wide
+        ((0.7, 0.0, 0.6), 82, 1.0, True),
+        ((-1.0, 0.0, 0.0), 359, 1.0, False),
+        ((-1.0, 0.0, 0.0), 360, 1.0, True),
+    ],
+)
+def test_range_and_cone(target, angle, reach, seen):
+    settings = PursuitSettings(sight_angle=angle, sight_range=reach)
+    ahead = jnp.array([[1.0, 0.0, 0.0]])
+    assert bool(within_view(settings, jnp.zeros((1, 3)), ahead, jnp.array(target))[0]) == seen
+
+
+@pytest.mark.slow
+def test_who_looks_away_captures_unseen():
+    """Limits of sight hide the evader from the pursuers, and nothing else."""
+    settings = PursuitSettings(
+        physics="stops", start_attitude="level", max_pillars=0, min_pillars=0, sight_angle=90.0
+    )
+    game = Pursuit(settings)
+    _, state = game.reset(jax.random.key(0))
+    near = jnp.array([[0.1, 0.0, 0.0], [0.5, 0.4, 0.0], [0.5, -0.4, 0.0]])
+    drones = state.drones.replace(position=state.evader_position + near)  # they look along x
+    observation, state, _, _, _, info = game.follow(state, jnp.zeros((3, 4)), drones)
+    assert bool(info.captured[0]) and not bool(info.seen)
+    assert np.all(observation.self_state[:, :3] == -5.0)
+    turned = drones.replace(quaternion=jnp.tile(jnp.array([0.0, 0.0, 0.0, 1.0]), (3, 1)))
+    assert bool(game.follow(state, jnp.zeros((3, 4)), turned)[-1].seen)

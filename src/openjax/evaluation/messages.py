@@ -92,7 +92,7 @@ class Hearsay:
         position = jnp.where(own[..., None], state.drones.position, position)
 
         told = jnp.any(arrives & ~own & heard.sees, axis=-1) & (heard.step > beliefs.reported)
-        sees = state.in_sight
+        sees = state.sees
 
         def newest(of_own, of_others, earlier):
             reported = jnp.where(told[:, None], of_others, earlier)
@@ -138,6 +138,7 @@ class Hearsay:
                 evader_position=belief.evader,
                 evader_velocity=belief.evader_velocity,
                 in_sight=jnp.broadcast_to(belief.seen, state.in_sight.shape),
+                in_view=None,
                 last_seen=belief.last_seen,
                 frames=belief.frames,
             )
@@ -150,7 +151,7 @@ class Hearsay:
 def _sent(state):
     return Sent(
         position=state.drones.position,
-        sees=state.in_sight,
+        sees=state.sees,
         evader=state.evader_position,
         evader_velocity=state.evader_velocity,
         step=state.step,

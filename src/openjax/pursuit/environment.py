@@ -36,7 +36,7 @@ from openjax.pursuit.reward import (
     over_speed,
     total_reward,
 )
-from openjax.pursuit.sensing import line_of_sight
+from openjax.pursuit.sensing import line_of_sight, within_view
 from openjax.pursuit.settings import PursuitSettings
 from openjax.pursuit.shapes import Actions, Active, Commands, Each, Flag, Pillars, Scalar, Vector
 from openjax.pursuit.spaces import Box
@@ -241,7 +241,8 @@ class Pursuit:
             own_history = jnp.broadcast_to(own_history, (steps, *own_history.shape))
         gone_after = draw_fall_out(settings, jax.random.fold_in(key, 4), task.active)
         in_sight = self._in_sight(task, task.active, task.pursuer_position, task.evader_position)
-        seen = jnp.any(in_sight)
+        in_view = self._in_view(in_sight, drones, task.evader_position)
+        seen = jnp.any(in_sight if in_view is None else in_view)
         still = jnp.zeros(3, jnp.float32)
         step = jnp.zeros((), jnp.int32)
         last_seen = jnp.where(seen, task.evader_position, jnp.array(settings.middle, jnp.float32))
@@ -271,6 +272,7 @@ class Pursuit:
             step=step,
             statistics=empty_statistics(settings.episode_length),
             gone_after=gone_after,
+            in_view=in_view,
         )
         return self.observe(state), state
 
@@ -309,6 +311,13 @@ class Pursuit:
             self.settings, position, evader, task.pillar_position, task.pillar_active
         )
         return sees if active is None else sees & active
+
+    def _in_view(self, in_sight, drones, evader):
+        """(N,) which of those in sight have the evader at (3,) in view; None: all of them."""
+        if not self.settings.limited_sight:
+            return None
+        ahead = rotation_axes(drones.quaternion)[0]
+        return in_sight & within_view(self.settings, drones.position, ahead, evader)
 
     def _seen(self, drones, vehicles):
         return self.dynamics.seen(drones, self._parameters(vehicles))
@@ -378,7 +387,8 @@ class Pursuit:
         position = drones.position
         active = self._active_after(before)
         in_sight = self._in_sight(task, active, position, evader)
-        seen = jnp.any(in_sight)
+        in_view = self._in_view(in_sight, drones, evader)
+        seen = jnp.any(in_sight if in_view is None else in_view)
         last_seen = jnp.where(seen, evader, before.last_seen)
         seen_drones = self._seen(drones, before.vehicles)
         framed = frame_pursuers(settings, seen_drones.position, last_seen, active)
@@ -394,6 +404,7 @@ class Pursuit:
             evader=evader_state,
             last_seen=last_seen,
             in_sight=in_sight,
+            in_view=in_view,
             frames=jnp.concatenate([before.frames[1:], newest[None]]),
             own_history=own_history,
             previous_action=action,

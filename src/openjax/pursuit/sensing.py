@@ -1,6 +1,7 @@
-"""Who sees the evader: line of sight past the pillars, shared by the team."""
+"""Who sees the evader: line of sight past the pillars, within range and cone; a team shares it."""
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from openjax.pursuit.settings import PursuitSettings
@@ -29,3 +30,20 @@ def line_of_sight(
     near = jnp.sum(across**2, axis=-1) < settings.pillar_radius**2
     blocked = pillar_active[None] & near & (along >= 0.0) & (along <= 1.0)
     return ~jnp.any(blocked, axis=-1)
+
+
+def within_view(
+    settings: PursuitSettings,
+    position: Float[Array, "places 3"],
+    ahead: Float[Array, "places 3"],
+    target: Vector,
+) -> Bool[Array, " places"]:
+    """(N,) whether the (3,) target is within `sight_range` of each (N, 3) position and within the
+    cone of `sight_angle` about each axis (N, 3), of length one.
+    """
+    offset = target - position
+    distance = jnp.sqrt(jnp.sum(offset**2, axis=-1) + 1e-12)
+    # a whole turn is everywhere, what lies exactly behind included
+    least = np.cos(np.deg2rad(settings.sight_angle) / 2) if settings.sight_angle < 360.0 else -2.0
+    in_cone = jnp.sum(offset * ahead, axis=-1) >= least * distance
+    return (distance <= settings.sight_range) & in_cone

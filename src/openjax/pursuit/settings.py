@@ -103,6 +103,12 @@ class PursuitSettings:
     """... after a time between these (s)."""
     capture_radii: Annotated[tuple[float, ...], Interval("(0, 10]")] = ()
     """Smallest and largest capture radius (m), the same in place of `capture_radius`."""
+    sight_range: Annotated[float, Interval("(0, 1000]")] = 1000.0
+    """Distance (m) up to which a pursuer sees the evader ..."""
+    sight_angle: Annotated[float, Interval("(0, 360]")] = 360.0
+    """... in a cone that opens so wide about its body x axis (degrees), if no pillar is between.
+    Neither limits captures, nor what the evader sees (not in the paper).
+    """
     evader_norm: Literal["euclidean", "axis"] = "euclidean"
     """How the evader's force becomes a velocity; "axis" normalises by the largest component (up to
     3**0.5 faster).
@@ -226,6 +232,12 @@ class PursuitSettings:
         """The same game with one size of team, one speed of the evader and one capture radius."""
         alike = {"team_sizes": (), "evader_speeds": (), "capture_radii": ()}
         return dataclasses.replace(self, num_pursuers=number, **alike)
+
+    @property
+    def limited_sight(self) -> bool:
+        """Whether something else than pillars can hide the evader."""
+        whole = PursuitSettings.sight_range, PursuitSettings.sight_angle
+        return (self.sight_range, self.sight_angle) != whole
 
     @property
     def arena(self) -> Arena:

@@ -25,7 +25,7 @@ class PursuitState:
     evader: EvaderState | None
     """which evader it is, and its memory; None where all are the paper's, which has none"""
     last_seen: jax.Array  # (3,) where the evader was last seen; the arena's middle before that
-    in_sight: jax.Array  # (N,) bool, which pursuers see the evader
+    in_sight: jax.Array  # (N,) bool, between which pursuers and the evader no pillar stands
     frames: jax.Array  # (n * spacing, F) history, oldest first
     own_history: jax.Array | None
     """(H * spacing, N, OWN_FRAME) as seen, oldest first; None where it isn't observed"""
@@ -34,6 +34,8 @@ class PursuitState:
     statistics: EpisodeStatistics
     gone_after: jax.Array | None = None
     """(N,) int32, the last step in which each pursuer is there; None: nobody falls out"""
+    in_view: jax.Array | None = None
+    """(N,) bool, which of those in sight have it in range and cone; None: these have no limits"""
 
     @property
     def active(self) -> Bool[Array, "*worlds drones"] | None:
@@ -41,6 +43,11 @@ class PursuitState:
         return still_there(self.task.active, self.gone_after, self.step)
 
     @property
+    def sees(self) -> Bool[Array, "*worlds drones"]:
+        """(N,) bool, which pursuers see the evader."""
+        return self.in_sight if self.in_view is None else self.in_view
+
+    @property
     def seen(self) -> Bool[Array, "*worlds"]:
         """() bool, some pursuer sees the evader."""
-        return jnp.any(self.in_sight, axis=-1)
+        return jnp.any(self.sees, axis=-1)

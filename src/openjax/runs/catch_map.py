@@ -65,6 +65,8 @@ def map_game(command: MapCommand, trained: PursuitSettings) -> PursuitSettings:
         rare_vehicles=0.0,
         fall_outs=command.fall_outs,
         fall_out_seconds=(FALL_OUT, FALL_OUT),
+        sight_range=command.sight_range,
+        sight_angle=command.sight_angle,
     )
 
 
@@ -109,6 +111,7 @@ def draw_map(command: MapCommand, loaded: LoadedPolicy, tell: Callable[[str], No
         "scenario": command.scenario,
         "messages": dataclasses.asdict(command.messages),
         "fall_outs": command.fall_outs,
+        "sight": {"range": command.sight_range, "angle": command.sight_angle},
         "trained_with": list(loaded.settings.environment.team_sizes),
         "cells": [cell_record(game, *pair) for pair in zip(cells, flown, strict=True)],
         "seconds": time.monotonic() - began,
