@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from openjax.baselines import Heuristic
-from openjax.baselines.stack import stack_bound
+from openjax.baselines.stack import planar_bound, stack_bound
 from openjax.pursuit import Pursuit, PursuitSettings, uniform_task
 from openjax.pursuit.evaders import draw_evader
 from openjax.pursuit.evaders.behaviours import MARGIN
@@ -71,6 +71,13 @@ def test_the_bound_of_the_papers_arena():
     assert (
         stack_bound(PursuitSettings(num_pursuers=2)) == 0.0
     )  # a height of .3 m isn't covered by .3 m
+
+
+def test_points_can_force_more_than_on_one_ray():
+    for changes in ({}, {"num_pursuers": 8}, {"num_pursuers": 5, "capture_radius": 0.15}):
+        settings = PursuitSettings(**changes)
+        assert planar_bound(settings) > stack_bound(settings) > 1.0
+    assert planar_bound(PursuitSettings(num_pursuers=2)) == 0.0
 
 
 @pytest.mark.slow

@@ -1,6 +1,8 @@
 """The map of what can be caught."""
 
 import dataclasses
+import json
+import re
 
 import jax.numpy as jnp
 import pytest
@@ -10,6 +12,7 @@ import openjax
 from openjax.evaluation.episodes import wilson
 from openjax.pursuit import PursuitSettings
 from openjax.runs.catch_map import draw_map, map_game
+from openjax.runs.map_page import map_page
 from openjax.runs.options import MapCommand
 from openjax.store.policies import own_controller
 
@@ -45,6 +48,10 @@ def test_cells_are_games_of_their_own():
         assert cell["episodes"] == 2
         # one pursuer in the middle leaves .6 m above and below it
         assert (cell["forced_below"] > 0.0) == (radius == 3.0 or (number == 3 and radius > 0.2))
+        assert cell["planar_below"] >= cell["forced_below"] or radius == 3.0
+    shown = re.search(r'<script id="data"[^>]*>(.*?)</script>', map_page({"empty <1>": found}))
+    (only,) = json.loads(shown[1])
+    assert only["name"] == "empty <1>" and len(only["cells"]) == 12
 
 
 def test_intervals_of_proportions_are_wilsons():

@@ -10,15 +10,27 @@ worst is the wall, y = R, up to x = R - s. So a capture is forced within finite 
 
 1.331 for three pursuers, r = .3 m, R = .9 m, H = 1.2 m. (An evader between axis and pursuer has
 crossed s before.)
+
+They can do more (`planar_bound`): while they keep its angle, the evader at the wall must run to one
+side, and they dash at where it will be.
 """
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
 from openjax.baselines.parameters import parameter
 from openjax.baselines.surroundings import Craft, Surroundings, length
 from openjax.pursuit.settings import PursuitSettings
+
+PLANAR = (
+    (1.0, 1.05, 1.1, 1.2, 1.3, 1.4, 1.5, 1.6, 1.8, 2.0, 2.25, 2.5, 3.0, 3.5),
+    (0.0, 0.01, 0.026, 0.065, 0.106, 0.146, 0.185, 0.221, 0.286, 0.342, 0.402, 0.453, 0.532, 0.592),
+)
+"""Ratios of speeds, and how near a point comes to a faster one in a disc, in radii: the game of
+both solved on a grid (experiments/results/planar.md).
+"""
 
 
 def stack_bound(settings: PursuitSettings) -> float:
@@ -30,6 +42,17 @@ def stack_bound(settings: PursuitSettings) -> float:
         return 0.0
     across = (settings.capture_radius**2 - half**2) ** 0.5
     return settings.arena_radius / max(settings.arena_radius - across, 1e-9)
+
+
+def planar_bound(settings: PursuitSettings) -> float:
+    """The ratio of speeds v_e / v_p below which points that fly one above another can force a
+    capture, by `PLANAR`; 0 where a pursuer's height isn't covered. How they do it isn't here.
+    """
+    half = settings.arena_height / (2 * settings.num_pursuers)
+    if half >= settings.capture_radius:
+        return 0.0
+    across = (settings.capture_radius**2 - half**2) ** 0.5
+    return float(np.interp(across / settings.arena_radius, *PLANAR[::-1]))
 
 
 @struct.dataclass

@@ -2,7 +2,8 @@
 
 It flies with teams of each size, after evaders of each speed, with each capture radius, against
 scripted evaders. The picture shows the share of captures in each cell, and the line below which a
-theorem forces one for points without inertia (`openjax.baselines.stack`).
+theorem forces one for points without inertia (`openjax.baselines.stack`); `--page` writes a page to
+move about in.
 """
 
 import dataclasses
@@ -10,7 +11,7 @@ from collections.abc import Sequence
 
 from openjax.command_line import output_console, parse
 from openjax.errors import UserError
-from openjax.files import check_output, write_json
+from openjax.files import check_output, write_json, write_text
 from openjax.pursuit.evaders.kinds import check_evaders
 from openjax.runs.options import MapCommand
 from openjax.store.compiled_programs import cache_programs
@@ -35,6 +36,7 @@ def main(arguments: Sequence[str]) -> int:
     import jax
 
     from openjax.runs.catch_map import draw_map, map_game
+    from openjax.runs.map_page import map_page
     from openjax.show.plots import plot_map
     from openjax.store.policies import load_policy
 
@@ -46,6 +48,7 @@ def main(arguments: Sequence[str]) -> int:
     command = parse(MapCommand, default, arguments, PROGRAM)
     check_output(command.out, "--out")
     check_output(command.json, "--json")
+    check_output(command.page, "--page")
     if command.out.suffix not in (".png", ".svg", ".pdf"):
         raise UserError(f"--out {command.out}: a picture ends in .png, .svg or .pdf")
     check_evaders(command.evaders)
@@ -54,6 +57,8 @@ def main(arguments: Sequence[str]) -> int:
     found = draw_map(command, loaded, lambda text: console.print(text, soft_wrap=True))
     if command.json is not None:
         write_json(command.json, found)
+    if command.page is not None:
+        write_text(command.page, map_page({command.scenario: found}))
     plot_map(command.out, found["cells"], f"{command.policy}: captures, {command.scenario}")
     least = min(found["cells"], key=lambda cell: cell["capture_rate"])
     console.print(

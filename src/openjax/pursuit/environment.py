@@ -344,10 +344,16 @@ class Pursuit:
           observation, state, reward (N,), terminated (), truncated (), info.
         """
         del key
+        action = jnp.clip(action.astype(jnp.float32), -1.0, 1.0)
+        return self.follow(state, action, self.move(state, action), wish)
+
+    def move(self, state: PursuitState, action: Actions) -> DroneState:
+        """The pursuers (leading axis N) a control step after `state`, in which they fly `action`
+        (N, 4) in -1..1: the part of `step` that is physics.
+        """
         settings = self.settings
         task = state.task
         chex.assert_shape(action, (settings.num_pursuers, 4))
-        action = jnp.clip(action.astype(jnp.float32), -1.0, 1.0)
         drones = self.dynamics(
             self.vehicle,
             state.drones,
@@ -361,8 +367,7 @@ class Pursuit:
             drones = drones.replace(
                 velocity=drones.velocity * jnp.minimum(1.0, settings.max_speed / speed)
             )
-        drones = held(self._active_after(state), drones)
-        return self.follow(state, action, drones, wish)
+        return held(self._active_after(state), drones)
 
     def follow(
         self,
@@ -374,7 +379,7 @@ class Pursuit:
         """The game's part of a step that began at `state` with `action` and ended with the pursuers
         as `drones`.
 
-        `step` is physics and this; where the pursuers are flown by something else, real vehicles
+        `step` is `move` and this; where the pursuers are flown by something else, real vehicles
         say, this alone. Returns what `step` does.
         """
         settings = self.settings

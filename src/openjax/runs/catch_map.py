@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from openjax.baselines.stack import stack_bound
+from openjax.baselines.stack import planar_bound, stack_bound
 from openjax.errors import UserError
 from openjax.evaluation.episodes import make_evaluate, wilson
 from openjax.pursuit import EpisodeStatistics, Pursuit, PursuitSettings, Task, uniform_task
@@ -112,6 +112,11 @@ def draw_map(command: MapCommand, loaded: LoadedPolicy, tell: Callable[[str], No
         "messages": dataclasses.asdict(command.messages),
         "fall_outs": command.fall_outs,
         "sight": {"range": command.sight_range, "angle": command.sight_angle},
+        "game": {
+            "arena_radius": game.arena_radius,
+            "arena_height": game.arena_height,
+            "seconds": game.episode_length * game.time_step,
+        },
         "trained_with": list(loaded.settings.environment.team_sizes),
         "cells": [cell_record(game, *pair) for pair in zip(cells, flown, strict=True)],
         "seconds": time.monotonic() - began,
@@ -151,8 +156,8 @@ def _fly(command, environment, loaded, cells, tell):
 
 def cell_record(game: PursuitSettings, cell: Cell, statistics: EpisodeStatistics) -> dict:
     """A cell's captures with their 95 % interval, crashes and mean capture time (s, of those that
-    capture), and the speed ratio below which a theorem forces a capture for points
-    (`openjax.baselines.stack`).
+    capture), and the speed ratios below which a theorem forces a capture for points
+    (`openjax.baselines.stack`): all on one ray, and as the game in a plane has it.
     """
     episodes = len(statistics.captured)
     caught = statistics.captured
@@ -167,5 +172,6 @@ def cell_record(game: PursuitSettings, cell: Cell, statistics: EpisodeStatistics
         "interval": list(wilson(int(caught.sum()), episodes)),
         "capture_seconds": None if seconds is None else float(seconds),
         "crash_rate": float(statistics.crashed.mean()),
-        "forced_below": float(stack_bound(points)),
+        "forced_below": stack_bound(points),
+        "planar_below": planar_bound(points),
     }

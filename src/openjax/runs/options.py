@@ -140,6 +140,8 @@ class MapCommand:
     """
     out: Path = Path("map.png")
     """File for the picture: a small map for each size of team."""
+    page: Path | None = None
+    """File for a page to move about in (.html), for a reader who knows no game theory."""
     json: Path | None = None
     """File to write all cells to."""
     sizes: Annotated[tuple[int, ...], Interval("[1, 8]")] = (1, 2, 3, 4, 5, 6, 7, 8)

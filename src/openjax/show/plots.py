@@ -101,8 +101,9 @@ def draw_from_above(axes: Axes, trajectory: Trajectory) -> None:
 
 
 def plot_map(path: Path, cells: Sequence[dict], title: str) -> None:
-    """A small map for each size of team: captures over capture radius and speed ratio, and the line
-    below which a theorem forces one.
+    """A small map for each size of team: captures over capture radius and speed ratio, the line
+    below which a theorem forces one, and, dashed, the one below which points can force one that fly
+    one above another.
 
     cells: records of `openjax.runs.catch_map.cell_record`.
     """
@@ -128,11 +129,12 @@ def _draw_map(axes, cells):
     radii = sorted({cell["capture_radius"] for cell in cells})
     ratios = sorted({cell["speed_ratio"] for cell in cells})
     rates = np.full((len(ratios), len(radii)), np.nan)
-    forced = dict.fromkeys(radii, 0.0)
+    bounds = {name: dict.fromkeys(radii, 0.0) for name in ("forced_below", "planar_below")}
     for cell in cells:
         place = ratios.index(cell["speed_ratio"]), radii.index(cell["capture_radius"])
         rates[place] = cell["capture_rate"]
-        forced[cell["capture_radius"]] = cell["forced_below"]
+        for name, forced in bounds.items():
+            forced[cell["capture_radius"]] = cell.get(name, 0.0)
         text = f"{cell['capture_rate']:.2f}".replace("0.", ".")
         dark = cell["capture_rate"] < 0.5
         color = "white" if dark else "black"
@@ -142,9 +144,10 @@ def _draw_map(axes, cells):
     axes.set_yticks(range(len(ratios)), [f"{ratio:g}" for ratio in ratios], fontsize=7)
     # between the middles of cells
     ends = {"left": -0.5, "right": len(ratios) - 0.5}
-    height = np.interp(list(forced.values()), ratios, range(len(ratios)), **ends)
     edges = np.arange(len(radii) + 1) - 0.5
-    axes.stairs(height, edges, baseline=None, color="red", linewidth=1.5)
+    for forced, style in zip(bounds.values(), ("-", "--"), strict=True):
+        height = np.interp(list(forced.values()), ratios, range(len(ratios)), **ends)
+        axes.stairs(height, edges, baseline=None, color="red", linewidth=1.5, linestyle=style)
     return shown
 
 

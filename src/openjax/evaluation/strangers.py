@@ -1,0 +1,97 @@
+"""Teams of strangers: pursuers of several policies in one team.
+
+Each policy looks at the world as its own settings say, and takes the others for its like. So a
+world has a state for each policy, with its own frames and history; drones and evader are the same
+in all of them.
+"""
+
+import dataclasses
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from openjax.policy import Policy, PolicyParameters
+from openjax.pursuit import EpisodeStatistics, Pursuit, PursuitSettings, Task
+
+OBSERVED = (
+    *("observed_pillars", "observe_time", "observe_position", "observe_game", "observe_in"),
+    *("observe_history", "observe_history_spacing"),
+    *("history_length", "history_spacing", "history_pursuers"),
+)
+"""The settings that say what a pursuer observes; all others are the game's."""
+
+
+def observed_by(game: PursuitSettings, policy: PursuitSettings) -> PursuitSettings:
+    """A game as the pursuers of a policy observe it, who learned in another one."""
+    return dataclasses.replace(game, **{name: getattr(policy, name) for name in OBSERVED})
+
+
+@dataclass(frozen=True, eq=False)
+class Strangers:
+    """K policies, and the one game of all of them as each observes it."""
+
+    environments: tuple[Pursuit, ...]
+    policies: tuple[Policy, ...]
+
+    def fly(
+        self,
+        parameters: tuple[PolicyParameters, ...],
+        tasks: Task,
+        members: jax.Array,
+        key: jax.Array,
+    ) -> EpisodeStatistics:
+        """One episode per task, to be compiled by the caller.
+
+        Args:
+          parameters: of each policy.
+          tasks: (B, ...).
+          members: (B, N) int32, the policy of each pursuer.
+          key: draws evaders, start attitudes and whatever else a reset draws.
+
+        Returns:
+          statistics (B,).
+        """
+        keys = jax.random.split(key, members.shape[0])
+        # each draws the same from the same key
+        worlds = tuple(jax.vmap(game.reset_to)(keys, tasks) for game in self.environments)
+        which = jnp.arange(members.shape[1])
+
+        def one(worlds, _):
+            actions = jnp.stack(
+                [
+                    policy.act(own, observation)
+                    for policy, own, (observation, _) in zip(
+                        self.policies, parameters, worlds, strict=True
+                    )
+                ],
+                axis=1,
+            )
+            action = jax.vmap(lambda own, member: own[member, which])(actions, members)
+            action = jnp.clip(action, -1.0, 1.0)
+            drones = jax.vmap(self.environments[0].move)(worlds[0][1], action)
+            after = []
+            for game, (_, state) in zip(self.environments, worlds, strict=True):
+                observation, state, *_ = jax.vmap(game.follow)(state, action, drones)
+                after.append((observation, state))
+            return tuple(after), None
+
+        length = self.environments[0].settings.episode_length
+        return jax.lax.scan(one, worlds, length=length)[0][0][1].statistics
+
+
+def bootstrap_mean(values: np.ndarray, seed: int = 0, draws: int = 5000) -> tuple[float, float]:
+    """95 % interval of the mean over strata (M) and their episodes (E), (M, E): episodes are drawn
+    anew within each stratum (the stratified bootstrap of Agarwal et al., 2021).
+
+    Which strata there are isn't drawn: it is an interval for these M, not for others like them.
+    """
+    generator = np.random.default_rng(seed)
+    strata, episodes = values.shape
+    means = np.zeros(draws)
+    for own in values:
+        chosen = generator.integers(episodes, size=(draws, episodes))
+        means += own[chosen].mean(axis=1) / strata
+    low, high = np.quantile(means, (0.025, 0.975))
+    return float(low), float(high)
