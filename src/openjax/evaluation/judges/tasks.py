@@ -16,10 +16,16 @@ MOVES = 4
 """Local expansions of a layout's starts: some .1 m along each axis."""
 
 
-def draw_task(settings: PursuitSettings, layouts: Task, share: float, key: jax.Array) -> Task:
-    """A task to learn on: uniform and turned, or a layout (L, ...) whose starts are moved."""
+def draw_task(
+    settings: PursuitSettings, layouts: Task | None, share: float, key: jax.Array
+) -> Task:
+    """A task to learn on: uniform and turned, or, with these odds, a layout (L, ...) whose starts
+    are moved. None: the game's number of pursuers has no layouts.
+    """
     keys = jax.random.split(key, 5)
     uniform = turn_task(keys[0], uniform_task(settings, keys[1]))
+    if layouts is None:
+        return uniform
     which = jax.random.randint(keys[2], (), 0, layouts.evader_position.shape[0])
     task = jax.tree.map(lambda leaf: leaf[which], layouts)
 
