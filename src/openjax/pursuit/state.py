@@ -45,7 +45,7 @@ class PursuitState:
     @property
     def sees(self) -> Bool[Array, "*worlds drones"]:
         """(N,) bool, which pursuers see the evader."""
-        return self.in_sight if self.in_view is None else self.in_view
+        return jnp.asarray(self.in_sight if self.in_view is None else self.in_view)
 
     @property
     def seen(self) -> Bool[Array, "*worlds"]:
