@@ -2,8 +2,8 @@
 
 Steps a second of drones (crazyflow, hyperdrone) and of a game (JaxMARL's simple_tag), and seconds
 until a tumbling drone is caught and held by a learner (Brax's PPO, rl-tools' SAC) on our physics.
-`pip install crazyflow hyperdrone jaxmarl brax rltools` has them all; one that isn't installed is
-left out with a line. Every call is compiled, warmed up and repeated; the median counts.
+`pip install crazyflow hyperdrone jaxmarl brax rltools` has them; what isn't installed is left out
+with a line. Every call is compiled, warmed up and repeated; the median counts.
 """
 
 import argparse
@@ -26,11 +26,11 @@ from openjax.vehicle import load_vehicle
 VEHICLE = load_vehicle()
 
 
-def rate(run, *arguments, steps: int, calls: int = 5) -> float:
+def rate(run, *arguments, steps: int) -> float:
     """Steps a second of a function that makes so many of them."""
     jax.block_until_ready(run(*arguments))
     times = []
-    for _ in range(calls):
+    for _ in range(5):
         begin = time.perf_counter()
         jax.block_until_ready(run(*arguments))
         times.append(time.perf_counter() - begin)
@@ -109,19 +109,17 @@ def jaxmarl_tag(options) -> dict:
     return game_steps(options, jaxmarl.make("MPE_simple_tag_v3"))
 
 
-def learner(name: str):
-    return lambda options: getattr(recovery, name)(options.learning_steps)
-
-
 CASES = {
     "openjax, rigid, solid": openjax_drones,
     "openjax, rigid, free": lambda options: openjax_drones(options, contacts=False),
     "crazyflow, body rates": crazyflow_drones,
-    "hyperdrone, motors": hyperdrone_drones,
     "openjax, the game": lambda options: game_steps(options, PursuitMultiAgentEnv()),
     "JaxMARL, simple_tag": jaxmarl_tag,
-    "Brax's PPO, recovery": learner("brax_ppo"),
-    "rl-tools' SAC, recovery": learner("rl_tools_sac"),
+    "Brax's PPO, recovery": lambda options: recovery.brax_ppo(
+        options.learning_steps, options.learning_worlds
+    ),
+    "hyperdrone, motors": hyperdrone_drones,
+    "rl-tools' SAC, recovery": lambda options: recovery.rl_tools_sac(options.sac_steps),
 }
 
 
@@ -130,18 +128,19 @@ def main(arguments) -> int:
     parser.add_argument("--worlds", type=int, default=131072)
     parser.add_argument("--steps", type=int, default=50, help="steps of a call")
     parser.add_argument("--learning_steps", type=int, default=10_000_000)
+    parser.add_argument("--learning_worlds", type=int, default=2048)
+    parser.add_argument("--sac_steps", type=int, default=20_000, help="of a single drone")
     parser.add_argument("--only", nargs="*", default=list(CASES), choices=list(CASES))
     parser.add_argument("--json", type=Path, default=Path("peers.json"))
     options = parser.parse_args(arguments)
-    sizes = {"worlds": options.worlds, "steps": options.steps}
-    result = {"machine": describe_machine(), **sizes, "rows": {}}
+    sizes = vars(options) | {"json": None}
+    result = {"machine": describe_machine(), "sizes": sizes, "rows": {}, "left_out": {}}
     for name in options.only:
         try:
             result["rows"][name] = CASES[name](options)
         except Exception as reason:  # not installed, or not with this JAX or compiler
-            print(f"{name}: left out, {type(reason).__name__}: {reason}".splitlines()[0])
-            continue
-        print(name, result["rows"][name], flush=True)
+            result["left_out"][name] = f"{type(reason).__name__}: {reason}".splitlines()[0]
+        print(name, result["rows"].get(name) or result["left_out"][name], flush=True)
         write_json(options.json, result)  # after each, so that an interrupted study leaves some
     return 0
 

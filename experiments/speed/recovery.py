@@ -101,6 +101,8 @@ class RecoveryEnv(gymnasium.Env):
 
     observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (SIZE,), np.float32)
     action_space = gymnasium.spaces.Box(-1.0, 1.0, (4,), np.float32)
+    spec = gymnasium.envs.registration.EnvSpec("Recovery-v0", max_episode_steps=EPISODE)
+    """By which rl-tools knows how long an episode is: without it its program isn't compiled."""
 
     def __init__(self):
         self._tumble = jax.jit(tumble)
@@ -127,6 +129,8 @@ def rl_tools_sac(steps: int) -> dict:
     """rl-tools' SAC, by its Python interface; what it does while it learns counts."""
     from rltools import SAC
 
+    # a single drone is stepped sooner there than on a GPU
+    jax.config.update("jax_default_device", jax.devices("cpu")[0])
     environments = []
 
     def make():
@@ -135,7 +139,7 @@ def rl_tools_sac(steps: int) -> dict:
         return environments[-1]
 
     begin = time.perf_counter()
-    state = SAC(make).State(0)
+    state = SAC(make, STEP_LIMIT=steps, enable_evaluation=False).State(0)
     curve = []
     for number in range(steps):
         if state.step():
