@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 
 from openjax.flying.controller import Pose, level_acceleration, moved_on
+from openjax.flying.drift import drifting
 from openjax.flying.innovations import Innovations
 from openjax.flying.judge import Track, Verdict, agree, follows
 from openjax.flying.set_point import as_sent
@@ -26,7 +27,29 @@ def see(state: State, time: float, samples: Sequence[PoseSample]) -> State:
     state = state._replace(time=time, dt=min(max(time - state.time, 0.0), 0.1))
     both = zip(state.drones, samples, strict=True)
     drones = tuple(_estimated(state, drone, sample) for drone, sample in both)
-    return state._replace(drones=drones)
+    drift = drifting([drone.innovations.drift for drone in drones])
+    return state._replace(
+        drones=tuple(
+            _without_drift(state, drone) if drifts and sample.captured is None else drone
+            for drone, drifts, sample in zip(drones, drift, samples, strict=True)
+        )
+    )
+
+
+def _without_drift(state, drone) -> Drone:
+    """The drone whose own estimate drifts: none is believed any more in this flight, and it is where
+    the last one was, as fast as thrust and drag explain.
+    """
+    if drone.contradiction or drone.mode not in CHECKED:
+        return drone
+    pose = drone.innovations.pose
+    excess = (*drone.innovations.drift.summed, 0.0)
+    velocity = tuple(v - part for v, part in zip(pose.velocity, excess, strict=True))
+    return drone._replace(
+        own=drone.own._replace(verdict=Verdict.DRIFTS),
+        contradiction=Verdict.DRIFTS,
+        estimate=moved_on(pose._replace(velocity=velocity), state.time),
+    )
 
 
 def _estimated(state, drone, sample) -> Drone:

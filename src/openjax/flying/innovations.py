@@ -10,8 +10,8 @@ in dynamic systems", Automatica 7):
 * the turn, with the gyroscope;
 * the gyroscope, with the body rates that were sent.
 
-A drift of position and velocity together that sets in gently passes all of them: only a second
-source tells it.
+A drift of position and velocity together that sets in gently passes all of them. Teammates tell
+some of these (`openjax.flying.drift`), a second source all.
 """
 
 import math
@@ -19,6 +19,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from openjax.flying.controller import Airframe, Pose, Vector, lift_acceleration
+from openjax.flying.drift import Drift
 from openjax.flying.judge import Verdict
 from openjax.flying.set_point import RATES, SetPoint
 
@@ -78,6 +79,7 @@ class Innovations(NamedTuple):
     age: float = 0.0  # s, for how long that is learnt
     thrust: float = 0.0  # share of the maximum that the motors have reached
     rates: Vector = ZERO  # rad/s, that the rate loop should have reached
+    drift: Drift = Drift()  # what neither thrust nor drag explains, of the level velocity
 
     def after(
         self, pose: Pose, sent: SetPoint, airframe: Airframe, refused: bool = False
@@ -102,7 +104,8 @@ class Innovations(NamedTuple):
         lift = lift_acceleration(pose.quaternion, thrust / airframe.hover_thrust)
         gain = _times(1.0 / dt, _difference(pose.velocity, last.velocity))
         # the bias is what thrust has not explained so far: drag, wind, an unknown weight
-        unexplained = _difference(_difference(gain, lift), self.bias)
+        beyond_thrust = _difference(gain, lift)
+        unexplained = _difference(beyond_thrust, self.bias)
         step = _times(dt, unexplained)
         turn = _difference(
             turn_between(last.quaternion, pose.quaternion),
@@ -122,6 +125,7 @@ class Innovations(NamedTuple):
             age=age,
             thrust=thrust,
             rates=rates,
+            drift=self.drift.after(beyond_thrust, mean, dt),
         )
 
     def corrected(self) -> Pose:

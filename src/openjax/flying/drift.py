@@ -1,0 +1,106 @@
+"""Whether a vehicle's estimated velocity drifts gently, told by its teammates.
+
+While a drift sets in, the estimate accelerates as thrust and attitude don't explain. So do the
+air's drag, which nobody told the vehicle, and an attitude that is off by a tenth of a degree. A
+constant and a drag for each level axis are therefore learnt in flight, by least squares that forget
+(Ljung 1999, "System identification", 11.2), and what they leave is summed up. How large such sums
+are where nothing drifts, the teammates say: they fly alike, in the same air.
+
+The height is left out. There the floor's cushion, another vehicle's wake and an emptier battery
+accelerate by more than a drift does.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from openjax.flying.controller import Vector
+
+WINDOW = 1.5
+"""Over this time constant (s) is summed up what a constant and drag leave: a gentle drift takes
+about as long to set in."""
+FORGETTING = 6.0
+"""Time constant (s) with which they are learnt: longer than the window, or they learn the drift."""
+LEARNT = 4.0
+"""Before (s) sums say how badly they are known yet."""
+SPREAD = 0.05
+"""Information that never fades, so that a vehicle at rest is taken to have no drag (m^2/s^2)."""
+FLOOR = 0.15
+"""Smaller sums (m/s) are no drift, whatever the teammates' are: an attitude's error of .2 degrees
+that comes within the window accelerates by .05 m/s ..."""
+RATIO = 4.0
+"""... and none is one that isn't so many times their root mean square: of flights of 30 s without a
+drift, at most one in fifty was ended (`experiments.flying.observable`)."""
+
+
+class Fit(NamedTuple):
+    """Constant and drag of one level axis: sums of least squares."""
+
+    time: float = 0.3  # s
+    way: float = 0.0  # of the velocity, m
+    energy: float = 0.3  # of its square, m^2/s
+    gained: float = 0.0  # of the acceleration, m/s
+    moment: float = 0.0  # of their product, m^2/s^2
+
+    def after(self, acceleration: float, velocity: float, dt: float) -> "Fit":
+        """With what was unexplained for `dt` (s) at a velocity (m/s)."""
+        kept = math.exp(-dt / FORGETTING)
+        return Fit(
+            kept * self.time + dt + (1.0 - kept) * SPREAD,
+            kept * self.way + dt * velocity,
+            kept * self.energy + dt * velocity**2 + (1.0 - kept) * SPREAD,
+            kept * self.gained + dt * acceleration,
+            kept * self.moment + dt * acceleration * velocity,
+        )
+
+    def at(self, velocity: float) -> float:
+        """The acceleration (m/s^2) that is usual at a velocity (m/s)."""
+        determinant = self.time * self.energy - self.way**2
+        constant = self.energy * self.gained - self.way * self.moment
+        slope = self.time * self.moment - self.way * self.gained
+        return (constant + slope * velocity) / determinant
+
+
+class Drift(NamedTuple):
+    """What of a vehicle's level velocity nothing explains."""
+
+    fits: tuple[Fit, Fit] = (Fit(), Fit())
+    summed: tuple[float, float] = (0.0, 0.0)  # m/s, over the window
+    squares: float = 0.0  # m^2/s, of the sums' lengths since they are worth something
+    age: float = 0.0  # s
+
+    def after(self, unexplained: Vector, velocity: Vector, dt: float) -> "Drift":
+        """After `dt` (s) with an acceleration (m/s^2, world) that thrust didn't explain."""
+        level = list(zip(self.fits, unexplained, velocity, strict=False))
+        kept = math.exp(-dt / WINDOW)
+        summed = tuple(
+            kept * total + dt * (acceleration - fit.at(speed))
+            for total, (fit, acceleration, speed) in zip(self.summed, level, strict=False)
+        )
+        fits = tuple(fit.after(acceleration, speed, dt) for fit, acceleration, speed in level)
+        worth = dt if self.age > LEARNT else 0.0
+        squares = self.squares + worth * sum(part**2 for part in summed)
+        return Drift(fits, summed, squares, self.age + dt)
+
+    @property
+    def size(self) -> float:
+        """Of the sum (m/s)."""
+        return math.hypot(*self.summed)
+
+    @property
+    def usual(self) -> float:
+        """Root mean square of its sums (m/s); infinite before they are worth something."""
+        seconds = self.age - LEARNT
+        return math.sqrt(self.squares / seconds) if seconds > 1.0 else math.inf
+
+
+def drifting(drifts: Sequence[Drift]) -> tuple[bool, ...]:
+    """Of each vehicle, whether its sum is larger than what its teammates' are. Nobody tells that of
+    a lone one.
+    """
+    usual = [drift.usual for drift in drifts]
+    largest = [max((*usual[:i], *usual[i + 1 :]), default=math.inf) for i in range(len(usual))]
+    return tuple(
+        drift.age > LEARNT and drift.size > max(FLOOR, RATIO * others)
+        for drift, others in zip(drifts, largest, strict=True)
+    )
