@@ -1,12 +1,11 @@
-"""What a vehicle could tell of a gentle drift of its own estimate: `python -m
+"""What teammates tell of a gentle drift of a vehicle's own estimate: `python -m
 experiments.flying.observable`.
 
 Position and velocity of an estimate drift together. A steady drift shows nowhere: thrust, attitude
 and gyroscope tell accelerations and turns, not speeds. While it sets in, the estimate accelerates
 as thrust doesn't explain. So does the air's drag, which nobody told the vehicle, and an attitude
-that is off by a tenth of a degree. Level accelerations are simulated with these, and what is left
-of a constant and of drag, both learnt in flight (recursive least squares), is summed up over 1.5 s.
-It is told where the sum is larger than in any flight without a drift.
+that is off by a tenth of a degree. Level accelerations of teams are simulated with these, and
+judged as `openjax.flying.drift` judges them, all flights at once.
 """
 
 from __future__ import annotations
@@ -14,17 +13,17 @@ from __future__ import annotations
 import numpy as np
 
 from experiments.table import Page, Table, page_parser, publish
+from openjax.flying.drift import FLOOR, FORGETTING, LEARNT, RATIO, SPREAD, WINDOW
 
 PERIOD = 0.01
-SECONDS = 16.0
-BEGIN = 8.0
-"""s, when a drift begins."""
+SECONDS = 30.0
+TEAM = 3
 SPEED = 0.7
 """m/s, of a hunting vehicle (rms)."""
-FORGETTING = 6.0
-"""s in which constant and drag are learnt."""
-WINDOW = 1.5
-"""s over which is summed up what they leave."""
+BEGIN = (5.0, 12.0)
+"""s, when a drift begins."""
+SOON = 6.0
+"""A drift that is told later (s) isn't counted as told."""
 VEHICLES = {
     "as the simulator: no drag, still air, exact attitude": (0.0, 0.0, 0.0, 0.01),
     "little drag, attitude to .1 degree": (0.1, 0.05, 0.1, 0.02),
@@ -36,52 +35,58 @@ rms). The sample Crazyflie's drag is .4/s.
 """
 DRIFTS = {".1 m/s within 2 s": (0.1, 2.0), ".3 m/s within 2 s": (0.3, 2.0)}
 DRIFTS |= {".5 m/s within 2 s": (0.5, 2.0), ".5 m/s within 4 s": (0.5, 4.0)}
-FLIGHTS = 200
+FLIGHTS = 300
 
 
 def wandering(rng: np.random.Generator, time_constant: float, size: float) -> np.ndarray:
-    """(T, FLIGHTS, 2) of a first-order Gauss-Markov process."""
+    """(T, FLIGHTS, TEAM, 2) of a first-order Gauss-Markov process."""
     steps = round(SECONDS / PERIOD)
     share = PERIOD / time_constant
-    noise = size * np.sqrt(2 * share) * rng.standard_normal((steps, FLIGHTS, 2))
-    out = np.zeros((steps, FLIGHTS, 2))
+    noise = size * np.sqrt(2 * share) * rng.standard_normal((steps, FLIGHTS, TEAM, 2))
+    out = np.empty_like(noise)
+    out[0] = size * rng.standard_normal((FLIGHTS, TEAM, 2))
     for k in range(1, steps):
         out[k] = (1 - share) * out[k - 1] + noise[k]
     return out
 
 
-def unexplained(rng, vehicle, drift) -> tuple[np.ndarray, np.ndarray]:
-    """What thrust and attitude don't explain of the estimate's acceleration, and the estimate's
-    velocity, (T, FLIGHTS, 2) each, m/s^2 and m/s, world.
+def unexplained(rng, vehicle, drift) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What thrust and attitude don't explain of the estimate's acceleration (m/s^2, world) and the
+    estimate's velocity (m/s), (T, FLIGHTS, TEAM, 2) each, and when the first vehicle's began to
+    drift (s).
     """
     drag, air, tilt, error = vehicle
     speed, seconds = drift
     time = PERIOD * np.arange(round(SECONDS / PERIOD))
     velocity = wandering(rng, 0.6, SPEED)
+    velocity *= np.clip(time - 1.5, 0.1, 1.0)[:, None, None, None]  # the way to the start is slow
+    begin = rng.uniform(*BEGIN, FLIGHTS)
     away = rng.uniform(0.0, 2 * np.pi, FLIGHTS)
     direction = np.stack([np.cos(away), np.sin(away)], 1)
-    begun = speed * np.clip((time - BEGIN) / seconds, 0.0, 1.0)
-    estimate = velocity + begun[:, None, None] * direction + wandering(rng, 0.3, error)
-    lean = 9.81 * np.radians(wandering(rng, 5.0, tilt) + rng.standard_normal((FLIGHTS, 2)))
+    begun = speed * np.clip((time[:, None] - begin) / seconds, 0.0, 1.0)
+    estimate = velocity + wandering(rng, 0.3, error)
+    estimate[:, :, 0] += begun[..., None] * direction
+    constant = rng.standard_normal((FLIGHTS, TEAM, 2))  # degrees: rotors, a battery's place
+    lean = 9.81 * np.radians(wandering(rng, 5.0, tilt) + constant)
     thrust = np.gradient(velocity, PERIOD, axis=0)
     thrust = thrust + drag * (velocity - wandering(rng, 2.0, air)) + lean
-    return np.gradient(estimate, PERIOD, axis=0) - thrust, estimate
+    return np.gradient(estimate, PERIOD, axis=0) - thrust, estimate, begin
 
 
 def summed(rest: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-    """(T, FLIGHTS) m/s, the sum over a window of what a constant and drag don't explain."""
-    inputs = np.stack([np.ones_like(velocity), velocity], -1)
+    """(T, FLIGHTS, TEAM) m/s, the sum over a window of what a constant and drag don't explain."""
     normal = np.zeros((*velocity.shape[1:], 2, 2)) + 0.3 * np.eye(2)
     moment = np.zeros((*velocity.shape[1:], 2))
-    learnt = np.zeros_like(moment)
     total = np.zeros(velocity.shape[1:])
+    learnt = np.zeros_like(moment)
     kept = np.exp(-PERIOD / FORGETTING)
-    out = np.zeros(velocity.shape[:2])
-    for k, (value, given) in enumerate(zip(rest, inputs, strict=True)):
+    out = np.zeros(velocity.shape[:-1])
+    for k, (value, speed) in enumerate(zip(rest, velocity, strict=True)):
+        given = np.stack([np.ones_like(speed), speed], -1)
         left = value - (learnt * given).sum(-1)
         total = np.exp(-PERIOD / WINDOW) * total + PERIOD * left
         normal = kept * normal + PERIOD * given[..., :, None] * given[..., None, :]
-        normal = normal + (1 - kept) * 0.05 * np.eye(2)
+        normal = normal + (1 - kept) * SPREAD * np.eye(2)
         moment = kept * moment + PERIOD * given * value[..., None]
         if k % 10 == 0:
             learnt = np.linalg.solve(normal, moment[..., None])[..., 0]
@@ -89,25 +94,36 @@ def summed(rest: np.ndarray, velocity: np.ndarray) -> np.ndarray:
     return out
 
 
+def told(sums: np.ndarray) -> np.ndarray:
+    """(FLIGHTS, TEAM) s, when each vehicle is told to drift; infinite for never."""
+    sums = sums[round(LEARNT / PERIOD) :]
+    seconds = PERIOD * np.arange(1, len(sums) + 1)[:, None, None]
+    usual = np.sqrt(PERIOD * np.cumsum(sums**2, 0) / seconds)
+    usual[seconds[:, 0, 0] <= 1.0] = np.inf
+    others = np.stack([np.delete(usual, i, 2).max(2) for i in range(TEAM)], 2)
+    beyond = sums > np.maximum(FLOOR, RATIO * others)
+    return np.where(beyond.any(0), LEARNT + PERIOD * beyond.argmax(0), np.inf)
+
+
 def study(options) -> dict:
-    """For each vehicle the largest sum without a drift, and the share of drifts that exceed it."""
-    after = round(BEGIN / PERIOD)
+    """For each vehicle how many flights without a drift would end, and which drifts are told."""
     rows = []
     for name, vehicle in VEHICLES.items():
         rng = np.random.default_rng(options.seed)
-        usual = summed(*unexplained(rng, vehicle, (0.0, 1.0)))[after:].max()
-        told = {
-            drift: float((summed(*unexplained(rng, vehicle, size))[after:].max(0) > usual).mean())
-            for drift, size in DRIFTS.items()
-        }
-        rows.append({"vehicle": name, "usual": float(usual), **told})
+        without = told(summed(*unexplained(rng, vehicle, (0.0, 1.0))[:2]))
+        row = {"vehicle": name, "ended": float(np.isfinite(without).any(1).mean())}
+        for drift, size in DRIFTS.items():
+            rest, velocity, begin = unexplained(rng, vehicle, size)
+            after = told(summed(rest, velocity))[:, 0] - begin
+            row[drift] = float(((after > 0.0) & (after < SOON)).mean())
+        rows.append(row)
     return {"flights": FLIGHTS, "rows": rows}
 
 
 def page(results) -> Page:
     """The study's table."""
-    prose = "Share of drifts that are told, where no flight without one would be."
-    columns = {"vehicle": "vehicle", "largest sum without a drift (m/s)": "usual:.2f"}
+    prose = "Share of drifts that are told within six seconds, and of flights that end for none."
+    columns = {"vehicle": "vehicle", "ended without a drift": "ended:.3f"}
     columns |= {f"told: {drift}": (lambda row, d=drift: f"{row[d]:.2f}") for drift in DRIFTS}
     return Page("What of a gentle drift can be told", prose, Table(columns, results["rows"]))
 
