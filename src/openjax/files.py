@@ -55,7 +55,7 @@ def _read(path, what, language, parse: Callable[[str], Any]):
             raise UserError(f"{path}: is no file; the {what} is one")
         if path.stat().st_size > LARGEST_TEXT:
             raise UserError(f"{path}: {path.stat().st_size} bytes are too many for a {what}")
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")  # editors of Windows begin with a mark
     except UnicodeDecodeError as error:
         raise UserError(
             f"{path}: not readable as {language} (byte {error.start} is not UTF-8)"

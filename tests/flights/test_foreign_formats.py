@@ -141,6 +141,50 @@ def test_gyroscope_and_motors_alone_are_a_flight(tmp_path, columns):
     assert any("torques alone" in issue.issue for issue in case.quality)
 
 
+def client_table(columns, begin=81234):
+    """All blocks in one table, as scripts with cflib write them."""
+    table = {"timestamp": begin + np.rint(columns["t"] * 1000)}
+    for values in client_blocks(columns).values():
+        table |= values
+    return table
+
+
+def test_the_firmwares_ticks_go_before_the_computers_clock(tmp_path, columns):
+    """Which says when a packet was received."""
+    received = 1.76e9 + columns["t"] + np.random.default_rng(0).uniform(0.0, 0.02, 400)
+    write_table(tmp_path / "log.csv", {"time": received} | client_table(columns), "{:.15g}")
+    assert_read(read_log(tmp_path / "log.csv"), columns, MOTION)
+
+
+def test_recordings_of_the_same_ticks_in_one_file_are_none(tmp_path, columns):
+    first, second = client_table(columns), client_table({n: -v for n, v in columns.items()})
+    second["timestamp"] = first["timestamp"]
+    write_table(tmp_path / "log.csv", {n: np.r_[v, second[n]] for n, v in first.items()})
+    with pytest.raises(LogError, match="several recordings in one file"):
+        read_log(tmp_path / "log.csv")
+
+
+def test_log_blocks_beside_others_and_of_another_time(tmp_path, columns):
+    """An empty block and a note change nothing; blocks that share no time are told."""
+    flight = tmp_path / "flight"
+    flight.mkdir()
+    for late in (0, 100_000):
+        for block, values in client_blocks(columns).items():
+            begin = 500 + late * (block == "motors")
+            ticks = {"Timestamp": begin + np.rint(columns["t"] * 1000)}
+            write_table(flight / f"{block}.csv", ticks | values)
+        if late:
+            with pytest.raises(LogError, match=r"m1, m2, m3, m4 were logged from 100\.50 to"):
+                read_log(flight)
+        else:
+            (flight / "battery.csv").write_text("Timestamp,pm.vbat\n")
+            (flight / "note.txt").write_text("hall 3")
+            assert find_logs(tmp_path) == [flight]
+            read = read_log(flight)
+            assert_read(read, columns, MOTION)
+            assert read.remarks == ("battery.csv: no rows: left out",)
+
+
 TOPICS = {
     "pose": ("x", "y", "z", "qw", "qx", "qy", "qz"),
     "imu": ("wx", "wy", "wz", "ax", "ay", "az"),
@@ -201,6 +245,42 @@ def test_columns_toml_names_a_time_for_each_group(tmp_path, columns):
     (tmp_path / "columns.toml").write_text(text.replace("pose clock", "pose time"))
     with pytest.raises(LogError, match="no column 'pose time' for t"):
         read_log(tmp_path / "flight.csv", load_mapping(tmp_path / "columns.toml"))
+
+
+def test_a_topics_name_may_end_in_an_underscore(tmp_path, columns):
+    write_table(tmp_path / "flight.csv", topic_table(columns, "{topic}_{column}", "{topic}_t"))
+    write_table(tmp_path / "plain.csv", topic_table(columns))
+    read, plain = (read_log(tmp_path / name) for name in ("flight.csv", "plain.csv"))
+    assert_read(read, plain.columns, ("t", "x", "qy", "wx", "m1"))
+
+
+def test_motors_that_were_sent_with_a_pose_are_there_with_it(tmp_path, columns):
+    """However the stamps of the two are rounded."""
+    table = topic_table(columns)
+    table["pose.time"] = [f"{int(v) * 1e-9:.9f}" for v in table["pose.time"]]
+    write_table(tmp_path / "flight.csv", table)
+    write_table(tmp_path / "plain.csv", topic_table(columns))
+    mixed, plain = (read_log(tmp_path / name) for name in ("flight.csv", "plain.csv"))
+    for name in ("m1", "m3"):
+        assert_read(mixed, {name: plain.columns[name]}, (name,), rows=slice(20, 360))
+
+
+@pytest.mark.parametrize("stamp", ["0", "1.7000000e18"])
+def test_a_clock_that_stands_is_told(tmp_path, columns, stamp):
+    """As where a spreadsheet kept seven digits of it."""
+    table = topic_table(columns)
+    table["motor.time"] = [stamp] * len(table["motor.time"])
+    write_table(tmp_path / "flight.csv", table)
+    with pytest.raises(LogError, match=r"motor\.time hardly moves \(1 different of 392 stamps\)"):
+        read_log(tmp_path / "flight.csv")
+
+
+def test_a_second_vehicle_in_a_table_of_topics_is_told(tmp_path, columns):
+    names = ("/cf{}/{{topic}}/{{column}}", "/cf{}/{{topic}}/time")
+    both = [topic_table(columns, *(n.format(i) for n in names)) for i in (1, 2)]
+    write_table(tmp_path / "flight.csv", both[0] | both[1])
+    (remark,) = read_log(tmp_path / "flight.csv").remarks
+    assert "/cf2/pose/x to /cf2/motor/m4" in remark
 
 
 def test_one_named_time_does_not_take_the_others_away(tmp_path, columns):
@@ -363,6 +443,58 @@ def test_a_px4_airframe_is_taken_from_its_parameters(tmp_path, columns):
         read_log(tmp_path / "flight.ulg")
 
 
+def _without_fields(topics):
+    return topics | {
+        "actuator_motors": (
+            topics["actuator_motors"][0],
+            {"control": ("float[3]", np.zeros((400, 3)))},
+        )
+    }
+
+
+def _outputs(topics, values):
+    rest = {name: topic for name, topic in topics.items() if name != "actuator_motors"}
+    return rest | {
+        "actuator_outputs": (topics["sensor_combined"][0], {"output": ("float[16]", values)})
+    }
+
+
+@pytest.mark.parametrize(
+    "change, parameters, words",
+    [
+        (_without_fields, {}, r"no actuator_motors:control\[3\] in the log"),
+        (
+            lambda t: _outputs(t, np.linspace(60.0, 1990.0, 6400).reshape(400, 16)),
+            {},
+            r"actuator_outputs reach from 60 to .*DShot",
+        ),
+        (
+            lambda t: _outputs(t, np.full((400, 16), 1500.0)),
+            {f"PWM_AUX_FUNC{i}": 100 + i for i in (1, 2, 3, 4)},
+            "motor 1 is on PWM_AUX_FUNC1",
+        ),
+        (
+            lambda t: (
+                t
+                | {
+                    "vehicle_attitude": (
+                        t["vehicle_attitude"][0],
+                        {"roll": ("float", np.zeros(400))},
+                    )
+                }
+            ),
+            {"CA_ROTOR_COUNT": 8},
+            "8 rotors",
+        ),
+    ],
+)
+def test_motors_that_a_px4_log_does_not_have_are_told(tmp_path, columns, change, parameters, words):
+    pytest.importorskip("pyulog")
+    (tmp_path / "flight.ulg").write_bytes(ulog(change(px4_topics(columns)), parameters))
+    with pytest.raises(LogError, match=words):
+        read_log(tmp_path / "flight.ulg")
+
+
 @pytest.mark.parametrize("data", [b"ULog\x01\x12\x35", b"ULog\x01\x12\x35\x01" + bytes(8)])
 def test_a_px4_log_without_a_flight_says_so(tmp_path, data):
     pytest.importorskip("pyulog")
@@ -506,6 +638,22 @@ def test_a_blackbox_of_pulses_is_told_from_one_of_dshot(tmp_path, columns):
     read = read_log(tmp_path / "log.csv")
     assert_blackbox(read, columns, ("m1", "m2", "m3", "m4"))
     assert any("pulses" in remark for remark in read.remarks)
+
+
+def test_a_blackbox_without_the_usual_fields(tmp_path, columns):
+    """The gyroscope before its filters stands for the filtered one; six rotors are refused."""
+    path = tmp_path / "log.csv"
+    table = {n.replace("gyroADC", "gyroUnfilt"): v for n, v in blackbox(columns).items()}
+    write_table(path, table, separator=", ")
+    read = read_log(path)
+    assert_blackbox(read, columns)
+    assert any("gyroUnfilt" in remark for remark in read.remarks)
+    write_table(path, {n: v for n, v in table.items() if "gyro" not in n}, separator=", ")
+    with pytest.raises(LogError, match=r"no gyroscope was logged \(gyroADC"):
+        read_log(path)
+    write_table(path, table | {"motor[4]": table["motor[0]"]}, separator=", ")
+    with pytest.raises(LogError, match="more than four motors"):
+        read_log(path)
 
 
 @pytest.mark.parametrize("name", ["LOG00001.BFL", "blackbox.bbl", "LOG1.TXT"])

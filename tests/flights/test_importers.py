@@ -223,6 +223,8 @@ def test_a_mapped_csv_in_other_names_units_and_angles(tmp_path, columns):
         ("[columns]\nxx = 'a'", "unknown column 'xx'"),
         ("[columns]\nx = { from = 'a', unit = 'feet' }", "unknown unit 'feet'"),
         ("[columns]\nx = { form = 'a' }", "x must be"),
+        ("[columns]\nx = { from = 'a', scale = true }", "must be numbers"),
+        ("[columns]\nm1 = 'a'\nm2 = 'a'", "m1 and m2 are both from 'a'"),
         ("[columns", "not readable as TOML"),
     ],
 )

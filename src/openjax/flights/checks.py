@@ -10,7 +10,13 @@ from openjax.flights.agreement import check_agreement, other_frames
 from openjax.flights.attitude import derive_attitude
 from openjax.flights.derived import derive_rates, derive_velocity, mend_velocity
 from openjax.flights.flight import CHANNEL_COLUMNS, Flight, Issue, Refused
-from openjax.flights.sampling import drop_frozen, drop_repeats, put_in_step, runs_of
+from openjax.flights.sampling import (
+    drop_frozen,
+    drop_repeats,
+    put_in_step,
+    runs_of,
+    several_recordings,
+)
 
 SHORTEST = 2.0  # s airborne: windows of 0.5 s, and a few of them
 SLOWEST = 0.05  # s between rows
@@ -138,29 +144,14 @@ def _sorted(flight: Flight, note) -> Flight:
     """Rows out of order are sorted: a few, or any number of one recording, whose rows are then
     evenly apart. Others are several recordings.
     """
-    steps = np.diff(flight.time)
-    backwards = int((steps < 0).sum())
+    backwards = int((np.diff(flight.time) < 0).sum())
     if not backwards:
         return flight
-    few = (steps >= -1.0).all() and backwards <= 0.05 * len(flight.time)
     in_order = _written_once(flight.rows(np.argsort(flight.time, kind="stable")), note)
-    if not few and not _even(in_order.time):
-        at = flight.time[int(np.argmin(steps))]
-        text = (
-            f"time runs backwards (after t = {at:g}): several recordings in one file, or unsorted"
-        )
-        raise Refused("time", f"{text}; one flight, one file, by time")
+    if problem := several_recordings(flight.time, in_order.time):
+        raise Refused("time", problem)
     note("time", f"{backwards} rows out of order in time were sorted")
     return in_order
-
-
-def _even(time: np.ndarray) -> bool:
-    """Whether times (T,), sorted, are those of one recording: two that were put together leave
-    steps of all lengths, or a gap between them.
-    """
-    steps = np.diff(time)
-    middle = float(np.median(steps))
-    return bool((steps > 0.5 * middle).mean() > 0.95 and steps.max() < max(5.0 * middle, 0.5))
 
 
 def _written_once(flight: Flight, note) -> Flight:
@@ -296,7 +287,11 @@ def _share_of_one(values: np.ndarray, columns: str) -> None:
     low = float(np.nanmin(values))
     high = float(np.nanmax(values))
     if high > 256.0:
-        hint = "16-bit counts; divide by 65535" if high > 2100 else "a pulse width in microseconds"
+        hint = (
+            "16-bit counts (divide by 65535), or rpm"
+            if high > 2100
+            else "a pulse width in microseconds"
+        )
         raise Refused("units", f"{columns} reach {high:.0f}: {hint}; the log format wants 0..1")
     if high > 1.02:
         hint = (
@@ -327,7 +322,11 @@ def _airborne(flight: Flight, floor_z: float | None, note, every: bool = False) 
     drive = np.interp(flight.time, flight.time[rows], drive[rows])
     usual = np.median(drive[drive >= np.median(drive)])
     if usual < 0.02:
-        raise Refused("short", "never took off: the commands stay near zero")
+        raise Refused(
+            "short",
+            f"never took off: the commands reach {np.max(drive):.2g} of their range, or are in "
+            "another unit",
+        )
     on_ground = _long_runs(drive < 0.4 * usual, flight.time)
     if flight.position is not None and flight.velocity is not None:
         floor = 0.0 if floor_z is None else float(floor_z)

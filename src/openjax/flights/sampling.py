@@ -14,6 +14,31 @@ IN_PHASE = 0.25  # concentration of their phases (0 to 1) from which they have o
 EDGE = 0.03  # cycles of that clock by which its phase may be wrong
 
 
+def several_recordings(time: np.ndarray, in_order: np.ndarray | None = None) -> str:
+    """What is wrong with the order of times (T,), in s: nothing if few rows are out of it, or if all
+    are those of one recording, shuffled. `in_order`: the same sorted, less rows that stand twice.
+    """
+    steps = np.diff(time)
+    backwards = int((steps < 0).sum())
+    few = not backwards or (steps.min() >= -1.0 and backwards <= 0.05 * len(time))
+    if few or _even(np.sort(time) if in_order is None else in_order):
+        return ""
+    at = time[int(np.argmin(steps))]
+    return (
+        f"time runs backwards (after t = {at:g}): several recordings in one file, or unsorted; one "
+        "flight, one file, by time"
+    )
+
+
+def _even(time: np.ndarray) -> bool:
+    """Whether times (T,), sorted, are those of one recording: two that were put together leave
+    steps of all lengths, or a gap between them.
+    """
+    steps = np.diff(time)
+    middle = float(np.median(steps))
+    return bool((steps > 0.5 * middle).mean() > 0.95 and steps.max() < max(5.0 * middle, 0.5))
+
+
 def drop_frozen(flight: Flight, note) -> Flight:
     """Constant columns refuse or drop their channel; frozen stretches become not sampled; holes are
     named.

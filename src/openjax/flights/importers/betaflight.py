@@ -48,7 +48,7 @@ def is_blackbox_csv(path: Path) -> bool:
         return False
     lines = head_of(path)
     above = _lines_above(lines)
-    return above is not None and "gyroADC[0]" in lines[above]
+    return above is not None and "time" in lines[above]
 
 
 def is_beside(path: Path) -> bool:
@@ -98,11 +98,15 @@ def read_blackbox_csv(path: Path, mapping: ColumnMapping | None = None) -> LogTa
     if decoded.is_file():
         said |= _headers(head_of(decoded))
     fields = {_FIELD.fullmatch(name)[1]: name for name in names}
+    if "motor[4]" in fields:
+        raise LogError("more than four motors were logged; four are needed")
+    remarks = _without_filter(fields)
     usual = _usual(fields, said)
     time = fields.get("time", "time")
     asked = {} if mapping is None else mapping.columns
     wanted = (time, *(source.name for source in (*usual.values(), *asked.values())))
-    raw, remarks = raw_columns(path, wanted, time, delimiter, above)
+    raw, found = raw_columns(path, wanted, time, delimiter, above)
+    remarks += found
     columns = usual | _force(raw, fields, said, remarks) | _motors(raw, fields, remarks)
     if mapping is not None:
         columns = mapping.over(columns)
@@ -112,6 +116,18 @@ def read_blackbox_csv(path: Path, mapping: ColumnMapping | None = None) -> LogTa
     for motor in set(CHANNEL_COLUMNS["motor_command"]) & set(merged) - set(asked):
         merged[motor] = np.maximum(merged[motor], 0.0)  # a motor at rest is below DShot's least
     return LogTable(path.name, merged, np.full(len(merged["t"]), "0"), tuple(remarks))
+
+
+def _without_filter(fields: dict[str, str]) -> list[str]:
+    """Takes `gyroUnfilt` for a `gyroADC` that wasn't logged, and says so. Raises LogError where
+    neither was.
+    """
+    if "gyroADC[0]" in fields:
+        return []
+    if "gyroUnfilt[0]" not in fields:
+        raise LogError("no gyroscope was logged (gyroADC[0..2]): switch it on in the blackbox")
+    fields |= {f"gyroADC[{i}]": fields[f"gyroUnfilt[{i}]"] for i in range(3)}
+    return ["gyroADC wasn't logged: gyroUnfilt, before Betaflight's filters, stands for it"]
 
 
 def _usual(fields: dict[str, str], said: dict[str, str]) -> dict[str, Source]:

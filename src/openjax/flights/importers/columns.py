@@ -34,6 +34,7 @@ from scipy.spatial.transform import Rotation
 from openjax.errors import UserError
 from openjax.files import read_toml
 from openjax.flights.reading import CHANNEL_COLUMNS, LOG_COLUMNS, LogError, LogTable
+from openjax.flights.sampling import several_recordings
 
 MAPPING_FILE = "columns.toml"
 EULER = ("roll", "pitch", "yaw")
@@ -53,6 +54,9 @@ _MOTION = {
     for c in CHANNEL_COLUMNS[n]
 }
 _CONTINUOUS = _MOTION | set(CHANNEL_COLUMNS["velocity"]) | set(EULER)
+TIE = (
+    1e-6  # s: stamps since 1970 are known to .24 us, so that what is sent with a row may seem later
+)
 _STALE = 5.0  # periods after which a stream's last value counts as not sampled
 
 
@@ -157,6 +161,12 @@ def load_mapping(path: str | Path) -> ColumnMapping:
     if isinstance(entries.get("t"), list):
         clocks = tuple(_clock(entry, path) for entry in entries.pop("t"))
     columns = {c: source_of(c, entry, path) for c, entry in entries.items()}
+    by_name: dict[str, str] = {}
+    for column, source in columns.items():
+        if by_name.setdefault(source.name, column) != column:
+            raise UserError(
+                f"{path}: {by_name[source.name]} and {column} are both from {source.name!r}"
+            )
     if clocks:
         columns["t"] = clocks[0].source
     return ColumnMapping(columns, delimiter, clocks)
@@ -184,13 +194,15 @@ def merge_streams(
 
     Other motion streams are interpolated linearly, commands are held, the battery keeps its own
     samples. What is older than five periods of its stream counts as not sampled. Raises LogError if
-    no motion is there.
+    no motion is there, if a stream holds several recordings, or if it ends before the others begin.
     """
     used = []
     for stream in streams:
         own = {c: s for c, s in columns.items() if s.name in stream.values}
         finite = np.isfinite(stream.time)
         if own and finite.sum() > 1:
+            if problem := several_recordings(stream.time[finite]):
+                raise LogError(problem)
             order = np.argsort(stream.time[finite], kind="stable")
             converted = {
                 c: (s.scale * stream.values[s.name] + s.offset)[finite][order]
@@ -206,12 +218,30 @@ def merge_streams(
         )
     clock = min(with_motion, key=lambda u: float(np.median(np.diff(u[0]))))[0]
     clock = clock[np.r_[True, np.diff(clock) > 0]]
+    used = _at_one_time(used, clock)
     merged = {"t": clock}
     for time, converted in used:
         period = max(float(np.median(np.diff(time))), 1e-4)
         for column, values in converted.items():
             merged.setdefault(column, _onto(clock, time, values, column, period))
     return with_quaternion(merged)
+
+
+def _at_one_time(used, clock: np.ndarray) -> list[tuple[np.ndarray, dict[str, np.ndarray]]]:
+    """The streams that were logged while the clock ran. Raises LogError for one that wasn't, where
+    no other one has its columns; the battery may be missing.
+    """
+    beside = [u for u in used if u[0][0] <= clock[-1] and u[0][-1] >= clock[0]]
+    there = {column for _, converted in beside for column in converted}
+    for time, converted in used:
+        missing = [column for column in converted if column not in there | {"vbat"}]
+        if missing:
+            raise LogError(
+                f"{', '.join(missing)} were logged from {time[0]:.2f} to {time[-1]:.2f} s, and "
+                f"the rest from {clock[0]:.2f} to {clock[-1]:.2f} s: of another flight, or by "
+                "another clock?"
+            )
+    return beside
 
 
 def _without_flips(converted: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -252,7 +282,7 @@ def _onto(clock, time, values, column: str, period: float) -> np.ndarray:
     values = values[finite]
     if not len(time):
         return np.full(len(clock), np.nan)
-    before = np.searchsorted(time, clock, side="right") - 1
+    before = np.searchsorted(time, clock + TIE, side="right") - 1
     if column == "vbat":
         out = np.full(len(clock), np.nan)
         nearest = np.clip(np.searchsorted(clock, time), 0, len(clock) - 1)
@@ -289,6 +319,6 @@ def source_of(column: str, entry, path: Path) -> Source:
     if unit not in UNITS:
         raise UserError(f"{path}: unknown unit {unit!r} for {column}; known are {', '.join(UNITS)}")
     numbers = (entry.get("scale", 1.0), entry.get("offset", 0.0))
-    if not all(isinstance(n, int | float) and math.isfinite(n) for n in numbers):
+    if not all(type(n) in (int, float) and math.isfinite(n) for n in numbers):
         raise UserError(f"{path}: scale and offset of {column} must be numbers")
     return Source(entry["from"], UNITS[unit] * numbers[0], float(numbers[1]))

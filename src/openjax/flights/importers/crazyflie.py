@@ -40,25 +40,37 @@ def is_block(path: Path) -> bool:
 
 
 def is_client_log(path: Path) -> bool:
-    """Whether a path is such a CSV, or a folder of one flight's log blocks and nothing else."""
+    """Whether a path is such a CSV, or a folder of one flight's log blocks; a note may lie beside."""
     if path.is_dir():
-        inside = sorted(path.iterdir())
-        return len(inside) > 1 and all(is_csv(file) and is_block(file) for file in inside)
+        inside = _blocks(path)
+        return len(inside) > 1 and all(map(is_block, inside))
     return is_block(path)
 
 
+def _blocks(folder: Path) -> list[Path]:
+    """A folder's CSV files."""
+    return [file for file in sorted(folder.iterdir()) if is_csv(file)]
+
+
 def time_name(names: list[str]) -> str | None:
-    """The column that holds the time."""
-    return next((name for name in names if name.lower() in TIME_NAMES), None)
+    """The column that holds the time: the firmware's own rather than the computer's."""
+    found = [name for name in names if name.lower() in TIME_NAMES]
+    return min(found, key=lambda name: TIME_NAMES.index(name.lower()), default=None)
 
 
 def read_client_log(path: Path, mapping: ColumnMapping | None = None) -> LogTable:
     """A flight's log blocks. Raises LogError where they hold nothing that can be used."""
-    files = sorted(path.iterdir()) if path.is_dir() else [path]
+    files = _blocks(path) if path.is_dir() else [path]
     streams = []
     remarks = []
     for file in files:
-        stream, found = _block(file, mapping)
+        try:
+            stream, found = _block(file, mapping)
+        except LogError as error:
+            if len(files) == 1:
+                raise
+            remarks.append(f"{file.name}: {error}: left out")
+            continue
         streams.append(with_mixer(stream))
         remarks += found
     columns, found = firmware_columns(streams, mapping)

@@ -25,6 +25,7 @@ MAGIC = b"ULog\x01\x12\x35"
 QUAD_X = ("front_right", "rear_left", "front_left", "rear_right")  # PX4's motors 1 to 4
 COLUMN_OF = {"front_right": "m1", "rear_right": "m2", "rear_left": "m3", "front_left": "m4"}
 PULSE = (1000.0, 2000.0)  # us, PX4's defaults of PWM_MIN and PWM_MAX
+SELDOM = 3  # values outside of its range that an output may have
 MOTOR_1 = 101  # the output function of motor 1 in PWM_MAIN_FUNCi
 
 # Topics and, in the frames of the log format, the columns that they hold: (field, scale).
@@ -88,7 +89,7 @@ def read_ulog(path: Path, mapping: ColumnMapping | None = None) -> LogTable:
     log = _parsed(path, {source.name.partition(":")[0] for source in asked.values()})
     topics = {data.name: data for data in log.data_list if data.multi_id == 0}
     streams = {name: _stream(data, log.start_timestamp) for name, data in topics.items()}
-    if ATTITUDE in streams:
+    if f"{ATTITUDE}:q[0]" in streams.get(ATTITUDE, Stream(np.empty(0), {})).values:
         streams[ATTITUDE] = _turned(streams[ATTITUDE])
     motors, remarks = _motors(streams, log.initial_parameters)
     if motors is not None:
@@ -190,12 +191,12 @@ def _motors(streams, parameters) -> tuple[Stream | None, list[str]]:
     places = _places(parameters)
     if MOTORS in streams:
         stream = streams[MOTORS]
-        names = [f"{MOTORS}:control[{i}]" for i in range(4)]
-        thrust = [stream.values[name] for name in names]
+        thrust = _fields(stream, [f"{MOTORS}:control[{i}]" for i in range(4)])
     elif OUTPUTS in streams:
         stream = streams[OUTPUTS]
         outputs = [_output_of(motor, parameters) for motor in range(4)]
-        signals = [_signal(stream.values[f"{OUTPUTS}:output[{o}]"], o, parameters) for o in outputs]
+        values = _fields(stream, [f"{OUTPUTS}:output[{o}]" for o in outputs])
+        signals = [_signal(v, o, parameters) for v, o in zip(values, outputs, strict=True)]
         curve = float(parameters.get("THR_MDL_FAC", 0.0))
         thrust = [curve * s**2 + (1.0 - curve) * s for s in signals]
     else:
@@ -208,6 +209,14 @@ def _motors(streams, parameters) -> tuple[Stream | None, list[str]]:
         said = ", ".join(f'"{turns[place]}"' for place in COLUMN_OF)
         remarks.append(f"by the log's parameters, motor.spin in vehicle.toml is [{said}]")
     return Stream(stream.time, columns), remarks
+
+
+def _fields(stream: Stream, names: list[str]) -> list[np.ndarray]:
+    """The values of a topic's fields. Raises LogError for one that it hasn't."""
+    missing = next((name for name in names if name not in stream.values), None)
+    if missing is not None:
+        raise LogError(f"no {missing} in the log; four motors are needed")
+    return [stream.values[name] for name in names]
 
 
 def _places(parameters) -> tuple[str, ...]:
@@ -227,17 +236,32 @@ def _places(parameters) -> tuple[str, ...]:
 
 
 def _output_of(motor: int, parameters) -> int:
-    """Index of the output that a motor, from 0 on, is on: by PWM_MAIN_FUNCi, or its own number."""
+    """Index of the output that a motor, from 0 on, is on: by PWM_MAIN_FUNCi, or its own number.
+    Raises LogError where it is on outputs of another kind.
+    """
+    elsewhere = [n for n, f in parameters.items() if "_FUNC" in n and f == MOTOR_1 + motor]
+    if elsewhere and not elsewhere[0].startswith("PWM_MAIN"):
+        raise LogError(
+            f"motor {motor + 1} is on {elsewhere[0]}, and the first actuator_outputs are the main "
+            "ones: log actuator_motors"
+        )
     functions = {i: parameters.get(f"PWM_MAIN_FUNC{i + 1}") for i in range(16)}
     return next((i for i, f in functions.items() if f == MOTOR_1 + motor), motor)
 
 
 def _signal(output: np.ndarray, index: int, parameters) -> np.ndarray:
-    """An output as a share of its range."""
+    """An output as a share of its range. Raises LogError where that isn't its range."""
     least, most = (
         float(parameters.get(f"PWM_MAIN_{end}{index + 1}", parameters.get(f"PWM_{end}", usual)))
         for end, usual in (("MIN", PULSE[0]), ("MAX", PULSE[1]))
     )
+    # a motor that is disarmed has one value or two below the least
+    beyond = np.unique(output[(output < least) | (output > most)])
+    if len(beyond) > SELDOM:
+        raise LogError(
+            f"actuator_outputs reach from {np.nanmin(output):g} to {np.nanmax(output):g}, and their "
+            f"range is {least:g} to {most:g} (PWM_MIN, PWM_MAX): DShot? Log actuator_motors"
+        )
     return np.clip((output - least) / max(most - least, 1.0), 0.0, 1.0)
 
 

@@ -72,11 +72,20 @@ def read_topic_times(path: Path, mapping: ColumnMapping | None = None) -> LogTab
     delimiter = delimiter_of(mapping)
     names = header_of(path, delimiter)
     stamps = _named_stamps(names, mapping)
-    sources = recognised(names, stamps) if mapping is None else _mapped(names, mapping)
+    again = []
+    if mapping is None:
+        sources, again = recognised(names, stamps)
+    else:
+        sources = _mapped(names, mapping)
     clock_of = _clocks(sources, stamps, mapping)
     wanted = (*stamps.values(), *(source.name for source in sources.values()))
     raw, remarks = raw_columns(path, wanted, next(iter(stamps.values())), delimiter)
     streams = _streams(raw, sources, clock_of, mapping)
+    if again:
+        remarks.append(
+            f"columns that others hold already are left out, {again[0]} to {again[-1]}: a vehicle "
+            "each, a file each"
+        )
     missing = [source.name for source in sources.values() if source.name not in raw]
     remarks += [f"no column {name!r}" for name in missing]
     used = sorted(set(clock_of.values()))
@@ -98,23 +107,30 @@ def _mapped(names: list[str], mapping: ColumnMapping) -> dict[str, Source]:
     return sources
 
 
-def recognised(names: list[str], stamps: dict[str, str]) -> dict[str, Source]:
-    """{column: source} of what a header's names say by themselves. Raises LogError for nothing."""
+def recognised(names: list[str], stamps: dict[str, str]) -> tuple[dict[str, Source], list[str]]:
+    """{column: source} of what a header's names say by themselves, and the names of columns that
+    are there already. Raises LogError for nothing.
+    """
     found = {}
+    again = []
     for name in names:
         topic = topic_of(name, stamps)
         if topic is None or name in stamps.values():
             continue
+        short = name[len(topic) + 1 :]  # "wx" of "imu_wx"
         *groups, last = re.split(rf"[{SEPARATORS}]", name)
+        last = short if short in LOG_COLUMNS[2:] else last
         column = next((GROUPS[g][last] for g in groups[::-1] if last in GROUPS.get(g, ())), last)
         if column in LOG_COLUMNS[2:] or column in EULER:
+            if column in found:
+                again.append(name)
             found.setdefault(column, Source(name))
     if not found:
         raise LogError(
             f"each topic has a time stamp ({', '.join(stamps.values())}), but no column is called "
             f"like x, qw, wx, m1: say in columns.toml which is which"
         )
-    return found
+    return found, again
 
 
 def _named_stamps(names: list[str], mapping: ColumnMapping | None) -> dict[str, str]:
@@ -170,6 +186,12 @@ def _streams(raw, sources, clock_of: dict[str, str], mapping) -> list[Stream]:
         time = (raw[clock] - begin[unit]) * unit + (begin[unit] * unit - start)
         _, rows = np.unique(time, return_index=True)
         rows = rows[np.isfinite(time[rows])]
+        finite = int(np.isfinite(time).sum())
+        if 1 <= len(rows) < min(4, finite):
+            raise LogError(
+                f"{clock} hardly moves ({len(rows)} different of {finite} stamps): a clock that "
+                "stands, or digits that a spreadsheet cut"
+            )
         mine = {sources[c].name for c, k in clock_of.items() if k == clock} & set(raw)
         streams.append(Stream(time[rows], {name: raw[name][rows] for name in mine}))
     return streams
