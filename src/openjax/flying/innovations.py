@@ -107,10 +107,7 @@ class Innovations(NamedTuple):
         beyond_thrust = _difference(gain, lift)
         unexplained = _difference(beyond_thrust, self.bias)
         step = _times(dt, unexplained)
-        turn = _difference(
-            turn_between(last.quaternion, pose.quaternion),
-            _times(dt, _towards(last.body_rates, pose.body_rates, 0.5)),
-        )
+        turn = _turn_beyond_gyroscope(last, pose)
         error = _difference(pose.body_rates, rates)
         age = self.age + dt
         return Innovations(
@@ -165,6 +162,13 @@ def turn_between(before: Sequence[float], after: Sequence[float]) -> Vector:
         sign * (a * y + b * z - c * w - d * x),
         sign * (a * z - b * y + c * x - d * w),
     )
+
+
+def _turn_beyond_gyroscope(last: Pose, pose: Pose) -> Vector:
+    """The turn (rad, body) from one pose to the next that the gyroscope doesn't tell."""
+    mean = _towards(last.body_rates, pose.body_rates, 0.5)
+    turn = turn_between(last.quaternion, pose.quaternion)
+    return _difference(turn, _times(pose.time - last.time, mean))
 
 
 def _share(dt: float, time_constant: float) -> float:
