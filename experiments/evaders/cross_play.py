@@ -45,6 +45,9 @@ GAMES = {
     "clamp": {"speed_limit": "clamp", "substeps": 1},
 }
 """What of a policy's game changes."""
+CASE = ("policy", "game", "vehicle")
+COUNTS = ("episodes", "captures", "crash_rate", "capture_step")
+"""What is stored of each evader and kind of tasks, in this order."""
 
 
 @functools.cache
@@ -110,26 +113,51 @@ def summary(statistics: EpisodeStatistics) -> dict:
         "capture_rate": captures / number,
         "crash_rate": float(statistics.crashed.mean()),
         "capture_step": float(statistics.capture_step.mean()),
-        "collision_rate": float((statistics.collision_steps / statistics.steps).mean()),
-        "over_speed_rate": float((statistics.over_speed_steps / statistics.steps).mean()),
     }
 
 
 def study(options) -> dict:
     """Fly the policies."""
-    return {"records": [record for name in options.policy for record in fly(name, options)]}
+    return {"flights": nested([record for name in options.policy for record in fly(name, options)])}
+
+
+def nested(records: list[dict]) -> list[dict]:
+    """Records as they are stored: for each policy, game and vehicle the `COUNTS` of each evader and
+    kind of tasks. One after the other, with all their names, they'd be a file of a megabyte.
+    """
+    flights = {}
+    for record in records:
+        case = tuple(record[name] for name in CASE)
+        if case not in flights:
+            flights[case] = {**dict(zip(CASE, case, strict=True)), "counts": COUNTS, "evaders": {}}
+        tasks = flights[case]["evaders"].setdefault(record["evader"], {})
+        tasks[record["tasks"]] = [round(record[name], 5) for name in COUNTS]
+    return list(flights.values())
+
+
+def records_of(flights: list[dict]) -> list[dict]:
+    """The records again, one of each policy, game, vehicle, evader and kind of tasks."""
+    records = []
+    for flight in flights:
+        case = {name: flight[name] for name in CASE}
+        for evader, by_tasks in flight["evaders"].items():
+            for tasks, counts in by_tasks.items():
+                record = dict(zip(flight["counts"], counts, strict=True))
+                rate = record["captures"] / record["episodes"]
+                record |= {"evader": evader, "tasks": tasks, "capture_rate": rate}
+                records.append(case | record)
+    return records
 
 
 def page(results: dict) -> Page:
     """First what matters of each policy and vehicle, then capture rates and crashes by evader, then
     how it was learnt.
     """
-    of = ("policy", "game", "vehicle")
     by_policy = defaultdict(list)
-    for record in results["records"]:
-        by_policy[tuple(record[name] for name in of)].append(record)
+    for record in records_of(results["flights"]):
+        by_policy[tuple(record[name] for name in CASE)].append(record)
     columns = {
-        **{name: name for name in of},
+        **{name: name for name in CASE},
         "the paper's field: capture": "field.capture_rate:.3f",
         "crash": "field.crash_rate:.3f",
         "steps": "field.capture_step:.0f",
@@ -139,7 +167,7 @@ def page(results: dict) -> Page:
         "worst evader, uniform tasks": "worst.uniform",
         "worst evader, layouts": "worst.layouts",
     }
-    rows = [dict(zip(of, name, strict=True)) | overview(own) for name, own in by_policy.items()]
+    rows = [dict(zip(CASE, name, strict=True)) | overview(own) for name, own in by_policy.items()]
     parts: list[Table | str] = [from_outside(), Table(columns, rows, title="Overview")]
     parts += [*told(results, "findings", "What was found"), everyone(by_policy)]
     for name, own in by_policy.items():
@@ -152,12 +180,9 @@ def page(results: dict) -> Page:
     )
     prose = (
         "Capture rate, crash rate. Vehicles: the nominal one; `table`, slower (motors by 40 ms, "
-        "commands 15 ms and poses 10 ms "
-        "late, drag); `family`, drawn as in training. Uniform tasks are drawn ones that nobody "
-        "trained on. "
-        "Held-out evaders were never trained on, nor were checkpoints chosen by them. Crashes "
-        "count to the end of the 8 s, "
-        "after the capture too."
+        "commands 15 ms and poses 10 ms late, drag); `family`, drawn as in training. Uniform tasks "
+        "are drawn ones that nobody trained on. Held-out evaders were never trained on, nor were "
+        "checkpoints chosen by them. Crashes count to the end of the 8 s, after the capture too."
     )
     return Page("Policies against evaders", prose, parts, summary_table(by_policy))
 
@@ -270,7 +295,10 @@ def whole_runs(runs: list[dict]) -> Table:
         "crash": "crash_rate:.3f",
         "breaches": "collision_rate:.4f",
     }
-    prose = "Tasks of the validation, never trained on, with drawn vehicles: a run's best and its last. s counts compilation."
+    prose = (
+        "Tasks of the validation, never trained on, with drawn vehicles: a run's best and its last. "
+        "s counts compilation."
+    )
     title = f"Training, validated against field, {', '.join(VALIDATED)}"
     return Table(columns, rows, title=title, prose=prose)
 
