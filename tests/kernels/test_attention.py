@@ -13,6 +13,7 @@ from openjax.kernels.attention import (
     ROWS,
     EntityKind,
     Layout,
+    Operands,
     _reference,
     _reference_backward,
     backward_by_kernel,
@@ -140,28 +141,28 @@ def test_normalised_linear_is_layer_norm_of_the_linear_layer():
 LAYOUT = Layout(FEATURES, HEADS, (EntityKind(2, 3), EntityKind(3, 5)), 0.5)
 
 
-def arguments_of(batch):
+def operands_of(batch):
     keys = jax.random.split(jax.random.key(batch), 6)
     weights = 0.5 * jax.random.normal(keys[3], (3 + 2 + 5 + 2, FEATURES))
     numbers = jax.random.normal(keys[2], (LAYOUT.input_rows, batch))
     masked = jnp.where(jax.random.uniform(keys[4], (5, batch)) < 0.3, -1e4, 0.0)
     query = jax.random.normal(keys[0], (batch, HEADS * FEATURES))
-    own = jax.random.normal(keys[1], (batch, FEATURES))
+    token = jax.random.normal(keys[1], (batch, FEATURES))
     inverse = jax.random.uniform(keys[5], (5, batch), minval=0.3, maxval=2.0)
-    return query, own, jnp.concatenate([numbers, masked]), inverse, weights
+    return Operands(query, token, jnp.concatenate([numbers, masked]), inverse, weights)
 
 
 def test_kernel_is_the_plain_formula_forward_and_backward():
     batch = BLOCK + 2 * ROWS + 3  # not a multiple of the block
-    arguments = arguments_of(batch)
-    gradient = jax.random.normal(jax.random.key(9), arguments[0].shape)
-    kernel = jax.jit(lambda *a: forward_by_kernel(LAYOUT, *a, interpret=True))
-    expected = jax.jit(lambda *a: _reference(LAYOUT, *a))(*arguments)
-    got = kernel(*arguments)
+    operands = operands_of(batch)
+    gradient = jax.random.normal(jax.random.key(9), operands.query.shape)
+    kernel = jax.jit(lambda operands: forward_by_kernel(LAYOUT, operands, interpret=True))
+    expected = jax.jit(lambda operands: _reference(LAYOUT, operands))(operands)
+    got = kernel(operands)
     assert got.shape == expected.shape
     np.testing.assert_allclose(got, expected, atol=1e-4)
 
-    expected = jax.jit(lambda *a: _reference_backward(LAYOUT, *a))(*arguments, gradient)
-    got = jax.jit(lambda *a: backward_by_kernel(LAYOUT, *a, interpret=True))(*arguments, gradient)
-    for name, a, b in zip(("query", "own", "inverse", "weights"), got, expected, strict=True):
+    expected = jax.jit(lambda *a: _reference_backward(LAYOUT, *a))(operands, gradient)
+    got = jax.jit(lambda *a: backward_by_kernel(LAYOUT, *a, interpret=True))(operands, gradient)
+    for name, a, b in zip(("query", "token", "inverse", "weights"), got, expected, strict=True):
         np.testing.assert_allclose(a, b, atol=1e-4 * float(jnp.abs(b).max() + 1), err_msg=name)

@@ -29,9 +29,8 @@ def kernel_arithmetic(dtype: jnp.dtype, interpret: bool) -> Arithmetic:
     """
     if interpret:
         return PLAIN
-    return Arithmetic(
-        pallas_triton.approx_tanh if dtype == jnp.bfloat16 else jnp.tanh, _multiply_add
-    )
+    tanh = pallas_triton.approx_tanh if dtype == jnp.bfloat16 else jnp.tanh
+    return Arithmetic(tanh, _multiply_add)
 
 
 def _multiply_add(a, b, c):
@@ -49,6 +48,7 @@ def activation(x: jax.Array, arithmetic: Arithmetic = PLAIN) -> jax.Array:
     """x sigmoid(1.702 x), the cheap approximation of GELU (Hendrycks and Gimpel, 2016), by one
     tanh.
     """
+    # sigmoid(2 z) = (1 + tanh z) / 2
     half = 0.5 * x
     return arithmetic.multiply_add(half, arithmetic.tanh(0.851 * x), half)
 

@@ -8,6 +8,7 @@ times as many bytes. Elsewhere the same formula is left to XLA.
 """
 
 import functools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -28,6 +29,7 @@ BLOCK = 64
 
 FORWARD_WARPS = 4
 BACKWARD_WARPS = 8
+"""Groups of 32 threads of a program; the backward one holds twice as much in its registers."""
 
 
 class EntityKind(NamedTuple):
@@ -66,36 +68,32 @@ class Layout(NamedTuple):
         return sum(kind.count * kind.size for kind in self.kinds)
 
 
-@functools.partial(jax.custom_vjp, nondiff_argnums=(5,))
-def attend(
-    query: jax.Array,
-    own: jax.Array,
-    inputs: jax.Array,
-    inverse: jax.Array,
-    weights: jax.Array,
-    layout: Layout,
-) -> jax.Array:
-    """Weighted mean of entities for each head.
+class Operands(NamedTuple):
+    """What attends to what, for B samples; all but `inputs` are differentiable."""
 
-    Entity 0 is `own`; entity m is activation(inverse_m (W' x_m + b) + c) with the weights of its
-    kind. With score s_hm = scale * query_h . e_m + bias_m, the result of head h is sum_m
-    softmax(s_h)_m e_m.
-
-    Args:
-      query: (B, heads * features), one query per head in the space of the embeddings.
-      own: (B, features).
-      inputs: (input_rows + entities, B) float32: all entities' numbers, then the biases (a large
-      negative one masks).
-      inverse: (entities, B) float32, by which the linear layer's output is scaled.
-      weights: (sum of size + 2 over kinds, features) float32: per kind its matrix W, then b and c.
-      layout: sizes.
-
-    All but `inputs` are differentiable.
-
-    Returns:
-      (B, heads * features) in the type of `query`.
+    query: jax.Array
+    """(B, heads * features), one query per head in the space of the embeddings"""
+    token: jax.Array
+    """(B, features), the pursuer itself"""
+    inputs: jax.Array
+    """(input_rows + entities, B) float32: all entities' numbers, then the biases (a large negative
+    one masks); samples last, so that a kernel reads neighbours' numbers in one go
     """
-    return on_platform(_reference, forward_by_kernel, layout)(query, own, inputs, inverse, weights)
+    inverse: jax.Array
+    """(entities, B) float32, by which the linear layer's output is scaled"""
+    weights: jax.Array
+    """(sum of size + 2 over kinds, features) float32: per kind its matrix W, then b and c"""
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(1,))
+def attend(operands: Operands, layout: Layout) -> jax.Array:
+    """Weighted mean of entities for each head, (B, heads * features) in the type of the queries.
+
+    Entity 0 is the token; entity m is activation(inverse_m (W' x_m + b) + c) with the weights of
+    its kind. With score s_hm = scale * query_h . e_m + bias_m, the result of head h is sum_m
+    softmax(s_h)_m e_m.
+    """
+    return on_platform(_reference, forward_by_kernel, layout)(operands)
 
 
 def attend_one_by_one(
@@ -122,6 +120,7 @@ def attend_one_by_one(
             jnp.sum(query * e, axis=-1, keepdims=True) + b
             for e, b in zip(entities, biases, strict=True)
         ]
+        # the largest score goes out of the quotient, and so needs no gradient
         top = jax.lax.stop_gradient(functools.reduce(jnp.maximum, scores))
         parts = [jnp.exp(score - top) for score in scores]
         inverse = 1.0 / functools.reduce(jnp.add, parts)
@@ -130,25 +129,26 @@ def attend_one_by_one(
     return means
 
 
-def _attend_forward(query, own, inputs, inverse, weights, layout):
-    saved = (query, own, inputs, inverse, weights)
-    return attend(*saved, layout), saved
+def _attend_forward(operands, layout):
+    return attend(operands, layout), operands
 
 
-def _attend_backward(layout, saved, gradient):
-    dquery, down, dinverse, dweights = on_platform(_reference_backward, backward_by_kernel, layout)(
-        *saved, gradient
-    )
-    return dquery, down, jnp.zeros_like(saved[2]), dinverse, dweights
+def _attend_backward(layout, operands, gradient):
+    backward = on_platform(_reference_backward, backward_by_kernel, layout)
+    dquery, dtoken, dinverse, dweights = backward(operands, gradient)
+    # what is observed has no gradient here: zeros, as a custom rule must say something for each
+    dinputs = jnp.zeros_like(operands.inputs)
+    return (Operands(dquery, dtoken, dinputs, dinverse, dweights),)
 
 
 attend.defvjp(_attend_forward, _attend_backward)
 
 
-def _reference(layout, query, own, inputs, inverse, weights):
+def _reference(layout, operands):
     """The formula as it stands."""
-    batch = own.shape[0]
-    entities = [own.astype(jnp.float32)]
+    query, token, inputs, inverse, weights = operands
+    batch = token.shape[0]
+    entities = [token.astype(jnp.float32)]
     for m, (row, size, weight) in enumerate(layout.entities):
         linear = (
             inputs[row : row + size].T @ weights[weight : weight + size] + weights[weight + size]
@@ -163,23 +163,42 @@ def _reference(layout, query, own, inputs, inverse, weights):
     return mean.reshape(batch, -1).astype(query.dtype)
 
 
-def _reference_backward(layout, query, own, inputs, inverse, weights, gradient):
-    def of_differentiable(query, own, inverse, weights):
-        return _reference(layout, query, own, inputs, inverse, weights)
+def _reference_backward(layout, operands, gradient):
+    def of_differentiable(query, token, inverse, weights):
+        return _reference(layout, Operands(query, token, operands.inputs, inverse, weights))
 
-    _, pullback = jax.vjp(of_differentiable, query, own, inverse, weights)
+    query, token, _, inverse, weights = operands
+    _, pullback = jax.vjp(of_differentiable, query, token, inverse, weights)
     return pullback(gradient)
 
 
-def _linear(layout, add, x, inverse, w_ref, m):
-    """W' x + b of entity m + 1 for a block of samples, (rows, F) float32, and that times inverse +
-    c.
-    """
-    row, size, weight = layout.entities[m]
-    linear = w_ref[weight + size, :][None, :]
-    for i in range(size):
-        linear = add(x(row + i)[:, None], w_ref[weight + i, :][None, :], linear)
-    return linear, add(inverse(m)[:, None], linear, w_ref[weight + size + 1, :][None, :])
+class _Entities(NamedTuple):
+    """The entities of a block of samples, as a kernel embeds them."""
+
+    layout: Layout
+    add: Callable
+    """(a, b, c) -> a * b + c"""
+    x: Callable
+    """(row) -> (rows,) one of the entities' numbers, or biases"""
+    inverse: Callable
+    """(m) -> (rows,)"""
+    w_ref: jax.Array
+
+    def linear(self, m):
+        """W' x + b of entity m + 1, (rows, F) float32, and that times inverse + c."""
+        row, size, weight = self.layout.entities[m]
+        linear = self.w_ref[weight + size, :][None, :]
+        for i in range(size):
+            linear = self.add(self.x(row + i)[:, None], self.w_ref[weight + i, :][None, :], linear)
+        shift = self.w_ref[weight + size + 1, :][None, :]
+        return linear, self.add(self.inverse(m)[:, None], linear, shift)
+
+    def scores(self, query, embedded):
+        """Of one head's queries (rows, F) with all embedded entities, (rows,) each."""
+        scores = [jnp.sum(query * entity, axis=1) for entity in embedded]
+        # the pursuer itself, the first one, is always there and has no bias
+        biases = [self.x(self.layout.input_rows + m) for m in range(len(embedded) - 1)]
+        return [scores[0], *(score + bias for score, bias in zip(scores[1:], biases, strict=True))]
 
 
 def _softmax(scores):
@@ -190,29 +209,19 @@ def _softmax(scores):
     return [p / total for p in parts]
 
 
-def _forward_kernel(layout, arithmetic, q_ref, own_ref, x_ref, inverse_ref, w_ref, out_ref):
+def _forward_kernel(layout, arithmetic, q_ref, token_ref, x_ref, inverse_ref, w_ref, out_ref):
     f = layout.features
-    heads = layout.heads
-    number = len(layout.entities)
     add = arithmetic.multiply_add
-
-    def x(row):
-        return x_ref[row, :]
-
-    def inverse(m):
-        return inverse_ref[m, :]
-
-    linear = (_linear(layout, add, x, inverse, w_ref, m)[1] for m in range(number))
-    entities = [
-        own_ref[...].astype(jnp.float32),
-        *(activation(entity, arithmetic) for entity in linear),
-    ]
-    for h in range(heads):
+    entities = _Entities(layout, add, lambda row: x_ref[row, :], lambda m: inverse_ref[m, :], w_ref)
+    embedded = [token_ref[...].astype(jnp.float32)]
+    for m in range(len(layout.entities)):
+        _, normal = entities.linear(m)
+        embedded.append(activation(normal, arithmetic))
+    for h in range(layout.heads):
         query = q_ref[:, h * f : (h + 1) * f].astype(jnp.float32) * layout.scale
-        scores = [jnp.sum(query * entity, axis=1) for entity in entities]
-        scores = [scores[0], *(scores[m + 1] + x(layout.input_rows + m) for m in range(number))]
+        weights = _softmax(entities.scores(query, embedded))
         mean = jnp.zeros_like(query)
-        for weight, entity in zip(_softmax(scores), entities, strict=True):
+        for weight, entity in zip(weights, embedded, strict=True):
             mean = add(weight[:, None], entity, mean)
         out_ref[:, h * f : (h + 1) * f] = mean.astype(out_ref.dtype)
 
@@ -221,62 +230,57 @@ def _backward_kernel(
     layout,
     arithmetic,
     q_ref,
-    own_ref,
+    token_ref,
     x_ref,
     inverse_ref,
     w_ref,
     g_ref,
     dq_ref,
-    down_ref,
+    dtoken_ref,
     dinverse_ref,
     dw_ref,
 ):
     f = layout.features
-    heads = layout.heads
-    number = len(layout.entities)
     add = arithmetic.multiply_add
 
     def block(j, sums):
         rows = pl.ds(j * ROWS, ROWS)
-
-        def x(row):
-            return x_ref[row, rows]
-
-        def inverse(m):
-            return inverse_ref[m, rows]
-
-        entities = [own_ref[rows, :].astype(jnp.float32)]
+        entities = _Entities(
+            layout, add, lambda row: x_ref[row, rows], lambda m: inverse_ref[m, rows], w_ref
+        )
+        # forward once more: to embed them again costs less than to have kept them
+        embedded = [token_ref[rows, :].astype(jnp.float32)]
         slopes = []
         linears = []
-        for m in range(number):
-            linear, normal = _linear(layout, add, x, inverse, w_ref, m)
+        for m in range(len(layout.entities)):
+            linear, normal = entities.linear(m)
             entity, slope = activation_and_slope(normal, arithmetic)
-            entities.append(entity)
+            embedded.append(entity)
             slopes.append(slope)
             linears.append(linear)
-        dentities = [jnp.zeros_like(entities[0]) for _ in entities]
-        for h in range(heads):
+        dembedded = [jnp.zeros_like(embedded[0]) for _ in embedded]
+        for h in range(layout.heads):
             query = q_ref[rows, h * f : (h + 1) * f].astype(jnp.float32) * layout.scale
             gradient = g_ref[rows, h * f : (h + 1) * f].astype(jnp.float32)
-            scores = [jnp.sum(query * entity, axis=1) for entity in entities]
-            scores = [scores[0], *(scores[m + 1] + x(layout.input_rows + m) for m in range(number))]
-            weight = _softmax(scores)
-            dweight = [jnp.sum(gradient * entity, axis=1) for entity in entities]
+            weight = _softmax(entities.scores(query, embedded))
+            dweight = [jnp.sum(gradient * entity, axis=1) for entity in embedded]
+            # the softmax's own derivative: w_m (d_m - sum w d)
             mean = functools.reduce(jnp.add, [w * d for w, d in zip(weight, dweight, strict=True)])
             dquery = jnp.zeros_like(query)
-            for m, entity in enumerate(entities):
+            for m, entity in enumerate(embedded):
                 dscore = (weight[m] * (dweight[m] - mean))[:, None]
                 dquery = add(dscore, entity, dquery)
-                dentities[m] = add(weight[m][:, None], gradient, add(dscore, query, dentities[m]))
+                dembedded[m] = add(weight[m][:, None], gradient, add(dscore, query, dembedded[m]))
             dq_ref[rows, h * f : (h + 1) * f] = (dquery * layout.scale).astype(dq_ref.dtype)
-        down_ref[rows, :] = dentities[0].astype(down_ref.dtype)
+        dtoken_ref[rows, :] = dembedded[0].astype(dtoken_ref.dtype)
+        # of the weights a row each, summed over samples only when all blocks are done
         sums = list(sums)
         for m, (row, size, weight) in enumerate(layout.entities):
-            dnormal = dentities[m + 1] * slopes[m]
+            dnormal = dembedded[m + 1] * slopes[m]
             dinverse_ref[m, rows] = jnp.sum(dnormal * linears[m], axis=1)
-            dlinear = dnormal * inverse(m)[:, None]
+            dlinear = dnormal * entities.inverse(m)[:, None]
             for i in range(size):
-                sums[weight + i] = add(dlinear, x(row + i)[:, None], sums[weight + i])
+                sums[weight + i] = add(dlinear, entities.x(row + i)[:, None], sums[weight + i])
             sums[weight + size] = sums[weight + size] + dlinear
             sums[weight + size + 1] = sums[weight + size + 1] + dnormal
         return tuple(sums)
@@ -286,70 +290,81 @@ def _backward_kernel(
         dw_ref[0, i, :] = jnp.sum(total, axis=0)
 
 
-def _block_specs(layout, rows, *arrays):
-    """Specifications of arrays in blocks of samples: (B, n) by rows, (n, B) by columns."""
-    return [
-        pl.BlockSpec((rows, array.shape[1]), lambda i: (i, 0))
-        if by_rows
-        else pl.BlockSpec((array.shape[0], rows), lambda i: (0, i))
-        for array, by_rows in arrays
-    ]
-
-
-def forward_by_kernel(layout, query, own, inputs, inverse, weights, interpret=False):
-    """What the reference gives, by a kernel; `interpret` runs it without a GPU."""
-    batch = own.shape[0]
-    query = whole_blocks(query, ROWS)
-    own = whole_blocks(own, ROWS)
-    inputs = whole_blocks(inputs, ROWS, axis=1)
-    inverse = whole_blocks(inverse, ROWS, axis=1)
-    specs = _block_specs(
-        layout, ROWS, (query, True), (own, True), (inputs, False), (inverse, False)
+def _in_blocks(operands, rows):
+    """The operands filled up to whole blocks of samples, and the specifications of these blocks:
+    (B, n) by rows, (n, B) by columns, all weights in each.
+    """
+    operands = Operands(
+        query=whole_blocks(operands.query, rows),
+        token=whole_blocks(operands.token, rows),
+        inputs=whole_blocks(operands.inputs, rows, axis=1),
+        inverse=whole_blocks(operands.inverse, rows, axis=1),
+        weights=operands.weights,
     )
+
+    def by_rows(array):
+        return pl.BlockSpec((rows, array.shape[1]), lambda i: (i, 0))
+
+    def by_columns(array):
+        return pl.BlockSpec((array.shape[0], rows), lambda i: (0, i))
+
+    specs = Operands(
+        query=by_rows(operands.query),
+        token=by_rows(operands.token),
+        inputs=by_columns(operands.inputs),
+        inverse=by_columns(operands.inverse),
+        weights=pl.BlockSpec(operands.weights.shape, lambda i: (0, 0)),
+    )
+    return operands, specs
+
+
+def forward_by_kernel(layout, operands, interpret=False):
+    """What the reference gives, by a kernel; `interpret` runs it without a GPU."""
+    batch = operands.token.shape[0]
+    operands, specs = _in_blocks(operands, ROWS)
+    query = operands.query
     mean = pl.pallas_call(
         functools.partial(_forward_kernel, layout, kernel_arithmetic(query.dtype, interpret)),
         out_shape=jax.ShapeDtypeStruct(query.shape, query.dtype),
-        grid=(own.shape[0] // ROWS,),
-        in_specs=[*specs, pl.BlockSpec(weights.shape, lambda i: (0, 0))],
-        out_specs=specs[0],
+        grid=(query.shape[0] // ROWS,),
+        in_specs=list(specs),
+        out_specs=specs.query,
         interpret=interpret,
         compiler_params=pallas_triton.CompilerParams(num_warps=FORWARD_WARPS, num_stages=1),
         name="attend",
-    )(query, own, inputs, inverse, weights)
+    )(*operands)
     return mean[:batch]
 
 
-def backward_by_kernel(layout, query, own, inputs, inverse, weights, gradient, interpret=False):
-    """The reference\'s gradients, by a kernel; `interpret` runs it without a GPU."""
-    batch = own.shape[0]
+def backward_by_kernel(layout, operands, gradient, interpret=False):
+    """The reference's gradients of query, token, inverse and weights, by a kernel; `interpret` runs
+    it without a GPU.
+    """
+    batch = operands.token.shape[0]
+    operands, specs = _in_blocks(operands, BLOCK)
     # samples that only fill the last block have no gradient, so they add nothing to the sums
-    query, own, gradient = (whole_blocks(samples, BLOCK) for samples in (query, own, gradient))
-    inputs = whole_blocks(inputs, BLOCK, axis=1)
-    inverse = whole_blocks(inverse, BLOCK, axis=1)
-    wide, narrow, numbers, scales = _block_specs(
-        layout, BLOCK, (query, True), (own, True), (inputs, False), (inverse, False)
-    )
-    programs = own.shape[0] // BLOCK
-    dquery, down, dinverse, parts = pl.pallas_call(
+    gradient = whole_blocks(gradient, BLOCK)
+    query, token, _, inverse, weights = operands
+    programs = token.shape[0] // BLOCK
+    dquery, dtoken, dinverse, parts = pl.pallas_call(
         functools.partial(_backward_kernel, layout, kernel_arithmetic(query.dtype, interpret)),
         out_shape=(
             jax.ShapeDtypeStruct(query.shape, query.dtype),
-            jax.ShapeDtypeStruct(own.shape, own.dtype),
+            jax.ShapeDtypeStruct(token.shape, token.dtype),
             jax.ShapeDtypeStruct(inverse.shape, inverse.dtype),
             jax.ShapeDtypeStruct((programs, *weights.shape), jnp.float32),
         ),
         grid=(programs,),
-        in_specs=[
-            wide,
-            narrow,
-            numbers,
-            scales,
-            pl.BlockSpec(weights.shape, lambda i: (0, 0)),
-            wide,
-        ],
-        out_specs=(wide, narrow, scales, pl.BlockSpec((1, *weights.shape), lambda i: (i, 0, 0))),
+        in_specs=[*specs, specs.query],
+        out_specs=(
+            specs.query,
+            specs.token,
+            specs.inverse,
+            # each program's own sums, added up below: programs can't add to one place
+            pl.BlockSpec((1, *weights.shape), lambda i: (i, 0, 0)),
+        ),
         interpret=interpret,
         compiler_params=pallas_triton.CompilerParams(num_warps=BACKWARD_WARPS, num_stages=1),
         name="attend_backward",
-    )(query, own, inputs, inverse, weights, gradient)
-    return dquery[:batch], down[:batch], dinverse[:, :batch], jnp.sum(parts, axis=0)
+    )(*operands, gradient)
+    return dquery[:batch], dtoken[:batch], dinverse[:, :batch], jnp.sum(parts, axis=0)

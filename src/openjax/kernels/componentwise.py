@@ -76,18 +76,15 @@ def _apply(equation, inputs):
         inner = parameters["jaxpr"] if "jaxpr" in parameters else parameters["call_jaxpr"]
         return _evaluate(inner.jaxpr, inner.consts, inputs)
     if name in _ELEMENTWISE:
-        return [_each(lambda *operands: _bind(equation, operands), *inputs)]
+        return [_each(functools.partial(_bind, equation), inputs)]
     if name in _REDUCTIONS:
         return [_total(_REDUCTIONS[name], inputs[0], parameters["axes"])]
     if name == "stop_gradient":  # nothing is differentiated here
         return inputs
-    if name == "reduce" and {inner.primitive.name for inner in parameters["jaxpr"].eqns} == {
-        "add"
-    }:  # several sums at once
-        return [
-            _total(operator.add, array, parameters["dimensions"])
-            for array in inputs[: len(inputs) // 2]
-        ]
+    if name == "reduce" and _is_sum(parameters["jaxpr"]):
+        # several sums at once: the arrays first, then as many starts, which are zero
+        arrays = inputs[: len(inputs) // 2]
+        return [_total(operator.add, array, parameters["dimensions"]) for array in arrays]
     if name == "unstack":
         axis = parameters["axis"]
         array = inputs[0]
@@ -97,10 +94,15 @@ def _apply(equation, inputs):
     return [_MOVES[name](inputs, parameters)]
 
 
+def _is_sum(combination):
+    """Whether all that a reduction combines with is addition."""
+    return {equation.primitive.name for equation in combination.eqns} == {"add"}
+
+
 def _slice(inputs, parameters):
     strides = parameters["strides"] or (1,) * inputs[0].ndim
     ranges = zip(parameters["start_indices"], parameters["limit_indices"], strides, strict=True)
-    return inputs[0][tuple(slice(*bounds) for bounds in ranges)]
+    return inputs[0][tuple(slice(start, stop, step) for start, stop, step in ranges)]
 
 
 def _broadcast(inputs, parameters):
@@ -122,28 +124,32 @@ _MOVES = {
 }
 
 
-def _each(function, *arrays):
+def _each(function, arrays):
+    """The function of the arrays' components one by one, in an array of their common shape."""
     shape = np.broadcast_shapes(*(array.shape for array in arrays))
     flat = (np.broadcast_to(array, shape).ravel() for array in arrays)
-    return split(function(*operands) for operands in zip(*flat, strict=True)).reshape(shape)
+    return split(function(operands) for operands in zip(*flat, strict=True)).reshape(shape)
 
 
 def _bind(equation, operands):
     """One operation on single components, which are made alike in shape."""
     if all(isinstance(operand, np.generic) for operand in operands):
+        # of numbers alone: worked out here, or the kernel would work it out for every sample
         with jax.ensure_compile_time_eval():
             return np.asarray(equation.primitive.bind(*operands, **equation.params))[()]
     shape = np.broadcast_shapes(*(np.shape(operand) for operand in operands))
-    alike = [
-        operand if np.shape(operand) == shape and not isinstance(operand, np.generic)
-        else jnp.broadcast_to(operand, shape)
-        for operand in operands
-    ]  # fmt: skip
-    return equation.primitive.bind(*alike, **equation.params)
+
+    def of_shape(operand):
+        if np.shape(operand) == shape and not isinstance(operand, np.generic):
+            return operand
+        return jnp.broadcast_to(operand, shape)
+
+    return equation.primitive.bind(*map(of_shape, operands), **equation.params)
 
 
 def _total(combine, array, axes):
-    kept = [axis for axis in range(array.ndim) if axis not in axes]
-    shape = [array.shape[axis] for axis in kept]
-    rows = array.transpose(*kept, *axes).reshape(int(np.prod(shape)), -1)
+    """The components combined along the axes: a row for each component that is left."""
+    other_axes = [axis for axis in range(array.ndim) if axis not in axes]
+    shape = [array.shape[axis] for axis in other_axes]
+    rows = array.transpose(*other_axes, *axes).reshape(int(np.prod(shape)), -1)
     return split(functools.reduce(combine, row) for row in rows).reshape(shape)

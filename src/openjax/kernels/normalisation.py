@@ -19,6 +19,7 @@ ROWS = 64
 """Samples that one program of the kernel works on."""
 
 WARPS = 4
+"""Groups of 32 threads of a program."""
 
 EPSILON = 1e-6
 """Added to the variance (Ba et al., 2016; the value of flax)."""
@@ -51,6 +52,7 @@ def normalised_layer(x: jax.Array, kernel: jax.Array, affine: jax.Array) -> jax.
     Returns:
       (B, features) in the type of `x`.
     """
+    # centring is linear: done once to the weights, it is done to all samples
     kernel = kernel - jnp.mean(kernel, axis=-1, keepdims=True)
     bias = affine[0] - jnp.mean(affine[0])
     y = (x @ kernel.astype(x.dtype)).astype(jnp.float32) + bias
@@ -106,6 +108,7 @@ def _backward_kernel(activate, arithmetic, x_ref, affine_ref, g_ref, dx_ref, daf
         out = arithmetic.multiply_add(standard, scale, affine_ref[2, :][None, :])
         dout = dout * activation_and_slope(out, arithmetic)[1]
     dstandard = dout * scale
+    # layer normalisation lets nothing through along its two directions, the mean and the output
     features = standard.shape[-1]
     mean = jnp.sum(dstandard, axis=-1, keepdims=True) / features
     along = jnp.sum(dstandard * standard, axis=-1, keepdims=True) / features
@@ -134,7 +137,7 @@ def forward_by_kernel(activate, x, affine, interpret=False):
 
 
 def backward_by_kernel(activate, x, affine, gradient, interpret=False):
-    """The reference\'s gradients, by a kernel; `interpret` runs it without a GPU."""
+    """The reference's gradients, by a kernel; `interpret` runs it without a GPU."""
     # samples that only fill the last block have no gradient, so they add nothing to the sums
     padded = whole_blocks(x, ROWS)
     padded_gradient = whole_blocks(gradient, ROWS)

@@ -44,6 +44,7 @@ class Actor(nn.Module):
         mean = nn.Dense(
             len(self.initial_action),
             dtype=jnp.float32,
+            # so small that a fresh policy hovers whatever it sees
             kernel_init=nn.initializers.orthogonal(0.01),
             bias_init=lambda key, shape, dtype: start.astype(dtype),
             name="mean",
@@ -53,7 +54,9 @@ class Actor(nn.Module):
             nn.initializers.constant(settings.initial_log_std),
             (len(self.initial_action),),
         )
-        return (jnp.tanh(mean) if settings.squash == "mean" else mean), log_std, hidden
+        if settings.squash == "mean":
+            mean = jnp.tanh(mean)
+        return mean, log_std, hidden
 
 
 class Critic(nn.Module):
@@ -81,10 +84,11 @@ class Critic(nn.Module):
                     jnp.concatenate([encoded, observation.privileged.astype(dtype)], axis=-1)
                 )
         else:
-            own = own_features(observation, predicted)
+            itself = own_features(observation, predicted)
             if sees_state:
-                own = jnp.concatenate([own, observation.privileged], axis=-1)
-            hidden = self._encoded(own, observation, dtype)
+                itself = jnp.concatenate([itself, observation.privileged], axis=-1)
+            hidden = self._encoded(itself, observation, dtype)
+        # one matrix product over all worlds and pursuers
         leading = hidden.shape[:-1]
         hidden = HiddenLayer(settings.features, dtype, name="hidden")(
             hidden.reshape(math.prod(leading), hidden.shape[-1])
@@ -94,12 +98,13 @@ class Critic(nn.Module):
         )(hidden)
         return value.reshape(leading)
 
-    def _encoded(self, own, observation, dtype):
+    def _encoded(self, itself, observation, dtype):
+        """What an encoder of the critic's own makes of a pursuer's own part and the rest."""
         settings = self.settings
-        leading = own.shape[:-1]
+        leading = itself.shape[:-1]
         if settings.critic_encoder == "attention":
             return Encoder(settings.features, settings.heads, dtype, name="encoder")(
-                own,
+                itself,
                 observation.others,
                 observation.pillars,
                 observation.pillar_seen,
@@ -108,7 +113,7 @@ class Critic(nn.Module):
         number = math.prod(leading)
         parts = [
             x.reshape(number, math.prod(x.shape[len(leading) :]))
-            for x in (own, observation.others, observation.pillars)
+            for x in (itself, observation.others, observation.pillars)
         ]
         hidden = padded(jnp.concatenate(parts, axis=-1))
         for name in ("layer_1", "layer_2"):

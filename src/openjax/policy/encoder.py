@@ -1,5 +1,6 @@
 """The attention-based observation encoder (the paper's section IV-B, figure 3)."""
 
+import functools
 import math
 
 import flax.linen as nn
@@ -7,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax.typing import DTypeLike
 
-from openjax.kernels.attention import EntityKind, Layout, attend, attend_one_by_one
+from openjax.kernels.attention import EntityKind, Layout, Operands, attend, attend_one_by_one
 from openjax.kernels.normalisation import normalise, normalised_layer
 from openjax.platform import can_compile_for_cuda
 
@@ -31,14 +32,14 @@ class SelfAttention(nn.Module):
     @nn.compact
     def __call__(
         self,
-        own: jax.Array,
+        token: jax.Array,
         others: jax.Array,
         pillars: jax.Array,
         pillar_seen: jax.Array,
         others_there: jax.Array | None = None,
     ) -> jax.Array:
-        """own (B, F) embedded; others (B, A, O), pillars (B, k, 5) as observed; pillar_seen (B, k)
-        and others_there (B, A) bool, None: all are -> (B, F).
+        """token (B, F), the pursuer's own embedded; others (B, A, O), pillars (B, k, 5) as
+        observed; pillar_seen (B, k) and others_there (B, A) bool, None: all are -> (B, F).
         """
         f = self.features
         h = self.heads
@@ -48,6 +49,7 @@ class SelfAttention(nn.Module):
         def kernel(name, shape, init=orthogonal):
             return self.param(name, init, shape, jnp.float32)
 
+        # parameters are the usual four matrices; products of two of them are what is worked with
         query = jnp.einsum(
             "ahd,fhd->ahf",
             kernel("query", (f, f)).reshape(f, h, width),
@@ -58,44 +60,45 @@ class SelfAttention(nn.Module):
             kernel("value", (f, f)).reshape(f, h, width),
             kernel("output", (f, f)).reshape(h, width, f),
         )
-        embed = nn.initializers.orthogonal(2**0.5)
         seen = jnp.where(pillar_seen, 0.0, MASKED)
         there = jnp.zeros(others.shape[:-1])
         if others_there is not None:
             there = jnp.where(others_there, 0.0, MASKED)
         entities = []
         for name, x, bias in (("others", others, there), ("pillars", pillars, seen)):
-            size = x.shape[-1]
-            if x.shape[-2] == 0:
-                continue
-            linear = jnp.concatenate(
-                [
-                    kernel(f"{name}_kernel", (size, f), embed),
-                    kernel(f"{name}_bias", (1, f), nn.initializers.zeros_init()),
-                ]
-            )
-            scale = kernel(f"{name}_scale", (f,), nn.initializers.ones_init())
-            shift = kernel(f"{name}_shift", (1, f), nn.initializers.zeros_init())
-            entities.append((x, linear, scale, shift, bias))
+            if x.shape[-2] > 0:  # a single pursuer has no others
+                entities.append((x, *self._embedding(kernel, name, x.shape[-1]), bias))
         if can_compile_for_cuda():
-            return self._fused(own, query, output, entities)
-        return self._one_by_one(own, query, output, entities)
+            return self._fused(token, query, output, entities)
+        return self._one_by_one(token, query, output, entities)
 
-    def _one_by_one(self, own, query, output, kinds):
+    def _embedding(self, kernel, name, size):
+        """Parameters that embed entities of a kind, of so many numbers: weights with the bias in
+        their last row, scale and shift.
+        """
+        f = self.features
+        weights = kernel(f"{name}_kernel", (size, f), nn.initializers.orthogonal(2**0.5))
+        bias = kernel(f"{name}_bias", (1, f), nn.initializers.zeros_init())
+        scale = kernel(f"{name}_scale", (f,), nn.initializers.ones_init())
+        shift = kernel(f"{name}_shift", (1, f), nn.initializers.zeros_init())
+        return jnp.concatenate([weights, bias]), scale, shift
+
+    def _one_by_one(self, token, query, output, kinds):
         """Entity by entity and head by head: matrix products of whole batches, which a CPU is good
         at.
         """
-        embedded = [own.astype(jnp.float32)]
+        # the pursuer itself is one of the entities, and always there
+        embedded = [token.astype(jnp.float32)]
         biases = [0.0]
         for x, linear, scale, shift, bias in kinds:
             affine = jnp.stack([linear[-1], scale, shift[0]])
             for m in range(x.shape[-2]):
                 embedded.append(normalised_layer(x[:, m], linear[:-1], affine))
                 biases.append(bias[:, m : m + 1])
-        own = own.astype(self.dtype)
+        token = token.astype(self.dtype)
         scale = (self.features // self.heads) ** -0.5
         queries = [
-            scale * (own @ query[:, h].astype(self.dtype)).astype(jnp.float32)
+            scale * (token @ query[:, h].astype(self.dtype)).astype(jnp.float32)
             for h in range(self.heads)
         ]
         means = attend_one_by_one(queries, embedded, biases)
@@ -103,7 +106,7 @@ class SelfAttention(nn.Module):
             means[h].astype(self.dtype) @ output[h].astype(self.dtype) for h in range(self.heads)
         )
 
-    def _fused(self, own, query, output, entities):
+    def _fused(self, token, query, output, entities):
         """By the kernels for GPUs, and the formula that stands for them elsewhere."""
         f = self.features
         h = self.heads
@@ -121,14 +124,14 @@ class SelfAttention(nn.Module):
             inputs.append(x.reshape(x.shape[0], count * size))
             inverses.append(inverse)
             biases.append(bias)
-        mean = attend(
-            own.astype(self.dtype) @ query.reshape(f, h * f).astype(self.dtype),
-            own,
-            jnp.concatenate(inputs + biases, axis=1).astype(jnp.float32).T,
-            jnp.concatenate(inverses, axis=1).T,
-            jnp.concatenate(weights),
-            Layout(f, h, tuple(kinds), width**-0.5),
+        operands = Operands(
+            query=token.astype(self.dtype) @ query.reshape(f, h * f).astype(self.dtype),
+            token=token,
+            inputs=jnp.concatenate(inputs + biases, axis=1).astype(jnp.float32).T,
+            inverse=jnp.concatenate(inverses, axis=1).T,
+            weights=jnp.concatenate(weights),
         )
+        mean = attend(operands, Layout(f, h, tuple(kinds), width**-0.5))
         return mean @ output.reshape(h * f, f).astype(self.dtype)
 
 
@@ -148,10 +151,11 @@ def normalised_linear(x: jax.Array, linear: jax.Array) -> tuple[jax.Array, jax.A
     """
     x = jnp.concatenate([x, jnp.ones_like(x[..., :1])], axis=-1)
     centred = linear - jnp.mean(linear, axis=1, keepdims=True)
-    covariance = (
-        jnp.matmul(centred, centred.T, precision=jax.lax.Precision.HIGHEST) / linear.shape[1]
-    )
-    variance = jnp.sum(jnp.matmul(x, covariance, precision=jax.lax.Precision.HIGHEST) * x, axis=-1)
+    # in full precision: a variance of large and small weights is a difference, and a GPU's products
+    # of float32 are rounded to ten bits
+    exact = functools.partial(jnp.matmul, precision=jax.lax.Precision.HIGHEST)
+    covariance = exact(centred, centred.T) / linear.shape[1]
+    variance = jnp.sum(exact(x, covariance) * x, axis=-1)
     return jax.lax.rsqrt(variance + 1e-6), centred
 
 
@@ -183,11 +187,11 @@ class Encoder(nn.Module):
             # not -1: with a single pursuer there are no others, and nothing to tell the size from
             return x.reshape(math.prod(leading), *x.shape[rows:])
 
-        own = HiddenLayer(self.features, self.dtype, name="self_1")(flat(padded(self_state)))
-        own = HiddenLayer(self.features, self.dtype, name="self_2")(own)
+        token = HiddenLayer(self.features, self.dtype, name="self_1")(flat(padded(self_state)))
+        token = HiddenLayer(self.features, self.dtype, name="self_2")(token)
         attention = SelfAttention(self.features, self.heads, self.dtype, name="attention")
         there = None if others_there is None else flat(others_there)
-        hidden = own + attention(own, flat(others), flat(pillars), flat(pillar_seen), there)
+        hidden = token + attention(token, flat(others), flat(pillars), flat(pillar_seen), there)
         hidden = normalise(hidden, affine_parameters(self, "norm", self.features), activate=False)
         hidden = HiddenLayer(self.features, self.dtype, name="hidden")(hidden)
         return hidden.reshape(*leading, self.features)
@@ -215,7 +219,9 @@ def padded(x: jax.Array) -> jax.Array:
     matrix unit.
     """
     extra = -x.shape[-1] % 8
-    return jnp.concatenate([x, jnp.zeros((*x.shape[:-1], extra), x.dtype)], axis=-1) if extra else x
+    if not extra:
+        return x
+    return jnp.concatenate([x, jnp.zeros((*x.shape[:-1], extra), x.dtype)], axis=-1)
 
 
 def affine_parameters(module: nn.Module, name: str, features: int) -> jax.Array:

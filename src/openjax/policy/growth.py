@@ -33,18 +33,18 @@ def with_longer_history(
         return parameters
     if not (isinstance(parameters.actor, Mapping) and "params" in parameters.actor):
         raise UserError("the policy has no networks that could learn")
-    before = old.self_size - old.observe_history * OWN_FRAME
+    # the history comes last in the own state, its oldest frame first: the new rows stand before it
+    place = old.self_size - old.observe_history * OWN_FRAME
     inputs = old.self_size + (3 * len(predictor.horizons) if predictor.enabled else 0)
 
     def grown(actor: Any) -> Any:
         params = dict(actor["params"])
         encoder = dict(params["encoder"])
+        # without the rows for the encoder's padding, which are added anew for the new length
         kernel = encoder["self_1"]["kernel"][:inputs]
         zeros = jnp.zeros((more, kernel.shape[1]), kernel.dtype)
-        kernel = jnp.concatenate([kernel[:before], zeros, kernel[before:]])
-        kernel = jnp.pad(
-            kernel, ((0, -kernel.shape[0] % 8), (0, 0))
-        )  # as the encoder pads its inputs
+        kernel = jnp.concatenate([kernel[:place], zeros, kernel[place:]])
+        kernel = jnp.pad(kernel, ((0, -kernel.shape[0] % 8), (0, 0)))
         encoder["self_1"] = {**encoder["self_1"], "kernel": kernel}
         return {**actor, "params": {**params, "encoder": encoder}}
 

@@ -43,6 +43,7 @@ class Policy:
         """The policy for an environment: its arena's size, and a start that hovers its vehicle."""
         with jax.ensure_compile_time_eval():  # an environment may be made inside a compiled program
             hover = np.asarray(hover_action(environment.vehicle), np.float64)
+        # before the tanh, which has no inverse at its ends
         hover = np.arctanh(np.clip(hover, -0.99, 0.99))
         return cls(
             network=network,
@@ -155,9 +156,8 @@ class Policy:
     ) -> Float[Array, "*worlds pursuers 4"]:
         """The mean policy's action in -1..1."""
         predicted = self.predict(parameters, observation)
-        return self.action(
-            self.distribution(parameters.actor, observation, predicted)[0], observation
-        )
+        mean, _ = self.distribution(parameters.actor, observation, predicted)
+        return self.action(mean, observation)
 
 
 def gaussian_log_prob(

@@ -31,17 +31,18 @@ class EvaderPredictor(nn.Module):
         for i in range(frames.shape[-2]):
             gates = inputs[..., i, :] + hidden @ recurrent
             in_gate, forget_gate, candidate, out_gate = jnp.split(gates, 4, axis=-1)
-            cell = jax.nn.sigmoid(forget_gate + 1.0) * cell + jax.nn.sigmoid(in_gate) * jnp.tanh(
-                candidate
-            )
+            # one more, so that a fresh cell forgets little (Jozefowicz et al. 2015, An empirical
+            # exploration of recurrent network architectures)
+            kept = jax.nn.sigmoid(forget_gate + 1.0) * cell
+            cell = kept + jax.nn.sigmoid(in_gate) * jnp.tanh(candidate)
             hidden = jax.nn.sigmoid(out_gate) * jnp.tanh(cell)
-        output = nn.Dense(
-            3 * len(horizons), kernel_init=nn.initializers.orthogonal(0.1), name="output"
-        )(hidden)
+        initial = nn.initializers.orthogonal(0.1)
+        output = nn.Dense(3 * len(horizons), kernel_init=initial, name="output")(hidden)
         output = output.reshape(*output.shape[:-1], len(horizons), 3)
         scale = jnp.array(
             [self.arena_radius, self.arena_radius, self.arena_height / 2], jnp.float32
         )
         if self.settings.relative:
+            # within a horizon the evader moves a tenth of the arena or so: outputs of one order
             return last_seen[..., None, :] + 0.1 * scale * output
         return jnp.array([0.0, 0.0, self.arena_height / 2], jnp.float32) + scale * output
