@@ -94,17 +94,17 @@ def test_the_best_step_on_the_way_is_kept():
     third.
     """
     policy = PolicyParameters(actor=np.zeros(1), critic={}, predictor=np.zeros(1))
-    training = AdaptSettings(updates=6, look_every=1)
     adaptation = SimpleNamespace(
+        settings=AdaptSettings(updates=6, look_every=1),
         fly=lambda parameters, key, bounds: None,
         optimiser=SimpleNamespace(init=lambda actor: None),
-        update=lambda actor, state, *_: (actor + 1.0, state, {}),
+        update=lambda actor, *_: (actor.replace(parameters=actor.parameters + 1.0), {}),
     )
     worth = lambda parameters: np.full(4, -((float(parameters.actor[0]) - 3.0) ** 2))  # noqa: E731
     key = jax.random.key(0)
-    tuned = fine_tune(adaptation, policy, np.zeros((1, 4)), training, key, worth)
+    tuned = fine_tune(adaptation, policy, np.zeros((1, 4)), key, worth)
     assert tuned.update == 3 and tuned.parameters.actor[0] == 3.0 and len(tuned.looks) == 7
-    worse = fine_tune(adaptation, policy, np.zeros((1, 4)), training, key, lambda p: -p.actor[:1])
+    worse = fine_tune(adaptation, policy, np.zeros((1, 4)), key, lambda p: -p.actor[:1])
     assert worse.update == 0 and worse.parameters.actor[0] == 0.0
 
 

@@ -101,10 +101,10 @@ def test_hard_starts_are_those_that_come_nearest(stage):
     def least(starts):
         return gradient.fly(parameters.actor, parameters, starts, gradient.steps)[1].least.min(-1)
 
-    bounds = jnp.concatenate([gradient.bounds()] * gradient.how.draws)
+    bounds = jnp.concatenate([gradient.bounds()] * gradient.settings.draws)
     all_of_them = np.sort(least(gradient.starts(key, bounds)))
     hard = np.sort(least(jax.jit(gradient.hard_starts)(parameters.actor, parameters, key)))
-    np.testing.assert_allclose(hard, all_of_them[: gradient.how.worlds], atol=1e-4)
+    np.testing.assert_allclose(hard, all_of_them[: gradient.settings.worlds], atol=1e-4)
 
 
 @pytest.mark.slow

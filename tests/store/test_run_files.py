@@ -149,8 +149,8 @@ def test_animation_is_drawn_without_a_display(tmp_path, trajectory, monkeypatch)
     longer = dataclasses.replace(
         trajectory, captured=np.zeros_like(trajectory.captured), time_step=0.04
     )
-    animate(tmp_path / "chase.gif", trajectory)
-    animate(tmp_path / "both.gif", trajectory, longer)
+    animate(tmp_path / "chase.gif", [trajectory])
+    animate(tmp_path / "both.gif", [trajectory, longer])
     with Image.open(tmp_path / "chase.gif") as one, Image.open(tmp_path / "both.gif") as both:
         assert (
             one.n_frames == 5 and both.n_frames == 20 and both.size == (one.width, 2 * one.height)

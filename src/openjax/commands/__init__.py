@@ -1,3 +1,1 @@
-"""What the commands are made of: command lines, a training run from start to end, evaluation,
-validation.
-"""
+"""The commands: a command line each, and what is printed; the work is done in other rooms."""

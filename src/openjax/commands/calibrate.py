@@ -74,21 +74,18 @@ def run(arguments: Arguments, console: Console):
 
 def _print(result, console: Console) -> None:
     title = f"Calibrated on {len(result.flights)} flights, {result.seconds:.0f} s"
-    table = numbers_table(title, "quantity", "value", "90 % interval", "of nominal", "")
+    table = numbers_table(title, ("quantity", "value", "90 % interval", "of nominal", ""))
     for name, quantity in result.quantities.items():
         for i, value in enumerate(quantity.value):
-            label = name.replace("_", " ") + (
-                f" {('xx', 'yy', 'zz')[i]}" if len(quantity.value) > 1 else ""
-            )
+            label = name.replace("_", " ")
+            if len(quantity.value) > 1:
+                label += f" {('xx', 'yy', 'zz')[i]}"
+            # in yaw only the torque constant over the inertia shows: this is taken as nominal
             assumed = name == "inertia" and i == 2
             low, high = quantity.interval90[i]
-            remark = (
-                "assumed"
-                if assumed
-                else ""
-                if quantity.determined
-                else "not determined: nominal kept"
-            )
+            remark = "" if quantity.determined else "not determined: nominal kept"
+            if assumed:
+                remark = "assumed"
             table.add_row(
                 f"{label} [dim]{quantity.unit}[/]",
                 f"{value:.4g}",
@@ -97,11 +94,12 @@ def _print(result, console: Console) -> None:
                 remark,
             )
     console.print(table)
-    for channel, (before, after) in result.explained.items():
-        given = f"{before:.1%}" if before > 0 else "none"
-        fitted = f"{max(after, 0.0):.1%}"
+    for channel, (nominal, fitted) in result.explained.items():
+        nominal_share = f"{nominal:.1%}" if nominal > 0 else "none"
+        fitted_share = f"{max(fitted, 0.0):.1%}"
         console.print(
-            f"{channel}: the fitted vehicle explains {fitted} of what changed, the given {given}"
+            f"{channel}: the fitted vehicle explains {fitted_share} of what changed, the given "
+            f"{nominal_share}"
         )
     console.print("[bold]What these flights can't tell[/]")
     for text in result.cannot_tell:

@@ -82,14 +82,14 @@ def train(
     return _trained(command, OwnParts(environment, policy, learners))
 
 
-def _trained(command, own):
+def _trained(command, parts):
     """The policy of a run, as `train` gives it."""
     with quiet_compiler():
-        status = start(command, ["(called from Python)"], time.monotonic(), Processes(), own)
+        status = start(command, ["(called from Python)"], time.monotonic(), Processes(), parts)
     run = command.resume or command.out
     if status:
         raise UserError(f"training in {run} stopped at a NaN; what is left to look at lies there")
-    return load_policy(run, own.environment, own.policy)
+    return load_policy(run, parts.environment, parts.policy)
 
 
 def _path(name):

@@ -101,8 +101,8 @@ def _checked_names(options: Options) -> list[str]:
         raise UserError(
             "no case given: name at least one folder of flight logs with a vehicle.toml"
         )
-    names = [c.resolve().name for c in options.cases]
-    twice = next((n for n in names if names.count(n) > 1), None)
+    names = [case.resolve().name for case in options.cases]
+    twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
         raise UserError(f"two cases are called {twice!r}: their reports would overwrite each other")
     check_output_folder(options.out, "--out")
@@ -150,19 +150,19 @@ def _changes(
     from openjax.gap.report import write_report
 
     change = comparison.compare(folder, options.reference)
-    found = _since(options, folder, tell)
+    diagnosis = _since(options, folder, tell)
     with replacing(options.out / name) as partial_folder:
         partial_folder.mkdir()
         report.write(change, partial_folder, options.html)
-        if found is not None:
-            write_report(found, partial_folder, options.html)
+        if diagnosis is not None:
+            write_report(diagnosis, partial_folder, options.html)
     written = options.out / name / f"changes.{'html' if options.html else 'json'}"
-    if found is None:
+    if diagnosis is None:
         title = "changed" if change.changed else "no change"
         return title, [*report.in_words(change), f"({written})"], report.prediction(change)
     trims = [f"Trims: {line}" for line in report.in_words(change)[:1]]
-    lines = [*found.in_words(), *trims, f"({found.seconds:.1f} s; {written})"]
-    return ", ".join(found.effects) or "no change", lines, found.prediction()
+    lines = [*diagnosis.in_words(), *trims, f"({diagnosis.seconds:.1f} s; {written})"]
+    return ", ".join(diagnosis.effects) or "no change", lines, diagnosis.prediction()
 
 
 def _since(options: Options, folder: Path, tell: Callable[[str], None]):
@@ -173,7 +173,7 @@ def _since(options: Options, folder: Path, tell: Callable[[str], None]):
     from openjax.gap.diagnosis import diagnose_case
 
     try:
-        reference = [load_case(r) for r in options.reference]
+        reference = [load_case(day) for day in options.reference]
         return diagnose_case(load_case(folder), options.without, tell, reference)
     except UserError:
         return None
@@ -184,4 +184,7 @@ def _unforeseen(name: str, error: Exception) -> str:
     place = traceback.extract_tb(error.__traceback__)[-1]
     where = f"{Path(place.filename).name}:{place.lineno}"
     text = " ".join(str(error).split())
-    return f"{name}: {type(error).__name__} in {where} ({text}): a fault of the program, please report it"
+    return (
+        f"{name}: {type(error).__name__} in {where} ({text}): a fault of the program, please "
+        "report it"
+    )

@@ -103,14 +103,11 @@ def main(arguments: Sequence[str]) -> int:
     """The command; returns its exit status."""
     command = parse(EvaluateCommand, EvaluateCommand(), arguments, PROGRAM)
     evaluators = {}
-    policies = prepare(command, arguments)
-    _show(
-        command,
-        [
-            (own, loaded.source, fly_scenarios(own, loaded, evaluators)[0])
-            for own, loaded in policies
-        ],
-    )
+    results = []
+    for own, loaded in prepare(command, arguments):
+        records, _ = fly_scenarios(own, loaded, evaluators)
+        results.append((own, loaded.source, records))
+    _show(command, results)
     return 0
 
 
@@ -202,26 +199,27 @@ def _game(command, loaded):
             f"--messages: {loaded.source} flies the team as one; policies that were trained fly "
             "each pursuer by what it knows"
         )
-    wanted = settings.num_pursuers
-    trained = wanted if loaded.any_number else loaded.settings.environment.num_pursuers
+    number = settings.num_pursuers
+    trained = number if loaded.any_number else loaded.settings.environment.num_pursuers
+    layouts = []
     if command.scenario == "all":
         layouts = [layout for layout in SCENARIOS.values() if len(layout.pursuers) == trained]
-    else:
-        layouts = (
-            [] if command.scenario == "uniform" else [find_scenario(command.scenario, settings)]
-        )
-    there = len(layouts[0].pursuers) if layouts else wanted
-    if command.num_pursuers not in (None, there):
+    elif command.scenario != "uniform":
+        layouts = [find_scenario(command.scenario, settings)]
+    in_layout = len(layouts[0].pursuers) if layouts else number
+    if command.num_pursuers not in (None, in_layout):
         raise UserError(
-            f"--num_pursuers {command.num_pursuers}: layout {layouts[0].name} has {there}; "
+            f"--num_pursuers {command.num_pursuers}: layout {layouts[0].name} has {in_layout}; "
             "--scenario uniform flies any number"
         )
-    if wanted not in (trained, there):
+    # a number that nobody typed is the policy's own, which a layout goes before
+    if number not in (trained, in_layout):
         raise UserError(
-            f"--environment.num_pursuers {wanted}: layout {layouts[0].name} has {there} pursuers"
+            f"--environment.num_pursuers {number}: layout {layouts[0].name} has {in_layout} "
+            "pursuers"
         )
     slots = max([layout_slots(settings), *(len(layout.pillars) for layout in layouts)])
-    game = dataclasses.replace(settings, max_pillars=slots, num_pursuers=there)
+    game = dataclasses.replace(settings, max_pillars=slots, num_pursuers=in_layout)
     environment = _environment(command, game, loaded)
     return environment, loaded.in_game(environment), layouts
 
@@ -254,8 +252,8 @@ def _show(command, results):
     if len(results) > 1:
         console.print(spread_table([rows for *_, rows in results]))
     if command.json is not None:
-        plain = [rows if command.scenario == "all" else rows[0] for *_, rows in results]
-        sources = [source for _, source, _ in results]
-        write_json(
-            command.json, plain[0] if len(plain) == 1 else dict(zip(sources, plain, strict=True))
-        )
+        by_policy = {
+            source: rows if command.scenario == "all" else rows[0] for _, source, rows in results
+        }
+        only = next(iter(by_policy.values()))
+        write_json(command.json, only if len(results) == 1 else by_policy)

@@ -64,7 +64,7 @@ def observations(policy, number: int, seed: int) -> dict:
     settings = dataclasses.replace(policy.settings.environment, physics="rigid", vehicles=())
     environment = Pursuit(settings)
     worlds = 64
-    steps = -(-number // 64)
+    steps = -(-number // worlds)  # rounded up
     reset = jax.jit(jax.vmap(environment.reset))
     observation, state = reset(jax.random.split(jax.random.key(seed), worlds))
 
@@ -75,18 +75,21 @@ def observations(policy, number: int, seed: int) -> dict:
             # some noise, or all worlds would soon look alike
             noise = 0.3 * jax.random.normal(key, state.previous_action.shape)
             action = jnp.clip(policy(observation) + noise, -1.0, 1.0)
-            after, state, *_ = jax.vmap(environment.step, in_axes=(None, 0, 0))(key, state, action)
-            return (after, state), observation
+            following, state, *_ = jax.vmap(environment.step, in_axes=(None, 0, 0))(
+                key, state, action
+            )
+            return (following, state), observation
 
         return jax.lax.scan(step, (observation, state), jax.random.split(key, steps))[1]
 
-    seen = play(observation, state, jax.random.key(seed + 1))
-    fields = {field.name: getattr(seen, field.name) for field in dataclasses.fields(seen)}
-    return {
-        name: np.asarray(array).reshape(-1, *array.shape[2:])
-        for name, array in fields.items()
-        if array is not None
-    }
+    played = play(observation, state, jax.random.key(seed + 1))
+    fields = {}
+    for field in dataclasses.fields(played):
+        array = getattr(played, field.name)
+        if array is not None:
+            # steps and worlds in one axis
+            fields[field.name] = np.asarray(array).reshape(-1, *array.shape[2:])
+    return fields
 
 
 def export(arguments: Arguments, tell: Callable[[str], None] = lambda step: None) -> dict:
@@ -94,34 +97,32 @@ def export(arguments: Arguments, tell: Callable[[str], None] = lambda step: None
     it can't be, or differs.
     """
     import jax
-    import numpy as np
 
     from openjax.pursuit import Observation
     from openjax.store.policies import load_policy
 
     check_output_folder(arguments.out, "--out")
     policy = load_policy(arguments.policy)
-    tell(next(iter(STEPS)))
-    seen = observations(policy, arguments.observations, arguments.seed)
-    expected = np.asarray(jax.jit(jax.vmap(policy))(Observation(**seen)))
-    if arguments.own:
-        expected = expected[:, :1]
-        seen |= {name: seen[name][:, :1] for name in EACH if name in seen}
+    playing, comparing = STEPS
+    tell(playing)
+    samples, expected = _samples(policy, arguments)
     inputs = {
-        name: jax.ShapeDtypeStruct(array.shape[1:], array.dtype) for name, array in seen.items()
+        name: jax.ShapeDtypeStruct(array.shape[1:], array.dtype) for name, array in samples.items()
     }
-    tell(list(STEPS)[1])
+    tell(comparing)
     write = {"onnx": _onnx, "jax": _jax, "c": _c}[arguments.format]
-    files, found, extra = write(
-        lambda **fields: policy(Observation(**fields)), inputs, seen, policy.source
-    )
+
+    def act(**fields):
+        return policy(Observation(**fields))
+
+    files, actions, extra = write(act, inputs, samples, policy.source)
     report = {
         "policy": policy.source,
         "format": arguments.format,
         "file": NAMES[arguments.format],
         "bytes": len(files[NAMES[arguments.format]]),
         "observations": len(expected),
-        "largest_difference": _difference(found, expected, policy.source),
+        "largest_difference": _difference(actions, expected, policy.source),
         "output": {"action": [int(n) for n in expected.shape[1:]]},
         **extra,
     }
@@ -132,14 +133,30 @@ def export(arguments: Arguments, tell: Callable[[str], None] = lambda step: None
     return report
 
 
-def _difference(found, expected, source):
+def _samples(policy, arguments):
+    """Observations, and the policy's own actions on them."""
+    import jax
+    import numpy as np
+
+    from openjax.pursuit import Observation
+
+    samples = observations(policy, arguments.observations, arguments.seed)
+    actions = np.asarray(jax.jit(jax.vmap(policy))(Observation(**samples)))
+    if arguments.own:
+        # the first pursuer's; all fly by the same networks
+        actions = actions[:, :1]
+        samples |= {name: samples[name][:, :1] for name in EACH if name in samples}
+    return samples, actions
+
+
+def _difference(actions, expected, source):
     """The largest of an action; None where nothing was compared. Raises UserError for one too
     large.
     """
-    if found is None:
+    if actions is None:
         return None
-    difference = float(abs(found - expected).max())
-    if not difference <= TOLERANCE:
+    difference = float(abs(actions - expected).max())
+    if not difference <= TOLERANCE:  # nor where it is no number
         raise UserError(
             f"the exported policy differs by {difference:.2g} from {source}: nothing was written"
         )
@@ -152,8 +169,8 @@ def _described(inputs) -> dict:
     }
 
 
-def _onnx(act, inputs, seen, source):
-    """The files, their actions on `seen`, and what to say about them."""
+def _onnx(act, inputs, samples, source):
+    """The files, their actions on the sampled observations, and what to say about them."""
     import numpy as np
 
     from openjax.export.onnx_graph import onnx_model, size
@@ -168,39 +185,42 @@ def _onnx(act, inputs, seen, source):
     options.intra_op_num_threads = 1
     session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
     read = [value.name for value in session.get_inputs()]
-    number = len(seen["frames"])
-    found = [session.run(None, {name: seen[name][i] for name in read})[0] for i in range(number)]
+    actions = []
+    for i in range(len(samples["frames"])):
+        actions += session.run(None, {name: samples[name][i] for name in read})
     extra = {
-        "inputs": _described({n: inputs[n] for n in read}),
+        "inputs": _described({name: inputs[name] for name in read}),
         "numbers": size(model),
         "nodes": len(model.graph.node),
     }
-    return {NAMES["onnx"]: data}, np.stack(found), extra
+    return {NAMES["onnx"]: data}, np.stack(actions), extra
 
 
-def _jax(act, inputs, seen, source):
+def _jax(act, inputs, samples, source):
     """See `_onnx`."""
     import jax
     import numpy as np
 
     exported = jax.export.export(jax.jit(lambda fields: act(**fields)))(inputs)
     data = bytes(exported.serialize())
-    again = jax.export.deserialize(bytearray(data))
-    call = jax.jit(again.call)
-    found = [
-        np.asarray(call({k: v[i] for k, v in seen.items()})) for i in range(len(seen["frames"]))
-    ]
+    # compared is what was read back, not what was written
+    call = jax.jit(jax.export.deserialize(bytearray(data)).call)
+    actions = []
+    for i in range(len(samples["frames"])):
+        sample = {name: array[i] for name, array in samples.items()}
+        actions.append(np.asarray(call(sample)))
     extra = {"inputs": _described(inputs), "platforms": list(exported.platforms)}
-    return {NAMES["jax"]: data}, np.stack(found), extra
+    return {NAMES["jax"]: data}, np.stack(actions), extra
 
 
-def _c(act, inputs, seen, source):
+def _c(act, inputs, samples, source):
     """See `_onnx`; nothing is compared where there is no C compiler."""
     from openjax.export.c_compiled import compiled
     from openjax.export.c_program import c_program
 
     name = Path(NAMES["c"]).stem
-    readable = Path(source).name.encode("ascii", "backslashreplace").decode()  # by every C compiler
+    # for every C compiler, in a comment
+    readable = Path(source).name.encode("ascii", "backslashreplace").decode()
     program = c_program(act, inputs, "action", name, f"The policy {readable}")
     extra = {
         "inputs": _described(program.inputs),
@@ -214,7 +234,7 @@ def _c(act, inputs, seen, source):
     if call is None:
         return files, None, extra
     extra["microseconds"] = round(1e6 * call.seconds(), 1)
-    return files, call(seen), extra
+    return files, call(samples), extra
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -224,11 +244,9 @@ def main(arguments: Sequence[str]) -> None:
     with Steps(f"exporting {parsed.policy}", STEPS, console) as steps:
         report = export(parsed, steps.begin)
     difference = report["largest_difference"]
-    compared = (
-        "compared with nothing, as there is no C compiler here"
-        if difference is None
-        else f"differs by at most {difference:.1e} on {report['observations']} observations"
-    )
+    compared = "compared with nothing, as there is no C compiler here"
+    if difference is not None:
+        compared = f"differs by at most {difference:.1e} on {report['observations']} observations"
     console.print(
         f"{parsed.out / report['file']}: {report['bytes'] / 1e6:.2f} MB, {compared}", soft_wrap=True
     )

@@ -203,6 +203,7 @@ def _session(arguments: Arguments):
     uris = uris_of(arguments)
     body_logs = arguments.body_logs
     if body_logs is None:
+        # a radio has less room, which commands and poses need first
         body_logs = 5 if all(uri.startswith("udp:") for uri in uris) else 1
     return SessionSettings(
         uris, body_logs, arguments.watchdog, arguments.guard, arguments.guard_after, feed
@@ -254,7 +255,7 @@ def _write(out, flown, flight, samples, scheduler):
     about = {
         **flown.about,
         "scheduler": scheduler,
-        "reasons": [d.reason for d in flight.state.drones],
+        "reasons": [drone.reason for drone in flight.state.drones],
     }
     with replacing(out) as folder:
         folder.mkdir()
@@ -262,10 +263,12 @@ def _write(out, flown, flight, samples, scheduler):
 
 
 def _check_numbers(arguments, starts, pursuers):
-    names = len(arguments.uri)
-    if names != pursuers:
+    """Raises UserError where vehicles, starts and pursuers aren't equally many."""
+    vehicles = len(arguments.uri)
+    if vehicles != pursuers:
         raise UserError(
-            f"--uri names {names} vehicles, the policy flies {pursuers}: name all after one --uri"
+            f"--uri names {vehicles} vehicles, the policy flies {pursuers}: name all after one "
+            "--uri"
         )
     if starts != pursuers:
         raise UserError(
@@ -304,8 +307,7 @@ def _show(console, flight, planned):
     age = timing["command_age_ms"]
     console.print(
         f"{timing['seconds']:.1f} s, {timing['ticks']} ticks: command age {age['p50']:.2f} ms "
-        "median, "
-        f"{age['p99']:.2f} ms p99; {timing['missed_deadlines']} missed deadlines "
+        f"median, {age['p99']:.2f} ms p99; {timing['missed_deadlines']} missed deadlines "
         f"({timing['missed_share']:.2%})"
     )
     for number, game in enumerate(() if planned else record.episodes):

@@ -54,15 +54,16 @@ def main(arguments: Sequence[str]) -> int:
     check_evaders(command.evaders)
     map_game(command, trained)
     console = output_console()
-    found = draw_map(command, loaded, lambda text: console.print(text, soft_wrap=True))
+    results = draw_map(command, loaded, lambda text: console.print(text, soft_wrap=True))
     if command.json is not None:
-        write_json(command.json, found)
+        write_json(command.json, results)
     if command.page is not None:
-        write_text(command.page, map_page({command.scenario: found}))
-    plot_map(command.out, found["cells"], f"{command.policy}: captures, {command.scenario}")
-    least = min(found["cells"], key=lambda cell: cell["capture_rate"])
+        write_text(command.page, map_page({command.scenario: results}))
+    cells = results["cells"]
+    plot_map(command.out, cells, f"{command.policy}: captures, {command.scenario}")
+    least = min(cells, key=lambda cell: cell["capture_rate"])
     console.print(
-        f"{command.out}: {len(found['cells'])} cells of {command.episodes} episodes; the least is "
+        f"{command.out}: {len(cells)} cells of {command.episodes} episodes; the least is "
         f"{least['capture_rate']:.2f}, with {least['num_pursuers']} pursuers, "
         f"{least['speed_ratio']:g} times their speed and {least['capture_radius']:g} m",
         soft_wrap=True,

@@ -63,30 +63,26 @@ def make_case(arguments: Arguments) -> list[Path]:
     with replacing(arguments.out) as folder:
         folder.mkdir()
         for number, (name, reference) in enumerate(flights.items()):
-            columns = fly(
-                described.vehicle,
-                described.vehicle,
-                reference,
-                1000 * arguments.seed + number,
-                effects,
-            )
+            # the vehicle that flies is the one that is described, but for the effects
+            seed = 1000 * arguments.seed + number
+            columns = fly(described.vehicle, described.vehicle, reference, seed, effects)
             write_csv(folder / f"{name}.csv.gz", log_of(columns, name), decimals)
         save_vehicle_file(folder / "vehicle.toml", described)
     return sorted(arguments.out.iterdir())
 
 
-def _checked_effects(given: tuple[str, ...], known: Collection[str]) -> tuple[str, ...]:
+def _checked_effects(names: tuple[str, ...], library: Collection[str]) -> tuple[str, ...]:
     """The effects that act. Raises UserError for one that there isn't, twice the same, or none
     beside others.
     """
-    for name in given:
-        if name not in ("none", *known):
-            raise UserError(f"--effect {name}: no such effect; {suggestion(name, known)}")
-    twice = next((name for name in given if given.count(name) > 1), None)
-    if twice is not None or not given or ("none" in given and len(given) > 1):
-        said = " ".join(given) or "nothing"
-        raise UserError(f"--effect {said}: name none alone, or each effect that acts once")
-    return tuple(name for name in given if name != "none")
+    for name in names:
+        if name not in ("none", *library):
+            raise UserError(f"--effect {name}: no such effect; {suggestion(name, library)}")
+    is_unclear = "none" in names and len(names) > 1
+    if len(set(names)) < len(names) or not names or is_unclear:
+        typed = " ".join(names) or "nothing"
+        raise UserError(f"--effect {typed}: name none alone, or each effect that acts once")
+    return tuple(name for name in names if name != "none")
 
 
 def main(arguments: Sequence[str]) -> None:

@@ -17,9 +17,8 @@ def main(arguments: Sequence[str]) -> int:
     if {"-h", "--help"} & set(arguments):
         return _help(arguments)
     if peek(arguments, "process_id") in (None, "0"):
-        print(
-            "openjax.train: loading JAX and MuJoCo ...", flush=True
-        )  # takes seconds; nobody should wonder
+        # takes seconds; nobody should wonder
+        print("openjax.train: loading JAX and MuJoCo ...", flush=True)
     import jax
 
     from openjax.cluster.joining import joined

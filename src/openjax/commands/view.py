@@ -68,7 +68,7 @@ def main(arguments: Sequence[str]) -> int:
     if command.gif is not None:
         from openjax.show.videos import animate
 
-        animate(command.gif, flights[0][1])
+        animate(command.gif, [flights[0][1]])
         console.print(f"{command.gif}: {command.gif.stat().st_size / 1e3:,.0f} kB")
     if command.html is not None:
         write_replay(command.html, flights)

@@ -66,6 +66,7 @@ def make(arguments: Arguments):
     if arguments.scenario != MIDDLE:
         starts = find_scenario(arguments.scenario, PursuitSettings()).pursuers
     stands = [start[:2] for start in starts][: arguments.number]
+    # more than a layout has stand outside the arena, apart
     stands += [(0.2 * i, -1.4) for i in range(arguments.number - len(stands))]
     effects = load_effects(arguments.effects)[1] if arguments.effects else {}
     vehicle = load_vehicle_file(arguments.vehicle).vehicle

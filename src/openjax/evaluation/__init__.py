@@ -1,4 +1,6 @@
-"""Evaluation: whole episodes, validation tasks and scores. It knows nothing of how anybody learned."""
+"""Evaluation: whole episodes, validation tasks and scores. It knows nothing of how anybody
+learned.
+"""
 
 from openjax.lazy import lazy_names
 

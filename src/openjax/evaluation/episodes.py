@@ -1,7 +1,9 @@
 """Evaluation: whole episodes of the mean policy on given tasks."""
 
+import functools
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
@@ -50,66 +52,83 @@ def make_evaluate(
     """
     imperfect = messages is not None and not messages.perfect
     hearsay = Hearsay(messages, environment) if imperfect else None
-    step = jax.vmap(environment.step, in_axes=(None, 0, 0))
+    return _Episodes(environment, policy, trajectory, hearsay).evaluate
 
-    def evaluate(parameters: PolicyParameters, tasks: Task, key: jax.Array):
+
+@dataclass(frozen=True)
+class _Episodes:
+    """Whole episodes of a policy, as one function of its parameters and tasks."""
+
+    environment: Pursuit
+    policy: Policy
+    trajectory: bool
+    hearsay: Hearsay | None
+
+    def evaluate(self, parameters: PolicyParameters, tasks: Task, key: jax.Array):
+        environment = self.environment
         number = tasks.evader_position.shape[0]
         reset_key, step_key = jax.random.split(key)
-        observation, state = jax.vmap(environment.reset_to)(
-            jax.random.split(reset_key, number), tasks
-        )
-
-        def decide(observation, state, beliefs):
-            """Actions, and the positions predicted for the evader."""
-            if hearsay is not None:
-                views = jax.vmap(hearsay.observations)(beliefs, state)
-                return policy.act(parameters, views)[..., 0, :], None
-            predicted = policy.predict(parameters, observation)
-            mean, _ = policy.distribution(parameters.actor, observation, predicted)
-            return policy.action(mean, observation), predicted
-
-        def one(carry, step_key):
-            observation, state, beliefs, errors = carry
-            action, predicted = decide(observation, state, beliefs)
-            last_seen = observation.last_seen
-            observation, state, _, _, _, info = step(step_key, state, action)
-            if hearsay is not None:
-                keys = jax.random.split(step_key, number)
-                beliefs = jax.vmap(hearsay.after)(beliefs, state, keys)
-            guesses = [last_seen if predicted is None else predicted[:, 0], last_seen]
-            errors = errors + jnp.stack(
-                [jnp.linalg.norm(guess - state.evader_position, axis=-1) for guess in guesses]
-            )
-            record = None
-            if trajectory:
-                record = EpisodeRecord(
-                    pursuers=state.drones.position,
-                    quaternion=state.drones.quaternion,
-                    evader=state.evader_position,
-                    seen=info.seen,
-                    captured=info.captured,
-                    crashed=info.crashed,
-                    predicted=predicted,
-                )
-            return (observation, state, beliefs, errors), record
+        reset_keys = jax.random.split(reset_key, number)
+        observation, state = jax.vmap(environment.reset_to)(reset_keys, tasks)
+        beliefs = None if self.hearsay is None else jax.vmap(self.hearsay.start)(state)
+        start = (observation, state, beliefs, jnp.zeros((2, number), jnp.float32))
 
         length = environment.settings.episode_length
-        beliefs = None if hearsay is None else jax.vmap(hearsay.start)(state)
-        start = (observation, state, beliefs, jnp.zeros((2, number), jnp.float32))
-        (_, state, _, errors), record = jax.lax.scan(one, start, jax.random.split(step_key, length))
-        errors = errors / length
-        evaluation = Evaluation(
-            statistics=state.statistics,
-            prediction_error=errors[0]
-            if policy.predictor.enabled and hearsay is None
-            else jnp.full_like(errors[0], jnp.nan),
-            last_seen_error=errors[1],
+        step = functools.partial(self._step, parameters)
+        (_, state, _, errors), record = jax.lax.scan(
+            step, start, jax.random.split(step_key, length)
         )
-        if trajectory:
-            return evaluation, jax.tree.map(lambda x: jnp.moveaxis(x, 0, 1), record)
-        return evaluation
+        prediction_error, last_seen_error = errors / length
+        if not self.policy.predictor.enabled or self.hearsay is not None:
+            prediction_error = jnp.full_like(prediction_error, jnp.nan)
+        evaluation = Evaluation(state.statistics, prediction_error, last_seen_error)
+        if not self.trajectory:
+            return evaluation
+        # from steps first, as a scan stacks them, to episodes first
+        return evaluation, jax.tree.map(lambda x: jnp.moveaxis(x, 0, 1), record)
 
-    return evaluate
+    def _step(self, parameters, carry, key):
+        """One step of all episodes; `errors` (2, B) m add up those of the prediction and of the
+        last seen position.
+        """
+        observation, state, beliefs, errors = carry
+        action, predicted = self._decide(parameters, observation, state, beliefs)
+        last_seen = observation.last_seen
+        # what was predicted one step ahead is compared with where the evader is after the step
+        step = jax.vmap(self.environment.step, in_axes=(None, 0, 0))
+        observation, state, _, _, _, info = step(key, state, action)
+        if self.hearsay is not None:
+            keys = jax.random.split(key, action.shape[0])
+            beliefs = jax.vmap(self.hearsay.after)(beliefs, state, keys)
+        guesses = [last_seen if predicted is None else predicted[:, 0], last_seen]
+        errors = errors + jnp.stack(
+            [jnp.linalg.norm(guess - state.evader_position, axis=-1) for guess in guesses]
+        )
+        record = None
+        if self.trajectory:
+            record = EpisodeRecord(
+                pursuers=state.drones.position,
+                quaternion=state.drones.quaternion,
+                evader=state.evader_position,
+                seen=info.seen,
+                captured=info.captured,
+                crashed=info.crashed,
+                predicted=predicted,
+            )
+        return (observation, state, beliefs, errors), record
+
+    def _decide(self, parameters, observation, state, beliefs):
+        """Actions, and the positions predicted for the evader; None where each pursuer has its own
+        view.
+        """
+        policy = self.policy
+        if self.hearsay is not None:
+            views = jax.vmap(self.hearsay.observations)(beliefs, state)
+            # (B, N, 1, 4): each view's policy acts for its own pursuer
+            return policy.act(parameters, views)[..., 0, :], None
+        predicted = policy.predict(parameters, observation)
+        mean, _ = policy.distribution(parameters.actor, observation, predicted)
+        return policy.action(mean, observation), predicted
 
 
 def summarise(evaluation: Evaluation) -> dict[str, float]:
@@ -117,7 +136,8 @@ def summarise(evaluation: Evaluation) -> dict[str, float]:
     slowest hundredth too.
     """
     statistics = evaluation.statistics
-    slowest = jnp.sort(statistics.capture_step)[-max(1, len(statistics.capture_step) // 100) :]
+    hundredth = max(1, len(statistics.capture_step) // 100)
+    slowest = jnp.sort(statistics.capture_step)[-hundredth:]
     steps = jnp.maximum(statistics.steps, 1)
 
     def mean(x):
@@ -149,4 +169,6 @@ def wilson(hits: int, n: int) -> tuple[float, float]:
     z = 1.96
     centre = p + z * z / (2 * n)
     half = z * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
-    return max(0.0, (centre - half) / (1 + z * z / n)), min(1.0, (centre + half) / (1 + z * z / n))
+    scale = 1 + z * z / n
+    # rounding may lead past the ends
+    return max(0.0, (centre - half) / scale), min(1.0, (centre + half) / scale)

@@ -4,6 +4,7 @@ trajectories.
 
 import dataclasses
 import math
+import operator
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -77,14 +78,16 @@ class Evaluator:
             flown = []
             for name, tasks in kinds.items():
                 tell(name)
-                flown.append(Flown(self, name, tasks, *self._fly(parameters, tasks, key)))
+                evaluation, records = self._fly(parameters, tasks, key)
+                flown.append(Flown(self, name, tasks, evaluation, records))
             return flown
         packed, part = stacked(kinds)
         evaluation, records = self._fly(parameters, packed, key)
+        parts = part(evaluation)
         first = np.cumsum([0, *numbers])
         return [
-            Flown(self, name, kinds[name], own, records, int(first[i]))
-            for i, (name, own) in enumerate(part(evaluation).items())
+            Flown(self, name, tasks, parts[name], records, int(first[i]))
+            for i, (name, tasks) in enumerate(kinds.items())
         ]
 
     def _fly(self, parameters, tasks, key):
@@ -93,13 +96,14 @@ class Evaluator:
         evaluations = []
         records = []
         for i, start in enumerate(range(0, number, self.batch)):
+            # the program knows one size: the last batch is filled up with the last task
             index = np.minimum(np.arange(start, start + self.batch), number - 1)
-            part = jax.tree.map(lambda leaf, index=index: leaf[index], tasks)
+            part = jax.tree.map(operator.itemgetter(index), tasks)
             evaluation, record = self._evaluate(parameters, part, jax.random.fold_in(key, i))
-            used = min(self.batch, number - start)
-            evaluations.append(
-                jax.tree.map(lambda leaf, used=used: np.asarray(leaf)[:used], evaluation)
-            )
+            asked_for = slice(min(self.batch, number - start))
+            evaluation = jax.tree.map(np.asarray, evaluation)
+            evaluations.append(jax.tree.map(operator.itemgetter(asked_for), evaluation))
+            # stays on the device: of most episodes nobody draws anything
             records.append(record)
         return jax.tree.map(lambda *parts: np.concatenate(parts), *evaluations), records
 
@@ -139,7 +143,7 @@ class Flown:
         record = jax.tree.map(lambda leaf: np.asarray(leaf[place]), self.records[batch])
         settings = self.evaluator.settings
         task = jax.tree.map(lambda leaf: np.asarray(leaf[episode]), self.tasks)
-        there = slice(None) if task.active is None else task.active
+        there = slice(None) if task.active is None else task.active  # no empty slots
         return Trajectory(
             title=title,
             pursuer_position=_on_the_floor(record.pursuers[:, there]),
@@ -162,6 +166,7 @@ def _on_the_floor(position):
     """Paths (T, N, 3) on which pursuers that have fallen out lie below where they did."""
     position = np.array(position)
     for path in position.swapaxes(0, 1):
+        # who has fallen out is parked far away, which no picture could show
         is_gone = path[:, 0] > FAR / 2
         if is_gone.any():
             path[is_gone] = (*path[~is_gone][-1, :2], 0.0)
@@ -196,13 +201,17 @@ def stacked(kinds: Mapping[str, Task]) -> tuple[Task, Callable[[Any], dict[str, 
     """Tasks of several kinds one after the other, and what parts a tree of results (B, ...) by
     their names again.
     """
-    ends = np.cumsum([tasks.evader_position.shape[0] for tasks in kinds.values()]).tolist()
-    places = dict(zip(kinds, map(slice, [0, *ends], ends), strict=False))
+    places = {}
+    start = 0
+    for name, tasks in kinds.items():
+        end = start + tasks.evader_position.shape[0]
+        places[name] = slice(start, end)
+        start = end
 
     def part(results):
         return {
-            name: jax.tree.map(lambda leaf, own=own: leaf[own], results)
-            for name, own in places.items()
+            name: jax.tree.map(operator.itemgetter(place), results)
+            for name, place in places.items()
         }
 
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *kinds.values()), part
@@ -239,9 +248,11 @@ def results_table(title: str, rows: Sequence[dict], game: str) -> Table:
         "capture\nstep",
         "colli-\nsions",
         "pillar/drone/\nbounds",
+        "crash\nrate",
+        "over-\nspeed",
+        "predicted\noff by, m",
     )
-    heads += ("crash\nrate", "over-\nspeed", "predicted\noff by, m")
-    table = numbers_table(title, "scenario", *heads, caption=game)
+    table = numbers_table(title, ("scenario", *heads), caption=game)
     for row in rows:
         parts = row["collision_parts"]
         table.add_row(
@@ -269,7 +280,7 @@ def spread_table(results: Sequence[Sequence[dict]]) -> Table:
         ("collision_rate", "collision rate", ".4f"),
         ("crash_rate", "crash rate", ".3f"),
     )
-    table = numbers_table(title, "scenario", *(label for _, label, _ in columns))
+    table = numbers_table(title, ("scenario", *(label for _, label, _ in columns)))
     for rows in zip(*results, strict=True):
         values = [(np.array([row[name] for row in rows]), style) for name, _, style in columns]
         cells = [f"{value.mean():{style}} ± {value.std(ddof=1):{style}}" for value, style in values]

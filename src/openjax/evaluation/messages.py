@@ -63,9 +63,9 @@ class Hearsay:
         def each(leaf):
             return jnp.broadcast_to(leaf, (number, *leaf.shape))
 
-        now = _sent(state)
+        # as if all had said the same since long before
         on_the_way = jax.tree.map(
-            lambda leaf: jnp.broadcast_to(leaf, (self.delay, *leaf.shape)), now
+            lambda leaf: jnp.broadcast_to(leaf, (self.delay, *leaf.shape)), _sent(state)
         )
         return Beliefs(
             position=each(state.drones.position),
@@ -81,27 +81,31 @@ class Hearsay:
     def after(self, beliefs: Beliefs, state: PursuitState, key: jax.Array) -> Beliefs:
         """Beliefs after a step that ended with `state`; `key` draws which messages are lost."""
         number = state.drones.position.shape[0]
-        now = _sent(state)
+        sent = _sent(state)
         line = jax.tree.map(
-            lambda old, new: jnp.concatenate([old, new[None]]), beliefs.on_the_way, now
+            lambda old, new: jnp.concatenate([old, new[None]]), beliefs.on_the_way, sent
         )
-        heard = jax.tree.map(lambda leaf: leaf[0], line)
-        own = jnp.eye(number, dtype=bool)
+        arriving = jax.tree.map(lambda leaf: leaf[0], line)
+        # (N, N): row by row what each pursuer hears of each
+        is_itself = jnp.eye(number, dtype=bool)
         arrives = jax.random.uniform(key, (number, number)) >= self.settings.lost
-        position = jnp.where((arrives & ~own)[..., None], heard.position, beliefs.position)
-        position = jnp.where(own[..., None], state.drones.position, position)
+        arrives &= ~is_itself
+        position = jnp.where(arrives[..., None], arriving.position, beliefs.position)
+        position = jnp.where(is_itself[..., None], state.drones.position, position)
 
-        told = jnp.any(arrives & ~own & heard.sees, axis=-1) & (heard.step > beliefs.reported)
+        # a report counts that is newer than what one knows, and one's own eyes before any report
+        has_report = jnp.any(arrives & arriving.sees, axis=-1)
+        has_report &= arriving.step > beliefs.reported
         sees = state.sees
 
-        def newest(of_own, of_others, earlier):
-            reported = jnp.where(told[:, None], of_others, earlier)
-            return jnp.where(sees[:, None], of_own, reported)
+        def newest(by_itself, by_report, by_belief):
+            believed = jnp.where(has_report[:, None], by_report, by_belief)
+            return jnp.where(sees[:, None], by_itself, believed)
 
-        evader = newest(now.evader, heard.evader, beliefs.evader)
-        velocity = newest(now.evader_velocity, heard.evader_velocity, beliefs.evader_velocity)
-        reported = jnp.where(told, heard.step, beliefs.reported)
-        seen = sees | told
+        evader = newest(sent.evader, arriving.evader, beliefs.evader)
+        velocity = newest(sent.evader_velocity, arriving.evader_velocity, beliefs.evader_velocity)
+        reported = jnp.where(has_report, arriving.step, beliefs.reported)
+        seen = sees | has_report
         beliefs = beliefs.replace(
             position=position,
             evader=evader,
@@ -116,17 +120,14 @@ class Hearsay:
     def _frames(self, beliefs, state):
         settings = self.environment.settings
 
-        def newest(position, evader, velocity, seen, last_seen):
-            framed = frame_pursuers(settings, position, last_seen, state.active)
-            return frame(settings, state.step, framed, evader, velocity, seen)
+        def newest(belief):
+            framed = frame_pursuers(settings, belief.position, belief.last_seen, state.active)
+            return frame(
+                settings, state.step, framed, belief.evader, belief.evader_velocity, belief.seen
+            )
 
-        frames = jax.vmap(newest)(
-            beliefs.position,
-            beliefs.evader,
-            beliefs.evader_velocity,
-            beliefs.seen,
-            beliefs.last_seen,
-        )
+        # what is on the way has another leading axis than the pursuers'
+        frames = jax.vmap(newest)(beliefs.replace(on_the_way=None))
         return jnp.concatenate([beliefs.frames[:, 1:], frames[:, None]], axis=1)
 
     def observations(self, beliefs: Beliefs, state: PursuitState) -> Observation:
@@ -164,8 +165,6 @@ WHOLE = ("last_seen", "frames")
 
 def _of_one(observation, i):
     """The observation of pursuer i alone, which keeps the pursuers' axis."""
-    common = {name: None for name in WHOLE}
-    own = jax.tree.map(
-        lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, i, 1), observation.replace(**common)
-    )
-    return own.replace(**{name: getattr(observation, name) for name in WHOLE})
+    each = observation.replace(**dict.fromkeys(WHOLE))
+    of_one = jax.tree.map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, i, 1), each)
+    return of_one.replace(**{name: getattr(observation, name) for name in WHOLE})

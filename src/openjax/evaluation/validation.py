@@ -43,9 +43,12 @@ def far_tasks(settings: PursuitSettings, number: int, slots: int) -> Task:
         uniform_key, turn_key, expand_key = jax.random.split(key, 3)
         task = turn_task(turn_key, uniform_task(settings, uniform_key))
         keys = jax.random.split(expand_key, FAR_EXPANSIONS)
-        return jax.lax.scan(lambda task, key: (expand_task(settings, key, task), None), task, keys)[
-            0
-        ]
+
+        def expand(task, key):
+            return expand_task(settings, key, task), None
+
+        far, _ = jax.lax.scan(expand, task, keys)
+        return far
 
     keys = jax.random.split(jax.random.fold_in(jax.random.key(VALIDATION_KEY), 1), number)
     return _with_slots(jax.jit(jax.vmap(draw))(keys), slots)
@@ -67,6 +70,7 @@ class Validation:
     ):
         drawn = environment.settings
         self.number = number
+        # drawn by the run's own game, which a wider one would draw otherwise; flown with more slots
         slots = layout_slots(drawn)
         game = dataclasses.replace(drawn, max_pillars=slots, evaders=evaders or drawn.evaders)
         changes = {"evaders": None} if evaders else {}

@@ -11,7 +11,6 @@ import dataclasses
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -39,6 +38,7 @@ from openjax.learning.gradient_step import (
     weighted_sum,
 )
 from openjax.learning.settings import AdaptSettings, TrainSettings
+from openjax.learning.train_state import TrainState
 from openjax.policy import Policy, PolicyParameters, make_policy
 from openjax.policy.growth import with_longer_history
 from openjax.pursuit import (
@@ -50,7 +50,7 @@ from openjax.pursuit import (
     turn_task,
     uniform_task,
 )
-from openjax.vehicle import load_vehicle
+from openjax.vehicle import Vehicle, load_vehicle
 from openjax.vehicle.family import REST, adapted_family, draw_vehicles, family_bounds, known_effects
 from openjax.vehicle.parameters import NOMINAL
 
@@ -110,25 +110,28 @@ def starting_parameters(parameters: PolicyParameters, trained: TrainSettings) ->
 class Flights:
     """Moments of flights with the nominal vehicle, and how that flew on from each."""
 
-    # (W, ...) where the nominal vehicle was; with vehicles of the bounds that are adapted to
     state: PursuitState
-    position: (
-        jax.Array
-    )  # (LAG + T, W, N, 3) m, after the LAG steps before the moment and the steps that followed
-    velocity: jax.Array  # (LAG + T, W, N, 3) m/s
+    """(W, ...) where the nominal vehicle was; with vehicles of the bounds that are adapted to"""
+    position: jax.Array
+    """(LAG + T, W, N, 3) m, after the LAG steps before the moment and the steps that followed"""
+    velocity: jax.Array
+    """(LAG + T, W, N, 3) m/s"""
 
 
 @dataclass(frozen=True)
 class Adaptation:
     """The programs, not compiled yet; vehicles' bounds (R, 4) are an argument."""
 
+    settings: AdaptSettings
     game: PursuitSettings
     policy: Policy
     optimiser: optax.GradientTransformation
     fly: Callable[[PolicyParameters, jax.Array, jax.Array], Flights]
     """(parameters, key, bounds) -> moments of flights."""
-    update: Callable[..., tuple[Any, Any, dict[str, jax.Array]]]
-    """(actor, optimiser's state, parameters, flights, key, bounds) -> actor, state, metrics."""
+    update: Callable[..., tuple[TrainState, dict[str, jax.Array]]]
+    """(actor, parameters, flights, key, bounds) -> actor, metrics; the actor with its optimiser's
+    state, the parameters are the policy's before.
+    """
     evaluate: Callable[[PolicyParameters, Task, jax.Array, jax.Array], Evaluation]
     """(parameters, tasks, key, bounds) -> one episode per task."""
 
@@ -136,112 +139,148 @@ class Adaptation:
 def make_adaptation(trained: TrainSettings, settings: AdaptSettings) -> Adaptation:
     """The programs for a policy that was trained with `trained`."""
     game = adapting_game(trained.environment)
-    vehicle = load_vehicle(trained.environment.airframe)
-    # nothing is solid while the gradient is taken: a crash is told by the gap
-    free = dataclasses.replace(game, physics="rigid", contacts=False)
     policy = make_policy(Pursuit(game), trained.network, trained.predictor)
-    worlds = settings.worlds or (8 if jax.default_backend() == "cpu" else 320)
-    nominal = bounds_of({}, {}, rest=0.0)
     optimiser = clipped_descent(falling_rate(settings.learning_rate, settings.updates))
+    stage = _Stage(
+        settings=settings,
+        game=game,
+        # nothing is solid while the gradient is taken: a crash is told by the gap
+        free=dataclasses.replace(game, physics="rigid", contacts=False),
+        vehicle=load_vehicle(trained.environment.airframe),
+        policy=policy,
+        optimiser=optimiser,
+        worlds=settings.worlds or (8 if jax.default_backend() == "cpu" else 320),
+    )
+    fly = jax.jit(stage.fly)
+    update = jax.jit(stage.update)
+    return Adaptation(settings, game, policy, optimiser, fly, update, jax.jit(stage.evaluate))
 
-    def environment(settings, bounds):
-        return Pursuit(settings, vehicle, vehicle_bounds=bounds)
 
-    def fly(parameters, key, bounds):
-        pursuit = environment(free, nominal)
-        number = 4 * worlds
+@dataclass(frozen=True)
+class _Stage:
+    """What the programs have in common."""
+
+    settings: AdaptSettings
+    game: PursuitSettings
+    free: PursuitSettings
+    """The game in which is learnt."""
+    vehicle: Vehicle
+    policy: Policy
+    optimiser: optax.GradientTransformation
+    worlds: int
+    """Of each kind of flight in an update."""
+
+    def pursuit(self, bounds, game=None):
+        """The game that is learnt in, or another one, with vehicles of the bounds."""
+        return Pursuit(game or self.free, self.vehicle, vehicle_bounds=bounds)
+
+    def fly(self, parameters, key, bounds):
+        """Moments of flights with the nominal vehicle, in which vehicles of the bounds fly on."""
+        nominal = self.pursuit(bounds_of({}, {}, rest=0.0))
+        # more than an update takes, so that these differ
+        number = 4 * self.worlds
         task_key, reset_key, moment_key, vehicle_key = jax.random.split(key, 4)
-        tasks = jax.vmap(lambda key: _task(free, key))(jax.random.split(task_key, number))
-        _, state = jax.vmap(pursuit.reset_to)(jax.random.split(reset_key, number), tasks)
+        tasks = jax.vmap(lambda key: _task(self.free, key))(jax.random.split(task_key, number))
+        _, start = jax.vmap(nominal.reset_to)(jax.random.split(reset_key, number), tasks)
         moment = jax.random.randint(moment_key, (number,), SETTLE, FLIGHT - STEPS)
-        fly_on = mean_step(pursuit, policy, parameters)
+        fly_on = mean_step(nominal, self.policy, parameters)
 
+        # the nominal vehicle's flights: their states at each world's moment and SETTLE steps before
+        # it, and the tracks
         def one(carry, step):
-            observation, state, before, kept = carry
-            before = _kept(moment - SETTLE == step, state, before)
-            kept = _kept(moment == step, state, kept)
+            observation, state, at_settling, at_moment = carry
+            at_settling = _recorded(moment - SETTLE == step, state, at_settling)
+            at_moment = _recorded(moment == step, state, at_moment)
             observation, state = fly_on(parameters.actor, observation, state)
-            return (observation, state, before, kept), (
-                state.drones.position,
-                state.drones.velocity,
-            )
+            track = (state.drones.position, state.drones.velocity)
+            return (observation, state, at_settling, at_moment), track
 
-        first = jax.vmap(pursuit.observe)(state), state, state, state
-        (_, _, before, kept), flown = jax.lax.scan(one, first, jnp.arange(FLIGHT))
-        after = moment + jnp.arange(-LAG, STEPS)[:, None]
-        position, velocity = (track[after, jnp.arange(number)] for track in flown)
+        first = (jax.vmap(nominal.observe)(start), start, start, start)
+        (_, _, at_settling, at_moment), tracks = jax.lax.scan(one, first, jnp.arange(FLIGHT))
+        steps = moment + jnp.arange(-LAG, STEPS)[:, None]
+        position, velocity = (track[steps, jnp.arange(number)] for track in tracks)
+        settled = self._settle(parameters, at_settling, vehicle_key, bounds)
+        return Flights(_in_its_place(settled, at_moment), position, velocity)
 
-        drawn = jax.vmap(
-            lambda key: draw_vehicles(free.vehicles, key, free.num_pursuers, 0.0, bounds)
-        )(jax.random.split(vehicle_key, number))
-        pursuit = environment(free, bounds)
-        settled = before.replace(vehicles=drawn)
-        fly_on = mean_step(pursuit, policy, parameters)
-        settled, _ = jax.lax.scan(
-            lambda carry, _: (fly_on(parameters.actor, *carry), None),
-            (jax.vmap(pursuit.observe)(settled), settled),
-            None,
-            length=SETTLE,
+    def _settle(self, parameters, state, key, bounds):
+        """States (W, ...) SETTLE steps later, flown by vehicles of the bounds."""
+        number = state.step.shape[0]
+        draw = functools.partial(draw_vehicles, self.free.vehicles)
+        drawn = jax.vmap(lambda key: draw(key, self.free.num_pursuers, 0.0, bounds))(
+            jax.random.split(key, number)
         )
-        return Flights(_in_its_place(settled[1], kept), position, velocity)
+        diagnosed = self.pursuit(bounds)
+        fly_on = mean_step(diagnosed, self.policy, parameters)
 
-    def begin(flights, key, bounds):
+        def one(carry, _):
+            observation, state = carry
+            return fly_on(parameters.actor, observation, state), None
+
+        state = state.replace(vehicles=drawn)
+        start = (jax.vmap(diagnosed.observe)(state), state)
+        (_, settled), _ = jax.lax.scan(one, start, None, length=SETTLE)
+        return settled
+
+    def _begin(self, flights, key, bounds):
         """Half of the worlds at starts, half in flight, all with vehicles of the bounds; and the
         flights to follow.
         """
-        pursuit = environment(free, bounds)
+        pursuit = self.pursuit(bounds)
+        worlds = self.worlds
         task_key, reset_key, moment_key = jax.random.split(key, 3)
-        tasks = jax.vmap(lambda key: draw_start(free, key))(jax.random.split(task_key, worlds))
+        task_keys = jax.random.split(task_key, worlds)
+        tasks = jax.vmap(lambda key: draw_start(self.free, key))(task_keys)
         _, starts = jax.vmap(pursuit.reset_to)(jax.random.split(reset_key, worlds), tasks)
         chosen = jax.random.choice(moment_key, flights.position.shape[1], (worlds,), replace=False)
         moments = jax.tree.map(lambda leaf: leaf[chosen], flights.state)
         state = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), starts, moments)
         return pursuit, state, flights.position[:, chosen], flights.velocity[:, chosen]
 
-    def loss(actor, parameters, flights, key, bounds):
-        pursuit, state, position, velocity = begin(flights, key, bounds)
-        fly_on = jax.checkpoint(mean_step(pursuit, policy, parameters))
+    def loss(self, actor, parameters, flights, key, bounds):
+        """() what is learnt, and its parts."""
+        free = self.free
+        worlds = self.worlds
+        pursuit, state, position, velocity = self._begin(flights, key, bounds)
+        # worked out again on the way back, which takes a fraction of the memory
+        fly_on = jax.checkpoint(mean_step(pursuit, self.policy, parameters))
 
         def one(carry, _):
             observation, state, least, breach = carry
             observation, state = fly_on(actor, observation, state)
             least = jnp.minimum(least, nearest_gap(free, state))
             breach = breach + breach_share(free, state) / STEPS
-            return (observation, state, least, breach), (
-                state.drones.position,
-                state.drones.velocity,
-            )
+            track = (state.drones.position, state.drones.velocity)
+            return (observation, state, least, breach), track
 
-        number = state.drones.position.shape[:2]
-        first = (
-            jax.vmap(pursuit.observe)(state),
-            state,
-            jnp.full(number, jnp.inf),
-            jnp.zeros(number),
-        )
-        (_, end, least, breach), (flown, speed) = jax.lax.scan(one, first, None, length=STEPS)
+        team = state.drones.position.shape[:2]  # worlds, pursuers
+        observation = jax.vmap(pursuit.observe)(state)
+        first = (observation, state, jnp.full(team, jnp.inf), jnp.zeros(team))
+        (_, end, least, breach), (path, speed) = jax.lax.scan(one, first, None, length=STEPS)
         crash = jnp.mean(crash_share(least), axis=-1)
+        # only at the end: a dive saves some starts. Flights follow the nominal vehicle's speeds
         fast = jnp.sqrt(jnp.sum(end.drones.velocity[:worlds] ** 2, axis=-1) + 1e-9) - FASTEST
         low = LOWEST - end.drones.position[:worlds, :, 2]
-        off = off_the_flight(flown[:, worlds:], speed[:, worlds:], position, velocity)
+        off = off_the_flight(path[:, worlds:], speed[:, worlds:], position, velocity)
         parts = {
             "crashes_from_starts": (1.0, crash[:worlds]),
             "crashes_in_flight": (1.0, crash[worlds:]),
             "breaches": (1.0, breach),
             "ends": (END, jnp.mean(jax.nn.relu(fast)) + jnp.mean(jax.nn.relu(low))),
-            "off_the_nominal_flight": (settings.follow, off),
+            "off_the_nominal_flight": (self.settings.follow, off),
         }
         return weighted_sum(parts)
 
-    def update(actor, state, parameters, flights, key, bounds):
-        gradient, watch = jax.grad(loss, has_aux=True)(actor, parameters, flights, key, bounds)
-        change, state = optimiser.update(finite_or_zero(gradient), state, actor)
-        return optax.apply_updates(actor, change), state, watch
+    def update(self, actor, parameters, flights, key, bounds):
+        """The actor (a `TrainState`) after a step, and the parts of the loss."""
+        gradient, watch = jax.grad(self.loss, has_aux=True)(
+            actor.parameters, parameters, flights, key, bounds
+        )
+        return actor.updated(self.optimiser, finite_or_zero(gradient)), watch
 
-    def evaluate(parameters, tasks, key, bounds):
-        return make_evaluate(environment(game, bounds), policy)(parameters, tasks, key)
-
-    return Adaptation(game, policy, optimiser, jax.jit(fly), jax.jit(update), jax.jit(evaluate))
+    def evaluate(self, parameters, tasks, key, bounds):
+        """One episode per task, with vehicles of the bounds."""
+        pursuit = self.pursuit(bounds, self.game)
+        return make_evaluate(pursuit, self.policy)(parameters, tasks, key)
 
 
 def off_the_flight(
@@ -263,33 +302,38 @@ def off_the_flight(
         off = off + jnp.sum(((velocity - target_velocity[part]) / ALIKE) ** 2, axis=-1)
         return jnp.sqrt(1.0 + off) - 1.0
 
+    # every other lag: between them a flight moves less than `NEAR`
     return functools.reduce(jnp.minimum, [at(lag) for lag in range(0, LAG + 1, 2)])
 
 
-def _kept(is_now, state, kept):
-    """States (W, ...) kept of earlier steps, but those of worlds whose moment `is_now` (W,)."""
-    return jax.vmap(lambda is_now, a, b: jax.tree.map(lambda x, y: jnp.where(is_now, x, y), a, b))(
-        is_now, state, kept
-    )
+def _recorded(is_due, state, record):
+    """The states (W, ...) in `record`, with those of worlds that are due (W,) in place of older
+    ones.
+    """
+
+    def newest(is_due, state, record):
+        return jax.tree.map(lambda new, old: jnp.where(is_due, new, old), state, record)
+
+    return jax.vmap(newest)(is_due, state, record)
 
 
-def _in_its_place(settled: PursuitState, there: PursuitState) -> PursuitState:
-    """States `there` whose vehicles, as one would find them in flight, are those of `settled`.
+def _in_its_place(settled: PursuitState, nominal: PursuitState) -> PursuitState:
+    """States `nominal` whose vehicles, as one would find them in flight, are those of `settled`.
 
-    Where they are and how they move, and what their sensors still show of that, is from `there`;
+    Where they are and how they move, and what their sensors still show of that, is from `nominal`;
     rotors, controllers, commands on the way, effects, and what the policy remembers of the vehicle
     from `settled`.
     """
     kinematic = ("position", "quaternion", "velocity", "body_rates", "previous_body_rates")
     sensors = {name for name, effect in known_effects().items() if effect.sensor is not None}
     memory = {
-        name: there.drones.effect_memory[name] if name in sensors else own
-        for name, own in settled.drones.effect_memory.items()
+        name: nominal.drones.effect_memory[name] if name in sensors else memory
+        for name, memory in settled.drones.effect_memory.items()
     }
     drones = settled.drones.replace(
-        **{name: getattr(there.drones, name) for name in kinematic}, effect_memory=memory
+        **{name: getattr(nominal.drones, name) for name in kinematic}, effect_memory=memory
     )
-    return there.replace(
+    return nominal.replace(
         vehicles=settled.vehicles,
         drones=drones,
         own_history=settled.own_history,
@@ -321,55 +365,54 @@ def fine_tune(
     adaptation: Adaptation,
     parameters: PolicyParameters,
     bounds: Float[Array, "ranges 4"],
-    training: AdaptSettings,
     key: PRNGKeyArray,
     score: Callable[[PolicyParameters], np.ndarray],
-    tell: Callable[[int, dict[str, jax.Array]], Any] = lambda update, metrics: None,
 ) -> Tuned:
     """Train `parameters` (from `starting_parameters`) on vehicles within `bounds` (R, 4), and keep
     the best on the way.
 
     `score` gives the scores of episodes (B,), of the same tasks and vehicles each time; what isn't
     clearly better than the first parameters, by the differences of single episodes, isn't kept.
-    `tell` hears of every update.
     """
+    settings = adaptation.settings
     bounds = jnp.asarray(bounds)
     fly_key, update_key = jax.random.split(key)
     flights = adaptation.fly(parameters, fly_key, bounds)
-    actor = parameters.actor
-    state = adaptation.optimiser.init(parameters.actor)
+    actor = TrainState(parameters.actor, adaptation.optimiser.init(parameters.actor))
     history = []
     first = np.asarray(score(parameters))
-    best = (parameters, 0)
+    best = parameters
+    best_update = 0
     looks = {0: float(first.mean())}
-    for update in range(1, training.updates + 1):
-        own_key = jax.random.fold_in(update_key, update)
-        actor, state, metrics = adaptation.update(
-            actor, state, parameters, flights, own_key, bounds
-        )
+    for update in range(1, settings.updates + 1):
+        step_key = jax.random.fold_in(update_key, update)
+        actor, metrics = adaptation.update(actor, parameters, flights, step_key, bounds)
         history.append(metrics)
-        tell(update, metrics)
-        if update % training.look_every == 0 or update == training.updates:
-            now = parameters.replace(actor=actor)
-            scores = np.asarray(score(now))
+        if update % settings.look_every == 0 or update == settings.updates:
+            candidate = parameters.replace(actor=actor.parameters)
+            scores = np.asarray(score(candidate))
             looks[update] = float(scores.mean())
-            if looks[update] > looks[best[1]] and clearly_better(first, scores):
-                best = now, update
+            # better than the best so far by the mean, and than the first ones beyond doubt: each
+            # look is another chance to be lucky
+            if looks[update] > looks[best_update] and clearly_better(first, scores):
+                best = candidate
+                best_update = update
+    # fetched at the end: to wait for every update's numbers would leave the device idle
     history = [
         {name: float(value) for name, value in row.items()} for row in jax.device_get(history)
     ]
-    return Tuned(*best, history, looks)
+    return Tuned(best, best_update, history, looks)
 
 
 def clearly_better(
-    before: Float[np.ndarray, " episodes"],
-    after: Float[np.ndarray, " episodes"],
+    first: Float[np.ndarray, " episodes"],
+    scores: Float[np.ndarray, " episodes"],
     errors: float = 2.0,
 ) -> bool:
     """Whether the scores (B,) of the same episodes rose by more than so many standard errors of
     their differences.
     """
-    gain = np.asarray(after, float) - np.asarray(before, float)
+    gain = np.asarray(scores, float) - np.asarray(first, float)
     return bool(gain.mean() > errors * gain.std() / np.sqrt(len(gain)))
 
 

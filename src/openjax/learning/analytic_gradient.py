@@ -97,22 +97,22 @@ def side_by_side(settings: PursuitSettings, key: PRNGKeyArray, task: Task) -> Ta
     something.
     """
     position = task.pursuer_position
-    for i, own_key in enumerate(jax.random.split(key, position.shape[0] - 1), start=1):
-        which_key, direction_key, gap_key = jax.random.split(own_key, 3)
+    for i, pursuer_key in enumerate(jax.random.split(key, position.shape[0] - 1), start=1):
+        which_key, direction_key, gap_key = jax.random.split(pursuer_key, 3)
+        # rather beside than above one another
         away = jax.random.normal(direction_key, (3,)) * jnp.array([1.0, 1.0, 0.3])
         gap = settings.drone_clearance + jax.random.uniform(gap_key, (), maxval=APART)
-        beside = position[jax.random.randint(which_key, (), 0, i)] + gap * away / jnp.linalg.norm(
-            away
-        )
-        position = position.at[i].set(beside)
-    pillars = jnp.linalg.norm(position[:, None, :2] - task.pillar_position[None], axis=-1)
+        neighbour = position[jax.random.randint(which_key, (), 0, i)]
+        position = position.at[i].set(neighbour + gap * away / jnp.linalg.norm(away))
+    to_axis = jnp.linalg.norm(position[:, None, :2] - task.pillar_position[None], axis=-1)
     room = settings.pillar_radius + settings.pillar_clearance
     if task.active is not None:
-        pillars = jnp.where(task.active[:, None], pillars, jnp.inf)
+        to_axis = jnp.where(task.active[:, None], to_axis, jnp.inf)
         position = parked(position, task.active)
-    clear = ~jnp.any(task.pillar_active & (pillars < room)) & jnp.all(
-        drone_distance(position) >= settings.drone_clearance - 1e-4
-    )
+    clear_of_pillars = ~jnp.any(task.pillar_active & (to_axis < room))
+    # less a rounding error: two that stand exactly as close as they may are apart
+    apart = jnp.all(drone_distance(position) >= settings.drone_clearance - 1e-4)
+    clear = clear_of_pillars & apart
     return task.with_starts(jnp.where(clear, position, task.pursuer_position))
 
 
@@ -156,7 +156,7 @@ class AnalyticGradient:
     states (B, ...).
     """
 
-    how: AnalyticSettings
+    settings: AnalyticSettings
     environment: Pursuit
     """See `free_flight`."""
     policy: Policy
@@ -174,6 +174,7 @@ class AnalyticGradient:
     @property
     def moments(self) -> int:
         """How often a flight is looked at: after each `HORIZON` but the episode's last."""
+        # what is learnt from a moment takes another `HORIZON`, which has to end with the episode
         return max(1, self.game.episode_length // self.steps - 1)
 
     def inputs(self, parameters: PolicyParameters, observation):
@@ -185,13 +186,16 @@ class AnalyticGradient:
     def fly(self, actor: Any, parameters: PolicyParameters, world, steps: int) -> tuple[Any, "Way"]:
         """Worlds some steps later, and what their pursuers met on the way."""
         fly_on = mean_step(self.environment, self.policy, parameters)
-        limit = self.how.speed_from * self.game.max_speed
+        limit = self.settings.speed_from * self.game.max_speed
         radius = capture_radius(self.game, world[1].task)
         rest = REST * radius
-        if jnp.ndim(rest):
+        if jnp.ndim(rest):  # of each world, beside its pursuers' distances
             rest = rest[:, None]
+        # found once: pillars stand still
         ways = jax.vmap(functools.partial(ways_of, self.game))(world[1].task)
 
+        # only the worlds between steps are kept, the rest is worked out again on the way back: it
+        # would take many times the memory
         @jax.checkpoint
         def moved(world):
             observation, state = world
@@ -224,8 +228,10 @@ class AnalyticGradient:
                 key, draw_start(self.game, task_key)
             )
 
+        task_key, reset_key = jax.random.split(key)
+        number = bounds.shape[0]
         return jax.vmap(one)(
-            *(jax.random.split(k, bounds.shape[0]) for k in jax.random.split(key)), bounds
+            jax.random.split(task_key, number), jax.random.split(reset_key, number), bounds
         )
 
     def flights(self, parameters: PolicyParameters, key: PRNGKeyArray, bounds: Bounds):
@@ -239,23 +245,25 @@ class AnalyticGradient:
         return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), worlds)
 
     def hard_starts(self, actor: Any, parameters: PolicyParameters, key: PRNGKeyArray):
-        """Of `how.draws` times as many starts those with the least gaps on the actor's way: few of
-        all come near a crash.
+        """Of `settings.draws` times as many starts those with the least gaps on the actor's way:
+        few of all come near a crash.
         """
-        starts = self.starts(key, jnp.concatenate([self.bounds()] * self.how.draws))
+        starts = self.starts(key, jnp.concatenate([self.bounds()] * self.settings.draws))
         least = jnp.min(self.fly(actor, parameters, starts, self.steps)[1].least, axis=-1)
-        hardest = jax.lax.top_k(-least, self.how.worlds)[1]
+        hardest = jax.lax.top_k(-least, self.settings.worlds)[1]
         return jax.tree.map(lambda leaf: leaf[hardest], starts)
 
     def loss(
         self, actor: Any, parameters: PolicyParameters, starts, flying
     ) -> tuple[Scalar, dict[str, Scalar]]:
         """What is learnt (), and its parts. `parameters` are the policy's before."""
-        how = self.how
+        settings = self.settings
         number = starts[1].step.shape[0]
-        inputs = self.inputs(parameters, flying[0])
-        mean, log_std = self.policy.distribution(parameters.actor, *inputs)
-        change = (self.policy.distribution(actor, *inputs)[0] - mean) * jnp.exp(-log_std)
+        observation, predicted = self.inputs(parameters, flying[0])
+        before, log_std = self.policy.distribution(parameters.actor, observation, predicted)
+        mean, _ = self.policy.distribution(actor, observation, predicted)
+        change = (mean - before) * jnp.exp(-log_std)
+        # starts and flights by one program, the starts first
         worlds = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), starts, flying)
         (_, end), way = self.fly(actor, parameters, worlds, self.steps)
         drones = jax.tree.map(lambda leaf: leaf[:number], end.drones)
@@ -268,9 +276,9 @@ class AnalyticGradient:
             # free but for its end
             "ends": (END, jax.nn.relu(fast) + jax.nn.relu(low)),
             "crashes_in_flight": (CRASH_IN_FLIGHT, crash_share(way.least[number:])),
-            "breaches_in_flight": (how.breach, way.breach[number:]),
-            "speed_in_flight": (how.speed, way.excess[number:]),
-            "change": (how.hold, jnp.sum(change**2, axis=-1)),
+            "breaches_in_flight": (settings.breach, way.breach[number:]),
+            "speed_in_flight": (settings.speed, way.excess[number:]),
+            "change": (settings.hold, jnp.sum(change**2, axis=-1)),
         }
         return weighted_sum(parts)
 
@@ -280,7 +288,7 @@ class AnalyticGradient:
         """The actor and its optimiser's state after an update, and the loss's parts."""
         start_key, choice_key = jax.random.split(key)
         moments = flights[1].step.shape[0]
-        chosen = jax.random.randint(choice_key, (self.how.worlds,), 0, moments)
+        chosen = jax.random.randint(choice_key, (self.settings.worlds,), 0, moments)
         flying = jax.tree.map(lambda leaf: leaf[chosen], flights)
         starts = self.hard_starts(actor, parameters, start_key)
         gradient, parts = jax.grad(self.loss, has_aux=True)(actor, parameters, starts, flying)
@@ -290,16 +298,16 @@ class AnalyticGradient:
     def bounds(self) -> Bounds:
         """(B, R, 4) of each world's vehicles: the game's family, and a share of nominal ones."""
         family = self.game.vehicles
-        worlds = self.how.worlds
+        worlds = self.settings.worlds
         if not family:
             return jnp.zeros((worlds, 0, 4))
-        plain = jnp.arange(worlds)[:, None, None] < self.how.nominal * worlds
+        plain = jnp.arange(worlds)[:, None, None] < self.settings.nominal * worlds
         return jnp.where(plain, narrowed_bounds(family, 0.0), jnp.asarray(family_bounds(family)))
 
     @functools.cached_property
     def optimiser(self) -> optax.GradientTransformation:
         """Adam with clipped gradients; its step size falls linearly to a twentieth."""
-        return clipped_descent(falling_rate(self.how.learning_rate, self.how.updates))
+        return clipped_descent(falling_rate(self.settings.learning_rate, self.settings.updates))
 
 
 def free_flight(environment: Pursuit) -> Pursuit:
@@ -332,6 +340,7 @@ def crash_share(gap: Float[Array, "*worlds"], smooth: float = SMOOTH) -> Float[A
     """How much of a crash a least gap (m) counts as, from 1 to 0 over `smooth` (m): it has a
     gradient before a touch.
     """
+    # half of one at three times the gap that counts as a touch
     return jax.nn.sigmoid((3 * TOUCH - gap) / smooth)
 
 
@@ -381,20 +390,22 @@ def nearest_way(distance: Pursuers) -> Worlds:
     """(W,) m, a smooth least of distances (W, N): where one pursuer is near, others needn't be, and
     may go round.
     """
+    # less the logarithm of their number: of equal distances it is that distance
     number = distance.shape[-1]
-    return -SMOOTH_NEAREST * (
-        jax.nn.logsumexp(-distance / SMOOTH_NEAREST, axis=-1) - jnp.log(number)
-    )
+    soft = jax.nn.logsumexp(-distance / SMOOTH_NEAREST, axis=-1) - jnp.log(number)
+    return -SMOOTH_NEAREST * soft
 
 
 def free_share(radius: float | jax.Array, distance: Pursuers) -> Worlds:
     """(W,) how free the evader at distances (W, N) is, from 0 to 1: smooth, and felt from afar;
     capture radius () or (W,) m.
     """
+    # half free a little inside the capture radius, so that pursuers come in all the way
     return jax.nn.sigmoid((jnp.min(distance, axis=-1) - 0.95 * radius) / SMOOTH_CAPTURE)
 
 
 def _speed(drones):
+    # the small number keeps the root's gradient finite at rest
     return jnp.sqrt(jnp.sum(drones.velocity**2, axis=-1) + 1e-9)
 
 
@@ -423,9 +434,10 @@ def compile_analytic(
         actor = parameters.actor
         state = gradient.optimiser.init(parameters.actor)
         flights = record(parameters, flight_key)
-        for number in range(gradient.how.updates):
-            own_key = jax.random.fold_in(update_key, number)
-            actor, state, parts = update(actor, state, parameters, flights, own_key)
+        for number in range(gradient.settings.updates):
+            step_key = jax.random.fold_in(update_key, number)
+            # `parameters` stay those from before: what flew the moments, and what is held to
+            actor, state, parts = update(actor, state, parameters, flights, step_key)
             yield parameters.replace(actor=actor), jax.device_get(parts)
 
     return learn

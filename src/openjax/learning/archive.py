@@ -59,25 +59,30 @@ def insert(
     capacity = archive.success.shape[0]
     m = success.shape[0]
     chex.assert_tree_shape_prefix(tasks, (m,))
+    # newest first, as the archive is
     pool = jax.tree.map(lambda new, old: jnp.concatenate([new[::-1], old]), tasks, archive.tasks)
     pool_success = jnp.concatenate([success[::-1], archive.success])
     used = jnp.concatenate([accepted[::-1], jnp.arange(capacity) < archive.size])
 
     features = descriptor(pool)
+    # |a - b|^2 = |a|^2 + |b|^2 - 2 ab, all pairs by one matrix product; in full precision, as what
+    # is left of it between close tasks is a small difference of large numbers
     squared = jnp.sum(features**2, axis=-1)
     product = jnp.matmul(features, features.T, precision=jax.lax.Precision.HIGHEST)
     distance = squared[:, None] + squared[None] - 2.0 * product
     index = jnp.arange(m + capacity)
     newer = (index[None] < index[:, None]) & used[None]
     novelty = jnp.min(jnp.where(newer, jnp.maximum(distance, 0.0), jnp.inf), axis=1)
+    # a squared distance is never negative: unused slots come behind all used ones
     novelty = jnp.where(used, novelty, -1.0)
 
-    kept = jax.lax.top_k(novelty, capacity)[1]
-    # back to newest first, unused last: rank by (unused, age)
-    kept = jnp.sort(jnp.where(used[kept], kept, kept + m + capacity)) % (m + capacity)
+    slot = jax.lax.top_k(novelty, capacity)[1]
+    # back to newest first, unused last: sorted by age, with the unused ones moved behind all
+    total = m + capacity
+    slot = jnp.sort(jnp.where(used[slot], slot, slot + total)) % total
     return TaskArchive(
-        tasks=jax.tree.map(lambda leaf: leaf[kept], pool),
-        success=pool_success[kept],
+        tasks=jax.tree.map(lambda leaf: leaf[slot], pool),
+        success=pool_success[slot],
         size=jnp.minimum(jnp.sum(used), capacity).astype(jnp.int32),
     )
 

@@ -25,19 +25,18 @@ def mean_over_devices(tree, axis: str | None):
 
 def gather_over_devices(tree, axis: str | None):
     """Every leaf with the devices' leading axes joined, in the order of the devices."""
-    return (
-        tree
-        if axis is None
-        else jax.tree.map(lambda x: jax.lax.all_gather(x, axis, tiled=True), tree)
-    )
+    if axis is None:
+        return tree
+    return jax.tree.map(lambda x: jax.lax.all_gather(x, axis, tiled=True), tree)
 
 
 def own_share(x: Shaped[Array, " whole *rest"], axis: str | None) -> Shaped[Array, " share *rest"]:
     """This device's part of an array that all devices have whole."""
     if axis is None:
         return x
-    number = x.shape[0] // jax.lax.axis_size(axis)
-    return jax.lax.dynamic_slice_in_dim(x, jax.lax.axis_index(axis) * number, number)
+    share = x.shape[0] // jax.lax.axis_size(axis)
+    first = jax.lax.axis_index(axis) * share
+    return jax.lax.dynamic_slice_in_dim(x, first, share)
 
 
 def own_keys(key: PRNGKeyArray, number: int, axis: str | None) -> Key[Array, " {number}"]:
@@ -56,8 +55,10 @@ def minibatches(tree, number: int):
     """
 
     def split(x):
-        x = jnp.moveaxis(x, 0, 1)
-        return jnp.moveaxis(x.reshape(x.shape[0] // number, number, *x.shape[1:]), 1, 0)
+        by_world = jnp.moveaxis(x, 0, 1)
+        worlds, *rest = by_world.shape
+        rows = by_world.reshape(worlds // number, number, *rest)
+        return jnp.moveaxis(rows, 1, 0)
 
     return jax.tree.map(split, tree)
 
@@ -68,7 +69,7 @@ def joint_moments(
     """Mean () and standard deviation () over all elements on all devices, or those `counted`, bool
     like x.
     """
-    # of `counted` all devices have about as many
+    # the mean of the devices' means: all of them have about as many `counted`
     mean = mean_over_devices(team_mean(counted, x), axis)
     variance = mean_over_devices(team_mean(counted, (x - mean) ** 2), axis)
     return mean, jnp.sqrt(variance)

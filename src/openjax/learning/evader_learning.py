@@ -73,7 +73,7 @@ class EvaderSamples:
 class EvaderLearning:
     """How the learned evaders of a game learn, as pure functions."""
 
-    how: EvaderLearningSettings
+    settings: EvaderLearningSettings
     environment: Pursuit
     updates: int
     """Of the run."""
@@ -82,28 +82,37 @@ class EvaderLearning:
     def number(self) -> int:
         """Networks; 0: none learns, as the game names none."""
         named = self.environment.settings.evaders.count("learned")
-        return named - self.how.past if named else 0
+        return named - self.settings.past if named else 0
 
     @functools.cached_property
     def optimiser(self) -> optax.GradientTransformation:
         """Of each network."""
-        how = self.how
-        steps = self.updates * self.how.epochs * self.how.minibatches
-        rate = optax.linear_schedule(how.learning_rate, how.learning_rate_end, steps)
+        settings = self.settings
+        steps = self.updates * settings.epochs * settings.minibatches
+        rate = optax.linear_schedule(settings.learning_rate, settings.learning_rate_end, steps)
         return clipped_adam(1.0, rate)
 
     def start(self, key: PRNGKeyArray) -> LearningEvaders:
-        """Evaders that do as greedy ones."""
-        keys = jax.vmap(lambda key: jax.random.split(key, self.number))(jax.random.split(key))
-        log_std = jnp.full((self.number, 3), self.how.initial_log_std, jnp.float32)
-        init = jax.vmap(functools.partial(init_network, own_axes=self.how.own_axes))
-        networks = *(init(own, jnp.arange(self.number)) for own in keys), log_std
-        places = jnp.arange(self.how.pool) % self.number
+        """Fresh evaders: some do as greedy ones, others nothing yet
+        (`openjax.pursuit.evaders.init_network`).
+        """
+        numbers = jnp.arange(self.number)
+        init = jax.vmap(functools.partial(init_network, own_axes=self.settings.own_axes))
+        actor_keys, critic_keys = jax.vmap(lambda key: jax.random.split(key, self.number))(
+            jax.random.split(key)
+        )
+        actor = init(actor_keys, numbers)
+        critic = init(critic_keys, numbers)
+        log_std = jnp.full((self.number, 3), self.settings.initial_log_std, jnp.float32)
+        # the pool begins full, with the fresh actors in turn
+        places = jnp.arange(self.settings.pool) % self.number
         return LearningEvaders(
-            *networks,
-            optimiser=jax.vmap(self.optimiser.init)(networks),
-            pool=jax.tree.map(lambda leaf: leaf[places], networks[0]),
-            past=jnp.arange(self.how.past, dtype=jnp.int32) % self.how.pool,
+            actor=actor,
+            critic=critic,
+            log_std=log_std,
+            optimiser=jax.vmap(self.optimiser.init)((actor, critic, log_std)),
+            pool=jax.tree.map(lambda leaf: leaf[places], actor),
+            past=jnp.arange(self.settings.past, dtype=jnp.int32) % self.settings.pool,
             update=jnp.zeros((), jnp.int32),
         )
 
@@ -128,16 +137,19 @@ class EvaderLearning:
         flying = evaders.flying
         which, seen = self.see(flying, state)
         mean = outputs_of(flying, which, seen)[0]
-        # earlier selves tremble as much as the others do on average
+        # earlier selves tremble as much as the others do on average: how they once did isn't kept
         usual = jnp.mean(evaders.log_std, 0)
-        spread = [evaders.log_std, jnp.broadcast_to(usual, (self.how.past, 3))]
-        log_std = jax.nn.one_hot(which, self.number + self.how.past) @ jnp.concatenate(spread)
+        spread = jnp.concatenate(
+            [evaders.log_std, jnp.broadcast_to(usual, (self.settings.past, 3))]
+        )
+        # a row for each world by a product; -1 has no one, and gets zeros
+        log_std = jax.nn.one_hot(which, self.number + self.settings.past) @ spread
         sample = mean + jnp.exp(log_std) * noise
         log_prob = jax.vmap(gaussian_log_prob)(sample, mean, log_std)
         samples = EvaderSamples(seen, which, sample, log_prob, ~state.statistics.captured)
-        return jax.lax.optimization_barrier(
-            jnp.where((which >= 0)[:, None], sample, jnp.nan)
-        ), samples
+        desired = jnp.where((which >= 0)[:, None], sample, jnp.nan)
+        # a program of its own: the compiler doesn't fuse the evaders' rules with the physics
+        return jax.lax.optimization_barrier(desired), samples
 
     def learn(
         self,
@@ -152,19 +164,18 @@ class EvaderLearning:
 
         `key` shuffles, the same on all devices; `axis` is the name of the devices' axis.
         """
-        how, (worlds, batch) = self.how, self._batch(evaders, samples, last, axis)
+        batch = self._batch(evaders, samples, last, axis)
 
         def step(carry, index):
             networks, state = carry
-            gradient = self._gradient(
-                networks, *jax.tree.map(lambda leaf: leaf[index], (worlds, batch))
-            )
+            worlds, part = jax.tree.map(lambda leaf: leaf[index], batch)
+            gradient = self._gradient(networks, worlds, part)
             gradient = mean_over_devices(gradient, axis)
             change, state = jax.vmap(self.optimiser.update)(gradient, state, networks)
             return (optax.apply_updates(networks, change), state), None
 
         start = evaders.networks, evaders.optimiser
-        order = shuffled(key, how.epochs, how.minibatches)
+        order = shuffled(key, self.settings.epochs, self.settings.minibatches)
         (networks, state), _ = jax.lax.scan(step, start, order)
         actor, critic, log_std = networks
         evaders = evaders.replace(
@@ -174,20 +185,24 @@ class EvaderLearning:
             optimiser=state,
             update=evaders.update + 1,
         )
-        return self._remember(evaders, jax.random.fold_in(key, 1)) if self.how.past else evaders
+        if not self.settings.past:
+            return evaders
+        return self._remember(evaders, jax.random.fold_in(key, 1))
 
     def _remember(self, evaders, key):
-        """Now and then one of the actors takes a place in the pool, and other earlier selves fly."""
-        due = evaders.update % self.how.pool_every == 0
+        """Now and then one of the actors takes a place in the pool, and other earlier selves
+        fly.
+        """
+        due = evaders.update % self.settings.pool_every == 0
         network_key, place_key, past_key = jax.random.split(key, 3)
         network = jax.random.randint(network_key, (), 0, self.number)
-        place = jax.random.randint(place_key, (), 0, self.how.pool)
-        drawn = jax.random.randint(past_key, (self.how.past,), 0, self.how.pool)
+        place = jax.random.randint(place_key, (), 0, self.settings.pool)
+        drawn = jax.random.randint(past_key, (self.settings.past,), 0, self.settings.pool)
 
-        def kept(pool, actor):
+        def renewed(pool, actor):
             return pool.at[place].set(jnp.where(due, actor[network], pool[place]))
 
-        pool = jax.tree.map(kept, evaders.pool, evaders.actor)
+        pool = jax.tree.map(renewed, evaders.pool, evaders.actor)
         return evaders.replace(pool=pool, past=jnp.where(due, drawn, evaders.past))
 
     def _by_network(self, which):
@@ -201,42 +216,53 @@ class EvaderLearning:
         worlds: the networks' numbers of worlds (K,) and all worlds (K, W), each network's own ones
         first; part: see `_loss`.
         """
-        (number, order), kinds = worlds, len(self.environment.settings.evaders)
-        some = order.shape[1] // max(n for n in range(1, kinds + 1) if order.shape[1] % n == 0)
+        number, order = worlds
+        total_worlds = order.shape[1]
+        # a network meets about as many worlds as one of the game's evaders: so many at a time, and
+        # where they aren't a divisor of all, somewhat more
+        kinds = len(self.environment.settings.evaders)
+        parts = max(n for n in range(1, kinds + 1) if total_worlds % n == 0)
+        some = total_worlds // parts
 
         def add(i, total):
             place = i * some + jnp.arange(some)
-            own = jax.tree.map(lambda leaf: leaf[order[:, place]], part)
-            gradient = jax.vmap(jax.grad(self._loss))(networks, place < number[:, None], own)
-            return jax.tree.map(lambda total, some: total + some / order.shape[1], total, gradient)
+            taken_worlds = jax.tree.map(lambda leaf: leaf[order[:, place]], part)
+            belongs = place < number[:, None]
+            gradient = jax.vmap(jax.grad(self._loss))(networks, belongs, taken_worlds)
+            # a mean over all worlds: `weight` makes up for how few of them are a network's
+            return jax.tree.map(lambda total, some: total + some / total_worlds, total, gradient)
 
-        rounds = jnp.max(-(-number // some))
+        rounds = jnp.max(-(-number // some))  # rounded up
         return jax.lax.fori_loop(0, rounds, add, jax.tree.map(jnp.zeros_like, networks))
 
-    def _loss(self, networks, own, part):
-        """() of one network, the sum over worlds of the mean over steps; own (n,) whether a world
-        is the network's; part: seen, sample, log_prob, weight, advantage, target, all (n, T,
+    def _loss(self, networks, belongs, part):
+        """() of one network, the sum over worlds of the mean over steps; belongs (n,) whether a
+        world is the network's; part: seen, sample, log_prob, weight, advantage, target, all (n, T,
         ...).
         """
         actor, critic, log_std = networks
         seen, sample, log_prob, weight, advantage, target = part
-        weight = own[:, None] * weight
+        weight = belongs[:, None] * weight
         log_ratio = gaussian_log_prob(sample, outputs(actor, seen)[0], log_std) - log_prob
-        # samples of other networks count for nothing, and mustn't overflow
+        # samples of other networks count for nothing, and mustn't overflow: zero times infinity is
+        # no number
         ratio = jnp.exp(jnp.where(weight > 0.0, log_ratio, 0.0))
-        clipped = jnp.clip(ratio, 1.0 - self.how.clip_epsilon, 1.0 + self.how.clip_epsilon)
+        clipped = jnp.clip(
+            ratio, 1.0 - self.settings.clip_epsilon, 1.0 + self.settings.clip_epsilon
+        )
         surrogate = jnp.minimum(ratio * advantage, clipped * advantage)
         error = (outputs(critic, seen)[1] - target) ** 2
         # weighted too: before the first of its worlds begins, a network's noise stays as it is
-        entropy = self.how.entropy_coefficient * gaussian_entropy(log_std)
+        entropy = self.settings.entropy_coefficient * gaussian_entropy(log_std)
         return jnp.sum(jnp.mean(weight * (0.5 * error - surrogate - entropy), axis=1))
 
     def _batch(self, evaders, samples, last, axis):
         """What gradient steps need, minibatch by minibatch: see `_gradient` and `_loss`."""
-        how = self.how
+        settings = self.settings
         critic = evaders.critic
         value = outputs_of(critic, samples.which, samples.seen)[1]
-        last_value = outputs_of(critic, *self.see(evaders.flying, last))[1]
+        which, seen = self.see(evaders.flying, last)
+        last_value = outputs_of(critic, which, seen)[1]
         caught = jnp.concatenate([~samples.flying[1:], last.statistics.captured[None]])
         advantage = generalised_advantages(
             REWARD * (~caught).astype(jnp.float32),
@@ -244,11 +270,12 @@ class EvaderLearning:
             jnp.concatenate([value[1:], last_value[None]]),
             caught,
             jnp.zeros_like(caught),
-            how.discount,
-            how.gae_lambda,
+            settings.discount,
+            settings.gae_lambda,
         )
         # a world keeps its evader until the rollout's end
         flying = samples.flying[..., None] * self._by_network(samples.which[0])  # (T, E, K)
+        # each network's samples weigh as much in all, however soon its worlds are caught
         scale = 1.0 / jnp.maximum(mean_over_devices(jnp.mean(flying, (0, 1)), axis), 1e-4)
         weight = jnp.sum(scale * flying, axis=-1)
 
@@ -260,7 +287,8 @@ class EvaderLearning:
         centred = advantage - mean(advantage)
         normal = centred / (jnp.sqrt(mean(centred**2)) + 1e-8)
         batch = samples.seen, samples.sample, samples.log_prob, weight, normal, advantage + value
-        which = minibatches(samples.which[:1], how.minibatches)[..., 0]  # (M, W)
-        own = which[:, None] == jnp.arange(self.number)[:, None]
-        worlds = jnp.sum(own, axis=-1), jnp.argsort(~own, axis=-1)
-        return worlds, minibatches(batch, how.minibatches)
+        which = minibatches(samples.which[:1], settings.minibatches)[..., 0]  # (M, W)
+        belongs = which[:, None] == jnp.arange(self.number)[:, None]  # (M, K, W)
+        # False comes before True: a network's own worlds first
+        worlds = jnp.sum(belongs, axis=-1), jnp.argsort(~belongs, axis=-1)
+        return worlds, minibatches(batch, settings.minibatches)

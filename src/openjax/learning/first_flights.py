@@ -88,7 +88,7 @@ class FirstFlights:
     share of them all.
     """
 
-    how: FirstFlightsSettings
+    settings: FirstFlightsSettings
     environment: Pursuit
     """See `first_game`."""
     policy: Policy
@@ -114,35 +114,36 @@ class FirstFlights:
             anywhere = scatter_starts(game, start_key, task)
             return jax.tree.map(lambda a, b: jnp.where(scattered, a, b), anywhere, task)
 
-        task_key, reset_key = (
-            own_share(jax.random.split(k, self.how.worlds), self.axis)
+        task_keys, reset_keys = (
+            own_share(jax.random.split(k, self.settings.worlds), self.axis)
             for k in jax.random.split(key)
         )
-        tasks = jax.vmap(draw)(task_key)
+        tasks = jax.vmap(draw)(task_keys)
         environment = self.environment
         if game.vehicles:
             environment = environment.with_bounds(narrowed_bounds(game.vehicles, 0.0))
-        return jax.vmap(environment.reset_to)(reset_key, tasks)
+        return jax.vmap(environment.reset_to)(reset_keys, tasks)
 
     def loss(self, actor: Any, parameters: PolicyParameters, world, risen: Scalar):
         """What is learnt (); worlds after it and its parts. `risen` () is how far the penalties
         have risen, 0 to 1.
         """
-        how = self.how
-        end, way = self.stage.fly(actor, parameters, world, how.steps)
+        settings = self.settings
+        is_fast_possible = self.environment.settings.speed_limit == "none"
+        end, way = self.stage.fly(actor, parameters, world, settings.steps)
         # with whole penalties from the start, pursuers stay away from the evader for good
-        penalty = how.penalty_start + (1.0 - how.penalty_start) * risen
+        penalty = settings.penalty_start + (1.0 - settings.penalty_start) * risen
         parts = {
             "free": (1.0, way.free),
             # along the shortest way: by the straight line they wait in sight of the evader, on the
             # wrong side of a row of pillars
-            "distance": (how.distance, way.distance),
+            "distance": (settings.distance, way.distance),
             # felt from farther than a touch, or they never leave such a place either: over 5 cm
             # they go round rows and hardly crash, over 1 cm they do neither
-            "crashes": (penalty * how.crash, crash_share(way.least, how.crash_smooth)),
-            "tips": (risen * how.crash, tip_share(way.upright)),
-            "breaches": (penalty * how.breach, way.breach),
-            "speed": (how.speed * (self.environment.settings.speed_limit == "none"), way.excess),
+            "crashes": (penalty * settings.crash, crash_share(way.least, settings.crash_smooth)),
+            "tips": (risen * settings.crash, tip_share(way.upright)),
+            "breaches": (penalty * settings.breach, way.breach),
+            "speed": (settings.speed * is_fast_possible, way.excess),
             "low": (1.0, jax.nn.relu(LOW - end[1].drones.position[..., 2])),
         }
         total, means = weighted_sum(parts)
@@ -157,20 +158,21 @@ class FirstFlights:
             parameters.actor, parameters, world, risen
         )
         gradient, parts = mean_over_devices((gradient, parts), self.axis)
-        step = 1.0 / (self.how.penalty_ramp * max(self.how.updates, 1))
+        # penalties wait for pursuers that catch: who fears a crash before that never comes near
+        step = 1.0 / (self.settings.penalty_ramp * max(self.settings.updates, 1))
         risen = jnp.minimum(
-            risen + jnp.where(parts["free"] < self.how.penalty_free, step, 0.0), 1.0
+            risen + jnp.where(parts["free"] < self.settings.penalty_free, step, 0.0), 1.0
         )
         change, state = self.optimiser.update(finite_or_zero(gradient), carry.optimiser)
         parameters = parameters.replace(actor=optax.apply_updates(parameters.actor, change))
         start_key, choice_key = jax.random.split(key)
-        anew = jax.random.uniform(choice_key, (self.how.worlds,)) < self.how.anew
-        over = self._over(end[1]) | own_share(anew, self.axis)
+        renewed = jax.random.uniform(choice_key, (self.settings.worlds,)) < self.settings.anew
+        over = self._over(end[1]) | own_share(renewed, self.axis)
 
-        def chosen(old, new):
+        def new_where_over(old, new):
             return jnp.where(over.reshape(-1, *[1] * (old.ndim - 1)), new, old)
 
-        world = jax.tree.map(chosen, end, self.start(start_key))
+        world = jax.tree.map(new_where_over, end, self.start(start_key))
         return FirstCarry(parameters, state, world, risen), parts
 
     def _over(self, state):
@@ -182,13 +184,13 @@ class FirstFlights:
         over = outside | (nearest_gap(game, state) < 0.0)
         if state.active is not None:
             over &= state.active
-        return jnp.any(over, axis=-1) | (state.step > game.episode_length - self.how.steps)
+        return jnp.any(over, axis=-1) | (state.step > game.episode_length - self.settings.steps)
 
     @functools.cached_property
     def optimiser(self) -> optax.GradientTransformation:
         """Adam with clipped gradients; its step size falls to a twentieth."""
         schedule = optax.cosine_decay_schedule(
-            self.how.learning_rate, max(self.how.updates, 1), SLOWEST_RATE
+            self.settings.learning_rate, max(self.settings.updates, 1), SLOWEST_RATE
         )
         return clipped_descent(schedule)
 

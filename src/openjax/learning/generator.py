@@ -25,9 +25,10 @@ from openjax.pursuit.shapes import Scalar
 def task_like(environment: PursuitSettings) -> Task:
     """A task of zeros, of the shapes of generated ones."""
     task = empty_task(environment)
-    return (
-        task.replace(evader=jnp.zeros((), jnp.int32)) if len(set(environment.evaders)) > 1 else task
-    )
+    # with one evader a task says nothing of it, and the archive has no column for it
+    if len(set(environment.evaders)) > 1:
+        task = task.replace(evader=jnp.zeros((), jnp.int32))
+    return task
 
 
 def generate_task(
@@ -44,11 +45,9 @@ def generate_task(
     evader.
     """
     task = _archived_or_uniform(settings, environment, archive, key)
-    return (
-        task
-        if close is None
-        else close_starts(environment, jax.random.fold_in(key, 1), task, close)
-    )
+    if close is None:
+        return task
+    return close_starts(environment, jax.random.fold_in(key, 1), task, close)
 
 
 def _archived_or_uniform(settings, environment, archive, key):
@@ -64,6 +63,7 @@ def _archived_or_uniform(settings, environment, archive, key):
         uniform = turn_task(turn_key, uniform)
     if not settings.enabled:
         return uniform
+    # both are drawn and one is taken: mapped over worlds, a branch would work out both, too
     expanded = expand_task(environment, expand_key, draw(archive, draw_key), settings.wall_distance)
     local = (jax.random.uniform(choice_key) < settings.expansion) & (archive.size > 0)
     return jax.tree.map(lambda a, b: jnp.where(local, a, b), expanded, uniform)

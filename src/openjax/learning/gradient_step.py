@@ -64,8 +64,9 @@ def mean_step(
 
     def fly_on(actor, observation, state):
         predicted = jax.lax.stop_gradient(policy.predict(parameters, observation))
-        action = policy.action(policy.distribution(actor, observation, predicted)[0], observation)
-        observation, state, *_ = step(jax.random.key(0), state, action)
+        mean, _ = policy.distribution(actor, observation, predicted)
+        # any key will do: the game draws nothing after its reset
+        observation, state, *_ = step(jax.random.key(0), state, policy.action(mean, observation))
         return observation, state
 
     return fly_on

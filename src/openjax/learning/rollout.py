@@ -21,9 +21,8 @@ class Rollout:
     """
 
     observation: Observation  # (T, E, ...), before the step; `frames` (T, E, 1, F)
-    predicted: (
-        jax.Array | None
-    )  # (T, E, K, 3) m, predicted evader positions; None without predictor
+    predicted: jax.Array | None
+    """(T, E, K, 3) m, predicted evader positions; None without predictor"""
     action: jax.Array  # (T, E, N, A) samples of the policy's Gaussian
     log_prob: jax.Array  # (T, E, N)
     reward: jax.Array  # (T, E, N)
@@ -89,9 +88,14 @@ def collect(
 
     def decide(world, noise):
         desired, samples = players.evaders(world[1], noise.evaders)
-        world, record = jax.lax.scan(lambda *args: step(*args, desired), world, noise.pursuers)
+
+        def fly_on(world, noise):
+            return step(world, noise, desired)
+
+        world, record = jax.lax.scan(fly_on, world, noise.pursuers)
         return world, (record, samples)
 
+    # two scans, one in the other: the evaders decide once, and their decision is flown `hold` steps
     held = noise.pursuers.reshape(-1, players.hold, *noise.pursuers.shape[1:])
     noise = noise.replace(pursuers=held)
     (observation, state), (record, samples) = jax.lax.scan(decide, world, noise)
@@ -110,6 +114,7 @@ def _step(players, penalty_share):
         observation, state = world
         predicted, action, log_prob = _sample(players, observation, noise)
         command = policy.action(action, observation)
+        # any key will do: the game draws nothing after its reset
         following, state, reward, terminated, truncated, info = move(
             jax.random.key(0), state, command, desired
         )
@@ -118,6 +123,7 @@ def _step(players, penalty_share):
             predicted=predicted,
             action=action,
             log_prob=log_prob,
+            # the reward holds the whole penalties: the share that doesn't count yet is given back
             reward=reward - (1.0 - penalty_share) * info.penalty,
             terminated=terminated,
             truncated=truncated,

@@ -32,6 +32,7 @@ class Schedule:
     def first(self, tasks: Any, number: int) -> Any:
         """Tasks (number, ...) drawn one group after the other, in the order of the worlds."""
 
+        # drawn group by group, they are dealt out: world e belongs to group e mod `groups`
         def spread(x):
             x = jnp.moveaxis(x.reshape(self.groups, -1, *x.shape[1:]), 0, 1)
             return x.reshape(number, *x.shape[2:])
@@ -71,15 +72,19 @@ class Schedule:
         member, group = np.divmod(np.arange(number), self.groups)
         task, neighbour = np.divmod(member, self.share)
         every = self.restart_every or 1
-        which = np.full(
-            self.groups, -1
-        )  # of the restarts, by how far a group is behind the one that ends
+        ages = len(self.restart_ages)
+        # which of the restart ages a group has, by how far it is behind the one that ends; -1: none
+        age_place = np.full(self.groups, -1)
         if self.restart_every:
-            which[list(self.restart_ages)] = np.arange(len(self.restart_ages))
+            age_place[list(self.restart_ages)] = np.arange(ages)
         behind = (group - ending) % self.groups
-        restart = jnp.where(task % every == 0, jnp.asarray(which)[behind], -1)
-        anew = (task // every * len(self.restart_ages) + restart) * self.share + neighbour
-        source = jnp.where(restart < 0, np.arange(number), number + number // self.groups + anew)
+        restart = jnp.where(task % every == 0, jnp.asarray(age_place)[behind], -1)
+
+        # one gather from [old worlds, fresh ones of the ending group, fresh ones of restarts]: each
+        # world says from which place of these three it comes
+        ending_size = number // self.groups
+        restarted = (task // every * ages + restart) * self.share + neighbour
+        source = jnp.where(restart < 0, np.arange(number), number + ending_size + restarted)
         source = jnp.where(behind == 0, number + member, source)
         return jax.tree.map(lambda x, new: jnp.concatenate([x, new])[source], worlds, fresh)
 

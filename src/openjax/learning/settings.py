@@ -10,9 +10,8 @@ from openjax.pursuit.evaders import check_evaders
 from openjax.ranges import Interval, Seed, check_intervals
 
 if TYPE_CHECKING:
-    from openjax.learning.schedule import (
-        Schedule,
-    )  # written in JAX, which a command's help needn't wait for
+    # written in JAX, which a command's help needn't wait for
+    from openjax.learning.schedule import Schedule
 
 
 @dataclass(frozen=True)
@@ -316,6 +315,13 @@ class TrainSettings:
 
     def _demands(self):
         """What settings ask of each other: whether it holds, and what to say if not."""
+        yield from self._demands_of_worlds()
+        yield from self._demands_of_teams()
+        yield from self._demands_of_evaders()
+        yield from self._demands_of_learners()
+
+    def _demands_of_worlds(self):
+        """Episodes, start groups and tasks share out rollouts and worlds evenly."""
         length = self.environment.episode_length
         rollout = self.rollout_length
         yield (
@@ -328,11 +334,25 @@ class TrainSettings:
             f"num_envs {self.num_envs} must be a multiple of {unit} (start groups times episodes "
             "per task" + (", times restart_every)" if self.restart_every else ")"),
         )
+        # with 1 all worlds would start anew in their middle, and no episode would be whole
         yield self.restart_every != 1, "restart_every is 1; 0 (never) or at least 2 are possible"
         yield (
             self.restart_steps >= rollout and self.restart_steps % rollout == 0,
             f"restart_steps {self.restart_steps} must be a multiple of rollout_length {rollout}",
         )
+        yield (
+            self.restart_every or not self.restart_close,
+            f"restart_close {self.restart_close} needs restart_every; without it no world is "
+            "started anew",
+        )
+        yield (
+            self.total_updates < 2**31,
+            f"total_steps {self.total_steps} are {self.total_updates} updates; fewer than 2^31 are "
+            "possible",
+        )
+
+    def _demands_of_teams(self):
+        """Networks for teams of several sizes have no input for a certain pursuer."""
         sizes = self.environment.team_sizes
         yield (
             not sizes or self.network.critic_encoder == "attention",
@@ -344,6 +364,10 @@ class TrainSettings:
             "predictor: frames of each pursuer are for teams of one size; "
             "environment.history_pursuers pooled would be right",
         )
+
+    def _demands_of_evaders(self):
+        """Evaders that learn decide evenly within a rollout, and one of them is no earlier self."""
+        rollout = self.rollout_length
         hold = self.evader_learning.hold
         learned = self.environment.evaders.count("learned")
         yield (
@@ -356,16 +380,10 @@ class TrainSettings:
             f"evader_learning.past {past} leaves none of {learned} learned evaders that learns; at "
             f"most {learned - 1} would be right",
         )
-        yield (
-            self.restart_every or not self.restart_close,
-            f"restart_close {self.restart_close} needs restart_every; without it no world is "
-            "started anew",
-        )
-        yield (
-            self.total_updates < 2**31,
-            f"total_steps {self.total_steps} are {self.total_updates} updates; fewer than 2^31 are "
-            "possible",
-        )
+
+    def _demands_of_learners(self):
+        """Minibatches, subsampled steps and the predictor's windows fit into a rollout."""
+        rollout = self.rollout_length
         for name, number in self.minibatches.items():
             yield (
                 self.num_envs % number == 0,
@@ -404,18 +422,17 @@ class TrainSettings:
     @property
     def minibatches(self) -> dict[str, int]:
         """Minibatches of the learners that part the worlds, by the group of their settings."""
-        evader = (
-            {"evader_learning": self.evader_learning.minibatches}
-            if "learned" in self.environment.evaders
-            else {}
-        )
-        return {"mappo": self.mappo.minibatches, **evader}
+        minibatches = {"mappo": self.mappo.minibatches}
+        if "learned" in self.environment.evaders:
+            minibatches["evader_learning"] = self.evader_learning.minibatches
+        return minibatches
 
     @property
     def schedule(self) -> "Schedule":
         """Which worlds start when."""
         from openjax.learning.schedule import Schedule
 
+        # counted in rollouts; not at the age at which the episode ends anyhow
         every = self.restart_steps // self.rollout_length
         ages = tuple(range(every, self.start_groups, every))
         return Schedule(self.start_groups, self.episodes_per_task, self.restart_every, ages)
@@ -428,4 +445,4 @@ class TrainSettings:
     @property
     def total_updates(self) -> int:
         """Training steps of the run."""
-        return max(1, -(-self.total_steps // self.steps_per_update))
+        return max(1, -(-self.total_steps // self.steps_per_update))  # rounded up

@@ -30,16 +30,21 @@ class TrainState:
 
 
 def clipped_adam(
-    most: float, rate: optax.ScalarOrSchedule, *after
+    max_norm: float,
+    rate: optax.ScalarOrSchedule,
+    last: optax.GradientTransformation | None = None,
 ) -> optax.GradientTransformationExtraArgs:
-    """Adam of gradients cut at norm `most`, and what comes after it.
+    """Adam of gradients cut at norm `max_norm`, and one more transformation behind it.
 
     On one vector instead of dozens of small arrays: on a GPU their updates cost by number, not by
     size.
     """
-    return optax.flatten(
-        optax.chain(optax.clip_by_global_norm(most), optax.adam(rate, eps=1e-5), *after)
-    )
+    # PPO's usual epsilon, a thousand times Adam's own: where a gradient has nearly vanished, its
+    # noise isn't blown up to whole steps
+    steps = [optax.clip_by_global_norm(max_norm), optax.adam(rate, eps=1e-5)]
+    if last is not None:
+        steps.append(last)
+    return optax.flatten(optax.chain(*steps))
 
 
 def shuffled(
@@ -53,7 +58,8 @@ def shuffled(
 
 
 _NETWORK = "(actor|critic|predictor)"
-_OF_POLICY = re.compile(f"policy/{_NETWORK}/(.+)"), re.compile(f"{_NETWORK}/parameters/(.+)")
+_LEAF = re.compile(f"policy/{_NETWORK}/(.+)")
+_OLD_LEAF = re.compile(f"{_NETWORK}/parameters/(.+)")
 
 
 def policy_leaf(name: str) -> str | None:
@@ -63,7 +69,5 @@ def policy_leaf(name: str) -> str | None:
     None for one that isn't of the policy. In carries from when each network lay beside its
     optimiser it is `actor/parameters/params/x`.
     """
-    for pattern in _OF_POLICY:
-        if found := pattern.fullmatch(name):
-            return "/".join(found.groups())
-    return None
+    match = _LEAF.fullmatch(name) or _OLD_LEAF.fullmatch(name)
+    return "/".join(match.groups()) if match else None

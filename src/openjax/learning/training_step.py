@@ -85,6 +85,7 @@ def shipped_learners(
     settings: TrainSettings, environment: Pursuit, policy: Policy | OwnPolicy
 ) -> dict[str, Learner]:
     """The learners that a run's settings name, in the order in which they learn."""
+    # the order is free: all learn from the predictions with which the rollout was flown
     learners = {}
     updates = settings.total_updates
     if policy.predictor.enabled:
@@ -121,6 +122,8 @@ def initial_carry(settings: TrainSettings, parts: Parts, key: PRNGKeyArray) -> T
     observation, state = jax.vmap(environment.reset_to)(
         jax.random.split(reset_key, settings.num_envs), tasks
     )
+    # staggered: the groups begin in the middle of an episode, so that from the first update on one
+    # of them ends its episodes with each rollout
     state = state.replace(step=settings.schedule.age(settings.num_envs) * settings.rollout_length)
     observation = jax.vmap(environment.observe)(state)
     policy = parts.policy.init(policy_key, jax.tree.map(lambda x: x[0], observation))
@@ -145,6 +148,7 @@ def _number_of(name):
 
 
 def _start_key(name, policy_key):
+    # 1 as ever for the shipped evaders, so that a seed's runs stay what they were
     return jax.random.fold_in(policy_key, 1 if name == "evaders" else _number_of(name))
 
 
@@ -298,16 +302,16 @@ class _Step:
         return carry, metrics
 
     def _fresh(self, environment, archive, keys, numbers):
-        """Observations and states of worlds of this device at the start of newly drawn tasks, of both
-        `numbers` in one; `keys` of tasks and resets.
+        """Observations and states of this device's worlds at the start of newly drawn tasks, of
+        both `numbers` in one; `keys` of tasks and resets.
 
-        Of the second ones some pursuers start close to something. All are drawn at once, by a program
-        half as large.
+        Of the second ones some pursuers start close to something. All are drawn at once, by a
+        program half as large.
         """
         settings = self.settings
         share = settings.episodes_per_task
-        close = jnp.repeat(jnp.array([0.0, settings.restart_close]), np.array(numbers) // share)
-
+        task_numbers = [number // share for number in numbers]
+        close = jnp.repeat(jnp.array([0.0, settings.restart_close]), np.array(task_numbers))
         task_key, reset_key = keys
 
         def of_worlds(key, numbers):
@@ -318,8 +322,7 @@ class _Step:
             )
             return jnp.concatenate(list(parts))
 
-        task_keys = of_worlds(task_key, [number // share for number in numbers])
-        tasks = _tasks(settings, environment, archive, task_keys, close)
+        tasks = _tasks(settings, environment, archive, of_worlds(task_key, task_numbers), close)
         return jax.vmap(environment.reset_to)(of_worlds(reset_key, numbers), tasks)
 
     def _key(self, carry, number):
@@ -384,15 +387,16 @@ def _selection(settings, archive, ended, penalty_share, axis):
     statistics = ended.statistics
     complete = statistics.steps >= settings.environment.episode_length
     share = settings.episodes_per_task
-    solved = (
-        successes(settings.generator, statistics, penalty_share)
-        .astype(jnp.float32)
-        .reshape(-1, share)
-    )
+    solved = successes(settings.generator, statistics, penalty_share)
+    # neighbours fly the same task: a row for each task
+    solved = solved.astype(jnp.float32).reshape(-1, share)
     if settings.generator.enabled:
         tasks = jax.tree.map(lambda x: x[::share], ended.task)
-        candidates = gather_over_devices((tasks, jnp.mean(solved, axis=1), complete[::share]), axis)
-        archive = select(settings.generator, archive, *candidates)
+        # the archive is the same on all devices, and so all of them see all candidates
+        tasks, success, complete = gather_over_devices(
+            (tasks, jnp.mean(solved, axis=1), complete[::share]), axis
+        )
+        archive = select(settings.generator, archive, tasks, success, complete)
     counted = {
         "capture_rate": statistics.captured,
         "capture_step": statistics.capture_step,
@@ -405,11 +409,13 @@ def _selection(settings, archive, ended, penalty_share, axis):
     if "learned" in settings.environment.evaders:
         by_network = learned_place(settings.environment.evaders, ended.evader.kind) >= 0
         counted |= {"learned": by_network, "learned_capture_rate": by_network & statistics.captured}
+    # worlds that were started anew within their episode flew a shorter one, which is no fair sample
     lasting = settings.schedule.lasting(statistics.steps.shape[0])
     counted = {
         name: jnp.mean(value.astype(jnp.float32)[lasting]) for name, value in counted.items()
     }
     counted = mean_over_devices(counted, axis)
     if "learned" in counted:
+        # shares of all episodes so far: one by the other is the rate among the learned ones'
         counted["learned_capture_rate"] /= jnp.maximum(counted["learned"], 1e-6)
     return archive, counted | {"archive_size": archive.size.astype(jnp.float32)}

@@ -41,10 +41,10 @@ def ways_of(settings: PursuitSettings, task: Task) -> Ways:
     """All corners and the shortest ways between them."""
     reach = _reach(settings)
     angle = 2.0 * np.pi * np.arange(CORNERS) / CORNERS
-    # where edges touch the circle, and a thousandth beyond it
-    around = (
-        1.001 * reach / np.cos(np.pi / CORNERS) * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    )
+    # so far out that the edges between corners touch the circle, and a thousandth beyond: an edge
+    # on the circle itself would count as crossing it
+    radius = 1.001 * reach / np.cos(np.pi / CORNERS)
+    around = radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     corner = (task.pillar_position[:, None] + around).reshape(-1, 2)
     to_axis = jnp.sum((corner[:, None] - task.pillar_position) ** 2, axis=-1)
     closed = jnp.any((to_axis < reach**2) & task.pillar_active, axis=-1)
@@ -53,9 +53,12 @@ def ways_of(settings: PursuitSettings, task: Task) -> Ways:
     direct = _straight(settings, task, corner[:, None], corner[None]) + toll
     if not corner.shape[0]:
         return Ways(corner, toll, direct)
-    # Floyd and Warshall
-    shorter = lambda k, length: jnp.minimum(length, length[:, k, None] + length[k])  # noqa: E731
-    return Ways(corner, toll, jax.lax.fori_loop(0, corner.shape[0], shorter, direct))
+
+    # Floyd and Warshall: after step k, the shortest ways that bend at the first k corners only
+    def shortened(k, length):
+        return jnp.minimum(length, length[:, k, None] + length[k])
+
+    return Ways(corner, toll, jax.lax.fori_loop(0, corner.shape[0], shortened, direct))
 
 
 def way_length(
@@ -64,13 +67,18 @@ def way_length(
     """(N,) m, of the shortest way from each of (N, 3) positions to (3,) a target; its gradient
     points along the way.
     """
+    # a way's first bend is one of the corners, or the target itself, from which nothing is left
     from_corner = _straight(settings, task, ways.corner, target[:2])
-    rest = jnp.append(ways.toll + jnp.min(ways.length + from_corner, axis=-1, initial=jnp.inf), 0.0)
-    first = jnp.concatenate([ways.corner, target[None, :2]])
+    through_corners = jnp.min(ways.length + from_corner, axis=-1, initial=jnp.inf)
+    rest = jnp.append(ways.toll + through_corners, 0.0)
+    bend = jnp.concatenate([ways.corner, target[None, :2]])
     here = jax.lax.stop_gradient(position[:, None, :2])
-    best = jnp.argmin(_straight(settings, task, here, first) + rest, axis=-1)
-    first, rest = jax.lax.stop_gradient((first[best], rest[best]))
-    level = jnp.sqrt(jnp.sum((position[:, :2] - first) ** 2, axis=-1) + 1e-9) + rest
+    best = jnp.argmin(_straight(settings, task, here, bend) + rest, axis=-1)
+
+    # which bend is best has no gradient; how far it is has one, straight towards the bend
+    bend, rest = jax.lax.stop_gradient((bend[best], rest[best]))
+    # the small number keeps the root's gradient finite where a pursuer stands at its bend
+    level = jnp.sqrt(jnp.sum((position[:, :2] - bend) ** 2, axis=-1) + 1e-9) + rest
     return jnp.sqrt(level**2 + (position[:, 2] - target[2]) ** 2)
 
 

@@ -15,7 +15,9 @@ __getattr__, __dir__, __all__ = lazy_names(
         "settings": "PursuitSettings RewardSettings",
         "state": "PursuitState",
         "statistics": "EpisodeStatistics",
-        "task": "Task close_starts empty_task expand_task line_up_pillars scatter_starts shift_pillars "
-        "task_descriptor turn_task uniform_task",
+        "task": (
+            "Task close_starts empty_task expand_task line_up_pillars scatter_starts "
+            "shift_pillars task_descriptor turn_task uniform_task"
+        ),
     },
 )

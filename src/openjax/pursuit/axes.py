@@ -22,6 +22,7 @@ def turned_back(
     """
     if heading is None:
         return vector
+    # a pursuer's yaw turns all of its vectors: as many axes of one as a vector has more
     axes = (*heading.shape[:-1], *[1] * (vector.ndim - heading.ndim))
     cosine = heading[..., 0].reshape(axes)
     sine = heading[..., 1].reshape(axes)

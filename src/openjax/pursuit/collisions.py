@@ -32,6 +32,7 @@ def pillar_distance(
 ) -> Float[Array, "drones pillars"]:
     """(N, P) distance (m) between (N, 3) centres and the surfaces of (P, 2) pillars."""
     offset = position[:, None, :2] - pillar_position[None]
+    # the small number keeps the root's gradient finite on the axis
     return jnp.sqrt(jnp.sum(offset**2, axis=-1) + 1e-12) - settings.pillar_radius
 
 

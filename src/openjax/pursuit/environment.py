@@ -1,6 +1,7 @@
 """The environment: reset and step as pure functions of arrays."""
 
 import dataclasses
+import functools
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -133,7 +134,8 @@ class Pursuit:
     """What moves the pursuers; None: the physics that the settings name, with the effects."""
     evaders: tuple[Evader, ...] | None = None
     """Who flies away, one of them in each episode: names, rows, or functions of one's own
-    (`openjax.pursuit.evaders.EvaderKind`); they go before those that the settings name. None: these.
+    (`openjax.pursuit.evaders.EvaderKind`); they go before those that the settings name. None:
+    these.
     """
     reward: tuple[Term, ...] | None = None
     """The reward's terms; None: `openjax.pursuit.default_reward(settings.reward)`."""
@@ -220,26 +222,14 @@ class Pursuit:
         chex.assert_shape(task.pursuer_position, (settings.num_pursuers, 3))
         chex.assert_shape(task.evader_position, (3,))
         chex.assert_shape(task.pillar_position, (*task.pillar_active.shape, 2))
+        # each draw has a key of its own, so that one that is added changes no other
         attitude_key, effect_key = jax.random.split(key)
+        vehicle_key, evader_key, fall_out_key = (jax.random.fold_in(key, i) for i in (2, 3, 4))
         quaternion = start_attitude(settings, attitude_key)
-        drones = jax.vmap(lambda p, q: hover_state(self.vehicle, p, q))(
-            task.pursuer_position, quaternion
-        )
+        hovering = functools.partial(hover_state, self.vehicle)
+        drones = jax.vmap(hovering)(task.pursuer_position, quaternion)
         drones = self.dynamics.reset(self.vehicle, drones, effect_key)
-        vehicles = draw_vehicles(
-            settings.vehicles,
-            jax.random.fold_in(key, 2),
-            settings.num_pursuers,
-            settings.rare_vehicles,
-            self.vehicle_bounds,
-        )
         action = jnp.broadcast_to(hover_action(self.vehicle), (settings.num_pursuers, 4))
-        own_history = None
-        if settings.observe_history:
-            own_history = own_frame(drones.quaternion, drones.velocity, action)
-            steps = settings.observe_history * settings.observe_history_spacing
-            own_history = jnp.broadcast_to(own_history, (steps, *own_history.shape))
-        gone_after = draw_fall_out(settings, jax.random.fold_in(key, 4), task.active)
         in_sight = self._in_sight(task, task.active, task.pursuer_position, task.evader_position)
         in_view = self._in_view(in_sight, drones, task.evader_position)
         seen = jnp.any(in_sight if in_view is None else in_view)
@@ -248,33 +238,49 @@ class Pursuit:
         last_seen = jnp.where(seen, task.evader_position, jnp.array(settings.middle, jnp.float32))
         framed = frame_pursuers(settings, task.pursuer_position, last_seen, task.active)
         first = frame(settings, step, framed, task.evader_position, still, seen)
-        frames = jnp.broadcast_to(
-            first, (settings.history_length * settings.history_spacing, settings.frame_size)
-        )
         state = PursuitState(
             task=task,
             drones=drones,
-            vehicles=vehicles,
+            vehicles=self._draw_vehicles(vehicle_key),
             evader_position=task.evader_position,
             evader_velocity=still,
-            evader=draw_row(
-                self.evader_rows,
-                jax.random.fold_in(key, 3),
-                task.pursuer_position,
-                self.evader_share,
-                task.evader,
-            ),
+            evader=self._draw_evader(evader_key, task),
             last_seen=last_seen,
             in_sight=in_sight,
-            frames=frames,
-            own_history=own_history,
+            # the history before the start is the start, as if all had waited there
+            frames=_repeated(first, settings.history_length * settings.history_spacing),
+            own_history=self._first_own_history(drones, action),
             previous_action=action,
             step=step,
             statistics=empty_statistics(settings.episode_length),
-            gone_after=gone_after,
+            gone_after=draw_fall_out(settings, fall_out_key, task.active),
             in_view=in_view,
         )
         return self.observe(state), state
+
+    def _draw_vehicles(self, key):
+        """The pursuers' vehicles of an episode."""
+        settings = self.settings
+        return draw_vehicles(
+            settings.vehicles,
+            key,
+            settings.num_pursuers,
+            settings.rare_vehicles,
+            self.vehicle_bounds,
+        )
+
+    def _draw_evader(self, key, task):
+        """The evader of an episode; the one that the task names, where it names one."""
+        rows = self.evader_rows
+        return draw_row(rows, key, task.pursuer_position, self.evader_share, task.evader)
+
+    def _first_own_history(self, drones, action):
+        """What pursuers remember of themselves at the start; None where that isn't observed."""
+        settings = self.settings
+        if not settings.observe_history:
+            return None
+        first = own_frame(drones.quaternion, drones.velocity, action)
+        return _repeated(first, settings.observe_history * settings.observe_history_spacing)
 
     def with_bounds(self, vehicle_bounds: Float[Array, "ranges 4"]) -> "Pursuit":
         """The same game with vehicles drawn within these bounds (R, 4)."""
@@ -363,6 +369,7 @@ class Pursuit:
             self._parameters(state.vehicles),
         )
         if settings.speed_limit == "clamp":
+            # as the paper's simulator does; the small number keeps the root's gradient finite
             speed = jnp.sqrt(jnp.sum(drones.velocity**2, axis=-1, keepdims=True) + 1e-12)
             drones = drones.replace(
                 velocity=drones.velocity * jnp.minimum(1.0, settings.max_speed / speed)
@@ -383,15 +390,13 @@ class Pursuit:
         say, this alone. Returns what `step` does.
         """
         settings = self.settings
-        task = state.task
         before = state
-        pillars = (task.pillar_position, task.pillar_active)
+        # the evader answers to the pursuers as they were at the step's start, while they moved
         velocity, evader_state = evader_velocity(settings, self.evader_rows, before, wish)
         evader = before.evader_position + settings.time_step * velocity
         step = before.step + 1
-        position = drones.position
         active = self._active_after(before)
-        in_sight = self._in_sight(task, active, position, evader)
+        in_sight = self._in_sight(before.task, active, drones.position, evader)
         in_view = self._in_view(in_sight, drones, evader)
         seen = jnp.any(in_sight if in_view is None else in_view)
         last_seen = jnp.where(seen, evader, before.last_seen)
@@ -400,8 +405,8 @@ class Pursuit:
         newest = frame(settings, step, framed, evader, velocity, seen)
         own_history = before.own_history
         if settings.observe_history:
-            now = own_frame(seen_drones.quaternion, seen_drones.velocity, action)
-            own_history = jnp.concatenate([own_history[1:], now[None]])
+            newest_own = own_frame(seen_drones.quaternion, seen_drones.velocity, action)
+            own_history = _with_newest(own_history, newest_own)
         state = before.replace(
             drones=drones,
             evader_position=evader,
@@ -410,32 +415,63 @@ class Pursuit:
             last_seen=last_seen,
             in_sight=in_sight,
             in_view=in_view,
-            frames=jnp.concatenate([before.frames[1:], newest[None]]),
+            frames=_with_newest(before.frames, newest),
             own_history=own_history,
             previous_action=action,
             step=step,
         )
-        info = StepInfo(
-            captured=captures(settings, position, evader, in_sight, task.capture_radius),
-            seen=seen,
-            breaches=breaches(settings, position, *pillars),
-            over_speed=over_speed(settings, drones.velocity),
-            crashed=crashed(
-                settings, position, rotation_axes(drones.quaternion)[1][:, 2], *pillars
-            ),
-            penalty=jnp.zeros(settings.num_pursuers, jnp.float32),
-        ).of_team(active)
-        transition = Transition(settings, before, state, info)
-        rewards, penalty = total_reward(self.terms, transition)
-        info = info.replace(penalty=penalty)
-        counted = count(before.statistics, step, info, rewards, active)
-        state = state.replace(statistics=counted)
-        over = step >= settings.episode_length
-        never = jnp.zeros((), bool)
-        # an observed horizon is part of the task, so its end is terminal; an unobserved one only
-        # cuts the episode
-        terminated, truncated = (over, never) if settings.observe_time else (never, over)
+        info, rewards = self._outcome(before, state, active)
+        state = state.replace(statistics=count(before.statistics, step, info, rewards, active))
+        terminated, truncated = self._end(step)
         return self._observe(state, seen_drones), state, rewards, terminated, truncated, info
+
+    def _outcome(self, before, state, active):
+        """What happened in a step to the slots that are `active`, and its rewards."""
+        info = self._events(state).of_team(active)
+        transition = Transition(self.settings, before, state, info)
+        rewards, penalty = total_reward(self.terms, transition)
+        return info.replace(penalty=penalty), rewards
+
+    def _events(self, state):
+        """What happened in the step that ended with `state`, but for the penalties."""
+        settings = self.settings
+        task = state.task
+        drones = state.drones
+        position = drones.position
+        pillars = task.pillar_position
+        pillar_active = task.pillar_active
+        body_z_up = rotation_axes(drones.quaternion)[1][:, 2]
+        return StepInfo(
+            captured=captures(
+                settings, position, state.evader_position, state.in_sight, task.capture_radius
+            ),
+            seen=state.seen,
+            breaches=breaches(settings, position, pillars, pillar_active),
+            over_speed=over_speed(settings, drones.velocity),
+            crashed=crashed(settings, position, body_z_up, pillars, pillar_active),
+            # known after the reward, whose terms are given the rest of this
+            penalty=jnp.zeros(settings.num_pursuers, jnp.float32),
+        )
+
+    def _end(self, step):
+        """() whether the episode ends for good with this step, and whether it is cut.
+
+        An observed horizon is part of the task, so its end is terminal; an unobserved one only cuts
+        the episode.
+        """
+        over = step >= self.settings.episode_length
+        never = jnp.zeros((), bool)
+        return (over, never) if self.settings.observe_time else (never, over)
+
+
+def _repeated(first, number):
+    """A history (number, ...) of the same moment."""
+    return jnp.broadcast_to(first, (number, *first.shape))
+
+
+def _with_newest(history, newest):
+    """A history, oldest first, that has moved on by one."""
+    return jnp.concatenate([history[1:], newest[None]])
 
 
 def make(
@@ -451,14 +487,12 @@ def make(
 
     Raises:
       UserError: no such setting, a value that it can't have, an evader that nobody knows, or the
-      learned one, which is more
-        than a name.
+        learned one, which is more than a name.
     """
     if evader == "learned":
         raise UserError(
             "evader learned: a name isn't enough; a file of openjax exploit is the opponent= of "
-            "openjax.evaluate, "
-            "the --opponent of commands"
+            "openjax.evaluate, the --opponent of commands"
         )
     game = changed(settings or PursuitSettings(), **changes)
     return Pursuit(game, evaders=None if evader is None else (evader,))

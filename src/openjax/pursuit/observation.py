@@ -63,14 +63,14 @@ def frame(
     pursuers: Float[Array, "kept 3"],
     evader: Vector,
     velocity: Vector,
-    seen: Flag,
+    is_seen: Flag,
 ) -> Float[Array, " frame"]:
     """(F,) one frame of the predictor's history: t/T, evader position and velocity (-5 where
     unseen), pursuers. Without `observe_time` t/T stays zero.
     """
     elapsed = step if settings.observe_time else jnp.zeros_like(step)
     time = elapsed.astype(jnp.float32)[None] / settings.episode_length
-    evader = jnp.where(seen, jnp.concatenate([evader, velocity]), HIDDEN)
+    evader = jnp.where(is_seen, jnp.concatenate([evader, velocity]), HIDDEN)
     return jnp.concatenate([time, evader, pursuers.ravel()])
 
 
@@ -89,6 +89,7 @@ def frame_pursuers(
     squared = jnp.sum(offset**2, axis=-1)
     if active is not None:
         squared = jnp.where(active, squared, jnp.inf)
+    # sums with weights of zero and one instead of an index, whose gradient is a scatter
     is_nearest = jnp.arange(squared.shape[0]) == jnp.argmin(squared)
     weights = jnp.stack([is_nearest.astype(jnp.float32), 1.0 / (squared + PRESS**2)])
     return jnp.sum(weights[..., None] * offset, axis=1)
@@ -109,51 +110,34 @@ def observe(settings: PursuitSettings, state: PursuitState, seen_drones: DroneSt
     `seen_drones` is what sensors tell of `state.drones`; only the critic sees these themselves.
     """
     n = settings.num_pursuers
-    evader = state.evader_position
-    seen = state.seen
     task = state.task
     position = seen_drones.position
-    heading = None
-    if settings.observe_in == "heading":
-        ahead = rotation_axes(seen_drones.quaternion)[0][:, :2]
-        heading = ahead / jnp.sqrt(jnp.sum(ahead**2, axis=-1, keepdims=True) + 1e-6)
+    heading = _heading(seen_drones) if settings.observe_in == "heading" else None
     turned = functools.partial(turned_back, heading)
 
-    # slices and no index: the gradient of an index is a scatter
-    others = turned(
-        jnp.stack(
-            [position[i] - jnp.concatenate([position[:i], position[i + 1 :]]) for i in range(n)]
-        )
-    )
+    def of_others(values):
+        """(N, N - 1, ...) of (N, ...): for each pursuer the values of all but itself."""
+        # slices and no index: the gradient of an index is a scatter
+        return jnp.stack([jnp.concatenate([values[:i], values[i + 1 :]]) for i in range(n)])
+
+    others = turned(position[:, None] - of_others(position))
     active = state.active
     others_there = None
     if active is not None:
-        others_there = jnp.stack([jnp.concatenate([active[:i], active[i + 1 :]]) for i in range(n)])
+        others_there = of_others(active)
         others = jnp.where(others_there[..., None], others, HIDDEN)
     pillars, pillar_seen = _nearest_pillars(
         settings, position, task.pillar_position, task.pillar_active
     )
-    drones = state.drones
-    vectors = (
-        drones.position - evader,
-        jnp.broadcast_to(state.evader_velocity, (n, 3)),
-        drones.position,
-    )
-    true_parts = [*map(turned, vectors), jnp.broadcast_to(seen.astype(jnp.float32), (n, 1))]
-    if settings.vehicles:
-        true_parts += [
-            turned(drones.velocity),
-            standard_parameters(settings.vehicles, state.vehicles),
-        ]
-    own = {
+    each = {
         "self_state": _own_part(settings, state, seen_drones, turned),
         "others": others,
         "pillars": jnp.where(pillar_seen[..., None], turned(pillars), HIDDEN),
-        "privileged": jnp.concatenate(true_parts, axis=-1),
+        "privileged": _privileged_part(settings, state, turned),
         "position": position,
     }
     return Observation(
-        **of_team(active, own),
+        **of_team(active, each),
         pillar_seen=pillar_seen,
         last_seen=state.last_seen,
         frames=state.frames[settings.history_spacing - 1 :: settings.history_spacing],
@@ -161,6 +145,13 @@ def observe(settings: PursuitSettings, state: PursuitState, seen_drones: DroneSt
         active=active,
         others_there=others_there,
     )
+
+
+def _heading(drones):
+    """(N, 2) cosine and sine of the yaw."""
+    ahead = rotation_axes(drones.quaternion)[0][:, :2]
+    # shorter than one where a pursuer points straight up or down and has no yaw
+    return ahead / jnp.sqrt(jnp.sum(ahead**2, axis=-1, keepdims=True) + 1e-6)
 
 
 def _own_part(settings, state, seen_drones, turned):
@@ -174,6 +165,7 @@ def _own_part(settings, state, seen_drones, turned):
     parts = [to_evader, quaternion, turned(seen_drones.velocity), body_x, body_z]
     if settings.observe_time:
         time = state.step.astype(jnp.float32) / settings.episode_length
+        # four times, as in the released code
         parts.append(jnp.broadcast_to(time, (len(position), 4)))
     if settings.observe_position:
         parts.append(turned(position))
@@ -184,16 +176,38 @@ def _own_part(settings, state, seen_drones, turned):
     if settings.observe_history:
         spacing = settings.observe_history_spacing
         history = jnp.moveaxis(state.own_history[spacing - 1 :: spacing], 0, 1)
+        # the past is seen in today's axes: velocity, body x and z axes are vectors, the command is
+        # none
         vectors = [turned(history[..., i : i + 3]) for i in (0, 3, 6)]
-        parts.append(
-            jnp.concatenate([*vectors, history[..., 9:]], axis=-1).reshape(len(position), -1)
-        )
+        history = jnp.concatenate([*vectors, history[..., 9:]], axis=-1)
+        parts.append(history.reshape(len(position), -1))
+    return jnp.concatenate(parts, axis=-1)
+
+
+def _privileged_part(settings, state, turned):
+    """`privileged`, by the drones' true states; `turned` as in `_own_part`."""
+    n = settings.num_pursuers
+    drones = state.drones
+    parts = [
+        turned(drones.position - state.evader_position),
+        turned(jnp.broadcast_to(state.evader_velocity, (n, 3))),
+        turned(drones.position),
+        jnp.broadcast_to(state.seen.astype(jnp.float32), (n, 1)),
+    ]
+    if settings.vehicles:
+        # which vehicle it is decides what a state is worth
+        parts += [
+            turned(drones.velocity),
+            standard_parameters(settings.vehicles, state.vehicles),
+        ]
     return jnp.concatenate(parts, axis=-1)
 
 
 def _quaternion(body_x, body_z):
     """Unit quaternions (N, 4) wxyz, w > 0, of attitudes with these body axes (N, 3)."""
     body_y = jnp.cross(body_z, body_x)
+    # the branch of the formula for w away from zero: upright axes have no half turn about the
+    # vertical, and what has tipped over has crashed
     trace = body_x[:, 0] + body_y[:, 1] + body_z[:, 2]
     w = 0.5 * jnp.sqrt(jnp.maximum(1.0 + trace, 1e-3))
     x = body_y[:, 2] - body_z[:, 1]

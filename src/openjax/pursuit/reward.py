@@ -158,12 +158,14 @@ def breach_number(transition: Transition) -> Each:
     settings = transition.settings
     weights = settings.reward
     drones = transition.state.drones
+    pillars, pillar_active = transition.pillars
     breach = transition.info.breaches
     if weights.margin != 0.0:
-        breach = breaches(settings, drones.position, *transition.pillars, weights.margin)
+        breach = breaches(settings, drones.position, pillars, pillar_active, weights.margin)
     if weights.lookahead != 0.0:
         ahead = drones.position + weights.lookahead * drones.velocity
-        soon = breaches(settings, ahead, *transition.pillars)
+        soon = breaches(settings, ahead, pillars, pillar_active)
+        # the greater, not the sum: one that is near and comes nearer counts once
         breach = jax.tree.map(jnp.maximum, breach, soon)
     return breach.total
 
@@ -180,13 +182,16 @@ def crashing(transition: Transition) -> Which:
     settings = transition.settings
     weights = settings.reward
     drones = transition.state.drones
-    upright = rotation_axes(drones.quaternion)[1][:, 2]
+    body_z_up = rotation_axes(drones.quaternion)[1][:, 2]
+    pillars, pillar_active = transition.pillars
     crash = transition.info.crashed
     if weights.margin != 0.0:
-        crash = crashed(settings, drones.position, upright, *transition.pillars, weights.margin)
+        crash = crashed(
+            settings, drones.position, body_z_up, pillars, pillar_active, weights.margin
+        )
     if weights.lookahead != 0.0:
         ahead = drones.position + weights.lookahead * drones.velocity
-        crash = crash | crashed(settings, ahead, upright, *transition.pillars)
+        crash = crash | crashed(settings, ahead, body_z_up, pillars, pillar_active)
     return crash
 
 

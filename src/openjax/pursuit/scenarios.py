@@ -40,6 +40,7 @@ def _layout(name, pillars, pursuers, evader):
     return Scenario(name, tuple(pillars), tuple(lift(xy) for xy in pursuers), lift(evader))
 
 
+# The starts of the layouts "empty" and "hidden", close together on the right.
 _RIGHT = ((0.6, 0.0), (0.8, 0.0), (0.8, -0.2))
 
 # The first five are the released code's; in "hidden" nobody sees the evader at the start.
@@ -126,8 +127,8 @@ def find_scenario(name_or_path: str, settings: PursuitSettings) -> Scenario:
             f"scenario {name_or_path}: no such layout, nor a .toml file; "
             f"{suggestion(str(name_or_path), SCENARIOS)}"
         )
-    told = {"name": path.stem, "pillars": [], **read_toml(path, "layout")}
-    scenario = from_plain(Scenario, told, f"{path}: ")
+    entries = {"name": path.stem, "pillars": [], **read_toml(path, "layout")}
+    scenario = from_plain(Scenario, entries, f"{path}: ")
     if faults := _faults(scenario, settings):
         raise UserError(f"{path}: {faults[0]}")
     return scenario

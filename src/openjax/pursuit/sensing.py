@@ -21,6 +21,7 @@ def line_of_sight(
     A pillar blocks it if its axis is closer to the segment than its radius and the foot point lies
     on the segment.
     """
+    # from above only: pillars are as high as the arena
     start = position[:, None, :2]
     segment = target[None, None, :2] - start
     to_axis = pillar_position[None] - start

@@ -195,12 +195,13 @@ class PursuitSettings:
                 f"environment.min_pillars {self.min_pillars} is more than environment.max_pillars "
                 f"{self.max_pillars}"
             )
+        # somewhere beside a pillar a pursuer must have room
         most = self.arena_radius - self.pillar_clearance
         if self.max_pillars and self.pillar_radius >= most:
             raise UserError(
                 f"environment.pillar_radius {self.pillar_radius} leaves no room in an arena of "
-                f"radius {self.arena_radius}: "
-                f"less than {most:.3g} would be right, or environment.max_pillars 0"
+                f"radius {self.arena_radius}: less than {most:.3g} would be right, or "
+                "environment.max_pillars 0"
             )
         if self.team_sizes and max(self.team_sizes) > self.num_pursuers:
             raise UserError(
@@ -221,9 +222,8 @@ class PursuitSettings:
 
             check_airframe(self.airframe)
         if self.vehicles:
-            from openjax.vehicle.family import (
-                check_ranges,
-            )  # knows the effects, which are written in JAX
+            # only here: it knows the effects, which are written in JAX
+            from openjax.vehicle.family import check_ranges
 
             check_ranges(self.vehicles)
         check_evaders(self.evaders)
@@ -260,19 +260,16 @@ class PursuitSettings:
     @property
     def self_size(self) -> int:
         """Numbers of a pursuer's own part of the observation, without the predicted positions."""
-        own = (
-            3
-            + 4
-            + 3
-            + 3
-            + 3
-            + (4 if self.observe_time else 0)
-            + (3 if self.observe_position else 0)
-            + (2 if self.observe_game else 0)
-        )
-        return own + OWN_FRAME * self.observe_history
+        # in the order of `Observation.self_state`: evader, quaternion, velocity, two axes, time,
+        # position, the game's numbers, history
+        always = 3 + 4 + 3 + 3 + 3
+        time = 4 if self.observe_time else 0
+        position = 3 if self.observe_position else 0
+        game = 2 if self.observe_game else 0
+        return always + time + position + game + OWN_FRAME * self.observe_history
 
     @property
     def privileged_size(self) -> int:
         """Numbers of the privileged part of the observation, for the critic."""
+        # evader, its velocity, own position, seen; own velocity and vehicle where these are drawn
         return 3 + 3 + 3 + 1 + (3 + len(self.vehicles) if self.vehicles else 0)

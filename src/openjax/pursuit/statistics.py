@@ -15,9 +15,8 @@ class EpisodeStatistics:
     """Running counts of one episode; every leaf ()."""
 
     steps: jax.Array  # int32, steps counted
-    capture_step: (
-        jax.Array
-    )  # int32, first step with a capture, counted from 1; the episode's length if none
+    capture_step: jax.Array
+    """int32, first step with a capture, counted from 1; the episode's length if none"""
     captured: jax.Array  # bool
     free_steps: jax.Array  # int32, steps since any pursuer last had the evader
     collision_steps: jax.Array  # float32, steps in which any pursuer breached any limit
@@ -68,8 +67,8 @@ def count(
 
     `active` (N,): slots in use, None: all; nothing of the others is in `info`.
     """
-    now = jnp.any(info.captured)
-    first = now & ~statistics.captured
+    captured = jnp.any(info.captured)
+    first = captured & ~statistics.captured
     breach = info.breaches
 
     def any_of(values):
@@ -78,8 +77,8 @@ def count(
     return EpisodeStatistics(
         steps=statistics.steps + 1,
         capture_step=jnp.where(first, step, statistics.capture_step),
-        captured=statistics.captured | now,
-        free_steps=jnp.where(now, 0, statistics.free_steps + 1),
+        captured=statistics.captured | captured,
+        free_steps=jnp.where(captured, 0, statistics.free_steps + 1),
         collision_steps=statistics.collision_steps + any_of(breach.total),
         pillar_steps=statistics.pillar_steps + any_of(breach.pillar),
         drone_steps=statistics.drone_steps + any_of(breach.drone),

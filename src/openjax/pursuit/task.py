@@ -112,10 +112,9 @@ def starts_clear(settings: PursuitSettings, task: Task) -> Flag:
     """Whether no pursuer starts in a breach and the evader starts outside all pillars. () bool."""
     breach = breaches(settings, task.pursuer_position, task.pillar_position, task.pillar_active)
     clear_of_evader = _clear_of(settings, task.pillar_position, task.evader_position[None, :2])
-    return ~(
-        jnp.any(of_team(task.active, breach.total) > 0)
-        | jnp.any(task.pillar_active & ~clear_of_evader)
-    )
+    is_breach = jnp.any(of_team(task.active, breach.total) > 0)
+    is_over_evader = jnp.any(task.pillar_active & ~clear_of_evader)
+    return ~(is_breach | is_over_evader)
 
 
 def pillar_cells() -> Float[np.ndarray, "cells 2"]:
@@ -123,6 +122,7 @@ def pillar_cells() -> Float[np.ndarray, "cells 2"]:
     steps = np.arange(-4, 5) * PILLAR_GRID
     x, y = np.meshgrid(steps, steps, indexing="ij")
     cells = np.stack([x.ravel(), y.ravel()], axis=-1)
+    # less a rounding error: cells exactly that far out don't count
     return cells[np.linalg.norm(cells, axis=-1) < PILLAR_REACH - 1e-6]
 
 
@@ -151,8 +151,10 @@ def uniform_task(settings: PursuitSettings, key: PRNGKeyArray) -> Task:
 
     cells = jnp.asarray(pillar_cells(), jnp.float32)
     vehicles = jnp.concatenate([pursuers, evader[None]])[:, :2]
-    own_cell = jnp.all(jnp.abs(cells[:, None] - vehicles[None]) <= PILLAR_GRID / 2, axis=-1)
-    free = _clear_of(settings, cells, vehicles) & ~jnp.any(own_cell, axis=-1)
+    holds_vehicle = jnp.all(jnp.abs(cells[:, None] - vehicles[None]) <= PILLAR_GRID / 2, axis=-1)
+    free = _clear_of(settings, cells, vehicles) & ~jnp.any(holds_vehicle, axis=-1)
+    # the first ones of a random order are a draw without replacement; cells that aren't free come
+    # last
     rank = jnp.where(free, jax.random.uniform(cell_key, (cells.shape[0],)), -1.0)
     chosen = jax.lax.top_k(rank, settings.max_pillars)[1]
     number = jax.random.randint(number_key, (), settings.min_pillars, settings.max_pillars + 1)
@@ -225,8 +227,8 @@ def close_starts(
         pillar = jax.random.categorical(which_key, jnp.where(task.pillar_active, 0.0, -jnp.inf))
         beside = jnp.append(task.pillar_position[pillar], position[i, 2])
         by_pursuer = (jax.random.bernoulli(kind_key) | no_pillar) & (i > 0)
-        before = jax.random.randint(which_key, (), 0, max(i, 1))
-        anchor = jnp.where(by_pursuer, position[before], beside)
+        settled = jax.random.randint(which_key, (), 0, max(i, 1))
+        anchor = jnp.where(by_pursuer, position[settled], beside)
         clearance = jnp.where(
             by_pursuer, settings.drone_clearance, settings.pillar_radius + settings.pillar_clearance
         )
@@ -260,11 +262,11 @@ def scatter_starts(settings: PursuitSettings, key: PRNGKeyArray, task: Task) -> 
 
     def draw(key):
         middle_key, apart_key, offset_key, height_key = jax.random.split(key, 4)
-        radius, angle = jax.random.uniform(middle_key, (2, 2))
-        angle = 2.0 * np.pi * angle
-        xy = (
-            reach * jnp.sqrt(radius) * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
-        )  # (2, 2), columns are places
+        # columns are places: the pursuers' middle, the evader; the root, so that equal shares are
+        # equal areas
+        share, turn = jax.random.uniform(middle_key, (2, 2))
+        angle = 2.0 * np.pi * turn
+        xy = reach * jnp.sqrt(share) * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
         offset = jax.random.uniform(offset_key, (n, 2), minval=-NEIGHBOURS, maxval=NEIGHBOURS)
         pursuers = xy[:, 0] + offset * jax.random.uniform(apart_key)
         from_axis = jnp.linalg.norm(pursuers, axis=-1, keepdims=True)
@@ -365,9 +367,9 @@ def start_attitude(settings: PursuitSettings, key: PRNGKeyArray) -> Quaternions:
     if settings.start_attitude == "level":
         return jnp.broadcast_to(jnp.array([1.0, 0.0, 0.0, 0.0], jnp.float32), (n, 4))
     limit = 0.2 * np.pi
-    half = 0.5 * jax.random.uniform(
-        key, (n, 3), jnp.float32, jnp.array([-limit, -limit, 0.0], jnp.float32), jnp.float32(limit)
-    )
+    low = jnp.array([-limit, -limit, 0.0], jnp.float32)
+    half = 0.5 * jax.random.uniform(key, (n, 3), jnp.float32, low, jnp.float32(limit))
+    # yaw after pitch after roll, by their half angles
     cr, cp, cy = jnp.cos(half).T
     sr, sp, sy = jnp.sin(half).T
     return jnp.stack(

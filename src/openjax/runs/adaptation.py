@@ -25,6 +25,7 @@ from openjax.files import write_json, write_text
 from openjax.flights.case import load_case
 from openjax.interruption import clean_up
 from openjax.learning.adaptation import bounds_of, fine_tune, make_adaptation, starting_parameters
+from openjax.learning.train_state import TrainState
 from openjax.runs.machine import describe_machine
 from openjax.runs.options import AdaptCommand
 from openjax.store.policies import load_policy
@@ -63,23 +64,23 @@ def adapt(command: AdaptCommand, tell: Callable[[str], None] = lambda step: None
     steps = iter(STEPS)
     tell(next(steps))
     with _diagnosis(command) as effects:
-        bench = _Bench(command)  # compiles meanwhile
-        found = _found(effects(), bench.game.airframe)
+        programs = _Programs(command)  # compiles meanwhile
+        vehicle = _diagnosed(effects(), programs.game.airframe)
         seconds["diagnosis"] = time.monotonic() - started
-    bench.ready()
+    programs.ready()
     seconds["compiled"] = time.monotonic() - started
     tell(next(steps))
-    tuned = bench.fine_tune(found)
+    tuned = programs.fine_tune(vehicle)
     seconds["fine-tuned"] = time.monotonic() - started
     tell(next(steps))
-    flown = bench.measure(found, tuned.parameters)
+    flown = programs.measure(vehicle, tuned.parameters)
     seconds["measured"] = time.monotonic() - started
-    results = {**_results(command, found, flown, tuned), "seconds": seconds}
-    _write(command, bench, found, tuned, results)
+    results = {**_results(command, vehicle, flown, tuned), "seconds": seconds}
+    _write(command, programs, vehicle, tuned, results)
     return results
 
 
-class _Found(NamedTuple):
+class _Diagnosed(NamedTuple):
     """What flights said of a vehicle."""
 
     values: dict[str, dict[str, float]]
@@ -87,21 +88,24 @@ class _Found(NamedTuple):
     bounds: jax.Array  # (R, 4) of it
 
 
-def _found(effects: Path, airframe: str) -> _Found:
+def _diagnosed(effects: Path, airframe: str) -> _Diagnosed:
     """What an effects file says."""
-    (_, values), intervals = load_effects(effects), load_intervals(effects)
+    _, values = load_effects(effects)
+    intervals = load_intervals(effects)
     family = adapted_family(values, intervals, airframe=airframe)
-    return _Found(values, family, bounds_of(values, intervals, airframe=airframe))
+    return _Diagnosed(values, family, bounds_of(values, intervals, airframe=airframe))
 
 
-class _Bench:
+class _Programs:
     """A policy, and the compiled programs that fine-tune and measure it."""
 
     def __init__(self, command: AdaptCommand):
         self.loaded = load_policy(command.policy)
-        self._training = command.training
         self.adaptation = make_adaptation(self.loaded.settings, command.training)
-        self.game, self._key = self.adaptation.game, jax.random.key(command.seed)
+        self.game = self.adaptation.game
+        self._key = jax.random.key(command.seed)
+        # half to choose a checkpoint by, half to measure it on: the chosen one is best on the first
+        # half in part by luck
         tasks = uniform_tasks(self.game, 2 * command.episodes, self.game.max_pillars)
         self._chosen_by = jax.tree.map(lambda leaf: leaf[: command.episodes], tasks)
         self._measured_on = jax.tree.map(lambda leaf: leaf[command.episodes :], tasks)
@@ -116,7 +120,7 @@ class _Bench:
         key = jax.random.fold_in(self._key, number)
         return episode_figures(self.adaptation.evaluate(parameters, tasks, key, bounds).statistics)
 
-    def fine_tune(self, found: _Found):
+    def fine_tune(self, vehicle: _Diagnosed):
         """The best of the policy's updates (see `openjax.learning.adaptation.fine_tune`), by
         `selection_score`.
 
@@ -127,22 +131,20 @@ class _Bench:
         usual = self._fly(self._parameters, self._chosen_by, 1, self._nominal)
 
         def scores(policy):
-            flown = self._fly(policy, self._chosen_by, 1, found.bounds)
+            flown = self._fly(policy, self._chosen_by, 1, vehicle.bounds)
             flown["over_speed_rate"] = np.maximum(
                 flown["over_speed_rate"], usual["over_speed_rate"]
             )
             return selection_score(flown, self.game.episode_length)
 
-        return fine_tune(
-            self.adaptation, self._parameters, found.bounds, self._training, self._key, scores
-        )
+        return fine_tune(self.adaptation, self._parameters, vehicle.bounds, self._key, scores)
 
-    def measure(self, found: _Found, tuned) -> dict[str, dict]:
+    def measure(self, vehicle: _Diagnosed, tuned) -> dict[str, dict]:
         """Figures (B,) of `WHICH` on tasks that no checkpoint was chosen by."""
         cases = (
             (self._parameters, self._nominal),
-            (self._parameters, found.bounds),
-            (tuned, found.bounds),
+            (self._parameters, vehicle.bounds),
+            (tuned, vehicle.bounds),
         )
         return {
             which: self._fly(parameters, self._measured_on, 2, bounds)
@@ -150,23 +152,24 @@ class _Bench:
         }
 
 
-def _results(command, found, flown, tuned) -> dict:
+def _results(command, vehicle, flown, tuned) -> dict:
     """What adapt.json holds, but for the time that it took."""
+    parameters = []
+    for name, low, high, *_ in vehicle.family:
+        effect, _, key = name.partition(".")
+        if effect in vehicle.values:
+            value = vehicle.values[effect].get(key)
+            parameters.append({"parameter": name, "value": value, "low": low, "high": high})
     return {
         "command": f"openjax adapt {command.flights} --policy {command.policy} --out {command.out}",
         "machine": describe_machine(),
         "policy": command.policy,
-        "effects": sorted(found.values),
-        "parameters": [
-            {"parameter": name, "value": found.values[effect].get(key), "low": low, "high": high}
-            for name, low, high, *_ in found.family
-            for effect, _, key in [name.partition(".")]
-            if effect in found.values
-        ],
+        "effects": sorted(vehicle.values),
+        "parameters": parameters,
         "episodes": command.episodes,
         **{
-            which: {name: float(own[name].mean()) for name in FIGURES}
-            for which, own in flown.items()
+            which: {name: float(figures[name].mean()) for name in FIGURES}
+            for which, figures in flown.items()
         },
         "won_back": won_back(flown),
         "kept": f"fine-tuned, as it was after step {tuned.update}"
@@ -177,12 +180,16 @@ def _results(command, found, flown, tuned) -> dict:
     }
 
 
-def _write(command, bench, found, tuned, results):
+def _write(command, programs, vehicle, tuned, results):
     """The policy, the figures and the page."""
-    game = dataclasses.replace(bench.game, vehicles=found.family)
-    settings = dataclasses.replace(bench.loaded.settings, environment=game)
+    game = dataclasses.replace(programs.game, vehicles=vehicle.family)
+    settings = dataclasses.replace(programs.loaded.settings, environment=game)
     command.out.mkdir(parents=True, exist_ok=True)
-    notes = {"adapted_from": command.policy, "effects": found.values, "machine": results["machine"]}
+    notes = {
+        "adapted_from": command.policy,
+        "effects": vehicle.values,
+        "machine": results["machine"],
+    }
     save_policy_file(
         command.out / "policy.npz", tuned.parameters, settings, notes, storage="float32"
     )
@@ -199,9 +206,11 @@ def won_back(flown: dict) -> dict[str, float | None]:
     """
     shares = {}
     for name in LOSSES:
-        loss, left = (flown[which][name] - flown["nominal"][name] for which in ("before", "after"))
-        seen = loss.mean() > ERRORS * loss.std() / len(loss) ** 0.5
-        shares[name] = float(1.0 - left.mean() / loss.mean()) if seen else None
+        # of the same episodes: by their differences chance is much smaller
+        loss = flown["before"][name] - flown["nominal"][name]
+        loss_left = flown["after"][name] - flown["nominal"][name]
+        beyond_chance = loss.mean() > ERRORS * loss.std() / len(loss) ** 0.5
+        shares[name] = float(1.0 - loss_left.mean() / loss.mean()) if beyond_chance else None
     return shares
 
 
@@ -244,8 +253,10 @@ def compile_programs(adaptation, parameters, tasks, bounds):
     key = jax.random.key(0)
     flights = jax.eval_shape(adaptation.fly, parameters, key, bounds)
     state = jax.eval_shape(adaptation.optimiser.init, parameters.actor)
+    actor = TrainState(parameters.actor, state)
+    # the update first: it takes longest
     waits = [
-        compile_ahead(adaptation.update, parameters.actor, state, parameters, flights, key, bounds),
+        compile_ahead(adaptation.update, actor, parameters, flights, key, bounds),
         compile_ahead(adaptation.evaluate, parameters, tasks, key, bounds),
         compile_ahead(adaptation.fly, parameters, key, bounds),
     ]
@@ -257,20 +268,23 @@ def in_words(results: dict) -> list[str]:
     effects = (
         ", ".join(results["effects"]) or "no effect: the simulator is right to within the noise"
     )
-    changes = "; ".join(
-        f"{name.replace('_', ' ')} " + " → ".join(f"{results[which][name]:.3g}" for which in WHICH)
-        for name in FIGURES
-    )
-    shares = {name: share for name, share in results["won_back"].items() if share is not None}
-    won = ", ".join(f"{name.replace('_', ' ')} {share:.0%}" for name, share in shares.items())
+    changes = []
+    for name in FIGURES:
+        course = " → ".join(f"{results[which][name]:.3g}" for which in WHICH)
+        changes.append(f"{name.replace('_', ' ')} {course}")
+    won = [
+        f"{name.replace('_', ' ')} {share:.0%}"
+        for name, share in results["won_back"].items()
+        if share is not None
+    ]
+    gain = "The vehicle costs nothing beyond chance."
+    if won:
+        gain = f"Won back of what the vehicle costs: {', '.join(won)}."
     return [
         f"Found: {effects}.",
         f"On {results['episodes']} tasks that neither was trained on, with the nominal vehicle → "
-        "with vehicles drawn from what "
-        f"was found, before → after: {changes}.",
-        f"Won back of what the vehicle costs: {won}."
-        if won
-        else "The vehicle costs nothing beyond chance.",
+        f"with vehicles drawn from what was found, before → after: {'; '.join(changes)}.",
+        gain,
         f"Kept: {results['kept']}. {results['seconds']['measured']:.0f} s.",
     ]
 

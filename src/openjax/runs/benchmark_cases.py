@@ -5,6 +5,7 @@ each as one function.
 import dataclasses
 import time
 from collections.abc import Callable, Iterator
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,25 +23,34 @@ from openjax.store.leaves import place
 from openjax.vehicle import hover_state, load_vehicle, make_drones_step
 
 
-def cases(
-    command: BenchmarkCommand, part: str, num_envs: int
-) -> Iterator[tuple[str, int, int, Callable, tuple]]:
-    """(name, environments, control steps per call, function, its arguments) of a part, made one at
-    a time.
-    """
+class Case(NamedTuple):
+    """What is timed."""
+
+    name: str
+    num_envs: int
+    steps: int
+    """Control steps of a call."""
+    function: Callable
+    arguments: tuple
+
+
+def cases(command: BenchmarkCommand, part: str, num_envs: int) -> Iterator[Case]:
+    """The cases of a part, made one at a time: together they wouldn't fit into memory."""
     settings = command.settings
     steps = command.steps
     if part == "training":
         for number in command.devices:
             fitting = fitting_settings(settings, num_envs, number)
-            for name, function, inputs in _training(fitting, number):
-                yield name, fitting.num_envs, fitting.rollout_length, function, inputs
-    elif part == "rollout":
-        yield part, num_envs, steps, *_rollout(settings, num_envs, steps)
+            for name, function, arguments in _training(fitting, number):
+                yield Case(name, fitting.num_envs, fitting.rollout_length, function, arguments)
+        return
+    if part == "rollout":
+        function, arguments = _rollout(settings, num_envs, steps)
     elif part == "environment":
-        yield part, num_envs, steps, *_environment(settings, num_envs, steps)
+        function, arguments = _environment(settings, num_envs, steps)
     else:
-        yield part, num_envs, steps, *_physics(part, settings, num_envs, steps)
+        function, arguments = _physics(part, settings, num_envs, steps)
+    yield Case(part, num_envs, steps, function, arguments)
 
 
 def _training(settings, devices):
@@ -55,10 +65,9 @@ def _training(settings, devices):
     phases = training_step.make_phases(settings)
     yield "training", training_step.make_training_step(settings), (carry,)
     yield "- fly", phases.fly, (carry,)
+    # zeros: learning from them takes as long as from anything
     flown = jax.eval_shape(phases.fly, carry)[1]
-    flown = jax.tree.map(
-        lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), flown
-    )  # takes as long as any
+    flown = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), flown)
     for learn in phases.learn:
         yield f"- {learn.__name__}", learn, (carry, flown)
     yield "- renew", phases.renew, (carry,)
@@ -157,23 +166,27 @@ class Timing:
     """Bytes for arguments, results and temporaries of one call, by the compiler's account."""
 
 
-def time_compiled(function: Callable, arguments: tuple, min_seconds: float) -> Timing:
-    """Compile `function` for `arguments`, run it once to warm up, then time three calls or more,
-    for at least `min_seconds`.
+def time_compiled(case: Case, min_seconds: float) -> Timing:
+    """Compile a case's function, run it once to warm up, then time three calls or more, for at
+    least `min_seconds`.
 
     Each call gets the same arguments and is waited for, so that all calls do the same work.
     """
     start = time.perf_counter()
-    compiled = jax.jit(function).lower(*arguments).compile()
+    compiled = jax.jit(case.function).lower(*case.arguments).compile()
     compile_seconds = time.perf_counter() - start
     memory = _memory(compiled)
+
+    def call():
+        start = time.perf_counter()
+        jax.block_until_ready(compiled(*case.arguments))
+        return time.perf_counter() - start
+
     times: list[float] = []
     try:
-        jax.block_until_ready(compiled(*arguments))
+        call()  # the first one also loads the program
         while sum(times) < min_seconds or len(times) < 3:
-            start = time.perf_counter()
-            jax.block_until_ready(compiled(*arguments))
-            times.append(time.perf_counter() - start)
+            times.append(call())
     except jax.errors.JaxRuntimeError as error:
         if "RESOURCE_EXHAUSTED" not in str(error):
             raise
@@ -183,8 +196,9 @@ def time_compiled(function: Callable, arguments: tuple, min_seconds: float) -> T
 
 def _memory(compiled):
     """See `Timing.memory`; None where the compiler doesn't tell."""
-    told = compiled.memory_analysis()
-    if told is None:
+    analysis = compiled.memory_analysis()
+    if analysis is None:
         return None
-    made = told.output_size_in_bytes + told.temp_size_in_bytes
-    return int(told.argument_size_in_bytes + made - told.alias_size_in_bytes)
+    produced = analysis.output_size_in_bytes + analysis.temp_size_in_bytes
+    # results that are written into an argument's place take no more
+    return int(analysis.argument_size_in_bytes + produced - analysis.alias_size_in_bytes)

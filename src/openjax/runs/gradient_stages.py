@@ -40,10 +40,10 @@ def compile_last_stage(settings: TrainSettings, environment: Pursuit, policy: An
 
 def first_flights(settings: TrainSettings, environment: Pursuit) -> FirstFlights:
     """The stage before MAPPO of a run with these settings."""
-    how = settings.first_flights
-    game = first_game(environment, how)
+    stage = settings.first_flights
+    game = first_game(environment, stage)
     exact = _exact(settings, environment)
-    return FirstFlights(how, game, exact, settings.generator)
+    return FirstFlights(stage, game, exact, settings.generator)
 
 
 def compile_first_flights(
@@ -67,8 +67,8 @@ def compile_first_flights(
       a function that waits for the compiler, and the stage: (fresh parameters, key) -> parameters;
       None where it was over before it began.
     """
-    how = flights.how
-    devices = _number_of_devices(policy, how.worlds)
+    updates = flights.settings.updates
+    devices = _number_of_devices(policy, flights.settings.worlds)
     at = None if devices == 1 else everywhere(devices)
     some_ready, begin_ready = _compiling(flights, policy, devices, at, keep)
 
@@ -78,20 +78,20 @@ def compile_first_flights(
         if over():
             return None
         started = time.monotonic()
+        # a copy, as the first call takes the carry's buffers, and the parameters are needed below
         parameters_there, key = place((own_copy(parameters), key), at)
         carry = begin(parameters_there, key)
-        for before in range(0, how.updates, TOGETHER):
-            if before and over():
+        for first in range(0, updates, TOGETHER):
+            if first and over():
                 break
-            carry, parts = some(carry, key, place(jnp.int32(before), at))
-            done = min(before + TOGETHER, how.updates)
-            shown = {name: float(value) for name, value in parts.items()}  # waits for them
-            left = (time.monotonic() - started) * (how.updates / done - 1.0)
+            carry, parts = some(carry, key, place(jnp.int32(first), at))
+            done = min(first + TOGETHER, updates)
+            loss = {name: float(value) for name, value in parts.items()}  # waits for them
+            seconds_left = (time.monotonic() - started) * (updates / done - 1.0)
             say(
-                f"{done} of {how.updates} updates, {duration(left)} left | evader out of reach "
-                f"{shown['free']:.0%} of the time, "
-                f"the nearest pursuer {shown['distance']:.2f} m too far, close to a crash "
-                f"{shown['crashes']:.1%}"
+                f"{done} of {updates} updates, {duration(seconds_left)} left | evader out of reach "
+                f"{loss['free']:.0%} of the time, the nearest pursuer {loss['distance']:.2f} m too "
+                f"far, close to a crash {loss['crashes']:.1%}"
             )
         return parameters.replace(actor=carry.parameters.actor)
 
@@ -103,21 +103,19 @@ def _compiling(flights, policy, devices, at, keep):
     lie `at` a sharding.
     """
     begin, some, shardings = make_device_first_flights(
-        flights, min(TOGETHER, flights.how.updates), devices
+        flights, min(TOGETHER, flights.settings.updates), devices
     )
-    policy, key, done = abstract_like(
-        (policy, *jax.eval_shape(lambda: (jax.random.key(0), jnp.int32(0)))), at
-    )
+    key, done = jax.eval_shape(lambda: (jax.random.key(0), jnp.int32(0)))
+    policy, key, done = abstract_like((policy, key, done), at)
     carry = abstract_like(jax.eval_shape(begin, policy, key), shardings)
     if keep is not None and devices == 1:
         some = keep("first_flights", jax.jit(some), lambda: (carry, key, done), carry=carry)
     options = compiler_options(devices, brief=True)
     some = jax.jit(some, donate_argnums=0, compiler_options=options)
-    lowered = (
-        some.lower(carry, key, done),
-        jax.jit(begin, compiler_options=options).lower(policy, key),
-    )
-    return [in_background(program.compile) for program in lowered]
+    lowered_some = some.lower(carry, key, done)
+    lowered_begin = jax.jit(begin, compiler_options=options).lower(policy, key)
+    # the larger one first
+    return [in_background(program.compile) for program in (lowered_some, lowered_begin)]
 
 
 def _number_of_devices(policy, worlds):
@@ -134,6 +132,5 @@ def _exact(settings: TrainSettings, environment: Pursuit) -> Policy:
     rough arithmetic.
     """
     policy = build(settings, environment).policy
-    return dataclasses.replace(
-        policy, network=dataclasses.replace(policy.network, compute_type="float32")
-    )
+    network = dataclasses.replace(policy.network, compute_type="float32")
+    return dataclasses.replace(policy, network=network)

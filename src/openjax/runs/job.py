@@ -37,8 +37,8 @@ class OwnParts:
     @property
     def names(self) -> list[str]:
         """What they are: a run that was begun with them goes on with the same ones only."""
-        given = [field.name for field in dataclasses.fields(self) if getattr(self, field.name)]
-        return given + [f"learner {name}" for name in self.learners or ()]
+        parts = [field.name for field in dataclasses.fields(self) if getattr(self, field.name)]
+        return parts + [f"learner {name}" for name in self.learners or ()]
 
 
 ALL_SHIPPED = OwnParts()
@@ -80,8 +80,9 @@ class TrainingJob:
         """
         game = self.environment
         settings = dataclasses.replace(self.settings, seed=0)
-        arrays = jax.tree.leaves((game.vehicle, game.effect_parameters))
-        arrays = [np.asarray(leaf).tolist() for leaf in arrays]
+        # numbers that are written into the programs as constants
+        leaves = jax.tree.leaves((game.vehicle, game.effect_parameters))
+        arrays = [np.asarray(leaf).tolist() for leaf in leaves]
         names = str(jax.tree.structure(game.effect_parameters))
         return repr((self.devices, settings, game.settings, game.effects, names, arrays))
 
@@ -123,16 +124,18 @@ def start_parameters(job: TrainingJob, fresh: PolicyParameters) -> PolicyParamet
         raise UserError(f"--start_from {job.start_from}: a heuristic has no networks to start from")
     settings = loaded.settings
     axes = job.settings.environment.observe_in
-    there = settings.environment.observe_in
-    if axes != there:  # of the same shapes
+    policy_axes = settings.environment.observe_in
+    # of the same shapes, so that nothing else would tell
+    if axes != policy_axes:
         raise UserError(
-            f"--start_from {job.start_from}: it observes in {there}, the run in {axes} "
+            f"--start_from {job.start_from}: it observes in {policy_axes}, the run in {axes} "
             "(--environment.observe_in)"
         )
-    own = with_longer_history(
+    old = with_longer_history(
         loaded.parameters, settings.predictor, settings.environment, job.settings.environment
     )
-    kept = fresh.replace(critic={})
-    kept = fill(kept, named_leaves(own.replace(critic={})), f"--start_from {job.start_from}")
-    fits = jax.tree.map(jnp.shape, own.critic) == jax.tree.map(jnp.shape, fresh.critic)
-    return kept.replace(critic=own.critic if fits else fresh.critic)
+    leaves = named_leaves(old.replace(critic={}))
+    filled = fill(fresh.replace(critic={}), leaves, f"--start_from {job.start_from}")
+    # a critic may see other numbers in another game; it is learnt anew sooner than an actor
+    fits = jax.tree.map(jnp.shape, old.critic) == jax.tree.map(jnp.shape, fresh.critic)
+    return filled.replace(critic=old.critic if fits else fresh.critic)

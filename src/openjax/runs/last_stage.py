@@ -44,33 +44,45 @@ def keep_best(
     length = settings.environment.episode_length
     looks = [{"update": 0, **validate(before)}]
     history = []
-    kept = 0
+    best = 0
     scores = [selection_score(looks[0], length)]
-    for after, parts in learn(before, jax.random.key(settings.seed)):
+    for parameters, parts in learn(before, jax.random.key(settings.seed)):
         history.append(parts)
         if over():
             break
-        if (
-            len(history) % settings.analytic.look_every
-            and len(history) != settings.analytic.updates
-        ):
+        if not _is_looked_at(settings.analytic, len(history)):
             continue
-        looks.append({"update": len(history), **validate(after)})
+        looks.append({"update": len(history), **validate(parameters)})
         scores.append(selection_score(looks[-1], length))
-        if scores[-1] > scores[kept]:
-            kept = len(looks) - 1
-            better = {"far_validation_score": scores[kept], "analytic_updates": len(history)}
+        if scores[-1] > scores[best]:
+            best = len(looks) - 1
+            better = {"far_validation_score": scores[best], "analytic_updates": len(history)}
             # at once: a stage that is ended early leaves the best of what it was
             save_policy_file(
-                directory.policy, after, settings, {**notes, **better}, storage="float32"
+                directory.policy, parameters, settings, {**notes, **better}, storage="float32"
             )
-    seconds = round(time.monotonic() - began, 1)
-    updates = looks[kept]["update"]
-    facts = {"seconds": seconds, "kept": updates, "validation_scores": scores}
+    facts = {
+        "seconds": round(time.monotonic() - began, 1),
+        "kept": looks[best]["update"],
+        "validation_scores": scores,
+    }
     write_json(directory.path / "analytic.json", {**facts, "validation": looks, "history": history})
-    told = f"{scores[0]:.4f} -> {scores[kept]:.4f} after {updates} of {len(history)} updates"
-    if not kept:
-        told = (
-            f"{scores[0]:.4f}, at most {max(scores[1:], default=scores[0]):.4f} after it, not kept"
-        )
-    return f"by the gradient through the simulation: score on far validation tasks {told}, {seconds:.0f} s"
+    return _in_words(facts, len(history))
+
+
+def _is_looked_at(stage, update):
+    """Whether what an update made is validated: every so often, and the last one."""
+    return update % stage.look_every == 0 or update == stage.updates
+
+
+def _in_words(facts, updates):
+    """What became of the policy's score in that many updates."""
+    scores = facts["validation_scores"]
+    course = f"{scores[0]:.4f} -> {max(scores):.4f} after {facts['kept']} of {updates} updates"
+    if not facts["kept"]:
+        most = max(scores[1:], default=scores[0])
+        course = f"{scores[0]:.4f}, at most {most:.4f} after it, not kept"
+    return (
+        f"by the gradient through the simulation: score on far validation tasks {course}, "
+        f"{facts['seconds']:.0f} s"
+    )

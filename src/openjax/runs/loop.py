@@ -8,7 +8,7 @@ import dataclasses
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -52,6 +52,15 @@ class Plan:
 
     None: on accelerators. On a CPU nothing is gained, and a NaN stops the run one update sooner.
     """
+
+
+class _Update(NamedTuple):
+    """An update's results, on the device until somebody reads them."""
+
+    number: int
+    metrics: dict[str, jax.Array]
+    broken: jax.Array
+    """See `guarded`."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -136,23 +145,25 @@ class Loop:
         if reason is None:
             self.progress.phase("compiling the training step", announce=False)
         while update < plan.total_updates and reason is None:
-            carry, *results = self.step(carry)
+            carry, values, broken = self.step(carry)
             update += 1
+            # the update before is read while the device works on this one
             if pending is not None:
-                self._finish(carry, update, *pending)
-            pending = (update, *results)
+                self._finish(carry, update, pending)
+            pending = _Update(update, values, broken)
             due = update % plan.validation_interval == 0 or update == plan.total_updates
             reason, late = self._decide()
+            # what is saved or validated must be known to hold no NaN
             if not overlap or due or late or reason:
-                self._finish(carry, update, *pending)
+                self._finish(carry, update, pending)
                 pending = None
             if due or late:
                 self._save(update, carry, validate=due)
         self._save(update, carry)  # does nothing where it's saved already
         self.checkpoints.wait()
-        return Outcome(
-            carry, update, self._elapsed(), reason if update < plan.total_updates else None
-        )
+        # a signal during the last update came too late to stop anything
+        stopped_by = reason if update < plan.total_updates else None
+        return Outcome(carry, update, self._elapsed(), stopped_by)
 
     def _elapsed(self):
         return self.seconds + time.monotonic() - self._started
@@ -162,14 +173,15 @@ class Loop:
             steps = update * self.plan.steps_per_update
             self.metrics.write(event, update, steps, self._elapsed(), values)
 
-    def _finish(self, carry, reached, update, values, broken):
-        """Read, write and show the metrics of an update.
+    def _finish(self, carry, reached, results):
+        """Read, write and show the results of an update.
 
         Raises NotFiniteError for a NaN, and leaves the carry, which `reached` one update more where
         updates overlap.
         """
-        broken = np.asarray(broken)
-        values = {name: float(value) for name, value in jax.device_get(values).items()}
+        update = results.number
+        broken = np.asarray(results.broken)
+        values = {name: float(value) for name, value in jax.device_get(results.metrics).items()}
         self._log("train", update, values)
         if broken.any():
             leaves = [name for name, bad in zip(float_leaves(carry), broken, strict=True) if bad]
@@ -184,8 +196,10 @@ class Loop:
         late = time.monotonic() - self._saved_at > self.plan.checkpoint_seconds
         asked = self.everyone([self.stop.name, self._elapsed() >= self.plan.time_limit, late])
         signals = [name for name, _, _ in asked if name is not None]
+        # hosts' clocks differ, and all must decide alike
         _, over, late = asked[0]
-        return signals[0] if signals else "the time limit" if over else None, late
+        limit = "the time limit" if over else None
+        return signals[0] if signals else limit, late
 
     def _save(self, update, carry, validate=False):
         """Write a checkpoint, with its score on the validation tasks where it is to have one."""
@@ -204,6 +218,7 @@ class Loop:
         self.checkpoints.wait()
         place = Path(self.directory) / NOT_FINITE
         save_state(place / f"{reached:09d}", carry, {"update": reached})
+        # JSON has no NaN
         metrics = {
             name: value if np.isfinite(value) else str(value) for name, value in values.items()
         }
@@ -216,8 +231,10 @@ class Loop:
         if jax.process_index() == 0:
             write_json(place / "report.json", report)
         latest = self.checkpoints.latest()
-        good = (
-            f"the last good checkpoint is {latest.path}" if latest else "there is no checkpoint yet"
-        )
-        shown = ", ".join(leaves[:3]) + (f" and {len(leaves) - 3} more" if len(leaves) > 3 else "")
-        return NotFiniteError(f"NaN in update {update} in {shown}; the state is in {place}, {good}")
+        good = "there is no checkpoint yet"
+        if latest:
+            good = f"the last good checkpoint is {latest.path}"
+        names = ", ".join(leaves[:3])
+        if len(leaves) > 3:
+            names += f" and {len(leaves) - 3} more"
+        return NotFiniteError(f"NaN in update {update} in {names}; the state is in {place}, {good}")

@@ -33,11 +33,11 @@ def game_for(environment: Pursuit, policy: LoadedPolicy) -> Pursuit:
     episodes last as long.
     """
     settings = environment.settings
-    own = policy.settings.environment
+    trained = policy.settings.environment
     settings = dataclasses.replace(
         settings,
-        **{name: getattr(own, name) for name in _OF_THE_POLICY},
-        episode_length=round(settings.episode_length * settings.time_step / own.time_step),
+        **{name: getattr(trained, name) for name in _OF_THE_POLICY},
+        episode_length=round(settings.episode_length * settings.time_step / trained.time_step),
         max_pillars=layout_slots(settings),
     )
     return dataclasses.replace(environment, settings=settings, dynamics=None, observer=None)
@@ -73,9 +73,7 @@ def compare(
     tasks |= layout_tasks(settings, scenarios, episodes)
     evaluator = Evaluator(game, policy.policy, validation + episodes * len(scenarios))
     flown = evaluator.fly(policy.parameters, tasks, jax.random.key(0))
-    longer = settings.time_step / environment.settings.time_step
-    rows = [
-        row | {"capture_step": longer * row["capture_step"]}
-        for row in (kind.record() for kind in flown)
-    ]
+    rows = [kind.record() for kind in flown]
+    for row in rows:
+        row["capture_step"] *= settings.time_step / environment.settings.time_step
     return rows, [kind.trajectory(0, f"{kind.name}, {policy.source}") for kind in flown]

@@ -36,62 +36,77 @@ def report(
     of both.
     """
     settings = job.settings
-    fitting = layouts_like(settings.environment)
+    layouts = layouts_like(settings.environment)
     abstract = jax.eval_shape(lambda: outcome.carry.policy)
     rows = {}
     for moment, path in (("before", directory.start_policy), ("after", directory.policy)):
         progress.phase(f"evaluating the policy {moment} training on the layouts")
         parameters = fill(abstract, load_policy_file(path)[0], str(path))
-        flown = validation(parameters)
-        shown = [
-            (flown[0], i, f"validation task {i + 1}") for i in range(min(3, validation.number))
-        ]
-        if fitting:
-            tasks = layout_tasks(validation.evaluator.settings, fitting, job.layout_episodes)
-            layouts = validation.evaluator.fly(parameters, tasks, jax.random.key(0))
-            flown = [*flown, *layouts]
-            shown = [(layout, 0, layout.name) for layout in layouts]
+        flown, pictured = _fly(validation, parameters, layouts, job.layout_episodes)
         rows[moment] = [kind.record(_BESIDE_RECORD) for kind in flown]
-    flights = [kind.trajectory(episode, title) for kind, episode, title in shown]
-    others = []
-    their_flights = []
-    if job.compare_with is not None:
-        progress.phase(f"evaluating {job.compare_with} in the same game")
-        # its networks may be large, and these are minutes on a small machine
-        number = min(job.layout_episodes, 8), min(validation.number, 32)
-        others, their_flights = compare(
-            load_policy(job.compare_with), job.environment, fitting, *number
-        )
+    # of the trained policy, which comes last
+    flights = [kind.trajectory(episode, title) for kind, episode, title in pictured]
+    other_rows, other_flights = _compare(job, layouts, validation.number, progress)
     progress.phase("drawing")
     facts = {
-        **({job.compare_with: others} if others else {}),
+        **({job.compare_with: other_rows} if other_rows else {}),
         "updates": outcome.update,
         "steps": outcome.update * settings.steps_per_update,
         "seconds": round(outcome.seconds, 1),
         **job.facts,
     }
     write_json(directory.path / "layouts.json", {**rows, **facts})
-    _draw(directory, flights, their_flights)
+    _draw(directory, flights, other_flights)
     progress.phase("done", announce=False)
     return before_after_table(
-        rows["before"], rows["after"], settings.environment.time_step, job.compare_with, others
+        rows["before"], rows["after"], settings.environment.time_step, job.compare_with, other_rows
     )
 
 
-def _draw(directory, flights, their_flights):
+def _compare(job, layouts, validation, progress):
+    """Records and flights of the policy beside which the run's is shown; none without one."""
+    if job.compare_with is None:
+        return [], []
+    progress.phase(f"evaluating {job.compare_with} in the same game")
+    # its networks may be large, and these are minutes on a small machine
+    return compare(
+        load_policy(job.compare_with),
+        job.environment,
+        layouts,
+        episodes=min(job.layout_episodes, 8),
+        validation=min(validation, 32),
+    )
+
+
+def _fly(validation, parameters, layouts, episodes):
+    """Validation tasks and layouts, flown by a policy; and what to draw of them: (kind, episode,
+    title), a flight of each layout, or some validation tasks where no layout fits the game.
+    """
+    flown = validation(parameters)
+    if not layouts:
+        number = min(3, validation.number)
+        return flown, [(flown[0], i, f"validation task {i + 1}") for i in range(number)]
+    evaluator = validation.evaluator
+    tasks = layout_tasks(evaluator.settings, layouts, episodes)
+    kinds = evaluator.fly(parameters, tasks, jax.random.key(0))
+    return [*flown, *kinds], [(kind, 0, kind.name) for kind in kinds]
+
+
+def _draw(directory, flights, other_flights):
     """Curves, paths and the chase."""
     from openjax.show.plots import plot_training, plot_trajectories
     from openjax.show.videos import animate
 
     plot_training(directory.path / "training.png", directory.path / METRICS_FILE)
     plot_trajectories(directory.path / "trajectories.png", flights)
+    # a chase that ends well shows what the game is about; beside it the other policy's, from the
+    # same start
     captured = [flight for flight in flights if flight.capture_index is not None]
     chosen = (captured or flights)[0]
-    shown = [flight for flight in their_flights if flight.title.startswith(f"{chosen.title}, ")]
-    shown.insert(
-        0, dataclasses.replace(chosen, title=f"{chosen.title}, this run") if shown else chosen
-    )
-    animate(directory.path / "chase.gif", *shown)
+    beside = [flight for flight in other_flights if flight.title.startswith(f"{chosen.title}, ")]
+    if beside:
+        chosen = dataclasses.replace(chosen, title=f"{chosen.title}, this run")
+    animate(directory.path / "chase.gif", [chosen, *beside])
 
 
 _KINDS = {"validation": "new tasks", "validation_far": "far starts"}
@@ -99,11 +114,11 @@ _KINDS = {"validation": "new tasks", "validation_far": "far starts"}
 
 
 def before_after_table(
-    before: Sequence[dict],
-    after: Sequence[dict],
+    first: Sequence[dict],
+    trained: Sequence[dict],
     time_step: float,
     other: str | None = None,
-    others: Sequence[dict] = (),
+    other_rows: Sequence[dict] = (),
 ) -> Table:
     """Captures, collisions and crashes before and after training; last what the policy `other` does
     in the same game.
@@ -121,19 +136,18 @@ def before_after_table(
     if other is not None:
         del columns[2]
         last.append(f"policy {other}:\nrate, seconds, crash")
-    heads = [head for head, *_ in columns]
-    table = numbers_table(
-        "Before and after training, in the game that was trained", "", *heads, *last
-    )
-    theirs = {row["scenario"]: row for row in others}
+    heads = ["", *(head for head, *_ in columns), *last]
+    table = numbers_table("Before and after training, in the game that was trained", heads)
+    by_scenario = {row["scenario"]: row for row in other_rows}
 
-    def shown(row):
+    def numbers(row):
         return [f"{unit * row[name]:{style}}" for _, name, unit, style in columns]
 
-    for old, new in zip(before, after, strict=True):
-        cells = [f"{was} → {is_now}" for was, is_now in zip(shown(old), shown(new), strict=True)]
+    for old, new in zip(first, trained, strict=True):
+        pairs = zip(numbers(old), numbers(new), strict=True)
+        cells = [f"{old_number} → {new_number}" for old_number, new_number in pairs]
         if last:
-            row = theirs.get(old["scenario"])
-            cells.append(", ".join(shown(row)) if row else "–")
+            row = by_scenario.get(old["scenario"])
+            cells.append(", ".join(numbers(row)) if row else "–")
         table.add_row(_KINDS.get(old["scenario"], old["scenario"]), *cells)
     return table

@@ -89,11 +89,19 @@ def start(
     arguments: Sequence[str],
     started: float,
     processes: Processes,
-    own: OwnParts = ALL_SHIPPED,
+    parts: OwnParts = ALL_SHIPPED,
 ) -> int:
-    """Make the run's directory, or open it, and train. Returns the exit status."""
+    """Make the run's directory, or open it, and train. Returns the exit status.
+
+    Args:
+      command: what to do.
+      arguments: the command line, for the run's facts.
+      started: `time.monotonic()` when the command started.
+      processes: that train together.
+      parts: those handed in from Python.
+    """
     cache = cache_programs() if command.compilation_cache else None
-    job, directory, files = prepare(command, arguments, started, processes, own)
+    job, directory, files = prepare(command, arguments, started, processes, parts)
     if command.traced_programs and cache is not None:
         job = dataclasses.replace(job, traced=cache / "traced")
     _check_same(job.settings, processes)  # a mistake shows before any process changes a file
@@ -109,6 +117,7 @@ def start(
             remove_unfinished(directory.path)
             if line := other_compiler(directory.read_facts()):
                 output_console().print(line, soft_wrap=True)
+        # nobody looks for the directory before the first process has made it
         processes.everyone()
         if not directory.path.is_dir():
             raise UserError(
@@ -123,28 +132,29 @@ def prepare(
     arguments: Sequence[str],
     started: float,
     processes: Processes,
-    own: OwnParts = ALL_SHIPPED,
+    parts: OwnParts = ALL_SHIPPED,
 ) -> tuple[TrainingJob, RunDirectory, dict[str, Path]]:
     """What to train, where, and the files to copy there, by their names; nothing is changed yet.
+    Arguments as of `start`.
 
     Raises:
       UserError: whatever can be wrong with the files or the settings.
     """
     resumed = None if command.resume is None else open_run(command.resume)
-    known = {} if resumed is None else resumed.read_facts()
+    stored = {} if resumed is None else resumed.read_facts()
     files = _files(command, resumed)
-    _check_own(own, files, known)
-    environment = own.environment or _environment(command.settings.environment, files)
+    _check_parts(parts, files, stored)
+    environment = parts.environment or _environment(command.settings.environment, files)
     settings = dataclasses.replace(command.settings, environment=environment.settings)
     directory = resumed or RunDirectory(_free_directory(command, processes))
-    started_from = _lasting(command.start_from) or known.get("start_from")
+    started_from = _lasting(command.start_from) or stored.get("start_from")
     facts = {
-        **({"own_parts": own.names} if own.names else {}),
+        **({"own_parts": parts.names} if parts.names else {}),
         "command": " ".join([PROGRAM, *arguments]),
         "machine": describe_machine(),
-        "devices": _devices(command.devices, settings, known.get("devices")),
+        "devices": _devices(command.devices, settings, stored.get("devices")),
         "start_from": started_from,
-        "compare_with": _comparison(command, known),
+        "compare_with": _comparison(command, stored),
     }
     job = TrainingJob(
         settings=settings,
@@ -158,7 +168,7 @@ def prepare(
         compare_with=facts["compare_with"],
         facts=facts,
         started=started,
-        own=own,
+        own=parts,
     )
     job.check()
     return job, directory, {name: path for name, path in files.items() if path is not None}
@@ -186,11 +196,11 @@ def other_compiler(facts: dict) -> str | None:
     """
     machine = facts.get("machine")
     versions = machine.get("versions") if isinstance(machine, dict) else None
-    before = versions.get("jax") if isinstance(versions, dict) else None
-    if before in (None, jax.__version__):
+    version = versions.get("jax") if isinstance(versions, dict) else None
+    if version in (None, jax.__version__):
         return None
     return (
-        f"this run was trained by JAX {before} so far; JAX {jax.__version__} goes on with it, but "
+        f"this run was trained by JAX {version} so far; JAX {jax.__version__} goes on with it, but "
         "rounds differently: what follows isn't bit for bit what it would have been"
     )
 
@@ -199,25 +209,27 @@ def _files(command, resumed):
     """What the run flies with by its name in a run's directory: vehicle, effects, evader; None
     where there is none.
     """
-    given = {
+    options = {
         "vehicle.toml": command.vehicle,
         "effects.toml": command.effects,
         "evader.npz": command.opponent,
     }
-    return {name: path or (resumed and resumed.optional(name)) for name, path in given.items()}
+    # an option goes before what a resumed run has kept
+    return {name: path or (resumed and resumed.optional(name)) for name, path in options.items()}
 
 
-def _check_own(own, files, known):
+def _check_parts(parts, files, stored):
     """Raises UserError for parts of one's own that don't go with files, or with the run that is
-    resumed.
+    resumed, whose `stored` facts these are.
     """
-    if own.environment is not None and any(files.values()):
+    if parts.environment is not None and any(files.values()):
         raise UserError("an environment of one's own has its vehicle, effects and evader already")
-    before = known.get("own_parts", own.names if not known else [])
-    if before != own.names:
+    # a new run may have any; one that is resumed and says nothing had none
+    first = stored.get("own_parts", []) if stored else parts.names
+    if first != parts.names:
         raise UserError(
-            f"the run was begun with {', '.join(before) or 'no part'} of one's own, here are "
-            f"{', '.join(own.names) or 'none'}; openjax.train(resume=...) takes the same ones"
+            f"the run was begun with {', '.join(first) or 'no part'} of one's own, here are "
+            f"{', '.join(parts.names) or 'none'}; openjax.train(resume=...) takes the same ones"
         )
 
 
@@ -233,20 +245,20 @@ def _free_directory(command, processes):
 
 def _layout_episodes(environment):
     """How often each layout is flown where nobody says."""
-    drawn = (
-        environment.settings.start_attitude == "drawn"
-        or environment.settings.vehicles
-        or environment.effects
-    )
-    return 1 if not drawn else 32 if jax.default_backend() == "cpu" else 100
+    settings = environment.settings
+    differ = settings.start_attitude == "drawn" or settings.vehicles or environment.effects
+    if not differ:  # one episode says all
+        return 1
+    return 32 if jax.default_backend() == "cpu" else 100
 
 
-def _comparison(command, known):
+def _comparison(command, stored):
     """The policy to compare with; None for none."""
     if command.compare_with is not None:
         return None if command.compare_with == "none" else _lasting(command.compare_with)
     if command.resume is not None:
-        return known.get("compare_with")
+        return stored.get("compare_with")
+    # beside a run of minutes, a policy of hours shows what more time is worth
     fits = command.settings.environment.num_pursuers == TrainSettings().environment.num_pursuers
     return "open" if fits and (command.preset or default_preset()) == "quick" else None
 
@@ -262,9 +274,9 @@ def _check_same(settings, processes):
     """Raises UserError where processes were started with different settings: their results would
     drift apart.
     """
-    own = {"settings": to_plain(settings), "JAX": jax.__version__}
-    for other, theirs in enumerate(processes.everyone(own)):
-        different = [name for name in own if own[name] != theirs[name]]
+    here = {"settings": to_plain(settings), "JAX": jax.__version__}
+    for other, there in enumerate(processes.everyone(here)):
+        different = [name for name in here if here[name] != there[name]]
         if different:
             raise UserError(
                 f"processes {other} and {processes.index} differ in their {' and '.join(different)}"
@@ -288,19 +300,20 @@ def check_resumed(command: TrainCommand, stored: TrainSettings) -> None:
         if name not in MAY_CHANGE:
             raise UserError(
                 f"--{name} can't change when a run is resumed; {', '.join(MAY_CHANGE)} can, or "
-                "start another run "
-                "with --start_from"
+                "start another run with --start_from"
             )
 
 
-def _devices(text, settings, before):
-    """How many; where nobody says, as many as `before`, or as many cores as the worlds can be
-    shared out to.
+def _devices(text, settings, stored):
+    """How many; where nobody says, as many as the run had (`stored`, None for a new one), or as
+    many cores as the worlds can be shared out to.
     """
     available = len(jax.devices())
     if text is None and jax.default_backend() == "cpu" and jax.process_count() == 1:
-        cores = max(number for number in range(1, available + 1) if can_share_out(settings, number))
-        return before if before in range(1, available + 1) else cores
+        numbers = range(1, available + 1)
+        if stored in numbers:
+            return stored
+        return max(number for number in numbers if can_share_out(settings, number))
     text = text or "1"
     if text == "all":
         return available

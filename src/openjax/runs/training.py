@@ -92,7 +92,9 @@ class _Run:
         self.progress = progress
         self.settings = job.settings
         self.processes = job.processes
-        self.taught, self.began, self.validation = False, float("inf"), None
+        self.taught = False
+        self.began = float("inf")
+        self.validation = None
         self.checkpoints = Checkpoints(directory.checkpoints, processes=job.processes)
         self.processes.advice = f"go on with openjax train --resume {directory.path} --devices all"
 
@@ -103,9 +105,8 @@ class _Run:
         job = self.job
         settings = self.settings
         latest = self.checkpoints.latest()
-        done = self.processes.of_first(
-            latest is not None and latest.update >= settings.total_updates
-        )
+        is_done = latest is not None and latest.update >= settings.total_updates
+        done = self.processes.of_first(is_done)
         if done:
             self.progress.message(
                 "all updates are done; --total_steps N goes on to more. Its report is made anew"
@@ -113,7 +114,7 @@ class _Run:
         self.progress.phase("compiling the start: networks, first tasks", announce=latest is None)
         start, step, self.abstract = _programs(job)
         # takes longest, so it comes first
-        step_ready = (lambda *_: None) if done else compile_ahead(step, self.abstract)
+        step_ready = _nothing_to_wait_for if done else compile_ahead(step, self.abstract)
         self.first_flights = self._first_flights()
         carry, self.first_update, seconds = self._first_carry(start)
         if self.processes.is_first:
@@ -125,23 +126,27 @@ class _Run:
             return None
         with self._metrics() as metrics:
             self.progress.phase("compiling the training step", announce=not (done or over))
-            self._compile_beside((lambda *_: None) if over else step_ready)
+            self._compile_beside(_nothing_to_wait_for if over else step_ready)
             self.began = min(self.began, time.monotonic())
-            loop = Loop(
-                step,
-                self._plan(seconds),
-                checkpoints=self.checkpoints,
-                metrics=metrics,
-                progress=self.progress,
-                directory=self.directory.path,
-                stop=self.stop,
-                evaluate=self._evaluate,
-                first_update=self.first_update,
-                seconds=seconds + time.monotonic() - job.started,
-                everyone=self.processes.everyone,
-            )
+            loop = self._loop(step, metrics, seconds)
             with self.stop.while_learning():
                 return loop.run(carry)
+
+    def _loop(self, step, metrics, seconds):
+        """The host's side of training, after so many seconds of earlier processes."""
+        return Loop(
+            step,
+            self._plan(seconds),
+            checkpoints=self.checkpoints,
+            metrics=metrics,
+            progress=self.progress,
+            directory=self.directory.path,
+            stop=self.stop,
+            evaluate=self._evaluate,
+            first_update=self.first_update,
+            seconds=seconds + time.monotonic() - self.job.started,
+            everyone=self.processes.everyone,
+        )
 
     def last_words(self) -> str:
         """What there is of the run, and how it goes on, should it end now."""
@@ -156,6 +161,7 @@ class _Run:
             total_updates=settings.total_updates,
             steps_per_update=settings.steps_per_update,
             validation_interval=settings.validation_interval,
+            # the loop's clock begins with the command, the limit's when learning does
             time_limit=seconds + self.began - self.job.started + self.job.time_limit,
             validate_start=self.taught,
         )
@@ -201,11 +207,8 @@ class _Run:
 
     def _first_flights(self):
         """The stage before MAPPO, of a run that has it still to come; else None."""
-        if (
-            not self.settings.first_flights.updates
-            or self.job.start_from
-            or self.checkpoints.any_finished()
-        ):
+        is_part = self.settings.first_flights.updates and not self.job.start_from
+        if not is_part or self.checkpoints.any_finished():
             return None
         flights = first_flights(self.settings, self.job.environment)
         say = self.progress.message
@@ -250,7 +253,8 @@ class _Run:
             self.progress.phase("learning to fly by the gradient through the simulation")
             policy = learn(carry.policy, jax.random.fold_in(jax.random.key(settings.seed), 1))
             self.taught = policy is not None
-            carry = carry.replace(policy=policy) if self.taught else carry
+            if self.taught:
+                carry = carry.replace(policy=policy)
         return place(carry, carry_shardings(job.devices)), 0, 0.0
 
     def _metrics(self):
@@ -275,8 +279,10 @@ class _Run:
         step_ready()
         self._prepare_validation()
         if first and settings.analytic.updates:
-            kinds = settings, self.job.environment, self.abstract.policy
-            self.last_stage = in_background(functools.partial(compile_last_stage, *kinds))
+            compile_it = functools.partial(
+                compile_last_stage, settings, self.job.environment, self.abstract.policy
+            )
+            self.last_stage = in_background(compile_it)
 
     def _prepare_validation(self):
         """Start to make the validation, once, where it is to be."""
@@ -288,9 +294,9 @@ class _Run:
         loaded.
         """
         load_orbax()
-        settings, environment = self.settings, self.job.environment
+        settings = self.settings
         validation = Validation(
-            environment,
+            self.job.environment,
             self.job.parts.policy,
             settings.validation_episodes,
             settings.evaders_validation,
@@ -303,9 +309,9 @@ class _Run:
         """Score and metrics of a carry on the validation tasks; the same in all processes."""
         if not self.processes.is_first:
             return self.processes.of_first()
-        uniform, far = (
-            summarise(kind.evaluation) for kind in self._await_validation()(own_copy(carry.policy))
-        )
+        # a copy: on several devices the carry's leaves lie elsewhere than the validation's
+        validation = self._await_validation()
+        uniform, far = (summarise(kind.evaluation) for kind in validation(own_copy(carry.policy)))
         settings = self.settings
         score = selection_score(uniform, settings.environment.episode_length)
         if int(carry.update) < settings.validation_start * settings.total_updates:
@@ -324,6 +330,10 @@ class _Run:
         }
         parameters = fill(self.abstract.policy, leaves, str(record.path))
         save_policy_file(self.directory.policy, parameters, self.settings, notes, storage="float32")
+
+
+def _nothing_to_wait_for(*_):
+    """In the place of a program that isn't needed any more."""
 
 
 def awaits_validation(
@@ -351,8 +361,9 @@ def _programs(job):
     abstract = abstract_like(jax.eval_shape(start, jax.random.key(settings.seed)), shardings)
     same = everywhere(job.devices)
     step = guarded(make_device_step(settings, job.parts, job.devices))
-    tried = job.devices == 1 or (jax.default_backend() == "cpu" and jax.process_count() == 1)
-    if tried and (keep := job.keep):
+    # where kept traces have been tried
+    can_keep = job.devices == 1 or (jax.default_backend() == "cpu" and jax.process_count() == 1)
+    if can_keep and (keep := job.keep):
         step = keep("step", step, lambda: (abstract,), carry=abstract)
         fresh = start
 

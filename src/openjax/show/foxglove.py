@@ -107,22 +107,26 @@ def trajectory_channels(name: str, flight: Trajectory) -> list[Channel]:
     topics.
     """
     every = max(1, round(LONGEST_STEP / flight.time_step))
-    steps = np.arange(0, flight.end(after=2.0), every)
+    steps = np.arange(0, flight.end(seconds=2.0), every)
     time = steps * flight.time_step
     drones = {
         f"pursuer_{k + 1}": (flight.pursuer_position[steps, k], flight.pursuer_quaternion[steps, k])
         for k in range(flight.pursuer_position.shape[1])
     }
     drones["evader"] = (flight.evader_position[steps], None)
-    poses = [pose_channel(f"/{name}/{d}/pose", time, *at) for d, at in drones.items()]
+    poses = [
+        pose_channel(f"/{name}/{drone}/pose", time, position, quaternion)
+        for drone, (position, quaternion) in drones.items()
+    ]
     scenes = []
     for row, moment in enumerate(time):
-        entities = [
-            _entity(d, "spheres", at[0][row], 2 * RADIUS, EVADER if d == "evader" else PURSUER)
-            for d, at in drones.items()
-        ]
+        entities = []
+        for drone, (position, _) in drones.items():
+            colour = EVADER if drone == "evader" else PURSUER
+            entities.append(_entity(drone, "spheres", position[row], 2 * RADIUS, colour))
         scenes.append((float(moment), {"entities": entities}))
     if len(scenes):
+        # in the first scene only: what stands stays
         scenes[0][1]["entities"] += _pillars(flight)
     return [*poses, Channel(f"/{name}/scene", "foxglove.SceneUpdate", scenes)]
 

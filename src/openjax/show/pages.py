@@ -11,7 +11,9 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-BEFORE, AFTER = "#d1495b", "#2e86ab"  # both stand out on white and on black
+# both stand out on white and on black
+BEFORE = "#d1495b"
+AFTER = "#2e86ab"
 GREY = "#8a8f98"
 INK = "#0a0b0c"  # becomes the page's text colour
 STYLE = {
@@ -58,5 +60,6 @@ def as_svg(figure: Figure, salt: str) -> str:
     with rc_context({"svg.hashsalt": salt}):
         figure.savefig(data, format="svg", metadata={"Date": None, "Creator": None})
     text = data.getvalue()
+    # without the XML declaration, which only a file of its own has
     text = text[text.index("<svg") :].replace(INK, "currentColor")
     return re.sub(r'<svg ([^>]*?)height="[^"]*"([^>]*?)width="[^"]*"', r"<svg \1\2", text, count=1)

@@ -41,18 +41,19 @@ def plot_trajectories(path: Path, trajectories: Sequence[Trajectory]) -> None:
     columns = min(3, len(trajectories))
     rows = -(-len(trajectories) // columns)
     figure = Figure(figsize=(4 * columns, 4.3 * rows), layout="constrained")
-    for axes, trajectory in zip(
-        np.atleast_1d(figure.subplots(rows, columns)).ravel(), trajectories, strict=False
-    ):
+    panels = figure.subplots(rows, columns, squeeze=False).ravel()
+    for axes, trajectory in zip(panels, trajectories, strict=False):
         draw_from_above(axes, trajectory)
-    for axes in figure.axes[len(trajectories) :]:
+    for axes in panels[len(trajectories) :]:
         axes.set_axis_off()
-    shown = {}
+    # one legend for all panels, each label once
+    legend = {}
     for axes in figure.axes:
-        for artist, label in zip(*axes.get_legend_handles_labels(), strict=True):
-            shown.setdefault(label, artist)
+        artists, labels = axes.get_legend_handles_labels()
+        for artist, label in zip(artists, labels, strict=True):
+            legend.setdefault(label, artist)
     figure.legend(
-        shown.values(), shown, loc="outside lower center", ncols=len(shown), fontsize="small"
+        legend.values(), legend, loc="outside lower center", ncols=len(legend), fontsize="small"
     )
     _save(figure, path)
 
@@ -113,14 +114,14 @@ def plot_map(path: Path, cells: Sequence[dict], title: str) -> None:
     figure = Figure(figsize=(3.1 * columns + 1.2, 3.0 * rows + 0.5), layout="constrained")
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
     for axes, size in zip(panels, sizes, strict=False):
-        shown = _draw_map(axes, [cell for cell in cells if cell["num_pursuers"] == size])
+        image = _draw_map(axes, [cell for cell in cells if cell["num_pursuers"] == size])
         axes.set_title(f"{size} pursuer{'s' if size > 1 else ''}", fontsize="medium")
     for axes in panels[len(sizes) :]:
         axes.set_axis_off()
     figure.supxlabel("capture radius [m]", fontsize="medium")
     figure.supylabel("evader's speed / pursuers'", fontsize="medium")
     figure.suptitle(title, fontsize="medium")
-    figure.colorbar(shown, ax=panels.tolist(), label="captured", shrink=0.8)
+    figure.colorbar(image, ax=panels.tolist(), label="captured", shrink=0.8)
     _save(figure, path)
 
 
@@ -131,15 +132,16 @@ def _draw_map(axes, cells):
     rates = np.full((len(ratios), len(radii)), np.nan)
     bounds = {name: dict.fromkeys(radii, 0.0) for name in ("forced_below", "planar_below")}
     for cell in cells:
-        place = ratios.index(cell["speed_ratio"]), radii.index(cell["capture_radius"])
-        rates[place] = cell["capture_rate"]
+        row = ratios.index(cell["speed_ratio"])
+        column = radii.index(cell["capture_radius"])
+        rates[row, column] = cell["capture_rate"]
         for name, forced in bounds.items():
             forced[cell["capture_radius"]] = cell.get(name, 0.0)
         text = f"{cell['capture_rate']:.2f}".replace("0.", ".")
-        dark = cell["capture_rate"] < 0.5
-        color = "white" if dark else "black"
-        axes.text(*place[::-1], text, ha="center", va="center", fontsize=6, color=color)
-    shown = axes.imshow(rates, origin="lower", vmin=0, vmax=1, cmap="viridis", aspect="auto")
+        # the colour map is dark below its middle
+        color = "white" if cell["capture_rate"] < 0.5 else "black"
+        axes.text(column, row, text, ha="center", va="center", fontsize=6, color=color)
+    image = axes.imshow(rates, origin="lower", vmin=0, vmax=1, cmap="viridis", aspect="auto")
     axes.set_xticks(range(len(radii)), [f"{radius:g}" for radius in radii], fontsize=7)
     axes.set_yticks(range(len(ratios)), [f"{ratio:g}" for ratio in ratios], fontsize=7)
     # between the middles of cells
@@ -148,7 +150,7 @@ def _draw_map(axes, cells):
     for forced, style in zip(bounds.values(), ("-", "--"), strict=True):
         height = np.interp(list(forced.values()), ratios, range(len(ratios)), **ends)
         axes.stairs(height, edges, baseline=None, color="red", linewidth=1.5, linestyle=style)
-    return shown
+    return image
 
 
 def plot_training(path: Path, metrics_path: Path) -> None:
@@ -156,18 +158,20 @@ def plot_training(path: Path, metrics_path: Path) -> None:
     training = list(read_metrics(metrics_path, "train"))
     evaluation = list(read_metrics(metrics_path, "validation"))
     figure = Figure(figsize=(11, 6), layout="constrained")
+    curves = (
+        (training, {"color": "tab:blue", "linewidth": 1}, "training"),
+        (evaluation, {"color": "tab:orange", "marker": "o", "markersize": 3}, "validation tasks"),
+    )
     for axes, (name, label) in zip(figure.subplots(2, 3).ravel(), _CURVES, strict=True):
-        for records, style, legend in (
-            (training, {"color": "tab:blue", "linewidth": 1}, "training"),
-            (
-                evaluation,
-                {"color": "tab:orange", "marker": "o", "markersize": 3},
-                "validation tasks",
-            ),
-        ):
-            points = [(r["steps"], r[name]) for r in records if r.get(name) is not None]
+        for records, style, legend in curves:
+            points = [
+                (record["steps"], record[name])
+                for record in records
+                if record.get(name) is not None
+            ]
             if points:
-                axes.plot(*np.asarray(points, dtype=float).T, label=legend, **style)
+                steps, values = np.asarray(points, dtype=float).T
+                axes.plot(steps, values, label=legend, **style)
         axes.set(xlabel="environment steps", ylabel=label)
         if axes.lines:
             axes.legend(fontsize="x-small")

@@ -2,6 +2,7 @@
 plain lines into a file.
 """
 
+import math
 import time
 from collections.abc import Mapping
 
@@ -33,7 +34,8 @@ class _Display:
 
     def __init__(self, console: Console, stays: bool):
         terminal = console.is_terminal
-        self._console, self._spinner = console, Spinner("dots")
+        self._console = console
+        self._spinner = Spinner("dots")
         transient = not (stays and terminal)
         self._live = Live(
             get_renderable=self._render, console=console, auto_refresh=terminal, transient=transient
@@ -59,7 +61,8 @@ class Progress(_Display):
     def __init__(self, title: str, total_steps: int, console: Console | None = None):
         self._title = title
         self._total = max(total_steps, 1)
-        self._phase, self._phase_start = "starting", time.monotonic()
+        self._phase = "starting"
+        self._phase_start = time.monotonic()
         self._steps = 0
         self._rate = 0.0
         self._last = None  # (time, steps) of the last update, for the speed
@@ -76,7 +79,8 @@ class Progress(_Display):
         """
         if text == self._phase:
             return
-        self._phase, self._phase_start = text, time.monotonic()
+        self._phase = text
+        self._phase_start = time.monotonic()
         self._last = None  # the speed is that of training alone
         self._last_line = self._phase_start
         if self._lines and announce:
@@ -97,21 +101,21 @@ class Progress(_Display):
         now = time.monotonic()
         if self._last is not None and now > self._last[0]:
             rate = (steps - self._last[1]) / (now - self._last[0])
+            # a running mean: single updates are uneven
             self._rate = rate if self._rate == 0.0 else 0.9 * self._rate + 0.1 * rate
         self._last = (now, steps)
         self._steps = steps
         self._values = values
         if self._lines and now - self._last_line > _LINE_INTERVAL:
             self._last_line = now
-            shown = ", ".join(f"{label} {value}" for label, value in _shown(values).items())
-            self.message(f"{self._speed()} | {shown}")
+            self.message(f"{self._speed()} | {_listed(values)}")
 
     def validation(self, values: dict[str, float], is_best: bool) -> None:
         """Result of an evaluation on the validation tasks."""
         self._validation = values
         if self._lines:
-            shown = ", ".join(f"{label} {value}" for label, value in _shown(values).items())
-            self.message(f"validation tasks: {shown}{' (best so far)' if is_best else ''}")
+            remark = " (best so far)" if is_best else ""
+            self.message(f"validation tasks: {_listed(values)}{remark}")
 
     def _speed(self):
         done = f"{100 * min(self._steps / self._total, 1):.0f} %, {_count(self._steps)} steps"
@@ -144,11 +148,18 @@ class Progress(_Display):
 
 def _shown(values):
     """Those that are shown, as text by their labels."""
-    known = {label: values[name] for name, label in _SHOWN.items() if name in values}
-    return {
-        label: "–" if value is None or value != value else f"{value:.3g}"
-        for label, value in known.items()
-    }
+    texts = {}
+    for name, label in _SHOWN.items():
+        if name in values:
+            value = values[name]
+            is_number = value is not None and not math.isnan(value)
+            texts[label] = f"{value:.3g}" if is_number else "–"
+    return texts
+
+
+def _listed(values):
+    """The same in a line."""
+    return ", ".join(f"{label} {value}" for label, value in _shown(values).items())
 
 
 def _count(value):
@@ -172,13 +183,13 @@ class Steps(_Display):
     Args:
       title: what is done.
       expected: {step: seconds on a usual machine}, in the order in which they come. What the steps
-      so far took against
-        this tells how long the rest takes here.
+        so far took against this tells how long the rest takes here.
       console: where to draw.
     """
 
     def __init__(self, title: str, expected: Mapping[str, float], console: Console):
-        self._title, self._expected = title, dict(expected)
+        self._title = title
+        self._expected = dict(expected)
         self._total = sum(self._expected.values())
         self._done = 0.0
         self._step = None
@@ -197,24 +208,27 @@ class Steps(_Display):
         """
         if step != self._step:
             self._done += self._expected.get(self._step, 0.0)
-            self._step, self._step_start = step, time.monotonic()
+            self._step = step
+            self._step_start = time.monotonic()
         self._note = note
 
-    def seconds_left(self, now: float) -> float:
-        """Until all steps are done, at time `now` of `time.monotonic`."""
+    def seconds_left(self, moment: float) -> float:
+        """Until all steps are done, at a moment of `time.monotonic`."""
         took = self._step_start - self._start
+        # as much slower than the usual machine as the steps so far were
         slower = took / self._done if self._done > 0 else 1.0
-        running = max(slower * self._expected.get(self._step, 0.0) - (now - self._step_start), 0.0)
-        later = self._total - self._done - self._expected.get(self._step, 0.0)
-        return running + slower * max(later, 0.0)
+        step = self._expected.get(self._step, 0.0)
+        in_step = max(slower * step - (moment - self._step_start), 0.0)
+        following = self._total - self._done - step
+        return in_step + slower * max(following, 0.0)
 
     def _render(self):
         now = time.monotonic()
         left = self.seconds_left(now)
         done = (now - self._start) / max(now - self._start + left, 1e-6)
-        text = (
-            f"{self._title}: {self._step or 'starting'}{f' ({self._note})' if self._note else ''}"
-        )
+        text = f"{self._title}: {self._step or 'starting'}"
+        if self._note:
+            text += f" ({self._note})"
         row = Table.grid(padding=(0, 1))
         row.add_row(
             self._spinner,

@@ -37,12 +37,13 @@ def _plain(policy: str, flight: Trajectory) -> dict:
     times in frames.
     """
     every = max(1, round(LONGEST_STEP / flight.time_step))
-    steps = slice(0, flight.end(after=2.0), every)
+    steps = slice(0, flight.end(seconds=2.0), every)
 
     def thousandths(values):
         return np.rint(1000.0 * np.asarray(values, float)).astype(int).ravel().tolist()
 
     def frame(index):
+        """The frame of a step; None for no step, or one after the last frame."""
         return None if index is None or index // every >= len(poses) else index // every
 
     poses = np.concatenate([flight.pursuer_position, flight.pursuer_quaternion], axis=-1)[steps]
@@ -70,5 +71,7 @@ def _plain(policy: str, flight: Trajectory) -> dict:
 
 def _spans(flags: np.ndarray) -> list[list[int]]:
     """[first, last] of each run of true flags (T,)."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], np.asarray(flags, int), [0]])))
-    return [[int(first), int(after) - 1] for first, after in edges.reshape(-1, 2)]
+    # with a zero before and after, edges come in pairs: where a run begins, and one past its end
+    padded = np.concatenate([[0], np.asarray(flags, int), [0]])
+    edges = np.flatnonzero(np.diff(padded))
+    return [[int(first), int(end) - 1] for first, end in edges.reshape(-1, 2)]

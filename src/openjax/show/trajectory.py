@@ -14,9 +14,8 @@ class Trajectory:
     pursuer_quaternion: np.ndarray  # (T, N, 4) wxyz, body to world
     evader_position: np.ndarray  # (T, 3)
     captured: np.ndarray  # (T, N) bool, pursuers that capture in this step
-    crashed: (
-        np.ndarray
-    )  # (T, N) bool, pursuers that touch something solid or lie on their side in this step
+    crashed: np.ndarray
+    """(T, N) bool, pursuers that touch something solid or lie on their side in this step"""
     pillar_position: np.ndarray  # (P, 2), those in use
     arena_radius: float
     arena_height: float
@@ -24,9 +23,8 @@ class Trajectory:
     capture_radius: float
     time_step: float  # s
     seen: np.ndarray | None = None  # (T,) bool, whether some pursuer sees the evader
-    predicted: np.ndarray | None = (
-        None  # (T, K, 3) where the policy expects the evader in the steps after
-    )
+    predicted: np.ndarray | None = None
+    """(T, K, 3) where the policy expects the evader in the steps after"""
 
     @property
     def capture_index(self) -> int | None:
@@ -42,12 +40,12 @@ class Trajectory:
         """Index of the first step in which this pursuer crashes."""
         return _first(self.crashed[:, pursuer])
 
-    def end(self, after: float = 1.0) -> int:
-        """Number of steps worth showing: up to `after` seconds after the first capture, or all."""
+    def end(self, seconds: float = 1.0) -> int:
+        """Number of steps worth showing: up to so many seconds after the first capture, or all."""
         steps = len(self.evader_position)
         if self.capture_index is None:
             return steps
-        return min(steps, self.capture_index + round(after / self.time_step))
+        return min(steps, self.capture_index + round(seconds / self.time_step))
 
 
 def _first(flags):

@@ -2,6 +2,7 @@
 display or OpenGL.
 """
 
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -35,7 +36,7 @@ _ROTORS = np.array([[1, 1, 0], [-1, 1, 0], [-1, -1, 0], [1, -1, 0]]) / np.sqrt(2
 _LETTERS = 20  # pixels
 
 
-def animate(path: Path, *trajectories: Trajectory) -> None:
+def animate(path: Path, trajectories: Sequence[Trajectory]) -> None:
     """Write an animated GIF up to a second after the first capture; time, capture and crash stand
     above it.
 
@@ -48,7 +49,8 @@ def animate(path: Path, *trajectories: Trajectory) -> None:
         every = max(1, round(1.0 / (FRAMES_PER_SECOND * flight.time_step)))
         films.append([_frame(flight, step) for step in range(0, flight.end(), every)])
     frames = _stacked(films)
-    # one palette, which covers small coloured things too
+    # one palette for all frames, from six of them, by the method that gives small coloured things
+    # their colours, too
     sample = np.concatenate(frames[:: max(1, len(frames) // 6)])
     palette = Image.fromarray(sample).quantize(255, method=Image.Quantize.MAXCOVERAGE)
     images = [
@@ -102,6 +104,7 @@ def draw(trajectory: Trajectory, step: int) -> Image.Image:
     for _, _, outlines in things:
         for outline in outlines:
             pen.fill(outline * (1, 1, 0), (60, 60, 60, 70))  # its shadow
+    # the painter's way: what is far first, what is near over it
     for _, draw_it, _ in sorted(things, key=lambda thing: -pen.depth(thing[0])):
         draw_it()
     return image.reduce(FINER)
@@ -122,8 +125,9 @@ def _things(pen, trajectory, step):
         yield from _trail(pen, path, step, color, trajectory.time_step)
     color = _rgb(EVADER_COLOR)
     path = trajectory.evader_position
-    now = (255, 200, 25) if trajectory.captured[step].any() else color
-    yield path[step], partial(pen.ball, path[step], BALL, now), [path[step] + BALL * _circle(24)]
+    ball_color = (255, 200, 25) if trajectory.captured[step].any() else color
+    shadow = path[step] + BALL * _circle(24)
+    yield path[step], partial(pen.ball, path[step], BALL, ball_color), [shadow]
     yield from _trail(pen, path, step, color, trajectory.time_step)
 
 
@@ -145,9 +149,13 @@ class _Pen:
         self._radius = radius
         self._height = height
         self._middle = np.array(image.size) / 2
-        (ca, ce), (sa, se) = (function((AZIMUTH, ELEVATION)) for function in (np.cos, np.sin))
-        # right, down, on
-        self._axes = np.array([[sa, -ca, 0], [-se * ca, -se * sa, -ce], [ce * ca, ce * sa, -se]])
+        ca, ce = np.cos((AZIMUTH, ELEVATION))
+        sa, se = np.sin((AZIMUTH, ELEVATION))
+        right = (sa, -ca, 0)
+        down = (-se * ca, -se * sa, -ce)
+        forward = (ce * ca, ce * sa, -se)
+        self._axes = np.array([right, down, forward])
+        # looks at a point somewhat below half the height: the floor's near edge needs room
         self._camera = (0, 0, 0.38 * height) - DISTANCE * radius * self._axes[2]
 
     def depth(self, place) -> float:
@@ -155,9 +163,10 @@ class _Pen:
         return float(self._axes[2, :2] @ place[:2])
 
     def _pixels(self, points):
-        seen = (np.asarray(points, float) - self._camera) @ self._axes.T
+        from_camera = (np.asarray(points, float) - self._camera) @ self._axes.T
         zoom = self._middle[1] / np.tan(OPENING / 2)
-        return [tuple(point) for point in self._middle + zoom * seen[:, :2] / seen[:, 2:]]
+        pixels = self._middle + zoom * from_camera[:, :2] / from_camera[:, 2:]
+        return [tuple(pixel) for pixel in pixels]
 
     def fill(self, outline, color) -> None:
         """A polygon (M, 3)."""
@@ -197,11 +206,9 @@ class _Pen:
     def ball(self, place, radius, color) -> None:
         """A ball, brighter above."""
         for size, light in ((1.0, 0.75), (0.7, 1.0)):
-            outline = (
-                place
-                - 0.7 * (1 - size) * radius * self._axes[1]
-                + size * radius * _circle(24)[:, :2] @ self._axes[:2]
-            )
+            # the bright part is smaller and farther up
+            centre = place - 0.7 * (1 - size) * radius * self._axes[1]
+            outline = centre + size * radius * _circle(24)[:, :2] @ self._axes[:2]
             self.fill(outline, tuple(round(light * part) for part in color))
 
 

@@ -110,10 +110,11 @@ def make_optimiser(
     def late(count):
         return jnp.where(count < settings.actor_start * steps, 0.0, schedule(count))
 
-    after = (follow_kl(settings.target_kl),) if settings.target_kl else ()
-    most = settings.max_grad_norm
-    actor = clipped_adam(most, late if settings.actor_start else schedule, *after)
-    return actor, clipped_adam(most, schedule)
+    max_norm = settings.max_grad_norm
+    actor_rate = late if settings.actor_start else schedule
+    # behind Adam, which would scale a scaled gradient up again
+    scaling = follow_kl(settings.target_kl) if settings.target_kl else None
+    return clipped_adam(max_norm, actor_rate, scaling), clipped_adam(max_norm, schedule)
 
 
 def loss(
@@ -129,7 +130,8 @@ def loss(
     critic's the Huber loss of normalised values. Unless they share an encoder, neither's gradient
     knows of the other. Means are those of pursuers that are there.
     """
-    mean, log_std, value = policy.evaluate(*parameters, batch.observation, batch.predicted)
+    actor, critic = parameters
+    mean, log_std, value = policy.evaluate(actor, critic, batch.observation, batch.predicted)
     log_ratio = gaussian_log_prob(batch.action, mean, log_std) - batch.log_prob
     ratio = jnp.exp(log_ratio)
     clipped = jnp.clip(ratio, 1.0 - clip, 1.0 + clip)
@@ -139,6 +141,8 @@ def loss(
     policy_loss = -surrogate - settings.entropy_coefficient * entropy
     value_loss = mean_of(optax.huber_loss(value, batch.target, delta=settings.huber))
     watch = {
+        # the same mean as that of -log_ratio, with less noise and never negative (Schulman 2020,
+        # Approximating KL divergence)
         "kl": mean_of(ratio - 1.0 - log_ratio),
         "clipped": mean_of(jnp.abs(ratio - 1.0) > clip),
         "entropy": entropy,
@@ -196,6 +200,7 @@ class Mappo:
         estimates = self._estimates(state.value_scale, parameters, flown)
         scale = self._renewed_scale(state.value_scale, estimates.returns, flown)
         mean, std = scale.moments
+        # by the moments with these returns in them: values and targets are then of one scale
         targets = (estimates.returns - mean) / std
         batch = self._batch(estimates.advantage, targets, flown)
 
@@ -239,21 +244,22 @@ class Mappo:
             settings.gae_lambda,
         )
         returns = advantage + value
+        # an advantage is what the value left of the return: one less the share that is unexplained
         active = rollout.observation.active
-        explained = 1.0 - joint_moments(advantage, flown.axis, active)[1] ** 2 / (
-            joint_moments(returns, flown.axis, active)[1] ** 2 + 1e-8
-        )
+        _, spread_left = joint_moments(advantage, flown.axis, active)
+        _, spread = joint_moments(returns, flown.axis, active)
+        explained = 1.0 - spread_left**2 / (spread**2 + 1e-8)
         return Estimates(advantage, returns, explained)
 
     def _renewed_scale(self, scale, returns, flown):
         """The running moments after these returns."""
-        kept = self.settings.value_norm_decay
+        decay = self.settings.value_norm_decay
         active = flown.rollout.observation.active
         mean, square = flown.mean((team_mean(active, returns), team_mean(active, returns**2)))
         return ValueScale(
-            mean=kept * scale.mean + (1 - kept) * mean,
-            square=kept * scale.square + (1 - kept) * square,
-            weight=kept * scale.weight + (1 - kept),
+            mean=decay * scale.mean + (1 - decay) * mean,
+            square=decay * scale.square + (1 - decay) * square,
+            weight=decay * scale.weight + (1 - decay),
         )
 
     def _batch(self, advantage, targets, flown):
@@ -285,9 +291,9 @@ class Mappo:
         actor_vector, to_actor = ravel_pytree(actor.parameters)
         critic_vector, to_critic = ravel_pytree(critic.parameters)
 
-        def gradient_step(carry, chosen):
+        def gradient_step(carry, step):
             actor, critic = carry
-            index, first = chosen
+            index, first = step
             part = jax.tree.map(
                 lambda x: every_nth(x[index], first, settings.step_subsampling), batch
             )
@@ -299,6 +305,7 @@ class Mappo:
             gradient = jax.grad(part_loss, argnums=(0, 1), has_aux=True)(
                 actor.parameters, critic.parameters
             )
+            # gradients and what is watched over all devices by one collective
             (actor_gradient, critic_gradient), watch = flown.mean(gradient)
             watch |= {"actor_gradient": jnp.linalg.norm(actor_gradient)}
             actor = actor.updated(self.optimisers[0], actor_gradient, kl=watch["kl"])

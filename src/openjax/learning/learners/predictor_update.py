@@ -48,8 +48,7 @@ def windows_and_labels(
       policy: for the predictor's horizons.
       history_spacing: steps between two frames of a window.
       earlier: (E, H, F) frames before the rollout's second step, oldest first (H = window's span);
-      its last one
-          is the rollout's first.
+        its last one is the rollout's first.
       rollout: T steps.
       times: (E, W) steps of the rollout, at most T - largest horizon.
 
@@ -149,15 +148,19 @@ class PredictorLearner:
         settings = self.policy.predictor
         rollout = flown.rollout
         keys = own_keys(key, flown.frames.shape[0], flown.axis)
+        # later windows would have labels beyond the rollout
         room = rollout.reward.shape[0] - settings.horizons[-1] + 1
         times = jax.vmap(lambda key: jax.random.permutation(key, room)[: settings.windows])(keys)
         data = windows_and_labels(
             self.policy, self.game.history_spacing, flown.frames, rollout, times
         )
-        return jax.tree.map(
-            lambda x: jnp.moveaxis(x.reshape(x.shape[0], settings.steps, -1, *x.shape[2:]), 1, 0),
-            data,
-        )
+
+        def by_step(x):
+            """(E, W, ...) -> (steps, E, W / steps, ...)."""
+            parts = x.reshape(x.shape[0], settings.steps, -1, *x.shape[2:])
+            return jnp.moveaxis(parts, 1, 0)
+
+        return jax.tree.map(by_step, data)
 
 
 def _take(values: jax.Array, index: jax.Array) -> jax.Array:

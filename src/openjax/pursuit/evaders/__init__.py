@@ -12,7 +12,10 @@ __getattr__, __dir__, __all__ = lazy_names(
         "evader": "draw_evader draw_row evader_velocity scene_of",
         "evader_state": "EvaderState",
         "field": "field_velocity",
-        "kinds": "EVADERS HELD_OUT SCRIPTED VALIDATED Evader EvaderKind check_evaders evader_rows handed_in",
+        "kinds": (
+            "EVADERS HELD_OUT SCRIPTED VALIDATED Evader EvaderKind check_evaders evader_rows "
+            "handed_in"
+        ),
         "learned": "init_network learned_place",
     },
 )

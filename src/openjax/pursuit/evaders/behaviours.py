@@ -78,11 +78,11 @@ class Scene:
     @property
     def nearest(self) -> Vector:
         """(3,) m, the nearest pursuer that it knows of."""
-        distance = jnp.sum((self.pursuers - self.position) ** 2, axis=-1)
-        chosen = jnp.argmin(jnp.where(self.known, distance, jnp.inf))
-        return jnp.sum(
-            jnp.where(jnp.arange(distance.shape[0])[:, None] == chosen, self.pursuers, 0.0), axis=0
-        )
+        squared = jnp.sum((self.pursuers - self.position) ** 2, axis=-1)
+        squared = jnp.where(self.known, squared, jnp.inf)
+        # a sum over all but one, cheaper on an accelerator than an index
+        is_nearest = jnp.arange(squared.shape[0])[:, None] == jnp.argmin(squared)
+        return jnp.sum(jnp.where(is_nearest, self.pursuers, 0.0), axis=0)
 
 
 def directions(number: int) -> Float[np.ndarray, "{number} 3"]:
@@ -147,6 +147,7 @@ def wall_runner(scene: Scene, memory: Memory) -> tuple[Vector, Memory]:
     radius = _length(scene.position[:2])
     out = scene.position[:2] / radius
     left = jnp.stack([-out[1], out[0]])
+    # the sign of the cross product says on which side of it the pursuer is; it runs to the other
     side = jnp.where(threat[0] * out[1] - threat[1] * out[0] >= 0.0, 1.0, -1.0)
     outward = jnp.clip((settings.arena_radius - AROUND - radius) / AROUND, -1.0, 1.0)
     goal = jnp.where(threat[2] > settings.arena_height / 2, AROUND, settings.arena_height - AROUND)
@@ -176,12 +177,13 @@ def safe_place(scene: Scene, memory: Memory) -> tuple[Vector, Memory]:
     pursuer; none behind a pillar.
     """
     settings = scene.settings
+    # the same places in every step, which fill the arena evenly
     share = np.mod(0.5 + np.arange(PLACES)[:, None] * R_SEQUENCE[[1, 0, 2]], 1.0)
     places = _free_place(scene, jnp.asarray(share, jnp.float32))
     to_place = places - scene.position
-    own = _length(to_place)[:, 0] / scene.reach
-    theirs = _length(places[:, None] - scene.pursuers)[..., 0] / settings.max_speed
-    lead = jnp.min(jnp.where(scene.known, theirs, FAR_AWAY), axis=-1) - own
+    own_time = _length(to_place)[:, 0] / scene.reach
+    their_time = _length(places[:, None] - scene.pursuers)[..., 0] / settings.max_speed
+    lead = jnp.min(jnp.where(scene.known, their_time, FAR_AWAY), axis=-1) - own_time
     in_the_open = line_of_sight(
         settings, places, scene.position, scene.pillar_position, scene.pillar_active
     )
@@ -195,16 +197,14 @@ def way_points(scene: Scene, memory: Memory) -> tuple[Vector, Memory]:
     discrepancy from a drawn one on.
     """
     share = memory[:3]
-    left = memory[3]
     rest = memory[4:]
     to_goal = _free_place(scene, share) - scene.position
     # after a second it gives up a point that it doesn't reach
-    left = left - scene.settings.time_step
-    done = (_length(to_goal)[0] < AROUND) | (left < 0.0)
-    own = jnp.where(
-        done, jnp.append(jnp.mod(share + R_SEQUENCE, 1.0), 1.0), jnp.append(share, left)
-    )
-    return _unit(to_goal), jnp.concatenate([own, rest])
+    seconds_left = memory[3] - scene.settings.time_step
+    is_done = (_length(to_goal)[0] < AROUND) | (seconds_left < 0.0)
+    next_point = jnp.append(jnp.mod(share + R_SEQUENCE, 1.0), 1.0)
+    point = jnp.where(is_done, next_point, jnp.append(share, seconds_left))
+    return _unit(to_goal), jnp.concatenate([point, rest])
 
 
 def frozen(scene: Scene, memory: Memory) -> tuple[Vector, Memory]:
@@ -229,6 +229,7 @@ def _free_place(scene, share):
     """
     settings = scene.settings
     angle = 2.0 * jnp.pi * share[..., 0]
+    # the root, so that equal shares are equal areas
     radius = settings.arena_radius * jnp.sqrt(share[..., 1])
     place = [
         radius * jnp.cos(angle),

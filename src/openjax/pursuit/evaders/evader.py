@@ -44,8 +44,8 @@ def draw_row(
       key: ().
       pursuers: (N, 3) m, their starts, for the memory of a learned evader.
       share: () from 0 to 1, how far a curriculum has come; None is 1. At 0 all worlds have the
-      first of the evaders; from
-        there the others' odds grow to the equal ones, and their speed from half to the whole.
+        first of the evaders; from there the others' odds grow to the equal ones, and their speed
+        from half to the whole.
       kind: () int32, the place in `rows` of the one it is; None draws it.
 
     Raises:
@@ -59,6 +59,8 @@ def draw_row(
         kind = jax.random.randint(kind_key, (), 0, len(rows))
     slow = jnp.ones(())
     if share is not None:
+        # at half the speed when they come in: who can't catch yet learns nothing from one that is
+        # always away
         kind = jnp.where(jax.random.uniform(jax.random.fold_in(kind_key, 1)) < share, kind, 0)
         slow = jnp.where(kind == 0, 1.0, 0.5 + 0.5 * share)
     draws = jax.random.uniform(number_key, (len(NUMBERS),))
@@ -84,10 +86,12 @@ def draw_row(
 
 def _drawn(values, kind, draw):
     """One of `values[kind]`, by the uniform `draw`."""
-    width = max(len(own) for own in values)
-    table = np.array([[*own, *[0.0] * (width - len(own))] for own in values], np.float32)
-    lengths = np.array([len(own) for own in values], np.float32)
-    return jnp.asarray(table)[kind, (draw * jnp.asarray(lengths)[kind]).astype(jnp.int32)]
+    # a table needs rows of one length: filled up with zeros, which no draw reaches
+    width = max(len(row) for row in values)
+    table = np.array([[*row, *[0.0] * (width - len(row))] for row in values], np.float32)
+    lengths = np.array([len(row) for row in values], np.float32)
+    place = (draw * jnp.asarray(lengths)[kind]).astype(jnp.int32)
+    return jnp.asarray(table)[kind, place]
 
 
 def evader_velocity(
@@ -115,16 +119,16 @@ def evader_velocity(
     if state is None:
         velocity = _flown(settings, world, evader_speed(settings, world.task), UNBOUNDED, wish)
         return jnp.where(jnp.any(jnp.isnan(wish)), _field(settings, world), velocity), None
-    own, memory = _wish(settings, rows, world)
-    is_own = jnp.ones((), bool) if wish is None else jnp.any(jnp.isnan(wish))
+    own_wish, memory = _wish(settings, rows, world)
+    by_itself = jnp.ones((), bool) if wish is None else jnp.any(jnp.isnan(wish))
     speed = state.numbers["speed"] * evader_speed(settings, world.task)
-    wish = own if wish is None else jnp.where(is_own, own, wish)
+    wish = own_wish if wish is None else jnp.where(by_itself, own_wish, wish)
     velocity = _flown(settings, world, speed, state.numbers["acceleration"], wish)
     is_field = np.array([row.behaviour == "field" for row in rows])
     if is_field.any():
-        velocity = jnp.where(
-            is_own & jnp.asarray(is_field)[state.kind], _field(settings, world), velocity
-        )
+        # the paper's flies its force as it is: nothing bounds its acceleration
+        flies_field = by_itself & jnp.asarray(is_field)[state.kind]
+        velocity = jnp.where(flies_field, _field(settings, world), velocity)
     return velocity, state.replace(memory=memory)
 
 
@@ -160,37 +164,38 @@ def _field(settings, world):
         world.task.pillar_position,
         world.task.pillar_active,
     )
-    own = world.task.evader_speed
-    return velocity if own is None else velocity * (own / settings.evader_speed)
+    task_speed = world.task.evader_speed
+    return velocity if task_speed is None else velocity * (task_speed / settings.evader_speed)
 
 
 def _wish(settings, rows, world):
     """Wish (3,) and memory of an evader with a behaviour; of the paper's something finite."""
     state = world.evader
     behaviours = [row.behaviour for row in rows]
-    own = {row.behaviour: _of_own(row) for row in rows if callable(row.behaviour)}
-    known = {**BEHAVIOURS, "learned": learning, **own}
-    used = [name for name in known if name in behaviours]
-    place = np.array([used.index(name) if name in used else 0 for name in behaviours], np.int32)
+    handed_in = {row.behaviour: _like_shipped(row) for row in rows if callable(row.behaviour)}
+    functions = {**BEHAVIOURS, "learned": learning, **handed_in}
     # mapped over worlds, a switch works all of them out and selects: each behaviour stands in it
-    # once
+    # once, however many rows have it
+    in_game = [name for name in functions if name in behaviours]
+    place = [in_game.index(name) if name in in_game else 0 for name in behaviours]
     return jax.lax.switch(
-        jnp.asarray(place)[state.kind],
-        [known[name] for name in used],
+        jnp.asarray(np.array(place, np.int32))[state.kind],
+        [functions[name] for name in in_game],
         scene_of(settings, world),
         state.memory,
     )
 
 
-def _of_own(row):
+def _like_shipped(row):
     """A behaviour like the shipped ones, of a row whose function gives m/s and has a memory of its
     own size.
     """
 
     def behaviour(scene, memory):
-        velocity, kept = row.behaviour(scene, memory[: row.memory])
-        kept = jnp.concatenate([kept, memory[row.memory :]])
-        return velocity / jnp.maximum(scene.reach, 1e-6), kept
+        velocity, remembered = row.behaviour(scene, memory[: row.memory])
+        # all evaders of a game have memories of one size, the largest
+        memory = jnp.concatenate([remembered, memory[row.memory :]])
+        return velocity / jnp.maximum(scene.reach, 1e-6), memory
 
     return behaviour
 
@@ -207,6 +212,7 @@ def _flown(settings, world, speed, acceleration, wish):
     start = world.evader_position
     before = world.evader_velocity
     velocity = at_most(before + at_most(speed * wish - before, acceleration * dt), speed)
+    # past what is solid it slides along the surface: where it would end is moved out of there
     pillars = world.task.pillar_position
     active = world.task.pillar_active
     moved = into_free_space(settings, start + dt * velocity, pillars, active)

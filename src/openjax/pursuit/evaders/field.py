@@ -9,8 +9,11 @@ from openjax.pursuit.settings import PursuitSettings
 from openjax.pursuit.shapes import Active, Pillars, Team, Vector, Which
 
 EPSILON = 1e-5
+"""Added to distances (m) and their squares, so that nothing is divided by zero."""
 INWARD = 1e5
-"""Push back where the evader is outside the arena or inside a pillar."""
+"""Push back where the evader is outside the arena or inside a pillar: what 1/distance comes to at
+`EPSILON`.
+"""
 
 
 def field_velocity(
@@ -27,9 +30,9 @@ def field_velocity(
     their surface.
     """
     away = evader - pursuers
-    force = jnp.sum(
-        jnp.where(in_sight[:, None], away / (_norm_squared(away) + EPSILON), 0.0), axis=0
-    )
+    # a unit vector over the distance is the offset over its square
+    push = away / (_norm_squared(away) + EPSILON)
+    force = jnp.sum(jnp.where(in_sight[:, None], push, 0.0), axis=0)
 
     radius = jnp.sqrt(_norm_squared(evader[:2])[0] + 1e-12)
     outward = evader[:2] / radius
@@ -44,16 +47,15 @@ def field_velocity(
     distance = jnp.sqrt(_norm_squared(from_pillar) + 1e-12)
     to_surface = distance - settings.pillar_radius
     strength = jnp.where(to_surface > 0.0, 1.0 / (jnp.maximum(to_surface, 0.0) + EPSILON), INWARD)
-    pillars = jnp.sum(
-        jnp.where(pillar_active[:, None], from_pillar / distance * strength, 0.0), axis=0
-    )
+    push = from_pillar / distance * strength
+    pillars = jnp.sum(jnp.where(pillar_active[:, None], push, 0.0), axis=0)
 
     force = force + jnp.concatenate([wall + pillars, (floor - ceiling)[None]])
-    size = (
-        jnp.max(jnp.abs(force))
-        if settings.evader_norm == "axis"
-        else jnp.sqrt(jnp.sum(force**2) + 1e-12)
-    )
+    # the field says where to, never how fast
+    if settings.evader_norm == "axis":
+        size = jnp.max(jnp.abs(force))
+    else:
+        size = jnp.sqrt(jnp.sum(force**2) + 1e-12)
     return settings.evader_speed * force / (size + EPSILON)
 
 

@@ -102,8 +102,8 @@ def evader_rows(
     """
     if names.count("own") != len(handed_in):
         raise UserError(
-            "evader own: a name isn't enough; Pursuit(settings, evaders=(...)) takes a function, or "
-            "--opponent FILE.py:function or a file of openjax exploit"
+            "evader own: a name isn't enough; Pursuit(settings, evaders=(...)) takes a function, "
+            "or --opponent FILE.py:function or a file of openjax exploit"
         )
     rest = iter(handed_in)
     return tuple(next(rest) if name == "own" else EVADERS[name] for name in names)

@@ -1,9 +1,9 @@
-"""A learned evader: a small network with a memory, added to what the greedy evader of some
-look-ahead would do.
+"""A learned evader: a small network with a memory; every third is added to what the greedy evader
+of some look-ahead would do.
 
 Its memory holds where the pursuers were in the last steps. Pursuers and pillars are pooled, so that
 their number and order don't matter. With zeros in its last layer, as it starts, it is that greedy
-evader.
+evader, or stays where it is.
 """
 
 import functools
@@ -30,6 +30,7 @@ response to who is caught out by a far-sighted one isn't found from a short-sigh
 _OWN = 9
 _PURSUER = 16
 _PILLAR = 4
+"""Numbers of each part of `features`."""
 
 
 def learned_place(names: tuple[str, ...], kind: Int32[Array, "*worlds"]) -> Int32[Array, "*worlds"]:
@@ -50,16 +51,13 @@ def init_network(
     turned looks the same.
     """
     inputs = {"pursuer": _PURSUER, "pillar": _PILLAR, "own": _OWN + 3 * WIDTH, "hidden": WIDTH}
+    # no orthogonal ones: several decompositions at once may wait for each other for ever on a CPU
+    # of two cores
+    initial = jax.nn.initializers.he_normal()
+    keys = jax.random.split(key, len(inputs))
     layers = {
-        # no orthogonal ones: several decompositions at once may wait for each other for ever on a
-        # CPU of two cores
-        name: {
-            "kernel": jax.nn.initializers.he_normal()(own, (size, WIDTH)),
-            "bias": jnp.zeros(WIDTH),
-        }
-        for (name, size), own in zip(
-            inputs.items(), jax.random.split(key, len(inputs)), strict=True
-        )
+        name: {"kernel": initial(layer_key, (size, WIDTH)), "bias": jnp.zeros(WIDTH)}
+        for (name, size), layer_key in zip(inputs.items(), keys, strict=True)
     }
     return {
         **layers,
@@ -75,37 +73,30 @@ def init_network(
 def features(
     networks: dict[str, Any], which: int | Count, scene: Scene, memory: Memory
 ) -> dict[str, jax.Array]:
-    """What the one of K networks that `which` () names sees: own (9,), pursuers (N, 10), pillars
+    """What the one of K networks that `which` () names sees: own (9,), pursuers (N, 16), pillars
     (P, 4), in_use (P,), greedy (3,), outward (2,), and active (N,) where slots may be empty.
+
+    Of itself: place in the arena, velocity, the greedy wish. Of each pursuer: offset and distance,
+    how it moved over the last half and the whole of the memory, its velocity, where its rotors
+    pull. Of each pillar: offset, distance, and whether the slot is in use.
     """
     settings = scene.settings
     scene = scene.replace(look_ahead=networks["look_ahead"][which])
-    before = memory[MEMORY:].reshape(STEPS, *scene.pursuers.shape)
-    relative = scene.pursuers - scene.position
-    distance = jnp.sqrt(jnp.sum(relative**2, axis=-1, keepdims=True) + 1e-12)
-    half = scene.pursuers - before[STEPS // 2]
-    whole = scene.pursuers - before[0]
-    scale = settings.max_speed * settings.time_step * STEPS
-    to_pillar = scene.pillar_position - scene.position[:2]
-    gap = jnp.sqrt(jnp.sum(to_pillar**2, axis=-1, keepdims=True) + 1e-12)
-    in_use = scene.pillar_active[:, None]
     size = np.array([settings.arena_radius] * 2 + [settings.arena_height / 2], np.float32)
     middle = np.array(settings.middle, np.float32)
     wish = networks["scripted"][which] * greedy(scene, memory)[0]
     outward = scene.position[:2] / jnp.sqrt(jnp.sum(scene.position[:2] ** 2) + 1e-6)
     outward = jnp.where(networks["own_axes"][which] > 0, outward, np.array([1.0, 0.0], np.float32))
-    own = functools.partial(turned_back, outward)
-    vectors = (
-        own((scene.position - middle) / size),
-        own(scene.velocity / settings.evader_speed),
-        own(wish),
-    )
-    flown = [own(scene.pursuer_velocity / settings.max_speed), own(scene.thrust_direction)]
-    moved = [own(relative), distance, own(2.0 * half / scale), own(whole / scale), *flown]
+    turned = functools.partial(turned_back, outward)
+    itself = [
+        turned((scene.position - middle) / size),
+        turned(scene.velocity / settings.evader_speed),
+        turned(wish),
+    ]
     seen = {
-        "own": jnp.concatenate(vectors),
-        "pursuers": jnp.concatenate(moved, axis=-1),
-        "pillars": jnp.where(in_use, jnp.concatenate([own(to_pillar), gap, in_use], axis=-1), 0.0),
+        "own": jnp.concatenate(itself),
+        "pursuers": _pursuer_features(scene, memory, turned),
+        "pillars": _pillar_features(scene, turned),
         "in_use": scene.pillar_active,
         "greedy": wish,
         "outward": outward,
@@ -117,27 +108,57 @@ def features(
     return jax.lax.optimization_barrier(seen)
 
 
+def _pursuer_features(scene, memory, turned):
+    """(N, 16) of the pursuers; `turned` turns vectors into the network's axes."""
+    settings = scene.settings
+    earlier = memory[MEMORY:].reshape(STEPS, *scene.pursuers.shape)  # oldest first
+    offset = scene.pursuers - scene.position
+    distance = jnp.sqrt(jnp.sum(offset**2, axis=-1, keepdims=True) + 1e-12)
+    # as far as a pursuer gets in the memory's time: what it moved is of the order of one
+    scale = settings.max_speed * settings.time_step * STEPS
+    numbers = [
+        turned(offset),
+        distance,
+        turned(2.0 * (scene.pursuers - earlier[STEPS // 2]) / scale),
+        turned((scene.pursuers - earlier[0]) / scale),
+        turned(scene.pursuer_velocity / settings.max_speed),
+        turned(scene.thrust_direction),
+    ]
+    return jnp.concatenate(numbers, axis=-1)
+
+
+def _pillar_features(scene, turned):
+    """(P, 4) of the pillars, zeros in slots that aren't in use."""
+    offset = scene.pillar_position - scene.position[:2]
+    distance = jnp.sqrt(jnp.sum(offset**2, axis=-1, keepdims=True) + 1e-12)
+    in_use = scene.pillar_active[:, None]
+    return jnp.where(in_use, jnp.concatenate([turned(offset), distance, in_use], axis=-1), 0.0)
+
+
 def outputs(
-    network: dict[str, Any], seen: dict[str, jax.Array]
+    network: dict[str, Any], inputs: dict[str, jax.Array]
 ) -> tuple[Float[Array, "*batch 3"], Float[Array, "*batch"]]:
-    """Mean wish (..., 3) and value (...,) for features with leading axes."""
+    """Mean wish (..., 3) and value (...,) for `features` with leading axes."""
 
     def dense(name, x):
         return x @ network[name]["kernel"] + network[name]["bias"]
 
-    pursuers = jnp.tanh(dense("pursuer", seen["pursuers"]))
-    pillars = jnp.where(seen["in_use"][..., None], jnp.tanh(dense("pillar", seen["pillars"])), 0.0)
-    if "active" in seen:
-        active = seen["active"][..., None]
+    pursuers = jnp.tanh(dense("pursuer", inputs["pursuers"]))
+    pillars = jnp.tanh(dense("pillar", inputs["pillars"]))
+    pillars = jnp.where(inputs["in_use"][..., None], pillars, 0.0)
+    if "active" in inputs:
+        active = inputs["active"][..., None]
         mean = jnp.sum(active * pursuers, axis=-2) / jnp.maximum(jnp.sum(active, axis=-2), 1)
         most = jnp.max(jnp.where(active, pursuers, -1.0), axis=-2)  # a tanh's least
     else:
-        mean, most = jnp.mean(pursuers, axis=-2), jnp.max(pursuers, axis=-2)
+        mean = jnp.mean(pursuers, axis=-2)
+        most = jnp.max(pursuers, axis=-2)
     pooled = [mean, most, jnp.sum(pillars, axis=-2)]
-    hidden = jnp.tanh(dense("own", jnp.concatenate([seen["own"], *pooled], axis=-1)))
+    hidden = jnp.tanh(dense("own", jnp.concatenate([inputs["own"], *pooled], axis=-1)))
     out = dense("output", jnp.tanh(dense("hidden", hidden)))
-    inverse = seen["outward"] * np.array([1.0, -1.0], np.float32)
-    return seen["greedy"] + turned_back(inverse, out[..., :3]), out[..., 3]
+    # from its own axes into the world's: the same yaw with the other sign
+    inverse = inputs["outward"] * np.array([1.0, -1.0], np.float32)
+    return inputs["greedy"] + turned_back(inverse, out[..., :3]), out[..., 3]
 
 
 def remember(scene: Scene, memory: Memory) -> Memory:
@@ -148,13 +169,13 @@ def remember(scene: Scene, memory: Memory) -> Memory:
 
 
 def outputs_of(
-    networks: dict[str, Any], which: Int32[Array, "*batch"], seen: dict[str, jax.Array]
+    networks: dict[str, Any], which: Int32[Array, "*batch"], inputs: dict[str, jax.Array]
 ) -> tuple[Float[Array, "*batch 3"], Float[Array, "*batch"]]:
     """`outputs` of the one of K networks, every leaf with their axis first, that `which` (...)
     names for each of the features.
     """
     # all of them: cheaper than their parameters by world
-    wishes, values = jax.vmap(outputs, (0, None))(networks, seen)
+    wishes, values = jax.vmap(outputs, (0, None))(networks, inputs)
     chosen = jax.nn.one_hot(which, values.shape[0], axis=0)
     return jnp.sum(chosen[..., None] * wishes, axis=0), jnp.sum(chosen * values, axis=0)
 
