@@ -47,7 +47,6 @@ def quiet_compiler() -> Iterator[None]:
     try:
         yield
     finally:
-        jax.config.update(
-            "jax_logging_level", before or "WARNING"
-        )  # XLA's own level has no "as before"
+        # XLA's own level has no "as before": it is set by one that it knows, then JAX's is put back
+        jax.config.update("jax_logging_level", before or "WARNING")
         jax.config.update("jax_logging_level", before)

@@ -104,6 +104,7 @@ def _showing_intervals():
         kind = info.type
         if not dataclasses.is_dataclass(kind) or kind in inside:
             return None
+        # the usual rules are asked below, and would come back here
         inside.add(kind)
         try:
             spec = ConstructorRegistry.get_struct_spec(info)
@@ -113,15 +114,15 @@ def _showing_intervals():
         if not intervals or not hasattr(spec, "fields"):
             return spec
 
-        def shown(field):
+        def with_interval(field):
             if field.name not in intervals:
                 return field
             text = field.helptext() if callable(field.helptext) else field.helptext
-            return dataclasses.replace(
-                field, helptext=f"{text or ''} In {intervals[field.name]}.".strip()
-            )
+            text = f"{text or ''} In {intervals[field.name]}.".strip()
+            return dataclasses.replace(field, helptext=text)
 
-        return dataclasses.replace(spec, fields=tuple(shown(field) for field in spec.fields))
+        fields = tuple(with_interval(field) for field in spec.fields)
+        return dataclasses.replace(spec, fields=fields)
 
     return registry
 
@@ -187,10 +188,7 @@ def one_line(error: BaseException) -> str | None:
         text = f"{where}{reason[:1].lower()}{reason[1:]}"
     elif isinstance(error, MemoryError):
         text = "not enough memory"
-    elif (
-        type(error).__name__ in ("JaxRuntimeError", "XlaRuntimeError")
-        and "RESOURCE_EXHAUSTED" in text
-    ):
+    elif _is_out_of_device_memory(error):
         text = f"not enough memory on the device; fewer --num_envs need less ({text})"
     elif type(error) is RuntimeError and text.startswith("Unable to initialize backend"):
         text = f"JAX finds no device: {text}"
@@ -200,6 +198,12 @@ def one_line(error: BaseException) -> str | None:
     elif not isinstance(error, UserError):
         return None
     return text if len(text) <= LONGEST else f"{text[: LONGEST - 3]}..."
+
+
+def _is_out_of_device_memory(error):
+    # by name, as JAX may not be loaded
+    of_jax = type(error).__name__ in ("JaxRuntimeError", "XlaRuntimeError")
+    return of_jax and "RESOURCE_EXHAUSTED" in str(error)
 
 
 def _discard_output() -> None:
@@ -214,9 +218,8 @@ def quiet_libraries() -> None:
     """Keep libraries' notes that no user can act on off the terminal; what matters comes as an
     exception.
     """
-    os.environ.setdefault(
-        "TF_CPP_MIN_LOG_LEVEL", "3"
-    )  # 3: neither that XLA compiles slowly, an error to it
+    # 3: not even errors, as which XLA counts that it compiles slowly
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     for name in ("absl", "jax._src.xla_bridge", "asyncio"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
     warnings.filterwarnings("ignore", message="Sharding info not provided when restoring")
@@ -231,11 +234,9 @@ def option_names(settings, prefix: str = "") -> list[str]:
     for field in dataclasses.fields(settings):
         value = getattr(settings, field.name)
         if dataclasses.is_dataclass(value):
-            named = [
-                getattr(entry, "name", None)
-                for entry in getattr(hints[field.name], "__metadata__", ())
-            ]
-            names += option_names(value, prefix if "" in named else f"{prefix}{field.name}.")
+            notes = getattr(hints[field.name], "__metadata__", ())
+            has_no_prefix = "" in [getattr(note, "name", None) for note in notes]
+            names += option_names(value, prefix if has_no_prefix else f"{prefix}{field.name}.")
         else:
             names.append(f"--{prefix}{field.name}")
     return names
@@ -253,25 +254,35 @@ def _one_line(box: str) -> str:
     box can be drawn.
     """
     lines = [line.strip("╰╯│ ") for line in box.splitlines() if not line.startswith("╭")]
-    parts = itertools.groupby(lines, key=lambda line: bool(line.strip("─-")))
-    parts = [" ".join(part) for says_something, part in parts if says_something]
-    message = " ".join(next(iter(parts if "╭" in box else parts[1:] or parts), "").split())
+    # paragraphs, between rules and empty lines
+    groups = itertools.groupby(lines, key=lambda line: bool(line.strip("─-")))
+    paragraphs = [" ".join(group) for says_something, group in groups if says_something]
+    if "╭" not in box:
+        paragraphs = paragraphs[1:] or paragraphs
+    message = " ".join(paragraphs[0].split()) if paragraphs else ""
     if wrong := re.match(r"Error parsing (--\S+): (.*?)\[?('[^']*')\]?\.?$", message):
         option, reason, value = wrong.groups()
         kind = next((word for part, word in KINDS.items() if part in reason), "another value")
-        return f"{option.replace('-', '_').replace('__', '--', 1)} is {value}; expected {kind}, see --help"
+        name = option.replace("-", "_").replace("__", "--", 1)
+        return f"{name} is {value}; expected {kind}, see --help"
     return f"{message.rstrip('.')}; see --help"
 
 
 def _unknown(argument, default, program):
     if not argument.startswith("-"):
-        return f"unexpected argument {argument!r}; options are written --name value, see {program} --help"
+        return (
+            f"unexpected argument {argument!r}; options are written --name value, see {program} "
+            "--help"
+        )
     name = argument.split("=", 1)[0].replace("-", "_").replace("__", "--", 1)
-    known = option_names(default)
+    options = option_names(default)
+
+    def last_part(option):
+        return re.split(r"\.|--", option)[-1]
+
     # a setting's own name often comes without its group, or with another: --n_pursuers for
     # --environment.n_pursuers
-    own = re.split(r"\.|--", name)[-1]
-    close = [option for option in known if re.split(r"\.|--", option)[-1] == own]
-    close = close or difflib.get_close_matches(name, known, n=1, cutoff=0.6)
+    close = [option for option in options if last_part(option) == last_part(name)]
+    close = close or difflib.get_close_matches(name, options, n=1, cutoff=0.6)
     hint = f"did you mean {close[0]}?" if close else f"see {program} --help"
     return f"unknown setting {argument.split('=', 1)[0]}; {hint}"

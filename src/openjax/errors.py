@@ -12,10 +12,10 @@ class UserError(Exception):
     """
 
 
-def suggestion(name: str, known: Iterable[str]) -> str:
-    """What an error can say of a name that isn't among the `known` ones: the one that is nearest,
-    or all.
+def suggestion(name: str, names: Iterable[str]) -> str:
+    """What an error can say of a name that isn't among the `names` that there are: the one that is
+    nearest, or all.
     """
-    known = list(known)
-    close = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
-    return f"did you mean {close[0]}?" if close else f"there are {', '.join(known)}"
+    names = list(names)
+    close = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
+    return f"did you mean {close[0]}?" if close else f"there are {', '.join(names)}"

@@ -22,8 +22,8 @@ DEEPEST = 32
 """Levels of nesting in a TOML or JSON file."""
 
 WRITING = ".writing-"
-"""What the names of unfinished files begin with; only a process that was killed (SIGKILL) leaves one
-behind.
+"""What the names of unfinished files begin with; only a process that was killed (SIGKILL) leaves
+one behind.
 """
 
 

@@ -23,8 +23,10 @@ def make_cores_devices() -> None:
     asked for.
     """
     accelerator = can_compile_for_cuda() and jax.config.jax_platforms != "cpu"
-    asked = jax.config.jax_num_cpu_devices >= 0 or "device_count" in os.environ.get("XLA_FLAGS", "")
-    if not accelerator and not asked:
+    by_flag = "device_count" in os.environ.get("XLA_FLAGS", "")
+    is_chosen = jax.config.jax_num_cpu_devices >= 0 or by_flag
+    if not accelerator and not is_chosen:
+        # those that this process may use: a container has fewer than the machine
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
         with contextlib.suppress(RuntimeError):  # somebody asked before
             jax.config.update("jax_num_cpu_devices", min(cores or 1, MOST_CORES))
@@ -35,10 +37,10 @@ def can_compile_for_cuda() -> bool:
     """Whether JAX's CUDA compiler is installed: without it, nobody asks for kernels, and they
     needn't be traced.
     """
-    names = ("xla_cuda13", "xla_cuda12")
-    return importlib.util.find_spec("jax_plugins") is not None and any(
-        importlib.util.find_spec(f"jax_plugins.{name}") is not None for name in names
-    )
+    if importlib.util.find_spec("jax_plugins") is None:
+        return False
+    plugins = ("jax_plugins.xla_cuda13", "jax_plugins.xla_cuda12")
+    return any(importlib.util.find_spec(plugin) is not None for plugin in plugins)
 
 
 def on_platform(reference: Callable, kernel: Callable, *static) -> Callable:
@@ -46,14 +48,13 @@ def on_platform(reference: Callable, kernel: Callable, *static) -> Callable:
     come first.
     """
 
+    reference = functools.partial(reference, *static)
+    kernel = functools.partial(kernel, *static)
+
     def run(*arrays):
         if not can_compile_for_cuda():
-            return reference(*static, *arrays)
-        return jax.lax.platform_dependent(
-            *arrays,
-            default=functools.partial(reference, *static),
-            cuda=functools.partial(kernel, *static),
-        )
+            return reference(*arrays)
+        return jax.lax.platform_dependent(*arrays, default=reference, cuda=kernel)
 
     return run
 

@@ -30,12 +30,8 @@ class Interval:
     unit: str = ""
 
     def __post_init__(self):
-        if not (
-            self._parts
-            and math.isfinite(self.low)
-            and math.isfinite(self.high)
-            and self.low < self.high
-        ):
+        is_interval = self._parts and self.low < self.high
+        if not (is_interval and math.isfinite(self.low) and math.isfinite(self.high)):
             raise ValueError(f"{self.notation!r} is no bounded interval")
 
     @functools.cached_property
@@ -54,7 +50,8 @@ class Interval:
 
     def __contains__(self, value: float) -> bool:
         above = value > self.low if self._parts[1] == "(" else value >= self.low
-        return bool(above and (value < self.high if self._parts[4] == ")" else value <= self.high))
+        below = value < self.high if self._parts[4] == ")" else value <= self.high
+        return bool(above and below)
 
     def __str__(self) -> str:
         return f"{self.notation} {self.unit}".rstrip()
@@ -79,23 +76,22 @@ class Ranged:
 @functools.cache
 def ranged_fields(settings: type) -> tuple[Ranged, ...]:
     """The fields of a dataclass that declare an interval."""
-    found = []
+    fields = []
     for name, hint in typing.get_type_hints(settings, include_extras=True).items():
-        interval = next(
-            (entry for entry in getattr(hint, "__metadata__", ()) if isinstance(entry, Interval)),
-            None,
-        )
-        if interval is None:
+        notes = getattr(hint, "__metadata__", ())
+        intervals = [note for note in notes if isinstance(note, Interval)]
+        if not intervals:
             continue
+        # peeled off one after the other: Annotated[...], ... | None, tuple[..., ...]
         kind = typing.get_args(hint)[0]
         optional = isinstance(kind, types.UnionType)
         if optional:
             kind = next(entry for entry in typing.get_args(kind) if entry is not type(None))
         several = typing.get_origin(kind) is tuple
-        found.append(
-            Ranged(name, typing.get_args(kind)[0] if several else kind, interval, several, optional)
-        )
-    return tuple(found)
+        if several:
+            kind = typing.get_args(kind)[0]
+        fields.append(Ranged(name, kind, intervals[0], several, optional))
+    return tuple(fields)
 
 
 def check_intervals(settings: Any, group: str = "") -> None:
@@ -109,18 +105,18 @@ def check_intervals(settings: Any, group: str = "") -> None:
       UserError: one doesn't, with its name and interval.
     """
     for field in ranged_fields(type(settings)):
-        given = getattr(settings, field.name)
-        if given is None and field.optional:
+        setting = getattr(settings, field.name)
+        if setting is None and field.optional:
             continue
-        if field.several and not isinstance(given, tuple | list):
-            raise UserError(f"{group}{field.name} is {shown(given)}; it must be a list of numbers")
+        if field.several and not isinstance(setting, tuple | list):
+            raise UserError(
+                f"{group}{field.name} is {shown(setting)}; it must be a list of numbers"
+            )
         kind = numbers.Integral if field.kind is int else numbers.Real
-        for value in given if field.several else (given,):
-            if (
-                isinstance(value, bool)
-                or not isinstance(value, kind)
-                or value not in field.interval
-            ):
+        for value in setting if field.several else (setting,):
+            # to Python, True is a whole number
+            is_number = isinstance(value, kind) and not isinstance(value, bool)
+            if not is_number or value not in field.interval:
                 whole = "a whole number in" if field.kind is int else "in"
                 raise UserError(
                     f"{group}{field.name} is {shown(value)}; it must be {whole} {field.interval}"
@@ -141,11 +137,10 @@ def changed(settings: Any, **changes) -> Any:
         if name not in names:
             of = type(settings).__name__
             raise UserError(f"{name}: {of} has no such setting; {suggestion(name, names)}")
-    given = {
-        name: changed(getattr(settings, name), **value) if isinstance(value, dict) else value
-        for name, value in changes.items()
-    }
-    return dataclasses.replace(settings, **given)
+    for name, value in changes.items():
+        if isinstance(value, dict):
+            changes[name] = changed(getattr(settings, name), **value)
+    return dataclasses.replace(settings, **changes)
 
 
 def shown(value: Any) -> str:

@@ -40,12 +40,11 @@ def check_devices(settings: TrainSettings, number: int) -> None:
     """
     if not can_share_out(settings, number):
         unit = number * _group(settings)
-        possible = -(-settings.num_envs // unit) * unit
+        possible = -(-settings.num_envs // unit) * unit  # rounded up
         fewer = [n for n in range(1, number) if can_share_out(settings, n)]
         raise UserError(
             f"num_envs {settings.num_envs} can't be shared out to {number} devices; {possible} "
-            "could, "
-            f"or --devices {' or '.join(map(str, fewer))}"
+            f"could, or --devices {' or '.join(map(str, fewer))}"
         )
 
 
@@ -67,12 +66,13 @@ def check_memory(settings: TrainSettings, number: int) -> None:
     per_world = tasks + history + settings.rollout_length * game.num_pursuers * observed
     shared_out = settings.num_envs * per_world / number
     validation = 2 * settings.validation_episodes * (tasks + history)
+    # four bytes a number; the archive and the validation are the same on each device
     needed = 4 * (shared_out + settings.generator.capacity * tasks + validation)
     if needed > (memory := _memory()):
         raise UserError(
             f"{settings.num_envs} worlds of {settings.rollout_length} steps need at least "
-            f"{needed / 2**30:.0f} GiB on each "
-            f"of {number} devices, which has {memory / 2**30:.0f}; fewer --num_envs need less"
+            f"{needed / 2**30:.0f} GiB on each of {number} devices, which has "
+            f"{memory / 2**30:.0f}; fewer --num_envs need less"
         )
 
 
@@ -87,9 +87,9 @@ def _memory():
 def carry_shardings(number: int) -> TrainCarry | jax.sharding.Sharding:
     """Where the leaves of a carry lie, as a prefix of its tree."""
     same = everywhere(number)
-    return (
-        same if number == 1 else _carry_of(NamedSharding(_mesh(number), PartitionSpec(AXIS)), same)
-    )
+    if number == 1:
+        return same
+    return _carry_of(NamedSharding(_mesh(number), PartitionSpec(AXIS)), same)
 
 
 def everywhere(number: int) -> jax.sharding.Sharding:
@@ -141,14 +141,13 @@ def compiler_options(number: int, brief: bool = False) -> dict:
     doesn't, a training step takes three times as long. A brief program takes those of cuBLAS as
     they are.
     """
-    if jax.default_backend() == "gpu":
-        return {"xla_gpu_autotune_level": 0, "xla_gpu_enable_triton_gemm": False} if brief else {}
-    # where devices are cores, threads would get in their way
-    return (
-        {"xla_cpu_multi_thread_eigen": False}
-        if number > 1 and jax.default_backend() == "cpu"
-        else {}
-    )
+    backend = jax.default_backend()
+    if backend == "gpu" and brief:
+        return {"xla_gpu_autotune_level": 0, "xla_gpu_enable_triton_gemm": False}
+    if backend == "cpu" and number > 1:
+        # devices are cores here, and threads would get in their way
+        return {"xla_cpu_multi_thread_eigen": False}
+    return {}
 
 
 def _shared_out(number, function, takes, gives):

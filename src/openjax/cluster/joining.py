@@ -12,7 +12,7 @@ import threading
 import time
 from collections.abc import Iterator
 
-from openjax.cluster.processes import Processes, encoded
+from openjax.cluster.processes import Connection, Processes, encoded
 from openjax.errors import UserError
 
 JOIN = 300.0
@@ -49,19 +49,21 @@ def find_membership(
     Raises:
       UserError: the three make no sense, or one is missing and nothing else tells it.
     """
-    given = (coordinator_address, num_processes, process_id)
-    by_hand = any(value is not None for value in given)
+    place = (coordinator_address, num_processes, process_id)
+    by_hand = any(value is not None for value in place)
     if not by_hand and not all_devices:
         return None
-    detection, given = _detected(given) if None in given else (_BY_HAND, given)
-    if None in given:
+    detection = _BY_HAND
+    if None in place:
+        detection, place = _detected(place)
+    if None in place:
         if not by_hand:
             return None
         raise UserError(
             "--coordinator_address, --num_processes and --process_id go together, "
             "unless Slurm or Open MPI tells what is missing"
         )
-    address, number, index = given
+    address, number, index = place
     host, _, port = address.rpartition(":")
     if not (host and port.isdecimal() and len(port) <= 5 and 0 < int(port) < 65535):
         raise UserError(
@@ -77,9 +79,9 @@ def find_membership(
     return Membership(address, number, index, detection) if number > 1 else None
 
 
-def _detected(given):
-    """What is missing of address, number and id, as `jax.distributed.initialize` itself would find
-    it.
+def _detected(place):
+    """Who tells what is missing of address, number and id, and all three, as
+    `jax.distributed.initialize` itself would find them.
 
     Only its private part tells; the public one joins at once, and the processes' own connections
     come before that.
@@ -89,9 +91,12 @@ def _detected(given):
     for name in _MANAGERS:
         kind = next((kind for kind in ClusterEnv._cluster_types if kind.name == name), None)
         if kind is not None and kind.is_env_present():
-            found = ClusterEnv.auto_detect_unset_distributed_params(*given, None, name, int(JOIN))
-            return name, found[:3]
-    return _BY_HAND, given
+            address, number, index = place
+            parameters = ClusterEnv.auto_detect_unset_distributed_params(
+                address, number, index, None, name, int(JOIN)
+            )
+            return name, parameters[:3]
+    return _BY_HAND, place
 
 
 @contextlib.contextmanager
@@ -153,8 +158,8 @@ def _one_line(error):
 
 @contextlib.contextmanager
 def _connected(membership):
-    """Connections, their readers and hosts by process (to all others on process 0, to process 0
-    elsewhere), and where JAX is to look for its coordinator: at the port after process 0's own.
+    """Connections by process (to all others on process 0, to process 0 elsewhere), and where JAX is
+    to look for its coordinator: at the port after process 0's own.
     """
     host, _, port = membership.coordinator_address.rpartition(":")
     host = host.strip("[]")
@@ -217,7 +222,7 @@ def _pump(source, sink):
 
 
 def _call(host, port, membership):
-    """Connection to process 0, its reader and host; waits until all processes have come."""
+    """The connection to process 0; waits until all processes have come."""
     deadline = time.monotonic() + JOIN
     place = {"process": membership.process_id, "of": membership.num_processes}
     while True:
@@ -228,7 +233,7 @@ def _call(host, port, membership):
             connection.settimeout(max(deadline - time.monotonic(), 1.0))
             reader = connection.makefile("rb")
             if welcome := reader.readline(LINE):
-                return connection, reader, json.loads(welcome)["host"]
+                return Connection(connection, reader, json.loads(welcome)["host"])
         except OSError as error:
             reason = str(error.strerror or error)
         if time.monotonic() > deadline:
@@ -239,15 +244,15 @@ def _call(host, port, membership):
 
 
 def _accept(server, number):
-    """Connections to all others, their readers and hosts, by process."""
-    found: dict[int, tuple] = {}
+    """Connections to all others, by process."""
+    others: dict[int, Connection] = {}
     deadline = time.monotonic() + JOIN
-    while len(found) < number - 1:
+    while len(others) < number - 1:
         server.settimeout(max(deadline - time.monotonic(), 0.01))
         try:
             connection, _ = server.accept()
         except TimeoutError:
-            missing = ", ".join(str(i) for i in range(1, number) if i not in found)
+            missing = ", ".join(str(i) for i in range(1, number) if i not in others)
             raise UserError(
                 f"process {missing} of {number} didn't come within {JOIN:.0f} s"
             ) from None
@@ -256,10 +261,11 @@ def _accept(server, number):
         with contextlib.suppress(OSError, ValueError, KeyError, TypeError):  # a stranger
             greeting = json.loads(reader.readline(LINE))
             other = greeting["process"]
-            if greeting["of"] == number and 1 <= other < number and other not in found:
-                found[other] = connection, reader, str(greeting["host"])
+            if greeting["of"] == number and 1 <= other < number and other not in others:
+                others[other] = Connection(connection, reader, str(greeting["host"]))
                 continue
         connection.close()
-    for connection, _, _ in found.values():
-        connection.sendall(encoded({"host": socket.gethostname()}))
-    return found
+    # only now: the welcome tells each that all have come
+    for other in others.values():
+        other.socket.sendall(encoded({"host": socket.gethostname()}))
+    return others

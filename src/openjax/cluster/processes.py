@@ -14,7 +14,7 @@ import queue
 import socket
 import sys
 import threading
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 BEAT = 2.0
 """Seconds between two signs of life."""
@@ -22,6 +22,16 @@ SILENCE = 30.0
 """Seconds without one after which a process counts as lost."""
 GRACE = 5.0
 """Seconds that a process has to end by itself when another one failed."""
+
+
+class Connection(NamedTuple):
+    """An open connection to another process."""
+
+    socket: socket.socket
+    reader: BinaryIO
+    """What comes from there."""
+    host: str
+    """Where that process runs."""
 
 
 class Processes:
@@ -32,15 +42,16 @@ class Processes:
       advice: says what to do now, when another process is lost.
     """
 
-    def __init__(self, number: int = 1, index: int = 0, connections: dict | None = None):
-        """`connections`: (socket, its reader, host) by process: to all others on process 0, to
-        process 0 elsewhere.
-        """
+    def __init__(
+        self, number: int = 1, index: int = 0, connections: dict[int, Connection] | None = None
+    ):
+        """`connections` by process: to all others on process 0, to process 0 elsewhere."""
         self.number = number
         self.index = index
         self.advice = "start it again"
         self._links = {
-            other: _Link(self, other, *link) for other, link in (connections or {}).items()
+            other: _Link(self, other, connection)
+            for other, connection in (connections or {}).items()
         }
         self._asked = {other: queue.Queue() for other in self._links}
         self._answers: queue.Queue = queue.Queue()
@@ -77,6 +88,7 @@ class Processes:
 
     def fail(self, status: int, text: str) -> None:
         """Tell the others that this process ends with an exit status, and why; they end too."""
+        # from here on no other process' end changes this one's
         self._ending.acquire(blocking=False)
         # what all did wrong, each reports by itself in the meantime
         self._send_all(
@@ -121,18 +133,17 @@ class Processes:
 class _Link:
     """A connection to another process: lines of JSON, and signs of life in both directions."""
 
-    def __init__(
-        self, job: Processes, other: int, connection: socket.socket, reader: BinaryIO, host: str
-    ):
+    def __init__(self, job: Processes, other: int, connection: Connection):
         self._job = job
         self._other = other
-        self._host = host
-        self._socket = connection
-        self._reader = reader
+        self._host = connection.host
+        self._socket = connection.socket
+        self._reader = connection.reader
         self._sending = threading.Lock()
         self._closed = threading.Event()
-        connection.settimeout(SILENCE)
-        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._socket.settimeout(SILENCE)
+        # a message is a line: to wait for more to send with it would only delay it
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def start(self) -> None:
         for target in (self._read, self._beat):
@@ -149,6 +160,7 @@ class _Link:
         self._closed.wait(seconds)
 
     def _read(self):
+        # a thread that reads as long as the connection lives; how it ends says why
         why = "its connection closed"
         leaves = False
         try:
@@ -165,11 +177,9 @@ class _Link:
         self._closed.set()
         if not leaves:
             job = self._job
-            who = f"process {self._other} of {self._job.number} (on {self._host})"
-            job.end(
-                self._other,
-                {"error": f"{who} was lost: {why}; {job.advice}", "status": 1, "after": 0.0},
-            )
+            who = f"process {self._other} of {job.number} (on {self._host})"
+            error = f"{who} was lost: {why}; {job.advice}"
+            job.end(self._other, {"error": error, "status": 1, "after": 0.0})
 
     def _beat(self):
         while not self._closed.wait(BEAT):
@@ -178,6 +188,7 @@ class _Link:
 
 def _exit(status, error):
     show_cursor = "\x1b[?25h\n" if sys.stdout.isatty() else ""  # a live display hides it
+    # past Python's own end, which would wait for the main thread
     os.write(2, f"{show_cursor}error: {error}\n".encode())
     os._exit(status)
 

@@ -31,41 +31,38 @@ class Compiled:
             command = [compiler, *FLAGS, "-o", str(library), str(folder / f"{name}.c"), "-lm"]
             ran = subprocess.run(command, capture_output=True, text=True, check=False)
             if ran.returncode != 0:
-                complaint = next(
-                    (line for line in ran.stderr.splitlines() if "error" in line), "no word"
-                )
+                errors = [line for line in ran.stderr.splitlines() if "error" in line]
+                complaint = errors[0] if errors else "no word"
                 raise UserError(f"{compiler} refuses the exported program: {complaint}")
             self._function = getattr(ctypes.CDLL(str(library)), name)
         self._function.restype = None
         self._inputs = tuple(program.inputs)
-        fields = [
-            (
-                name,
-                (ctypes.c_ubyte if kind.dtype == bool else ctypes.c_float) * math.prod(kind.shape),
-            )
-            for name, kind in program.inputs.items()
-        ]
+        fields = []
+        for field, kind in program.inputs.items():
+            number = ctypes.c_ubyte if kind.dtype == bool else ctypes.c_float
+            fields.append((field, number * math.prod(kind.shape)))
         observation = type("Observation", (ctypes.Structure,), {"_fields_": fields})()
         self._observation = {
             name: np.ctypeslib.as_array(getattr(observation, name)) for name in self._inputs
         }
-        self._workspace = np.full(program.workspace, np.nan, np.float32)  # nobody clears it
+        # nobody clears it on a vehicle either: what is read before it was written shows as NaN
+        self._workspace = np.full(program.workspace, np.nan, np.float32)
         self._output = np.zeros(program.shape, np.float32)
-        arrays = (self._workspace, self._output)
         self._pointers = [
             ctypes.byref(observation),
-            *(ctypes.c_void_p(a.ctypes.data) for a in arrays),
+            ctypes.c_void_p(self._workspace.ctypes.data),
+            ctypes.c_void_p(self._output.ctypes.data),
         ]
 
-    def __call__(self, seen: dict) -> np.ndarray:
+    def __call__(self, samples: dict) -> np.ndarray:
         """Outputs (number, ...) for {input: array (number, ...)}."""
-        found = []
-        for i in range(len(seen[self._inputs[0]])):
+        outputs = []
+        for i in range(len(samples[self._inputs[0]])):
             for name in self._inputs:
-                self._observation[name][:] = seen[name][i].reshape(-1)
+                self._observation[name][:] = samples[name][i].reshape(-1)
             self._function(*self._pointers)
-            found.append(self._output.copy())
-        return np.stack(found)
+            outputs.append(self._output.copy())
+        return np.stack(outputs)
 
     def seconds(self, repeats: int = 500) -> float:
         """Of one call; the best of five batches."""

@@ -49,19 +49,22 @@ def _placed(buffers: list[Buffer]) -> int:
     """Give all buffers their offsets, so that two that live at once don't overlap; the floats
     needed.
     """
+    # the largest first, each into the first gap between those that live while it does
     placed: list[Buffer] = []
-    for buffer in sorted(buffers, key=lambda b: -b.size):
-        others = sorted(
-            (b for b in placed if b.written <= buffer.read and buffer.written <= b.read),
-            key=lambda b: b.offset,
-        )
+    for buffer in sorted(buffers, key=lambda buffer: -buffer.size):
+        alive = [
+            other
+            for other in placed
+            if other.written <= buffer.read and buffer.written <= other.read
+        ]
+        others = sorted(alive, key=lambda other: other.offset)
         buffer.offset = 0
         for other in others:
             if buffer.offset + buffer.size <= other.offset:
                 break
             buffer.offset = max(buffer.offset, other.offset + other.size)
         placed.append(buffer)
-    return max((b.offset + b.size for b in buffers), default=1)
+    return max((buffer.offset + buffer.size for buffer in buffers), default=1)
 
 
 def c_program(
@@ -91,8 +94,16 @@ def c_program(
         for name, kind in inputs.items()
         if f"in->{name}[" in text or f"in->{name}," in text
     }
-    values = {"about": about, "prefix": prefix, "inputs": read, "output": output, "shape": shape}
-    values |= {"workspace": workspace, "writer": writer, "statements": text}
+    values = {
+        "about": about,
+        "prefix": prefix,
+        "inputs": read,
+        "output": output,
+        "shape": shape,
+        "workspace": workspace,
+        "writer": writer,
+        "statements": text,
+    }
     return CProgram(
         header=_TEMPLATES.get_template("program.h.jinja").render(values),
         source=_TEMPLATES.get_template("program.c.jinja").render(values),
@@ -111,8 +122,8 @@ def _written(function, inputs, output):
     """
     traced = trace(function, inputs)
     writer = Writer()
-    given = [dense_array(f"in->{name}", kind.shape) for name, kind in inputs.items()]
-    (result,) = writer.run(traced.jaxpr, traced.consts, given)
+    arrays = [dense_array(f"in->{name}", kind.shape) for name, kind in inputs.items()]
+    (result,) = writer.run(traced.jaxpr, traced.consts, arrays)
     shape = tuple(traced.out_avals[0].shape)
-    writer.write(dense_array(output, shape), "{}", writer.array(result))
+    writer.write(dense_array(output, shape), "{}", [writer.array(result)])
     return writer, _placed(writer.buffers), shape

@@ -73,11 +73,10 @@ class Array:
     ) -> "Array":
         """Entries from `starts` on, every `steps`-th of each axis."""
         steps = steps or [1] * len(shape)
-        offset = self.offset + sum(
-            start * own for start, own in zip(starts, self.strides, strict=True)
-        )
-        strides = tuple(step * own for step, own in zip(steps, self.strides, strict=True))
-        return replace(self, shape=tuple(shape), strides=strides, offset=int(offset))
+        skipped = sum(start * stride for start, stride in zip(starts, self.strides, strict=True))
+        strides = tuple(step * stride for step, stride in zip(steps, self.strides, strict=True))
+        offset = int(self.offset + skipped)
+        return replace(self, shape=tuple(shape), strides=strides, offset=offset)
 
 
 def row_by_row(shape: Sequence[int]) -> tuple[int, ...]:
@@ -119,6 +118,7 @@ class Writer(Walk):
             one = value.take([0], axis)
             if value.shape[axis] > 1 and np.array_equal(np.broadcast_to(one, value.shape), value):
                 value = one
+                # outer axes are that much closer together now
                 strides = [s // shape[axis] if a < axis else s for a, s in enumerate(strides)]
                 strides[axis] = 0
         if value.size == 1:
@@ -132,28 +132,29 @@ class Writer(Walk):
 
     def new(self, shape: Sequence[int]) -> Array:
         """An array in the workspace."""
-        now = len(self.statements)
-        self.buffers.append(Buffer(math.prod(shape), now, now))
+        statement = len(self.statements)
+        self.buffers.append(Buffer(math.prod(shape), statement, statement))
         return dense_array(f"t{len(self.buffers) - 1}", shape, self.buffers[-1])
 
-    def emit(self, text: str, *arrays: Array) -> None:
+    def emit(self, text: str, arrays: Sequence[Array]) -> None:
         """Append a statement that reads or writes these."""
         for array in arrays:
             if array.buffer is not None:
                 array.buffer.read = len(self.statements)
         self.statements.append(text)
 
-    def write(self, out: Array, form: str, *values: Array) -> Array:
+    def write(self, out: Array, form: str, values: Sequence[Array]) -> Array:
         """Write every entry of an array, which is the form of those of `values`."""
-        if all(
-            value.number or (value.dense and value.shape == out.shape) for value in (out, *values)
-        ):
-            whole = (math.prod(out.shape),)  # one loop
-            out, *values = (replace(value, shape=whole, strides=(1,)) for value in (out, *values))
-        indices = index_names(out.shape)
-        body = f"{out.at(indices)} = {form.format(*(value.at(indices) for value in values))};"
-        self.emit(loops(out.shape, indices, body), out, *values)
-        return out
+        arrays = [out, *values]
+        if all(array.number or (array.dense and array.shape == out.shape) for array in arrays):
+            # entry by entry in the order of memory: one loop does for all axes
+            whole = (math.prod(out.shape),)
+            arrays = [replace(array, shape=whole, strides=(1,)) for array in arrays]
+        indices = index_names(arrays[0].shape)
+        target, *operands = (array.at(indices) for array in arrays)
+        body = f"{target} = {form.format(*operands)};"
+        self.emit(loops(arrays[0].shape, indices, body), arrays)
+        return arrays[0]
 
     def stored(self, value: Array) -> Array:
         """The same as a dense array."""
@@ -161,16 +162,16 @@ class Writer(Walk):
 
     def _made(self, form, values, shape):
         out = self.new(shape)
-        self.write(out, form, *map(self.array, values))
+        self.write(out, form, [self.array(value) for value in values])
         return out
 
     # -- operations
 
     def _op_stop_gradient(self, operation):
-        before, after = (
-            v.aval.dtype.kind for v in (operation.equation.invars[0], operation.equation.outvars[0])
-        )
-        if after == "b" != before:
+        source = operation.equation.invars[0].aval.dtype.kind
+        target = operation.equation.outvars[0].aval.dtype.kind
+        # all of C's values are floats: flags are 0 and 1, and other numbers would stay as they are
+        if target == "b" and source != "b":
             raise UserError(
                 "the policy turns numbers into flags, which the C export doesn't know yet"
             )
@@ -188,9 +189,8 @@ class Writer(Walk):
         return self._made(form, [value], operation.shape)
 
     def _transpose(self, value, order):
-        shape, strides = zip(
-            *((value.shape[axis], value.strides[axis]) for axis in order), strict=True
-        )
+        shape = tuple(value.shape[axis] for axis in order)
+        strides = tuple(value.strides[axis] for axis in order)
         return replace(value, shape=shape, strides=strides)
 
     def _op_slice(self, operation):
@@ -201,23 +201,19 @@ class Writer(Walk):
     def _op_broadcast_in_dim(self, operation):
         value = operation.inputs[0]
         strides = [0] * len(operation.shape)
-        for axis, size, own in zip(
-            operation.parameters["broadcast_dimensions"], value.shape, value.strides, strict=True
-        ):
-            strides[axis] = own if size > 1 else 0
+        axes = operation.parameters["broadcast_dimensions"]
+        for axis, size, stride in zip(axes, value.shape, value.strides, strict=True):
+            strides[axis] = stride if size > 1 else 0
         return replace(value, shape=operation.shape, strides=tuple(strides))
 
     def _reshape(self, value, shape):
         value = self.array(value)
-        if [n for n in value.shape if n > 1] == [
-            n for n in shape if n > 1
-        ]:  # only axes of length one
-            left = iter(
-                own for own, size in zip(value.strides, value.shape, strict=True) if size > 1
-            )
-            return replace(
-                value, shape=shape, strides=tuple(next(left) if size > 1 else 0 for size in shape)
-            )
+        if [size for size in value.shape if size > 1] == [size for size in shape if size > 1]:
+            # only axes of length one come or go: the others keep their strides
+            sized = zip(value.strides, value.shape, strict=True)
+            strides = iter([stride for stride, size in sized if size > 1])
+            new_strides = tuple(next(strides) if size > 1 else 0 for size in shape)
+            return replace(value, shape=shape, strides=new_strides)
         return replace(self.stored(value), shape=shape, strides=row_by_row(shape))
 
     def _op_split(self, operation):
@@ -226,7 +222,8 @@ class Writer(Walk):
         start = 0
         parts = []
         for size in operation.parameters["sizes"]:
-            parts.append(value.part(*_within(value.shape, axis, start, size)))
+            starts, shape = _within(value.shape, axis, start, size)
+            parts.append(value.part(starts, shape))
             start += size
         return parts
 
@@ -234,15 +231,18 @@ class Writer(Walk):
         joined = self.new(shape)
         start = 0
         for value in map(self.array, values):
-            self.write(joined.part(*_within(shape, axis, start, value.shape[axis])), "{}", value)
-            start += value.shape[axis]
+            size = value.shape[axis]
+            starts, part_shape = _within(shape, axis, start, size)
+            self.write(joined.part(starts, part_shape), "{}", [value])
+            start += size
         return joined
 
     def _op_pad(self, operation):
         value, filling = map(self.array, operation.inputs)
         padded = self.new(operation.shape)
-        self.write(padded, "{}", filling)
-        self.write(padded.part(outer_padding(operation)[0], value.shape), "{}", value)
+        self.write(padded, "{}", [filling])
+        low, _ = outer_padding(operation)
+        self.write(padded.part(low, value.shape), "{}", [value])
         return padded
 
     def _op_reduce_sum(self, operation):
@@ -254,31 +254,29 @@ class Writer(Walk):
         every = index_names(value.shape)
         outer = [index for axis, index in enumerate(every) if axis not in axes]
         inner = [index for axis, index in enumerate(every) if axis in axes]
-        added = f"sum = {form.format('sum', value.at(every))};"
-        body = (
-            f"float sum = {start};\n{loops([value.shape[axis] for axis in axes], inner, added)}\n"
-            f"{reduced.at(outer)} = sum;"
-        )
-        self.emit(loops(shape, outer, body), reduced, value)
+        add = f"sum = {form.format('sum', value.at(every))};"
+        adding = loops([value.shape[axis] for axis in axes], inner, add)
+        body = f"float sum = {start};\n{adding}\n{reduced.at(outer)} = sum;"
+        self.emit(loops(shape, outer, body), [reduced, value])
         return reduced
 
     _op_reduce_max = _op_reduce_min = _op_reduce_sum
 
-    def _product(self, left, right, shape):
-        left = self.stored(self.array(left))
-        right = self.stored(self.array(right))
-        rows, inner, columns = *left.shape[-2:], shape[-1]
+    def _product(self, first, second, shape):
+        first = self.stored(self.array(first))
+        second = self.stored(self.array(second))
+        rows, inner = first.shape[-2:]
+        columns = shape[-1]
         out = self.new(shape)
         batches = math.prod(shape[:-2])
+        arrays = (first, second, out)
+        sizes = (rows * inner, inner * columns, rows * columns)
         for k in range(batches):
-            sizes = (rows * inner, inner * columns, rows * columns)
             places = [
-                replace(v, offset=v.offset + k * n).start
-                for v, n in zip((left, right, out), sizes, strict=True)
+                replace(array, offset=array.offset + k * size).start
+                for array, size in zip(arrays, sizes, strict=True)
             ]
-            self.emit(
-                f"product({', '.join(places)}, {rows}, {inner}, {columns});", left, right, out
-            )
+            self.emit(f"product({', '.join(places)}, {rows}, {inner}, {columns});", arrays)
         self.multiply_adds += batches * rows * inner * columns
         return out
 

@@ -5,18 +5,42 @@ import math
 import numpy as np
 
 FUNCTIONS = {
-    "tanh": "tanhf({})", "exp": "expf({})", "log": "logf({})", "sqrt": "sqrtf({})", "rsqrt": "(1.0f / sqrtf({}))",
-    "logistic": "(1.0f / (1.0f + expf(-{})))", "sin": "sinf({})", "cos": "cosf({})", "erf": "erff({})",
-}  # fmt: skip
+    "tanh": "tanhf({})",
+    "exp": "expf({})",
+    "log": "logf({})",
+    "sqrt": "sqrtf({})",
+    "rsqrt": "(1.0f / sqrtf({}))",
+    "logistic": "(1.0f / (1.0f + expf(-{})))",
+    "sin": "sinf({})",
+    "cos": "cosf({})",
+    "erf": "erff({})",
+}
 """Operations that take a processor a function of the library."""
 ELEMENTWISE = {
-    "add": "({} + {})", "sub": "({} - {})", "mul": "({} * {})", "div": "({} / {})", "add_any": "({} + {})",
-    "max": "fmaxf({}, {})", "min": "fminf({}, {})", "pow": "powf({}, {})", "neg": "(-{})", "abs": "fabsf({})",
-    "lt": "(float)({} < {})", "le": "(float)({} <= {})", "gt": "(float)({} > {})", "ge": "(float)({} >= {})",
-    "eq": "(float)({} == {})", "ne": "(float)({} != {})", "and": "(float)({} != 0.0f && {} != 0.0f)",
-    "or": "(float)({} != 0.0f || {} != 0.0f)", "not": "(float)({} == 0.0f)", "floor": "floorf({})",
-    "select_n": "({0} != 0.0f ? {2} : {1})", "clamp": "fminf(fmaxf({1}, {0}), {2})", **FUNCTIONS,
-}  # fmt: skip
+    "add": "({} + {})",
+    "sub": "({} - {})",
+    "mul": "({} * {})",
+    "div": "({} / {})",
+    "add_any": "({} + {})",
+    "max": "fmaxf({}, {})",
+    "min": "fminf({}, {})",
+    "pow": "powf({}, {})",
+    "neg": "(-{})",
+    "abs": "fabsf({})",
+    "lt": "(float)({} < {})",
+    "le": "(float)({} <= {})",
+    "gt": "(float)({} > {})",
+    "ge": "(float)({} >= {})",
+    "eq": "(float)({} == {})",
+    "ne": "(float)({} != {})",
+    "and": "(float)({} != 0.0f && {} != 0.0f)",
+    "or": "(float)({} != 0.0f || {} != 0.0f)",
+    "not": "(float)({} == 0.0f)",
+    "floor": "floorf({})",
+    "select_n": "({0} != 0.0f ? {2} : {1})",
+    "clamp": "fminf(fmaxf({1}, {0}), {2})",
+    **FUNCTIONS,
+}
 
 
 def index_names(shape) -> list[str]:

@@ -6,7 +6,7 @@ the operations below.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import jax
 import numpy as np
@@ -16,12 +16,39 @@ from openjax.export.traced import Walk, outer_padding, trace
 
 OPSET = 18
 _ELEMENTWISE = {
-    "add": "Add", "sub": "Sub", "mul": "Mul", "div": "Div", "max": "Max", "min": "Min", "tanh": "Tanh", "exp": "Exp",
-    "log": "Log", "logistic": "Sigmoid", "neg": "Neg", "abs": "Abs", "sqrt": "Sqrt", "sin": "Sin", "cos": "Cos",
-    "erf": "Erf", "floor": "Floor", "sign": "Sign", "pow": "Pow", "lt": "Less", "le": "LessOrEqual", "gt": "Greater",
-    "ge": "GreaterOrEqual", "eq": "Equal", "and": "And", "or": "Or", "not": "Not", "stop_gradient": "Identity",
-    "copy": "Identity", "copy_p": "Identity", "optimization_barrier": "Identity",
-}  # fmt: skip
+    "add": "Add",
+    "sub": "Sub",
+    "mul": "Mul",
+    "div": "Div",
+    "max": "Max",
+    "min": "Min",
+    "tanh": "Tanh",
+    "exp": "Exp",
+    "log": "Log",
+    "logistic": "Sigmoid",
+    "neg": "Neg",
+    "abs": "Abs",
+    "sqrt": "Sqrt",
+    "sin": "Sin",
+    "cos": "Cos",
+    "erf": "Erf",
+    "floor": "Floor",
+    "sign": "Sign",
+    "pow": "Pow",
+    "lt": "Less",
+    "le": "LessOrEqual",
+    "gt": "Greater",
+    "ge": "GreaterOrEqual",
+    "eq": "Equal",
+    "and": "And",
+    "or": "Or",
+    "not": "Not",
+    "stop_gradient": "Identity",
+    "copy": "Identity",
+    "copy_p": "Identity",
+    "optimization_barrier": "Identity",
+}
+_REDUCE = {"reduce_sum": "ReduceSum", "reduce_max": "ReduceMax", "reduce_min": "ReduceMin"}
 
 
 class _Graph(Walk):
@@ -50,7 +77,7 @@ class _Graph(Walk):
         self.initializers.append(self.numpy_helper.from_array(np.ascontiguousarray(value), name))
         return name
 
-    def add(self, kind: str, *inputs, outputs: int = 1, **attributes):
+    def add(self, kind: str, inputs: Sequence, outputs: int = 1, **attributes):
         """The output of a new node, or all of them."""
         self._count += 1
         names = [f"t{self._count}_{i}" for i in range(outputs)]
@@ -59,80 +86,77 @@ class _Graph(Walk):
         return names[0] if outputs == 1 else names
 
     def _reshape(self, value, shape):
-        return self.add("Reshape", value, _whole(shape))
+        return self.add("Reshape", [value, _whole(shape)])
 
     def _transpose(self, value, order):
-        return self.add("Transpose", value, perm=list(order))
+        return self.add("Transpose", [value], perm=list(order))
 
-    def _product(self, left, right, shape):
-        return self.add("MatMul", left, right)
+    def _product(self, first, second, shape):
+        return self.add("MatMul", [first, second])
 
     def _join(self, values, shape, axis):
-        return self.add("Concat", *values, axis=axis)
+        return self.add("Concat", values, axis=axis)
 
     def _power(self, value, exponent, operation):
         if exponent == 2:
-            return self.add("Mul", value, value)
-        return self.add("Pow", value, np.array(exponent, operation.equation.invars[0].aval.dtype))
+            return self.add("Mul", [value, value])
+        dtype = operation.equation.invars[0].aval.dtype
+        return self.add("Pow", [value, np.array(exponent, dtype)])
 
     def _op_elementwise(self, operation):
-        return self.add(_ELEMENTWISE[operation.name], *operation.inputs)
+        return self.add(_ELEMENTWISE[operation.name], operation.inputs)
 
     def _op_ne(self, operation):
-        return self.add("Not", self.add("Equal", *operation.inputs))
+        return self.add("Not", [self.add("Equal", operation.inputs)])
 
     def _op_rsqrt(self, operation):
-        return self.add("Reciprocal", self.add("Sqrt", operation.inputs[0]))
+        return self.add("Reciprocal", [self.add("Sqrt", operation.inputs)])
 
     def _op_select_n(self, operation):
-        which, otherwise, chosen = operation.inputs
-        return self.add("Where", which, chosen, otherwise)
+        # JAX names what stands for False first, ONNX what stands for True
+        condition, if_false, if_true = operation.inputs
+        return self.add("Where", [condition, if_true, if_false])
 
     def _op_clamp(self, operation):
         low, value, high = operation.inputs
-        return self.add("Min", self.add("Max", low, value), high)
+        return self.add("Min", [self.add("Max", [low, value]), high])
 
     def _op_convert_element_type(self, operation):
         kind = self.helper.np_dtype_to_tensor_dtype(np.dtype(operation.parameters["new_dtype"]))
-        return self.add("Cast", operation.inputs[0], to=kind)
+        return self.add("Cast", operation.inputs, to=kind)
 
     def _op_broadcast_in_dim(self, operation):
         ones = [1] * len(operation.shape)
-        for axis, size in zip(
-            operation.parameters["broadcast_dimensions"], operation.shapes[0], strict=True
-        ):
+        axes = operation.parameters["broadcast_dimensions"]
+        for axis, size in zip(axes, operation.shapes[0], strict=True):
             ones[axis] = size
         value = self._reshape(operation.inputs[0], ones)
-        return (
-            value
-            if tuple(ones) == operation.shape
-            else self.add("Expand", value, _whole(operation.shape))
-        )
+        if tuple(ones) == operation.shape:
+            return value
+        return self.add("Expand", [value, _whole(operation.shape)])
 
     def _op_split(self, operation):
         sizes = operation.parameters["sizes"]
         axis = operation.parameters["axis"]
-        return self.add("Split", operation.inputs[0], _whole(sizes), outputs=len(sizes), axis=axis)
+        inputs = [operation.inputs[0], _whole(sizes)]
+        return self.add("Split", inputs, outputs=len(sizes), axis=axis)
 
     def _op_slice(self, operation):
-        p = operation.parameters
-        starts = p["start_indices"]
-        axes = range(len(p["start_indices"]))
-        strides = p["strides"] or [1] * len(starts)
-        return self.add(
-            "Slice", operation.inputs[0], *map(_whole, (starts, p["limit_indices"], axes, strides))
-        )
+        starts = operation.parameters["start_indices"]
+        ends = operation.parameters["limit_indices"]
+        axes = range(len(starts))
+        strides = operation.parameters["strides"] or [1] * len(starts)
+        bounds = [_whole(numbers) for numbers in (starts, ends, axes, strides)]
+        return self.add("Slice", [operation.inputs[0], *bounds])
 
     def _op_pad(self, operation):
         value, filling = operation.inputs
         low, high = outer_padding(operation)
-        return self.add("Pad", value, _whole([*low, *high]), filling)
+        return self.add("Pad", [value, _whole([*low, *high]), filling])
 
     def _op_reduce_sum(self, operation):
-        kind = {"reduce_sum": "ReduceSum", "reduce_max": "ReduceMax", "reduce_min": "ReduceMin"}[
-            operation.name
-        ]
-        return self.add(kind, operation.inputs[0], _whole(operation.parameters["axes"]), keepdims=0)
+        axes = _whole(operation.parameters["axes"])
+        return self.add(_REDUCE[operation.name], [operation.inputs[0], axes], keepdims=0)
 
     _op_reduce_max = _op_reduce_min = _op_reduce_sum
 

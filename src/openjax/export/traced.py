@@ -52,7 +52,7 @@ class Walk:
     A value is a NumPy array, or whatever those methods make and `inputs` give. A language says how
     it writes the parts of which the operations below are made: `_reshape(value, shape)`,
     `_transpose(value, order)`, `_join(values, shape, axis)`, `_power(value, exponent, operation)`,
-    and `_product(left, right, shape)` of matrices, or of as many batches of them.
+    and `_product(first, second, shape)` of matrices, or of as many batches of them.
     """
 
     language = ""
@@ -85,6 +85,8 @@ class Walk:
         sums, batches = operation.parameters["dimension_numbers"]
         sizes = []
         factors = []
+        # each factor as matrices: axes of a kind are joined, and what is summed over stands last on
+        # the left side, first on the right
         for side, (value, shape) in enumerate(zip(operation.inputs, operation.shapes, strict=True)):
             batch = batches[side]
             summed = sums[side]
@@ -93,17 +95,22 @@ class Walk:
             matrix = [math.prod(shape[axis] for axis in group) for group in groups]
             matrix = tuple(matrix if batch else matrix[1:])
             order = [axis for group in groups for axis in group]
-            if order != sorted(order):
-                value = (
-                    np.transpose(value, order) if _known(value) else self._transpose(value, order)
-                )
-            if matrix != tuple(shape[axis] for axis in order):
-                value = np.reshape(value, matrix) if _known(value) else self._reshape(value, matrix)
             sizes.append(matrix)
-            factors.append(value)
+            factors.append(self._as_matrices(value, shape, order, matrix))
         shape = (*sizes[0][:-1], sizes[1][-1])
-        found = self._product(*factors, shape)
-        return found if shape == operation.shape else self._reshape(found, operation.shape)
+        first, second = factors
+        product = self._product(first, second, shape)
+        return product if shape == operation.shape else self._reshape(product, operation.shape)
+
+    def _as_matrices(self, value, shape, order, matrix):
+        """A value with its axes in another order and joined to those of `matrix`; what is known is
+        moved here, and not by the program.
+        """
+        if order != sorted(order):
+            value = np.transpose(value, order) if _known(value) else self._transpose(value, order)
+        if matrix != tuple(shape[axis] for axis in order):
+            value = np.reshape(value, matrix) if _known(value) else self._reshape(value, matrix)
+        return value
 
     def run(self, jaxpr, consts, inputs) -> list:
         """The outputs of a jaxpr for input values."""
@@ -114,8 +121,8 @@ class Walk:
             return np.asarray(atom.val) if hasattr(atom, "val") else values[atom]
 
         for equation in jaxpr.eqns:
-            found = self._equation(equation, [read(atom) for atom in equation.invars])
-            values |= dict(zip(equation.outvars, found, strict=True))
+            results = self._equation(equation, [read(atom) for atom in equation.invars])
+            values |= dict(zip(equation.outvars, results, strict=True))
         return [read(atom) for atom in jaxpr.outvars]
 
     def _equation(self, equation, inputs) -> list:
@@ -133,17 +140,17 @@ class Walk:
             consts = getattr(inner, "consts", ())
             return self.run(getattr(inner, "jaxpr", inner), consts, inputs)
         if all(map(_known, inputs)):
-            found = equation.primitive.bind(*inputs, **parameters)
-            found = found if equation.primitive.multiple_results else [found]
-            return [np.asarray(value) for value in found]
+            results = equation.primitive.bind(*inputs, **parameters)
+            results = results if equation.primitive.multiple_results else [results]
+            return [np.asarray(value) for value in results]
         rule = getattr(self, f"_op_{'elementwise' if name in self.elementwise else name}", None)
         if rule is None:
             raise UserError(
                 f"the policy uses the operation {name!r}, which has no counterpart in the "
                 f"{self.language} export yet"
             )
-        found = rule(Operation(name, parameters, inputs, equation))
-        return found if isinstance(found, list) else [found]
+        results = rule(Operation(name, parameters, inputs, equation))
+        return results if isinstance(results, list) else [results]
 
 
 def _known(value) -> bool:
@@ -163,7 +170,8 @@ def outer_padding(operation: Operation) -> tuple[list[int], list[int]]:
 
 def trace(function: Callable, inputs: dict[str, jax.ShapeDtypeStruct]):
     """The closed jaxpr of `function(**inputs)`, its inputs in the order of `inputs`."""
-    names = list(inputs)
-    return jax.make_jaxpr(lambda *values: function(**dict(zip(names, values, strict=True))))(
-        *inputs.values()
-    )
+
+    def of_values(*values):
+        return function(**dict(zip(inputs, values, strict=True)))
+
+    return jax.make_jaxpr(of_values)(*inputs.values())

@@ -37,4 +37,4 @@ def flat_observation(observation: Observation) -> jax.Array:
 
 def to_numpy(tree):
     """A tree of arrays as NumPy arrays of their own memory."""
-    return jax.tree.map(lambda leaf: np.array(leaf), tree)
+    return jax.tree.map(np.array, tree)

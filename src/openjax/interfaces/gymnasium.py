@@ -38,7 +38,7 @@ class _Team:
 
     def step(self, state, action):
         action = action.reshape(self._number, ACTION_SIZE)
-        # the game draws nothing after its reset: the key is for the interface only
+        # any key will do: the game draws nothing after its reset
         observation, state, reward, terminated, truncated, info = self.environment.step(
             jax.random.key(0), state, action
         )
@@ -135,17 +135,20 @@ class PursuitVectorEnv(VectorEnv):
             self._state, actions
         )
         over = np.asarray(terminated | truncated)
-        infos = {name: np.array(value) for name, value in info.items()} | {
-            f"_{name}": np.ones(self.num_envs, bool) for name in info
-        }
+        # Gymnasium's manner: beside each entry a mask says of which worlds it is
+        infos = {name: np.array(value) for name, value in info.items()}
+        infos |= {f"_{name}": np.ones(self.num_envs, bool) for name in info}
         if over.any():
+            # all worlds start anew, and those that are over take theirs: one compiled program
             fresh_observation, fresh = self._reset(self._keys())
             infos["final_obs"] = to_numpy(observation)
             infos["_final_obs"] = over
+
+            def new_where_over(new, old):
+                return jnp.where(over.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+
             observation, self._state = jax.tree.map(
-                lambda new, old: jnp.where(over.reshape(-1, *[1] * (new.ndim - 1)), new, old),
-                (fresh_observation, fresh),
-                (observation, self._state),
+                new_where_over, (fresh_observation, fresh), (observation, self._state)
             )
         return *to_numpy((observation, reward, terminated, truncated)), infos
 

@@ -58,17 +58,16 @@ class PursuitMultiAgentEnv:
         ended.
         """
         key, reset_key = jax.random.split(key)
-        after = self.step_env(key, state, actions)
-        fresh = (
-            self.reset(reset_key)
-            if reset_state is None
-            else (self.get_obs(reset_state), reset_state)
-        )
-        over = after[3]["__all__"]
+        observations, state, rewards, dones, infos = self.step_env(key, state, actions)
+        if reset_state is None:
+            fresh = self.reset(reset_key)
+        else:
+            fresh = (self.get_obs(reset_state), reset_state)
+        over = dones["__all__"]
         observations, state = jax.tree.map(
-            lambda new, old: jnp.where(over, new, old), fresh, after[:2]
+            lambda new, old: jnp.where(over, new, old), fresh, (observations, state)
         )
-        return observations, state, *after[2:]
+        return observations, state, rewards, dones, infos
 
     def step_env(self, key: jax.Array, state: PursuitState, actions: dict[str, jax.Array]):
         """One control step: observations, state, rewards, dones (with `__all__`), infos, all by

@@ -21,7 +21,11 @@ class PursuitParallelEnv(ParallelEnv):
       environment: the game; None is the nominal one.
     """
 
-    metadata = {"name": "openjax_pursuit_v0", "render_modes": [], "is_parallelizable": True}  # noqa: RUF012
+    metadata = {  # noqa: RUF012
+        "name": "openjax_pursuit_v0",
+        "render_modes": [],
+        "is_parallelizable": True,
+    }
 
     def __init__(self, environment: Pursuit | None = None):
         self.environment = environment or Pursuit()
@@ -33,7 +37,8 @@ class PursuitParallelEnv(ParallelEnv):
         self._action_space = spaces.Box(-1.0, 1.0, (ACTION_SIZE,), np.float32)
         self._key = jax.random.key(0)
         self._state = None
-        self._reset, self._step = jax.jit(self.environment.reset), jax.jit(self.environment.step)
+        self._reset = jax.jit(self.environment.reset)
+        self._step = jax.jit(self.environment.step)
 
     def observation_space(self, agent: str) -> spaces.Box:
         """Of one agent."""
@@ -50,27 +55,32 @@ class PursuitParallelEnv(ParallelEnv):
         self._key, key = jax.random.split(self._key)
         self.agents = list(self.possible_agents)
         observation, self._state = self._reset(key)
-        return self._by_agent(to_numpy(flat_observation(observation))), {
-            agent: {} for agent in self.agents
-        }
+        observations = self._by_agent(to_numpy(flat_observation(observation)))
+        return observations, {agent: {} for agent in self.agents}
 
     def step(self, actions: dict[str, np.ndarray]):
         """One control step of all agents."""
         action = jnp.stack(
             [jnp.asarray(actions[agent], jnp.float32) for agent in self.possible_agents]
         )
-        # the game draws nothing after its reset: the key is for the interface only
-        observation, self._state, *told = self._step(jax.random.key(0), self._state, action)
-        reward, terminated, truncated, info = to_numpy(told)
+        # any key will do: the game draws nothing after its reset
+        observation, self._state, *results = self._step(jax.random.key(0), self._state, action)
+        reward, terminated, truncated, info = to_numpy(results)
         infos = [
             {"captured": bool(captured), "crashed": bool(crashed)}
             for captured, crashed in zip(info.captured, info.crashed, strict=True)
         ]
-        over = [bool(terminated)] * len(infos), [bool(truncated)] * len(infos)
-        rows = to_numpy(flat_observation(observation)), reward.tolist(), *over, infos
+        agents = len(infos)
+        results = (
+            to_numpy(flat_observation(observation)),
+            reward.tolist(),
+            [bool(terminated)] * agents,
+            [bool(truncated)] * agents,
+            infos,
+        )
         if terminated or truncated:
-            self.agents = []
-        return tuple(self._by_agent(values) for values in rows)
+            self.agents = []  # PettingZoo's sign that the episode is over
+        return tuple(self._by_agent(values) for values in results)
 
     def close(self) -> None:
         """Nothing is held."""

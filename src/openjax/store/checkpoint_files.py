@@ -50,9 +50,9 @@ def load_state(path: Path, abstract: Any) -> Any:
     path = Path(path).absolute()
     check_state(path)
     stored = load_orbax().metadata(path).metadata
-    wanted = {name: leaf for name, leaf in named_leaves(abstract).items() if leaf.size}
-    _check_same_shapes(path, stored, wanted)
-    arrays = load_orbax().load(path, wanted)
+    expected = {name: leaf for name, leaf in named_leaves(abstract).items() if leaf.size}
+    _check_same_shapes(path, stored, expected)
+    arrays = load_orbax().load(path, expected)
     # Orbax can't write arrays without elements; they hold nothing, so they are made anew.
     leaves = [
         arrays[name] if leaf.size else jnp.zeros(leaf.shape, leaf.dtype, device=leaf.sharding)
@@ -78,17 +78,17 @@ def load_arrays(
     sharding = first_device()
     stored = load_orbax().metadata(path).metadata
     names = {name: name_of(name) for name in stored}
-    wanted = {
-        name: load_orbax().PLACEHOLDER
-        if names[name] is None
-        else jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding)
-        for name, leaf in stored.items()
-    }
+    abstract = {}
+    for name, leaf in stored.items():
+        abstract[name] = jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding)
+        if names[name] is None:  # not read at all
+            abstract[name] = load_orbax().PLACEHOLDER
+    # else Orbax would wait for the other processes
     alone = load_orbax().Context()
     alone.multiprocessing.primary_host = jax.process_index()
     alone.multiprocessing.active_processes = {jax.process_index()}
     with alone:
-        loaded = load_orbax().load(path, wanted)
+        loaded = load_orbax().load(path, abstract)
 
     def plain(leaf):
         is_key = jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
@@ -116,6 +116,7 @@ def commit(path: Path, started: Any) -> None:
     """Wait until orbax has written a checkpoint, and seal it by its checksums."""
     started.result()
     if jax.process_index() == 0:
+        # on the disk before the checksums are, as a checkpoint counts once these are there
         for written in (*_files(path), path, path.parent):
             flush(written)
         lines = [f"{_checksum(file)}  {file.relative_to(path).as_posix()}" for file in _files(path)]
@@ -130,11 +131,13 @@ def check_state(path: Path) -> None:
         raise UserError(f"{path} is no checkpoint; expected a directory written by openjax.train")
     try:
         lines = _checksums_file(path).read_text(encoding="utf-8").splitlines()
-        expected = {
-            name: checksum for checksum, _, name in (line.partition("  ") for line in lines)
-        }
-        found = {file.relative_to(path).as_posix(): _checksum(file) for file in _files(path)}
-        different = sorted(dict(expected.items() ^ found.items()))
+        expected = {}
+        for line in lines:
+            checksum, _, name = line.partition("  ")
+            expected[name] = checksum
+        actual = {file.relative_to(path).as_posix(): _checksum(file) for file in _files(path)}
+        # names that only one of them has, or with another checksum
+        different = sorted(dict(expected.items() ^ actual.items()))
     except (OSError, UnicodeDecodeError) as error:
         raise DamagedError(f"checkpoint {path} is damaged ({error})") from error
     if different or not expected:
@@ -169,20 +172,22 @@ def _checksums_file(path):
     return path.with_name(path.name + _CHECKSUMS)
 
 
-def _check_same_shapes(path, stored, wanted):
+def _check_same_shapes(path, stored, leaves):
+    """Raises UserError where a checkpoint's leaves aren't these."""
     reason = "it was written by other settings or another version"
-    for name, leaf in wanted.items():
+    for name, leaf in leaves.items():
         if name not in stored:
             raise UserError(f"checkpoint {path} lacks {name}; {reason}")
+        # Orbax writes a random key as its numbers
         is_key = jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
         expected = jax.eval_shape(jax.random.key_data, leaf) if is_key else leaf
         shape = tuple(stored[name].shape)
         if shape != tuple(expected.shape) or stored[name].dtype != expected.dtype:
             raise UserError(
                 f"checkpoint {path} is of another shape: {name} is "
-                f"{stored[name].dtype}{list(shape)} there, "
-                f"the settings make it {expected.dtype}{list(expected.shape)}"
+                f"{stored[name].dtype}{list(shape)} there, the settings make it "
+                f"{expected.dtype}{list(expected.shape)}"
             )
     for name in stored:
-        if name not in wanted:
+        if name not in leaves:
             raise UserError(f"checkpoint {path} also holds {name}; {reason}")

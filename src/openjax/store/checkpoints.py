@@ -28,6 +28,7 @@ from openjax.store.checkpoint_files import (
 )
 
 _DIGITS = 9
+"""Of an update in a checkpoint's name: names of one length are sorted as their numbers are."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,7 +65,7 @@ class Checkpoints:
 
     def records(self) -> list[CheckpointRecord]:
         """Finished and undamaged checkpoints, oldest first."""
-        found = []
+        records = []
         for path in sorted(self.directory.glob("[0-9]" * _DIGITS)):
             if not is_checkpoint(path) or path.name in self._damaged:
                 continue
@@ -74,8 +75,8 @@ class Checkpoints:
                 except DamagedError as error:
                     self._damaged[path.name] = str(error)
                     continue
-            found.append(self._known[path.name])
-        return found
+            records.append(self._known[path.name])
+        return records
 
     def any_finished(self) -> bool:
         """Whether there is a checkpoint, damaged or not."""
@@ -132,7 +133,8 @@ class Checkpoints:
             return
         if self._processes.is_first:
             remove_state(path)
-            self._known.pop(path.name, None), self._damaged.pop(path.name, None)
+            self._known.pop(path.name, None)
+            self._damaged.pop(path.name, None)
         started = start_save(path, carry, {**(notes or {}), "score": score})
         self._pending = in_background(functools.partial(commit, path, started))
 
@@ -166,6 +168,7 @@ class Checkpoints:
             return
         records = self.records()
         best = self.best()
+        # only now, when the newer one is whole on the disk
         for record in records[: -self.keep_last]:
             if best is None or record.path != best.path:
                 remove_state(record.path)
@@ -193,6 +196,7 @@ class Checkpoints:
                 raise
             except Exception as error:  # orbax and tensorstore raise many kinds on damaged files
                 failure = type(error).__name__
+            # where one process can't read its part, all go on to the one before
             failures = [failure for failure in self._processes.everyone(failure) if failure]
             if not failures:
                 return carry, records[name]

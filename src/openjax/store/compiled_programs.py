@@ -34,13 +34,13 @@ def cache_programs() -> Path | None:
 
     from openjax.store.checked_cache import use_checked_cache
 
-    given = jax.config.jax_compilation_cache_dir
-    if given is not None and "://" in given:  # a bucket; JAX reads it by itself
-        return Path(given)
-    folder = _own_folder() if given is None else Path(given)
+    chosen = jax.config.jax_compilation_cache_dir
+    if chosen is not None and "://" in chosen:  # a bucket; JAX reads it by itself
+        return Path(chosen)
+    folder = _own_folder() if chosen is None else Path(chosen)
     if folder is None:
         return None
-    if given is not None and folder.exists() and not _is_private(folder):
+    if chosen is not None and folder.exists() and not _is_private(folder):
         _LOGGER.warning(
             "others can write to %s, and so run what they like here: chmod go-w it", folder
         )
@@ -48,7 +48,7 @@ def cache_programs() -> Path | None:
     jax.config.update("jax_compilation_cache_dir", str(folder))
     # XLA's own caches have no checksums
     jax.config.update("jax_persistent_cache_enable_xla_caches", "none")
-    if given is None:
+    if chosen is None:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", _WORTH_KEEPING)
     return folder
 
@@ -63,6 +63,8 @@ def _own_folder():
         top = _user_cache() / "openjax"
         top.mkdir(mode=0o700, parents=True, exist_ok=True)
         if _is_private(top):
+            # by JAX's version too: what another one compiled is never asked for again, and is
+            # deleted in its turn
             folder = top / f"{jax.__version__}-{_processor_key()}"
             folder.mkdir(exist_ok=True)
             _bound(top, CACHE_SIZE)
@@ -91,11 +93,11 @@ def _processor_key():
     text = platform.machine() + platform.processor()
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-        text += "".join(
-            sorted({line for line in lines if line.startswith(("model name", "flags", "Features"))})
-        )
+        described = ("model name", "flags", "Features")
+        text += "".join(sorted({line for line in lines if line.startswith(described)}))
     except OSError:
         pass
+    # enough to tell a user's machines apart, and short in a path
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
@@ -104,10 +106,13 @@ def _bound(folder, size):
     bytes.
     """
     files = [(path.stat(), path) for path in folder.rglob("*") if path.is_file()]
+
+    def last_use(file):
+        # a file system may not note when a file was read
+        return max(file[0].st_atime, file[0].st_mtime)
+
     total = 0
-    for status, path in sorted(
-        files, key=lambda file: max(file[0].st_atime, file[0].st_mtime), reverse=True
-    ):
+    for status, path in sorted(files, key=last_use, reverse=True):
         total += status.st_size
         if total > size:
             path.unlink(missing_ok=True)

@@ -77,7 +77,9 @@ def make_environment(
 
 
 def is_evader_file(opponent: Any) -> bool:
-    """Whether it is a file that `openjax exploit` wrote, neither a scripted evader's name nor code."""
+    """Whether it is a file that `openjax exploit` wrote, neither a scripted evader's name nor
+    code.
+    """
     named = isinstance(opponent, str | Path) and str(opponent) not in SCRIPTED
     return named and not is_own_code(opponent)
 
@@ -134,6 +136,7 @@ def find_opponent(evader: str | Path | Evader, game: PursuitSettings) -> Evader:
             f"--opponent {path}: senses {slots} pillars at most, the game has up to "
             f"{game.max_pillars}; environment.max_pillars {slots} would be right"
         )
+    # the network's sizes are those of its biases
     width, outputs = (leaves[f"evader/actor/bias_{layer}"].shape[-1] for layer in (0, 2))
     sizes = (number_of_senses(game.num_pursuers, slots), width, outputs)
     actor = jax.eval_shape(lambda key: init_network(key, 1, sizes), jax.random.key(0))

@@ -98,13 +98,15 @@ class LoadedPolicy:
         if isinstance(self.policy, OwnController):
             return self  # it takes what it is given
         game = environment.settings
-        own = self.settings.environment
-        seen = ("self_size", "observe_in", "observed_pillars", "history_length", "frame_size")
-        number = () if self.any_number else ("num_pursuers",)
-        for name in (*number, *seen):
-            if getattr(game, name) != getattr(own, name):
+        trained = self.settings.environment
+        fixed = ["self_size", "observe_in", "observed_pillars", "history_length", "frame_size"]
+        if not self.any_number:
+            fixed.insert(0, "num_pursuers")  # first, as the sizes follow from it
+        for name in fixed:
+            value = getattr(trained, name)
+            if getattr(game, name) != value:
                 raise UserError(
-                    f"policy {self.source} was trained with {name} {getattr(own, name)}, here it's "
+                    f"policy {self.source} was trained with {name} {value}, here it's "
                     f"{getattr(game, name)}: pursuers, observation and history must stay as in "
                     "training"
                 )
@@ -150,12 +152,12 @@ class LoadedPolicy:
         if self.environment is not None:  # what it observes may be anything
             return self.policy.act(self.parameters, observation)
         axes = "world" if observation.heading is None else "heading"
-        given = (observation.self_state.shape[-1], *observation.frames.shape[-2:], axes)
+        sizes = (observation.self_state.shape[-1], *observation.frames.shape[-2:], axes)
         expected = (game.self_size, game.history_length, game.frame_size, game.observe_in)
-        if given != expected:
+        if sizes != expected:
             raise UserError(
                 f"policy {self.source} observes {expected} (own state, history, axes), "
-                f"here are {given}; make its game with openjax.make(policy.settings.environment)"
+                f"here are {sizes}; make its game with openjax.make(policy.settings.environment)"
             )
         return self.policy.act(self.parameters, observation)
 
@@ -169,9 +171,8 @@ def load_policy(
 
     Args:
       name_or_path: a name from `known_policies()` (`DEFAULT_POLICY` if none is given), a policy
-      file (.npz), a run's directory
-        (its best policy) or a checkpoint's directory inside a run, or `FILE.py:function`, see
-        `own_controller`.
+        file (.npz), a run's directory (its best policy) or a checkpoint's directory inside a run,
+        or `FILE.py:function`, see `own_controller`.
       environment, policy: those of one's own that a run was trained with (`openjax.train`), as its
       files hold numbers alone.
 
@@ -182,6 +183,7 @@ def load_policy(
     source = str(name_or_path)
     if environment is not None or policy is not None:
         return _own(open_run(path), source, environment, policy)
+    # names before paths: a folder called "open" doesn't hide the shipped policy
     if source in METHODS:
         return _heuristic(source)
     if is_own_code(source):

@@ -46,6 +46,7 @@ def save_policy_file(
     }
     arrays = {}
     for name, leaf in named_leaves(parameters).items():
+        # NumPy's files know no bfloat16
         array = np.asarray(leaf.astype(jnp.float32) if leaf.dtype == jnp.bfloat16 else leaf)
         header["dtypes"][name] = str(leaf.dtype)
         arrays[name] = array.astype(storage) if np.issubdtype(array.dtype, np.floating) else array
@@ -77,9 +78,8 @@ def load_policy_file(
         raise
     except OSError as error:
         raise UserError(f"{path} can't be read: {error.strerror or error}") from error
-    except (
-        Exception
-    ) as error:  # a damaged or foreign archive fails in every way that zipfile and NumPy know
+    except Exception as error:
+        # a damaged or foreign archive fails in every way that zipfile and NumPy know
         raise UserError(
             f"{path} is no {kind}, or it's damaged ({type(error).__name__}); expected one written "
             f"by {writer} (.npz)"
@@ -94,6 +94,7 @@ def load_policy_file(
 
 def _read_arrays(path):
     """The arrays of an .npz file, without pickles, and none larger than `LARGEST`."""
+    # before anything is unpacked: a small file may claim to hold more than the memory
     with zipfile.ZipFile(path) as archive:
         if sum(member.file_size for member in archive.infolist()) > LARGEST:
             raise UserError(

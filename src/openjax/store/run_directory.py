@@ -144,8 +144,8 @@ def create_run(path: Path, overwrite: bool) -> RunDirectory:
     check_free(path, overwrite)
     path = Path(path)
     path.mkdir(parents=True, exist_ok=True)
-    # The settings file goes first: what is left of a half-removed run is no run that could be
-    # resumed.
+    # the settings file goes first: what is left of a half-removed run is no run that could be
+    # resumed
     for name in _FILES:
         (path / name).unlink(missing_ok=True)
     for name in _FOLDERS:

@@ -106,11 +106,13 @@ def _read(file):
 
 def _key(name, carry, made_from):
     """What a program depends on, in short."""
+    # all sources: which of them a program depends on, nobody knows without tracing it
     digest = hashlib.sha256()
     sources = [*Path(openjax.__file__).parent.rglob("*.py"), *assets_directory().iterdir()]
     for path in sorted(path for path in sources if path.is_file()):
         digest.update(path.name.encode() + path.read_bytes())
     kinds = [(leaf.shape, str(leaf.dtype)) for leaf in jax.tree.leaves(carry)]
+    # where programs are cached changes none of them
     options = {
         name: value for name, value in sorted(jax.config.values.items()) if "cache" not in name
     }
