@@ -18,7 +18,7 @@ FUNCTION = {"lines": 40, "branches": 10, "arguments": 5}
 """The most of a function: lines without its docstring, branches and arguments without those of
 functions inside it.
 """
-OVER = {"lines": 48, "branches": 10, "arguments": 60}
+OVER = {"lines": 34, "branches": 10, "arguments": 49}
 """Functions that are still over each limit; too many branches have some of `flights`, `gap` and the
 experiments alone.
 """
@@ -46,7 +46,7 @@ TWICE = {
 """Module names that more than one room has."""
 CIRCLES = {"openjax.gap.report"}
 """Packages in which a class draws the page that is drawn from it."""
-MOST = {"pairs": 40, "starred": 90, "columns": 77, "adverbs": 120, "effects": 33}
+MOST = {"pairs": 20, "starred": 42, "columns": 50, "adverbs": 71, "effects": 32}
 """Places of each kind of hard reading that are left; these numbers only get smaller. Pairs: a tuple
 written out and bound to several names. Starred: a tuple that an own function takes apart again.
 Columns: lines longer than 100 characters. Adverbs: parameters called by one of `ADVERBS` alone.

@@ -230,9 +230,7 @@ class Pursuit:
         drones = jax.vmap(hovering)(task.pursuer_position, quaternion)
         drones = self.dynamics.reset(self.vehicle, drones, effect_key)
         action = jnp.broadcast_to(hover_action(self.vehicle), (settings.num_pursuers, 4))
-        in_sight = self._in_sight(task, task.active, task.pursuer_position, task.evader_position)
-        in_view = self._in_view(in_sight, drones, task.evader_position)
-        seen = jnp.any(in_sight if in_view is None else in_view)
+        in_sight, in_view, seen = self._sights(task, task.active, drones, task.evader_position)
         still = jnp.zeros(3, jnp.float32)
         step = jnp.zeros((), jnp.int32)
         last_seen = jnp.where(seen, task.evader_position, jnp.array(settings.middle, jnp.float32))
@@ -318,6 +316,14 @@ class Pursuit:
         )
         return sees if active is None else sees & active
 
+    def _sights(self, task, active, drones, evader):
+        """(N,) to whom of the drones nothing hides the evader at (3,), (N,) who also looks its way
+        (None: looking isn't part of the game), and () whether somebody sees it.
+        """
+        in_sight = self._in_sight(task, active, drones.position, evader)
+        in_view = self._in_view(in_sight, drones, evader)
+        return in_sight, in_view, jnp.any(in_sight if in_view is None else in_view)
+
     def _in_view(self, in_sight, drones, evader):
         """(N,) which of those in sight have the evader at (3,) in view; None: all of them."""
         if not self.settings.limited_sight:
@@ -396,9 +402,7 @@ class Pursuit:
         evader = before.evader_position + settings.time_step * velocity
         step = before.step + 1
         active = self._active_after(before)
-        in_sight = self._in_sight(before.task, active, drones.position, evader)
-        in_view = self._in_view(in_sight, drones, evader)
-        seen = jnp.any(in_sight if in_view is None else in_view)
+        in_sight, in_view, seen = self._sights(before.task, active, drones, evader)
         last_seen = jnp.where(seen, evader, before.last_seen)
         seen_drones = self._seen(drones, before.vehicles)
         framed = frame_pursuers(settings, seen_drones.position, last_seen, active)
