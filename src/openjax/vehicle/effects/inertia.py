@@ -31,6 +31,7 @@ EFFECT = Effect(
     body=body,
     card=Card(
         torque_axes=(0, 1),
+        thrust_map=True,
         possible=heavy_inside,
         fitted=tuple(Fitted(axis, mean=1.0, spread=0.12, start=1.1, step=0.005) for axis in AXES),
         common=0.3,
