@@ -11,6 +11,8 @@ from openjax.vehicle.effects.effect import (
 )
 from openjax.vehicle.effects.ground_effect import gain
 
+FARTHEST = 0.06  # m, twice what is usual
+
 
 def thrust(parameters, thrust, reaction, context):
     """The ground effect mirrored at the ceiling, per rotor."""
@@ -21,6 +23,13 @@ def thrust(parameters, thrust, reaction, context):
 def above(position) -> bool:
     """Whether a flight (T, 3) m was higher than the paper's ceiling: then there is none."""
     return bool((position[:, 2] > ARENA_CEILING).any())
+
+
+def within_reach(values, deviations) -> bool:
+    """Whether the rotors stand no further from the tracked point than FARTHEST: a ceiling that
+    would have to be higher than the room's is some slow change of thrust.
+    """
+    return values["offset"] < FARTHEST
 
 
 _SOURCE = "as strong as the ground effect or stronger (Hsiao, Chirarattananon 2019)"
@@ -43,6 +52,7 @@ EFFECT = Effect(
         needs="position",
         coordinate="height",
         impossible=above,
+        possible=within_reach,
         sample={"strength": 0.6, "offset": 0.01},
         practical={"strength": 0.08},
         next_flight="slow passes just below the ceiling.",
