@@ -50,6 +50,18 @@ class Evidence:
         silent = any(t.voltage is None for t in self.tracks)
         return silent and self.case.vehicle_file.motor.command == "pwm"
 
+    @property
+    def measured(self) -> dict[tuple[str, str], tuple[float, float]]:
+        """{(effect, parameter): (value, standard deviation)} of what the torques' response tells
+        without a model of the loop; of gains nothing where the map to thrust isn't known.
+        """
+        found = self.identification
+        if found is None or not found.trusted:
+            return {}
+        hidden = {e for e in self.library.physics if self.motion.exposure[e] == 0.0}
+        names = [key for key in found.estimates.names if key[0] not in hidden]
+        return {key: found.estimates.of(*key) for key in names}
+
     def support(self, theta: np.ndarray) -> float:
         """Nats by which the identified torques speak for parameters theta (P,); 0 where they
         aren't trusted.

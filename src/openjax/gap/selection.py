@@ -12,6 +12,7 @@ weighed anew by a Bayesian bootstrap is its probability; named is the most proba
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import combinations
@@ -32,6 +33,7 @@ from openjax.gap.shapes import Squares
 # square's root.
 DETECTABLE = 2.0 * DECISION.standard_errors**2
 NOTHING = frozenset()
+Measured = Mapping[tuple[str, str], tuple[float, float]]
 REACH = 1.645  # standard deviations of a 90 % interval
 LARGEST = 3  # effects of a set
 # Growth of the gap that counts where nuisances are as the best set has them. With .05, errors of the
@@ -176,19 +178,24 @@ def log_odds(effects) -> float:
     return sum(CARDS[e].log_odds for e in effects)
 
 
-def practical(fit: SetFit) -> bool:
+def practical(fit: SetFit, measured: Measured) -> bool:
     """Whether every effect of a set is clearly of a size that matters in practice: of some parameter
     the 90 % interval is further from doing nothing than its card says (a region of practical
-    equivalence on the parameter, Kruschke 2018).
+    equivalence on the parameter, Kruschke 2018). Intervals are the replay's and, of what the
+    torques' response tells, those that are `measured`: {(effect, parameter): (value, deviation)}.
     """
     found = fit.parameters()
+
+    def matters_of(effect: str, parameter: str, size: float) -> bool:
+        place = PLACE[effect, parameter]
+        least = size * fit.replay.grown[place]
+        estimates = [found[effect][parameter]]
+        estimates += [measured[effect, parameter]] if (effect, parameter) in measured else []
+        return any(abs(v - fit.replay.absent[place]) - REACH * d > least for v, d in estimates)
+
     return all(
         not CARDS[e].practical
-        or any(
-            abs(found[e][p][0] - fit.replay.absent[PLACE[e, p]]) - REACH * found[e][p][1]
-            > size * fit.replay.grown[PLACE[e, p]]
-            for p, size in CARDS[e].practical.items()
-        )
+        or any(matters_of(e, parameter, size) for parameter, size in CARDS[e].practical.items())
         for e in fit.effects
     )
 
@@ -331,7 +338,8 @@ class Search:
         density, worth as many nats as blocks bear out (Pauli, Racugno, Ventura 2011), less what its
         parameters cost (Occam's factor).
         """
-        sets = [h for h in self.visited.values() if possible(h.fit) and practical(h.fit)]
+        measured = self.evidence.measured
+        sets = [h for h in self.visited.values() if possible(h.fit) and practical(h.fit, measured)]
         odds, costs = np.array([(h.log_odds, h.fit.cost) for h in sets]).T
         pairs = [[difference(a.judged, b.judged) for b in sets] for a in sets]
         _, errors, trust = np.moveaxis(np.array(pairs), 2, 0)
