@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Float, Shaped
 
 from openjax.flights.track import Track, smooth
-from openjax.gap.model.library import PHYSICS_EFFECTS, THETA
+from openjax.gap.model.library import PHYSICS_EFFECTS, THETA, growths
 from openjax.gap.model.physics import Path, compiled_physics
-from openjax.gap.shapes import Hypotheses
+from openjax.gap.shapes import Hypotheses, Parameters
 from openjax.vehicle.effects.effect import ARENA_CEILING
 
 RATES = slice(0, 3)
@@ -64,6 +64,11 @@ class Physics:
             for number, lane in zip(numbers, np.asarray(rows), strict=False):
                 parts[number].append(lane[: len(self.tracks[number])])
         return [_integrated(np.stack(p), t.dt) for p, t in zip(parts, self.tracks, strict=True)]
+
+    @cached_property
+    def grown(self) -> Parameters:
+        """(P,) by what usual sizes of parameters are multiplied for a vehicle of this size."""
+        return growths(self.vehicles[0])
 
     @cached_property
     def _nominal(self) -> tuple:

@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 from scipy.linalg import solve_triangular
 
 from openjax.flights.track import Track
-from openjax.gap.model.library import ABSENT, CARDS, PLACE, STEP, growths
+from openjax.gap.model.library import ABSENT, CARDS, PLACE, STEP
 from openjax.gap.model.nuisances import OF_A_BLOCK, SIZE, columns_of
 from openjax.gap.model.prediction import FORCE, RATES, VELOCITY, Physics, make_physics
 from openjax.gap.model.whitening import Noise, first_noise, whiten
@@ -71,10 +71,12 @@ class Replay:
             return self.columns
         return [np.tensordot(self.mixing, c, 1) for c in self.columns]
 
-    @cached_property
-    def grown(self) -> np.ndarray:
-        """(P,) by what usual sizes of parameters are multiplied for a vehicle of this size."""
-        return growths(self.physics.vehicles[0])
+    @property
+    def grown(self) -> Parameters:
+        """(P,) by what usual sizes of parameters are multiplied for a vehicle of this size; every
+        replay of the same physics shares them.
+        """
+        return self.physics.grown
 
     @cached_property
     def flights(self) -> tuple[str, ...]:
