@@ -36,6 +36,9 @@ BETTER = 0.9  # share of it that a peak at another offset may have, and be as go
 # s that motors may seem early: half a row where rows are single samples, and EARLY of a motor that
 # is faster than assumed. The largest in 120 cases of four simulators was .0025.
 EARLY = 0.0015
+# Share of a flight's likeness at its own offset that it has at the common one of all flights, from
+# which it tells no other: where a flight hardly turns the curve is flat.
+TELLS = 0.85
 SLOWEST_ROW = 0.004  # s: rows that are shorter hide nothing by a row's shift
 # s that motors may seem late by: a time constant of .13 s looks like .05 in this band
 LATE = 0.06
@@ -164,23 +167,37 @@ def _offsets(signals) -> dict[str, float]:
     for track, late, early in signals:
         if (found := _likeness(late, early, track.dt)) is not None:
             likeness.setdefault(_flight_of(track), []).append((found, track.dt / FINER))
-    out = {}
+    curves = {}
     for flight, parts in likeness.items():
         # Stretches of one flight may have rows of another length: all on the grid of the shortest.
         reach = min(len(part) // 2 * step for part, step in parts)
         step = parts[0][1]
         grid = step * np.arange(-int(reach / step), int(reach / step) + 1)
         whole = sum(_on(grid, *part) for part in parts) / len(parts)
-        best = int(np.argmax(whole))
-        middle = len(whole) // 2
-        if whole[best] < FOLLOWS:
-            continue
-        # Of peaks that are as high the one in the middle, as where a flight is periodic.
-        high = find_peaks(whole, BETTER * whole[best], distance=int(APART / parts[0][1]))[0]
-        if len(high):
-            best = int(high[np.argmin(np.abs(high - middle))])
-        out[flight] = (best - middle) * parts[0][1]
+        if whole.max() >= FOLLOWS:
+            curves[flight] = whole, step
+    out = {flight: _peak(*curve) for flight, curve in curves.items()}
+    if len(curves) > 1:  # one logger has one clock, unless a flight tells another one clearly
+        reach = min(len(whole) // 2 * step for whole, step in curves.values())
+        step = min(step for _, step in curves.values())
+        grid = step * np.arange(-int(reach / step), int(reach / step) + 1)
+        alike = {flight: _on(grid, *curve) for flight, curve in curves.items()}
+        common = _peak(sum(alike.values()), step)
+        for flight, whole in alike.items():
+            if np.interp(common, grid, whole) >= TELLS * whole.max():
+                out[flight] = common
     return out
+
+
+def _peak(whole: np.ndarray, step: float) -> float:
+    """The offset, s, of the highest peak of a curve (N,) around zero; of peaks that are as high
+    that of the one in the middle, as where a flight is periodic.
+    """
+    best, middle = int(np.argmax(whole)), len(whole) // 2
+    high = find_peaks(whole, BETTER * whole[best], distance=int(APART / step))[0]
+    if len(high):
+        best = int(high[np.argmin(np.abs(high - middle))])
+    return (best - middle) * step
 
 
 def _on(grid: np.ndarray, values: np.ndarray, step: float) -> np.ndarray:
