@@ -119,7 +119,9 @@ def _read_around(tracks: list[Track], delay: float) -> Delay:
             SIZE["imu_tilt"] * np.concatenate([start, np.cumsum(np.cross(axis, between), 0)])
             for axis in np.eye(3)
         ]
-        data.append(np.stack([y, late, *drift, *tilted, SIZE["pose_clock"] * late]))
+        turned_so_far = np.concatenate([start, np.cumsum(between, 0)])
+        gained = [SIZE["gyroscope_gain"] * axis * turned_so_far for axis in np.eye(3)]
+        data.append(np.stack([y, late, *drift, *tilted, *gained, SIZE["pose_clock"] * late]))
     return _fit(data)
 
 
