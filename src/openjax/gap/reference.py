@@ -28,6 +28,7 @@ ROUNDS = 3  # of the fit, between which nuisances are worked out anew
 # What trims of a day look like, and so nothing that another day has as well.
 OF_DAYS = tuple(e for e, card in CARDS.items() if card.trim is not None)
 # Rare names of what a vehicle with nothing wrong has as well, as flapping of drag.
+LASTING = tuple(e for e in FORM if e not in OF_DAYS)  # what no day moves
 OTHER_NAMES = tuple(e for e in CARDS if CARDS[e].log_odds <= VERY_RARE and e not in FORM)
 
 
@@ -47,7 +48,7 @@ def read_reference(case: Case, progress=None) -> Baseline:
     theta = ABSENT.copy()
     for name, moved in zip(names, mean, strict=True):
         key = PLACE[tuple(name.split(" "))]
-        theta[key] = fit.theta[key] + moved
+        theta[key] = fit.theta[key] + moved  # of an effect that the fit hasn't that is "absent"
     channels = {c.path: c for c in evidence.channels}
     trim = _trim_of_a_day(fit, evidence.vehicles[0])
     return Baseline(theta, kept, names, covariance, measures, channels, trim)
@@ -70,9 +71,10 @@ def borne_out(evidence: Evidence) -> Baseline:
 
 def _with(baseline: Baseline, effects) -> Baseline:
     """A baseline with only these of its effects."""
-    theta = ABSENT.copy()
-    theta[places(effects)] = baseline.theta[places(effects)]
-    rows = [k for k, n in enumerate(baseline.names) if n.split(" ")[0] in effects]
+    gone = set(baseline.effects) - set(effects)
+    theta = baseline.theta.copy()
+    theta[places(gone)] = ABSENT[places(gone)]
+    rows = [k for k, n in enumerate(baseline.names) if n.split(" ")[0] not in gone]
     names = tuple(baseline.names[k] for k in rows)
     covariance = baseline.covariance[np.ix_(rows, rows)]
     return replace(baseline, theta=theta, effects=effects, names=names, covariance=covariance)
@@ -117,24 +119,35 @@ def _trim_of_a_day(fit: SetFit, vehicle) -> np.ndarray:
 
 def _another_day(evidence: Evidence, fit: SetFit, effects) -> tuple[tuple[str, ...], ...]:
     """Names, mean and covariance of the numbers of the `effects` (away from the fit, in their
-    units), as they are on another day. The nuisances aren't transferred: what they take depends on
-    what is flown, as in closed loop they also take what feedback makes of gusts.
+    units) and of the other numbers of a vehicle that no day moves, as they are on another day. The
+    other nuisances aren't transferred: what they take depends on what is flown, as in closed loop
+    they also take what feedback makes of gusts.
     """
     table = build(fit, None)
     equations = Equations(table, with_effects(table))
     columns, model = equations.columns, equations.model
-    keys = [THETA[i] for i in fit.index]
-    inside = len(keys)
+    inside = len(fit.index)
+    sizes = {f"{e} {p}": size for e, p, size in fit.replay.numbers}
+    shared = [n for n, s in zip(fit.replay.nuisance_names, fit.replay.shared, strict=True) if s]
+    names = [" ".join(THETA[i]) for i in fit.index]
+    kept = [n.split(" ")[0] in effects for n in names]
+    kept += [n in sizes and n not in names and n.split(" ")[0] in LASTING for n in shared]
+    names += shared
+    unit = np.array([1.0] * inside + [sizes.get(n, 1.0) for n in shared])
+    # Of the parameters themselves, whatever the columns' units.
     hessian = table.total[np.ix_(columns, columns)] / COLOURED
     precision = block_diag(model.precision, np.eye(len(columns) - inside))
     around = np.concatenate([model.mean, np.zeros(len(columns) - inside)])
     push = table.total[columns, 0] / COLOURED - hessian @ around
-    of_a_day = np.array([e not in effects for e, _ in keys] + [True] * (len(columns) - inside))
     days = np.ones(len(columns))
-    days[:inside] = [day_of(*k, evidence.vehicles[0], evidence.charge_unknown) for k in keys]
-    found, covariance = transferred(hessian, push, precision, of_a_day, days)
-    names = tuple(" ".join(k) for k in keys if k[0] in effects)
-    return names, found + around[~of_a_day], covariance
+    for k in np.flatnonzero(kept):
+        day = day_of(*names[k].split(" "), evidence.vehicles[0], evidence.charge_unknown)
+        days[k] = day / unit[k]
+    found, covariance = transferred(hessian, push, precision, ~np.array(kept), days)
+    unit = unit[kept]
+    moved = (found + around[kept]) * unit
+    told = tuple(n for n, k in zip(names, kept, strict=True) if k)
+    return told, moved, covariance * np.outer(unit, unit)
 
 
 def joined(cases: Sequence[Case]) -> Case:

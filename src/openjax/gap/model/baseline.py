@@ -45,8 +45,8 @@ class Baseline:
 
     @property
     def numbers(self) -> tuple[tuple[str, str, float], ...]:
-        """Those of the effects, as `library.numbers_of` has them, in units of the parameter."""
-        return tuple((e, p, 1.0) for e, p in THETA if e in self.effects)
+        """What is known of the vehicle, as `library.numbers_of` has it, in units of the parameter."""
+        return tuple((*name.split(" "), 1.0) for name in self.names)
 
     def mixing(self, names) -> np.ndarray:
         """(N, N): columns of `names`, each of its usual size or unit -> columns of unit prior
