@@ -53,7 +53,8 @@ EFFECT = Effect(
         log_odds=VERY_RARE,
         possible=tilts_back,
         sample={"tilt": 0.02, "stiffness": 0.0002},
-        practical={"tilt": 0.002, "stiffness": 1e-05},
+        # A tilt of as much force as the drag that matters: a smaller one stood in for small drags.
+        practical={"tilt": 0.006, "stiffness": 1e-05},
         next_flight="fast straight passes with sudden stops, to load roll and pitch.",
     ),
 )
