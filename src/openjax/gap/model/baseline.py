@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from openjax.gap.decision import DECISION
-from openjax.gap.model.library import CARDS, PHYSICS_EFFECTS, THETA
+from openjax.gap.model.library import CARDS, PHYSICS_EFFECTS
 from openjax.vehicle.effects import EFFECTS
 from openjax.vehicle.effects.effect import growth
 
