@@ -3,6 +3,7 @@ that are slow are neither.
 """
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -60,6 +61,23 @@ def test_motors_that_act_from_their_row_on_are_no_finding(tracks):
     assert read(tracks) == clocks.MotorClock({}, True, {})
     assert read([moved(t, 0.005) for t in tracks], rows="sample") == read(tracks)
     assert read([moved(t, 0.004) for t in tracks], row=0.001) == read(tracks)
+
+
+def test_a_flight_that_turns_slowly_tells_no_clock_of_its_own():
+    """At 30 ms beside its peak the likeness of turns of about 1 Hz is still nine tenths of it."""
+    time = 0.01 * np.arange(2000)
+    turns = [np.sin(2 * np.pi * f * time) for f in np.linspace(0.83, 1.37, 18)]
+    slow = np.stack(turns, 1).reshape(len(time), 3, 6).sum(2)
+    noise = np.random.default_rng(0).normal(size=slow.shape)
+
+    def offsets(late):  # of a slow flight, beside a fast one whose signals are at once
+        signals = zip(("slow", "fast"), (slow, noise), (late, 0), strict=True)
+        return clocks._offsets(
+            (SimpleNamespace(name=n, dt=0.01), np.roll(v, rows, 0), v) for n, v, rows in signals
+        )
+
+    assert offsets(3) == pytest.approx({"slow": 0.0, "fast": 0.0}, abs=0.003)
+    assert offsets(15)["slow"] == pytest.approx(0.15, abs=0.003)
 
 
 @pytest.mark.parametrize("time", [0.02, 0.05, 0.095])

@@ -13,7 +13,7 @@ from openjax.gap.decision import DECISION
 from openjax.gap.diagnosis import diagnose_case
 from openjax.gap.model.baseline import Baseline, day_of, transferred
 from openjax.gap.model.library import ABSENT, PLACE
-from openjax.gap.reference import differs, trim_of, trimmed_before
+from openjax.gap.reference import differs, trim_of, trimmed_before, with_some
 from openjax.gap.residual import changed_p
 from openjax.vehicle import load_vehicle
 
@@ -59,6 +59,18 @@ def test_another_day_knows_what_was_shown_less_what_days_move():
         covariance, np.diag(usual[seen] ** 2) - gain @ across, rtol=1e-9, atol=1e-12
     )
     assert covariance[2, 2] == pytest.approx(0.3**2)
+
+
+def test_without_an_effect_the_numbers_of_the_others_stay_known():
+    names = ("rotor_drag d_xy", "motor_lag extra_up")
+    theta = ABSENT.copy()
+    theta[[PLACE[tuple(n.split(" "))] for n in names]] = 0.004, 0.003
+    known = Baseline(theta, ("rotor_drag",), names, np.diag([1e-6, 4e-6]), {}, {}, np.zeros(4))
+    without = with_some(known, ())
+    assert without.numbers == (("motor_lag", "extra_up", 1.0),) and not without.effects
+    assert without.theta[PLACE["rotor_drag", "d_xy"]] == 0.0
+    assert without.theta[PLACE["motor_lag", "extra_up"]] == 0.003
+    np.testing.assert_array_equal(without.covariance, [[4e-6]])
 
 
 def test_days_move_the_trims_and_an_unlogged_battery_moves_the_map_of_thrust():

@@ -24,8 +24,8 @@ from openjax.gap.selection import searched
 from openjax.vehicle.effects import EFFECTS
 from openjax.vehicle.effects.effect import VERY_RARE
 
-# Of what is left of a case's flights before any effect, by which they must be better without what the
-# reference has: a lag of 70 ms and motors at a limit made it .2 and .4 % of themselves.
+# Of what is left of a case's flights before any effect: by which they must be better without what
+# the reference has. A lag of 70 ms and motors at a limit made it .2 and .4 % of themselves.
 SPOKEN_AGAINST = 0.01
 ROUNDS = 3  # of the fit, between which nuisances are worked out anew
 # What trims of a day look like, and so nothing that another day has as well.
@@ -66,15 +66,15 @@ def borne_out(evidence: Evidence) -> Baseline:
     subsets = [
         s for n in range(len(baseline.effects) + 1) for s in combinations(baseline.effects, n)
     ]
-    thetas = np.array([_with(baseline, s).theta for s in subsets])
+    thetas = np.array([with_some(baseline, s).theta for s in subsets])
     left = [y[None] - p for y, p in zip(replay.measured, replay.predict(thetas), strict=True)]
     squares = np.diag(replay.grams(left).sum(0))
     kept = np.flatnonzero(squares <= (1.0 + SPOKEN_AGAINST) * squares.min())
-    return _with(baseline, subsets[max(kept, key=lambda k: (len(subsets[k]), -squares[k]))])
+    return with_some(baseline, subsets[max(kept, key=lambda k: (len(subsets[k]), -squares[k]))])
 
 
-def _with(baseline: Baseline, effects) -> Baseline:
-    """A baseline with only these of its effects."""
+def with_some(baseline: Baseline, effects) -> Baseline:
+    """A baseline with only these of its effects; the numbers that are no effect's stay."""
     gone = set(baseline.effects) - set(effects)
     theta = baseline.theta.copy()
     theta[places(gone)] = ABSENT[places(gone)]
