@@ -53,7 +53,7 @@ class Evidence:
     @property
     def measured(self) -> dict[tuple[str, str], tuple[float, float]]:
         """{(effect, parameter): (value, standard deviation)} of what the torques' response tells
-        without a model of the loop; of gains nothing where the map to thrust isn't known.
+        without a model of the loop, of effects that these logs can show.
         """
         found = self.identification
         if found is None or not found.trusted:
