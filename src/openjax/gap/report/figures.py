@@ -11,7 +11,7 @@ from openjax.flights.track import smooth, to_body
 from openjax.gap.model.library import CARDS
 from openjax.gap.model.replay import SKIP
 from openjax.gap.model.table import HORIZONS
-from openjax.gap.report import Report
+from openjax.gap.report.report import Report
 from openjax.gap.residual import disturbances
 from openjax.gap.where import CALM, before_and_after
 from openjax.show.pages import AFTER, BEFORE, GREY, STYLE, add_legend, as_svg, small_figure
@@ -26,9 +26,14 @@ def figures(report: Report) -> list[tuple[str, str, str]]:
     """
     if not report.plots:
         return []
+    found = []
     with rc_context(STYLE):
-        drawn = [draw(report) for draw in (_places, _course, _horizons, _coordinate)]
-        return [(title, text, as_svg(figure, title)) for title, text, figure in filter(None, drawn)]
+        for draw in (_places, _course, _horizons, _coordinate):
+            drawn = draw(report)
+            if drawn is not None:
+                title, text, figure = drawn
+                found.append((title, text, as_svg(figure, title)))
+    return found
 
 
 def _residuals(report: Report) -> tuple[list, list]:
@@ -67,18 +72,17 @@ def _places(report: Report):
 
 @dataclass(frozen=True, eq=False)
 class Course:
-    """What is drawn of one channel of one flight: `before` and `after` (T,), in `unit`; `adds_up`:
-    errors of a prediction are differences of these, else these are the errors.
-    """
+    """What is drawn of one channel of one flight."""
 
     flight: str
     dt: float
-    time: np.ndarray
-    before: np.ndarray
+    time: np.ndarray  # (T,) s
+    before: np.ndarray  # (T,) in `unit`
     after: np.ndarray
     name: str
     unit: str
     adds_up: bool
+    """Whether errors of a prediction are differences of these; else these are the errors."""
 
     def errors(self, seconds: float) -> tuple[np.ndarray, np.ndarray]:
         """Errors of predictions so far ahead, before and after."""
@@ -102,13 +106,7 @@ def rms(values: Float[np.ndarray, "..."]) -> float:
 def _courses(report: Report) -> Iterator[Course]:
     """Every channel of every flight."""
     evidence = report.plots["evidence"]
-    axes = (*range(3), *range(3, 6)) if evidence.replay.usable[3] else range(3)
-    axes = [axis for axis in axes if evidence.replay.usable[axis]]
-    for track, before, after in zip(evidence.tracks, *_residuals(report), strict=True):
-        skip = int(SKIP / track.dt)
-        for axis in axes:
-            both = (before[skip:, axis], after[skip:, axis])
-            yield Course(track.name, track.dt, track.time[skip:], *both, *_axis_name(axis), True)
+    yield from _courses_of_motion(report)
     for channel in evidence.channels:
         without = channel.residuals(())
         floor = channel.residuals(evidence.library.of(channel.path))
@@ -117,10 +115,37 @@ def _courses(report: Report) -> Iterator[Course]:
             for track, before, after in zip(evidence.tracks, without[name], series, strict=True):
                 # of some channels one number is known of a whole flight
                 skip = int(SKIP / track.dt) if len(after) > 1 else 0
-                both = (np.resize(v, len(track))[skip:] / scale for v in (before, after))
-                time = track.time[skip:]
-                said = "mean motor command" if name == "motors all" else name
-                yield Course(track.name, track.dt, time, *both, said, "times the noise", False)
+                yield Course(
+                    flight=track.name,
+                    dt=track.dt,
+                    time=track.time[skip:],
+                    before=np.resize(before, len(track))[skip:] / scale,
+                    after=np.resize(after, len(track))[skip:] / scale,
+                    name="mean motor command" if name == "motors all" else name,
+                    unit="times the noise",
+                    adds_up=False,
+                )
+
+
+def _courses_of_motion(report: Report) -> Iterator[Course]:
+    """Body rates and velocity of every flight, as far as they were logged."""
+    evidence = report.plots["evidence"]
+    axes = [axis for axis in range(6) if evidence.replay.usable[axis]]
+    nominal, corrected = _residuals(report)
+    for track, before, after in zip(evidence.tracks, nominal, corrected, strict=True):
+        skip = int(SKIP / track.dt)
+        for axis in axes:
+            name, unit = _axis_name(axis)
+            yield Course(
+                flight=track.name,
+                dt=track.dt,
+                time=track.time[skip:],
+                before=before[skip:, axis],
+                after=after[skip:, axis],
+                name=name,
+                unit=unit,
+                adds_up=True,
+            )
 
 
 def _worst(report: Report) -> Course | None:
@@ -177,7 +202,8 @@ def _horizons(report: Report):
     ahead = sorted({max(round(h / course.dt), 1) * course.dt for h in HORIZONS_SHOWN})
     figure, axes = small_figure(2.6)
     sizes = np.array([[rms(error) for error in course.errors(h)] for h in ahead])
-    for size, colour, label in _lines(report, *sizes.T):
+    before, after = sizes.T
+    for size, colour, label in _lines(report, before, after):
         axes.semilogx(ahead, size, "o-", color=colour, markersize=5, label=label)
     axes.set(
         xlabel="time ahead [s]",
@@ -209,11 +235,15 @@ def _coordinate(report: Report):
     for residuals, (_, colour, label) in zip(
         _residuals(report), _lines(report, None, None), strict=False
     ):
-        both = zip(evidence.tracks, residuals, strict=True)
-        pairs = [p for p in (_pairs(*of, coordinate) for of in both) if p is not None]
+        pairs = []
+        for track, residual in zip(evidence.tracks, residuals, strict=True):
+            pair = _pairs(track, residual, coordinate)
+            if pair is not None:
+                pairs.append(pair)
         if not pairs:
             return None
-        axes.plot(*_binned(np.concatenate(pairs)).T, "o-", color=colour, markersize=5, label=label)
+        along, missing = _binned(np.concatenate(pairs)).T
+        axes.plot(along, missing, "o-", color=colour, markersize=5, label=label)
     units = {
         "body velocity": "forward speed [m/s]",
         "voltage": "voltage [V]",
@@ -236,20 +266,28 @@ def _pairs(track, residual, coordinate):
     hasn't it.
     """
     missing = smooth(disturbances(track, residual), CALM, track.dt)[:, 3:6]
-    if coordinate == "body velocity":
-        x = to_body(track.quaternion, track.velocity)[:, 0]
-        y = missing[:, 0]
-    else:
-        y = missing[:, 2]
-        x = {
-            "height": lambda: track.position[:, 2],
-            "thrust": lambda: smooth(track.motor.mean(1), 0.05, track.dt),
-            "voltage": lambda: track.voltage,
-            "height below a neighbour": lambda: (
-                track.neighbours[0][:, 2] - track.position[:, 2] if len(track.neighbours) else None
-            ),
-        }.get(coordinate, lambda: None)()
-    return None if x is None else np.stack([x, y], 1)[int(SKIP / track.dt) :]
+    # drag acts against the motion, all else along the rotors' axes
+    axis = 0 if coordinate == "body velocity" else 2
+    along = _along(track, coordinate)
+    if along is None:
+        return None
+    return np.stack([along, missing[:, axis]], 1)[int(SKIP / track.dt) :]
+
+
+def _along(track, coordinate: str) -> np.ndarray | None:
+    """(T,) values of a coordinate along a track; None where the track hasn't it."""
+    match coordinate:
+        case "body velocity":
+            return to_body(track.quaternion, track.velocity)[:, 0]
+        case "height":
+            return track.position[:, 2]
+        case "thrust":
+            return smooth(track.motor.mean(1), 0.05, track.dt)
+        case "voltage":
+            return track.voltage
+        case "height below a neighbour" if len(track.neighbours):
+            return track.neighbours[0][:, 2] - track.position[:, 2]
+    return None
 
 
 def _binned(data: np.ndarray) -> np.ndarray:

@@ -7,13 +7,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from openjax.gap.model.library import CARDS
-from openjax.gap.report import VERDICTS, Report
 from openjax.gap.report.figures import figures
+from openjax.gap.report.report import VERDICTS, Report
 from openjax.gap.report.response import response_of
 from openjax.show.pages import filled
 from openjax.vehicle.effects import EFFECTS
 
-MOST = 0.5  # of the gap: what is named isn't most of it below
+MOST = 0.5
+"""Share of the gap below which what is named isn't most of it."""
 
 
 def page_of(report: Report, folder: Path | None = None) -> str:
@@ -58,12 +59,12 @@ def sentence(report: Report) -> str:
     named = report.named
     if not named:
         return VERDICTS[report.verdict]
-    found = {e: report.shares.effects[e].value for e in named}
+    values = [report.shares.effects[effect].value for effect in named]
+    names = [report.class_of(effect).replace("_", " ") for effect in named]
     parts = " and ".join(
-        f"{report.class_of(e).replace('_', ' ')} ({100 * share:.0f} %)"
-        for e, share in found.items()
+        f"{name} ({100 * value:.0f} %)" for name, value in zip(names, values, strict=True)
     )
-    whole = sum(found.values())
+    whole = sum(values)
     if whole < MOST:
         rest = {
             "unexplained": report.shares.unexplained.value,
@@ -72,10 +73,12 @@ def sentence(report: Report) -> str:
         other = max(rest, key=rest.get)
         text = f"What the simulator misses is {100 * rest[other]:.0f} % {other}; named is {parts}"
     else:
-        text = f"What the simulator misses is {'' if whole > 0.995 else 'mostly '}{parts}"
+        mostly = "" if whole > 0.995 else "mostly "  # .995 is 100 % as it is printed
+        text = f"What the simulator misses is {mostly}{parts}"
     if report.parameters:
         those = "it" if len(named) == 1 else "them"
-        text += f"; with {those}, errors on held-out flights shrink by {100 * report.gap.reduction:.0f} %"
+        smaller = f"{100 * report.gap.reduction:.0f} %"
+        text += f"; with {those}, errors on held-out flights shrink by {smaller}"
     unknown = " Something unknown acts as well." if "unknown" in report.effects else ""
     return f"{text}.{unknown}"
 
@@ -84,23 +87,25 @@ def shares(report: Report) -> list[dict]:
     """Rows of the chart: name, value and interval in per cent, and what kind of thing it is."""
     if not report.effects and not report.sensors:
         return []
-    rows = [(effect, share, "effect") for effect, share in report.shares.effects.items()]
-    rows += [("sensors and clocks", report.shares.sensors, "nuisance")]
-    rows += [("unexplained", report.shares.unexplained, "unexplained")]
 
     def row(name, share, kind):
-        value, low, high = (
-            min(max(100.0 * v, 0.0), 100.0) for v in (share.value, *share.interval90)
-        )
+        low, high = share.interval90
         return {
             "name": name.replace("_", " "),
             "kind": kind,
-            "value": value,
-            "low": low,
-            "high": high,
+            "value": per_cent(share.value),
+            "low": per_cent(low),
+            "high": per_cent(high),
         }
 
-    return [row(*entry) for entry in rows]
+    def per_cent(value):
+        """Within the chart: an estimate's interval may leave it."""
+        return min(max(100.0 * value, 0.0), 100.0)
+
+    rows = [row(effect, share, "effect") for effect, share in report.shares.effects.items()]
+    rows.append(row("sensors and clocks", report.shares.sensors, "nuisance"))
+    rows.append(row("unexplained", report.shares.unexplained, "unexplained"))
+    return rows
 
 
 def next_steps(report: Report, folder: Path | None = None) -> list[tuple[str, str]]:
@@ -109,8 +114,8 @@ def next_steps(report: Report, folder: Path | None = None) -> list[tuple[str, st
     """
     steps = []
     for name, others in report.equivalent.items():
-        told = f"These flights can't tell {name} from {', '.join(others)}. {_fly(report, others)}"
-        steps.append((told, "openjax plan . --out next_flight"))
+        why = f"These flights can't tell {name} from {', '.join(others)}. {_fly(report, others)}"
+        steps.append((why, "openjax plan . --out next_flight"))
     if report.parameters:
         names = ", ".join(effect.replace("_", " ") for effect in report.parameters)
         tune = "openjax adapt effects.toml --policy flight"
@@ -126,7 +131,10 @@ def next_steps(report: Report, folder: Path | None = None) -> list[tuple[str, st
         steps.append((why, f"openjax diagnose NEW_FLIGHTS --reference {case}"))
     if "unknown" in report.effects:
         follows = f" {report.rest}" if report.rest else ""
-        why = f"Look for what is not on the list of effects.{follows} Did anything change since it flew well?"
+        why = (
+            f"Look for what is not on the list of effects.{follows} Did anything change since it "
+            "flew well?"
+        )
         steps.append((why, f"openjax diagnose {case} --reference EARLIER_FLIGHTS"))
     if report.not_testable and not report.equivalent and report.next_flight:
         missing = ", ".join(effect.replace("_", " ") for effect in report.not_testable)
@@ -145,10 +153,9 @@ def _case_from(report: Report, folder: Path | None) -> str:
 
 def _fly(report: Report, others: Sequence[str] = ()) -> str:
     """The next flight, of the first of `others` that has one."""
-    found = next((CARDS[o].next_flight for o in others if o in CARDS), report.next_flight)
-    text = found.strip().rstrip(".")
-    return (
-        f"Next flight: {text[:1].lower()}{text[1:]}; then diagnose all of them again."
-        if text
-        else ""
-    )
+    flights = [CARDS[other].next_flight for other in others if other in CARDS]
+    flight = flights[0] if flights else report.next_flight
+    text = flight.strip().rstrip(".")
+    if not text:
+        return ""
+    return f"Next flight: {text[:1].lower()}{text[1:]}; then diagnose all of them again."

@@ -59,10 +59,11 @@ def _picture(found: Identification) -> str:
         figure = Figure(figsize=(2.6 * count, 4.2), layout="constrained")
         grid = figure.subplots(2, count, sharex=True, squeeze=False)
         for column, (axis, pair) in enumerate(found.responses.items()):
-            for response, color, name in (
+            drawn = (
                 (pair.simulated, BEFORE, "nominal simulator"),
                 (pair.measured, AFTER, "measured"),
-            ):
+            )
+            for response, color, name in drawn:
                 for row, values in enumerate((response.gain, response.phase)):
                     low, middle, high = np.array(values).T
                     axes = grid[row, column]

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 
-from openjax.gap.report import Report
+from openjax.gap.report.report import Report
 from openjax.vehicle.effects import EFFECTS
 
 LEAST_SHARE = 0.005  # of the gap: less is shown as nothing

@@ -1,0 +1,209 @@
+"""What was found in one case, as plain data and as text."""
+
+from dataclasses import asdict, dataclass, field, fields, is_dataclass
+
+from openjax.gap.identification.quantities import Identification
+from openjax.gap.shares import Gap, Split
+from openjax.gap.where import Place, in_words
+
+VERDICTS = {
+    "none": "The simulator agrees with these flights to within the sensors' noise.",
+    "unknown": "The simulator misses something that no known effect explains.",
+    "not_testable": "No effect is seen, but these flights couldn't show most of those that are usual.",
+}
+"""What is said of each verdict that names nothing."""
+VERDICTS_SINCE = {
+    "none": "The vehicle is as in its reference flights, to within what a day changes.",
+    "unknown": "The vehicle changed in a way that no known effect explains.",
+    "not_testable": "No change is seen, but these flights couldn't show most of those that are usual.",
+}
+"""The same where a reference of the vehicle was given."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A fitted parameter with its 90 % interval."""
+
+    value: float
+    unit: str
+    interval90: tuple[float, float]
+    usual: tuple[float, float]
+    """Its prior range."""
+    may_be_none: bool = False
+    """Whether the interval holds the value at which the effect does nothing."""
+
+    def in_words(self, name: str) -> str:
+        """The value of the parameter `name` with its interval and unit, and whether it is
+        unusual.
+        """
+        low, high = self.interval90
+        text = f"{name} = {self.value:.4g} [{low:.4g}, {high:.4g}]"
+        if self.unit != "1":
+            text += f" {self.unit}"
+        return f"{text} (unusual)" if self.unusual else text
+
+    @property
+    def unusual(self) -> bool:
+        """Whether it lies outside of its prior range."""
+        return not self.usual[0] <= self.value <= self.usual[1]
+
+
+@dataclass(frozen=True, eq=False)
+class Report:
+    """What the flights of one case say."""
+
+    case: str
+    verdict: str
+    """One of `VERDICTS`, or "effect"."""
+    effects: tuple[str, ...]
+    """By share, largest first; "unknown" stands among them where what is left isn't noise."""
+    probabilities: dict[str, float]
+    shares: Split
+    equivalent: dict[str, list[str]]
+    """{named effect: those that would do as well in its place}."""
+    parameters: dict[str, dict[str, Estimate]]
+    """{effect: {parameter: estimate}} of the named effects."""
+    where: list[Place]
+    gap: Gap
+    not_testable: list[str]
+    next_flight: str
+    quality: list[dict]
+    """An entry for each flight; with `left_out` where it wasn't used."""
+    runner_up: str = ""
+    rest: str = ""
+    """What is left when the named effects are accounted for."""
+    sensors: tuple[str, ...] = ()
+    contradictions: tuple[str, ...] = ()
+    nuisances: dict[str, str] = field(default_factory=dict)
+    """{name: what it took}."""
+    residual: dict[str, float] = field(default_factory=dict)
+    reference: str = ""
+    """What the reference flights say of the vehicle; empty: none were given."""
+    identification: Identification | None = None
+    """What the vehicle does; None: no motors were logged."""
+    seconds: float = 0.0
+    plots: dict = field(default_factory=dict, repr=False)
+    """Arrays for the pictures; no part of the JSON."""
+
+    @property
+    def named(self) -> list[str]:
+        """The effects without "unknown"."""
+        return [e for e in self.effects if e != "unknown"]
+
+    @property
+    def left_out(self) -> list[str]:
+        """Logs that weren't used, each with the reason."""
+        return [f"{q['flight']}: {q['issue']}" for q in self.quality if q.get("left_out")]
+
+    def prediction(self) -> dict:
+        """The case's entry in a predictions file."""
+        return {
+            "effects": list(self.effects),
+            "probabilities": {k: round(v, 5) for k, v in self.probabilities.items() if v >= 5e-6},
+            "where": in_words(self.where),
+            "reduction": round(min(max(self.gap.reduction, 0.0), 1.0), 4),
+            "not_testable": list(self.not_testable),
+        }
+
+    def to_dict(self) -> dict:
+        """`report.json`: every field but the pictures' arrays, numbers rounded."""
+        shares = {
+            "effects": self.shares.effects,
+            "sensors": self.shares.sensors,
+            "unexplained": self.shares.unexplained,
+        }
+        estimates = {
+            effect: {name: asdict(v) | {"unusual": v.unusual} for name, v in found.items()}
+            for effect, found in self.parameters.items()
+        }
+        apart = ("case", "plots", "seconds", "identification")
+        plain = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in apart}
+        if self.identification is not None:
+            of_gap = {e: share.value for e, share in self.shares.effects.items()}
+            plain["identification"] = self.identification.to_dict(of_gap)
+        return _plain(plain | {"shares": shares, "parameters": estimates})
+
+    def class_of(self, effect: str) -> str:
+        """A named effect, and those that would do as well in its place."""
+        return " or ".join([effect, *self.equivalent.get(effect, ())])
+
+    def shares_in_words(self) -> str:
+        """Every named class' share with its interval, then sensors and clocks, then what is
+        unexplained.
+        """
+        named = []
+        for effect in self.named:
+            share = self.shares.effects[effect]
+            low, high = share.interval90
+            interval = f"[{_short(low)}, {_short(high)}]"
+            named.append(f"{self.class_of(effect)} {_short(share.value)} {interval}")
+        parts = [
+            *([", ".join(named)] if named else []),
+            f"sensors and clocks {_short(self.shares.sensors.value)}",
+            f"unexplained {_short(self.shares.unexplained.value)}",
+        ]
+        return f"Shares of the gap: {'; '.join(parts)}."
+
+    def verdict_in_words(self) -> str:
+        """What a verdict that names nothing means, and how probable it is."""
+        meanings = VERDICTS_SINCE if self.reference else VERDICTS
+        meaning = meanings.get(self.verdict, "")
+        sure = self.probabilities.get(self.verdict)
+        return meaning if sure is None else f"{meaning} Probability {sure:.2f}."
+
+    def in_words(self) -> list[str]:
+        """The shares, then what they mean, in a few plain sentences."""
+        lines = [f"Left out: {text}." for text in self.left_out]
+        does = self.identification
+        if does is not None and does.trusted:
+            lines.append(does.sentence())
+        if self.effects or self.sensors:
+            lines.append(self.shares_in_words())
+        if not self.parameters:
+            lines.append(self.verdict_in_words())
+        lines += [f"Sensors: {text}." for text in self.sensors]
+        lines += [self.rest, self.reference]
+        if self.effects:
+            lines.append(f"Where: {in_words(self.where)}.")
+        lines += self._parameters_in_words()
+        if self.parameters:
+            lines.append(self.gap.in_words())
+        if self.runner_up:
+            lines.append(f"Runner-up: {self.runner_up}.")
+        if self.not_testable:
+            lines.append(f"Not testable with these flights: {', '.join(self.not_testable)}.")
+        if self.next_flight:
+            lines.append(f"Fly next: {self.next_flight}")
+        return [line for line in lines if line]
+
+    def _parameters_in_words(self) -> list[str]:
+        """The named effects' values, then what is doubtful about them."""
+        lines = []
+        doubts = []
+        for effect, estimates in self.parameters.items():
+            values = [estimate.in_words(name) for name, estimate in estimates.items()]
+            lines.append(f"{effect}: {', '.join(values)}.")
+            if all(estimate.may_be_none for estimate in estimates.values()):
+                doubts.append(
+                    f"Flights disagree about {effect}: it may be none at all. Were they of one "
+                    "vehicle, and alike?"
+                )
+        for effect, others in self.equivalent.items():
+            doubts.append(f"These flights can't tell {effect} from {', '.join(others)}.")
+        return lines + doubts
+
+
+def _plain(value):
+    """JSON-ready: dataclasses as dicts, tuples as lists, floats with six digits."""
+    if is_dataclass(value):
+        value = asdict(value)
+    if isinstance(value, dict):
+        return {k: _plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    return float(f"{value:.6g}") if isinstance(value, float) else value
+
+
+def _short(value: float) -> str:
+    """Two digits without a leading zero."""
+    return f"{value:.2f}".replace("0.", ".", 1)
