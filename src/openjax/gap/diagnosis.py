@@ -34,10 +34,17 @@ from openjax.gap.where import locate
 def diagnose_case(
     case: Case, without: Iterable[str] = (), progress=None, reference: Sequence[Case] = ()
 ) -> Report:
-    """Diagnose the flights of a case, `without` effects that the library must do without;
-    `progress(text)` is called as the work goes on. `reference`: flights of the same vehicle while
-    nothing was wrong with it, a case for each day; told is then what changed since. Raises
-    UserError where the flights are too short or hold no commands.
+    """Diagnose the flights of a case.
+
+    Args:
+      case: see `openjax.gap.load_case`.
+      without: effects that the library must do without.
+      progress: called with a text as the work goes on.
+      reference: flights of the same vehicle while nothing was wrong with it, a case for each day;
+      told is then what changed since.
+
+    Raises:
+      UserError: the flights are too short or hold no commands.
     """
     begin = time.perf_counter()
     baseline = read_reference(joined(reference), progress) if reference else None
@@ -123,6 +130,7 @@ def not_testable(evidence: Evidence) -> list[str]:
 def _report(
     evidence: Evidence, selection: Selection, check: Check, parts: Split, chances
 ) -> Report:
+    """The report of a selection, checked and split into shares."""
     effects = words(check, parts)
     missing = [e for e in not_testable(evidence) if e not in effects]
     nothing = "not_testable" if len(missing) >= len(evidence.library.effects) // 2 else "none"

@@ -24,22 +24,27 @@ from openjax.gap.model.replay import Replay
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What was read. `channels`: of pose, radio and rate loop those that were logged; `motion`: the
-    physics; `identification`: what the torques do in closed loop.
-    """
+    """What was read of a case."""
 
     case: Case
     library: Library
     tracks: list[Track]
+    """The stretches of all flights."""
     vehicles: list
+    """The nominal vehicle of each."""
     sensors: Kinematics
     channels: tuple[Channel, ...]
+    """Of pose, radio and rate loop those that were logged."""
     motion: Motion
+    """Of the physics."""
     baseline: Baseline | None = None
+    """What the vehicle is like while nothing acts; None where that isn't known."""
     identification: Identification | None = None
+    """What the torques do in closed loop."""
 
     @property
     def replay(self) -> Replay:
+        """Of the motion."""
         return self.motion.replay
 
     @property

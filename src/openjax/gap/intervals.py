@@ -23,39 +23,46 @@ def estimates(evidence: Evidence, fit: SetFit, named) -> dict[str, dict[str, Est
     out = {}
     for effect in named:
         channel = channels.get(path_of(effect))
-        told = {
-            p.name: channel.estimate(effect, p.name) if channel else _of_physics(fit, effect, p)
-            for p in CARDS[effect].fitted
-        }
-        parameters = EFFECTS[effect].parameters
-        out[effect] = {
-            p: _estimate(v, parameters[p], evidence.vehicles[0]) for p, v in told.items()
-        }
+        out[effect] = {}
+        for fitted in CARDS[effect].fitted:
+            found = (
+                channel.estimate(effect, fitted.name)
+                if channel
+                else _of_physics(fit, effect, fitted)
+            )
+            parameter = EFFECTS[effect].parameters[fitted.name]
+            out[effect][fitted.name] = _estimate(found, parameter, evidence.vehicles[0])
     return out
 
 
-def _estimate(v: Estimated, parameter: Parameter, vehicle) -> Estimate:
+def _estimate(found: Estimated, parameter: Parameter, vehicle) -> Estimate:
     """A value with its 90 % interval, both as far as they lie where the parameter means
     anything.
     """
-    ends = (v.value - REACH * v.below, v.value + REACH * v.above)
-    value, *interval = np.clip((v.value, *ends), *parameter.limits(vehicle)).tolist()
-    may_be_none = bool(ends[0] <= parameter.none <= ends[1])
-    usual = parameter.usual(vehicle)
-    return Estimate(value, parameter.unit, tuple(interval), usual, may_be_none)
+    start = found.value - REACH * found.below
+    end = found.value + REACH * found.above
+    least, most = parameter.limits(vehicle)
+    value, low, high = np.clip((found.value, start, end), least, most).tolist()
+    return Estimate(
+        value=value,
+        unit=parameter.unit,
+        interval90=(low, high),
+        usual=parameter.usual(vehicle),
+        # before it is cut: an interval beyond the domain still holds what lies at its edge
+        may_be_none=bool(start <= parameter.none <= end),
+    )
 
 
-def interval(told: Estimated, parameter) -> tuple[float, float]:
+def interval(found: Estimated, parameter) -> tuple[float, float]:
     """The 90 % interval. A number that multiplies something (it does nothing at 1) stays positive:
     its logarithm is normal.
     """
-    below, above = REACH * told.below, REACH * told.above
-    if parameter.none == 1.0 and told.value > 0.0:
-        return (
-            told.value * float(np.exp(-below / told.value)),
-            told.value * float(np.exp(above / told.value)),
-        )
-    return told.value - below, told.value + above
+    value = found.value
+    below = REACH * found.below
+    above = REACH * found.above
+    if parameter.none == 1.0 and value > 0.0:
+        return value * float(np.exp(-below / value)), value * float(np.exp(above / value))
+    return value - below, value + above
 
 
 def _of_physics(fit: SetFit, effect: str, parameter) -> Estimated:

@@ -23,9 +23,8 @@ from openjax.gap.selection import DRAWS, Selection
 
 METRIC = (
     "rms over channels of prediction error / noise floor on stretches left out (velocity over 0.25 "
-    "s by path and by "
-    "accelerometer, body rates over 0.05 s, pose against gyroscope over 0.1 s, motor commands from "
-    "body-rate commands)"
+    "s by path and by accelerometer, body rates over 0.05 s, pose against gyroscope over 0.1 s, "
+    "motor commands from body-rate commands)"
 )
 # Nuisances that are the sensors' and the clocks': how they are mounted, biased, filtered and timed.
 SENSORS = (
@@ -48,42 +47,46 @@ class Share:
 
 @dataclass(frozen=True)
 class Gap:
-    """`before` (no effect; sensors and clocks as the flights show them), `after` and `floor`, in
-    units of the floor; `reduction` is 1 - after / before.
-    """
+    """How far the simulator is off, in units of the floor."""
 
     metric: str
     before: float
+    """With no effect; sensors and clocks as the flights show them."""
     after: float
+    """With the named effects."""
     floor: float
     reduction: float
+    """1 - after / before."""
     interval90: tuple[float, float]
+    """Of the reduction."""
 
     def in_words(self) -> str:
         """How far the gap shrinks, and a warning where it doesn't."""
         low, high = (100 * v for v in self.interval90)
-        careful = " Careful: with these effects the held-out predictions got worse." * (
-            self.reduction < 0
+        text = (
+            f"Gap on held-out flights: {self.before:.2f} before, {self.after:.2f} after, "
+            f"floor {self.floor:.2f}: "
+            f"{100 * self.reduction:.0f} % smaller [{low:.0f}, {high:.0f}]."
         )
-        return (
-            f"Gap on held-out flights: {self.before:.2f} before, {self.after:.2f} after, floor "
-            f"{self.floor:.2f}: "
-            f"{100 * self.reduction:.0f} % smaller [{low:.0f}, {high:.0f}].{careful}"
-        )
+        if self.reduction < 0:
+            text += " Careful: with these effects the held-out predictions got worse."
+        return text
 
 
 @dataclass(frozen=True)
 class Split:
-    """`effects` {name: Share}; `sensors`: sensors and clocks; `unexplained`: more than noise, and
-    no accepted effect; `largest` {part: share of the bootstrap's draws in which it is the largest},
-    of effects and "unexplained".
-    """
+    """The gap, and what its parts take of it."""
 
     gap: Gap
     effects: dict[str, Share]
     sensors: Share
+    """Of sensors and clocks."""
     unexplained: Share
+    """Of what is more than noise, and no accepted effect."""
     largest: dict[str, float]
+    """{part: share of the bootstrap's draws in which it is the largest}, of effects and
+    "unexplained".
+    """
 
 
 def split(
@@ -96,25 +99,26 @@ def split(
     known = dict(zip(ERRORS, predicted, strict=True))
     left = 1.0 - np.array([known.get(n, 0.0) for n in channels])
     blocks = squares.shape[1]
+    # the first row are the flights as they are, the others draws of a Bayesian bootstrap
     drawn = np.random.default_rng(0).dirichlet(np.ones(blocks), DRAWS)
-    values, before = shares_of_squares(
-        squares, np.concatenate([np.full((1, blocks), 1.0 / blocks), drawn]), left
-    )
+    weights = np.concatenate([np.full((1, blocks), 1.0 / blocks), drawn])
+    values, before = shares_of_squares(squares, weights, left)
     names = (*named, "sensors", "unexplained")
     low, high = np.quantile(values[1:], [0.05, 0.95], axis=0)
-    shares = {
-        n: Share(float(v), (float(min(a, v)), float(max(b, v))))
-        for n, v, a, b in zip(names, values[0], low, high, strict=True)
-    }
+    shares = {}
+    for name, value, start, end in zip(names, values[0], low, high, strict=True):
+        # a share at the end of its range may lie beside the draws' quantiles
+        interval = (float(min(start, value)), float(max(end, value)))
+        shares[name] = Share(float(value), interval)
     rows = [k for k, n in enumerate(names) if n != "sensors"]
     first = np.argmax(values[1:][:, rows], 1)
     largest = {names[k]: float(np.mean(first == place)) for place, k in enumerate(rows)}
     return Split(
-        _gap(before),
-        {e: shares[e] for e in named},
-        shares["sensors"],
-        shares["unexplained"],
-        largest,
+        gap=_gap(before),
+        effects={e: shares[e] for e in named},
+        sensors=shares["sensors"],
+        unexplained=shares["unexplained"],
+        largest=largest,
     )
 
 
@@ -138,7 +142,7 @@ def shares_of_squares(
     sure = whole > 2.0 * DECISION.least_gap  # without a gap, all there is are the sensors
     unexplained = np.where(sure, np.clip((after - 1.0) / np.where(sure, whole, 1.0), 0.0, 1.0), 0.0)
     useful = np.maximum(level[:, 3:] - after[:, None], 0.0) * sure[:, None]
-    useful[:, -1] += 1e-12
+    useful[:, -1] += 1e-12  # the sensors take all where nothing else is of use
     shares = useful / useful.sum(1, keepdims=True) * (1.0 - unexplained)[:, None]
     return np.concatenate([shares, unexplained[:, None]], 1), np.stack([before, after], 1)
 
@@ -150,12 +154,12 @@ def _gap(square: np.ndarray) -> Gap:
     before, after = np.sqrt(square[0])
     value = float(reduction[0])
     return Gap(
-        METRIC,
-        float(before),
-        float(after),
-        1.0,
-        value,
-        (min(float(low), value), max(float(high), value)),
+        metric=METRIC,
+        before=float(before),
+        after=float(after),
+        floor=1.0,
+        reduction=value,
+        interval90=(min(float(low), value), max(float(high), value)),
     )
 
 
@@ -175,10 +179,10 @@ def _squares_of_sets(
     def squares(there, off=None) -> dict[str, np.ndarray]:
         gone = [e for e in named if e not in there and e in selection.fit.effects]
         motion = ablated(table, found, (*never, *gone), off) / table.rows[:, None]
-        heard = dict(zip(np.array(ERRORS)[evidence.replay.usable > 0], motion.T, strict=True))
-        return heard | _other_squares(
-            evidence, [e for e in there if e not in selection.fit.effects], table
-        )
+        channels = np.array(ERRORS)[evidence.replay.usable > 0]
+        of_motion = dict(zip(channels, motion.T, strict=True))
+        of_channels = [e for e in there if e not in selection.fit.effects]
+        return of_motion | _other_squares(evidence, of_channels, table)
 
     sets = [squares(named), squares((), sensors), squares(())]
     sets += [squares([e for e in named if e != gone]) for gone in named]
@@ -196,9 +200,10 @@ def _other_squares(evidence: Evidence, named, table) -> dict[str, np.ndarray]:
         for name, series in channel.residuals(named).items():
             blocks = []
             for track, errors, count in zip(evidence.tracks, series, counts, strict=True):
-                used = (
-                    errors[int(SKIP / track.dt) :] if len(errors) > 1 else np.repeat(errors, count)
-                )
+                # of some channels one number is known of a whole flight
+                used = errors[int(SKIP / track.dt) :]
+                if len(errors) == 1:
+                    used = np.repeat(errors, count)
                 blocks += [float((b**2).mean()) for b in np.array_split(used, count)]
             out[name] = np.array(blocks)
     return out

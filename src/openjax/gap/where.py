@@ -31,17 +31,18 @@ CALM = 0.12  # s over which the rest is smoothed: sensor noise out, causes in
 
 @dataclass(frozen=True)
 class Place:
-    """One cell of the table. `before` and `after` are rms in units of the noise floor; `share` is
-    the part of the whole excess over the floor that lies here; `seconds` the time spent in the
-    regime.
-    """
+    """One cell of the table."""
 
     channel: str
     regime: str
     share: float
+    """Part of the whole excess over the floor that lies here."""
     before: float
+    """Rms in units of the noise floor, without the named effects."""
     after: float
+    """The same with them."""
     seconds: float
+    """Spent in the regime."""
 
 
 def locate(evidence: Evidence, fit: SetFit, named=()) -> list[Place]:
@@ -53,9 +54,8 @@ def locate(evidence: Evidence, fit: SetFit, named=()) -> list[Place]:
     inside = {r: np.concatenate([m[r] for m in masks]) for r in REGIMES}
     seconds = {r: int(m.sum()) * evidence.tracks[0].dt for r, m in inside.items()}
     places = []
-    for channel, powers in (
-        _motion_powers(evidence, fit, names) | _other_powers(evidence, named)
-    ).items():
+    powers_of = _motion_powers(evidence, fit, names) | _other_powers(evidence, named)
+    for channel, powers in powers_of.items():
         floor = powers[2].mean() + 1e-18
         for regime in (r for r in REGIMES if seconds[r] >= LEAST_TIME):
             b, a = (float(p[inside[regime]].mean() / floor) for p in powers[:2])
@@ -100,23 +100,28 @@ def _other_powers(evidence: Evidence, named) -> dict[str, list[np.ndarray]]:
     found: dict[str, list[np.ndarray]] = {}
     for channel in evidence.channels:
         floor = channel.residuals(evidence.library.of(channel.path))
-        scale = {
-            n: float(np.sqrt(np.mean(np.concatenate(v) ** 2))) + 1e-12 for n, v in floor.items()
-        }
-        powers = []
-        for errors in (channel.residuals(()), channel.residuals(named), floor):
-            tracks = zip(
-                evidence.tracks, *([v / scale[n] for v in errors[n]] for n in errors), strict=True
-            )
-            means = [(np.mean(np.square(own), 0), t) for t, *own in tracks]  # (T,) or (1,)
-            powers.append(
-                np.concatenate([np.broadcast_to(m, len(t))[int(SKIP / t.dt) :] for m, t in means])
-            )
+        scale = {}
+        for name, series in floor.items():
+            scale[name] = float(np.sqrt(np.mean(np.concatenate(series) ** 2))) + 1e-12
+        powers = [
+            _mean_squares(evidence, errors, scale)
+            for errors in (channel.residuals(()), channel.residuals(named), floor)
+        ]
         name = "estimator" if channel.path == "estimator" else "firmware"
-        found[name] = (
-            [a + b for a, b in zip(found[name], powers, strict=True)] if name in found else powers
-        )
+        if name in found:  # radio and rate loop are both the firmware's
+            powers = [a + b for a, b in zip(found[name], powers, strict=True)]
+        found[name] = powers
     return found
+
+
+def _mean_squares(evidence: Evidence, errors: dict, scale: dict[str, float]) -> np.ndarray:
+    """(rows,) mean over a channel's series of their squared errors, each in units of its scale."""
+    rows = []
+    for number, track in enumerate(evidence.tracks):
+        scaled = [series[number] / scale[name] for name, series in errors.items()]
+        mean = np.mean(np.square(scaled), 0)  # (T,), or (1,) of a whole flight
+        rows.append(np.broadcast_to(mean, len(track))[int(SKIP / track.dt) :])
+    return np.concatenate(rows)
 
 
 def in_words(places: list[Place]) -> str:
@@ -126,8 +131,6 @@ def in_words(places: list[Place]) -> str:
     for place in (p for p in places[:2] if p.share >= 0.02 and p.before >= 1.15):
         kind, _, axis = place.channel.partition("_")
         name = f"{words[kind]} {axis}" if kind in words else place.channel
-        parts.append(
-            f"{name} in {place.regime.replace('_', ' ')} flight ({place.before:.1f} times the "
-            "noise floor)"
-        )
+        regime = place.regime.replace("_", " ")
+        parts.append(f"{name} in {regime} flight ({place.before:.1f} times the noise floor)")
     return "; ".join(parts) or "no channel stands out of the noise"

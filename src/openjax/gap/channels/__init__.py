@@ -52,11 +52,13 @@ class Channel(Protocol):
         """By what share the channel's errors are larger without an effect than with all that
         act.
         """
-        without, whole = (
-            np.array([np.mean(np.concatenate(v) ** 2) for v in self.residuals(named).values()])
-            for named in (set(acting) - {effect}, acting)
-        )
-        return float(np.sqrt((without / whole).mean())) - 1.0
+
+        def squares(named):
+            residuals = self.residuals(named).values()
+            return np.array([np.mean(np.concatenate(series) ** 2) for series in residuals])
+
+        ratio = squares(set(acting) - {effect}) / squares(acting)
+        return float(np.sqrt(ratio.mean())) - 1.0
 
 
 def few(count: int) -> float:

@@ -28,15 +28,16 @@ EDGE = 0.3  # s at either end that the filter spoils
 
 @dataclass(frozen=True, eq=False)
 class Feedback:
-    """Of one track: `acceleration` (T, 3) rad/s^2 that the feedback part of the motors makes,
-    through their lag; `trim` the same of what motors do slowly but for its mean, which holds what
-    pushes the body slowly; `quick` (T, 3) the same of what motors do within QUICK s, whoever caused
-    it.
+    """Angular accelerations (T, 3) rad/s^2 of one track that parts of what its motors do make,
+    through their lag.
     """
 
     acceleration: np.ndarray
+    """By the feedback part."""
     trim: np.ndarray
+    """By what they do slowly but for its mean, which holds what pushes the body slowly."""
     quick: np.ndarray
+    """By what they do within QUICK s, whoever caused it."""
 
 
 def outputs_of(vehicle) -> Float[np.ndarray, "4 3"]:
@@ -65,18 +66,22 @@ def read_feedback(tracks, vehicles, by_commands) -> list[Feedback]:
     # axis by axis. More freedom (a filter) would let the outer loop's answers to gusts in.
     made = [m - m.mean(0) for m in made]
     power = sum((c * c).sum(0) for c in caused)
-    share = sum((c * m).sum(0) for c, m in zip(caused, made, strict=True)) / np.maximum(
-        power, 1e-12
-    )
+    common = sum((c * m).sum(0) for c, m in zip(caused, made, strict=True))
+    share = common / np.maximum(power, 1e-12)
     rest = [m - share * c for c, m in zip(caused, made, strict=True)]
-    return [
-        Feedback(
-            _turning((r - smooth(r, TRIM, t.dt)) @ np.asarray(mixer(v), float).T, t, v),
-            _turning(smooth(t.motor, TRIM, t.dt) - t.motor.mean(0), t, v),
-            _turning(t.motor - smooth(t.motor, QUICK, t.dt), t, v),
-        )
-        for r, t, v in zip(rest, tracks, vehicles, strict=True)
-    ]
+    return [_feedback(r, t, v) for r, t, v in zip(rest, tracks, vehicles, strict=True)]
+
+
+def _feedback(rest: np.ndarray, track: Track, vehicle) -> Feedback:
+    """What outputs (T, 3) that no command explains, and the motors themselves, do to one track."""
+    quick_part = rest - smooth(rest, TRIM, track.dt)
+    slow_motors = smooth(track.motor, TRIM, track.dt)
+    by_outputs = np.asarray(mixer(vehicle), float).T
+    return Feedback(
+        acceleration=_turning(quick_part @ by_outputs, track, vehicle),
+        trim=_turning(slow_motors - track.motor.mean(0), track, vehicle),
+        quick=_turning(track.motor - smooth(track.motor, QUICK, track.dt), track, vehicle),
+    )
 
 
 def caused_by_commands(
@@ -90,10 +95,10 @@ def caused_by_commands(
         sent = track.command if link is None else in_force(track, link).mean(1)
     else:
         gain = np.asarray(vehicle.rate_kp, float) * COUNT
+        # of the law outputs = gain (commanded - measured rates)
         implied = track.motor @ outputs_of(vehicle) / gain + track.body_rates
-        sent = np.concatenate(
-            [track.motor.mean(1)[:, None], smooth(implied - implied.mean(0), SLOW, track.dt)], 1
-        )
+        slowly = smooth(implied - implied.mean(0), SLOW, track.dt)
+        sent = np.concatenate([track.motor.mean(1)[:, None], slowly], 1)
     motors, rates = commanded(vehicle, padded(sent, bucket(len(track))), np.float32(track.dt))
     return np.asarray(motors, float)[: len(track)], np.asarray(rates, float)[: len(track)]
 
@@ -102,6 +107,8 @@ def _turning(motors: np.ndarray, track: Track, vehicle) -> np.ndarray:
     """Angular acceleration (T, 3) that changes of the motor commands (T, 4) make, through the
     motors' lag.
     """
+    # a command is a share of thrust, so the lag may act on thrust instead of speed: to first order
+    # of small changes both are the same
     blend = -np.expm1(-track.dt / float(vehicle.motor_time_constant))
     thrust = lfilter([blend], [1.0, blend - 1.0], motors, axis=0)
     thrust *= float(vehicle.thrust_constant * vehicle.max_rotor_speed**2)

@@ -22,49 +22,56 @@ from openjax.gap.model.observer import TICKS
 from openjax.gap.model.replay import Replay, make_replay
 from openjax.vehicle.effects import EFFECTS
 
-# of a log in one of the grid's: if they are samples, their mean isn't what five ticks of the loop
-# did
+# rows of a log in one of the grid's: if fewer are samples, their mean isn't what five ticks of the
+# loop did
 FEW_ROWS = 2.4
-SLOW_ROWS = (
-    1.2  # grid periods: rows as slow hide every other command of a loop that sends one each 10 ms
-)
+# grid periods: rows as slow hide every other command of a loop that sends one each 10 ms
+SLOW_ROWS = 1.2
 
 
 @dataclass(frozen=True, eq=False)
 class Reading:
-    """How the rows of a case are read. `arrived`: the commands that the link let through, None
-    without commands; `pwm`: motors are duty cycles; `at_once`: a row's motors are one sample, as
-    the vehicle file's [log] says by motor_rows = "sample"; `blind`: what motors do within a row
-    isn't known; `late` s: by how much they may be off against the gyroscope, None where that isn't
-    known either; `baseline`: what the vehicle is like while nothing acts, None where that isn't
-    known; `reference`: whether that is what these flights are to tell.
-    """
+    """How the rows of a case are read."""
 
     library: Library
     tracks: list[Track]
     vehicles: list
     arrived: list | None
+    """The commands that the link let through; None without commands."""
     sensors: Kinematics
     pwm: bool
+    """Whether motors are duty cycles."""
     at_once: bool
+    """Whether a row's motors are one sample, as the vehicle file's [log] says by motor_rows =
+    "sample".
+    """
     blind: bool
+    """Whether it isn't known what motors do within a row."""
     late: float | None
+    """By how much motors may be off against the gyroscope (s); None where that isn't known."""
     baseline: Baseline | None = None
+    """What the vehicle is like while nothing acts; None where that isn't known."""
     reference: bool = False
+    """Whether that is what these flights are to tell."""
 
     @property
     def numbers(self):
-        situation = (
-            "nuisance_duty" if self.pwm else "nuisance_samples" if self.blind else "nuisance"
-        )
+        """The vehicle's numbers that are free in every hypothesis, as `library.numbers_of` has
+        them: how far they are usually off depends on how motors were logged.
+        """
+        situation = "nuisance"
+        if self.pwm:
+            situation = "nuisance_duty"
+        elif self.blind:
+            situation = "nuisance_samples"
         usual = numbers_of(situation, self.vehicles[0])
         if self.reference:
             return with_days(usual, self.vehicles[0])
         if self.baseline is None:
             return usual
         known = self.baseline.numbers
-        told = {n[:2] for n in known}
-        return (*known, *(n for n in usual if n[:2] not in told))
+        keys = {number[:2] for number in known}
+        return (*known, *(number for number in usual if number[:2] not in keys))
 
     @property
     def unmapped(self) -> bool:
@@ -79,17 +86,15 @@ class Reading:
         """The tracks as the firmware hears them: its gyroscope as it is, whatever was found to be
         its gain.
         """
-        return [
-            dataclasses.replace(t, body_rates=t.body_rates * self.sensors.gain) for t in self.tracks
-        ]
+        gain = self.sensors.gain
+        return [dataclasses.replace(t, body_rates=t.body_rates * gain) for t in self.tracks]
 
     @cached_property
     def by_commands(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """`caused_by_commands` of each track."""
         links = self.arrived if self.arrived is not None else [None] * len(self.tracks)
-        return [
-            caused_by_commands(*of) for of in zip(self.tracks, self.vehicles, links, strict=True)
-        ]
+        each = zip(self.tracks, self.vehicles, links, strict=True)
+        return [caused_by_commands(track, vehicle, link) for track, vehicle, link in each]
 
 
 def motor_rows(case: Case) -> str:
@@ -117,18 +122,27 @@ def make_reading(
     blind = hidden or (at_once and (arrived is None or seldom))
     late = None if blind or seldom else ROW_DELAY[0 if slow else 1]
     pwm = case.vehicle_file.motor.command == "pwm"
-    return Reading(library, tracks, vehicles, arrived, sensors, pwm, at_once, blind, late)
+    return Reading(
+        library=library,
+        tracks=tracks,
+        vehicles=vehicles,
+        arrived=arrived,
+        sensors=sensors,
+        pwm=pwm,
+        at_once=at_once,
+        blind=blind,
+        late=late,
+    )
 
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """`replay` of the flights; `exposure` {effect: nats that it would leave at its usual size},
-    none where it can't be told.
-    """
+    """What the flights say of the effects between motors and motion."""
 
     replay: Replay
     library: Library
     exposure: dict[str, float]
+    """{effect: nats that it would leave at its usual size}; 0 where it can't be told."""
 
     @cached_property
     def nothing(self) -> SetFit:
@@ -148,9 +162,9 @@ def read_motion(reading: Reading, loop: RateLoop | None) -> Motion:
     library = reading.library
     ticks = [np.repeat(t.motor[:, None], TICKS, 1) for t in tracks] if loop is None else loop.ticks
     if loop is not None and reading.at_once:
-        tracks = [
-            dataclasses.replace(t, motor=m.mean(1)) for t, m in zip(tracks, ticks, strict=True)
-        ]
+        # single samples: what the ticks did on the mean is nearer to what drove the row
+        both = zip(tracks, ticks, strict=True)
+        tracks = [dataclasses.replace(track, motor=motor.mean(1)) for track, motor in both]
     feedback = read_feedback(tracks, reading.vehicles, reading.by_commands)
     clocks = sensors.one_clock, reading.at_once
     replay = make_replay(

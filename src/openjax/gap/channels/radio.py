@@ -18,36 +18,43 @@ DELAY_STEP = 0.0005  # s
 TOLERANCE = 3e-4  # of thrust: rounding of the logs and of the firmware's integers
 READABLE = 3e-3  # of thrust: mean misfit above which motors and commands aren't one stream
 INFORMATIVE = 1.5e-3  # smallest change of commanded thrust that shows what the link does at all
-HELD, BETWEEN = (
-    0.2,
-    0.6,
-)  # of the way from the command held to the one due: up to here it is held, or neither
+# of the way from the command held to the one due: up to HELD it is held, up to BETWEEN neither
+HELD = 0.2
+BETWEEN = 0.6
 DEPENDENT = 3.0  # rows that count as one independent error
 FEWEST = 30  # changes of the command that tell what a link does
 CLEAR = 20.0  # nats that a delay or losses must gain: errors of a link aren't independent
-ROW_ERROR = (0.1, 0.29)  # of a row, by which a delay is known: rows that are means, single samples
+# of a row, by which a delay is known where rows are means, and where they are single samples: the
+# deviation of a uniform distribution over one row is 1 / sqrt(12) of it
+ROW_ERROR = (0.1, 0.29)
 
-DELAY, LOSS = "delay", "probability"  # the parameters of the effects that a radio tells
+# the parameters of the effects that a radio tells
+DELAY = "delay"
+LOSS = "probability"
 
 
 @dataclass(frozen=True, eq=False)
 class Link:
-    """The link under one hypothesis. `arrived` [(fraction, (T, 2) rows)]: of each track the command
-    in force at the end and at the start of each row, and the share of the row that the older one
-    rules; `error` (M,) of the collective thrust; (tracks,) numbers of rows: `informative` have a
-    new command, `told` ones are so clear that they tell whether it arrived, in `lost` of them it
-    didn't, and `between` neither hold the old command nor follow the new one.
-    """
+    """The link under one hypothesis. The last four are (tracks,) numbers of rows."""
 
     arrived: list
+    """[(fraction, (T, 2) rows)]: of each track the command in force at the end and at the start of
+    each row, and the share of the row that the older one rules.
+    """
     error: np.ndarray
+    """(M,) of the collective thrust."""
     informative: np.ndarray
+    """With a new command."""
     told: np.ndarray
+    """So clear that they tell whether it arrived."""
     lost: np.ndarray
+    """In which it didn't."""
     between: np.ndarray
+    """That neither hold the old command nor follow the new one."""
 
     @property
     def misfit(self) -> float:
+        """Mean error of the collective thrust."""
         return float(np.mean(np.abs(self.error))) if len(self.error) else 0.0
 
     @property
@@ -58,15 +65,16 @@ class Link:
 
 @dataclass(frozen=True, eq=False)
 class Radio(Channel):
-    """`links` {parameters that aren't as nominal: the link}; `names` {parameter: effect} of the
-    library.
-    """
+    """What the commands' way to the vehicle does to them."""
 
-    delay: float
+    delay: float  # s
     links: dict[frozenset, Link]
+    """{parameters that aren't nominal: the link}"""
     names: dict[str, str]
-    row: float = 0.01
+    """{parameter: effect} of the library."""
+    row: float = 0.01  # s
     sampled: bool = False
+    """Whether a row's motors are one sample."""
     path = "radio"
 
     @property
@@ -134,29 +142,38 @@ class Radio(Channel):
 def read_radio(tracks: list[Track], library, sampled: bool = False) -> Radio:
     """Delay and lost packets from the commanded thrust against the mean of the motor commands."""
     delays = np.arange(0.0, LONGEST_DELAY, DELAY_STEP)
-    delay = float(delays[int(np.argmin(sum(_delay_misfit(t, delays) for t in tracks)))])
+    misfit = sum(_delay_misfit(track, delays) for track in tracks)
+    delay = float(delays[int(np.argmin(misfit))])
     links = {
-        frozenset(p for p, on in ((DELAY, late), (LOSS, lost)) if on): _decode(
-            tracks, late * delay, lost
-        )
-        for late in (False, True)
-        for lost in (False, True)
+        frozenset(): _decode(tracks, 0.0, may_lose=False),
+        frozenset({LOSS}): _decode(tracks, 0.0, may_lose=True),
+        frozenset({DELAY}): _decode(tracks, delay, may_lose=False),
+        frozenset({DELAY, LOSS}): _decode(tracks, delay, may_lose=True),
     }
     names = {CARDS[e].fitted[0].name: e for e in library.of("radio")}
     return Radio(delay, links, names, max(t.dt for t in tracks), sampled)
 
 
 def _clean_rows(track: Track) -> np.ndarray:
+    """(T,) rows in which no motor is at its limits, where their mean isn't the commanded thrust;
+    without the first, before which commands aren't known.
+    """
     clean = ((track.motor < 0.997) & (track.motor > 0.003)).all(1)
     clean[: int(LONGEST_DELAY / track.dt) + 2] = False
     return clean
 
 
 def _delay_misfit(track: Track, delays: np.ndarray) -> np.ndarray:
+    """(D,) sums of a track's errors of the thrust under each of the delays (D,)."""
     thrust = track.command[:, 0]
     clean = _clean_rows(track)
     cap = 0.3 * np.std(np.diff(thrust)) + 1e-9  # a lost packet must not pull at the delay
-    return np.array([np.minimum(np.abs(_late_error(track, d)[clean]), cap).sum() for d in delays])
+
+    def misfit(delay):
+        error = np.abs(_late_error(track, delay)[clean])
+        return np.minimum(error, cap).sum()
+
+    return np.array([misfit(delay) for delay in delays])
 
 
 def _late_error(track: Track, delay: float) -> np.ndarray:
@@ -167,6 +184,7 @@ def _late_error(track: Track, delay: float) -> np.ndarray:
 
 
 def _late(values: np.ndarray, rows: int) -> np.ndarray:
+    """Values so many rows later, the first one before."""
     return np.concatenate([np.repeat(values[:1], rows, 0), values[: len(values) - rows]])
 
 
@@ -183,8 +201,10 @@ def _link_rows(track: Track, delay: float) -> tuple[int, float, np.ndarray, np.n
     """
     clean = _clean_rows(track)
     if track.fast_thrust is None:
-        return *_rows_late(track, delay), track.motor.mean(1), clean
-    given = held_means(*track.fast_thrust, track.time + delay, track.dt)
+        whole, part = _rows_late(track, delay)
+        return whole, part, track.motor.mean(1), clean
+    times, thrust = track.fast_thrust
+    given = held_means(times, thrust, track.time + delay, track.dt)
     rows = int(np.ceil(delay / track.dt - 1e-9))
     for later in range(1, rows + 1):  # what a row holds then is in these
         clean = clean & np.concatenate([clean[later:], np.zeros(min(later, len(clean)), bool)])
@@ -203,7 +223,8 @@ def _decode(tracks, delay: float, may_lose: bool) -> Link:
         whole, part = _rows_late(track, delay)
         in_force = in_force if track.fast_thrust is None else _late(in_force, whole)
         arrived.append((part, np.stack([in_force, _late(in_force, 1)], 1)))
-    return Link(arrived, np.concatenate(errors), *np.array(counts).T)
+    informative, told, lost, between = np.array(counts).T
+    return Link(arrived, np.concatenate(errors), informative, told, lost, between)
 
 
 def _follow(track: Track, delay: float, may_lose: bool):
@@ -213,9 +234,8 @@ def _follow(track: Track, delay: float, may_lose: bool):
     whole, part, given, clean = _link_rows(track, delay)
     error = np.abs(_late_error(track, delay)[clean])
     noise = float(np.median(error)) if len(error) else 0.0
-    telling = (
-        TOLERANCE + 2.0 * noise
-    ) / HELD  # least change of thrust that shows whether a packet arrived
+    # least change of thrust that shows whether a packet arrived
+    telling = (TOLERANCE + 2.0 * noise) / HELD
     thrust = track.command[:, 0].tolist()
     given = given.tolist()
     flags = clean.tolist()

@@ -43,17 +43,20 @@ GAINS = ("p", "i", "d")
 
 @dataclass(frozen=True, eq=False)
 class RateLoop(Channel):
-    """`change` (6,) and `error` (6,) of p, i, d as shares, roll and pitch first and then yaw;
-    `outputs` [(4, T, 3)]: logged less nominal outputs of each track, and what one more of p, i, d
-    would give; `ticks` [(T, TICKS, 4)]: the motor commands of the rate loop's ticks; `names`: the
-    effects that it tells.
-    """
+    """What the rate controllers on board did."""
 
     change: np.ndarray
+    """(6,) of p, i, d as shares: roll and pitch first, then yaw."""
     error: np.ndarray
+    """(6,) standard deviations of it."""
     outputs: list[np.ndarray]
+    """[(4, T, 3)]: logged less nominal outputs of each track, and what one more of p, i, d would
+    give.
+    """
     ticks: list[np.ndarray]
+    """[(T, TICKS, 4)]: the motor commands of the rate loop's ticks."""
     names: tuple[str, ...]
+    """The effects that it tells."""
     dt: float = 0.01
     path = "rate_loop"
 
@@ -91,9 +94,12 @@ class RateLoop(Channel):
         return Estimated(1.0 + change, error, error)
 
     def residuals(self, named) -> dict[str, list[np.ndarray]]:
-        changed = np.append(1.0, -self.gain[0] if set(named) & set(self.names) else np.zeros(3))
+        changes = -self.gain[0] if set(named) & set(self.names) else np.zeros(3)
+        changed = np.append(1.0, changes)
         out: dict[str, list[np.ndarray]] = {
-            f"motors {axis}": [] for axis in ("roll", "pitch", "yaw")
+            "motors roll": [],
+            "motors pitch": [],
+            "motors yaw": [],
         }
         for outputs in self.outputs:
             left = detrend(np.tensordot(changed, outputs, 1), axis=0)
@@ -112,9 +118,8 @@ def read_rate_loop(reading) -> RateLoop:
         wanted, sent = observed(track, vehicle, link, reading.at_once)
         ticks.append(sent)
         logged, nominal, *larger = np.concatenate([track.motor[None], wanted]) @ outputs_of(vehicle)
-        outputs.append(
-            np.stack([logged - nominal, *((made - nominal) / GAIN_STEP for made in larger)])
-        )
+        slopes = [(made - nominal) / GAIN_STEP for made in larger]
+        outputs.append(np.stack([logged - nominal, *slopes]))
         series.append(_series(track, vehicle, in_force(track, link), drawn, reading))
     change, error = read_gains(reading, series, ticks)
     names = reading.library.of("rate_loop")
@@ -144,10 +149,13 @@ def observed(track: Track, vehicle, link, at_once=False):
     rates inside a row are right whatever the physics.
     """
     rows = len(track)
-    size = bucket(len(track))
-    inputs = [padded(v, size) for v in (in_force(track, link), track.motor, track.body_rates)]
+    size = bucket(rows)
+    command = padded(in_force(track, link), size)
+    motor = padded(track.motor, size)
+    gyro = padded(track.body_rates, size)
+    dt = np.float32(track.dt)
     push = padded(np.zeros((rows, 3)), size)
-    *_, rates = observe(vehicle, vehicle, *inputs, push, np.float32(track.dt), at_once)
+    *_, rates = observe(vehicle, vehicle, command, motor, gyro, push, dt, at_once)
     miss = track.body_rates[1:] - np.asarray(rates, float)[: rows - 1]
     step = miss.copy()  # undo the observer's own correction of what it missed before
     step[1:] -= (1.0 - GYRO_GAIN) * miss[:-1]
@@ -155,10 +163,11 @@ def observed(track: Track, vehicle, link, at_once=False):
     gains = ("rate_kp", "rate_ki", "rate_kd")
     larger = [vehicle.replace(**{n: (1.0 + GAIN_STEP) * getattr(vehicle, n)}) for n in gains]
     runs = [
-        observe(c, vehicle, *inputs, push, np.float32(track.dt), at_once)
-        for c in (vehicle, *larger)
+        observe(controller, vehicle, command, motor, gyro, push, dt, at_once)
+        for controller in (vehicle, *larger)
     ]
-    return np.array([r[0] for r in runs], float)[:, :rows], np.asarray(runs[0][1])[:rows]
+    wanted = np.array([run[0] for run in runs], float)[:, :rows]
+    return wanted, np.asarray(runs[0][1])[:rows]
 
 
 def read_gains(reading, series, ticks) -> tuple[np.ndarray, np.ndarray]:
@@ -216,25 +225,29 @@ def _series(track: Track, vehicle, ruling: np.ndarray, drawn: np.ndarray, readin
     The rates at the ticks of a row lie on a smooth curve through those of the rows; the derivative
     is of the tick before.
     """
-    pick = (
-        0 if reading.at_once else slice(None) if track.fast_thrust is None else TICKS // 2
-    )  # means already
+
+    def of_row(ticks):
+        """What a row of the log shows (T, 3) of what the ticks did (T, TICKS, 3)."""
+        if reading.at_once:
+            return ticks[:, 0]
+        if track.fast_thrust is None:
+            return ticks.mean(1)
+        return ticks[:, TICKS // 2]  # rows of a faster log are means already
+
     at = np.arange(len(track))[:, None] + np.arange(TICKS) / TICKS
     curve = CubicSpline(np.arange(len(track)), track.body_rates)
     rates = curve(at)
     slopes = (curve(at) - curve(at - 1.0 / TICKS)) * TICKS / track.dt
     low = butter(2, FILTER, fs=TICKS / track.dt)
     filtered = lfilter(*low, slopes.reshape(-1, 3), axis=0).reshape(slopes.shape)
-    sent, rates, slope, filtered = (
-        (v[:, pick] if pick != slice(None) else v.mean(1))
-        for v in (ruling[..., 1:], rates, slopes, filtered)
-    )
-    x = _terms(track, vehicle, sent - rates, slope)
+    sent = of_row(ruling[..., 1:])
+    slope = of_row(slopes)
+    x = _terms(track, vehicle, sent - of_row(rates), slope)
     z = _terms(track, vehicle, sent - drawn, np.gradient(drawn, track.dt, axis=0))
     apart = reading.late or 0.0
     off = [
         apart * np.gradient(x[0], track.dt, axis=0),
-        _terms(track, vehicle, sent, filtered - slope)[2],
+        _terms(track, vehicle, sent, of_row(filtered) - slope)[2],
     ]
     late = [apart * np.gradient(v, track.dt, axis=0) for v in z[[0, 2]]]
     y = track.motor @ outputs_of(vehicle) - x.sum(0)
@@ -243,9 +256,9 @@ def _series(track: Track, vehicle, ruling: np.ndarray, drawn: np.ndarray, readin
 
 def _terms(track: Track, vehicle, error: np.ndarray, slope: np.ndarray) -> np.ndarray:
     """(3, T, 3): outputs of P, I and D for an error of the body rates and their slope (T, 3)."""
-    p, i, d = (
-        np.asarray(getattr(vehicle, n), float) * COUNT for n in ("rate_kp", "rate_ki", "rate_kd")
-    )
+    p = np.asarray(vehicle.rate_kp, float) * COUNT
+    i = np.asarray(vehicle.rate_ki, float) * COUNT
+    d = np.asarray(vehicle.rate_kd, float) * COUNT
     return np.stack([p * error, i * np.cumsum(error, 0) * track.dt, -d * slope])
 
 

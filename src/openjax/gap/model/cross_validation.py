@@ -9,26 +9,30 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from openjax.gap.model.bounds import bounded
-from openjax.gap.model.library import prior
+from openjax.gap.model.library import places
 from openjax.gap.model.table import Model, Table
 
 
 @dataclass(frozen=True, eq=False)
 class Judged:
-    """A model on stretches left out: `nats` (B,) minus half the whitened sum of squares, a block's
-    own nuisances marginalised; `squares` (B, K) of the errors of logged channels, `taken` (B, N) of
-    the shared nuisances. Errors are the quadratic forms `error` (B, K, C, C) of the coefficients
-    `found` (B, C), of which `nuisances` (N,) are the last.
-    """
+    """A model on B blocks, each left out of the fit by which it is judged."""
 
     nats: np.ndarray
+    """(B,) minus half the whitened sum of squares, a block's own nuisances marginalised."""
     squares: np.ndarray
+    """(B, K) of the errors of logged channels."""
     taken: np.ndarray
-    left: np.ndarray  # (M,) whitened residuals and own nuisances, block after block
-    starts: np.ndarray  # (B,) where each block begins
+    """(B, N) what the shared nuisances took."""
+    left: np.ndarray
+    """(M,) whitened residuals and own nuisances, block after block."""
+    starts: np.ndarray
+    """(B,) where each block begins in it."""
     error: np.ndarray
+    """(B, K, C, C) quadratic forms of the coefficients, which the squared errors are."""
     found: np.ndarray
+    """(B, C) coefficients."""
     nuisances: np.ndarray
+    """(N,) places in them of the nuisances: the last."""
 
     def squares_beside(self, other: Judged) -> np.ndarray:
         """`squares` with the nuisances as another model has them: what nuisances take on themselves
@@ -50,6 +54,7 @@ class Equations:
 
     @cached_property
     def columns(self) -> np.ndarray:
+        """The table's columns whose coefficients are solved for."""
         return np.concatenate([self.model.free, self.table.nuisances[self.table.shared]])
 
     def solve(self, sums: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -106,19 +111,17 @@ def judge(table: Table, model: Model) -> Judged:
     """The model on each block, fitted to all others."""
     found = left_out(table, model)
     # |y - Nv|^2 + |v|^2 at its least is y'(I + NN')^-1 y: what a block's nuisances take costs.
-    left = [
-        np.concatenate([u @ columns, u[table.own]])
-        for u, columns in zip(found, table.columns, strict=True)
-    ]
+    each = zip(found, table.columns, strict=True)
+    left = [np.concatenate([u @ columns, u[table.own]]) for u, columns in each]
     return Judged(
-        np.array([-0.5 * (r @ r) for r in left]),
-        _squares(table.error, found),
-        -found[:, table.nuisances[table.shared]],
-        np.concatenate(left),
-        np.cumsum([0, *map(len, left)])[:-1],
-        table.error.astype(np.float32),  # of all sets that are visited
-        found,
-        table.nuisances,
+        nats=np.array([-0.5 * (r @ r) for r in left]),
+        squares=_squares(table.error, found),
+        taken=-found[:, table.nuisances[table.shared]],
+        left=np.concatenate(left),
+        starts=np.cumsum([0, *map(len, left)])[:-1],
+        error=table.error.astype(np.float32),  # half the memory: one of each set that is visited
+        found=found,
+        nuisances=table.nuisances,
     )
 
 
@@ -132,11 +135,12 @@ def ablated(table: Table, found: np.ndarray, drop=(), off: np.ndarray | None = N
     without the effects `drop` and the nuisances `off` (N,); everything else stays as fitted.
     """
     found = found.copy()
-    kept = {int(i) for e in table.fit.effects if e not in drop for i in prior((e,))[0]}
+    remaining = [e for e in table.fit.effects if e not in drop]
+    kept = {int(i) for e in remaining for i in places((e,))}
     for effect in drop:
-        found[:, [table.derivative[int(i)] for i in prior((effect,))[0] if int(i) not in kept]] = (
-            0.0
-        )
+        # parameters that another effect shares stay as they were fitted
+        gone = [table.derivative[int(i)] for i in places((effect,)) if int(i) not in kept]
+        found[:, gone] = 0.0
         found[:, table.part[effect]] = 1.0
     if off is not None:
         found[:, table.nuisances[off]] = 0.0

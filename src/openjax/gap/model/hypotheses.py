@@ -18,42 +18,46 @@ from openjax.gap.shapes import Parameters, Rows
 
 ITERATIONS = 6
 SMALL_STEP = 0.05  # nats: an improvement below this ends the search
-STEADY = (
-    20.0  # degrees of freedom of the prior on a block's variance, whose scale is that of all blocks
-)
+# degrees of freedom of the prior on a block's variance, whose scale is that of all blocks
+STEADY = 20.0
 UNEXPOSED = 0.5  # nats that a typical effect would leave: below, the effect isn't fitted at all
 
 
 @dataclass(frozen=True, eq=False)
 class SetFit:
-    """A fitted set of effects. `replay`: with nuisances as they are there; `grams` (F, 1 + p, 1 +
-    p) of residual and derivatives at the optimum, by flight, and their `columns`; `index` (p,)
-    places in `theta` (P,); `precision` (p, p) of the prior.
-    """
+    """A fitted set of effects."""
 
     replay: Replay
+    """With nuisances as they are at the optimum."""
     effects: tuple[str, ...]
     theta: np.ndarray
+    """(P,) parameters of all physics."""
     index: np.ndarray
+    """(p,) places in it of the set's own."""
     precision: np.ndarray
+    """(p, p) of their prior."""
     columns: list
+    """[(1 + p, T, 9)]: residual and derivatives of each track at the optimum."""
     grams: np.ndarray
+    """(F, 1 + p, 1 + p) inner products of those, by flight."""
     objective: float
 
     @property
     def hessian(self) -> np.ndarray:
+        """(p, p) of the objective."""
         return self.grams.sum(0)[1:, 1:] + self.precision
 
     @cached_property
     def covariance(self) -> np.ndarray:
+        """(p, p) of the posterior."""
         return np.linalg.inv(self.hessian)
 
     @cached_property
     def cost(self) -> float:
         """Nats that the parameters cost: how much narrower their posterior is than their prior."""
-        return 0.5 * float(
-            np.linalg.slogdet(self.hessian)[1] - np.linalg.slogdet(self.precision)[1]
-        )
+        _, posterior = np.linalg.slogdet(self.hessian)
+        _, before = np.linalg.slogdet(self.precision)
+        return 0.5 * float(posterior - before)
 
     @property
     def score(self) -> float:
@@ -108,6 +112,7 @@ def _at(replay: Replay, effects, theta: np.ndarray, columns=None) -> SetFit:
 def _descend(fit: SetFit, iterations: int) -> SetFit:
     """Steps of Gauss and Newton, half of one that overshoots, while they gain anything."""
     index, mean, precision = prior(fit.effects, fit.replay.absent, fit.replay.grown)
+    # no step longer than three prior deviations: farther away the derivatives say little
     reach = 3.0 * np.sqrt(np.diag(np.linalg.inv(precision)))
     share = 1.0
     for _ in range(iterations):
@@ -119,7 +124,11 @@ def _descend(fit: SetFit, iterations: int) -> SetFit:
         theta[index] += share * np.clip(step, -reach, reach)
         ahead = _at(fit.replay, fit.effects, theta)
         gain = fit.objective - ahead.objective
-        fit, share = (ahead, 1.0) if gain > 0.0 else (fit, 0.5 * share)
+        if gain > 0.0:
+            fit = ahead
+            share = 1.0
+        else:
+            share = 0.5 * share
         if 0.0 < gain < SMALL_STEP:
             break
     return fit
@@ -135,24 +144,21 @@ def model_noise(replay: Replay, library: Library) -> tuple[Replay, dict[str, flo
     columns = replay.linearised(replay.absent, index)
     ahead = np.array([theta for _, theta in starts])
     moved = replay.predict(ahead) if starts else [np.zeros((0, *n.shape)) for n in replay.nominal]
-    columns = [
-        np.concatenate([c, m - n[None]])
-        for c, m, n in zip(columns, moved, replay.nominal, strict=True)
-    ]
+    each = zip(columns, moved, replay.nominal, strict=True)
+    columns = [np.concatenate([c, m - n[None]]) for c, m, n in each]
     size = len(index)
     penalty = np.eye(size + len(starts))
     penalty[:size, :size] = precision
+    # what effects take depends on the noise, and the noise on that: first without any effect,
+    # until the noise models are near, and then with all
     for weighed in (False, False, True, True):
-        gram = replay.grams(columns).sum(0)
-        taken = (
-            np.linalg.solve(gram[1:, 1:] + penalty, gram[1:, 0])
-            if weighed
-            else np.zeros(len(penalty))
-        )
+        taken = np.zeros(len(penalty))
+        if weighed:
+            gram = replay.grams(columns).sum(0)
+            taken = np.linalg.solve(gram[1:, 1:] + penalty, gram[1:, 0])
         left = [c[0] - np.tensordot(taken, c[1:], 1) for c in columns]
-        replay = with_noise_of(
-            replay, [without_nuisances(replay, r, k) for k, r in enumerate(left)]
-        )
+        residuals = [without_nuisances(replay, r, k) for k, r in enumerate(left)]
+        replay = with_noise_of(replay, residuals)
     shown = np.diag(replay.grams(columns).sum(0))[1 + size :]
     exposure = {e: 0.0 for e in library.physics}
     for (effect, _), square in zip(starts, shown, strict=True):
@@ -180,9 +186,8 @@ def _loudness(replay: Replay, residual: np.ndarray, track: int) -> np.ndarray:
     """
     squares = replay.whiten(residual, track) ** 2
     out = np.ones_like(squares)
-    for rows in np.array_split(
-        np.arange(len(squares)), block_count(len(squares), replay.tracks[track].dt)
-    ):
+    blocks = block_count(len(squares), replay.tracks[track].dt)
+    for rows in np.array_split(np.arange(len(squares)), blocks):
         for axes, _ in GROUPS:
             block = np.ix_(rows, axes)
             out[block] = (squares[block].sum() + STEADY) / (squares[block].size + STEADY)

@@ -18,9 +18,8 @@ from openjax.vehicle.rate_controller import rate_controller
 from openjax.vehicle.rotors import rotor_reaction, rotor_speed_step, rotor_thrust, total_wrench
 
 TICKS = 5  # of the rate loop per row
-GYRO_GAIN = (
-    0.3  # share of a gyro innovation that corrects the observer, near the optimum for usual noise
-)
+# share of a gyro innovation that corrects the observer, near the optimum for usual noise
+GYRO_GAIN = 0.3
 # share of what single samples of the motors miss that corrects the next ones: their noise stays out
 FOLLOWED = 0.2
 
@@ -30,17 +29,26 @@ def _ticking(controller, vehicle, h):
     angular acceleration beyond the nominal -> the same, what the controller wanted and what the
     motors got.
     """
-    at_rest = jnp.zeros(3), jnp.array([1.0, 0.0, 0.0, 0.0])
+    level = jnp.array([1.0, 0.0, 0.0, 0.0])
 
     def tick(state, command, offset, push):
         rates, previous, integral, speed = state
-        drone = DroneState(*at_rest, jnp.zeros(3), rates, speed, integral, previous, ())
+        # the rate controller knows neither place nor attitude
+        drone = DroneState(
+            position=jnp.zeros(3),
+            quaternion=level,
+            velocity=jnp.zeros(3),
+            body_rates=rates,
+            rotor_speed=speed,
+            rate_integral=integral,
+            previous_body_rates=previous,
+            effect_memory=(),
+        )
         wanted, integral = rate_controller(controller, drone, command, h)
         given = jnp.clip(wanted + offset, 0.0, 1.0)
         speed = rotor_speed_step(vehicle, speed, given, h)
-        _, torque = total_wrench(
-            vehicle, rotor_thrust(vehicle, speed), rotor_reaction(vehicle, speed)
-        )
+        thrust = rotor_thrust(vehicle, speed)
+        _, torque = total_wrench(vehicle, thrust, rotor_reaction(vehicle, speed))
         gyroscopic = jnp.cross(rates, vehicle.inertia * rates)
         after = rates + h * ((torque - gyroscopic) / vehicle.inertia + push)
         return (after, rates, integral, speed), (wanted, given)

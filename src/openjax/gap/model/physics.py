@@ -78,18 +78,39 @@ def _rotors(flown, wanted, given, dt, late):
     return speed, sped_up
 
 
-def _channels(effects, parameters, theta, vehicle, path: Path):
-    """(T, 9) of one track with parameters theta (P,)."""
-    values = {
-        e.name: {k: jnp.asarray(v, theta.dtype) for k, v in e.none().items()} for e in effects
-    }
+def _values(effects, parameters, theta) -> dict[str, dict[str, jax.Array]]:
+    """{effect: {parameter: ()}}: those of theta (P,), and of the others what does nothing."""
+    values = {}
+    for effect in effects:
+        absent = effect.none()
+        values[effect.name] = {k: jnp.asarray(v, theta.dtype) for k, v in absent.items()}
     for number, (effect, parameter) in enumerate(parameters):
         values[effect] = {**values[effect], parameter: theta[number]}
+    return values
+
+
+def _state(position, quaternion, velocity, rates, speed) -> DroneState:
+    """A drone as physics sees it: none looks at the memory of its controller."""
+    return DroneState(
+        position=position,
+        quaternion=quaternion,
+        velocity=velocity,
+        body_rates=rates,
+        rotor_speed=speed,
+        rate_integral=rates,
+        previous_body_rates=rates,
+        effect_memory=(),
+    )
+
+
+def _channels(effects, parameters, theta, vehicle, path: Path):
+    """(T, 9) of one track with parameters theta (P,)."""
+    values = _values(effects, parameters, theta)
     flown = change_body(effects, values, vehicle)
     step = path.dt / path.motor.shape[1]
 
     def context(position, quaternion, velocity, rates, voltage, others, speed):
-        state = DroneState(position, quaternion, velocity, rates, speed, rates, rates, ())
+        state = _state(position, quaternion, velocity, rates, speed)
         room = {"others_position": others, "ceiling_height": path.ceiling}
         return make_context(flown, state, battery_voltage=voltage, dt=step, **room)
 

@@ -30,29 +30,38 @@ ERRORS = tuple(f"{kind} {axis}" for kind in HORIZONS for axis in "xyz")
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """`white` (B, C, C) and `error` (B, logged of ERRORS, C, C) by block; `rows` (B,) that count;
-    `track_of` (B,). Columns: 0 is what is left; `derivative` {place: column}; `step` {effect:
-    column}; `part` {effect: column}; the last are nuisances, of which `shared` (N,) are the case's
-    and the others a block's.
+    """Inner products of C columns in each of B blocks. Column 0 is what is left; then come
+    derivatives, steps and parts; the last are nuisances.
     """
 
     fit: SetFit
     white: np.ndarray
+    """(B, C, C) of the whitened columns: the likelihood."""
     error: np.ndarray
+    """(B, logged of ERRORS, C, C) of the errors of short predictions: the gap."""
     rows: np.ndarray
+    """(B,) rows that count."""
     track_of: np.ndarray
+    """(B,) whose a block is."""
     derivative: dict[int, int]
+    """{place in theta: column of the derivative by it}."""
     step: dict[str, int]
+    """{effect that may come in: column of what it does as it was fitted alone}."""
     part: dict[str, int]
+    """{effect of the set: column of what it does}."""
     shared: np.ndarray
-    columns: list  # whitened columns (C, M) of each block
+    """(N,) whether a nuisance is the case's; the others are a block's."""
+    columns: list
+    """[(C, M)]: whitened columns of each block."""
 
     @property
     def size(self) -> int:
+        """C."""
         return self.white.shape[1]
 
     @property
     def nuisances(self) -> np.ndarray:
+        """(N,) columns of the nuisances."""
         return np.arange(self.size - len(self.shared), self.size)
 
     @property
@@ -111,11 +120,9 @@ def build(fit: SetFit, singles: dict[str, SetFit] | None) -> Table:
         point[at] = replay.absent[at] if effect in own else singles[effect].theta[at]
         points.append(point)
     columns = fit.columns if singles is None else replay.linearised(fit.theta, index)
-    moved = (
-        replay.predict(np.array(points))
-        if points
-        else [np.zeros((0, *y.shape)) for y in replay.measured]
-    )
+    moved = [np.zeros((0, *y.shape)) for y in replay.measured]
+    if points:
+        moved = replay.predict(np.array(points))
     white = []
     error = []
     rows = []
@@ -125,9 +132,8 @@ def build(fit: SetFit, singles: dict[str, SetFit] | None) -> Table:
         now = replay.measured[number] - c[0]
         nuisances = replay.nuisances[number]
         x = np.concatenate([c, m[: len(others)] - now, now - m[len(others) :], nuisances])
-        w = np.concatenate(
-            [replay.whiten(x[: -len(nuisances)], number), replay.whitened_nuisances[number]]
-        )
+        without = replay.whiten(x[: -len(nuisances)], number)
+        w = np.concatenate([without, replay.whitened_nuisances[number]])
         count = block_count(w.shape[1], track.dt)
         e = _errors(x, track.dt)[:, max(int(SKIP / track.dt), 25) :, replay.usable > 0]
         for a, b in zip(np.array_split(w, count, 1), np.array_split(e, count, 1), strict=True):
@@ -137,15 +143,20 @@ def build(fit: SetFit, singles: dict[str, SetFit] | None) -> Table:
             error.append(np.einsum("ctk,dtk->kcd", b, b, optimize=True))
             rows.append(b.shape[1])
             track_of.append(number)
-    at = 1 + len(index)
+    first_step = 1 + len(index)
+    first_part = first_step + len(others)
     return Table(
-        fit, np.array(white), np.array(error), np.array(rows), np.array(track_of),
-        {int(i): 1 + k for k, i in enumerate(index)},
-        {e: at + k for k, e in enumerate(others)},
-        {e: at + len(others) + k for k, e in enumerate(own)},
-        replay.shared,
-        whole,
-    )  # fmt: skip
+        fit=fit,
+        white=np.array(white),
+        error=np.array(error),
+        rows=np.array(rows),
+        track_of=np.array(track_of),
+        derivative={int(i): 1 + k for k, i in enumerate(index)},
+        step={e: first_step + k for k, e in enumerate(others)},
+        part={e: first_part + k for k, e in enumerate(own)},
+        shared=replay.shared,
+        columns=whole,
+    )
 
 
 def _errors(x: np.ndarray, dt: float) -> np.ndarray:
@@ -176,10 +187,12 @@ def with_effects(table: Table, add=(), drop=()) -> Model:
             free.append(np.array([table.step[effect]]))
             means.append(np.array([0.0]))
             blocks.append(np.eye(1))
+        where = places((effect,))
         spread = np.array([p.spread for p in CARDS[effect].fitted])
-        spread = spread * table.fit.replay.grown[places((effect,))]
-        inside = [k for k, i in enumerate(places((effect,))) if table.derivative[int(i)] not in own]
-        free.append(np.array([table.derivative[int(places((effect,))[k])] for k in inside], int))
+        spread = spread * table.fit.replay.grown[where]
+        derivatives = [table.derivative[int(i)] for i in where]
+        inside = [k for k, column in enumerate(derivatives) if column not in own]
+        free.append(np.array([derivatives[k] for k in inside], int))
         means.append(np.zeros(len(inside)))
         blocks.append(np.diag(1.0 / spread[inside] ** 2))
     free = np.concatenate(free).astype(int)

@@ -57,24 +57,22 @@ def whiten(
 
 def first_noise(axes, integrated: bool, deviation: float) -> Noise:
     """A noise model to begin with: sensor noise and some white steps."""
-    return Noise(
-        tuple(axes), *_kalman(0.9, 0.04, 0.15 if integrated else 0.0, integrated), deviation
-    )
+    step = 0.15 if integrated else 0.0
+    numerator, denominator = _kalman(memory=0.9, gust=0.04, step=step, integrated=integrated)
+    return Noise(tuple(axes), numerator, denominator, deviation)
 
 
 def fit_noise(axes, residuals, integrated: bool, skip: int = 20) -> Noise:
     """Noise model of residuals [(T, C), ...], pooled over tracks and `axes`.
 
     The model of the grid is chosen by Whittle's likelihood."""
-    axes = tuple(axes)
-    chosen = _choose([r[skip:, list(axes)] for r in residuals], integrated)
-    numerator, denominator = _kalman(*chosen, integrated)
-    white = [
-        lfilter(numerator, denominator, r[:, list(axes)], axis=0)[skip:].ravel() for r in residuals
-    ]
-    return Noise(
-        axes, numerator, denominator, float(np.sqrt(np.mean(np.concatenate(white) ** 2))) + 1e-9
-    )
+    series = [r[:, list(axes)] for r in residuals]
+    memory, gust, step = _choose([s[skip:] for s in series], integrated)
+    numerator, denominator = _kalman(memory, gust, step, integrated)
+    # the filter starts at the first row, and what it makes of its start is cut off afterwards
+    white = [lfilter(numerator, denominator, s, axis=0)[skip:].ravel() for s in series]
+    deviation = float(np.sqrt(np.mean(np.concatenate(white) ** 2))) + 1e-9
+    return Noise(tuple(axes), numerator, denominator, deviation)
 
 
 def _choose(parts, integrated: bool) -> tuple[float, float, float]:
@@ -85,11 +83,12 @@ def _choose(parts, integrated: bool) -> tuple[float, float, float]:
     ratio_part = 0.0
     count = 0
     for part in parts:
+        # differences of what adds up are stationary, as Whittle's likelihood asks for
         z = np.diff(part, axis=0) if integrated else part
         taper = np.hanning(len(z))[:, None]
-        periodogram = (np.abs(np.fft.rfft((z - z.mean(0)) * taper, axis=0)) ** 2).sum(1)[2:] / (
-            taper**2
-        ).sum()
+        power = np.abs(np.fft.rfft((z - z.mean(0)) * taper, axis=0)) ** 2
+        # without the two lowest frequencies, into which the taper smears the mean
+        periodogram = power.sum(1)[2:] / (taper**2).sum()
         spectra, logs = _spectra(len(z), integrated)
         ratio_part = ratio_part + (periodogram / spectra).sum(1)
         log_part = log_part + z.shape[1] * logs

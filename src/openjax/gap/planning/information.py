@@ -8,6 +8,7 @@ Fedorov 1975; the bound is Bhattacharyya's). The air is as uneven as in a quiet 
 every segment would tell everything.
 """
 
+import itertools
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -28,40 +29,42 @@ ENOUGH = 0.98  # of what all segments tell together
 
 @dataclass(frozen=True, eq=False)
 class Belief:
-    """A cause, or several at once: `effects`, where their parameters are, `theta` (P,), and how
-    probable it is.
-    """
+    """A cause, or several at once."""
 
     effects: tuple[str, ...]
     theta: np.ndarray
+    """(P,) where their parameters are."""
     probability: float
 
     @property
     def name(self) -> str:
+        """In words."""
         return " and ".join(self.effects) or "nothing"
 
 
 @dataclass(frozen=True)
 class Promise:
-    """What a segment promises: its `value`, and the pair of causes that it tells best, for what
-    they are worth, with the nats of one segment.
-    """
+    """What a segment promises."""
 
     segment: str
     value: float
+    """Probability that two causes drawn from what is believed are told apart."""
     pair: tuple[str, str]
+    """Of causes, which it tells best for what they are worth."""
     nats: float
+    """By which one segment tells them."""
 
 
 @dataclass(frozen=True, eq=False)
 class Advice:
-    """`promises`, best first; `chosen`: the fewest segments that together tell nearly what all do;
-    `nats` {(cause, other): nats of the best segment}.
-    """
+    """What to fly next."""
 
     promises: tuple[Promise, ...]
+    """Best first."""
     chosen: tuple[str, ...]
+    """The fewest segments that together tell nearly what all do."""
     nats: dict[tuple[str, str], float]
+    """{(cause, other): nats of the best segment}."""
 
 
 def advise(beliefs: list[Belief], vehicle_file: VehicleFile) -> Advice:
@@ -80,12 +83,9 @@ def advise(beliefs: list[Belief], vehicle_file: VehicleFile) -> Advice:
         )
     chosen = _fewest(apart, together)
     best = apart.max(0)
-    nats = {
-        (a.name, b.name): float(best[i, j])
-        for i, a in enumerate(beliefs)
-        for j, b in enumerate(beliefs)
-        if i < j
-    }
+    nats = {}
+    for i, j in itertools.combinations(range(len(beliefs)), 2):
+        nats[beliefs[i].name, beliefs[j].name] = float(best[i, j])
     ranked = tuple(sorted(promises, key=lambda p: -p.value))
     names = [name.split(".")[0] for name in replay.flights]
     return Advice(ranked, tuple(names[k] for k in chosen), nats)
