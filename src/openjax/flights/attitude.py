@@ -49,12 +49,13 @@ def derive_attitude(flight: Flight, note) -> Flight:
 def _attitude(part: Flight) -> np.ndarray:
     """Quaternions (T, 4) of a stretch without gaps."""
     time = np.arange(part.time[0], part.time[-1], STEP)
-    rates, force, velocity = (
-        part.interpolated(c, time) for c in ("body_rates", "specific_force", "velocity")
-    )
+    rates = part.interpolated("body_rates", time)
+    force = part.interpolated("specific_force", time)
+    velocity = part.interpolated("velocity", time)
     size = round(WINDOW / STEP)
     windows = len(time) // size - 1
     ends = size * np.arange(windows + 1)
+    # an accelerometer feels what holds the vehicle against gravity, as if it accelerated upwards
     wanted = np.diff(velocity[ends], axis=0) / WINDOW + [0.0, 0.0, GRAVITY]
     turned = _integrated(rates)
     early = slice(0, max(int(START / WINDOW), FEWEST))
@@ -72,6 +73,7 @@ def _attitude(part: Flight) -> np.ndarray:
         attitude = Rotation.from_rotvec(_hats(time - time[0], knots) @ drift) * attitude
         if np.abs(drift).max() < 1e-4:
             break
+    # without jumps between q and -q, so that rows between may be interpolated
     found = attitude.as_quat(scalar_first=True)
     found[1:] *= np.cumprod(np.where((found[1:] * found[:-1]).sum(1) < 0.0, -1.0, 1.0))[:, None]
     at = np.clip(part.time, time[0], time[-1])

@@ -48,9 +48,8 @@ def load_case(path: str | Path, dtype=jnp.float32, comparison: bool = False) -> 
         raise UserError(f"{path}: no vehicle.toml; an empty one there means the nominal Crazyflie")
     vehicle_file = load_vehicle_file(path / "vehicle.toml" if described else None, dtype)
     mapping = load_mapping(path / MAPPING_FILE) if (path / MAPPING_FILE).exists() else None
-    kept, issues = _usable(
-        [_read(log, vehicle_file, mapping) for log in logs], vehicle_file, comparison
-    )
+    read = [_read(log, vehicle_file, mapping) for log in logs]
+    kept, issues = _usable(read, vehicle_file, comparison)
     if not kept:
         reasons = [i for i in issues if i.refused]
         first = f"{reasons[0].flight}: {reasons[0].issue}" if reasons else "no vehicle in any log"
@@ -71,6 +70,7 @@ def _held_instead(path: Path) -> str:
 
 
 def _cases_inside(path):
+    """In words: which cases a folder holds, where somebody gave the one above."""
     cases = sorted(file.parent.name for file in path.glob("*/vehicle.toml"))
     return f"; cases are folders in it: {cases[0]}, in all {len(cases)}" if cases else ""
 
@@ -79,7 +79,8 @@ def _usable(read, vehicle_file: VehicleFile, comparison: bool) -> tuple[list[Fli
     """Of what was `read` of all logs the flights that can be used, checked and mended, and what was
     found.
     """
-    flights, issues = ([entry for log in read for entry in log[k]] for k in (0, 1))
+    flights = [flight for found, _ in read for flight in found]
+    issues = [issue for _, found in read for issue in found]
     copies = duplicates(flights)
     for name, original in copies.items():
         text = f"the same values as {original}: a copy, left out"
@@ -104,13 +105,14 @@ def _trusted(
     out = []
     found = []
     for flight, right in zip(kept, shown, strict=True):
-        doubt = next(
-            (what for what in failed if what not in right and failed[what] > passed[what]), None
-        )
-        if doubt is None:
+        doubts = [what for what in failed if what not in right and failed[what] > passed[what]]
+        if not doubts:
             out.append(flight)
         else:
-            text = f"too calm to show that it doesn't contradict {doubt}, as other flights of the case do"
+            text = (
+                f"too calm to show that it doesn't contradict {doubts[0]}, as other flights of the "
+                "case do"
+            )
             found.append(Issue(flight.name, text, refused=True, kind="garbage"))
     return out, found
 
@@ -118,10 +120,10 @@ def _trusted(
 def _check(
     flight: Flight, vehicle_file: VehicleFile, comparison: bool
 ) -> tuple[Flight | None, list[Issue]]:
+    """One flight checked and mended, None where it can't be used, and what was found."""
+    vehicle = vehicle_file.vehicle_of(flight.vehicle)
     try:
-        return check_flight(
-            flight, vehicle_file.vehicle_of(flight.vehicle), vehicle_file.log, comparison
-        )
+        return check_flight(flight, vehicle, vehicle_file.log, comparison)
     except (ArithmeticError, ValueError, IndexError, np.linalg.LinAlgError) as error:
         # Values that no check has foreseen: this flight can't be used, the others can.
         text = f"can't be checked ({type(error).__name__}: {error})".split("\n")[0]
@@ -131,6 +133,7 @@ def _check(
 def _read(
     log: Path, vehicle_file: VehicleFile, mapping: ColumnMapping | None
 ) -> tuple[list[Flight], list[Issue]]:
+    """The flights of one log, and what was found."""
     try:
         flights, remarks = flights_of(read_log(log, mapping), vehicle_file.motor_permutation)
     except LogError as error:

@@ -42,6 +42,8 @@ def check_flight(
     def note(kind: str, text: str) -> None:
         issues.append(Issue(flight.name, text, kind=kind))
 
+    # in this order: time before what is cut by it, motors before sensors that stand still with
+    # them, ranges before anything is derived from values that can't be
     try:
         _has_what_is_needed(flight, comparison)
         checked = _while_motors_turn(_in_time(_with_forces(flight, note), note), note)
@@ -106,8 +108,11 @@ def _in_time(flight: Flight, note) -> Flight:
     flight = _sorted(_written_once(flight, note), note)
     repeated = np.diff(flight.time) == 0
     if repeated.mean() > 0.2:
-        text = f"{repeated.mean():.0%} of the rows repeat the time of the row before: the clock is frozen, or too coarse"
-        raise Refused("time", text)
+        raise Refused(
+            "time",
+            f"{repeated.mean():.0%} of the rows repeat the time of the row before: the clock is "
+            "frozen, or too coarse",
+        )
     if repeated.any():
         note("time", f"{repeated.sum()} rows repeat the time of the row before and are left out")
         flight = flight.rows(np.r_[True, ~repeated])
@@ -117,8 +122,9 @@ def _in_time(flight: Flight, note) -> Flight:
     gaps = np.flatnonzero(steps > max(5 * step, 0.05))
     if len(gaps):
         longest = gaps[np.argmax(steps[gaps])]
-        note("gaps", f"{len(gaps)} gap{'s' * (len(gaps) > 1)} in time, the longest {steps[longest]:.2f} s "
-                     f"after t = {flight.time[longest]:.2f}")  # fmt: skip
+        number = f"{len(gaps)} gap{'s' * (len(gaps) > 1)}"
+        where = f"the longest {steps[longest]:.2f} s after t = {flight.time[longest]:.2f}"
+        note("gaps", f"{number} in time, {where}")
     return flight
 
 
@@ -219,9 +225,8 @@ def _in_range(flight: Flight, note) -> Flight:
         span = np.nanmax(np.ptp(flight.position[np.isfinite(flight.position).all(1)], axis=0))
         if span > 20.0:
             raise Refused("units", f"x, y, z span {span:.0f}: in cm or mm? The log format wants m")
-    if flight.body_rates is not None and np.nanmax(np.abs(flight.body_rates)) > 60.0:
-        raise Refused("units", f"wx, wy, wz reach {np.nanmax(np.abs(flight.body_rates)):.0f}: in deg/s? "
-                                "The log format wants rad/s")  # fmt: skip
+    if flight.body_rates is not None:
+        _refuse_degrees(flight.body_rates)
     voltage = flight.battery_voltage
     if voltage is not None:
         middle = float(np.nanmedian(voltage))
@@ -231,6 +236,16 @@ def _in_range(flight: Flight, note) -> Flight:
             note("corrupt", f"vbat is {middle:.2g} V, which no battery in flight has; left out")
             changes["battery_voltage"] = None
     return dataclasses.replace(flight, **changes) if changes else flight
+
+
+def _refuse_degrees(body_rates: np.ndarray) -> None:
+    """Refuse body rates (T, 3) that are none in rad/s: ten turns a second are beyond the full scale
+    of such gyroscopes.
+    """
+    fastest = np.nanmax(np.abs(body_rates))
+    if fastest > 60.0:
+        text = f"wx, wy, wz reach {fastest:.0f}: in deg/s? The log format wants rad/s"
+        raise Refused("units", text)
 
 
 def _without_saturated(flight: Flight, note) -> Flight:
@@ -284,6 +299,7 @@ def _without_lost_poses(flight: Flight, note) -> Flight:
 
 
 def _share_of_one(values: np.ndarray, columns: str) -> None:
+    """Refuse commands that aren't shares of the largest, with what they look like."""
     low = float(np.nanmin(values))
     high = float(np.nanmax(values))
     if high > 256.0:
@@ -294,9 +310,11 @@ def _share_of_one(values: np.ndarray, columns: str) -> None:
         )
         raise Refused("units", f"{columns} reach {high:.0f}: {hint}; the log format wants 0..1")
     if high > 1.02:
-        hint = (
-            "8-bit counts" if high > 101 else "per cent" if high > 2 else "a wrong scale or corrupt"
-        )
+        hint = "a wrong scale or corrupt"
+        if high > 101:
+            hint = "8-bit counts"
+        elif high > 2:
+            hint = "per cent"
         raise Refused("units", f"{columns} reach {high:.3g}: {hint}; the log format wants 0..1")
     if low < -0.02:
         raise Refused("corrupt", f"{columns} go down to {low:.3g}; commands lie in 0..1")
@@ -320,6 +338,7 @@ def _airborne(flight: Flight, floor_z: float | None, note, every: bool = False) 
     drive = drive if drive.ndim == 1 else drive.mean(1)
     rows = np.isfinite(drive)
     drive = np.interp(flight.time, flight.time[rows], drive[rows])
+    # the median of the upper half: a long wait on the ground doesn't take it down
     usual = np.median(drive[drive >= np.median(drive)])
     if usual < 0.02:
         raise Refused(
@@ -349,8 +368,8 @@ def _airborne(flight: Flight, floor_z: float | None, note, every: bool = False) 
         return flight.rows(kept)
     if stop - start < len(flight):
         cut = flight.duration - airborne
-        note("ground", f"{cut:.1f} s on the ground are cut away (kept: t = {flight.time[start]:.2f} "
-                       f"to {flight.time[stop - 1]:.2f})")  # fmt: skip
+        kept = f"t = {flight.time[start]:.2f} to {flight.time[stop - 1]:.2f}"
+        note("ground", f"{cut:.1f} s on the ground are cut away (kept: {kept})")
         flight = flight.rows(slice(start, stop))
     return flight
 
@@ -363,9 +382,11 @@ def _above_floor(flight: Flight, floor: float) -> None:
     if height < -BELOW:
         if words := other_frames(flight):
             raise Refused("axes", words)
-        text = f"z is {height + floor:.2f} m in flight, below the floor at {floor:g}"
-        raise Refused("axes", f"{text}: z points up (scale = -1 in columns.toml), or floor_z is "
-                              "what z reads on the floor")  # fmt: skip
+        raise Refused(
+            "axes",
+            f"z is {height + floor:.2f} m in flight, below the floor at {floor:g}: z points up "
+            "(scale = -1 in columns.toml), or floor_z is what z reads on the floor",
+        )
 
 
 def _long_runs(flags: np.ndarray, time: np.ndarray, shortest: float = 0.5) -> np.ndarray:

@@ -20,12 +20,12 @@ NORTH = Rotation.from_quat([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0])
 
 @dataclass(frozen=True)
 class Convention:
-    """`words`: what is the matter and what would be right; `convert`: the signals as they are in
-    the log format's convention, if they were logged in this one.
-    """
+    """A way to write a log that isn't the log format's."""
 
     words: str
+    """What is the matter, and what would be right."""
     convert: Callable[[Signals], Signals]
+    """The signals as they are in the log format's convention, if they were logged in this one."""
 
 
 def upright(signals: Signals) -> bool:

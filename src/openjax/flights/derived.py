@@ -6,14 +6,12 @@ import numpy as np
 
 from openjax.flights.flight import Flight, Refused
 
-RATE_NOISE = (
-    0.04  # rad/s of body rates that are derived: what gyroscopes of such vehicles have at most
-)
-BESIDE_GAP, GAP, OUTSIDE = (
-    4,
-    1.5,
-    6.0,
-)  # rows, usual steps, deviations: of a velocity that a gap has spoilt
+# rad/s of body rates that are derived: what gyroscopes of such vehicles have at most
+RATE_NOISE = 0.04
+# of a velocity that a gap has spoilt:
+BESIDE_GAP = 4  # rows beside it in which that shows
+GAP = 1.5  # usual steps, from which rows are missing
+OUTSIDE = 6.0  # standard deviations by which it is off
 
 
 def derive_velocity(flight: Flight, note) -> Flight:

@@ -23,9 +23,8 @@ LOW = (0.3, 2.5)
 WIDE = (0.3, 4.0)
 WINDOW = 8.0  # s in which a clock offset is constant
 LAG = 0.2  # s, largest clock offset and latency between honest streams
-AGREE = (
-    0.5  # share of the correlation to be expected below which two channels contradict each other
-)
+# share of the correlation to be expected below which two channels contradict each other
+AGREE = 0.5
 FITS = 0.75  # share above which another labelling is what was meant
 TELLS = 0.5  # correlation that the sensors' noise must leave for a comparison to tell anything
 FULL = 0.98  # motor command that counts as the largest: a rotor has nothing left to trim with
@@ -140,21 +139,23 @@ class Pair:
         found = self.agreement
         worst = int(np.argmin(np.where(self.bad, found.correlation, np.inf)))
         columns = ", ".join(n for n, b in zip(self.names, self.bad, strict=True) if b)
+        low, high = self.band
         return (
-            f"contradictory: {columns} against {self.what}: correlation "
-            f"{found.correlation[worst]:.2f} where sensors "
-            f"allow {found.expected[worst]:.2f} ({found.measured[worst]:.2g} against "
-            f"{found.reference[worst]:.2g} "
-            f"{self.unit} from {self.band[0]:g} to {self.band[1]:g} Hz)"
+            f"contradictory: {columns} against {self.what}: "
+            f"correlation {found.correlation[worst]:.2f} "
+            f"where sensors allow {found.expected[worst]:.2f} "
+            f"({found.measured[worst]:.2g} against {found.reference[worst]:.2g} {self.unit} "
+            f"from {low:g} to {high:g} Hz)"
         )
 
 
 def pairs_of(s: Signals) -> Iterator[Pair]:
     """All pairs that were logged."""
-    turned, (acceleration, order) = s.attitude_rates, s.acceleration
-    rates, velocity, commands = (
-        CHANNEL_COLUMNS[c] for c in ("body_rates", "velocity", "command_body_rates")
-    )
+    turned = s.attitude_rates
+    acceleration, order = s.acceleration
+    rates = CHANNEL_COLUMNS["body_rates"]
+    velocity = CHANNEL_COLUMNS["velocity"]
+    commands = CHANNEL_COLUMNS["command_body_rates"]
     if turned is not None and s.body_rates is not None:
         least = MOVED["rate"]
         what = "the attitude's rate"

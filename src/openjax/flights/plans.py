@@ -24,16 +24,14 @@ FARTHEST = 100.0  # of any number in a plan
 
 @dataclass(frozen=True, eq=False)
 class SetPoints:
-    """T rows of 10 ms: `position`, `velocity`, `acceleration` (T, 3), `yaw` (T,), `extra` (T, 4),
-    and the `segment` (T,) each belongs to.
-    """
+    """T rows of 10 ms."""
 
-    position: np.ndarray
-    velocity: np.ndarray
-    acceleration: np.ndarray
-    yaw: np.ndarray
-    extra: np.ndarray
-    segment: tuple[str, ...]
+    position: np.ndarray  # (T, 3) m
+    velocity: np.ndarray  # (T, 3) m/s
+    acceleration: np.ndarray  # (T, 3) m/s^2
+    yaw: np.ndarray  # (T,) rad
+    extra: np.ndarray  # (T, 4) added to thrust and body rates
+    segment: tuple[str, ...]  # (T,) to which each belongs
 
     def __len__(self) -> int:
         return len(self.yaw)
@@ -55,7 +53,12 @@ def plan_of(segments: Iterable[str] = tuple(SEGMENTS)) -> SetPoints:
     velocity = np.gradient(place, PERIOD, axis=0)
     acceleration = np.gradient(velocity, PERIOD, axis=0)
     return SetPoints(
-        place, velocity, acceleration, np.concatenate(yaw), np.concatenate(extra), tuple(names)
+        position=place,
+        velocity=velocity,
+        acceleration=acceleration,
+        yaw=np.concatenate(yaw),
+        extra=np.concatenate(extra),
+        segment=tuple(names),
     )
 
 
@@ -65,11 +68,10 @@ def write_plan(path: Path, plan: SetPoints) -> None:
     numbers = np.column_stack(
         [time, plan.position, plan.velocity, plan.acceleration, plan.yaw, plan.extra]
     )
-    rows = [
-        ",".join([*(f"{v:.4f}" for v in row), name])
-        for row, name in zip(numbers, plan.segment, strict=True)
-    ]
-    write_text(path, "\n".join([",".join(COLUMNS), *rows]) + "\n")
+    lines = [",".join(COLUMNS)]
+    for row, name in zip(numbers, plan.segment, strict=True):
+        lines.append(",".join([*(f"{v:.4f}" for v in row), name]))
+    write_text(path, "\n".join(lines) + "\n")
 
 
 def read_plan(name_or_path: str | Path) -> SetPoints:
@@ -96,10 +98,10 @@ def read_plan(name_or_path: str | Path) -> SetPoints:
     if not np.allclose(np.diff(numbers[:, 0]), PERIOD, atol=1e-3):
         raise UserError(f"{path}: a plan's rows must be {1e3 * PERIOD:g} ms apart")
     return SetPoints(
-        numbers[:, 1:4],
-        numbers[:, 4:7],
-        numbers[:, 7:10],
-        numbers[:, 10],
-        numbers[:, 11:15],
-        tuple(row[-1] for row in cells),
+        position=numbers[:, 1:4],
+        velocity=numbers[:, 4:7],
+        acceleration=numbers[:, 7:10],
+        yaw=numbers[:, 10],
+        extra=numbers[:, 11:15],
+        segment=tuple(row[-1] for row in cells),
     )

@@ -233,8 +233,8 @@ def _check_header(header: Header, time: str) -> None:
     names = header.names
     if len(names) > MOST_COLUMNS:
         raise LogError(
-            f"the first row has {len(names)} cells, more than {MOST_COLUMNS} "
-            "columns: has the log lost its line ends?"
+            f"the first row has {len(names)} cells, more than {MOST_COLUMNS} columns: has the log "
+            "lost its line ends?"
         )
     if len(names) == 1:
         _check_separator(names[0], header.delimiter, time)

@@ -7,8 +7,16 @@ from openjax.flights.track import Track, smooth
 from openjax.vehicle.effects.effect import ARENA_CEILING
 
 NEAR_CEILING = 0.15  # m, as near as `low` is to the floor
-REGIMES = tuple(
-    "hover fast climb low high under_neighbour low_battery high_thrust transient".split()
+REGIMES = (
+    "hover",
+    "fast",
+    "climb",
+    "low",
+    "high",
+    "under_neighbour",
+    "low_battery",
+    "high_thrust",
+    "transient",
 )
 
 

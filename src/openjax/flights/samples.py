@@ -82,9 +82,8 @@ class Reference:
 
     position: np.ndarray  # (T, N, 3) m
     yaw: np.ndarray  # (T, N) rad
-    extra_command: (
-        np.ndarray
-    )  # (T, N, 4) thrust in 0..1, body rates in rad/s, added to the controller's
+    extra_command: np.ndarray
+    """(T, N, 4) thrust in 0..1, body rates in rad/s, added to the controller's."""
     open_circuit_voltage: float = 3.9  # V at the start
 
 

@@ -181,9 +181,8 @@ def _regular_clock(seen: np.ndarray, row: float) -> np.ndarray | None:
     if np.abs(turned[best]) < IN_PHASE:
         return None
     middle = np.angle(turned[best]) / (2.0 * np.pi)
-    late = (
-        rates[best] * since - middle + 0.5 * row * rates[best]
-    )  # cycles since a tick could first be seen
+    # cycles since a tick could first be seen
+    late = rates[best] * since - middle + 0.5 * row * rates[best]
     ticks = np.floor(late + EDGE)
     usual = late - ticks < row * rates[best] + EDGE
     slope, start = np.polyfit(ticks[usual], seen[usual], 1)
@@ -205,11 +204,10 @@ def _frozen(table: np.ndarray, rows: np.ndarray, time: np.ndarray, together: boo
     values = table[rows]
     still = np.diff(values, axis=0) == 0
     extreme = (values == values.min(0)) | (values == values.max(0))
-    per_column = (
-        [still.all(1)]
-        if together
-        else [s & ~e for s, e in zip(still.T, extreme[1:].T, strict=True)]
-    )
+    if together:
+        per_column = [still.all(1)]
+    else:
+        per_column = [s & ~e for s, e in zip(still.T, extreme[1:].T, strict=True)]
     frozen = np.zeros(len(time), bool)
     for run in per_column:
         for start, stop in runs_of(run):

@@ -26,20 +26,23 @@ EMPTY = 3.6
 
 @dataclass(frozen=True)
 class Segment:
-    """`seconds` of flight. `path`(t, ease) gives position (T, 3) m and yaw (T,) rad; `commands`(t)
-    what is added to commands (T, 4), or nothing.
-    """
+    """A piece of flight that begins and ends in the middle."""
 
     seconds: float
     shows: str
+    """What it is, in words."""
     path: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+    """path(t, ease): position (T, 3) m and yaw (T,) rad."""
     commands: Callable[[np.ndarray], np.ndarray] | None = None
+    """commands(t): what is added to the commands (T, 4); None: nothing."""
     voltage: float = FULL
+    """Of the battery, open circuit (V)."""
 
     def reference(self, seconds: float | None = None) -> Reference:
         """What one vehicle is to fly, from the middle back to the middle."""
         t = np.arange(0.0, seconds or self.seconds, PERIOD)
         ease = np.clip(np.minimum(t, t[-1] - t) / EASE, 0.0, 1.0)
+        # a minimum-jerk step: velocity and acceleration begin and end at zero
         ease = ease**3 * (10.0 - 15.0 * ease + 6.0 * ease**2)
         position, yaw = self.path(t, ease[:, None])
         extra = np.zeros((len(t), 4)) if self.commands is None else self.commands(t)
@@ -56,6 +59,9 @@ def _middle(t):
 
 
 def _dither(t: np.ndarray) -> np.ndarray:
+    """Commands (T, 4): body rates that jump between -1, 0 and 1 times DITHER at random moments, the
+    same in every flight.
+    """
     rng = np.random.default_rng(1)
     out = np.zeros((len(t), 4))
     for axis in (1, 2, 3):
@@ -68,6 +74,9 @@ def _dither(t: np.ndarray) -> np.ndarray:
 
 
 def _doublets(t: np.ndarray) -> np.ndarray:
+    """Commands (T, 4): every half second a step there and one back, on each axis in turn and then
+    with the other sign.
+    """
     out = np.zeros((len(t), 4))
     for number, begin in enumerate(np.arange(EASE, t[-1] - EASE, 0.5)):
         axis = number % 4

@@ -68,12 +68,12 @@ def in_band(values: Columns, band: tuple[float, float]) -> Float[np.ndarray, "in
     """`values` (T, C) between two frequencies, without delay, and without the ends where that isn't
     right.
     """
-    edge = min(
-        20, len(values) // 8
-    )  # rows at the ends where filter and differences aren't trustworthy
-    # Faded in and out: a filter this slow would carry the last row's noise far into the flight.
+    # rows at the ends where filter and differences aren't trustworthy
+    edge = min(20, len(values) // 8)
+    # faded in and out: a filter this slow would carry the last row's noise far into the flight
     fade = _fade(len(values))[:, None]
-    return sosfiltfilt(_bandpass(band), fade * (values - values.mean(0)), axis=0)[edge:-edge]
+    faded = fade * (values - values.mean(0))
+    return sosfiltfilt(_bandpass(band), faded, axis=0)[edge:-edge]
 
 
 @lru_cache(maxsize=32)

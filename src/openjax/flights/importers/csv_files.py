@@ -10,9 +10,8 @@ from openjax.flights.importers.columns import ColumnMapping
 from openjax.flights.reading import LOG_COLUMNS, LogError, read_csv
 
 TIME_UNITS = {1.0: "s", 1e-3: "ms", 1e-6: "us", 1e-9: "ns"}
-USUAL_STEP = (
-    0.01  # s between rows; units are a factor of a thousand apart, so this need not be near
-)
+# s between rows; units are a factor of a thousand apart, so this need not be near
+USUAL_STEP = 0.01
 
 
 def is_csv(path: Path) -> bool:

@@ -13,19 +13,19 @@ from openjax.flights.reading import LogTable
 
 @dataclass(frozen=True)
 class Importer:
-    """How logs of one format are read.
-
-    name: of the format, in words.
-    matches(path): whether a file or folder of a case is such a log. It is asked of everything in
-        the folder, so it looks at the name or at the first bytes, and never raises.
-    read(path, mapping): the log in the log format's columns and units. `mapping` is what the case's
-        `columns.toml` says, None without one. Raises LogError, in one line, for a log that can't be
-        read.
-    """
+    """How logs of one format are read."""
 
     name: str
+    """Of the format, in words."""
     matches: Callable[[Path], bool]
+    """matches(path): whether a file or folder of a case is such a log. It is asked of everything in
+    the folder, so it looks at the name or at the first bytes, and never raises.
+    """
     read: Callable[[Path, ColumnMapping | None], LogTable]
+    """read(path, mapping): the log in the log format's columns and units. `mapping` is what the
+    case's `columns.toml` says, None without one. Raises LogError, in one line, for a log that can't
+    be read.
+    """
 
 
 _IMPORTERS: list[Importer] = []
