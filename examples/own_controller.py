@@ -30,6 +30,6 @@ def chase(observation):
 
 
 for name, policy, speed in (("slower", chase, 0.8), ("faster", chase, 1.3), ("open", "open", 1.3)):
-    game = {"start_attitude": "level", "physics": "rigid", "evader_speed": speed}
+    game = {"start_attitude": "level", "evader_speed": speed}
     record = openjax.evaluate(policy, "empty", episodes=16, **game)
     print(f"{name:6} captured {record['capture_rate']:.2f}, crashed {record['crash_rate']:.2f}")

@@ -80,7 +80,8 @@ def parse(
                 default=default,
                 prog=program,
                 return_unknown_args=True,
-                registry=_showing_intervals(),
+                registry=_rules_of_help(),
+                use_underscores=True,  # as all pages and messages write options
             )
     except SystemExit as stop:
         if stop.code in (0, None):
@@ -92,8 +93,10 @@ def parse(
     return parsed
 
 
-def _showing_intervals():
-    """Rules for tyro by which `--help` shows the interval of a setting after what it means."""
+def _rules_of_help():
+    """Rules for tyro by which `--help` shows the interval of a setting after what it means, and
+    breaks lines where the terminal ends, not where the source does.
+    """
     from tyro.constructors import ConstructorRegistry
 
     registry = ConstructorRegistry()
@@ -111,15 +114,15 @@ def _showing_intervals():
         finally:
             inside.discard(kind)
         intervals = {field.name: field.interval for field in ranged_fields(kind)}
-        if not intervals or not hasattr(spec, "fields"):
+        if not hasattr(spec, "fields"):
             return spec
 
         def with_interval(field):
-            if field.name not in intervals:
-                return field
             text = field.helptext() if callable(field.helptext) else field.helptext
-            text = f"{text or ''} In {intervals[field.name]}.".strip()
-            return dataclasses.replace(field, helptext=text)
+            text = " ".join((text or "").split())
+            if field.name in intervals:
+                text = f"{text} In {intervals[field.name]}.".strip()
+            return dataclasses.replace(field, helptext=text or None)
 
         fields = tuple(with_interval(field) for field in spec.fields)
         return dataclasses.replace(spec, fields=fields)

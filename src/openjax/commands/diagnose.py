@@ -22,7 +22,7 @@ from openjax.vehicle.effect_names import effect_names
 PROGRAM = "openjax diagnose"
 SECONDS = 5.0
 """Of a case on a laptop, about."""
-_WITHOUT_HELP = f"Effects that the library must do without, of {', '.join(effect_names())}."
+_WITHOUT_HELP = f"Effects that are not to be looked for: any of {', '.join(effect_names())}."
 
 
 @dataclass(frozen=True)

@@ -48,7 +48,7 @@ class Arguments:
     observations: Annotated[int, Interval("[1, 100000000]")] = 10_000
     """How many observations of its game it is compared on."""
     seed: Seed = 0
-    """Draws them."""
+    """Draws those observations."""
 
 
 def observations(policy, number: int, seed: int) -> dict:

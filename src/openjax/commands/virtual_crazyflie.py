@@ -30,7 +30,7 @@ class Arguments:
     """Fly virtual Crazyflies until interrupted; each has a port of its own."""
 
     number: Annotated[int, Interval("[1, 10]")] = 3
-    """How many."""
+    """Vehicles that fly."""
     host: str = "127.0.0.1"
     """Address to listen at."""
     port: Annotated[int, Interval("[0, 65535]")] = UDP_PORT

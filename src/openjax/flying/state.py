@@ -29,11 +29,11 @@ class SafetySettings:
     arena_radius: Annotated[float, Interval("[0.3, 1000]")] = Arena.radius
     """No vehicle is let out of a cylinder of this radius (m)."""
     arena_height: Annotated[float, Interval("[0.6, 1000]")] = Arena.height
-    """Nor above this (m)."""
+    """No vehicle is let out above this height (m)."""
     floor: Annotated[float, Interval("[0, 100]")] = 0.12
-    """Nor, in pursuit, below this (m)."""
+    """No vehicle in pursuit is let below this height (m)."""
     outside: Annotated[float, Interval("[0, 100]")] = 0.3
-    """Farther out than this (m) something is wrong: all land."""
+    """Farther out of the arena than this (m) something is wrong: all land."""
     separation: Annotated[float, Interval("[0, 10]")] = 0.16
     """Vehicles in pursuit that couldn't stop at this distance (m) any more brake and part. 0
     switches it off.
@@ -59,9 +59,9 @@ class SafetySettings:
     action_timeout: Annotated[float, Interval("(0, 60]")] = 0.035
     """Without a new action of the policy for longer (s): all stop where they are."""
     battery_low: Annotated[float, Interval("[0, 100]")] = 3.2
-    """Voltage under load, for `battery_time`, at which a vehicle lands (V)."""
+    """Voltage under load at which a vehicle lands (V), if it is as low for `battery_time`."""
     battery_time: Annotated[float, Interval("[0, 60]")] = 0.5
-    """For so long (s): a sudden climb alone takes the voltage down for a moment."""
+    """How long the voltage must be low (s): a sudden climb takes it down for a moment."""
     battery_start: Annotated[float, Interval("[0, 100]")] = 3.7
     """No vehicle takes off with less, measured without load (V)."""
     stand: Annotated[float, Interval("(0, 1000]")] = 0.15
@@ -69,13 +69,13 @@ class SafetySettings:
     lift: Annotated[float, Interval("(0, 1]")] = 0.1
     """Height of the test lift (m)."""
     lift_time: Annotated[float, Interval("(0, 60]")] = 2.0
-    """It must be done by then (s)."""
+    """The test lift must be done within this time (s)."""
     hold_time: Annotated[float, Interval("[0, 600]")] = 0.5
     """How long vehicles wait after a trouble before they land (s)."""
     transfer_speed: Annotated[float, Interval("(0, 10]")] = 0.5
-    """On the way to the start (m/s)."""
+    """Speed on the way to the start (m/s)."""
     landing_speed: Annotated[float, Interval("(0, 10]")] = 0.4
-    """m/s."""
+    """Speed at which vehicles come down (m/s)."""
 
     def __post_init__(self):
         check_intervals(self, "safety.")

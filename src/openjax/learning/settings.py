@@ -25,16 +25,18 @@ class MappoSettings:
     its critic learns that first.
     """
     epochs: Annotated[int, Interval("[1, 1000]")] = 4
+    """Passes over each iteration's rollouts."""
     minibatches: Annotated[int, Interval("[1, 100000]")] = 16
+    """Gradient steps of one pass, each on as many worlds."""
     step_subsampling: Annotated[int, Interval("[1, 100000]")] = 1
     """A gradient step sees every n-th step of its trajectories, from a first one drawn each time:
     consecutive steps are so alike that fewer of them teach nearly as much. Divides
     `rollout_length`.
     """
     clip_epsilon: Annotated[float, Interval("(0, 10]")] = 0.1
-    """Clip range of the probability ratio at the start ..."""
+    """Clip range of the probability ratio at the start of the run."""
     clip_epsilon_end: Annotated[float, Interval("(0, 10]")] = 0.1
-    """... which changes linearly to this over `total_steps`."""
+    """Clip range at the end of the run, to which it changes linearly."""
     target_kl: Annotated[float, Interval("[0, 10]")] = 0.0
     """Divergence (nats) of the learning policy from the one that flew, near which the actor's step
     size keeps it; 0: steps aren't scaled. A run that starts from a policy with little noise needs
@@ -43,6 +45,7 @@ class MappoSettings:
     entropy_coefficient: Annotated[float, Interval("[0, 10]")] = 1e-3
     """Weight of the entropy."""
     discount: Annotated[float, Interval("[0, 1]")] = 0.995
+    """Of the reward, per control step."""
     gae_lambda: Annotated[float, Interval("[0, 1]")] = 0.95
     """Lambda of the generalised advantage estimate."""
     max_grad_norm: Annotated[float, Interval("(0, 1e6]")] = 10.0
@@ -56,10 +59,11 @@ class MappoSettings:
     iteration.
     """
     reward_scale: Annotated[float, Interval("(0, 1e6]")] = 0.1
+    """By which rewards are multiplied before they are learnt from."""
     penalty_start: Annotated[float, Interval("[0, 1]")] = 1.0
-    """Share of the penalties (collision, speed, crash) at the start of the run ..."""
+    """Share of the penalties (collision, speed, crash) that counts at the start of the run."""
     penalty_ramp: Annotated[float, Interval("[0, 1]")] = 0.5
-    """... which rises linearly to one over this share of the run."""
+    """Share of the run over which the penalties rise linearly to their whole size."""
 
     def __post_init__(self):
         check_intervals(self, "mappo.")
@@ -88,8 +92,9 @@ class GeneratorSettings:
     expansion: Annotated[float, Interval("[0, 1]")] = 0.7
     """Probability p of local expansion of an archived task, else a uniform one."""
     success_low: Annotated[float, Interval("[0, 1]")] = 0.5
+    """Least success rate of a task that enters the archive."""
     success_high: Annotated[float, Interval("[0, 1]")] = 0.9
-    """A task enters the archive if its success rate lies between these."""
+    """Largest success rate of a task that enters the archive."""
     wall_distance: Annotated[float, Interval("[0, 10]")] = 0.1
     """Expanded starts keep this far from the arena's wall (m); 0.1 in the released code."""
     episodes_per_task: Annotated[int, Interval("[1, 100000]")] = 4
@@ -114,13 +119,17 @@ class EvaderLearningSettings:
     """PPO of evaders that learn; see `openjax.learning.evader_learning`."""
 
     learning_rate: Annotated[float, Interval("(0, 1]")] = 1e-3
-    """Adam step size at the start ..."""
+    """Adam step size at the start of the run."""
     learning_rate_end: Annotated[float, Interval("[0, 1]")] = 1e-4
-    """... which falls linearly to this."""
+    """Adam step size at the end of the run, to which it falls linearly."""
     epochs: Annotated[int, Interval("[1, 1000]")] = 3
+    """Passes over each iteration's rollouts."""
     minibatches: Annotated[int, Interval("[1, 100000]")] = 4
+    """Gradient steps of one pass."""
     clip_epsilon: Annotated[float, Interval("(0, 10]")] = 0.2
+    """Clip range of the probability ratio."""
     entropy_coefficient: Annotated[float, Interval("[0, 10]")] = 1e-3
+    """Weight of the entropy."""
     hold: Annotated[int, Interval("[1, 1000]")] = 4
     """Control steps for which a decision is flown while it is learnt; divides `rollout_length`.
     Noise that is new in each step averages out before an evader has moved 2 cm.
@@ -128,17 +137,21 @@ class EvaderLearningSettings:
     discount: Annotated[float, Interval("[0, 1]")] = 0.99
     """Of a decision: where one holds for 40 ms, it sees 4 s ahead. A trap takes one to three."""
     gae_lambda: Annotated[float, Interval("[0, 1]")] = 0.95
+    """Lambda of the generalised advantage estimate."""
     initial_log_std: Annotated[float, Interval("[-10, 2]")] = -0.5
+    """Start of the log standard deviation of the evaders' decisions."""
     own_axes: bool = False
     """Evaders see in axes of their own, x away from the arena's axis."""
     past: Annotated[int, Interval("[0, 64]")] = 0
-    """The last ones of a game's learned evaders are earlier selves of the others: who only meets
-    the newest ones unlearns what beat the older ones. Each is drawn ...
+    """How many of a game's learned evaders, the last ones, are earlier selves of the others: who
+    only meets the newest ones unlearns what beat the older ones.
     """
     pool: Annotated[int, Interval("[1, 1000]")] = 32
-    """... from as many networks that are kept ..."""
+    """Earlier networks that are kept, from which those are drawn."""
     pool_every: Annotated[int, Interval("[1, 1000000]")] = 10
-    """... one of which is replaced, and all drawn anew, after as many updates."""
+    """Updates after which one of the kept networks is replaced, and all earlier selves are drawn
+    anew.
+    """
 
     def __post_init__(self):
         check_intervals(self)
@@ -153,6 +166,7 @@ class FirstFlightsSettings:
     updates: Annotated[int, Interval("[0, 1000000]")] = 0
     """Updates of the actor; 0: there is no such stage."""
     worlds: Annotated[int, Interval("[1, 65536]")] = 256
+    """Worlds that are simulated at once."""
     time_step: Annotated[float, Interval("[0.0001, 0.1]")] = 0.04
     """Control step (s): longer ones than the game's teach as much in fewer."""
     steps: Annotated[int, Interval("[1, 1000]")] = 15
@@ -162,29 +176,31 @@ class FirstFlightsSettings:
     anew: Annotated[float, Interval("[0, 1]")] = 0.15
     """Share of the worlds that start anew after each update, beside those that have to."""
     distance: Annotated[float, Interval("[0, 1000]")] = 3.0
-    """Weight of the nearest pursuer's mean way to the evader (m), beside the share of the time in
-    which it is free ...
+    """Weight of the nearest pursuer's mean way to the evader (m). What is minimised is this, the
+    share of the time in which the evader is free, and what follows.
     """
     crash: Annotated[float, Interval("[0, 1000]")] = 20.0
-    """... at the end of the share of pursuers that touch something or tip over ..."""
+    """Weight, at the end of the stage, of the share of pursuers that touch something or tip
+    over.
+    """
     crash_smooth: Annotated[float, Interval("[0.001, 1]")] = 0.012
-    """... from all to none over this distance (m): a longer one is felt earlier, and closes
-    narrower ways ...
+    """Distance (m) over which a touch counts from all to none: a longer one is felt earlier, and
+    closes narrower ways.
     """
     breach: Annotated[float, Interval("[0, 1000]")] = 10.0
-    """... and of the mean number of breaches ..."""
+    """Weight, at the end of the stage, of the mean number of breaches."""
     speed: Annotated[float, Interval("[0, 1000]")] = 1.0
-    """... and of speeds over the limit."""
+    """Weight of speeds over the limit."""
     penalty_start: Annotated[float, Interval("[0, 1]")] = 0.2
     """Share of the weights of crashes and breaches at the start: who fears them then stays away
     from the evader.
     """
     penalty_free: Annotated[float, Interval("[0, 1]")] = 0.62
-    """They rise, and tips over begin to count, in updates in which the evader is free for less than
-    this share of the time ...
+    """Share of the time below which the evader must be free in an update for these weights to rise
+    in it, and for tips over to begin to count.
     """
     penalty_ramp: Annotated[float, Interval("(0, 1]")] = 0.4
-    """... and have their whole weights after this share of the stage of such updates."""
+    """Share of the stage's updates that must be such until the weights are whole."""
 
     def __post_init__(self):
         check_intervals(self, "first_flights.")
@@ -234,6 +250,7 @@ class AdaptSettings:
     enough to see it work.
     """
     updates: Annotated[int, Interval("[1, 1000000]")] = 120
+    """Updates of the actor."""
     look_every: Annotated[int, Interval("[1, 1000000]")] = 40
     """Updates between evaluations of the policy; the best of all is kept."""
     learning_rate: Annotated[float, Interval("(0, 1]")] = 3e-4
@@ -282,17 +299,19 @@ class TrainSettings:
     another pursuer.
     """
     vehicles_start: Annotated[float, Interval("[0, 1]")] = 0.0
-    """Share of the run in which all vehicles are nominal; after it, the family
-    `environment.vehicles` grows about them ...
-    """
+    """Share of the run, at its start, in which all vehicles are nominal."""
     vehicles_ramp: Annotated[float, Interval("[0, 1]")] = 0.0
-    """... to its whole size over this share of the run."""
+    """Share of the run after that over which the family `environment.vehicles` grows about the
+    nominal vehicle to its whole size.
+    """
     evaders_start: Annotated[float, Interval("[0, 1]")] = 0.0
-    """Share of the run in which all evaders are the first of `environment.evaders`; then the others
-    come in, slow ones ...
+    """Share of the run, at its start, in which all evaders are the first of
+    `environment.evaders`.
     """
     evaders_ramp: Annotated[float, Interval("[0, 1]")] = 0.0
-    """... and have their whole odds and speed after this share of the run."""
+    """Share of the run after that over which the others come in, slow ones first, until they have
+    their whole odds and speed.
+    """
     evaders_validation: tuple[str, ...] = ()
     """Evaders of the validation; none: those of the training."""
     validation_start: Annotated[float, Interval("[0, 1]")] = 0.0
@@ -304,6 +323,7 @@ class TrainSettings:
     validation_episodes: Annotated[int, Interval("[1, 1000000]")] = 256
     """Uniform tasks that are never trained on, and as many far ones."""
     seed: Seed = 0
+    """Draws the networks' first parameters, the tasks and the exploration."""
 
     def __post_init__(self):
         check_intervals(self)

@@ -87,9 +87,13 @@ class PursuitSettings:
     max_pillars: Annotated[int, Interval("[0, 32]")] = 5
     """Most pillars of a uniform task; also the number of pillar slots of a task."""
     arena_radius: Annotated[float, Interval("[0.1, 100]")] = 0.9
+    """Of the cylinder that nobody may leave (m)."""
     arena_height: Annotated[float, Interval("[0.3, 100]")] = 1.2
+    """Of that cylinder, and of the pillars (m)."""
     pillar_radius: Annotated[float, Interval("[0.001, 10]")] = 0.1
+    """Of each pillar (m)."""
     capture_radius: Annotated[float, Interval("(0, 10]")] = 0.3
+    """The evader is captured while a pursuer is nearer than this (m)."""
     evader_speed: Annotated[float, Interval("(0, 100]")] = 1.3
     """Speed of the evader (m/s)."""
     evader_speeds: Annotated[tuple[float, ...], Interval("(0, 100]")] = ()
@@ -97,10 +101,9 @@ class PursuitSettings:
     drawn, in place of `evader_speed`; empty: none is drawn.
     """
     fall_outs: Annotated[float, Interval("[0, 1]")] = 0.0
-    """Share of the episodes of two or more pursuers in which one of them falls out, and is gone ...
-    """
+    """Share of the episodes of two or more pursuers in which one of them falls out, and is gone."""
     fall_out_seconds: Annotated[tuple[float, ...], Interval("[0, 1000]")] = (0.5, 4.0)
-    """... after a time between these (s)."""
+    """Earliest and latest time at which a pursuer falls out (s)."""
     capture_radii: Annotated[tuple[float, ...], Interval("(0, 10]")] = ()
     """Smallest and largest capture radius (m), the same in place of `capture_radius`."""
     sight_range: Annotated[float, Interval("(0, 1000]")] = 1000.0

@@ -26,9 +26,8 @@ MAY_CHANGE = ("total_steps", "validation_interval", "validation_episodes")
 class TrainCommand:
     """Train pursuers to capture a faster evader.
 
-    Every setting of the run can be given, for example --environment.capture_radius 0.2 or
-    --mappo.epochs 2; the defaults shown are those of the preset quick, or of the one given: openjax
-    train --preset paper --help.
+    Every setting of the run can be given, such as --mappo.epochs 2. The defaults shown are those of
+    the preset quick, or of the one given: openjax train --preset paper --help.
     """
 
     preset: str | None = None
@@ -159,7 +158,7 @@ class MapCommand:
     evaders: tuple[str, ...] = HELD_OUT
     """One of them is drawn for each episode; by default those that no preset trains with."""
     episodes: Annotated[int, Interval("[1, 1000000]")] = 200
-    """Of each cell."""
+    """Episodes of each cell."""
     messages: MessageSettings = dataclasses.field(default_factory=MessageSettings)
     fall_outs: Annotated[float, Interval("[0, 1]")] = 0.0
     """Share of the episodes of two or more pursuers in which one of them is gone after 2 s."""
@@ -190,6 +189,7 @@ class AdaptCommand:
     CPU.
     """
     seed: Seed = 0
+    """Draws the worlds in which the policy is fine-tuned and measured."""
     overwrite: bool = False
     """Replace what --out already holds."""
     compilation_cache: bool = True

@@ -23,7 +23,7 @@ class LinkFaults:
     latency_ms: Annotated[float, Interval("[0, 1000]")] = 0.0
     """Set-points arrive this much later (ms)."""
     jitter_ms: Annotated[float, Interval("[0, 1000]")] = 0.0
-    """Up to this much more, drawn for each set-point (ms)."""
+    """Set-points arrive up to this much later than that, drawn for each (ms)."""
     loss: Annotated[float, Interval("[0, 1]")] = 0.0
     """Share of the set-points that never arrive."""
     pose_latency_ms: Annotated[float, Interval("[0, 1000]")] = 0.0

@@ -12,7 +12,7 @@ class BestResponseSettings:
     """How evaders learn against fixed pursuers."""
 
     learners: Annotated[int, Interval("[1, 64]")] = 8
-    """That learn side by side; every second one in the world's axes."""
+    """Evaders that learn side by side; every second one in the world's axes."""
     total_steps: Annotated[int, Interval("[1, 1e15]")] = 800_000_000
     """Environment steps of all learners."""
     num_envs: Annotated[int, Interval("[1, 16777216]")] = 1024
@@ -24,8 +24,8 @@ class BestResponseSettings:
     of a single one leads into the middle.
     """
     width: Annotated[int, Interval("[1, 4096]")] = 256
-    """Of both hidden layers: 100 numbers are sensed, and two layers of 64 gave evaders that ran
-    into corners.
+    """Width of both hidden layers: 100 numbers are sensed, and two layers of 64 gave evaders that
+    ran into corners.
     """
     rollout_length: Annotated[int, Interval("[1, 100000]")] = 25
     """Decisions per iteration: a second of the game."""
@@ -34,16 +34,23 @@ class BestResponseSettings:
     three.
     """
     gae_lambda: Annotated[float, Interval("[0, 1]")] = 0.95
+    """Lambda of the generalised advantage estimate."""
     learning_rate: Annotated[float, Interval("(0, 1]")] = 5e-4
     """Adam step size at the start; falls linearly to zero."""
     epochs: Annotated[int, Interval("[1, 1000]")] = 4
+    """Passes over each iteration's rollouts."""
     minibatches: Annotated[int, Interval("[1, 100000]")] = 4
+    """Gradient steps of one pass."""
     clip_epsilon: Annotated[float, Interval("(0, 10]")] = 0.2
+    """Clip range of the probability ratio."""
     entropy_coefficient: Annotated[float, Interval("[0, 10]")] = 2e-3
+    """Weight of the entropy."""
     value_coefficient: Annotated[float, Interval("(0, 1000]")] = 10.0
     """Weight of the squared error of values, which are at most one."""
     initial_log_std: Annotated[float, Interval("[-10, 2]")] = 0.0
+    """Start of the log standard deviation of a decision."""
     least_log_std: Annotated[float, Interval("[-10, 2]")] = -2.5
+    """Least log standard deviation, so that exploring doesn't end."""
     layouts: Annotated[float, Interval("[0, 1]")] = 0.5
     """Share of the episodes that begin among a layout's pillars, turned and with starts moved; the
     others are uniform tasks, turned.
@@ -121,7 +128,7 @@ class MatrixGameSettings:
     evader_plans: Annotated[int, Interval("[3, 1000]")] = 16
     team_plans: Annotated[int, Interval("[5, 1000]")] = 16
     pieces: Annotated[int, Interval("[1, 100]")] = 4
-    """Of a plan, one after the other."""
+    """Pieces of a plan, one after the other."""
     piece_steps: Annotated[int, Interval("[1, 1000]")] = 20
     """Control steps of each piece."""
     replan: Annotated[int, Interval("[1, 1000]")] = 10
