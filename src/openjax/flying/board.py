@@ -129,6 +129,7 @@ class Board:
             mode, trim, known, *numbers = self._numbers[start : start + _EACH]
             pose = moved_on(pose_of(numbers), now) if known else None
             drones.append(drone._replace(mode=_MODES[int(mode)], trim=trim, estimate=pose))
+        # from now on: that no action came while nobody flew is no reason to stop
         return state._replace(drones=tuple(drones), time=now, action_time=now)
 
 

@@ -197,6 +197,7 @@ def accelerate(
     along = sum(a * b for a, b in zip(body_axis(quaternion), (ax, ay, GRAVITY + az), strict=True))
     thrust = (airframe.hover_thrust + trim) * max(along, 0.0) / GRAVITY
     yaw_rate = -YAW_GAIN * yaw
+    # where rates are sent nobody on board tracks the angles
     if mode == RATES:
         return SetPoint(
             RATES,

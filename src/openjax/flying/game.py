@@ -117,7 +117,8 @@ class Game:
 
         self._first = compile_in_line(jax.jit(begin).lower(example))
         self._tick = compile_in_line(jax.jit(move).lower(self._flat, example, *nowhere))
-        self.start(poses)  # the first calls take tens of milliseconds: not in flight
+        # the first calls take tens of milliseconds: not in flight
+        self.start(poses)
         self.step(poses)
 
     def start(self, poses: list[Pose]) -> Play:

@@ -160,6 +160,7 @@ class RawLinks:
                 data = bytes(packet.data)
                 if (packet.port, packet.channel) != (Port.LOG, 2) or data[:1] != bytes([block]):
                     continue
+                # block, three bytes of time, and the variables
                 if len(data) == 4 + struct.calcsize(self._layout):
                     values = dict(
                         zip(self._names, struct.unpack(self._layout, data[4:]), strict=True)

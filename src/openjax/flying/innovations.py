@@ -40,7 +40,9 @@ WAY = Memory(1.2, 0.095)
 have nothing to do with each other reach .09.
 """
 SPEED = Memory(0.1, 0.2)
-"""Of velocity against thrust (m/s): a disturbance of 2 m/s^2 that sets in at once, as no drag does."""
+"""Of velocity against thrust (m/s): a disturbance of 2 m/s^2 that sets in at once, as no drag
+does.
+"""
 RISING = 0.3
 SINKING = 0.7
 """The same upwards (m/s), where the floor's cushion pushes, and downwards, where the wake of another

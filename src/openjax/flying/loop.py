@@ -250,6 +250,7 @@ class Flight:
     @property
     def over(self) -> bool:
         """Whether all that flew is down, or nothing is going to fly."""
+        # half a second for the first poses to come, before which all stand on the ground
         if self.state.flying or self.state.time - self._since < 0.5:
             return False
         return self.state.all_in(Mode.LANDED, Mode.STOPPED) or any(

@@ -74,6 +74,7 @@ class MotionCaptured(Links):
         at = time.perf_counter() if at is None else at
         position = tuple(map(float, position))
         quaternion = tuple(map(float, quaternion))
+        # put there whole: the loop's thread sees this pose or the one before
         self._captured[vehicle] = Pose(at, position, (0.0, 0.0, 0.0), quaternion)
         self._arrived.set()
 

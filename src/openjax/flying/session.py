@@ -155,6 +155,7 @@ class Session:
             lander = max(lander, board.pilot)
             if all(board.silent(role, now) > board.silence for role in (Role.LINKS, Role.GUARD)):
                 lander = Role.LOOP
+                # should one of them wake up, two would fly, and a dongle serves one process
                 for role in (Role.LINKS, Role.GUARD):
                     board.end_process(role)
                 self._own.open()

@@ -230,6 +230,7 @@ class Swarm:
             ) from error
         for name in ("cflib.crazyflie", "cflib.crazyflie.toccache", "cflib.crazyflie.log"):
             logging.getLogger(name).setLevel(logging.CRITICAL)
+        # cflib's list of drivers is the process' own: a second call would add them again
         if not cflib.crtp.CLASSES:
             cflib.crtp.init_drivers()
         try:
@@ -300,8 +301,8 @@ class Swarm:
             if perf_counter() > deadline:
                 raise UserError(f"the log blocks didn't start within {timeout:g} s")
             sleep(0.01)
-        # Once more, in step: a vehicle samples every 1 or 2 ms, and blocks that share a sample leave
-        # a gap elsewhere.
+        # once more, in step: a vehicle samples every 1 or 2 ms, and blocks that share a sample
+        # leave a gap elsewhere
         for _ in range(TRIES):
             self._start_in_step()
             sleep(5e-3 * PERIOD_MS)

@@ -101,8 +101,8 @@ def rigid_step(
 ) -> DroneState:
     """One drone after dt seconds, its rotors and controller as they are.
 
-    force_world and torque_body as for `accelerations`. `contact`, if any, maps the acceleration (3,)
-    m/s^2 that the drone would have in free flight to what contacts add.
+    force_world and torque_body as for `accelerations`. `contact`, if any, maps the acceleration
+    (3,) m/s^2 that the drone would have in free flight to what contacts add.
     """
     acceleration, angular_acceleration = accelerations(vehicle, drone, force_world, torque_body)
     if contact is not None:

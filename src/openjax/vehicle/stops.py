@@ -47,10 +47,12 @@ def _push(position, velocity, away, reach, solid, share, moving=None):
     """
     size = away.shape[-1]
     moving = velocity[:, None, :size] if moving is None else moving
+    # the root keeps a slope where a drone is in the middle of a pillar
     distance = jnp.sqrt(jnp.sum(away * away, axis=-1) + 1e-12)
     normal = away / distance[..., None]
     hit = solid & (distance < reach)
     depth = jnp.where(hit, share * (reach - distance), 0.0)
+    # only what goes inwards is taken off: who leaves already keeps its velocity
     approach = jnp.where(hit, share * jnp.minimum(jnp.sum(normal * moving, axis=-1), 0.0), 0.0)
     shift = jnp.sum(depth[..., None] * normal, axis=1)
     change = jnp.sum(approach[..., None] * normal, axis=1)

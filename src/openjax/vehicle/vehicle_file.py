@@ -170,6 +170,7 @@ def load_vehicle_file(path: str | Path | None = None, dtype=jnp.float32) -> Vehi
     path = Path(NOMINAL if path is None else path)
     if str(path) in AIRFRAMES and not path.exists():
         return VehicleFile(load_vehicle(str(path), dtype), _usual_name(str(path)), str(path))
+    # a name without a suffix was meant for an airframe, or for a folder
     if not path.exists() and not path.suffix:
         raise UserError(
             f"{path}: no such vehicle file, nor airframe; {suggestion(str(path), AIRFRAMES)}"
@@ -216,6 +217,7 @@ def copy_vehicle_file(source: str | Path, target: Path) -> None:
 def _copy_mjcf(vehicle_file, target):
     """Put the MJCF that a vehicle file names beside another one."""
     source = vehicle_file.mjcf
+    # one that lies there already isn't written over itself
     if source is not None and source.resolve().parent != target.resolve().parent:
         write_text(target.with_name(source.name), source.read_text(encoding="utf-8"))
 
@@ -365,6 +367,7 @@ def _tables_of(vehicle_file: VehicleFile) -> dict[str, Any]:
         "vehicle": {
             "name": vehicle_file.name,
             "airframe": vehicle_file.airframe,
+            # as a person writes it: single precision has seven digits, and prints seventeen
             "mass": float(f"{float(vehicle_file.vehicle.mass):.6g}"),
             "mass_weighed": vehicle_file.mass_weighed,
         },

@@ -40,7 +40,10 @@ EFFECT = Effect(
             unit="1",
             none=0.0,
             prior=(0.0, 2.0),
-            source="0 with voltage compensation, 2 where speed follows voltage; to 40 % less thrust empty",
+            source=(
+                "0 with voltage compensation, 2 where speed follows voltage; to 40 % less thrust "
+                "empty"
+            ),
         ),
         "reference": Parameter(
             "V", 3.9, (3.7, 4.2), _CELL, "voltage at which the nominal thrust holds", NOT_NEGATIVE

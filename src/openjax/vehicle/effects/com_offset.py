@@ -8,6 +8,7 @@ from openjax.vehicle.effects.effect import Card, Effect, Fitted, Parameter
 
 def body(parameters, vehicle):
     """Positions and velocities of the state are those of the centre of mass, wherever it is."""
+    # the body frame's origin is the centre of mass: seen from it the rotors move the other way
     offset = jnp.stack([parameters["x"], parameters["y"], parameters["z"]])
     return vehicle.replace(rotor_position=vehicle.rotor_position - offset)
 

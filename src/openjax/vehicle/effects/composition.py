@@ -150,6 +150,7 @@ def record(effects, memory, state: DroneState, dt):
     """Memory at the end of a step of dt seconds that led to `state`; without effects it stays."""
     if not effects:
         return memory
+    # a new dictionary: a state that is written to would change for whoever still holds it
     memory = {**memory, AIR_TIME: memory[AIR_TIME] + jnp.asarray(dt, memory[AIR_TIME].dtype)}
     for effect in effects:
         if effect.record is not None:

@@ -27,11 +27,16 @@ def wrench(parameters, context):
     return hub_wrench(context, push[:, None] * up)
 
 
-_SOURCE = "3-20 g under another Crazyflie, 3-8 cm wide (Shi et al. 2020, Neural-Swarm; Preiss et al. 2017)"
+_SOURCE = (
+    "3-20 g under another Crazyflie, 3-8 cm wide (Shi et al. 2020, Neural-Swarm; Preiss et al. "
+    "2017)"
+)
 
 EFFECT = Effect(
     name="downwash",
-    description="force along -z under another vehicle, decaying with the distance below it and to the side",
+    description=(
+        "force along -z under another vehicle, decaying with the distance below it and to the side"
+    ),
     formula=r"f = -A\,e^{-\Delta z/h}\,e^{-r^2/2s^2}\,e_z,\quad s = w + b\,\Delta z",
     parameters={
         "force": Parameter(

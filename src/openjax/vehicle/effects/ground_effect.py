@@ -19,7 +19,10 @@ def thrust(parameters, thrust, reaction, context):
     return thrust * gain(parameters["strength"], height + parameters["offset"]), reaction
 
 
-_SOURCE = "5-25 % at 5 cm (Cheeseman-Bennett form with free strength; Sanchez-Cuevas et al. 2017 for multirotors)"
+_SOURCE = (
+    "5-25 % at 5 cm (Cheeseman-Bennett form with free strength; Sanchez-Cuevas et al. 2017 for "
+    "multirotors)"
+)
 
 EFFECT = Effect(
     name="ground_effect",

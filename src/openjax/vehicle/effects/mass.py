@@ -24,7 +24,9 @@ EFFECT = Effect(
             unit="kg",
             none=0.0,
             prior=(-0.005, 0.010),
-            source="Crazyflie 2.x with and without decks and other batteries: 27-42 g, nominal 32.1 g",
+            source=(
+                "Crazyflie 2.x with and without decks and other batteries: 27-42 g, nominal 32.1 g"
+            ),
             meaning="mass beyond the assumed one",
             domain=some_is_left,
         )
@@ -39,6 +41,8 @@ EFFECT = Effect(
         sample={"extra": 0.003},
         practical={"extra": 0.0003},
         trim=lambda values, vehicle: np.full(4, -values["extra"] / float(vehicle.mass)),
-        next_flight="weigh the vehicle, then hover and climb hard: a weighed mass leaves only the thrust.",
+        next_flight=(
+            "weigh the vehicle, then hover and climb hard: a weighed mass leaves only the thrust."
+        ),
     ),
 )

@@ -56,7 +56,10 @@ _SOURCE = "coreless motors of this size: time constants of 0.02-0.12 s, against 
 EFFECT = Effect(
     name="motor_lag",
     description="first-order lag of the rotor speed, separately for speeding up and slowing down",
-    formula=r"\dot\omega_i = (\omega_i^{\ast} - \omega_i)/\tau_{\pm},\quad \tau_{\pm} = \tau_{\pm,0} + \Delta\tau_{\pm}",
+    formula=(
+        r"\dot\omega_i = (\omega_i^{\ast} - \omega_i)/\tau_{\pm},"
+        r"\quad \tau_{\pm} = \tau_{\pm,0} + \Delta\tau_{\pm}"
+    ),
     parameters={
         "extra_up": Parameter(
             "s", 0.0, (-0.005, 0.095), _SOURCE, "added to the time constant of speeding up", up

@@ -26,8 +26,8 @@ def register_effect(effect: Effect) -> None:
         raise UserError(f"effect {effect.name!r}: there is one of that name already")
     if effect.name not in EFFECTS and "openjax.gap.model.library" in sys.modules:
         raise UserError(
-            f"effect {effect.name!r}: register it before openjax.gap is imported, which has read the "
-            "list of effects"
+            f"effect {effect.name!r}: register it before openjax.gap is imported, which has read "
+            "the list of effects"
         )
     EFFECTS[effect.name] = effect
 

@@ -12,7 +12,10 @@ def wrench(parameters, context):
     return hub_wrench(context, -0.25 * drag * hub_velocity(context))
 
 
-_SOURCE = "induced drag of small quadrotors (Foerster 2015 for the Crazyflie; Faessler, Franchi, Scaramuzza 2018)"
+_SOURCE = (
+    "induced drag of small quadrotors (Foerster 2015 for the Crazyflie; Faessler, Franchi, "
+    "Scaramuzza 2018)"
+)
 
 
 def brakes(value, deviation):

@@ -39,6 +39,8 @@ EFFECT = Effect(
         practical={"scale": 0.01},
         days=0.012,
         trim=lambda values, vehicle: np.full(4, values["scale"]),
-        next_flight="weigh the vehicle, then hover and climb hard: a weighed mass leaves only the thrust.",
+        next_flight=(
+            "weigh the vehicle, then hover and climb hard: a weighed mass leaves only the thrust."
+        ),
     ),
 )
