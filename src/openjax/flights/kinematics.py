@@ -31,19 +31,22 @@ ONE_CLOCK = 0.93  # below which they don't share a clock
 
 @dataclass(frozen=True)
 class Kinematics:
-    """`gain` of the gyroscope, 1 where it isn't clearly another; `tilt` (2,) rad by which the world
-    leans about its x and y axes, None where that isn't clear; `one_clock`: whether attitude and
-    gyroscope can be compared sample by sample: what their streams leave of each other is noise, not
-    time; `motor_clock`, `motors_late`: the same of motors and gyroscope (see `MotorClock`); `findings`: what is off by
-    more than usual, in words, by name.
-    """
+    """What the sensors of a case say of each other."""
 
     gain: float
+    """Of the gyroscope, 1 where it isn't clearly another."""
     tilt: np.ndarray | None
+    """(2,) rad by which the world leans about its x and y axes; None where that isn't clear."""
     one_clock: bool
+    """Whether attitude and gyroscope can be compared sample by sample: what their streams leave of
+    each other is noise, not time.
+    """
     findings: dict[str, str]
+    """What is off by more than usual, in words, by name."""
     motor_clock: bool = True
+    """The same of motors and gyroscope, see `MotorClock`."""
     motors_late: Mapping[str, float] = field(default_factory=dict)
+    """{flight and vehicle: s by which its motor commands stand later in the log than they act}."""
 
 
 def read_kinematics(tracks: list[Track], limits) -> Kinematics:
@@ -60,7 +63,7 @@ def read_kinematics(tracks: list[Track], limits) -> Kinematics:
     if words := _unusual(gain, error, limits.gyroscope_gain):
         findings["gyroscope gain"] = f"the gyroscope reads {words} times the rate of the attitude"
     scale = _gains(_streams(tracks, _accelerating, (BAND[0], SLOW)))
-    if words := _unusual(*scale[:2], limits.gyroscope_gain):
+    if words := _unusual(scale[0], scale[1], limits.gyroscope_gain):
         findings["scale"] = (
             f"positions change by {words} times what accelerometer and attitude feel: check their "
             "scale"
@@ -69,17 +72,16 @@ def read_kinematics(tracks: list[Track], limits) -> Kinematics:
         words = ", ".join(f"{a} {c:.2f}" for a, c in zip("xyz", coherence, strict=True))
         findings["clocks"] = (
             f"gyroscope and attitude don't share a clock (correlation {words} between {BAND[0]} "
-            f"and {BAND[1]:g} Hz): "
-            "torques and lags can't be told from these logs"
+            f"and {BAND[1]:g} Hz): torques and lags can't be told from these logs"
         )
     if (world := _world(tracks)) is not None:
         lean, lean_error = world
         size = float(np.hypot(*lean))
         tilt = lean if size >= limits.standard_errors * float(np.hypot(*lean_error)) else None
+        # of the error's two axes what lies along the lean
         along = lean / max(size, 1e-12)
-        if size > max(
-            np.radians(limits.world_tilt), CLEAR * float(np.sqrt(along**2 @ lean_error**2))
-        ):
+        error_along = float(np.sqrt(along**2 @ lean_error**2))
+        if size > max(np.radians(limits.world_tilt), CLEAR * error_along):
             findings["world tilt"] = (
                 f"motion capture's world leans by {np.degrees(size):.1f} degrees against gravity "
                 f"({np.degrees(lean[0]):+.1f} about x, {np.degrees(lean[1]):+.1f} about y)"
@@ -108,8 +110,10 @@ def _unusual(gain: np.ndarray, error: np.ndarray, usual: float) -> str:
     """
     away = np.abs(gain - 1.0)  # NaN where it isn't known
     off = (away > CLEAR * error) & (away > usual)
-    words = ", ".join(f"{a} {g:.3f}" for a, g, o in zip("xyz", gain, off, strict=True) if o)
-    return words if off.sum() >= 2 else ""
+    # of a single axis it may be the calibration of that; two or more say that it is the unit
+    if off.sum() < 2:
+        return ""
+    return ", ".join(f"{a} {g:.3f}" for a, g, o in zip("xyz", gain, off, strict=True) if o)
 
 
 def corrected(track: Track, found: Kinematics) -> Track:
@@ -132,9 +136,9 @@ def _turning(track: Track) -> tuple[np.ndarray, np.ndarray] | None:
     """Rate of the attitude (T, 3) and gyroscope (T, 3), rad/s."""
     if track.quaternion is None or track.body_rates is None:
         return None
-    return turn_increments(track.quaternion) / track.dt, 0.5 * (
-        track.body_rates[1:] + track.body_rates[:-1]
-    )
+    # between two rows, where the attitude's increment is
+    gyroscope = 0.5 * (track.body_rates[1:] + track.body_rates[:-1])
+    return turn_increments(track.quaternion) / track.dt, gyroscope
 
 
 def _accelerating(track: Track) -> tuple[np.ndarray, np.ndarray] | None:
@@ -144,7 +148,8 @@ def _accelerating(track: Track) -> tuple[np.ndarray, np.ndarray] | None:
     if track.quaternion is None or track.position is None or track.specific_force is None:
         return None
     felt = to_world(track.quaternion, track.specific_force)
-    return felt, np.gradient(np.gradient(track.position, track.dt, axis=0), track.dt, axis=0)
+    velocity = np.gradient(track.position, track.dt, axis=0)
+    return felt, np.gradient(velocity, track.dt, axis=0)
 
 
 def _streams(tracks, signals_of, band) -> list[tuple[float, np.ndarray, np.ndarray]]:
@@ -158,7 +163,8 @@ def _streams(tracks, signals_of, band) -> list[tuple[float, np.ndarray, np.ndarr
         if signals is None or len(signals[0]) < 4 * edge:
             continue
         passed = butter(2, band, "bandpass", fs=1.0 / track.dt, output="sos")
-        out.append((track.dt, *(sosfiltfilt(passed, v, axis=0)[edge:-edge] for v in signals)))
+        first, second = (sosfiltfilt(passed, v, axis=0)[edge:-edge] for v in signals)
+        out.append((track.dt, first, second))
     return out
 
 
@@ -172,23 +178,21 @@ def _gains(streams) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         for k in range(0, len(a) - size // 2, size):
             p = a[k : k + size]
             q = b[k : k + size]
-            sums.append(
-                np.stack([(p * p).sum(0), (p * q).sum(0), (q * q).sum(0), np.full(3, len(p))])
-            )
+            squares = [(p * p).sum(0), (p * q).sum(0), (q * q).sum(0)]
+            sums.append(np.stack([*squares, np.full(3, len(p))]))
     nothing = np.full(3, np.nan)
     if len(sums) < 4:
         return nothing, nothing, np.ones(3), np.zeros(3, bool)
     sums = np.array(sums)
     total = sums.sum(0)
 
-    def gains(s):
-        # Both have noise: the geometric mean of the two regressions.
-        return np.sqrt(s[2] / np.maximum(s[0], 1e-12)), s[1] / np.sqrt(
-            np.maximum(s[0] * s[2], 1e-12)
-        )
+    def gain_of(s):
+        # both have noise: the geometric mean of the two regressions
+        return np.sqrt(s[2] / np.maximum(s[0], 1e-12))
 
-    gain, coherence = gains(total)
-    error = _jackknife(sums, lambda s: gains(s)[0])
+    gain = gain_of(total)
+    coherence = total[1] / np.sqrt(np.maximum(total[0] * total[2], 1e-12))
+    error = _jackknife(sums, gain_of)
     # The quieter of the two: noise alone is no motion.
     moving = np.sqrt(np.minimum(total[0], total[2]) / total[3]) > LEAST
     return np.where(moving & (coherence > COHERENT), gain, np.nan), error, coherence, moving

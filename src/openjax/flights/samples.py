@@ -107,9 +107,9 @@ def references(
     phase = rng.uniform(0, 2 * np.pi, 3)
     frequency = np.array([0.42, 0.35, 0.25]) * 2 * np.pi * rng.uniform(0.9, 1.1, 3)
     start = np.clip(t / 3.0, 0, 1)[:, None]
-    figure = (
-        start**2 * (3 - 2 * start) * [0.55, 0.55, 0.22] * np.sin(frequency * t[:, None] + phase)
-    )
+    # a smooth step, so that the figure begins at rest in the middle
+    swell = start**2 * (3 - 2 * start)
+    figure = swell * [0.55, 0.55, 0.22] * np.sin(frequency * t[:, None] + phase)
     figure += [0.0, 0.0, 0.6]
 
     doublets = zero.copy()
@@ -126,20 +126,26 @@ def references(
         "flight_b": (figure, 0.8 * np.sin(0.7 * t), zero, 3.9),
         "flight_c": (hover, 0.0 * t, doublets, 3.7),
     }
-    if not neighbour:
-        return {
-            n: Reference(p[:, None], y[:, None], c[:, None], v)
-            for n, (p, y, c, v) in flights.items()
-        }
-    offset = np.stack(
-        [0.25 * np.sin(1.3 * t), 0.1 * np.sin(0.8 * t), 0.45 + 0.1 * np.sin(0.5 * t)], 1
-    )
-    return {
-        n: Reference(
-            np.stack([p, p + offset], 1), np.stack([y, 0 * y], 1), np.stack([c, zero], 1), v
+    sideways = 0.25 * np.sin(1.3 * t)
+    along = 0.1 * np.sin(0.8 * t)
+    above = 0.45 + 0.1 * np.sin(0.5 * t)
+    offset = np.stack([sideways, along, above], 1)
+    found = {}
+    for name, (place, yaw, command, voltage) in flights.items():
+        places = [place]
+        yaws = [yaw]
+        commands = [command]
+        if neighbour:
+            places.append(place + offset)
+            yaws.append(0 * yaw)
+            commands.append(zero)
+        found[name] = Reference(
+            position=np.stack(places, 1),
+            yaw=np.stack(yaws, 1),
+            extra_command=np.stack(commands, 1),
+            open_circuit_voltage=voltage,
         )
-        for n, (p, y, c, v) in flights.items()
-    }
+    return found
 
 
 def fly(
@@ -164,14 +170,14 @@ def fly(
     wanted = tuple(jnp.asarray(w, jnp.float32) for w in wanted)
     start = jnp.float32(reference.open_circuit_voltage)
     length, count = reference.position.shape[:2]
+    # generators of their own: the same flight in other air, or with other sensors
     gusts = None
     if air is not None:
         drawn = air.drawn(np.random.default_rng([seed, 2]), length, count)
         gusts = jnp.asarray(drawn, jnp.float32)
     key = jax.random.key(seed)
-    rows = jax.device_get(
-        _fly(plant, assumed, wanted, start, parameters, key, gusts, names, sensors)
-    )
+    flown = _fly(plant, assumed, wanted, start, parameters, key, gusts, names, sensors)
+    rows = jax.device_get(flown)
     rng = np.random.default_rng([seed, 1])
     return [_columns([r[:, n] for r in rows], rng, sensors) for n in range(count)]
 
@@ -317,11 +323,13 @@ def _columns(rows, rng: np.random.Generator, sensors: SensorModel) -> dict[str, 
         return values + size * rng.standard_normal(values.shape)
 
     specific_force = specific_force + sensors.accelerometer_bias * rng.standard_normal(3)
+
+    def shaken(attitudes):
+        return _turned(attitudes, noisy(np.zeros((count, 3)), sensors.attitude_noise))
+
     groups = {
         ("x", "y", "z"): noisy(position, sensors.position_noise),
-        ("qw", "qx", "qy", "qz"): _turned(
-            quaternion, noisy(np.zeros((count, 3)), sensors.attitude_noise)
-        ),
+        ("qw", "qx", "qy", "qz"): shaken(quaternion),
         ("vx", "vy", "vz"): noisy(velocity, sensors.velocity_noise),
         ("wx", "wy", "wz"): noisy(gyro, sensors.gyro_noise),
         ("ax", "ay", "az"): noisy(specific_force, sensors.accelerometer_noise),
@@ -331,6 +339,7 @@ def _columns(rows, rng: np.random.Generator, sensors: SensorModel) -> dict[str, 
     columns = {"t": np.arange(count) * PERIOD}
     for names, values in groups.items():
         columns |= dict(zip(names, values.T, strict=True))
+    # a battery is logged at 10 Hz
     every_tenth = np.arange(count) % 10 == 0
     return columns | {"vbat": np.where(every_tenth, noisy(voltage, sensors.voltage_noise), np.nan)}
 
@@ -340,9 +349,8 @@ def _turned(quaternion: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     w = quaternion[:, :1]
     u = quaternion[:, 1:]
     half = rotation / 2
-    turned = np.concatenate(
-        [w - (u * half).sum(1, keepdims=True), u + w * half + np.cross(u, half)], 1
-    )
+    scalar = w - (u * half).sum(1, keepdims=True)
+    turned = np.concatenate([scalar, u + w * half + np.cross(u, half)], 1)
     return turned / np.linalg.norm(turned, axis=1, keepdims=True)
 
 
