@@ -22,13 +22,13 @@ GAME = PursuitSettings(
 
 @dataclasses.dataclass(frozen=True)
 class ByVelocity:
-    """Commands that depend on the own velocity, which stands behind evader and attitude."""
+    """Thrust, and turns by the own velocity, which stands behind evader and attitude."""
 
     gain: float
 
     def act(self, parameters, observation):
         velocity = observation.self_state[..., 7:10]
-        thrust = 0.1 * jnp.ones_like(velocity[..., :1])
+        thrust = 0.3 * self.gain * jnp.ones_like(velocity[..., :1])
         return jnp.concatenate([thrust, jnp.tanh(self.gain * velocity)], axis=-1)
 
 
