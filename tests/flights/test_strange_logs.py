@@ -198,6 +198,20 @@ def test_a_coarse_gyroscope_at_the_peaks_of_a_motion_is_not_at_its_end(
         assert not any("the sensor's end" in issue for issue in issues)
 
 
+def test_a_table_of_rows_that_repeat_is_the_flight_without_them(tmp_path, sample_columns):
+    """As a logger at 1 kHz leaves it of a vehicle that tells something a hundred times a second."""
+    columns = sample_columns["flight_c"]
+    repeated = {name: np.repeat(values, 10) for name, values in columns.items()}
+    write_case(tmp_path, repeated | {"t": 0.001 * np.arange(len(repeated["t"]))})
+    case = load_case(tmp_path)
+    (flight,) = case.flights
+    write_case(tmp_path, columns)
+    (plain,) = load_case(tmp_path).flights
+    for channel in ("time", "position", "body_rates", "motor_command"):
+        np.testing.assert_allclose(getattr(flight, channel), getattr(plain, channel), atol=1e-6)
+    assert "90% of the rows repeat the one before" in case.quality[0].issue
+
+
 def test_a_long_stand_before_the_flight_is_no_frozen_sensor(tmp_path, sample_columns):
     """Where a simulator or an estimator stands still to the last digit."""
     columns = sample_columns["flight_a"]

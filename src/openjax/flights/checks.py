@@ -11,7 +11,9 @@ from openjax.flights.attitude import derive_attitude
 from openjax.flights.derived import derive_rates, derive_velocity, mend_velocity
 from openjax.flights.flight import CHANNEL_COLUMNS, Flight, Issue, Refused
 from openjax.flights.sampling import (
+    SLOWEST,
     drop_frozen,
+    drop_held_rows,
     drop_repeats,
     put_in_step,
     runs_of,
@@ -19,7 +21,6 @@ from openjax.flights.sampling import (
 )
 
 SHORTEST = 2.0  # s airborne: windows of 0.5 s, and a few of them
-SLOWEST = 0.05  # s between rows
 BELOW = 0.3  # m below the floor, where nothing flies: more than an origin on a table is off by
 AT_REST = 0.02  # command below which a motor doesn't turn
 LONG_REST = 1.0  # s
@@ -47,6 +48,7 @@ def check_flight(
     try:
         _has_what_is_needed(flight, comparison)
         checked = _while_motors_turn(_in_time(_with_forces(flight, note), note), note)
+        checked = drop_held_rows(checked, note)
         checked = put_in_step(drop_repeats(drop_frozen(checked, note), note), note)
         checked = _in_range(checked, note)
         checked = derive_velocity(mend_velocity(checked, note), note)

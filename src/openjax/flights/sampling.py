@@ -9,6 +9,7 @@ from openjax.flights.shapes import Chosen
 
 FROZEN = 0.5  # s without a change of a sensor that has noise
 HELD = 0.1  # share of rows that repeat the one before, from which a sensor is slower than the rows
+SLOWEST = 0.05  # s between rows of a flight
 IN_STEP = 50  # poses from which a clock of their own is looked for
 IN_PHASE = 0.25  # concentration of their phases (0 to 1) from which they have one
 EDGE = 0.03  # cycles of that clock by which its phase may be wrong
@@ -109,6 +110,26 @@ def _hole(time: np.ndarray, rows: np.ndarray) -> str:
     if rows[hole + 1] - rows[hole] <= 1 or steps[hole] <= max(0.2, 10 * np.median(steps)):
         return ""
     return f"not sampled for {steps[hole]:.2f} s after t = {time[rows][hole]:.2f}"
+
+
+def drop_held_rows(flight: Flight, note) -> Flight:
+    """Without the rows of a logger that was faster than all it logged, motors and commands as well:
+    they repeat the one before in every column but the time's and the battery's. Longer stretches
+    without a change are a stand, or frozen.
+    """
+    logged = [
+        c for c in CHANNEL_COLUMNS if c != "battery_voltage" and getattr(flight, c) is not None
+    ]
+    table = np.column_stack([getattr(flight, c).reshape(len(flight), -1) for c in logged])
+    same = (table[1:] == table[:-1]) | (np.isnan(table[1:]) & np.isnan(table[:-1]))
+    held = np.r_[False, same.all(1)]
+    for begin, end in runs_of(held):
+        if flight.time[end - 1] - flight.time[begin - 1] > 0.5 * FROZEN:
+            held[begin:end] = False
+    if held.mean() < HELD or np.median(np.diff(flight.time[~held])) > SLOWEST:
+        return flight
+    note("held", f"{held.mean():.0%} of the rows repeat the one before in every column: left out")
+    return flight.rows(~held)
 
 
 def drop_repeats(flight: Flight, note) -> Flight:

@@ -171,7 +171,7 @@ def _streams(raw, sources, clock_of: dict[str, str], mapping) -> list[Stream]:
     """A stream for each time stamp in use, in seconds since the first of any; rows that repeat a
     stamp hold nothing new.
     """
-    clocks = [clock for clock in set(clock_of.values()) if clock in raw]
+    clocks = [clock for clock in dict.fromkeys(clock_of.values()) if clock in raw]
     units = {} if mapping is None else {c.source.name: c.source.scale for c in mapping.clocks}
     usual = None if mapping is None or "t" not in mapping.columns else mapping.columns["t"].scale
     scale = {c: units.get(c, usual or seconds_per_unit(raw[c])) for c in clocks}
