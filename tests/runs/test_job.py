@@ -32,20 +32,26 @@ GOOD = {
 
 
 @pytest.mark.parametrize(
-    "crashes, kept, asked_after",
+    "crashes, kept, asked_after, planning_worlds",
     [
-        ([0.1, 0.0, 0.05], 1, 99),
-        ([0.1, 0.05, 0.0], 2, 99),
-        ([0.0, 0.1, 0.0], 0, 99),
-        ([0.1, 0.05], 1, 7),
-        ([0.1], 0, 3),
+        ([0.1, 0.0, 0.05], 1, 99, 0),
+        ([0.1, 0.05, 0.0], 2, 99, 0),
+        ([0.0, 0.1, 0.0], 0, 99, 0),
+        ([0.1, 0.05], 1, 7, 0),
+        ([0.1], 0, 3, 0),
+        # scripted evaders don't tell what a stage against planning ones is for
+        ([0.0, 0.0, 0.01], 2, 99, 8),
+        ([0.0, 0.01, 0.1], 1, 99, 8),
     ],
 )
 def test_last_stage_keeps_what_validates_best_and_ends_when_asked(
-    crashes, kept, asked_after, tmp_path
+    crashes, kept, asked_after, planning_worlds, tmp_path
 ):
     small = dict(network=dict(features=8, heads=1), predictor=dict(enabled=False))
-    settings = preset("quick", **small, analytic=dict(updates=10, look_every=5))
+    stage = dict(
+        analytic=dict(updates=10, look_every=5), worst_plans=dict(worlds=planning_worlds)
+    )
+    settings = preset("quick", **small, **stage)
     environment = Pursuit(settings.environment)
     observation = jax.eval_shape(lambda key: environment.reset(key)[0], jax.random.key(0))
     observation = jax.tree.map(lambda kind: jnp.zeros(kind.shape, kind.dtype), observation)

@@ -13,7 +13,7 @@ import dataclasses
 import functools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -183,8 +183,17 @@ class AnalyticGradient:
         """
         return observation, jax.lax.stop_gradient(self.policy.predict(parameters, observation))
 
-    def fly(self, actor: Any, parameters: PolicyParameters, world, steps: int) -> tuple[Any, "Way"]:
-        """Worlds some steps later, and what their pursuers met on the way."""
+    def fly(
+        self,
+        actor: Any,
+        parameters: PolicyParameters,
+        world,
+        steps: int,
+        wish: Float[Array, "worlds 3"] | None = None,
+    ) -> tuple[Any, "Way"]:
+        """Worlds some steps later, and what their pursuers met on the way; `wish` is where the
+        evaders fly, see `mean_step`.
+        """
         fly_on = mean_step(self.environment, self.policy, parameters)
         limit = self.settings.speed_from * self.game.max_speed
         radius = capture_radius(self.game, world[1].task)
@@ -199,7 +208,7 @@ class AnalyticGradient:
         @jax.checkpoint
         def moved(world):
             observation, state = world
-            return fly_on(actor, observation, state)
+            return fly_on(actor, observation, state, wish)
 
         def one(carry, _):
             way = carry[1]
@@ -282,17 +291,31 @@ class AnalyticGradient:
         }
         return weighted_sum(parts)
 
-    def update(
-        self, actor: Any, state: Any, parameters: PolicyParameters, flights, key: PRNGKeyArray
-    ):
-        """The actor and its optimiser's state after an update, and the loss's parts."""
+    def begin(self, parameters: PolicyParameters, key: PRNGKeyArray) -> Any:
+        """What `update` carries on, before the first one: the optimiser's state."""
+        del key
+        return self.optimiser.init(parameters.actor)
+
+    def record(self, parameters: PolicyParameters, key: PRNGKeyArray):
+        """Worlds along the policy's flights, of which each update learns from some."""
+        return self.flights(parameters, key, self.bounds())
+
+    def gradient(self, actor: Any, parameters: PolicyParameters, flights, key: PRNGKeyArray):
+        """The actor's gradient, and the loss's parts."""
         start_key, choice_key = jax.random.split(key)
         moments = flights[1].step.shape[0]
         chosen = jax.random.randint(choice_key, (self.settings.worlds,), 0, moments)
         flying = jax.tree.map(lambda leaf: leaf[chosen], flights)
         starts = self.hard_starts(actor, parameters, start_key)
         gradient, parts = jax.grad(self.loss, has_aux=True)(actor, parameters, starts, flying)
-        change, state = self.optimiser.update(finite_or_zero(gradient), state)
+        return finite_or_zero(gradient), parts
+
+    def update(
+        self, actor: Any, state: Any, parameters: PolicyParameters, flights, key: PRNGKeyArray
+    ):
+        """The actor and its optimiser's state after an update, and the loss's parts."""
+        gradient, parts = self.gradient(actor, parameters, flights, key)
+        change, state = self.optimiser.update(gradient, state)
         return optax.apply_updates(actor, change), state, parts
 
     def bounds(self) -> Bounds:
@@ -409,8 +432,26 @@ def _speed(drones):
     return jnp.sqrt(jnp.sum(drones.velocity**2, axis=-1) + 1e-9)
 
 
+@runtime_checkable
+class GradientStage(Protocol):
+    """A last stage of a run: `AnalyticGradient`, or `openjax.learning.worst_plans.WorstPlans`."""
+
+    settings: AnalyticSettings
+
+    def record(self, parameters: PolicyParameters, key: PRNGKeyArray) -> Any:
+        """Flights of the policy as it was before the stage."""
+
+    def begin(self, parameters: PolicyParameters, key: PRNGKeyArray) -> Any:
+        """What is carried from update to update beside the actor."""
+
+    def update(
+        self, actor: Any, state: Any, parameters: PolicyParameters, flights, key: PRNGKeyArray
+    ) -> tuple[Any, Any, dict[str, Scalar]]:
+        """Actor and state after an update, and parts of the loss."""
+
+
 def compile_analytic(
-    gradient: AnalyticGradient, parameters: PolicyParameters
+    stage: GradientStage, parameters: PolicyParameters
 ) -> Callable[[PolicyParameters, jax.Array], Iterator[tuple[PolicyParameters, dict[str, float]]]]:
     """Start to compile the stage for parameters of these shapes (or abstract ones), in the
     background.
@@ -420,21 +461,24 @@ def compile_analytic(
       parameters and its metrics.
     """
     key = jax.eval_shape(lambda: jax.random.key(0))
-    record = jax.jit(lambda parameters, key: gradient.flights(parameters, key, gradient.bounds()))
-    actor = parameters.actor
+    record, begin = jax.jit(stage.record), jax.jit(stage.begin)
     flights = jax.eval_shape(record, parameters, key)
-    state = jax.eval_shape(gradient.optimiser.init, actor)
-    update = jax.jit(gradient.update)
-    lowered = record.lower(parameters, key), update.lower(actor, state, parameters, flights, key)
+    state = jax.eval_shape(begin, parameters, key)
+    update = jax.jit(stage.update)
+    lowered = (
+        record.lower(parameters, key),
+        begin.lower(parameters, key),
+        update.lower(parameters.actor, state, parameters, flights, key),
+    )
     ready = [in_background(program.compile) for program in lowered]
 
     def learn(parameters, key):
-        record, update = (wait() for wait in ready)
+        record, begin, update = (wait() for wait in ready)
         flight_key, update_key = jax.random.split(key)
         actor = parameters.actor
-        state = gradient.optimiser.init(parameters.actor)
+        state = begin(parameters, jax.random.fold_in(flight_key, 1))
         flights = record(parameters, flight_key)
-        for number in range(gradient.settings.updates):
+        for number in range(stage.settings.updates):
             step_key = jax.random.fold_in(update_key, number)
             # `parameters` stay those from before: what flew the moments, and what is held to
             actor, state, parts = update(actor, state, parameters, flights, step_key)

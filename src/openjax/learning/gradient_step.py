@@ -56,17 +56,19 @@ def weighted_sum(
 
 def mean_step(
     environment: Pursuit, policy: Policy, parameters: PolicyParameters
-) -> Callable[[Any, Observation, PursuitState], tuple[Observation, PursuitState]]:
-    """A control step of worlds (W, ...) by the policy's mean: (actor, observation, state) ->
+) -> Callable[..., tuple[Observation, PursuitState]]:
+    """A control step of worlds (W, ...) by the policy's mean: (actor, observation, state, wish) ->
     observation, state; the predictor of `parameters` has no gradient.
-    """
-    step = jax.vmap(environment.step, in_axes=(None, 0, 0))
 
-    def fly_on(actor, observation, state):
+    `wish` (W, 3) is where the evaders fly, as a share of their speed; None or NaN: their own rule.
+    """
+    step = jax.vmap(environment.step, in_axes=(None, 0, 0, 0))
+
+    def fly_on(actor, observation, state, wish=None):
         predicted = jax.lax.stop_gradient(policy.predict(parameters, observation))
         mean, _ = policy.distribution(actor, observation, predicted)
-        # any key will do: the game draws nothing after its reset
-        observation, state, *_ = step(jax.random.key(0), state, policy.action(mean, observation))
+        # no key: the game draws nothing after its reset
+        observation, state, *_ = step(None, state, policy.action(mean, observation), wish)
         return observation, state
 
     return fly_on

@@ -242,6 +242,34 @@ class AnalyticSettings:
 
 
 @dataclass(frozen=True)
+class WorstPlansSettings:
+    """What the last stage learns from evaders' plans; see `openjax.learning.worst_plans`."""
+
+    worlds: Annotated[int, Interval("[0, 65536]")] = 0
+    """Worlds in which an evader plans; 0: the last stage has none of them."""
+    plans: Annotated[int, Interval("[5, 10000]")] = 32
+    """That each evader tries."""
+    pieces: Annotated[int, Interval("[2, 100]")] = 4
+    """Velocities of a plan, one after the other ..."""
+    piece_seconds: Annotated[float, Interval("(0, 10]")] = 0.2
+    """... each for so long: four see .8 s ahead, in which an evader crosses half of the arena."""
+    distance: Annotated[float, Interval("[0, 1000]")] = 1.0
+    """Weight of the nearest pursuer's mean way to the evader (m), beside the share of the plan in
+    which it is free ...
+    """
+    crash: Annotated[float, Interval("[0, 1000]")] = 8.0
+    breach: Annotated[float, Interval("[0, 1000]")] = 2.0
+    """... of the share of pursuers that touch something, and of the breaches per step."""
+    hold_unseen: Annotated[float, Interval("[0, 1000]")] = 0.3
+    """As `analytic.hold`, where nobody sees the evader: nothing is learnt there, and what was is
+    held.
+    """
+
+    def __post_init__(self):
+        check_intervals(self, "worst_plans.")
+
+
+@dataclass(frozen=True)
 class AdaptSettings:
     """How a policy is fine-tuned."""
 
@@ -277,6 +305,7 @@ class TrainSettings:
     generator: GeneratorSettings = field(default_factory=GeneratorSettings)
     first_flights: FirstFlightsSettings = field(default_factory=FirstFlightsSettings)
     analytic: AnalyticSettings = field(default_factory=AnalyticSettings)
+    worst_plans: WorstPlansSettings = field(default_factory=WorstPlansSettings)
     evader_learning: EvaderLearningSettings = field(default_factory=EvaderLearningSettings)
     num_envs: Annotated[int, Interval("[1, 16777216]")] = 2560
     """Worlds that are simulated at once."""

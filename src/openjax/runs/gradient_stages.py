@@ -21,6 +21,7 @@ from openjax.learning import build
 from openjax.learning.analytic_gradient import AnalyticGradient, compile_analytic, free_flight
 from openjax.learning.first_flights import FirstFlights, first_game
 from openjax.learning.settings import TrainSettings
+from openjax.learning.worst_plans import WorstPlans, planning_game
 from openjax.policy import Policy, PolicyParameters
 from openjax.pursuit import Pursuit
 from openjax.show.progress import duration
@@ -32,9 +33,16 @@ TOGETHER = 100
 
 def compile_last_stage(settings: TrainSettings, environment: Pursuit, policy: Any) -> Callable:
     """The stage after MAPPO, compiled for parameters of these shapes; see `compile_analytic`."""
-    stage = AnalyticGradient(
-        settings.analytic, free_flight(environment), _exact(settings, environment)
-    )
+    exact = _exact(settings, environment)
+    if not settings.worst_plans.worlds:
+        stage = AnalyticGradient(settings.analytic, free_flight(environment), exact)
+    else:
+        # networks that learned with the policy aren't in its file
+        names = tuple(name for name in environment.settings.evaders if name != "learned")
+        scripted = dataclasses.replace(environment.settings, evaders=names or ("field",))
+        game = free_flight(dataclasses.replace(environment, settings=scripted))
+        usual = AnalyticGradient(settings.analytic, game, exact)
+        stage = WorstPlans(settings.worst_plans, planning_game(game), usual, settings.generator)
     return compile_analytic(stage, abstract_like(policy))
 
 

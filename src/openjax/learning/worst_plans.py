@@ -1,0 +1,305 @@
+"""The last stage against evaders that plan: the gradient of the pursuers' loss at the plan that is
+worst for them.
+
+An evader that learns beside the pursuers finds some of their weaknesses, and an evader that plans
+in the true simulation against the true policy finds others: those of the next second, without
+having to learn anything. Here evaders plan, and the pursuers follow the gradient through the
+simulation along the plan that came out worst. The gradient of a maximum is the gradient at the
+place of the maximum (Danskin 1966, The theory of max-min), so the plan itself needs none; training
+networks against their worst inputs works the same way (Madry et al. 2018, arXiv 1706.06083).
+"""
+
+import dataclasses
+import functools
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from openjax.learning.analytic_gradient import AnalyticGradient, crash_share, nearest_gap
+from openjax.learning.generator import vary_pillars
+from openjax.learning.gradient_step import (
+    clipped_descent,
+    falling_rate,
+    finite_or_zero,
+    mean_step,
+    weighted_sum,
+)
+from openjax.learning.settings import AnalyticSettings, GeneratorSettings, WorstPlansSettings
+from openjax.policy import PolicyParameters
+from openjax.pursuit import (
+    Pursuit,
+    PursuitSettings,
+    PursuitState,
+    scatter_starts,
+    turn_task,
+    uniform_task,
+)
+from openjax.pursuit.shapes import Scalar
+from openjax.vehicle.family import family_bounds, narrowed_bounds
+
+Plans = Float[Array, "worlds plans pieces 3"]
+Plan = Float[Array, "worlds pieces 3"]
+
+AHEAD = 0.15
+"""Seconds after which pursuers are thought to be where their velocity leads, at a plan's end."""
+SCATTERED = 0.5
+"""Share of the worlds that start anywhere; the others start as uniform tasks do."""
+NOMINAL = 0.5
+"""Share of the worlds whose vehicles are nominal ones: evaders are judged against these."""
+OUTSIDE = 1.2
+"""A world starts anew where a pursuer is farther out than this share of the arena's radius or
+height.
+"""
+WARM_UP = 15
+"""Updates in which the step size rises: Adam's first steps are of full size whatever the gradient,
+and one of them undoes a policy (captures of a planner fell from .44 to .06).
+"""
+
+
+@struct.dataclass
+class Planned:
+    """What is carried from update to update."""
+
+    optimiser: Any
+    world: Any
+    """Observations and states (B, ...)"""
+    plan: jax.Array
+    """(B, pieces, 3) the rest of the last plan of each, NaN or zero where there is none"""
+
+
+@dataclass(frozen=True, eq=False)
+class WorstPlans:
+    """A last stage in which evaders plan, beside what `usual` learns."""
+
+    planning: WorstPlansSettings
+    environment: Pursuit
+    """See `planning_game`."""
+    usual: AnalyticGradient
+    tasks: GeneratorSettings
+    """How the generator's uniform tasks differ from the paper's; these do, too."""
+
+    @property
+    def settings(self) -> AnalyticSettings:
+        """The stage's length, its step size and what it weighs in flight."""
+        return self.usual.settings
+
+    @functools.cached_property
+    def flight(self) -> AnalyticGradient:
+        """What flies in that game, and measures."""
+        return dataclasses.replace(self.usual, environment=self.environment)
+
+    @property
+    def game(self) -> PursuitSettings:
+        """The game's settings."""
+        return self.environment.settings
+
+    @property
+    def piece_steps(self) -> int:
+        """Control steps of a plan's piece."""
+        return max(1, round(self.planning.piece_seconds / self.game.time_step))
+
+    @property
+    def steps(self) -> int:
+        """Control steps of a plan."""
+        return self.planning.pieces * self.piece_steps
+
+    @functools.cached_property
+    def optimiser(self) -> optax.GradientTransformation:
+        """Adam with clipped gradients, whose step size rises first and falls then."""
+        rate = self.settings.learning_rate
+        warm_up = min(WARM_UP, self.settings.updates // 4)
+        rising = optax.linear_schedule(0.0, rate, warm_up)
+        falling = falling_rate(rate, self.settings.updates - warm_up)
+        return clipped_descent(optax.join_schedules([rising, falling], [warm_up]))
+
+    def begin(self, parameters: PolicyParameters, key: PRNGKeyArray) -> Planned:
+        """Fresh worlds, and no plan yet."""
+        plan = jnp.zeros((self.planning.worlds, self.planning.pieces, 3))
+        return Planned(self.optimiser.init(parameters.actor), self.start(key), plan)
+
+    def record(self, parameters: PolicyParameters, key: PRNGKeyArray):
+        """Flights for the usual part."""
+        return self.usual.record(parameters, key)
+
+    def start(self, key: PRNGKeyArray):
+        """Worlds (B, ...) at the starts of tasks like the generator's uniform ones."""
+        game = self.game
+
+        def one(key, bounds):
+            task_key, pillar_key, turn_key, start_key, choice_key = jax.random.split(key, 5)
+            task = vary_pillars(self.tasks, game, pillar_key, uniform_task(game, task_key))
+            task = turn_task(turn_key, task)
+            scattered = jax.random.bernoulli(choice_key, SCATTERED)
+            anywhere = scatter_starts(game, start_key, task)
+            task = jax.tree.map(lambda a, b: jnp.where(scattered, a, b), anywhere, task)
+            environment = self.environment
+            if game.vehicles:
+                environment = environment.with_bounds(bounds)
+            return environment.reset_to(jax.random.fold_in(key, 1), task)
+
+        keys = jax.random.split(key, self.planning.worlds)
+        return jax.vmap(one)(keys, self._bounds())
+
+    def _bounds(self):
+        """(B, R, 4) of each world's vehicles."""
+        family = self.game.vehicles
+        worlds = self.planning.worlds
+        if not family:
+            return jnp.zeros((worlds, 0, 4))
+        nominal = jnp.arange(worlds)[:, None, None] < NOMINAL * worlds
+        return jnp.where(nominal, narrowed_bounds(family, 0.0), jnp.asarray(family_bounds(family)))
+
+    def candidates(self, key: PRNGKeyArray, plan: Plan) -> Plans:
+        """The rest of the last plan and the same a piece later, to stay, the evader's own rule
+        (NaN), straight ways, and ways that turn after a piece as often as not.
+        """
+        planning = self.planning
+        number = plan.shape[0]
+        straight = (planning.plans - 4) // 3
+        turn_key, way_key, straight_key = jax.random.split(key, 3)
+        shape = (number, planning.plans - 4 - straight, planning.pieces)
+        drawn = _unit(jax.random.normal(way_key, (*shape, 3)))
+        turns = jax.random.bernoulli(turn_key, 0.5, shape)
+        # the last piece at which a way turned is the one that it flies
+        turned = jax.lax.cummax(jnp.where(turns, jnp.arange(planning.pieces), 0), axis=2)
+        bent = jnp.take_along_axis(drawn, turned[..., None], axis=2)
+        ways = _unit(jax.random.normal(straight_key, (number, straight, 1, 3)))
+        parts = [
+            plan[:, None],
+            _later(plan)[:, None],
+            jnp.zeros_like(plan)[:, None],
+            jnp.full_like(plan, jnp.nan)[:, None],
+            jnp.broadcast_to(ways, (number, straight, planning.pieces, 3)),
+            bent,
+        ]
+        return jnp.concatenate(parts, axis=1)
+
+    def worst(
+        self, actor: Any, parameters: PolicyParameters, world, plan: Plan, key: PRNGKeyArray
+    ) -> tuple[Plan, Float[Array, " worlds"]]:
+        """The plan of those tried that is worst for the pursuers of worlds (B, ...), and what it
+        promises the evader, see `promise`; `plan` is the rest of the last one.
+        """
+        tried = self.candidates(key, plan)
+        number = self.planning.plans
+        copied = jax.tree.map(lambda leaf: jnp.repeat(leaf, number, axis=0), world)
+        pieces = jnp.moveaxis(tried.reshape(-1, *tried.shape[2:]), 1, 0)
+        fly_on = mean_step(self.environment, self.usual.policy, parameters)
+
+        def piece(world, wish):
+            def one(world, _):
+                return fly_on(actor, *world, wish), None
+
+            return jax.lax.scan(one, world, length=self.piece_steps)[0], None
+
+        (_, end), _ = jax.lax.scan(piece, copied, pieces)
+        promised = self.promise(copied[1], end).reshape(-1, number)
+        best = jnp.argmax(promised, axis=1)
+        chosen = jnp.take_along_axis(tried, best[:, None, None, None], axis=1)[:, 0]
+        return chosen, jnp.max(promised, axis=1)
+
+    def promise(self, start: PursuitState, end: PursuitState) -> Float[Array, " worlds"]:
+        """(W,) how good the end of a plan is for the evader: steps free first, then the room that
+        is left.
+        """
+        newly = end.statistics.captured & ~start.statistics.captured
+        free = jnp.where(newly, end.statistics.capture_step - start.step, self.steps)
+        ahead = end.drones.position + AHEAD * end.drones.velocity
+        offset = ahead - end.evader_position[:, None]
+        room = jnp.sqrt(jnp.min(jnp.sum(offset**2, axis=-1), axis=-1))
+        return free + room / self.game.arena_radius
+
+    def loss(
+        self, actor: Any, parameters: PolicyParameters, world, plan: Plan
+    ) -> tuple[Scalar, tuple[Any, dict[str, Scalar]]]:
+        """What is learnt () while evaders fly their plans; the worlds after the plans' first piece,
+        and the loss's parts.
+        """
+        planning = self.planning
+        policy = self.usual.policy
+
+        def piece(world, wish):
+            world, way = self.flight.fly(actor, parameters, world, self.piece_steps, wish)
+            return world, (world, way)
+
+        # one body for all pieces: each would take a GPU's compiler half a minute
+        worlds, way = jax.lax.scan(piece, world, jnp.moveaxis(plan, 1, 0))[1]
+        after = jax.tree.map(lambda leaf: jax.lax.stop_gradient(leaf[0]), worlds)
+        inputs = self.usual.inputs(parameters, world[0])
+        before, log_std = policy.distribution(parameters.actor, *inputs)
+        change = (policy.distribution(actor, *inputs)[0] - before) * jnp.exp(-log_std)
+        # the gradient knows where the evader is, and who doesn't see it can't learn from that: they
+        # would unlearn to search
+        seen = world[1].seen.astype(jnp.float32)
+        hold = jnp.where(world[1].seen, self.settings.hold, planning.hold_unseen)[:, None]
+        parts = {
+            "free": (1.0, seen * jnp.mean(way.free, axis=0)),
+            "distance": (planning.distance, seen * jnp.mean(way.distance, axis=0)),
+            "crashes": (planning.crash, crash_share(jnp.min(way.least, axis=0))),
+            "breaches": (planning.breach, way.breach),
+            "speed": (self.settings.speed, way.excess),
+            "held": (1.0, hold * jnp.sum(change**2, axis=-1)),
+        }
+        total, means = weighted_sum(parts)
+        return total, (after, means)
+
+    def update(
+        self, actor: Any, state: Planned, parameters: PolicyParameters, flights, key: PRNGKeyArray
+    ) -> tuple[Any, Planned, dict[str, Scalar]]:
+        """Actor and state after an update, and parts of both losses."""
+        plan_key, usual_key, start_key = jax.random.split(key, 3)
+        plan, promised = self.worst(actor, parameters, state.world, state.plan, plan_key)
+        gradient, (world, parts) = jax.grad(self.loss, has_aux=True)(
+            actor, parameters, state.world, plan
+        )
+        usual, usual_parts = self.usual.gradient(actor, parameters, flights, usual_key)
+        gradient = jax.tree.map(jnp.add, finite_or_zero(gradient), usual)
+        change, optimiser = self.optimiser.update(gradient, state.optimiser)
+        over = self._over(world[1])
+
+        def renewed(old, new):
+            return jnp.where(over.reshape(-1, *[1] * (old.ndim - 1)), new, old)
+
+        world = jax.tree.map(renewed, world, self.start(start_key))
+        plan = jnp.where(over[:, None, None], 0.0, _later(plan))
+        parts = {f"planned_{name}": value for name, value in parts.items()}
+        survived = {"planned_survived": jnp.mean(promised >= self.steps)}
+        return (
+            optax.apply_updates(actor, change),
+            Planned(optimiser, world, plan),
+            usual_parts | parts | survived,
+        )
+
+    def _over(self, state: PursuitState) -> Bool[Array, " worlds"]:
+        """(B,) worlds that start anew: the evader is caught, a pursuer crashed or left, or there is
+        no time for another plan.
+        """
+        position = state.drones.position
+        away = jnp.sum(position[..., :2] ** 2, axis=-1) > (OUTSIDE * self.game.arena_radius) ** 2
+        away |= position[..., 2] > OUTSIDE * self.game.arena_height
+        lost = away | (nearest_gap(self.game, state) < 0.0)
+        if state.active is not None:
+            lost &= state.active
+        late = state.step > self.game.episode_length - self.steps
+        return jnp.any(lost, axis=-1) | state.statistics.captured | late
+
+
+def planning_game(environment: Pursuit) -> Pursuit:
+    """`environment` with an evader that flies as it's told, without limits of acceleration."""
+    settings = dataclasses.replace(environment.settings, evaders=("field",))
+    return dataclasses.replace(environment, settings=settings, evaders=None)
+
+
+def _unit(vector):
+    """(..., 3) of length one."""
+    return vector / jnp.sqrt(jnp.sum(vector**2, axis=-1, keepdims=True) + 1e-12)
+
+
+def _later(plan):
+    """(..., pieces, 3) the plan after its first piece; its last one goes on."""
+    return jnp.concatenate([plan[:, 1:], plan[:, -1:]], axis=1)
