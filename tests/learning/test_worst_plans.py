@@ -81,11 +81,12 @@ def test_the_worst_plan_is_the_worst_of_those_tried(flown):
         promises = []
         tried = stage.candidates(key, plan)[world]
         for pieces in tried:
-            before = observation, state = jax.tree.map(lambda leaf: leaf[world], carried.world)
+            start = jax.tree.map(lambda leaf, world=world: leaf[world], carried.world)
+            observation, state = start
             for wish in jnp.repeat(pieces, stage.piece_steps, axis=0):
                 action = act(parameters, observation)
                 observation, state, *_ = step(None, state, action, wish)
-            lead = [jax.tree.map(lambda leaf: leaf[None], one) for one in (before[1], state)]
+            lead = [jax.tree.map(lambda leaf: leaf[None], one) for one in (start[1], state)]
             promises.append(float(stage.promise(*lead)[0]))
         assert promised[world] == pytest.approx(max(promises), abs=1e-3)
         np.testing.assert_array_equal(worst[world], tried[int(np.argmax(promises))])
@@ -96,9 +97,7 @@ def test_pursuers_learn_from_the_worst_plan(flown):
     stage, parameters, carried = flown
     update = jax.jit(stage.update)
     flights = jax.jit(stage.record)(parameters, jax.random.key(5))
-    actor, after, parts = update(
-        parameters.actor, carried, parameters, flights, jax.random.key(6)
-    )
+    actor, after, parts = update(parameters.actor, carried, parameters, flights, jax.random.key(6))
     assert jax.tree.structure(after) == jax.tree.structure(carried)
     assert all(np.isfinite(value) for value in parts.values())
     # worlds are a piece of the plan later, the plan is what is left of it

@@ -48,9 +48,7 @@ def test_last_stage_keeps_what_validates_best_and_ends_when_asked(
     crashes, kept, asked_after, planning_worlds, tmp_path
 ):
     small = dict(network=dict(features=8, heads=1), predictor=dict(enabled=False))
-    stage = dict(
-        analytic=dict(updates=10, look_every=5), worst_plans=dict(worlds=planning_worlds)
-    )
+    stage = dict(analytic=dict(updates=10, look_every=5), worst_plans=dict(worlds=planning_worlds))
     settings = preset("quick", **small, **stage)
     environment = Pursuit(settings.environment)
     observation = jax.eval_shape(lambda key: environment.reset(key)[0], jax.random.key(0))

@@ -195,11 +195,6 @@ class AnalyticGradient:
         evaders fly, see `mean_step`.
         """
         fly_on = mean_step(self.environment, self.policy, parameters)
-        limit = self.settings.speed_from * self.game.max_speed
-        radius = capture_radius(self.game, world[1].task)
-        rest = REST * radius
-        if jnp.ndim(rest):  # of each world, beside its pursuers' distances
-            rest = rest[:, None]
         # found once: pillars stand still
         ways = jax.vmap(functools.partial(ways_of, self.game))(world[1].task)
 
@@ -211,23 +206,30 @@ class AnalyticGradient:
             return fly_on(actor, observation, state, wish)
 
         def one(carry, _):
-            way = carry[1]
             world = moved(carry[0])
-            state = world[1]
-            distance = evader_distance(self.game, state, ways)
-            way = Way(
-                jnp.minimum(way.least, nearest_gap(self.game, state)),
-                jnp.minimum(way.upright, rotation_axes(state.drones.quaternion)[1][..., 2]),
-                way.breach + breach_share(self.game, state) / steps,
-                way.excess + jax.nn.relu(_speed(state.drones) - limit) / FAST / steps,
-                way.distance + nearest_way(jax.nn.relu(distance - rest)) / steps,
-                way.free + free_share(radius, distance) / steps,
-            )
+            way = self._met(carry[1], world[1], ways, steps)
             return (world, way), None
 
         zeros = jnp.zeros(world[1].drones.position.shape[:2])
         first = world, Way(zeros + jnp.inf, zeros + 1.0, zeros, zeros, zeros[:, 0], zeros[:, 0])
         return jax.lax.scan(one, first, None, length=steps)[0]
+
+    def _met(self, way, state, ways, steps):
+        """The way so far, and what the last of its steps adds."""
+        limit = self.settings.speed_from * self.game.max_speed
+        radius = capture_radius(self.game, state.task)
+        rest = REST * radius
+        if jnp.ndim(rest):  # of each world, beside its pursuers' distances
+            rest = rest[:, None]
+        distance = evader_distance(self.game, state, ways)
+        return Way(
+            jnp.minimum(way.least, nearest_gap(self.game, state)),
+            jnp.minimum(way.upright, rotation_axes(state.drones.quaternion)[1][..., 2]),
+            way.breach + breach_share(self.game, state) / steps,
+            way.excess + jax.nn.relu(_speed(state.drones) - limit) / FAST / steps,
+            way.distance + nearest_way(jax.nn.relu(distance - rest)) / steps,
+            way.free + free_share(radius, distance) / steps,
+        )
 
     def starts(self, key: PRNGKeyArray, bounds: Bounds):
         """Worlds to learn from, at their starts; bounds (B, R, 4)."""

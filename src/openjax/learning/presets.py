@@ -139,6 +139,19 @@ def flight() -> TrainSettings:
     )
 
 
+# The distance pays for going near a pillar, captures for the last centimetres: a step of it alone
+# costs too much. Breaches that count .02 m early make a way between pillars .4 m apart cost as much
+# as a capture pays
+_PAY_OF_CAPTURES = dict(
+    distance=0.5,
+    first_capture=500.0,
+    recapture=500.0,
+    margin=0.01,
+    crash=60.0,
+    first_crash=2000.0,
+)
+
+
 def evaders() -> TrainSettings:
     """Policies to be flown after evaders that fight back: first the paper's, then scripted ones,
     slow at first, and some that learn while the pursuers do, beside their earlier selves; at last
@@ -160,17 +173,7 @@ def evaders() -> TrainSettings:
             # and .33 in the eighth second, and an evader that lasted so long was safe
             observe_time=False,
             min_pillars=0,
-            # The distance pays for going near a pillar, the first capture for the last centimetres:
-            # a step of it alone costs too much. Breaches that count .02 m early make a way between
-            # pillars .4 m apart cost as much as a capture pays
-            reward=dict(
-                distance=0.5,
-                first_capture=500.0,
-                recapture=500.0,
-                margin=0.01,
-                crash=60.0,
-                first_crash=2000.0,
-            ),
+            reward=_PAY_OF_CAPTURES,
         ),
         # as long as a breach costs less than a step in reach pays, pursuers learn to hold an evader
         # from beyond the wall

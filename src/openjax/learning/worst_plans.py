@@ -193,7 +193,8 @@ class WorstPlans:
 
         def piece(world, wish):
             def one(world, _):
-                return fly_on(actor, *world, wish), None
+                observation, state = world
+                return fly_on(actor, observation, state, wish), None
 
             return jax.lax.scan(one, world, length=self.piece_steps)[0], None
 
