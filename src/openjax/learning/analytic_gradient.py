@@ -463,7 +463,8 @@ def compile_analytic(
       parameters and its metrics.
     """
     key = jax.eval_shape(lambda: jax.random.key(0))
-    record, begin = jax.jit(stage.record), jax.jit(stage.begin)
+    record = jax.jit(stage.record)
+    begin = jax.jit(stage.begin)
     flights = jax.eval_shape(record, parameters, key)
     state = jax.eval_shape(begin, parameters, key)
     update = jax.jit(stage.update)

@@ -231,9 +231,10 @@ class WorstPlans:
         # one body for all pieces: each would take a GPU's compiler half a minute
         worlds, way = jax.lax.scan(piece, world, jnp.moveaxis(plan, 1, 0))[1]
         after = jax.tree.map(lambda leaf: jax.lax.stop_gradient(leaf[0]), worlds)
-        inputs = self.usual.inputs(parameters, world[0])
-        before, log_std = policy.distribution(parameters.actor, *inputs)
-        change = (policy.distribution(actor, *inputs)[0] - before) * jnp.exp(-log_std)
+        observation, predicted = self.usual.inputs(parameters, world[0])
+        before, log_std = policy.distribution(parameters.actor, observation, predicted)
+        mean, _ = policy.distribution(actor, observation, predicted)
+        change = (mean - before) * jnp.exp(-log_std)
         # the gradient knows where the evader is, and who doesn't see it can't learn from that: they
         # would unlearn to search
         seen = world[1].seen.astype(jnp.float32)
