@@ -26,6 +26,8 @@ FACTS = ("command", "machine", "seconds")
 PLACES = (*SCENARIOS, "uniform")
 SUMMARIES = ("README.md", "docs/model_cards.md")
 """Pages that show the rows of weights that ship ..."""
+LIMITS = "both plan"
+"""How the names of judges begin that say more of the game than of a policy."""
 FOR_ALL = ("evaders that learn", "a planner", "scripted ones, held out", "the paper's")
 """... of these judges, whose episodes are many."""
 JUDGES: Mapping[str, Callable[[str], bool]] = {
@@ -123,8 +125,10 @@ def page(results: Mapping) -> Page:
 
 
 def is_shown(row: Mapping, hidden: Sequence[str]) -> bool:
-    """Whether the table has a row: of weights that don't ship, only what finds most."""
-    finds_most = row["judge"] in tuple(JUDGES)[:2]
+    """Whether the table has a row: of weights that don't ship, only what finds most, and what the
+    game allows.
+    """
+    finds_most = row["judge"] in tuple(JUDGES)[:2] or row["judge"].startswith(LIMITS)
     is_hidden = {row["policy"], f"{row['policy']}: {row['judge']}"} & set(hidden)
     return not is_hidden and (finds_most or row["policy"] == DEFAULT_POLICY)
 
