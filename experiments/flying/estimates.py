@@ -145,7 +145,7 @@ GROUPS = {
 }
 """The rows of the page."""
 UNTOLD = tuple(kind for kind in DAMAGES if "with its velocity" in kind)
-"""What nothing on board can tell where it is small, or sets in gently."""
+"""What nothing on board can tell where it is small, or sets in gently; teammates tell some."""
 TOLD = tuple(kind for kind in DAMAGES if kind not in UNTOLD)
 
 
@@ -235,7 +235,7 @@ def page(results) -> Page:
         "Does a flight end well when a vehicle's own estimate, or a camera, goes wrong so gently "
         "that no single pose shows it? Flights that end well stay within 10 cm of the arena, and "
         "nothing falls. The last four kinds move position and velocity together: where they are "
-        "small or set in gently, nothing on board tells them, and only the time limit ends the "
+        "small or set in gently, hardly anything tells them, and only the time limit ends the "
         "flight (`docs/flying.md`)."
     )
     columns = {
@@ -253,6 +253,14 @@ def page(results) -> Page:
         for name, kinds in GROUPS.items()
         if set(kinds) <= set(rows)
     ]
+    if later := results.get("after_5_s"):
+        rows = {row["kind"]: row for row in later["summary"]}
+        for name, high in (
+            ("both, level, after 5 s in the air", False),
+            ("... of the height", True),
+        ):
+            kinds = [kind for kind in UNTOLD if kind.startswith("height") is high]
+            grouped.append(_together(name, [rows[kind] for kind in kinds]))
     return Page("Estimates that go wrong gently", prose, Table(columns, grouped))
 
 
