@@ -76,6 +76,7 @@ def _read(path, what, language, parse: Callable[[str], Any]):
 
 def _check_plain(path, value):
     """Raises UserError for nesting and integers that nothing here can mean."""
+    # level by level and not by recursion, which a hostile file could exhaust
     level = [value]
     for _ in range(DEEPEST):
         inner = []
@@ -176,6 +177,7 @@ def to_plain(value: Any) -> Any:
         return [to_plain(entry) for entry in value]
     if isinstance(value, Path):
         return str(value)
+    # a number of NumPy's or JAX's
     if hasattr(value, "item") and getattr(value, "ndim", 0) == 0:
         return value.item()
     return value
@@ -200,6 +202,7 @@ def check_output(path: str | Path | None, option: str) -> None:
             raise UserError(f"{option} {path}: is a folder; a file is needed")
         if not path.parent.is_dir():
             raise UserError(f"{option} {path}: the folder {path.parent} doesn't exist")
+        # tried and not asked: permissions don't tell of a full or a read-only disk
         with tempfile.TemporaryFile(dir=path.parent):
             pass
         if path.exists() and not os.access(path, os.W_OK):
@@ -216,6 +219,7 @@ def check_output_folder(path: str | Path, option: str) -> None:
     """
     path = Path(path).absolute()
     try:
+        # the nearest folder above that is there already
         there = next(folder for folder in (path, *path.parents) if folder.exists())
         if not there.is_dir():
             raise UserError(f"{option} {path}: {there} is a file; a folder is needed")

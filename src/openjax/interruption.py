@@ -157,6 +157,7 @@ def leave(number: int) -> None:
     if not _watch.installed:
         return
     _watch.leaving.acquire()
+    # a few steps that mustn't be parted may be under way; if they hang, the process ends anyhow
     _watch.undivided.acquire(timeout=PATIENCE)
     # in a thread of its own: whatever hangs there, the process ends
     cleaner = threading.Thread(target=_clean_up, daemon=True)

@@ -39,12 +39,11 @@ def from_plain(kind: Any, value: Any, where: str = "settings") -> Any:
     if origin is tuple:
         return _tuple_from_plain(arguments, value, where)
     if origin is dict:
-        return {
-            from_plain(arguments[0], key, f"{where}: a key"): from_plain(
-                arguments[1], entry, _place(where, key)
-            )
-            for key, entry in _table(value, where).items()
-        }
+        filled = {}
+        for key, entry in _table(value, where).items():
+            name = from_plain(arguments[0], key, f"{where}: a key")
+            filled[name] = from_plain(arguments[1], entry, _place(where, key))
+        return filled
     if origin is typing.Literal and value not in arguments:
         raise UserError(
             f"{where} is {shown(value)}; expected one of {', '.join(map(repr, arguments))}"
@@ -74,6 +73,7 @@ def _tuple_from_plain(arguments, value, where):
 
 
 def _leaf_from_plain(kind, value, where):
+    # TOML's 1 may stand for 1.0; to Python, True is a number, too
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
     if kind is Path and isinstance(value, str):
@@ -90,30 +90,33 @@ def _leaf_from_plain(kind, value, where):
 def _dataclass_from_plain(kind, value, where):
     fields = {field.name: field for field in dataclasses.fields(kind) if field.init}
     root = where.removesuffix(ROOT)
-    given = _table(value, where)
-    for key in given:
+    entries = _table(value, where)
+    for key in entries:
         if key not in fields:
             raise UserError(
                 f"{root} has the unknown key {shown(key)}; {suggestion(str(key), sorted(fields))}"
             )
     for name, field in fields.items():
-        none = field.default is field.default_factory is dataclasses.MISSING
-        if none and name not in given:
+        has_no_default = field.default is field.default_factory is dataclasses.MISSING
+        if has_no_default and name not in entries:
             raise UserError(f"{root} lacks {name}")
     hints = typing.get_type_hints(kind, include_extras=True)
-    made = kind(
-        **{key: from_plain(hints[key], entry, _place(where, key)) for key, entry in given.items()}
-    )
-    check_intervals(made, _place(where, ""))
-    return made
+    values = {
+        key: from_plain(hints[key], entry, _place(where, key)) for key, entry in entries.items()
+    }
+    filled = kind(**values)
+    # once more, though most kinds check themselves: here the error names the file
+    check_intervals(filled, _place(where, ""))
+    return filled
 
 
 def _union_from_plain(arguments, value, where):
     reasons = []
-    # The exact match first: True is not 1, and 1 must not become 1.0 when int stands in the union.
+    # the exact match first: True is not 1, and 1 must not become 1.0 when int stands in the union
     for argument in sorted(arguments, key=lambda kind: kind is not type(value)):
         try:
             return from_plain(argument, value, where)
         except UserError as error:
             reasons.append(str(error))
+    # the first: that of the kind which fits best
     raise UserError(reasons[0])

@@ -1,6 +1,7 @@
 """Parts of one's own in the game: evaders, reward terms, observations."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -14,10 +15,16 @@ from openjax.pursuit.evaders import EvaderKind
 GAME = PursuitSettings(physics="stops", start_attitude="level", num_pursuers=2)
 
 
+@functools.cache
+def compiled(game):
+    """Reset and step, compiled once for each game."""
+    return jax.jit(game.reset), jax.jit(game.step)
+
+
 def stepped(game, steps=3, wish=None, key=0):
     """The states, last observation and rewards (T, N) of some steps."""
-    observation, state = jax.jit(game.reset)(jax.random.key(key))
-    step = jax.jit(game.step)
+    reset, step = compiled(game)
+    observation, state = reset(jax.random.key(key))
     states = [state]
     rewards = []
     for _ in range(steps):
@@ -29,10 +36,11 @@ def stepped(game, steps=3, wish=None, key=0):
 
 
 def test_a_wish_that_is_not_a_number_is_the_papers_evaders_own_rule():
-    free, _, _ = stepped(Pursuit(GAME))
-    told, _, _ = stepped(Pursuit(GAME), wish=jnp.full(3, jnp.nan))
+    game = Pursuit(GAME)
+    free, _, _ = stepped(game)
+    told, _, _ = stepped(game, wish=jnp.full(3, jnp.nan))
     np.testing.assert_array_equal(told[-1].evader_position, free[-1].evader_position)
-    up, _, _ = stepped(Pursuit(GAME), wish=jnp.array([0.0, 0.0, 0.5]))
+    up, _, _ = stepped(game, wish=jnp.array([0.0, 0.0, 0.5]))
     wanted = [0.0, 0.0, 0.5 * GAME.evader_speed]
     np.testing.assert_allclose(up[1].evader_velocity, wanted, atol=1e-5)
 
@@ -82,15 +90,22 @@ def test_reward_terms_add_up_and_penalties_are_told_apart():
     def height(transition):
         return transition.state.drones.position[:, 2]
 
-    before = stepped(Pursuit(game))[2]
     own = (*shipped, Term(height, 2.0), Term(height, -0.5, penalty=True))
-    states, _, after = stepped(Pursuit(game, reward=own))
-    heights = np.stack([state.drones.position[:, 2] for state in states[1:]])
-    np.testing.assert_allclose(after, before + 1.5 * heights, rtol=1e-5)
-    alone = stepped(Pursuit(game, reward=(Term(lambda step: jnp.ones(()), 1.0),)))[2]
-    np.testing.assert_array_equal(alone, 1.0)
-    nothing = stepped(Pursuit(game, reward=()))[2]
-    assert nothing.shape == before.shape and not nothing.any()
+    constant = (Term(lambda step: jnp.ones(()), 1.0),)
+    games = [Pursuit(game, reward=terms) for terms in (None, own, constant, ())]
+
+    @jax.jit  # one program: its physics is the same for all rewards, and compiled once
+    def step(state):
+        results = [game.step(None, state, jnp.zeros((2, 4))) for game in games]
+        return results[0][1], jnp.stack([reward for _, _, reward, *_ in results])
+
+    _, state = compiled(games[0])[0](jax.random.key(0))
+    for _ in range(3):
+        state, (before, after, alone, nothing) = step(state)
+        heights = state.drones.position[:, 2]
+        np.testing.assert_allclose(after, before + 1.5 * heights, rtol=1e-5)
+        np.testing.assert_array_equal(alone, 1.0)
+        assert not nothing.any()
 
 
 def test_an_observation_of_ones_own():

@@ -64,6 +64,7 @@ def train(
     resumed = None if resume is None else open_run(Path(resume)).read_settings()
     if resume is None and out is None:
         out = Path("runs") / time.strftime("%Y%m%d-%H%M%S")
+    # by the command's own options, so that both are checked by the same code
     command = TrainCommand(
         out=_path(out),
         resume=_path(resume),

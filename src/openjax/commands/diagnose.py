@@ -69,11 +69,13 @@ def run(options: Options) -> int:
     if not options.reference:
         from openjax.gap.model.library import library
 
-        library(options.without)  # is wrong now or never
+        # a misspelt effect is an error of all cases, and said before the first
+        library(options.without)
     predictions = {}
     failed = 0
     for i, (folder, name) in enumerate(zip(options.cases, names, strict=True)):
         try:
+            # shows how long all that are still to come will take
             with Steps("diagnosing", {case: SECONDS for case in names[i:]}, console) as steps:
                 steps.begin(name)
                 title, lines, prediction = answer(options, folder, name, partial(steps.begin, name))

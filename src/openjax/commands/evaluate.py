@@ -161,6 +161,7 @@ def fly_scenarios(command: EvaluateCommand, loaded, evaluators: dict) -> tuple[l
     if not compiled:
         batch = min(command.episodes, LARGEST_BATCH)
         evaluators[kind] = Evaluator(game, loaded.policy, batch, command.messages)
+    # seconds of an episode on a laptop, about
     expected = dict.fromkeys(tasks, 0.02 * command.episodes)
     first = next(iter(tasks))
     if not compiled:

@@ -164,6 +164,7 @@ def prepare(arguments: Arguments) -> Prepared:
     settings = policy.settings.environment
     _check_numbers(arguments, len(scenario.pursuers), settings.num_pursuers)
     vehicle = load_vehicle_file(arguments.vehicle or settings.airframe)
+    # a layout may have more pillars than the policy was trained with; it observes the nearest ones
     slots = max(settings.max_pillars, len(scenario.pillars))
     game = Game(policy, scenario_task(dataclasses.replace(settings, max_pillars=slots), scenario))
     game.airframe = airframe_of(vehicle.vehicle)

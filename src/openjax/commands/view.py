@@ -3,6 +3,7 @@ browser or as a file.
 """
 
 import dataclasses
+import itertools
 import webbrowser
 from collections.abc import Sequence
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -61,9 +62,10 @@ def main(arguments: Sequence[str]) -> int:
     if command.mcap is not None:
         from openjax.show.foxglove import trajectory_channels, write_mcap
 
-        names = [f"{Path(policy).name}/{flight.title}" for policy, flight in flights]
-        episodes = zip(names, flights, strict=True)
-        write_mcap(command.mcap, (c for n, f in episodes for c in trajectory_channels(n, f[1])))
+        channels = []
+        for policy, flight in flights:
+            channels += trajectory_channels(f"{Path(policy).name}/{flight.title}", flight)
+        write_mcap(command.mcap, channels)
         console.print(_written(command.mcap))
     if command.gif is not None:
         from openjax.show.videos import animate
@@ -101,7 +103,9 @@ def write_flights(command: ViewCommand) -> None:
         raise UserError("--flights shows logs in Foxglove: name the file to write, --mcap FILE")
     nameless = not (command.flights / "vehicle.toml").exists()
     case = load_case(command.flights, comparison=nameless)  # to look at, any vehicle will do
-    write_mcap(command.mcap, (c for flight in case.flights for c in flight_channels(flight)))
+    # one flight's channels at a time: a log of an hour holds millions of rows
+    channels = (flight_channels(flight) for flight in case.flights)
+    write_mcap(command.mcap, itertools.chain.from_iterable(channels))
 
 
 def fly_all(command: ViewCommand) -> list[tuple[str, Trajectory]]:
@@ -116,8 +120,10 @@ def fly_all(command: ViewCommand) -> list[tuple[str, Trajectory]]:
         field.name: getattr(command, field.name) for field in dataclasses.fields(FlightOptions)
     }
     for loaded in command.start():
+        # each policy flies the game that it was trained in
         own = EvaluateCommand(**shared, episodes=1, environment=loaded.settings.environment)
-        flights += [(loaded.source, flight) for flight in fly_scenarios(own, loaded, evaluators)[1]]
+        _, episodes = fly_scenarios(own, loaded, evaluators)
+        flights += [(loaded.source, episode) for episode in episodes]
     return flights
 
 

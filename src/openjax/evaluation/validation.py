@@ -50,6 +50,7 @@ def far_tasks(settings: PursuitSettings, number: int, slots: int) -> Task:
         far, _ = jax.lax.scan(expand, task, keys)
         return far
 
+    # of another key than the uniform ones: no task is in both
     keys = jax.random.split(jax.random.fold_in(jax.random.key(VALIDATION_KEY), 1), number)
     return _with_slots(jax.jit(jax.vmap(draw))(keys), slots)
 

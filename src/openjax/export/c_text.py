@@ -73,6 +73,7 @@ def literal(number: float) -> str:
         return "INFINITY" if number > 0 else "-INFINITY"
     if math.isnan(number):
         return "NAN"
+    # nine digits tell every float32 from its neighbours; a literal without a point would be an int
     text = f"{np.float32(number):.9g}"
     text = text if any(c in text for c in ".e") else text + ".0"
     return f"({text}f)" if number < 0 else f"{text}f"
@@ -85,5 +86,6 @@ def dims(shape) -> str:
 
 def number_rows(value: np.ndarray) -> str:
     """Entries of a const array (N,), eight to a line."""
+    # brackets are for negative numbers within formulas
     literals = [literal(number).strip("()") for number in value.tolist()]
     return "\n".join(", ".join(literals[k : k + 8]) + "," for k in range(0, len(literals), 8))

@@ -144,6 +144,7 @@ class Walk:
             results = results if equation.primitive.multiple_results else [results]
             return [np.asarray(value) for value in results]
         rule = getattr(self, f"_op_{'elementwise' if name in self.elementwise else name}", None)
+        # refused, and not left out: a policy that is nearly right is worse than none
         if rule is None:
             raise UserError(
                 f"the policy uses the operation {name!r}, which has no counterpart in the "

@@ -85,6 +85,7 @@ class PursuitMultiAgentEnv:
         over = terminated | truncated
         dones = {agent: over for agent in self.agents} | {"__all__": over}
         observations = self._by_agent(flat_observation(observation))
+        # of each agent, as JaxMARL's wrappers stack what is in `infos`
         cut = jnp.broadcast_to(truncated, info.captured.shape)
         infos = {"captured": info.captured, "crashed": info.crashed, "truncated": cut}  # (N,) each
         if not self.environment.settings.observe_time:

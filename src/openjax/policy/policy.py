@@ -35,6 +35,7 @@ class Policy:
     arena_radius: float = 0.9
     arena_height: float = 1.2
     initial_action: tuple[float, ...] = (0.2549, 0.0, 0.0, 0.0)
+    """Before the tanh; by default what hovers the nominal Crazyflie."""
 
     @classmethod
     def for_environment(
@@ -73,6 +74,8 @@ class Policy:
             predictor = self._predictor.init(
                 predictor_key, observation.frames, observation.last_seen
             )
+        # in this order: the actor sees what the predictor predicts, the critic what the actor's
+        # encoder makes of it
         parameters = PolicyParameters(actor={}, critic={}, predictor=predictor)
         predicted = self.predict(parameters, observation)
         actor = self._actor.init(actor_key, observation, predicted)

@@ -18,6 +18,7 @@ def describe_machine() -> dict:
 
     devices = jax.devices()
     return {
+        # of a CPU, JAX's kind is "cpu", which tells no two apart
         "device": devices[0].device_kind if devices[0].platform != "cpu" else _processor(),
         "platform": devices[0].platform,
         "device_count": len(devices),
@@ -39,8 +40,8 @@ def commit() -> dict:
     this_file = Path(__file__).resolve()
     source = this_file.parents[1]
     revision = _git(source, "rev-parse", "HEAD")
-    # Installed from a wheel, the files may lie inside another repository, whose commit says
-    # nothing.
+    # installed from a wheel, the files may lie inside another repository, whose commit says
+    # nothing
     if revision is None or _git(source, "ls-files", "--error-unmatch", str(this_file)) is None:
         return {"commit": None, "commit_clean": None}
     changes = _git(source, "status", "--porcelain", "--", str(source))

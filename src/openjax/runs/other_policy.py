@@ -37,6 +37,7 @@ def game_for(environment: Pursuit, policy: LoadedPolicy) -> Pursuit:
     settings = dataclasses.replace(
         settings,
         **{name: getattr(trained, name) for name in _OF_THE_POLICY},
+        # as many seconds, in steps of its own
         episode_length=round(settings.episode_length * settings.time_step / trained.time_step),
         max_pillars=layout_slots(settings),
     )
@@ -71,6 +72,7 @@ def compare(
     policy = policy.in_game(game)
     tasks = {"validation": uniform_tasks(environment.settings, validation, settings.max_pillars)}
     tasks |= layout_tasks(settings, scenarios, episodes)
+    # all in one batch, which is flown once
     evaluator = Evaluator(game, policy.policy, validation + episodes * len(scenarios))
     flown = evaluator.fly(policy.parameters, tasks, jax.random.key(0))
     rows = [kind.record() for kind in flown]

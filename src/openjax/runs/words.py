@@ -24,6 +24,7 @@ def opening_words(settings: TrainSettings) -> str:
         name: [leaf for leaf in different_settings(settings, make()) if leaf != "seed"]
         for name, make in PRESETS.items()
     }
+    # the preset from which the fewest settings differ
     name = min(changed, key=lambda name: len(changed[name]))
     words = changed[name][:NAMED]
     if more := len(changed[name]) - len(words):
@@ -76,6 +77,11 @@ def closing_words(settings: TrainSettings, run: Path, on_cpu: bool) -> list[str]
     return [*lines, "\n  ".join(["Next:", *steps])]
 
 
+def _pillars(game):
+    """How many, as "4 to 5" or "5"."""
+    return " to ".join(map(str, sorted({game.min_pillars, game.max_pillars})))
+
+
 def unlike_the_papers(game: PursuitSettings, evaders: tuple[str, ...]) -> str:
     """How a game differs from the paper's, as a sentence; empty where it doesn't. `evaders`: names
     or files of those who fly, its own or others.
@@ -94,11 +100,8 @@ def unlike_the_papers(game: PursuitSettings, evaders: tuple[str, ...]) -> str:
         )
     if game.num_pursuers != paper.num_pursuers:
         words.append(f"{game.num_pursuers} pursuers instead of {paper.num_pursuers}")
-    pillars, theirs = (
-        " to ".join(map(str, sorted({g.min_pillars, g.max_pillars}))) for g in (game, paper)
-    )
-    if pillars != theirs:
-        words.append(f"{pillars} pillars instead of {theirs}")
+    if _pillars(game) != _pillars(paper):
+        words.append(f"{_pillars(game)} pillars instead of {_pillars(paper)}")
     if game.observed_pillars != paper.observed_pillars:
         words.append(f"{game.observed_pillars} pillars in view instead of {paper.observed_pillars}")
     if game.start_attitude != paper.start_attitude:

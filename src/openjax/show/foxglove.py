@@ -141,7 +141,7 @@ def _entity(name: str, kind: str, position, size, colour: dict) -> dict:
     }
     if kind == "cylinders":
         body |= {"bottom_scale": 1.0, "top_scale": 1.0}
-    lifetime = {"sec": 0, "nsec": 0}
+    lifetime = {"sec": 0, "nsec": 0}  # for ever
     return {
         "frame_id": WORLD,
         "id": name,

@@ -45,6 +45,7 @@ class MetricsWriter:
         if tensorboard:
             from tensorboardX import SummaryWriter
 
+            # has TensorBoard forget what a killed process logged after its last checkpoint
             purge_step = None if resumed_update is None else resumed_steps + 1
             self._events = SummaryWriter(
                 str(directory / "tensorboard"), purge_step=purge_step, flush_secs=10
@@ -91,7 +92,7 @@ def read_metrics(path: Path, event: str | None = None) -> Iterator[dict]:
         for line in lines:
             try:
                 record = json.loads(line)
-            except ValueError:
+            except ValueError:  # a kill cut the line
                 continue
             if event is None or record["event"] == event:
                 yield record
