@@ -56,7 +56,11 @@ INTERVALS = {"motor_lag": {"extra_up": (0.035, 0.045)}}
 @pytest.fixture
 def policy_file(tmp_path):
     parts = build(TINY)
-    start = lambda key: parts.policy.init(key, parts.environment.reset(key)[0])  # noqa: E731
+
+    def start(key):
+        observation, _ = parts.environment.reset(key)
+        return parts.policy.init(key, observation)
+
     path = tmp_path / "policy.npz"
     save_policy_file(path, jax.jit(start)(jax.random.key(1)), TINY)
     return path
@@ -100,7 +104,10 @@ def test_the_best_step_on_the_way_is_kept():
         optimiser=SimpleNamespace(init=lambda actor: None),
         update=lambda actor, *_: (actor.replace(parameters=actor.parameters + 1.0), {}),
     )
-    worth = lambda parameters: np.full(4, -((float(parameters.actor[0]) - 3.0) ** 2))  # noqa: E731
+
+    def worth(parameters):
+        return np.full(4, -((float(parameters.actor[0]) - 3.0) ** 2))
+
     key = jax.random.key(0)
     tuned = fine_tune(adaptation, policy, np.zeros((1, 4)), key, worth)
     assert tuned.update == 3 and tuned.parameters.actor[0] == 3.0 and len(tuned.looks) == 7

@@ -67,7 +67,10 @@ def crazyflow_drones(options) -> dict:
     hover = float(sim.data.params.mass[0]) * 9.81
     sim.body_rate_control(jnp.full((options.worlds, 3, 4), jnp.array([0.1, 0.1, 0.1, hover])))
     number = 3 * options.worlds * options.steps
-    run = lambda data: sim._step(data, n_steps=options.steps)  # noqa: E731
+
+    def run(data):
+        return sim._step(data, n_steps=options.steps)
+
     return {"drone_steps_per_second": rate(run, sim.data, steps=number)}
 
 

@@ -49,8 +49,13 @@ def steps(b, number, m=0.0):
 def test_a_vehicle_without_thrust_falls_and_turns_as_mechanics_says():
     p = vehicle.nominal_parameters([told()])
     b = body(p, velocity=[0.5, -0.2, 1.0], rates=[3.0, -2.0, 5.0])
-    momentum = lambda: vehicle.rotate(b.q, b.principal * b.rates)  # noqa: E731
-    energy = lambda: 0.5 * (b.principal * b.rates**2).sum()  # noqa: E731
+
+    def momentum():
+        return vehicle.rotate(b.q, b.principal * b.rates)
+
+    def energy():
+        return 0.5 * (b.principal * b.rates**2).sum()
+
     before = momentum()
     spin = energy()
     steps(b, 500)

@@ -121,7 +121,10 @@ def test_memory_of_effects_that_the_step_does_not_have_is_left_alone():
 
 def test_worlds_become_more_worlds_of_one_call(monkeypatch):
     drones, command, pillars = crowded(6)
-    step = lambda drones, command, pillars: AMONG_SOLIDS(VEHICLE, drones, command, *pillars)  # noqa: E731
+
+    def step(drones, command, pillars):
+        return AMONG_SOLIDS(VEHICLE, drones, command, *pillars)
+
     twice = jax.tree.map(
         lambda leaf: leaf.reshape(2, 3, *leaf.shape[1:]), (drones, command, pillars)
     )
