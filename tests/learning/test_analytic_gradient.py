@@ -11,17 +11,9 @@ import optax
 import pytest
 
 from openjax.learning import AnalyticSettings
-from openjax.learning.analytic_gradient import (
-    APART,
-    SMOOTH,
-    AnalyticGradient,
-    breach_share,
-    compile_analytic,
-    crash_depth,
-    crash_share,
-    free_flight,
-    side_by_side,
-)
+from openjax.learning.analytic_gradient import AnalyticGradient, compile_analytic, free_flight
+from openjax.learning.drawn_starts import APART, side_by_side
+from openjax.learning.smooth_measures import SMOOTH, breach_share, crash_depth, crash_share
 from openjax.policy import NetworkSettings, Policy, PredictorSettings
 from openjax.pursuit import Pursuit, PursuitSettings, uniform_task
 from openjax.pursuit.collisions import breaches

@@ -11,16 +11,16 @@ import jax.numpy as jnp
 import pytest
 
 from openjax.learning import preset
-from openjax.learning.analytic_gradient import (
+from openjax.learning.first_flights import FirstFlights, first_game, make_first_flights
+from openjax.learning.settings import FirstFlightsSettings
+from openjax.learning.shortest_paths import shortest_paths
+from openjax.learning.smooth_measures import (
     crash_share,
     evader_distance,
     free_share,
-    nearest_way,
+    nearest_distance,
     tip_share,
 )
-from openjax.learning.first_flights import FirstFlights, first_game, make_first_flights
-from openjax.learning.settings import FirstFlightsSettings
-from openjax.learning.ways import ways_of
 from openjax.policy import NetworkSettings, Policy, PredictorSettings
 from openjax.pursuit import Pursuit, PursuitSettings
 
@@ -120,7 +120,9 @@ def test_an_evader_within_reach_is_not_free():
     near = state.drones.position.at[:, 0].set(state.evader_position + jnp.array([0.1, 0.0, 0.0]))
     near = state.replace(drones=state.drones.replace(position=near))
     distance = jax.jit(
-        lambda s: evader_distance(GAME, s, jax.vmap(functools.partial(ways_of, GAME))(s.task))
+        lambda s: evader_distance(
+            GAME, s, jax.vmap(functools.partial(shortest_paths, GAME))(s.task)
+        )
     )
     far = distance(state)
     near = distance(near)
@@ -132,8 +134,8 @@ def test_an_evader_within_reach_is_not_free():
 
 def test_one_near_pursuer_lets_others_be_far():
     distance = jnp.array([[0.5, 0.5, 0.5], [0.0, 1.0, 1.0]])
-    assert nearest_way(distance) == pytest.approx([0.5, 0.15 * math.log(3.0)], abs=1e-3)
-    pull = jax.jit(jax.grad(lambda d: nearest_way(d)[0]))(distance[1:])[0]
+    assert nearest_distance(distance) == pytest.approx([0.5, 0.15 * math.log(3.0)], abs=1e-3)
+    pull = jax.jit(jax.grad(lambda d: nearest_distance(d)[0]))(distance[1:])[0]
     assert pull[0] > 0.99 and pull[1] < 0.01
 
 

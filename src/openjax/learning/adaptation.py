@@ -21,12 +21,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 import openjax.baselines  # noqa: F401  registers its policies
 from openjax.evaluation.episodes import Evaluation, make_evaluate
-from openjax.learning.analytic_gradient import (
-    breach_share,
-    crash_share,
-    draw_start,
-    nearest_gap,
-)
+from openjax.learning.drawn_starts import draw_start
 from openjax.learning.gradient_step import (
     END,
     FASTEST,
@@ -38,6 +33,7 @@ from openjax.learning.gradient_step import (
     weighted_sum,
 )
 from openjax.learning.settings import AdaptSettings, TrainSettings
+from openjax.learning.smooth_measures import breach_share, crash_share, nearest_gap
 from openjax.learning.train_state import TrainState
 from openjax.policy import Policy, PolicyParameters, make_policy
 from openjax.policy.growth import with_longer_history

@@ -21,6 +21,7 @@ import optax
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from openjax.background import in_background
+from openjax.learning.drawn_starts import draw_start
 from openjax.learning.gradient_step import (
     END,
     FASTEST,
@@ -32,50 +33,30 @@ from openjax.learning.gradient_step import (
     weighted_sum,
 )
 from openjax.learning.settings import AnalyticSettings
-from openjax.learning.ways import Ways, way_length, ways_of
-from openjax.policy import Policy, PolicyParameters
-from openjax.pursuit import (
-    Pursuit,
-    PursuitSettings,
-    PursuitState,
-    RewardSettings,
-    Task,
-    close_starts,
-    turn_task,
-    uniform_task,
+from openjax.learning.shortest_paths import shortest_paths
+from openjax.learning.smooth_measures import (
+    FAST,
+    breach_share,
+    crash_depth,
+    crash_share,
+    evader_distance,
+    free_share,
+    nearest_distance,
+    nearest_gap,
+    speed,
 )
-from openjax.pursuit.collisions import TOUCH, drone_distance, pillar_distance
-from openjax.pursuit.observation import rotation_axes
+from openjax.policy import Policy, PolicyParameters
+from openjax.pursuit import Pursuit, PursuitSettings, RewardSettings
+from openjax.pursuit.axes import rotation_axes
 from openjax.pursuit.shapes import Scalar
 from openjax.pursuit.task import capture_radius
-from openjax.pursuit.teams import parked
 from openjax.vehicle.family import family_bounds, narrowed_bounds
-from openjax.vehicle.solids import DRONE_RADIUS
 
-Worlds = Float[Array, "worlds"]
-"""A number of each world."""
-Pursuers = Float[Array, "worlds pursuers"]
-"""A number of each pursuer of each world."""
 Bounds = Float[Array, "worlds ranges 4"]
 """Of each world's vehicles; see `openjax.vehicle.family`."""
 
 HORIZON = 0.5
 """Seconds that are learnt at once."""
-SMOOTH = 0.012
-SMOOTH_BREACH = 0.008
-"""Distances (m) over which a crash and a breach go from sure to none in what is learnt; ways
-through rows aren't wide.
-"""
-SMOOTH_TILT = 0.05
-"""The same for a tip over 90 degrees (cosine of the tilt)."""
-SMOOTH_CAPTURE = 0.1
-"""The same for a capture (m)."""
-SMOOTH_NEAREST = 0.15
-"""The same for which pursuer is nearest to the evader (m)."""
-FAST = 0.05
-"""Speed (m/s) above where the speed begins to cost that costs as much as a crash in every step
-would.
-"""
 CRASH_IN_FLIGHT = 4.0
 BREACH_AT_START = 0.5
 """Weights beside the crashes from starts: an episode has one start, and many half seconds after
@@ -83,55 +64,9 @@ it.
 """
 REST = 0.9
 """Share of the capture radius within which a pursuer needn't come nearer to the evader."""
-CLOSE = 0.45
-SIDE_BY_SIDE = 0.35
-"""Shares of the starts close to something (70 % of the pursuers), and of those in which all stand
-side by side.
-"""
-APART = 0.1
-"""Farthest gap beyond the safety distance of pursuers side by side (m)."""
 
 
-def side_by_side(settings: PursuitSettings, key: PRNGKeyArray, task: Task) -> Task:
-    """A task whose pursuers all start beside one before them; as it was where that would breach
-    something.
-    """
-    position = task.pursuer_position
-    for i, pursuer_key in enumerate(jax.random.split(key, position.shape[0] - 1), start=1):
-        which_key, direction_key, gap_key = jax.random.split(pursuer_key, 3)
-        # rather beside than above one another
-        away = jax.random.normal(direction_key, (3,)) * jnp.array([1.0, 1.0, 0.3])
-        gap = settings.drone_clearance + jax.random.uniform(gap_key, (), maxval=APART)
-        neighbour = position[jax.random.randint(which_key, (), 0, i)]
-        position = position.at[i].set(neighbour + gap * away / jnp.linalg.norm(away))
-    to_axis = jnp.linalg.norm(position[:, None, :2] - task.pillar_position[None], axis=-1)
-    room = settings.pillar_radius + settings.pillar_clearance
-    if task.active is not None:
-        to_axis = jnp.where(task.active[:, None], to_axis, jnp.inf)
-        position = parked(position, task.active)
-    clear_of_pillars = ~jnp.any(task.pillar_active & (to_axis < room))
-    # less a rounding error: two that stand exactly as close as they may are apart
-    apart = jnp.all(drone_distance(position) >= settings.drone_clearance - 1e-4)
-    clear = clear_of_pillars & apart
-    return task.with_starts(jnp.where(clear, position, task.pursuer_position))
-
-
-def draw_start(settings: PursuitSettings, key: PRNGKeyArray) -> Task:
-    """A task to learn from: close to something, side by side, or any."""
-    task_key, turn_key, start_key, choice_key = jax.random.split(key, 4)
-    task = turn_task(turn_key, uniform_task(settings, task_key))
-    near = close_starts(settings, start_key, task, 0.7)
-    beside = side_by_side(settings, start_key, task) if settings.num_pursuers > 1 else near
-    kind = jax.random.uniform(choice_key)
-    return jax.tree.map(
-        lambda a, b, c: jnp.where(kind < CLOSE, a, jnp.where(kind < CLOSE + SIDE_BY_SIDE, b, c)),
-        near,
-        beside,
-        task,
-    )
-
-
-class Way(NamedTuple):
+class Encounter(NamedTuple):
     """What the pursuers of B worlds met in some steps, all smooth and (B, N) unless said
     otherwise.
     """
@@ -145,9 +80,25 @@ class Way(NamedTuple):
     excess: jax.Array
     """mean excess of speed, in units of `FAST`"""
     distance: jax.Array
-    """(B,) m, mean length of the nearest pursuers' ways to the evader beyond where they may rest"""
+    """(B,) m, mean length of the nearest pursuers' paths to the evader, beyond where they may
+    rest
+    """
     free: jax.Array
     """(B,) share of the steps in which nobody has caught the evader"""
+
+
+def no_encounter(shape: tuple[int, int]) -> Encounter:
+    """What pursuers (B, N) have met before the first step."""
+    zeros = jnp.zeros(shape)
+    of_worlds = jnp.zeros(shape[0])
+    return Encounter(
+        least=zeros + jnp.inf,
+        upright=zeros + 1.0,
+        breach=zeros,
+        excess=zeros,
+        distance=of_worlds,
+        free=of_worlds,
+    )
 
 
 @dataclass(frozen=True)
@@ -190,13 +141,13 @@ class AnalyticGradient:
         world,
         steps: int,
         wish: Float[Array, "worlds 3"] | None = None,
-    ) -> tuple[Any, "Way"]:
-        """Worlds some steps later, and what their pursuers met on the way; `wish` is where the
+    ) -> tuple[Any, "Encounter"]:
+        """Worlds some steps later, and what their pursuers met in these; `wish` is where the
         evaders fly, see `mean_step`.
         """
         fly_on = mean_step(self.environment, self.policy, parameters)
         # found once: pillars stand still
-        ways = jax.vmap(functools.partial(ways_of, self.game))(world[1].task)
+        paths = jax.vmap(functools.partial(shortest_paths, self.game))(world[1].task)
 
         # only the worlds between steps are kept, the rest is worked out again on the way back: it
         # would take many times the memory
@@ -207,28 +158,28 @@ class AnalyticGradient:
 
         def one(carry, _):
             world = moved(carry[0])
-            way = self._met(carry[1], world[1], ways, steps)
-            return (world, way), None
+            met = self._met(carry[1], world[1], paths, steps)
+            return (world, met), None
 
-        zeros = jnp.zeros(world[1].drones.position.shape[:2])
-        first = world, Way(zeros + jnp.inf, zeros + 1.0, zeros, zeros, zeros[:, 0], zeros[:, 0])
-        return jax.lax.scan(one, first, None, length=steps)[0]
+        nothing = no_encounter(world[1].drones.position.shape[:2])
+        return jax.lax.scan(one, (world, nothing), None, length=steps)[0]
 
-    def _met(self, way, state, ways, steps):
-        """The way so far, and what the last of its steps adds."""
+    def _met(self, met, state, paths, steps):
+        """What pursuers have met so far, with what the step that ended with `state` adds."""
         limit = self.settings.speed_from * self.game.max_speed
         radius = capture_radius(self.game, state.task)
         rest = REST * radius
         if jnp.ndim(rest):  # of each world, beside its pursuers' distances
             rest = rest[:, None]
-        distance = evader_distance(self.game, state, ways)
-        return Way(
-            jnp.minimum(way.least, nearest_gap(self.game, state)),
-            jnp.minimum(way.upright, rotation_axes(state.drones.quaternion)[1][..., 2]),
-            way.breach + breach_share(self.game, state) / steps,
-            way.excess + jax.nn.relu(_speed(state.drones) - limit) / FAST / steps,
-            way.distance + nearest_way(jax.nn.relu(distance - rest)) / steps,
-            way.free + free_share(radius, distance) / steps,
+        distance = evader_distance(self.game, state, paths)
+        beyond_rest = jax.nn.relu(distance - rest)
+        return Encounter(
+            least=jnp.minimum(met.least, nearest_gap(self.game, state)),
+            upright=jnp.minimum(met.upright, rotation_axes(state.drones.quaternion)[1][..., 2]),
+            breach=met.breach + breach_share(self.game, state) / steps,
+            excess=met.excess + jax.nn.relu(speed(state.drones) - limit) / FAST / steps,
+            distance=met.distance + nearest_distance(beyond_rest) / steps,
+            free=met.free + free_share(radius, distance) / steps,
         )
 
     def starts(self, key: PRNGKeyArray, bounds: Bounds):
@@ -276,19 +227,19 @@ class AnalyticGradient:
         change = (mean - before) * jnp.exp(-log_std)
         # starts and flights by one program, the starts first
         worlds = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), starts, flying)
-        (_, end), way = self.fly(actor, parameters, worlds, self.steps)
+        (_, end), met = self.fly(actor, parameters, worlds, self.steps)
         drones = jax.tree.map(lambda leaf: leaf[:number], end.drones)
-        fast = _speed(drones) - FASTEST
+        fast = speed(drones) - FASTEST
         low = LOWEST - drones.position[..., 2]
         parts = {
-            "crashes_from_starts": (1.0, crash_depth(way.least[:number])),
-            "breaches_from_starts": (BREACH_AT_START, way.breach[:number]),
+            "crashes_from_starts": (1.0, crash_depth(met.least[:number])),
+            "breaches_from_starts": (BREACH_AT_START, met.breach[:number]),
             # a dive saves some of those that start tilted towards something, so there the speed is
             # free but for its end
             "ends": (END, jax.nn.relu(fast) + jax.nn.relu(low)),
-            "crashes_in_flight": (CRASH_IN_FLIGHT, crash_share(way.least[number:])),
-            "breaches_in_flight": (settings.breach, way.breach[number:]),
-            "speed_in_flight": (settings.speed, way.excess[number:]),
+            "crashes_in_flight": (CRASH_IN_FLIGHT, crash_share(met.least[number:])),
+            "breaches_in_flight": (settings.breach, met.breach[number:]),
+            "speed_in_flight": (settings.speed, met.excess[number:]),
             "change": (settings.hold, jnp.sum(change**2, axis=-1)),
         }
         return weighted_sum(parts)
@@ -344,94 +295,6 @@ def free_flight(environment: Pursuit) -> Pursuit:
     )
     by_default = {"vehicle_bounds": None, "evader_share": None, "dynamics": None}
     return dataclasses.replace(environment, settings=free, **by_default)
-
-
-def nearest_gap(game: PursuitSettings, state: PursuitState) -> Pursuers:
-    """(W, N) m, from each pursuer of worlds (W, ...) to the nearest solid thing: pillar, pursuer or
-    floor.
-    """
-    position = state.drones.position
-    task = state.task
-    to_pillar = jax.vmap(lambda p, q: pillar_distance(game, p, q))(position, task.pillar_position)
-    active = task.pillar_active[:, None]
-    gap = jnp.min(to_pillar, axis=-1, where=active, initial=jnp.inf) - DRONE_RADIUS
-    if game.num_pursuers > 1:
-        others = jnp.min(jax.vmap(drone_distance)(position), axis=-1)
-        gap = jnp.minimum(gap, others - 2 * DRONE_RADIUS)
-    return jnp.minimum(gap, position[..., 2] - DRONE_RADIUS)
-
-
-def crash_share(gap: Float[Array, "*worlds"], smooth: float = SMOOTH) -> Float[Array, "*worlds"]:
-    """How much of a crash a least gap (m) counts as, from 1 to 0 over `smooth` (m): it has a
-    gradient before a touch.
-    """
-    # half of one at three times the gap that counts as a touch
-    return jax.nn.sigmoid((3 * TOUCH - gap) / smooth)
-
-
-def crash_depth(gap: Float[Array, "*worlds"]) -> Float[Array, "*worlds"]:
-    """The same that goes on to grow, by 1 every `SMOOTH`: what would crash by far is learnt from,
-    too.
-    """
-    return jax.nn.softplus((3 * TOUCH - gap) / SMOOTH)
-
-
-def tip_share(upright: Float[Array, "*worlds"]) -> Float[Array, "*worlds"]:
-    """The same of a least cosine of the tilt."""
-    return jax.nn.sigmoid((2 * SMOOTH_TILT - upright) / SMOOTH_TILT)
-
-
-def breach_share(game: PursuitSettings, state: PursuitState) -> Pursuers:
-    """(W, N) smooth number of breaches of each pursuer in worlds (W, ...);
-    `openjax.pursuit.collisions.breaches`.
-    """
-    position = state.drones.position
-    task = state.task
-    to_pillar = jax.vmap(lambda p, q: pillar_distance(game, p, q))(position, task.pillar_position)
-    to_pillar = jnp.where(task.pillar_active[:, None], to_pillar, jnp.inf) - game.pillar_clearance
-    to_drone = jax.vmap(drone_distance)(position) - game.drone_clearance
-    to_wall = game.arena_radius - jnp.sqrt(jnp.sum(position[..., :2] ** 2, axis=-1) + 1e-12)
-    to_ceiling = game.arena_height - position[..., 2]
-
-    def near(distance):
-        return jax.nn.sigmoid((SMOOTH_BREACH - distance) / SMOOTH_BREACH)
-
-    total = jnp.sum(near(to_pillar), axis=-1) + jnp.sum(near(to_drone), axis=-1)
-    total = total + near(to_wall) + near(to_ceiling)
-    return total if state.active is None else jnp.where(state.active, total, 0.0)
-
-
-def evader_distance(game: PursuitSettings, state: PursuitState, ways: Ways) -> Pursuers:
-    """(W, N) m, ways from pursuers of worlds (W, ...) to the evader, whose flight has no gradient:
-    its answers are a cliff.
-    """
-    evader = jax.lax.stop_gradient(state.evader_position)
-    return jax.vmap(functools.partial(way_length, game))(
-        state.task, ways, state.drones.position, evader
-    )
-
-
-def nearest_way(distance: Pursuers) -> Worlds:
-    """(W,) m, a smooth least of distances (W, N): where one pursuer is near, others needn't be, and
-    may go round.
-    """
-    # less the logarithm of their number: of equal distances it is that distance
-    number = distance.shape[-1]
-    soft = jax.nn.logsumexp(-distance / SMOOTH_NEAREST, axis=-1) - jnp.log(number)
-    return -SMOOTH_NEAREST * soft
-
-
-def free_share(radius: float | jax.Array, distance: Pursuers) -> Worlds:
-    """(W,) how free the evader at distances (W, N) is, from 0 to 1: smooth, and felt from afar;
-    capture radius () or (W,) m.
-    """
-    # half free a little inside the capture radius, so that pursuers come in all the way
-    return jax.nn.sigmoid((jnp.min(distance, axis=-1) - 0.95 * radius) / SMOOTH_CAPTURE)
-
-
-def _speed(drones):
-    # the small number keeps the root's gradient finite at rest
-    return jnp.sqrt(jnp.sum(drones.velocity**2, axis=-1) + 1e-9)
 
 
 @runtime_checkable

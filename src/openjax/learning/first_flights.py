@@ -19,13 +19,7 @@ import optax
 from flax import struct
 from jaxtyping import PRNGKeyArray
 
-from openjax.learning.analytic_gradient import (
-    AnalyticGradient,
-    crash_share,
-    free_flight,
-    nearest_gap,
-    tip_share,
-)
+from openjax.learning.analytic_gradient import AnalyticGradient, free_flight
 from openjax.learning.collectives import mean_over_devices, own_share
 from openjax.learning.generator import vary_pillars
 from openjax.learning.gradient_step import (
@@ -35,6 +29,7 @@ from openjax.learning.gradient_step import (
     weighted_sum,
 )
 from openjax.learning.settings import AnalyticSettings, FirstFlightsSettings, GeneratorSettings
+from openjax.learning.smooth_measures import crash_share, nearest_gap, tip_share
 from openjax.policy import Policy, PolicyParameters
 from openjax.pursuit import Pursuit, scatter_starts, turn_task, uniform_task
 from openjax.pursuit.shapes import Scalar
@@ -130,20 +125,20 @@ class FirstFlights:
         """
         settings = self.settings
         is_fast_possible = self.environment.settings.speed_limit == "none"
-        end, way = self.stage.fly(actor, parameters, world, settings.steps)
+        end, met = self.stage.fly(actor, parameters, world, settings.steps)
         # with whole penalties from the start, pursuers stay away from the evader for good
         penalty = settings.penalty_start + (1.0 - settings.penalty_start) * risen
         parts = {
-            "free": (1.0, way.free),
-            # along the shortest way: by the straight line they wait in sight of the evader, on the
+            "free": (1.0, met.free),
+            # along the shortest path: by the straight line they wait in sight of the evader, on the
             # wrong side of a row of pillars
-            "distance": (settings.distance, way.distance),
+            "distance": (settings.distance, met.distance),
             # felt from farther than a touch, or they never leave such a place either: over 5 cm
             # they go round rows and hardly crash, over 1 cm they do neither
-            "crashes": (penalty * settings.crash, crash_share(way.least, settings.crash_smooth)),
-            "tips": (risen * settings.crash, tip_share(way.upright)),
-            "breaches": (penalty * settings.breach, way.breach),
-            "speed": (settings.speed * is_fast_possible, way.excess),
+            "crashes": (penalty * settings.crash, crash_share(met.least, settings.crash_smooth)),
+            "tips": (risen * settings.crash, tip_share(met.upright)),
+            "breaches": (penalty * settings.breach, met.breach),
+            "speed": (settings.speed * is_fast_possible, met.excess),
             "low": (1.0, jax.nn.relu(LOW - end[1].drones.position[..., 2])),
         }
         total, means = weighted_sum(parts)

@@ -20,7 +20,7 @@ import optax
 from flax import struct
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from openjax.learning.analytic_gradient import AnalyticGradient, crash_share, nearest_gap
+from openjax.learning.analytic_gradient import AnalyticGradient
 from openjax.learning.generator import vary_pillars
 from openjax.learning.gradient_step import (
     clipped_descent,
@@ -30,6 +30,7 @@ from openjax.learning.gradient_step import (
     weighted_sum,
 )
 from openjax.learning.settings import AnalyticSettings, GeneratorSettings, WorstPlansSettings
+from openjax.learning.smooth_measures import crash_share, nearest_gap
 from openjax.policy import PolicyParameters
 from openjax.pursuit import (
     Pursuit,
@@ -225,11 +226,11 @@ class WorstPlans:
         policy = self.usual.policy
 
         def piece(world, wish):
-            world, way = self.flight.fly(actor, parameters, world, self.piece_steps, wish)
-            return world, (world, way)
+            world, met = self.flight.fly(actor, parameters, world, self.piece_steps, wish)
+            return world, (world, met)
 
         # one body for all pieces: each would take a GPU's compiler half a minute
-        worlds, way = jax.lax.scan(piece, world, jnp.moveaxis(plan, 1, 0))[1]
+        worlds, met = jax.lax.scan(piece, world, jnp.moveaxis(plan, 1, 0))[1]
         after = jax.tree.map(lambda leaf: jax.lax.stop_gradient(leaf[0]), worlds)
         observation, predicted = self.usual.inputs(parameters, world[0])
         before, log_std = policy.distribution(parameters.actor, observation, predicted)
@@ -240,11 +241,11 @@ class WorstPlans:
         seen = world[1].seen.astype(jnp.float32)
         hold = jnp.where(world[1].seen, self.settings.hold, planning.hold_unseen)[:, None]
         parts = {
-            "free": (1.0, seen * jnp.mean(way.free, axis=0)),
-            "distance": (planning.distance, seen * jnp.mean(way.distance, axis=0)),
-            "crashes": (planning.crash, crash_share(jnp.min(way.least, axis=0))),
-            "breaches": (planning.breach, way.breach),
-            "speed": (self.settings.speed, way.excess),
+            "free": (1.0, seen * jnp.mean(met.free, axis=0)),
+            "distance": (planning.distance, seen * jnp.mean(met.distance, axis=0)),
+            "crashes": (planning.crash, crash_share(jnp.min(met.least, axis=0))),
+            "breaches": (planning.breach, met.breach),
+            "speed": (self.settings.speed, met.excess),
             "held": (1.0, hold * jnp.sum(change**2, axis=-1)),
         }
         total, means = weighted_sum(parts)

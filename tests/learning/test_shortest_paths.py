@@ -1,4 +1,4 @@
-"""Ways round pillars, against closed forms and against Dijkstra's algorithm on a fine grid."""
+"""ShortestPaths round pillars, against closed forms and against Dijkstra's algorithm on a fine grid."""
 
 import functools
 import heapq
@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from openjax.learning.ways import ROOM, TOLL, way_length, ways_of
+from openjax.learning.shortest_paths import ROOM, TOLL, path_length, shortest_paths
 from openjax.pursuit import PursuitSettings, line_up_pillars, uniform_task
 
 GAME = PursuitSettings(min_pillars=5)
@@ -21,7 +21,7 @@ CELL = 0.02
 def length(task, position, target):
     position = jnp.asarray(position)
     target = jnp.asarray(target)
-    return way_length(GAME, task, ways_of(GAME, task), position, target)
+    return path_length(GAME, task, shortest_paths(GAME, task), position, target)
 
 
 def one_pillar():

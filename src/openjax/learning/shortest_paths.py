@@ -1,8 +1,8 @@
-"""How far it is to the evader for who can't fly through pillars: shortest ways in the plane, by a
+"""How far it is to the evader for who can't fly through pillars: shortest paths in the plane, by a
 visibility graph.
 
-A shortest way round discs is straight but for where it bends about one. Here the discs, pillars
-with their safety distance, are polygons, and a way bends at their corners (Lozano-Perez and Wesley
+A shortest path round discs is straight but for where it bends about one. Here the discs, pillars
+with their safety distance, are polygons, and a path bends at their corners (Lozano-Perez and Wesley
 1979, An algorithm for planning collision-free paths).
 """
 
@@ -17,28 +17,28 @@ from openjax.pursuit.shapes import Each, Team, Vector
 CORNERS = 6
 """Of the polygon about each pillar."""
 ROOM = 0.03
-"""How much farther from a pillar than the safety distance a way keeps (m). Nearer, the shares of
-crashes and breaches that a first flight counts early cost more than a way through saves: pursuers
+"""How much farther from a pillar than the safety distance a path keeps (m). Nearer, the shares of
+crashes and breaches that a first flight counts early cost more than a path through saves: pursuers
 then stand before it.
 """
 TOLL = 3.0
-"""What a way through a pillar costs (m): more than any way round."""
+"""What a path through a pillar costs (m): more than any path round."""
 
 
 @struct.dataclass
-class Ways:
-    """The ways of a task with P pillar slots, between the C = P * CORNERS corners."""
+class ShortestPaths:
+    """The shortest paths of a task with P pillar slots, between the C = P * CORNERS corners."""
 
     corner: jax.Array  # (C, 2) m
     toll: jax.Array  # (C,) m
-    """Of corners that no way may pass: outside the arena, in another pillar's reach, of no
+    """Of corners that no path may pass: outside the arena, in another pillar's reach, of no
     pillar.
     """
-    length: jax.Array  # (C, C) m, of the shortest way from one to another
+    length: jax.Array  # (C, C) m, of the shortest path from one to another
 
 
-def ways_of(settings: PursuitSettings, task: Task) -> Ways:
-    """All corners and the shortest ways between them."""
+def shortest_paths(settings: PursuitSettings, task: Task) -> ShortestPaths:
+    """All corners and the shortest paths between them."""
     reach = _reach(settings)
     angle = 2.0 * np.pi * np.arange(CORNERS) / CORNERS
     # so far out that the edges between corners touch the circle, and a thousandth beyond: an edge
@@ -52,26 +52,26 @@ def ways_of(settings: PursuitSettings, task: Task) -> Ways:
     toll = TOLL * (closed | ~jnp.repeat(task.pillar_active, CORNERS))
     direct = _straight(settings, task, corner[:, None], corner[None]) + toll
     if not corner.shape[0]:
-        return Ways(corner, toll, direct)
+        return ShortestPaths(corner, toll, direct)
 
-    # Floyd and Warshall: after step k, the shortest ways that bend at the first k corners only
+    # Floyd and Warshall: after step k, the shortest paths that bend at the first k corners only
     def shortened(k, length):
         return jnp.minimum(length, length[:, k, None] + length[k])
 
-    return Ways(corner, toll, jax.lax.fori_loop(0, corner.shape[0], shortened, direct))
+    return ShortestPaths(corner, toll, jax.lax.fori_loop(0, corner.shape[0], shortened, direct))
 
 
-def way_length(
-    settings: PursuitSettings, task: Task, ways: Ways, position: Team, target: Vector
+def path_length(
+    settings: PursuitSettings, task: Task, paths: ShortestPaths, position: Team, target: Vector
 ) -> Each:
-    """(N,) m, of the shortest way from each of (N, 3) positions to (3,) a target; its gradient
-    points along the way.
+    """(N,) m, of the shortest path from each of (N, 3) positions to (3,) a target; its gradient
+    points along the path.
     """
-    # a way's first bend is one of the corners, or the target itself, from which nothing is left
-    from_corner = _straight(settings, task, ways.corner, target[:2])
-    through_corners = jnp.min(ways.length + from_corner, axis=-1, initial=jnp.inf)
-    rest = jnp.append(ways.toll + through_corners, 0.0)
-    bend = jnp.concatenate([ways.corner, target[None, :2]])
+    # a path's first bend is one of the corners, or the target itself, from which nothing is left
+    from_corner = _straight(settings, task, paths.corner, target[:2])
+    through_corners = jnp.min(paths.length + from_corner, axis=-1, initial=jnp.inf)
+    rest = jnp.append(paths.toll + through_corners, 0.0)
+    bend = jnp.concatenate([paths.corner, target[None, :2]])
     here = jax.lax.stop_gradient(position[:, None, :2])
     best = jnp.argmin(_straight(settings, task, here, bend) + rest, axis=-1)
 
@@ -83,7 +83,7 @@ def way_length(
 
 
 def _straight(settings, task, start, end):
-    """(...,) m, from (..., 2) to (..., 2), with the toll of each pillar that is nearer on the way
+    """(...,) m, from (..., 2) to (..., 2), with the toll of each pillar that is nearer on the path
     than at both its ends.
     """
     along = end - start
@@ -101,5 +101,5 @@ def _straight(settings, task, start, end):
 
 
 def _reach(settings):
-    """How far from the axis of a pillar a way keeps (m)."""
+    """How far from the axis of a pillar a path keeps (m)."""
     return settings.pillar_radius + settings.pillar_clearance + ROOM
