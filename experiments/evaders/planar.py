@@ -20,6 +20,7 @@ import numpy as np
 from jax.scipy.ndimage import map_coordinates
 
 from experiments.table import Page, Table, page_parser, publish
+from openjax.baselines.stack import nearest_in_disc
 from openjax.command_line import run_command
 
 RATIOS = (1.05, 1.1, 1.2, 1.3, 1.4, 1.5, 1.6, 1.8, 2.0, 2.25, 2.5, 3.0, 3.5)
@@ -186,25 +187,33 @@ def _record(grid, ratios):
     return {"grid": dataclasses.asdict(grid), "reached": reached}
 
 
-def values(results: dict) -> list[dict]:
-    """By ratio: what the finest grid says, both ways, and what both orders and the two finest grids
-    lead to where errors are proportional to the spacing.
+def limits(records: list[dict], i: int) -> np.ndarray:
+    """(2,) where both orders lead at the i-th ratio, if errors are proportional to the spacing of
+    the two finest grids.
     """
-    coarse, fine = results["wall"][-2:]
+    coarse, fine = records[-2:]
+    wide, narrow = (1.0 / (one["grid"]["radii"] - 1) for one in (coarse, fine))
+    before, after = (np.array(one["reached"][i]) for one in (coarse, fine))
+    return after - (before - after) * narrow / (wide - narrow)
+
+
+def values(results: dict) -> list[dict]:
+    """By ratio: how near the pursuer comes to an evader that keeps to the wall, and to one that may
+    leave it, which is worth what coarser grids say.
+    """
+    places = range(len(results["free_ratios"]))
+    worth = [np.mean(limits(results["free"], i) - limits(results["wall_alike"], i)) for i in places]
     rows = []
     for i, ratio in enumerate(results["ratios"]):
-        spacing = [1.0 / (one["grid"]["radii"] - 1) for one in (coarse, fine)]
-        limits = [
-            after - (before - after) * spacing[1] / (spacing[0] - spacing[1])
-            for before, after in zip(coarse["reached"][i], fine["reached"][i], strict=True)
-        ]
+        both = limits(results["wall"], i)
+        leaving = float(np.interp(ratio, results["free_ratios"], worth))
         rows.append(
             {
                 "ratio": ratio,
-                "low": fine["reached"][i][0],
-                "high": fine["reached"][i][1],
-                "limits": limits,
-                "value": float(np.mean(limits)),
+                "value": float(np.mean(both)) + leaving,
+                "wall": float(np.mean(both)),
+                "apart": float(np.ptp(both)),
+                "formula": nearest_in_disc(ratio),
                 "ray": 1.0 - 1.0 / ratio,
             }
         )
@@ -212,16 +221,17 @@ def values(results: dict) -> list[dict]:
 
 
 def page(results: dict) -> Page:
-    """A row for each ratio, every second one on the page."""
+    """A row for each ratio, most of them on the page."""
     columns = {
         "evader's speed": "ratio:.2f",
         "comes as near as": "value:.3f",
-        "at least (finest grid)": "low:.3f",
-        "at most": "high:.3f",
+        "closed form": "formula:.3f",
+        "to one that keeps to the wall": "wall:.3f",
+        "orders apart by": "apart:.3f",
         "on one ray": "ray:.3f",
     }
     rows = values(results)
-    shown = Table(columns, rows[1::2])
+    shown = Table(columns, [row for row in rows if row["ratio"] not in (1.05, 1.4, 2.25)])
     return Page("Two points in a disc", "Distances in radii.", [Table(columns, rows)], shown)
 
 

@@ -73,10 +73,18 @@ def test_the_bound_of_the_papers_arena():
     )  # a height of .3 m isn't covered by .3 m
 
 
-def test_points_can_force_more_than_on_one_ray():
+def test_points_capture_more_than_on_one_ray():
     for changes in ({}, {"num_pursuers": 8}, {"num_pursuers": 5, "capture_radius": 0.15}):
         settings = PursuitSettings(**changes)
-        assert planar_bound(settings) > stack_bound(settings) > 1.0
+        ratio = planar_bound(settings)
+        assert ratio > stack_bound(settings) > 1.0
+        # nearest to an evader on the wall, of all straight lines that leave the ray to its side
+        turned = np.linspace(0.0, np.arccos(1.0 / ratio), 200)
+        place = np.stack([np.cos(turned), np.sin(turned)], axis=-1)
+        distance = np.linalg.norm(place - [1.0 / ratio, 0.0], axis=-1) - turned / ratio
+        half = settings.arena_height / (2 * settings.num_pursuers)
+        reach = (settings.capture_radius**2 - half**2) ** 0.5 / settings.arena_radius
+        assert distance.min() == pytest.approx(reach, abs=1e-6)
     assert planar_bound(PursuitSettings(num_pursuers=2)) == 0.0
 
 

@@ -15,22 +15,18 @@ They can do more (`planar_bound`): while they keep its angle, the evader at the 
 side, and they dash at where it will be.
 """
 
+import math
+
 import jax
 import jax.numpy as jnp
-import numpy as np
 from flax import struct
 
 from openjax.baselines.parameters import parameter
 from openjax.baselines.surroundings import Craft, Surroundings, length
 from openjax.pursuit.settings import PursuitSettings
 
-PLANAR = (
-    (1.0, 1.05, 1.1, 1.2, 1.3, 1.4, 1.5, 1.6, 1.8, 2.0, 2.25, 2.5, 3.0, 3.5),
-    (0.0, 0.01, 0.026, 0.065, 0.106, 0.146, 0.185, 0.221, 0.286, 0.342, 0.402, 0.453, 0.532, 0.592),
-)
-"""Ratios of speeds, and how near a point comes to a faster one in a disc, in radii: the game of
-both solved on a grid (experiments/results/planar.md).
-"""
+LARGEST = 1000.0
+"""Ratio of speeds above which nobody looks."""
 
 
 def stack_bound(settings: PursuitSettings) -> float:
@@ -45,14 +41,39 @@ def stack_bound(settings: PursuitSettings) -> float:
 
 
 def planar_bound(settings: PursuitSettings) -> float:
-    """The ratio of speeds v_e / v_p below which points that fly one above another can force a
-    capture, by `PLANAR`; 0 where a pursuer's height isn't covered. How they do it isn't here.
+    """The ratio of speeds v = v_e / v_p below which points that fly one above another capture; 0
+    where a pursuer's height isn't covered, at most `LARGEST`. How they do it isn't here.
+
+    Up to the radius R / v they keep the evader's angle. From there it must run one way round the
+    wall, and they dash straight on, across the ray. They are nearest when it has come to the angle
+    a with cos a = 1 / v, at R (sin a - a / v); so leaves the lady in the lake (Isaacs, 1965), who
+    flees from the one that runs round. They capture if
+
+        sqrt(1 - 1 / v^2) - arccos(1 / v) / v < s / R.
+
+    It isn't proved that neither side does better; the game of both points solved on grids says the
+    same within their errors (`experiments.evaders.planar`).
     """
     half = settings.arena_height / (2 * settings.num_pursuers)
     if half >= settings.capture_radius:
         return 0.0
-    across = (settings.capture_radius**2 - half**2) ** 0.5
-    return float(np.interp(across / settings.arena_radius, *PLANAR[::-1]))
+    reach = (settings.capture_radius**2 - half**2) ** 0.5 / settings.arena_radius
+    low = 1.0
+    high = LARGEST
+    while high - low > 1e-9:
+        middle = (low + high) / 2.0
+        if nearest_in_disc(middle) < reach:
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+def nearest_in_disc(ratio: float) -> float:
+    """How near a point comes to one in a disc that is `ratio` > 1 times as fast, in radii; see
+    `planar_bound`.
+    """
+    return math.sqrt(1.0 - ratio**-2) - math.acos(1.0 / ratio) / ratio
 
 
 @struct.dataclass
