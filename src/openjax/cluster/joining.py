@@ -176,6 +176,7 @@ def _connected(membership):
 
 def _listen(port):
     """A server on all of this host's addresses. Raises UserError where the port is taken."""
+    # hosts of a cluster may name each other by either kind of address
     both = socket.has_dualstack_ipv6()
     try:
         return socket.create_server(
@@ -240,6 +241,7 @@ def _call(host, port, membership):
             raise UserError(
                 f"process 0 can't be reached at {host}:{port} within {JOIN:.0f} s: {reason}"
             )
+        # process 0 may not have started yet
         time.sleep(0.2)
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from openjax.errors import UserError
 from openjax.export.traced import Walk, outer_padding, trace
 
+# the first whose reductions all take their axes as an input
 OPSET = 18
 _ELEMENTWISE = {
     "add": "Add",

@@ -23,6 +23,7 @@ def flat_observation(observation: Observation) -> jax.Array:
     In this order: its own state (see `Observation.self_state`), the other pursuers, the nearest
     pillars, and its position relative to where the evader was last seen (m). What isn't seen is -5.
     """
+    # the axes of worlds and pursuers stay; what each sees of others and pillars becomes one row
     lead = observation.self_state.shape[:-1]
     parts = (
         observation.self_state,

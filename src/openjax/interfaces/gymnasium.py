@@ -75,6 +75,7 @@ class PursuitEnv(Env):
 
     def reset(self, *, seed: int | None = None, options: dict | None = None):
         """Start an episode; `seed` determines it and those that follow. `options` are ignored."""
+        # Gymnasium's generator draws our key, so that its seed determines all episodes
         super().reset(seed=seed)
         key = jax.random.key(int(self.np_random.integers(2**31)))
         observation, self._state = self._reset(key)

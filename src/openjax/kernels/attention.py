@@ -203,6 +203,7 @@ class _Entities(NamedTuple):
 
 def _softmax(scores):
     """Softmax over a list of equally shaped arrays."""
+    # less the largest, or an exponential of a large score would be infinite
     top = functools.reduce(jnp.maximum, scores)
     parts = [jnp.exp(s - top) for s in scores]
     total = functools.reduce(jnp.add, parts)

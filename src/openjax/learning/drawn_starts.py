@@ -45,6 +45,7 @@ def draw_start(settings: PursuitSettings, key: PRNGKeyArray) -> Task:
     """A task to learn from: close to something, side by side, or any."""
     task_key, turn_key, start_key, choice_key = jax.random.split(key, 4)
     task = turn_task(turn_key, uniform_task(settings, task_key))
+    # with a share of the pursuers left where they are, so that not all starts are tight
     near = close_starts(settings, start_key, task, 0.7)
     beside = side_by_side(settings, start_key, task) if settings.num_pursuers > 1 else near
     kind = jax.random.uniform(choice_key)

@@ -85,5 +85,6 @@ def crashed(
     on_pillar = jnp.any(
         pillar_active & (pillar_distance(settings, position, pillar_position) < reach), axis=-1
     )
+    # two radii, but one touch and one margin
     on_drone = jnp.any(drone_distance(position) < DRONE_RADIUS + reach, axis=-1)
     return on_floor | on_pillar | on_drone | (body_z_up < margin)

@@ -221,6 +221,7 @@ def _nearest_pillars(settings, position, pillar_position, pillar_active):
     n = settings.num_pursuers
     k = settings.observed_pillars
     slots = pillar_position.shape[0]
+    # a network has inputs for k pillars, a task may have fewer slots
     if slots < k:
         pillar_position = jnp.concatenate([pillar_position, jnp.zeros((k - slots, 2), jnp.float32)])
         pillar_active = jnp.concatenate([pillar_active, jnp.zeros(k - slots, bool)])

@@ -83,6 +83,7 @@ def total_reward(terms: tuple[Term, ...], transition: Transition) -> tuple[Each,
     """(N,) reward of each pursuer, the sum of the terms in their order, penalties last; and (N,)
     the sum of its penalties. Empty slots have none.
     """
+    # penalties apart, as a training may let them grow; always in one order, which rounds alike
     nothing = jnp.zeros(transition.settings.num_pursuers, jnp.float32)
 
     def total(is_penalty):
@@ -150,6 +151,7 @@ def recapture(transition: Transition) -> Flag:
 def steadiness(transition: Transition) -> Each:
     """(N,) from one, where the squashed command stays, to zero."""
     change = transition.state.previous_action - transition.before.previous_action
+    # the small number keeps the root's gradient finite where nothing changes
     return jnp.exp(-jnp.sqrt(jnp.sum(change**2, axis=-1) + 1e-12))
 
 

@@ -212,6 +212,7 @@ class PursuitSettings:
                 f"{max(self.team_sizes)}, here it's {self.num_pursuers}"
             )
         for name in ("evader_speeds", "capture_radii", "fall_out_seconds"):
+            # none at all is fine, but for the seconds of those that fall out
             drawn = getattr(self, name)
             needed = name == "fall_out_seconds" and self.fall_outs
             if (drawn or needed) and (len(drawn) != 2 or drawn[0] > drawn[1]):

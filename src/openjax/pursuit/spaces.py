@@ -23,4 +23,5 @@ class Box:
             return jax.random.bernoulli(key, 0.5, self.shape)
         if np.isfinite(self.low) and np.isfinite(self.high):
             return jax.random.uniform(key, self.shape, self.dtype, self.low, self.high)
+        # what is unbounded, observations, is of the order of one
         return jax.random.normal(key, self.shape, self.dtype)

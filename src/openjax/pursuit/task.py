@@ -93,6 +93,7 @@ def task_descriptor(tasks: Task) -> Float[Array, "tasks features"]:
     """(M, D) what tells M tasks apart: all start positions and the pillars in use (m), and the
     numbers of its own that a task has.
     """
+    # two tasks that differ in slots that aren't used are the same
     pillars = jnp.where(tasks.pillar_active[..., None], tasks.pillar_position, 0.0)
     m = pillars.shape[0]
     pursuers = tasks.pursuer_position
@@ -140,6 +141,8 @@ def uniform_task(settings: PursuitSettings, key: PRNGKeyArray) -> Task:
     high = jnp.array([START_X[1], START_Y, middle + START_Z], jnp.float32)
     # each further pursuer about halves the chance that all are apart
     draws = CANDIDATES * 2 ** max(0, n - 3)
+    # all candidates at once and the first good one: a loop that draws until one is good would have
+    # no fixed length
     candidates = jax.random.uniform(position_key, (draws, n, 3), jnp.float32, low, high)
     active = draw_team(settings, key)
     apart = jax.vmap(
@@ -193,6 +196,7 @@ def expand_task(
             moved = position + jax.random.uniform(
                 key, position.shape, jnp.float32, -EXPANSION, EXPANSION
             )
+            # who would come too near the wall is drawn back along the radius
             radius = jnp.linalg.norm(moved[..., :2], axis=-1, keepdims=True)
             reach = settings.arena_radius - wall_distance
             xy = moved[..., :2] * jnp.minimum(1.0, reach / jnp.maximum(radius, 1e-6))
@@ -317,6 +321,7 @@ def line_up_pillars(settings: PursuitSettings, key: PRNGKeyArray, task: Task) ->
     middle = jax.random.uniform(middle_key, (2,), jnp.float32, -ROW_OFFSET, ROW_OFFSET)
     angle = jax.random.uniform(angle_key, (), jnp.float32, -np.pi / 4, np.pi / 4)
     spacing = jax.random.uniform(spacing_key, (), jnp.float32, *ROW_SPACING)
+    # symmetric about the row's middle, whatever the number of pillars
     number = jnp.sum(task.pillar_active)
     along = (jnp.arange(task.pillar_active.shape[0]) - (number - 1) / 2) * spacing
     direction = jnp.stack([-jnp.sin(angle), jnp.cos(angle)])

@@ -128,6 +128,7 @@ class _Programs:
         as it was with the nominal vehicle: to fly as fast with the diagnosed one is what is wanted,
         and a vehicle that made a policy slower did nothing good by it.
         """
+        # the same draws for all that is compared, here and in each look
         usual = self._fly(self._parameters, self._chosen_by, 1, self._nominal)
 
         def scores(policy):
@@ -224,6 +225,7 @@ def _diagnosis(command: AdaptCommand) -> Iterator[Callable[[], Path]]:
         return
     out = command.out / "diagnosis"
     name = command.flights.resolve().name
+    # a process of its own: within one, the diagnosis and the tracing of programs would take turns
     shutil.rmtree(out, ignore_errors=True)
     process = subprocess.Popen(
         [sys.executable, "-m", "openjax.diagnose", str(command.flights), "--out", str(out)],

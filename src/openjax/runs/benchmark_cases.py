@@ -57,6 +57,7 @@ def _training(settings, devices):
     """The whole training step, then, of one device, the programs that it is made of: (name,
     function, its arguments).
     """
+    # what is timed begins where a run does; later updates take as long
     carry = make_start(settings)(jax.random.key(0))
     if devices > 1:
         step = make_device_step(settings, build(settings), devices)

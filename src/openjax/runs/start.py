@@ -65,6 +65,7 @@ def membership(arguments: Sequence[str]) -> Membership | None:
     if {"-h", "--help"} & set(arguments):
         return None
 
+    # not by tyro, which isn't asked before the devices are known; nine digits hold any job's number
     def number(name):
         text = peek(arguments, name)
         if text is not None and not (text.isdecimal() and len(text) <= 9):
@@ -265,6 +266,7 @@ def _comparison(command, stored):
 
 def _lasting(start_from):
     """The name of a policy, or a path that also holds in other folders."""
+    # what isn't there is left as it was typed, and the error that follows names it so
     if start_from is None or start_from in known_policies() or not Path(start_from).exists():
         return start_from
     return str(Path(start_from).absolute())

@@ -33,6 +33,7 @@ STYLE = {
 def filled(template: str, folder: Path, **values) -> str:
     """A template of a folder with its values and the pages' looks."""
     loader = jinja2.FileSystemLoader([folder, Path(__file__).parent])
+    # escaped, as names come from people's files; a name that is missing is an error, not a gap
     environment = jinja2.Environment(
         loader=loader, autoescape=True, undefined=jinja2.StrictUndefined
     )
@@ -57,6 +58,7 @@ def as_svg(figure: Figure, salt: str) -> str:
     the page's.
     """
     data = io.StringIO()
+    # without salt and date the same figure would be another file each time
     with rc_context({"svg.hashsalt": salt}):
         figure.savefig(data, format="svg", metadata={"Date": None, "Creator": None})
     text = data.getvalue()

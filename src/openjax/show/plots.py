@@ -144,7 +144,7 @@ def _draw_map(axes, cells):
     image = axes.imshow(rates, origin="lower", vmin=0, vmax=1, cmap="viridis", aspect="auto")
     axes.set_xticks(range(len(radii)), [f"{radius:g}" for radius in radii], fontsize=7)
     axes.set_yticks(range(len(ratios)), [f"{ratio:g}" for ratio in ratios], fontsize=7)
-    # between the middles of cells
+    # a picture's axes count cells: a ratio between two of them lies between their middles
     ends = {"left": -0.5, "right": len(ratios) - 0.5}
     edges = np.arange(len(radii) + 1) - 0.5
     for forced, style in zip(bounds.values(), ("-", "--"), strict=True):

@@ -127,6 +127,7 @@ class Checkpoints:
         A second save of the same update is ignored: training is deterministic, the content would be
         the same. Only a score that the first one lacked is worth writing it again.
         """
+        # one at a time: copies of two carries at once may not fit into memory
         self.wait()
         path = self.directory / f"{update:0{_DIGITS}d}"
         if self._processes.of_first(self._holds(path, score)):

@@ -42,6 +42,7 @@ def with_airframe(settings: PursuitSettings, vehicle: Path | None) -> PursuitSet
       UserError: a file that can't be used.
     """
     airframe = settings.airframe if vehicle is None else load_vehicle_file(vehicle).airframe
+    # a vehicle of one's own is no airframe by name: it flies in the game as it is
     if airframe == settings.airframe or airframe not in AIRFRAMES:
         return settings
     if settings.vehicles and settings.vehicles == vehicle_family(settings.airframe):

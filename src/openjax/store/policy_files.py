@@ -42,6 +42,7 @@ def save_policy_file(
         "format": _FORMAT,
         "settings": to_plain(settings),
         "notes": to_plain(notes or {}),
+        # as they were: in the file most are shorter
         "dtypes": {},
     }
     arrays = {}
@@ -84,6 +85,7 @@ def load_policy_file(
             f"{path} is no {kind}, or it's damaged ({type(error).__name__}); expected one written "
             f"by {writer} (.npz)"
         ) from error
+    # float16 turns what is larger than 65,504 into infinity, and a flipped bit may do it, too
     broken = [
         name for name, leaf in leaves.items() if not np.isfinite(leaf.astype(np.float32)).all()
     ]

@@ -118,6 +118,7 @@ def greedy(scene: Scene, memory: Memory) -> tuple[Vector, Memory]:
     tried = directions(DIRECTIONS)
     ends, open_way = _ends(scene, scene.position, tried)
     score = jnp.where(open_way, _nearness(scene, ends, scene.pursuers), -jnp.inf)
+    # who knows of nobody stays where it is
     return _chosen(tried, score) * jnp.any(scene.known), memory
 
 
@@ -129,6 +130,7 @@ def two_step(scene: Scene, memory: Memory) -> tuple[Vector, Memory]:
     first, open_way = _ends(scene, scene.position, tried)
 
     def best_after(end):
+        # as if they knew where it goes, at full speed: nothing is worse for it
         to_end = end - scene.pursuers
         step = jnp.minimum(scene.settings.max_speed * scene.look_ahead / _length(to_end), 1.0)
         answer = scene.pursuers + step * to_end
@@ -262,6 +264,7 @@ def _nearness(scene, ends, pursuers):
             scene.settings, pursuers, end, scene.pillar_position, scene.pillar_active
         )
     )(ends)
+    # hiding pays as if the pursuer were that much farther
     distance = distance + jnp.where(sees, 0.0, scene.hiding)
     return jnp.min(jnp.where(scene.known, distance, FAR_AWAY), axis=-1)
 

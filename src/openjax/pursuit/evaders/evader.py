@@ -51,6 +51,7 @@ def draw_row(
     Raises:
       UserError: one's own remembers more than fits beside a learned one's memory.
     """
+    # the paper's has no numbers to draw and no memory: its game carries nothing for them
     behaviours = [row.behaviour for row in rows]
     if set(behaviours) == {"field"}:
         return None
@@ -114,6 +115,7 @@ def evader_velocity(
     """
     if world.evader is None and wish is None:
         return _field(settings, world), None
+    # what they decide is a choice among directions, which has no gradient
     world = jax.lax.stop_gradient(world)
     state = world.evader
     if state is None:
