@@ -48,13 +48,13 @@ def on_platform(reference: Callable, kernel: Callable, *static) -> Callable:
     come first.
     """
 
-    reference = functools.partial(reference, *static)
-    kernel = functools.partial(kernel, *static)
+    by_formula = functools.partial(reference, *static)
+    by_kernel = functools.partial(kernel, *static)
 
     def run(*arrays):
         if not can_compile_for_cuda():
-            return reference(*arrays)
-        return jax.lax.platform_dependent(*arrays, default=reference, cuda=kernel)
+            return by_formula(*arrays)
+        return jax.lax.platform_dependent(*arrays, default=by_formula, cuda=by_kernel)
 
     return run
 

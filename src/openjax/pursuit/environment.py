@@ -429,10 +429,12 @@ class Pursuit:
         terminated, truncated = self._end(step)
         return self._observe(state, seen_drones), state, rewards, terminated, truncated, info
 
-    def _outcome(self, before, state, active):
-        """What happened in a step to the slots that are `active`, and its rewards."""
+    def _outcome(self, start, state, active):
+        """What happened in a step from `start` to `state` to the slots that are `active`, and its
+        rewards.
+        """
         info = self._events(state).of_team(active)
-        transition = Transition(self.settings, before, state, info)
+        transition = Transition(self.settings, start, state, info)
         rewards, penalty = total_reward(self.terms, transition)
         return info.replace(penalty=penalty), rewards
 
