@@ -4,6 +4,7 @@ in one line.
 
 import dataclasses
 import math
+import re
 import typing
 
 import pytest
@@ -127,3 +128,10 @@ def test_help_shows_the_range(capsys):
         in shown
     )
     assert "In [1, 8]." in shown
+    # each option stands alone, and is written as the pages write it
+    unexplained = re.findall(
+        r"(--[\w.]+) (?:INT|FLOAT|\{None\}\|INT|\{None\}\|FLOAT) In [\[(]", shown
+    )
+    assert not unexplained
+    assert not re.search(r"\.\.\. In | \.\.\. [a-z]", shown), "goes on in another option's text"
+    assert "--layout_episodes" in shown

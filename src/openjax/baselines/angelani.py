@@ -31,7 +31,7 @@ class AngelaniParameters:
     """Distance from their surface at which that is half of its weight (m)."""
 
 
-def angelani(craft: Craft, parameters: AngelaniParameters, known: Surroundings) -> jax.Array:
+def angelani(craft: Craft, parameters: AngelaniParameters, around: Surroundings) -> jax.Array:
     """Desired velocities (..., N, 3), m/s, world.
 
     v = v_max N[N(r_e - r_i) + w_a N(sum_j v_j) + w_r sum_j N(r_i - r_j) / (1 + exp((d_ij - r_r) /
@@ -41,19 +41,19 @@ def angelani(craft: Craft, parameters: AngelaniParameters, known: Surroundings) 
     def fermi(distance, middle):
         return jax.nn.sigmoid((middle - distance) / parameters.width)
 
-    distance = jnp.sqrt(jnp.sum(known.from_others**2, axis=-1) + 1e-12)
-    apart = fermi(distance, parameters.repulsion_range)[..., None] * unit(known.from_others)
+    distance = jnp.sqrt(jnp.sum(around.from_others**2, axis=-1) + 1e-12)
+    apart = fermi(distance, parameters.repulsion_range)[..., None] * unit(around.from_others)
 
-    near = fermi(known.obstacle_distance, parameters.obstacle_range)
-    sideways = jnp.sum(near[..., None] * known.obstacle_normal, axis=-2)
+    near = fermi(around.obstacle_distance, parameters.obstacle_range)
+    sideways = jnp.sum(near[..., None] * around.obstacle_normal, axis=-2)
     # the floor pushes up, the ceiling down
-    from_floor = fermi(known.floor_distance, parameters.obstacle_range)
-    from_ceiling = fermi(known.ceiling_distance, parameters.obstacle_range)
+    from_floor = fermi(around.floor_distance, parameters.obstacle_range)
+    from_ceiling = fermi(around.ceiling_distance, parameters.obstacle_range)
     obstacles = level(sideways) + upward(from_floor - from_ceiling)
 
     force = (
-        unit(known.target - known.position)
-        + parameters.alignment * unit(known.team_velocity)
+        unit(around.target - around.position)
+        + parameters.alignment * unit(around.team_velocity)
         + parameters.repulsion * jnp.sum(apart, axis=-2)
         + parameters.obstacle * obstacles
     )

@@ -48,7 +48,7 @@ class Forces:
     inside: jax.Array  # (..., N) bool, nearer to an obstacle than the margin
 
 
-def forces(parameters: ApfParameters, known: Surroundings) -> Forces:
+def forces(parameters: ApfParameters, around: Surroundings) -> Forces:
     """The field at each pursuer; parameters () or (..., N)."""
 
     def push(gap, eta, rho, margin):
@@ -60,32 +60,32 @@ def forces(parameters: ApfParameters, known: Surroundings) -> Forces:
     rho = jnp.asarray(parameters.influence)
     margin = jnp.asarray(parameters.margin)
     # an axis more: each pursuer's parameters hold for all of its obstacles
-    each = push(known.obstacle_distance, eta[..., None], rho[..., None], margin[..., None])
-    from_floor = push(known.floor_distance, eta, rho, margin)
-    from_ceiling = push(known.ceiling_distance, eta, rho, margin)
+    each = push(around.obstacle_distance, eta[..., None], rho[..., None], margin[..., None])
+    from_floor = push(around.floor_distance, eta, rho, margin)
+    from_ceiling = push(around.ceiling_distance, eta, rho, margin)
 
-    distance = length(known.from_others)
+    distance = length(around.from_others)
     beyond = jnp.maximum(distance - SAFE_PURSUER, NEAREST)
     balance = jnp.asarray(parameters.balance)[..., None, None]
-    pull = -known.from_others / distance * (0.5 - balance / beyond)
-    sideways = jnp.sum(each[..., None] * known.obstacle_normal, axis=-2)
+    pull = -around.from_others / distance * (0.5 - balance / beyond)
+    sideways = jnp.sum(each[..., None] * around.obstacle_normal, axis=-2)
     return Forces(
-        attraction=unit(known.target - known.position),
+        attraction=unit(around.target - around.position),
         repulsion=level(sideways) + upward(from_floor - from_ceiling),
-        individual=jnp.sum(pull, axis=-2) / max(known.from_others.shape[-2], 1),
-        inside=jnp.min(known.obstacle_distance, axis=-1) < parameters.margin,
+        individual=jnp.sum(pull, axis=-2) / max(around.from_others.shape[-2], 1),
+        inside=jnp.min(around.obstacle_distance, axis=-1) < parameters.margin,
     )
 
 
-def apf(craft: Craft, parameters: ApfParameters, known: Surroundings) -> jax.Array:
+def apf(craft: Craft, parameters: ApfParameters, around: Surroundings) -> jax.Array:
     """Desired velocities (..., N, 3), m/s, world: along the field, or along an obstacle that is in
     the way.
     """
-    field = forces(parameters, known)
+    field = forces(parameters, around)
     # without the force between pursuers: it alone never holds anybody in a local minimum
     towards = field.attraction + field.repulsion
     blocked = jnp.sum(towards * field.attraction, axis=-1, keepdims=True) < 0.0
-    along = wall_following(field, known.velocity)
+    along = wall_following(field, around.velocity)
     total = towards + field.individual
     return craft.speed * jnp.where(blocked, along, unit(total))
 

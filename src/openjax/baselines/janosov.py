@@ -38,25 +38,25 @@ class JanosovParameters:
     """That size in units of the speed; the prey's over the chasers' in the source."""
 
 
-def janosov(craft: Craft, parameters: JanosovParameters, known: Surroundings) -> jax.Array:
+def janosov(craft: Craft, parameters: JanosovParameters, around: Surroundings) -> jax.Array:
     """Desired velocities (..., N, 3), m/s, world: the sum of the terms, cut at the largest
     speed.
     """
-    to_target = known.target - known.position
+    to_target = around.target - around.position
     # no farther ahead than the prey could come here itself
-    coming = length(to_target) / jnp.maximum(length(known.target_velocity), 1e-3)
+    coming = length(to_target) / jnp.maximum(length(around.target_velocity), 1e-3)
     ahead = jnp.minimum(parameters.prediction_time, coming)
-    predicted = known.target + ahead * known.target_velocity
-    relative = known.velocity - known.target_velocity
+    predicted = around.target + ahead * around.target_velocity
+    relative = around.velocity - around.target_velocity
     # a prey that isn't seen has no velocity to be damped against
-    seen = jnp.any(known.target_velocity != 0.0, axis=-1, keepdims=True)
+    seen = jnp.any(around.target_velocity != 0.0, axis=-1, keepdims=True)
     friction = jnp.where(seen, relative / jnp.maximum(length(to_target) ** 2, 1e-4), 0.0)
-    chase = unit(unit(predicted - known.position) - parameters.chase_friction * friction)
+    chase = unit(unit(predicted - around.position) - parameters.chase_friction * friction)
 
-    distance = length(known.from_others)
-    away = known.from_others / distance
+    distance = length(around.from_others)
+    away = around.from_others / distance
     spread = away * jnp.maximum(parameters.interaction_range - distance, 0.0)
-    spread = spread - parameters.interaction_friction * known.from_others_velocity / distance**2
+    spread = spread - parameters.interaction_friction * around.from_others_velocity / distance**2
     within = distance < parameters.interaction_range
     spread = jnp.sum(jnp.where(within, spread, 0.0), axis=-2)
     avoidance = jnp.sum(away * jnp.maximum(parameters.avoidance_range - distance, 0.0), axis=-2)
@@ -65,10 +65,10 @@ def janosov(craft: Craft, parameters: JanosovParameters, known: Surroundings) ->
         """0 from `wall_range` on, 1 at the surface, a half sine between (equation 6)."""
         return 0.5 + 0.5 * jnp.cos(jnp.pi * jnp.clip(gap / parameters.wall_range, 0.0, 1.0))
 
-    near = soft_wall(known.obstacle_distance)
-    sideways = jnp.sum(near[..., None] * known.obstacle_normal, axis=-2)
+    near = soft_wall(around.obstacle_distance)
+    sideways = jnp.sum(near[..., None] * around.obstacle_normal, axis=-2)
     # the floor pushes up, the ceiling down
-    vertical = soft_wall(known.floor_distance) - soft_wall(known.ceiling_distance)
+    vertical = soft_wall(around.floor_distance) - soft_wall(around.ceiling_distance)
     walls = level(sideways) + upward(vertical)
     terms = (
         chase + parameters.interaction * unit(spread) + unit(avoidance) + parameters.wall * walls

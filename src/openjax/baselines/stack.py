@@ -88,13 +88,13 @@ class StackParameters:
     """1/s, distance to velocity."""
 
 
-def stack(craft: Craft, parameters: StackParameters, known: Surroundings) -> jax.Array:
+def stack(craft: Craft, parameters: StackParameters, around: Surroundings) -> jax.Array:
     """Desired velocities (..., N, 3), m/s, world."""
-    number = known.position.shape[-2]
+    number = around.position.shape[-2]
     goal = craft.arena_height * (2 * jnp.arange(number) + 1.0) / (2 * number)
-    height = goal - known.position[..., 2]
-    target = known.target[..., :2]
-    place = known.position[..., :2]
+    height = goal - around.position[..., 2]
+    target = around.target[..., :2]
+    place = around.position[..., :2]
     out = target / length(target)
     aside = jnp.stack([-out[..., 1], out[..., 0]], axis=-1)
     along = jnp.sum(place * out, axis=-1)
@@ -103,10 +103,10 @@ def stack(craft: Craft, parameters: StackParameters, known: Surroundings) -> jax
     # all must stand before any moves: the bound holds for a whole stack only
     ready = jnp.all(ready & (along > -parameters.tolerance), axis=-1, keepdims=True)
 
-    def cut(speed, left):
+    def cut(speed, rest):
         """Velocity at most what is left of the speed, and what then is left (both (...,))."""
-        speed = jnp.clip(speed, -left, left)
-        return speed, jnp.sqrt(jnp.maximum(left**2 - speed**2, 0.0))
+        speed = jnp.clip(speed, -rest, rest)
+        return speed, jnp.sqrt(jnp.maximum(rest**2 - speed**2, 0.0))
 
     # what keeps the ray comes first, then the height; moving outwards gets what speed is left
     left = jnp.full_like(height, craft.speed)

@@ -64,7 +64,9 @@ _NOT_EXPLAINED = (
 _ADVICE = {
     "thrust_constant": "climb and descend hard, or log the pose",
     "torque_constant": "turn left and right sharply",
-    "motor_time_constant": "change thrust or rates sharply, with motors and IMU logged on one clock",
+    "motor_time_constant": (
+        "change thrust or rates sharply, with motors and IMU logged on one clock"
+    ),
     "inertia": "roll and pitch sharply left and right",
 }
 _ASSUMED_MASS = "for the assumed mass, which wasn't weighed"

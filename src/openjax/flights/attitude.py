@@ -120,9 +120,9 @@ def _integrated(rates: np.ndarray) -> Rotation:
     return Rotation.from_quat(found)
 
 
-def _kabsch(vectors: np.ndarray, wanted: np.ndarray) -> Rotation:
+def _kabsch(vectors: np.ndarray, targets: np.ndarray) -> Rotation:
     """The rotation that turns vectors (W, 3) into wanted ones best."""
-    return Rotation.align_vectors(wanted, vectors)[0]
+    return Rotation.align_vectors(targets, vectors)[0]
 
 
 def _means(values: np.ndarray, ends: np.ndarray) -> np.ndarray:

@@ -92,19 +92,19 @@ def _usable(read, vehicle_file: VehicleFile, comparison: bool) -> tuple[list[Fli
 
 
 def _trusted(
-    kept: list[Flight], issues: list[Issue], vehicle_file: VehicleFile
+    flights: list[Flight], issues: list[Issue], vehicle_file: VehicleFile
 ) -> tuple[list[Flight], list[Issue]]:
     """The flights without those that are too calm to show what most others contradict: columns are
     mixed up for a case.
     """
     failed = Counter(what for issue in issues for what in issue.against)
     if not failed:
-        return kept, []
-    shown = [shown_right(f, vehicle_file.vehicle_of(f.vehicle)) for f in kept]
+        return flights, []
+    shown = [shown_right(f, vehicle_file.vehicle_of(f.vehicle)) for f in flights]
     passed = Counter(what for flight in shown for what in flight)
     out = []
     found = []
-    for flight, right in zip(kept, shown, strict=True):
+    for flight, right in zip(flights, shown, strict=True):
         doubts = [what for what in failed if what not in right and failed[what] > passed[what]]
         if not doubts:
             out.append(flight)

@@ -116,13 +116,13 @@ def _unusual(gain: np.ndarray, error: np.ndarray, usual: float) -> str:
     return ", ".join(f"{a} {g:.3f}" for a, g, o in zip("xyz", gain, off, strict=True) if o)
 
 
-def corrected(track: Track, found: Kinematics) -> Track:
+def corrected(track: Track, kinematics: Kinematics) -> Track:
     """The track as it would read with sensors that agree."""
     changes = {}
-    if found.gain != 1.0:
-        changes["body_rates"] = track.body_rates / found.gain
-    if found.tilt is not None:
-        turn = Rotation.from_rotvec([*-found.tilt, 0.0])
+    if kinematics.gain != 1.0:
+        changes["body_rates"] = track.body_rates / kinematics.gain
+    if kinematics.tilt is not None:
+        turn = Rotation.from_rotvec([*-kinematics.tilt, 0.0])
         logged = [n for n in ("position", "velocity") if getattr(track, n) is not None]
         changes |= {name: turn.apply(getattr(track, name)) for name in logged}
         attitude = turn * Rotation.from_quat(track.quaternion, scalar_first=True)

@@ -1,8 +1,8 @@
 """Plans of set-points as CSV files: rows of 10 ms, for `openjax fly --plan` and for Crazyswarm2.
 
-Columns: t (s); x, y, z (m), vx, vy, vz (m/s), ax, ay, az (m/s^2), world; yaw (rad), as Crazyswarm2's
-`cmdFullState` takes them; then what is added to the commands of a controller of thrust and body
-rates: thrust (share of the largest), wx, wy, wz (rad/s); segment's name.
+Columns: t (s); x, y, z (m), vx, vy, vz (m/s), ax, ay, az (m/s^2), world; yaw (rad), as
+Crazyswarm2's `cmdFullState` takes them; then what is added to the commands of a controller of
+thrust and body rates: thrust (share of the largest), wx, wy, wz (rad/s); segment's name.
 """
 
 from collections.abc import Iterable
@@ -75,7 +75,9 @@ def write_plan(path: Path, plan: SetPoints) -> None:
 
 
 def read_plan(name_or_path: str | Path) -> SetPoints:
-    """The standard plan by its name, or a plan's CSV. Raises UserError where that can't be flown."""
+    """The standard plan by its name, or a plan's CSV. Raises UserError where that can't be
+    flown.
+    """
     if str(name_or_path) == STANDARD and not Path(name_or_path).exists():
         return plan_of()
     path = Path(name_or_path)

@@ -40,14 +40,15 @@ NOTHING = ("na", "n/a", "#n/a", "null", "none", "-", "--")
 
 @dataclass(frozen=True, eq=False)
 class LogTable:
-    """One log file as columns of the log format: `columns[name]` (R,) float64, NaN where a cell was
-    empty; `vehicle` (R,) ids. `remarks` are things found while reading that don't stop it.
-    """
+    """One log file as columns of the log format."""
 
     name: str
     columns: dict[str, np.ndarray]
+    """{name: (R,) float64}, NaN where a cell was empty."""
     vehicle: np.ndarray
+    """(R,) ids."""
     remarks: tuple[str, ...] = field(default=())
+    """What was found while reading and doesn't stop it."""
 
 
 def read_csv(
@@ -166,17 +167,12 @@ def flights_of(
     flights = []
     for vehicle_id in ids:
         rows = np.flatnonzero(table.vehicle == vehicle_id)
-        own = {c: v[rows] for c, v in channels.items() if not np.isnan(v[rows]).all()}
+        # in the long format a vehicle's rows hold what it logged, and nothing of the others'
+        logged = {c: v[rows] for c, v in channels.items() if not np.isnan(v[rows]).all()}
         name = table.name if len(ids) == 1 else f"{table.name}:{vehicle_id}"
+        time = table.columns["t"][rows]
         flights.append(
-            Flight(
-                name,
-                table.name,
-                vehicle_id,
-                table.columns["t"][rows],
-                fingerprint=fingerprint,
-                **own,
-            )
+            Flight(name, table.name, vehicle_id, time, fingerprint=fingerprint, **logged)
         )
     return flights, remarks
 
@@ -217,12 +213,11 @@ def write_csv(path: str | Path, table: LogTable, decimals: dict[str, int] | None
         if name == "vehicle":
             return table.vehicle.tolist()
         form = f"%.{decimals.get(name, 6)}f"
-        return [
-            "" if math.isnan(v) else form % v
-            for v in np.asarray(table.columns[name], float).tolist()
-        ]
+        numbers = np.asarray(table.columns[name], float).tolist()
+        return ["" if math.isnan(number) else form % number for number in numbers]
 
-    lines = [",".join(names), *(",".join(row) for row in zip(*map(cells, names), strict=True))]
+    rows = zip(*map(cells, names), strict=True)
+    lines = [",".join(names), *(",".join(row) for row in rows)]
     data = ("\n".join(lines) + "\n").encode()
     path = Path(path)
     path.write_bytes(gzip.compress(data, 6, mtime=0) if path.suffix == ".gz" else data)

@@ -197,7 +197,7 @@ def log_of(columns: list[dict[str, Shaped[np.ndarray, "..."]]], name: str) -> Lo
 def _fly(
     plant: Vehicle,
     assumed: Vehicle,
-    wanted,
+    target,
     voltage,
     parameters,
     key,
@@ -206,11 +206,11 @@ def _fly(
     sensors: SensorModel,
 ):
     effects = composition.resolve(names)
-    count = wanted[0].shape[1]
+    count = target[0].shape[1]
     flown = composition.change_body(effects, parameters, plant)
     key, bias_key, memory_key = jax.random.split(key, 3)
     gyro_bias = sensors.gyro_bias * jax.random.normal(bias_key, (count, 3))
-    drones = hover_state(plant, wanted[0][0], velocity=wanted[1][0])
+    drones = hover_state(plant, target[0][0], velocity=target[1][0])
     memory = jax.vmap(lambda d, k: composition.initial_memory(effects, plant, d, PERIOD, k))(
         drones, jax.random.split(memory_key, count)
     )
@@ -271,9 +271,9 @@ def _fly(
 
     hover = jnp.zeros((count, 3)).at[:, 2].set(flown.mass * flown.gravity)
     load = jnp.full(count, 0.6)
-    air_time = jnp.arange(wanted[0].shape[0], dtype=jnp.float32) * PERIOD
+    air_time = jnp.arange(target[0].shape[0], dtype=jnp.float32) * PERIOD
     start = (drones, jnp.zeros((count, 3)), hover, load, key)
-    return jax.lax.scan(row, start, (wanted, air_time, gusts))[1]
+    return jax.lax.scan(row, start, (target, air_time, gusts))[1]
 
 
 def _physics(vehicle, effects, parameters, drone: DroneState, motor_command, context, gust):
@@ -290,12 +290,12 @@ def _physics(vehicle, effects, parameters, drone: DroneState, motor_command, con
     return drone.replace(rotor_speed=speed), force
 
 
-def _position_controller(assumed: Vehicle, state: DroneState, integral, wanted):
+def _position_controller(assumed: Vehicle, state: DroneState, integral, target):
     """Command (4,) of a position controller and its integral (3,) m s: PID to a wanted
     acceleration, thrust along body z, attitude error to body rates. Gains are for a vehicle of this
     size.
     """
-    position, velocity, acceleration, yaw, extra = wanted
+    position, velocity, acceleration, yaw, extra = target
     error = position - state.position
     integral = jnp.clip(integral + error * PERIOD, -0.5, 0.5)
     pull = acceleration + 9.0 * error + 5.0 * (velocity - state.velocity) + 5.0 * integral

@@ -16,8 +16,9 @@ EDGE = 0.03  # cycles of that clock by which its phase may be wrong
 
 
 def several_recordings(time: np.ndarray, in_order: np.ndarray | None = None) -> str:
-    """What is wrong with the order of times (T,), in s: nothing if few rows are out of it, or if all
-    are those of one recording, shuffled. `in_order`: the same sorted, less rows that stand twice.
+    """What is wrong with the order of times (T,), in s: nothing if few rows are out of it, or if
+    all are those of one recording, shuffled. `in_order`: the same sorted, less rows that stand
+    twice.
     """
     steps = np.diff(time)
     backwards = int((steps < 0).sum())
@@ -83,7 +84,8 @@ def _standing_still(flight: Flight, channel: str, rows, note) -> np.ndarray:
     if frozen.any():
         share = frozen.mean()
         start = flight.time[np.argmax(frozen)]
-        words = f"{', '.join(columns)} stand still for {share * flight.duration:.1f} s from t = {start:.2f}"
+        still = f"stand still for {share * flight.duration:.1f} s from t = {start:.2f}"
+        words = f"{', '.join(columns)} {still}"
         if share > 0.5:
             raise Refused("corrupt", f"{words}: frozen for {share:.0%} of the flight")
         note("corrupt", f"{words}; taken as not sampled there")
@@ -189,13 +191,13 @@ def put_in_step(flight: Flight, note) -> Flight:
     return dataclasses.replace(flight, **changes)
 
 
-def _regular_clock(seen: np.ndarray, row: float) -> np.ndarray | None:
+def _regular_clock(times: np.ndarray, row: float) -> np.ndarray | None:
     """Times (S,) of a regular clock whose ticks were seen at times (S,) up to a `row` s apart from
     it, later where rows are missing; None where they have none. Its rate is where the phases of
     what was seen agree most (Rayleigh's periodogram).
     """
-    since = seen - seen[0]
-    usual = (len(seen) - 1) / since[-1]
+    since = times - times[0]
+    usual = (len(times) - 1) / since[-1]
     rates = np.arange(0.9 * usual, 1.15 * usual, 0.2 / since[-1])
     turned = np.exp(2j * np.pi * rates[:, None] * since).mean(1)
     best = int(np.argmax(np.abs(turned)))
@@ -206,7 +208,7 @@ def _regular_clock(seen: np.ndarray, row: float) -> np.ndarray | None:
     late = rates[best] * since - middle + 0.5 * row * rates[best]
     ticks = np.floor(late + EDGE)
     usual = late - ticks < row * rates[best] + EDGE
-    slope, start = np.polyfit(ticks[usual], seen[usual], 1)
+    slope, start = np.polyfit(ticks[usual], times[usual], 1)
     return start + slope * ticks
 
 

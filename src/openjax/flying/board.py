@@ -78,13 +78,13 @@ class Board:
         self._numbers = context.RawArray("d", _HEAD + _EACH * number)
         self.silence = silence
 
-    def beat(self, role: Role, now: float) -> None:
-        """`role` lives at `now` (s)."""
-        self._numbers[_BEATS + role] = now
+    def beat(self, role: Role, time: float) -> None:
+        """`role` lives at `time` (s)."""
+        self._numbers[_BEATS + role] = time
 
-    def silent(self, role: Role, now: float) -> float:
+    def silent(self, role: Role, time: float) -> float:
         """For how long (s) nothing was heard of `role`; infinite if it never was."""
-        return now - (self._numbers[_BEATS + role] or -float("inf"))
+        return time - (self._numbers[_BEATS + role] or -float("inf"))
 
     def enter(self, role: Role) -> None:
         """This process is `role`'s."""
@@ -107,8 +107,8 @@ class Board:
                 select.select([process], [], [], self.silence)
                 os.close(process)
 
-    def write(self, role: Role, now: float, state: State) -> None:
-        """`role` flew a tick at `now` (s), and this is what it knows."""
+    def write(self, role: Role, time: float, state: State) -> None:
+        """`role` flew a tick at `time` (s), and this is what it knows."""
         numbers = []
         for drone in state.drones:
             known = drone.estimate is not None
@@ -117,20 +117,20 @@ class Board:
         self._numbers[_HEAD:] = numbers
         self.flying = state.flying
         # the beat comes last: who takes over for a silent process finds a page that is whole
-        self.beat(role, now)
+        self.beat(role, time)
 
-    def read(self, state: State, now: float) -> State:
-        """`state` with what was written last, moved on to `now` (s): vehicles go on turning as they
-        were told.
+    def read(self, state: State, time: float) -> State:
+        """`state` with what was written last, moved on to `time` (s): vehicles go on turning as
+        they were told.
         """
         drones = []
         for i, drone in enumerate(state.drones):
             start = _HEAD + _EACH * i
             mode, trim, known, *numbers = self._numbers[start : start + _EACH]
-            pose = moved_on(pose_of(numbers), now) if known else None
+            pose = moved_on(pose_of(numbers), time) if known else None
             drones.append(drone._replace(mode=_MODES[int(mode)], trim=trim, estimate=pose))
         # from now on: that no action came while nobody flew is no reason to stop
-        return state._replace(drones=tuple(drones), time=now, action_time=now)
+        return state._replace(drones=tuple(drones), time=time, action_time=time)
 
 
 def start_deaf(process) -> None:

@@ -130,14 +130,14 @@ def lift_acceleration(quaternion, lift: float) -> Vector:
     return lift * GRAVITY * x, lift * GRAVITY * y, lift * GRAVITY * z - GRAVITY
 
 
-def moved_on(pose: Pose, now: float) -> Pose:
-    """The pose at `now` (s) if velocity and body rates have stayed what they were."""
-    age = now - pose.time
+def moved_on(pose: Pose, time: float) -> Pose:
+    """The pose at `time` (s) if velocity and body rates have stayed what they were."""
+    age = time - pose.time
     if age == 0.0:
         return pose
     position = tuple(p + age * v for p, v in zip(pose.position, pose.velocity, strict=True))
     quaternion = turned_on(pose.quaternion, pose.body_rates, age)
-    return pose._replace(time=now, position=position, quaternion=quaternion)
+    return pose._replace(time=time, position=position, quaternion=quaternion)
 
 
 def turned_on(quaternion, rates: Vector, duration: float) -> tuple[float, float, float, float]:
@@ -163,11 +163,11 @@ def wanted_velocity(position: Vector, target: Vector, speed: float) -> Vector:
     return tuple(v * share for v in wanted)
 
 
-def wanted_acceleration(velocity: Vector, wanted: Vector) -> Vector:
-    """The acceleration (m/s^2, world) that leads from a velocity to the `wanted` one, within the
+def wanted_acceleration(velocity: Vector, target: Vector) -> Vector:
+    """The acceleration (m/s^2, world) that leads from a velocity to the `target`, within the
     tilt limit.
     """
-    ax, ay, az = (VELOCITY_GAIN * (w - v) for w, v in zip(wanted, velocity, strict=True))
+    ax, ay, az = (VELOCITY_GAIN * (w - v) for w, v in zip(target, velocity, strict=True))
     # height first: the tilt that is left for the rest follows from the lift
     az = min(max(az, -CLIMB_LIMIT), CLIMB_LIMIT)
     level = math.hypot(ax, ay)

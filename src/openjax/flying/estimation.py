@@ -166,7 +166,7 @@ def _captured(state, drone, sample, moving) -> Drone:
     )
 
 
-def _with_motion(pose, last, own) -> Pose:
+def _with_motion(pose, last, estimate) -> Pose:
     """A pose of motion capture with the velocity from differences, smoothed, and the body rates of
     the gyroscope.
     """
@@ -181,5 +181,5 @@ def _with_motion(pose, last, own) -> Pose:
         for p, q, v in zip(pose.position, last.position, last.velocity, strict=True)
     )
     return pose._replace(
-        velocity=velocity, body_rates=pose.body_rates if own is None else own.body_rates
+        velocity=velocity, body_rates=pose.body_rates if estimate is None else estimate.body_rates
     )

@@ -207,11 +207,11 @@ class Guard:
       state: of the loop's state machine; settings, pillars and airframe are taken from it.
     """
 
-    def __init__(self, board: Board, own: RawLinks, state: State):
+    def __init__(self, board: Board, links: RawLinks, state: State):
         self._board = board
         context = multiprocessing.get_context("spawn")
         self._process = context.Process(
-            target=watch, args=(board, os.getpid(), own, state), name="openjax guard"
+            target=watch, args=(board, os.getpid(), links, state), name="openjax guard"
         )
         start_deaf(self._process)
 
@@ -234,10 +234,10 @@ class Guard:
             self._process.join()
 
 
-def watch(board: Board, parent: int, own: RawLinks, state: State) -> None:
+def watch(board: Board, parent: int, links: RawLinks, state: State) -> None:
     """The guard's process."""
     stand_alone()
-    own.open(udp_only=True)
+    links.open(udp_only=True)
     real_time.hurry()
     board.enter(Role.GUARD)
     while not board.over:
@@ -253,12 +253,12 @@ def watch(board: Board, parent: int, own: RawLinks, state: State) -> None:
             board.beat(Role.GUARD, now + OPENING)
             board.end_process(Role.LINKS)
             say("openjax fly: nothing from the links' process, the guard lands all vehicles")
-            own.open()
-            fly_down(board, Role.GUARD, own, state)
+            links.open()
+            fly_down(board, Role.GUARD, links, state)
         elif board.armed and not board.flying and links_silent:
             board.end_process(Role.LINKS)
-            own.open()
-            disarm(own, board, Role.GUARD)
+            links.open()
+            disarm(links, board, Role.GUARD)
         elif not board.flying and os.getppid() != parent and (links_silent or not board.armed):
             break
     os._exit(0)  # the links' threads would take a second each

@@ -44,9 +44,10 @@ SPEED = Memory(0.1, 0.2)
 does.
 """
 RISING = 0.3
+"""The same upwards (m/s), where the floor's cushion pushes."""
 SINKING = 0.7
-"""The same upwards (m/s), where the floor's cushion pushes, and downwards, where the wake of another
-vehicle does: .2 N (Shi et al. 2020) on 30 g.
+"""The same downwards (m/s), where the wake of another vehicle pushes: .2 N (Shi et al. 2020) on
+30 g.
 """
 STEP = 0.2
 """Of one pose's velocity against thrust (m/s): no wake pushes so much between two poses."""
@@ -151,12 +152,12 @@ class Innovations(NamedTuple):
         return Verdict.GOOD
 
 
-def turn_between(before: Sequence[float], after: Sequence[float]) -> Vector:
+def turn_between(start: Sequence[float], end: Sequence[float]) -> Vector:
     """The small rotation (rad, body) from one attitude wxyz to another."""
     # the vector part of conj(before) * after, which is half of a small rotation; `sign` also
     # chooses between q and -q
-    a, b, c, d = before
-    w, x, y, z = after
+    a, b, c, d = start
+    w, x, y, z = end
     scalar = a * w + b * x + c * y + d * z
     sign = math.copysign(2.0, scalar)
     return (

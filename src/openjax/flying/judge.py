@@ -129,21 +129,26 @@ class Track(NamedTuple):
     verdict: Verdict = Verdict.GOOD  # on the newest
     heard: float = -math.inf  # s, when that was measured
 
-    def fresh(self, now: float, limits: PoseLimits) -> bool:
-        """Whether its last good pose is new enough to fly by at `now` (s)."""
-        return self.pose is not None and now - self.pose.time <= limits.horizon
+    def fresh(self, time: float, limits: PoseLimits) -> bool:
+        """Whether its last good pose is new enough to fly by at `time` (s)."""
+        return self.pose is not None and time - self.pose.time <= limits.horizon
 
     def after(
-        self, pose: Pose | None, now: float, limits: PoseLimits, moving: bool, expected: Pose | None
+        self,
+        pose: Pose | None,
+        time: float,
+        limits: PoseLimits,
+        moving: bool,
+        expected: Pose | None,
     ) -> "Track":
-        """The track after its source's newest pose at `now` (s).
+        """The track after its source's newest pose at `time` (s).
 
         A pose that isn't newer than the last good one, or old, or from the future, changes nothing.
         Of a vehicle that isn't `moving` any pose is believed that is one. `expected`: see `judge`;
         at any time.
         """
         last = self.pose
-        if pose is None or not abs(now - pose.time) <= limits.horizon:
+        if pose is None or not abs(time - pose.time) <= limits.horizon:
             return self
         if last is None or not moving:
             verdict = judge(pose, None, 0.0, limits)
@@ -161,25 +166,25 @@ def at_one_time(a: Pose, b: Pose) -> tuple[Pose, Pose]:
     return moved_on(a, late), moved_on(b, late)
 
 
-def agree(captured: Pose, own: Pose, limits: PoseLimits) -> Verdict:
+def agree(captured: Pose, estimate: Pose, limits: PoseLimits) -> Verdict:
     """Whether motion capture and the vehicle's own estimate tell the same, at the later one's
     time.
     """
-    captured, own = at_one_time(captured, own)
-    near = math.dist(captured.position, own.position) <= limits.apart
-    turned = angle_between(captured.quaternion, own.quaternion) <= limits.turned
+    captured, estimate = at_one_time(captured, estimate)
+    near = math.dist(captured.position, estimate.position) <= limits.apart
+    turned = angle_between(captured.quaternion, estimate.quaternion) <= limits.turned
     return Verdict.GOOD if near and turned else Verdict.APART
 
 
-def follows(captured: Pose, own: Pose, limits: PoseLimits) -> bool:
+def follows(captured: Pose, estimate: Pose, limits: PoseLimits) -> bool:
     """Whether the estimator on board may be told a pose of motion capture: errors explain the
     distance from its own, at the later one's time.
 
     An estimator that is told late or drifting poses takes their error for a velocity, by which it
     would have to land.
     """
-    captured, own = at_one_time(captured, own)
-    return math.dist(own.position, captured.position) <= limits.position
+    captured, estimate = at_one_time(captured, estimate)
+    return math.dist(estimate.position, captured.position) <= limits.position
 
 
 def angle_between(a, b) -> float:

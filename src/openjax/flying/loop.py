@@ -120,11 +120,11 @@ class TickSchedule:
         self.skipped = 0
         self._in_step = False
 
-    def next(self, now: float, measured: Sequence[float]) -> float:
-        """The next tick's time, after one that ended at `now` and knew poses measured at `measured`
-        (s).
+    def next(self, time: float, measured: Sequence[float]) -> float:
+        """The next tick's time, after one that ended at `time` and knew poses measured at
+        `measured` (s).
         """
-        ages = sorted((self.due - t) % PERIOD for t in measured if now - t < GONE)
+        ages = sorted((self.due - t) % PERIOD for t in measured if time - t < GONE)
         shift = 0.0
         if ages:
             # poses come in a bunch: the newest of a bunch is the one after the longest pause
@@ -137,7 +137,7 @@ class TickSchedule:
             shift = min(max(0.02 * error, -1e-4), 1e-4) if self._in_step else error
             self._in_step = True
         self.due += PERIOD - shift
-        while self.due < now - PERIOD:  # that one can't be caught up with any more
+        while self.due < time - PERIOD:  # that one can't be caught up with any more
             self.due += PERIOD
             self.skipped += 1
         return self.due
@@ -257,38 +257,38 @@ class Flight:
             d.reason for d in self.state.drones
         )
 
-    def tick(self, now: float, due: float) -> None:
-        """One tick at `now` that was due at `due` (s)."""
+    def tick(self, time: float, due: float) -> None:
+        """One tick at `time` that was due at `due` (s)."""
         arrivals = self.vehicles.arrivals()
         samples = self.vehicles.observe()
         before = self.state.drones
-        self.state = see(self.state, now, samples)
+        self.state = see(self.state, time, samples)
         for i, (drone, old) in enumerate(zip(self.state.drones, before, strict=True)):
             if drone.captured.pose is not old.captured.pose:
                 self.vehicles.believed(i, drone.captured.pose, drone.feeds_estimator)
         # the operator before the watch, the watch before the plan
-        request = self._requests() or (Request.LAND if self._alarm else self._planned(now))
+        request = self._requests() or (Request.LAND if self._alarm else self._planned(time))
         actions = None
         if self._episode >= 0 or request is Request.PURSUE:
-            actions = self._actions(now, request is Request.PURSUE)
+            actions = self._actions(time, request is Request.PURSUE)
         self.state, set_points = decide(
-            self.state, Event(now, samples, actions, request, self._alarm)
+            self.state, Event(time, samples, actions, request, self._alarm)
         )
         sent = self.vehicles.send(set_points)
-        self._alarm = self._watched(now, self.state)
+        self._alarm = self._watched(time, self.state)
         self.record.keep((due, sent, self._episode), arrivals, measured_times(samples), set_points)
         if self._episode >= 0 and not any(m is Mode.PURSUIT for m in self.state.modes):
             self._end_episode("safety")
 
-    def _planned(self, now) -> Request:
+    def _planned(self, time) -> Request:
         """What the plan asks for at this tick."""
         state = self.state
         plan = self.plan
-        waited = now - self._since
+        waited = time - self._since
         if state.all_in(Mode.GROUND) and all(d.estimate is not None for d in state.drones):
             return Request.TRANSFER
         if state.all_in(Mode.READY) and self._episode < 0:
-            if now - max(d.since for d in state.drones) < SETTLE:
+            if time - max(d.since for d in state.drones) < SETTLE:
                 return Request.NONE
             if len(self.record.episodes) >= plan.episodes:
                 return Request.LAND
@@ -297,13 +297,13 @@ class Flight:
         if any(mode in underway for mode in state.modes) and waited > TRANSFER:
             self._alarm = f"not all at their starts after {TRANSFER:g} s"
             return Request.LAND
-        if self._episode >= 0 and (self._play.over or now - self._begun > plan.episode_seconds):
+        if self._episode >= 0 and (self._play.over or time - self._begun > plan.episode_seconds):
             self._end_episode("over")
-            self._since = now
+            self._since = time
             return Request.TRANSFER  # back to the starts, also to land there
         return Request.NONE
 
-    def _actions(self, now, first):
+    def _actions(self, time, first):
         """The set-points that the policy, and the evader's rule, ask for; they know of poses only
         what was believed.
         """
@@ -311,7 +311,7 @@ class Flight:
         if first:
             self._play = self.game.start(poses[: self._pursuers])
             self._episode = len(self.record.episodes)
-            self._begun = now
+            self._begun = time
             notes = {"capture_step": None, "breaches": 0, "crash": False, "steps": 0, "end": ""}
             self.record.episodes.append(notes | {"over_speed": 0})
         else:

@@ -256,10 +256,10 @@ def _react(state, drones, troubles) -> tuple[Drone, ...]:
     return tuple(reacted)
 
 
-def _risen(drone, now) -> bool:
+def _risen(drone, time) -> bool:
     """Whether a test lift is over; not before its rotors must have turned up."""
     near = abs(drone.estimate.position[2] - drone.anchor[2]) < RISEN
-    return near and now - drone.since > 2.0 * SPIN_UP
+    return near and time - drone.since > 2.0 * SPIN_UP
 
 
 # -----------------------------------------------------------------------------------------------
@@ -288,8 +288,8 @@ def steer(state: State, i: int, action: SetPoint | None, sample: PoseSample) -> 
 def _watched(state, drone, sample) -> Drone:
     """The drone with since when its battery is low and since when it is upside down."""
 
-    def since(before, is_so):
-        return (state.time if before is None else before) if is_so else None
+    def since(begin, is_so):
+        return (state.time if begin is None else begin) if is_so else None
 
     low = sample.voltage < state.settings.battery_low  # an unknown voltage is not low
     over = drone.estimate is not None and up(drone.estimate.quaternion) < 0.0

@@ -171,13 +171,15 @@ class Drone(NamedTuple):
     reason: str = ""  # why it left the pursuit
     sent: SetPoint = MOTORS_OFF
 
-    def to(self, mode: Mode, now: float, anchor: Vector | None = None, reason: str = "") -> "Drone":
-        """The drone in another mode from `now` (s) on; anchor and reason stay what they were unless
-        given.
+    def to(
+        self, mode: Mode, time: float, anchor: Vector | None = None, reason: str = ""
+    ) -> "Drone":
+        """The drone in another mode from `time` (s) on; anchor and reason stay what they were
+        unless given.
         """
         return self._replace(
             mode=mode,
-            since=now,
+            since=time,
             anchor=self.anchor if anchor is None else anchor,
             reason=reason or self.reason,
         )

@@ -198,12 +198,12 @@ def _runner_up(chances, effects, equivalent) -> str:
     return second if second and chances[second] > 0.01 else ""
 
 
-def _next_flight(evidence: Evidence, wanted) -> str:
-    """What to fly for the first of the effects `wanted` within reach of who logged these flights:
+def _next_flight(evidence: Evidence, effects) -> str:
+    """What to fly for the first of `effects` within reach of who logged these flights:
     nobody is sent for a second vehicle.
     """
     alone = not any(len(t.neighbours) for t in evidence.tracks)
-    for effect in (e for e in wanted if e in CARDS):
+    for effect in (e for e in effects if e in CARDS):
         if not (alone and CARDS[effect].coordinate == "height below a neighbour"):
             return CARDS[effect].next_flight
     return ""

@@ -35,14 +35,14 @@ def estimates(evidence: Evidence, fit: SetFit, named) -> dict[str, dict[str, Est
     return out
 
 
-def _estimate(found: Estimated, parameter: Parameter, vehicle) -> Estimate:
+def _estimate(estimated: Estimated, parameter: Parameter, vehicle) -> Estimate:
     """A value with its 90 % interval, both as far as they lie where the parameter means
     anything.
     """
-    start = found.value - REACH * found.below
-    end = found.value + REACH * found.above
+    start = estimated.value - REACH * estimated.below
+    end = estimated.value + REACH * estimated.above
     least, most = parameter.limits(vehicle)
-    value, low, high = np.clip((found.value, start, end), least, most).tolist()
+    value, low, high = np.clip((estimated.value, start, end), least, most).tolist()
     return Estimate(
         value=value,
         unit=parameter.unit,
@@ -53,13 +53,13 @@ def _estimate(found: Estimated, parameter: Parameter, vehicle) -> Estimate:
     )
 
 
-def interval(found: Estimated, parameter) -> tuple[float, float]:
+def interval(estimated: Estimated, parameter) -> tuple[float, float]:
     """The 90 % interval. A number that multiplies something (it does nothing at 1) stays positive:
     its logarithm is normal.
     """
-    value = found.value
-    below = REACH * found.below
-    above = REACH * found.above
+    value = estimated.value
+    below = REACH * estimated.below
+    above = REACH * estimated.above
     if parameter.none == 1.0 and value > 0.0:
         return value * float(np.exp(-below / value)), value * float(np.exp(above / value))
     return value - below, value + above

@@ -125,17 +125,17 @@ def split(
 def shares_of_squares(
     squares: Float[np.ndarray, "sets blocks channels"],
     weights: Float[np.ndarray, "draws blocks"],
-    left: Float[np.ndarray, " channels"],
+    floor_share: Float[np.ndarray, " channels"],
 ):
     """Shares (draws, parts + 1), what is unexplained last, and the gap's square before and after
     (draws, 2).
 
     squares (sets, blocks, channels): of all parts, none, none but the sensors, and all without each
-    part. weights (draws, blocks). left (channels,): of the squares that all parts leave, what is
-    floor.
+    part. weights (draws, blocks). floor_share (channels,): of the squares that all parts leave,
+    what is floor.
     """
     level = np.einsum("db,sbc->dsc", weights, squares)
-    floor = level[:, :1] * left + 1e-30
+    floor = level[:, :1] * floor_share + 1e-30
     level = (level / floor).mean(2)  # (draws, sets)
     after, raw, before = level[:, :3].T
     whole = np.maximum(raw, before) - 1.0

@@ -107,10 +107,13 @@ class PursuitSettings:
     capture_radii: Annotated[tuple[float, ...], Interval("(0, 10]")] = ()
     """Smallest and largest capture radius (m), the same in place of `capture_radius`."""
     sight_range: Annotated[float, Interval("(0, 1000]")] = 1000.0
-    """Distance (m) up to which a pursuer sees the evader ..."""
+    """Distance (m) up to which a pursuer sees the evader, if no pillar is between (not in the
+    paper). It limits neither captures nor what the evader sees.
+    """
     sight_angle: Annotated[float, Interval("(0, 360]")] = 360.0
-    """... in a cone that opens so wide about its body x axis (degrees), if no pillar is between.
-    Neither limits captures, nor what the evader sees (not in the paper).
+    """Angle (degrees) by which the cone opens about a pursuer's body x axis in which it sees the
+    evader, if no pillar is between (not in the paper). It limits neither captures nor what the
+    evader sees.
     """
     evader_norm: Literal["euclidean", "axis"] = "euclidean"
     """How the evader's force becomes a velocity; "axis" normalises by the largest component (up to

@@ -154,9 +154,9 @@ class DronesStep:
         """What moves in a substep."""
         return Bodies(self.physics, self.contacts, self.arena, self.dt / self.substeps)
 
-    def _parameters(self, given, drones):
+    def _parameters(self, values, drones):
         """Parameters (N,) of every effect."""
-        parameters = composition.complete_parameters(self.effects, given, drones.position.dtype)
+        parameters = composition.complete_parameters(self.effects, values, drones.position.dtype)
         number = drones.position.shape[0]
         return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (number,)), parameters)
 

@@ -62,8 +62,8 @@ def world_xml(arena: Arena, n_pillars: int, n_others: int, dt: float, contacts: 
       <option timestep="{dt}" integrator="Euler" solver="Newton" iterations="1" ls_iterations="1"
               jacobian="sparse">
         <flag warmstart="disable" filterparent="disable" actuation="disable" sensor="disable"
-              equality="disable" limit="disable" frictionloss="disable" eulerdamp="disable" refsafe="disable"
-              contact="{"enable" if contacts else "disable"}"/>
+              equality="disable" limit="disable" frictionloss="disable" eulerdamp="disable"
+              refsafe="disable" contact="{"enable" if contacts else "disable"}"/>
       </option>
       <default><geom contype="0" conaffinity="0" mass="0"/></default>
       <worldbody>

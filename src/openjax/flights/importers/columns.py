@@ -49,14 +49,14 @@ UNITS = {
 }  # fmt: skip
 
 _MOTION = {
-    c
-    for n in ("position", "quaternion", "body_rates", "specific_force")
-    for c in CHANNEL_COLUMNS[n]
+    *CHANNEL_COLUMNS["position"],
+    *CHANNEL_COLUMNS["quaternion"],
+    *CHANNEL_COLUMNS["body_rates"],
+    *CHANNEL_COLUMNS["specific_force"],
 }
 _CONTINUOUS = _MOTION | set(CHANNEL_COLUMNS["velocity"]) | set(EULER)
-TIE = (
-    1e-6  # s: stamps since 1970 are known to .24 us, so that what is sent with a row may seem later
-)
+# s: stamps since 1970 are known to .24 us, so that what is sent with a row may seem later
+TIE = 1e-6
 _STALE = 5.0  # periods after which a stream's last value counts as not sampled
 
 
@@ -89,13 +89,14 @@ class Stream:
 
 @dataclass(frozen=True, eq=False)
 class ColumnMapping:
-    """Sources of the log format's columns. `delimiter`: between a CSV's cells, empty where its
-    header shows it. `clocks`: the time stamps where there are several, of which the first is `t`.
-    """
+    """Which column of a log is what."""
 
     columns: dict[str, Source] = field(default_factory=dict)
+    """Sources of the log format's columns."""
     delimiter: str = ""
+    """Between a CSV's cells; empty where its header shows it."""
     clocks: tuple[Clock, ...] = ()
+    """The time stamps where there are several, of which the first is `t`."""
 
     @property
     def time(self) -> str:
@@ -135,12 +136,10 @@ class ColumnMapping:
                 columns.pop(column, None)
                 remarks.append(f"no column {source.name!r} for {column}")
         if "t" not in columns:
-            named = (
-                f" {self.columns['t'].name!r}, which {MAPPING_FILE} names for t"
-                if "t" in self.columns
-                else " t"
-            )
-            raise LogError(f"no column{named}; the log has {', '.join(raw.columns)}")
+            missing = "t"
+            if "t" in self.columns:
+                missing = f"{self.columns['t'].name!r}, which {MAPPING_FILE} names for t"
+            raise LogError(f"no column {missing}; the log has {', '.join(raw.columns)}")
         columns["t"] = columns["t"] - np.nanmin(columns["t"])
         return LogTable(name, with_quaternion(columns), raw.vehicle, tuple(remarks))
 
@@ -198,18 +197,9 @@ def merge_streams(
     """
     used = []
     for stream in streams:
-        own = {c: s for c, s in columns.items() if s.name in stream.values}
-        finite = np.isfinite(stream.time)
-        if own and finite.sum() > 1:
-            if problem := several_recordings(stream.time[finite]):
-                raise LogError(problem)
-            order = np.argsort(stream.time[finite], kind="stable")
-            converted = {
-                c: (s.scale * stream.values[s.name] + s.offset)[finite][order]
-                for c, s in own.items()
-            }
-            converted |= _without_flips(converted)
-            used.append((stream.time[finite][order], converted))
+        sources = {c: s for c, s in columns.items() if s.name in stream.values}
+        if sources and np.isfinite(stream.time).sum() > 1:
+            used.append(_converted(stream, sources))
     with_motion = [u for u in used if _MOTION & set(u[1])]
     if not with_motion:
         raise LogError(
@@ -225,6 +215,24 @@ def merge_streams(
         for column, values in converted.items():
             merged.setdefault(column, _onto(clock, time, values, column, period))
     return with_quaternion(merged)
+
+
+def _converted(
+    stream: Stream, sources: dict[str, Source]
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Times of a stream, sorted, and its columns in the log format's units. Raises LogError for
+    several recordings.
+    """
+    finite = np.isfinite(stream.time)
+    time = stream.time[finite]
+    if problem := several_recordings(time):
+        raise LogError(problem)
+    order = np.argsort(time, kind="stable")
+    converted = {}
+    for column, source in sources.items():
+        values = source.scale * stream.values[source.name] + source.offset
+        converted[column] = values[finite][order]
+    return time[order], converted | _without_flips(converted)
 
 
 def _at_one_time(used, clock: np.ndarray) -> list[tuple[np.ndarray, dict[str, np.ndarray]]]:
@@ -275,6 +283,7 @@ def with_quaternion(
 
 
 def _onto(clock, time, values, column: str, period: float) -> np.ndarray:
+    """Values (N,) of a column at its `time` (N,) moved to the rows of `clock` (T,)."""
     if len(time) == len(clock) and np.array_equal(time, clock):
         return values
     finite = np.isfinite(values)
@@ -293,8 +302,10 @@ def _onto(clock, time, values, column: str, period: float) -> np.ndarray:
         after = np.clip(before + 1, 0, len(time) - 1)
         wide = time[after] - time[np.clip(before, 0, None)] > max(_STALE * period, 0.05)
         return np.where(wide, np.nan, out)
-    out = np.where(before >= 0, values[np.clip(before, 0, None)], np.nan)
-    return np.where(clock - time[np.clip(before, 0, None)] > max(_STALE * period, 0.1), np.nan, out)
+    # a command holds until the next one comes
+    last = np.clip(before, 0, None)
+    out = np.where(before >= 0, values[last], np.nan)
+    return np.where(clock - time[last] > max(_STALE * period, 0.1), np.nan, out)
 
 
 def source_of(column: str, entry, path: Path) -> Source:

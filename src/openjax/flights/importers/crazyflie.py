@@ -40,7 +40,9 @@ def is_block(path: Path) -> bool:
 
 
 def is_client_log(path: Path) -> bool:
-    """Whether a path is such a CSV, or a folder of one flight's log blocks; a note may lie beside."""
+    """Whether a path is such a CSV, or a folder of one flight's log blocks; a note may lie
+    beside.
+    """
     if path.is_dir():
         inside = _blocks(path)
         return len(inside) > 1 and all(map(is_block, inside))

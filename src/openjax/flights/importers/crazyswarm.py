@@ -1,9 +1,9 @@
 """Topics of Crazyswarm2: log blocks of the firmware as `LogDataGeneric`, an array of values, and the
 poses of all bodies that motion capture sees as one `NamedPoseArray`.
 
-A log block's message doesn't say what its values are. The `crazyflies.yaml` with which the server was started
-does, under `firmware_logging.custom_topics` of `all`, of a robot's type, or of the robot; it is
-looked for beside the bag and in it.
+A log block's message doesn't say what its values are. The `crazyflies.yaml` with which the server
+was started does, under `firmware_logging.custom_topics` of `all`, of a robot's type, or of the
+robot; it is looked for beside the bag and in it.
 """
 
 from pathlib import Path

@@ -259,8 +259,8 @@ def _signal(output: np.ndarray, index: int, parameters) -> np.ndarray:
     beyond = np.unique(output[(output < least) | (output > most)])
     if len(beyond) > SELDOM:
         raise LogError(
-            f"actuator_outputs reach from {np.nanmin(output):g} to {np.nanmax(output):g}, and their "
-            f"range is {least:g} to {most:g} (PWM_MIN, PWM_MAX): DShot? Log actuator_motors"
+            f"actuator_outputs reach from {np.nanmin(output):g} to {np.nanmax(output):g}, and "
+            f"their range is {least:g} to {most:g} (PWM_MIN, PWM_MAX): DShot? Log actuator_motors"
         )
     return np.clip((output - least) / max(most - least, 1.0), 0.0, 1.0)
 

@@ -141,9 +141,9 @@ def _named_stamps(names: list[str], mapping: ColumnMapping | None) -> dict[str, 
     for clock in () if mapping is None else mapping.clocks:
         name = clock.source.name
         if name not in names:
-            raise LogError(
-                f"no column {name!r} for t; {suggestion(name, [n[:LONGEST_NAME] for n in names[:MOST_NAMES]])}"
-            )
+            # a broken log may have thousands of columns, or one of a thousand letters
+            columns = [n[:LONGEST_NAME] for n in names[:MOST_NAMES]]
+            raise LogError(f"no column {name!r} for t; {suggestion(name, columns)}")
         if name not in stamps.values():
             stamps[name] = name
     return stamps

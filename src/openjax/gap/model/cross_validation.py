@@ -68,13 +68,13 @@ class Equations:
         push[:free] += self.model.precision @ self.model.mean
         return hessian, push, bounded(hessian, push, free)
 
-    def coefficients(self, found: np.ndarray, block: int) -> np.ndarray:
+    def coefficients(self, solution: np.ndarray, block: int) -> np.ndarray:
         """Coefficients (C,) of every column on a block, whose own nuisances are the most likely
         ones.
         """
         out = np.zeros(self.table.size)
         out[[0, *self.model.parts]] = 1.0
-        out[self.columns] -= found
+        out[self.columns] -= solution
         out[self.table.own] = -self.table.taken[block] @ out
         return out
 
@@ -125,23 +125,25 @@ def judge(table: Table, model: Model) -> Judged:
     )
 
 
-def _squares(error: np.ndarray, found: np.ndarray) -> np.ndarray:
+def _squares(error: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
     """Squared errors (B, K) by their quadratic forms (B, K, C, C), with coefficients (B, C)."""
-    return np.einsum("bkc,bc->bk", np.einsum("bkcd,bd->bkc", error, found), found)
+    return np.einsum("bkc,bc->bk", np.einsum("bkcd,bd->bkc", error, coefficients), coefficients)
 
 
-def ablated(table: Table, found: np.ndarray, drop=(), off: np.ndarray | None = None) -> np.ndarray:
-    """Squared errors (B, K) of a table's set with the coefficients `found` (B, C) of `left_out`,
-    without the effects `drop` and the nuisances `off` (N,); everything else stays as fitted.
+def ablated(
+    table: Table, coefficients: np.ndarray, drop=(), off: np.ndarray | None = None
+) -> np.ndarray:
+    """Squared errors (B, K) of a table's set with `coefficients` (B, C) of `left_out`, without the
+    effects `drop` and the nuisances `off` (N,); everything else stays as fitted.
     """
-    found = found.copy()
+    coefficients = coefficients.copy()
     remaining = [e for e in table.fit.effects if e not in drop]
     kept = {int(i) for e in remaining for i in places((e,))}
     for effect in drop:
         # parameters that another effect shares stay as they were fitted
         gone = [table.derivative[int(i)] for i in places((effect,)) if int(i) not in kept]
-        found[:, gone] = 0.0
-        found[:, table.part[effect]] = 1.0
+        coefficients[:, gone] = 0.0
+        coefficients[:, table.part[effect]] = 1.0
     if off is not None:
-        found[:, table.nuisances[off]] = 0.0
-    return _squares(table.error, found)
+        coefficients[:, table.nuisances[off]] = 0.0
+    return _squares(table.error, coefficients)

@@ -51,11 +51,12 @@ def compiled_physics(names: tuple[str, ...], parameters: tuple[tuple[str, str], 
     return jax.jit(jax.vmap(partial(_channels, resolve(names), parameters)))
 
 
-def _rotors(flown, wanted, given, dt, late):
-    """Rotor speeds (T, 4) whose square is the row's mean, and their change (T, 4), 1/s^2, of wanted
-    speeds (T, TICKS, 4) under the motors' lag, `late` s later.
+def _rotors(flown, targets_in_ticks, commands, dt, late):
+    """Rotor speeds (T, 4) whose square is the row's mean, and their change (T, 4), 1/s^2, under the
+    motors' lag, `late` s later. `targets_in_ticks` (T, TICKS, 4): the speeds that `commands` of the
+    same shape ask for.
     """
-    step = dt / wanted.shape[1]
+    step = dt / targets_in_ticks.shape[1]
     # As `rotor_speed_step`, with what doesn't change outside the loop.
     faster = -jnp.expm1(-step / flown.motor_time_constant)
     slower = -jnp.expm1(-step / (flown.motor_time_constant * flown.motor_slowdown_ratio))
@@ -71,8 +72,8 @@ def _rotors(flown, wanted, given, dt, late):
             speed = after
         return speed, (total / len(targets), (speed - before) / dt)
 
-    start = jnp.sqrt(jnp.clip(given[0, 0], 1e-6, None)) * flown.max_rotor_speed
-    _, driven = jax.lax.scan(row, start, wanted)
+    start = jnp.sqrt(jnp.clip(commands[0, 0], 1e-6, None)) * flown.max_rotor_speed
+    _, driven = jax.lax.scan(row, start, targets_in_ticks)
     square, sped_up = (v - late * jnp.gradient(v, dt, axis=0) for v in driven)
     speed = jnp.sqrt(jnp.maximum(square, 0.0))
     return speed, sped_up

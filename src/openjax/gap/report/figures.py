@@ -65,7 +65,10 @@ def _places(report: Report):
     add_legend(axes)
     return (
         "Where the gap lies",
-        f"Forces and torques, averaged over {CALM} s, estimator and firmware, by part of the flight.",
+        (
+            f"Forces and torques, averaged over {CALM} s, estimator and firmware, by part of the "
+            "flight."
+        ),
         figure,
     )
 
@@ -185,13 +188,13 @@ def _course(report: Report):
     return ("One flight", f"{course.flight}: error of {course.name}{ahead}.", figure)
 
 
-def _lines(report: Report, before, after) -> Sequence[tuple]:
+def _lines(report: Report, nominal, corrected) -> Sequence[tuple]:
     """(residual, colour, label): the nominal simulator, and the corrected one where effects were
     named.
     """
     if not report.parameters:
-        return ((before, AFTER if report.verdict == "none" else BEFORE, "nominal simulator"),)
-    return (before, BEFORE, "nominal simulator"), (after, AFTER, "with the named effects")
+        return ((nominal, AFTER if report.verdict == "none" else BEFORE, "nominal simulator"),)
+    return (nominal, BEFORE, "nominal simulator"), (corrected, AFTER, "with the named effects")
 
 
 def _horizons(report: Report):

@@ -9,13 +9,17 @@ from openjax.gap.where import Place, in_words
 VERDICTS = {
     "none": "The simulator agrees with these flights to within the sensors' noise.",
     "unknown": "The simulator misses something that no known effect explains.",
-    "not_testable": "No effect is seen, but these flights couldn't show most of those that are usual.",
+    "not_testable": (
+        "No effect is seen, but these flights couldn't show most of those that are usual."
+    ),
 }
 """What is said of each verdict that names nothing."""
 VERDICTS_SINCE = {
     "none": "The vehicle is as in its reference flights, to within what a day changes.",
     "unknown": "The vehicle changed in a way that no known effect explains.",
-    "not_testable": "No change is seen, but these flights couldn't show most of those that are usual.",
+    "not_testable": (
+        "No change is seen, but these flights couldn't show most of those that are usual."
+    ),
 }
 """The same where a reference of the vehicle was given."""
 

@@ -27,9 +27,9 @@ WORDS = {
 }
 
 
-def response_of(found: Identification | None) -> dict | None:
+def response_of(identification: Identification | None) -> dict | None:
     """Sentence, remarks, rows of numbers and the picture (SVG) for the page; None without."""
-    if found is None:
+    if identification is None:
         return None
     rows = [
         {
@@ -40,25 +40,25 @@ def response_of(found: Identification | None) -> dict | None:
             "unit": "" if q.unit == "1" else q.unit,
             "differs": q.differs,
         }
-        for name, q in found.quantities.items()
+        for name, q in identification.quantities.items()
     ]
     return {
-        "sentence": found.sentence(),
-        "remarks": found.remarks,
+        "sentence": identification.sentence(),
+        "remarks": identification.remarks,
         "rows": rows,
-        "picture": _picture(found),
+        "picture": _picture(identification),
     }
 
 
-def _picture(found: Identification) -> str:
+def _picture(identification: Identification) -> str:
     """Gain and phase of every axis over frequency, measured with 90 % bands beside simulated."""
     from matplotlib.figure import Figure
 
     with rc_context(STYLE):
-        count = len(found.responses)
+        count = len(identification.responses)
         figure = Figure(figsize=(2.6 * count, 4.2), layout="constrained")
         grid = figure.subplots(2, count, sharex=True, squeeze=False)
-        for column, (axis, pair) in enumerate(found.responses.items()):
+        for column, (axis, pair) in enumerate(identification.responses.items()):
             drawn = (
                 (pair.simulated, BEFORE, "nominal simulator"),
                 (pair.measured, AFTER, "measured"),

@@ -44,7 +44,7 @@ def complete_parameters(
                 f"parameters for {name!r}, which is not among the effects {sorted(known)}"
             )
         for parameter in values:
-            find_effect(name, parameter, known=known)
+            find_effect(name, parameter, effects=known)
     complete = {name: {**effect.none(), **given.get(name, {})} for name, effect in known.items()}
     return jax.tree.map(lambda value: jnp.asarray(value, dtype), complete)
 

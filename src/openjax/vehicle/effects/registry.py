@@ -33,16 +33,19 @@ def register_effect(effect: Effect) -> None:
 
 
 def find_effect(
-    name: str, parameter: str | None = None, where: str = "", known: Mapping[str, Effect] = EFFECTS
+    name: str,
+    parameter: str | None = None,
+    where: str = "",
+    effects: Mapping[str, Effect] = EFFECTS,
 ) -> Effect:
     """The effect of that name. Raises UserError where there is none, or it hasn't that
     parameter.
     """
-    if name not in known:
-        raise UserError(f"{where}effect {name!r} is unknown; {suggestion(name, known)}")
-    parameters = known[name].parameters
+    if name not in effects:
+        raise UserError(f"{where}effect {name!r} is unknown; {suggestion(name, effects)}")
+    parameters = effects[name].parameters
     if parameter is not None and parameter not in parameters:
         raise UserError(
             f"{where}effect {name!r} has no parameter {parameter!r}; it has {', '.join(parameters)}"
         )
-    return known[name]
+    return effects[name]

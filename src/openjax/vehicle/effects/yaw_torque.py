@@ -18,7 +18,8 @@ EFFECT = Effect(
             none=1.0,
             prior=(0.15, 2.0),
             source=(
-                "torque per thrust of 0.005-0.007 m measured on Crazyflies, against a nominal 0.031 m"
+                "torque per thrust of 0.005-0.007 m measured on Crazyflies, against a nominal "
+                "0.031 m"
             ),
             domain=RATIO,
         )
