@@ -44,9 +44,7 @@ TWICE = {
     *("exploit", "adaptation", "loop"),
 }
 """Module names that more than one room has."""
-CIRCLES = {"openjax.gap.report"}
-"""Packages in which a class draws the page that is drawn from it."""
-MOST = {"pairs": 16, "starred": 29, "columns": 29, "adverbs": 70, "effects": 32}
+MOST = {"pairs": 16, "starred": 29, "columns": 14, "adverbs": 22, "effects": 32}
 """Places of each kind of hard reading that are left; these numbers only get smaller. Pairs: a tuple
 written out and bound to several names. Starred: a tuple that an own function takes apart again.
 Columns: lines longer than 100 characters. Adverbs: parameters called by one of `ADVERBS` alone.
@@ -178,7 +176,7 @@ def test_no_module_imports_itself_by_a_detour():
         return seen
 
     circles = {name for name in list(imports()) if name in reachable(name)}
-    assert not [name for name in circles if not name.startswith(tuple(CIRCLES))]
+    assert not circles
 
 
 def test_modules_of_one_name_are_few():
