@@ -33,10 +33,9 @@ HORIZONS = {
 # By how much of its own size an effect may be left, where it isn't quite of the library's form: of
 # 51 development cases with a cause 4 are then called unknown, and 6 without (seed 886).
 FORM_LEFT = 0.3
-# Share of what grew of forces or torques that the effects leave where they aren't what acts: those
-# named beside an unknown cause left .71 to 1, those that act .54 at most (seeds 890 to 893).
+# Share of what grew that effects leave where they aren't what acts: those named beside an unknown
+# cause left .71 to 1, those that act .54 at most (seeds 890 to 893).
 MOSTLY = 0.65
-MOTION = ("velocity", "rates")  # measures that effects of the physics are to explain
 CALIBRATION = Path(__file__).with_name("residual.json")
 
 
@@ -88,8 +87,7 @@ def check_residual(evidence: Evidence, fit: SetFit, nothing: SetFit) -> Check:
         before = _comparable(evidence)
         unnamed, _ = measure(evidence, residuals_of(nothing))
         p_value, name = changed_p(measured, before, unnamed)
-        left = unexplained(measured[name], before[name], unnamed[name]) if name in MOTION else 0.0
-        mostly = left > MOSTLY
+        mostly = bool(name) and unexplained(measured[name], before[name], unnamed[name]) > MOSTLY
     rejects = p_value <= DECISION.unknown
     predicted = beyond(axes, before) if rejects else np.zeros(9)
     where = HORIZONS.get(name, (0.0, ""))[1]
@@ -173,13 +171,14 @@ def _path_against_accelerometer(track: Track) -> np.ndarray:
 def _comparable(evidence: Evidence) -> dict[str, float]:
     """The reference's measures, of which those of forces and torques say nothing where a battery
     that nobody logged makes another thrust of every duty cycle, and those of the pose nothing where
-    it was moved in time.
+    it was moved in time in one of both alone.
     """
-    before = evidence.baseline.measures
+    before = evidence.baseline
     silent = ("velocity", "rates") if evidence.charge_unknown else ()
-    moved = any(c.path == "estimator" and c.acting() for c in evidence.channels)
-    silent += ("estimator", "position") if moved else ()
-    return {n: v for n, v in before.items() if n not in silent}
+    here = {c.path: c for c in evidence.channels}
+    moved = [p["estimator"].acting() if "estimator" in p else {} for p in (here, before.channels)]
+    silent += ("estimator", "position") if bool(moved[0]) != bool(moved[1]) else ()
+    return {n: v for n, v in before.measures.items() if n not in silent}
 
 
 def changed_p(
