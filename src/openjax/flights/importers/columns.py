@@ -55,6 +55,7 @@ _MOTION = {
     *CHANNEL_COLUMNS["specific_force"],
 }
 _CONTINUOUS = _MOTION | set(CHANNEL_COLUMNS["velocity"]) | set(EULER)
+OVERTAKEN = 1.0  # s by which a message may come before an older one
 # s: stamps since 1970 are known to .24 us, so that what is sent with a row may seem later
 TIE = 1e-6
 _STALE = 5.0  # periods after which a stream's last value counts as not sampled
@@ -225,7 +226,8 @@ def _converted(
     """
     finite = np.isfinite(stream.time)
     time = stream.time[finite]
-    if problem := several_recordings(time):
+    back = float(np.diff(time).min())
+    if back < -OVERTAKEN and (problem := several_recordings(time)):
         raise LogError(problem)
     order = np.argsort(time, kind="stable")
     converted = {}
