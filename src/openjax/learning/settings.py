@@ -254,12 +254,13 @@ class WorstPlansSettings:
     piece_seconds: Annotated[float, Interval("(0, 10]")] = 0.2
     """... each for so long: four see .8 s ahead, in which an evader crosses half of the arena."""
     distance: Annotated[float, Interval("[0, 1000]")] = 1.0
-    """Weight of the nearest pursuer's mean way to the evader (m), beside the share of the plan in
-    which it is free ...
+    """Weight of the nearest pursuer's mean path to the evader (m), beside the share of the plan in
+    which it is free.
     """
     crash: Annotated[float, Interval("[0, 1000]")] = 8.0
+    """Weight of the share of pursuers that touch something, beside the same."""
     breach: Annotated[float, Interval("[0, 1000]")] = 2.0
-    """... of the share of pursuers that touch something, and of the breaches per step."""
+    """Weight of the breaches per step, beside the same."""
     hold_unseen: Annotated[float, Interval("[0, 1000]")] = 0.3
     """As `analytic.hold`, where nobody sees the evader: nothing is learnt there, and what was is
     held.
