@@ -248,11 +248,13 @@ class WorstPlansSettings:
     worlds: Annotated[int, Interval("[0, 65536]")] = 0
     """Worlds in which an evader plans; 0: the last stage has none of them."""
     plans: Annotated[int, Interval("[5, 10000]")] = 32
-    """That each evader tries."""
+    """Plans that each evader tries."""
     pieces: Annotated[int, Interval("[2, 100]")] = 4
-    """Velocities of a plan, one after the other ..."""
+    """Velocities of a plan, one after the other."""
     piece_seconds: Annotated[float, Interval("(0, 10]")] = 0.2
-    """... each for so long: four see .8 s ahead, in which an evader crosses half of the arena."""
+    """For how long each is flown (s): four see .8 s ahead, in which an evader crosses half of the
+    arena.
+    """
     distance: Annotated[float, Interval("[0, 1000]")] = 1.0
     """Weight of the nearest pursuer's mean path to the evader (m), beside the share of the plan in
     which it is free.

@@ -163,9 +163,9 @@ class MapCommand:
     fall_outs: Annotated[float, Interval("[0, 1]")] = 0.0
     """Share of the episodes of two or more pursuers in which one of them is gone after 2 s."""
     sight_range: Annotated[float, Interval("(0, 1000]")] = PursuitSettings.sight_range
-    """Distance up to which a pursuer sees the evader (m) ..."""
+    """Distance up to which a pursuer sees the evader (m)."""
     sight_angle: Annotated[float, Interval("(0, 360]")] = PursuitSettings.sight_angle
-    """... within a cone that opens so wide about its body x axis (degrees)."""
+    """Opening angle of the cone about its body x axis within which a pursuer sees it (degrees)."""
     batch: Annotated[int, Interval("[1, 1000000]")] = 8192
     """Episodes that are flown at once."""
     seed: Seed = 0
