@@ -157,7 +157,12 @@ def fly_two(options) -> list[dict]:
 
 
 def study(options) -> dict:
-    """Both parts."""
+    """Both parts, or the one that is asked for."""
+    two = {"pursuers": options.pursuers, "records": []}
+    if options.only != "teams":
+        two["records"] = fly_two(options)
+    if options.only == "two":
+        return {"teams": [], "strangers": [], "two": two}
     flown = fly_teams(options)
     return {
         "teams": [{"members": list(team), **record(*own)} for team, own in flown.items()],
@@ -166,7 +171,7 @@ def study(options) -> dict:
             for ego in options.egos
             for seats in (1, 2)
         ],
-        "two": {"pursuers": options.pursuers, "records": fly_two(options)},
+        "two": two,
     }
 
 
@@ -181,7 +186,7 @@ def page(results: Mapping) -> Page:
     ]
     mixed = [row for row in results["teams"] if len(set(row["members"])) == 3]
     rows += [{**row, "team": ", ".join(row["members"])} for row in mixed]
-    chosen = chosen_choice(results["two"]["records"])
+    chosen = chosen_choice(results["two"]["records"])  # None where that part wasn't flown
     rows += [
         {
             **row,
@@ -213,10 +218,10 @@ def page(results: Mapping) -> Page:
     )
 
 
-def chosen_choice(records: list[dict]) -> str:
+def chosen_choice(records: list[dict]) -> str | None:
     """The choice of targets that catches both most often among evaders of the training."""
     own = [row for row in records if row["evaders"] == "training"]
-    return max(own, key=lambda row: row["capture_rate"])["choice"]
+    return max(own, key=lambda row: row["capture_rate"])["choice"] if own else None
 
 
 def draw(results: Mapping, path: Path) -> None:
@@ -248,6 +253,7 @@ def main(arguments: list[str]) -> None:
     parser = page_parser(__doc__, "strangers")
     parser.add_argument("--egos", nargs="+", default=EGOS, help="policies (the first flies two)")
     parser.add_argument("--mates", nargs="+", default=TEAMMATES)
+    parser.add_argument("--only", choices=("teams", "two"), help="one of the two parts")
     parser.add_argument("--episodes", type=int, default=500)
     parser.add_argument("--pursuers", type=int, default=4, help="after two evaders")
     parser.add_argument("--seed", type=int, default=0)
