@@ -54,13 +54,13 @@ def test_modules_that_the_pages_run_are_there():
 
 
 def test_readme_and_pages_stay_short():
-    """README 1,300 words, all pages of the documentation 17,000; a word has a letter."""
+    """README 1,300 words, all pages of the documentation 18,700; a word has a letter."""
 
     def words(text):
         return len(re.findall(r"\S*[^\W\d_]\S*", text))
 
     assert words(README) <= 1300
-    assert sum(words(page.read_text(encoding="utf-8")) for page in PAGES) <= 17_000
+    assert sum(words(page.read_text(encoding="utf-8")) for page in PAGES) <= 18_700
 
 
 def test_links_lead_somewhere():

@@ -207,7 +207,8 @@ def merge_streams(
             "holds neither position and orientation nor a gyroscope under known names: name what "
             "it has in columns.toml"
         )
-    clock = min(with_motion, key=lambda u: float(np.median(np.diff(u[0]))))[0]
+    # to a microsecond: of streams at one rate the first is the clock, however stamps are rounded
+    clock = min(with_motion, key=lambda u: round(float(np.median(np.diff(u[0]))), 6))[0]
     clock = clock[np.r_[True, np.diff(clock) > 0]]
     used = _at_one_time(used, clock)
     merged = {"t": clock}
