@@ -143,7 +143,8 @@ def main(arguments) -> int:
             result["rows"][name] = CASES[name](options)
         except Exception as reason:  # not installed, or not with this JAX or compiler
             result["left_out"][name] = f"{type(reason).__name__}: {reason}".splitlines()[0]
-        print(name, result["rows"].get(name) or result["left_out"][name], flush=True)
+        left_out = result["left_out"].get(name)
+        print(f"{name}: {f'left out, {left_out}' if left_out else result['rows'][name]}", flush=True)
         write_json(options.json, result)  # after each, so that an interrupted study leaves some
     return 0
 
