@@ -140,11 +140,12 @@ def main(arguments) -> int:
     result = {"machine": describe_machine(), "sizes": sizes, "rows": {}, "left_out": {}}
     for name in options.only:
         try:
-            result["rows"][name] = CASES[name](options)
+            row = result["rows"][name] = CASES[name](options)
         except Exception as reason:  # not installed, or not with this JAX or compiler
-            result["left_out"][name] = f"{type(reason).__name__}: {reason}".splitlines()[0]
-        left_out = result["left_out"].get(name)
-        print(f"{name}: {f'left out, {left_out}' if left_out else result['rows'][name]}", flush=True)
+            why = f"{type(reason).__name__}: {reason}".splitlines()[0]
+            result["left_out"][name] = why
+            row = f"left out, {why}"
+        print(f"{name}: {row}", flush=True)
         write_json(options.json, result)  # after each, so that an interrupted study leaves some
     return 0
 
