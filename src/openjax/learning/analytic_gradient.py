@@ -50,7 +50,7 @@ from openjax.pursuit import Pursuit, PursuitSettings, RewardSettings
 from openjax.pursuit.axes import rotation_axes
 from openjax.pursuit.shapes import Scalar
 from openjax.pursuit.task import capture_radius
-from openjax.vehicle.family import family_bounds, narrowed_bounds
+from openjax.vehicle.family import partly_nominal
 
 Bounds = Float[Array, "worlds ranges 4"]
 """Of each world's vehicles; see `openjax.vehicle.family`."""
@@ -273,12 +273,7 @@ class AnalyticGradient:
 
     def bounds(self) -> Bounds:
         """(B, R, 4) of each world's vehicles: the game's family, and a share of nominal ones."""
-        family = self.game.vehicles
-        worlds = self.settings.worlds
-        if not family:
-            return jnp.zeros((worlds, 0, 4))
-        plain = jnp.arange(worlds)[:, None, None] < self.settings.nominal * worlds
-        return jnp.where(plain, narrowed_bounds(family, 0.0), jnp.asarray(family_bounds(family)))
+        return partly_nominal(self.game.vehicles, self.settings.worlds, self.settings.nominal)
 
     @functools.cached_property
     def optimiser(self) -> optax.GradientTransformation:

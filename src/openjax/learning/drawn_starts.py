@@ -1,10 +1,21 @@
-"""Starts to learn from by the gradient through the simulation: those that leave the least room."""
+"""Starts to learn from by the gradient through the simulation, and which worlds need a new one."""
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import PRNGKeyArray
+from jaxtyping import Array, Bool, PRNGKeyArray
 
-from openjax.pursuit import PursuitSettings, Task, close_starts, turn_task, uniform_task
+from openjax.learning.generator import vary_pillars
+from openjax.learning.settings import GeneratorSettings
+from openjax.learning.smooth_measures import nearest_gap
+from openjax.pursuit import (
+    PursuitSettings,
+    PursuitState,
+    Task,
+    close_starts,
+    scatter_starts,
+    turn_task,
+    uniform_task,
+)
 from openjax.pursuit.collisions import drone_distance
 from openjax.pursuit.teams import parked
 
@@ -15,6 +26,12 @@ side by side.
 """
 APART = 0.1
 """Farthest gap beyond the safety distance of pursuers side by side (m)."""
+SCATTERED = 0.5
+"""Share of the tasks that start anywhere: who knows the uniform ones alone dives where the evader
+is far, into the floor.
+"""
+OUTSIDE = 1.2
+"""A pursuer is lost where it is farther out than this share of the arena's radius or height."""
 
 
 def side_by_side(settings: PursuitSettings, key: PRNGKeyArray, task: Task) -> Task:
@@ -55,3 +72,26 @@ def draw_start(settings: PursuitSettings, key: PRNGKeyArray) -> Task:
         beside,
         task,
     )
+
+
+def draw_anywhere(settings: PursuitSettings, tasks: GeneratorSettings, key: PRNGKeyArray) -> Task:
+    """A task like the uniform ones that a generator with settings `tasks` draws, turned; with its
+    starts, or with any others.
+    """
+    task_key, pillar_key, turn_key, start_key, choice_key = jax.random.split(key, 5)
+    task = vary_pillars(tasks, settings, pillar_key, uniform_task(settings, task_key))
+    task = turn_task(turn_key, task)
+    scattered = jax.random.bernoulli(choice_key, SCATTERED)
+    anywhere = scatter_starts(settings, start_key, task)
+    return jax.tree.map(lambda a, b: jnp.where(scattered, a, b), anywhere, task)
+
+
+def is_lost(settings: PursuitSettings, state: PursuitState) -> Bool[Array, " worlds"]:
+    """(W,) whether a pursuer of worlds (W, ...) has crashed or is far outside."""
+    position = state.drones.position
+    lost = jnp.sum(position[..., :2] ** 2, axis=-1) > (OUTSIDE * settings.arena_radius) ** 2
+    lost |= position[..., 2] > OUTSIDE * settings.arena_height
+    lost |= nearest_gap(settings, state) < 0.0
+    if state.active is not None:
+        lost &= state.active
+    return jnp.any(lost, axis=-1)

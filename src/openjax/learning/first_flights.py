@@ -21,30 +21,23 @@ from jaxtyping import PRNGKeyArray
 
 from openjax.learning.analytic_gradient import AnalyticGradient, free_flight
 from openjax.learning.collectives import mean_over_devices, own_share
-from openjax.learning.generator import vary_pillars
+from openjax.learning.drawn_starts import draw_anywhere, is_lost
 from openjax.learning.gradient_step import (
     SLOWEST_RATE,
     clipped_descent,
     finite_or_zero,
+    renewed,
     weighted_sum,
 )
 from openjax.learning.settings import AnalyticSettings, FirstFlightsSettings, GeneratorSettings
-from openjax.learning.smooth_measures import crash_share, nearest_gap, tip_share
+from openjax.learning.smooth_measures import crash_share, tip_share
 from openjax.policy import Policy, PolicyParameters
-from openjax.pursuit import Pursuit, scatter_starts, turn_task, uniform_task
+from openjax.pursuit import Pursuit
 from openjax.pursuit.shapes import Scalar
 from openjax.vehicle.family import narrowed_bounds
 
-OUTSIDE = 1.2
-"""A world starts anew where a pursuer is farther out than this share of the arena's radius or
-height.
-"""
 PHYSICS_STEP = 0.01
 """Seconds of a physics step: finer ones teach nothing more."""
-SCATTERED = 0.5
-"""Share of the tasks that start anywhere: who knows the uniform ones alone dives where the evader
-is far, into the floor.
-"""
 LOW = 0.25
 """Height (m) below which the end of a moment costs: the gap to the floor is felt too late."""
 
@@ -101,19 +94,11 @@ class FirstFlights:
         """Worlds at the starts of uniform tasks and of scattered ones, their vehicles nominal."""
         game = self.environment.settings
 
-        def draw(key):
-            task_key, pillar_key, turn_key, start_key, choice_key = jax.random.split(key, 5)
-            task = vary_pillars(self.tasks, game, pillar_key, uniform_task(game, task_key))
-            task = turn_task(turn_key, task)
-            scattered = jax.random.bernoulli(choice_key, SCATTERED)
-            anywhere = scatter_starts(game, start_key, task)
-            return jax.tree.map(lambda a, b: jnp.where(scattered, a, b), anywhere, task)
-
         task_keys, reset_keys = (
             own_share(jax.random.split(k, self.settings.worlds), self.axis)
             for k in jax.random.split(key)
         )
-        tasks = jax.vmap(draw)(task_keys)
+        tasks = jax.vmap(functools.partial(draw_anywhere, game, self.tasks))(task_keys)
         environment = self.environment
         if game.vehicles:
             environment = environment.with_bounds(narrowed_bounds(game.vehicles, 0.0))
@@ -161,25 +146,16 @@ class FirstFlights:
         change, state = self.optimiser.update(finite_or_zero(gradient), carry.optimiser)
         parameters = parameters.replace(actor=optax.apply_updates(parameters.actor, change))
         start_key, choice_key = jax.random.split(key)
-        renewed = jax.random.uniform(choice_key, (self.settings.worlds,)) < self.settings.anew
-        over = self._over(end[1]) | own_share(renewed, self.axis)
-
-        def new_where_over(old, new):
-            return jnp.where(over.reshape(-1, *[1] * (old.ndim - 1)), new, old)
-
-        world = jax.tree.map(new_where_over, end, self.start(start_key))
+        drawn = jax.random.uniform(choice_key, (self.settings.worlds,)) < self.settings.anew
+        over = self._over(end[1]) | own_share(drawn, self.axis)
+        world = renewed(over, end, self.start(start_key))
         return FirstCarry(parameters, state, world, risen), parts
 
     def _over(self, state):
         """(B,) worlds that end: crashed, far outside, or too late for another moment."""
         game = self.environment.settings
-        position = state.drones.position
-        outside = jnp.sum(position[..., :2] ** 2, axis=-1) > (OUTSIDE * game.arena_radius) ** 2
-        outside |= position[..., 2] > OUTSIDE * game.arena_height
-        over = outside | (nearest_gap(game, state) < 0.0)
-        if state.active is not None:
-            over &= state.active
-        return jnp.any(over, axis=-1) | (state.step > game.episode_length - self.settings.steps)
+        late = state.step > game.episode_length - self.settings.steps
+        return is_lost(game, state) | late
 
     @functools.cached_property
     def optimiser(self) -> optax.GradientTransformation:

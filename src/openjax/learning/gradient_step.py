@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from openjax.policy import Policy, PolicyParameters
 from openjax.pursuit import Observation, Pursuit, PursuitState
@@ -44,6 +44,15 @@ def finite_or_zero(gradient: Any) -> Any:
     """
     finite = jnp.isfinite(optax.global_norm(gradient))
     return jax.tree.map(lambda leaf: jnp.where(finite, leaf, 0.0), gradient)
+
+
+def renewed(over: Bool[Array, " worlds"], world: Any, fresh: Any) -> Any:
+    """Worlds (W, ...), those that are `over` (W,) replaced by fresh ones."""
+
+    def chosen(old, new):
+        return jnp.where(over.reshape(-1, *[1] * (old.ndim - 1)), new, old)
+
+    return jax.tree.map(chosen, world, fresh)
 
 
 def weighted_sum(

@@ -7,6 +7,8 @@ having to learn anything. Here evaders plan, and the pursuers follow the gradien
 simulation along the plan that came out worst. The gradient of a maximum is the gradient at the
 place of the maximum (Danskin 1966, The theory of max-min), so the plan itself needs none; training
 networks against their worst inputs works the same way (Madry et al. 2018, arXiv 1706.06083).
+
+It shares no code with the planner of `openjax.evaluation.judges`, which judges what is learnt here.
 """
 
 import dataclasses
@@ -21,41 +23,29 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from openjax.learning.analytic_gradient import AnalyticGradient
-from openjax.learning.generator import vary_pillars
+from openjax.learning.drawn_starts import draw_anywhere, is_lost
 from openjax.learning.gradient_step import (
     clipped_descent,
     falling_rate,
     finite_or_zero,
     mean_step,
+    renewed,
     weighted_sum,
 )
 from openjax.learning.settings import AnalyticSettings, GeneratorSettings, WorstPlansSettings
-from openjax.learning.smooth_measures import crash_share, nearest_gap
+from openjax.learning.smooth_measures import crash_share
 from openjax.policy import PolicyParameters
-from openjax.pursuit import (
-    Pursuit,
-    PursuitSettings,
-    PursuitState,
-    scatter_starts,
-    turn_task,
-    uniform_task,
-)
+from openjax.pursuit import Pursuit, PursuitSettings, PursuitState
 from openjax.pursuit.shapes import Scalar
-from openjax.vehicle.family import family_bounds, narrowed_bounds
+from openjax.vehicle.family import partly_nominal
 
 Plans = Float[Array, "worlds plans pieces 3"]
 Plan = Float[Array, "worlds pieces 3"]
 
 AHEAD = 0.15
 """Seconds after which pursuers are thought to be where their velocity leads, at a plan's end."""
-SCATTERED = 0.5
-"""Share of the worlds that start anywhere; the others start as uniform tasks do."""
 NOMINAL = 0.5
 """Share of the worlds whose vehicles are nominal ones: evaders are judged against these."""
-OUTSIDE = 1.2
-"""A world starts anew where a pursuer is farther out than this share of the arena's radius or
-height.
-"""
 WARM_UP = 15
 """Updates in which the step size rises: Adam's first steps are of full size whatever the gradient,
 and one of them undoes a policy (captures of a planner fell from .44 to .06).
@@ -132,28 +122,15 @@ class WorstPlans:
         game = self.game
 
         def one(key, bounds):
-            task_key, pillar_key, turn_key, start_key, choice_key = jax.random.split(key, 5)
-            task = vary_pillars(self.tasks, game, pillar_key, uniform_task(game, task_key))
-            task = turn_task(turn_key, task)
-            scattered = jax.random.bernoulli(choice_key, SCATTERED)
-            anywhere = scatter_starts(game, start_key, task)
-            task = jax.tree.map(lambda a, b: jnp.where(scattered, a, b), anywhere, task)
             environment = self.environment
             if game.vehicles:
                 environment = environment.with_bounds(bounds)
+            task = draw_anywhere(game, self.tasks, key)
             return environment.reset_to(jax.random.fold_in(key, 1), task)
 
-        keys = jax.random.split(key, self.planning.worlds)
-        return jax.vmap(one)(keys, self._bounds())
-
-    def _bounds(self):
-        """(B, R, 4) of each world's vehicles."""
-        family = self.game.vehicles
         worlds = self.planning.worlds
-        if not family:
-            return jnp.zeros((worlds, 0, 4))
-        nominal = jnp.arange(worlds)[:, None, None] < NOMINAL * worlds
-        return jnp.where(nominal, narrowed_bounds(family, 0.0), jnp.asarray(family_bounds(family)))
+        bounds = partly_nominal(game.vehicles, worlds, NOMINAL)
+        return jax.vmap(one)(jax.random.split(key, worlds), bounds)
 
     def candidates(self, key: PRNGKeyArray, plan: Plan) -> Plans:
         """The rest of the last plan and the same a piece later, to stay, the evader's own rule
@@ -264,11 +241,7 @@ class WorstPlans:
         gradient = jax.tree.map(jnp.add, finite_or_zero(gradient), usual)
         change, optimiser = self.optimiser.update(gradient, state.optimiser)
         over = self._over(world[1])
-
-        def renewed(old, new):
-            return jnp.where(over.reshape(-1, *[1] * (old.ndim - 1)), new, old)
-
-        world = jax.tree.map(renewed, world, self.start(start_key))
+        world = renewed(over, world, self.start(start_key))
         plan = jnp.where(over[:, None, None], 0.0, _later(plan))
         parts = {f"planned_{name}": value for name, value in parts.items()}
         survived = {"planned_survived": jnp.mean(promised >= self.steps)}
@@ -282,14 +255,8 @@ class WorstPlans:
         """(B,) worlds that start anew: the evader is caught, a pursuer crashed or left, or there is
         no time for another plan.
         """
-        position = state.drones.position
-        away = jnp.sum(position[..., :2] ** 2, axis=-1) > (OUTSIDE * self.game.arena_radius) ** 2
-        away |= position[..., 2] > OUTSIDE * self.game.arena_height
-        lost = away | (nearest_gap(self.game, state) < 0.0)
-        if state.active is not None:
-            lost &= state.active
         late = state.step > self.game.episode_length - self.steps
-        return jnp.any(lost, axis=-1) | state.statistics.captured | late
+        return is_lost(self.game, state) | state.statistics.captured | late
 
 
 def planning_game(environment: Pursuit) -> Pursuit:

@@ -99,6 +99,15 @@ def narrowed_bounds(ranges: Sequence[VehicleRange], share) -> jax.Array:
     return none + share * (family_bounds(ranges) - none)
 
 
+def partly_nominal(ranges: Sequence[VehicleRange], worlds: int, share: float) -> jax.Array:
+    """(W, R, 4) bounds of the family for each world; this share of them has nominal vehicles."""
+    if not ranges:
+        return jnp.zeros((worlds, 0, 4))
+    is_nominal = jnp.arange(worlds)[:, None, None] < share * worlds
+    nominal = narrowed_bounds(ranges, 0.0)
+    return jnp.where(is_nominal, nominal, jnp.asarray(family_bounds(ranges)))
+
+
 def draw_vehicles(
     ranges: Sequence[VehicleRange],
     key: jax.Array,
