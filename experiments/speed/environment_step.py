@@ -4,6 +4,9 @@ experiments.speed.environment_step [--source SRC ...]`.
 Each SRC is a folder that holds a package `openjax`, timed in a process of its own and in turns, so
 that two versions are compared on one machine: `git archive COMMIT src assets | tar -x -C DIR`. The
 step is vmapped and runs in a scan, as in anybody's program. Prints a line of JSON for each.
+
+With `--masked` each source is timed a second time with masks: a game of teams of any size, in which
+all slots are in use, and the evader's speed and the capture radius are the task's.
 """
 
 import argparse
@@ -19,14 +22,15 @@ REPEATS = 3
 """Runs after the first, of which the fastest counts."""
 
 
-def measure(worlds: int, steps: int, contacts: bool) -> dict:
+def measure(worlds: int, steps: int, contacts: bool, masked: bool) -> dict:
     """In this process: seconds to compile, and drone steps a second."""
     import jax
 
     import openjax
 
     jax.config.update("jax_enable_compilation_cache", False)
-    environment = openjax.make(physics="rigid", contacts=contacts)
+    teams = {"team_sizes": (3,), "evader_speeds": (0.8, 2.0), "capture_radii": (0.2, 0.4)}
+    environment = openjax.make(physics="rigid", contacts=contacts, **(teams if masked else {}))
     key = jax.random.key(0)
     state = jax.jit(jax.vmap(environment.reset))(jax.random.split(key, worlds))[1]
     pursuers = environment.settings.num_pursuers
@@ -47,6 +51,7 @@ def measure(worlds: int, steps: int, contacts: bool) -> dict:
         seconds.append(time.perf_counter() - began)
     return {
         "device": jax.devices()[0].device_kind,
+        "masked": masked,
         "compile_seconds": compiling,
         "drone_steps_a_second": worlds * pursuers * steps / min(seconds),
     }
@@ -59,17 +64,22 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--worlds", type=int, default=131_072)
     parser.add_argument("--steps", type=int, default=50)
     parser.add_argument("--free", action="store_true", help="without contacts")
+    parser.add_argument("--masked", action="store_true", help="with masks, too")
     parser.add_argument("--here", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
     if options.here:
-        print(json.dumps(measure(options.worlds, options.steps, not options.free)))
+        contacts = not options.free
+        print(json.dumps(measure(options.worlds, options.steps, contacts, options.masked)))
         return
+    plain = [argument for argument in arguments if argument != "--masked"]
+    ways = [plain, arguments] if options.masked else [plain]
     for _ in range(2):  # in turns: a machine warms up
         for source in options.source:
-            command = [sys.executable, __file__, "--here", *arguments]
             environment = os.environ | {"PYTHONPATH": str(Path(source).resolve())}
             print(source, flush=True)
-            subprocess.run(command, env=environment, check=True)
+            for own in ways:
+                command = [sys.executable, __file__, "--here", *own]
+                subprocess.run(command, env=environment, check=True)
 
 
 if __name__ == "__main__":
