@@ -1,9 +1,9 @@
 """Where one of a team falls out, who gets away: `python -m experiments.evaders.fallen --json FILE`.
 
-Flies a team of each size against the held-out scripted evaders on uniform tasks, whole and with one
-pursuer gone after two seconds, and says how many are caught by the end of each second, by which
-evader, and how fast the pursuers fly while it is free. With `--clock S` the time that pursuers
-observe stands still after S seconds: who knows the time may risk less and less as it passes.
+Flies a team of each size against scripted evaders, by default the held-out ones, on uniform tasks,
+whole and with one pursuer gone after two seconds. Says how many are caught by the end of each second,
+by which evader, and how fast the pursuers fly where it gets away. With `--clock S` the time that
+pursuers observe stands still after S seconds: who knows the time may risk less as it passes.
 """
 
 import argparse
@@ -49,7 +49,11 @@ def fly(options: argparse.Namespace, size: int, fall_outs: float) -> dict:
     """Figures of one size of team."""
     loaded = load_policy(options.policy)
     command = MapCommand(
-        options.policy, sizes=(size,), scenario="uniform", fall_outs=fall_outs, evaders=HELD_OUT
+        options.policy,
+        sizes=(size,),
+        scenario="uniform",
+        fall_outs=fall_outs,
+        evaders=tuple(options.evaders),
     )
     game = map_game(command, loaded.settings.environment)
     observer = None
@@ -58,7 +62,7 @@ def fly(options: argparse.Namespace, size: int, fall_outs: float) -> dict:
     environment = Pursuit(game, observer=observer)
     loaded = loaded.in_game(environment)
     evaluate = make_evaluate(environment, loaded.policy, trajectory=True)
-    kinds = jnp.arange(options.episodes) % len(HELD_OUT)
+    kinds = jnp.arange(options.episodes) % len(options.evaders)
 
     @jax.jit
     def all_episodes(key):
@@ -97,7 +101,7 @@ def figures(game: PursuitSettings, kinds: np.ndarray, statistics, path: np.ndarr
             float((caught & (statistics.capture_step <= end)).mean()) for end in ends
         ],
         "by_evader": {
-            name: float(caught[kinds == place].mean()) for place, name in enumerate(HELD_OUT)
+            name: float(caught[kinds == place].mean()) for place, name in enumerate(game.evaders)
         },
         "speed_by_second": [
             round(float(np.nanmean(free[:, end - second : end - 1])), 3) if len(free) else None
@@ -111,6 +115,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--policy", default="teams")
     parser.add_argument("--sizes", nargs="+", type=int, default=[2, 3, 4])
+    parser.add_argument("--evaders", nargs="+", default=HELD_OUT)
     parser.add_argument("--episodes", type=int, default=1200)
     parser.add_argument("--clock", type=float, help="seconds after which the observed time stops")
     parser.add_argument("--speed_ratio", type=float, default=1.3)
