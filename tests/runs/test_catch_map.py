@@ -5,13 +5,16 @@ import json
 import re
 
 import jax.numpy as jnp
+import numpy as np
 import pytest
 from scipy.stats import binomtest
 
 import openjax
 from openjax.evaluation.episodes import wilson
+from openjax.evaluation.judges.settings import BestResponseSettings, PlannerSettings
 from openjax.pursuit import PursuitSettings
 from openjax.runs.catch_map import draw_map, map_game
+from openjax.runs.map_evaders import least_caught
 from openjax.runs.map_page import map_page
 from openjax.runs.options import MapCommand
 from openjax.store.policies import own_controller
@@ -26,6 +29,7 @@ COMMAND = MapCommand(
     evaders=("frozen", "way_points"),
     episodes=2,
     batch=9,
+    best_response=False,
 )
 
 
@@ -36,7 +40,7 @@ def test_cells_are_games_of_their_own():
     policy = own_controller(still, GAME, "still")
     lines = []
     found = draw_map(COMMAND, policy, lines.append)
-    assert len(lines) == 3 and lines[-1].startswith("24 of 24 episodes")
+    assert len(lines) == 3 and lines[-1].endswith("24 of 24 episodes")
     cells = {
         (cell["num_pursuers"], cell["speed_ratio"], cell["capture_radius"]): cell
         for cell in found["cells"]
@@ -51,7 +55,48 @@ def test_cells_are_games_of_their_own():
         assert cell["planar_below"] >= cell["forced_below"] or radius == 3.0
     shown = re.search(r'<script id="data"[^>]*>(.*?)</script>', map_page({"empty <1>": found}))
     (only,) = json.loads(shown[1])
-    assert only["name"] == "empty <1>" and len(only["cells"]) == 12
+    assert only["name"].startswith("empty <1>, ") and len(only["cells"]) == 12
+
+
+@pytest.mark.slow
+def test_evaders_learn_and_plan_in_the_cells_and_fly_again_from_their_file(tmp_path):
+    """A team that stays where it starts is never near who has learned to stay away, and always where
+    the reach is the whole arena.
+    """
+
+    def still(observation):
+        return jnp.zeros((observation.position.shape[0], 4))
+
+    policy = own_controller(still, GAME, "still")
+    command = dataclasses.replace(
+        COMMAND,
+        best_response=True,
+        evaders_out=tmp_path / "evaders.npz",
+        learning=BestResponseSettings(learners=2, num_envs=2, rollout_length=2, total_steps=32),
+        planner_share=0.5,
+        planner_episodes=1,
+        planning=PlannerSettings(plans=3, pieces=1, piece_steps=1, replan=5),
+    )
+    found = draw_map(command, policy, lambda text: None)
+    again = dataclasses.replace(command, learned=command.evaders_out, evaders_out=None)
+    flown_again = draw_map(again, policy, lambda text: None)
+    assert found["curve"] and flown_again["curve"] == found["curve"]
+    for cell, other in zip(found["cells"], flown_again["cells"], strict=True):
+        assert cell == other
+        for who in ("learned", "planner"):
+            if who in cell:
+                assert cell[who]["capture_rate"] == float(cell["capture_radius"] == 3.0)
+    planned = [cell["planner"]["episodes"] for cell in found["cells"] if "planner" in cell]
+    assert planned == [1] * 6
+    shown = map_page({"empty": found})
+    assert "learned to escape from this team" in shown
+    with pytest.raises(openjax.UserError, match=r"--learned.*openjax map writes one"):
+        draw_map(dataclasses.replace(again, learned=tmp_path / "no.npz"), policy, print)
+
+
+def test_who_is_caught_least_is_chosen_by_the_other_half():
+    caught = np.array([[0, 1], [1, 0], [0, 1], [1, 0]], bool)
+    np.testing.assert_array_equal(least_caught(caught), [1, 0, 1, 0])
 
 
 def test_intervals_of_proportions_are_wilsons():

@@ -1,9 +1,10 @@
 """What a policy catches: `openjax map --policy RUN`.
 
-It flies with teams of each size, after evaders of each speed, with each capture radius, against
-scripted evaders. The picture shows the share of captures in each cell, and the line below which a
-theorem forces one for points without inertia (`openjax.baselines.stack`); `--page` writes a page to
-move about in.
+It flies with teams of each size, after evaders of each speed, with each capture radius: after
+scripted evaders, after some that learned to escape from this policy, and, in some cells, after one
+that plans. The picture shows the share of captures in each cell, and the line below which a theorem
+forces one for points without inertia (`openjax.baselines.stack`); `--page` writes a page to move
+about in.
 """
 
 import dataclasses
@@ -22,6 +23,7 @@ ON_CPU = {
     "radii": (0.2, 0.3, 0.4),
     "episodes": 4,
     "batch": 96,
+    "best_response": False,
 }
 """What is less by default without an accelerator: enough to see it work."""
 
@@ -37,18 +39,18 @@ def main(arguments: Sequence[str]) -> int:
 
     from openjax.runs.catch_map import draw_map, map_game
     from openjax.runs.map_page import map_page
-    from openjax.show.plots import plot_map
     from openjax.store.policies import load_policy
 
     loaded = load_policy(command.policy)
     trained = loaded.settings.environment
     less = ON_CPU if jax.default_backend() == "cpu" else {}
+    if not command.messages.perfect:
+        less = less | {"best_response": False}  # who learns doesn't know what was heard
     sizes = {} if trained.team_sizes else {"sizes": (trained.num_pursuers,)}
     default = dataclasses.replace(MapCommand(), **less, **sizes)
     command = parse(MapCommand, default, arguments, PROGRAM)
-    check_output(command.out, "--out")
-    check_output(command.json, "--json")
-    check_output(command.page, "--page")
+    for option in ("out", "json", "page", "evaders_out"):
+        check_output(getattr(command, option), f"--{option}")
     if command.out.suffix not in (".png", ".svg", ".pdf"):
         raise UserError(f"--out {command.out}: a picture ends in .png, .svg or .pdf")
     check_evaders(command.evaders)
@@ -59,8 +61,18 @@ def main(arguments: Sequence[str]) -> int:
         write_json(command.json, results)
     if command.page is not None:
         write_text(command.page, map_page({command.scenario: results}))
-    cells = results["cells"]
-    plot_map(command.out, cells, f"{command.policy}: captures, {command.scenario}")
+    _show(command, results, console)
+    return 0
+
+
+def _show(command, results, console):
+    """Draw the picture, of evaders that learned where there are some, and tell the least cell."""
+    from openjax.runs.catch_map import cells_against
+    from openjax.show.plots import plot_map
+
+    who = "learned" if command.best_response else "scripted"
+    cells = cells_against(results, who)
+    plot_map(command.out, cells, f"{command.policy}: captures, {command.scenario}, {who} evaders")
     least = min(cells, key=lambda cell: cell["capture_rate"])
     console.print(
         f"{command.out}: {len(cells)} cells of {command.episodes} episodes; the least is "
@@ -68,4 +80,3 @@ def main(arguments: Sequence[str]) -> int:
         f"{least['speed_ratio']:g} times their speed and {least['capture_radius']:g} m",
         soft_wrap=True,
     )
-    return 0

@@ -4,9 +4,10 @@ forces.
 """
 
 import dataclasses
+import functools
 import itertools
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import jax
@@ -18,6 +19,7 @@ from openjax.errors import UserError
 from openjax.evaluation.episodes import make_evaluate, wilson
 from openjax.pursuit import EpisodeStatistics, Pursuit, PursuitSettings, Task, uniform_task
 from openjax.runs.machine import describe_machine
+from openjax.runs.map_evaders import Flight, MapEvaders, least_caught
 from openjax.runs.options import MapCommand
 from openjax.store.policies import LoadedPolicy
 
@@ -52,6 +54,11 @@ def map_game(command: MapCommand, trained: PursuitSettings) -> PursuitSettings:
     for name in ("sizes", "speed_ratios", "radii"):
         if not getattr(command, name):
             raise UserError(f"--{name} needs at least one number")
+    if command.best_response and not command.messages.perfect:
+        raise UserError(
+            "--best_response: nobody learns against a team whose messages are lost or late; with "
+            "--best_response False scripted evaders fly alone"
+        )
     largest = max(command.sizes)
     if not trained.team_sizes and set(command.sizes) != {trained.num_pursuers}:
         raise UserError(
@@ -89,22 +96,35 @@ def draw_map(command: MapCommand, loaded: LoadedPolicy, tell: Callable[[str], No
     """Fly all cells.
 
     Args:
-      command: which cells, how often.
+      command: which cells, how often, and against whom.
       loaded: the policy.
       tell: shows a line of progress.
 
     Returns:
-      policy, evaders, scenario, what is taken away, cells (see `cell_record`), seconds, machine.
+      policy, evaders, scenario, what is taken away, cells (see `cell_record`), how evaders learned,
+      seconds, machine.
 
     Raises:
-      UserError: a game that the policy can't play.
+      UserError: a game that the policy can't play, or a file of evaders that can't be used.
     """
     began = time.monotonic()
     game = map_game(command, loaded.settings.environment)
     environment = Pursuit(game)
     loaded = loaded.in_game(environment)
+    draw = functools.partial(draw_task, game, command)
     cells = cells_of(command)
-    flown = _fly(command, environment, loaded, cells, tell)
+    evaluate = make_evaluate(environment, loaded.policy, messages=command.messages)
+
+    def scripted(_, tasks, key):
+        return evaluate(loaded.parameters, tasks, key).statistics
+
+    flights = [Flight("scripted evaders", scripted, command.episodes)]
+    learning = {}
+    if command.best_response:
+        knowing = MapEvaders(command, game, loaded, draw)
+        learners, learning["curve"] = knowing.evaders(tell)
+        learning["seconds_of_learning"] = time.monotonic() - began
+        flights += [knowing.learned(learners), knowing.planned]
     return {
         "policy": loaded.source,
         "evaders": list(command.evaders),
@@ -118,60 +138,117 @@ def draw_map(command: MapCommand, loaded: LoadedPolicy, tell: Callable[[str], No
             "seconds": game.episode_length * game.time_step,
         },
         "trained_with": list(loaded.settings.environment.team_sizes),
-        "cells": [cell_record(game, *pair) for pair in zip(cells, flown, strict=True)],
+        "cells": _records(_Flyer(command, draw, tell), game, cells, flights),
+        **learning,
         "seconds": time.monotonic() - began,
         "machine": describe_machine(),
     }
 
 
-def _fly(command, environment, loaded, cells, tell):
-    """The statistics (episodes,) of each cell."""
-    evaluate = make_evaluate(environment, loaded.policy, messages=command.messages)
-    game = environment.settings
+def _records(flyer, game, cells, flights):
+    """A record of each cell."""
+    scripted, *knowing = flights
+    flown = flyer.fly(scripted, cells)
+    records = [cell_record(game, *pair) for pair in zip(cells, flown, strict=True)]
+    if not knowing:
+        return records
+    learned, planned = knowing
+    for record, statistics in zip(records, flyer.fly(learned, cells), strict=True):
+        record["learned"] = figures(game, _of_least_caught(statistics))
+    command = flyer.command
+    number = round(command.planner_share * len(cells))
+    if number:
+        generator = np.random.default_rng(command.seed)
+        places = np.sort(generator.choice(len(cells), number, replace=False)).tolist()
+        flown = flyer.fly(planned, [cells[place] for place in places])
+        for place, statistics in zip(places, flown, strict=True):
+            records[place]["planner"] = figures(game, statistics)
+    return records
 
-    @jax.jit
-    def fly(keys, cells, key):
-        tasks = jax.vmap(lambda key, cell: draw_task(game, command, key, cell))(keys, cells)
-        return evaluate(loaded.parameters, tasks, key).statistics
 
-    number = len(cells) * command.episodes
-    batch = min(command.batch, number)
-    first = jax.random.key(command.seed)
-    keys = jax.random.split(first, command.episodes)  # the same tasks in all cells
-    parts = []
-    for start in range(0, number, batch):
-        place = np.minimum(np.arange(start, start + batch), number - 1)
-        which, episode = np.divmod(place, command.episodes)
-        own_cells = jnp.asarray(cells, jnp.float32)[which]
-        statistics = fly(keys[episode], own_cells, jax.random.fold_in(first, 1 + start))
-        parts.append(jax.tree.map(np.asarray, statistics))
-        tell(f"{min(start + batch, number)} of {number} episodes")
-    flown = jax.tree.map(lambda *leaves: np.concatenate(leaves)[:number], *parts)
-    starts = range(0, number, command.episodes)
-    return [
-        jax.tree.map(lambda leaf, start=start: leaf[start : start + command.episodes], flown)
-        for start in starts
-    ]
+def cells_against(found: Mapping, evaders: str) -> list[dict]:
+    """The cells of a map (see `draw_map`) that evaders of one kind flew, with their figures:
+    "scripted", "learned", or "planner".
+    """
+    if evaders == "scripted":
+        return list(found["cells"])
+    return [{**cell, **cell[evaders]} for cell in found["cells"] if evaders in cell]
+
+
+@dataclasses.dataclass(frozen=True)
+class _Flyer:
+    """Flies episodes in cells, some at a time."""
+
+    command: MapCommand
+    draw: Callable[[jax.Array, jax.Array], Task]
+    """(key, cell (3,)) -> a task in it"""
+    tell: Callable[[str], None]
+
+    def fly(self, flight: Flight, cells: Sequence[Cell]) -> list[EpisodeStatistics]:
+        """The statistics (episodes, ...) of each cell."""
+        command = self.command
+        episodes = flight.episodes
+        number = len(cells) * episodes
+        batch = min(max(1, command.batch // flight.width), number)
+        first = jax.random.key(command.seed)
+        # the same tasks in all cells, whoever flies
+        keys = jax.random.split(first, command.episodes)[:episodes]
+
+        @jax.jit
+        def fly(networks, keys, cells, key):
+            return flight.fly(networks, jax.vmap(self.draw)(keys, cells), key)
+
+        parts = []
+        for start in range(0, number, batch):
+            place = np.minimum(np.arange(start, start + batch), number - 1)
+            which, episode = np.divmod(place, episodes)
+            own = jnp.asarray(cells, jnp.float32)[which]
+            key = jax.random.fold_in(first, 1 + start)
+            statistics = fly(flight.networks, keys[episode], own, key)
+            parts.append(jax.tree.map(np.asarray, statistics))
+            self.tell(f"{flight.name}: {min(start + batch, number)} of {number} episodes")
+        flown = jax.tree.map(lambda *leaves: np.concatenate(leaves)[:number], *parts)
+        starts = range(0, number, episodes)
+        return [
+            jax.tree.map(lambda leaf, start=start: leaf[start : start + episodes], flown)
+            for start in starts
+        ]
+
+
+def _of_least_caught(statistics):
+    """(E,) of (E, L): of each half of the episodes, those of the learner that is caught least in
+    the other half.
+    """
+    chosen = least_caught(statistics.captured)
+    return jax.tree.map(lambda leaf: leaf[np.arange(len(chosen)), chosen], statistics)
 
 
 def cell_record(game: PursuitSettings, cell: Cell, statistics: EpisodeStatistics) -> dict:
-    """A cell's captures with their 95 % interval, crashes and mean capture time (s, of those that
-    capture), and the speed ratios below which a theorem forces a capture for points
-    (`openjax.baselines.stack`): all on one ray, and as the game in a plane has it.
+    """A cell's figures with scripted evaders, and the speed ratios below which a theorem forces a
+    capture for points (`openjax.baselines.stack`): all on one ray, and as the game in a plane has
+    it.
     """
-    episodes = len(statistics.captured)
-    caught = statistics.captured
     points = dataclasses.replace(
         game, num_pursuers=cell.num_pursuers, capture_radius=cell.capture_radius
     )
-    seconds = statistics.capture_step[caught].mean() * game.time_step if caught.any() else None
     return {
         **cell._asdict(),
-        "episodes": episodes,
-        "capture_rate": float(caught.mean()),
-        "interval": list(wilson(int(caught.sum()), episodes)),
-        "capture_seconds": None if seconds is None else float(seconds),
-        "crash_rate": float(statistics.crashed.mean()),
+        **figures(game, statistics),
         "forced_below": stack_bound(points),
         "planar_below": planar_bound(points),
+    }
+
+
+def figures(game: PursuitSettings, statistics: EpisodeStatistics) -> dict:
+    """Captures of episodes (E,) with their 95 % interval, crashes and mean capture time (s, of those
+    that capture).
+    """
+    caught = statistics.captured
+    seconds = statistics.capture_step[caught].mean() * game.time_step if caught.any() else None
+    return {
+        "episodes": len(caught),
+        "capture_rate": float(caught.mean()),
+        "interval": list(wilson(int(caught.sum()), len(caught))),
+        "capture_seconds": None if seconds is None else float(seconds),
+        "crash_rate": float(statistics.crashed.mean()),
     }

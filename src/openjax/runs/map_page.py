@@ -5,13 +5,19 @@ theory nor drones.
 from collections.abc import Mapping
 from pathlib import Path
 
+from openjax.runs.catch_map import cells_against
 from openjax.show.pages import filled
 
 SHOWN = (
     *("num_pursuers", "speed_ratio", "capture_radius", "episodes", "capture_rate", "interval"),
-    *("capture_seconds", "crash_rate", "forced_below", "planar_below"),
+    *("capture_seconds", "crash_rate", "forced_below", "planar_below", "planner"),
 )
 """What a page has of a cell."""
+WHO = {
+    "learned": "one that learned to escape from this team",
+    "scripted": "one that flies by rules",
+}
+"""Kinds of evaders (`openjax.runs.catch_map.cells_against`), and how the page calls them."""
 
 
 def map_page(maps: Mapping[str, dict]) -> str:
@@ -22,10 +28,13 @@ def map_page(maps: Mapping[str, dict]) -> str:
       first is shown first.
     """
     first = next(iter(maps.values()))
-    plain = [
-        {"name": name, "cells": [{key: cell.get(key) for key in SHOWN} for cell in found["cells"]]}
-        for name, found in maps.items()
-    ]
+    plain = []
+    for name, found in maps.items():
+        for evaders, words in WHO.items():
+            cells = cells_against(found, evaders)
+            if cells:
+                shown = [{key: cell.get(key) for key in SHOWN} for cell in cells]
+                plain.append({"name": f"{name}, {words}", "cells": shown})
     return filled(
         "catch_map.html.jinja",
         Path(__file__).parent,

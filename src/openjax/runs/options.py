@@ -166,6 +166,27 @@ class MapCommand:
     """Distance up to which a pursuer sees the evader (m)."""
     sight_angle: Annotated[float, Interval("(0, 360]")] = PursuitSettings.sight_angle
     """Opening angle of the cone about its body x axis within which a pursuer sees it (degrees)."""
+    best_response: tyro.conf.FlagConversionOff[bool] = True
+    """Let evaders learn against the policy, one network for all cells, and fly them in all cells,
+    too; by default not on a CPU.
+    """
+    learned: Path | None = None
+    """File of evaders that learned in a map before (--evaders_out), in place of learning."""
+    evaders_out: Path | None = None
+    """File to write those that learned to (.npz)."""
+    minutes: Annotated[float | None, Interval("(0, 100000]")] = None
+    """Stop learning after this time, which begins when all is compiled."""
+    learning: BestResponseSettings = dataclasses.field(
+        default_factory=lambda: BestResponseSettings(
+            learners=4, total_steps=400_000_000, layouts=0.0
+        )
+    )
+    """How they learn; their tasks are the map's, and `layouts` counts for nothing."""
+    planner_share: Annotated[float, Interval("[0, 1]")] = 0.1
+    """Share of the cells in which an evader that plans flies, too."""
+    planner_episodes: Annotated[int, Interval("[1, 1000000]")] = 50
+    """Its episodes in each of them, the first of the cell's: each takes hundreds of others."""
+    planning: PlannerSettings = dataclasses.field(default_factory=PlannerSettings)
     batch: Annotated[int, Interval("[1, 1000000]")] = 8192
     """Episodes that are flown at once."""
     seed: Seed = 0

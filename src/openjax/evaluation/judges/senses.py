@@ -1,7 +1,8 @@
 """What a judge's evader knows: all of the world's state, as numbers in axes of its own.
 
 The x axis points away from the arena's axis, so that a game that is turned looks the same; with
-`world_axes` it is the world's. Pursuers and pillars are sorted by their distance.
+`world_axes` it is the world's. Pursuers and pillars are sorted by their distance. Where tasks have
+an evader's speed and a capture radius of their own, it knows these, too: one network plays them all.
 """
 
 import jax
@@ -9,6 +10,7 @@ import jax.numpy as jnp
 
 from openjax.pursuit import PursuitSettings, PursuitState
 from openjax.pursuit.observation import rotation_axes
+from openjax.pursuit.task import capture_radius, evader_speed
 
 TINY = 1e-9
 NEAR = 3.0
@@ -16,7 +18,10 @@ NEAR = 3.0
 _EVADER = 14
 _PURSUER = 13
 _NO_PILLAR = (4.0, 0.0, 0.0, 0.0)
-"""What is sensed of a slot that isn't in use: a pillar far away."""
+_NO_PURSUER = (4.0, 0.0, 0.0, 4.0, *[0.0] * 9)
+"""What is sensed of a slot that isn't in use: a pillar, a pursuer far away."""
+USUAL_RADIUS = 0.3
+"""By which a task's own capture radius is measured (m): the paper's."""
 
 
 def sense(
@@ -42,11 +47,18 @@ def sense(
         _pursuers(settings, state, turned).ravel(),
         jnp.concatenate([pillars, absent]).ravel(),
     ]
+    task = state.task
+    if task.evader_speed is not None:
+        parts.append(task.evader_speed[None] / settings.max_speed)
+    if task.capture_radius is not None:
+        parts.append(task.capture_radius[None] / USUAL_RADIUS)
     return jnp.concatenate(parts)
 
 
 def number_of_senses(pursuers: int, slots: int) -> int:
-    """F for as many pursuers and pillar slots."""
+    """F for as many pursuers and pillar slots, in a game whose tasks have no numbers of their
+    own.
+    """
     return _EVADER + _PURSUER * pursuers + len(_NO_PILLAR) * slots
 
 
@@ -80,7 +92,7 @@ def _evader(settings, state, turned):
             turned @ (position - middle) / settings.arena_radius,
             1.0 - radius / settings.arena_radius,
             position[2:] / settings.arena_height,
-            turned @ state.evader_velocity / settings.evader_speed,
+            turned @ state.evader_velocity / evader_speed(settings, state.task),
             turned @ (state.last_seen - position) / settings.arena_radius,
             jnp.stack([state.seen.astype(jnp.float32), time, 1.0 - time]),
         ]
@@ -89,9 +101,10 @@ def _evader(settings, state, turned):
 
 def _pursuers(settings, state, turned):
     """(N, 13), the nearest first: where each is, how it flies, where its rotors pull, if it sees
-    the evader.
+    the evader; empty slots are far away.
     """
-    near = NEAR * settings.capture_radius
+    radius = capture_radius(settings, state.task)
+    near = NEAR * radius
     offset = state.drones.position - state.evader_position
     distance = _length(offset)
     thrust = rotation_axes(state.drones.quaternion)[1]
@@ -101,7 +114,7 @@ def _pursuers(settings, state, turned):
         [
             offset @ turned.T / near,
             distance / near,
-            settings.capture_radius / jnp.maximum(distance, settings.capture_radius / 2),
+            radius / jnp.maximum(distance, radius / 2),
             velocity @ turned.T,
             closing,
             thrust @ turned.T,
@@ -109,6 +122,9 @@ def _pursuers(settings, state, turned):
         ],
         axis=-1,
     )
+    if state.active is not None:
+        # where they are parked is no number of the order of one
+        rows = jnp.where(state.active[:, None], rows, jnp.array(_NO_PURSUER))
     return rows[jnp.argsort(distance[:, 0])]
 
 
@@ -119,9 +135,8 @@ def _pillars(settings, state, turned):
     active = task.pillar_active[:, None]
     gap = _length(offset) - settings.pillar_radius
     near = jnp.exp(-jnp.maximum(gap, 0.0) / settings.pillar_radius)
-    rows = jnp.concatenate(
-        [offset @ turned[:2, :2].T / (NEAR * settings.capture_radius), near], axis=-1
-    )
+    scale = NEAR * capture_radius(settings, task)
+    rows = jnp.concatenate([offset @ turned[:2, :2].T / scale, near], axis=-1)
     rows = jnp.concatenate([rows, jnp.ones_like(near)], axis=-1)
     rows = jnp.where(active, rows, jnp.array(_NO_PILLAR))
     return rows[jnp.argsort(jnp.where(active, gap, jnp.inf)[:, 0])]

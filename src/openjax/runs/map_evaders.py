@@ -1,0 +1,188 @@
+"""Evaders of a map that know the team: some learn against the policy, each by one network for all
+cells, and one plans.
+"""
+
+import dataclasses
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from openjax.background import compile_ahead
+from openjax.errors import UserError
+from openjax.evaluation.judges.best_response import BestResponse, Evaders, fly_learners
+from openjax.evaluation.judges.duel import Duel
+from openjax.evaluation.judges.planner import Planner
+from openjax.pursuit import EpisodeStatistics, Pursuit, PursuitSettings, Task
+from openjax.runs.options import MapCommand
+from openjax.store.policies import LoadedPolicy
+from openjax.store.policy_files import fill, load_policy_file, save_policy_file
+
+LINES = 20
+"""Lines that are told of a whole training."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Flight:
+    """Evaders of one kind, in whatever cells."""
+
+    name: str
+    fly: Callable[[Any, Task, jax.Array], EpisodeStatistics]
+    """(the evaders' networks, tasks (B, ...), key) -> statistics (B, ...)."""
+    episodes: int
+    """Of each cell."""
+    networks: Any = None
+    width: int = 1
+    """Worlds that an episode needs."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class MapEvaders:
+    """Those that learn in a map's cells, and the one that plans, against one policy."""
+
+    command: MapCommand
+    game: PursuitSettings
+    """Of all cells."""
+    loaded: LoadedPolicy
+    """The policy in it."""
+    draw: Callable[[jax.Array, jax.Array], Task]
+    """(key, cell (3,)) -> a task in it."""
+
+    @property
+    def duel(self) -> Duel:
+        """The game with an evader that is told where to fly; its own rule is the cheapest one."""
+        return Duel(Pursuit(dataclasses.replace(self.game, evaders=("field",))), self.loaded.policy)
+
+    @property
+    def response(self) -> BestResponse:
+        """The learners; they meet whatever lies between the map's cells, too."""
+        command = self.command
+        sizes = jnp.array(command.sizes, jnp.float32)
+
+        def draw_task(key):
+            keys = jax.random.split(key, 4)
+            cell = [jax.random.choice(keys[0], sizes)]
+            for key, values in zip(keys[1:3], (command.speed_ratios, command.radii), strict=True):
+                cell.append(jax.random.uniform(key, (), minval=min(values), maxval=max(values)))
+            return self.draw(keys[3], jnp.stack(cell))
+
+        return BestResponse(command.learning, self.duel, draw_task)
+
+    def learn(self, tell: Callable[[str], None]) -> tuple[Evaders, list[dict]]:
+        """Learners after their training, and what was told on the way."""
+        tell("compiling the evaders' learning ...")
+        settings = self.command.learning
+        response = self.response
+        start = jax.jit(response.start)
+        step = jax.jit(response.step, donate_argnums=1)
+        key = jax.random.key(self.command.seed)
+        parameters = self.loaded.parameters
+        programs = (
+            compile_ahead(step, parameters, jax.eval_shape(start, key)),
+            compile_ahead(start, key),
+        )
+        for ready in programs:
+            ready()
+        began = time.monotonic()
+        carry = start(key)
+        curve = []
+        for update in range(1, settings.total_updates + 1):
+            # one at a time, as in `openjax.runs.exploit`
+            carry, metrics = jax.block_until_ready(step(parameters, carry))
+            seconds = time.monotonic() - began
+            over = self.command.minutes is not None and seconds > 60 * self.command.minutes
+            if over or update % max(1, settings.total_updates // LINES) == 0:
+                values = {name: np.asarray(value).tolist() for name, value in metrics.items()}
+                steps = update * settings.steps_per_update
+                curve.append({"steps": steps, "seconds": seconds, **values})
+                rates = ", ".join(f"{rate:.2f}" for rate in values["capture_rate"])
+                tell(f"{steps / 1e6:.1f} M steps, {seconds:.0f} s: episodes end caught {rates}")
+            if over:
+                break
+        return carry.evaders, curve
+
+    def learned(self, evaders: Evaders) -> Flight:
+        """Each learner's mean; statistics (B, L)."""
+        duel = self.duel
+        hold = self.command.learning.hold
+
+        def fly(evaders, tasks, key):
+            start = duel.start(tasks, key)
+            flown = fly_learners(duel, hold, evaders, self.loaded.parameters, start)
+            return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), flown)
+
+        learners = len(evaders.world_axes)
+        return Flight("evaders that learned", fly, self.command.episodes, evaders, learners)
+
+    @property
+    def planned(self) -> Flight:
+        """The planner, in the first of a cell's episodes."""
+        command = self.command
+        planner = Planner(command.planning, self.duel)
+
+        def fly(_, tasks, key):
+            return planner.fly(self.loaded.parameters, planner.duel.start(tasks, key), key)
+
+        episodes = min(command.planner_episodes, command.episodes)
+        # wider than others, as nothing but the ends of its plans is kept
+        width = -(-command.planning.plans // 4)
+        return Flight("an evader that plans", fly, episodes, width=width)
+
+    def evaders(self, tell: Callable[[str], None]) -> tuple[Evaders, list[dict]]:
+        """Those of the command's file, or new ones, and what was told while they learned."""
+        command = self.command
+        learners, curve = (
+            self.learn(tell) if command.learned is None else self.load(command.learned)
+        )
+        if command.evaders_out is not None:
+            # at once: flying takes minutes, in which anything may happen
+            self.save(command.evaders_out, learners, curve)
+        return learners, curve
+
+    def save(self, path: Path, evaders: Evaders, curve: list[dict]) -> None:
+        """Write those that learned, for `load`."""
+        notes = {"policy": self.loaded.source, "scenario": self.command.scenario, "curve": curve}
+        stored = {"map_evaders": {"actor": evaders.actor, "world_axes": evaders.world_axes}}
+        save_policy_file(path, stored, {"environment": self.game}, notes, storage="float32")
+
+    def load(self, path: Path) -> tuple[Evaders, list[dict]]:
+        """What `save` wrote; they can fly, not learn on.
+
+        Raises:
+          UserError: no such file, or one of other evaders.
+        """
+        if not path.is_file():
+            raise UserError(
+                f"--learned {path}: no such file; openjax map writes one by --evaders_out"
+            )
+        leaves, _, notes = load_policy_file(path, "file of a map's evaders", "openjax map")
+        if "map_evaders/world_axes" not in leaves:
+            raise UserError(
+                f"--learned {path}: holds no evaders of a map; openjax map writes one by "
+                "--evaders_out"
+            )
+        learners = len(leaves["map_evaders/world_axes"])
+        settings = dataclasses.replace(self.command.learning, learners=learners)
+        response = dataclasses.replace(self.response, settings=settings)
+        kinds = jax.eval_shape(response.start, jax.random.key(0)).evaders
+        abstract = {"map_evaders": {"actor": kinds.actor, "world_axes": kinds.world_axes}}
+        stored = fill(abstract, leaves, str(path))["map_evaders"]
+        evaders = jax.tree.map(lambda kind: jnp.zeros(kind.shape, kind.dtype), kinds)
+        return evaders.replace(**stored), notes.get("curve", [])
+
+
+def least_caught(captured: np.ndarray) -> np.ndarray:
+    """(E,) the place of the learner that flies each of a cell's episodes (E, L) that end with a
+    capture or not: the one that is caught least in the other half of them, as whoever is chosen by
+    the episodes that count looks better than it is.
+    """
+    even = np.arange(len(captured)) % 2 == 0
+    if len(captured) < 2:
+        return np.zeros(len(captured), int)
+    by_even = np.argmin(captured[even].mean(axis=0))
+    by_odd = np.argmin(captured[~even].mean(axis=0))
+    return np.where(even, by_odd, by_even)
