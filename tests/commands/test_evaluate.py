@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import pytest
 
 import openjax
+from openjax.command_line import parse
 from openjax.commands import evaluate
 from openjax.policy import make_policy
 from openjax.store.policies import abstract_parameters
@@ -90,3 +91,24 @@ def test_a_policy_for_teams_flies_with_any_number(tmp_path, capsys):
     pair = loaded.of_team(2)
     seen = jax.eval_shape(openjax.make(pair.settings.environment).reset, jax.random.key(0))[0]
     assert jax.eval_shape(pair, seen).shape == (2, 4)
+
+
+def test_where_none_is_named_a_policy_flies_that_takes_so_many(tmp_path, capsys):
+    layout = tmp_path / "pair.toml"
+    layout.write_text("pursuers = [[0.3, 0.0, 0.6], [0.3, 0.3, 0.6]]\nevader = [-0.3, 0.0, 0.6]\n")
+    arguments = {
+        (): "evaders",
+        ("--num_pursuers", "5", "--scenario", "uniform"): "teams",
+        ("--scenario", str(layout)): "teams",
+        ("--num_pursuers", "5", "--scenario", "uniform", "--policy", "flight"): None,
+    }
+    for typed, name in arguments.items():
+        command = parse(evaluate.EvaluateCommand, evaluate.EvaluateCommand(), typed, "evaluate")
+        if name is None:
+            with pytest.raises(openjax.UserError, match="num_pursuers 3"):
+                evaluate.prepare(command, typed)
+            continue
+        ((_, loaded),) = evaluate.prepare(command, typed)
+        assert loaded.source == name
+        said = " ".join(capsys.readouterr().out.split())
+        assert ("evaders flies 3 pursuers only" in said) == (name == "teams")

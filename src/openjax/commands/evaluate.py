@@ -20,7 +20,7 @@ from openjax.files import check_output, write_json
 from openjax.pursuit.settings import LAYOUT_PURSUERS, PursuitSettings
 from openjax.ranges import Interval, Seed
 from openjax.show.progress import Steps
-from openjax.store import DEFAULT_POLICY
+from openjax.store import default_policy, default_policy_line
 from openjax.store.compiled_programs import cache_programs
 
 if TYPE_CHECKING:
@@ -37,10 +37,10 @@ LARGEST_BATCH = 1000
 class FlightOptions:
     """What is flown: policies on layouts, against an evader."""
 
-    policy: tuple[str, ...] = (DEFAULT_POLICY,)
+    policy: tuple[str, ...] | None = None
     """Runs' directories, policy files (.npz), checkpoints, or names of policies in the package
     (flight, open ...) or of heuristics (angelani, janosov, apf, stack), or FILE.py:function for a
-    controller of one's own.
+    controller of one's own. By default evaders, or teams for another number of pursuers than three.
     """
     scenario: str = "all"
     """wall, narrow_gap, random, passage, empty, hidden, a TOML file with an own layout, uniform
@@ -57,17 +57,35 @@ class FlightOptions:
     compilation_cache: bool = True
     """Keep compiled programs in the user's cache folder."""
 
-    def start(self) -> list["LoadedPolicy"]:
+    def start(self, environment: PursuitSettings | None = None) -> list["LoadedPolicy"]:
         """The policies, loaded, after JAX was told where it keeps programs. Raises UserError where
-        there are none.
+        there are none. `environment`: settings that were typed; None: none were.
         """
         if self.compilation_cache:
             cache_programs()
         from openjax.store.policies import load_policy
 
-        if not self.policy:
+        names = self.policy
+        if names is None:
+            number = self.pursuers_of(environment or PursuitSettings())
+            names = (default_policy(number),)
+            if line := default_policy_line(number):
+                output_console().print(line, soft_wrap=True)
+        if not names:
             raise UserError("--policy needs at least one policy")
-        return [load_policy(name) for name in self.policy]
+        return [load_policy(name) for name in names]
+
+    def pursuers_of(self, environment: PursuitSettings) -> int:
+        """How many pursuers are asked for: those of a layout's file, or of the settings.
+
+        Raises:
+          UserError: an unusable file.
+        """
+        from openjax.pursuit.scenarios import find_scenario
+
+        if self.scenario.endswith(".toml"):
+            return len(find_scenario(self.scenario, environment).pursuers)
+        return environment.num_pursuers
 
 
 @dataclasses.dataclass(frozen=True)
@@ -120,7 +138,10 @@ def prepare(command: EvaluateCommand, arguments: Sequence[str]) -> list[tuple]:
     """
     check_output(command.json, "--json")
     policies = []
-    for loaded in command.start():
+    typed = command.environment
+    if command.num_pursuers is not None:
+        typed = dataclasses.replace(typed, num_pursuers=command.num_pursuers)
+    for loaded in command.start(typed):
         default = dataclasses.replace(EvaluateCommand(), environment=loaded.settings.environment)
         own = parse(EvaluateCommand, default, arguments, PROGRAM)
         _game(own, loaded)

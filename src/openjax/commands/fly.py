@@ -19,7 +19,7 @@ from openjax.files import check_new_folder, replacing
 from openjax.flying.endpoints import UDP_PORT, endpoints_of, sole_command
 from openjax.flying.state import SafetySettings
 from openjax.ranges import Interval
-from openjax.store import DEFAULT_POLICY
+from openjax.store import default_policy, default_policy_line
 
 PROGRAM = "openjax fly"
 DRIFT = 0.1
@@ -34,8 +34,10 @@ class Arguments:
     waits.
     """
 
-    policy: str = DEFAULT_POLICY
-    """A run's directory, a policy file (.npz), or the name of a policy in the package."""
+    policy: str | None = None
+    """A run's directory, a policy file (.npz), or the name of a policy in the package; by default
+    evaders, or teams for a layout of another number of pursuers than three.
+    """
     plan: str | None = None
     """Fly a plan instead, with one vehicle: identify (two minutes by which a vehicle shows what it
     does), or a CSV of openjax plan.
@@ -150,14 +152,18 @@ def prepare(arguments: Arguments) -> Prepared:
     from openjax.flying.controller import airframe_of
     from openjax.flying.game import Game
     from openjax.flying.loop import flight_state
-    from openjax.pursuit import find_scenario, scenario_task
+    from openjax.pursuit import PursuitSettings, find_scenario, scenario_task
     from openjax.store.policies import load_policy
     from openjax.vehicle.vehicle_file import load_vehicle_file
 
     real_time.prepare()
     if arguments.plan is not None:
         return _planned(arguments)
-    policy = load_policy(arguments.policy)
+    name = arguments.policy
+    if name is None:
+        number = len(find_scenario(arguments.scenario, PursuitSettings()).pursuers)
+        name = default_policy(number)
+    policy = load_policy(name)
     settings = policy.settings.environment
     scenario = find_scenario(arguments.scenario, settings)
     policy = policy.of_team(len(scenario.pursuers))
@@ -172,6 +178,8 @@ def prepare(arguments: Arguments) -> Prepared:
     session = _session(arguments)
     state = flight_state(game, len(uris), arguments.safety)
     remarks = _remarks(arguments, game, vehicle)
+    if arguments.policy is None and (line := default_policy_line(len(scenario.pursuers))):
+        remarks = (line, *remarks)
     about = {"policy": policy.source, "scenario": scenario.name, "uris": uris}
     return Prepared(game, state, session, vehicle, about, remarks)
 

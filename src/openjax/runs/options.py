@@ -14,7 +14,7 @@ from openjax.learning.settings import AdaptSettings, TrainSettings
 from openjax.pursuit.evaders.kinds import HELD_OUT
 from openjax.pursuit.settings import PursuitSettings
 from openjax.ranges import Interval, Seed
-from openjax.store import DEFAULT_POLICY
+from openjax.store import DEFAULT_POLICY, TEAM_POLICY
 
 PROGRAM = "openjax train"
 
@@ -94,9 +94,10 @@ class ExploitCommand:
     evaders.
     """
 
-    policy: str = DEFAULT_POLICY
+    policy: str | None = None
     """A run's directory, a policy file (.npz), a checkpoint, the name of a policy in the package
-    or of a heuristic, or FILE.py:function for a controller of one's own.
+    or of a heuristic, or FILE.py:function for a controller of one's own. By default evaders, or
+    teams for another number of pursuers than three.
     """
     out: Path = Path("evader.npz")
     """File to write the strongest learned evader to."""
@@ -133,7 +134,7 @@ class ExploitCommand:
 class MapCommand:
     """Map what a policy catches: over teams, speeds of the evader and capture radii."""
 
-    policy: str = DEFAULT_POLICY
+    policy: str = TEAM_POLICY
     """A run's directory, a policy file (.npz), a checkpoint, or the name of a policy in the
     package; one of the preset teams flies with any number of pursuers.
     """
