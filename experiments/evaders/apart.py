@@ -23,11 +23,14 @@ def main() -> None:
     settings = SplittingSettings(options.copies)
     splitting = Splitting(settings, game.environment, game.loaded.policy)
     began = time.monotonic()
-    records = game.records(NAME, splitting.fly)
-    seconds = time.monotonic() - began
-    rates = ", ".join(f"{one['scenario']} {one['capture_rate']:.2f}" for one in records)
-    print(f"{NAME}, {seconds:.0f} s: {rates}")
-    write_json(options.json, {"policy": game.loaded.source, "records": records, "seconds": seconds})
+
+    def keep(records):
+        seconds = time.monotonic() - began
+        write_json(options.json, {**game.flown, "records": records, "seconds": seconds})
+        rates = ", ".join(f"{one['scenario']} {one['capture_rate']:.2f}" for one in records)
+        print(f"{NAME}, {seconds:.0f} s: {rates}", flush=True)
+
+    game.records(NAME, splitting.fly, keep)
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
 import argparse
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -37,12 +37,45 @@ class JudgedGame:
         effects = self.environment.effect_parameters
         return {"policy": self.loaded.source, "vehicle": str(vehicle), "effects": effects}
 
-    def records(self, name: str, fly: Callable) -> list[dict]:
-        """Records of one evader; `fly` (parameters, tasks, key) -> statistics (B,), traceable."""
-        key = jax.random.key(self.options.seed)
-        flown = jax.jit(fly)(self.loaded.parameters, self.tasks, key)
-        parts = self.part(jax.tree.map(np.asarray, flown))
-        return [record(name, kind, own) for kind, own in parts.items()]
+    def records(self, name: str, fly: Callable, keep: Callable | None = None) -> list[dict]:
+        """Records of one evader.
+
+        Args:
+          name: of the evader.
+          fly: (parameters, tasks, key) -> statistics (B,), traceable.
+          keep: is given the records so far, after every part of the tasks.
+        """
+        number = len(self.tasks.evader_position)
+        of_kinds = self.part(np.arange(number))
+        order = spread([len(places) for places in of_kinds.values()])
+        together = min(self.options.together or number, number)
+        run = jax.jit(fly)
+        flown = {}
+        for begin in range(0, number, together):
+            # the last part is filled up with tasks that have been flown: one program for all
+            places = order[min(begin, number - together) :][:together]
+            key = jax.random.fold_in(jax.random.key(self.options.seed), begin)
+            tasks = jax.tree.map(lambda leaf, places=places: leaf[places], self.tasks)
+            statistics = jax.tree.map(np.asarray, run(self.loaded.parameters, tasks, key))
+            own = (jax.tree.map(lambda leaf, i=i: leaf[i], statistics) for i in range(together))
+            flown |= dict(zip(places.tolist(), own, strict=True))
+            records = []
+            for kind, all_places in of_kinds.items():
+                done = [flown[place] for place in all_places.tolist() if place in flown]
+                if done:
+                    stack = jax.tree.map(lambda *leaves: np.stack(leaves), *done)
+                    records.append(record(name, kind, stack))
+            if keep is not None:
+                keep(records)
+        return records
+
+
+def spread(sizes: Sequence[int]) -> np.ndarray:
+    """Places of things that lie kind after kind, in an order in which each beginning has of every
+    kind the share that the whole has.
+    """
+    share = np.concatenate([(np.arange(size) + 0.5) / size for size in sizes])
+    return np.argsort(share, kind="stable")
 
 
 def game_parser(doc: str | None, episodes: int, uniform: int) -> argparse.ArgumentParser:
@@ -53,6 +86,7 @@ def game_parser(doc: str | None, episodes: int, uniform: int) -> argparse.Argume
     parser.add_argument("--effects", type=Path, help="effects.toml")
     parser.add_argument("--episodes", type=int, default=episodes, help="of each layout")
     parser.add_argument("--uniform", type=int, default=uniform, help="uniform tasks")
+    parser.add_argument("--together", type=int, help="tasks that fly side by side; by default all")
     parser.add_argument("--steps", type=int, help="of an episode, to try it")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path, required=True)

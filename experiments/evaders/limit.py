@@ -5,6 +5,7 @@ Both sides plan in the true simulation, the pursuers with the policy among their
 the captures from above, and of the one in which the evader does.
 """
 
+import functools
 import time
 
 import jax
@@ -14,13 +15,14 @@ from experiments.evaders.judged_game import game_parser, judged_game
 from openjax.baselines.surroundings import Craft
 from openjax.baselines.velocity_controller import velocity_action
 from openjax.evaluation.judges.duel import Duel
-from openjax.evaluation.judges.matrix_game import MatrixGame, VelocityFlight
+from openjax.evaluation.judges.matrix_game import MatrixGame, VelocityFlight, Ways
 from openjax.evaluation.judges.settings import MatrixGameSettings
 from openjax.files import write_json
-from openjax.pursuit import Pursuit
+from openjax.learning.shortest_paths import path_length, shortest_paths
+from openjax.pursuit import Pursuit, PursuitSettings
 from openjax.vehicle import hover_share
 
-LAST = {"both plan, pursuers last": True, "both plan, evader last": False}
+SIDES = ("pursuers", "evader")
 HONEST = ", honest sight"
 """What is added to a name where pursuers that plan don't see through pillars."""
 
@@ -40,37 +42,63 @@ def vehicles_flight(environment: Pursuit) -> VelocityFlight:
     return action
 
 
+def ways_round_pillars(settings: PursuitSettings) -> Ways:
+    """Shortest paths that keep clear of the pillars."""
+
+    def length(task, paths, position, target):
+        return path_length(settings, task, paths, position[None], target)[0]
+
+    return Ways(functools.partial(shortest_paths, settings), length)
+
+
 def main() -> None:
     """The command."""
     parser = game_parser(__doc__, episodes=16, uniform=48)
-    parser.add_argument("--plans", type=int, default=16, help="of the pursuers")
-    parser.add_argument("--evader_plans", type=int, help="by default as many")
+    defaults = MatrixGameSettings()
+    parser.add_argument("--plans", type=int, default=defaults.team_plans, help="of the pursuers")
+    parser.add_argument(
+        "--direct_plans", type=int, default=defaults.direct_plans, help="beside, without the policy"
+    )
+    parser.add_argument("--evader_plans", type=int, help="by default as many as --plans")
+    parser.add_argument("--pieces", type=int, default=defaults.pieces, help="of .2 s, of each plan")
+    parser.add_argument("--last", choices=SIDES, nargs="*", default=SIDES, help="who knows all")
     parser.add_argument(
         "--sight", choices=("full", "honest"), default="full", help="of pursuers that plan"
     )
     options = parser.parse_args()
     game = judged_game(options)
     duel = Duel(game.environment, game.loaded.policy)
-    found = {**game.flown, "sight": options.sight, "records": [], "seconds": {}}
-    for name, pursuers_last in LAST.items():
+    plans = {
+        name: getattr(options, name) for name in ("plans", "direct_plans", "evader_plans", "pieces")
+    }
+    found = {**game.flown, "sight": options.sight, **plans, "records": [], "seconds": {}}
+    ways = ways_round_pillars(game.environment.settings)
+    for side in options.last:
+        name = f"both plan, {side} last" + HONEST * (options.sight == "honest")
         settings = MatrixGameSettings(
-            pursuers_last,
+            side == "pursuers",
             evader_plans=options.evader_plans or options.plans,
             team_plans=options.plans,
+            direct_plans=options.direct_plans,
+            pieces=options.pieces,
             full_sight=options.sight == "full",
         )
-        both = MatrixGame(settings, duel, vehicles_flight(game.environment))
+        both = MatrixGame(settings, duel, vehicles_flight(game.environment), ways)
 
         def fly(parameters, tasks, key, both=both):
             return both.fly(parameters, duel.start(tasks, key), key)
 
         began = time.monotonic()
-        own = game.records(name + HONEST * (options.sight == "honest"), fly)
-        found["seconds"][name] = time.monotonic() - began
-        found["records"] += own
-        rates = ", ".join(f"{one['scenario']} {one['capture_rate']:.2f}" for one in own)
-        print(f"{name}, {found['seconds'][name]:.0f} s: {rates}", flush=True)
-        write_json(options.json, found)
+        before = found["records"]
+
+        def keep(own, name=name, before=before, began=began):
+            found["seconds"][name] = time.monotonic() - began
+            found["records"] = before + own
+            rates = ", ".join(f"{one['scenario']} {one['capture_rate']:.2f}" for one in own)
+            print(f"{name}, {found['seconds'][name]:.0f} s: {rates}", flush=True)
+            write_json(options.json, found)
+
+        game.records(name, fly, keep)
 
 
 if __name__ == "__main__":

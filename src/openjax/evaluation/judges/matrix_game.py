@@ -8,11 +8,14 @@ lets them see.
 
 An evader's plan is a sequence of held velocities (`openjax.evaluation.judges.planner`). A plan of
 the pursuers says of each of them, piece by piece, that it flies as the policy does, or to a place
-beside the evader, wherever that will be.
+beside the evader, wherever that will be, round the pillars that stand between. What a pair of plans
+is worth at its end is how long the ways to the evader are: by the straight line, pursuers would
+hover before a pillar behind which it is, and nobody would go round.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +25,7 @@ from openjax.evaluation.judges.duel import Duel, World
 from openjax.evaluation.judges.planner import Planner, unit
 from openjax.evaluation.judges.settings import MatrixGameSettings, PlannerSettings
 from openjax.policy import PolicyParameters
-from openjax.pursuit import EpisodeStatistics, Observation, PursuitState
+from openjax.pursuit import EpisodeStatistics, Observation, PursuitState, Task
 
 BESIDE = 0.4
 """Places beside the evader to which a pursuer is sent are at most so far from it (m)."""
@@ -34,6 +37,10 @@ SPEED = 0.98
 """Share of the pursuers' speed at which they fly to it: short of what a controller overshoots."""
 CRASH = 2.0
 """What a crash costs the pursuers, in horizons that the evader is free."""
+OTHERS = 0.5
+"""What the mean of all ways to the evader counts beside the shortest one: who is nearest may be
+before a pillar or above the ceiling's edge, and then it's for the others to come round.
+"""
 
 
 @struct.dataclass
@@ -46,6 +53,26 @@ class TeamPlans:
 
 VelocityFlight = Callable[[Observation, PursuitState, jax.Array], jax.Array]
 """observation, state of one world and desired velocities (N, 3) m/s -> actions (N, 4)."""
+
+
+@dataclass(frozen=True)
+class Ways:
+    """How far it is from place to place."""
+
+    prepare: Callable[[Task], Any]
+    """A task -> what is worked out once for it."""
+    length: Callable[[Task, Any, jax.Array, jax.Array], jax.Array]
+    """task, what was prepared, (3,) position, (3,) target -> () m; its gradient by the position
+    points away from the target, along the way.
+    """
+
+
+def _straight_length(task, prepared, position, target):
+    return jnp.sqrt(jnp.sum((position - target) ** 2) + 1e-9)
+
+
+STRAIGHT = Ways(lambda task: (), _straight_length)
+"""As if there were no pillars."""
 
 
 def choose(payoff: jax.Array, pursuers_last: bool) -> tuple[jax.Array, jax.Array]:
@@ -66,6 +93,7 @@ class MatrixGame:
     settings: MatrixGameSettings
     duel: Duel
     flight: VelocityFlight
+    ways: Ways = STRAIGHT
 
     @property
     def _planner(self) -> Planner:
@@ -81,41 +109,34 @@ class MatrixGame:
         shape = (number, settings.pieces, game.num_pursuers)
         team = TeamPlans(jnp.zeros((*shape, 3)), jnp.ones(shape, bool))
         plan = jnp.zeros((number, settings.pieces, 3))
+        prepared = jax.vmap(self.ways.prepare)(start[1].task)
 
         def one(carry, key):
             world, plan, team = carry
-            plan, team = self._decide(parameters, world, plan, team, key)
+            evader_key, team_key = jax.random.split(key)
+            plans = self._planner.candidates(evader_key, plan)  # (B, E, P, 3)
+            teams = self._team_candidates(team_key, team)  # (B, T, P, ...)
+            plan, team = self._decide(parameters, world, prepared, plans, teams)
             now = jax.tree.map(lambda leaf: leaf[:, 0], team)
-            world = self._fly_piece(parameters, world, plan[:, 0], now, settings.replan)
+            act = self._act(parameters, prepared, now)
+            world = self.duel.fly_actions(act, world, plan[:, 0], settings.replan)
             return (world, plan, team), None
 
         keys = jax.random.split(key, game.episode_length // settings.replan)
         return jax.lax.scan(one, (start, plan, team), keys)[0][0][1].statistics
 
-    def _decide(self, parameters, world, plan, team, key):
-        """(B, P, 3) and TeamPlans (B, P, ...): what both sides fly in worlds (B, ...)."""
+    def _decide(self, parameters, world, prepared, plans, teams):
+        """(B, P, 3) and TeamPlans (B, P, ...): what both sides choose in worlds (B, ...) of plans
+        (B, E, P, 3) and (B, T, P, ...).
+        """
         settings = self.settings
-        evader_key, team_key = jax.random.split(key)
-        plans = self._planner.candidates(evader_key, plan)  # (B, E, P, 3)
-        teams = self._team_candidates(team_key, team)  # (B, T, P, ...)
-        pairs = settings.evader_plans * settings.team_plans
-
-        def of_pairs(leaf, axis):
-            """(P, B * E * T, ...) of (B, E or T, P, ...)."""
-            leaf = jnp.expand_dims(leaf, axis)
-            shape = (leaf.shape[0], settings.evader_plans, settings.team_plans, *leaf.shape[3:])
-            leaf = jnp.broadcast_to(leaf, shape)
-            return jnp.moveaxis(leaf.reshape(-1, *leaf.shape[3:]), 1, 0)
-
-        copied = jax.tree.map(lambda leaf: jnp.repeat(leaf, pairs, axis=0), world)
-        pieces = of_pairs(plans, 2), jax.tree.map(lambda leaf: of_pairs(leaf, 1), teams)
-
-        def piece(world, both):
-            return self._fly_piece(parameters, world, *both, settings.piece_steps), None
-
-        end = jax.lax.scan(piece, copied, pieces)[0][1]
-        payoff = jax.vmap(self._payoff)(copied[1], end)
-        payoff = payoff.reshape(-1, settings.evader_plans, settings.team_plans)
+        # plans in which no pursuer asks the policy are flown without it, which is most of the work
+        with_policy = jax.tree.map(lambda leaf: leaf[:, : settings.team_plans], teams)
+        payoff = self._payoffs(parameters, world, prepared, (plans, with_policy))
+        if settings.direct_plans:
+            direct = jax.tree.map(lambda leaf: leaf[:, settings.team_plans :], teams)
+            more = self._payoffs(None, world, prepared, (plans, direct))
+            payoff = jnp.concatenate([payoff, more], axis=-1)
         if not settings.full_sight:
             # a team that doesn't see has one plan, the first: to fly as the policy does
             payoff = jnp.where(world[1].seen[:, None, None], payoff, payoff[:, :, :1])
@@ -126,60 +147,129 @@ class MatrixGame:
 
         return chosen(plans, mine), jax.tree.map(lambda leaf: chosen(leaf, theirs), teams)
 
-    def _fly_piece(self, parameters, world, velocity, team, steps):
-        """Worlds (B, ...) after control steps of one piece of both plans."""
-        speed = SPEED * self.duel.environment.settings.max_speed
+    def _payoffs(self, parameters, world, prepared, both):
+        """(B, E, T) what all pairs of plans are worth in worlds (B, ...); `parameters` None: none
+        of the team's asks the policy.
+        """
+        plans, teams = both
+        number, evader_plans = plans.shape[:2]
+        team_plans = teams.by_policy.shape[1]
 
-        def action(observation, state, by_policy, team):
+        def of_pairs(leaf, axis):
+            """(P, B * E * T, ...) of (B, E or T, P, ...)."""
+            leaf = jnp.expand_dims(leaf, axis)
+            shape = (number, evader_plans, team_plans, *leaf.shape[3:])
+            leaf = jnp.broadcast_to(leaf, shape)
+            return jnp.moveaxis(leaf.reshape(-1, *leaf.shape[3:]), 1, 0)
+
+        def of_worlds(leaf):
+            return jnp.repeat(leaf, evader_plans * team_plans, axis=0)
+
+        copied, prepared = jax.tree.map(of_worlds, (world, prepared))
+        pieces = of_pairs(plans, 2), jax.tree.map(lambda leaf: of_pairs(leaf, 1), teams)
+
+        def piece(world, both):
+            velocity, team = both
+            act = self._act(parameters, prepared, team)
+            return self.duel.fly_actions(act, world, velocity, self.settings.piece_steps), None
+
+        end = jax.lax.scan(piece, copied, pieces)[0][1]
+        payoff = jax.vmap(self._payoff)(copied[1], end, prepared)
+        return payoff.reshape(number, evader_plans, team_plans)
+
+    def _act(self, parameters, prepared, team):
+        """What the pursuers of worlds (B, ...) do in one piece of their plans (B, ...)."""
+        speed = SPEED * self.duel.environment.settings.max_speed
+        from_all = jax.vmap(self.ways.length, in_axes=(None, None, 0, 0))
+
+        def flown(observation, state, prepared, beside):
             place = state.evader_position + LEAD * state.evader_velocity
             if not self.settings.full_sight:
                 place = jnp.where(state.seen, place, state.last_seen)
-            place = place + team.beside
-            desired = (place - state.drones.position) / REACTION
-            length = jnp.linalg.norm(desired, axis=-1, keepdims=True)
-            desired = desired * jnp.minimum(1.0, speed / jnp.maximum(length, 1e-6))
-            flown = self.flight(observation, state, desired)
-            return jnp.where(team.by_policy[:, None], by_policy, flown)
+
+            def total(position):
+                length = from_all(state.task, prepared, position, place + beside)
+                return jnp.sum(length), length
+
+            away, length = jax.grad(total, has_aux=True)(state.drones.position)
+            desired = -away * jnp.minimum(speed, length / REACTION)[:, None]
+            return self.flight(observation, state, desired)
 
         def act(observation, state):
+            direct = jax.vmap(flown)(observation, state, prepared, team.beside)
+            if parameters is None:
+                return direct
             by_policy = self.duel.policy.act(parameters, observation)
-            return jax.vmap(action)(observation, state, by_policy, team)
+            return jnp.where(team.by_policy[..., None], by_policy, direct)
 
-        return self.duel.fly_actions(act, world, velocity, steps)
+        return act
 
     def _team_candidates(self, key, team):
         """(B, T, P, ...) the policy, straight at the evader, the last plan, the same shifted by a
-        piece, and random ones.
+        piece, the shifted one with another task for one pursuer, and random ones; and as many
+        random ones as are `direct_plans`, without the policy.
         """
-        others = self.settings.team_plans - 4
-        number, pieces, pursuers = team.by_policy.shape
-        shape = (number, others, pieces, pursuers)
-        way_key, far_key, straight_key, policy_key, turn_key = jax.random.split(key, 5)
-        far = BESIDE * jax.random.uniform(far_key, (*shape, 1)) ** (1 / 3)
-        beside = far * unit(jax.random.normal(way_key, (*shape, 3)))
-        straight = jax.random.bernoulli(straight_key, 0.5, (*shape, 1))
-        drawn = TeamPlans(
-            beside=jnp.where(straight, 0.0, beside),
-            by_policy=jax.random.bernoulli(policy_key, 0.5, shape),
-        )
-        # half of them do the same all the time
-        steady = jax.random.bernoulli(turn_key, 0.5, (number, others))
-
-        def held(leaf):
-            same = steady.reshape(*steady.shape, *[1] * (leaf.ndim - 2))
-            return jnp.where(same, leaf[:, :, :1], leaf)
-
-        drawn = jax.tree.map(held, drawn)
+        settings = self.settings
+        random_key, direct_key, near_key, who_key = jax.random.split(key, 4)
         shifted = jax.tree.map(lambda leaf: jnp.concatenate([leaf[:, 1:], leaf[:, -1:]], 1), team)
         none = jnp.zeros_like(team.beside)
         policy = TeamPlans(none, jnp.ones_like(team.by_policy))
         at_it = TeamPlans(none, jnp.zeros_like(team.by_policy))
         known = (policy, at_it, team, shifted)
-        known = jax.tree.map(lambda *leaves: jnp.stack(leaves, axis=1), *known)
-        return jax.tree.map(lambda a, b: jnp.concatenate([a, b], axis=1), known, drawn)
+        parts = [jax.tree.map(lambda *leaves: jnp.stack(leaves, axis=1), *known)]
+        others = settings.team_plans - len(known)
+        near = int(settings.refined * others)
+        shape = team.by_policy.shape
+        parts.append(_random_teams(random_key, shape, others - near, 0.5))
+        if near:
+            drawn = _random_teams(near_key, shape, near, 0.5)
+            who = jax.random.randint(who_key, (shape[0], near), 0, shape[-1])
+            is_new = (jnp.arange(shape[-1]) == who[..., None])[:, :, None]
 
-    def _payoff(self, start: PursuitState, end: PursuitState) -> jax.Array:
-        """() what the end of a pair of plans is worth to the evader, in steps."""
+            def refine(new, old):
+                own = is_new.reshape(*is_new.shape, *[1] * (new.ndim - 4))
+                return jnp.where(own, new, old[:, None])
+
+            parts.append(jax.tree.map(refine, drawn, shifted))
+        if settings.direct_plans:
+            parts.append(_random_teams(direct_key, shape, settings.direct_plans, 0.0))
+        return jax.tree.map(lambda *leaves: jnp.concatenate(leaves, axis=1), *parts)
+
+    def _payoff(self, start: PursuitState, end: PursuitState, prepared: Any) -> jax.Array:
+        """() what the end of a pair of plans is worth to the evader, in steps: those that it is
+        free first, then how far it is from the pursuers.
+        """
         horizon = self.settings.pieces * self.settings.piece_steps
         crashed = end.statistics.crashed & ~start.statistics.crashed
-        return self._planner.promise(start, end) + CRASH * horizon * crashed
+        free = self._planner.free_steps(start, end)
+        ahead = end.drones.position + self._planner.settings.ahead * end.drones.velocity
+        length = jax.vmap(self.ways.length, in_axes=(None, None, 0, None))
+        ways = length(start.task, prepared, ahead, end.evader_position)
+        room = jnp.min(ways) + OTHERS * jnp.mean(ways)
+        # less than a step, as long as no way goes through a pillar
+        room = room / (4.0 * self.duel.environment.settings.arena_radius)
+        return free + room + CRASH * horizon * crashed
+
+
+def _random_teams(key, shape, number, by_policy):
+    """(B, number, P, N) plans, in which pieces are the policy's with these odds; `shape` is B, P,
+    N.
+    """
+    worlds, pieces, pursuers = shape
+    shape = (worlds, number, pieces, pursuers)
+    way_key, far_key, straight_key, policy_key, turn_key = jax.random.split(key, 5)
+    far = BESIDE * jax.random.uniform(far_key, (*shape, 1)) ** (1 / 3)
+    beside = far * unit(jax.random.normal(way_key, (*shape, 3)))
+    straight = jax.random.bernoulli(straight_key, 0.5, (*shape, 1))
+    drawn = TeamPlans(
+        beside=jnp.where(straight, 0.0, beside),
+        by_policy=jax.random.bernoulli(policy_key, by_policy, shape),
+    )
+    # half of them do the same all the time
+    steady = jax.random.bernoulli(turn_key, 0.5, (worlds, number))
+
+    def held(leaf):
+        same = steady.reshape(*steady.shape, *[1] * (leaf.ndim - 2))
+        return jnp.where(same, leaf[:, :, :1], leaf)
+
+    return jax.tree.map(held, drawn)

@@ -131,13 +131,15 @@ class Planner:
 
     def promise(self, start: PursuitState, end: PursuitState) -> jax.Array:
         """() how good the end of a plan is: steps free first, then the room that is left."""
-        game = self.duel.environment.settings
-        newly = end.statistics.captured & ~start.statistics.captured
-        horizon = self.settings.pieces * self.settings.piece_steps
-        free = jnp.where(newly, end.statistics.capture_step - start.step, horizon)
         ahead = end.drones.position + self.settings.ahead * end.drones.velocity
         room = jnp.min(jnp.linalg.norm(ahead - end.evader_position, axis=-1))
-        return free + room / game.arena_radius
+        return self.free_steps(start, end) + room / self.duel.environment.settings.arena_radius
+
+    def free_steps(self, start: PursuitState, end: PursuitState) -> jax.Array:
+        """() steps of a plan before the capture, all of them where there is none."""
+        newly = end.statistics.captured & ~start.statistics.captured
+        horizon = self.settings.pieces * self.settings.piece_steps
+        return jnp.where(newly, end.statistics.capture_step - start.step, horizon)
 
 
 def unit(vector: jax.Array) -> jax.Array:

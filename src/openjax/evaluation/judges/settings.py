@@ -127,6 +127,11 @@ class MatrixGameSettings:
     """Whether the pursuers choose knowing the evader's plan, or the evader knowing theirs."""
     evader_plans: Annotated[int, Interval("[3, 1000]")] = 16
     team_plans: Annotated[int, Interval("[5, 1000]")] = 16
+    """In which pursuers may fly as the policy does."""
+    direct_plans: Annotated[int, Interval("[0, 1000]")] = 0
+    """Of the team beside those, in which none does: flown without the policy, for less."""
+    refined: Annotated[float, Interval("[0, 1]")] = 0.5
+    """Share of the team's new plans that are the last one with another task for one pursuer."""
     pieces: Annotated[int, Interval("[1, 100]")] = 4
     """Pieces of a plan, one after the other."""
     piece_steps: Annotated[int, Interval("[1, 1000]")] = 20
