@@ -3,7 +3,10 @@
 import numpy as np
 
 from experiments.evaders.escapes import Moment, summary
+from experiments.evaders.judge_table import SECOND, rate
+from experiments.evaders.judge_table import rows_of as lines_of
 from experiments.evaders.judged import is_shown, rows_of, vehicle_of
+from experiments.evaders.judged_game import spread
 from experiments.evaders.survival import curves_of
 from experiments.flying.vehicles import SLOWER
 from openjax.pursuit import PursuitSettings
@@ -53,6 +56,18 @@ def test_a_slower_vehicle_has_rows_of_its_own():
     assert learned["capture_rate"]["random"] == 0.5 and not learned["shown"]
     assert is_shown(paper, []) and not is_shown(paper, ["evaders: the paper's"])
     assert is_shown(planner, ["evaders: the paper's"]) and not is_shown(planner, ["evaders"])
+
+
+def test_the_second_judge_is_the_least_over_learners_and_planner():
+    cells = dict(lines_of({"records": RECORDS[:4]}, rate))[SECOND]
+    assert cells[0].startswith("0.25") and cells[1:] == ["-"] * 6
+
+
+def test_the_beginning_of_an_order_has_of_all_kinds_what_the_whole_has():
+    order = spread([2, 4, 1])
+    assert sorted(order) == list(range(7))
+    # of the first half: one, two, and one of the single
+    assert sorted(np.digitize(order[:4], [2, 6])) == [0, 1, 1, 2]
 
 
 def test_a_curve_is_of_the_strongest_evader_and_ends_where_it_is_free():

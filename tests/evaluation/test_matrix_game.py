@@ -36,6 +36,6 @@ def test_pursuers_that_plan_catch_a_slower_evader_that_their_policy_lets_go():
     task = Task(place, jnp.array([[-0.3, 0.0, 0.6]]), jnp.zeros((1, 1, 2)), jnp.zeros((1, 1), bool))
     start = duel.start(task, jax.random.key(0))
     for last in (True, False):
-        settings = MatrixGameSettings(pursuers_last=last, evader_plans=6, team_plans=8)
+        settings = MatrixGameSettings(last, evader_plans=6, team_plans=6, direct_plans=4)
         fly = jax.jit(MatrixGame(settings, duel, flight).fly)
         assert np.asarray(fly({}, start, jax.random.key(1)).captured).all(), last

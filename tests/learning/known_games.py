@@ -156,9 +156,10 @@ if __name__ == "__main__":
         "--defaults", action="store_true", help="an accelerator's: those of `openjax exploit`"
     )
     changes = {"seeds": "learners", "worlds": "num_envs"}
-    for name in ("seeds", "worlds", "ways", "minibatches"):
+    for name in ("seeds", "worlds", "ways", "minibatches", "epochs", "width", "learning_rate"):
         setting = changes.get(name, name)
-        parser.add_argument(f"--{name}", dest=setting, type=int, default=argparse.SUPPRESS)
+        kind = float if name == "learning_rate" else int
+        parser.add_argument(f"--{name}", dest=setting, type=kind, default=argparse.SUPPRESS)
     options = vars(parser.parse_args())
     radius = options.pop("radius")
     play = two_against_one if radius is None else functools.partial(against_stack, radius)
