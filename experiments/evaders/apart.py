@@ -4,12 +4,9 @@ Evaders by splitting (`openjax.evaluation.judges.splitting`), on weights that ar
 chooses weights by it has a judge less. Records as `openjax exploit --json` writes them.
 """
 
-import time
-
 from experiments.evaders.judged_game import game_parser, judged_game
 from openjax.evaluation.judges.settings import SplittingSettings
 from openjax.evaluation.judges.splitting import Splitting
-from openjax.files import write_json
 
 NAME = "splitting"
 
@@ -22,15 +19,8 @@ def main() -> None:
     game = judged_game(options)
     settings = SplittingSettings(options.copies)
     splitting = Splitting(settings, game.environment, game.loaded.policy)
-    began = time.monotonic()
-
-    def keep(records):
-        seconds = time.monotonic() - began
-        write_json(options.json, {**game.flown, "records": records, "seconds": seconds})
-        rates = ", ".join(f"{one['scenario']} {one['capture_rate']:.2f}" for one in records)
-        print(f"{NAME}, {seconds:.0f} s: {rates}", flush=True)
-
-    game.records(NAME, splitting.fly, keep)
+    found = {**game.flown, "records": [], "seconds": {}}
+    game.records_kept(NAME, splitting.fly, found, options.json)
 
 
 if __name__ == "__main__":

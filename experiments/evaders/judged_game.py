@@ -2,6 +2,8 @@
 
 import argparse
 import dataclasses
+import operator
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +14,7 @@ import numpy as np
 
 from openjax.evaluation.evaluator import layout_slots, layout_tasks, stacked
 from openjax.evaluation.judges.tasks import judging_tasks
+from openjax.files import write_json
 from openjax.pursuit import SCENARIOS, Pursuit, RewardSettings, Task
 from openjax.runs.exploit import record
 from openjax.store.compiled_programs import cache_programs
@@ -37,37 +40,39 @@ class JudgedGame:
         effects = self.environment.effect_parameters
         return {"policy": self.loaded.source, "vehicle": str(vehicle), "effects": effects}
 
-    def records(self, name: str, fly: Callable, keep: Callable | None = None) -> list[dict]:
-        """Records of one evader.
-
-        Args:
-          name: of the evader.
-          fly: (parameters, tasks, key) -> statistics (B,), traceable.
-          keep: is given the records so far, after every part of the tasks.
+    def records_kept(self, name: str, fly: Callable, found: dict, path: Path) -> None:
+        """Fly one evader, and write its records beside those that are `found`, and its seconds,
+        after every part of the tasks; `fly` (parameters, tasks, key) -> statistics (B,), traceable.
         """
+        began = time.monotonic()
+        before = found["records"]
+        for records in self._records_in_parts(name, jax.jit(fly)):
+            found["records"] = before + records
+            found["seconds"][name] = time.monotonic() - began
+            write_json(path, found)
+            rates = ", ".join(f"{one['scenario']} {one['capture_rate']:.2f}" for one in records)
+            print(f"{name}, {found['seconds'][name]:.0f} s: {rates}", flush=True)
+
+    def _records_in_parts(self, name, fly):
+        """Records of all that has flown, after every part."""
         number = len(self.tasks.evader_position)
         of_kinds = self.part(np.arange(number))
         order = spread([len(places) for places in of_kinds.values()])
         together = min(self.options.together or number, number)
-        run = jax.jit(fly)
         flown = {}
         for begin in range(0, number, together):
             # the last part is filled up with tasks that have been flown: one program for all
-            places = order[min(begin, number - together) :][:together]
+            places = order[min(begin, number - together) :][:together].tolist()
             key = jax.random.fold_in(jax.random.key(self.options.seed), begin)
-            tasks = jax.tree.map(lambda leaf, places=places: leaf[places], self.tasks)
-            statistics = jax.tree.map(np.asarray, run(self.loaded.parameters, tasks, key))
-            own = (jax.tree.map(lambda leaf, i=i: leaf[i], statistics) for i in range(together))
-            flown |= dict(zip(places.tolist(), own, strict=True))
-            records = []
-            for kind, all_places in of_kinds.items():
-                done = [flown[place] for place in all_places.tolist() if place in flown]
-                if done:
-                    stack = jax.tree.map(lambda *leaves: np.stack(leaves), *done)
-                    records.append(record(name, kind, stack))
-            if keep is not None:
-                keep(records)
-        return records
+            tasks = jax.tree.map(lambda leaf, here=tuple(places): leaf[np.array(here)], self.tasks)
+            statistics = jax.tree.map(np.asarray, fly(self.loaded.parameters, tasks, key))
+            for i, place in enumerate(places):
+                flown[place] = jax.tree.map(operator.itemgetter(i), statistics)
+            yield [
+                record(name, kind, jax.tree.map(lambda *leaves: np.stack(leaves), *done))
+                for kind, here in of_kinds.items()
+                if (done := [flown[place] for place in here.tolist() if place in flown])
+            ]
 
 
 def spread(sizes: Sequence[int]) -> np.ndarray:

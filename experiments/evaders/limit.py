@@ -5,8 +5,9 @@ Both sides plan in the true simulation, the pursuers with the policy among their
 the captures from above, and of the one in which the evader does.
 """
 
+import argparse
+import dataclasses
 import functools
-import time
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +18,6 @@ from openjax.baselines.velocity_controller import velocity_action
 from openjax.evaluation.judges.duel import Duel
 from openjax.evaluation.judges.matrix_game import MatrixGame, VelocityFlight, Ways
 from openjax.evaluation.judges.settings import MatrixGameSettings
-from openjax.files import write_json
 from openjax.learning.shortest_paths import path_length, shortest_paths
 from openjax.pursuit import Pursuit, PursuitSettings
 from openjax.vehicle import hover_share
@@ -51,10 +51,10 @@ def ways_round_pillars(settings: PursuitSettings) -> Ways:
     return Ways(functools.partial(shortest_paths, settings), length)
 
 
-def main() -> None:
-    """The command."""
-    parser = game_parser(__doc__, episodes=16, uniform=48)
+def limit_parser() -> argparse.ArgumentParser:
+    """The options."""
     defaults = MatrixGameSettings()
+    parser = game_parser(__doc__, episodes=16, uniform=48)
     parser.add_argument("--plans", type=int, default=defaults.team_plans, help="of the pursuers")
     parser.add_argument(
         "--direct_plans", type=int, default=defaults.direct_plans, help="beside, without the policy"
@@ -65,13 +65,15 @@ def main() -> None:
     parser.add_argument(
         "--sight", choices=("full", "honest"), default="full", help="of pursuers that plan"
     )
-    options = parser.parse_args()
+    return parser
+
+
+def main() -> None:
+    """The command."""
+    options = limit_parser().parse_args()
     game = judged_game(options)
     duel = Duel(game.environment, game.loaded.policy)
-    plans = {
-        name: getattr(options, name) for name in ("plans", "direct_plans", "evader_plans", "pieces")
-    }
-    found = {**game.flown, "sight": options.sight, **plans, "records": [], "seconds": {}}
+    found = {**game.flown, "sight": options.sight, "plans": {}, "records": [], "seconds": {}}
     ways = ways_round_pillars(game.environment.settings)
     for side in options.last:
         name = f"both plan, {side} last" + HONEST * (options.sight == "honest")
@@ -83,22 +85,13 @@ def main() -> None:
             pieces=options.pieces,
             full_sight=options.sight == "full",
         )
+        found["plans"][name] = dataclasses.asdict(settings)
         both = MatrixGame(settings, duel, vehicles_flight(game.environment), ways)
 
         def fly(parameters, tasks, key, both=both):
             return both.fly(parameters, duel.start(tasks, key), key)
 
-        began = time.monotonic()
-        before = found["records"]
-
-        def keep(own, name=name, before=before, began=began):
-            found["seconds"][name] = time.monotonic() - began
-            found["records"] = before + own
-            rates = ", ".join(f"{one['scenario']} {one['capture_rate']:.2f}" for one in own)
-            print(f"{name}, {found['seconds'][name]:.0f} s: {rates}", flush=True)
-            write_json(options.json, found)
-
-        game.records(name, fly, keep)
+        game.records_kept(name, fly, found, options.json)
 
 
 if __name__ == "__main__":
