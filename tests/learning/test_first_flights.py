@@ -13,7 +13,6 @@ import pytest
 from openjax.learning import preset
 from openjax.learning.first_flights import FirstFlights, first_game, make_first_flights
 from openjax.learning.settings import FirstFlightsSettings
-from openjax.learning.shortest_paths import shortest_paths
 from openjax.learning.smooth_measures import (
     crash_share,
     evader_distance,
@@ -23,6 +22,7 @@ from openjax.learning.smooth_measures import (
 )
 from openjax.policy import NetworkSettings, Policy, PredictorSettings
 from openjax.pursuit import Pursuit, PursuitSettings
+from openjax.pursuit.shortest_paths import shortest_paths
 
 GAME = PursuitSettings(
     physics="rigid",

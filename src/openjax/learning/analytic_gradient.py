@@ -33,7 +33,6 @@ from openjax.learning.gradient_step import (
     weighted_sum,
 )
 from openjax.learning.settings import AnalyticSettings
-from openjax.learning.shortest_paths import shortest_paths
 from openjax.learning.smooth_measures import (
     FAST,
     breach_share,
@@ -49,6 +48,7 @@ from openjax.policy import Policy, PolicyParameters
 from openjax.pursuit import Pursuit, PursuitSettings, RewardSettings
 from openjax.pursuit.axes import rotation_axes
 from openjax.pursuit.shapes import Scalar
+from openjax.pursuit.shortest_paths import shortest_paths
 from openjax.pursuit.task import capture_radius
 from openjax.vehicle.family import partly_nominal
 

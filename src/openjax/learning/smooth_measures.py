@@ -10,9 +10,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from openjax.learning.shortest_paths import ShortestPaths, path_length
 from openjax.pursuit import PursuitSettings, PursuitState
 from openjax.pursuit.collisions import TOUCH, drone_distance, pillar_distance
+from openjax.pursuit.shortest_paths import ShortestPaths, path_length
 from openjax.vehicle import DroneState
 from openjax.vehicle.solids import DRONE_RADIUS
 

@@ -40,6 +40,7 @@ from openjax.pursuit.reward import (
 from openjax.pursuit.sensing import line_of_sight, within_view
 from openjax.pursuit.settings import PursuitSettings
 from openjax.pursuit.shapes import Actions, Active, Commands, Each, Flag, Pillars, Scalar, Vector
+from openjax.pursuit.shortest_paths import shortest_paths
 from openjax.pursuit.spaces import Box
 from openjax.pursuit.state import PursuitState
 from openjax.pursuit.statistics import count, empty_statistics
@@ -253,6 +254,7 @@ class Pursuit:
             statistics=empty_statistics(settings.episode_length),
             gone_after=draw_fall_out(settings, fall_out_key, task.active),
             in_view=in_view,
+            paths=shortest_paths(settings, task) if settings.reward.needs_paths else None,
         )
         return self.observe(state), state
 

@@ -17,7 +17,9 @@ from openjax.pursuit.collisions import breaches, crashed
 from openjax.pursuit.info import StepInfo
 from openjax.pursuit.settings import PursuitSettings, RewardSettings
 from openjax.pursuit.shapes import Active, Each, Flag, Pillars, Scalar, Team, Vector, Which
+from openjax.pursuit.shortest_paths import evader_territory, path_length
 from openjax.pursuit.state import PursuitState
+from openjax.pursuit.task import capture_radius
 from openjax.pursuit.teams import of_team
 
 OVER_SPEED = 1.01
@@ -107,6 +109,8 @@ def default_reward(weights: RewardSettings) -> tuple[Term, ...]:
         Term(captured, weights.capture),
         Term(evader_distance, -weights.distance),
         Term(nearest_distance, -weights.nearest),
+        Term(evader_path, -weights.path),
+        Term(territory, -weights.territory),
         Term(first_capture, weights.first_capture),
         Term(recapture, weights.recapture),
         Term(steadiness, weights.smoothness),
@@ -139,6 +143,28 @@ def evader_distance(transition: Transition) -> Each:
     """(N,) m to the evader."""
     offset = transition.state.drones.position - transition.state.evader_position
     return jnp.sqrt(jnp.sum(offset**2, axis=-1) + 1e-12)
+
+
+def evader_path(transition: Transition) -> Each:
+    """(N,) m, the shortest path round the pillars to the evader."""
+    state = transition.state
+    position = state.drones.position
+    return path_length(
+        transition.settings, state.task, state.paths, position, state.evader_position
+    )
+
+
+def territory(transition: Transition) -> Scalar:
+    """() share of the arena that the evader can be at before any pursuer has it in reach."""
+    state = transition.state
+    return evader_territory(
+        transition.settings,
+        state.task,
+        state.paths,
+        state.drones.position,
+        state.evader_position,
+        capture_radius(transition.settings, state.task),
+    )
 
 
 def recapture(transition: Transition) -> Flag:

@@ -42,6 +42,14 @@ class RewardSettings:
     """Subtracted, of all pursuers, per metre between the evader and the nearest of them: who isn't
     the nearest loses nothing by going round (not in the paper).
     """
+    path: Annotated[float, Interval("[0, 1e6]")] = 0.0
+    """Subtracted per metre of the shortest path round the pillars between pursuer and evader: who
+    minds the straight line alone waits behind a wall, opposite to the evader (not in the paper).
+    """
+    territory: Annotated[float, Interval("[0, 1e6]")] = 0.0
+    """Subtracted, of all pursuers, times the share of the arena that the evader can be at before
+    any of them: who comes from the other side takes some of it away (not in the paper).
+    """
     collision: Annotated[float, Interval("[0, 1e6]")] = 10.0
     """Subtracted per breach of a safety distance or an arena bound."""
     over_speed: Annotated[float, Interval("[0, 1e6]")] = 10.0
@@ -68,6 +76,11 @@ class RewardSettings:
 
     def __post_init__(self):
         check_intervals(self, "environment.reward.")
+
+    @property
+    def needs_paths(self) -> bool:
+        """Whether worlds have to know the shortest paths round their pillars."""
+        return self.path != 0.0 or self.territory != 0.0
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ from flax import struct
 from jaxtyping import Array, Bool
 
 from openjax.pursuit.evaders.evader_state import EvaderState
+from openjax.pursuit.shortest_paths import ShortestPaths
 from openjax.pursuit.statistics import EpisodeStatistics
 from openjax.pursuit.task import Task
 from openjax.pursuit.teams import still_there
@@ -36,6 +37,9 @@ class PursuitState:
     """(N,) int32, the last step in which each pursuer is there; None: nobody falls out"""
     in_view: jax.Array | None = None
     """(N,) bool, which of those in sight have it in range and cone; None: these have no limits"""
+
+    paths: ShortestPaths | None = None
+    """round the task's pillars; None where no term of the settings' reward asks for them"""
 
     @property
     def active(self) -> Bool[Array, "*worlds drones"] | None:

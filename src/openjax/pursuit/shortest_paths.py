@@ -10,9 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
+from jaxtyping import Array, Float
 
-from openjax.pursuit import PursuitSettings, Task
-from openjax.pursuit.shapes import Each, Team, Vector
+from openjax.pursuit.settings import PursuitSettings
+from openjax.pursuit.shapes import Each, Scalar, Team, Vector
+from openjax.pursuit.task import Task, evader_speed
 
 CORNERS = 6
 """Of the polygon about each pillar."""
@@ -23,6 +25,10 @@ then stand before it.
 """
 TOLL = 3.0
 """What a path through a pillar costs (m): more than any path round."""
+POINTS = 40
+"""Of the arena at which is asked who is there first: one for each 6 dm²."""
+SMOOTH = 0.1
+"""Seconds over which a point goes from one side to the other."""
 
 
 @struct.dataclass
@@ -35,6 +41,7 @@ class ShortestPaths:
     pillar.
     """
     length: jax.Array  # (C, C) m, of the shortest path from one to another
+    to_point: jax.Array  # (C, M) m, from a corner to each of `arena_points`
 
 
 def shortest_paths(settings: PursuitSettings, task: Task) -> ShortestPaths:
@@ -51,14 +58,18 @@ def shortest_paths(settings: PursuitSettings, task: Task) -> ShortestPaths:
     closed |= jnp.sum(corner**2, axis=-1) > settings.arena_radius**2
     toll = TOLL * (closed | ~jnp.repeat(task.pillar_active, CORNERS))
     direct = _straight(settings, task, corner[:, None], corner[None]) + toll
-    if not corner.shape[0]:
-        return ShortestPaths(corner, toll, direct)
 
     # Floyd and Warshall: after step k, the shortest paths that bend at the first k corners only
     def shortened(k, length):
         return jnp.minimum(length, length[:, k, None] + length[k])
 
-    return ShortestPaths(corner, toll, jax.lax.fori_loop(0, corner.shape[0], shortened, direct))
+    length = direct
+    if corner.shape[0]:
+        length = jax.lax.fori_loop(0, corner.shape[0], shortened, direct)
+    # a path's last bend is one of the corners, the first one perhaps
+    last = _straight(settings, task, corner[:, None], arena_points(settings))
+    through = jnp.min(length[:, :, None] + last, axis=1, initial=jnp.inf)
+    return ShortestPaths(corner, toll, length, jnp.minimum(last, through))
 
 
 def path_length(
@@ -80,6 +91,46 @@ def path_length(
     # the small number keeps the root's gradient finite where a pursuer stands at its bend
     level = jnp.sqrt(jnp.sum((position[:, :2] - bend) ** 2, axis=-1) + 1e-9) + rest
     return jnp.sqrt(level**2 + (position[:, 2] - target[2]) ** 2)
+
+
+def arena_points(settings: PursuitSettings, number: int = POINTS) -> Float[Array, "points 2"]:
+    """(M, 2) m, points spread evenly over the arena: Vogel's sunflower (1979, A better way to
+    construct the sunflower head).
+    """
+    index = np.arange(number)
+    radius = settings.arena_radius * np.sqrt((index + 0.5) / number)
+    angle = index * np.pi * (3.0 - np.sqrt(5.0))
+    return jnp.asarray(radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], -1), jnp.float32)
+
+
+def evader_territory(
+    settings: PursuitSettings,
+    task: Task,
+    paths: ShortestPaths,
+    position: Team,
+    target: Vector,
+    reach: float | Scalar,
+) -> Scalar:
+    """() share of the arena that the evader at (3,) is at before any of the pursuers at (N, 3) has
+    it within `reach` (m): smooth, in the plane, and with the evader flying straight.
+
+    Empty slots' pursuers are parked too far to count.
+    """
+    points = arena_points(settings)
+    here = position[:, None, :2]
+    # whoever of the team is sooner at a corner is sooner wherever the path leads from there
+    to_corner = jnp.min(_straight(settings, task, here, paths.corner), axis=0)
+    round_pillars = jnp.min(
+        (to_corner + paths.toll)[:, None] + paths.to_point, axis=0, initial=jnp.inf
+    )
+    straight = jnp.min(_straight(settings, task, here, points), axis=0)
+    length = jnp.minimum(straight, round_pillars)
+    pursuers = jax.nn.relu(length - reach) / settings.max_speed
+    evader = jnp.sqrt(jnp.sum((points - target[:2]) ** 2, axis=-1) + 1e-12)
+    first = jax.nn.sigmoid((pursuers - evader / evader_speed(settings, task)) / SMOOTH)
+    to_axis = jnp.sum((points[:, None] - task.pillar_position) ** 2, axis=-1)
+    inside = jnp.any((to_axis < settings.pillar_radius**2) & task.pillar_active, axis=-1)
+    return jnp.mean(first, where=~inside)
 
 
 def _straight(settings, task, start, end):

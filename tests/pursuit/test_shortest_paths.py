@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from openjax.learning.shortest_paths import ROOM, TOLL, path_length, shortest_paths
 from openjax.pursuit import PursuitSettings, line_up_pillars, uniform_task
+from openjax.pursuit.shortest_paths import ROOM, TOLL, path_length, shortest_paths
 
 GAME = PursuitSettings(min_pillars=5)
 REACH = GAME.pillar_radius + GAME.pillar_clearance + ROOM
