@@ -43,6 +43,7 @@ from openjax.learning.smooth_measures import (
     nearest_distance,
     nearest_gap,
     speed,
+    territory_share,
 )
 from openjax.policy import Policy, PolicyParameters
 from openjax.pursuit import Pursuit, PursuitSettings, RewardSettings
@@ -85,6 +86,8 @@ class Encounter(NamedTuple):
     """
     free: jax.Array
     """(B,) share of the steps in which nobody has caught the evader"""
+    territory: jax.Array
+    """(B,) mean share of the arena that the evader can be at before any pursuer"""
 
 
 def no_encounter(shape: tuple[int, int]) -> Encounter:
@@ -98,6 +101,7 @@ def no_encounter(shape: tuple[int, int]) -> Encounter:
         excess=zeros,
         distance=of_worlds,
         free=of_worlds,
+        territory=of_worlds,
     )
 
 
@@ -180,6 +184,7 @@ class AnalyticGradient:
             excess=met.excess + jax.nn.relu(speed(state.drones) - limit) / FAST / steps,
             distance=met.distance + nearest_distance(beyond_rest) / steps,
             free=met.free + free_share(radius, distance) / steps,
+            territory=met.territory + territory_share(self.game, state, paths) / steps,
         )
 
     def starts(self, key: PRNGKeyArray, bounds: Bounds):

@@ -259,6 +259,10 @@ class WorstPlansSettings:
     """Weight of the nearest pursuer's mean path to the evader (m), beside the share of the plan in
     which it is free.
     """
+    territory: Annotated[float, Interval("[0, 1000]")] = 0.0
+    """Weight of the share of the arena that the evader can be at before any pursuer, beside the
+    same: it is what those can change who aren't the nearest.
+    """
     crash: Annotated[float, Interval("[0, 1000]")] = 8.0
     """Weight of the share of pursuers that touch something, beside the same."""
     breach: Annotated[float, Interval("[0, 1000]")] = 2.0

@@ -12,7 +12,8 @@ from jaxtyping import Array, Float
 
 from openjax.pursuit import PursuitSettings, PursuitState
 from openjax.pursuit.collisions import TOUCH, drone_distance, pillar_distance
-from openjax.pursuit.shortest_paths import ShortestPaths, path_length
+from openjax.pursuit.shortest_paths import ShortestPaths, evader_territory, path_length
+from openjax.pursuit.task import capture_radius
 from openjax.vehicle import DroneState
 from openjax.vehicle.solids import DRONE_RADIUS
 
@@ -101,6 +102,19 @@ def evader_distance(game: PursuitSettings, state: PursuitState, paths: ShortestP
     return jax.vmap(functools.partial(path_length, game))(
         state.task, paths, state.drones.position, evader
     )
+
+
+def territory_share(game: PursuitSettings, state: PursuitState, paths: ShortestPaths) -> Worlds:
+    """(W,) share of the arena that the evader of worlds (W, ...) can be at before any pursuer; its
+    flight has no gradient.
+    """
+
+    def one(state, paths):
+        evader = jax.lax.stop_gradient(state.evader_position)
+        reach = capture_radius(game, state.task)
+        return evader_territory(game, state.task, paths, state.drones.position, evader, reach)
+
+    return jax.vmap(one)(state, paths)
 
 
 def nearest_distance(distance: Pursuers) -> Worlds:

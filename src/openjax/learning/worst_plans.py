@@ -220,6 +220,7 @@ class WorstPlans:
         parts = {
             "free": (1.0, seen * jnp.mean(met.free, axis=0)),
             "distance": (planning.distance, seen * jnp.mean(met.distance, axis=0)),
+            "territory": (planning.territory, seen * jnp.mean(met.territory, axis=0)),
             "crashes": (planning.crash, crash_share(jnp.min(met.least, axis=0))),
             "breaches": (planning.breach, met.breach),
             "speed": (self.settings.speed, met.excess),
