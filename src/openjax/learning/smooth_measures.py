@@ -13,7 +13,6 @@ from jaxtyping import Array, Float
 from openjax.pursuit import PursuitSettings, PursuitState
 from openjax.pursuit.collisions import TOUCH, drone_distance, pillar_distance
 from openjax.pursuit.shortest_paths import ShortestPaths, evader_territory, path_length
-from openjax.pursuit.task import capture_radius
 from openjax.vehicle import DroneState
 from openjax.vehicle.solids import DRONE_RADIUS
 
@@ -111,8 +110,7 @@ def territory_share(game: PursuitSettings, state: PursuitState, paths: ShortestP
 
     def one(state, paths):
         evader = jax.lax.stop_gradient(state.evader_position)
-        reach = capture_radius(game, state.task)
-        return evader_territory(game, state.task, paths, state.drones.position, evader, reach)
+        return evader_territory(game, state.task, paths, state.drones.position, evader)
 
     return jax.vmap(one)(state, paths)
 

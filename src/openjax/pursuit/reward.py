@@ -19,7 +19,6 @@ from openjax.pursuit.settings import PursuitSettings, RewardSettings
 from openjax.pursuit.shapes import Active, Each, Flag, Pillars, Scalar, Team, Vector, Which
 from openjax.pursuit.shortest_paths import evader_territory, path_length
 from openjax.pursuit.state import PursuitState
-from openjax.pursuit.task import capture_radius
 from openjax.pursuit.teams import of_team
 
 OVER_SPEED = 1.01
@@ -157,13 +156,9 @@ def evader_path(transition: Transition) -> Each:
 def territory(transition: Transition) -> Scalar:
     """() share of the arena that the evader can be at before any pursuer has it in reach."""
     state = transition.state
+    position = state.drones.position
     return evader_territory(
-        transition.settings,
-        state.task,
-        state.paths,
-        state.drones.position,
-        state.evader_position,
-        capture_radius(transition.settings, state.task),
+        transition.settings, state.task, state.paths, position, state.evader_position
     )
 
 

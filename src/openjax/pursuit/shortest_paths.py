@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from openjax.pursuit.settings import PursuitSettings
 from openjax.pursuit.shapes import Each, Scalar, Team, Vector
-from openjax.pursuit.task import Task, evader_speed
+from openjax.pursuit.task import Task, capture_radius, evader_speed
 
 CORNERS = 6
 """Of the polygon about each pillar."""
@@ -109,10 +109,9 @@ def evader_territory(
     paths: ShortestPaths,
     position: Team,
     target: Vector,
-    reach: float | Scalar,
 ) -> Scalar:
     """() share of the arena that the evader at (3,) is at before any of the pursuers at (N, 3) has
-    it within `reach` (m): smooth, in the plane, and with the evader flying straight.
+    it within the capture radius: smooth, in the plane, and with the evader flying straight.
 
     Empty slots' pursuers are parked too far to count.
     """
@@ -125,7 +124,7 @@ def evader_territory(
     )
     straight = jnp.min(_straight(settings, task, here, points), axis=0)
     length = jnp.minimum(straight, round_pillars)
-    pursuers = jax.nn.relu(length - reach) / settings.max_speed
+    pursuers = jax.nn.relu(length - capture_radius(settings, task)) / settings.max_speed
     evader = jnp.sqrt(jnp.sum((points - target[:2]) ** 2, axis=-1) + 1e-12)
     first = jax.nn.sigmoid((pursuers - evader / evader_speed(settings, task)) / SMOOTH)
     to_axis = jnp.sum((points[:, None] - task.pillar_position) ** 2, axis=-1)
