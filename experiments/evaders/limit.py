@@ -18,8 +18,8 @@ from openjax.baselines.velocity_controller import velocity_action
 from openjax.evaluation.judges.duel import Duel
 from openjax.evaluation.judges.matrix_game import MatrixGame, VelocityFlight, Ways
 from openjax.evaluation.judges.settings import MatrixGameSettings
-from openjax.learning.shortest_paths import path_length, shortest_paths
 from openjax.pursuit import Pursuit, PursuitSettings
+from openjax.pursuit.shortest_paths import path_length, shortest_paths
 from openjax.vehicle import hover_share
 
 SIDES = ("pursuers", "evader")
