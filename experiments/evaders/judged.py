@@ -42,6 +42,8 @@ JUDGES: Mapping[str, Callable[[str], bool]] = {
     "both plan, evader last, as they see": lambda evader: (
         evader == "both plan, evader last, honest sight"
     ),
+    "both plan, pursuers last, points": lambda evader: evader == "both plan, pursuers last, points",
+    "both plan, evader last, points": lambda evader: evader == "both plan, evader last, points",
     "scripted ones, held out": lambda evader: evader in HELD_OUT,
     "the paper's": lambda evader: evader == "field",
 }

@@ -12,7 +12,7 @@ import functools
 import jax
 import jax.numpy as jnp
 
-from experiments.evaders.judged_game import game_parser, judged_game
+from experiments.evaders.judged_game import JudgedGame, game_parser, judged_game
 from openjax.baselines.surroundings import Craft
 from openjax.baselines.velocity_controller import velocity_action
 from openjax.evaluation.judges.duel import Duel
@@ -21,10 +21,13 @@ from openjax.evaluation.judges.settings import MatrixGameSettings
 from openjax.pursuit import Pursuit, PursuitSettings
 from openjax.pursuit.shortest_paths import path_length, shortest_paths
 from openjax.vehicle import hover_share
+from tests.baselines.points import Points, Team
 
 SIDES = ("pursuers", "evader")
 HONEST = ", honest sight"
-"""What is added to a name where pursuers that plan don't see through pillars."""
+"""What is added to a name where pursuers that plan don't see through pillars ..."""
+POINTS = ", points"
+"""... and where they have no inertia."""
 
 
 def vehicles_flight(environment: Pursuit) -> VelocityFlight:
@@ -51,6 +54,23 @@ def ways_round_pillars(settings: PursuitSettings) -> Ways:
     return Ways(functools.partial(shortest_paths, settings), length)
 
 
+def points_in(game: JudgedGame) -> tuple[Duel, VelocityFlight]:
+    """The same tasks with pursuers that have no inertia; in the policy's place they stay where they
+    are.
+    """
+    settings = game.environment.settings
+    points = Points(settings.max_speed, settings.time_step)
+    environment = dataclasses.replace(game.environment, dynamics=points)
+
+    def flight(observation, state, velocity):
+        return jnp.pad(velocity / settings.max_speed, ((0, 0), (1, 0)))
+
+    def stay(observation):
+        return jnp.zeros_like(observation.self_state[..., :3])
+
+    return Duel(environment, Team(stay)), flight
+
+
 def limit_parser() -> argparse.ArgumentParser:
     """The options."""
     defaults = MatrixGameSettings()
@@ -65,6 +85,7 @@ def limit_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--sight", choices=("full", "honest"), default="full", help="of pursuers that plan"
     )
+    parser.add_argument("--points", action="store_true", help="pursuers without inertia")
     return parser
 
 
@@ -72,11 +93,16 @@ def main() -> None:
     """The command."""
     options = limit_parser().parse_args()
     game = judged_game(options)
-    duel = Duel(game.environment, game.loaded.policy)
+    if options.points:
+        duel, flight = points_in(game)
+    else:
+        duel = Duel(game.environment, game.loaded.policy)
+        flight = vehicles_flight(game.environment)
     found = {**game.flown, "sight": options.sight, "plans": {}, "records": [], "seconds": {}}
     ways = ways_round_pillars(game.environment.settings)
     for side in options.last:
         name = f"both plan, {side} last" + HONEST * (options.sight == "honest")
+        name += POINTS * options.points
         settings = MatrixGameSettings(
             side == "pursuers",
             evader_plans=options.evader_plans or options.plans,
@@ -86,7 +112,7 @@ def main() -> None:
             full_sight=options.sight == "full",
         )
         found["plans"][name] = dataclasses.asdict(settings)
-        both = MatrixGame(settings, duel, vehicles_flight(game.environment), ways)
+        both = MatrixGame(settings, duel, flight, ways)
 
         def fly(parameters, tasks, key, both=both):
             return both.fly(parameters, duel.start(tasks, key), key)
