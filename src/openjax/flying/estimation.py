@@ -59,7 +59,7 @@ def _estimated(state, drone, sample) -> Drone:
     moving = drone.mode in FLYING and not (drone.mode is Mode.LIFT and now - drone.since < SPIN_UP)
     by_capture = sample.captured is not None and not drone.capture_fault
     own = _own(state, drone, sample, by_capture, moving)
-    drone = _consistent(state, drone, own)
+    drone = _consistent(state, drone, own, sample.force)
     if by_capture and not drone.capture_fault:
         drone = _captured(state, drone, sample, moving)
     source = drone.captured if by_capture and not drone.capture_fault else drone.own
@@ -81,8 +81,8 @@ def _reckoned(state, drone) -> Drone:
     return drone._replace(estimate=estimate)
 
 
-def _consistent(state, drone, own) -> Drone:
-    """The drone after its newest own estimate. If its innovations contradict that, none is believed
+def _consistent(state, drone, own, force) -> Drone:
+    """The drone after its newest own estimate, with what its accelerometer feels. If its innovations contradict that, none is believed
     any more in this flight, nor motion capture where it tells the same: what the estimator on board
     follows can't confirm it.
     """
@@ -98,7 +98,9 @@ def _consistent(state, drone, own) -> Drone:
         )
         return drone._replace(own=own, contradiction=own.verdict if lost else Verdict.GOOD)
     refused = bool(drone.own.verdict)
-    innovations = drone.innovations.after(own.pose, as_sent(drone.sent), state.airframe, refused)
+    innovations = drone.innovations.after(
+        own.pose, as_sent(drone.sent), state.airframe, refused, force
+    )
     verdict = innovations.verdict()
     seen = drone.captured
     if not verdict:

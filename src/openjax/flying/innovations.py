@@ -8,16 +8,18 @@ in dynamic systems", Automatica 7):
 * the way, with the velocity that the same estimate tells;
 * the change of velocity, with thrust and attitude;
 * the turn, with the gyroscope;
-* the gyroscope, with the body rates that were sent.
+* the gyroscope, with the body rates that were sent;
+* the climb, with the accelerometer (`openjax.flying.climb`), where it is logged.
 
-A drift of position and velocity together that sets in gently passes all of them. Teammates tell
-some of these (`openjax.flying.drift`), a second source all.
+A drift along the ground, of position and velocity together, that sets in gently passes all of them.
+Teammates tell some of these (`openjax.flying.drift`), a second source all.
 """
 
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
+from openjax.flying.climb import Climb
 from openjax.flying.controller import Airframe, Pose, Vector, lift_acceleration
 from openjax.flying.drift import Drift
 from openjax.flying.judge import Verdict
@@ -83,11 +85,18 @@ class Innovations(NamedTuple):
     thrust: float = 0.0  # share of the maximum that the motors have reached
     rates: Vector = ZERO  # rad/s, that the rate loop should have reached
     drift: Drift = Drift()  # what neither thrust nor drag explains, of the level velocity
+    climb: Climb = Climb()  # what the accelerometer doesn't feel, of the upward velocity
 
     def after(
-        self, pose: Pose, sent: SetPoint, airframe: Airframe, refused: bool = False
+        self,
+        pose: Pose,
+        sent: SetPoint,
+        airframe: Airframe,
+        refused: bool = False,
+        force: Vector | None = None,
     ) -> "Innovations":
-        """With the next pose; `sent` has acted since the last one.
+        """With the next pose; `sent` has acted since the last one, and its accelerometer feels
+        `force` (m/s^2, body), if anything is known of that.
 
         `refused`: whether poses between them came and weren't believed. Then this one must follow
         from the last believable one, however long that is ago.
@@ -95,7 +104,10 @@ class Innovations(NamedTuple):
         last = self.pose
         longest = math.inf if refused else LONGEST
         if last is None or not 0.0 < pose.time - last.time <= longest:
-            return self._replace(pose=pose, thrust=sent.thrust, rates=pose.body_rates)
+            climb = self.climb._replace(felt=None)
+            return self._replace(
+                pose=pose, thrust=sent.thrust, rates=pose.body_rates, climb=climb
+            )
         dt = pose.time - last.time
         # what motors and rate loop have made of what was sent, as two low-passes
         reached = _share(dt, airframe.motor_time_constant)
@@ -126,15 +138,21 @@ class Innovations(NamedTuple):
             thrust=thrust,
             rates=rates,
             drift=self.drift.after(beyond_thrust, mean, dt),
+            climb=self.climb.after(last, pose, force),
         )
 
     def corrected(self) -> Pose:
         """The newest pose without what was summed up: where the vehicle is if what it is compared
         with is right.
         """
+        way = self.way
+        recent = self.recent
+        if self.climb.contradicts:
+            way = (*way[:2], self.climb.height)
+            recent = (*recent[:2], self.climb.summed)
         return self.pose._replace(
-            position=_difference(self.pose.position, self.way),
-            velocity=_difference(self.pose.velocity, self.recent),
+            position=_difference(self.pose.position, way),
+            velocity=_difference(self.pose.velocity, recent),
         )
 
     def verdict(self) -> Verdict:
@@ -145,6 +163,8 @@ class Innovations(NamedTuple):
             return Verdict.NOT_ITS_WAY
         if self.age > SETTLED and (pushed or math.hypot(*self.step) > STEP):
             return Verdict.NOT_ITS_THRUST
+        if self.climb.contradicts:
+            return Verdict.NOT_ITS_CLIMB
         if math.hypot(*self.turn) > TURN.bound:
             return Verdict.NOT_ITS_TURN
         if math.hypot(*self.rate) > RATE.bound:

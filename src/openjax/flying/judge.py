@@ -27,6 +27,7 @@ class Verdict(StrEnum):
     APART = "motion capture and the vehicle's own estimate disagree"
     NOT_ITS_WAY = "estimated position and velocity disagree"
     NOT_ITS_THRUST = "estimated velocity disagrees with thrust and attitude"
+    NOT_ITS_CLIMB = "estimated climb disagrees with the accelerometer"
     NOT_ITS_TURN = "estimated attitude disagrees with the gyroscope"
     DRIFTS = "estimated velocity drifts: neither thrust nor drag explains it, as they do teammates'"
     NOT_ITS_RATES = "the gyroscope disagrees with the body rates that were sent"

@@ -37,8 +37,11 @@ STARTING = 20.0
 """s until its interpreter has loaded `cflib`, on a busy machine."""
 CLOSING = 2.0
 """s that it has to disarm."""
-_POSE = struct.Struct("<iI16d")
-"""Vehicle, supervisor; arrival, voltage, time, position, velocity, quaternion, body rates."""
+_POSE = struct.Struct("<iI19d")
+"""Vehicle, supervisor; arrival, voltage, specific force (NaN: unknown), and of the pose time,
+position, velocity, quaternion, body rates.
+"""
+_NO_FORCE = (math.nan,) * 3
 _NUMBER = struct.Struct("<q")
 """Number of the set-points, before all of them."""
 _SET_POINT = struct.Struct("<i4d")
@@ -185,7 +188,14 @@ class Links:
             whole = len(data) - len(data) % _POSE.size
             self._rest = data[whole:]
             for vehicle, supervisor, arrival, voltage, *numbers in _POSE.iter_unpack(data[:whole]):
-                self._samples[vehicle] = PoseSample(pose_of(numbers), arrival, voltage, supervisor)
+                force = tuple(numbers[:3])
+                self._samples[vehicle] = PoseSample(
+                    own=pose_of(numbers[3:]),
+                    last_contact=arrival,
+                    voltage=voltage,
+                    supervisor=supervisor,
+                    force=None if math.isnan(sum(force)) else force,
+                )
                 self._arrivals[vehicle] = arrival
                 self.counts[vehicle] += 1
 
@@ -321,7 +331,8 @@ def _pass_on(swarm: Swarm, contacts, stream: socket.socket) -> None:
     def pass_on(vehicle: int, member: Member, new_pose: bool) -> None:
         contacts[vehicle] = member.last_contact
         if new_pose:
-            numbers = (member.arrival, member.voltage, *numbers_of(member.pose))
+            force = member.sample().force or _NO_FORCE
+            numbers = (member.arrival, member.voltage, *force, *numbers_of(member.pose))
             record = _POSE.pack(vehicle, member.supervisor, *numbers)
             # nobody reads any more: then there is no loop to tell
             with lock, contextlib.suppress(OSError):

@@ -18,6 +18,8 @@ from openjax.vehicle.arena import Arena
 
 SPIN_UP = 0.3
 """A vehicle that lifts off may stand still for so long (s)."""
+FORCE_AGE = 0.025
+"""An accelerometer's sample tells of a pose that was measured no longer (s) before or after it."""
 _NOTHING_SEEN = Track()
 _NOTHING_SUMMED = Innovations()
 
@@ -131,6 +133,10 @@ class PoseSample(NamedTuple):
     captured: Pose | None = None
     """The newest of motion capture, whose velocity and body rates mean nothing; None where there is
     no motion capture.
+    """
+    force: Vector | None = None
+    """The newest specific force of its accelerometer (m/s^2, body), measured within `FORCE_AGE` of
+    its own estimate; None where none is logged.
     """
 
 

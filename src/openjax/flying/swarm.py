@@ -19,7 +19,7 @@ from openjax.errors import UserError
 from openjax.flying.controller import Pose, numbers_of
 from openjax.flying.crtp import expand_quaternion
 from openjax.flying.set_point import OFF, SetPoint, manual_arguments
-from openjax.flying.state import PoseSample
+from openjax.flying.state import FORCE_AGE, PoseSample
 
 PERIOD_MS = 10
 """Of the log blocks: the shortest that the protocol knows."""
@@ -103,6 +103,7 @@ class Member:
         self.last_contact = perf_counter()
         self.voltage = math.nan
         self.supervisor = 0
+        self.felt: tuple = (-math.inf, None)  # host s, the newest specific force (m/s^2, body)
         self.error: str | None = None
         self.poses = array("d")  # rows as in `Samples`
         self.bodies = array("d")
@@ -114,7 +115,14 @@ class Member:
 
     def sample(self) -> PoseSample:
         """What is known of it."""
-        return PoseSample(self.pose, self.last_contact, self.voltage, self.supervisor)
+        near = self.pose is not None and abs(self.pose.time - self.felt[0]) <= FORCE_AGE
+        return PoseSample(
+            own=self.pose,
+            last_contact=self.last_contact,
+            voltage=self.voltage,
+            supervisor=self.supervisor,
+            force=self.felt[1] if near else None,
+        )
 
     def pose_arrived(self, stamp: int, data: dict, _block=None) -> None:
         """A pose block, called by cflib's thread."""
@@ -141,10 +149,13 @@ class Member:
         now = perf_counter()
         self.last_contact = now
         self.phases[_block] = stamp % PERIOD_MS
+        measured = self._onboard.host(stamp, now)
+        force = tuple(9.81 * data[name] for name, _ in BODY_BLOCK[4:])
+        if measured > self.felt[0]:  # packets may overtake each other
+            self.felt = measured, force
         if self.recording:
             motors = tuple(data[name] / 65536 for name, _ in BODY_BLOCK[:4])
-            force = tuple(9.81 * data[name] for name, _ in BODY_BLOCK[4:])
-            self.bodies.extend((self._onboard.host(stamp, now), *motors, *force))
+            self.bodies.extend((measured, *motors, *force))
         self.listener(False)
 
 

@@ -120,6 +120,8 @@ class SimulatedSwarm:
         quaternion = report.quaternion.tolist()
         rates = report.body_rates.tolist()
         voltage = self.vehicles.voltage().tolist()
+        # in g, as half-precision numbers
+        force = (9.81 * (report.specific_force / 9.81).astype(np.float16).astype(float)).tolist()
         for i, old in enumerate(self._samples):
             if i in self.asleep:
                 continue
@@ -139,4 +141,5 @@ class SimulatedSwarm:
                 voltage=voltage[i] if claimed is None else claimed,
                 supervisor=self.firmware[i].supervisor_info if received else old.supervisor,
                 captured=self._camera(i, self.now, seen) or old.captured,
+                force=tuple(force[i]) if received else old.force,
             )
