@@ -21,7 +21,7 @@ TEAM = 3
 SPEED = 0.7
 """m/s, of a hunting vehicle (rms)."""
 BEGIN = (5.0, 12.0)
-"""s, when a drift begins."""
+"""s, when a drift begins, after the hover."""
 SOON = 6.0
 """A drift that is told later (s) isn't counted as told."""
 VEHICLES = {
@@ -50,17 +50,22 @@ def wandering(rng: np.random.Generator, time_constant: float, size: float) -> np
     return out
 
 
-def unexplained(rng, vehicle, drift) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def unexplained(
+    rng, vehicle, drift, hover: float = 0.0, begins: tuple[float, float] = BEGIN
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """What thrust and attitude don't explain of the estimate's acceleration (m/s^2, world) and the
     estimate's velocity (m/s), (T, FLIGHTS, TEAM, 2) each, and when the first vehicle's began to
     drift (s).
+
+    `hover`: how long (s) all hover before they hunt.
     """
     drag, air, tilt, error = vehicle
     speed, seconds = drift
     time = PERIOD * np.arange(round(SECONDS / PERIOD))
     velocity = wandering(rng, 0.6, SPEED)
-    velocity *= np.clip(time - 1.5, 0.1, 1.0)[:, None, None, None]  # the way to the start is slow
-    begin = rng.uniform(*BEGIN, FLIGHTS)
+    # the way to the start is slow, and so is a hover
+    velocity *= np.clip(time - hover - 1.5, 0.1, 1.0)[:, None, None, None]
+    begin = hover + rng.uniform(*begins, FLIGHTS)
     away = rng.uniform(0.0, 2 * np.pi, FLIGHTS)
     direction = np.stack([np.cos(away), np.sin(away)], 1)
     begun = speed * np.clip((time[:, None] - begin) / seconds, 0.0, 1.0)
@@ -110,10 +115,11 @@ def study(options) -> dict:
     rows = []
     for name, vehicle in VEHICLES.items():
         rng = np.random.default_rng(options.seed)
-        without = told(summed(*unexplained(rng, vehicle, (0.0, 1.0))[:2]))
+        how = (options.hover, tuple(options.begin))
+        without = told(summed(*unexplained(rng, vehicle, (0.0, 1.0), *how)[:2]))
         row = {"vehicle": name, "ended": float(np.isfinite(without).any(1).mean())}
         for drift, size in DRIFTS.items():
-            rest, velocity, begin = unexplained(rng, vehicle, size)
+            rest, velocity, begin = unexplained(rng, vehicle, size, *how)
             after = told(summed(rest, velocity))[:, 0] - begin
             row[drift] = float(((after > 0.0) & (after < SOON)).mean())
         rows.append(row)
@@ -131,4 +137,6 @@ def page(results) -> Page:
 if __name__ == "__main__":
     parser = page_parser(__doc__, "flying_drifts")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--hover", type=float, default=0.0, help="s, before they hunt")
+    parser.add_argument("--begin", type=float, nargs=2, default=BEGIN, help="s, of a drift")
     publish(parser.parse_args(), study, page)

@@ -174,6 +174,9 @@ def test_a_flight_from_the_floor_to_its_log(uris, tmp_path):
     assert flight.record.episodes[0]["capture_step"] == 11
     timing = flight.record.timing()
     assert timing["ticks"] > 200
+    # the accelerometer comes up with the poses, and agrees with them
+    assert all(d.innovations.climb.felt is not None for d in flight.state.drones)
+    assert not any(d.contradiction for d in flight.state.drones)
     # a set-point leaves after the poses that it was made of, and those were measured before they
     # arrived
     assert 0.0 < timing["command_age_ms"]["p50"] < timing["measured_to_sent_ms"]["p50"] < 10.0
