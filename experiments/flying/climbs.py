@@ -85,7 +85,9 @@ def study(options) -> dict:
         for name, begins in BEGINS.items():
             late = []
             for begin in begins:
-                told = [judged(f, sign * speed, within, begin)[1] for f in flights for sign in (1, -1)]
+                told = [
+                    judged(f, sign * speed, within, begin)[1] for f in flights for sign in (1, -1)
+                ]
                 late += [np.inf if t is None else t - begin for t in told]
             late = np.array(late)
             row[name] = float((late < SOON).mean())
@@ -110,7 +112,9 @@ def page(results) -> Page:
         "told, late": "late:.2f",
         "after (s), late": "late_seconds:.1f",
     }
-    return Page("What an accelerometer tells of a drifting height", prose, Table(columns, results["rows"]))
+    return Page(
+        "What an accelerometer tells of a drifting height", prose, Table(columns, results["rows"])
+    )
 
 
 if __name__ == "__main__":

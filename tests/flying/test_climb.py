@@ -1,6 +1,8 @@
 """A height that drifts gently, told by the accelerometer: of a vehicle that is pushed, leans and
 climbs, and in a flight."""
 
+import itertools
+
 import pytest
 from scipy.spatial.transform import Rotation
 
@@ -30,7 +32,7 @@ def felt(pose, following):
 def flown():
     """(pose, set-point, specific force) of six seconds, each with the force that has acted."""
     rows = list(flight(push=PUSH))
-    forces = [felt(a[0], b[0]) for a, b in zip(rows, rows[1:], strict=False)]
+    forces = [felt(a[0], b[0]) for a, b in itertools.pairwise(rows)]
     return [(*row, force) for row, force in zip(rows[1:], forces, strict=False)]
 
 
@@ -48,9 +50,7 @@ def judged(rows, speed=0.0, axis=2, begin=0.3, logged=True):
         position[axis] += way
         velocity[axis] += drift
         told = pose._replace(position=tuple(position), velocity=tuple(velocity))
-        innovations = innovations.after(
-            told, sent, AIRFRAME, force=force if logged else None
-        )
+        innovations = innovations.after(told, sent, AIRFRAME, force=force if logged else None)
         if innovations.verdict():
             break
     return innovations, pose

@@ -82,9 +82,10 @@ def _reckoned(state, drone) -> Drone:
 
 
 def _consistent(state, drone, own, force) -> Drone:
-    """The drone after its newest own estimate, with what its accelerometer feels. If its innovations contradict that, none is believed
-    any more in this flight, nor motion capture where it tells the same: what the estimator on board
-    follows can't confirm it.
+    """The drone after its newest own estimate, with what its accelerometer feels.
+
+    If its innovations contradict that, none is believed any more in this flight, nor motion capture
+    where it tells the same: what the estimator on board follows can't confirm it.
     """
     if drone.contradiction:
         return drone._replace(own=drone.own._replace(verdict=drone.contradiction))

@@ -105,9 +105,7 @@ class Innovations(NamedTuple):
         longest = math.inf if refused else LONGEST
         if last is None or not 0.0 < pose.time - last.time <= longest:
             climb = self.climb._replace(felt=None)
-            return self._replace(
-                pose=pose, thrust=sent.thrust, rates=pose.body_rates, climb=climb
-            )
+            return self._replace(pose=pose, thrust=sent.thrust, rates=pose.body_rates, climb=climb)
         dt = pose.time - last.time
         # what motors and rate loop have made of what was sent, as two low-passes
         reached = _share(dt, airframe.motor_time_constant)
