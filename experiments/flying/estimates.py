@@ -145,7 +145,8 @@ GROUPS = {
 }
 """The rows of the page."""
 UNTOLD = tuple(kind for kind in DAMAGES if "with its velocity" in kind)
-"""What nothing on board can tell where it is small, or sets in gently; teammates tell some."""
+"""What nothing on board can tell where it is small, or sets in gently along the ground; teammates
+tell some of that, and the accelerometer some of the height."""
 TOLD = tuple(kind for kind in DAMAGES if kind not in UNTOLD)
 
 
