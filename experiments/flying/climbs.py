@@ -51,7 +51,6 @@ def airborne(flight) -> list[tuple[Pose, tuple]]:
 def judged(rows, speed: float = 0.0, within: float = 1.0, begin: float = 0.0):
     """(the largest smoothed sum (m/s), when it was told (s in the air) or None)."""
     climb = Climb()
-    last = None
     largest = 0.0
     told = None
     first = rows[0][0].time
@@ -59,11 +58,7 @@ def judged(rows, speed: float = 0.0, within: float = 1.0, begin: float = 0.0):
         t = true.time - first
         drift = speed * min(max((t - begin) / within, 0.0), 1.0)
         pose = true._replace(velocity=(*true.velocity[:2], true.velocity[2] + drift))
-        if last is not None and 0.0 < pose.time - last.time < 0.025:
-            climb = climb.after(last, pose, force)
-        else:
-            climb = climb._replace(felt=None)
-        last = pose
+        climb = climb.after(pose, force)
         largest = max(largest, abs(climb.smooth))
         if told is None and climb.contradicts:
             told = t

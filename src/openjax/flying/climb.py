@@ -20,6 +20,8 @@ WINDOW = 4.0
 CALM = 0.3
 """Time constant of the sum's low-pass (s): accelerometer and estimate are sampled some
 milliseconds apart, in sharp turns by .1 m/s."""
+LONGEST = 0.025
+"""After a longer pause (s) between two poses nobody knows what was felt."""
 TRUSTED = 10.0
 """The offset is taken to be zero as surely as this time (s) would tell ..."""
 LEARNT = 30.0
@@ -32,28 +34,31 @@ BOUND = 0.16
 class Climb(NamedTuple):
     """What of an estimate's climb the accelerometer doesn't feel."""
 
-    felt: float | None = None
-    """World z of the specific force at the last pose, less gravity (m/s^2); None: unknown."""
+    time: float = -math.inf  # s, of the last pose
+    speed: float = 0.0  # m/s, upwards, of that
+    felt: float = math.nan  # m/s^2, upwards, by the accelerometer; no number where it isn't known
     offset: float = 0.0  # m/s^2, as learnt
     age: float = 0.0  # s, for how long
     summed: float = 0.0  # m/s
     smooth: float = 0.0  # m/s, the sum's low-pass
     height: float = 0.0  # m, what the sum has added to the height
 
-    def after(self, last: Pose, pose: Pose, force: Vector | None) -> "Climb":
-        """From one pose to the next, with the specific force (m/s^2, body) that is felt there. Of a
-        time without one nothing is known: it changes nothing.
+    def after(self, pose: Pose, force: Vector | None) -> "Climb":
+        """With the next pose and the specific force (m/s^2, body) that is felt there. Where a pose
+        or a force is missing, nothing changes.
         """
-        felt = None if force is None else felt_climb(pose.quaternion, force)
-        if felt is None or self.felt is None:
-            return self._replace(felt=felt)
-        dt = pose.time - last.time
-        gained = pose.velocity[2] - last.velocity[2]
-        beyond = gained - dt * (0.5 * (felt + self.felt) + self.offset)
+        dt = pose.time - self.time
+        speed = pose.velocity[2]
+        felt = math.nan if force is None else felt_climb(pose.quaternion, force)
+        if not 0.0 < dt <= LONGEST or math.isnan(felt + self.felt):
+            return self._replace(time=pose.time, speed=speed, felt=felt)
+        beyond = speed - self.speed - dt * (0.5 * (felt + self.felt) + self.offset)
         age = self.age + dt
         kept = math.exp(-dt / WINDOW)
         summed = kept * self.summed + beyond
         return Climb(
+            time=pose.time,
+            speed=speed,
             felt=felt,
             offset=self.offset + beyond / min(age + TRUSTED, LEARNT),
             age=age,

@@ -99,9 +99,8 @@ def _consistent(state, drone, own, force) -> Drone:
         )
         return drone._replace(own=own, contradiction=own.verdict if lost else Verdict.GOOD)
     refused = bool(drone.own.verdict)
-    innovations = drone.innovations.after(
-        own.pose, as_sent(drone.sent), state.airframe, refused, force
-    )
+    innovations = drone.innovations.after(own.pose, as_sent(drone.sent), state.airframe, refused)
+    innovations = innovations.feeling(force)
     verdict = innovations.verdict()
     seen = drone.captured
     if not verdict:

@@ -88,15 +88,9 @@ class Innovations(NamedTuple):
     climb: Climb = Climb()  # what the accelerometer doesn't feel, of the upward velocity
 
     def after(
-        self,
-        pose: Pose,
-        sent: SetPoint,
-        airframe: Airframe,
-        refused: bool = False,
-        force: Vector | None = None,
+        self, pose: Pose, sent: SetPoint, airframe: Airframe, refused: bool = False
     ) -> "Innovations":
-        """With the next pose; `sent` has acted since the last one, and its accelerometer feels
-        `force` (m/s^2, body), if anything is known of that.
+        """With the next pose; `sent` has acted since the last one.
 
         `refused`: whether poses between them came and weren't believed. Then this one must follow
         from the last believable one, however long that is ago.
@@ -104,8 +98,7 @@ class Innovations(NamedTuple):
         last = self.pose
         longest = math.inf if refused else LONGEST
         if last is None or not 0.0 < pose.time - last.time <= longest:
-            climb = self.climb._replace(felt=None)
-            return self._replace(pose=pose, thrust=sent.thrust, rates=pose.body_rates, climb=climb)
+            return self._replace(pose=pose, thrust=sent.thrust, rates=pose.body_rates)
         dt = pose.time - last.time
         # what motors and rate loop have made of what was sent, as two low-passes
         reached = _share(dt, airframe.motor_time_constant)
@@ -136,8 +129,14 @@ class Innovations(NamedTuple):
             thrust=thrust,
             rates=rates,
             drift=self.drift.after(beyond_thrust, mean, dt),
-            climb=self.climb.after(last, pose, force),
+            climb=self.climb,
         )
+
+    def feeling(self, force: Vector | None) -> "Innovations":
+        """With the specific force (m/s^2, body) that the accelerometer feels at the newest pose;
+        None: it isn't known.
+        """
+        return self._replace(climb=self.climb.after(self.pose, force))
 
     def corrected(self) -> Pose:
         """The newest pose without what was summed up: where the vehicle is if what it is compared
