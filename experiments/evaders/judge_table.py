@@ -25,7 +25,7 @@ SECOND = "learners and planner"
 def rows_of(found: dict, of_each: Callable[[dict], str]) -> Iterator[tuple[str, list[str]]]:
     """Names of judges and a cell for each kind of tasks; what hasn't flown is a dash."""
     kinds = JUDGES | {
-        SECOND: lambda evader: evader == "planner" or evader.startswith("learned"),
+        SECOND: lambda evader: evader.startswith(("learned", "planner")),
         **{name: lambda evader, name=name: evader == name for name in HELD_OUT},
     }
     for judge, belongs in kinds.items():

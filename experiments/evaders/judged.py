@@ -32,7 +32,7 @@ FOR_ALL = ("evaders that learn", "a planner", "scripted ones, held out", "the pa
 """... of these judges, whose episodes are many."""
 JUDGES: Mapping[str, Callable[[str], bool]] = {
     "evaders that learn": lambda evader: evader.startswith("learned"),
-    "a planner": lambda evader: evader == "planner",
+    "a planner": lambda evader: evader.startswith("planner"),
     "splitting, kept apart": lambda evader: evader == "splitting",
     "both plan, pursuers last": lambda evader: evader == "both plan, pursuers last",
     "both plan, evader last": lambda evader: evader == "both plan, evader last",

@@ -103,6 +103,18 @@ def test_plans_end_by_the_evaders_own_rule_and_refined_ones_keep_their_speed():
     assert not same.all(-1).any() and same.any()
 
 
+def test_a_value_counts_at_the_end_of_a_plan_unless_it_was_caught():
+    state = state_of(jax.jit(lambda key: uniform_task(GAME.settings, key))(jax.random.key(0)))
+    statistics = state.statistics
+    caught = dataclasses.replace(statistics, captured=jnp.bool_(True), capture_step=state.step + 3)
+    duel = Duel(GAME, Team(straight))
+    plain = Planner(PlannerSettings(), duel)
+    valued = Planner(PlannerSettings(), duel, value=lambda state: 9.0)
+    for end, free in ((state, 80 + 9), (state.replace(statistics=caught), 3)):
+        room = plain.promise(state, end) - plain.free_steps(state, end)
+        np.testing.assert_allclose(valued.promise(state, end) - room, free, atol=1e-4)
+
+
 def test_of_several_ways_the_likeliest_is_flown():
     means = jnp.arange(6.0)
     odds = jnp.array([0.1, 0.7])

@@ -24,7 +24,7 @@ from openjax.evaluation.judges.networks import apply_network, init_network, like
 from openjax.evaluation.judges.senses import sense, to_world
 from openjax.evaluation.judges.settings import BestResponseSettings
 from openjax.policy import PolicyParameters
-from openjax.pursuit import EpisodeStatistics, PursuitSettings, Task
+from openjax.pursuit import EpisodeStatistics, PursuitSettings, PursuitState, Task
 
 FIRST = 0.5
 """Share of the speed that each way has at first."""
@@ -45,6 +45,17 @@ class Evaders:
         world's axes.
         """
         return jax.tree.map(lambda leaf: leaf[place], (self.actor, self.world_axes))
+
+    def steps_free(
+        self, place: int, game: PursuitSettings, hold: int, state: PursuitState
+    ) -> jax.Array:
+        """() steps that one learner expects to be free from a state of one world, those to come
+        counting less.
+        """
+        critic = jax.tree.map(lambda leaf: leaf[place][None], self.critic)
+        sensed = sense(game, state, self.world_axes[place])
+        share = apply_network(critic, sensed[None, None])[0, 0, 0]
+        return hold * share / (1.0 - self.discount[place])
 
     @property
     def networks(self) -> tuple[Any, Any, jax.Array]:

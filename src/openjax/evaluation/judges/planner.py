@@ -29,6 +29,10 @@ class Planner:
 
     settings: PlannerSettings
     duel: Duel
+    value: Callable[[PursuitState], jax.Array] | None = None
+    """State of one world -> () steps that an evader will be free from there; None: the farther from
+    the pursuers the better.
+    """
 
     def fly(self, parameters: PolicyParameters, start: World, key: jax.Array) -> EpisodeStatistics:
         """Statistics (B,) of one episode from each of B starts."""
@@ -133,7 +137,10 @@ class Planner:
         """() how good the end of a plan is: steps free first, then the room that is left."""
         ahead = end.drones.position + self.settings.ahead * end.drones.velocity
         room = jnp.min(jnp.linalg.norm(ahead - end.evader_position, axis=-1))
-        return self.free_steps(start, end) + room / self.duel.environment.settings.arena_radius
+        free = self.free_steps(start, end)
+        if self.value is not None:
+            free += jnp.where(end.statistics.captured, 0.0, self.value(end))
+        return free + room / self.duel.environment.settings.arena_radius
 
     def free_steps(self, start: PursuitState, end: PursuitState) -> jax.Array:
         """() steps of a plan before the capture, all of them where there is none."""

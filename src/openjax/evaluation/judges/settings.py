@@ -113,6 +113,11 @@ class PlannerSettings:
     the strongest of those that learned: it knows what comes after the horizon.
     """
 
+    learned_value: bool = False
+    """Whether a second planner flies, to which the end of a plan is worth as many steps as the
+    strongest of those that learned would be free from there, by its own estimate.
+    """
+
     def __post_init__(self):
         check_intervals(self, "planning.")
 
