@@ -7,13 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from openjax.baselines.points import Team, game_of_points
 from openjax.evaluation.judges.duel import Duel
 from openjax.evaluation.judges.networks import likeliest, ways
 from openjax.evaluation.judges.planner import Planner
 from openjax.evaluation.judges.senses import number_of_senses, sense, to_world
 from openjax.evaluation.judges.settings import PlannerSettings
 from openjax.pursuit import turn_task, uniform_task
-from tests.baselines.points import Team, game_of_points
 
 GAME = game_of_points(max_pillars=3, episode_length=80)
 

@@ -5,11 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from openjax.baselines.points import Team, game_of_points
 from openjax.evaluation.judges.duel import Duel
 from openjax.evaluation.judges.matrix_game import MatrixGame, choose
 from openjax.evaluation.judges.settings import MatrixGameSettings
 from openjax.pursuit import Task
-from tests.baselines.points import Team, game_of_points
 
 PAYOFF = jnp.array([[3.0, 1.0], [0.0, 2.0], [0.5, 0.9]])
 """Rows are the evader's plans, who wants much."""

@@ -4,10 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from openjax.baselines.points import Team, game_of_points
 from openjax.evaluation.judges.settings import SplittingSettings
 from openjax.evaluation.judges.splitting import Splitting, sources
 from openjax.pursuit import Task
-from tests.baselines.points import Team, game_of_points
 
 SETTINGS = SplittingSettings(copies=256)
 

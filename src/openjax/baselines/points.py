@@ -1,4 +1,6 @@
-"""Pursuers that are points, and how they fly: games whose answer is known."""
+"""Pursuers that are points, of whom theorems speak, and how they fly: games whose answer is known,
+and what a vehicle's inertia costs beside them.
+"""
 
 import dataclasses
 from collections.abc import Callable
@@ -22,9 +24,11 @@ class Points:
     time_step: float
 
     def reset(self, vehicle, drones: DroneState, key=None) -> DroneState:
+        """They start where they are."""
         return drones
 
     def __call__(self, vehicle, drones: DroneState, command: jax.Array, *_) -> DroneState:
+        """The points a step later; nothing is solid to them."""
         share = command[:, 1:] / jnp.pi
         velocity = self.speed * share / jnp.maximum(length(share), 1.0)
         return drones.replace(
@@ -32,6 +36,7 @@ class Points:
         )
 
     def seen(self, drones: DroneState, effect_parameters=None) -> DroneState:
+        """They know where they are."""
         return drones
 
 
