@@ -104,7 +104,9 @@ def figures(game: PursuitSettings, kinds: np.ndarray, statistics, path: np.ndarr
             name: float(caught[kinds == place].mean()) for place, name in enumerate(game.evaders)
         },
         "speed_by_second": [
-            round(float(np.nanmean(free[:, end - second : end - 1])), 3) if len(free) else None
+            round(float(np.nanmean(free[:, end - second : end - 1])), 3)
+            if np.isfinite(free[:, end - second : end - 1]).any()
+            else None
             for end in ends
         ],
     }

@@ -203,9 +203,9 @@ def teams() -> TrainSettings:
             team_sizes=(1, 3, 4, 6, 8),
             evader_speeds=(0.8, 2.0),
             capture_radii=(0.2, 0.4),
-            # whoever remains flies on as a smaller team, which two learn in no other way: with three
-            # of ten, with the time observed and no pay of later captures, two caught .92 and the
-            # two left of three .95
+            # whoever remains flies on as a smaller team, and two learn in no other way: with three
+            # of ten, the time observed and no pay of later captures, two caught .92 and the two
+            # left of three .95
             fall_outs=0.6,
             observe_game=True,
             history_pursuers="pooled",

@@ -240,8 +240,8 @@ def cell_record(game: PursuitSettings, cell: Cell, statistics: EpisodeStatistics
 
 
 def figures(game: PursuitSettings, statistics: EpisodeStatistics) -> dict:
-    """Captures of episodes (E,) with their 95 % interval, crashes and mean capture time (s, of those
-    that capture).
+    """Captures of episodes (E,) with their 95 % interval, crashes and mean capture time (s, of
+    those that capture).
     """
     caught = statistics.captured
     seconds = statistics.capture_step[caught].mean() * game.time_step if caught.any() else None

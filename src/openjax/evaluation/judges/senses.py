@@ -2,7 +2,8 @@
 
 The x axis points away from the arena's axis, so that a game that is turned looks the same; with
 `world_axes` it is the world's. Pursuers and pillars are sorted by their distance. Where tasks have
-an evader's speed and a capture radius of their own, it knows these, too: one network plays them all.
+an evader's speed and a capture radius of their own, it knows these, too: one network plays them
+all.
 """
 
 import jax
