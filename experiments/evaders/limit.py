@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from experiments.evaders.judged_game import JudgedGame, game_parser, judged_game
+from openjax.baselines.points import Points, Team
 from openjax.baselines.surroundings import Craft
 from openjax.baselines.velocity_controller import velocity_action
 from openjax.evaluation.judges.duel import Duel
@@ -21,7 +22,6 @@ from openjax.evaluation.judges.settings import MatrixGameSettings
 from openjax.pursuit import Pursuit, PursuitSettings
 from openjax.pursuit.shortest_paths import path_length, shortest_paths
 from openjax.vehicle import hover_share
-from tests.baselines.points import Points, Team
 
 SIDES = ("pursuers", "evader")
 HONEST = ", honest sight"
