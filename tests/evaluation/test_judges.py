@@ -1,6 +1,7 @@
 """Judges: what their evaders sense, and that one that plans gets away where it can."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -12,9 +13,11 @@ from openjax.evaluation.judges.duel import Duel
 from openjax.evaluation.judges.networks import likeliest, ways
 from openjax.evaluation.judges.planner import Planner
 from openjax.evaluation.judges.senses import number_of_senses, sense, to_world
-from openjax.evaluation.judges.settings import PlannerSettings
+from openjax.evaluation.judges.settings import BestResponseSettings, PlannerSettings
+from openjax.evaluation.judges.tasks import draw_own_task
 from openjax.pursuit import turn_task, uniform_task
 
+KEY = jax.random.key(0)
 GAME = game_of_points(max_pillars=3, episode_length=80)
 
 
@@ -62,6 +65,19 @@ def test_more_slots_sense_pillars_that_are_not_there():
     blind = dataclasses.replace(state.task, pillar_active=jnp.zeros(3, bool))
     absent = sense(GAME.settings, state.replace(task=blind), jnp.bool_(False))
     np.testing.assert_array_equal(many[few.size :], absent[-8:])
+
+
+def test_a_specialist_learns_on_a_layout_of_its_own():
+    """Of two layouts without and with a pillar, two of four learners have one each."""
+    learning = BestResponseSettings(learners=4, specialists=2, layouts=0.0)
+    tasks = jax.vmap(lambda key: uniform_task(GAME.settings, key))(jax.random.split(KEY, 2))
+    layouts = tasks.replace(pillar_active=jnp.array([[True, False, True], [False, True, False]]))
+    draw = functools.partial(draw_own_task, GAME.settings, layouts, learning)
+    keys = jax.random.split(KEY, 4 * 64)
+    drawn = jax.jit(jax.vmap(draw))(keys, jnp.repeat(jnp.arange(4), 64)).pillar_active
+    drawn = drawn.reshape(4, 64, 3)
+    share = [(drawn == active).all(-1).mean(1) for active in layouts.pillar_active]
+    np.testing.assert_allclose(share, [[0, 0, 0.75, 0], [0, 0, 0, 0.75]], atol=0.15)
 
 
 def test_who_plans_gets_away_from_slower_points_in_the_open():

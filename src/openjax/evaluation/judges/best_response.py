@@ -94,6 +94,8 @@ class BestResponse:
     duel: Duel
     draw_task: Callable[[jax.Array], Task]
     """key -> a task to learn on"""
+    draw_own_task: Callable[[jax.Array, jax.Array], Task] | None = None
+    """key, () int which learner -> a task for it; None: all learn on the same."""
 
     @functools.cached_property
     def optimiser(self) -> optax.GradientTransformation:
@@ -157,8 +159,12 @@ class BestResponse:
     def _fresh(self, key):
         """All worlds at the start of an episode."""
         task_key, reset_key = jax.random.split(key)
-        number = self.settings.learners * self.settings.num_envs
-        tasks = jax.vmap(self.draw_task)(jax.random.split(task_key, number))
+        learners = jnp.repeat(jnp.arange(self.settings.learners), self.settings.num_envs)
+        keys = jax.random.split(task_key, learners.size)
+        if self.draw_own_task is None:
+            tasks = jax.vmap(self.draw_task)(keys)
+        else:
+            tasks = jax.vmap(self.draw_own_task)(keys, learners)
         return self.duel.start(tasks, reset_key)
 
     def _decide(self, parameters, evaders, fresh, world, key):

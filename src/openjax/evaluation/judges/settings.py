@@ -56,8 +56,17 @@ class BestResponseSettings:
     others are uniform tasks, turned.
     """
 
+    specialists: Annotated[int, Interval("[0, 64]")] = 0
+    """Of the learners, how many learn on one layout each, in turn, and now and then on uniform
+    tasks: a learner of all six sees little of each.
+    """
+
     def __post_init__(self):
         check_intervals(self)
+        if self.specialists > self.learners:
+            raise UserError(
+                f"specialists {self.specialists}: at most the {self.learners} learners can be some"
+            )
         if not self.foresight or min(self.foresight) <= 0.0:
             raise UserError(f"foresight {self.foresight}: seconds above zero are needed")
         if self.num_envs * self.rollout_length % self.minibatches:

@@ -5,6 +5,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
+from openjax.evaluation.judges.settings import BestResponseSettings
 from openjax.evaluation.validation import uniform_tasks
 from openjax.pursuit import PursuitSettings, Task, expand_task, turn_task, uniform_task
 
@@ -12,6 +13,8 @@ JUDGE_KEY = 70_000_009
 """The tasks by which a policy is judged are drawn from this key: neither those by which runs choose
 their checkpoints nor any that was trained on.
 """
+OWN = 0.75
+"""Share of a specialist's episodes that begin in its layout."""
 MOVES = 4
 """Local expansions of a layout's starts: some .1 m along each axis."""
 
@@ -35,6 +38,25 @@ def draw_task(
     moved = jax.lax.scan(move, task, jax.random.split(keys[3], MOVES))[0]
     on_layout = jax.random.uniform(keys[4]) < share
     return jax.tree.map(lambda a, b: jnp.where(on_layout, a, b), moved, uniform)
+
+
+def draw_own_task(
+    settings: PursuitSettings,
+    layouts: Task,
+    learning: BestResponseSettings,
+    key: jax.Array,
+    learner: jax.Array,
+) -> Task:
+    """A task for one of the learners, () int: of the last ones, specialists, mostly a layout of its
+    own out of `layouts` (L, ...).
+    """
+    number = layouts.evader_position.shape[0]
+    place = learner - (learning.learners - learning.specialists)
+    one = jax.tree.map(lambda leaf: leaf[place % number][None], layouts)
+    any_key, own_key = jax.random.split(key)
+    of_any = draw_task(settings, layouts, learning.layouts, any_key)
+    own = draw_task(settings, one, OWN, own_key)
+    return jax.tree.map(lambda a, b: jnp.where(place >= 0, a, b), own, of_any)
 
 
 def judging_tasks(settings: PursuitSettings, number: int) -> Task:
