@@ -11,7 +11,7 @@ from openjax.errors import UserError
 from openjax.vehicle import hover_state, load_vehicle, make_drones_step
 from openjax.vehicle.family import (
     VehicleRange,
-    check_ranges,
+    checked_ranges,
     draw_vehicles,
     family_bounds,
     family_effects,
@@ -77,7 +77,7 @@ def test_a_family_grows_from_the_nominal_vehicle():
 )
 def test_impossible_families_are_refused(entry):
     with pytest.raises(UserError):
-        check_ranges((entry,))
+        checked_ranges((entry,))
 
 
 def test_a_drone_of_a_mixed_team_flies_as_in_a_team_of_its_own_kind():

@@ -243,9 +243,10 @@ class PursuitSettings:
             check_airframe(self.airframe)
         if self.vehicles:
             # only here: it knows the effects, which are written in JAX
-            from openjax.vehicle.family import check_ranges
+            from openjax.vehicle.family import checked_ranges
 
-            check_ranges(self.vehicles)
+            # files and Python hand in plain tuples; from here on their numbers have names
+            object.__setattr__(self, "vehicles", checked_ranges(self.vehicles))
         check_evaders(self.evaders)
 
     def of_one_team(self, number: int) -> "PursuitSettings":

@@ -3,7 +3,7 @@ pursuer and episode.
 """
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import jax
@@ -16,6 +16,11 @@ from openjax.vehicle.disturbances import DISTURBANCES
 from openjax.vehicle.effects.effect import Effect, Parameter
 from openjax.vehicle.effects.registry import EFFECTS, find_effect
 from openjax.vehicle.parameters import NOMINAL, find_mjcf
+
+REST = 0.35
+"""The part of the family's ranges that remains for what a diagnosis didn't find: it can't rule out
+that a little of it acts.
+"""
 
 
 class VehicleRange(NamedTuple):
@@ -44,10 +49,14 @@ def find_parameter(name: str) -> tuple[Effect, Parameter]:
     return effect, effect.parameters[parameter]
 
 
-def check_ranges(ranges: Sequence[VehicleRange]) -> None:
-    """Raises UserError for unknown parameters, parameters that come twice and ranges that
-    aren't.
+def checked_ranges(entries: Iterable[Iterable]) -> tuple[VehicleRange, ...]:
+    """The ranges that entries (parameter, low, high, rare low, rare high) hold: files and settings
+    that a person writes have plain tuples.
+
+    Raises:
+      UserError: an unknown parameter, one that comes twice, or a range that isn't.
     """
+    ranges = tuple(VehicleRange._make(entry) for entry in entries)
     names = set()
     for name, low, high, rare_low, rare_high in ranges:
         _, parameter = find_parameter(name)
@@ -69,20 +78,16 @@ def check_ranges(ranges: Sequence[VehicleRange]) -> None:
                 f"vehicles: {name} lies in {low}..{high}, rarely {rare_low}..{rare_high}; it can't "
                 f"leave {least:g}..{most:g}"
             )
+    return ranges
 
 
 def family_effects(ranges: Sequence[VehicleRange]) -> tuple[Effect, ...]:
     """The effects that a family's vehicles fly with, by name."""
     effects = {}
-    for entry in _named(ranges):
+    for entry in ranges:
         effect, _ = find_parameter(entry.parameter)
         effects[effect.name] = effect
     return tuple(effects[name] for name in sorted(effects))
-
-
-def _named(ranges):
-    """The ranges with names for their numbers: those of a policy's file are plain tuples."""
-    return [VehicleRange(*entry) for entry in ranges]
 
 
 def family_bounds(ranges: Sequence[VehicleRange]) -> np.ndarray:
@@ -94,7 +99,7 @@ def narrowed_bounds(ranges: Sequence[VehicleRange], share) -> jax.Array:
     """(R, 4) bounds of the family of which only this `share` () is left about the nominal
     vehicle.
     """
-    parameters = [find_parameter(entry.parameter)[1] for entry in _named(ranges)]
+    parameters = [find_parameter(entry.parameter)[1] for entry in ranges]
     none = np.array([[parameter.none] for parameter in parameters], np.float32)
     return none + share * (family_bounds(ranges) - none)
 
@@ -126,7 +131,7 @@ def draw_vehicles(
         return {}
     names = [effect.name for effect in family_effects(ranges)]
     bounds = family_bounds(ranges) if bounds is None else bounds
-    owner = np.array([names.index(entry.parameter.partition(".")[0]) for entry in _named(ranges)])
+    owner = np.array([names.index(entry.parameter.partition(".")[0]) for entry in ranges])
     value_key, chosen_key, rare_key = jax.random.split(key, 3)
     share = jax.random.uniform(value_key, (number, len(ranges)))
     chosen = jax.random.randint(chosen_key, (number,), 0, len(names))
@@ -137,7 +142,7 @@ def draw_vehicles(
     high = jnp.where(rarely, bounds[:, 3], bounds[:, 1])
     values = low + share * (high - low)
     drawn: dict[str, dict[str, jax.Array]] = {name: {} for name in names}
-    for i, entry in enumerate(_named(ranges)):
+    for i, entry in enumerate(ranges):
         effect, _, parameter = entry.parameter.partition(".")
         drawn[effect][parameter] = values[:, i]
     return drawn
@@ -151,7 +156,7 @@ def standard_parameters(ranges: Sequence[VehicleRange], parameters: dict) -> jax
     be shown another.
     """
     columns = []
-    for entry in _named(ranges):
+    for entry in ranges:
         effect, _, name = entry.parameter.partition(".")
         _, parameter = find_parameter(entry.parameter)
         low, high = parameter.prior
@@ -173,19 +178,12 @@ def vehicle_family(airframe: str = NOMINAL) -> tuple[VehicleRange, ...]:
         for effect, parameters in read_toml(path, "family of vehicles").items():
             for name, entry in parameters.items():
                 bounds = map(float, (*entry["range"], *entry["rare"]))
-                family.append(VehicleRange(f"{effect}.{name}", *bounds))
+                family.append((f"{effect}.{name}", *bounds))
+        return checked_ranges(family)
     except (AttributeError, KeyError, TypeError, ValueError):
         raise UserError(
             f"{path}: each [effect.parameter] needs range and rare, of two numbers each"
         ) from None
-    check_ranges(family)
-    return tuple(family)
-
-
-REST = 0.35
-"""The part of the family's ranges that remains for what a diagnosis didn't find: it can't rule out
-that a little of it acts.
-"""
 
 
 def adapted_family(
@@ -215,9 +213,10 @@ def adapted_family(
             name = f"{effect.name}.{key}"
             none = parameter.none
             if found is None:
-                _, low, high, *_ = usual.get(name, (name, none, none))
-                low = none + rest * (low - none)
-                high = none + rest * (high - none)
+                # an effect that the airframe's family lacks stays as the nominal vehicle has it
+                whole = usual.get(name, VehicleRange(name, none, none, none, none))
+                low = none + rest * (whole.low - none)
+                high = none + rest * (whole.high - none)
             else:
                 value = found.get(key, none)
                 margin = 0.1 * abs(value - none)
