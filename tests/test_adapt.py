@@ -18,12 +18,11 @@ from openjax.learning.adaptation import (
     AdaptSettings,
     adapting_game,
     bounds_of,
-    clearly_better,
-    fine_tune,
     make_adaptation,
     off_the_flight,
     starting_parameters,
 )
+from openjax.learning.fine_tuning import clearly_better, fine_tune
 from openjax.learning.settings import GeneratorSettings, MappoSettings
 from openjax.policy import NetworkSettings, PolicyParameters, PredictorSettings
 from openjax.pursuit import PursuitSettings

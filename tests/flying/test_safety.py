@@ -14,13 +14,13 @@ from openjax.flying.board import Board, Role
 from openjax.flying.controller import Pose, accelerate, nominal_airframe, roll_pitch_yaw
 from openjax.flying.guard import fly_down, take_over
 from openjax.flying.judge import Track
-from openjax.flying.safety import (
+from openjax.flying.limits import (
     fence_velocity,
     parting_velocity,
     resting_places,
-    step,
     stopping_point,
 )
+from openjax.flying.safety import step
 from openjax.flying.set_point import OFF, RATES, SetPoint, from_action
 from openjax.flying.state import (
     Drone,
@@ -427,6 +427,9 @@ def test_resting_places_are_inside_apart_and_off_the_pillars():
         assert 0.25 < z < LIMITS.arena_height - 0.25
         assert math.hypot(x - 0.5, y - 0.1) > 0.2
         assert all(math.dist(places[i][:2], places[j][:2]) > 0.25 for j in range(i))
+    # estimates that agree to the last digit lead apart, too
+    first, second = resting_places(LIMITS, [], [poses[2]] * 2)
+    assert math.dist(first, second) > 0.25
 
 
 def test_the_fence_turns_back_what_could_not_stop_any_more():

@@ -1,10 +1,12 @@
 """Safety of a flight as a pure state machine: what was seen in, set-points out.
 
-Three parts, from what is wanted to what is possible:
+Two parts:
 
 * decisions: who flies each vehicle, the policy or the controller that lifts, waits and lands;
-* steering: how a vehicle is flown in each mode;
-* limits: where a vehicle may stop, turn back, part, wait, and what it can follow.
+* steering: how a vehicle is flown in each mode.
+
+What is possible, where a vehicle could still stop and what it can follow, is
+`openjax.flying.limits`'.
 
 `see` (`openjax.flying.estimation`) judges the poses and brings each vehicle's estimate to now;
 `decide` does the rest; `step` is both. Nothing here reads a clock or touches a link, so that
@@ -16,14 +18,10 @@ arena; no action came in time; a key.
 """
 
 import math
-from collections.abc import Sequence
 
 from openjax.flying.controller import (
-    Airframe,
-    Pose,
     Vector,
     accelerate,
-    level_acceleration,
     lift_acceleration,
     turned_on,
     up,
@@ -32,6 +30,13 @@ from openjax.flying.controller import (
 )
 from openjax.flying.crtp import Supervisor
 from openjax.flying.estimation import see
+from openjax.flying.limits import (
+    APART,
+    fence_velocity,
+    parting_velocity,
+    resting_places,
+    within_reach,
+)
 from openjax.flying.set_point import ANGLES, LEAST_THRUST, MOTORS_OFF, RATES, SetPoint
 from openjax.flying.state import (
     FLYING,
@@ -41,7 +46,6 @@ from openjax.flying.state import (
     Mode,
     PoseSample,
     Request,
-    SafetySettings,
     State,
 )
 
@@ -49,8 +53,6 @@ ASIDE = 0.08
 """How far (m) a vehicle may move sideways in the test lift: a hover that starts beside its trim."""
 RISEN = 0.04
 """The test lift is over this close (m) to its height."""
-APART = 0.35
-"""Waiting vehicles keep this distance (m)."""
 LOW = 0.05
 """Below this height (m) a landing settles."""
 SETTLING = 0.75
@@ -262,6 +264,12 @@ def _risen(drone, time) -> bool:
     return near and time - drone.since > 2.0 * SPIN_UP
 
 
+def resting_places_of(state: State) -> list[Vector]:
+    """Where the vehicles of a flight may wait or land (m)."""
+    poses = [drone.estimate for drone in state.drones]
+    return resting_places(state.settings, state.pillars, poses)
+
+
 # -----------------------------------------------------------------------------------------------
 # Steering: by the policy within its limits, or by the controller
 # -----------------------------------------------------------------------------------------------
@@ -398,154 +406,3 @@ def _yaw_only(quaternion):
     w, _, _, z = quaternion
     size = math.hypot(w, z)
     return (w / size, 0.0, 0.0, z / size) if size > 1e-6 else (1.0, 0.0, 0.0, 0.0)
-
-
-# -----------------------------------------------------------------------------------------------
-# Limits: where a vehicle may stop, turn back, part, wait, and what it can follow
-# -----------------------------------------------------------------------------------------------
-
-
-def stopping_point(
-    settings: SafetySettings, pose: Pose, acceleration: Vector | None = None
-) -> Vector:
-    """Where a vehicle comes to rest that brakes now (m): its acceleration fades with the time
-    constant `reaction`, and as slowly the braking sets in.
-
-    `acceleration`: at present (m/s^2, world); that of level flight at its tilt, if it isn't known.
-    """
-    lag = settings.reaction
-    present = acceleration or level_acceleration(pose.quaternion)
-    # once the acceleration has faded
-    velocity = [v + lag * a for v, a in zip(pose.velocity, present, strict=True)]
-    time = lag + math.hypot(*velocity) / (2.0 * settings.braking)
-    moving = zip(pose.position, velocity, present, strict=True)
-    return tuple(p + time * v - lag**2 * a for p, v, a in moving)
-
-
-def fence_velocity(
-    settings: SafetySettings, pose: Pose, acceleration: Vector | None = None
-) -> Vector | None:
-    """The velocity (m/s) that keeps a vehicle in the arena; None while it could still stop inside.
-    See `stopping_point`.
-    """
-    x, y, z = stopping_point(settings, pose, acceleration)
-    out = math.hypot(x, y)
-    outside = out > settings.arena_radius
-    above = z > settings.arena_height
-    below = z < settings.floor
-    if not (outside or above or below):
-        return None
-    vx, vy, _ = pose.velocity
-    if outside:
-        vx = -0.5 * x / out
-        vy = -0.5 * y / out
-    return vx, vy, -0.4 if above else 0.4 if below else 0.0
-
-
-def parting_velocity(
-    settings: SafetySettings, i: int, poses: Sequence[Pose | None]
-) -> Vector | None:
-    """The velocity (m/s) that keeps vehicle i off the others; None while all could still stop
-    apart.
-
-    Two vehicles that close in at `c` and both brake at `braking` need `c * reaction + c**2 / (4 *
-    braking)` to stop.
-    """
-    own = poses[i]
-    wanted = None
-    for j, other in enumerate(poses):
-        if j == i or other is None:
-            continue
-        distance = math.dist(own.position, other.position)
-        if distance < 1e-6:
-            continue
-        away = tuple((p - q) / distance for p, q in zip(own.position, other.position, strict=True))
-        approach = zip(away, own.velocity, other.velocity, strict=True)
-        closing = max(sum(a * (w - v) for a, v, w in approach), 0.0)
-        stopping = closing * (settings.reaction + closing / (4.0 * settings.braking))
-        lack = settings.separation - (distance - stopping)
-        if lack > 0.0:
-            # half of the approach: the other brakes the other half
-            push = 0.5 * closing + min(lack / settings.reaction, 0.5)
-            wanted = tuple(w + push * a for w, a in zip(wanted or own.velocity, away, strict=True))
-    return wanted
-
-
-def within_reach(action: SetPoint, sent: SetPoint, airframe: Airframe, dt: float) -> SetPoint:
-    """The action within its bounds, and no farther from what was sent `dt` (s) before than the
-    vehicle can follow.
-
-    Its rates can't change faster than its largest angular acceleration, its thrust than its motors'
-    time constant.
-    """
-
-    def near(value, old, room):
-        return min(max(value, old - room), old + room) if sent.mode == RATES else value
-
-    def rate(value, old):
-        return near(min(max(value, -math.pi), math.pi), old, turn)
-
-    turn = airframe.angular_acceleration * dt
-    lift = dt / airframe.motor_time_constant
-    return SetPoint(
-        mode=RATES,
-        roll=rate(action.roll, sent.roll),
-        pitch=rate(action.pitch, sent.pitch),
-        yaw_rate=rate(action.yaw_rate, sent.yaw_rate),
-        thrust=near(min(max(action.thrust, 0.0), 1.0), sent.thrust, lift),
-    )
-
-
-def resting_places(
-    settings: SafetySettings, pillars: Sequence[Vector], poses: Sequence[Pose | None]
-) -> list[Vector]:
-    """Where vehicles may wait or land: near where they would stop, inside, off the pillars, apart
-    (m).
-
-    Args:
-      settings: limits.
-      pillars: x, y, radius (m).
-      poses: of the vehicles; None for one that was never seen.
-    """
-    nowhere = (0.0, 0.0, 0.0)
-    stops = [nowhere if pose is None else stopping_point(settings, pose) for pose in poses]
-    # a hand's breadth from the wall, and well off floor and ceiling
-    reach = settings.arena_radius - 0.15
-    low = 0.3
-    high = settings.arena_height - 0.3
-    places = [(x, y, min(max(z, low), high)) for x, y, z in stops]
-    # each push may undo another, so all are repeated until nothing moves
-    for _ in range(20):
-        moved = []
-        for i, place in enumerate(places):
-            for x, y, radius in pillars:
-                place = _pushed(place, (x, y), radius + 0.15)
-            for j, other in enumerate(places):
-                if j != i:
-                    place = _pushed(place, other, APART, 0.5)
-            inside = min(1.0, reach / max(math.hypot(*place[:2]), 1e-6))
-            moved.append((place[0] * inside, place[1] * inside, place[2]))
-        if all(math.dist(a, b) < 1e-4 for a, b in zip(moved, places, strict=True)):
-            break
-        places = moved
-    return places
-
-
-def resting_places_of(state: State) -> list[Vector]:
-    """Where the vehicles of a flight may wait or land (m)."""
-    poses = [drone.estimate for drone in state.drones]
-    return resting_places(state.settings, state.pillars, poses)
-
-
-def _pushed(place, other, distance, share=1.0) -> Vector:
-    """The place (x, y, z) moved on its level by a share of what it lacks of a distance from
-    another.
-    """
-    dx = place[0] - other[0]
-    dy = place[1] - other[1]
-    apart = math.hypot(dx, dy)
-    if apart >= distance:
-        return place
-    dx, dy = (dx / apart, dy / apart) if apart > 1e-6 else (1.0, 0.0)
-    lack = share * (distance - apart)
-    return place[0] + lack * dx, place[1] + lack * dy, place[2]

@@ -1,5 +1,5 @@
-"""Adapting a policy to one diagnosed vehicle by the gradient through the simulation, compiled
-before the diagnosis is known.
+"""Adapting a policy to one diagnosed vehicle by the gradient through the simulation: the programs,
+which are compiled before the diagnosis is known. `openjax.learning.fine_tuning` runs them.
 
 Two things are learnt at once, from flights of half a second. From drawn starts, leaning and close
 to things: to touch nothing. From moments of the policy's flights with the nominal vehicle: to fly
@@ -14,10 +14,9 @@ from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optax
 from flax import struct
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float
 
 import openjax.baselines  # noqa: F401  registers its policies
 from openjax.evaluation.episodes import Evaluation, make_evaluate
@@ -341,75 +340,6 @@ def _task(game, key):
     """A uniform task, turned about the arena's axis."""
     task_key, turn_key = jax.random.split(key)
     return turn_task(turn_key, uniform_task(game, task_key))
-
-
-@dataclass(frozen=True)
-class Tuned:
-    """What fine-tuning led to."""
-
-    parameters: PolicyParameters
-    """The best of those looked at, the first ones among them; without a critic."""
-    update: int
-    """After which update they were found; 0: they are the first ones."""
-    history: list[dict[str, float]]
-    """Metrics of each update."""
-    looks: dict[int, float]
-    """{update: mean score}."""
-
-
-def fine_tune(
-    adaptation: Adaptation,
-    parameters: PolicyParameters,
-    bounds: Float[Array, "ranges 4"],
-    key: PRNGKeyArray,
-    score: Callable[[PolicyParameters], np.ndarray],
-) -> Tuned:
-    """Train `parameters` (from `starting_parameters`) on vehicles within `bounds` (R, 4), and keep
-    the best on the way.
-
-    `score` gives the scores of episodes (B,), of the same tasks and vehicles each time; what isn't
-    clearly better than the first parameters, by the differences of single episodes, isn't kept.
-    """
-    settings = adaptation.settings
-    bounds = jnp.asarray(bounds)
-    fly_key, update_key = jax.random.split(key)
-    flights = adaptation.fly(parameters, fly_key, bounds)
-    actor = TrainState(parameters.actor, adaptation.optimiser.init(parameters.actor))
-    history = []
-    first = np.asarray(score(parameters))
-    best = parameters
-    best_update = 0
-    looks = {0: float(first.mean())}
-    for update in range(1, settings.updates + 1):
-        step_key = jax.random.fold_in(update_key, update)
-        actor, metrics = adaptation.update(actor, parameters, flights, step_key, bounds)
-        history.append(metrics)
-        if update % settings.look_every == 0 or update == settings.updates:
-            candidate = parameters.replace(actor=actor.parameters)
-            scores = np.asarray(score(candidate))
-            looks[update] = float(scores.mean())
-            # better than the best so far by the mean, and than the first ones beyond doubt: each
-            # look is another chance to be lucky
-            if looks[update] > looks[best_update] and clearly_better(first, scores):
-                best = candidate
-                best_update = update
-    # fetched at the end: to wait for every update's numbers would leave the device idle
-    history = [
-        {name: float(value) for name, value in row.items()} for row in jax.device_get(history)
-    ]
-    return Tuned(best, best_update, history, looks)
-
-
-def clearly_better(
-    first: Float[np.ndarray, " episodes"],
-    scores: Float[np.ndarray, " episodes"],
-    errors: float = 2.0,
-) -> bool:
-    """Whether the scores (B,) of the same episodes rose by more than so many standard errors of
-    their differences.
-    """
-    gain = np.asarray(scores, float) - np.asarray(first, float)
-    return bool(gain.mean() > errors * gain.std() / np.sqrt(len(gain)))
 
 
 def bounds_of(

@@ -24,7 +24,8 @@ from openjax.evaluation.validation import selection_score, uniform_tasks
 from openjax.files import write_json, write_text
 from openjax.flights.case import load_case
 from openjax.interruption import clean_up
-from openjax.learning.adaptation import bounds_of, fine_tune, make_adaptation, starting_parameters
+from openjax.learning.adaptation import bounds_of, make_adaptation, starting_parameters
+from openjax.learning.fine_tuning import fine_tune
 from openjax.learning.train_state import TrainState
 from openjax.runs.machine import describe_machine
 from openjax.runs.options import AdaptCommand
@@ -121,7 +122,7 @@ class _Programs:
         return episode_figures(self.adaptation.evaluate(parameters, tasks, key, bounds).statistics)
 
     def fine_tune(self, vehicle: _Diagnosed):
-        """The best of the policy's updates (see `openjax.learning.adaptation.fine_tune`), by
+        """The best of the policy's updates (see `openjax.learning.fine_tuning.fine_tune`), by
         `selection_score`.
 
         Speeds over the limit count as far as they are more than in the same episode of the policy
