@@ -27,6 +27,7 @@ def generalised_advantages(
       discount: gamma.
       trace: lambda.
     """
+    # a cut episode has a value after it but no advantage: what came next is another episode's
     goes_on = 1.0 - terminated.astype(reward.dtype)
     error = reward + discount * goes_on * next_value - value
     decay = discount * trace * goes_on * (1.0 - truncated.astype(reward.dtype))

@@ -76,6 +76,7 @@ def insert(
     # a squared distance is never negative: unused slots come behind all used ones
     novelty = jnp.where(used, novelty, -1.0)
 
+    # the newest of all has nobody newer: its novelty is infinite, and it always stays
     slot = jax.lax.top_k(novelty, capacity)[1]
     # back to newest first, unused last: sorted by age, with the unused ones moved behind all
     total = m + capacity

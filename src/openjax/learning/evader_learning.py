@@ -263,6 +263,7 @@ class EvaderLearning:
         value = outputs_of(critic, samples.which, samples.seen)[1]
         which, seen = self.see(evaders.flying, last)
         last_value = outputs_of(critic, which, seen)[1]
+        # a capture ends what an evader learns from, though the pursuers' episode goes on
         caught = jnp.concatenate([~samples.flying[1:], last.statistics.captured[None]])
         advantage = generalised_advantages(
             REWARD * (~caught).astype(jnp.float32),

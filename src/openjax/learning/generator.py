@@ -59,6 +59,7 @@ def _archived_or_uniform(settings, environment, archive, key):
             jax.random.fold_in(uniform_key, 2), (), 0, len(environment.evaders)
         )
         uniform = uniform.replace(evader=kind)
+    # after the pillars, so that rows stand across the way of pursuers from all sides
     if settings.turn:
         uniform = turn_task(turn_key, uniform)
     if not settings.enabled:

@@ -45,6 +45,7 @@ class Schedule:
 
     def ending(self, update: Count) -> Count:
         """() the group whose episodes end with this training step."""
+        # group g starts with age g: the last group's episodes end first
         return (self.groups - 1 - update) % self.groups
 
     def members(self, worlds: Any, group: Count) -> Any:
@@ -85,6 +86,7 @@ class Schedule:
         ending_size = number // self.groups
         restarted = (task // every * ages + restart) * self.share + neighbour
         source = jnp.where(restart < 0, np.arange(number), number + ending_size + restarted)
+        # last, so that it has the word: what ends its episode is not started anew as well
         source = jnp.where(behind == 0, number + member, source)
         return jax.tree.map(lambda x, new: jnp.concatenate([x, new])[source], worlds, fresh)
 

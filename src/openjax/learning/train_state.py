@@ -69,5 +69,6 @@ def policy_leaf(name: str) -> str | None:
     None for one that isn't of the policy. In carries from when each network lay beside its
     optimiser it is `actor/parameters/params/x`.
     """
+    # old runs can't be resumed, but their policies load
     match = _LEAF.fullmatch(name) or _OLD_LEAF.fullmatch(name)
     return "/".join(match.groups()) if match else None

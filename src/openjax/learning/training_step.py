@@ -109,6 +109,7 @@ def make_start(
 
 def initial_carry(settings: TrainSettings, parts: Parts, key: PRNGKeyArray) -> TrainCarry:
     """The carry of a run's start; `parts` are what `build` gives."""
+    # vehicles and evaders as at the beginning of their curricula
     environment = _starting(settings, parts.environment, 0.0)
     archive = empty_archive(task_like(parts.environment.settings), settings.generator.capacity)
     key, policy_key, task_key, reset_key = jax.random.split(key, 4)
@@ -228,6 +229,7 @@ class _Step:
         pursuers = self.parts.environment.settings.num_pursuers
         shape = (steps, pursuers, policy.sample_size)
         keys = own_keys(self._key(carry, 1), carry.state.step.shape[0], axis)
+        # a key for each world: the same noise on however many devices the worlds lie
         noise = jax.vmap(lambda k: jax.random.normal(k, shape))(keys)
         noise = Noise(jnp.moveaxis(noise, 1, 0))
         act = self._evaders(carry)
@@ -241,6 +243,7 @@ class _Step:
         progress = self._progress(carry)
         share = penalty_share_at(settings, progress)
         rollout, observation, state = collect(players, world, noise, share)
+        # a rollout keeps the newest frame of each step only: windows begin in the history before it
         flown = Flown(
             rollout=rollout,
             frames=carry.state.frames,
@@ -280,7 +283,11 @@ class _Step:
         schedule = self.settings.schedule
         axis = self.axis
         progress = self._progress(carry)
+        # the episodes that begin now fly as this moment of the run asks for, those under way as
+        # they began
         starting = _starting(settings, self.parts.environment, progress)
+        # one group of worlds ends its episodes with each rollout: tasks are judged by whole
+        # episodes, and no rollout has a reset in its middle
         group = schedule.ending(carry.update)
         ended = schedule.members(carry.state, group)
         archive, metrics = _selection(
@@ -391,6 +398,7 @@ def _selection(settings, archive, ended, penalty_share, axis):
     # neighbours fly the same task: a row for each task
     solved = solved.astype(jnp.float32).reshape(-1, share)
     if settings.generator.enabled:
+        # of neighbours that flew one task the first stands for all
         tasks = jax.tree.map(lambda x: x[::share], ended.task)
         # the archive is the same on all devices, and so all of them see all candidates
         tasks, success, complete = gather_over_devices(

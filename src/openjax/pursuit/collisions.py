@@ -57,6 +57,7 @@ def breaches(
     to_pillar = pillar_distance(settings, position, pillar_position)
     near_pillar = pillar_active[None] & (to_pillar < settings.pillar_clearance + margin)
     near_drone = drone_distance(position) < settings.drone_clearance + margin
+    # the floor is none of these bounds: touching it is a crash
     above = position[:, 2] > settings.arena_height - margin
     outside = jnp.sum(position[:, :2] ** 2, axis=-1) > (settings.arena_radius - margin) ** 2
     return Breaches(

@@ -91,6 +91,7 @@ def frame_pursuers(
         squared = jnp.where(active, squared, jnp.inf)
     # sums with weights of zero and one instead of an index, whose gradient is a scatter
     is_nearest = jnp.arange(squared.shape[0]) == jnp.argmin(squared)
+    # `PRESS` keeps one that is very near from being all that counts
     weights = jnp.stack([is_nearest.astype(jnp.float32), 1.0 / (squared + PRESS**2)])
     return jnp.sum(weights[..., None] * offset, axis=1)
 
@@ -240,6 +241,7 @@ def _nearest_pillars(settings, position, pillar_position, pillar_active):
     features = jnp.concatenate(
         [
             position[:, None, :2] - axis,
+            # a pillar's centre is at half of its height
             jnp.broadcast_to(position[:, None, 2:] - settings.arena_height / 2, (n, k, 1)),
             jnp.full((n, k, 1), settings.arena_height, jnp.float32),
             jnp.full((n, k, 1), settings.pillar_radius, jnp.float32),

@@ -104,6 +104,7 @@ def default_reward(weights: RewardSettings) -> tuple[Term, ...]:
     A capture by any rewards all; distance to the evader, breaches, speed, crashes and the change of
     the squashed command count for each.
     """
+    # the order stays: sums of floats depend on it, and first updates are compared to the bit
     terms = (
         Term(captured, weights.capture),
         Term(evader_distance, -weights.distance),

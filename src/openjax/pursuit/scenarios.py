@@ -144,6 +144,7 @@ def _faults(layout: Scenario, settings: PursuitSettings) -> list[str]:
         *((f"pursuer {i + 1}", p) for i, p in enumerate(pursuers)),
         ("the evader", layout.evader),
     ]
+    # where a drone would stand inside the pillar; a start that only breaches is a fair task
     reach = settings.pillar_radius + DRONE_RADIUS
     faults = []
     if not 1 <= len(pursuers) <= 8:

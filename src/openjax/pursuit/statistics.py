@@ -79,6 +79,7 @@ def count(
         capture_step=jnp.where(first, step, statistics.capture_step),
         captured=statistics.captured | captured,
         free_steps=jnp.where(captured, 0, statistics.free_steps + 1),
+        # steps, not breaches: a rate is the share of steps in which anything is breached
         collision_steps=statistics.collision_steps + any_of(breach.total),
         pillar_steps=statistics.pillar_steps + any_of(breach.pillar),
         drone_steps=statistics.drone_steps + any_of(breach.drone),

@@ -148,6 +148,7 @@ def uniform_task(settings: PursuitSettings, key: PRNGKeyArray) -> Task:
     apart = jax.vmap(
         lambda p: jnp.all(drone_distance(parked(p, active)) >= settings.drone_clearance)
     )(candidates)
+    # where none is good, `argmax` gives the first: such a task starts in a breach
     pursuers = parked(candidates[jnp.argmax(apart)], active)
     mirrored = jnp.array([-1.0, 1.0, 1.0], jnp.float32)
     evader = jax.random.uniform(evader_key, (3,), jnp.float32, low, high) * mirrored
@@ -161,6 +162,7 @@ def uniform_task(settings: PursuitSettings, key: PRNGKeyArray) -> Task:
     rank = jnp.where(free, jax.random.uniform(cell_key, (cells.shape[0],)), -1.0)
     chosen = jax.lax.top_k(rank, settings.max_pillars)[1]
     number = jax.random.randint(number_key, (), settings.min_pillars, settings.max_pillars + 1)
+    # fewer than drawn where not enough cells are free
     in_use = (jnp.arange(settings.max_pillars) < number) & free[chosen]
     return Task(
         pursuer_position=pursuers,
@@ -231,11 +233,13 @@ def close_starts(
         pillar = jax.random.categorical(which_key, jnp.where(task.pillar_active, 0.0, -jnp.inf))
         beside = jnp.append(task.pillar_position[pillar], position[i, 2])
         by_pursuer = (jax.random.bernoulli(kind_key) | no_pillar) & (i > 0)
+        # the pillar's key once more: of the two draws only one is used
         settled = jax.random.randint(which_key, (), 0, max(i, 1))
         anchor = jnp.where(by_pursuer, position[settled], beside)
         clearance = jnp.where(
             by_pursuer, settings.drone_clearance, settings.pillar_radius + settings.pillar_clearance
         )
+        # normal numbers point in all directions alike
         away = jax.random.normal(direction_key, (3,))
         away = away.at[2].multiply(by_pursuer)  # a pillar is as high as the arena
         gap = jax.random.uniform(gap_key, (), jnp.float32, 0.0, CLOSE)
@@ -247,6 +251,7 @@ def close_starts(
         choice_key, place_key = jax.random.split(key)
         moved = jax.random.uniform(choice_key, (n,)) < share
         position = start
+        # one after the other, so that nobody is put beside a start that moves away again
         for i, key in enumerate(jax.random.split(place_key, n)):
             position = jnp.where(moved[i], place(position, i, key), position)
         return task.with_starts(position)
@@ -272,6 +277,7 @@ def scatter_starts(settings: PursuitSettings, key: PRNGKeyArray, task: Task) -> 
         angle = 2.0 * np.pi * turn
         xy = reach * jnp.sqrt(share) * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
         offset = jax.random.uniform(offset_key, (n, 2), minval=-NEIGHBOURS, maxval=NEIGHBOURS)
+        # one factor for all: in some tasks they start together, in others all over the arena
         pursuers = xy[:, 0] + offset * jax.random.uniform(apart_key)
         from_axis = jnp.linalg.norm(pursuers, axis=-1, keepdims=True)
         pursuers = pursuers * jnp.minimum(1.0, reach / jnp.maximum(from_axis, 1e-6))
@@ -334,6 +340,7 @@ def _move_pillars(settings, task, moved):
     """
     vehicles = jnp.concatenate([task.pursuer_position, task.evader_position[None]])[:, :2]
     inside = jnp.linalg.norm(moved, axis=-1) < PILLAR_REACH
+    # each pillar by itself: a row may have gaps
     accepted = (_clear_of(settings, moved, vehicles) & inside & task.pillar_active)[:, None]
     return task.replace(pillar_position=jnp.where(accepted, moved, task.pillar_position))
 

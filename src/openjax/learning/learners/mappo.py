@@ -35,6 +35,7 @@ class ValueScale:
         """Mean () and standard deviation () of the returns; 0 and 1 before the first update."""
         weight = jnp.maximum(self.weight, 1e-6)
         mean = self.mean / weight
+        # a weighted sum of what was seen, over the sum of its weights, as Adam does
         variance = self.square / weight - mean**2
         std = jnp.where(self.weight > 0, jnp.sqrt(jnp.maximum(variance, 1e-4)), 1.0)
         return mean, std
@@ -111,6 +112,7 @@ def make_optimiser(
         return jnp.where(count < settings.actor_start * steps, 0.0, schedule(count))
 
     max_norm = settings.max_grad_norm
+    # the critic isn't held back: with `actor_start` it is what learns first
     actor_rate = late if settings.actor_start else schedule
     # behind Adam, which would scale a scaled gradient up again
     scaling = follow_kl(settings.target_kl) if settings.target_kl else None
@@ -136,6 +138,7 @@ def loss(
     ratio = jnp.exp(log_ratio)
     clipped = jnp.clip(ratio, 1.0 - clip, 1.0 + clip)
     mean_of = functools.partial(team_mean, batch.observation.active)
+    # the lesser of both: a pessimistic bound (Schulman et al., 2017, section 3)
     surrogate = mean_of(jnp.minimum(ratio * batch.advantage, clipped * batch.advantage))
     entropy = gaussian_entropy(log_std)
     policy_loss = -surrogate - settings.entropy_coefficient * entropy
@@ -267,6 +270,7 @@ class Mappo:
         W, T, ...).
         """
         rollout = flown.rollout
+        # over the whole rollout, not in each minibatch, whose moments are noisier
         mean, std = joint_moments(advantage, flown.axis, rollout.observation.active)
         batch = Batch(
             observation=rollout.observation.replace(frames=None),

@@ -84,7 +84,9 @@ def prediction_loss(
     error = predicted - positions
     if settings.loss == "squared":
         return jnp.mean(error**2)
+    # in units of the distance that the evader flies within each horizon, all horizons weigh alike
     flown = game.evader_speed * game.time_step * jnp.array(settings.horizons, jnp.float32)
+    # the arena's middle stands for an evader that nobody has seen yet
     was_seen = jnp.any(last_seen != jnp.array(game.middle, jnp.float32), axis=-1)
     return jnp.mean(was_seen[..., None, None] * (error / flown[:, None]) ** 2)
 
@@ -133,6 +135,7 @@ class PredictorLearner:
 
         predictor = TrainState(parameters.predictor, state)
         predictor, values = jax.lax.scan(gradient_step, predictor, data)
+        # of the nearest horizon, which is one step where the settings name it first
         error = jnp.linalg.norm(rollout.predicted[:, :, 0] - rollout.evader, axis=-1)
         metrics = {
             "predictor_loss": jnp.mean(values),

@@ -151,6 +151,7 @@ def wall_runner(scene: Scene, memory: Memory) -> tuple[Vector, Memory]:
     left = jnp.stack([-out[1], out[0]])
     # the sign of the cross product says on which side of it the pursuer is; it runs to the other
     side = jnp.where(threat[0] * out[1] - threat[1] * out[0] >= 0.0, 1.0, -1.0)
+    # towards its distance from the wall, from either side
     outward = jnp.clip((settings.arena_radius - AROUND - radius) / AROUND, -1.0, 1.0)
     goal = jnp.where(threat[2] > settings.arena_height / 2, AROUND, settings.arena_height - AROUND)
     climb = 0.5 * jnp.clip((goal - scene.position[2:]) / AROUND, -1.0, 1.0)
@@ -184,6 +185,7 @@ def safe_place(scene: Scene, memory: Memory) -> tuple[Vector, Memory]:
     places = _free_place(scene, jnp.asarray(share, jnp.float32))
     to_place = places - scene.position
     own_time = _length(to_place)[:, 0] / scene.reach
+    # as if they flew straight, pillars or not
     their_time = _length(places[:, None] - scene.pursuers)[..., 0] / settings.max_speed
     lead = jnp.min(jnp.where(scene.known, their_time, FAR_AWAY), axis=-1) - own_time
     in_the_open = line_of_sight(
@@ -198,6 +200,8 @@ def way_points(scene: Scene, memory: Memory) -> tuple[Vector, Memory]:
     """Fly from point to point, whatever the pursuers do. The points are a sequence of low
     discrepancy from a drawn one on.
     """
+    # three shares say where the present point lies, the fourth number how long (s) it is flown to;
+    # more follows where another evader of the game remembers more
     share = memory[:3]
     rest = memory[4:]
     to_goal = _free_place(scene, share) - scene.position

@@ -78,6 +78,7 @@ def draw_row(
                 f"evaders: beside learned ones, one's own remembers {MEMORY} numbers, not "
                 f"{MEMORY + more}"
             )
+        # as if all pursuers had waited at their starts
         memory = jnp.concatenate([memory, jnp.tile(pursuers.ravel(), STEPS)])
     elif more:
         memory = jnp.concatenate([memory, jnp.zeros(more)])

@@ -50,6 +50,7 @@ def field_velocity(
     push = from_pillar / distance * strength
     pillars = jnp.sum(jnp.where(pillar_active[:, None], push, 0.0), axis=0)
 
+    # pillars and wall push on the level alone, ceiling and floor upright
     force = force + jnp.concatenate([wall + pillars, (floor - ceiling)[None]])
     # the field says where to, never how fast
     if settings.evader_norm == "axis":

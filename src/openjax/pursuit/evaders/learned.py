@@ -82,6 +82,7 @@ def features(
     """
     settings = scene.settings
     scene = scene.replace(look_ahead=networks["look_ahead"][which])
+    # so that all inputs are of the order of one
     size = np.array([settings.arena_radius] * 2 + [settings.arena_height / 2], np.float32)
     middle = np.array(settings.middle, np.float32)
     wish = networks["scripted"][which] * greedy(scene, memory)[0]
@@ -153,6 +154,8 @@ def outputs(
     else:
         mean = jnp.mean(pursuers, axis=-2)
         most = jnp.max(pursuers, axis=-2)
+    # pursuers by mean and maximum, whose size doesn't grow with their number; pillars by a sum, as
+    # empty slots are zeros
     pooled = [mean, most, jnp.sum(pillars, axis=-2)]
     hidden = jnp.tanh(dense("own", jnp.concatenate([inputs["own"], *pooled], axis=-1)))
     out = dense("output", jnp.tanh(dense("hidden", hidden)))
