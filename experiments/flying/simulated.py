@@ -43,10 +43,10 @@ from openjax.flying.board import SILENCE
 from openjax.flying.controller import Pose
 from openjax.flying.estimation import see
 from openjax.flying.game import game_functions, pose_array
-from openjax.flying.guard import take_over
 from openjax.flying.safety import decide
 from openjax.flying.set_point import from_action
 from openjax.flying.state import Drone, Event, Mode, Request, initial_state
+from openjax.flying.takeover import take_over
 from openjax.pursuit import find_scenario, scenario_task
 from openjax.pursuit.environment import THRUST_LIMIT
 from openjax.vehicle import load_vehicle

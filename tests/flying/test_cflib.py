@@ -24,10 +24,10 @@ from openjax.flying.controller import nominal_airframe
 from openjax.flying.crtp import Supervisor
 from openjax.flying.estimation import see
 from openjax.flying.flight_files import write_case
-from openjax.flying.guard import RawLinks, fly_down
 from openjax.flying.links import Links
 from openjax.flying.loop import Flight, Plan, flight_state
 from openjax.flying.motion_capture import MotionCaptured
+from openjax.flying.raw_links import RawLinks
 from openjax.flying.set_point import (
     ANGLES,
     LEAST_THRUST,
@@ -38,6 +38,7 @@ from openjax.flying.set_point import (
     manual_arguments,
 )
 from openjax.flying.state import Mode, SafetySettings, initial_state
+from openjax.flying.takeover import fly_down
 from openjax.vehicle import load_vehicle
 from openjax.vehicle.vehicle_file import load_vehicle_file
 from openjax.virtual_crazyflie.firmware import VirtualFirmware

@@ -8,11 +8,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from openjax.flying import loop
+from openjax.flying import ticks
 from openjax.flying.controller import GRAVITY, Pose, nominal_airframe
+from openjax.flying.flight_record import FlightRecord
 from openjax.flying.game import Play
-from openjax.flying.loop import PATIENCE, Flight, Plan, Record, await_poses, flight_state
+from openjax.flying.loop import Flight, Plan, flight_state
 from openjax.flying.state import Mode, PoseSample, SafetySettings
+from openjax.flying.ticks import PATIENCE, await_poses
 
 STARTS = ((0.5, 0.3, 0.5), (0.5, 0.0, 0.5), (0.5, -0.3, 0.5))
 
@@ -107,7 +109,7 @@ def test_ticks_leave_half_a_kilobyte_each_and_nothing_to_collect(flight):
 
 
 def test_a_flight_may_end_before_its_first_tick():
-    assert Record(3).timing() == {"ticks": 0}
+    assert FlightRecord(3).timing() == {"ticks": 0}
 
 
 def test_poses_that_are_never_of_now_end_a_flight_that_hasnt_begun():
@@ -149,7 +151,7 @@ def test_a_tick_after_a_stall_gives_poses_time_to_arrive(waiting, monkeypatch):
         else:
             clock.now += stall
 
-    monkeypatch.setattr(loop, "perf_counter", lambda: clock.now)
+    monkeypatch.setattr(ticks, "perf_counter", lambda: clock.now)
     links.wait = wait
     links.now = clock.now - stall * (not waiting)
     await_poses(links, links.now + (0.008 if waiting else 0.06))

@@ -12,7 +12,7 @@ pytest.importorskip("cflib", reason='the extra "fly" is not installed')
 
 from cflib.crtp import radiodriver
 
-from openjax.flying.guard import RawLinks
+from openjax.flying.raw_links import RawLinks
 from openjax.flying.set_point import OFF, RATES, SetPoint
 from openjax.flying.swarm import Swarm
 from openjax.virtual_crazyflie.firmware import VirtualFirmware

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 
 from openjax.flying.board import Board, Role
 from openjax.flying.controller import Pose, accelerate, nominal_airframe, roll_pitch_yaw
-from openjax.flying.guard import fly_down, take_over
 from openjax.flying.judge import Track
 from openjax.flying.limits import (
     fence_velocity,
@@ -31,6 +30,7 @@ from openjax.flying.state import (
     SafetySettings,
     initial_state,
 )
+from openjax.flying.takeover import fly_down, take_over
 
 LIMITS = SafetySettings()
 LEVEL = (1.0, 0.0, 0.0, 0.0)

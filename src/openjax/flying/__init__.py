@@ -2,5 +2,5 @@
 actions, who lands for whom.
 
 Nothing here is imported by the rest of openjax but the virtual Crazyflie; `cflib` (GPLv3, an extra)
-by `swarm` and `guard` only.
+by `swarm` and `raw_links` only.
 """

@@ -55,6 +55,7 @@ class Fit(NamedTuple):
 
     def at(self, velocity: float) -> float:
         """The acceleration (m/s^2) that is usual at a velocity (m/s)."""
+        # the normal equations of a straight line, whose sums fade
         determinant = self.time * self.energy - self.way**2
         constant = self.energy * self.gained - self.way * self.moment
         slope = self.time * self.moment - self.way * self.gained
@@ -71,6 +72,7 @@ class Drift(NamedTuple):
 
     def after(self, unexplained: Vector, velocity: Vector, dt: float) -> "Drift":
         """After `dt` (s) with an acceleration (m/s^2, world) that thrust didn't explain."""
+        # x and y of the velocity; the third, the height, is left out
         level = list(zip(self.fits, unexplained, velocity, strict=False))
         kept = math.exp(-dt / WINDOW)
         summed = tuple(

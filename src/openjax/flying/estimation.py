@@ -73,6 +73,7 @@ def _estimated(state, drone, sample) -> Drone:
 
 def _reckoned(state, drone) -> Drone:
     """The drone a tick on by dead reckoning, its attitude as it was."""
+    # without a pose nothing tells how it turns
     old = drone.estimate
     dt = state.dt
     velocity = tuple(v + dt * a for v, a in zip(old.velocity, drone.acceleration, strict=True))
@@ -108,8 +109,10 @@ def _consistent(state, drone, own, force) -> Drone:
     drone = drone._replace(
         own=drone.own._replace(verdict=verdict), innovations=innovations, contradiction=verdict
     )
+    # motion capture tells otherwise than the estimate, so it isn't what the estimate followed
     if seen.pose is not None and not follows(seen.pose, own.pose, state.limits):
         return drone
+    # neither is believed any more: back to where the sums say that the vehicle is
     estimate = moved_on(innovations.corrected(), state.time)
     return drone._replace(estimate=estimate, capture_fault=verdict)
 
@@ -177,6 +180,7 @@ def _with_motion(pose, last, estimate) -> Pose:
     if (pose.position, pose.quaternion) == (last.position, last.quaternion):
         return last._replace(time=pose.time)  # which is judged frozen
     step = pose.time - last.time
+    # differences of poses that are off by a millimetre jump by .1 m/s at 100 Hz
     share = 1.0 - math.exp(-step / SMOOTHING)
     velocity = tuple(
         v + share * ((p - q) / step - v)

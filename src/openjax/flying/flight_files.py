@@ -14,7 +14,7 @@ import numpy as np
 
 from openjax.flights.reading import CHANNEL_COLUMNS, LogTable, write_csv
 from openjax.flights.samples import log_of
-from openjax.flying.loop import Record
+from openjax.flying.flight_record import FlightRecord
 from openjax.flying.set_point import RATES
 from openjax.flying.swarm import Samples
 from openjax.vehicle.vehicle_file import VehicleFile, save_vehicle_file
@@ -34,7 +34,7 @@ _COMMAND = CHANNEL_COLUMNS["command_thrust"] + CHANNEL_COLUMNS["command_body_rat
 
 
 def write_case(
-    folder: Path, samples, record: Record, vehicle: VehicleFile, about: dict
+    folder: Path, samples, record: FlightRecord, vehicle: VehicleFile, about: dict
 ) -> list[Path]:
     """Write the case: one log per game long enough, vehicle.toml, flight.json. Returns the files.
 

@@ -105,6 +105,7 @@ class Innovations(NamedTuple):
         thrust = self.thrust + reached * (sent.thrust - self.thrust)
         asked = (sent.roll, sent.pitch, sent.yaw_rate) if sent.mode == RATES else pose.body_rates
         rates = _towards(self.rates, asked, _share(dt, RATE_LAG))
+        # the trapezoidal rule: exact for an acceleration that stays
         mean = _towards(last.velocity, pose.velocity, 0.5)
         way = _difference(_difference(pose.position, last.position), _times(dt, mean))
         lift = lift_acceleration(pose.quaternion, thrust / airframe.hover_thrust)

@@ -58,6 +58,7 @@ def fence_velocity(
     if not (outside or above or below):
         return None
     vx, vy, _ = pose.velocity
+    # straight towards the axis: what leads along the wall is given up
     if outside:
         vx = -WALL_RETURN * x / out
         vy = -WALL_RETURN * y / out
@@ -83,6 +84,7 @@ def parting_velocity(
             continue
         away = tuple((p - q) / distance for p, q in zip(own.position, other.position, strict=True))
         approach = zip(away, own.velocity, other.velocity, strict=True)
+        # along the line between them; what moves apart needs no room
         closing = max(sum(a * (w - v) for a, v, w in approach), 0.0)
         stopping = closing * (settings.reaction + closing / (4.0 * settings.braking))
         lack = settings.separation - (distance - stopping)

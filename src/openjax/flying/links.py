@@ -28,10 +28,11 @@ from openjax.errors import UserError
 from openjax.flying import real_time
 from openjax.flying.board import SILENCE, Board, Role, say, stand_alone, start_deaf
 from openjax.flying.controller import Pose, numbers_of, pose_of
-from openjax.flying.guard import CHECK, disarm, fly_down
+from openjax.flying.guard import CHECK
 from openjax.flying.set_point import SetPoint
 from openjax.flying.state import PoseSample, State
 from openjax.flying.swarm import Member, Samples, Swarm
+from openjax.flying.takeover import disarm, fly_down
 
 STARTING = 20.0
 """s until its interpreter has loaded `cflib`, on a busy machine."""

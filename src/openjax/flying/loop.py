@@ -1,12 +1,11 @@
-"""The loop: a hundred times a second from poses to set-points, on time, with a record of how well
-that went.
+"""The loop: a hundred times a second from poses to set-points, through take-off, games and landing.
+
+When a tick is due is `openjax.flying.ticks`', what is noted of it `openjax.flying.flight_record`'s.
 """
 
 import gc
-import itertools
 import math
-from array import array
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from time import perf_counter
 
@@ -14,161 +13,19 @@ import numpy as np
 
 from openjax.flying.controller import accelerate, wanted_acceleration
 from openjax.flying.estimation import see
+from openjax.flying.flight_record import FlightRecord
 from openjax.flying.game import Game
 from openjax.flying.links import Links
 from openjax.flying.safety import decide
-from openjax.flying.set_point import OFF, RATES, as_sent, from_action
+from openjax.flying.set_point import RATES, from_action
 from openjax.flying.state import Event, Mode, Request, SafetySettings, State, initial_state
+from openjax.flying.ticks import TickSchedule, await_poses, measured_times
 from openjax.pursuit.environment import THRUST_LIMIT
 
-PERIOD = 0.01
-"""Of the ticks (s)."""
-MARGIN = 2.0e-3
-"""A tick is due this long after the newest poses were measured (s), as far as the fastest packets
-tell.
-"""
-EARLY = 3.0e-3
-"""A tick begins as soon as all poses are there, up to this much before it is due (s)."""
-PATIENCE = 5.0e-3
-"""It begins without them this long after it could have begun (s)."""
 TRANSFER = 20.0
 """All land if their starts aren't reached within this time (s)."""
 SETTLE = 0.3
 """All wait for so long (s) at their starts before a game."""
-GONE = 0.1
-"""A vehicle whose newest pose is older (s) isn't waited for."""
-
-
-class Record:
-    """What happened at every tick of a flight with `vehicles`; as numbers, since objects would take
-    two kilobytes a tick.
-
-    Attributes:
-      episodes: notes on each game.
-      skipped: ticks that were left out because the one before took too long.
-    """
-
-    def __init__(self, vehicles: int):
-        self._rows = array("d")
-        self._width = 3 + 7 * vehicles
-        self.episodes: list[dict] = []
-        self.skipped = 0
-
-    def keep(self, tick, arrivals, measured, set_points) -> None:
-        """Add a row.
-
-        Args:
-          tick: when it was due, when its last set-point left (s), and the game (-1: none).
-          arrivals, measured: when each vehicle's newest pose arrived and was measured (s).
-          set_points: each vehicle's.
-        """
-        self._rows.extend(tick)
-        for arrival, seen, s in zip(arrivals, measured, set_points, strict=True):
-            s = s if s.mode == OFF else as_sent(s)
-            self._rows.extend((arrival, seen, s.mode, s.thrust, s.roll, s.pitch, s.yaw_rate))
-
-    def table(self) -> tuple[np.ndarray, np.ndarray]:
-        """(T, 3) due, sent, game; (T, N, 7) arrival, measured, mode, thrust, roll, pitch, yaw rate
-        as they fit into packets.
-        """
-        rows = np.array(self._rows).reshape(-1, self._width)
-        # the number of vehicles is spelt out: a flight may end before its first tick
-        return rows[:, :3], rows[:, 3:].reshape(len(rows), self._width // 7, 7)
-
-    def timing(self) -> dict:
-        """Command age (ms) and missed deadlines of all ticks. A tick's deadline is the next tick's
-        due time; a tick that was left out is a missed one.
-
-        `measured_to_sent_ms` counts from the moment on board, as far as the fastest packet of the
-        flight tells it.
-        """
-        ticks, vehicles = self.table()
-        if not len(ticks):
-            return {"ticks": 0}
-        due, sent, _ = ticks.T
-        # of each tick the vehicle with the oldest pose counts
-        age, measured = 1e3 * (sent[:, None, None] - vehicles[..., :2]).max(1).T
-        work = 1e3 * (sent - due)
-        gaps = 1e3 * np.diff(sent)
-        missed = int((work > 1e3 * PERIOD).sum()) + self.skipped
-        return {
-            "ticks": len(due),
-            "seconds": round(sent[-1] - due[0], 2),
-            "command_age_ms": _percentiles(age),
-            "measured_to_sent_ms": _percentiles(measured),
-            "due_to_sent_ms": _percentiles(work),
-            "between_set_points_ms": _percentiles(gaps) if len(gaps) else {},
-            "missed_deadlines": missed,
-            "missed_share": missed / (len(due) + self.skipped),
-        }
-
-
-def _percentiles(values) -> dict:
-    at = np.percentile(values, [50, 99, 99.9, 100])
-    return {n: round(float(v), 3) for n, v in zip(("p50", "p99", "p99.9", "max"), at, strict=True)}
-
-
-class TickSchedule:
-    """When the ticks are due: every 10 ms, just after the moments at which poses are measured.
-
-    Those moments are regular, unlike arrivals: the vehicles send by clocks of their own, which
-    drift a little.
-    """
-
-    def __init__(self, now: float):
-        self.due = now
-        self.skipped = 0
-        self._in_step = False
-
-    def next(self, time: float, measured: Sequence[float]) -> float:
-        """The next tick's time, after one that ended at `time` and knew poses measured at
-        `measured` (s).
-        """
-        ages = sorted((self.due - t) % PERIOD for t in measured if time - t < GONE)
-        shift = 0.0
-        if ages:
-            # poses come in a bunch: the newest of a bunch is the one after the longest pause
-            pauses = [ages[0] + PERIOD - ages[-1]]
-            pauses += [older - newer for newer, older in itertools.pairwise(ages)]
-            newest = ages[pauses.index(max(pauses))]
-            # the way round the period that is shorter
-            error = (newest - MARGIN + PERIOD / 2) % PERIOD - PERIOD / 2
-            # slowly, once in step: one late packet mustn't move the ticks
-            shift = min(max(0.02 * error, -1e-4), 1e-4) if self._in_step else error
-            self._in_step = True
-        self.due += PERIOD - shift
-        while self.due < time - PERIOD:  # that one can't be caught up with any more
-            self.due += PERIOD
-            self.skipped += 1
-        return self.due
-
-
-def await_poses(vehicles: Links, due: float) -> None:
-    """Return around `due` (s): as soon as each vehicle's newest pose is there that was measured
-    before.
-    """
-    begun = perf_counter()
-    latest = max(due, begun) + PATIENCE
-    while True:
-        now = perf_counter()
-        stood_still = latest + PATIENCE < now < begun + GONE
-        if now >= latest and not stood_still:
-            return
-        if stood_still:
-            # so may the links have, which have first to pass on what came
-            due = now - PATIENCE
-            latest = now + PATIENCE
-        measured = measured_times(vehicles.observe())
-        complete = all(t > due - PERIOD or now - t > GONE for t in measured)
-        if complete and now >= due - EARLY:
-            return
-        vehicles.wait(due - EARLY if complete else latest)
-
-
-def measured_times(samples) -> tuple[float, ...]:
-    """When each vehicle's newest pose was measured (s); minus infinity where there is none."""
-    poses = (sample.captured or sample.own for sample in samples)
-    return tuple(-math.inf if pose is None else pose.time for pose in poses)
 
 
 def flight_state(game: Game, number: int, safety: SafetySettings) -> State:
@@ -225,14 +82,14 @@ class Flight:
         self._watched = watched
         self._pursuers = game.settings.num_pursuers
         self._evader_flies = len(state.drones) > self._pursuers
-        self.record = Record(len(state.drones))
+        self.record = FlightRecord(len(state.drones))
         self._play = None
         self._episode = -1
         self._begun = 0.0
         self._since = perf_counter()
         self._alarm = ""
 
-    def run(self) -> Record:
+    def run(self) -> FlightRecord:
         """Fly it. Returns when all motors are off."""
         gc.disable()  # a search for garbage would cost ticks
         try:
@@ -264,6 +121,7 @@ class Flight:
         before = self.state.drones
         self.state = see(self.state, time, samples)
         for i, (drone, old) in enumerate(zip(self.state.drones, before, strict=True)):
+            # only what was believed goes to the estimators on board, and each pose once
             if drone.captured.pose is not old.captured.pose:
                 self.vehicles.believed(i, drone.captured.pose, drone.feeds_estimator)
         # the operator before the watch, the watch before the plan
@@ -276,6 +134,7 @@ class Flight:
         )
         sent = self.vehicles.send(set_points)
         self._alarm = self._watched(time, self.state)
+        # after the set-points have left: they mustn't wait for it
         self.record.keep((due, sent, self._episode), arrivals, measured_times(samples), set_points)
         if self._episode >= 0 and not any(m is Mode.PURSUIT for m in self.state.modes):
             self._end_episode("safety")
@@ -285,6 +144,7 @@ class Flight:
         state = self.state
         plan = self.plan
         waited = time - self._since
+        # each vehicle must have said where it stands before any rises
         if state.all_in(Mode.GROUND) and all(d.estimate is not None for d in state.drones):
             return Request.TRANSFER
         if state.all_in(Mode.READY) and self._episode < 0:

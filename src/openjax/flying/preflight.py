@@ -10,20 +10,20 @@ from openjax.flying.judge import agree, judge
 from openjax.flying.state import PoseSample, State
 from openjax.flying.swarm import PERIOD_MS
 
-LOOK = 0.5
-"""For how long (s) links are listened to."""
-RATE = 1000.0 / PERIOD_MS
-"""Own estimates a second (Hz)."""
-SHARE = 0.8
-"""Least share of them that must arrive: a vehicle lands after 60 ms without one, and .2**6 of the
+LISTENING = 0.5
+"""How long (s) links are listened to, to count poses."""
+POSE_RATE = 1000.0 / PERIOD_MS
+"""Own estimates that a vehicle sends a second (Hz)."""
+LEAST_SHARE = 0.8
+"""Least share of these that must arrive: a vehicle lands after 60 ms without one, and .2**6 of the
 time six in a row are lost.
 """
-LEVEL = math.radians(10.0)
-"""A floor, or a body marked by hand, is this level."""
-AHEAD = math.radians(30.0)
-"""A vehicle stands along x as far as somebody can see."""
-FLOOR = 0.1
-"""Nor higher or lower (m) than this does it stand."""
+MOST_TILT = math.radians(10.0)
+"""More tilted (rad) than a floor, or a body marked by hand, is ever off level."""
+MOST_YAW = math.radians(30.0)
+"""A vehicle stands along x to within this angle (rad): as well as somebody can see."""
+MOST_HEIGHT = 0.1
+"""It stands no higher or lower than this (m): its poses call the floor zero."""
 
 
 def poses_arriving(links) -> list[float]:
@@ -34,10 +34,10 @@ def poses_arriving(links) -> list[float]:
         return list(zip(times, links.counts, strict=True))
 
     before = newest()
-    time.sleep(LOOK)
+    time.sleep(LISTENING)
     # by the times at which poses were measured, since the sleep may have taken longer
     return [
-        (count - old_count) / max(at - since, LOOK)
+        (count - old_count) / max(at - since, LISTENING)
         for (at, count), (since, old_count) in zip(newest(), before, strict=True)
     ]
 
@@ -82,15 +82,16 @@ def _firmware_faults(settings, sample, rate) -> Iterator[str]:
     if not sample.voltage >= settings.battery_start:  # true of an unknown voltage, too
         least = f"{settings.battery_start:g} V"
         yield f"battery at {sample.voltage:.2f} V; charge it to {least} or more"
-    if rate < SHARE * RATE:
+    if rate < LEAST_SHARE * POSE_RATE:
         yield (
-            f"{rate:.0f} of {RATE:.0f} poses a second arrive; bring the antenna nearer or change "
+            f"{rate:.0f} of {POSE_RATE:.0f} poses a second arrive; bring the antenna nearer or change "
             "the channel"
         )
 
 
 def _pose_faults(state, sample, start: Vector) -> Iterator[str]:
     """What its poses say against it. A pose that can't be one hides all else."""
+    # motion capture says where a vehicle is, where there is one: the own estimate follows it
     pose = sample.captured or sample.own
     limits = state.limits
     for source in (sample.own, sample.captured):
@@ -99,14 +100,14 @@ def _pose_faults(state, sample, start: Vector) -> Iterator[str]:
             return
     x, y, z = pose.position
     where = f"({x:.2f}, {y:.2f}, {z:.2f})"
-    if math.dist((x, y), start[:2]) > state.settings.stand or abs(z) > FLOOR:
+    if math.dist((x, y), start[:2]) > state.settings.stand or abs(z) > MOST_HEIGHT:
         yield (
             f"stands at {where} m, its start's mark is ({start[0]:.2f}, {start[1]:.2f}, 0): put it "
             "there, or mend the positioning system's axes, origin or unit"
         )
-    if up(pose.quaternion) < math.cos(LEVEL):
+    if up(pose.quaternion) < math.cos(MOST_TILT):
         yield "doesn't stand level; put it upright, or mend the body's axes"
-    elif abs(roll_pitch_yaw(pose.quaternion)[2]) > AHEAD:
+    elif abs(roll_pitch_yaw(pose.quaternion)[2]) > MOST_YAW:
         yield "doesn't face +x; turn it, or mend the body's axes"
     if sample.captured is None or sample.own is None:
         return

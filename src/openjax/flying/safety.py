@@ -119,6 +119,7 @@ def _requested(state, event) -> tuple[Drone, ...]:
     if answer is not None:
         anchors = resting_places_of(state)
     elif event.request is Request.TRANSFER:
+        # who was in trouble, or landed for some reason, never rises again in this flight
         able = (*_DOWN, Mode.HOLD, Mode.PURSUIT, Mode.READY)
         if all(d.mode in able and not d.reason and d.estimate is not None for d in drones):
             answer = _transfer
@@ -184,6 +185,7 @@ def _trouble(state, drone, sample) -> tuple[Mode, str] | None:
     """The mode that a drone must go to, and why; None if all is well."""
     if drone.mode not in FLYING:
         return None
+    # the firmware has stopped its motors: whatever is asked of it, it won't fly
     if sample.supervisor & (Supervisor.LOCKED | Supervisor.CRASHED):
         return Mode.STOPPED, "stopped by its firmware"
     if drone.mode is Mode.SETTLE:
@@ -283,6 +285,7 @@ def steer(state: State, i: int, action: SetPoint | None, sample: PoseSample) -> 
         return drone
     if drone.mode is Mode.SETTLE and now - drone.since > SETTLING:
         return drone.to(Mode.LANDED, now)
+    # the last centimetres go level: nothing on board knows exactly where the floor is
     if drone.mode is Mode.LAND and _is_low(state, drone):
         drone = drone.to(Mode.SETTLE, now)
     if drone.mode is Mode.SETTLE:

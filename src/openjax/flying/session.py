@@ -13,17 +13,20 @@ from openjax.errors import UserError
 from openjax.flying import real_time
 from openjax.flying.board import SILENCE, Role, say
 from openjax.flying.crtp import Supervisor
-from openjax.flying.guard import Guard, RawLinks, fly_down
+from openjax.flying.guard import Guard
 from openjax.flying.keys import Operator
 from openjax.flying.links import Links
-from openjax.flying.loop import Flight, measured_times
+from openjax.flying.loop import Flight
 from openjax.flying.motion_capture import MotionCaptured
 from openjax.flying.preflight import faults, poses_arriving
+from openjax.flying.raw_links import RawLinks
 from openjax.flying.state import Request, State
+from openjax.flying.takeover import fly_down
+from openjax.flying.ticks import measured_times
 
 STILL_ARMED = "a vehicle doesn't say that it is disarmed: keep away, and switch it off"
 FRESH = 0.05
-"""No flight begins with poses older than this (s)."""
+"""No flight begins with poses older than this (s): one every 10 ms is sent."""
 ARMING = 1.0
 """A vehicle has this long (s) to say that it is armed."""
 POSES = 5.0
@@ -35,9 +38,13 @@ class SessionSettings:
     """How vehicles are connected and watched."""
 
     uris: tuple[str, ...]
+    """Of the vehicles, in the order of the game: the pursuers first."""
     body_logs: int = 1
+    """Log blocks of motors and accelerometer, 0 to 5: one is what a radio carries."""
     watchdog: bool = True
+    """Whether the firmware's watchdog stops the motors once nothing feeds it any more."""
     guard: bool = True
+    """Whether a process of its own watches, and lands all should loop and links fall silent."""
     silence: float = SILENCE
     """Of the loop, after which the links' process lands the vehicles (s)."""
     feed: Callable | None = None
@@ -63,6 +70,7 @@ class Session:
         self._guard: Guard | None = None
         self.scheduler = "ordinary"
         """What of the real-time scheduler was granted, see `openjax.flying.real_time`."""
+        self._raw_links: RawLinks | None = None
         self._stack = contextlib.ExitStack()
 
     def __enter__(self) -> Session:
@@ -77,12 +85,12 @@ class Session:
             self._wait_for_poses()
             blocks = self.links.pose_blocks()
             # the loop's own, should links and guard both go; over a dongle they open only then
-            self._own = RawLinks(settings.uris, blocks, settings.watchdog)
+            self._raw_links = RawLinks(settings.uris, blocks, settings.watchdog)
             if settings.guard:
-                self._guard = Guard(self.links.board, self._own, self._state)
+                self._guard = Guard(self.links.board, self._raw_links, self._state)
                 stack.callback(self._guard.close)
                 self._guard.wait()
-            self._own.open(udp_only=True)
+            self._raw_links.open(udp_only=True)
             self.scheduler = real_time.hurry()
             self._stack = stack.pop_all()
         return self
@@ -95,6 +103,7 @@ class Session:
         each stands in a line.
         """
         self._wait_for_poses()
+        # first, as it takes half a second: what is judged is what is known after it
         rates = poses_arriving(self.links)
         guarded = self._guard is None or self._guard.lives()
         found = faults(self._state, self.links.observe(), rates, guarded)
@@ -158,8 +167,8 @@ class Session:
                 # should one of them wake up, two would fly, and a dongle serves one process
                 for role in (Role.LINKS, Role.GUARD):
                     board.end_process(role)
-                self._own.open()
-                fly_down(board, Role.LOOP, self._own, self._state, self._listen)
+                self._raw_links.open()
+                fly_down(board, Role.LOOP, self._raw_links, self._state, self._listen)
         board.leave(Role.LOOP)
         return f"all vehicles were landed by the process of the {lander.name.lower()}"
 

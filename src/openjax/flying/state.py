@@ -157,11 +157,11 @@ class Drone(NamedTuple):
 
     mode: Mode = Mode.GROUND
     since: float = 0.0  # s, when the mode began
-    estimate: Pose | None = None  # now; reckoned on where no pose is fresh
+    estimate: Pose | None = None  # where it is now: the newest pose, moved on to this tick
     own: Track = _NOTHING_SEEN  # its own estimates
-    innovations: Innovations = _NOTHING_SUMMED  # of its own estimates ...
-    captured_innovations: Innovations = _NOTHING_SUMMED  # ... and of motion capture
-    contradiction: Verdict = Verdict.GOOD  # why those aren't believed any more in this flight
+    innovations: Innovations = _NOTHING_SUMMED  # of its own estimates
+    captured_innovations: Innovations = _NOTHING_SUMMED  # of motion capture
+    contradiction: Verdict = Verdict.GOOD  # why its own aren't believed any more in this flight
     captured: Track = _NOTHING_SEEN  # motion capture, with velocity and rates
     feeds_estimator: bool = True  # whether the estimator on board is to follow the newest of it
     seen: float = -math.inf  # s, when the pose that it is flown by was measured
