@@ -30,7 +30,8 @@ def main(arguments: Sequence[str]) -> int:
         cache_programs()
     import jax
 
-    from openjax.runs.adaptation import ON_CPU, STEPS, adapt, check, in_words
+    from openjax.runs.adapt_report import in_words
+    from openjax.runs.adaptation import ON_CPU, STEPS, adapt, check
 
     console = output_console()
     on_cpu = jax.default_backend() == "cpu"

@@ -146,8 +146,9 @@ def hypotheses_of(mixer: np.ndarray, trims: np.ndarray) -> Hypotheses:
     anything = USUAL_CHANGE / 2 * draws.normal[:, :4]
     each = dict(zip(TRIMS, anything.T, strict=True))
     draws.add("something else", 1.0, each, (), np.abs(anything).sum(1))
-    joined = (np.concatenate(part) for part in zip(*draws.parts, strict=True))
-    return Hypotheses(*joined, tuple(draws.place_of))
+    joined = zip(*draws.parts, strict=True)
+    change, weight, cause, place, sizes = (np.concatenate(part) for part in joined)
+    return Hypotheses(change, weight, cause, place, sizes, tuple(draws.place_of))
 
 
 def _rotors(draws: _Draws) -> None:

@@ -102,21 +102,22 @@ class Game:
         kinds = jax.eval_shape(first, task, example)
         nothing = jax.tree.map(lambda kind: jnp.zeros(kind.shape, kind.dtype), kinds)
         self._flat, unflatten = ravel_pytree(nothing)
-        nowhere = (np.zeros(3, np.float32), np.zeros((), bool))
+        nowhere = np.zeros(3, np.float32)
+        not_measured = np.zeros((), bool)
 
         # the state as one array: as a tree of some thirty the call takes half as long again
-
         def begin(poses):
             state, action = first(task, poses)
             return ravel_pytree((state, action))[0], action
 
-        def move(flat, *seen):
+        def move(flat, poses, evader, evader_measured):
             state, action = unflatten(flat)
-            state, *results = tick(state, action, *seen)
+            state, *results = tick(state, action, poses, evader, evader_measured)
             return ravel_pytree((state, results[0]))[0], results
 
         self._first = compile_in_line(jax.jit(begin).lower(example))
-        self._tick = compile_in_line(jax.jit(move).lower(self._flat, example, *nowhere))
+        lowered = jax.jit(move).lower(self._flat, example, nowhere, not_measured)
+        self._tick = compile_in_line(lowered)
         # the first calls take tens of milliseconds: not in flight
         self.start(poses)
         self.step(poses)

@@ -363,7 +363,8 @@ def _send_on(swarm: Swarm, commands: socket.socket, board: Board) -> None:
             (number,) = _NUMBER.unpack_from(data)
             if board.pilot is not Role.LOOP:
                 return
-            sent = swarm.send([SetPoint(*s) for s in _SET_POINT.iter_unpack(data[_NUMBER.size :])])
+            packed = _SET_POINT.iter_unpack(data[_NUMBER.size :])
+            sent = swarm.send([SetPoint._make(numbers) for numbers in packed])
             commands.send(_SENT.pack(number, sent))
         except (OSError, struct.error):
             return

@@ -27,6 +27,7 @@ from openjax.interruption import clean_up
 from openjax.learning.adaptation import bounds_of, make_adaptation, starting_parameters
 from openjax.learning.fine_tuning import fine_tune
 from openjax.learning.train_state import TrainState
+from openjax.runs.adapt_report import FIGURES, WHICH, page
 from openjax.runs.machine import describe_machine
 from openjax.runs.options import AdaptCommand
 from openjax.store.policies import load_policy
@@ -37,8 +38,6 @@ from openjax.vehicle.family import adapted_family
 STEPS = {"diagnosing and compiling": 60.0, "fine-tuning": 90.0, "measuring": 10.0}
 ON_CPU = {"diagnosing and compiling": 80.0, "fine-tuning": 240.0, "measuring": 25.0}
 """Seconds of each, about, with an accelerator and without."""
-FIGURES = ("capture_rate", "capture_step", "collision_rate", "crash_rate", "over_speed_rate")
-WHICH = ("nominal", "before", "after")
 LOSSES = ("crash_rate", "collision_rate", "capture_step")
 """Figures that a vehicle can make worse, of which adapting is to win back what it can."""
 ERRORS = 2.0
@@ -264,62 +263,3 @@ def compile_programs(adaptation, parameters, tasks, bounds):
         compile_ahead(adaptation.fly, parameters, key, bounds),
     ]
     return lambda: [wait() for wait in waits]
-
-
-def in_words(results: dict) -> list[str]:
-    """What was found and gained."""
-    effects = (
-        ", ".join(results["effects"]) or "no effect: the simulator is right to within the noise"
-    )
-    changes = []
-    for name in FIGURES:
-        course = " → ".join(f"{results[which][name]:.3g}" for which in WHICH)
-        changes.append(f"{name.replace('_', ' ')} {course}")
-    won = [
-        f"{name.replace('_', ' ')} {share:.0%}"
-        for name, share in results["won_back"].items()
-        if share is not None
-    ]
-    gain = "The vehicle costs nothing beyond chance."
-    if won:
-        gain = f"Won back of what the vehicle costs: {', '.join(won)}."
-    return [
-        f"Found: {effects}.",
-        f"On {results['episodes']} tasks that neither was trained on, with the nominal vehicle → "
-        f"with vehicles drawn from what was found, before → after: {'; '.join(changes)}.",
-        gain,
-        f"Kept: {results['kept']}. {results['seconds']['measured']:.0f} s.",
-    ]
-
-
-def page(results: dict) -> str:
-    """One self-contained HTML page."""
-    from openjax.show.pages import filled  # with matplotlib: not before the compiler has begun
-
-    values = {
-        "words": in_words(results),
-        "figures": FIGURES,
-        "which": WHICH,
-        "picture": _picture(results),
-    }
-    return filled("adapt.html.jinja", Path(__file__).parent, results=results, **values)
-
-
-def _picture(results):
-    from matplotlib import rc_context
-    from matplotlib.figure import Figure
-
-    from openjax.show.pages import STYLE, as_svg
-
-    shown = {
-        "crashes_from_starts": "crashes from leaning starts (smooth)",
-        "crashes_in_flight": "crashes within flights (smooth)",
-        "off_the_nominal_flight": "distance from nominal flights",
-    }
-    with rc_context(STYLE):
-        figure = Figure(figsize=(11, 3.2), layout="constrained")
-        for axes, (name, title) in zip(figure.subplots(1, len(shown)), shown.items(), strict=True):
-            course = [row[name] for row in results["history"]]
-            axes.plot(range(1, len(course) + 1), course)
-            axes.set(title=title, xlabel="update", ylim=(0, None))
-        return as_svg(figure, results["policy"])

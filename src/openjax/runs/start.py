@@ -181,7 +181,9 @@ def _has_begun(run):
 
 def _environment(game, files):
     """The game with what `files` say; those that needn't be kept become None."""
-    environment = make_environment(game, *files.values())
+    environment = make_environment(
+        game, files["vehicle.toml"], files["effects.toml"], files["evader.npz"]
+    )
     # a scripted evader, or a vehicle that is known by name, is in the settings; a function isn't in
     # any file of the run
     if not is_evader_file(files["evader.npz"]):

@@ -92,10 +92,19 @@ class _Run:
         self.progress = progress
         self.settings = job.settings
         self.processes = job.processes
-        self.taught = False
-        self.began = float("inf")
-        self.validation = None
         self.checkpoints = Checkpoints(directory.checkpoints, processes=job.processes)
+        self.abstract = None
+        """Shapes of the carry."""
+        self.first_update = 0
+        """Updates that were done before this process began."""
+        self.taught = False
+        """Whether first flights have taught the policy something that isn't validated yet."""
+        self.began = float("inf")
+        """When learning began (`time.monotonic`), from which on a time limit counts."""
+        # programs that are made in the background, each a function that waits for the compiler
+        self.first_flights = None
+        self.validation = None
+        self.last_stage = None
         self.processes.advice = f"go on with openjax train --resume {directory.path} --devices all"
 
     def train(self) -> Outcome | None:

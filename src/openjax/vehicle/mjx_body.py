@@ -86,7 +86,7 @@ def make_world(arena: Arena, n_pillars: int, n_others: int, dt: float, contacts:
     def build():
         mjx_model = _mjx().put_model(model, device, impl="jax")
         mjx_data = _mjx().make_data(mjx_model, device)
-        return World(*jax.tree.map(np.asarray, (mjx_model, mjx_data)))
+        return jax.tree.map(np.asarray, World(mjx_model, mjx_data))
 
     # A thread of its own knows nothing of the caller's trace or mesh, which may span other
     # processes' devices.

@@ -80,10 +80,13 @@ def step_many(
     if drones.position.dtype != jnp.float32:
         return mapped_step(step, vehicle, drones, command, pillars or ())
     if pillars is None:  # every drone is a world of its own
-        alone = jax.tree.map(lambda leaf: leaf[:, None], (drones, command))
-        return jax.tree.map(lambda leaf: leaf[:, 0], _many_worlds(step)(vehicle, *alone, ()))
-    world = jax.tree.map(lambda leaf: leaf[None], (drones, command, tuple(pillars)))
-    return jax.tree.map(lambda leaf: leaf[0], _many_worlds(step)(vehicle, *world))
+        drones, command = jax.tree.map(lambda leaf: leaf[:, None], (drones, command))
+        stepped = _many_worlds(step)(vehicle, drones, command, ())
+        return jax.tree.map(lambda leaf: leaf[:, 0], stepped)
+    world = (drones, command, tuple(pillars))
+    drones, command, pillars = jax.tree.map(lambda leaf: leaf[None], world)
+    stepped = _many_worlds(step)(vehicle, drones, command, pillars)
+    return jax.tree.map(lambda leaf: leaf[0], stepped)
 
 
 def mapped_step(
@@ -131,11 +134,11 @@ def _many_worlds(step):
         return fastest(vehicle, drones, command, pillars)
 
     @run.def_vmap
-    def _(axis_size, in_batched, vehicle, *worlds):
+    def _(axis_size, in_batched, vehicle, drones, command, pillars):
         # the kernel holds one vehicle's numbers: of many vehicles it isn't taken
         if any(jax.tree.leaves(in_batched[0])):
             axes = jax.tree.map(lambda batched: 0 if batched else None, tuple(in_batched))
-            stepped = jax.vmap(mapped, axes)(vehicle, *worlds)
+            stepped = jax.vmap(mapped, axes)(vehicle, drones, command, pillars)
         else:
 
             def flat(leaf, batched):
@@ -143,7 +146,9 @@ def _many_worlds(step):
                 return leaf.reshape(-1, *leaf.shape[2:])
 
             # two axes of worlds become one, and two again afterwards
-            stepped = run(vehicle, *jax.tree.map(flat, worlds, tuple(in_batched[1:])))
+            worlds = (drones, command, pillars)
+            drones, command, pillars = jax.tree.map(flat, worlds, tuple(in_batched[1:]))
+            stepped = run(vehicle, drones, command, pillars)
             stepped = jax.tree.map(
                 lambda leaf: leaf.reshape(axis_size, -1, *leaf.shape[1:]), stepped
             )

@@ -111,7 +111,7 @@ class VirtualVehicles:
         `SetPoint`.
         """
         self._state, report = self._advance(self._state, set_points, np.int32(steps))
-        self.report = Report(*(np.asarray(leaf, np.float64) for leaf in report))
+        self.report = Report._make(np.asarray(leaf, np.float64) for leaf in report)
         share = self.report.motor_command.mean(1) / self._hover
         self.battery = np.maximum(self.battery - steps * STEP * share / self._endurance, 0.0)
         return self.report
