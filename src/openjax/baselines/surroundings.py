@@ -104,6 +104,7 @@ def surroundings(craft: Craft, observation: Observation) -> Surroundings:
     def for_all(vector):
         return jnp.broadcast_to(vector[..., None, :], per_pursuer)
 
+    # a frame is time (1), evader's position and velocity (6) and the pursuers' positions
     moved = newest[..., 7:] - observation.frames[..., 0, 7:]
     velocities = moved.reshape(per_pursuer) / max(craft.history_seconds, 1e-6)
     apart_velocity = velocities[..., :, None, :] - velocities[..., others(number), :]

@@ -131,7 +131,7 @@ def joined(membership: Membership | None) -> Iterator[Processes]:
                 status = 2
                 reason = _one_line(error)
             elif isinstance(error, KeyboardInterrupt):
-                status = 130
+                status = 130  # as a shell tells a process that SIGINT ended: 128 + 2
                 reason = "interrupted"
             else:
                 processes.await_verdict()

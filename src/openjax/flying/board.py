@@ -112,6 +112,7 @@ class Board:
         numbers = []
         for drone in state.drones:
             known = drone.estimate is not None
+            # a row has its place for a pose's 14 numbers, known or not
             pose = numbers_of(drone.estimate) if known else (0.0,) * 14
             numbers += [float(_MODES.index(drone.mode)), drone.trim, float(known), *pose]
         self._numbers[_HEAD:] = numbers

@@ -56,6 +56,18 @@ class SupervisorCommand(IntEnum):
     FEED_WATCHDOG = 4
 
 
+class LogCommand(IntEnum):
+    """First byte of a packet on the log port's channel 1, with 16-bit ids of variables."""
+
+    DELETE = 2
+    START = 3  # with a period in units of 10 ms
+    STOP = 4
+    RESET = 5  # all blocks go
+    CREATE = 6
+    APPEND = 7
+    START_IN_MS = 8
+
+
 class Packet(NamedTuple):
     """One packet: port 0..15, channel 0..3, data."""
 

@@ -128,6 +128,7 @@ class Member:
         """A pose block, called by cflib's thread."""
         now = perf_counter()
         values = [data[name] for name, _ in POSE_BLOCK]
+        # in millimetres, mm/s, degrees/s and millivolts, so that all fits into one packet
         pose = Pose(
             self._onboard.host(stamp, now),
             tuple(1e-3 * v for v in values[:3]),
@@ -154,6 +155,7 @@ class Member:
         if measured > self.felt[0]:  # packets may overtake each other
             self.felt = measured, force
         if self.recording:
+            # motors are 16 bits, the accelerometer counts in g
             motors = tuple(data[name] / 65536 for name, _ in BODY_BLOCK[:4])
             self.bodies.extend((measured, *motors, *force))
         self.listener(False)

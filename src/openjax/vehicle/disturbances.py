@@ -87,6 +87,7 @@ GUST = Effect(
 def _noise_memory(vehicle, state, dt, key):
     dtype = state.position.dtype
     return {
+        # of position, velocity and attitude
         "noise": jnp.zeros(9, dtype),
         "late": jnp.zeros((), dtype),
         "key": jax.random.key_data(key),
@@ -109,6 +110,7 @@ def _noise_sensor(parameters, memory, state):
     was then.
     """
     position, velocity, angle = jnp.split(memory["noise"], 3)
+    # what was measured `late` ago is shown as if it were measured now
     late = parameters["jitter"] * memory["late"]
     # half of a small rotation vector is the vector part of its quaternion
     turn = 0.5 * (parameters["attitude"] * angle - late * state.body_rates)

@@ -215,6 +215,7 @@ class VirtualFirmware:
             self.external_pose[:3] = struct.unpack("<3f", packet.data[:12])
             self.external_poses += 1
         elif packet.data[0] == 8:
+            # scalar last in the packet, first everywhere else
             x, y, z, qx, qy, qz, qw = struct.unpack("<7f", packet.data[1:29])
             self.external_pose[:] = x, y, z, qw, qx, qy, qz
             self.external_poses += 1
@@ -227,6 +228,7 @@ class VirtualFirmware:
     def _commander(self, packet, time):
         """The legacy set-point, of which a parameter says whether it is angles."""
         *degrees, thrust = struct.unpack("<fffH", packet.data[:14])
+        # the firmware's dead band: so little thrust means none
         thrust = 0 if thrust < 1000 else min(thrust, THRUST_CUT)
         rates = self.parameters["flightmode.stabModeRoll"] == 0
         self._accept(RATES if rates else ANGLES, degrees, thrust, time)

@@ -6,7 +6,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from openjax.flying.crtp import LOG_FORMATS, MAX_LOG_DATA, Packet, Port, pack_number
+from openjax.flying.crtp import (
+    LOG_FORMATS,
+    MAX_LOG_DATA,
+    LogCommand,
+    Packet,
+    Port,
+    pack_number,
+)
 from openjax.virtual_crazyflie.tables import LOG_NAMES, LOG_VARIABLES, Sensors
 
 MAX_BLOCKS = 16
@@ -33,34 +40,31 @@ class LogBlocks:
         self._blocks: dict[int, _Block] = {}
 
     def control(self, command: int, ident: int, data: bytes, time: float) -> int:
-        """The status of a command on log blocks, 0 or an errno: 5 deletes all, 6 makes one, 7
-        appends variables to it, 2 deletes it, 4 stops it, 3 and 8 start it with a period in 10 ms
-        or in ms.
-        """
-        if command == 5:
+        """The status of a `LogCommand` on the block `ident`: 0 or an errno."""
+        if command == LogCommand.RESET:
             self._blocks.clear()
             return 0
-        if command == 6:
+        if command == LogCommand.CREATE:
             if ident in self._blocks:
                 return errno.EEXIST
             if len(self._blocks) >= MAX_BLOCKS:
                 return errno.ENOMEM
             self._blocks[ident] = _Block()
             return self._append(ident, data[2:])
-        if command not in (2, 3, 4, 7, 8):
+        if command not in set(LogCommand):
             return errno.ENOEXEC
         if ident not in self._blocks:
             return errno.ENOENT
         block = self._blocks[ident]
-        if command == 2:
+        if command == LogCommand.DELETE:
             del self._blocks[ident]
-        elif command == 4:
+        elif command == LogCommand.STOP:
             block.period = 0.0
-        elif command == 7:
+        elif command == LogCommand.APPEND:
             return self._append(ident, data[2:])
         else:
             block.period = data[2] * 0.01
-            if command == 8:
+            if command == LogCommand.START_IN_MS:
                 block.period = struct.unpack("<H", data[2:4])[0] * 1e-3
             block.due = time + block.period
         return 0
@@ -68,9 +72,12 @@ class LogBlocks:
     def _append(self, ident, data) -> int:
         block = self._blocks[ident]
         for kind, variable in struct.iter_unpack("<BH", data[: len(data) // 3 * 3]):
-            if variable >= len(LOG_NAMES) or kind & 0x0F not in LOG_FORMATS:
+            # the upper four bits say in which type the memory holds it, the lower ones as which
+            # it is sent
+            sent_as = kind & 0x0F
+            if variable >= len(LOG_NAMES) or sent_as not in LOG_FORMATS:
                 return errno.ENOENT
-            fmt = LOG_FORMATS[kind & 0x0F]
+            fmt = LOG_FORMATS[sent_as]
             if block.size() + struct.calcsize(fmt) > MAX_LOG_DATA:
                 return errno.E2BIG
             if sum(len(b.variables) for b in self._blocks.values()) >= MAX_VARIABLES:

@@ -22,6 +22,7 @@ def record(memory, state):
     be averaged.
     """
     pose = _pose(state)
+    # a pose is position (3), quaternion (4) and velocity (3) in one row
     same = jnp.sum(state.quaternion * memory["pose"][0, 3:7]) >= 0.0
     sign = jnp.where(same, 1.0, -1.0).astype(pose.dtype)
     pose = pose.at[3:7].multiply(sign)
