@@ -188,7 +188,8 @@ def test_precision_is_that_of_the_state(vehicle):
             with jax.enable_x64(x64):
                 step = make_drones_step(physics, contacts=contacts, substeps=2)
                 pillars = jnp.zeros((1, 2), jnp.float32), jnp.ones(1, bool)
-                end = jax.eval_shape(lambda d: step(vehicle, d, jnp.zeros((2, 4)), *pillars), start)  # noqa: B023
+                command = jnp.zeros((2, 4))
+                end = jax.eval_shape(step, vehicle, start, command, *pillars)
             for before, after in zip(jax.tree.leaves(start), jax.tree.leaves(end), strict=True):
                 assert (after.dtype, after.shape, after.weak_type) == (
                     before.dtype,
