@@ -54,13 +54,16 @@ def test_modules_that_the_pages_run_are_there():
 
 
 def test_readme_and_pages_stay_short():
-    """README 1,300 words, all pages of the documentation 18,700; a word has a letter."""
+    """README 1,300 words, all pages of the documentation 18,600; a word has a letter, and what the
+    API page lists of the code is no prose.
+    """
 
     def words(text):
+        text = re.sub(r"^```{eval-rst}.*?^```", "", text, flags=re.MULTILINE | re.DOTALL)
         return len(re.findall(r"\S*[^\W\d_]\S*", text))
 
     assert words(README) <= 1300
-    assert sum(words(page.read_text(encoding="utf-8")) for page in PAGES) <= 18_700
+    assert sum(words(page.read_text(encoding="utf-8")) for page in PAGES) <= 18_600
 
 
 def test_links_lead_somewhere():
