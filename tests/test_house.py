@@ -44,7 +44,7 @@ TWICE = {
     *("exploit", "adaptation", "loop"),
 }
 """Module names that more than one room has."""
-MOST = {"pairs": 16, "starred": 29, "columns": 14, "adverbs": 22, "effects": 32}
+MOST = {"pairs": 15, "starred": 23, "columns": 14, "adverbs": 21, "effects": 32}
 """Places of each kind of hard reading that are left; these numbers only get smaller. Pairs: a tuple
 written out and bound to several names. Starred: a tuple that an own function takes apart again.
 Columns: lines longer than 100 characters. Adverbs: parameters called by one of `ADVERBS` alone.

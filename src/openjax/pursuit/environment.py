@@ -426,7 +426,6 @@ class Pursuit:
             previous_action=action,
             step=step,
         )
-        # the observation comes last: it holds what the step has changed, the counts too
         info, rewards = self._outcome(before, state, active)
         state = state.replace(statistics=count(before.statistics, step, info, rewards, active))
         terminated, truncated = self._end(step)

@@ -209,6 +209,22 @@ class PursuitSettings:
 
     def __post_init__(self):
         check_intervals(self, "environment.")
+        self._check_numbers()
+        if self.airframe != PursuitSettings.airframe:
+            # only here: settings alone needn't wait for MuJoCo
+            from openjax.vehicle.parameters import check_airframe
+
+            check_airframe(self.airframe)
+        if self.vehicles:
+            # only here: it knows the effects, which are written in JAX
+            from openjax.vehicle.family import checked_ranges
+
+            # files and Python hand in plain tuples; from here on their numbers have names
+            object.__setattr__(self, "vehicles", checked_ranges(self.vehicles))
+        check_evaders(self.evaders)
+
+    def _check_numbers(self):
+        """Raises UserError for numbers of which one rules the other out."""
         if self.min_pillars > self.max_pillars:
             raise UserError(
                 f"environment.min_pillars {self.min_pillars} is more than environment.max_pillars "
@@ -236,18 +252,6 @@ class PursuitSettings:
                     f"environment.{name} {list(drawn)} must be two numbers, the lower one first, "
                     "or none"
                 )
-        if self.airframe != PursuitSettings.airframe:
-            # only here: settings alone needn't wait for MuJoCo
-            from openjax.vehicle.parameters import check_airframe
-
-            check_airframe(self.airframe)
-        if self.vehicles:
-            # only here: it knows the effects, which are written in JAX
-            from openjax.vehicle.family import checked_ranges
-
-            # files and Python hand in plain tuples; from here on their numbers have names
-            object.__setattr__(self, "vehicles", checked_ranges(self.vehicles))
-        check_evaders(self.evaders)
 
     def of_one_team(self, number: int) -> "PursuitSettings":
         """The same game with one size of team, one speed of the evader and one capture radius."""

@@ -134,7 +134,8 @@ def _many_worlds(step):
         return fastest(vehicle, drones, command, pillars)
 
     @run.def_vmap
-    def _(axis_size, in_batched, vehicle, drones, command, pillars):
+    def _(axis_size, in_batched, *arguments):
+        vehicle, drones, command, pillars = arguments
         # the kernel holds one vehicle's numbers: of many vehicles it isn't taken
         if any(jax.tree.leaves(in_batched[0])):
             axes = jax.tree.map(lambda batched: 0 if batched else None, tuple(in_batched))
