@@ -1,7 +1,7 @@
 """Where a vehicle may stop, turn back, part and wait, and what it can follow.
 
-Plain mechanics of poses, limits in `SafetySettings`: nothing here knows who flies a vehicle, or why.
-That is `openjax.flying.safety`'s.
+Plain mechanics of poses, limits in `SafetySettings`: nothing here knows who flies a vehicle, or
+why. That is `openjax.flying.safety`'s.
 """
 
 import math

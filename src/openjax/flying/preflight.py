@@ -84,8 +84,8 @@ def _firmware_faults(settings, sample, rate) -> Iterator[str]:
         yield f"battery at {sample.voltage:.2f} V; charge it to {least} or more"
     if rate < LEAST_SHARE * POSE_RATE:
         yield (
-            f"{rate:.0f} of {POSE_RATE:.0f} poses a second arrive; bring the antenna nearer or change "
-            "the channel"
+            f"{rate:.0f} of {POSE_RATE:.0f} poses a second arrive; bring the antenna nearer or "
+            "change the channel"
         )
 
 

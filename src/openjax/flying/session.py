@@ -133,9 +133,9 @@ class Session:
                 samples = self.links.samples()
         return samples, complaint
 
-    def watched(self, now: float, state: State) -> str:
+    def watched(self, moment: float, state: State) -> str:
         """Tell the others that the loop lives and what it knows; why it must land, if it must."""
-        self.links.board.write(Role.LOOP, now, state)
+        self.links.board.write(Role.LOOP, moment, state)
         if self._guard is not None and not self._guard.lives():
             return "the guard is gone"
         return ""

@@ -21,9 +21,9 @@ TICK = 0.01
 """Of the landing (s)."""
 
 
-def take_over(state: State, now: float) -> State:
-    """The state in which another process goes on flying: all stop where they are, wait, and
-    land.
+def take_over(state: State, moment: float) -> State:
+    """The state in which another process goes on flying from `moment` (s) on: all stop where they
+    are, wait, and land.
     """
 
     def handed_over(drone, anchor):
@@ -32,11 +32,11 @@ def take_over(state: State, now: float) -> State:
         # who lands goes on landing, and who had just lifted off is nearest to the floor
         mode = Mode.LAND if drone.mode in (*LANDING, Mode.LIFT) else Mode.HOLD
         # the estimate is as good as what the one before knew
-        drone = drone._replace(seen=now)
-        return drone.to(mode, now, anchor, "another process took over")
+        drone = drone._replace(seen=moment)
+        return drone.to(mode, moment, anchor, "another process took over")
 
     drones = tuple(map(handed_over, state.drones, resting_places_of(state)))
-    return state._replace(drones=drones, time=now, action_time=now)
+    return state._replace(drones=drones, time=moment, action_time=moment)
 
 
 def fly_down(

@@ -28,8 +28,8 @@ class TickSchedule:
     drift a little.
     """
 
-    def __init__(self, now: float):
-        self.due = now
+    def __init__(self, first: float):
+        self.due = first
         self.skipped = 0
         self._in_step = False
 
