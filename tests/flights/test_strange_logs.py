@@ -34,6 +34,7 @@ def ended(text, ends_in=","):
 
 AROUND = {
     "semicolons, decimal commas": lambda t: t.replace(",", ";").replace(".", ","),
+    "UTF-32": lambda t: t.encode("utf-32"),
     "tabs in UTF-16": lambda t: t.replace(",", "\t").encode("utf-16"),
     "a byte order mark and quotes": quoted,
     "comments": lambda t: "# Monday, hall 3\n\n# 100 Hz\n" + t,
@@ -61,6 +62,29 @@ def test_what_stands_around_a_table_changes_nothing(tmp_path, text, around, name
     for column, values in plain.columns.items():
         np.testing.assert_array_equal(read.columns[column], values, err_msg=column)
     assert [r for r in read.remarks if "line 2 holds words" not in r] == []
+
+
+def test_units_in_the_header_are_read(tmp_path, sample_columns):
+    """In other units than the format's, and however they are written."""
+    columns = sample_columns["flight_a"]
+    units = {"t": "ms", "x": "mm", "wx": "°/s", "az": "m/s²", "qw": "-", "vbat": "mV", "m1": "%"}
+    sizes = {"t": 1e3, "x": 1e3, "wx": np.degrees(1.0), "vbat": 1e3, "m1": 100.0}
+    named = {
+        f"{name} [{units[name]}]" if name in units else name: sizes.get(name, 1.0) * values
+        for name, values in columns.items()
+    }
+    path = tmp_path / "flight.csv"
+    rows = np.stack(list(named.values()), 1)
+    np.savetxt(path, rows, delimiter=",", header=",".join(named), comments="", encoding="utf-8")
+    read = read_log(path)
+    for name, values in columns.items():
+        np.testing.assert_allclose(read.columns[name], values, rtol=1e-9, atol=1e-12)
+
+
+def test_what_an_unknown_unit_holds_is_left_out_and_named(tmp_path, text):
+    (tmp_path / "flight.csv").write_text(text.replace("vbat", "vbat [furlong]"))
+    read = read_log(tmp_path / "flight.csv")
+    assert "vbat" not in read.columns and "vbat [furlong]" in read.remarks[0]
 
 
 def case_of(folder, text):
@@ -113,6 +137,26 @@ def test_poses_of_a_camera_that_lost_the_body_are_not_sampled(tmp_path, sample_c
     (flight,) = load_case(tmp_path).flights
     assert np.isnan(flight.position[:, 0]).sum() >= lost.sum() - 40
     assert np.nanmin(flight.position[:, 2]) > 0.05
+
+
+def test_a_mark_in_place_of_a_position_is_not_sampled(tmp_path, sample_columns):
+    columns = {name: values.copy() for name, values in sample_columns["flight_a"].items()}
+    lost = np.arange(len(columns["t"])) // 37 % 4 == 2
+    for name in ("x", "y", "z"):
+        columns[name][lost] = -999.0
+    write_csv(tmp_path / "flight.csv", log_of([columns], "flight"))
+    (tmp_path / "vehicle.toml").write_text("")
+    case = load_case(tmp_path)
+    assert f"{lost.sum()} rows whose x, y, z all are -999" in case.quality[0].issue
+    assert np.nanmin(case.flights[0].position) > -2.0
+
+
+def test_a_vehicle_that_is_in_no_log_is_said_and_a_hidden_file_is_none(tmp_path, text):
+    case_of(tmp_path, text)
+    (tmp_path / "._flight.csv").write_bytes(b"\0\5\26\7" + bytes(100))
+    (tmp_path / "vehicle.toml").write_text("[vehicles.cf01]\nmass = 0.04\n")
+    (issue,) = load_case(tmp_path).quality
+    assert issue.issue == "[vehicles.cf01]: no log is of such a vehicle; they are of 0"
 
 
 def test_a_folder_without_a_log_says_what_is_in_it(tmp_path):

@@ -50,6 +50,7 @@ def load_case(path: str | Path, dtype=jnp.float32, comparison: bool = False) -> 
     mapping = load_mapping(path / MAPPING_FILE) if (path / MAPPING_FILE).exists() else None
     read = [_read(log, vehicle_file, mapping) for log in logs]
     kept, issues = _usable(read, vehicle_file, comparison)
+    issues += _not_flown(vehicle_file, read)
     if not kept:
         reasons = [i for i in issues if i.refused]
         first = f"{reasons[0].flight}: {reasons[0].issue}" if reasons else "no vehicle in any log"
@@ -59,6 +60,19 @@ def load_case(path: str | Path, dtype=jnp.float32, comparison: bool = False) -> 
     weighed = all(vehicle_file.mass_weighed_of(flight.vehicle) for flight in kept)
     vehicle_file = dataclasses.replace(vehicle_file, mass_weighed=weighed)
     return Case(path.resolve().name, tuple(kept), vehicle_file, tuple(issues), path)
+
+
+def _not_flown(vehicle_file: VehicleFile, read) -> list[Issue]:
+    """What the vehicle file says of vehicles that are in none of the logs: an id with another
+    spelling, whose mass would go unnoticed.
+    """
+    flown = sorted({flight.vehicle for flights, _ in read for flight in flights})
+    others = sorted(set(vehicle_file.vehicles) - set(flown))
+    if not others or not flown:
+        return []
+    tables = ", ".join(f"[vehicles.{name}]" for name in others)
+    text = f"{tables}: no log is of such a vehicle; they are of {', '.join(flown)}"
+    return [Issue("vehicle.toml", text, kind="vehicle")]
 
 
 def _held_instead(path: Path) -> str:

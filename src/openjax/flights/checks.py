@@ -27,6 +27,7 @@ LONG_REST = 1.0  # s
 SATURATED = 0.01  # share of rows at one largest value from which that is the sensor's end
 OFTEN = 0.05  # share from which the sensor is of no use
 LEAST_RANGE = {"body_rates": 0.3, "specific_force": 15.0}  # rad/s, m/s^2
+NOWHERE = 20.0  # m: beyond, three coordinates that are one number are a mark, and no place
 GROUND_CLEARANCE = 0.02  # m above the floor
 
 
@@ -288,7 +289,20 @@ def _piled_up(size: np.ndarray) -> bool:
 
 
 def _without_lost_poses(flight: Flight, note) -> Flight:
-    """Cameras that lost a body write zeros: such a pose isn't sampled."""
+    """Cameras that lost a body write zeros, or a number that is no place, -999 for one: such a pose
+    isn't sampled.
+    """
+    place = flight.position
+    if place is not None:
+        nowhere = (place == place[:, :1]).all(1) & (np.abs(place[:, 0]) > NOWHERE)
+        if nowhere.any() and not nowhere.all():
+            value = place[nowhere][0, 0]
+            note(
+                "corrupt",
+                f"{nowhere.sum()} rows whose x, y, z all are {value:g} are taken as not sampled",
+            )
+            place = np.where(nowhere[:, None], np.nan, place)
+            flight = dataclasses.replace(flight, position=place)
     if flight.quaternion is None:
         return flight
     lost = (flight.quaternion == 0.0).all(1)

@@ -22,6 +22,7 @@ LONGEST_HEADER = 1 << 16  # bytes: a header of a firmware's some hundred names h
 GZIP = b"\x1f\x8b"
 ZIP = b"PK\x03\x04"  # also of spreadsheets
 WIDE = (b"\xff\xfe", b"\xfe\xff")  # how a text in UTF-16 begins
+WIDEST = (b"\xff\xfe\0\0", b"\0\0\xfe\xff")  # in UTF-32
 SEPARATORS = (",", ";", "\t")
 COMMENT = "#"
 MOST_ABOVE = 1_000  # lines among which the header is
@@ -77,7 +78,7 @@ def head_of(path: Path) -> list[str]:
     try:
         with ExitStack() as stack:
             data = _opened(path, stack).read(LONGEST_HEADER)
-        return _decoded(data[: len(data) // 2 * 2], "replace").split("\n")
+        return _decoded(data[: len(data) // 4 * 4], "replace").split("\n")
     except (OSError, EOFError, zlib.error, LogError):
         return []
 
@@ -132,11 +133,15 @@ def _opened(path: Path, stack: ExitStack) -> io.BufferedIOBase:
 
 def _decoded(data: bytes, errors: str = "strict") -> str:
     """Bytes as text with line ends of one kind. Raises LogError for what is no text."""
-    wide = data.startswith(WIDE)
-    if b"\0" in data and not wide:
+    code = "utf-8-sig"
+    if data.startswith(WIDEST):
+        code = "utf-32"
+    elif data.startswith(WIDE):
+        code = "utf-16"
+    elif b"\0" in data:
         raise LogError("not a text file in UTF-8")
     try:
-        text = data.decode("utf-16" if wide else "utf-8-sig", errors)
+        text = data.decode(code, errors)
     except UnicodeDecodeError as error:
         raise LogError("not a text file in UTF-8: save it as one") from error
     return text.replace("\r\n", "\n").replace("\r", "\n")

@@ -37,6 +37,9 @@ CALIBRATED_UNITS = MappingProxyType({
 FAR = 100.0
 """A calibrated value may be this many times the nominal one, or this part of it."""
 
+ROUNDED = 1.02
+"""By so much moments of inertia may be off what a body can have: they are rounded.
+"""
 HEAVY = 1.0
 """kg, above which the Crazyflie's moments of inertia say nothing of a vehicle."""
 
@@ -98,6 +101,7 @@ class _Log:
 
     floor_z: Annotated[float, Interval("[-1000, 1000]", "m")] = 0.0
     ceiling_z: Annotated[float, Interval("[-1000, 1000]", "m")] | None = None
+    motor_rows: Literal["mean", "mean_before", "sample"] = "mean"
 
 
 @dataclass(frozen=True)
@@ -247,7 +251,11 @@ def _from_tables(plain: dict, path: Path, dtype) -> VehicleFile:
     motor = tables.motor
     # [log] may hold anything: only what openjax reads of it is checked
     read = {f.name for f in fields(_Log)}
-    from_plain(_Log, {k: v for k, v in tables.log.items() if k in read}, f"{root}log")
+    log = from_plain(_Log, {k: v for k, v in tables.log.items() if k in read}, f"{root}log")
+    if log.ceiling_z is not None and log.ceiling_z <= log.floor_z:
+        raise UserError(
+            f"{root}log.ceiling_z is {log.ceiling_z:g}; it must be above floor_z, {log.floor_z:g} m"
+        )
     if sorted(motor.order) != sorted(NOMINAL_ORDER):
         raise UserError(
             f"{root}motor.order is {list(motor.order)}; it must name each of "
@@ -303,6 +311,11 @@ def _sized(nominal: Vehicle, table: _Vehicle, mjcf: Path | None, root: str) -> V
         )
     if table.inertia is None:
         return nominal
+    if max(table.inertia) > ROUNDED * 0.5 * sum(table.inertia):
+        raise UserError(
+            f"{root}vehicle.inertia is {list(table.inertia)}; of a body none of the three is larger "
+            "than the sum of the other two"
+        )
     changes: dict[str, Any] = {"inertia": table.inertia}
     heavier = 1.0 if mass is None else mass / float(np.asarray(nominal.mass))
     if mjcf is None and not 1.0 / SAME_ROTORS <= heavier <= SAME_ROTORS:

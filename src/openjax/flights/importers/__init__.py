@@ -48,8 +48,10 @@ for _importer in (
 
 def find_logs(folder: Path) -> list[Path]:
     """The logs of a case folder, by name."""
-    files = (path for path in folder.iterdir() if not betaflight.is_beside(path))
-    return sorted(path for path in files if importer_of(path) is not None)
+    # hidden files aren't logs: macOS leaves one beside each file that it copies
+    files = (path for path in folder.iterdir() if not path.name.startswith("."))
+    logs = (path for path in files if not betaflight.is_beside(path))
+    return sorted(path for path in logs if importer_of(path) is not None)
 
 
 def read_log(path: Path, mapping: ColumnMapping | None = None) -> LogTable:
