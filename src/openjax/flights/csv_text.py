@@ -78,7 +78,7 @@ def head_of(path: Path) -> list[str]:
     try:
         with ExitStack() as stack:
             data = _opened(path, stack).read(LONGEST_HEADER)
-        return _decoded(data[: len(data) // 4 * 4], "replace").split("\n")
+        return _decoded(data[: len(data) // 2 * 2], "replace").split("\n")
     except (OSError, EOFError, zlib.error, LogError):
         return []
 
