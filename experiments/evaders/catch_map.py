@@ -1,8 +1,9 @@
 """The map of what can be caught: `python -m experiments.evaders.catch_map NAME=FILE ...`.
 
 Each FILE is what `openjax map --json FILE` wrote, by the names of `KINDS`: the whole map in an empty
-arena, and maps in which one thing is taken away. Losses are means over the cells that both maps have,
-which are flown from the same starts. Draws the eight small maps, and the page to move about in.
+arena, and maps in which one thing is taken away; or, as `inertia`, what `experiments.evaders.forced`
+wrote. Losses are means over the cells that both maps have, which are flown from the same starts. Draws
+the eight small maps, and the page to move about in.
 """
 
 from collections.abc import Mapping
@@ -13,6 +14,7 @@ import numpy as np
 from experiments.table import Page, Table, page_parser, publish
 from openjax.command_line import run_command
 from openjax.files import read_json, write_text
+from openjax.runs.catch_map import cells_against
 from openjax.runs.map_page import map_page
 from openjax.show.plots import plot_map
 
@@ -23,6 +25,9 @@ KINDS = {
     "messages": "a fifth of the messages lost, the rest .1 s late",
 }
 """Maps, and how the page calls them; the first is the one that others are compared with."""
+WHO = ("scripted", "learned", "planner")
+INERTIA = ("points", "vehicles")
+"""Who flies stack where it forces a capture for points, by the names of `forced`."""
 CERTAIN = 0.95
 BOUNDS = {"forced_below": "below the solid line", "planar_below": "below the dashed line"}
 
@@ -30,15 +35,18 @@ BOUNDS = {"forced_below": "below the solid line", "planar_below": "below the das
 def study(options) -> dict:
     """The maps of all files, after those stored before."""
     data = options.out.with_suffix(".json")
-    stored = read_json(data)["maps"] if data.exists() else {}
-    files = dict(item.split("=", 1) for item in options.maps)
-    return {"maps": stored | {name: read_json(Path(file)) for name, file in files.items()}}
+    stored = read_json(data) if data.exists() else {}
+    files = {
+        name: read_json(Path(file)) for name, file in (item.split("=", 1) for item in options.maps)
+    }
+    inertia = files.pop("inertia", stored.get("inertia", {"teams": []}))
+    return {"maps": stored.get("maps", {}) | files, "inertia": inertia}
 
 
-def by_cell(found: Mapping) -> dict[tuple, dict]:
+def by_cell(cells: list[dict]) -> dict[tuple, dict]:
     """Cells of a map by number of pursuers, speed ratio and radius."""
     names = ("num_pursuers", "speed_ratio", "capture_radius")
-    return {tuple(cell[name] for name in names): cell for cell in found["cells"]}
+    return {tuple(cell[name] for name in names): cell for cell in cells}
 
 
 def mean_rate(cells: list[dict]) -> float | None:
@@ -46,49 +54,65 @@ def mean_rate(cells: list[dict]) -> float | None:
     return float(np.mean([cell["capture_rate"] for cell in cells])) if cells else None
 
 
-def rows_of(maps: Mapping) -> list[dict]:
+def mean_difference(cells: Mapping, others: Mapping) -> float | None:
+    """Mean of the capture rates of other cells less those of the same cells; None where none is in
+    both.
+    """
+    common = [key for key in cells if key in others]
+    pairs = [others[key]["capture_rate"] - cells[key]["capture_rate"] for key in common]
+    return float(np.mean(pairs)) if common else None
+
+
+def rows_of(results: Mapping) -> list[dict]:
     """A row for each size of team."""
-    whole = by_cell(maps["empty"])
+    maps = results["maps"]
+    flown = {who: by_cell(cells_against(maps["empty"], who)) for who in WHO}
+    inertia = {team["pursuers"]: team for team in results["inertia"]["teams"]}
     rows = []
-    for size in sorted({key[0] for key in whole}):
-        own = {key: cell for key, cell in whole.items() if key[0] == size}
-        cells = list(own.values())
-        row = {"size": size, "mean": mean_rate(cells)}
-        row["certain"] = sum(cell["interval"][0] >= CERTAIN for cell in cells)
-        for bound in BOUNDS:
-            row[bound] = mean_rate([cell for cell in cells if cell["speed_ratio"] < cell[bound]])
+    for size in sorted({key[0] for key in flown["scripted"]}):
+        row = {"size": size}
+        of_size = {
+            who: {key: cell for key, cell in cells.items() if key[0] == size}
+            for who, cells in flown.items()
+        }
+        for who, cells in of_size.items():
+            own = list(cells.values())
+            row[who] = {"mean": mean_rate(own)}
+            row[who]["certain"] = sum(cell["interval"][0] >= CERTAIN for cell in own)
+            for bound in BOUNDS:
+                below = [cell for cell in own if cell["speed_ratio"] < cell[bound]]
+                row[who][bound] = mean_rate(below)
+        row["planner"]["gain"] = mean_difference(of_size["learned"], of_size["planner"])
         for kind in list(KINDS)[1:]:
-            other = by_cell(maps[kind]) if kind in maps else {}
-            common = [key for key in own if key in other]
-            if common:
-                pairs = [other[key]["capture_rate"] - own[key]["capture_rate"] for key in common]
-                row[kind] = float(np.mean(pairs))
+            if kind in maps:
+                row[kind] = mean_difference(of_size["scripted"], by_cell(maps[kind]["cells"]))
+        row |= {who: inertia.get(size, {}).get(who) for who in INERTIA}
         rows.append(row)
     return rows
 
 
 def page(results: Mapping) -> Page:
-    """One table by size of team."""
+    """What is caught, and what is taken away."""
+    rows = rows_of(results)
     columns = {
         "pursuers": "size",
-        "mean over all cells": "mean:.3f",
-        f"cells surely above {CERTAIN}": "certain",
-        **{head: f"{bound}:.3f" for bound, head in BOUNDS.items()},
-        **{kind: f"{kind}:+.3f" for kind in list(KINDS)[1:] if kind in results["maps"]},
+        "by rules": "scripted.mean:.3f",
+        "learned": "learned.mean:.3f",
+        f"cells surely above {CERTAIN}, learned": "learned.certain",
+        **{f"{head}, learned": f"learned.{bound}:.3f" for bound, head in BOUNDS.items()},
+        "planner less learned": "planner.gain:+.3f",
     }
-    return Page(
-        "What can be caught",
-        "Captures over speed ratios and capture radii.",
-        Table(columns, rows_of(results["maps"])),
-    )
+    losses = {kind: f"{kind}:+.3f" for kind in list(KINDS)[1:] if kind in results["maps"]}
+    losses |= {f"stack forces, {who}": f"{who}:.2f" for who in INERTIA}
+    short = Table(columns | losses, rows)
+    return Page("What can be caught", "Captures over speed ratios and capture radii.", short)
 
 
 def draw(results: Mapping, path: Path) -> None:
     """The eight small maps."""
-    maps = results["maps"]
-    plot_map(
-        path, maps["empty"]["cells"], f"{maps['empty']['policy']}: share of chases that end caught"
-    )
+    whole = results["maps"]["empty"]
+    cells = cells_against(whole, "learned") or whole["cells"]
+    plot_map(path, cells, f"{whole['policy']}: share of chases that end caught")
 
 
 def main(arguments: list[str]) -> None:
