@@ -3,7 +3,6 @@ cells, and one plans.
 """
 
 import dataclasses
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,18 +11,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from openjax.background import compile_ahead
 from openjax.errors import UserError
 from openjax.evaluation.judges.best_response import BestResponse, Evaders, fly_learners
 from openjax.evaluation.judges.duel import Duel
 from openjax.evaluation.judges.planner import Planner
 from openjax.pursuit import EpisodeStatistics, Pursuit, PursuitSettings, Task
+from openjax.runs.exploit import Findings, compile_learning, learn
 from openjax.runs.options import MapCommand
 from openjax.store.policies import LoadedPolicy
 from openjax.store.policy_files import fill, load_policy_file, save_policy_file
-
-LINES = 20
-"""Lines that are told of a whole training."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,35 +71,12 @@ class MapEvaders:
     def learn(self, tell: Callable[[str], None]) -> tuple[Evaders, list[dict]]:
         """Learners after their training, and what was told on the way."""
         tell("compiling the evaders' learning ...")
-        settings = self.command.learning
-        response = self.response
-        start = jax.jit(response.start)
-        step = jax.jit(response.step, donate_argnums=1)
-        key = jax.random.key(self.command.seed)
         parameters = self.loaded.parameters
-        programs = (
-            compile_ahead(step, parameters, jax.eval_shape(start, key)),
-            compile_ahead(start, key),
-        )
-        for ready in programs:
-            ready()
-        began = time.monotonic()
-        carry = start(key)
-        curve = []
-        for update in range(1, settings.total_updates + 1):
-            # one at a time, as in `openjax.runs.exploit`
-            carry, metrics = jax.block_until_ready(step(parameters, carry))
-            seconds = time.monotonic() - began
-            over = self.command.minutes is not None and seconds > 60 * self.command.minutes
-            if over or update % max(1, settings.total_updates // LINES) == 0:
-                values = {name: np.asarray(value).tolist() for name, value in metrics.items()}
-                steps = update * settings.steps_per_update
-                curve.append({"steps": steps, "seconds": seconds, **values})
-                rates = ", ".join(f"{rate:.2f}" for rate in values["capture_rate"])
-                tell(f"{steps / 1e6:.1f} M steps, {seconds:.0f} s: episodes end caught {rates}")
-            if over:
-                break
-        return carry.evaders, curve
+        programs, wait_for_programs = compile_learning(self.response, parameters)
+        wait_for_programs()
+        findings = Findings(None, tell, {})
+        evaders = learn(self.command, programs, parameters, findings)
+        return evaders, findings.values["curve"]
 
     def learned(self, evaders: Evaders) -> Flight:
         """Each learner's mean; statistics (B, L)."""
