@@ -25,6 +25,7 @@ from openjax.flying.takeover import fly_down
 from openjax.flying.ticks import measured_times
 
 STILL_ARMED = "a vehicle doesn't say that it is disarmed: keep away, and switch it off"
+"""What is said after a flight that ends so."""
 FRESH = 0.05
 """No flight begins with poses older than this (s): one every 10 ms is sent."""
 ARMING = 1.0

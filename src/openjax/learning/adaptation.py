@@ -68,11 +68,10 @@ LAG = 6
 """Control steps by which the diagnosed vehicle may follow late: one that hears late can't help it,
 and would learn to overdo what it does if it were to catch up.
 """
-NEAR = 0.02
-ALIKE = 0.1
-"""Distance (m) and difference in velocity (m/s) from the nominal vehicle's flight that count as
-one.
-"""
+NEAR_POSITION = 0.02
+"""Distance (m) from the nominal vehicle's flight that counts as one ..."""
+NEAR_VELOCITY = 0.1
+"""... and so does this difference in velocity (m/s)."""
 
 
 def adapting_game(game: PursuitSettings) -> PursuitSettings:
@@ -287,17 +286,17 @@ def off_the_flight(
     """(T, W, N) how far flights (T, W, N, 3) are from those that are wanted (LAG + T, W, N, 3), at
     the lag that suits best.
 
-    In multiples of `NEAR` and `ALIKE`, less one where it is large and half the square where it is
-    small.
+    In multiples of `NEAR_POSITION` and `NEAR_VELOCITY`, less one where it is large and half the
+    square where it is small.
     """
 
     def at(lag):
         part = slice(LAG - lag, LAG - lag + position.shape[0])
-        off = jnp.sum(((position - target[part]) / NEAR) ** 2, axis=-1)
-        off = off + jnp.sum(((velocity - target_velocity[part]) / ALIKE) ** 2, axis=-1)
+        off = jnp.sum(((position - target[part]) / NEAR_POSITION) ** 2, axis=-1)
+        off = off + jnp.sum(((velocity - target_velocity[part]) / NEAR_VELOCITY) ** 2, axis=-1)
         return jnp.sqrt(1.0 + off) - 1.0
 
-    # every other lag: between them a flight moves less than `NEAR`
+    # every other lag: between them a flight moves less than `NEAR_POSITION`
     return functools.reduce(jnp.minimum, [at(lag) for lag in range(0, LAG + 1, 2)])
 
 

@@ -20,10 +20,11 @@ from openjax.pursuit.collisions import drone_distance
 from openjax.pursuit.teams import parked
 
 CLOSE = 0.45
+"""Share of the starts in which most pursuers stand close to something."""
+MOST = 0.7
+"""Share of the pursuers that do: with some left where they are, not all starts are tight."""
 SIDE_BY_SIDE = 0.35
-"""Shares of the starts close to something (70 % of the pursuers), and of those in which all stand
-side by side.
-"""
+"""Share of the starts in which all stand side by side; what is left of both are uniform ones."""
 APART = 0.1
 """Farthest gap beyond the safety distance of pursuers side by side (m)."""
 SCATTERED = 0.5
@@ -62,8 +63,7 @@ def draw_start(settings: PursuitSettings, key: PRNGKeyArray) -> Task:
     """A task to learn from: close to something, side by side, or any."""
     task_key, turn_key, start_key, choice_key = jax.random.split(key, 4)
     task = turn_task(turn_key, uniform_task(settings, task_key))
-    # with a share of the pursuers left where they are, so that not all starts are tight
-    near = close_starts(settings, start_key, task, 0.7)
+    near = close_starts(settings, start_key, task, MOST)
     beside = side_by_side(settings, start_key, task) if settings.num_pursuers > 1 else near
     kind = jax.random.uniform(choice_key)
     return jax.tree.map(

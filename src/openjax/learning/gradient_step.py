@@ -18,8 +18,9 @@ from openjax.pursuit import Observation, Pursuit, PursuitState
 from openjax.pursuit.shapes import Scalar
 
 LOWEST = 0.35
+"""The end of a start costs below this height (m) ..."""
 FASTEST = 1.0
-"""Height (m) below, and speed (m/s) above which the end of a start costs."""
+"""... and above this speed (m/s): a dive saves some starts, and must end."""
 END = 0.2
 """Weight of that, beside the share of pursuers that touch something."""
 SLOWEST_RATE = 0.05

@@ -22,10 +22,11 @@ Pursuers = Float[Array, "worlds pursuers"]
 """A number of each pursuer of each world."""
 
 SMOOTH = 0.012
-SMOOTH_BREACH = 0.008
-"""Distances (m) over which a crash and a breach go from sure to none in what is learnt:
-gaps between pillars of a row aren't wide.
+"""Distance (m) over which a crash goes from sure to none in what is learnt: gaps between pillars of
+a row aren't wide. First flights feel it from farther (`crash_smooth`).
 """
+SMOOTH_BREACH = 0.008
+"""The same for a breach of a safety distance or a bound (m)."""
 SMOOTH_TILT = 0.05
 """The same for a tip over 90 degrees (cosine of the tilt)."""
 SMOOTH_CAPTURE = 0.1

@@ -14,17 +14,20 @@ from openjax.pursuit.teams import draw_team, of_team, parked
 START_X = (0.1, 0.536)
 """Uniform tasks: pursuers start at x in this range, the evader at the mirrored one (m)."""
 START_Y = 0.536
+"""Uniform tasks: all start at |y| up to this (m): a corner is .76 m from the axis, inside the
+arena's .9 m.
+"""
 START_Z = 0.1
 """Uniform tasks: |z - H/2| at the start at most (m)."""
 PILLAR_GRID = 0.2
+"""Pillars of uniform tasks stand on the cells of a grid of this width (m) ..."""
 PILLAR_REACH = 0.8
-"""Pillars of uniform tasks stand on cells of this grid whose centre is closer to the axis than this
-(m).
-"""
+"""... whose centre is closer to the axis than this (m): a pillar then stands inside the arena."""
 ROW_OFFSET = 0.2
+"""Pillars in a row: its middle is up to this far from the axis along x and y (m)."""
 ROW_SPACING = (0.2, 0.4)
-"""Pillars in a row: its middle's largest offset from the axis along x and y, and the distance of
-neighbours (m).
+"""Pillars in a row: distance of the axes of neighbours (m), from touching ones to a way of 6 cm
+that breaches nothing.
 """
 EXPANSION = 0.1
 """Local expansion moves each vehicle by up to this along each axis (m): the paper's delta."""

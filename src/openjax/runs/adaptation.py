@@ -36,8 +36,9 @@ from openjax.vehicle.effects.effects_file import load_effects, load_intervals
 from openjax.vehicle.family import adapted_family
 
 STEPS = {"diagnosing and compiling": 60.0, "fine-tuning": 90.0, "measuring": 10.0}
+"""Seconds of each step, about, with an accelerator ..."""
 ON_CPU = {"diagnosing and compiling": 80.0, "fine-tuning": 240.0, "measuring": 25.0}
-"""Seconds of each, about, with an accelerator and without."""
+"""... and without."""
 LOSSES = ("crash_rate", "collision_rate", "capture_step")
 """Figures that a vehicle can make worse, of which adapting is to win back what it can."""
 ERRORS = 2.0

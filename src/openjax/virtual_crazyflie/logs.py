@@ -17,8 +17,9 @@ from openjax.flying.crtp import (
 from openjax.virtual_crazyflie.tables import LOG_NAMES, LOG_VARIABLES, Sensors
 
 MAX_BLOCKS = 16
+"""Of a vehicle, as on board."""
 MAX_VARIABLES = 128
-"""In all blocks together; both as on board."""
+"""In all blocks together, as on board."""
 
 
 @dataclass

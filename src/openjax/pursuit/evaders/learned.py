@@ -23,14 +23,17 @@ from openjax.pursuit.teams import of_team
 STEPS = 10
 """Steps that it remembers."""
 WIDTH = 64
+"""Units of each hidden layer."""
 LOOK_AHEAD = (0.15, 0.5, 0.3)
 """Seconds that the greedy evaders look ahead as which networks start, one after the other: a best
 response to who is caught out by a far-sighted one isn't found from a short-sighted one.
 """
 _OWN = 9
+"""Numbers of `features` that an evader knows of itself: place, velocity, greedy wish (3 each)."""
 _PURSUER = 16
+"""And of each pursuer: offset, two moves, velocity, thrust direction (3 each), distance."""
 _PILLAR = 4
-"""Numbers of each part of `features`."""
+"""And of each pillar: offset (2), distance, in use."""
 
 
 def learned_place(names: tuple[str, ...], kind: Int32[Array, "*worlds"]) -> Int32[Array, "*worlds"]:
