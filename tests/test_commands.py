@@ -19,7 +19,7 @@ import pytest
 import openjax
 from openjax.command_line import run_command
 from openjax.commands import benchmark, evaluate, train
-from openjax.evaluation.evaluator import FIELDS
+from openjax.evaluation.result_tables import FIELDS
 from openjax.learning import training_step
 from openjax.learning.training_step import make_phases
 from openjax.pursuit import SCENARIOS

@@ -24,7 +24,8 @@ from openjax.background import compile_ahead
 from openjax.baselines import METHODS as HEURISTICS
 from openjax.command_line import run_command
 from openjax.evaluation.episodes import summarise
-from openjax.evaluation.evaluator import layout_slots, record_of, repeat_task, stacked
+from openjax.evaluation.evaluator import layout_slots, repeat_task, stacked
+from openjax.evaluation.result_tables import record_of
 from openjax.files import read_json, to_plain, write_text
 from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings, RewardSettings, Task, scenario_task
 from openjax.store.policies import LoadedPolicy, load_policy

@@ -262,7 +262,7 @@ def _environment(command, game, loaded):
 
 def _show(command, results):
     """Print the tables and write the file: a record, a list of them, or such a list by policy."""
-    from openjax.evaluation.evaluator import results_table, spread_table
+    from openjax.evaluation.result_tables import results_table, spread_table
     from openjax.runs.words import unlike_the_papers
 
     console = output_console()

@@ -8,7 +8,8 @@ __getattr__, __dir__, __all__ = lazy_names(
     __name__,
     {
         "episodes": "EpisodeRecord Evaluation make_evaluate summarise",
-        "evaluator": "Evaluator layout_slots layout_tasks record_of",
+        "evaluator": "Evaluator layout_slots layout_tasks",
+        "result_tables": "record_of",
         "validation": "Validation selection_score uniform_tasks",
     },
 )

@@ -1,9 +1,8 @@
-"""Evaluation of policies on layouts and on validation tasks, as tables, records and
-trajectories.
+"""Evaluation of policies on layouts and on validation tasks: episodes in batches of one size, as
+records and trajectories.
 """
 
 import dataclasses
-import math
 import operator
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -11,32 +10,17 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from rich.table import Table
 
 from openjax.background import compile_ahead
 from openjax.evaluation.episodes import Evaluation, make_evaluate, summarise
 from openjax.evaluation.message_settings import MessageSettings
+from openjax.evaluation.result_tables import record_of
 from openjax.policy import Policy, PolicyParameters
 from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings, Scenario, Task, scenario_task
 from openjax.pursuit.statistics import EpisodeStatistics
 from openjax.pursuit.task import capture_radius
 from openjax.pursuit.teams import FAR
-from openjax.show.number_tables import numbers_table
 from openjax.show.trajectory import Trajectory
-
-FIELDS = (
-    "scenario",
-    "episodes",
-    "capture_rate",
-    "capture_step",
-    "slowest_capture_step",
-    "collision_rate",
-    "collision_parts",
-    "crash_rate",
-    "over_speed_rate",
-    "prediction_error",
-)
-"""What a record of an evaluation holds, in this order."""
 
 
 class Evaluator:
@@ -224,65 +208,3 @@ def layout_tasks(
     return {
         layout.name: repeat_task(scenario_task(settings, layout), episodes) for layout in scenarios
     }
-
-
-def record_of(scenario: str, episodes: int, summary: dict, extra: tuple[str, ...] = ()) -> dict:
-    """A summary as a record with exactly `FIELDS` (and `extra` ones); what isn't a number is
-    None.
-    """
-    values = {"scenario": scenario, "episodes": episodes, **summary}
-
-    def clean(value):
-        if isinstance(value, dict):
-            return {name: clean(entry) for name, entry in value.items()}
-        return None if isinstance(value, float) and not math.isfinite(value) else value
-
-    return {name: clean(values[name]) for name in (*FIELDS, *extra)}
-
-
-def results_table(title: str, rows: Sequence[dict], game: str) -> Table:
-    """Records as a table, below it a sentence on the game."""
-    heads = (
-        "epi-\nsodes",
-        "capture\nrate",
-        "capture\nstep",
-        "colli-\nsions",
-        "pillar/drone/\nbounds",
-        "crash\nrate",
-        "over-\nspeed",
-        "predicted\noff by, m",
-    )
-    table = numbers_table(title, ("scenario", *heads), caption=game)
-    for row in rows:
-        parts = row["collision_parts"]
-        table.add_row(
-            row["scenario"],
-            str(row["episodes"]),
-            f"{row['capture_rate']:.3f}",
-            f"{row['capture_step']:.0f}",
-            f"{row['collision_rate']:.4f}",
-            "/".join(
-                f"{parts[name]:.3f}".removeprefix("0") for name in ("pillar", "drone", "bounds")
-            ),
-            f"{row['crash_rate']:.3f}",
-            f"{row['over_speed_rate']:.4f}",
-            "–" if row["prediction_error"] is None else f"{row['prediction_error']:.4f}",
-        )
-    return table
-
-
-def spread_table(results: Sequence[Sequence[dict]]) -> Table:
-    """Mean and standard deviation over several policies' records of the same scenarios."""
-    title = f"Mean ± standard deviation of {len(results)} policies"
-    columns = (
-        ("capture_rate", "capture rate", ".3f"),
-        ("capture_step", "capture step", ".0f"),
-        ("collision_rate", "collision rate", ".4f"),
-        ("crash_rate", "crash rate", ".3f"),
-    )
-    table = numbers_table(title, ("scenario", *(label for _, label, _ in columns)))
-    for rows in zip(*results, strict=True):
-        values = [(np.array([row[name] for row in rows]), style) for name, _, style in columns]
-        cells = [f"{value.mean():{style}} ± {value.std(ddof=1):{style}}" for value, style in values]
-        table.add_row(rows[0]["scenario"], *cells)
-    return table
