@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import jax
 
 from openjax.vehicle.arena import Arena
+from openjax.vehicle.contacts import contact_acceleration
 from openjax.vehicle.mjx_body import make_world, mjx_step
 from openjax.vehicle.parameters import Vehicle
 from openjax.vehicle.rigid_body import rigid_step
 from openjax.vehicle.shapes import Active, Pillars, Team, Vector
 from openjax.vehicle.solids import (
     Surroundings,
-    contact_acceleration,
     encounters,
     place_solids,
     surroundings,

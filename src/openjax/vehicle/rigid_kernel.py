@@ -18,13 +18,12 @@ from jax.experimental.pallas import triton as pallas_triton
 from openjax.kernels.componentwise import evaluate, split
 from openjax.platform import on_platform, whole_blocks
 from openjax.vehicle.arena import Arena
+from openjax.vehicle.contacts import contact_acceleration, looped_contact_acceleration
 from openjax.vehicle.parameters import Vehicle
 from openjax.vehicle.rigid_body import euler_step
 from openjax.vehicle.solids import (
     Surroundings,
-    contact_acceleration,
     floor,
-    looped_contact_acceleration,
     other_drone,
     pillar,
     surroundings,
