@@ -13,7 +13,9 @@ from openjax.kernels.normalisation import normalise, normalised_layer
 from openjax.platform import can_compile_for_cuda
 
 MASKED = -1e4
-"""Added to the score of an entity that isn't there."""
+"""Added to the score of an entity that isn't there, whose weight is then zero in single precision;
+finite, since infinities less each other are no numbers.
+"""
 
 
 class SelfAttention(nn.Module):

@@ -44,6 +44,7 @@ def with_longer_history(
         kernel = encoder["self_1"]["kernel"][:inputs]
         zeros = jnp.zeros((more, kernel.shape[1]), kernel.dtype)
         kernel = jnp.concatenate([kernel[:place], zeros, kernel[place:]])
+        # to a multiple of eight, as the encoder pads what it observes
         kernel = jnp.pad(kernel, ((0, -kernel.shape[0] % 8), (0, 0)))
         encoder["self_1"] = {**encoder["self_1"], "kernel": kernel}
         return {**actor, "params": {**params, "encoder": encoder}}

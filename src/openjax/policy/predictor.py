@@ -36,6 +36,8 @@ class EvaderPredictor(nn.Module):
             kept = jax.nn.sigmoid(forget_gate + 1.0) * cell
             cell = kept + jax.nn.sigmoid(in_gate) * jnp.tanh(candidate)
             hidden = jax.nn.sigmoid(out_gate) * jnp.tanh(cell)
+        # small, so that a fresh predictor says what it is relative to: where the evader was last
+        # seen, or the arena's middle
         initial = nn.initializers.orthogonal(0.1)
         output = nn.Dense(3 * len(horizons), kernel_init=initial, name="output")(hidden)
         output = output.reshape(*output.shape[:-1], len(horizons), 3)

@@ -100,6 +100,8 @@ def narrowed_bounds(ranges: Sequence[VehicleRange], share) -> jax.Array:
     vehicle.
     """
     parameters = [find_parameter(entry.parameter)[1] for entry in ranges]
+    # about the nominal vehicle, not about the range's middle: a family needn't hold it in the
+    # middle
     none = np.array([[parameter.none] for parameter in parameters], np.float32)
     return none + share * (family_bounds(ranges) - none)
 
@@ -133,6 +135,7 @@ def draw_vehicles(
     bounds = family_bounds(ranges) if bounds is None else bounds
     owner = np.array([names.index(entry.parameter.partition(".")[0]) for entry in ranges])
     value_key, chosen_key, rare_key = jax.random.split(key, 3)
+    # one draw serves both widths: which of them holds is chosen afterwards
     share = jax.random.uniform(value_key, (number, len(ranges)))
     chosen = jax.random.randint(chosen_key, (number,), 0, len(names))
     # -1 is no effect's place: nothing of such a vehicle is out of the ordinary
