@@ -17,20 +17,27 @@ from typing import NamedTuple
 from openjax.flying.controller import Vector
 
 WINDOW = 1.5
-"""Over this time constant (s) is summed up what a constant and drag leave: a gentle drift takes
-about as long to set in."""
+"""What constant and drag leave is summed up over this time constant (s): a gentle drift takes about
+as long to set in.
+"""
 FORGETTING = 6.0
-"""Time constant (s) with which they are learnt: longer than the window, or they learn the drift."""
+"""Time constant (s) with which constant and drag are learnt: longer than the window, or they learn
+the drift.
+"""
 LEARNT = 4.0
-"""Before (s) sums say how badly they are known yet."""
+"""In the first of a flight (s) the sums don't count: they say how badly constant and drag are known
+yet.
+"""
 SPREAD = 0.05
 """Information that never fades, so that a vehicle at rest is taken to have no drag (m^2/s^2)."""
 FLOOR = 0.15
 """Smaller sums (m/s) are no drift, whatever the teammates' are: an attitude's error of .2 degrees
-that comes within the window accelerates by .05 m/s ..."""
+that comes within the window accelerates by .05 m/s.
+"""
 RATIO = 4.0
-"""... and none is one that isn't so many times their root mean square: of flights of 30 s without a
-drift, at most one in fifty was ended (`experiments.flying.observable`)."""
+"""Nor are sums that aren't so many times the teammates' root mean square: of flights of 30 s without
+a drift, at most one in fifty was ended (`experiments.flying.observable`).
+"""
 
 
 class Fit(NamedTuple):

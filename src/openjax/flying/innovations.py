@@ -58,12 +58,15 @@ TURN = Memory(1.0, 0.08)
 RATE = Memory(0.2, 1.5)
 """Mean difference of the gyroscope from the body rates that were sent (rad/s)."""
 SETTLED = 0.3
-"""Before (s) velocity isn't judged: until then it is learnt what thrust doesn't explain, drag, wind
-or a weight that isn't known ..."""
+"""Velocity isn't judged in a flight's first moments (s), in which it is learnt what thrust doesn't
+explain: drag, wind or a weight that isn't known.
+"""
 BIAS = 3.0
-"""... and then only with this time constant (s)."""
+"""From then on that is learnt with this time constant (s) only."""
 RECENT = 0.5
-"""For so long (s) the velocity is remembered that thrust explains, to fly on by it."""
+"""How long (s) it is remembered by how much the velocity left what thrust explains: a vehicle whose
+estimate is refused flies on without that.
+"""
 RATE_LAG = 0.04
 """Time constant of the rate loop (s)."""
 LONGEST = 0.025
