@@ -18,7 +18,7 @@ import pytest
 
 import openjax
 from openjax.command_line import run_command
-from openjax.commands import benchmark, evaluate, train
+from openjax.commands import benchmark, diagnose, evaluate, fly, train
 from openjax.evaluation.result_tables import FIELDS
 from openjax.learning import training_step
 from openjax.learning.training_step import make_phases
@@ -465,6 +465,8 @@ def wrong_layout(change):
             "unknown setting --episode; did you mean --episodes?",
         ),
         (benchmark, "--envs 0", "--envs is 0; it must be a whole number in"),
+        (diagnose, "{folder} --reference", "--reference needs at least one folder of flights"),
+        (fly, "--policy open --motion_capture nobody:poses", "no such MODULE:FUNCTION"),
     ],
 )
 def test_bad_input_is_one_line_and_status_2(

@@ -54,7 +54,10 @@ class Options:
 
 def main(arguments: Sequence[str]) -> int:
     """Run the command; the exit status is 0, or 2 if nothing could be diagnosed."""
-    return run(parse(Options, Options(cases=tyro.MISSING), arguments, PROGRAM))
+    options = parse(Options, Options(cases=tyro.MISSING), arguments, PROGRAM)
+    if "--reference" in arguments and not options.reference:
+        raise UserError("--reference needs at least one folder of flights before the change")
+    return run(options)
 
 
 def run(options: Options) -> int:

@@ -170,12 +170,12 @@ def prepare(arguments: Arguments) -> Prepared:
     settings = policy.settings.environment
     _check_numbers(arguments, len(scenario.pursuers), settings.num_pursuers)
     vehicle = load_vehicle_file(arguments.vehicle or settings.airframe)
+    session = _session(arguments)  # before the game, which takes its time to compile
     # a layout may have more pillars than the policy was trained with; it observes the nearest ones
     slots = max(settings.max_pillars, len(scenario.pillars))
     game = Game(policy, scenario_task(dataclasses.replace(settings, max_pillars=slots), scenario))
     game.airframe = airframe_of(vehicle.vehicle)
     uris = uris_of(arguments)
-    session = _session(arguments)
     state = flight_state(game, len(uris), arguments.safety)
     remarks = _remarks(arguments, game, vehicle)
     if arguments.policy is None and (line := default_policy_line(len(scenario.pursuers))):
