@@ -91,7 +91,9 @@ def hyperdrone_drones(options) -> dict:
     return {"drone_steps_per_second": rate(run, steps=3 * options.worlds * options.steps)}
 
 
-def game_steps(options, environment) -> dict:
+def game_steps(options, environment, restarts: bool = True) -> dict:
+    """With `restarts` as JaxMARL steps: each draws a new start, used or not."""
+    advance = environment.step if restarts else environment.step_env
     keys = jax.random.split(jax.random.key(0), options.worlds)
     state = jax.jit(jax.vmap(environment.reset))(keys)[1]
     actions = {
@@ -99,17 +101,17 @@ def game_steps(options, environment) -> dict:
     }
 
     def step(state):
-        observed, state, reward, *_ = jax.vmap(environment.step, (0, 0, None))(keys, state, actions)
+        observed, state, reward, *_ = jax.vmap(advance, (0, 0, None))(keys, state, actions)
         return state, sum(jnp.sum(leaf) for leaf in jax.tree.leaves((observed, reward)))
 
     run = jax.jit(lambda state: jax.lax.scan(lambda s, _: step(s), state, None, options.steps))
     return {"environment_steps_per_second": rate(run, state, steps=options.worlds * options.steps)}
 
 
-def jaxmarl_tag(options) -> dict:
+def jaxmarl_tag(options, restarts: bool = True) -> dict:
     import jaxmarl
 
-    return game_steps(options, jaxmarl.make("MPE_simple_tag_v3"))
+    return game_steps(options, jaxmarl.make("MPE_simple_tag_v3"), restarts)
 
 
 CASES = {
@@ -118,6 +120,10 @@ CASES = {
     "crazyflow, body rates": crazyflow_drones,
     "openjax, the game": lambda options: game_steps(options, PursuitMultiAgentEnv()),
     "JaxMARL, simple_tag": jaxmarl_tag,
+    "openjax, the game without restarts": lambda options: game_steps(
+        options, PursuitMultiAgentEnv(), restarts=False
+    ),
+    "JaxMARL, simple_tag without restarts": lambda options: jaxmarl_tag(options, restarts=False),
     "Brax's PPO, recovery": lambda options: recovery.brax_ppo(
         options.learning_steps, options.learning_worlds
     ),
