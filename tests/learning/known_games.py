@@ -25,7 +25,7 @@ SIZES = {
     "learners": 3,
     "num_envs": 32,
     "width": 64,
-    "ways": 6,
+    "minibatches": 4,
     "foresight": (4.0,),
     # of a narrower network, Adam's steps move the output less
     "learning_rate": 2e-3,

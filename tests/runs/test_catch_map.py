@@ -72,7 +72,9 @@ def test_evaders_learn_and_plan_in_the_cells_and_fly_again_from_their_file(tmp_p
         COMMAND,
         best_response=True,
         evaders_out=tmp_path / "evaders.npz",
-        learning=BestResponseSettings(learners=2, num_envs=2, rollout_length=2, total_steps=32),
+        learning=BestResponseSettings(
+            learners=2, num_envs=2, rollout_length=2, total_steps=32, minibatches=4
+        ),
         planner_share=0.5,
         planner_episodes=1,
         planning=PlannerSettings(plans=3, pieces=1, piece_steps=1, replan=5),
