@@ -117,7 +117,10 @@ def main() -> None:
         def fly(parameters, tasks, key, both=both):
             return both.fly(parameters, duel.start(tasks, key), key)
 
-        game.records_kept(name, fly, found, options.json)
+        if options.slots:
+            game.replanned_kept(name, both, found, options.json)
+        else:
+            game.records_kept(name, fly, found, options.json)
 
 
 if __name__ == "__main__":

@@ -53,18 +53,29 @@ def planners_of(options) -> dict[str, dict]:
     return {name: known[name] for name in options.only or known}
 
 
-def program(game: JudgedGame, settings: PlannerSettings, opponent: str | None):
-    """(parameters, tasks, key) -> statistics (B,), compiled by `jax.jit`."""
+def planner_of(game: JudgedGame, settings: PlannerSettings, opponent: str | None) -> Planner:
+    """One that tries what a learned evader would do, if its settings say so."""
     environment = game.environment
     if opponent and settings.own_rule:
         own = game.options
         environment = make_environment(environment.settings, own.vehicle, own.effects, opponent)
-    duel = Duel(environment, game.loaded.policy)
+    return Planner(settings, Duel(environment, game.loaded.policy))
+
+
+def program(planner: Planner):
+    """(parameters, tasks, key) -> statistics (B,), compiled by `jax.jit`."""
 
     def fly(parameters, tasks, key):
-        return Planner(settings, duel).fly(parameters, duel.start(tasks, key), key)
+        return planner.fly(parameters, planner.duel.start(tasks, key), key)
 
     return jax.jit(fly)
+
+
+def fly_in_slots(game: JudgedGame, planners: dict[str, Planner]) -> None:
+    """One after the other, as a CPU does it."""
+    found = {**game.flown, "records": [], "seconds": {}}
+    for name, planner in planners.items():
+        game.replanned_kept(name, planner, found, game.options.json)
 
 
 def main() -> None:
@@ -76,10 +87,16 @@ def main() -> None:
     game = judged_game(options)
     key = jax.random.key(options.seed)
     arguments = (game.loaded.parameters, game.tasks, key)
-    ready = {}
-    for name, changes in planners_of(options).items():
-        settings = PlannerSettings(**changes)
-        ready[name] = compile_ahead(program(game, settings, options.opponent), *arguments)
+    planners = {
+        name: planner_of(game, PlannerSettings(**changes), options.opponent)
+        for name, changes in planners_of(options).items()
+    }
+    if options.slots:
+        fly_in_slots(game, planners)
+        return
+    ready = {
+        name: compile_ahead(program(planner), *arguments) for name, planner in planners.items()
+    }
     found = {**game.flown, "records": [], "seconds": {}, "planners": {}}
     for name, compiled in ready.items():
         run = compiled()

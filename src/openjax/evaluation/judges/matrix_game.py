@@ -51,6 +51,17 @@ class TeamPlans:
     by_policy: jax.Array  # (..., P, N) bool, flies as the policy does
 
 
+@struct.dataclass
+class BothPlanned:
+    """B worlds, and what both sides have planned in them."""
+
+    world: World
+    prepared: Any
+    """What `Ways` has worked out for each."""
+    plan: jax.Array  # (B, P, 3), the evader's
+    team: TeamPlans
+
+
 VelocityFlight = Callable[[Observation, PursuitState, jax.Array], jax.Array]
 """observation, state of one world and desired velocities (N, 3) m/s -> actions (N, 4)."""
 
@@ -103,27 +114,34 @@ class MatrixGame:
 
     def fly(self, parameters: PolicyParameters, start: World, key: jax.Array) -> EpisodeStatistics:
         """Statistics (B,) of one episode from each of B starts."""
-        settings = self.settings
-        game = self.duel.environment.settings
-        number = start[1].step.size
-        shape = (number, settings.pieces, game.num_pursuers)
-        team = TeamPlans(jnp.zeros((*shape, 3)), jnp.ones(shape, bool))
-        plan = jnp.zeros((number, settings.pieces, 3))
-        prepared = jax.vmap(self.ways.prepare)(start[1].task)
 
         def one(carry, key):
-            world, plan, team = carry
-            evader_key, team_key = jax.random.split(key)
-            plans = self._planner.candidates(evader_key, plan)  # (B, E, P, 3)
-            teams = self._team_candidates(team_key, team)  # (B, T, P, ...)
-            plan, team = self._decide(parameters, world, prepared, plans, teams)
-            now = jax.tree.map(lambda leaf: leaf[:, 0], team)
-            act = self._act(parameters, prepared, now)
-            world = self.duel.fly_actions(act, world, plan[:, 0], settings.replan)
-            return (world, plan, team), None
+            return self.replan(parameters, carry, key), None
 
-        keys = jax.random.split(key, game.episode_length // settings.replan)
-        return jax.lax.scan(one, (start, plan, team), keys)[0][0][1].statistics
+        episode = self.duel.environment.settings.episode_length
+        keys = jax.random.split(key, episode // self.settings.replan)
+        return jax.lax.scan(one, self.begin(start), keys)[0].world[1].statistics
+
+    def begin(self, start: World) -> BothPlanned:
+        """Worlds (B, ...) at the start of an episode, and plans that are none."""
+        game = self.duel.environment.settings
+        shape = (start[1].step.size, self.settings.pieces, game.num_pursuers)
+        team = TeamPlans(jnp.zeros((*shape, 3)), jnp.ones(shape, bool))
+        prepared = jax.vmap(self.ways.prepare)(start[1].task)
+        return BothPlanned(start, prepared, jnp.zeros((*shape[:2], 3)), team)
+
+    def replan(
+        self, parameters: PolicyParameters, carry: BothPlanned, key: jax.Array
+    ) -> BothPlanned:
+        """The same after both have planned once and flown until the next time."""
+        evader_key, team_key = jax.random.split(key)
+        plans = self._planner.candidates(evader_key, carry.plan)  # (B, E, P, 3)
+        teams = self._team_candidates(team_key, carry.team)  # (B, T, P, ...)
+        plan, team = self._decide(parameters, carry.world, carry.prepared, plans, teams)
+        now = jax.tree.map(lambda leaf: leaf[:, 0], team)
+        act = self._act(parameters, carry.prepared, now)
+        world = self.duel.fly_actions(act, carry.world, plan[:, 0], self.settings.replan)
+        return carry.replace(world=world, plan=plan, team=team)
 
     def _decide(self, parameters, world, prepared, plans, teams):
         """(B, P, 3) and TeamPlans (B, P, ...): what both sides choose in worlds (B, ...) of plans

@@ -13,6 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from flax import struct
 
 from openjax.evaluation.judges.duel import Duel, World
 from openjax.evaluation.judges.settings import PlannerSettings
@@ -21,6 +22,14 @@ from openjax.pursuit import EpisodeStatistics, PursuitState
 
 SPREAD = 0.6
 """How far the pieces of a refined plan lead aside, a share of their length: some 40 degrees."""
+
+
+@struct.dataclass
+class Planned:
+    """B worlds, and what their evaders have planned."""
+
+    world: World
+    plan: jax.Array  # (B, pieces, 3) shares of the speed
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,19 +57,25 @@ class Planner:
         """The states (B, ...) at the end of one episode from each of B starts, and what `keep` says
         of those after each time it plans (T, ...).
         """
-        settings = self.settings
-        plan = jnp.zeros((start[1].step.size, settings.pieces, 3))
 
         def one(carry, key):
-            world, plan = carry
-            plan = self._best(parameters, world, plan, key)
-            world = self.duel.fly(parameters, world, plan[:, 0], settings.replan)
-            return (world, plan), keep(world[1])
+            carry = self.replan(parameters, carry, key)
+            return carry, keep(carry.world[1])
 
         episode = self.duel.environment.settings.episode_length
-        keys = jax.random.split(key, episode // settings.replan)
-        ((_, state), _), kept = jax.lax.scan(one, (start, plan), keys)
-        return state, kept
+        keys = jax.random.split(key, episode // self.settings.replan)
+        end, kept = jax.lax.scan(one, self.begin(start), keys)
+        return end.world[1], kept
+
+    def begin(self, start: World) -> Planned:
+        """Worlds (B, ...) at the start of an episode, and plans that are none."""
+        return Planned(start, jnp.zeros((start[1].step.size, self.settings.pieces, 3)))
+
+    def replan(self, parameters: PolicyParameters, carry: Planned, key: jax.Array) -> Planned:
+        """The same after it has planned once and flown until the next time."""
+        plan = self._best(parameters, carry.world, carry.plan, key)
+        world = self.duel.fly(parameters, carry.world, plan[:, 0], self.settings.replan)
+        return Planned(world, plan)
 
     def _best(self, parameters, world, plan, key):
         """(B, pieces, 3) the plan of those tried that promises most in each world (B, ...)."""
