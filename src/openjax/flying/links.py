@@ -1,5 +1,5 @@
-"""The vehicles' links in a process of their own, so that `cflib`'s threads never keep the loop
-waiting.
+"""The vehicles' links in a process of their own (`openjax.flying.links_process`), so that `cflib`'s
+threads never keep the loop waiting: the loop's end of them.
 
 `cflib` has two Python threads per vehicle. In one interpreter with the loop they take it from each
 other, for milliseconds in one tick of a hundred. Here poses come up as they arrive, a record each;
@@ -8,70 +8,37 @@ one had left. Everything else (arming, recording, the samples at the end) is a c
 """
 
 import contextlib
-import functools
-import gc
 import math
 import multiprocessing
 import os
 import select
 import socket
-import struct
-import sys
 import threading
 import time
 from collections.abc import Sequence
-from typing import Any, NamedTuple
 
 import numpy as np
 
 from openjax.errors import UserError
-from openjax.flying import real_time
-from openjax.flying.board import SILENCE, Board, Role, say, stand_alone, start_deaf
-from openjax.flying.controller import Pose, numbers_of, pose_of
-from openjax.flying.guard import CHECK
+from openjax.flying.board import SILENCE, Board, Role, start_deaf
+from openjax.flying.controller import Pose, pose_of
+from openjax.flying.links_process import (
+    POSE_RECORD,
+    SENT_RECORD,
+    SET_POINT_RECORD,
+    SET_POINTS_NUMBER,
+    Connection,
+    Ends,
+    serve,
+)
 from openjax.flying.set_point import SetPoint
 from openjax.flying.state import PoseSample, State
-from openjax.flying.swarm import Member, Samples, Swarm
-from openjax.flying.takeover import disarm, fly_down
+from openjax.flying.swarm import Samples
 
 STARTING = 20.0
 """s until its interpreter has loaded `cflib`, on a busy machine."""
 CLOSING = 2.0
 """s that it has to disarm."""
-_POSE = struct.Struct("<iI19d")
-"""Vehicle, supervisor; arrival, voltage, specific force (NaN: unknown), and of the pose time,
-position, velocity, quaternion, body rates.
-"""
-_NO_FORCE = (math.nan,) * 3
-_NUMBER = struct.Struct("<q")
-"""Number of the set-points, before all of them."""
-_SET_POINT = struct.Struct("<i4d")
-"""The five fields of a `SetPoint`."""
-_SENT = struct.Struct("<qd")
-"""Number of the set-points, when the last one had left."""
-
-
-class Connection(NamedTuple):
-    """What the links' process connects to, and how."""
-
-    uris: tuple[str, ...]
-    body_logs: int
-    watchdog: bool
-    timeout: float
-    """For each vehicle (s)."""
-
-
-class Ends(NamedTuple):
-    """The links' process' ends of all that leads to the loop."""
-
-    contacts: Any
-    """Shared memory: when anything was heard of each vehicle (s)."""
-    stream: socket.socket
-    """Poses go up."""
-    commands: socket.socket
-    """Set-points come down."""
-    control: Any
-    """A pipe for all else, by calls."""
 
 
 class LinksGone(UserError):
@@ -135,7 +102,7 @@ class Links:
         connection = Connection(self._uris, self._body_logs, self._watchdog, timeout)
         ends = Ends(self._contacts, stream, commands, control)
         arguments = (connection, ends, self.board, os.getpid(), self._state)
-        self._process = context.Process(target=_serve, args=arguments, name="openjax links")
+        self._process = context.Process(target=serve, args=arguments, name="openjax links")
         start_deaf(self._process)
         for end in (stream, commands, control):
             end.close()
@@ -186,9 +153,11 @@ class Links:
                 return
             # a stream keeps no records apart: the last one may have come in part
             data = self._rest + data
-            whole = len(data) - len(data) % _POSE.size
+            whole = len(data) - len(data) % POSE_RECORD.size
             self._rest = data[whole:]
-            for vehicle, supervisor, arrival, voltage, *numbers in _POSE.iter_unpack(data[:whole]):
+            for vehicle, supervisor, arrival, voltage, *numbers in POSE_RECORD.iter_unpack(
+                data[:whole]
+            ):
                 force = tuple(numbers[:3])
                 self._samples[vehicle] = PoseSample(
                     own=pose_of(numbers[3:]),
@@ -226,13 +195,13 @@ class Links:
         if self.board.pilot is not Role.LOOP:
             raise LinksGone("another process flies")
         self._count += 1
-        packed = b"".join(_SET_POINT.pack(*s) for s in set_points)
+        packed = b"".join(SET_POINT_RECORD.pack(*s) for s in set_points)
         try:
-            self._commands.send(_NUMBER.pack(self._count) + packed)
+            self._commands.send(SET_POINTS_NUMBER.pack(self._count) + packed)
             number = 0
             # an answer that came too late for its tick may still be there
             while number != self._count:
-                number, sent = _SENT.unpack(self._commands.recv(_SENT.size))
+                number, sent = SENT_RECORD.unpack(self._commands.recv(SENT_RECORD.size))
         except OSError as error:
             raise LinksGone("the links' process is gone or stuck") from error
         return sent
@@ -283,110 +252,3 @@ class Links:
         self.kill()
         for end in (self._stream, self._commands, self._control):
             end.close()
-
-
-def _serve(
-    connection: Connection, ends: Ends, board: Board, parent: int, state: State | None
-) -> None:
-    """The links' process. Should the loop stop, it lands the vehicles; with nothing in the air it
-    ends with the loop.
-    """
-    stand_alone()
-    board.enter(Role.LINKS)
-    sys.setswitchinterval(5e-4)  # cflib's threads and the one that passes on set-points
-    threading.excepthook = _say_nothing  # of cflib's threads, when their socket goes
-    real_time.hurry()
-    swarm = Swarm(connection.uris, connection.body_logs, connection.watchdog)
-    threading.Thread(
-        target=_watch, args=(swarm, board, parent, state), daemon=True, name="watch"
-    ).start()
-    _pass_on(swarm, ends.contacts, ends.stream)
-    try:
-        swarm.connect(connection.timeout)
-    except Exception as error:  # whatever cflib raises, too
-        ends.control.send((" ".join(str(error).split()) or type(error).__name__, ()))
-        os._exit(0)  # cflib's threads may hang
-    # a search for garbage would keep poses and set-points waiting for milliseconds
-    gc.collect()
-    gc.disable()
-    threading.Thread(
-        target=_send_on, args=(swarm, ends.commands, board), daemon=True, name="set-points"
-    ).start()
-    ends.control.send((None, swarm.pose_blocks()))
-    with contextlib.suppress(EOFError, OSError):
-        _answer(swarm, ends.control, board)
-    threading.Event().wait()  # the loop is gone: the watch ends the process
-
-
-def _say_nothing(_) -> None:
-    """In place of the traceback of a thread."""
-
-
-def _pass_on(swarm: Swarm, contacts, stream: socket.socket) -> None:
-    """Have all poses go up the stream as they arrive, and when anything was heard of a vehicle into
-    `contacts`.
-    """
-    lock = threading.Lock()
-    stream.setblocking(False)
-
-    def pass_on(vehicle: int, member: Member, new_pose: bool) -> None:
-        contacts[vehicle] = member.last_contact
-        if new_pose:
-            force = member.sample().force or _NO_FORCE
-            numbers = (member.arrival, member.voltage, *force, *numbers_of(member.pose))
-            record = _POSE.pack(vehicle, member.supervisor, *numbers)
-            # nobody reads any more: then there is no loop to tell
-            with lock, contextlib.suppress(OSError):
-                stream.send(record)
-
-    for i, member in enumerate(swarm.members):
-        member.listener = functools.partial(pass_on, i, member)
-
-
-def _answer(swarm: Swarm, control, board: Board) -> None:
-    """Answer the loop's calls until it closes the links, which ends the process."""
-    while True:
-        number, name, arguments = control.recv()
-        disarming = name in ("disarm", "close")
-        result = disarm(swarm, board, Role.LINKS) if disarming else getattr(swarm, name)(*arguments)
-        if number:
-            control.send((number, result))
-        if name == "close":
-            os._exit(0)
-
-
-def _send_on(swarm: Swarm, commands: socket.socket, board: Board) -> None:
-    """Pass on set-points as they come, as long as it's the loop that flies."""
-    while True:
-        try:
-            data = commands.recv(1 << 12)
-            (number,) = _NUMBER.unpack_from(data)
-            if board.pilot is not Role.LOOP:
-                return
-            packed = _SET_POINT.iter_unpack(data[_NUMBER.size :])
-            sent = swarm.send([SetPoint._make(numbers) for numbers in packed])
-            commands.send(_SENT.pack(number, sent))
-        except (OSError, struct.error):
-            return
-
-
-def _watch(swarm: Swarm, board: Board, parent: int, state: State | None) -> None:
-    """Beat; land for a loop that is silent; end the process once the loop's has and nothing
-    flies.
-    """
-    while True:
-        time.sleep(CHECK)
-        now = time.perf_counter()
-        board.beat(Role.LINKS, now)
-        silent = board.silent(Role.LOOP, now)
-        left = board.pilot is Role.LINKS or (board.pilot is Role.LOOP and silent > board.silence)
-        if left and board.flying and state is not None:
-            say(
-                f"openjax fly: the loop, heard {silent:.2f} s ago, left all vehicles to the links' "
-                "process"
-            )
-            fly_down(board, Role.LINKS, swarm, state)
-        if os.getppid() != parent and not board.flying:
-            if board.armed:
-                disarm(swarm, board, Role.LINKS)
-            os._exit(1)
