@@ -6,7 +6,8 @@ import functools
 
 import numpy as np
 
-from experiments.diagnosis import cases, effects, measure, plant, sensors, unknowns, vehicle
+from experiments.diagnosis import cases, effects, forces, measure, sensors, unknowns, vehicle
+from experiments.diagnosis.firmware import SAMPLE
 from experiments.diagnosis.fleet import VOCABULARY
 
 HIDDEN = 0.5  # floors; a cause that shows less can't be asked for
@@ -24,7 +25,7 @@ def floors(fleet, i, turbulence):
     left = turbulence.copy()
     if "m" in spec["sensors"]["channels"]:
         samples = len(fleet.flown["motor"])
-        lasts = [round(r["t"][-1] / plant.SAMPLE) for r in rows]
+        lasts = [round(r["t"][-1] / SAMPLE) for r in rows]
         both = np.stack([measure.motors_of_log(r, samples) for r in rows], axis=-1)
         logged = np.min(
             [fleet.replayed(i, fleet.parameters, m, np.array(lasts)) for m in both], axis=0
@@ -131,9 +132,9 @@ def scale_stands_in(fleet, i, name, squares, floor):
     demands = []
     for p in (fleet.parameters, without):
         p = {k: x[..., c] for k, x in p.items()}
-        active = effects.Active(p, vehicle.nominal_parameters([fleet.told[j] for j in c]))
+        active = forces.Active(p, vehicle.nominal_parameters([fleet.told[j] for j in c]))
         demands.append(
-            [effects.motor_demand(p, active, *now) for now in zip(m, voltage, load, strict=True)]
+            [forces.motor_demand(p, active, *now) for now in zip(m, voltage, load, strict=True)]
         )
     true, plain = np.array(demands)
     # on the command, so that the rotors' speeds at the start of a window are those that flew

@@ -10,6 +10,7 @@ from experiments.diagnosis import (
     cases,
     effects,
     garbage,
+    injection,
     measure,
     plant,
     real,
@@ -91,7 +92,7 @@ class Fleet:
             for i, cause in enumerate(own):
                 rng = cases.case_rng(self.seed, self.column, spec["number"], 2, i)
                 if cause["effect"] in VOCABULARY:
-                    said.append(effects.apply(cause, p, columns, scratch, rng))
+                    said.append(injection.inject(cause, p, columns, scratch, rng))
                 else:
                     strangers.setdefault(cause["effect"], []).append((columns, cause))
                     said.append({"strength": cause["size"], "unit": cause["unit"]})

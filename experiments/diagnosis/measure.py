@@ -16,7 +16,9 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 
 from experiments.diagnosis import vehicle as v
-from experiments.diagnosis.plant import PER_TICK, SAMPLE, Body, Firmware
+from experiments.diagnosis.body import Body
+from experiments.diagnosis.firmware import SAMPLE, Firmware
+from experiments.diagnosis.plant import PER_TICK
 from experiments.diagnosis.sensors import GROUPS, at, smooth_derivative
 
 LONG, SHORT, TURN = 125, 25, 50  # samples of 2 ms

@@ -1,25 +1,24 @@
-"""The plant: quadrotors at 1 kHz under a firmware rate loop at 500 Hz with its filters and an
-off-board controller.
+"""The plant: vehicles in the air under commands from anywhere, or along references.
 
-Bodies are integrated as one batch (NumPy, body index last). `Body` is the physics alone; `measure`
-steps it over short windows. `Flight` is what flies: body, firmware, battery, link and the poses as
-they are seen, 2 ms at a time, under commands from anywhere. `fly` commands it with the exam's
-controllers along references and returns the true motion. Euler angles appear nowhere in the
-physics; integration is semi-implicit with a second-order position.
+`Flight` is what flies: body (1 kHz), firmware (500 Hz), battery, link and the poses as they are
+seen, 2 ms at a time. `fly` commands it with the exam's controllers along references and returns the
+true motion. Arrays have the body index last.
 """
 
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from experiments.diagnosis import effects, vehicle
+from experiments.diagnosis import forces, vehicle
+from experiments.diagnosis.body import DT, Battery, Body
 from experiments.diagnosis.controllers import Controllers
+from experiments.diagnosis.firmware import SAMPLE, Firmware
 from experiments.diagnosis.unknowns import Unknowns
 
-DT = 0.001
-SAMPLE = 0.002  # s, at which the truth is kept and the rate loop runs
-PER_TICK = 5  # samples in a tick of the off-board controller, 10 ms
-CLEARANCE = 0.015  # m, between the body and the floor or the ceiling: less is a crash
+PER_TICK = 5
+"""Samples in a tick of the off-board controller, 10 ms."""
+CLEARANCE = 0.015
+"""Metres between a body and the floor or the ceiling: less is a crash."""
 
 
 @dataclass
@@ -38,191 +37,6 @@ class Batch:
     )  # (K, B) ms at which the command of tick k reaches the vehicle; >= 10**8: lost
     air: dict  # see `sensors.draw_air`
     unknowns: dict = field(default_factory=dict)  # site -> [(columns, cause), …], see `unknowns`
-
-
-class Filter:
-    """Second-order Butterworth low-pass of (n, B) signals at 500 Hz; `cut` (B,) Hz, 0 lets
-    everything through.
-    """
-
-    def __init__(self, cut, rows, start):
-        on = cut > 0
-        k = np.tan(np.pi * np.where(on, cut, 1.0) * SAMPLE)
-        scale = 1.0 / (1.0 + np.sqrt(2.0) * k + k * k)
-        self.b0 = np.where(on, k * k * scale, 1.0)
-        self.b1, self.b2 = (np.where(on, c * k * k * scale, 0.0) for c in (2, 1))
-        self.a1 = np.where(on, 2 * (k * k - 1) * scale, 0.0)
-        self.a2 = np.where(on, (1 - np.sqrt(2.0) * k + k * k) * scale, 0.0)
-        self.any = bool(on.any())
-        self.one = np.broadcast_to(start, (rows, len(cut))) * (1 - self.b0)
-        self.two = np.broadcast_to(start, (rows, len(cut))) * (self.b2 - self.a2)
-
-    def __call__(self, x):
-        if not self.any:
-            return x
-        y = self.b0 * x + self.one
-        self.one = self.b1 * x - self.a1 * y + self.two
-        self.two = self.b2 * x - self.a2 * y
-        return y
-
-
-class Firmware:
-    """Rate loop of the firmware at 500 Hz: filters of gyroscope and derivative, PID in counts,
-    mixer.
-    """
-
-    def __init__(self, p, gyro, integral=None):
-        self.p = p
-        count = gyro.shape[1]
-        self.limit = vehicle.INTEGRAL_LIMIT[:, None]
-        self.integral = np.zeros((3, count)) if integral is None else integral.copy()
-        self.gyro_filter = Filter(p["gyro_cut"], 3, gyro)
-        self.slope_filter = Filter(p["derivative_cut"], 3, 0.0)
-        self.keep = np.where(
-            p["d_filter"] > 0, np.exp(-SAMPLE / np.maximum(p["d_filter"], 1e-6)), 0.0
-        )
-        self.slow = bool(self.keep.any())
-        self.previous, self.slope = gyro.copy(), np.zeros((3, count))
-
-    def __call__(self, command, gyro):
-        """Motor commands (4, B) from the command in force (4, B) and the filtered gyroscope (3,
-        B).
-        """
-        p = self.p
-        error = np.rad2deg(command[1:] - gyro)
-        self.integral = np.minimum(
-            np.maximum(self.integral + SAMPLE * error, -self.limit), self.limit
-        )
-        slope = self.slope_filter(np.rad2deg(self.previous - gyro) / SAMPLE)
-        self.slope = self.keep * self.slope + (1 - self.keep) * slope if self.slow else slope
-        self.previous = gyro
-        return vehicle.mix(
-            command[0], p["kp"] * error + p["ki"] * self.integral + p["kd"] * self.slope
-        )
-
-
-class Body:
-    """Rotors, forces and the rigid body of a batch; state position, velocity, rates (3, B), q,
-    rotor (4, B).
-    """
-
-    def __init__(self, p, neutral, position, velocity, q, rates, rotor):
-        self.p, self.active = p, effects.Active(p, neutral)
-        self.position = position
-        self.velocity = velocity
-        self.q = q
-        self.rates = rates
-        self.rotor, self.drive, self.specific = rotor, rotor.copy(), np.zeros_like(rates)
-        self.count = rates.shape[1]
-        self.wake = bool(np.any(p["wake"] != 0))
-        self.gyroscopes = bool(np.any(p["propeller_inertia"] != 0))
-        self.inverse = np.moveaxis(np.linalg.inv(np.moveaxis(p["inertia"], 2, 0)), 0, 2)
-        self.diagonal = not np.any(p["inertia"][~np.eye(3, dtype=bool)])
-        self.principal = p["inertia"][np.arange(3), np.arange(3)]
-        self.arm_x = vehicle.ROTOR_X[:, None] - p["com"][0]
-        self.arm_y = vehicle.ROTOR_Y[:, None] - p["com"][1]
-        self.up, self.down = 1 - np.exp(-DT / p["tau_up"]), 1 - np.exp(-DT / p["tau_down"])
-        self.second = np.where(
-            p["tau_second"] > 0, 1 - np.exp(-DT / np.maximum(p["tau_second"], 1e-4)), 1.0
-        )
-        self.lifts = p["thrust_constant"] * p["rotor_gain"]
-        self.reacts = p["torque_ratio"] * p["torque_gain"] * vehicle.SPIN[:, None] * self.lifts
-        self.zero = np.zeros(self.count)
-
-    def step(
-        self, m, voltage, load, gust_force, gust_torque, slow, others=(), unknowns=None, time=0.0
-    ):
-        """One millisecond under motor commands m (4, B); `others` are positions (3, B) of vehicles
-        that may fly above.
-        """
-        p = self.p
-        zero = self.zero
-        u = effects.motor_demand(p, self.active, m, voltage, load)
-        if unknowns:
-            unknowns.look(self.position, self.q, self.velocity, self.rates, m, voltage)
-            u = unknowns.motors(u, time)
-        before = self.rotor
-        self.drive = self.drive + self.second * (vehicle.MAX_SPEED * np.sqrt(u) - self.drive)
-        share = np.where(self.drive > self.rotor, self.up, self.down)
-        self.rotor = self.rotor + share * (self.drive - self.rotor)
-        squared = self.rotor * self.rotor
-        spinning = self.gyroscopes and p["propeller_inertia"] * vehicle.SPIN[:, None]
-        thrust = self.lifts * squared * effects.surface_gain(p, self.active, self.position, self.q)
-        moment = np.stack(
-            [
-                (self.arm_y * thrust).sum(0),
-                -(self.arm_x * thrust).sum(0),
-                (self.reacts * squared).sum(0),
-            ]
-        )
-        force, torque = effects.air_forces(
-            p,
-            self.active,
-            self.q,
-            self.velocity,
-            self.rates,
-            self.rotor,
-            thrust,
-            self.position,
-            slow,
-        )
-        force[2] += thrust.sum(axis=0)
-        outside = gust_force
-        for other in others if self.wake else ():
-            pull, gradient = effects.wake_force(p, self.position, other)
-            outside = outside + np.stack([zero, zero, pull])
-            tilting = np.stack([gradient[1], -gradient[0], zero])
-            torque = torque + vehicle.rotate_back(self.q, tilting) * vehicle.ARM**2
-        force = force + vehicle.rotate_back(self.q, outside)
-        torque = torque + moment + gust_torque
-        if unknowns:
-            more_force, more_torque = unknowns.wrench(self.q, time)
-            force = force + more_force
-            torque = torque + more_torque
-        if (
-            self.gyroscopes
-        ):  # what speeds a rotor up turns the body; spinning rotors resist being tilted
-            spun = (spinning * self.rotor).sum(0)
-            torque = torque + np.stack(
-                [
-                    self.rates[1] * spun,
-                    -self.rates[0] * spun,
-                    (spinning * (self.rotor - before)).sum(0) / DT,
-                ]
-            )
-        specific = force / p["mass"]
-        accel = vehicle.rotate(self.q, specific)
-        accel[2] -= vehicle.GRAVITY
-        if self.diagonal:
-            turning = (
-                torque - vehicle.cross(self.rates, self.principal * self.rates)
-            ) / self.principal
-        else:
-            momentum = np.einsum("ijb,jb->ib", p["inertia"], self.rates)
-            turning = np.einsum(
-                "ijb,jb->ib", self.inverse, torque - vehicle.cross(self.rates, momentum)
-            )
-        self.rates = self.rates + DT * turning
-        self.position = self.position + DT * self.velocity + 0.5 * DT * DT * accel
-        self.velocity = self.velocity + DT * accel
-        self.q = vehicle.turn(self.q, self.rates, DT)
-        self.specific = specific
-
-
-class Battery:
-    """Voltage (B,) V: open-circuit voltage falls with the charge used, the terminals sag with the
-    current.
-    """
-
-    def __init__(self, air, hover):
-        self.air, self.used, self.load = air, np.zeros(len(hover)), hover.copy()
-
-    def step(self, m, dt):
-        current = (m * np.sqrt(m)).mean(axis=0)
-        self.used = self.used + dt * current
-        self.load = self.load + (dt / 0.04) * (current - self.load)
-        air = self.air
-        return air["open_voltage"] - air["discharge"] * self.used - air["resistance"] * self.load
 
 
 def received(arrival, steps):
@@ -415,7 +229,7 @@ def fly(batch):
                 body.rates[:, dead], body.q[:, dead] = 0.0, np.array([[1.0], [0], [0], [0]])
         flight.look()
         specific = (
-            effects.seen_by_accelerometer(p, body.specific, body.rates) if lever else body.specific
+            forces.seen_by_accelerometer(p, body.specific, body.rates) if lever else body.specific
         )
         now = {"rates": body.rates, "specific": specific, "gyro": flight.gyro, "rotor": body.rotor}
         now |= {

@@ -19,8 +19,10 @@ import numpy as np
 from experiments.diagnosis import cases, fleet, measure, sensors
 from experiments.diagnosis import vehicle as v
 from experiments.diagnosis.answer_key import HIDDEN, accepted
+from experiments.diagnosis.body import Battery
+from experiments.diagnosis.firmware import SAMPLE, Filter
 from experiments.diagnosis.generate import case_parser, in_processes, write_answers
-from experiments.diagnosis.plant import KEPT, POSE, SAMPLE, Battery, Filter
+from experiments.diagnosis.plant import KEPT, POSE
 from experiments.flying.single_thread import use_single_thread
 
 PATHS = ("circle", "eight", "rocking", "yawing")

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.signal import butter, lfilter, lfilter_zi
 
 from experiments.diagnosis import unknowns, vehicle
-from experiments.diagnosis.plant import SAMPLE
+from experiments.diagnosis.firmware import SAMPLE
 
 KINDS = ("white", "coloured", "filtered", "vibrating", "quantised", "radio")
 STRANGERS = ("estimator", "stale")

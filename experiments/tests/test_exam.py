@@ -9,12 +9,15 @@ from experiments.diagnosis import (
     effects,
     garbage,
     generate,
+    injection,
     measure,
     plant,
     sensors,
     unknowns,
     vehicle,
 )
+from experiments.diagnosis.body import Body
+from experiments.diagnosis.firmware import Filter
 
 pytestmark = pytest.mark.slow
 
@@ -27,7 +30,7 @@ def body(parameters, q=None, velocity=None, rates=None, speed=0.0):
     q = np.tile([[1.0], [0], [0], [0]], (1, count)) if q is None else q
     zero = np.zeros((3, count))
     neutral = vehicle.nominal_parameters([told()] * count)
-    return plant.Body(
+    return Body(
         parameters,
         neutral,
         np.array([[0.0], [0], [1.0]]) + zero,
@@ -82,7 +85,7 @@ def test_rotors_follow_a_step_with_their_lag_and_hover_carries_the_weight():
 def test_each_effect_pushes_as_its_formula_says():
     def specific(effect, size, form, shape=(0.25,) * 8, **state):
         p = vehicle.nominal_parameters([told()])
-        effects.apply(
+        injection.inject(
             {"effect": effect, "form": form, "size": size, "shape": list(shape)}, p, np.array([0])
         )
         b = body(p, speed=vehicle.MAX_SPEED * np.sqrt(told().hover), **state)
@@ -106,11 +109,11 @@ def test_each_effect_pushes_as_its_formula_says():
 def test_the_firmware_filter_is_a_butterworth_and_starts_at_rest():
     rng = np.random.default_rng(0)
     signal = rng.standard_normal((200, 3, 1))
-    own = plant.Filter(np.array([80.0]), 3, np.zeros((3, 1)))
+    own = Filter(np.array([80.0]), 3, np.zeros((3, 1)))
     got = np.stack([own(x) for x in signal])
     want = lfilter(*butter(2, 80.0, fs=500.0), signal, axis=0)
     np.testing.assert_allclose(got, want, atol=1e-12)
-    constant = plant.Filter(np.array([30.0]), 3, np.full((3, 1), 2.0))
+    constant = Filter(np.array([30.0]), 3, np.full((3, 1), 2.0))
     np.testing.assert_allclose(constant(np.full((3, 1), 2.0)), 2.0)
 
 

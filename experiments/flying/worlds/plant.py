@@ -2,14 +2,14 @@
 the simulator.
 
 A game needs the next state before it knows the next command, a speed limit after each tick, solid
-things and the wakes of a whole team: `exam.plant.Flight` flies all of it, one tick at a time.
+things and the wakes of a whole team: `diagnosis.plant.Flight` flies all of it, one tick at a time.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from experiments.diagnosis import effects, plant, sensors, vehicle
+from experiments.diagnosis import injection, plant, sensors, vehicle
 from experiments.flying.worlds.game import Poses, per_world
 from openjax.pursuit import Task
 from openjax.vehicle import DroneState
@@ -121,7 +121,7 @@ class PlantWorld:
         ticks += 1  # a pose is measured after the last step, too
         arrival = np.repeat(10 * np.arange(ticks)[:, None], count, axis=1)
         if cause is not None:
-            effects.apply(cause, parameters, everyone, arrival, rng_of(seed, number, 4, first))
+            injection.inject(cause, parameters, everyone, arrival, rng_of(seed, number, 4, first))
         index = everyone.reshape(worlds, self.team)
         self.flight = plant.Flight(
             told,
