@@ -16,8 +16,8 @@ from pathlib import Path
 
 import tyro
 
+from experiments.flying.fault_worlds import LATEST, SECONDS, Worlds
 from experiments.flying.faults import ENDING, MARGIN, Fault, finite
-from experiments.flying.simulated import LATEST, SECONDS, Worlds
 from experiments.flying.single_thread import use_single_thread
 from experiments.table import RESULTS, Page, Table, facts, write_page
 from openjax.files import read_json, write_json

@@ -8,8 +8,9 @@ import math
 import pytest
 
 from experiments.flying import estimates
+from experiments.flying.fault_worlds import fly
 from experiments.flying.faults import BEYOND, FALL, KINDS, finite
-from experiments.flying.simulated import fly, well
+from experiments.flying.simulated import well
 from experiments.flying.single_thread import share_out
 from openjax.flying.safety import step
 from openjax.flying.state import Event, Mode, Request, initial_state
