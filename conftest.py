@@ -5,6 +5,7 @@ may leave out costly passes.
 import gc
 import importlib
 import os
+import sys
 from importlib.metadata import version
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,6 +14,10 @@ import pytest
 from beartype import BeartypeConf, beartype
 from hypothesis import HealthCheck, settings
 from jaxtyping import install_import_hook
+
+# many processes load the same modules: bytecode is kept, also where the environment says otherwise
+sys.dont_write_bytecode = False
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 _beartype = beartype(conf=BeartypeConf(is_pep484_tower=True))  # an int is a float, too
 
@@ -47,8 +52,9 @@ _rooms = ["openjax.pursuit", "openjax.learning", "openjax.flights", "openjax.gap
 install_import_hook([*_networks, *_drone, *_rooms], "conftest.check_types")
 
 _flags = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
-# workers are the parallel part: more threads would only wait for each other's cores
-_flags += " --xla_cpu_multi_thread_eigen=false"
+# workers are the parallel part: more threads would only wait for each other's cores, and a program
+# that is compiled in parts for them takes a fifth longer
+_flags += " --xla_cpu_multi_thread_eigen=false --xla_cpu_parallel_codegen_split_count=1"
 if version("jaxlib").startswith("0.10."):
     # its way of fusing compiles three times as long; later versions know no such flag
     _flags += " --xla_cpu_use_fusion_emitters=false"

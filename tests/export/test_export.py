@@ -69,7 +69,8 @@ def test_the_file_acts_as_the_policy_does(policy_file, flown, tmp_path, monkeypa
 
 
 @NEEDS_CC
-def test_a_name_in_no_encoding_is_exported(policy_file, tmp_path):
+def test_a_name_in_no_encoding_is_exported(policy_file, flown, tmp_path, monkeypatch):
+    monkeypatch.setattr("openjax.commands.export.observations", lambda *_: dict(flown))
     odd = shutil.copyfile(policy_file, os.fsdecode(os.fsencode(tmp_path) + b"/policy_\xff.npz"))
     export(Arguments(str(odd), "c", out=tmp_path, observations=64))
     assert "policy_\\udcff.npz" in (tmp_path / "policy.c").read_text()

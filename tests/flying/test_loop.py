@@ -16,6 +16,7 @@ from openjax.flying.loop import Flight, Plan, flight_state
 from openjax.flying.state import Mode, PoseSample, SafetySettings
 from openjax.flying.ticks import PATIENCE, await_poses
 
+TICKS = 400
 STARTS = ((0.5, 0.3, 0.5), (0.5, 0.0, 0.5), (0.5, -0.3, 0.5))
 
 
@@ -97,15 +98,15 @@ def test_ticks_leave_half_a_kilobyte_each_and_nothing_to_collect(flight):
     gc.disable()
     tracemalloc.start()
     try:
-        go_on(1000)  # by then the interpreter keeps as many tuples for later as it will
+        go_on(400)  # by then the interpreter keeps as many tuples for later as it will
         before = tracemalloc.get_traced_memory()[0]
-        go_on(1000)
+        go_on(TICKS)
         grown = tracemalloc.get_traced_memory()[0] - before
         unreachable = gc.collect()
     finally:
         tracemalloc.stop()
         gc.enable()
-    assert grown < 1000 * 512 and unreachable < 100
+    assert grown < TICKS * 512 and unreachable < 100
 
 
 def test_a_flight_may_end_before_its_first_tick():

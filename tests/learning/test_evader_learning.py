@@ -19,11 +19,14 @@ from openjax.pursuit import uniform_task
 from openjax.pursuit.evaders import init_network, scene_of
 from openjax.pursuit.evaders.learned import STEPS, features, outputs, outputs_of
 
-WORLDS = 512
+WORLDS = 256
 ENVIRONMENT = make(
     evaders=("field", "learned", "greedy", "learned"), physics="stops", max_pillars=5
 )
 HOW = EvaderLearningSettings(epochs=4, learning_rate=3e-3, initial_log_std=0.0)
+LEARNING = EvaderLearning(HOW, ENVIRONMENT, updates=1)
+act = jax.jit(LEARNING.act)
+learn = jax.jit(LEARNING.learn)
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +41,13 @@ def worlds():
     return jax.jit(jax.vmap(begin))(keys, jnp.arange(WORLDS) % 4)
 
 
-def test_each_learns_from_its_own_samples_what_pays(worlds):
+@pytest.fixture(scope="module")
+def start():
+    """The two networks before they learn."""
+    return jax.jit(LEARNING.start)(jax.random.key(1))
+
+
+def test_each_learns_from_its_own_samples_what_pays(worlds, start):
     """Network 1 is caught at once where it flies to the left, network 0 whatever it does."""
     learning = EvaderLearning(HOW, ENVIRONMENT, updates=30)
 
@@ -52,7 +61,7 @@ def test_each_learns_from_its_own_samples_what_pays(worlds):
         samples = jax.tree.map(lambda leaf: leaf[None], samples)
         return learning.learn(evaders, samples, last, order_key), caught
 
-    evaders = start = jax.jit(learning.start)(jax.random.key(1))
+    evaders = start
     for key in jax.random.split(jax.random.key(2), 30):
         evaders, caught = improve(evaders, key)
     which, seen = jax.jit(learning.see)(evaders.actor, worlds)
@@ -67,15 +76,13 @@ def test_each_learns_from_its_own_samples_what_pays(worlds):
     assert max(jax.tree.leaves(still)) < 0.2 * moved
 
 
-def test_a_network_without_a_world_stays_as_it_is(worlds):
+def test_a_network_without_a_world_stays_as_it_is(worlds, start):
     """Evaders that come in late haven't more noise by then than they begin with."""
-    learning = EvaderLearning(HOW, ENVIRONMENT, updates=1)
-    start = jax.jit(learning.start)(jax.random.key(1))
-    samples = jax.jit(learning.act)(start, worlds, jnp.ones((WORLDS, 3)))[1]
+    samples = act(start, worlds, jnp.ones((WORLDS, 3)))[1]
     samples = jax.tree.map(
         lambda leaf: leaf[None], samples.replace(which=jnp.where(samples.which == 0, 0, -1))
     )
-    end = jax.jit(learning.learn)(start, samples, worlds, jax.random.key(2))
+    end = learn(start, samples, worlds, jax.random.key(2))
     changed = [
         np.any(np.asarray(a != b), axis=tuple(range(1, a.ndim)))
         for a, b in zip(*map(jax.tree.leaves, (start.networks, end.networks)), strict=True)
@@ -88,25 +95,22 @@ def test_a_network_that_flies_all_worlds_learns_as_if_alone(worlds):
     alone = EvaderLearning(
         HOW, make(evaders=("learned",), physics="stops", max_pillars=5), updates=1
     )
-    beside = EvaderLearning(HOW, ENVIRONMENT, updates=1)
     ended = worlds.replace(statistics=worlds.statistics.replace(captured=jnp.ones(WORLDS, bool)))
-    start = jax.jit(alone.start)(jax.random.key(1))
+    one = jax.jit(alone.start)(jax.random.key(1))
     kinds = worlds.evader.replace(kind=jnp.zeros(WORLDS, jnp.int32))
-    samples = jax.jit(alone.act)(start, worlds.replace(evader=kinds), jnp.ones((WORLDS, 3)))[1]
+    samples = jax.jit(alone.act)(one, worlds.replace(evader=kinds), jnp.ones((WORLDS, 3)))[1]
     samples = jax.tree.map(lambda leaf: leaf[None], samples)
-    two = jax.tree.map(lambda leaf: jnp.repeat(leaf, 2, axis=0), start)
+    two = jax.tree.map(lambda leaf: jnp.repeat(leaf, 2, axis=0), one)
     ends = [
-        jax.jit(learning.learn)(first, samples, ended, jax.random.key(2))
-        for learning, first in ((alone, start), (beside, two))
+        step(first, samples, ended, jax.random.key(2))
+        for step, first in ((jax.jit(alone.learn), one), (learn, two))
     ]
     for mine, its in zip(*(jax.tree.leaves(end.networks) for end in ends), strict=True):
         np.testing.assert_allclose(its[0], mine[0], atol=1e-5)
 
 
-def test_wishes_fly_only_where_a_network_acts(worlds):
-    learning = EvaderLearning(HOW, ENVIRONMENT, updates=1)
-    start = jax.jit(learning.start)(jax.random.key(1))
-    wish, samples = jax.jit(learning.act)(start, worlds, jnp.ones((WORLDS, 3)))
+def test_wishes_fly_only_where_a_network_acts(worlds, start):
+    wish, samples = act(start, worlds, jnp.ones((WORLDS, 3)))
     acts = np.asarray(samples.which) >= 0
     assert (np.isnan(np.asarray(wish)).any(-1) == ~acts).all()
     step = jax.jit(jax.vmap(ENVIRONMENT.step, (None, 0, None, 0)))
@@ -128,12 +132,11 @@ def test_wishes_fly_only_where_a_network_acts(worlds):
 
 
 def test_every_place_flies_its_own_network(worlds):
-    learning = EvaderLearning(HOW, ENVIRONMENT, updates=1)
     networks = jax.vmap(init_network)(jax.random.split(jax.random.key(3), 2))
     networks["output"]["kernel"] = jax.random.normal(
         jax.random.key(4), networks["output"]["kernel"].shape
     )
-    which, seen = jax.jit(learning.see)(networks, worlds)
+    which, seen = jax.jit(LEARNING.see)(networks, worlds)
     found = jax.jit(outputs_of)(networks, which, seen)
     for place in (0, 1):
         alone = jax.jit(outputs)(jax.tree.map(lambda leaf, i=place: leaf[i], networks), seen)

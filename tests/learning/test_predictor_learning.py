@@ -23,6 +23,7 @@ from openjax.policy import (
     gaussian_log_prob,
 )
 from openjax.pursuit import Observation, Pursuit, PursuitSettings
+from tests.policy.parameters import random_parameters
 
 WORLDS = 2
 STEPS = 6
@@ -72,7 +73,7 @@ def recorded():
 
     reset = jax.jit(jax.vmap(environment.reset))
     observation, state = reset(jax.random.split(jax.random.key(0), WORLDS))
-    parameters = jax.jit(policy.init)(jax.random.key(1), observation)
+    parameters = random_parameters(policy, observation)
     runs = []
     for number, share in enumerate((1.0, 0.25)):
         rollout, last, after, account = play(

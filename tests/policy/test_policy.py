@@ -18,6 +18,7 @@ from openjax.policy import (
 )
 from openjax.policy.predictor import EvaderPredictor
 from openjax.pursuit import Observation
+from tests.policy.parameters import random_parameters
 
 N = 3
 BATCH = 4
@@ -45,24 +46,16 @@ def observation_of(seed, n=N, pillars=3, batch=BATCH):
     return jax.tree.map(jnp.asarray, observation)
 
 
-def functions(policy):
-    def both(parameters, observation):
-        predicted = policy.predict(parameters, observation)
-        mean, _ = policy.distribution(parameters.actor, observation, predicted)
-        return mean, policy.value(parameters.actor, parameters.critic, observation, predicted)
-
-    return jax.jit(policy.init), jax.jit(both)
-
-
 @pytest.fixture(scope="module")
 def networks():
-    """(parameters away from their start, function to mean and value)."""
-    init, both = functions(POLICY)
-    parameters = init(jax.random.key(0), observation_of(0))
-    draw = np.random.default_rng(1)
-    return jax.tree.map(
-        lambda x: x + 0.1 * draw.normal(size=x.shape).astype(x.dtype), parameters
-    ), both
+    """(parameters, function to mean and value)."""
+
+    def both(parameters, observation):
+        predicted = POLICY.predict(parameters, observation)
+        mean, _ = POLICY.distribution(parameters.actor, observation, predicted)
+        return mean, POLICY.value(parameters.actor, parameters.critic, observation, predicted)
+
+    return random_parameters(POLICY, observation_of(0)), jax.jit(both)
 
 
 def test_order_of_others_and_pillars_does_not_matter(networks):
@@ -125,7 +118,7 @@ def test_a_critic_of_observations_does_not_see_it():
     network = NetworkSettings(features=16, heads=2, critic_input="observation")
     policy = Policy(network, PredictorSettings(enabled=False))
     observation = observation_of(4)
-    parameters = jax.jit(policy.init)(jax.random.key(0), observation)
+    parameters = random_parameters(policy, observation)
     value = jax.jit(
         lambda observation: policy.value(parameters.actor, parameters.critic, observation, None)
     )
@@ -139,7 +132,7 @@ def test_a_critic_of_layers_sees_all_and_each_pursuer_its_own():
         PredictorSettings(enabled=False),
     )
     observation = observation_of(4)
-    parameters = jax.jit(policy.init)(jax.random.key(0), observation)
+    parameters = random_parameters(policy, observation)
 
     @jax.jit
     def slopes(observation):

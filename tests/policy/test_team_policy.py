@@ -11,6 +11,7 @@ from openjax import Pursuit, PursuitSettings
 from openjax.learning.learners.mappo import Batch, loss
 from openjax.learning.settings import MappoSettings
 from openjax.policy import NetworkSettings, PredictorSettings, make_policy
+from tests.policy.parameters import random_parameters
 
 GAME = PursuitSettings(
     physics="rigid",
@@ -27,20 +28,13 @@ TEAMS = dataclasses.replace(GAME, num_pursuers=SIZE, team_sizes=(TEAM,))
 
 @pytest.fixture(scope="module")
 def networks():
-    """A function from parameters and an observation to mean and value, parameters away from their
-    start, and an observation of `TEAM` pursuers in `SIZE` slots.
+    """A policy, a function from parameters and an observation to mean and value, random parameters,
+    and an observation of `TEAM` pursuers in `SIZE` slots.
     """
     game = Pursuit(TEAMS)
     network = NetworkSettings(features=16, heads=2, shared_encoder=True)
     policy = make_policy(game, network, PredictorSettings(units=8, horizons=(1, 2)))
     observation = jax.jit(game.reset)(jax.random.key(0))[0]
-    parameters = jax.jit(policy.init)(jax.random.key(0), observation)
-    leaves, structure = jax.tree.flatten(parameters)
-    keys = jax.random.split(jax.random.key(1), len(leaves))
-    leaves = [
-        leaf + 0.1 * jax.random.normal(key, leaf.shape)
-        for leaf, key in zip(leaves, keys, strict=True)
-    ]
 
     def both(parameters, observation):
         predicted = policy.predict(parameters, observation)
@@ -49,7 +43,7 @@ def networks():
         )
         return mean, value
 
-    return policy, jax.jit(both), structure.unflatten(leaves), observation
+    return policy, jax.jit(both), random_parameters(policy, observation), observation
 
 
 def alone(observation, number=TEAM):

@@ -41,7 +41,7 @@ def flown(settings, task, actions):
     return record, state
 
 
-@pytest.mark.parametrize("physics", ["rigid", "stops"])
+@pytest.mark.parametrize("physics", ["rigid", pytest.param("stops", marks=pytest.mark.slow)])
 def test_three_of_five_fly_as_three(physics):
     """Whatever the two empty slots do: steps, what is seen, rewards and counts are those of three."""
     alone = dataclasses.replace(ALONE, physics=physics)

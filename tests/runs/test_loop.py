@@ -195,8 +195,8 @@ def test_an_update_leaves_nothing_in_memory(compiled, tmp_path):
 
     tracemalloc.start()
     try:
-        run(tmp_path, compiled, 3000, evaluate=evaluate, validation_interval=1000)
+        run(tmp_path, compiled, 1200, evaluate=evaluate, validation_interval=400)
     finally:
         tracemalloc.stop()
     _, (before, arrays), (after, same) = seen
-    assert after - before < 250 * 1000 and same == arrays
+    assert after - before < 250 * 400 and same == arrays

@@ -39,7 +39,8 @@ def hard_manoeuvres():
         ("crazyflie", "mjx", True, 1),
         ("crazyflie", "rigid", False, 2),
         ("brushless", "rigid", False, 1),
-        ("brushless", "mjx", True, 1),
+        # what is the vehicle's and what is the engine's is each held by a row above
+        pytest.param("brushless", "mjx", True, 1, marks=pytest.mark.slow),
     ],
 )
 def test_a_second_of_hard_manoeuvres(airframe, physics, contacts, substeps):
