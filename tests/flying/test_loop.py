@@ -98,7 +98,7 @@ def test_ticks_leave_half_a_kilobyte_each_and_nothing_to_collect(flight):
     gc.disable()
     tracemalloc.start()
     try:
-        go_on(400)  # by then the interpreter keeps as many tuples for later as it will
+        go_on(1000)  # by then the interpreter keeps as many tuples for later as it will
         before = tracemalloc.get_traced_memory()[0]
         go_on(TICKS)
         grown = tracemalloc.get_traced_memory()[0] - before
