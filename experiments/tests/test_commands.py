@@ -32,7 +32,7 @@ PAGES = [
 COMMIT = re.compile(r"\b(?=[a-f]*\d)(?=\d*[a-f])[0-9a-f]{7,40}\b")
 COMMAND = re.compile(
     rf"(?:^|(?<=; )|(?<=then ))(openjax (?:{'|'.join(COMMANDS)})|"
-    r"python -m (?:openjax|experiments|tests)\.[\w.]+)(?= )(.*?)(?=; |, |$| \(| #| &| then)"
+    r"python -m (?:openjax|experiments|tests)\.[\w.]+)(?= )((?:'[^']*'|[^'])*?)(?=; |, |$| \(| #| &| then)"
 )
 """A command with options, up to what a text says after it."""
 

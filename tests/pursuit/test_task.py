@@ -1,5 +1,7 @@
 """Drawn tasks: where they start, what expansion and turning keep, and attitudes."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -204,9 +206,8 @@ def test_pillars_in_a_row_stand_between_the_sides(uniform):
 
 
 def test_close_starts_leave_little_room_beside_a_pillar_or_another_pursuer(uniform):
-    close = jax.jit(jax.vmap(lambda key, task: close_starts(SETTINGS, key, task, 0.5)))(
-        keys(33), uniform
-    )
+    move = jax.jit(jax.vmap(functools.partial(close_starts, SETTINGS), (0, 0, None)))
+    close = move(keys(33), uniform, 0.5)
     assert_clear(close)
     assert np.abs(close.pursuer_position[..., 2] - 0.6).max() <= 0.1 + 1e-6
     for name in ("evader_position", "pillar_position", "pillar_active"):
@@ -220,9 +221,7 @@ def test_close_starts_leave_little_room_beside_a_pillar_or_another_pursuer(unifo
     assert to_pursuer[moved].mean() > 0.35 and to_pillar[moved].mean() > 0.5
     # without pillars there's nothing to be put beside for the first
     alone = uniform.replace(pillar_active=np.zeros_like(uniform.pillar_active))
-    close = jax.jit(jax.vmap(lambda key, task: close_starts(SETTINGS, key, task, 1.0)))(
-        keys(34), alone
-    )
+    close = move(keys(34), alone, 1.0)
     assert_clear(close)
     moved = np.asarray(close.pursuer_position != uniform.pursuer_position).any(axis=-1)
     assert not moved[:, 0].any() and moved[:, 1:].mean() > 0.9
