@@ -214,6 +214,8 @@ def teams() -> TrainSettings:
             # left of three .95
             fall_outs=0.6,
             observe_game=True,
+            # by the shortest path, as `evaders`, teams haven't been flown
+            reward=dict(distance=0.5, path=0.0, territory=0.0),
             history_pursuers="pooled",
             evaders=("field", "field", "greedy", "wall_runner", "slow_hugger"),
             # every pursuer is the nominal vehicle, which shows in one frame how it answers
