@@ -8,7 +8,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from openjax.pursuit import Pursuit, PursuitSettings
-from openjax.pursuit.sensing import line_of_sight, within_view
+from openjax.pursuit.sensing import line_of_sight, sight_room, within_view
 
 RADIUS = PursuitSettings().pillar_radius
 
@@ -56,6 +56,23 @@ def test_it_is_mutual(sight):
     there = sight(start, end, pillars, active)
     np.testing.assert_array_equal(there, sight(end, start, pillars, active))
     assert 0.2 < there.mean() < 0.9
+
+
+def test_room_beside_the_line_is_negative_where_it_is_blocked(sight):
+    draw = np.random.default_rng(2)
+    start, end = jnp.asarray(draw.uniform(-0.9, 0.9, (2, 500, 2)), jnp.float32)
+    pillars = jnp.asarray(draw.uniform(-0.8, 0.8, (500, 4, 2)), jnp.float32)
+    active = jnp.asarray(draw.uniform(size=(500, 4)) < 0.7)
+
+    def one(start, end, pillars, active):
+        lift = jnp.array([0.5])
+        position = jnp.concatenate([start, lift])[None]
+        target = jnp.concatenate([end, lift])
+        return sight_room(PursuitSettings(), position, target, pillars, active)[0]
+
+    room = jax.jit(jax.vmap(one))(start, end, pillars, active)
+    np.testing.assert_array_equal(room >= 0.0, sight(start, end, pillars, active))
+    assert RADIUS == pytest.approx(room.max())
 
 
 @given(points=st.lists(st.floats(-0.9, 0.9), min_size=6, max_size=6))

@@ -40,6 +40,7 @@ from openjax.learning.smooth_measures import (
     crash_share,
     evader_distance,
     free_share,
+    hidden_share,
     nearest_distance,
     nearest_gap,
     speed,
@@ -88,6 +89,8 @@ class Encounter(NamedTuple):
     """(B,) share of the steps in which nobody has caught the evader"""
     territory: jax.Array
     """(B,) mean share of the arena that the evader can be at before any pursuer"""
+    unseen: jax.Array
+    """(B,) mean of how well the evader hides from all pursuers"""
 
 
 def no_encounter(shape: tuple[int, int]) -> Encounter:
@@ -102,6 +105,7 @@ def no_encounter(shape: tuple[int, int]) -> Encounter:
         distance=of_worlds,
         free=of_worlds,
         territory=of_worlds,
+        unseen=of_worlds,
     )
 
 
@@ -185,6 +189,7 @@ class AnalyticGradient:
             distance=met.distance + nearest_distance(beyond_rest) / steps,
             free=met.free + free_share(radius, distance) / steps,
             territory=met.territory + territory_share(self.game, state, paths) / steps,
+            unseen=met.unseen + hidden_share(self.game, state) / steps,
         )
 
     def starts(self, key: PRNGKeyArray, bounds: Bounds):

@@ -263,6 +263,8 @@ class WorstPlansSettings:
     """Weight of the share of the arena that the evader can be at before any pursuer, beside the
     same: it is what those can change who aren't the nearest.
     """
+    unseen: Annotated[float, Interval("[0, 1000]")] = 0.0
+    """Weight of how well the evader hides from all of them, beside the same."""
     crash: Annotated[float, Interval("[0, 1000]")] = 8.0
     """Weight of the share of pursuers that touch something, beside the same."""
     breach: Annotated[float, Interval("[0, 1000]")] = 2.0

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from openjax.pursuit import PursuitSettings, PursuitState
 from openjax.pursuit.collisions import TOUCH, drone_distance, pillar_distance
+from openjax.pursuit.sensing import sight_room
 from openjax.pursuit.shortest_paths import ShortestPaths, evader_territory, path_length
 from openjax.vehicle import DroneState
 from openjax.vehicle.solids import DRONE_RADIUS
@@ -33,6 +34,8 @@ SMOOTH_CAPTURE = 0.1
 """The same for a capture (m)."""
 SMOOTH_NEAREST = 0.15
 """The same for which pursuer is nearest to the evader (m)."""
+SMOOTH_SIGHT = 0.05
+"""The same for whether a line of sight passes a pillar (m)."""
 FAST = 0.05
 """Speed (m/s) above where the speed begins to cost that costs as much as a crash in every step
 would.
@@ -114,6 +117,22 @@ def territory_share(game: PursuitSettings, state: PursuitState, paths: ShortestP
         return evader_territory(game, state.task, paths, state.drones.position, evader)
 
     return jax.vmap(one)(state, paths)
+
+
+def hidden_share(game: PursuitSettings, state: PursuitState) -> Worlds:
+    """(W,) how well pillars hide the evader of worlds (W, ...) from all pursuers, from 0 to 1; its
+    flight has no gradient.
+    """
+
+    def one(state):
+        task = state.task
+        target = jax.lax.stop_gradient(state.evader_position)
+        room = sight_room(
+            game, state.drones.position, target, task.pillar_position, task.pillar_active
+        )
+        return jax.nn.sigmoid(-jnp.max(room) / SMOOTH_SIGHT)
+
+    return jax.vmap(one)(state)
 
 
 def nearest_distance(distance: Pursuers) -> Worlds:

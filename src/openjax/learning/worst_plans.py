@@ -221,6 +221,8 @@ class WorstPlans:
             "free": (1.0, seen * jnp.mean(met.free, axis=0)),
             "distance": (planning.distance, seen * jnp.mean(met.distance, axis=0)),
             "territory": (planning.territory, seen * jnp.mean(met.territory, axis=0)),
+            # where nobody sees it, too: to look where it was last seen is what is to be learnt
+            "unseen": (planning.unseen, met.unseen),
             "crashes": (planning.crash, crash_share(jnp.min(met.least, axis=0))),
             "breaches": (planning.breach, met.breach),
             "speed": (self.settings.speed, met.excess),

@@ -111,6 +111,7 @@ def default_reward(weights: RewardSettings) -> tuple[Term, ...]:
         Term(nearest_distance, -weights.nearest),
         Term(evader_path, -weights.path),
         Term(territory, -weights.territory),
+        Term(unseen, -weights.unseen),
         Term(first_capture, weights.first_capture),
         Term(recapture, weights.recapture),
         Term(steadiness, weights.smoothness),
@@ -161,6 +162,11 @@ def territory(transition: Transition) -> Scalar:
     return evader_territory(
         transition.settings, state.task, state.paths, position, state.evader_position
     )
+
+
+def unseen(transition: Transition) -> Flag:
+    """() whether nobody sees the evader."""
+    return ~transition.info.seen
 
 
 def recapture(transition: Transition) -> Flag:

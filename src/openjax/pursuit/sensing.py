@@ -21,16 +21,38 @@ def line_of_sight(
     A pillar blocks it if its axis is closer to the segment than its radius and the foot point lies
     on the segment.
     """
-    # from above only: pillars are as high as the arena
+    square, between = _from_axes(position, target, pillar_position, pillar_active)
+    return ~jnp.any(between & (square < settings.pillar_radius**2), axis=-1)
+
+
+def sight_room(
+    settings: PursuitSettings,
+    position: Float[Array, "places 3"],
+    target: Vector,
+    pillar_position: Pillars,
+    pillar_active: Active,
+) -> Float[Array, " places"]:
+    """(N,) m, how far the segment from each (N, 3) position to the (3,) target passes the surface
+    of the pillars between them: negative where it is blocked, a pillar's radius at most.
+    """
+    square, between = _from_axes(position, target, pillar_position, pillar_active)
+    # the small number keeps the root's gradient finite on a pillar's axis
+    room = jnp.sqrt(square + 1e-12) - settings.pillar_radius
+    return jnp.min(room, axis=-1, where=between, initial=settings.pillar_radius)
+
+
+def _from_axes(position, target, pillar_position, pillar_active):
+    """(N, P) m², of the lines from positions to the target to pillars' axes, from above: pillars are
+    as high as the arena; (N, P) which of the pillars stand between.
+    """
     start = position[:, None, :2]
     segment = target[None, None, :2] - start
     to_axis = pillar_position[None] - start
     length_squared = jnp.sum(segment**2, axis=-1)
     along = jnp.sum(to_axis * segment, axis=-1) / jnp.maximum(length_squared, 1e-12)
     across = to_axis - along[..., None] * segment
-    near = jnp.sum(across**2, axis=-1) < settings.pillar_radius**2
-    blocked = pillar_active[None] & near & (along >= 0.0) & (along <= 1.0)
-    return ~jnp.any(blocked, axis=-1)
+    between = pillar_active[None] & (along >= 0.0) & (along <= 1.0)
+    return jnp.sum(across**2, axis=-1), between
 
 
 def within_view(

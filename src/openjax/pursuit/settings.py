@@ -50,6 +50,10 @@ class RewardSettings:
     """Subtracted, of all pursuers, times the share of the arena that the evader can be at before
     any of them: who comes from the other side takes some of it away (not in the paper).
     """
+    unseen: Annotated[float, Interval("[0, 1e6]")] = 0.0
+    """Subtracted, of all pursuers, in each step in which nobody sees the evader: in a notch between
+    two pillars it is safe from a team that waits all round and doesn't look in (not in the paper).
+    """
     collision: Annotated[float, Interval("[0, 1e6]")] = 10.0
     """Subtracted per breach of a safety distance or an arena bound."""
     over_speed: Annotated[float, Interval("[0, 1e6]")] = 10.0
