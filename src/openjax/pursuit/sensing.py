@@ -42,8 +42,8 @@ def sight_room(
 
 
 def _from_axes(position, target, pillar_position, pillar_active):
-    """(N, P) m², of the lines from positions to the target to pillars' axes, from above: pillars are
-    as high as the arena; (N, P) which of the pillars stand between.
+    """(N, P) m², squares of how far pillars' axes are from the lines to the target, from above:
+    pillars are as high as the arena; (N, P) which of the pillars stand between.
     """
     start = position[:, None, :2]
     segment = target[None, None, :2] - start
