@@ -43,8 +43,10 @@ def bodies(seed, column, spec):
 class Fleet:
     """Bodies of several variants of several cases, flown as one batch."""
 
-    def __init__(self, seed, column, variants, drawn):
-        """variants: list of (spec, causes); drawn: {case name: `bodies`}."""
+    def __init__(self, seed, column, variants, drawn, wakes_from=None):
+        """variants: list of (spec, causes); drawn: {case name: `bodies`}; `wakes_from` as in
+        `plant.Batch`.
+        """
         self.seed = seed
         self.column = column
         self.variants = variants
@@ -74,6 +76,8 @@ class Fleet:
         batch = plant.Batch(
             told, self.parameters, reference, kinds, self.partner, arrival, air, strangers
         )
+        if wakes_from is not None:
+            batch.wakes_from = wakes_from
         self.flown = plant.fly(batch)
         # What is measured is what the logs cover: a fault that comes after their end shows nothing.
         self.seen = self.flown | {"crashed": np.minimum(self.flown["crashed"], logged)}

@@ -5,6 +5,7 @@ seen, 2 ms at a time. `fly` commands it with the exam's controllers along refere
 true motion. Arrays have the body index last.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -37,6 +38,8 @@ class Batch:
     )  # (K, B) ms at which the command of tick k reaches the vehicle; >= 10**8: lost
     air: dict  # see `sensors.draw_air`
     unknowns: dict = field(default_factory=dict)  # site -> [(columns, cause), …], see `unknowns`
+    # (positions (3, B) below, positions (3, B) of those above) -> where the wakes seem to come from
+    wakes_from: Callable = lambda below, above: above
 
 
 def received(arrival, steps):
@@ -68,6 +71,7 @@ class Flight:
       none.
       unknowns: as in `Batch`.
       solids: anything with `stop(position, velocity)`, called after each ms, or None.
+      wakes_from: as in `Batch`, called every 2 ms.
     """
 
     def __init__(
@@ -81,8 +85,10 @@ class Flight:
         partners=(),
         unknowns=None,
         solids=None,
+        wakes_from=lambda below, above: above,
     ):
         ticks, count = arrival.shape
+        self.wakes_from = wakes_from
         self.p = parameters
         self.air = air
         self.solids = solids
@@ -168,7 +174,8 @@ class Flight:
         m = self.firmware(now, self.gyro)
         self.voltage = self.battery.step(m, SAMPLE)
         gusts = [air[name][k] for name in ("gust_force", "gust_torque", "slow")]
-        others = [self.body.position[:, partner] + away for partner, away in self.partners]
+        here = self.body.position
+        others = [self.wakes_from(here, here[:, i] + away) for i, away in self.partners]
         for half_step in range(2):
             now_s = SAMPLE * s + DT * half_step
             self.body.step(m, self.voltage, self.battery.load, *gusts, others, self.unknowns, now_s)
@@ -203,6 +210,7 @@ def fly(batch):
         q,
         [batch.partner],
         batch.unknowns,
+        wakes_from=batch.wakes_from,
     )
     body = flight.body
     samples = PER_TICK * ticks

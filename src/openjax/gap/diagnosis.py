@@ -121,7 +121,10 @@ def words(check: Check, parts: Split) -> tuple[str, ...]:
 
 def not_testable(evidence: Evidence) -> list[str]:
     """Effects of the library that, at a usual size, these flights would not show."""
-    missing = [e for e in evidence.library.physics if evidence.motion.exposure[e] < DETECTABLE]
+    motion = evidence.motion
+    missing = [e for e in evidence.library.physics if motion.exposure[e] < DETECTABLE]
+    if motion.gusts is not None:  # what is felt of a wake isn't the mean that the effect holds
+        missing += [e for e in evidence.library.physics if CARDS[e].of_others and e not in missing]
     logged = {c.path for c in evidence.channels} | {"physics"}
     missing += [e for e in evidence.library.effects if path_of(e) not in logged]
     return missing + [e for c in evidence.channels for e in c.undetectable()]

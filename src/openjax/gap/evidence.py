@@ -18,7 +18,7 @@ from openjax.gap.decision import DECISION
 from openjax.gap.identification.quantities import Identification
 from openjax.gap.identification.support import support
 from openjax.gap.model.baseline import Baseline
-from openjax.gap.model.library import CARDS, Library
+from openjax.gap.model.library import CARDS, Library, places
 from openjax.gap.model.replay import Replay
 
 
@@ -68,9 +68,18 @@ class Evidence:
         return {key: found.estimates.of(*key) for key in names}
 
     def support(self, theta: np.ndarray) -> float:
-        """Nats by which the identified torques speak for parameters theta (P,); 0 where they
-        aren't trusted.
+        """Nats by which what the replay doesn't weigh speaks for parameters theta (P,): the
+        identified torques, where they are trusted, and gusts under other vehicles.
         """
+        return self._of_torques(theta) + self._of_gusts(theta)
+
+    def _of_gusts(self, theta: np.ndarray) -> float:
+        gusts = self.motion.gusts
+        wakes = [places((e,)) for e in self.library.physics if CARDS[e].of_others]
+        acts = any((theta[own] != self.replay.absent[own]).any() for own in wakes)
+        return gusts.nats if gusts is not None and acts else 0.0
+
+    def _of_torques(self, theta: np.ndarray) -> float:
         found = self.identification
         if found is None or not found.trusted:
             return 0.0
@@ -103,6 +112,9 @@ def gather(
     tell("replaying the flights")
     channels = tuple(c for c in (pose, radio, loop) if c is not None)
     motion = read_motion(reading, loop)
+    if motion.gusts is not None:
+        told = {"gusts under others": motion.gusts.in_words()}
+        sensors = replace(sensors, findings=sensors.findings | told)
     return Evidence(case, library, tracks, vehicles, sensors, channels, motion, baseline)
 
 

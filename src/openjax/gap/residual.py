@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from openjax.flights.shapes import Chosen
 from openjax.flights.track import Track, specific_force_of, to_body
 from openjax.gap.decision import DECISION
 from openjax.gap.evidence import Evidence
@@ -36,6 +37,8 @@ FORM_LEFT = 0.3
 # Share of what grew that effects leave where they aren't what acts: those named beside an unknown
 # cause left .71 to 1, those that act .54 at most (seeds 890 to 893).
 MOSTLY = 0.65
+# Of HORIZONS what another vehicle's gusts shake; where there are any, rows under it don't count.
+HELD_FROM_GUSTS = ("velocity", "rates")
 CALIBRATION = Path(__file__).with_name("residual.json")
 
 
@@ -126,8 +129,18 @@ def measure(
     axes = {}
     for name, parts in _series(evidence, residuals).items():
         step = max(round(HORIZONS[name][0] / dt), 1)
-        axes[name] = np.concatenate([(p[step:] - p[:-step])[skip:] for p in parts]).std(0)
+        moved = [(p[step:] - p[:-step])[skip:] for p in parts]
+        if name in HELD_FROM_GUSTS and evidence.motion.gusts is not None:
+            calm = [_calm(rows, step)[skip:] for rows in evidence.motion.gusts.rows]
+            moved = [m[c] for m, c in zip(moved, calm, strict=True)]
+        axes[name] = np.concatenate(moved).std(0)
     return {name: float(size.max()) for name, size in axes.items()}, axes
+
+
+def _calm(rows: Chosen, step: int) -> Chosen:
+    """(T - step,) whether none of the rows from each one to the one a step later is chosen."""
+    before = np.concatenate([[0], np.cumsum(rows)])
+    return before[step + 1 :] == before[: -step - 1]
 
 
 def beyond(axes: dict[str, np.ndarray], reference: dict[str, float]) -> np.ndarray:

@@ -16,10 +16,17 @@ from openjax.flights.track import GRID_PERIOD, Track
 from openjax.gap.channels.instruments import caused_by_commands, read_feedback
 from openjax.gap.channels.rate_loop import ROW_DELAY, RateLoop
 from openjax.gap.model.baseline import Baseline, with_days
-from openjax.gap.model.hypotheses import SetFit, fit_set, fit_singles, model_noise
+from openjax.gap.model.hypotheses import (
+    UNEXPOSED,
+    SetFit,
+    fit_set,
+    fit_singles,
+    model_noise,
+)
 from openjax.gap.model.library import CARDS, Library, numbers_of
 from openjax.gap.model.observer import TICKS
 from openjax.gap.model.replay import Replay, make_replay
+from openjax.gap.model.wakes import Gusts, as_loud_as, fit_wake, read_gusts
 from openjax.vehicle.effects import EFFECTS
 
 # rows of a log in one of the grid's: if fewer are samples, their mean isn't what five ticks of the
@@ -143,6 +150,8 @@ class Motion:
     library: Library
     exposure: dict[str, float]
     """{effect: nats that it would leave at its usual size}; 0 where it can't be told."""
+    gusts: Gusts | None = None
+    """Under other vehicles, if these gust beyond doubt."""
 
     @cached_property
     def nothing(self) -> SetFit:
@@ -174,7 +183,24 @@ def read_motion(reading: Reading, loop: RateLoop | None) -> Motion:
     exposure |= {e: 0.0 for e in library.physics if _hidden(CARDS[e], reading)}
     if not sensors.motor_clock:
         exposure |= {e: 0.0 for e in library.physics if _is_lag(e)}
-    return Motion(replay, library, exposure)
+    return _beside_others(Motion(replay, library, exposure))
+
+
+def _beside_others(motion: Motion) -> Motion:
+    """The motion with what other vehicles' wakes do beside a push at once."""
+    if not any(len(track.neighbours) for track in motion.replay.tracks):
+        return motion
+    shown = [
+        e for e in motion.library.physics if CARDS[e].of_others and motion.exposure[e] >= UNEXPOSED
+    ]
+    fit = fit_wake(motion.replay, shown[0]) if shown else motion.nothing
+    gusts = read_gusts(fit)
+    # nuisances are as around nothing again
+    replay = dataclasses.replace(motion.replay, physics=fit.replay.physics)
+    if not gusts.louder:
+        return dataclasses.replace(motion, replay=replay)
+    replay, gusts = as_loud_as(gusts, replay, shown)
+    return dataclasses.replace(motion, replay=replay, gusts=gusts)
 
 
 def _is_lag(effect: str) -> bool:

@@ -202,7 +202,12 @@ def without_nuisances(replay: Replay, residual: Rows, track: int) -> Rows:
 def fit_singles(replay: Replay, library: Library, exposure) -> dict[str, SetFit]:
     """The fit of every effect alone that the flights could show."""
     shown = [effect for effect in library.physics if exposure[effect] >= UNEXPOSED]
-    return {effect: fit_set(replay, (effect,), _best_start(replay, effect)) for effect in shown}
+    return {effect: fit_single(replay, effect) for effect in shown}
+
+
+def fit_single(replay: Replay, effect: str) -> SetFit:
+    """The fit of one effect alone."""
+    return fit_set(replay, (effect,), _best_start(replay, effect))
 
 
 def _starts(effect: str, replay: Replay) -> np.ndarray:
