@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import block_diag
 
+from openjax.gap.model.blocks import block_diagonal
 from openjax.gap.model.bounds import bounded
 from openjax.gap.model.library import places
 from openjax.gap.model.table import Model, Table
@@ -64,7 +64,7 @@ class Equations:
         hessian = sums[np.ix_(self.columns, self.columns)]
         free = len(self.model.free)
         push = sums[self.columns][:, [0, *self.model.parts]].sum(1)
-        hessian += block_diag(self.model.precision, np.eye(len(push) - free))
+        hessian += block_diagonal([self.model.precision, np.eye(len(push) - free)])
         push[:free] += self.model.precision @ self.model.mean
         return hessian, push, bounded(hessian, push, free)
 

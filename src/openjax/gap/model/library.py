@@ -8,9 +8,9 @@ from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.linalg import block_diag
 
 from openjax.errors import UserError, suggestion
+from openjax.gap.model.blocks import block_diagonal
 from openjax.gap.shapes import Parameters
 from openjax.vehicle.effects import EFFECTS, Card
 from openjax.vehicle.effects.effect import growth
@@ -100,7 +100,7 @@ def prior(
         mean += [p.mean for p in card.fitted]
         block = np.diag([p.spread**2 for p in card.fitted]) + card.common**2
         blocks.append(block - BALANCE * block.mean() if card.balanced else block)
-    precision = np.linalg.inv(block_diag(*blocks)) if blocks else np.zeros((0, 0))
+    precision = np.linalg.inv(block_diagonal(blocks))
     index = np.array(index, int)
     size = np.ones(len(index)) if grown is None else grown[index]
     mean = size * np.array(mean) + (absent - ABSENT)[index]

@@ -24,6 +24,7 @@ FORCE = slice(6, 9)
 BUCKETS = (256, 512, 1024, 2048, 4096, 8192, 16384, 32768)
 FAR = 1e3  # m, where a ceiling does nothing
 LANES = 8  # parameter vectors along tracks that one call of the physics takes
+KEPT = 32  # mixtures of tracks that stay on the device, some megabytes each
 
 
 def bucket(length: int) -> int:
@@ -58,7 +59,7 @@ class Physics:
         for begin in range(0, len(lanes), LANES):
             numbers, vectors = np.array(lanes[begin : begin + LANES]).T
             fill = np.minimum(np.arange(LANES), len(numbers) - 1)
-            nominal = jax.tree.map(lambda leaf, which=numbers[fill]: leaf[which], self._nominal)
+            nominal = self._in_lanes(tuple(numbers[fill].tolist()))
             running.append((numbers, run(theta[vectors[fill]], *nominal)))
         for numbers, rows in running:
             for number, lane in zip(numbers, np.asarray(rows), strict=False):
@@ -69,6 +70,23 @@ class Physics:
     def grown(self) -> Parameters:
         """(P,) by what usual sizes of parameters are multiplied for a vehicle of this size."""
         return growths(self.vehicles[0])
+
+    def _in_lanes(self, numbers: tuple[int, ...]) -> tuple:
+        """Vehicles and paths of the tracks `numbers`, on the device: a search asks for the same
+        few mixtures again and again.
+        """
+        kept = self._kept
+        if numbers not in kept:
+            if len(kept) == KEPT:
+                kept.pop(next(iter(kept)))
+            chosen = jax.tree.map(lambda leaf: leaf[list(numbers)], self._nominal)
+            kept[numbers] = jax.device_put(chosen)
+        return kept[numbers]
+
+    @cached_property
+    def _kept(self) -> dict:
+        """{numbers of tracks: what `_in_lanes` gives}."""
+        return {}
 
     @cached_property
     def _nominal(self) -> tuple:

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import block_diag
 
+from openjax.gap.model.blocks import block_diagonal
 from openjax.gap.model.hypotheses import SetFit
 from openjax.gap.model.library import CARDS, places, prior
 from openjax.gap.model.replay import FORCE, SKIP, block_count
@@ -197,5 +197,5 @@ def with_effects(table: Table, add=(), drop=()) -> Model:
         blocks.append(np.diag(1.0 / spread[inside] ** 2))
     free = np.concatenate(free).astype(int)
     return Model(
-        tuple(table.part[e] for e in drop), free, np.concatenate(means), block_diag(*blocks)
+        tuple(table.part[e] for e in drop), free, np.concatenate(means), block_diagonal(blocks)
     )
