@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.stats import norm, t
 
 from openjax.flights.shapes import Chosen
@@ -44,7 +44,7 @@ LATER = 4.0  # nats by which one of these must be better than a wake at once
 class Gusts:
     """What a case shows of gusts under other vehicles."""
 
-    rows: tuple[Chosen, ...]
+    rows: tuple[Bool[np.ndarray, " _"], ...]
     """(T,) of each track: under another vehicle, or just before."""
     louder: dict[tuple[int, ...], float]
     """{axes of the groups that are clearly louder there: by which factor in the mean square}."""
@@ -117,7 +117,9 @@ def read_gusts(fit: SetFit) -> Gusts:
 
 
 def louder_in(
-    tracks: Sequence[Track], rows: Sequence[Chosen], left: Sequence[Float[np.ndarray, "_ axes"]]
+    tracks: Sequence[Track],
+    rows: Sequence[Bool[np.ndarray, " _"]],
+    left: Sequence[Float[np.ndarray, "_ axes"]],
 ) -> tuple[float, float]:
     """By which factor mean squares of innovations (T', axes) are larger in the chosen rows than
     elsewhere, and how many standard errors the logarithm is from none.
