@@ -44,7 +44,8 @@ def left_over(push):
     residuals = [1e-3 * rng.standard_normal((ROWS, 9)) for _ in tracks]
     for residual in residuals:
         residual[:, 3] += np.cumsum(push) * DT
-    made = SimpleNamespace(replay=replay, tracks=tracks, channels=())
+    motion = SimpleNamespace(gusts=None)
+    made = SimpleNamespace(replay=replay, tracks=tracks, channels=(), motion=motion)
     measures, axes = measure(made, residuals)
     return measures, beyond(axes, {})
 
