@@ -45,15 +45,16 @@ def test_perfect_messages_give_all_the_games_own_view():
         np.testing.assert_allclose(getattr(views, name), wanted, atol=1e-5, err_msg=name)
 
 
-def test_late_messages_show_teammates_where_they_were():
+def test_late_messages_show_teammates_where_they_told_they_would_be():
     delay = 3
     late = MessageSettings(late=delay * GAME.time_step)
     states, _, views = flights(late)(jax.random.key(0))
+    told = np.asarray(states.drones.position + late.late * states.drones.velocity)
     position = np.asarray(states.drones.position)
     heights = views.others[:, :, 0, :, 2]  # those aren't turned
     for t in range(delay, STEPS):
         for i in range(3):
-            others = np.delete(position[t - delay, :, 2], i)
+            others = np.delete(told[t - delay, :, 2], i)
             np.testing.assert_allclose(heights[t, i], position[t, i, 2] - others, atol=1e-5)
 
 

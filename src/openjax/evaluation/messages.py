@@ -1,10 +1,11 @@
 """A team whose messages are lost or late: each pursuer flies the policy by what it believes.
 
-A pursuer knows where it is itself, what it sees, and of the others what it was told last. It takes
-the teammates to be where they told, and the evader to be where it saw it, or where the newest
-report has it; without a report in this step the evader counts as hidden. So each has its own view
-of the world, in which the policy acts for it alone. With perfect messages all views are the same,
-and those of a game in which what one sees is seen by all.
+A pursuer knows where it is itself, what it sees, and of the others what it was told last, and when.
+It takes the teammates to have flown on as they told, as a tenth of a second is a hand's breadth.
+The evader it takes to be where it saw it, or where the newest report has it; without a report in
+this step the evader counts as hidden. So each has its own view of the world, in which the policy
+acts for it alone. With perfect messages all views are the same, and those of a game in which what
+one sees is seen by all.
 """
 
 from dataclasses import dataclass
@@ -17,12 +18,18 @@ from openjax.evaluation.message_settings import MessageSettings
 from openjax.pursuit import Observation, Pursuit, PursuitState
 from openjax.pursuit.observation import frame, frame_pursuers
 
+COAST = 0.3
+"""Seconds for which a teammate that isn't heard of is taken to fly on as it told: about twice the
+time in which a vehicle turns its velocity round.
+"""
+
 
 @struct.dataclass
 class Sent:
     """What the N pursuers of a world send in a step."""
 
     position: jax.Array  # (N, 3) m, their own
+    velocity: jax.Array  # (N, 3) m/s, their own
     sees: jax.Array  # (N,) bool, whether the evader is in it
     evader: jax.Array  # (3,) m
     evader_velocity: jax.Array  # (3,) m/s
@@ -33,7 +40,9 @@ class Sent:
 class Beliefs:
     """What each of the N pursuers of a world takes it to be."""
 
-    position: jax.Array  # (N, N, 3) m, of each pursuer (second axis)
+    position: jax.Array  # (N, N, 3) m, where each pursuer (second axis) was when it told
+    velocity: jax.Array  # (N, N, 3) m/s, at that time
+    told: jax.Array  # (N, N) int32, the step of that time
     evader: jax.Array  # (N, 3) m, by the newest report
     evader_velocity: jax.Array  # (N, 3) m/s
     reported: jax.Array  # (N,) int32, the step of that report; -1: none yet
@@ -69,6 +78,8 @@ class Hearsay:
         )
         return Beliefs(
             position=each(state.drones.position),
+            velocity=each(state.drones.velocity),
+            told=jnp.broadcast_to(state.step, (number, number)),
             evader=each(state.evader_position),
             evader_velocity=each(state.evader_velocity),
             reported=jnp.where(each(state.seen), state.step, -1),
@@ -90,8 +101,11 @@ class Hearsay:
         is_itself = jnp.eye(number, dtype=bool)
         arrives = jax.random.uniform(key, (number, number)) >= self.settings.lost
         arrives &= ~is_itself
-        position = jnp.where(arrives[..., None], arriving.position, beliefs.position)
-        position = jnp.where(is_itself[..., None], state.drones.position, position)
+
+        def told(by_itself, by_message, by_belief):
+            axes = (..., *[None] * (by_belief.ndim - 2))
+            heard = jnp.where(arrives[axes], by_message, by_belief)
+            return jnp.where(is_itself[axes], by_itself, heard)
 
         # a report counts that is newer than what one knows, and one's own eyes before any report
         has_report = jnp.any(arrives & arriving.sees, axis=-1)
@@ -107,7 +121,9 @@ class Hearsay:
         reported = jnp.where(has_report, arriving.step, beliefs.reported)
         seen = sees | has_report
         beliefs = beliefs.replace(
-            position=position,
+            position=told(sent.position, arriving.position, beliefs.position),
+            velocity=told(sent.velocity, arriving.velocity, beliefs.velocity),
+            told=told(sent.step, arriving.step, beliefs.told),
             evader=evader,
             evader_velocity=velocity,
             reported=jnp.where(sees, state.step, reported),
@@ -117,11 +133,17 @@ class Hearsay:
         )
         return beliefs.replace(frames=self._frames(beliefs, state))
 
+    def _place(self, belief, step):
+        """(N, 3) m, where one pursuer takes all to be at a step ()."""
+        age = (step - belief.told) * self.environment.settings.time_step
+        return belief.position + belief.velocity * jnp.minimum(age, COAST)[..., None]
+
     def _frames(self, beliefs, state):
         settings = self.environment.settings
 
         def newest(belief):
-            framed = frame_pursuers(settings, belief.position, belief.last_seen, state.active)
+            place = self._place(belief, state.step)
+            framed = frame_pursuers(settings, place, belief.last_seen, state.active)
             return frame(
                 settings, state.step, framed, belief.evader, belief.evader_velocity, belief.seen
             )
@@ -134,8 +156,9 @@ class Hearsay:
         """What each pursuer observes in its own view: observations (N, ...) of one pursuer each."""
 
         def view(i, belief):
+            place = self._place(belief, state.step)
             believed = state.replace(
-                drones=state.drones.replace(position=belief.position),
+                drones=state.drones.replace(position=place),
                 evader_position=belief.evader,
                 evader_velocity=belief.evader_velocity,
                 in_sight=jnp.broadcast_to(belief.seen, state.in_sight.shape),
@@ -152,6 +175,7 @@ class Hearsay:
 def _sent(state):
     return Sent(
         position=state.drones.position,
+        velocity=state.drones.velocity,
         sees=state.sees,
         evader=state.evader_position,
         evader_velocity=state.evader_velocity,
