@@ -101,12 +101,6 @@ class Hearsay:
         is_itself = jnp.eye(number, dtype=bool)
         arrives = jax.random.uniform(key, (number, number)) >= self.settings.lost
         arrives &= ~is_itself
-
-        def told(by_itself, by_message, by_belief):
-            axes = (..., *[None] * (by_belief.ndim - 2))
-            heard = jnp.where(arrives[axes], by_message, by_belief)
-            return jnp.where(is_itself[axes], by_itself, heard)
-
         # a report counts that is newer than what one knows, and one's own eyes before any report
         has_report = jnp.any(arrives & arriving.sees, axis=-1)
         has_report &= arriving.step > beliefs.reported
@@ -120,10 +114,7 @@ class Hearsay:
         velocity = newest(sent.evader_velocity, arriving.evader_velocity, beliefs.evader_velocity)
         reported = jnp.where(has_report, arriving.step, beliefs.reported)
         seen = sees | has_report
-        beliefs = beliefs.replace(
-            position=told(sent.position, arriving.position, beliefs.position),
-            velocity=told(sent.velocity, arriving.velocity, beliefs.velocity),
-            told=told(sent.step, arriving.step, beliefs.told),
+        beliefs = _with_teammates(beliefs, sent, arriving, arrives).replace(
             evader=evader,
             evader_velocity=velocity,
             reported=jnp.where(sees, state.step, reported),
@@ -170,6 +161,22 @@ class Hearsay:
 
         number = beliefs.seen.shape[0]
         return jax.vmap(view)(jnp.arange(number), beliefs.replace(on_the_way=None))
+
+
+def _with_teammates(beliefs, sent, arriving, arrives):
+    """Beliefs after messages (N, N) of who `arrives`, and what each knows of itself."""
+    is_itself = jnp.eye(len(arrives), dtype=bool)
+
+    def told(by_itself, by_message, by_belief):
+        axes = (..., *[None] * (by_belief.ndim - 2))
+        heard = jnp.where(arrives[axes], by_message, by_belief)
+        return jnp.where(is_itself[axes], by_itself, heard)
+
+    return beliefs.replace(
+        position=told(sent.position, arriving.position, beliefs.position),
+        velocity=told(sent.velocity, arriving.velocity, beliefs.velocity),
+        told=told(sent.step, arriving.step, beliefs.told),
+    )
 
 
 def _sent(state):
