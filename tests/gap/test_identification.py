@@ -17,7 +17,7 @@ from openjax.gap.identification.quantities import Identification, doubts, quanti
 from openjax.gap.identification.records import Record, records_of
 from openjax.gap.identification.responses import responses
 from openjax.gap.identification.rotor_rows import rotor_rows
-from openjax.gap.identification.support import support
+from openjax.gap.identification.support import GAIN, Response, log_density
 from openjax.gap.identification.torques import identify_torques
 from openjax.gap.model.library import ABSENT, PLACE
 from openjax.gap.report.response import response_of
@@ -79,7 +79,8 @@ def test_the_search_hears_that_slow_motors_are_no_inertia(records):
         theta = ABSENT.copy()
         for (effect, parameter), place in PLACE.items():
             theta[place] = values.get(f"{effect}_{parameter}", theta[place])
-        return support(found, theta, pwm=False)
+        response = Response(found, lambda _: 1.0 + values.get("thrust_scale_scale", 0.0), GAIN)
+        return log_density(response.residuals(theta))
 
     lag = speaks_for(motor_lag_extra_up=0.05, motor_lag_extra_down=0.05)
     assert lag > -3.0

@@ -7,10 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from openjax.flights.clocks import case_on_gyroscope_clock
 from openjax.flights.flight import Case
-from openjax.gap.evidence import Evidence, gather
-from openjax.gap.identification.quantities import identify
+from openjax.gap.evidence import Evidence, gather, with_identification
 from openjax.gap.intervals import estimates
 from openjax.gap.model.bounds import BOUND
 from openjax.gap.model.library import CARDS, PLACE, library, path_of
@@ -26,7 +24,7 @@ from openjax.gap.reference import (
 from openjax.gap.report import Report
 from openjax.gap.report.rules import LEAST_SHARE
 from openjax.gap.residual import Check, check_residual
-from openjax.gap.selection import DETECTABLE, Selection, select
+from openjax.gap.selection import DETECTABLE, Selection, plainly, select
 from openjax.gap.shares import Split, split
 from openjax.gap.where import locate
 
@@ -53,15 +51,12 @@ def diagnose_case(
         evidence = gather(case, library(without), progress, both)
     if progress:
         progress("identifying what the vehicle does")
-    sensors = evidence.sensors
-    in_time = case_on_gyroscope_clock(case, sensors.motors_late)
-    found = identify(in_time, sensors.one_clock and sensors.motor_clock)
-    evidence = replace(evidence, identification=found)
+    evidence = with_identification(evidence)
     if progress:
         progress("trying every effect that the flights can show")
     report = conclude(evidence)
     seconds = time.perf_counter() - begin
-    return replace(report, identification=found, seconds=seconds)
+    return replace(report, identification=evidence.identification, seconds=seconds)
 
 
 def conclude(evidence: Evidence) -> Report:
@@ -74,7 +69,8 @@ def conclude(evidence: Evidence) -> Report:
         for e, p in channel.named().items()
         if differs(channel, e, evidence.baseline)
     }
-    check = check_residual(evidence, selection.fit, selection.search.nothing.fit)
+    nothing = plainly(selection.search.nothing.fit)
+    check = check_residual(evidence, selection.plain, nothing)
     old = trimmed_before(
         selection.fit.theta, selection.effects, evidence.baseline, evidence.vehicles[0]
     )
@@ -149,7 +145,7 @@ def _report(
         shares=parts,
         equivalent=equivalent,
         parameters=estimates(evidence, selection.fit, named),
-        where=locate(evidence, selection.fit, named),
+        where=locate(evidence, selection.plain, named),
         gap=parts.gap,
         not_testable=missing,
         next_flight=_next_flight(evidence, (*others, *missing, second)),

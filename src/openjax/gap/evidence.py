@@ -5,7 +5,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from openjax.errors import UserError
-from openjax.flights.clocks import on_gyroscope_clock, read_command_clock, read_motor_clock
+from openjax.flights.clocks import (
+    case_on_gyroscope_clock,
+    on_gyroscope_clock,
+    read_command_clock,
+    read_motor_clock,
+)
 from openjax.flights.flight import Case
 from openjax.flights.kinematics import Kinematics, corrected, read_kinematics
 from openjax.flights.track import Track, tracks_of, undelayed
@@ -15,11 +20,19 @@ from openjax.gap.channels.pose import Pose, read_pose
 from openjax.gap.channels.radio import read_radio
 from openjax.gap.channels.rate_loop import read_rate_loop, with_motors
 from openjax.gap.decision import DECISION
-from openjax.gap.identification.quantities import Identification
-from openjax.gap.identification.support import support
+from openjax.gap.identification.quantities import Identification, identify
+from openjax.gap.identification.support import (
+    CHARGE,
+    GAIN,
+    UNKNOWN_GAIN,
+    UNKNOWN_MAP,
+    Response,
+    log_density,
+)
 from openjax.gap.model.baseline import Baseline
 from openjax.gap.model.library import CARDS, Library, places
 from openjax.gap.model.replay import Replay
+from openjax.vehicle.effects import EFFECTS
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,12 +73,12 @@ class Evidence:
         """{(effect, parameter): (value, standard deviation)} of what the torques' response tells
         without a model of the loop, of effects that these logs can show.
         """
-        found = self.identification
-        if found is None or not found.trusted:
+        response = self.replay.response
+        if response is None:
             return {}
         hidden = {e for e in self.library.physics if self.motion.exposure[e] == 0.0}
-        names = [key for key in found.estimates.names if key[0] not in hidden]
-        return {key: found.estimates.of(*key) for key in names}
+        names = [key for key in response.estimates.names if key[0] not in hidden]
+        return {key: response.measured(key) for key in names}
 
     def support(self, theta: np.ndarray) -> float:
         """Nats by which what the replay doesn't weigh speaks for parameters theta (P,): the
@@ -80,11 +93,63 @@ class Evidence:
         return gusts.nats if gusts is not None and acts else 0.0
 
     def _of_torques(self, theta: np.ndarray) -> float:
-        found = self.identification
-        if found is None or not found.trusted:
-            return 0.0
-        pwm = self.case.vehicle_file.motor.command == "pwm"
-        return support(found.estimates, theta, pwm)
+        response = self.replay.response
+        return 0.0 if response is None else log_density(response.residuals(theta))
+
+
+def with_identification(evidence: Evidence) -> Evidence:
+    """The evidence with what the torques do in closed loop, which counts where it is trusted."""
+    sensors = evidence.sensors
+    in_time = case_on_gyroscope_clock(evidence.case, sensors.motors_late)
+    found = identify(in_time, sensors.one_clock and sensors.motor_clock)
+    if found is None or not found.trusted:
+        return replace(evidence, identification=found)
+    known = None if evidence.baseline is None else evidence.baseline.identification
+    before = known.estimates if known is not None and known.trusted else None
+    replay = evidence.replay
+    response = Response(
+        found.estimates,
+        replay.physics.thrust_slope,
+        _common(evidence, found.duty_cycles, before is not None),
+        sensors.gain if before is None else 1.0,
+        before,
+        replay.absent,
+    )
+    motion = replace(
+        evidence.motion,
+        replay=replay.identified(response),
+        exposure=evidence.motion.exposure | _shown(evidence, response),
+    )
+    return replace(evidence, identification=found, motion=motion)
+
+
+def _shown(evidence: Evidence, response: Response) -> dict[str, float]:
+    """{effect: nats by which the response would tell it at its usual size}, of those that can be
+    told from these logs.
+    """
+    absent = evidence.replay.absent
+    shown = {}
+    for effect in response.effects:
+        if evidence.motion.exposure.get(effect, 0.0) > 0.0:
+            own = places((effect,))
+            theta = absent.copy()
+            sample = CARDS[effect].sample
+            theta[own] += [
+                sample[p.name] - EFFECTS[effect].parameters[p.name].none
+                for p in CARDS[effect].fitted
+            ]
+            change = response.residuals(theta) - response.residuals(absent)
+            shown[effect] = 0.5 * float(change @ change)
+    return shown
+
+
+def _common(evidence: Evidence, pwm: bool, known: bool) -> float:
+    """What all gains of the torques may have in common that no effect is: as `support.GAIN`."""
+    if known:
+        return float(np.hypot(GAIN, CHARGE if evidence.charge_unknown else 0.0))
+    compared = evidence.sensors.one_clock and all(t.quaternion is not None for t in evidence.tracks)
+    gyroscope = 0.0 if compared else UNKNOWN_GAIN
+    return float(np.linalg.norm([GAIN, gyroscope, UNKNOWN_MAP if pwm else 0.0]))
 
 
 def gather(

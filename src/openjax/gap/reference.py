@@ -13,14 +13,14 @@ from openjax.errors import UserError
 from openjax.flights.flight import Case
 from openjax.gap.channels import Channel
 from openjax.gap.decision import DECISION
-from openjax.gap.evidence import Evidence, gather
+from openjax.gap.evidence import Evidence, gather, with_identification
 from openjax.gap.model.baseline import COLOURED, FORM, Baseline, day_of, transferred
 from openjax.gap.model.cross_validation import Equations
 from openjax.gap.model.hypotheses import SetFit, fit_set
 from openjax.gap.model.library import ABSENT, CARDS, PLACE, THETA, Library, library, places
 from openjax.gap.model.table import build, with_effects
 from openjax.gap.residual import measure, residuals_of
-from openjax.gap.selection import searched
+from openjax.gap.selection import plainly, searched
 from openjax.vehicle.effects import EFFECTS
 from openjax.vehicle.effects.effect import VERY_RARE
 
@@ -41,11 +41,11 @@ def read_reference(case: Case, progress=None) -> Baseline:
     Raises UserError as `gather`.
     """
     effects = Library(tuple(e for e in library().effects if e not in (*OF_DAYS, *OTHER_NAMES)))
-    evidence = gather(case, effects, progress, reference=True)
+    evidence = with_identification(gather(case, effects, progress, reference=True))
     search = searched(evidence)
     best = search.choose(np.ones((1, len(search.nothing.judged.nats))))[0].fit
     fit = fit_set(best.replay, best.effects, best.theta, rounds=ROUNDS)
-    measures, _ = measure(evidence, residuals_of(fit))
+    measures, _ = measure(evidence, residuals_of(plainly(fit)))
     kept = tuple(e for e in fit.effects if e in FORM)
     names, mean, covariance = _another_day(evidence, fit, kept)
     theta = ABSENT.copy()
@@ -54,7 +54,8 @@ def read_reference(case: Case, progress=None) -> Baseline:
         theta[key] = fit.theta[key] + moved  # of an effect that the fit hasn't that is "absent"
     channels = {c.path: c for c in evidence.channels}
     trim = _trim_of_a_day(fit, evidence.vehicles[0])
-    return Baseline(theta, kept, names, covariance, measures, channels, trim)
+    identified = evidence.identification
+    return Baseline(theta, kept, names, covariance, measures, channels, trim, identified)
 
 
 def borne_out(evidence: Evidence) -> Baseline:
@@ -135,7 +136,12 @@ def _another_day(evidence: Evidence, fit: SetFit, effects) -> tuple[tuple[str, .
     shared = [n for n, s in zip(fit.replay.nuisance_names, fit.replay.shared, strict=True) if s]
     names = [" ".join(THETA[i]) for i in fit.index]
     kept = [n.split(" ")[0] in effects for n in names]
-    kept += [n in sizes and n not in names and n.split(" ")[0] in LASTING for n in shared]
+    told = (
+        LASTING
+        if evidence.replay.response is None
+        else set(LASTING) - set(evidence.replay.response.effects)
+    )
+    kept += [n in sizes and n not in names and n.split(" ")[0] in told for n in shared]
     names += shared
     unit = np.array([1.0] * inside + [sizes.get(n, 1.0) for n in shared])
     # Of the parameters themselves, whatever the columns' units.
@@ -150,8 +156,8 @@ def _another_day(evidence: Evidence, fit: SetFit, effects) -> tuple[tuple[str, .
     found, covariance = transferred(hessian, push, precision, ~np.array(kept), days)
     unit = unit[kept]
     moved = (found + around[kept]) * unit
-    told = tuple(n for n, k in zip(names, kept, strict=True) if k)
-    return told, moved, covariance * np.outer(unit, unit)
+    known = tuple(n for n, k in zip(names, kept, strict=True) if k)
+    return known, moved, covariance * np.outer(unit, unit)
 
 
 def joined(cases: Sequence[Case]) -> Case:

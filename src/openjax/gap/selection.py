@@ -87,6 +87,11 @@ class Selection:
     def fit(self) -> SetFit:
         return self.chosen.fit
 
+    @property
+    def plain(self) -> SetFit:
+        """The same, with torques of its parameters alone."""
+        return self.table.fit
+
     def probability(self, effect: str) -> float:
         """That the effect, or one that would do as well in its place, acts."""
         alike = {effect, *self.equivalent.get(effect, ())}
@@ -106,8 +111,18 @@ def select(evidence: Evidence) -> Selection:
     chosen = replace(
         chosen, fit=fit_set(chosen.fit.replay, chosen.effects, chosen.fit.theta, rounds=ROUNDS)
     )
-    table = build(chosen.fit, {})
+    table = build(plainly(chosen.fit), {})
     return Selection(chosen, table, ordered, weights, search.equivalents(chosen, ordered), search)
+
+
+def plainly(fit: SetFit) -> SetFit:
+    """A fit with torques of its parameters alone: what its effects do, and what it leaves."""
+    if not fit.replay.answering:
+        return fit
+    plain = fit.replay.plain()
+    if fit.effects:
+        plain = plain.around(fit.theta)
+    return fit_set(plain, fit.effects, fit.theta, rounds=0)
 
 
 def searched(evidence: Evidence) -> Search:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from openjax.gap.decision import DECISION
+from openjax.gap.identification.quantities import Identification
 from openjax.gap.model.library import CARDS, PHYSICS_EFFECTS
 from openjax.vehicle.effects import EFFECTS
 from openjax.vehicle.effects.effect import growth
@@ -32,7 +33,8 @@ class Baseline:
     """`theta` (P,) of the physics; `effects` that act in the reference, of the vehicle's form;
     `names` of their numbers ("effect parameter") whose joint `covariance` is known; `measures` of
     what is left of the reference flights, as `residual` has them; `channels` of the reference by
-    path; `trim` (4,) of its rotors on that day, as `reference.trim_of`.
+    path; `trim` (4,) of its rotors on that day, as `reference.trim_of`; `identification` of its
+    torques, None where no flight has them.
     """
 
     theta: np.ndarray
@@ -42,6 +44,7 @@ class Baseline:
     measures: dict[str, float]
     channels: dict[str, object]
     trim: np.ndarray
+    identification: Identification | None = None
 
     @property
     def numbers(self) -> tuple[tuple[str, str, float], ...]:

@@ -11,7 +11,8 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float
 
-from openjax.gap.model.library import ABSENT, CARDS, PLACE, Library, places, prior
+from openjax.gap.identification.support import log_density, weight
+from openjax.gap.model.library import ABSENT, CARDS, PLACE, STEP, Library, places, prior
 from openjax.gap.model.replay import GROUPS, SKIP, Replay, block_count
 from openjax.gap.model.whitening import fit_noise
 from openjax.gap.shapes import Parameters, Rows
@@ -35,7 +36,9 @@ class SetFit:
     index: np.ndarray
     """(p,) places in it of the set's own."""
     precision: np.ndarray
-    """(p, p) of their prior."""
+    """(p, p) of their prior, with what the torques' response says."""
+    mean: np.ndarray
+    """(p,) the same."""
     columns: list
     """[(1 + p, T, 9)]: residual and derivatives of each track at the optimum."""
     grams: np.ndarray
@@ -56,7 +59,8 @@ class SetFit:
     def cost(self) -> float:
         """Nats that the parameters cost: how much narrower their posterior is than their prior."""
         _, posterior = np.linalg.slogdet(self.hessian)
-        _, before = np.linalg.slogdet(self.precision)
+        _, _, alone = prior(self.effects, self.replay.absent, self.replay.grown)
+        _, before = np.linalg.slogdet(alone)
         return 0.5 * float(posterior - before)
 
     @property
@@ -106,17 +110,37 @@ def _at(replay: Replay, effects, theta: np.ndarray, columns=None) -> SetFit:
     grams = replay.grams(columns)
     off = theta[index] - mean
     objective = 0.5 * float(grams[:, 0, 0].sum() + off @ precision @ off)
-    return SetFit(replay, effects, theta, index, precision, columns, grams, objective)
+    if replay.response is not None:
+        objective -= log_density(replay.response.residuals(theta))
+        mean, precision = _with_response(replay, theta, index, mean, precision)
+    return SetFit(replay, effects, theta, index, precision, mean, columns, grams, objective)
+
+
+def _with_response(replay: Replay, theta, index, mean, precision):
+    """Mean (p,) and precision (p, p) of a prior with what the torques' response says, linearised at
+    theta (P,).
+    """
+    residuals = replay.response.residuals(theta)
+    sizes = (STEP * replay.grown)[index]
+    slopes = np.zeros((len(residuals), len(index)))
+    for k, (place, size) in enumerate(zip(index, sizes, strict=True)):
+        ahead = theta.copy()
+        ahead[place] += size
+        slopes[:, k] = (replay.response.residuals(ahead) - residuals) / size
+    information = weight(residuals) * slopes.T
+    total = precision + information @ slopes
+    push = precision @ mean + information @ (slopes @ theta[index] - residuals)
+    return np.linalg.solve(total, push), total
 
 
 def _descend(fit: SetFit, iterations: int) -> SetFit:
     """Steps of Gauss and Newton, half of one that overshoots, while they gain anything."""
-    index, mean, precision = prior(fit.effects, fit.replay.absent, fit.replay.grown)
+    index, _, precision = prior(fit.effects, fit.replay.absent, fit.replay.grown)
     # no step longer than three prior deviations: farther away the derivatives say little
     reach = 3.0 * np.sqrt(np.diag(np.linalg.inv(precision)))
     share = 1.0
     for _ in range(iterations):
-        push = fit.grams.sum(0)[1:, 0] - precision @ (fit.theta[index] - mean)
+        push = fit.grams.sum(0)[1:, 0] - fit.precision @ (fit.theta[index] - fit.mean)
         step = np.linalg.solve(fit.hessian, push)
         if 0.5 * push @ step < SMALL_STEP:
             break

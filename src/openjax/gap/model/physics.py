@@ -51,6 +51,38 @@ def compiled_physics(names: tuple[str, ...], parameters: tuple[tuple[str, str], 
     return jax.jit(jax.vmap(partial(_channels, resolve(names), parameters)))
 
 
+@lru_cache(maxsize=16)
+def compiled_slopes(names: tuple[str, ...], parameters: tuple[tuple[str, str], ...]):
+    """How strongly thrust follows the motor commands with the effects `names`: theta (P,), vehicle
+    and path of T rows -> (T,) of the nominal vehicle's slope. Arguments as `compiled_physics`.
+    """
+    return jax.jit(partial(_slopes, resolve(names), parameters))
+
+
+def _slopes(effects, parameters, theta, vehicle, path: Path):
+    """(T,) slopes of one track."""
+    values = _values(effects, parameters, theta)
+    flown = change_body(effects, values, vehicle)
+    nominal = 4.0 * vehicle.thrust_constant * vehicle.max_rotor_speed**2
+
+    def slope(row):
+        def lift(m):
+            motion = row.position, row.quaternion, row.velocity, row.body_rates
+            state = _state(*motion, commanded_rotor_speed(flown, m))
+            room = {"others_position": row.others, "ceiling_height": row.ceiling}
+            around = make_context(flown, state, battery_voltage=row.voltage, **room)
+            speed = commanded_rotor_speed(flown, change_motor_command(effects, values, m, around))
+            thrust, _ = change_thrust(
+                effects, values, rotor_thrust(flown, speed), rotor_reaction(flown, speed), around
+            )
+            return thrust.sum()
+
+        return jax.grad(lift)(row.motor.mean(0)).sum() / nominal
+
+    along = Path(*([0] * 7), ceiling=None, dt=None)  # these two are the track's
+    return jax.vmap(slope, in_axes=(along,))(path)
+
+
 def _rotors(flown, targets_in_ticks, commands, dt, late):
     """Rotor speeds (T, 4) whose square is the row's mean, and their change (T, 4), 1/s^2, under the
     motors' lag, `late` s later. `targets_in_ticks` (T, TICKS, 4): the speeds that `commands` of the

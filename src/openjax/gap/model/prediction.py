@@ -14,7 +14,7 @@ from jaxtyping import Float, Shaped
 
 from openjax.flights.track import Track, smooth
 from openjax.gap.model.library import PHYSICS_EFFECTS, THETA, growths
-from openjax.gap.model.physics import Path, compiled_physics
+from openjax.gap.model.physics import Path, compiled_physics, compiled_slopes
 from openjax.gap.shapes import Hypotheses, Parameters
 from openjax.vehicle.effects.effect import ARENA_CEILING
 
@@ -23,6 +23,7 @@ VELOCITY = slice(3, 6)
 FORCE = slice(6, 9)
 BUCKETS = (256, 512, 1024, 2048, 4096, 8192, 16384, 32768)
 FAR = 1e3  # m, where a ceiling does nothing
+SLOPES = 256  # rows of all tracks together, at which thrust's slope is asked for
 LANES = 8  # parameter vectors along tracks that one call of the physics takes
 KEPT = 32  # mixtures of tracks that stay on the device, some megabytes each
 
@@ -65,6 +66,29 @@ class Physics:
             for number, lane in zip(numbers, np.asarray(rows), strict=False):
                 parts[number].append(lane[: len(self.tracks[number])])
         return [_integrated(np.stack(p), t.dt) for p, t in zip(parts, self.tracks, strict=True)]
+
+    def thrust_slope(self, theta: Parameters) -> float:
+        """How strongly thrust follows the motor commands on the mean over all tracks, for
+        parameters theta (P,), of the nominal vehicle's: what torques are scaled by.
+        """
+        run = compiled_slopes(PHYSICS_EFFECTS, THETA)
+        return float(np.mean(run(np.asarray(theta, np.float32), self.vehicles[0], self._some_rows)))
+
+    @cached_property
+    def _some_rows(self) -> Path:
+        """SLOPES rows of all tracks, evenly spaced."""
+        lengths = [len(t) for t in self.tracks]
+        owner = np.repeat(np.arange(len(lengths)), lengths)
+        row = np.concatenate([np.arange(n) for n in lengths])
+        chosen = np.linspace(0, len(row) - 1, SLOPES).astype(int)
+        rows = list(zip(owner[chosen].tolist(), row[chosen].tolist(), strict=True))
+
+        def of(name):
+            return np.stack([np.asarray(getattr(self.paths[k], name)[i]) for k, i in rows])
+
+        first = self.paths[0]
+        names = ("position", "quaternion", "velocity", "body_rates", "motor", "voltage", "others")
+        return first.replace(**{name: of(name) for name in names})
 
     @cached_property
     def grown(self) -> Parameters:

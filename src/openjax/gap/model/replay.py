@@ -16,6 +16,7 @@ from jaxtyping import Float, Int
 from scipy.linalg import solve_triangular
 
 from openjax.flights.track import Track
+from openjax.gap.identification.support import Response
 from openjax.gap.model.library import ABSENT, CARDS, PLACE, STEP
 from openjax.gap.model.nuisances import OF_A_BLOCK, SIZE, columns_of
 from openjax.gap.model.prediction import FORCE, RATES, VELOCITY, Physics, make_physics
@@ -59,6 +60,8 @@ class Replay:
     )
     absent: np.ndarray = field(default_factory=ABSENT.copy)  # (P,) the vehicle while nothing acts
     mixing: np.ndarray | None = None  # (N, N) of `columns` to independent ones
+    response: Response | None = None  # what the torques' response says of the parameters
+    answering: bool = False  # whether torques answer as they were identified, whatever acts
 
     @property
     def tracks(self) -> tuple[Track, ...]:
@@ -109,7 +112,28 @@ class Replay:
 
     def predict(self, theta: Hypotheses) -> list[Float[np.ndarray, "hypotheses _ channels"]]:
         """Channels (B, T, 9) of each track for parameter vectors theta (B, P)."""
+        if self.answering:
+            theta = np.array([self.response.answering(t) for t in theta])
         return self.physics.predict(theta)
+
+    def identified(self, response: Response) -> Replay:
+        """With what the torques' response says, which the motors' torques then follow: in closed
+        loop what a replay says of it is biased, and the identification has all of the motors'
+        signal.
+        """
+        return replace(self, response=response, answering=True).while_nothing_acts()
+
+    def plain(self) -> Replay:
+        """In which torques are those of the parameters alone."""
+        return replace(self, answering=False).while_nothing_acts() if self.answering else self
+
+    def while_nothing_acts(self) -> Replay:
+        """With the derivatives of a vehicle on which nothing acts."""
+        around = self.around(self.absent)
+        if any(CARDS[key[0]].balanced for key in self.numbers):  # trims are told otherwise
+            return around
+        count = len(self.numbers)
+        return replace(around, columns=[_balanced(c, count) for c in around.columns])
 
     def around(self, theta: Parameters) -> Replay:
         """With the derivatives of a vehicle that has the effects theta (P,): a wrong moment of
@@ -118,7 +142,10 @@ class Replay:
         """
         places = [PLACE[key[:2]] for key in self.numbers] + [len(theta) - 2, len(theta) - 1]
         columns = []
-        moved = (column[1:] for column in self.linearised(theta, places))
+        if self.answering:
+            theta = self.response.answering(theta)
+        plain = replace(self, answering=False)
+        moved = (column[1:] for column in plain.linearised(theta, places))
         for m, old, size in zip(moved, self.columns, self.sizes, strict=True):
             own = np.concatenate([m, m[-1:]]) * size[:, None, None]
             columns.append(np.concatenate([own, old[len(own) :]]))
@@ -227,9 +254,7 @@ def make_replay(
         usable,
         tuple(first_noise(a, i, d) for (a, i), d in zip(GROUPS, FIRST_NOISE, strict=True)),
         absent=absent.copy(),
-    ).around(absent)
-    if not any(CARDS[key[0]].balanced for key in numbers):  # trims are told otherwise
-        replay = replace(replay, columns=[_balanced(c, len(numbers)) for c in replay.columns])
+    ).while_nothing_acts()
     mixing = None if baseline is None else baseline.mixing(replay.nuisance_names)
     return replace(replay, mixing=mixing)
 

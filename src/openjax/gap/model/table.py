@@ -177,6 +177,8 @@ def with_effects(table: Table, add=(), drop=()) -> Model:
     kept = tuple(e for e in table.fit.effects if e not in drop)
     index, mean, precision = prior(kept, table.fit.replay.absent, table.fit.replay.grown)
     own = np.array([table.derivative[int(i)] for i in index], int)
+    if kept == table.fit.effects:  # with what the torques' response says
+        mean, precision = table.fit.mean, table.fit.precision
     # The set's parameters: coefficients count from where they were fitted.
     mean = mean - table.fit.theta[index] if len(index) else mean
     free = [own]

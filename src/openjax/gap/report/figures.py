@@ -40,7 +40,7 @@ def _residuals(report: Report) -> tuple[list, list]:
     """Residuals of each track of the nominal simulator, sensors and clocks as with the named
     effects, and with those.
     """
-    fit = report.plots["selection"].fit
+    fit = report.plots["selection"].plain
     return before_and_after(fit, [e for e in report.named if e in fit.effects])
 
 
