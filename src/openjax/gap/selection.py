@@ -44,6 +44,7 @@ DOES = 0.15
 FITTED = 10
 FITTED_AGAIN = 6
 SCREENED = 4  # times as many are weighed with bounded nuisances before that
+USUAL = 2  # of each prior odds
 SIMPLER = 3  # of the best sets, those without one of their effects are fitted as well
 DRAWS = 400  # of the bootstrap
 ROUNDS = 10  # of the chosen set's last fit, between which nuisances are worked out anew
@@ -188,6 +189,17 @@ def worse(gain, error, gaps, beside):
     return clear | ((gain > REACH * error) & matters(*beside, DOES))
 
 
+def by_odds(ordered: list[frozenset], most: int) -> list[frozenset]:
+    """Of each prior odds the first so many of the sets."""
+    count: Counter = Counter()
+    out = []
+    for key in ordered:
+        count[log_odds(key)] += 1
+        if count[log_odds(key)] <= most:
+            out.append(key)
+    return out
+
+
 def log_odds(effects) -> float:
     """The log prior odds of a set of effects."""
     return sum(CARDS[e].log_odds for e in effects)
@@ -274,8 +286,9 @@ class Search:
 
     def enumerate(self, near: Hypothesis, most: int, without: frozenset = NOTHING) -> None:
         """Fit and judge the most promising sets of up to LARGEST effects that weren't visited yet,
-        by the model linearised around the hypothesis `near`, and what is left of each when one of
-        its effects goes; sets with an effect of `without` aside.
+        by the model linearised around the hypothesis `near`, of each prior odds the best, as those
+        of the largest are chosen, and what is left of each when one of its effects goes; sets with
+        an effect of `without` aside.
         """
         table = build(near.fit, self.singles)
         models = {key: self._model(table, key) for key in self.sets() if not key & without}
@@ -287,9 +300,11 @@ class Search:
             }
             return [k for k in sorted(keys, key=lambda k: -score[k]) if score[k] > score[NOTHING]]
 
-        likely = ranked(models, screened)[: SCREENED * most]
-        best = ranked([NOTHING, *(k for k in likely if k != NOTHING)], promise)
+        better = ranked(models, screened)
+        likely = {*better[: SCREENED * most], *by_odds(better, SCREENED)} - {NOTHING}
+        best = ranked([NOTHING, *(k for k in better if k in likely)], promise)
         chosen = [key for key in best if key not in self.visited][:most]
+        chosen += by_odds(best, USUAL)
         chosen += [key - {effect} for key in best[:SIMPLER] for effect in key]
         for key in dict.fromkeys(chosen):
             self.of_set(key, near.fit)
