@@ -102,16 +102,19 @@ def with_identification(evidence: Evidence) -> Evidence:
     sensors = evidence.sensors
     in_time = case_on_gyroscope_clock(evidence.case, sensors.motors_late)
     found = identify(in_time, sensors.one_clock and sensors.motor_clock)
-    if found is None or not found.trusted:
-        return replace(evidence, identification=found)
     known = None if evidence.baseline is None else evidence.baseline.identification
-    before = known.estimates if known is not None and known.trusted else None
+    alike = found is not None and known is not None and found.trusted == known.trusted
+    before = known.estimates if alike and found.comparable and known.comparable else None
+    # Where the replay itself knows what single samples hide, it says more than their change.
+    compared = before is not None and evidence.motion.blind
+    if found is None or not (found.trusted or compared):
+        return replace(evidence, identification=found)
     replay = evidence.replay
     response = Response(
         found.estimates,
         replay.physics.thrust_slope,
         _common(evidence, found.duty_cycles, before is not None),
-        sensors.gain if before is None else 1.0,
+        sensors.gain,
         before,
         replay.absent,
     )
@@ -130,7 +133,7 @@ def _shown(evidence: Evidence, response: Response) -> dict[str, float]:
     absent = evidence.replay.absent
     shown = {}
     for effect in response.effects:
-        if evidence.motion.exposure.get(effect, 0.0) > 0.0:
+        if effect in evidence.library.effects and effect not in evidence.motion.hidden:
             own = places((effect,))
             theta = absent.copy()
             sample = CARDS[effect].sample

@@ -152,6 +152,10 @@ class Motion:
     """{effect: nats that it would leave at its usual size}; 0 where it can't be told."""
     gusts: Gusts | None = None
     """Under other vehicles, if these gust beyond doubt."""
+    hidden: frozenset[str] = frozenset()
+    """Effects that can't be told whatever their torques do."""
+    blind: bool = False
+    """Whether it isn't known what motors do within a row."""
 
     @cached_property
     def nothing(self) -> SetFit:
@@ -180,10 +184,12 @@ def read_motion(reading: Reading, loop: RateLoop | None) -> Motion:
         tracks, reading.vehicles, ticks, feedback, reading.numbers, clocks, reading.baseline
     )
     replay, exposure = model_noise(replay, library)
-    exposure |= {e: 0.0 for e in library.physics if _hidden(CARDS[e], reading)}
+    hidden = frozenset(e for e in library.physics if _hidden(CARDS[e], reading))
+    exposure |= dict.fromkeys(hidden, 0.0)
+    exposure |= {e: 0.0 for e in library.physics if reading.blind and CARDS[e].torque_axes}
     if not sensors.motor_clock:
         exposure |= {e: 0.0 for e in library.physics if _is_lag(e)}
-    return _beside_others(Motion(replay, library, exposure))
+    return _beside_others(Motion(replay, library, exposure, None, hidden, reading.blind))
 
 
 def _beside_others(motion: Motion) -> Motion:
@@ -210,7 +216,7 @@ def _is_lag(effect: str) -> bool:
 
 def _hidden(card, reading: Reading) -> bool:
     """Whether an effect can't be told from these logs, however large it is: its channel is missing,
-    or it looks like a nuisance, what motors do unseen or the map from duty cycles to thrust.
+    or it looks like the map from duty cycles to thrust.
     """
     if card.needs and any(getattr(t, card.needs) is None for t in reading.tracks):
         return True
@@ -218,7 +224,7 @@ def _hidden(card, reading: Reading) -> bool:
     weightless = any(t.velocity is None and t.specific_force is None for t in reading.tracks)
     if card.needs_force and weightless:
         return True
-    if (reading.blind and card.torque_axes) or (reading.unmapped and card.thrust_map):
+    if reading.unmapped and card.thrust_map:
         return True
     return card.impossible is not None and any(
         t.ceiling is None and card.impossible(t.position) for t in reading.tracks

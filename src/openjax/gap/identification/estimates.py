@@ -12,7 +12,8 @@ from openjax.gap.identification.torques import identify_torques
 
 @dataclass(frozen=True, eq=False)
 class EffectEstimates:
-    """`value` (n,) and `covariance` (n, n) of effects' parameters `names`: (effect, parameter).
+    """`value` (n,) and `covariance` (n, n) of effects' parameters `names`: (effect, parameter);
+    `again` (n, n): in which those of other flights that were logged alike differ.
     `clock`: s by which motors answer later than logged, and its standard deviation; a delay in
     the vehicle and clocks that are off look alike.
     """
@@ -20,6 +21,7 @@ class EffectEstimates:
     names: tuple[tuple[str, str], ...]
     value: np.ndarray
     covariance: np.ndarray
+    again: np.ndarray
     clock: tuple[float, float]
     fit: TorqueFit
 
@@ -61,6 +63,6 @@ def of_fit(fit: TorqueFit, records: list[Record]) -> EffectEstimates:
     slopes[0, 0] = slopes[1, 1] = slopes[4, 5] = 1.0
     slopes[2, 3] = -1.0 / roll**2
     slopes[3, 4] = -1.0 / pitch**2
-    covariance = slopes @ fit.covariance @ slopes.T
+    covariance, again = (slopes @ c @ slopes.T for c in (fit.covariance, fit.again))
     clock = float(fit.value[2]), float(np.sqrt(fit.covariance[2, 2]))
-    return EffectEstimates(ESTIMATED, value, covariance, clock, fit)
+    return EffectEstimates(ESTIMATED, value, covariance, again, clock, fit)

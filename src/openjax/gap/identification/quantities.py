@@ -21,6 +21,10 @@ MAP = (
     "motor commands are duty cycles: inertia and yaw ratio hold the unknown slope of their thrust, "
     "too"
 )
+SAMPLES = (
+    "a row's motors are one sample of a loop that runs several times within it; log their means at "
+    "100 Hz, or every sample at 500 Hz"
+)
 TURNS = 8.0  # standard deviations of noise: below, rows show a loop that answers noise
 CLOCK = 0.010  # s: rows off by more are worth a sentence
 POSITIVE = ("spin_up", "spin_down", "roll_gain", "pitch_gain", "yaw_gain")
@@ -65,7 +69,8 @@ class Quantity:
 @dataclass(frozen=True, eq=False)
 class Identification:
     """`quantities` {name: quantity}, `responses` {axis: measured and simulated}, `remarks`: what to
-    think of when reading them; `estimates` are for the diagnosis; `duty_cycles`: what thrust a
+    think of when reading them; `estimates` are for the diagnosis; `trusted` as they are, or
+    `comparable` with those of other flights that were logged alike; `duty_cycles`: what thrust a
     motor command makes isn't known, so that gains tell its map and the inertia together.
     """
 
@@ -74,6 +79,7 @@ class Identification:
     remarks: tuple[str, ...]
     estimates: EffectEstimates
     trusted: bool = True
+    comparable: bool = True
     duty_cycles: bool = False
 
     def to_dict(self, shares: dict[str, float] | None = None) -> dict:
@@ -143,6 +149,7 @@ def identify(case: Case, one_clock: bool = True) -> Identification | None:
         (*untrusted, *remarks),
         of_fit(fit, records),
         trusted=not untrusted,
+        comparable=not untrusted or untrusted == (SAMPLES,),
         duty_cycles=duty_cycles,
     )
 
@@ -203,10 +210,7 @@ def doubts(records: list[Record], fit: TorqueFit, one_clock: bool) -> tuple[str,
             "holes"
         )
     if any(r.hidden and r.samples for r in records):
-        found.append(
-            "a row's motors are one sample of a loop that runs several times within it; log their "
-            "means at 100 Hz, or every sample at 500 Hz"
-        )
+        found.append(SAMPLES)
     if any(r.hidden for r in records) and fit.turning[:2].max() < TURNS:
         found.append("the vehicle hardly turns; fly the segments yaw, agile or step")
     if np.isclose(fit.value[3:6], SEARCHED[1][0], rtol=0.02).any() and not found:

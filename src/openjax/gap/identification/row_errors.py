@@ -40,14 +40,23 @@ def turning(problem: Problem, axes: list) -> tuple[np.ndarray, np.ndarray]:
 
 def hidden_errors(problem: Problem, axes: list) -> np.ndarray:
     """Standard deviations (9,) at a place of the search, of what rows hide."""
+    if not (problem.records[0].hidden and any(r.samples for r in problem.records)):
+        return repeated_errors(problem, axes)
+    out = np.zeros(len(NAMES))
+    out[2] = HALF_CYCLE
+    out[[0, 1]] = SAMPLED_LAG
+    out[[3, 4, 5]] = SAMPLED_GAIN
+    out[[6, 7]] = SAMPLED_DAMPING
+    return out
+
+
+def repeated_errors(problem: Problem, axes: list) -> np.ndarray:
+    """The same (9,) of what rows hide in one set of flights and not in another that was logged
+    alike: what single samples miss of the loop they miss in both.
+    """
     out = np.zeros(len(NAMES))
     out[2] = HALF_CYCLE
     if not problem.records[0].hidden:
-        return out
-    if any(r.samples for r in problem.records):
-        out[[0, 1]] = SAMPLED_LAG
-        out[[3, 4, 5]] = SAMPLED_GAIN
-        out[[6, 7]] = SAMPLED_DAMPING
         return out
     turned, quick = turning(problem, axes)
     beyond = max(quick[:2].max() ** 2 - 1.0, NOISE_IN_LAG / LARGEST_ERROR)

@@ -10,7 +10,7 @@ from openjax.gap.identification.prediction_errors import (
     Problem,
     value_at,
 )
-from openjax.gap.identification.row_errors import hidden_errors, turning
+from openjax.gap.identification.row_errors import hidden_errors, repeated_errors, turning
 
 SEARCHED = np.array([[0.002, 0.15], [0.02, 5.0]])
 """Time constants, s, and gains beyond which nothing is looked for."""
@@ -27,13 +27,15 @@ SWEEPS = 2
 
 @dataclass(frozen=True, eq=False)
 class TorqueFit:
-    """`value` (9,) and `covariance` (9, 9) of `NAMES`; `loss` nats; `noise` {axis: coefficients
-    (p,)}; `whole` innovations' variances (3,); `turning` (3,): what each axis turns, in standard
-    deviations of its noise.
+    """`value` (9,) and `covariance` (9, 9) of `NAMES`, `again` (9, 9) in which such estimates of
+    other flights of the vehicle that were logged alike differ; `loss` nats; `noise` {axis:
+    coefficients (p,)}; `whole` innovations' variances (3,); `turning` (3,): what each axis turns,
+    in standard deviations of its noise.
     """
 
     value: np.ndarray
     covariance: np.ndarray
+    again: np.ndarray
     loss: float
     noise: list
     whole: np.ndarray
@@ -95,10 +97,13 @@ def search(problem: Problem, place: np.ndarray) -> TorqueFit:
             break
     scale = np.ones(len(value))
     scale[LOGARITHMS] = value_at(value)[LOGARITHMS]
+    shown = _covariance(problem, value, axes)
+    errors = (hidden_errors(problem, axes), repeated_errors(problem, axes))
+    once, again = ((shown + np.diag(e**2)) * np.outer(scale, scale) for e in errors)
     return TorqueFit(
         value_at(value),
-        (_covariance(problem, value, axes) + np.diag(hidden_errors(problem, axes) ** 2))
-        * np.outer(scale, scale),
+        once,
+        again,
         loss,
         [a[2] for a in axes],
         np.array([a[0].var() for a in axes]),

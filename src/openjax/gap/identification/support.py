@@ -80,7 +80,8 @@ class Response:
         for found in (self.estimates, self.before):
             if found is not None:
                 scale = np.where(gains, found.value, 1.0)
-                covariance += found.covariance / np.outer(scale, scale)
+                each = found.covariance if self.before is None else found.again
+                covariance += each / np.outer(scale, scale)
         return np.linalg.cholesky(covariance)
 
     @cached_property
@@ -88,13 +89,13 @@ class Response:
         """(n,) by how much the reference's estimates differ from what is taken for true there."""
         if self.before is None:
             return np.zeros(len(self._gains))
-        return self._off(self.before, self.absent, 1.0)
+        return self._off(self.before, self.absent)
 
     def residuals(self, theta: np.ndarray) -> np.ndarray:
         """(n,) by how much the estimates differ from those that parameters theta (P,) would make, in
         standard deviations.
         """
-        off = self._off(self.estimates, theta, self.gain) - self._reference
+        off = self._off(self.estimates, theta) - self._reference
         return np.linalg.solve(self._root, off)
 
     def answering(self, theta: np.ndarray) -> np.ndarray:
@@ -110,18 +111,18 @@ class Response:
         out[PLACE["inertia", "zz"]] = 1.0
         return out
 
-    def _off(self, found: EffectEstimates, theta: np.ndarray, gain: float) -> np.ndarray:
-        expected = self._expected(theta, gain)
+    def _off(self, found: EffectEstimates, theta: np.ndarray) -> np.ndarray:
+        expected = self._expected(theta)
         gains = self._gains
         off = found.value - expected
         off[gains] = np.log(found.value[gains] / np.maximum(expected[gains], LEAST))
         return off
 
-    def _expected(self, theta: np.ndarray, gain: float) -> np.ndarray:
+    def _expected(self, theta: np.ndarray) -> np.ndarray:
         def of(effect, parameter):
             return float(theta[PLACE[effect, parameter]])
 
-        slope = max(gain * self.slope(theta), 0.1)
+        slope = max(self.gain * self.slope(theta), 0.1)
         out = np.array([of(*name) for name in self.estimates.names])
         for number, (effect, _) in enumerate(self.estimates.names):
             if effect == "inertia":
@@ -135,14 +136,16 @@ class Response:
         value, deviation = self.estimates.of(*name)
         if self.before is None:
             return value, deviation
-        there = self.before.of(*name)
+        place = self.estimates.names.index(name)
+        there = float(self.before.value[place])
+        variances = self.estimates.again[place, place], self.before.again[place, place]
         then = float(self.absent[PLACE[name]])
         usual = BETWEEN[name[1]]
         if name[0] == "motor_lag":
-            return then + value - there[0], float(np.hypot(np.hypot(deviation, there[1]), usual))
-        errors = deviation / value, there[1] / there[0], usual
-        value = then * value / there[0]
-        return value, value * float(np.sqrt(np.square(errors).sum()))
+            return then + value - there, float(np.sqrt(sum(variances) + usual**2))
+        square = variances[0] / value**2 + variances[1] / there**2 + usual**2
+        value = then * value / there
+        return value, value * float(np.sqrt(square))
 
 
 def _sign(effect: str) -> float:
