@@ -11,7 +11,7 @@ from experiments.diagnosis.rate_flights import Truth, fly, rows_of, vehicle_of
 from openjax.flights.clocks import case_on_gyroscope_clock
 from openjax.flights.flight import Case, Flight
 from openjax.gap.identification.corrections import corrections
-from openjax.gap.identification.estimates import of_fit
+from openjax.gap.identification.estimates import EffectEstimates, of_fit
 from openjax.gap.identification.prediction_errors import NAMES
 from openjax.gap.identification.quantities import Identification, doubts, quantities_of
 from openjax.gap.identification.records import Record, records_of
@@ -89,6 +89,32 @@ def test_the_search_hears_that_slow_motors_are_no_inertia(records):
     # A weaker thrust would turn it less, too.
     both = {"inertia_xx": 0.8, "inertia_yy": 0.8, "inertia_zz": 0.8, "thrust_scale_scale": -0.2}
     assert speaks_for(motor_lag_extra_up=0.05, motor_lag_extra_down=0.05, **both) > -5.0
+
+
+def test_what_form_does_in_both_sets_of_flights_is_no_change():
+    names = (("motor_lag", "extra_up"), ("motor_lag", "extra_down"))
+    names += (("inertia", "xx"), ("inertia", "yy"), ("yaw_torque", "ratio"))
+    small = np.diag([1e-6, 1e-6, 1e-4, 1e-4, 1e-4])
+
+    def told(*value):
+        return EffectEstimates(names, np.array(value), small, small, (0.0, 0.001), None)
+
+    def of(before, **values):
+        theta = ABSENT.copy()
+        for (effect, parameter), place in PLACE.items():
+            theta[place] = values.get(f"{effect}_{parameter}", theta[place])
+        heavier = told(0.008, 0.02, 1.25 * 1.2, 1.25 * 1.2, 0.8 / 1.2)
+        response = Response(heavier, lambda _: 1.0, GAIN, 1.0, before, ABSENT)
+        return log_density(response.residuals(theta)), response
+
+    # A gyroscope that reads a fifth too little, and motors 8 and 20 ms slower than told.
+    before = told(0.008, 0.02, 1.25, 1.25, 0.8)
+    heavy = {"inertia_xx": 1.2, "inertia_yy": 1.2, "inertia_zz": 1.2}
+    assert of(before, **heavy)[0] > -0.01
+    assert of(before)[0] < -4.0
+    assert of(None, **heavy)[0] < -8.0
+    value, deviation = of(before)[1].measured(("inertia", "xx"))
+    assert value == pytest.approx(1.2) and deviation < 0.04
 
 
 def test_motors_logged_late_are_a_clock(records):

@@ -111,3 +111,20 @@ def test_a_propeller_that_spins_up_turns_the_body_by_its_angular_momentum():
     np.testing.assert_allclose(
         turned - without, [0.0, 0.0, 0.002 * gained], atol=1e-3 * abs(gained) * 0.002
     )
+
+
+def test_the_slope_of_thrust_is_that_of_what_acts():
+    track = track_of(200, 0)
+    physics = make_physics([track], [load_vehicle()], [np.repeat(track.motor[:, None], TICKS, 1)])
+
+    def slope(**values):
+        theta = ABSENT.copy()
+        for (effect, parameter), place in PLACE.items():
+            theta[place] = values.get(f"{effect}_{parameter}", theta[place])
+        return physics.thrust_slope(theta)
+
+    mean = track.motor.mean()
+    assert slope() == pytest.approx(1.0)
+    assert slope(thrust_scale_scale=-0.2, inertia_xx=1.5) == pytest.approx(0.8)
+    assert slope(thrust_curve_curvature=0.3) == pytest.approx(1.0 + 0.6 * mean, rel=0.02)
+    assert slope(thrust_saturation_limit=0.6) < 0.7

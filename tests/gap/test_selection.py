@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from openjax.gap.model.cross_validation import Judged
-from openjax.gap.selection import difference, growth, worse
+from openjax.gap.selection import by_odds, difference, growth, worse
 
 
 def judged(left: np.ndarray, blocks: int) -> Judged:
@@ -71,3 +71,10 @@ def test_an_effect_that_nuisances_take_on_matters_as_what_it_does():
     gaps, own = ((s, floor, s) for s in (inside, beside))
     assert worse(10.0, 5.0, gaps, own) and not worse(10.0, 5.0, gaps, gaps)
     assert not worse(10.0, 7.0, gaps, own)  # and it isn't clear
+
+
+def test_of_each_prior_odds_the_first_sets_are_tried():
+    drag, scale, curve = (frozenset({e}) for e in ("rotor_drag", "thrust_scale", "thrust_curve"))
+    ordered = [drag | curve, curve, scale | curve, drag | scale, scale, drag]
+    assert by_odds(ordered, 1) == [drag | curve, curve, drag | scale, scale]
+    assert by_odds(ordered, 2) == ordered

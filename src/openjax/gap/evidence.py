@@ -118,6 +118,8 @@ def with_identification(evidence: Evidence) -> Evidence:
         before,
         replay.absent,
     )
+    if not response.exact:
+        return replace(evidence, identification=found)
     motion = replace(
         evidence.motion,
         replay=replay.identified(response),

@@ -44,7 +44,7 @@ DOES = 0.15
 FITTED = 10
 FITTED_AGAIN = 6
 SCREENED = 4  # times as many are weighed with bounded nuisances before that
-USUAL = 2  # of each prior odds
+USUAL = 2  # of each prior odds that are larger than the best one's
 SIMPLER = 3  # of the best sets, those without one of their effects are fitted as well
 DRAWS = 400  # of the bootstrap
 ROUNDS = 10  # of the chosen set's last fit, between which nuisances are worked out anew
@@ -286,9 +286,9 @@ class Search:
 
     def enumerate(self, near: Hypothesis, most: int, without: frozenset = NOTHING) -> None:
         """Fit and judge the most promising sets of up to LARGEST effects that weren't visited yet,
-        by the model linearised around the hypothesis `near`, of each prior odds the best, as those
-        of the largest are chosen, and what is left of each when one of its effects goes; sets with
-        an effect of `without` aside.
+        by the model linearised around the hypothesis `near`, the best of all larger prior odds, on
+        which the choice falls, and what is left of each when one of its effects goes; sets with an
+        effect of `without` aside.
         """
         table = build(near.fit, self.singles)
         models = {key: self._model(table, key) for key in self.sets() if not key & without}
@@ -304,7 +304,7 @@ class Search:
         likely = {*better[: SCREENED * most], *by_odds(better, SCREENED)} - {NOTHING}
         best = ranked([NOTHING, *(k for k in better if k in likely)], promise)
         chosen = [key for key in best if key not in self.visited][:most]
-        chosen += by_odds(best, USUAL)
+        chosen += by_odds([k for k in best if log_odds(k) > log_odds(best[0])], USUAL)
         chosen += [key - {effect} for key in best[:SIMPLER] for effect in key]
         for key in dict.fromkeys(chosen):
             self.of_set(key, near.fit)

@@ -35,6 +35,8 @@ BETWEEN = {"extra_up": 0.0015, "extra_down": 0.002, "xx": 0.02, "yy": 0.02, "rat
 which no effect on the torques acts, nine in ten lie within 1.6 times these and their errors (seed
 2302).
 """
+EXACT = {"extra_up": 0.006, "extra_down": 0.008, "xx": 0.12, "yy": 0.12, "ratio": 0.25}
+"""Standard deviations, in the same units, beyond which the replay says more than the response."""
 CHARGE = 0.15
 """Of gains on another day, where the battery's charge acts unseen."""
 LEAST = 0.05  # of a gain
@@ -59,6 +61,18 @@ class Response:
     gain: float = 1.0
     before: EffectEstimates | None = None
     absent: np.ndarray | None = None
+
+    @property
+    def exact(self) -> bool:
+        """Whether the estimates are good enough for torques to follow them."""
+        limits = np.array([EXACT[p] for _, p in self.estimates.names])
+        each = (self.estimates,) if self.before is None else (self.estimates, self.before)
+        return all((self._deviations(e) < limits).all() for e in each)
+
+    def _deviations(self, found: EffectEstimates) -> np.ndarray:
+        """(n,) of lags, s, and logarithms of gains."""
+        variances = np.diag(found.covariance if self.before is None else found.again)
+        return np.sqrt(variances) / np.where(self._gains, found.value, 1.0)
 
     @property
     def effects(self) -> tuple[str, ...]:
