@@ -324,9 +324,12 @@ class Search:
         return with_effects(table, come, gone)
 
     def sets(self) -> list[frozenset]:
-        """All sets of up to LARGEST effects that may act."""
+        """All sets of up to LARGEST effects that may act, with one at most that scales all
+        motion.
+        """
         sizes = range(LARGEST + 1)
-        return [frozenset(s) for n in sizes for s in combinations(self.singles, n)]
+        every = (frozenset(s) for n in sizes for s in combinations(self.singles, n))
+        return [s for s in every if sum(CARDS[e].scales_motion for e in s) <= 1]
 
     @property
     def best(self) -> Hypothesis:

@@ -20,7 +20,7 @@ import numpy as np
 from openjax.gap.identification.estimates import EffectEstimates
 from openjax.gap.model.library import PLACE
 
-USUAL = {"extra_up": 0.005, "extra_down": 0.01, "xx": 0.03, "yy": 0.03, "ratio": 0.05}
+USUAL = {"extra_up": 0.005, "extra_down": 0.007, "xx": 0.03, "yy": 0.03, "ratio": 0.05}
 """s, and as logarithms: what vehicles that nobody would call faulty differ by from what is told of
 them, each number by itself.
 """
