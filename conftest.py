@@ -1,5 +1,5 @@
-"""Settings and fixtures of the whole suite: it compiles much and computes little, so the compiler
-may leave out costly passes.
+"""Settings and fixtures of the whole suite: it compiles much and computes little, so
+the compiler may leave out costly passes.
 """
 
 import gc
@@ -15,7 +15,8 @@ from beartype import BeartypeConf, beartype
 from hypothesis import HealthCheck, settings
 from jaxtyping import install_import_hook
 
-# many processes load the same modules: bytecode is kept, also where the environment says otherwise
+# many processes load the same modules: bytecode is kept, also where the environment
+# says otherwise
 sys.dont_write_bytecode = False
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
@@ -25,8 +26,9 @@ _beartype = beartype(conf=BeartypeConf(is_pep484_tower=True))  # an int is a flo
 def check_types(function):
     """A function that raises where an argument or a result isn't of its type.
 
-    Structures are left alone: JAX puts into their fields whatever a transformation needs, axes or
-    nothing at all. Settings check themselves, and a private function is its module's business.
+    Structures are left alone: JAX puts into their fields whatever a transformation
+    needs, axes or nothing at all. Settings check themselves, and a private function is
+    its module's business.
     """
     if function.__name__.startswith("_"):
         return function
@@ -34,45 +36,55 @@ def check_types(function):
 
     def checked_unless_stand_in(*args, **kwargs):
         given = (*args, *kwargs.values())
-        given += tuple(item for value in given if isinstance(value, list | tuple) for item in value)
-        # a test that makes a namespace of the few things a function looks at knows what it does
+        given += tuple(
+            item for value in given if isinstance(value, list | tuple) for item in value
+        )
+        # a test that makes a namespace of the few things a function looks at knows what
+        # it does
         if not any(isinstance(value, SimpleNamespace) for value in given):
             checked(*args, **kwargs)
 
     return checked_unless_stand_in
 
 
-# shapes and types of arrays in signatures are checked at each call, which is when a function is
-# traced
+# shapes and types of arrays in signatures are checked at each call, which is when a
+# function is traced
 _networks = [
-    f"openjax.policy.{name}" for name in ("actor_critic", "encoder", "policy", "predictor")
+    f"openjax.policy.{name}"
+    for name in ("actor_critic", "encoder", "policy", "predictor")
 ]
-_drone = [f"openjax.vehicle.{name}" for name in ("rigid_body", "rate_controller", "stops")]
+_drone = [
+    f"openjax.vehicle.{name}" for name in ("rigid_body", "rate_controller", "stops")
+]
 _rooms = ["openjax.pursuit", "openjax.learning", "openjax.flights", "openjax.gap"]
 install_import_hook([*_networks, *_drone, *_rooms], "conftest.check_types")
 
 _flags = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
-# workers are the parallel part: more threads would only wait for each other's cores, and a program
-# that is compiled in parts for them takes a fifth longer
+# workers are the parallel part: more threads would only wait for each other's cores,
+# and a program that is compiled in parts for them takes a fifth longer
 _flags += " --xla_cpu_multi_thread_eigen=false --xla_cpu_parallel_codegen_split_count=1"
 if version("jaxlib").startswith("0.10."):
     # its way of fusing compiles three times as long; later versions know no such flag
     _flags += " --xla_cpu_use_fusion_emitters=false"
 os.environ.setdefault("XLA_FLAGS", _flags)
-importlib.import_module("openjax")  # adds the flag without which sums are wrong, if JAX needs it
+# adds the flag without which sums are wrong, if JAX needs it
+importlib.import_module("openjax")
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
-# what one test compiled, its other processes, other workers and the next session needn't compile
-# again
+# what one test compiled, its other processes, other workers and the next session
+# needn't compile again
 os.environ.setdefault(
-    "JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parent / ".pytest_cache" / "compiled")
+    "JAX_COMPILATION_CACHE_DIR",
+    str(Path(__file__).parent / ".pytest_cache" / "compiled"),
 )
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "0")
 
 # how long an example takes says how busy the machine is
-settings.register_profile("suite", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.register_profile(
+    "suite", deadline=None, suppress_health_check=[HealthCheck.too_slow]
+)
 settings.load_profile("suite")
 
 # tracing leaves many objects and little garbage
@@ -80,7 +92,9 @@ gc.set_threshold(100_000, 50, 50)
 
 
 def pytest_collection_modifyitems(items):
-    """What needs the machine to itself is no part of `make test`, whoever forgot to say so."""
+    """What needs the machine to itself is no part of `make test`, whoever forgot to say
+    so.
+    """
     for item in items:
         if item.get_closest_marker("real_time"):
             item.add_marker(pytest.mark.slow)
@@ -99,8 +113,8 @@ command = "thrust"
 
 @pytest.fixture(scope="session")
 def sample_columns():
-    """Columns of three sample flights of the nominal vehicle: {"flight_a": {"t": ..., ...},
-    ...}.
+    """Columns of three sample flights of the nominal vehicle: {"flight_a": {"t": ...,
+    ...}, ...}.
     """
     from openjax.flights.samples import fly, references
     from openjax.vehicle import load_vehicle
@@ -108,7 +122,9 @@ def sample_columns():
     vehicle = load_vehicle()
     return {
         name: fly(vehicle, vehicle, reference, seed)[0]
-        for seed, (name, reference) in enumerate(references(seed=1, duration=8.0).items())
+        for seed, (name, reference) in enumerate(
+            references(seed=1, duration=8.0).items()
+        )
     }
 
 

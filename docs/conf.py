@@ -1,5 +1,5 @@
-"""The documentation site: `make docs` builds it into docs/_build/html, and any warning is an
-error.
+"""The documentation site: `make docs` builds it into docs/_build/html, and any warning
+is an error.
 """
 
 import re
@@ -45,14 +45,15 @@ html_extra_path = [
 ]  # a replay of six layouts: `openjax view --scenario all --seed 3 --html FILE`
 
 HERE = Path(__file__).parent
-RESULTS = HERE / "measured"  # a copy of the pages of results, so that links lead to them
+# a copy of the pages of results, so that links lead to them
+RESULTS = HERE / "measured"
 TO_RESULTS = re.compile(r"\]\((?:\.\./)*experiments/results/")
 TO_PAGES = re.compile(r"\]\((?:\.\./)*docs/")
 
 
 def setup(app):
-    """Bring the pages of results in, and let links that lead there from outside lead into the
-    site.
+    """Bring the pages of results in, and let links that lead there from outside lead
+    into the site.
     """
     shutil.rmtree(RESULTS, ignore_errors=True)
     shutil.copytree(HERE.parent / "experiments" / "results", RESULTS)

@@ -1,9 +1,9 @@
 """The page of the effects and its pictures, from the effects' own code: `python
 docs/make_effects.py`.
 
-Each kind of hook has its picture: what becomes of a command, of a pose, of a motor command, of a
-rotor's thrust, of the wrench, or of a manoeuvre where the vehicle itself is another one. Grey is
-the nominal vehicle; parameters are usual ones.
+Each kind of hook has its picture: what becomes of a command, of a pose, of a motor
+command, of a rotor's thrust, of the wrench, or of a manoeuvre where the vehicle itself
+is another one. Grey is the nominal vehicle; parameters are usual ones.
 """
 
 from pathlib import Path
@@ -29,21 +29,25 @@ HOVER = float(VEHICLE.mass * VEHICLE.gravity / (4 * max_rotor_thrust(VEHICLE)))
 
 
 def usual(effect: Effect) -> dict:
-    """Parameters at which the effect acts, as arrays; where they may have either sign, every second
-    one has the other.
+    """Parameters at which the effect acts, as arrays; where they may have either sign,
+    every second one has the other.
     """
     values = {}
     for i, (name, what) in enumerate(effect.parameters.items()):
         low, high = what.prior
         both = np.isclose(low + high, 2 * what.none)
-        values[name] = jnp.float32(low + (0.3 if both and i % 2 else 0.75) * (high - low))
+        values[name] = jnp.float32(
+            low + (0.3 if both and i % 2 else 0.75) * (high - low)
+        )
     return values
 
 
 def state_at(position=(0.0, 0.0, 0.6), velocity=(0.0, 0.0, 0.0)):
     """One hovering drone."""
     drones = hover_state(
-        VEHICLE, jnp.array([position], jnp.float32), velocity=jnp.array([velocity], jnp.float32)
+        VEHICLE,
+        jnp.array([position], jnp.float32),
+        velocity=jnp.array([velocity], jnp.float32),
     )
     return jax.tree.map(lambda leaf: leaf[0], drones)
 
@@ -98,7 +102,10 @@ def draw_motor(effect, axes):
     for (voltage, line), colour in zip(lines.items(), COLOURS, strict=False):
         if not same or voltage == 3.7:
             axes.plot(
-                commands, line, color=colour, label="with the effect" if same else f"{voltage} V"
+                commands,
+                line,
+                color=colour,
+                label="with the effect" if same else f"{voltage} V",
             )
     axes.set(xlabel="motor command", ylabel="takes effect as")
 
@@ -129,15 +136,17 @@ def draw_thrust(effect, axes):
 
 
 def draw_wrench(effect, axes):
-    """Force against forward speed; where speed doesn't matter, against the place of a vehicle
-    above.
+    """Force against forward speed; where speed doesn't matter, against the place of a
+    vehicle above.
     """
 
     def force(speed, offset):
         state = state_at(velocity=(speed, 0.0, 0.0))
         other = jnp.array([[offset, 0.0, 1.0]], jnp.float32)
         return np.asarray(
-            effect.wrench(usual(effect), make_context(VEHICLE, state, others_position=other))[0]
+            effect.wrench(
+                usual(effect), make_context(VEHICLE, state, others_position=other)
+            )[0]
         )
 
     speeds = np.linspace(-1.5, 1.5, 31)
@@ -154,13 +163,15 @@ def draw_wrench(effect, axes):
     axes.axhline(0.0, label="nominal", **GREY)
     for axis, colour in zip(range(3), COLOURS, strict=False):
         if np.abs(found[:, axis]).max() > 1e-6:
-            axes.plot(grid, 1000 * found[:, axis], color=colour, label=f"body {'xyz'[axis]}")
+            axes.plot(
+                grid, 1000 * found[:, axis], color=colour, label=f"body {'xyz'[axis]}"
+            )
     axes.set(xlabel=label, ylabel="force [mN]")
 
 
 def draw_body(effect, axes):
-    """Answer of the vehicle to steps of roll rate, yaw rate and thrust; what differs most is
-    drawn.
+    """Answer of the vehicle to steps of roll rate, yaw rate and thrust; what differs
+    most is drawn.
     """
     time = np.arange(0.0, 0.8, DT)
     commands = np.zeros((len(time), 1, 4), np.float32)
@@ -171,11 +182,21 @@ def draw_body(effect, axes):
     commands[:, 0, 3] = np.where((time > 0.3) & (time < 0.5), 2.0, 0.0)
     answers = [
         _flown(names, parameters, commands)
-        for names, parameters in (((), {}), ((effect.name,), {effect.name: usual(effect)}))
+        for names, parameters in (
+            ((), {}),
+            ((effect.name,), {effect.name: usual(effect)}),
+        )
     ]
-    scale = {"roll rate [rad/s]": 3.0, "yaw rate [rad/s]": 2.0, "vertical speed [m/s]": 0.3}
+    scale = {
+        "roll rate [rad/s]": 3.0,
+        "yaw rate [rad/s]": 2.0,
+        "vertical speed [m/s]": 0.3,
+    }
     most = max(
-        scale, key=lambda name: np.abs(answers[1][name] - answers[0][name]).max() / scale[name]
+        scale,
+        key=lambda name: (
+            np.abs(answers[1][name] - answers[0][name]).max() / scale[name]
+        ),
     )
     axes.plot(time, answers[0][most], label="nominal", **GREY)
     axes.plot(time, answers[1][most], color=COLOURS[0], label="with the effect")
@@ -183,12 +204,16 @@ def draw_body(effect, axes):
 
 
 def _flown(names, parameters, commands):
-    step = make_drones_step(physics="rigid", dt=DT, substeps=1, contacts=False, effects=names)
+    step = make_drones_step(
+        physics="rigid", dt=DT, substeps=1, contacts=False, effects=names
+    )
     drones = hover_state(VEHICLE, jnp.array([[0.0, 0.0, 0.6]], jnp.float32))
     drones = step.reset(VEHICLE, drones, jax.random.key(0))
 
     def one(drones, command):
-        drones = step(VEHICLE, drones, command, jnp.zeros((0, 2)), jnp.zeros(0, bool), parameters)
+        drones = step(
+            VEHICLE, drones, command, jnp.zeros((0, 2)), jnp.zeros(0, bool), parameters
+        )
         return drones, (drones.body_rates[0], drones.velocity[0])
 
     _, (rates, velocity) = jax.lax.scan(one, drones, jnp.asarray(commands))
@@ -208,9 +233,11 @@ def draw(effect: Effect, path: Path) -> None:
     """Write the picture of an effect."""
     figure = Figure(figsize=(4.6, 2.5), layout="constrained")
     axes = figure.subplots()
-    next(function for hook, function in DRAWN.items() if getattr(effect, hook) is not None)(
-        effect, axes
-    )
+    next(
+        function
+        for hook, function in DRAWN.items()
+        if getattr(effect, hook) is not None
+    )(effect, axes)
     axes.legend(fontsize="small", frameon=False)
     axes.spines[["top", "right"]].set_visible(False)
     figure.savefig(path, dpi=110, metadata={"Software": None})

@@ -1,9 +1,9 @@
-"""The picture of evaders that get away: `python docs/make_escapes.py [--opponent NAME] [--policy
-NAME] [--tasks 1024]`.
+"""The picture of evaders that get away: `python docs/make_escapes.py [--opponent NAME]
+[--policy NAME] [--tasks 1024]`.
 
-On uniform tasks with four or five pillars, with the vehicles that the policy was trained on. Left:
-the paper's evader on the first task that the opponent survives; then the first three such tasks.
-Prints what the evaders do, in captures and in escapes.
+On uniform tasks with four or five pillars, with the vehicles that the policy was
+trained on. Left: the paper's evader on the first task that the opponent survives; then
+the first three such tasks. Prints what the evaders do, in captures and in escapes.
 """
 
 import argparse
@@ -53,7 +53,10 @@ def draw_heights(axes, flight: Trajectory) -> None:
         axes.plot(time, flight.pursuer_position[:, i, 2], color=color, linewidth=0.8)
     axes.plot(time, flight.evader_position[:, 2], color=EVADER_COLOR)
     axes.set(
-        xlabel="s", ylabel="height [m]", xlim=(0, flight.end() * flight.time_step), ylim=(0, 1.2)
+        xlabel="s",
+        ylabel="height [m]",
+        xlim=(0, flight.end() * flight.time_step),
+        ylim=(0, 1.2),
     )
 
 
@@ -80,8 +83,12 @@ def main() -> None:
     options = parser.parse_args()
     loaded = load_policy(options.policy)
     slots = layout_slots(loaded.settings.environment)
-    game = dataclasses.replace(loaded.settings.environment, min_pillars=4, max_pillars=slots)
-    tasks = uniform_tasks(dataclasses.replace(game, max_pillars=5), options.tasks, slots)
+    game = dataclasses.replace(
+        loaded.settings.environment, min_pillars=4, max_pillars=slots
+    )
+    tasks = uniform_tasks(
+        dataclasses.replace(game, max_pillars=5), options.tasks, slots
+    )
 
     def fly(opponent):
         environment = make_environment(game, None, None, opponent)
@@ -91,7 +98,9 @@ def main() -> None:
 
     def tell(flown, name, which):
         all_of = [habits(flown.trajectory(i, "")) for i in which]
-        means = ", ".join(f"{np.mean([h[k] for h in all_of]):.2f} {k}" for k in all_of[0])
+        means = ", ".join(
+            f"{np.mean([h[k] for h in all_of]):.2f} {k}" for k in all_of[0]
+        )
         print(f"{name} ({len(all_of)}): {means}")
 
     field = fly("field")
@@ -106,7 +115,8 @@ def main() -> None:
         tell(flown, f"{options.opponent}, escapes", escapes)
         seen = [field.trajectory(escapes[0], "the paper's evader")]
         draw(
-            options.out, [*seen, *(flown.trajectory(i, options.opponent) for i in escapes[:SHOWN])]
+            options.out,
+            [*seen, *(flown.trajectory(i, options.opponent) for i in escapes[:SHOWN])],
         )
 
 

@@ -1,7 +1,8 @@
 """Pictures of a replay and of a diagnosis' first screen: `python docs/make_screens.py`.
 
-Writes docs/pictures/replay.png, of the page docs/extra/replay/chase.html, and report.png, of sample
-flights with rotor drag that are diagnosed for it. Needs a headless Chromium.
+Writes docs/pictures/replay.png, of the page docs/extra/replay/chase.html, and
+report.png, of sample flights with rotor drag that are diagnosed for it. Needs a
+headless Chromium.
 """
 
 import shutil
@@ -35,15 +36,24 @@ def take(page: Path, name: str, folder: Path) -> None:
         f"--window-size={width},{height}",
         f"--screenshot={shot}",
     ]
-    subprocess.run([browser, *options, page.resolve().as_uri()], check=True, capture_output=True)
-    picture = Image.open(shot).convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE)
+    subprocess.run(
+        [browser, *options, page.resolve().as_uri()], check=True, capture_output=True
+    )
+    picture = (
+        Image.open(shot).convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE)
+    )
     picture.save(DOCS / "pictures" / f"{name}.png", optimize=True)
 
 
 def diagnosed(folder: Path) -> Path:
     """The report of sample flights in a folder."""
-    for words in (("sample_flights", "flights", "--effect", "rotor_drag"), ("diagnose", "flights")):
-        subprocess.run([sys.executable, "-m", "openjax", *words], cwd=folder, check=True)
+    for words in (
+        ("sample_flights", "flights", "--effect", "rotor_drag"),
+        ("diagnose", "flights"),
+    ):
+        subprocess.run(
+            [sys.executable, "-m", "openjax", *words], cwd=folder, check=True
+        )
     return folder / "diagnosis" / "flights" / "report.html"
 
 

@@ -1,4 +1,5 @@
-"""A physical effect of one's own, flown and diagnosed: a cable hangs from the vehicle to the floor.
+"""A physical effect of one's own, flown and diagnosed: a cable hangs from the vehicle
+to the floor.
 
 python examples/own_effect.py
 """
@@ -23,7 +24,9 @@ def wrench(parameters, context):
 tether = Effect(
     name="tether",
     description="the weight of a cable that hangs down to the floor",
-    parameters={"weight": Parameter("N/m", 0.0, (0.01, 0.05), "thin cables, 1 to 5 g a metre")},
+    parameters={
+        "weight": Parameter("N/m", 0.0, (0.01, 0.05), "thin cables, 1 to 5 g a metre")
+    },
     wrench=wrench,
     card=Card(
         fitted=(Fitted("weight", mean=0.0, spread=0.03, start=0.01, step=0.0005),),
@@ -31,7 +34,8 @@ tether = Effect(
         next_flight="climb slowly to the ceiling and back.",
     ),
 )
-register_effect(tether)  # before the diagnosis is loaded, which is when it is first asked
+# before the diagnosis is loaded, which is when it is first asked
+register_effect(tether)
 
 folder = Path(tempfile.mkdtemp()) / "tether"
 sample_flights.make_case(sample_flights.Arguments(folder, effect=("tether",)))

@@ -26,7 +26,8 @@ class Plain:  # what `openjax.policy.Network` asks for
 
     def distribution(self, actor, seen):
         mean = Layers(4).apply(actor, seen.self_state, seen.others, seen.pillars)
-        return mean + jnp.array([0.25, 0.0, 0.0, 0.0]), jnp.full(4, -1.5)  # about hovering
+        # about hovering
+        return mean + jnp.array([0.25, 0.0, 0.0, 0.0]), jnp.full(4, -1.5)
 
     def value(self, critic, seen):
         return Layers(1).apply(critic, seen.self_state, seen.privileged)[..., 0]
@@ -35,4 +36,6 @@ class Plain:  # what `openjax.policy.Network` asks for
 settings = openjax.preset("quick", first_flights=dict(updates=0))
 options = dict(minutes=6, overwrite=True)
 policy = openjax.train(settings, "runs/own_network", policy=Plain(), **options)
-print(f"captured in {openjax.evaluate(policy, 'empty', episodes=9)['capture_rate']:.0%}")
+print(
+    f"captured in {openjax.evaluate(policy, 'empty', episodes=9)['capture_rate']:.0%}"
+)

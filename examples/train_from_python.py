@@ -12,7 +12,8 @@ import openjax
 
 minutes = float(sys.argv[1]) if len(sys.argv) > 1 else 6.0
 settings = openjax.preset("quick")
-settings = dataclasses.replace(settings, seed=1)  # any field of any part can be replaced
+# any field of any part can be replaced
+settings = dataclasses.replace(settings, seed=1)
 
 policy = openjax.train(settings, "runs/from_python", minutes=minutes, overwrite=True)
 record = openjax.evaluate(policy, "empty", episodes=32)

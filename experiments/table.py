@@ -1,5 +1,5 @@
-"""One manner for all studies: measure, store what was found as JSON, make the page from what is
-stored.
+"""One manner for all studies: measure, store what was found as JSON, make the page from
+what is stored.
 
     from experiments.table import Page, Table, page_parser, publish
 
@@ -13,8 +13,9 @@ stored.
 
     publish(page_parser(__doc__, "vehicles").parse_args(arguments), study, page)
 
-`--report` prints every table of what is stored. A page of results has one of them, between two
-marks, in words that somebody wrote: those stay, and the table between the marks is made anew.
+`--report` prints every table of what is stored. A page of results has one of them,
+between two marks, in words that somebody wrote: those stay, and the table between the
+marks is made anew.
 """
 
 import argparse
@@ -42,8 +43,8 @@ MARKS = ("<!-- table -->", "<!-- end of table -->")
 """Between them stands a page's table, which a program makes."""
 
 Column = str | Callable[[Mapping], Any]
-"""Of a record: a path through it with a format, `summary.capture_rate:.3f`, or what is computed
-from it.
+"""Of a record: a path through it with a format, `summary.capture_rate:.3f`, or what is
+computed from it.
 """
 
 
@@ -51,8 +52,8 @@ from it.
 class Table:
     """Records, one a row, and by the head of each column what it shows of them.
 
-    A list of numbers is shown as mean (standard deviation), a truth as yes or no, and what is
-    missing, None or no number as a dash.
+    A list of numbers is shown as mean (standard deviation), a truth as yes or no, and
+    what is missing, None or no number as a dash.
     """
 
     columns: Mapping[str, Column]
@@ -65,16 +66,19 @@ class Table:
         head = [f"## {self.title}", ""] if self.title else []
         prose = [self.prose, ""] if self.prose else []
         rows = [
-            [cell(record, column) for column in self.columns.values()] for record in self.records
+            [cell(record, column) for column in self.columns.values()]
+            for record in self.records
         ]
         return [*head, *prose, *table(list(self.columns), rows)]
 
 
 @dataclass(frozen=True)
 class Page:
-    """A title, what was done in words, then tables or paragraphs: all that a study prints.
+    """A title, what was done in words, then tables or paragraphs: all that a study
+    prints.
 
-    `table` is the one of at most ten rows that stands on the page of results; by default the first.
+    `table` is the one of at most ten rows that stands on the page of results; by
+    default the first.
     """
 
     title: str
@@ -87,8 +91,12 @@ class Page:
         return [self.parts] if isinstance(self.parts, Table | str) else self.parts
 
     def rows(self) -> list[str]:
-        """The Markdown of the one table that stands between the marks of the page of results."""
-        chosen = self.table or next(part for part in self.all_parts() if isinstance(part, Table))
+        """The Markdown of the one table that stands between the marks of the page of
+        results.
+        """
+        chosen = self.table or next(
+            part for part in self.all_parts() if isinstance(part, Table)
+        )
         return Table(chosen.columns, chosen.records).lines()
 
     def lines(self, facts: Mapping) -> list[str]:
@@ -141,18 +149,24 @@ def made(facts: Mapping) -> str:
 
 
 def page_parser(doc: str | None, name: str) -> argparse.ArgumentParser:
-    """A parser with `--report`, `--commit` and, by default for the page `name`, `--out`."""
+    """A parser with `--report`, `--commit` and, by default for the page `name`,
+    `--out`.
+    """
     parser = argparse.ArgumentParser(
         description=doc, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--report", action="store_true", help="from the stored results")
-    parser.add_argument("--commit", default="", help="where the machine has no repository")
+    parser.add_argument(
+        "--commit", default="", help="where the machine has no repository"
+    )
     parser.add_argument("--out", type=Path, default=RESULTS / name)
     return parser
 
 
 def typed_command() -> str:
-    """The command that runs, as one types it, without the places of its work and its results."""
+    """The command that runs, as one types it, without the places of its work and its
+    results.
+    """
     spec = getattr(sys.modules["__main__"], "__spec__", None)
     name = spec.name.removesuffix(".__main__") if spec else Path(sys.argv[0]).name
     words = iter(sys.argv[1:])
@@ -166,11 +180,14 @@ def typed_command() -> str:
 
 
 def facts(commit: str | None = None) -> dict:
-    """What stands beside all results: the command, the machine, and the commit, where the source
-    tree can't tell.
+    """What stands beside all results: the command, the machine, and the commit, where
+    the source tree can't tell.
     """
     machine = describe_machine()
-    return {"command": typed_command(), "machine": machine | ({"commit": commit} if commit else {})}
+    return {
+        "command": typed_command(),
+        "machine": machine | ({"commit": commit} if commit else {}),
+    }
 
 
 def publish(
@@ -179,8 +196,8 @@ def publish(
     page: Callable[[Any], Page],
     draw: Callable[[Any, Path], None] | None = None,
 ) -> None:
-    """Store what `study` finds (unless told to read it), print the report made from what is stored,
-    and write its page.
+    """Store what `study` finds (unless told to read it), print the report made from
+    what is stored, and write its page.
 
     Command, machine and seconds stand beside it; `draw` draws the page's figure.
     """
@@ -188,7 +205,10 @@ def publish(
     if not options.report:
         started = time.monotonic()
         found = study(options)
-        write_json(data, {**facts(options.commit), "seconds": time.monotonic() - started, **found})
+        write_json(
+            data,
+            {**facts(options.commit), "seconds": time.monotonic() - started, **found},
+        )
     write_page(options.out, page, read_json(data), draw)
 
 
@@ -198,9 +218,11 @@ def write_page(
     results: Any,
     draw: Callable[[Any, Path], None] | None = None,
 ) -> None:
-    """Print the report of `results`, write its page, and draw its figure if there is one.
+    """Print the report of `results`, write its page, and draw its figure if there is
+    one.
 
-    A page whose table stands between the marks keeps its words; any other becomes the report.
+    A page whose table stands between the marks keeps its words; any other becomes the
+    report.
     """
     made = page(results)
     report = "\n".join(made.lines(results)) + "\n"

@@ -1,5 +1,5 @@
-"""`openjax`: every command has help that needs no JAX; mistyped names are mended; editors see the
-public functions.
+"""`openjax`: every command has help that needs no JAX; mistyped names are mended;
+editors see the public functions.
 """
 
 import importlib.util
@@ -28,7 +28,9 @@ print([name for name in ("jax", "mujoco", "flax", "scipy", "matplotlib") if name
 @pytest.mark.parametrize("command", COMMANDS)
 def test_help_needs_no_jax(command):
     done = subprocess.run(
-        [sys.executable, "-c", SCRIPT.format(command=command)], capture_output=True, text=True
+        [sys.executable, "-c", SCRIPT.format(command=command)],
+        capture_output=True,
+        text=True,
     )
     assert done.returncode == 0, done.stderr
     assert f"usage: openjax {command}" in done.stdout

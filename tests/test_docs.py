@@ -1,5 +1,5 @@
-"""The page of the effects is what their files say, that of the flying policies what is stored, and
-pages of results have one form that reads at a glance.
+"""The page of the effects is what their files say, that of the flying policies what is
+stored, and pages of results have one form that reads at a glance.
 """
 
 import importlib.util
@@ -19,12 +19,13 @@ from openjax.vehicle.effects import EFFECTS
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 RESULTS = ROOT / "experiments" / "results"
-MADE = ("_build", "jupyter_execute", "measured")  # folders that building the site leaves
+# folders that building the site leaves
+MADE = ("_build", "jupyter_execute", "measured")
 PAGES = [path for path in sorted(DOCS.rglob("*.md")) if not set(MADE) & set(path.parts)]
 PAGES += [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")]
 MOST = {"words": 600, "rows": 10, "line": 400, "sentences": 3, "pictures": 1}
-"""Of a page of results: words of prose, rows of its one table, characters of a line, sentences of
-the answer, pictures.
+"""Of a page of results: words of prose, rows of its one table, characters of a line,
+sentences of the answer, pictures.
 """
 COMMIT = re.compile(r"\b(?=[a-f]*\d)(?=\d*[a-f])[0-9a-f]{7,40}\b")
 
@@ -32,12 +33,19 @@ COMMIT = re.compile(r"\b(?=[a-f]*\d)(?=\d*[a-f])[0-9a-f]{7,40}\b")
 def prose_of(text: str) -> list[str]:
     """Lines that are neither of a table, nor of a picture, nor of code."""
     text = re.sub(r"^```.*?^```", "", text, flags=re.MULTILINE | re.DOTALL)
-    return [line for line in text.splitlines() if not line.lstrip().startswith(("|", "!", "<"))]
+    return [
+        line
+        for line in text.splitlines()
+        if not line.lstrip().startswith(("|", "!", "<"))
+    ]
 
 
-@pytest.mark.parametrize("path", sorted(RESULTS.rglob("*.md")), ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path", sorted(RESULTS.rglob("*.md")), ids=lambda path: path.stem
+)
 def test_results_have_one_form(path):
-    """A question, an answer of at most three sentences, one short table, one picture, how sure.
+    """A question, an answer of at most three sentences, one short table, one picture,
+    how sure.
 
     Seeds, cores, commits and further tables belong into the JSON beside the page.
     """
@@ -79,25 +87,41 @@ def texts_of(stored, record=None):
 
 @pytest.mark.parametrize(
     "path",
-    [ROOT / "experiments" / "README.md", *sorted(RESULTS.rglob("*.md")), *RESULTS.rglob("*.json")],
+    [
+        ROOT / "experiments" / "README.md",
+        *sorted(RESULTS.rglob("*.md")),
+        *RESULTS.rglob("*.json"),
+    ],
     ids=lambda path: path.name,
 )
 def test_programs_that_results_name_are_there(path):
-    """Or a commit that has them is named beside them: in the same paragraph, or as the record's
-    `program`, in the words of `git show`.
+    """Or a commit that has them is named beside them: in the same paragraph, or as the
+    record's `program`, in the words of `git show`.
     """
     text = path.read_text(encoding="utf-8")
-    named = texts_of(json.loads(text)) if path.suffix == ".json" else texts_of(text.split("\n\n"))
+    named = (
+        texts_of(json.loads(text))
+        if path.suffix == ".json"
+        else texts_of(text.split("\n\n"))
+    )
     for line, record in named:
-        assert set(re.findall(r"(?:^|`)openjax ([a-z_]+)(?= -)", line)) <= set(COMMANDS), line
-        for name in re.findall(r"python -m ((?:openjax|experiments|tests)\b[\w.]*)", line):
+        assert set(re.findall(r"(?:^|`)openjax ([a-z_]+)(?= -)", line)) <= set(
+            COMMANDS
+        ), line
+        for name in re.findall(
+            r"python -m ((?:openjax|experiments|tests)\b[\w.]*)", line
+        ):
             place = (record or {}).get("program", "").partition(":")[2]
             moved = place.startswith(name.replace(".", "/"))
-            assert moved or COMMIT.search(line) or "NAME" in name or find_spec(name), name
+            assert moved or COMMIT.search(line) or "NAME" in name or find_spec(name), (
+                name
+            )
 
 
 def test_page_of_the_effects_is_made_from_their_files():
-    spec = importlib.util.spec_from_file_location("make_effects", DOCS / "make_effects.py")
+    spec = importlib.util.spec_from_file_location(
+        "make_effects", DOCS / "make_effects.py"
+    )
     make_effects = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(make_effects)
     told = (DOCS / "effects.md").read_text(encoding="utf-8")
@@ -114,23 +138,25 @@ def test_policies_that_fly_are_as_stored():
     page = (DOCS / "policies_that_fly.md").read_text(encoding="utf-8")
 
     def mean(of_layouts, figure, digits):
-        return (
-            f"{np.mean([of_layouts[name][figure] for name in SCENARIOS]):.{digits}f}".removeprefix(
-                "0"
-            )
+        return f"{np.mean([of_layouts[name][figure] for name in SCENARIOS]):.{digits}f}".removeprefix(
+            "0"
         )
 
     figures = {"capture_rate": 3, "crash_rate": 3, "over_speed_rate": 3}
     for name, of_vehicles in policies.items():
         cells = [
-            " / ".join(mean(of_vehicles[vehicle], *figure) for figure in figures.items())
+            " / ".join(
+                mean(of_vehicles[vehicle], *figure) for figure in figures.items()
+            )
             for vehicle in ("nominal", "table", "family")
         ]
         assert f"| `{name}` | {' | '.join(cells)} |" in page, name
 
 
 def test_names_of_the_api_page_are_there():
-    """A program that is renamed keeps its place on the page; the site itself takes minutes."""
+    """A program that is renamed keeps its place on the page; the site itself takes
+    minutes.
+    """
     text = (DOCS / "api.md").read_text(encoding="utf-8")
     names = re.findall(r"auto(?:class|function|exception):: (\S+)", text)
     # the package's own names first: it has modules of the same names

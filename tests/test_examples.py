@@ -18,7 +18,9 @@ pytestmark = pytest.mark.slow
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
 
-@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.stem
+)
 def test_example_is_short(path):
     assert len(path.read_text().splitlines()) <= 40
 
@@ -31,16 +33,19 @@ def test_own_game_captures(capsys):
 
 def test_own_controller_is_flown_like_a_policy(capsys):
     runpy.run_path(str(EXAMPLES / "own_controller.py"))
-    rows = {line.split()[0]: line.split() for line in capsys.readouterr().out.splitlines()}
+    rows = {
+        line.split()[0]: line.split() for line in capsys.readouterr().out.splitlines()
+    }
     captured = {name: float(row[2].rstrip(",")) for name, row in rows.items()}
     assert captured["open"] == 1.0  # the shipped policy, in the same game
-    assert captured["slower"] > 0.9 > captured["faster"]  # running after a faster one isn't enough
+    # running after a faster one isn't enough
+    assert captured["slower"] > 0.9 > captured["faster"]
 
 
 @pytest.fixture
 def tiny_preset(tmp_path, monkeypatch):
-    """`openjax.preset` gives a run of two updates, whatever it is asked for; in a folder of its
-    own.
+    """`openjax.preset` gives a run of two updates, whatever it is asked for; in a
+    folder of its own.
     """
     tiny = openjax.preset("quick")
     tiny = dataclasses.replace(
@@ -69,7 +74,11 @@ def test_a_part_of_ones_own_is_trained(part, tiny_preset, tmp_path, capsys):
     assert part == "learner" or "captured in" in printed
     run = tmp_path / "runs" / f"own_{part}"
     metrics = list(read_metrics(run / "metrics.jsonl", "train"))
-    assert len(metrics) == 2 and (run / "chase.gif").is_file() and (run / "policy.npz").is_file()
+    assert (
+        len(metrics) == 2
+        and (run / "chase.gif").is_file()
+        and (run / "policy.npz").is_file()
+    )
     assert ("reinforce_loss" in metrics[0]) == (part == "learner")
     with pytest.raises(openjax.UserError, match="was begun with"):
         openjax.train(resume=run)
@@ -82,7 +91,11 @@ def test_a_part_of_ones_own_is_trained(part, tiny_preset, tmp_path, capsys):
 
 def test_an_evader_of_ones_own_is_flown(capsys):
     runpy.run_path(str(EXAMPLES / "own_evader.py"), run_name="__main__")
-    rows = [line.split() for line in capsys.readouterr().out.splitlines() if "caught in" in line]
+    rows = [
+        line.split()
+        for line in capsys.readouterr().out.splitlines()
+        if "caught in" in line
+    ]
     assert [row[0] for row in rows] == ["field", "foresee"]
     assert float(rows[0][3]) == 1.0
 
@@ -94,7 +107,9 @@ def test_training_from_python_gives_a_policy(tiny_preset, tmp_path, capsys):
 
 
 def test_an_effect_of_ones_own_is_flown_and_named():
-    """In a process of its own: effects are registered before the diagnosis is loaded."""
+    """In a process of its own: effects are registered before the diagnosis is
+    loaded.
+    """
     command = [sys.executable, str(EXAMPLES / "own_effect.py")]
     done = subprocess.run(command, capture_output=True, text=True)
     assert not done.returncode, done.stderr
@@ -107,8 +122,8 @@ def test_diagnosis_names_drag(capfd):
 
 
 def test_own_importer_reads_a_format_of_its_own(tmp_path, sample_columns):
-    """A log of JSON lines becomes a flight of a case, once the example has registered its
-    importer.
+    """A log of JSON lines becomes a flight of a case, once the example has registered
+    its importer.
     """
     from openjax.flights.case import load_case
     from openjax.flights.importers import importer
@@ -134,4 +149,6 @@ def test_own_importer_reads_a_format_of_its_own(tmp_path, sample_columns):
         importer._IMPORTERS[:] = shipped
     assert [flight.name for flight in case.flights] == ["first.flight.jsonl"]
     assert [issue.issue for issue in case.left_out()] == ["holds no row"]
-    np.testing.assert_allclose(case.flights[0].body_rates[:, 1], columns["wy"][:300], atol=1e-9)
+    np.testing.assert_allclose(
+        case.flights[0].body_rates[:, 1], columns["wy"][:300], atol=1e-9
+    )

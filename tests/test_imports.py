@@ -1,5 +1,5 @@
-"""What stands alone can be loaded alone: the paper's ideas without physics, commands' help without
-arrays.
+"""What stands alone can be loaded alone: the paper's ideas without physics, commands'
+help without arrays.
 """
 
 import subprocess
@@ -19,7 +19,9 @@ import pytest
 )  # fmt: skip
 def test_modules_load_without_what_they_do_not_need(modules, unwanted):
     script = f"import sys, {', '.join(modules)}; print([name for name in {unwanted.split()} if name in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True
+    )
     assert done.stdout == "[]\n", done.stdout + done.stderr
 
 

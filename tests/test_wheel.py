@@ -1,4 +1,6 @@
-"""What a user installs: a wheel holds all that the package needs, and runs elsewhere."""
+"""What a user installs: a wheel holds all that the package needs, and runs
+elsewhere.
+"""
 
 import os
 import subprocess
@@ -46,6 +48,11 @@ def test_wheel_runs_away_from_the_checkout(tmp_path):
     assert "0.03" in run.stdout
     command = [sys.executable, "-m", "openjax.evaluate", "--help"]
     told = subprocess.run(
-        command, cwd=tmp_path, env=environment, check=True, capture_output=True, text=True
+        command,
+        cwd=tmp_path,
+        env=environment,
+        check=True,
+        capture_output=True,
+        text=True,
     )
     assert "--scenario" in told.stdout

@@ -1,16 +1,17 @@
-"""How far does the gap shrink in the task? What training in the corrected simulator wins back of
-what training in the true one would, and what a wrong name wins or costs.
+"""How far does the gap shrink in the task? What training in the corrected simulator
+wins back of what training in the true one would, and what a wrong name wins or costs.
 
     python -m experiments.diagnosis.adapting diagnose --work DIR --jobs 16
     python -m experiments.diagnosis.adapting tune --work DIR --part 0 2 --out part_0.json   (a GPU)
     python -m experiments.diagnosis.adapting report part_0.json part_1.json --out adapting.json
 
-A vehicle is openjax' own with one effect of 1.5 times its sample strength. `diagnose` flies it
-through six segments in uneven air, with sensors of a laboratory, and diagnoses these flights twice:
-as they are, and with a library that lacks the cause and what would do as well by the first report,
-so that only a wrong name can be given. `tune` flies a policy with the true vehicle and with the nominal one. Where
-the vehicle costs something beyond chance it is fine-tuned as `openjax adapt` does, to the true
-effect, to what was found, and to the wrong name; all of them fly the same tasks with the true one.
+A vehicle is openjax' own with one effect of 1.5 times its sample strength. `diagnose`
+flies it through six segments in uneven air, with sensors of a laboratory, and diagnoses
+these flights twice: as they are, and with a library that lacks the cause and what would
+do as well by the first report, so that only a wrong name can be given. `tune` flies a
+policy with the true vehicle and with the nominal one. Where the vehicle costs something
+beyond chance it is fine-tuned as `openjax adapt` does, to the true effect, to what was
+found, and to the wrong name; all of them fly the same tasks with the true one.
 """
 
 import argparse
@@ -26,8 +27,22 @@ from experiments.flying.single_thread import use_single_thread
 
 # What a policy can lose by; of the others the game of `flight` feels little.
 CAUSES = (
-    *("motor_lag", "command_latency", "wind", "packet_loss", "com_offset", "rate_gains"),
-    *("mass", "state_latency", "rotor_drag", "inertia", "motor_imbalance", "thrust_saturation"),
+    *(
+        "motor_lag",
+        "command_latency",
+        "wind",
+        "packet_loss",
+        "com_offset",
+        "rate_gains",
+    ),
+    *(
+        "mass",
+        "state_latency",
+        "rotor_drag",
+        "inertia",
+        "motor_imbalance",
+        "thrust_saturation",
+    ),
     *("thrust_scale", "blade_flapping"),
 )
 STRENGTH = 1.5  # of the effect's sample strength
@@ -54,7 +69,9 @@ class Flown:
 
         effect = EFFECTS[self.cause]
         none = effect.none()
-        strong = {k: none[k] + STRENGTH * (v - none[k]) for k, v in effect.card.sample.items()}
+        strong = {
+            k: none[k] + STRENGTH * (v - none[k]) for k, v in effect.card.sample.items()
+        }
         return {self.cause: none | strong}
 
     def case(self):
@@ -76,14 +93,21 @@ class Flown:
             seed = 1000 * SEED + 100 * self.number + place
             reference = ALL[name].reference(SECONDS)
             columns = fly(
-                told.vehicle, told.vehicle, reference, seed, self.effects(), air=Turbulence()
+                told.vehicle,
+                told.vehicle,
+                reference,
+                seed,
+                self.effects(),
+                air=Turbulence(),
             )
             found += flights_of(log_of(columns, name), (0, 1, 2, 3))[0]
         return flight.Case(self.cause, tuple(found), told)
 
 
 def diagnosed(job: tuple[int, Path]) -> dict:
-    """Diagnose a vehicle's flights twice and write down what a simulator would be told."""
+    """Diagnose a vehicle's flights twice and write down what a simulator would be
+    told.
+    """
     from openjax.gap.diagnosis import diagnose_case
     from openjax.gap.report.writing import to_fly
     from openjax.vehicle.effects import save_effects
@@ -113,7 +137,11 @@ class Tuner:
         import jax
 
         from openjax.evaluation.validation import uniform_tasks
-        from openjax.learning.adaptation import bounds_of, make_adaptation, starting_parameters
+        from openjax.learning.adaptation import (
+            bounds_of,
+            make_adaptation,
+            starting_parameters,
+        )
         from openjax.learning.settings import AdaptSettings
         from openjax.runs.adaptation import compile_programs
         from openjax.store.policies import load_policy
@@ -123,10 +151,12 @@ class Tuner:
         self.adaptation = make_adaptation(loaded.settings, settings)
         game = self.adaptation.game
         tasks = uniform_tasks(game, 3 * episodes, game.max_pillars)
-        # a third to choose an update by, one to choose vehicles that lose, one to measure by: what
-        # was best on tasks is so in part by luck
+        # a third to choose an update by, one to choose vehicles that lose, one to
+        # measure by: what was best on tasks is so in part by luck
         self.tasks = [
-            jax.tree.map(lambda leaf, i=i: leaf[i * episodes : (i + 1) * episodes], tasks)
+            jax.tree.map(
+                lambda leaf, i=i: leaf[i * episodes : (i + 1) * episodes], tasks
+            )
             for i in range(3)
         ]
         self.key = jax.random.key(seed)
@@ -145,8 +175,8 @@ class Tuner:
         return episode_figures(flown.statistics)
 
     def tuned(self, bounds):
-        """The policy fine-tuned to vehicles of the bounds, as `openjax adapt` does, and after which
-        update it was kept.
+        """The policy fine-tuned to vehicles of the bounds, as `openjax adapt` does, and
+        after which update it was kept.
         """
         from openjax.evaluation.validation import selection_score
         from openjax.learning.adaptation import fine_tune
@@ -176,7 +206,9 @@ def bounds_in(folder: Path, name: str):
 
 
 def losing(nominal: dict, before: dict) -> list[str]:
-    """The losses that a vehicle has beyond chance, by the same episodes with the nominal one."""
+    """The losses that a vehicle has beyond chance, by the same episodes with the
+    nominal one.
+    """
     found = []
     for name in LOSSES:
         loss = np.asarray(before[name], float) - np.asarray(nominal[name], float)
@@ -199,23 +231,28 @@ def adapted(tuner: Tuner, folder: Path) -> dict:
     for name in TUNED if out["loses"] else ():
         parameters, out["kept"][name] = tuner.tuned(bounds_in(folder, name))
         flown[name] = tuner.fly(parameters, true, 2)
-    out["means"] = {w: {n: float(np.mean(f[n])) for n in LOSSES} for w, f in flown.items()}
+    out["means"] = {
+        w: {n: float(np.mean(f[n])) for n in LOSSES} for w, f in flown.items()
+    }
     if out["loses"]:
         out["won"] = {n: won(flown, n) for n in LOSSES}
     return out
 
 
 def won(flown: dict, name: str) -> dict:
-    """Mean and covariance of the mean of what each training wins by the same episodes, true, found,
-    wrong.
+    """Mean and covariance of the mean of what each training wins by the same episodes,
+    true, found, wrong.
     """
     gains = np.array([flown["before"][name] - flown[w][name] for w in TUNED], float)
-    return {"mean": gains.mean(1).tolist(), "cov": (np.cov(gains) / gains.shape[1]).tolist()}
+    return {
+        "mean": gains.mean(1).tolist(),
+        "cov": (np.cov(gains) / gains.shape[1]).tolist(),
+    }
 
 
 def shares(vehicles: list[dict], name: str) -> dict:
-    """Of what true training wins over all vehicles that lose by a figure, the share that the found
-    and the wrong name win, with a 90 % interval by the delta method.
+    """Of what true training wins over all vehicles that lose by a figure, the share
+    that the found and the wrong name win, with a 90 % interval by the delta method.
     """
     rows = [v["won"][name] for v in vehicles if name in v["loses"]]
     if not rows:
@@ -233,12 +270,16 @@ def shares(vehicles: list[dict], name: str) -> dict:
 
 
 def report(vehicles: list[dict]) -> dict:
-    """The figures of all vehicles; those whose cause was found first stand by themselves."""
+    """The figures of all vehicles; those whose cause was found first stand by
+    themselves.
+    """
     losers = [v for v in vehicles if v["loses"]]
     right = [v for v in losers if (v["found"]["named"] or [""])[0] == v["cause"]]
     return {
         "vehicles": len(vehicles),
-        "named_first": sum((v["found"]["named"] or [""])[0] == v["cause"] for v in vehicles),
+        "named_first": sum(
+            (v["found"]["named"] or [""])[0] == v["cause"] for v in vehicles
+        ),
         "lose": [v["cause"] for v in losers],
         "shares": {name: shares(losers, name) for name in LOSSES},
         "shares_where_named_first": {name: shares(right, name) for name in LOSSES},
@@ -246,7 +287,9 @@ def report(vehicles: list[dict]) -> dict:
 
 
 def tune(options) -> None:
-    """Fine-tune and fly part of the vehicles; each is written as soon as it is there."""
+    """Fine-tune and fly part of the vehicles; each is written as soon as it is
+    there.
+    """
     from openjax.runs.machine import describe_machine
     from openjax.store.compiled_programs import cache_programs
 
@@ -280,7 +323,9 @@ def main() -> None:
     first = commands.add_parser("diagnose")
     first.add_argument("--jobs", type=int, default=1)
     second = commands.add_parser("tune")
-    second.add_argument("--part", type=int, nargs=2, default=(0, 1), metavar=("NUMBER", "OF"))
+    second.add_argument(
+        "--part", type=int, nargs=2, default=(0, 1), metavar=("NUMBER", "OF")
+    )
     second.add_argument("--policy", default="flight")
     second.add_argument("--episodes", type=int, default=2048)
     second.add_argument("--updates", type=int, default=120)

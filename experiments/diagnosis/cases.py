@@ -1,9 +1,10 @@
-"""Which cases are drawn. Everything follows from the seed, the column (`known` or `stranger`) and
-the case's number.
+"""Which cases are drawn. Everything follows from the seed, the column (`known` or
+`stranger`) and the case's number.
 
-The known column may be used for development at will, and the real one, the same on vehicles with
-the errors of form that real ones have. The stranger's column draws sensors, a controller, vehicles,
-unknown kinds and garbage that the others never draw; it is for reported runs only.
+The known column may be used for development at will, and the real one, the same on
+vehicles with the errors of form that real ones have. The stranger's column draws
+sensors, a controller, vehicles, unknown kinds and garbage that the others never draw;
+it is for reported runs only.
 """
 
 from dataclasses import replace
@@ -40,7 +41,8 @@ STYLES = {  # what a lab flies beside the flight that exposes the cause
     "laps": ("laps", "fast", "spiral", "climb"),
     "survey": ("hover", "climb", "low", "high", "laps"),
 }
-# effect -> missions that do not show it; everything else about the vehicle is as in a testable case
+# effect -> missions that do not show it; everything else about the vehicle is as in a
+# testable case
 BLIND = {
     "ground_effect": ("hover", "agile", "fast", "yaw", "high"),
     "ceiling_effect": ("hover", "fast", "yaw", "low"),
@@ -57,7 +59,9 @@ COLUMN = {"known": 0, "stranger": 1, "real": 2}
 
 def case_rng(seed, column, number, *more):
     """The random numbers of one case; columns and seeds share none."""
-    return np.random.default_rng(np.random.SeedSequence([13, COLUMN[column], seed, number, *more]))
+    return np.random.default_rng(
+        np.random.SeedSequence([13, COLUMN[column], seed, number, *more])
+    )
 
 
 def label(severity):
@@ -79,8 +83,8 @@ def _target(rng, band):
 
 
 def draw_missions(rng, needed, style, two):
-    """Three flights, each a mission or a pair of them; what is needed is flown twice if there is
-    room.
+    """Three flights, each a mission or a pair of them; what is needed is flown twice if
+    there is room.
     """
     flights = [str(rng.choice(options)) for options in needed * 2 if options][:3]
     while len(flights) < 3:
@@ -89,7 +93,10 @@ def draw_missions(rng, needed, style, two):
     flights = [flights[i] for i in rng.permutation(3)]
     if not two and not any(f in missions.PAIR for f in flights):
         return [(f,) for f in flights]
-    return [(f, f) if f in missions.PAIR else (f, str(rng.choice(STYLES[style]))) for f in flights]
+    return [
+        (f, f) if f in missions.PAIR else (f, str(rng.choice(STYLES[style])))
+        for f in flights
+    ]
 
 
 def _kinds(column, known, strangers):
@@ -97,15 +104,17 @@ def _kinds(column, known, strangers):
 
 
 def draw_case(seed, column, number, category, index):
-    """One case as a dict of plain values; `index` counts within the category, so that kinds come in
-    turn.
+    """One case as a dict of plain values; `index` counts within the category, so that
+    kinds come in turn.
     """
     rng = case_rng(seed, column, number)
     told = vehicle.draw_told(rng)
     wrong_form = None
     if column == "real" or (column == "stranger" and rng.random() < 0.5):
         told, wrong_form = real.draw(rng, column == "stranger")
-    turn = int(case_rng(seed, column, 0, 7, sorted(SHARES).index(category)).integers(1000))
+    turn = int(
+        case_rng(seed, column, 0, 7, sorted(SHARES).index(category)).integers(1000)
+    )
     names = list(effects.EFFECTS)
     causes = []
     targets = []
@@ -115,7 +124,9 @@ def draw_case(seed, column, number, category, index):
     if category == "single":
         effect = names[(index + turn) % len(names)]
         causes = [effects.draw(rng, effect)]
-        targets = [_target(rng, ("low", "medium", "high")[(index // len(names) + index) % 3])]
+        targets = [
+            _target(rng, ("low", "medium", "high")[(index // len(names) + index) % 3])
+        ]
     elif category == "pair":
         while True:
             one, two = (str(e) for e in rng.choice(names, 2, replace=False))
@@ -128,7 +139,9 @@ def draw_case(seed, column, number, category, index):
         kind = kinds[(index + turn) % len(kinds)]
         (low, high), unit, logs = unknowns.SITES[kind]
         form = unknowns.FORMS["stranger" if column == "stranger" else "known"]
-        causes = [{"effect": kind, "form": form, "shape": rng.uniform(0, 1, 8).tolist()}]
+        causes = [
+            {"effect": kind, "form": form, "shape": rng.uniform(0, 1, 8).tolist()}
+        ]
         causes[0] |= {"size": float(low * (high / low) ** rng.uniform()), "unit": unit}
         targets = [_target(rng, str(rng.choice(["medium", "high"])))]
         needed = [unknowns.MISSIONS]
@@ -143,7 +156,8 @@ def draw_case(seed, column, number, category, index):
         spoiled = kinds[(index + turn) % len(kinds)]
         channels = (garbage.KINDS | garbage.STRANGERS)[spoiled]
     elif category == "none":
-        # the missions of some effect's cases, so that missions do not give the answer away
+        # the missions of some effect's cases, so that missions do not give the answer
+        # away
         needed = [effects.EFFECTS[str(rng.choice(names))].missions]
     if category in ("single", "pair"):
         needed = [effects.EFFECTS[c["effect"]].missions for c in causes]
@@ -154,7 +168,9 @@ def draw_case(seed, column, number, category, index):
         flights = [(str(rng.choice(BLIND[effect])),) for _ in range(3)]
         channels = effects.EFFECTS[effect].needs
     else:
-        flights = draw_missions(rng, needed, style, rng.random() < 0.12 and category != "garbage")
+        flights = draw_missions(
+            rng, needed, style, rng.random() < 0.12 and category != "garbage"
+        )
     kind = str(rng.choice(_kinds(column, sensors.KINDS, sensors.STRANGERS)))
     if kind == "radio" and any(c["effect"] in TIMED for c in causes):
         kind = "filtered"  # clocks that wander by ten milliseconds can't time anything
@@ -162,7 +178,13 @@ def draw_case(seed, column, number, category, index):
     if "mass" in (c["effect"] for c in causes):
         told = replace(told, weighed=False)
     # 1000 rows a second make long files: the flights are shorter there
-    most = TICKS if drawn["rate"] <= 250 else TICKS // 2 if drawn["rate"] <= 500 else TICKS * 2 // 5
+    most = (
+        TICKS
+        if drawn["rate"] <= 250
+        else TICKS // 2
+        if drawn["rate"] <= 500
+        else TICKS * 2 // 5
+    )
     return {
         "name": f"case_{number:03d}",
         "number": number,
@@ -175,15 +197,17 @@ def draw_case(seed, column, number, category, index):
         "missions": flights,
         "style": style,
         "ticks": [int(rng.integers(8 * most // 10, most + 1)) for _ in flights],
-        "controller": str(rng.choice(_kinds(column, controllers.KINDS, controllers.STRANGERS))),
+        "controller": str(
+            rng.choice(_kinds(column, controllers.KINDS, controllers.STRANGERS))
+        ),
         "sensors": drawn,
         "told": told,
     }
 
 
 def draw_cases(seed, column, count, only=None):
-    """A list of `count` cases in shuffled order, categories in the shares of `SHARES` (or those
-    named in `only`).
+    """A list of `count` cases in shuffled order, categories in the shares of `SHARES`
+    (or those named in `only`).
     """
     shares = {k: w for k, w in SHARES.items() if not only or k in only}
     total = sum(shares.values())
@@ -200,5 +224,7 @@ def reference_of(rng, mission, ticks):
         return list(missions.pair(mission[0], rng, ticks))
     if len(mission) == 2:
         sides = zip(mission, (-1, 1), strict=True)
-        return [missions.apart(missions.single(m, rng, ticks), side) for m, side in sides]
+        return [
+            missions.apart(missions.single(m, rng, ticks), side) for m, side in sides
+        ]
     return [missions.single(mission[0], rng, ticks)]

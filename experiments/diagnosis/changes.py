@@ -1,15 +1,16 @@
-"""What changed, where the answer is known: sample flights with a known effect, and real flights of
-two Crazyflies.
+"""What changed, where the answer is known: sample flights with a known effect, and real
+flights of two Crazyflies.
 
     python -m experiments.diagnosis.changes --work DIR --seeds 11 12 13 --vehicles E8=FOLDER
     E9=FOLDER=ANSWERS.json
 
-Sample flights of each effect, and of none, are compared with those of none flown with another seed.
-A vehicle is a folder of conditions with `labels.json` (or a file of answers) and its normal flights
-in `normal_flight` or `reference`. These two are of CrazyPAD
-(github.com/AerialRoboticsUUST/CrazyPAD, commit 5448265, MIT; Masalimov et al., Data 2024, 9(6),
-79): no orientation. Every condition is compared with all normal flights, and each day of normal
-flights with the others. `--figure` draws the figure of docs/what_changed.md into `--work` instead.
+Sample flights of each effect, and of none, are compared with those of none flown with
+another seed. A vehicle is a folder of conditions with `labels.json` (or a file of
+answers) and its normal flights in `normal_flight` or `reference`. These two are of
+CrazyPAD (github.com/AerialRoboticsUUST/CrazyPAD, commit 5448265, MIT; Masalimov et al.,
+Data 2024, 9(6), 79): no orientation. Every condition is compared with all normal
+flights, and each day of normal flights with the others. `--figure` draws the figure of
+docs/what_changed.md into `--work` instead.
 """
 
 from pathlib import Path
@@ -55,21 +56,33 @@ def sample_records(work: Path, seeds: list[int]) -> list[dict]:
     out = []
     for effect in EFFECTS:
         for seed, other in zip(seeds, [*seeds[1:], seeds[0]], strict=True):
-            change = comparison.compare(work / f"{effect}_{seed}", [work / f"none_{other}"])
-            out.append(record_of("sample", f"{effect}, seed {seed}", {"cause": effect}, change))
+            change = comparison.compare(
+                work / f"{effect}_{seed}", [work / f"none_{other}"]
+            )
+            out.append(
+                record_of("sample", f"{effect}, seed {seed}", {"cause": effect}, change)
+            )
     return out
 
 
 def vehicle_records(name: str, folder: Path, labels: dict) -> list[dict]:
-    """Each condition against all normal flights, each day of these against the others."""
+    """Each condition against all normal flights, each day of these against the
+    others.
+    """
     (normal,) = [n for n in NORMAL if (folder / n).is_dir()]
     case, old, _ = comparison.read(folder / normal)
     out = []
     for number, day in enumerate(dict.fromkeys(f.day for f in old), 1):
-        new, others = ([f for f in old if (f.day == day) == own] for own in (True, False))
+        new, others = (
+            [f for f in old if (f.day == day) == own] for own in (True, False)
+        )
         if others:
             change = comparison.change_between(day, new, others, case)
-            out.append(record_of(name, f"normal flights, day {number}", {"cause": "none"}, change))
+            out.append(
+                record_of(
+                    name, f"normal flights, day {number}", {"cause": "none"}, change
+                )
+            )
     for condition, truth in labels.items():
         if condition != normal:
             change = comparison.change_between(
@@ -84,7 +97,9 @@ def study(options) -> dict:
     records = sample_records(options.work, options.seeds) if options.seeds else []
     for entry in options.vehicles:
         name, folder, *answers = entry.split("=")
-        labels = read_json(Path(answers[0]) if answers else Path(folder) / "labels.json")
+        labels = read_json(
+            Path(answers[0]) if answers else Path(folder) / "labels.json"
+        )
         records += vehicle_records(name, Path(folder), labels)
     return {"records": records}
 
@@ -118,7 +133,9 @@ def figures_of(records: list[dict]) -> Table:
         lambda r: not r["changed"],
     )
     deep = [r for r in real if cut(r) >= 4]
-    count("real, a propeller cut by 4 mm or more: changed", deep, lambda r: r["changed"])
+    count(
+        "real, a propeller cut by 4 mm or more: changed", deep, lambda r: r["changed"]
+    )
     shallow = [r for r in real if 0 < cut(r) < 4]
     count("real, cut by less: changed", shallow, lambda r: r["changed"])
     count(
@@ -155,8 +172,8 @@ def page(results: dict) -> Page:
 
 
 def figure(folder: Path) -> None:
-    """Two normal days, whose rotors differ by 2 % as new propellers do, and one with a weaker
-    rotor.
+    """Two normal days, whose rotors differ by 2 % as new propellers do, and one with a
+    weaker rotor.
     """
     vehicle = load_vehicle()
     rng = np.random.default_rng(3)
@@ -164,14 +181,22 @@ def figure(folder: Path) -> None:
         {"friday": 0.0, "monday": 0.0, "tuesday": 0.22}.items(), 1
     ):
         (folder / name).mkdir(parents=True)
-        factors = 0.02 * rng.standard_normal(4) - weaker * np.array([0.0, 0.0, 1.0, 0.0])
+        factors = 0.02 * rng.standard_normal(4) - weaker * np.array(
+            [0.0, 0.0, 1.0, 0.0]
+        )
         effects = {
-            "motor_imbalance": dict(zip(("m1", "m2", "m3", "m4"), factors.tolist(), strict=True))
+            "motor_imbalance": dict(
+                zip(("m1", "m2", "m3", "m4"), factors.tolist(), strict=True)
+            )
         }
-        for k, (flight, reference) in enumerate(references(seed=seed, duration=8.0).items()):
+        for k, (flight, reference) in enumerate(
+            references(seed=seed, duration=8.0).items()
+        ):
             columns = fly(vehicle, vehicle, reference, 10 * seed + k, effects)
             write_csv(folder / name / f"{flight}.csv.gz", log_of(columns, flight))
-    change = comparison.compare(folder / "tuesday", [folder / "friday", folder / "monday"])
+    change = comparison.compare(
+        folder / "tuesday", [folder / "friday", folder / "monday"]
+    )
     draw(change).savefig(folder / "what_changed.png", dpi=90)
 
 
@@ -183,7 +208,10 @@ def main() -> None:
         "--vehicles", nargs="+", default=[], help="real flights: NAME=FOLDER[=ANSWERS]"
     )
     parser.add_argument(
-        "--work", type=Path, default=Path("runs/changes"), help="folder for sample flights"
+        "--work",
+        type=Path,
+        default=Path("runs/changes"),
+        help="folder for sample flights",
     )
     parser.add_argument("--figure", action="store_true")
     options = parser.parse_args()

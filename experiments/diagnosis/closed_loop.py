@@ -1,12 +1,13 @@
-"""Does the advised flight tell more than a random one? Two hovers that say little, a diagnosis, its
-advice, the advised segments flown, the next diagnosis, twice; beside it as many random segments.
+"""Does the advised flight tell more than a random one? Two hovers that say little, a
+diagnosis, its advice, the advised segments flown, the next diagnosis, twice; beside it
+as many random segments.
 
     python -m experiments.diagnosis.closed_loop --cases 48 --jobs 32 --out
     experiments/results/closed_loop.json
 
-The plant is openjax' own vehicle with one effect of its sample strength, so this asks for the
-advice, not for the diagnosis' strength on foreign vehicles. `--each` also diagnoses the hovers with
-each segment alone: which segment shows which cause.
+The plant is openjax' own vehicle with one effect of its sample strength, so this asks
+for the advice, not for the diagnosis' strength on foreign vehicles. `--each` also
+diagnoses the hovers with each segment alone: which segment shows which cause.
 """
 
 import argparse
@@ -20,8 +21,22 @@ from experiments.diagnosis.generate import in_processes
 from experiments.flying.single_thread import use_single_thread
 
 CAUSES = (
-    *("rotor_drag", "ground_effect", "wind", "com_offset", "blade_flapping", "thrust_curve"),
-    *("motor_lag", "inertia", "yaw_torque", "battery_sag", "ceiling_effect", "motor_imbalance"),
+    *(
+        "rotor_drag",
+        "ground_effect",
+        "wind",
+        "com_offset",
+        "blade_flapping",
+        "thrust_curve",
+    ),
+    *(
+        "motor_lag",
+        "inertia",
+        "yaw_torque",
+        "battery_sag",
+        "ceiling_effect",
+        "motor_imbalance",
+    ),
 )
 FLOWN = 2  # segments in a round
 ROUNDS = 2
@@ -69,7 +84,9 @@ def described():
 
 
 def diagnose(flights: list, cause: str) -> tuple[dict, dict]:
-    """What is kept of a diagnosis of a vehicle with one cause, and its report as JSON has it."""
+    """What is kept of a diagnosis of a vehicle with one cause, and its report as JSON
+    has it.
+    """
     from openjax.flights import flight
     from openjax.gap.diagnosis import diagnose_case
 
@@ -145,7 +162,9 @@ def studied(job: tuple[int, str]) -> tuple[int, dict]:
 
 
 def study(numbers: list[int], jobs: int, each: bool) -> list[dict]:
-    """All cases. The longest jobs begin first, so that none is waited for at the end."""
+    """All cases. The longest jobs begin first, so that none is waited for at the
+    end.
+    """
     parts = ["advised", "random", *(segment_names() if each else ())]
     work = [(number, part) for part in parts for number in numbers]
     cases: dict[int, dict] = {n: {"number": n, "cause": Case(n).cause} for n in numbers}
@@ -178,7 +197,12 @@ def main() -> None:
     command = "python -m experiments.diagnosis.closed_loop"
     command += f" --first {arguments.first} --cases {len(cases)}"
     command += " --each" if arguments.each else ""
-    found = {"command": command, "of": len(cases), "right": figures(cases), "cases": cases}
+    found = {
+        "command": command,
+        "of": len(cases),
+        "right": figures(cases),
+        "cases": cases,
+    }
     arguments.out.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
 
 

@@ -1,10 +1,10 @@
-"""Three off-board controllers that turn a reference and a measured pose into collective thrust and
-body rates.
+"""Three off-board controllers that turn a reference and a measured pose into collective
+thrust and body rates.
 
-`geometric` aligns the thrust with the wanted acceleration; `cascade` is a chain of PIDs on
-position, velocity and Euler angles, as firmware position controllers are; `preview` (stranger's
-column only) tracks a point ahead, every 20 ms, with smoothed commands. All see the told mass and
-thrust constant.
+`geometric` aligns the thrust with the wanted acceleration; `cascade` is a chain of PIDs
+on position, velocity and Euler angles, as firmware position controllers are; `preview`
+(stranger's column only) tracks a point ahead, every 20 ms, with smoothed commands. All
+see the told mass and thrust constant.
 """
 
 import numpy as np
@@ -18,8 +18,8 @@ AHEAD = 8  # ticks that `preview` looks ahead
 
 
 class Controllers:
-    """The controllers of a batch: `kind` names one per body, `mass` (B,) kg and `most` (B,) N of
-    all four rotors.
+    """The controllers of a batch: `kind` names one per body, `mass` (B,) kg and `most`
+    (B,) N of all four rotors.
     """
 
     def __init__(self, kinds, mass, most, reference):
@@ -33,8 +33,8 @@ class Controllers:
         self.command = None
 
     def __call__(self, k, position, q, velocity):
-        """Commands (4, B) at tick k: thrust 0..1 and body rates rad/s; held where the controller is
-        not due.
+        """Commands (4, B) at tick k: thrust 0..1 and body rates rad/s; held where the
+        controller is not due.
         """
         r = self.reference
         last = len(self.reference["position"]) - 1
@@ -50,13 +50,17 @@ class Controllers:
         out[0] = np.clip(out[0], 0.08, 0.92)
         out[1:] = np.clip(out[1:], -np.pi, np.pi)
         self.command = (
-            out if self.command is None else np.where(k % self.period == 0, out, self.command)
+            out
+            if self.command is None
+            else np.where(k % self.period == 0, out, self.command)
         )
         return self.command
 
     def _collect(self, own, error):
         """Position error integrated with a limit."""
-        held = np.clip(self.integral[:, own] + 0.01 * np.clip(error, -0.2, 0.2), -0.5, 0.5)
+        held = np.clip(
+            self.integral[:, own] + 0.01 * np.clip(error, -0.2, 0.2), -0.5, 0.5
+        )
         self.integral[:, own] = held
         return held
 
@@ -67,7 +71,9 @@ class Controllers:
         stiff, damp, turn = gains
         error = goal["position"] - position
         want = goal["acceleration"] + np.array([[stiff], [stiff], [2 * stiff]]) * error
-        want = want + np.array([[damp], [damp], [1.45 * damp]]) * (goal["velocity"] - velocity)
+        want = want + np.array([[damp], [damp], [1.45 * damp]]) * (
+            goal["velocity"] - velocity
+        )
         want = want + np.array([[1.5], [1.5], [5.0]]) * self._collect(own, error)
         want[2] = np.clip(want[2], -6.0, 8.0) + GRAVITY
         side = np.sqrt(want[0] ** 2 + want[1] ** 2)
@@ -75,7 +81,9 @@ class Controllers:
             1.0, 0.78 * want[2] / np.maximum(side, 1e-9)
         )  # at most 38 degrees of tilt
         w, x, y, z = q
-        up = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
+        up = np.stack(
+            [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)]
+        )
         lean = rotate_back(q, cross(up, want / np.sqrt((want * want).sum(axis=0))))
         heading = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
         twist = (goal["yaw"] - heading + np.pi) % (2 * np.pi) - np.pi
@@ -101,10 +109,14 @@ class Controllers:
         pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
         ahead = want[0] * np.cos(yaw) + want[1] * np.sin(yaw)
         aside = -want[0] * np.sin(yaw) + want[1] * np.cos(yaw)
-        pitch_goal, roll_goal = (np.clip(v / GRAVITY, -0.5, 0.5) for v in (ahead, -aside))
+        pitch_goal, roll_goal = (
+            np.clip(v / GRAVITY, -0.5, 0.5) for v in (ahead, -aside)
+        )
         twist = (goal["yaw"] - yaw + np.pi) % (2 * np.pi) - np.pi
         thrust = self.mass[own] * (GRAVITY + np.clip(want[2], -5, 6)) / self.most[own]
-        return np.stack([thrust, 6.5 * (roll_goal - roll), 6.5 * (pitch_goal - pitch), 3.5 * twist])
+        return np.stack(
+            [thrust, 6.5 * (roll_goal - roll), 6.5 * (pitch_goal - pitch), 3.5 * twist]
+        )
 
     def _preview(self, own, goal, position, q, velocity):
         ahead = position + 0.01 * AHEAD * velocity

@@ -1,5 +1,5 @@
-"""The vocabulary of the exam: twenty effects, the forms and sizes that they are drawn in, and which
-of them can stand in for one another.
+"""The vocabulary of the exam: twenty effects, the forms and sizes that they are drawn
+in, and which of them can stand in for one another.
 
 How an effect acts is in `forces`, how a drawn cause gets into the plant's parameters in
 `injection`.
@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 
 class Drawn(NamedTuple):
-    """What is drawn of an effect: (smallest, largest) size, forms, missions that expose it, logged
-    channels that it needs.
+    """What is drawn of an effect: (smallest, largest) size, forms, missions that expose
+    it, logged channels that it needs.
     """
 
     sizes: tuple
@@ -36,8 +36,18 @@ _EFFECTS = {
         ("fast", "laps", "spiral"),
         "p",
     ),
-    "blade_flapping": ((0.05, 3.0), ("linear", "advance_ratio"), ("fast", "agile", "laps"), "pg"),
-    "wind": ((0.2, 12.0), ("steady", "quadratic", "shear", "gusty"), ("yaw", "fast", "hover"), "p"),
+    "blade_flapping": (
+        (0.05, 3.0),
+        ("linear", "advance_ratio"),
+        ("fast", "agile", "laps"),
+        "pg",
+    ),
+    "wind": (
+        (0.2, 12.0),
+        ("steady", "quadratic", "shear", "gusty"),
+        ("yaw", "fast", "hover"),
+        "p",
+    ),
     "ground_effect": ((0.015, 0.35), SURFACE, ("low",), "pm"),
     "ceiling_effect": ((0.015, 0.35), SURFACE, ("high",), "pm"),
     "downwash": ((2.0, 20.0), ("gaussian", "jet"), ("pass", "pass_moving"), "pm"),
@@ -53,14 +63,29 @@ _EFFECTS = {
         ("agile", "step", "yaw"),
         "gcm",
     ),
-    "packet_loss": ((0.01, 0.5), ("independent", "bursts"), ("agile", "step", "yaw"), "gcm"),
+    "packet_loss": (
+        (0.01, 0.5),
+        ("independent", "bursts"),
+        ("agile", "step", "yaw"),
+        "gcm",
+    ),
     "thrust_curve": ((0.05, 1.0), ("quadratic", "power", "dip"), ("climb",), "m"),
     "motor_imbalance": ((0.003, 0.15), ("all", "one_weak"), (), "gm"),
     "com_offset": ((0.05, 8.0), ("torque", "full"), (), "gm"),
     "inertia": ((0.06, 0.6), ("diagonal", "products"), ("agile", "step", "yaw"), "gm"),
     "yaw_torque": ((0.06, 0.85), ("scale",), ("yaw",), "gm"),
-    "rate_gains": ((0.08, 1.0), ("gains", "filtered_d"), ("agile", "step", "yaw"), "gcm"),
-    "state_latency": ((4.0, 60.0), ("constant", "jitter"), ("agile", "fast", "step"), "pg"),
+    "rate_gains": (
+        (0.08, 1.0),
+        ("gains", "filtered_d"),
+        ("agile", "step", "yaw"),
+        "gcm",
+    ),
+    "state_latency": (
+        (4.0, 60.0),
+        ("constant", "jitter"),
+        ("agile", "fast", "step"),
+        "pg",
+    ),
 }
 EFFECTS = {name: Drawn(*drawn) for name, drawn in _EFFECTS.items()}
 # effects that can stand in for one another: not drawn together
@@ -83,8 +108,8 @@ PARTS = {
 
 
 def draw(rng, effect, form=None):
-    """A cause of the effect; the size lies within its usual range, the form is drawn unless
-    given.
+    """A cause of the effect; the size lies within its usual range, the form is drawn
+    unless given.
     """
     (low, high), forms = EFFECTS[effect].sizes, EFFECTS[effect].forms
     form = str(rng.choice(forms)) if form is None else form

@@ -1,4 +1,5 @@
-"""The firmware's rate loop at 500 Hz: filters of gyroscope and derivative, PID in counts, mixer.
+"""The firmware's rate loop at 500 Hz: filters of gyroscope and derivative, PID in
+counts, mixer.
 
 Arrays have the body index last.
 """
@@ -12,8 +13,8 @@ SAMPLE = 0.002
 
 
 class Filter:
-    """Second-order Butterworth low-pass of (n, B) signals at 500 Hz; `cut` (B,) Hz, 0 lets
-    everything through.
+    """Second-order Butterworth low-pass of (n, B) signals at 500 Hz; `cut` (B,) Hz, 0
+    lets everything through.
     """
 
     def __init__(self, cut, rows, start):
@@ -38,8 +39,8 @@ class Filter:
 
 
 class Firmware:
-    """Rate loop of the firmware at 500 Hz: filters of gyroscope and derivative, PID in counts,
-    mixer.
+    """Rate loop of the firmware at 500 Hz: filters of gyroscope and derivative, PID in
+    counts, mixer.
     """
 
     def __init__(self, p, gyro, integral=None):
@@ -56,8 +57,8 @@ class Firmware:
         self.previous, self.slope = gyro.copy(), np.zeros((3, count))
 
     def __call__(self, command, gyro):
-        """Motor commands (4, B) from the command in force (4, B) and the filtered gyroscope (3,
-        B).
+        """Motor commands (4, B) from the command in force (4, B) and the filtered
+        gyroscope (3, B).
         """
         p = self.p
         error = np.rad2deg(command[1:] - gyro)
@@ -65,7 +66,9 @@ class Firmware:
             np.maximum(self.integral + SAMPLE * error, -self.limit), self.limit
         )
         slope = self.slope_filter(np.rad2deg(self.previous - gyro) / SAMPLE)
-        self.slope = self.keep * self.slope + (1 - self.keep) * slope if self.slow else slope
+        self.slope = (
+            self.keep * self.slope + (1 - self.keep) * slope if self.slow else slope
+        )
         self.previous = gyro
         return vehicle.mix(
             command[0], p["kp"] * error + p["ki"] * self.integral + p["kd"] * self.slope

@@ -1,8 +1,8 @@
-"""How the effects act inside the plant: motors' demand, thrust near surfaces, wakes, and the forces
-of the air.
+"""How the effects act inside the plant: motors' demand, thrust near surfaces, wakes,
+and the forces of the air.
 
-What acts is decided by the plant's parameters alone (`vehicle.nominal_parameters`, with causes
-written in by `injection`). Arrays have the body index last.
+What acts is decided by the plant's parameters alone (`vehicle.nominal_parameters`, with
+causes written in by `injection`). Arrays have the body index last.
 """
 
 import numpy as np
@@ -23,15 +23,17 @@ class Active:
     """Which parameters differ from their neutral value somewhere in the batch."""
 
     def __init__(self, parameters, neutral):
-        self.names = {k for k, v in parameters.items() if k in neutral and np.any(v != neutral[k])}
+        self.names = {
+            k for k, v in parameters.items() if k in neutral and np.any(v != neutral[k])
+        }
 
     def __call__(self, *names):
         return any(n in self.names for n in names)
 
 
 def motor_demand(p, active, m, voltage, load):
-    """Motor commands (4, B) to effective thrust fraction: thrust map, battery, saturation, in this
-    order.
+    """Motor commands (4, B) to effective thrust fraction: thrust map, battery,
+    saturation, in this order.
     """
     u = m
     hover = p["hover"]
@@ -49,7 +51,9 @@ def motor_demand(p, active, m, voltage, load):
         drop = np.clip(p["sag_reference"] - voltage, -1.0, None)
         u = u * (1.0 - p["sag_quadratic"] * (drop + 0.6 * drop * np.abs(drop)))
     if active("sag_load"):
-        u = u * (1.0 - p["sag_load"] * ((p["sag_reference"] - voltage) + 0.1 * (load - 0.6)))
+        u = u * (
+            1.0 - p["sag_load"] * ((p["sag_reference"] - voltage) + 0.1 * (load - 0.6))
+        )
     if active("limit"):
         top = p["limit"] * (1.0 + p["limit_voltage"] * (voltage - 3.6))
         knee = np.maximum(p["limit_knee"], 1e-6)
@@ -59,8 +63,14 @@ def motor_demand(p, active, m, voltage, load):
 
 
 def surface_gain(p, active, position, q):
-    """Thrust factor of each rotor (4, B) near the floor and the ceiling; 1 where neither acts."""
-    sides = [s for s in ("ground", "ceiling") if active(s + "_image", s + "_exp", s + "_inverse")]
+    """Thrust factor of each rotor (4, B) near the floor and the ceiling; 1 where
+    neither acts.
+    """
+    sides = [
+        s
+        for s in ("ground", "ceiling")
+        if active(s + "_image", s + "_exp", s + "_inverse")
+    ]
     if not sides:
         return 1.0
     gain = 1.0
@@ -70,19 +80,21 @@ def surface_gain(p, active, position, q):
     for side in sides:
         distance = height if side == "ground" else CEILING - height
         d = np.maximum(distance, 0.0) + p[side + "_offset"]
-        # Cheeseman-Bennett 1 / (1 - (R / 4 z)^2) with an effective radius; an exponential; the
-        # simple (R / z)^2
+        # Cheeseman-Bennett 1 / (1 - (R / 4 z)^2) with an effective radius; an
+        # exponential; the simple (R / z)^2
         ratio = np.minimum((p[side + "_image"] * PROPELLER / (4.0 * d)) ** 2, 0.5)
         gain = (
-            gain + (1.0 / (1.0 - ratio) - 1.0) + p[side + "_exp"] * np.exp(-d / p[side + "_scale"])
+            gain
+            + (1.0 / (1.0 - ratio) - 1.0)
+            + p[side + "_exp"] * np.exp(-d / p[side + "_scale"])
         )
         gain = gain + p[side + "_inverse"] * (PROPELLER / d) ** 2
     return gain
 
 
 def wake_force(p, position, other):
-    """Vertical force (B,) N, negative, from the rotor wake of the vehicle at `other` (3, B), and
-    its gradient (2, B) N/m.
+    """Vertical force (B,) N, negative, from the rotor wake of the vehicle at `other`
+    (3, B), and its gradient (2, B) N/m.
     """
     dx = position[0] - other[0]
     dy = position[1] - other[1]
@@ -104,19 +116,22 @@ def wake_force(p, position, other):
 
 
 def air_forces(p, active, q, velocity, rates, speed, thrust, position, gust):
-    """Force (3, B) N and torque (3, B) N m in the body frame from drag, flapping and wind;
-    `thrust`, `speed` (4, B).
+    """Force (3, B) N and torque (3, B) N m in the body frame from drag, flapping and
+    wind; `thrust`, `speed` (4, B).
     """
     vb = rotate_back(q, velocity)
     force = np.zeros_like(vb)
     torque = np.zeros_like(vb)
     if active("drag_xy", "drag_z"):
-        force -= np.stack([p["drag_xy"] * vb[0], p["drag_xy"] * vb[1], p["drag_z"] * vb[2]])
+        force -= np.stack(
+            [p["drag_xy"] * vb[0], p["drag_xy"] * vb[1], p["drag_z"] * vb[2]]
+        )
     if active("drag_quadratic"):
         norm = np.sqrt((vb * vb).sum(axis=0))
         force -= p["drag_quadratic"] * norm * vb * np.array([1.0, 1.0, 0.6])[:, None]
     if active("drag_rotor"):
-        # in-plane force at each hub, proportional to rotor speed and the hub's own velocity
+        # in-plane force at each hub, proportional to rotor speed and the hub's own
+        # velocity
         c = p["drag_rotor"] * speed / MAX_SPEED
         x = ROTOR_X[:, None]
         y = ROTOR_Y[:, None]
@@ -124,10 +139,16 @@ def air_forces(p, active, q, velocity, rates, speed, thrust, position, gust):
         fy = -c * (vb[1] + rates[2] * x)
         fz = -0.5 * c * (vb[2] + rates[0] * y - rates[1] * x)
         force += np.stack([fx.sum(0), fy.sum(0), fz.sum(0)])
-        torque += np.stack([(y * fz).sum(0), -(x * fz).sum(0), (x * fy - y * fx).sum(0)])
+        torque += np.stack(
+            [(y * fz).sum(0), -(x * fz).sum(0), (x * fy - y * fx).sum(0)]
+        )
     if active("drag_height"):
         torque += np.stack(
-            [-p["drag_height"] * force[1], p["drag_height"] * force[0], np.zeros(vb.shape[1])]
+            [
+                -p["drag_height"] * force[1],
+                p["drag_height"] * force[0],
+                np.zeros(vb.shape[1]),
+            ]
         )
     if active("flap_torque", "flap_tilt"):
         total = thrust.sum(axis=0)
@@ -141,7 +162,9 @@ def air_forces(p, active, q, velocity, rates, speed, thrust, position, gust):
         # the disk tilts back: the torque is along v x e3 = (v_y, -v_x, 0)
         torque += np.stack([bend * vb[1], -bend * vb[0], np.zeros(vb.shape[1])])
     if active("wind_drag", "wind_quadratic"):
-        wind = p["wind"] * (1.0 + p["wind_shear"] * (position[2] - 0.6) + p["wind_gust"] * gust)
+        wind = p["wind"] * (
+            1.0 + p["wind_shear"] * (position[2] - 0.6) + p["wind_gust"] * gust
+        )
         relative = rotate_back(q, wind - velocity)
         norm = np.sqrt((relative * relative).sum(axis=0))
         force += (p["wind_drag"] + p["wind_quadratic"] * norm) * relative
@@ -149,8 +172,8 @@ def air_forces(p, active, q, velocity, rates, speed, thrust, position, gust):
 
 
 def seen_by_accelerometer(p, specific, rates):
-    """Specific force (3, B) where the accelerometer sits, if that isn't the centre of mass
-    (centripetal part).
+    """Specific force (3, B) where the accelerometer sits, if that isn't the centre of
+    mass (centripetal part).
     """
     lever = -p["com"] * p["imu_lever"]
     return specific + cross(rates, cross(rates, lever))

@@ -1,6 +1,6 @@
-"""What an identification of torques makes of flights with known truth: rows of 100, 250 and 500 Hz,
-means and samples, calm air and strong gusts; and of folders of real flights, where only the
-simulator's numbers stand beside.
+"""What an identification of torques makes of flights with known truth: rows of 100, 250
+and 500 Hz, means and samples, calm air and strong gusts; and of folders of real
+flights, where only the simulator's numbers stand beside.
 
     python -m experiments.diagnosis.identification --out experiments/results/identification.json
 """
@@ -52,7 +52,9 @@ TOLD = NAMES[:8]
 def record_of(rates, motor, rate: int, samples: bool, vehicle) -> Record:
     """A record of rows without anything but rates and motors."""
     rest = dict.fromkeys(("force", "velocity", "quaternion", "voltage"))
-    return Record("flight", 1.0 / rate, rates, motor, vehicle=vehicle, samples=samples, **rest)
+    return Record(
+        "flight", 1.0 / rate, rates, motor, vehicle=vehicle, samples=samples, **rest
+    )
 
 
 def fitted(record: Record, free: bool) -> TorqueFit:
@@ -68,12 +70,22 @@ def truth_of(truth: Truth) -> np.ndarray:
     """(8,) the parameters of TOLD."""
     gain = 1.0 / truth.inertia
     return np.array(
-        [truth.up, truth.down, truth.delay, gain, gain, gain * truth.yaw, *[truth.damping] * 2]
+        [
+            truth.up,
+            truth.down,
+            truth.delay,
+            gain,
+            gain,
+            gain * truth.yaw,
+            *[truth.damping] * 2,
+        ]
     )
 
 
 def flown() -> tuple[list[tuple], tuple]:
-    """(vehicle, gusts, number) of each flight, and all flights' gyroscopes and motors."""
+    """(vehicle, gusts, number) of each flight, and all flights' gyroscopes and
+    motors.
+    """
     cases = list(itertools.product(VEHICLES, GUSTS, range(SEEDS)))
     # Each flight has air of its own, so that their errors are independent.
     truths = [
@@ -113,9 +125,13 @@ def study() -> list[dict]:
                     "gust": truth.gust,
                     "flights": len(values),
                     "truth": dict(zip(TOLD, right.tolist(), strict=True)),
-                    "mean": dict(zip(TOLD, np.mean(values, 0).round(5).tolist(), strict=True)),
+                    "mean": dict(
+                        zip(TOLD, np.mean(values, 0).round(5).tolist(), strict=True)
+                    ),
                     "inside_90": dict(zip(TOLD, inside.mean(0).tolist(), strict=True)),
-                    "roll_at_2_5_10_hz": np.mean(gains, 0).round(1).tolist() if gains else None,
+                    "roll_at_2_5_10_hz": np.mean(gains, 0).round(1).tolist()
+                    if gains
+                    else None,
                 }
             )
             print(kind, name, gust, out[-1]["mean"], flush=True)
@@ -123,8 +139,8 @@ def study() -> list[dict]:
 
 
 def summary(rows: list[dict]) -> dict:
-    """Of each kind of rows: root mean squares of the logarithms of lag and gain over the truth,
-    and how often 90 % intervals hold it.
+    """Of each kind of rows: root mean squares of the logarithms of lag and gain over
+    the truth, and how often 90 % intervals hold it.
     """
     found = {}
     for kind in ROWS:
@@ -140,7 +156,12 @@ def summary(rows: list[dict]) -> dict:
             "damping": round(
                 float(
                     np.sqrt(
-                        np.mean([(r["mean"]["damping"] - r["truth"]["damping"]) ** 2 for r in of])
+                        np.mean(
+                            [
+                                (r["mean"]["damping"] - r["truth"]["damping"]) ** 2
+                                for r in of
+                            ]
+                        )
                     )
                 ),
                 3,
@@ -157,7 +178,9 @@ def _inside(rows: list[dict]) -> float:
 
 
 def of_flights(folder: Path) -> dict:
-    """What a case's flights say, and the share of the simulator's response that they show."""
+    """What a case's flights say, and the share of the simulator's response that they
+    show.
+    """
     found = identify(load_case(folder))
     shares = {f"{f:g} Hz": [round(v, 3) for v in found.at(f)] for f in (2.0, 5.0, 10.0)}
     quantities = {
@@ -179,8 +202,15 @@ def main() -> None:
     real = {folder.name: of_flights(folder) for folder in arguments.flights}
     rows = study()
     command = "python -m experiments.diagnosis.identification"
-    command += "".join(f" --flights {name}" for name in real) + f" --out {arguments.out.name}"
-    found = {"command": command, "summary": summary(rows), "flights": real, "rows": rows}
+    command += (
+        "".join(f" --flights {name}" for name in real) + f" --out {arguments.out.name}"
+    )
+    found = {
+        "command": command,
+        "summary": summary(rows),
+        "flights": real,
+        "rows": rows,
+    }
     text = json.dumps(found, indent=1)
     arguments.out.write_text(text + "\n", encoding="utf-8")
 

@@ -1,11 +1,12 @@
 """How a drawn cause is written into the plant's parameters, an effect a function.
 
-A cause is {"effect", "form", "size", "shape"}: `size` is the one number that decides the severity,
-`shape` are eight uniform draws that fix everything else (signs, axes, ratios), once per case. The
-first form of an effect is close to what any library would write; the others are not.
+A cause is {"effect", "form", "size", "shape"}: `size` is the one number that decides
+the severity, `shape` are eight uniform draws that fix everything else (signs, axes,
+ratios), once per case. The first form of an effect is close to what any library would
+write; the others are not.
 
-Each function changes the parameters `p` of the bodies `c` in place and returns the magnitudes in
-the units of the parameter tables: kg, N s/m, m/s, ms, mm, shares.
+Each function changes the parameters `p` of the bodies `c` in place and returns the
+magnitudes in the units of the parameter tables: kg, N s/m, m/s, ms, mm, shares.
 """
 
 from typing import NamedTuple
@@ -32,8 +33,8 @@ class Cause(NamedTuple):
 
 
 def inject(cause, p, c, arrival=None, rng=None):
-    """Write the cause into the parameters of the bodies `c`; the link's effects change `arrival`
-    (K, B), in ms, by draws of `rng`.
+    """Write the cause into the parameters of the bodies `c`; the link's effects change
+    `arrival` (K, B), in ms, by draws of `rng`.
 
     Returns the magnitudes of the effect.
     """
@@ -79,8 +80,8 @@ def battery_sag(cause, p, c):
 
 
 def thrust_saturation(cause, p, c):
-    """A ceiling of the demand; the size is how much of the room between hover and .92 is
-    missing.
+    """A ceiling of the demand; the size is how much of the room between hover and .92
+    is missing.
     """
     top = 0.92 - cause.size * (0.88 - p["hover"][c])
     p["limit"][c] = top
@@ -92,7 +93,8 @@ def thrust_saturation(cause, p, c):
 def thrust_curve(cause, p, c):
     """The map from command to thrust bends."""
     if cause.form == "quadratic":
-        # zero at hover and at a second thrust: the curvature is the cause, not the scale
+        # zero at hover and at a second thrust: the curvature is the cause, not the
+        # scale
         p["curve_quadratic"][c] = cause.sign * cause.size
         p["curve_root"][c] = p["hover"][c] - 0.28 + 0.2 * cause.shape[1]
         return {"curvature": cause.sign * cause.size}
@@ -109,7 +111,9 @@ def thrust_curve(cause, p, c):
 
 
 def rotor_drag(cause, p, c):
-    """Force against the velocity, by several laws; the size is its level coefficient."""
+    """Force against the velocity, by several laws; the size is its level
+    coefficient.
+    """
     a = cause.size
     ratio = 0.3 + 0.6 * cause.shape[1]
     values = {"d_xy": a, "d_z": a * ratio}
@@ -132,8 +136,8 @@ def rotor_drag(cause, p, c):
 
 
 def blade_flapping(cause, p, c):
-    """The size is the torque at hover thrust in 1e-4 N m per m/s; the thrust leans by .004 to .03
-    rad per m/s.
+    """The size is the torque at hover thrust in 1e-4 N m per m/s; the thrust leans by
+    .004 to .03 rad per m/s.
     """
     p["flap_torque"][c] = 1e-4 * cause.size
     p["flap_tilt"][c] = (0.004 + 0.02 * cause.shape[1]) * min(cause.size, 1.3)
@@ -170,7 +174,9 @@ def surface_effect(cause, p, c, side):
     if cause.form == "inverse_square":
         p[side + "_inverse"][c] = gain * ((0.05 + offset) / PROPELLER) ** 2
     elif cause.form == "cheeseman_bennett":
-        p[side + "_image"][c] = 4 * (0.05 + offset) / PROPELLER * np.sqrt(gain / (1 + gain))
+        p[side + "_image"][c] = (
+            4 * (0.05 + offset) / PROPELLER * np.sqrt(gain / (1 + gain))
+        )
     else:
         scale = 0.035 + 0.04 * cause.shape[2]
         p[side + "_scale"][c] = scale
@@ -179,7 +185,9 @@ def surface_effect(cause, p, c, side):
 
 
 def downwash(cause, p, c):
-    """The wake of a vehicle above; the size is its force in thousandths of the weight of 1 kg."""
+    """The wake of a vehicle above; the size is its force in thousandths of the weight
+    of 1 kg.
+    """
     p["wake"][c] = cause.size * 1e-3 * GRAVITY
     p["wake_width"][c] = 0.02 * 7.5 ** cause.shape[1]
     p["wake_spread"][c] = 0.12 * cause.shape[2]
@@ -204,7 +212,8 @@ def motor_lag(cause, p, c):
         up = 1 + a * (0.5 + 0.4 * cause.shape[1])
         down = 1 + a * (1.1 + 0.6 * cause.shape[2])
     if cause.form == "brushed":
-        # as measured on real ones: several times slower, differently up and down, 5 ms late
+        # as measured on real ones: several times slower, differently up and down, 5 ms
+        # late
         up = 1 + a * (0.75 + 0.1 * cause.shape[1])
         down = 1 + a * (1.0 + 0.2 * cause.shape[2])
         p["tau_second"][c] = 0.004 + 0.002 * cause.shape[3]
@@ -243,7 +252,9 @@ def com_offset(cause, p, c):
 
 
 def inertia(cause, p, c):
-    """Moments of inertia of their own, mostly larger; or with a product between x and y."""
+    """Moments of inertia of their own, mostly larger; or with a product between x and
+    y.
+    """
     factors = 1 + cause.size * (0.6 + 0.4 * cause.shape[1:4])
     factors = factors if cause.shape[0] < 0.7 else 1 / factors
     if cause.form == "products":
@@ -255,7 +266,9 @@ def inertia(cause, p, c):
 
 
 def yaw_torque(cause, p, c):
-    """The rotors' reaction: mostly below the nominal, down to .15; sometimes above, up to 2."""
+    """The rotors' reaction: mostly below the nominal, down to .15; sometimes above, up
+    to 2.
+    """
     factor = 1 - cause.size if cause.shape[0] < 0.7 else 1 + cause.size
     p["torque_ratio"][c] *= factor
     return {"ratio": factor}
@@ -290,7 +303,9 @@ def command_latency(cause, arrival, c, rng):
         if cause.form == "jitter":
             extra = a * (0.75 + 0.5 * rng.uniform(0, 1, ticks))
         elif cause.form == "spikes":
-            extra = a * (0.85 + (rng.uniform(0, 1, ticks) < 0.1) * rng.uniform(0.5, 2.5, ticks))
+            extra = a * (
+                0.85 + (rng.uniform(0, 1, ticks) < 0.1) * rng.uniform(0.5, 2.5, ticks)
+            )
         arrival[:, j] += np.rint(extra).astype(arrival.dtype)
     return {"delay_ms": a}
 
@@ -308,8 +323,8 @@ def packet_loss(cause, arrival, c, rng):
 
 
 def bursts(share, draws):
-    """Which packets a Gilbert-Elliott link loses, from two uniform draws a packet: bad spells last
-    some 5 packets, in which nearly all are lost.
+    """Which packets a Gilbert-Elliott link loses, from two uniform draws a packet: bad
+    spells last some 5 packets, in which nearly all are lost.
     """
     stay = 0.8
     enter = (1 - stay) * share / max(0.95 - share, 0.05)

@@ -1,8 +1,10 @@
-"""Reference trajectories of the exam's plants: what the off-board controller is asked to fly.
+"""Reference trajectories of the exam's plants: what the off-board controller is asked
+to fly.
 
-A mission is sampled at 100 Hz. Positions are drawn as way-points or closed curves and smoothed with
-a Gaussian, whose derivatives give the velocity and acceleration that the controller feeds forward.
-All missions stay inside the arena (radius 0.9 m, height 1.2 m).
+A mission is sampled at 100 Hz. Positions are drawn as way-points or closed curves and
+smoothed with a Gaussian, whose derivatives give the velocity and acceleration that the
+controller feeds forward. All missions stay inside the arena (radius 0.9 m, height 1.2
+m).
 """
 
 import numpy as np
@@ -26,7 +28,9 @@ def _held(rng, knots, length, spacing):
 
 
 def _curve(rng, t, speed, radius):
-    """Ellipse or figure of eight in the plane, at about `speed` (m/s), fading in over 1.5 s."""
+    """Ellipse or figure of eight in the plane, at about `speed` (m/s), fading in over
+    1.5 s.
+    """
     rate = speed / radius * rng.choice([-1.0, 1.0])
     phase = rate * t * np.clip(t / 3.0, 0.5, 1.0)
     fade = np.clip(t / 1.5, 0.0, 1.0)
@@ -44,14 +48,16 @@ def _curve(rng, t, speed, radius):
 
 
 def _doublets(rng, length, rate, axes, size):
-    """Short alternating pulses (K, 4) on [thrust, wx, wy, wz]; they excite what tracking alone does
-    not.
+    """Short alternating pulses (K, 4) on [thrust, wx, wy, wz]; they excite what
+    tracking alone does not.
     """
     pulses = np.zeros((length, 4))
     start = 100
     while start < length - 40:
         axis = rng.choice(axes)
-        amplitude = rng.uniform(0.4, 1.0) * rng.choice([-1, 1]) * (0.1 if axis == 0 else size)
+        amplitude = (
+            rng.uniform(0.4, 1.0) * rng.choice([-1, 1]) * (0.1 if axis == 0 else size)
+        )
         width = rng.integers(4, 9)
         pulses[start : start + width, axis] += amplitude
         pulses[start + width : start + 2 * width, axis] -= amplitude
@@ -60,16 +66,16 @@ def _doublets(rng, length, rate, axes, size):
 
 
 def _dither(rng, length):
-    """Pseudo-random body-rate commands (K, 4) on top of tracking: a broad excitation, as
-    identification flights have.
+    """Pseudo-random body-rate commands (K, 4) on top of tracking: a broad excitation,
+    as identification flights have.
     """
     held = _held(rng, rng.choice([-1.0, 0.0, 1.0], (length, 3)), length, (0.04, 0.16))
     return np.concatenate([np.zeros((length, 1)), rng.uniform(0.2, 0.7) * held], axis=1)
 
 
 def single(kind, rng, length):
-    """One vehicle's reference: position (K, 3) m, velocity, acceleration, yaw (K,) rad, yaw rate,
-    pulses (K, 4).
+    """One vehicle's reference: position (K, 3) m, velocity, acceleration, yaw (K,) rad,
+    yaw rate, pulses (K, 4).
     """
     t = np.arange(length) / RATE
     position = np.zeros((length, 3))
@@ -92,7 +98,9 @@ def single(kind, rng, length):
         position[:, 2] += rng.uniform(0, 0.12) * np.sin(rng.uniform(0.8, 2.0) * t)
     elif kind == "climb":
         heights = np.where(
-            np.arange(30) % 2 == 0, rng.uniform(0.2, 0.45, 30), rng.uniform(0.75, 1.0, 30)
+            np.arange(30) % 2 == 0,
+            rng.uniform(0.2, 0.45, 30),
+            rng.uniform(0.75, 1.0, 30),
         )
         position[:, 2] = _held(rng, heights[:, None], length, (0.7, 1.3))[:, 0]
         sigma = rng.uniform(0.09, 0.14)
@@ -100,9 +108,13 @@ def single(kind, rng, length):
     elif kind in ("low", "high"):
         bounds = (0.045, 0.22) if kind == "low" else (0.98, 1.15)
         position[:, :2] = _curve(rng, t, rng.uniform(0.3, 0.7), rng.uniform(0.25, 0.45))
-        position[:, 2] = _held(rng, rng.uniform(*bounds, (40, 1)), length, (0.5, 1.4))[:, 0]
+        position[:, 2] = _held(rng, rng.uniform(*bounds, (40, 1)), length, (0.5, 1.4))[
+            :, 0
+        ]
         start = np.clip(t / 2.0, 0, 1)
-        position[:, 2] = (1 - start) * (0.35 if kind == "low" else 0.9) + start * position[:, 2]
+        position[:, 2] = (1 - start) * (
+            0.35 if kind == "low" else 0.9
+        ) + start * position[:, 2]
         sigma = 0.16
     elif kind == "yaw":
         knots = np.c_[rng.uniform(-0.35, 0.35, (24, 2)), rng.uniform(0.4, 0.8, 24)]
@@ -110,7 +122,9 @@ def single(kind, rng, length):
         sigma = 0.25
         yaw = (
             yaw
-            + np.cumsum(_held(rng, rng.uniform(-2.6, 2.6, (30, 1)), length, (0.5, 1.5))[:, 0])
+            + np.cumsum(
+                _held(rng, rng.uniform(-2.6, 2.6, (30, 1)), length, (0.5, 1.5))[:, 0]
+            )
             / RATE
         )
         pulses = _doublets(rng, length, 0.8, [3], 2.2)
@@ -126,9 +140,9 @@ def single(kind, rng, length):
         yaw_rate_of = 0.0
         sigma = 0.15
     elif kind == "step":
-        knots = np.tile(centre, (24, 1)) + rng.choice([-1, 0, 1], (24, 3)) * rng.uniform(
-            0.15, 0.35, (24, 3)
-        )
+        knots = np.tile(centre, (24, 1)) + rng.choice(
+            [-1, 0, 1], (24, 3)
+        ) * rng.uniform(0.15, 0.35, (24, 3))
         position = _held(rng, knots, length, (1.0, 1.8))
         sigma = 0.07
         position[:, 2] = np.clip(position[:, 2], 0.25, 0.95)
@@ -149,7 +163,10 @@ def _smooth(position, yaw, pulses, sigma):
     width = sigma * RATE
 
     def smooth(signal, order):
-        return gaussian_filter1d(signal, width, axis=0, order=order, mode="nearest") * RATE**order
+        return (
+            gaussian_filter1d(signal, width, axis=0, order=order, mode="nearest")
+            * RATE**order
+        )
 
     return {
         "position": smooth(position, 0),
@@ -172,11 +189,13 @@ def apart(reference, side):
 
 
 def pair(kind, rng, length):
-    """Two vehicles' references; the second passes above the first, so that the first is in its wake
-    now and then.
+    """Two vehicles' references; the second passes above the first, so that the first is
+    in its wake now and then.
     """
     t = np.arange(length) / RATE
-    lower = np.tile(np.r_[rng.uniform(-0.1, 0.1, 2), rng.uniform(0.3, 0.45)], (length, 1))
+    lower = np.tile(
+        np.r_[rng.uniform(-0.1, 0.1, 2), rng.uniform(0.3, 0.45)], (length, 1)
+    )
     if kind == "pass_moving":
         lower[:, :2] += _curve(rng, t, rng.uniform(0.15, 0.35), 0.2)
     angle = rng.uniform(0, 2 * np.pi)

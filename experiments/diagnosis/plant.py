@@ -1,8 +1,8 @@
 """The plant: vehicles in the air under commands from anywhere, or along references.
 
-`Flight` is what flies: body (1 kHz), firmware (500 Hz), battery, link and the poses as they are
-seen, 2 ms at a time. `fly` commands it with the exam's controllers along references and returns the
-true motion. Arrays have the body index last.
+`Flight` is what flies: body (1 kHz), firmware (500 Hz), battery, link and the poses as
+they are seen, 2 ms at a time. `fly` commands it with the exam's controllers along
+references and returns the true motion. Arrays have the body index last.
 """
 
 from collections.abc import Callable
@@ -29,7 +29,9 @@ class Batch:
     told: list  # B `vehicle.Told`
     parameters: dict  # arrays of `vehicle.nominal_parameters`
     reference: (
-        dict  # position, velocity, acceleration (K, 3, B), yaw, yaw_rate (K, B), pulses (K, 4, B)
+        # position, velocity, acceleration (K, 3, B), yaw, yaw_rate (K, B), pulses (K,
+        # 4, B)
+        dict
     )
     controllers: list  # B names
     partner: np.ndarray  # (B,) index of the vehicle that may fly above; itself if alone
@@ -37,13 +39,17 @@ class Batch:
         np.ndarray
     )  # (K, B) ms at which the command of tick k reaches the vehicle; >= 10**8: lost
     air: dict  # see `sensors.draw_air`
-    unknowns: dict = field(default_factory=dict)  # site -> [(columns, cause), …], see `unknowns`
-    # (positions (3, B) below, positions (3, B) of those above) -> where the wakes seem to come from
+    # site -> [(columns, cause), …], see `unknowns`
+    unknowns: dict = field(default_factory=dict)
+    # (positions (3, B) below, positions (3, B) of those above) -> where the wakes seem
+    # to come from
     wakes_from: Callable = lambda below, above: above
 
 
 def received(arrival, steps):
-    """(steps, B) index of the newest command that has arrived by each ms; -1 before the first."""
+    """(steps, B) index of the newest command that has arrived by each ms; -1 before the
+    first.
+    """
     ticks, count = arrival.shape
     table = np.full((steps, count), -1, dtype=np.int32)
     columns = np.arange(count)
@@ -55,7 +61,15 @@ def received(arrival, steps):
 
 
 POSE = {"position": 3, "velocity": 3, "quaternion": 4}
-KEPT = {"rates": 3, "specific": 3, "gyro": 3, "rotor": 4, "motor": 4, "integral": 3, "applied": 4}
+KEPT = {
+    "rates": 3,
+    "specific": 3,
+    "gyro": 3,
+    "rotor": 4,
+    "motor": 4,
+    "integral": 3,
+    "applied": 4,
+}
 
 
 class Flight:
@@ -65,10 +79,11 @@ class Flight:
       told: B `vehicle.Told`.
       parameters: of `vehicle.nominal_parameters`, with causes and nuisances written in.
       air: of `sensors.stack`, for as many ticks as are flown.
-      arrival: (K, B) ms at which the command of each tick reaches its vehicle; >= 10**8: lost.
+      arrival: (K, B) ms at which the command of each tick reaches its vehicle; >=
+      10**8: lost.
       position, quaternion: (3, B) m and (4, B) wxyz at the start.
-      partners: list of (B,) indices of vehicles that may fly above each body; a body's own index:
-      none.
+      partners: list of (B,) indices of vehicles that may fly above each body; a body's
+      own index: none.
       unknowns: as in `Batch`.
       solids: anything with `stop(position, velocity)`, called after each ms, or None.
       wakes_from: as in `Batch`, called every 2 ms.
@@ -112,33 +127,44 @@ class Flight:
         self.voltage = self.battery.step(np.tile(hover, (4, 1)), 0.0)
         self.commands = np.zeros((ticks, 4, count))
         samples = PER_TICK * ticks
-        self.history = {n: np.zeros((samples, size, count), np.float32) for n, size in POSE.items()}
+        self.history = {
+            n: np.zeros((samples, size, count), np.float32) for n, size in POSE.items()
+        }
         self.columns = np.arange(count)
         far = np.array([[0.0], [0.0], [-10.0]])
         self.partners = [
-            (partner, np.where(partner == self.columns, far, 0.0)) for partner in partners
+            (partner, np.where(partner == self.columns, far, 0.0))
+            for partner in partners
         ]
 
     def look(self):
-        """Sample the sensors: the pose into `history`, the firmware's gyroscope into `gyro`. Once
-        before each `step`.
+        """Sample the sensors: the pose into `history`, the firmware's gyroscope into
+        `gyro`. Once before each `step`.
         """
         s = self.sample
         body = self.body
         for name, kept in self.history.items():
             kept[s] = body.q if name == "quaternion" else getattr(body, name)
-        seen = self.p["gyro_gain"] * body.rates + self.air["gyro_bias"] + self.air["gyro"][s]
+        seen = (
+            self.p["gyro_gain"] * body.rates
+            + self.air["gyro_bias"]
+            + self.air["gyro"][s]
+        )
         self.gyro = self.firmware.gyro_filter(seen)
 
     def seen(self):
-        """Position (3, B), quaternion (4, B) and velocity (3, B) as the motion capture gives them
-        now, late and noisy.
+        """Position (3, B), quaternion (4, B) and velocity (3, B) as the motion capture
+        gives them now, late and noisy.
         """
         p = self.p
         air = self.air
         s = self.sample
         k = self.sample // PER_TICK
-        late = air["pose_delay"] + p["pose_delay"] + p["pose_jitter"] * air["pose_jitter"][k]
+        late = (
+            air["pose_delay"]
+            + p["pose_delay"]
+            + p["pose_jitter"] * air["pose_jitter"][k]
+        )
         back = np.clip(np.maximum(late, 0.0) / 2.0, 0.0, s)
         whole = back.astype(int)
         rest = back - whole
@@ -161,15 +187,17 @@ class Flight:
         self.commands[self.sample // PER_TICK] = command
 
     def step(self):
-        """Two milliseconds after `look`; returns the command in force and the motor commands (4,
-        B).
+        """Two milliseconds after `look`; returns the command in force and the motor
+        commands (4, B).
         """
         s = self.sample
         k = self.sample // PER_TICK
         air = self.air
         index = self.received[2 * s]
         now = np.where(
-            index >= 0, self.commands[np.maximum(index, 0), :, self.columns].T, self.start
+            index >= 0,
+            self.commands[np.maximum(index, 0), :, self.columns].T,
+            self.start,
         )
         m = self.firmware(now, self.gyro)
         self.voltage = self.battery.step(m, SAMPLE)
@@ -178,7 +206,9 @@ class Flight:
         others = [self.wakes_from(here, here[:, i] + away) for i, away in self.partners]
         for half_step in range(2):
             now_s = SAMPLE * s + DT * half_step
-            self.body.step(m, self.voltage, self.battery.load, *gusts, others, self.unknowns, now_s)
+            self.body.step(
+                m, self.voltage, self.battery.load, *gusts, others, self.unknowns, now_s
+            )
             if self.solids is not None:
                 self.solids.stop(self.body.position, self.body.velocity)
         self.sample += 1
@@ -186,12 +216,13 @@ class Flight:
 
 
 def fly(batch):
-    """Fly the batch: dict of true signals every 2 ms, (S, n, B) float32, and commands (K, 4, B) as
-    issued.
+    """Fly the batch: dict of true signals every 2 ms, (S, n, B) float32, and commands
+    (K, 4, B) as issued.
 
-    `gyro` is the firmware's gyroscope (bias, noise, filter), `applied` the command in force,
-    `motor` what the firmware asks for in the 2 ms from that sample on; `voltage` (S, B); `crashed`
-    (B,) sample of the first breach (floor, ceiling, tilt above 85 degrees, 2.5 m away), S if none.
+    `gyro` is the firmware's gyroscope (bias, noise, filter), `applied` the command in
+    force, `motor` what the firmware asks for in the 2 ms from that sample on; `voltage`
+    (S, B); `crashed` (B,) sample of the first breach (floor, ceiling, tilt above 85
+    degrees, 2.5 m away), S if none.
     """
     p = batch.parameters
     reference = batch.reference
@@ -214,8 +245,13 @@ def fly(batch):
     )
     body = flight.body
     samples = PER_TICK * ticks
-    out = {name: np.zeros((samples, size, count), np.float32) for name, size in KEPT.items()}
-    out |= {name: np.zeros((samples, count), np.float32) for name in ("voltage", "load")}
+    out = {
+        name: np.zeros((samples, size, count), np.float32)
+        for name, size in KEPT.items()
+    }
+    out |= {
+        name: np.zeros((samples, count), np.float32) for name in ("voltage", "load")
+    }
     crashed = np.full(count, samples)
     lever = bool(np.any(p["imu_lever"] != 0))
 
@@ -226,20 +262,33 @@ def fly(batch):
                 1 - 2 * (body.q[1] ** 2 + body.q[2] ** 2) < 0.087
             )
             bad |= body.position[2] > vehicle.CEILING - CLEARANCE
-            bad |= ((body.position**2).sum(axis=0) > 2.5**2) | ~np.isfinite(body.position[0])
+            bad |= ((body.position**2).sum(axis=0) > 2.5**2) | ~np.isfinite(
+                body.position[0]
+            )
             crashed = np.where(bad & (crashed == samples), s, crashed)
             dead = crashed < samples
-            if dead.any():  # parked, so that one wreck does not spoil the arithmetic of the batch
+            # parked, so that one wreck does not spoil the arithmetic of the batch
+            if dead.any():
                 body.position[:, dead], body.velocity[:, dead] = (
                     reference["position"][k][:, dead],
                     0.0,
                 )
-                body.rates[:, dead], body.q[:, dead] = 0.0, np.array([[1.0], [0], [0], [0]])
+                body.rates[:, dead], body.q[:, dead] = (
+                    0.0,
+                    np.array([[1.0], [0], [0], [0]]),
+                )
         flight.look()
         specific = (
-            forces.seen_by_accelerometer(p, body.specific, body.rates) if lever else body.specific
+            forces.seen_by_accelerometer(p, body.specific, body.rates)
+            if lever
+            else body.specific
         )
-        now = {"rates": body.rates, "specific": specific, "gyro": flight.gyro, "rotor": body.rotor}
+        now = {
+            "rates": body.rates,
+            "specific": specific,
+            "gyro": flight.gyro,
+            "rotor": body.rotor,
+        }
         now |= {
             "integral": flight.firmware.integral,
             "voltage": flight.voltage,
@@ -252,5 +301,8 @@ def fly(batch):
         out["applied"][s], out["motor"][s] = flight.step()
     out |= flight.history
     out["command"], out["crashed"] = flight.commands.astype(np.float32), crashed
-    out["pose_delay"], out["pose_jitter"] = 1e-3 * p["pose_delay"], 1e-3 * p["pose_jitter"]
+    out["pose_delay"], out["pose_jitter"] = (
+        1e-3 * p["pose_delay"],
+        1e-3 * p["pose_jitter"],
+    )
     return out

@@ -1,8 +1,9 @@
-"""Flights of body rates alone, with known truth: what an identification of the torques is tried on.
+"""Flights of body rates alone, with known truth: what an identification of the torques
+is tried on.
 
-A rate loop at 500 Hz (the firmware's gains) around rigid-body rates at 1 kHz, in NumPy, many
-flights at once. Commands wander; a coloured torque pushes (gusts); the gyroscope is noisy. Nothing
-of it is openjax' code.
+A rate loop at 500 Hz (the firmware's gains) around rigid-body rates at 1 kHz, in NumPy,
+many flights at once. Commands wander; a coloured torque pushes (gusts); the gyroscope
+is noisy. Nothing of it is openjax' code.
 """
 
 from dataclasses import dataclass
@@ -18,7 +19,10 @@ TORQUE_PER_THRUST = 0.025  # m
 PLACES = ARM * np.array([[1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0], [1.0, 1.0]])
 SPIN = np.array([-1.0, 1.0, -1.0, 1.0])
 COUNTS = np.rad2deg(1.0) / 65536.0
-GAINS = [COUNTS * np.array(g)[:, None] for g in ([250, 250, 120], [500, 500, 16.7], [2.5, 2.5, 0])]
+GAINS = [
+    COUNTS * np.array(g)[:, None]
+    for g in ([250, 250, 120], [500, 500, 16.7], [2.5, 2.5, 0])
+]
 HOVER = 0.62  # of the largest thrust
 COMMANDS = 2.0  # rad/s
 GYROSCOPE = 0.02  # rad/s
@@ -28,8 +32,8 @@ TRIM = 0.01  # of a rotor's thrust
 
 @dataclass(frozen=True)
 class Truth:
-    """One flight's vehicle and air. Lags and delay in s; `inertia` and `yaw` as multiples;
-    `damping` 1/s; `gust` rad/s^2.
+    """One flight's vehicle and air. Lags and delay in s; `inertia` and `yaw` as
+    multiples; `damping` 1/s; `gust` rad/s^2.
     """
 
     up: float = 0.025
@@ -50,7 +54,9 @@ class Plant:
             return np.array([getattr(t, name) for t in truths], float)
 
         self.inertia = INERTIA[:, None] * of("inertia")
-        self.torque = LARGEST * np.stack([PLACES[:, 1], -PLACES[:, 0], TORQUE_PER_THRUST * SPIN])
+        self.torque = LARGEST * np.stack(
+            [PLACES[:, 1], -PLACES[:, 0], TORQUE_PER_THRUST * SPIN]
+        )
         self.trims = trims
         self.faster = -np.expm1(-STEP / of("up"))
         self.slower = -np.expm1(-STEP / of("down"))
@@ -67,7 +73,9 @@ class Plant:
         self.steps = 0
 
     def step(self, motors: np.ndarray, gust: np.ndarray):
-        """One millisecond under motor commands (4, B); `gust` (3, B) standard normal."""
+        """One millisecond under motor commands (4, B); `gust` (3, B) standard
+        normal.
+        """
         size = len(self.sent)
         self.sent[self.steps % size] = motors
         target = np.sqrt(self.sent[(self.steps - self.late) % size, :, self.every].T)
@@ -86,7 +94,9 @@ class Plant:
 
 
 def fly(truths: list[Truth], seconds: float) -> tuple[np.ndarray, np.ndarray]:
-    """Gyroscope (B, N, 3) rad/s and motor commands (B, N, 4) of every cycle of the rate loop."""
+    """Gyroscope (B, N, 3) rad/s and motor commands (B, N, 4) of every cycle of the rate
+    loop.
+    """
     count = round(seconds / TICK)
     draws = [np.random.default_rng(t.seed) for t in truths]
 
@@ -97,19 +107,28 @@ def fly(truths: list[Truth], seconds: float) -> tuple[np.ndarray, np.ndarray]:
     gusts = noise(count, 2, 3)
     command_steps = noise(count // 5 + 1, 3)
     plant = Plant(truths, 1.0 + TRIM * noise(4))
-    mixer = np.stack([0.5 * np.sign(PLACES[:, 1]), -0.5 * np.sign(PLACES[:, 0]), SPIN], 1)
+    mixer = np.stack(
+        [0.5 * np.sign(PLACES[:, 1]), -0.5 * np.sign(PLACES[:, 0]), SPIN], 1
+    )
     integral, before, wanted = (np.zeros_like(plant.rates) for _ in range(3))
     seen = np.zeros((count, *plant.rates.shape))
     motors = np.zeros((count, *plant.speed.shape))
     for k in range(count):
         if k % 5 == 0:
-            wanted = 0.97 * wanted + COMMANDS * np.sqrt(1.0 - 0.97**2) * command_steps[k // 5]
+            wanted = (
+                0.97 * wanted
+                + COMMANDS * np.sqrt(1.0 - 0.97**2) * command_steps[k // 5]
+            )
         phase = 2.0 * np.pi * TICK * k
         thrust = HOVER + 0.05 * np.sin(0.7 * phase) + 0.03 * np.sin(2.3 * phase)
         seen[k] = plant.rates + gyroscope[k]
         error = wanted - seen[k]
         integral = np.clip(integral + TICK * error, -0.58, 0.58)
-        output = GAINS[0] * error + GAINS[1] * integral - GAINS[2] * (seen[k] - before) / TICK
+        output = (
+            GAINS[0] * error
+            + GAINS[1] * integral
+            - GAINS[2] * (seen[k] - before) / TICK
+        )
         before = seen[k]
         motors[k] = np.clip(thrust + mixer @ output, 0.0, 1.0)
         for half in range(2):
@@ -118,7 +137,9 @@ def fly(truths: list[Truth], seconds: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def rows_of(gyroscope: np.ndarray, motors: np.ndarray, rate: int, samples: bool):
-    """One flight's rows (T, 3) and (T, 4) at `rate` Hz: motors as means over rows, or `samples`."""
+    """One flight's rows (T, 3) and (T, 4) at `rate` Hz: motors as means over rows, or
+    `samples`.
+    """
     every = round(1.0 / rate / TICK)
     count = len(motors) // every * every
     rows = motors[:count].reshape(-1, every, 4)

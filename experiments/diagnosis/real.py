@@ -1,9 +1,10 @@
-"""Real vehicles in the family of plants: errors of form that nobody tells the simulator and that
-aren't a case's cause.
+"""Real vehicles in the family of plants: errors of form that nobody tells the simulator
+and that aren't a case's cause.
 
-Ranges: motors of 65 to 85 ms, different up and down, 4 to 6 ms late, and gyroscopes of .93 to 1.11
-were measured on small brushed vehicles in published flights; maps from duty cycle to thrust are off
-the public one by ± 30 % in curvature; propellers of such vehicles have some 3.5e-8 kg m^2.
+Ranges: motors of 65 to 85 ms, different up and down, 4 to 6 ms late, and gyroscopes of
+.93 to 1.11 were measured on small brushed vehicles in published flights; maps from duty
+cycle to thrust are off the public one by ± 30 % in curvature; propellers of such
+vehicles have some 3.5e-8 kg m^2.
 """
 
 import numpy as np
@@ -14,12 +15,15 @@ from experiments.diagnosis.vehicle import GRAVITY, MASS, MAX_SPEED, Told
 # The firmware's public map: U = A g^2 + B g volts for g grams of all four rotors.
 A = -0.0006239
 B = 0.088
-SLOW_DOWN = 1.3  # times slower down than up: more than was measured is a lag that has a name
+# times slower down than up: more than was measured is a lag that has a name
+SLOW_DOWN = 1.3
 HEAVIEST_ON_MAP = 0.034  # kg: beyond, the map's parabola ends below full thrust
 
 
 def draw(rng, stranger=False):
-    """(Told, form errors) of a real vehicle; strangers are heavier and have larger errors."""
+    """(Told, form errors) of a real vehicle; strangers are heavier and have larger
+    errors.
+    """
     mass = float(rng.uniform(0.05, 0.09) if stranger else rng.uniform(0.027, 0.05))
     size = mass / MASS
     thrust = mass * GRAVITY / (4 * rng.uniform(0.45, 0.62) * MAX_SPEED**2)
@@ -31,7 +35,9 @@ def draw(rng, stranger=False):
         motor_time=round(
             float(rng.uniform(0.065, 0.085) if brushed else rng.uniform(0.02, 0.04)), 4
         ),
-        inertia=tuple(float(f"{v:.4g}") for v in vehicle.INERTIA * size ** rng.uniform(1.0, 1.4)),
+        inertia=tuple(
+            float(f"{v:.4g}") for v in vehicle.INERTIA * size ** rng.uniform(1.0, 1.4)
+        ),
         weighed=bool(rng.random() < 0.6),
     )
     more = 1.5 if stranger else 1.0
@@ -78,8 +84,8 @@ def apply(errors, p, c):
 
 
 def as_logged(errors, told, rows):
-    """The rows with motors as duty cycles where the vehicle is commanded so: the firmware's battery
-    compensation.
+    """The rows with motors as duty cycles where the vehicle is commanded so: the
+    firmware's battery compensation.
     """
     if not (errors and errors["pwm"]):
         return rows

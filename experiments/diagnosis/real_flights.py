@@ -1,12 +1,13 @@
-"""What the diagnosis says of folders of published flights whose causes nobody knows in full: names,
-sizes, and the response of the torques.
+"""What the diagnosis says of folders of published flights whose causes nobody knows in
+full: names, sizes, and the response of the torques.
 
     python -m experiments.diagnosis.real_flights FOLDER ... --separate FOLDER --jobs 2
     --out experiments/results/real/real.json
 
-A folder is one case, or holds several. Of a folder after `--separate` each flight is a case, once
-with its own rows and once with rows of 100 Hz that hold the motors' means, as laboratories log them:
-both are of one vehicle, so that what rows hide shows as a difference.
+A folder is one case, or holds several. Of a folder after `--separate` each flight is a
+case, once with its own rows and once with rows of 100 Hz that hold the motors' means,
+as laboratories log them: both are of one vehicle, so that what rows hide shows as a
+difference.
 """
 
 import argparse
@@ -31,26 +32,38 @@ def cases_of(folder: Path) -> list[Path]:
 
 
 def as_means(case):
-    """A case of fast rows with rows of PERIOD: sensors at a row's time, motors as means from there
-    to the next.
+    """A case of fast rows with rows of PERIOD: sensors at a row's time, motors as means
+    from there to the next.
     """
     flights = []
     for flight in case.flights:
         grid = np.arange(flight.time[0], flight.time[-1] - PERIOD, PERIOD)
         begin = np.searchsorted(flight.time, grid)
         end = np.searchsorted(flight.time, grid + PERIOD)
-        whole = end - begin > 0.7 * np.median(end - begin)  # rows are missing now and then
+        # rows are missing now and then
+        whole = end - begin > 0.7 * np.median(end - begin)
         begin = begin[whole]
         end = end[whole]
-        motor = [flight.motor_command[i:j].mean(0) for i, j in zip(begin, end, strict=True)]
-        sensed = {name: getattr(flight, name)[begin] for name in ("body_rates", "specific_force")}
-        flights.append(replace(flight, time=grid[whole], motor_command=np.array(motor), **sensed))
+        motor = [
+            flight.motor_command[i:j].mean(0) for i, j in zip(begin, end, strict=True)
+        ]
+        sensed = {
+            name: getattr(flight, name)[begin]
+            for name in ("body_rates", "specific_force")
+        }
+        flights.append(
+            replace(flight, time=grid[whole], motor_command=np.array(motor), **sensed)
+        )
     log = case.vehicle_file.log | {"motor_rows": "mean"}
-    return replace(case, flights=tuple(flights), vehicle_file=replace(case.vehicle_file, log=log))
+    return replace(
+        case, flights=tuple(flights), vehicle_file=replace(case.vehicle_file, log=log)
+    )
 
 
 def parts_of(folder: Path, separate: bool) -> list[tuple[Path, int | None, bool]]:
-    """(folder, number of its flight or None for all, whether as means) of each diagnosis."""
+    """(folder, number of its flight or None for all, whether as means) of each
+    diagnosis.
+    """
     from openjax.flights.case import load_case
 
     if not separate:
@@ -79,7 +92,9 @@ def diagnose(part: tuple[Path, int | None, bool]) -> dict:
     told = report.to_dict()
     torques = report.identification
     out = {"case": name, "named": list(report.effects) or [report.verdict]}
-    out["probabilities"] = {e: round(p, 3) for e, p in report.probabilities.items() if p > 0.03}
+    out["probabilities"] = {
+        e: round(p, 3) for e, p in report.probabilities.items() if p > 0.03
+    }
     out["shares"] = told["shares"]["effects"]
     out["parameters"] = {
         effect: {p: [v["value"], *v["interval90"]] for p, v in found.items()}
@@ -88,9 +103,10 @@ def diagnose(part: tuple[Path, int | None, bool]) -> dict:
     out["not_testable"] = told["not_testable"]
     out["sensors"] = list(report.sensors)
     if torques is not None:
-        out["torques"] = {"sentence": torques.sentence(), "trusted": torques.trusted} | {
-            n: [q.value, *q.interval90] for n, q in torques.quantities.items()
-        }
+        out["torques"] = {
+            "sentence": torques.sentence(),
+            "trusted": torques.trusted,
+        } | {n: [q.value, *q.interval90] for n, q in torques.quantities.items()}
     out["cpu_seconds"] = round(seconds, 1)
     print(json.dumps(out), flush=True)
     return out
@@ -113,9 +129,13 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("real.json"))
     arguments = parser.parse_args()
     use_single_thread()
-    parts = [p for f in arguments.folders for c in cases_of(f) for p in parts_of(c, False)]
+    parts = [
+        p for f in arguments.folders for c in cases_of(f) for p in parts_of(c, False)
+    ]
     parts += [p for f in arguments.separate for p in parts_of(f, True)]
-    found = sorted(in_processes(diagnose, parts, arguments.jobs), key=lambda c: c["case"])
+    found = sorted(
+        in_processes(diagnose, parts, arguments.jobs), key=lambda c: c["case"]
+    )
     command = "python -m experiments.diagnosis.real_flights"
     command += "".join(f" {f.name}" for f in arguments.folders)
     command += "".join(f" --separate {f.name}" for f in arguments.separate)

@@ -1,11 +1,11 @@
-"""How the identified torques of one vehicle change between two sets of flights, where no effect on
-torques acts: what a reference's diagnosis may take for a change.
+"""How the identified torques of one vehicle change between two sets of flights, where
+no effect on torques acts: what a reference's diagnosis may take for a change.
 
     python -m experiments.diagnosis.responses --sets DIR … --cores 2 --out FILE.json
 
-A set is a folder of cases with its answers and reference flights beside it, as `generate --healthy`
-writes them. Stated are quantiles of the lags' changes (ms) and of the gains' (logarithms) over the
-cases whose torques can be told in both.
+A set is a folder of cases with its answers and reference flights beside it, as
+`generate --healthy` writes them. Stated are quantiles of the lags' changes (ms) and of
+the gains' (logarithms) over the cases whose torques can be told in both.
 """
 
 import argparse
@@ -46,12 +46,16 @@ def identified(folder: Path) -> dict | None:
 
 def both(folder: Path) -> tuple[str, dict | None, dict | None]:
     """A case's name, what its flights say and what those of its reference do."""
-    return folder.name, identified(folder), identified(healthy_beside(folder.parent) / folder.name)
+    return (
+        folder.name,
+        identified(folder),
+        identified(healthy_beside(folder.parent) / folder.name),
+    )
 
 
 def change(here: dict | None, there: dict | None) -> np.ndarray | None:
-    """(5,) ms of speeding up and slowing down, logarithms of the inertias about x and y and of the
-    yaw torque; None where one of both can't be told.
+    """(5,) ms of speeding up and slowing down, logarithms of the inertias about x and y
+    and of the yaw torque; None where one of both can't be told.
     """
     if here is None or there is None or not (here["trusted"] and there["trusted"]):
         return None
@@ -68,7 +72,9 @@ def summary(changes: np.ndarray) -> dict[str, list[float]]:
         "half of what x and y are apart": 0.5 * (x - y),
         "yaw torque and inertia": changes[:, 4] + 0.5 * (x + y),
     }
-    return {name: np.quantile(v, QUANTILES).round(4).tolist() for name, v in columns.items()}
+    return {
+        name: np.quantile(v, QUANTILES).round(4).tolist() for name, v in columns.items()
+    }
 
 
 def main() -> None:
@@ -88,7 +94,11 @@ def main() -> None:
         with multiprocessing.get_context("spawn").Pool(options.cores) as pool:
             found = [change(here, there) for _, here, there in pool.imap(both, folders)]
         changes += [c for c in found if c is not None]
-    out = {"cases": len(changes), "quantiles": QUANTILES, "changes": summary(np.array(changes))}
+    out = {
+        "cases": len(changes),
+        "quantiles": QUANTILES,
+        "changes": summary(np.array(changes)),
+    }
     options.out.write_text(json.dumps(out, indent=1) + "\n")
     print(json.dumps(out, indent=1))
 

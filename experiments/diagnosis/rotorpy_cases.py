@@ -1,13 +1,15 @@
-"""Cases flown in somebody else's simulator: RotorPy 3 (Folk, Paulos, Kumar 2023), the `dev` extra.
+"""Cases flown in somebody else's simulator: RotorPy 3 (Folk, Paulos, Kumar 2023), the
+`dev` extra.
 
     python -m experiments.diagnosis.rotorpy_cases --seed 101 --each 4 --logs LOGS --answers
     ANSWERS.json [--jobs 8]
 
-Rigid body, rotors, hub drag, parasitic drag, flapping moment, translational lift, motor lag, wind,
-the controller (SE3Control, motor speeds at 250 Hz from the measured state) and the trajectories are
-RotorPy's; the told vehicles, the sensors of the known column and the measure of severity are the
-exam's. There are no body-rate commands. RotorPy's flapping coefficient is taken negative: with its
-sign convention a positive one pitches the nose down in forward flight, against what flapping does.
+Rigid body, rotors, hub drag, parasitic drag, flapping moment, translational lift, motor
+lag, wind, the controller (SE3Control, motor speeds at 250 Hz from the measured state)
+and the trajectories are RotorPy's; the told vehicles, the sensors of the known column
+and the measure of severity are the exam's. There are no body-rate commands. RotorPy's
+flapping coefficient is taken negative: with its sign convention a positive one pitches
+the nose down in forward flight, against what flapping does.
 """
 
 from dataclasses import replace
@@ -35,15 +37,22 @@ TURNING = ("yawing", "rocking")
 
 
 def hubs(x=0.0, y=0.0):
-    """Rotors of RotorPy's vehicle, numbered as the firmware has them, about a centre of mass at (x,
-    y) m.
+    """Rotors of RotorPy's vehicle, numbered as the firmware has them, about a centre of
+    mass at (x, y) m.
     """
-    return {f"r{i + 1}": np.array([v.ROTOR_X[i] - x, v.ROTOR_Y[i] - y, 0.0]) for i in range(4)}
+    return {
+        f"r{i + 1}": np.array([v.ROTOR_X[i] - x, v.ROTOR_Y[i] - y, 0.0])
+        for i in range(4)
+    }
 
 
 def _drag(rng, told, hover):
     d = rng.uniform(0.005, 0.025)
-    return {"k_d": d / (4 * hover), "k_z": 0.7 * d / (4 * hover)}, None, {"d_xy": d, "d_z": 0.7 * d}
+    return (
+        {"k_d": d / (4 * hover), "k_z": 0.7 * d / (4 * hover)},
+        None,
+        {"d_xy": d, "d_z": 0.7 * d},
+    )
 
 
 def _parasitic(rng, told, hover):
@@ -53,7 +62,11 @@ def _parasitic(rng, told, hover):
 
 def _flapping(rng, told, hover):
     k = rng.uniform(0.6e-4, 3e-4)
-    return {"k_flap": -k / (4 * hover)}, None, {"torque_N_m_per_m_s": k, "tilt_rad_per_m_s": 0.0}
+    return (
+        {"k_flap": -k / (4 * hover)},
+        None,
+        {"torque_N_m_per_m_s": k, "tilt_rad_per_m_s": 0.0},
+    )
 
 
 def _wind(rng, told, hover, name="steady", times=1):
@@ -75,7 +88,11 @@ def _lag(rng, told, hover):
 
 def _mass(rng, told, hover):
     ratio = 1 + rng.choice([-1, 1]) * rng.uniform(0.03, 0.2)
-    return {"mass": told.mass * ratio}, None, {"mass_kg": told.mass * ratio, "ratio": ratio}
+    return (
+        {"mass": told.mass * ratio},
+        None,
+        {"mass_kg": told.mass * ratio, "ratio": ratio},
+    )
 
 
 def _thrust(rng, told, hover):
@@ -87,13 +104,19 @@ def _thrust(rng, told, hover):
 
 def _inertia(rng, told, hover):
     ratio = rng.uniform(1.15, 1.5, 3)
-    moments = dict(zip(("Ixx", "Iyy", "Izz"), np.array(told.inertia) * ratio, strict=True))
+    moments = dict(
+        zip(("Ixx", "Iyy", "Izz"), np.array(told.inertia) * ratio, strict=True)
+    )
     return moments, None, {"ratio": ratio.tolist()}
 
 
 def _yaw(rng, told, hover):
     ratio = rng.uniform(0.3, 0.8)
-    return {"k_m": told.torque_ratio * told.thrust_constant * ratio}, None, {"ratio": ratio}
+    return (
+        {"k_m": told.torque_ratio * told.thrust_constant * ratio},
+        None,
+        {"ratio": ratio},
+    )
 
 
 def _offset(rng, told, hover):
@@ -110,11 +133,15 @@ def _lift(rng, told, hover):
 
 
 def _noisy(rng, told, hover):
-    return {"motor_noise_std": rng.uniform(0.5, 2.0)}, None, {}  # process noise, no cause
+    # process noise, no cause
+    return {"motor_noise_std": rng.uniform(0.5, 2.0)}, None, {}
 
 
 def _drag_and_lag(rng, told, hover):
-    (one, _, said_one), (two, _, said_two) = _drag(rng, told, hover), _lag(rng, told, hover)
+    (one, _, said_one), (two, _, said_two) = (
+        _drag(rng, told, hover),
+        _lag(rng, told, hover),
+    )
     return one | two, None, [said_one, said_two]
 
 
@@ -139,7 +166,12 @@ KINDS = {
     "yaw_torque": (_yaw, ["yaw_torque"], "scale", ("yawing",)),
     "com_offset": (_offset, ["com_offset"], "torque", ()),
     "translational_lift": (_lift, ["unknown"], "outside", LAPS),
-    "wind_tunnel": (partial(_wind, name="tunnel", times=2), ["unknown"], "outside", LAPS),
+    "wind_tunnel": (
+        partial(_wind, name="tunnel", times=2),
+        ["unknown"],
+        "outside",
+        LAPS,
+    ),
     "drag_and_lag": (
         _drag_and_lag,
         ["rotor_drag", "motor_lag"],
@@ -150,8 +182,8 @@ KINDS = {
 
 
 def rotorpy_vehicle(told, changed):
-    """RotorPy's parameter dict of the told vehicle without aerodynamics, with some entries
-    changed.
+    """RotorPy's parameter dict of the told vehicle without aerodynamics, with some
+    entries changed.
     """
     out = {
         "mass": told.mass,
@@ -162,11 +194,20 @@ def rotorpy_vehicle(told, changed):
     }
     out |= dict(zip(("Ixx", "Iyy", "Izz"), told.inertia, strict=True))
     out |= dict.fromkeys(
-        ("Ixy", "Iyz", "Ixz", "c_Dx", "c_Dy", "c_Dz", "k_d", "k_z", "k_h", "k_flap"), 0.0
+        ("Ixy", "Iyz", "Ixz", "c_Dx", "c_Dy", "c_Dz", "k_d", "k_z", "k_h", "k_flap"),
+        0.0,
     )
     thrust = told.thrust_constant
-    out |= {"k_eta": thrust, "k_m": told.torque_ratio * thrust, "tau_m": told.motor_time}
-    out |= {"rotor_speed_min": 0.0, "rotor_speed_max": v.MAX_SPEED, "motor_noise_std": 0.0}
+    out |= {
+        "k_eta": thrust,
+        "k_m": told.torque_ratio * thrust,
+        "tau_m": told.motor_time,
+    }
+    out |= {
+        "rotor_speed_min": 0.0,
+        "rotor_speed_max": v.MAX_SPEED,
+        "motor_noise_std": 0.0,
+    }
     if set(changed) - set(out):
         raise ValueError(
             f"not parameters of RotorPy's multirotor: {sorted(set(changed) - set(out))}"
@@ -183,14 +224,18 @@ def _air(kind):
     name, mean = kind
     mean = np.array(mean)
     if name == "tunnel":
-        # Its axis goes through the origin, which is on the floor: it is lifted to where the flights
-        # are.
+        # Its axis goes through the origin, which is on the floor: it is lifted to where
+        # the flights are.
         tunnel = WindTunnel(np.linalg.norm(mean), mean / np.linalg.norm(mean), 0.25)
         return lambda t, x: tunnel.update(t, x - [0.0, 0.0, TUNNEL_HEIGHT])
     steady = ConstantWind(*mean)
-    sway = SinusoidWind(0.25 * mean, np.array([0.4, 0.55, 0.3]), np.array([0.0, 0.7, 0.3]))
+    sway = SinusoidWind(
+        0.25 * mean, np.array([0.4, 0.55, 0.3]), np.array([0.0, 0.7, 0.3])
+    )
     return (
-        steady.update if name == "steady" else lambda t, x: steady.update(t, x) + sway.update(t, x)
+        steady.update
+        if name == "steady"
+        else lambda t, x: steady.update(t, x) + sway.update(t, x)
     )
 
 
@@ -207,7 +252,12 @@ def trajectory(name, rng, slower=1.0):
     if name == "eight":
         a = speed
         return TwoDLissajous(
-            A=0.55, B=0.5, a=a, b=2 * a, height=height, yaw_bool=bool(rng.random() < 0.5)
+            A=0.55,
+            B=0.5,
+            a=a,
+            b=2 * a,
+            height=height,
+            yaw_bool=bool(rng.random() < 0.5),
         )
     radius = rng.uniform(0.4, 0.6)
     rate = speed / 0.5 / (2 * np.pi)
@@ -219,11 +269,15 @@ def trajectory(name, rng, slower=1.0):
         )
     sizes = np.array([radius, radius, rng.uniform(0.05, 0.25)])
     rates = np.array([rate, rate, 0.6 * rate])
-    return ThreeDCircularTraj(np.array([0, 0, height]), sizes, rates, yaw_bool=name == "yawing")
+    return ThreeDCircularTraj(
+        np.array([0, 0, height]), sizes, rates, yaw_bool=name == "yawing"
+    )
 
 
 def fly(told, changed, wind, path, drawn, air):
-    """One flight in RotorPy as `plant.fly` would give it: dict of (S, n, 1) arrays every 2 ms."""
+    """One flight in RotorPy as `plant.fly` would give it: dict of (S, n, 1) arrays
+    every 2 ms.
+    """
     from rotorpy.controllers.quadrotor_control import SE3Control
     from rotorpy.vehicles.multirotor import Multirotor
 
@@ -249,8 +303,12 @@ def fly(told, changed, wind, path, drawn, air):
     low = Filter(np.array([drawn["gyro_cut"]]), 3, air["gyro_bias"][:, None])
     cell = {k: np.array([air[k]]) for k in ("open_voltage", "discharge", "resistance")}
     battery = Battery(cell, np.array([told.hover]))
-    sizes = POSE | {k: size for k, size in KEPT.items() if k not in ("integral", "applied")}
-    out = {name: np.zeros((samples, size, 1), np.float32) for name, size in sizes.items()}
+    sizes = POSE | {
+        k: size for k, size in KEPT.items() if k not in ("integral", "applied")
+    }
+    out = {
+        name: np.zeros((samples, size, 1), np.float32) for name, size in sizes.items()
+    }
     out |= {name: np.zeros((samples, 1), np.float32) for name in ("voltage", "load")}
     m = np.full((4, 1), told.hover)
     crashed = samples
@@ -258,25 +316,43 @@ def fly(told, changed, wind, path, drawn, air):
     for s in range(samples):
         t = SAMPLE * s
         state["wind"] = wind_at(t, state["x"])
-        gyro = low(state["w"][:, None] + air["gyro_bias"][:, None] + air["gyro"][s][:, None])
+        gyro = low(
+            state["w"][:, None] + air["gyro_bias"][:, None] + air["gyro"][s][:, None]
+        )
         if s % 2 == 0:
             k = s // 5
-            q = state["q"] + 0.5 * np.append(air["seen_attitude"][k][1:] * 2, 0.0) * state["q"][3]
+            q = (
+                state["q"]
+                + 0.5 * np.append(air["seen_attitude"][k][1:] * 2, 0.0) * state["q"][3]
+            )
             seen = {
                 "x": state["x"] + air["seen_position"][k],
                 "v": state["v"] + air["seen_velocity"][k],
             }
             seen |= {"q": q / np.linalg.norm(q), "w": gyro[:, 0]}
             speeds = np.clip(
-                control.update(t, seen, path.update(t))["cmd_motor_speeds"], 0.0, v.MAX_SPEED
+                control.update(t, seen, path.update(t))["cmd_motor_speeds"],
+                0.0,
+                v.MAX_SPEED,
             )
             m = (speeds[:, None] / v.MAX_SPEED) ** 2
         rotation = np.roll(state["q"], 1)[:, None]
-        accel = model.statedot(state, {"cmd_motor_speeds": speeds}, SAMPLE)["vdot"][:, None]
+        accel = model.statedot(state, {"cmd_motor_speeds": speeds}, SAMPLE)["vdot"][
+            :, None
+        ]
         accel[2] += v.GRAVITY
-        names = {"position": "x", "velocity": "v", "rates": "w", "rotor": "rotor_speeds"}
+        names = {
+            "position": "x",
+            "velocity": "v",
+            "rates": "w",
+            "rotor": "rotor_speeds",
+        }
         now = {name: state[theirs][:, None] for name, theirs in names.items()}
-        now |= {"quaternion": rotation, "specific": v.rotate_back(rotation, accel), "gyro": gyro}
+        now |= {
+            "quaternion": rotation,
+            "specific": v.rotate_back(rotation, accel),
+            "gyro": gyro,
+        }
         now |= {"motor": m, "voltage": voltage, "load": battery.load}
         for name, value in now.items():
             out[name][s] = value
@@ -285,7 +361,10 @@ def fly(told, changed, wind, path, drawn, air):
             break
         state = model.step(state, {"cmd_motor_speeds": speeds}, SAMPLE)
         voltage = battery.step(m, SAMPLE)
-    out |= {"command": np.zeros((samples // 5, 4, 1), np.float32), "crashed": np.array([crashed])}
+    out |= {
+        "command": np.zeros((samples // 5, 4, 1), np.float32),
+        "crashed": np.array([crashed]),
+    }
     return out | {"pose_delay": np.zeros(1), "pose_jitter": np.zeros(1)}
 
 
@@ -314,8 +393,17 @@ def make_case(job):
     flown = []
     for name in names:
         for slower in (1.0, 0.7, 0.5, 0.35):  # some vehicles can't follow fast paths
-            air = sensors.draw_air(rng, drawn, ticks, drawn["voltage"] + rng.uniform(-0.15, 0.1))
-            flight = fly(told, nuisance | changed, wind, trajectory(name, rng, slower), drawn, air)
+            air = sensors.draw_air(
+                rng, drawn, ticks, drawn["voltage"] + rng.uniform(-0.15, 0.1)
+            )
+            flight = fly(
+                told,
+                nuisance | changed,
+                wind,
+                trajectory(name, rng, slower),
+                drawn,
+                air,
+            )
             if flight["crashed"][0] >= LEAST:
                 break
         flown.append(flight)
@@ -323,13 +411,15 @@ def make_case(job):
         flights.append([sensors.log_rows(rng, drawn, flight, 0, length)])
     joined = {k: np.concatenate([f[k] for f in flown], axis=-1) for k in flown[0]}
     place = Path(folder) / f"case_{number:03d}"
-    fleet.write_logs(place, flights, drawn["channels"], v.toml(told, "RotorPy 3", drawn))
+    fleet.write_logs(
+        place, flights, drawn["channels"], v.toml(told, "RotorPy 3", drawn)
+    )
     return answer(place.name, kind, told, drawn, joined, flights, said)
 
 
 def floor_of(told, drawn, joined, flights):
-    """(seen, floor): mean squares (12,) of the told vehicle without a cause, and root mean squares
-    of what air, sensors and the rows of the log leave to a true one.
+    """(seen, floor): mean squares (12,) of the told vehicle without a cause, and root
+    mean squares of what air, sensors and the rows of the log leave to a true one.
     """
     many = [told] * 3
     none = np.zeros(3, bool)
@@ -337,16 +427,22 @@ def floor_of(told, drawn, joined, flights):
     p["rotor_gain"] *= 1 + drawn["thrust_offset"]
 
     def errors(flown):
-        return (measure.errors(flown, many, p, np.arange(3), none, none) ** 2).mean(axis=1)
+        return (measure.errors(flown, many, p, np.arange(3), none, none) ** 2).mean(
+            axis=1
+        )
 
     rows = [f[0] for f in flights]
     samples = len(joined["motor"])
     seen = errors(joined)
-    sensed = np.array([measure.sensor_floor(drawn, r, joined, j) for j, r in enumerate(rows)])
+    sensed = np.array(
+        [measure.sensor_floor(drawn, r, joined, j) for j, r in enumerate(rows)]
+    )
     logged = np.stack([measure.motors_of_log(r, samples) for r in rows], axis=-1)
     lasts = np.minimum(joined["crashed"], [round(r["t"][-1] / SAMPLE) for r in rows])
     hidden = [errors(joined | {"motor": m, "crashed": lasts}) for m in logged]
-    return seen, np.sqrt((sensed**2).mean(axis=0) + np.maximum(np.min(hidden, axis=0) - seen, 0.0))
+    return seen, np.sqrt(
+        (sensed**2).mean(axis=0) + np.maximum(np.min(hidden, axis=0) - seen, 0.0)
+    )
 
 
 def answer(name, kind, told, drawn, joined, flights, said):
@@ -356,9 +452,11 @@ def answer(name, kind, told, drawn, joined, flights, said):
     known = np.isfinite(floor)
     severity = float(np.sqrt(np.where(known, seen / floor**2, 0.0).max()))
     truth = [e if e != "unknown" else kind for e in effects]
-    category = {0: "none", 1: "unknown" if effects == ["unknown"] else "single", 2: "pair"}[
-        len(effects)
-    ]
+    category = {
+        0: "none",
+        1: "unknown" if effects == ["unknown"] else "single",
+        2: "pair",
+    }[len(effects)]
     if effects and severity < HIDDEN:
         category = "not_testable"
     forms, each = ([x] if isinstance(x, str | dict) else x for x in (form, said))
@@ -387,8 +485,12 @@ def main():
     use_single_thread()
     kinds = [kind for kind in KINDS for _ in range(options.each)]
     order = np.random.default_rng(options.seed).permutation(len(kinds))
-    jobs = [(options.seed, n, kinds[i], str(options.logs)) for n, i in enumerate(order, 1)]
-    answers = sorted(in_processes(make_case, jobs, options.jobs), key=lambda a: a["case"])
+    jobs = [
+        (options.seed, n, kinds[i], str(options.logs)) for n, i in enumerate(order, 1)
+    ]
+    answers = sorted(
+        in_processes(make_case, jobs, options.jobs), key=lambda a: a["case"]
+    )
     print("sha256", write_answers(options.answers, answers, options.seed, "rotorpy"))
 
 

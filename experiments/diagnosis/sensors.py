@@ -1,9 +1,10 @@
-"""The family of sensors and logs: what a case's vehicle carries, the air that it flies in, and the
-rows of its logs.
+"""The family of sensors and logs: what a case's vehicle carries, the air that it flies
+in, and the rows of its logs.
 
-`draw` makes a case's set-up; eight kinds of sensors, two of which (`STRANGERS`) are drawn for
-reported runs only. Every case, "none" included, has biases, a tilt up to 1 degree between IMU and
-tracked frame, a thrust offset up to 0.8 % and constants off by up to 1 % beside what is told.
+`draw` makes a case's set-up; eight kinds of sensors, two of which (`STRANGERS`) are
+drawn for reported runs only. Every case, "none" included, has biases, a tilt up to 1
+degree between IMU and tracked frame, a thrust offset up to 0.8 % and constants off by
+up to 1 % beside what is told.
 """
 
 import numpy as np
@@ -26,16 +27,27 @@ GROUPS = {
     "v": ["vbat"],
 }
 COLUMNS = ["t", "vehicle", *(column for group in GROUPS.values() for column in group)]
-DIGITS = (4,) * 3 + (5,) * 4 + (4,) * 3 + (4,) * 3 + (3,) * 3 + (4,) + (3,) * 3 + (4,) * 4 + (3,)
+DIGITS = (
+    (4,) * 3
+    + (5,) * 4
+    + (4,) * 3
+    + (4,) * 3
+    + (3,) * 3
+    + (4,)
+    + (3,) * 3
+    + (4,) * 4
+    + (3,)
+)
 LOGGED = {"p": 0.88, "g": 0.9, "a": 0.85, "s": 0.6, "c": 0.75, "m": 0.92, "v": 0.8}
 """How often a log has a group."""
 DECIMALS = dict(zip(COLUMNS[2:], DIGITS, strict=True))
-TURBULENCE = {"none": (0.0, 0.05), "light": (0.3, 1.2), "strong": (2.0, 4.0)}  # mN rms per axis
+# mN rms per axis
+TURBULENCE = {"none": (0.0, 0.05), "light": (0.3, 1.2), "strong": (2.0, 4.0)}
 
 
 def coloured(rng, count, axes, time, rms, step):
-    """First-order noise (count, axes) of correlation time `time` (s) and the given rms, sampled
-    every `step` (s).
+    """First-order noise (count, axes) of correlation time `time` (s) and the given rms,
+    sampled every `step` (s).
     """
     keep = np.exp(-step / time)
     white = rng.standard_normal((count, axes)) * np.sqrt(1 - keep**2)
@@ -44,8 +56,8 @@ def coloured(rng, count, axes, time, rms, step):
 
 
 def narrow(rng, count, axes, frequency, quality, rms, step):
-    """Narrow-band noise (count, axes) around `frequency` (Hz): white noise through a resonance of
-    the given quality.
+    """Narrow-band noise (count, axes) around `frequency` (Hz): white noise through a
+    resonance of the given quality.
     """
     pole = np.exp(-np.pi * frequency / quality * step)
     a = [1.0, -2 * pole * np.cos(2 * np.pi * frequency * step), pole * pole]
@@ -54,10 +66,12 @@ def narrow(rng, count, axes, frequency, quality, rms, step):
 
 
 def _channels(rng, needed):
-    """Letters of the logged groups: what an effect needs is there, the rest is drawn; always a
-    legal log.
+    """Letters of the logged groups: what an effect needs is there, the rest is drawn;
+    always a legal log.
     """
-    have = set(needed) | {letter for letter, chance in LOGGED.items() if rng.random() < chance}
+    have = set(needed) | {
+        letter for letter, chance in LOGGED.items() if rng.random() < chance
+    }
     if "p" not in have:
         have -= {"s"}
         have |= {"a", "g"}
@@ -69,10 +83,11 @@ def _channels(rng, needed):
 
 
 def draw(rng, kind, needed="", turbulence=None):
-    """Sensors and air of a case: a dict of plain numbers, see the keys below. `needed`: letters of
-    `GROUPS`.
+    """Sensors and air of a case: a dict of plain numbers, see the keys below. `needed`:
+    letters of `GROUPS`.
     """
-    size = float(np.exp(rng.uniform(np.log(0.5), np.log(2.0))))  # good and bad instruments
+    # good and bad instruments
+    size = float(np.exp(rng.uniform(np.log(0.5), np.log(2.0))))
     tilt = rng.standard_normal(3)
     tilt *= np.deg2rad(rng.uniform(0, 1.0)) / np.linalg.norm(tilt)
     filtered = kind == "filtered" or rng.random() < 0.5
@@ -97,7 +112,9 @@ def draw(rng, kind, needed="", turbulence=None):
         "turbulence": turbulence,
         "gust": float(rng.uniform(*TURBULENCE[turbulence])),
         "pose_delay": float(rng.uniform(0.0, 2.5)),  # ms
-        "pose_rate": int(rng.choice([60, 100, 120, 240])) if rate > 100 else min(rate, 100),
+        "pose_rate": int(rng.choice([60, 100, 120, 240]))
+        if rate > 100
+        else min(rate, 100),
         "position": 2.0e-4 * size,  # m, white
         "angle": 1.8e-3 * size,  # rad, white
         "accel": 0.16 * size,
@@ -128,7 +145,10 @@ def draw(rng, kind, needed="", turbulence=None):
     elif kind == "quantised":
         out |= {"quantum": float(rng.choice([4.0, 10.0, 20.0]))}
     elif kind == "radio":
-        out |= {"wander": float(rng.uniform(2.0, 10.0)), "stream_rate": float(rng.uniform(70, 90))}
+        out |= {
+            "wander": float(rng.uniform(2.0, 10.0)),
+            "stream_rate": float(rng.uniform(70, 90)),
+        }
     elif kind == "estimator":
         out |= {
             "colour": float(rng.uniform(1.5, 4.0)),
@@ -141,8 +161,8 @@ def draw(rng, kind, needed="", turbulence=None):
 
 
 def draw_air(rng, sensors, ticks, voltage, strong=1.0):
-    """Air, gyroscope and pose of one body in one flight as `plant.fly` wants them (no body axis
-    yet).
+    """Air, gyroscope and pose of one body in one flight as `plant.fly` wants them (no
+    body axis yet).
     """
     samples = 5 * ticks
     size = sensors["size"]
@@ -150,10 +170,14 @@ def draw_air(rng, sensors, ticks, voltage, strong=1.0):
     force = coloured(rng, ticks, 3, 0.35, gust, 0.01) + coloured(
         rng, ticks, 3, 0.05, 0.4 * gust, 0.01
     )
-    torque = coloured(rng, ticks, 3, 0.08, 0.013 * gust, 0.01) * np.array([1.0, 1.0, 0.5])
+    torque = coloured(rng, ticks, 3, 0.08, 0.013 * gust, 0.01) * np.array(
+        [1.0, 1.0, 0.5]
+    )
     gyro = sensors["gyro"] * rng.standard_normal((samples, 3))
     if sensors["colour"]:
-        gyro += coloured(rng, samples, 3, 0.02, 0.4 * sensors["gyro"] * sensors["colour"], SAMPLE)
+        gyro += coloured(
+            rng, samples, 3, 0.02, 0.4 * sensors["gyro"] * sensors["colour"], SAMPLE
+        )
     if sensors["vibration"]:
         gyro += _vibration(rng, sensors, samples, 0.04 * sensors["vibration"])
     angle = 1.5e-3 * size * rng.standard_normal((ticks, 3))
@@ -175,33 +199,38 @@ def draw_air(rng, sensors, ticks, voltage, strong=1.0):
 
 
 def holds_poses(sensors):
-    """Whether rows repeat the last pose, which makes them late by half the hold on average,
-    whatever flies.
+    """Whether rows repeat the last pose, which makes them late by half the hold on
+    average, whatever flies.
     """
     return sensors["kind"] == "stale" and "p" in sensors["channels"]
 
 
 def pose_lag(delay_ms, sensors):
-    """By how much poses in the log are late, ms: the cause together with the motion capture's own;
-    None if they are held.
+    """By how much poses in the log are late, ms: the cause together with the motion
+    capture's own; None if they are held.
     """
     return None if holds_poses(sensors) else delay_ms + sensors["pose_delay"]
 
 
 def stack(flights):
     """List of `draw_air` dicts to one with the body index last."""
-    return {key: np.stack([np.asarray(f[key]) for f in flights], axis=-1) for key in flights[0]}
+    return {
+        key: np.stack([np.asarray(f[key]) for f in flights], axis=-1)
+        for key in flights[0]
+    }
 
 
 def _vibration(rng, sensors, samples, rms):
     frequency = sensors["vibration_frequency"]
     quality = sensors["vibration_quality"]
-    return narrow(rng, samples, 3, frequency, quality, rms, SAMPLE) * np.array([1.0, 1.0, 0.6])
+    return narrow(rng, samples, 3, frequency, quality, rms, SAMPLE) * np.array(
+        [1.0, 1.0, 0.6]
+    )
 
 
 def apply_nuisances(p, columns, sensors):
-    """What is off in every case: thrust, motor time, yaw torque, moments of inertia, and the
-    firmware's filters.
+    """What is off in every case: thrust, motor time, yaw torque, moments of inertia,
+    and the firmware's filters.
     """
     lag, yaw, *moments = sensors["constants_off"]
     p["rotor_gain"][:, columns] *= 1 + sensors["thrust_offset"]
@@ -226,7 +255,9 @@ def at(signal, times):
 
 
 def _through(cut, signal):
-    """A (S, n) signal through the second-order low-pass of `cut` Hz, started in rest."""
+    """A (S, n) signal through the second-order low-pass of `cut` Hz, started in
+    rest.
+    """
     if not cut:
         return signal
     low = butter(2, cut, fs=1 / SAMPLE)
@@ -234,7 +265,9 @@ def _through(cut, signal):
 
 
 def _pose(rng, sensors, flown, j, times, delay):
-    """Position, orientation, velocity (n, 10) of the motion capture at its own `times`."""
+    """Position, orientation, velocity (n, 10) of the motion capture at its own
+    `times`.
+    """
     size = sensors["size"]
     n = len(times)
     step = float(np.median(np.diff(times)))
@@ -246,7 +279,8 @@ def _pose(rng, sensors, flown, j, times, delay):
         rng, n, 3, 1.5, 8e-4 * size, step
     )
     velocity = at(flown["velocity"][:, :, j].astype(float), when)
-    if sensors["kind"] == "estimator":  # smoothed: hardly any white noise, slow errors instead
+    # smoothed: hardly any white noise, slow errors instead
+    if sensors["kind"] == "estimator":
         slow = sensors["colour"]
         time = sensors["colour_time"]
         wander = coloured(rng, n, 3, time, slow * 6e-4 * size, step)
@@ -265,7 +299,9 @@ def _pose(rng, sensors, flown, j, times, delay):
         )
     q = at(flown["quaternion"][:, :, j].astype(float), when)
     q = vehicle.multiply(q.T, np.concatenate([np.ones((1, n)), 0.5 * angle.T]))
-    return np.concatenate([position, (q / np.sqrt((q * q).sum(axis=0))).T, velocity], axis=1)
+    return np.concatenate(
+        [position, (q / np.sqrt((q * q).sum(axis=0))).T, velocity], axis=1
+    )
 
 
 def smooth_derivative(position, step):
@@ -283,13 +319,15 @@ def _inputs(flown, j, times, hover):
     """What `unknowns.misread` depends on, from the truth at `times`."""
     names = ("position", "quaternion", "velocity", "rates", "motor")
     rows = [at(flown[name][:, :, j].astype(float), times).T for name in names]
-    return unknowns.inputs_of(*rows, at(flown["voltage"][:, j].astype(float), times), hover)
+    return unknowns.inputs_of(
+        *rows, at(flown["voltage"][:, j].astype(float), times), hover
+    )
 
 
 def log_rows(rng, sensors, flown, j, ticks, unknown=(), hover=0.5):
-    """Rows of body j: dict column -> (n,) with NaN where a channel was not sampled; `t` first. All
-    groups are made, the caller leaves out what was not logged. `unknown`: causes that sit in
-    sensors.
+    """Rows of body j: dict column -> (n,) with NaN where a channel was not sampled; `t`
+    first. All groups are made, the caller leaves out what was not logged. `unknown`:
+    causes that sit in sensors.
     """
     seconds = 0.01 * ticks
     rate = sensors["rate"]
@@ -301,23 +339,36 @@ def log_rows(rng, sensors, flown, j, ticks, unknown=(), hover=0.5):
     n = len(t)
     wander = None
     if sensors["wander"]:
-        wander = coloured(rng, len(flown["rates"]), 2, 2.0, 1e-3 * sensors["wander"], SAMPLE)
+        wander = coloured(
+            rng, len(flown["rates"]), 2, 2.0, 1e-3 * sensors["wander"], SAMPLE
+        )
 
     def stream(signal, times, clock):
-        """A 500 Hz signal as its stream delivers it at `times`, by the IMU's clock (0) or the
-        motors' (1).
+        """A 500 Hz signal as its stream delivers it at `times`, by the IMU's clock (0)
+        or the motors' (1).
         """
-        own = np.arange(0, seconds, 1 / sensors["stream_rate"]) if sensors["stream_rate"] else times
-        values = at(signal, own + (0.0 if wander is None else at(wander[:, clock], own)))
+        own = (
+            np.arange(0, seconds, 1 / sensors["stream_rate"])
+            if sensors["stream_rate"]
+            else times
+        )
+        values = at(
+            signal, own + (0.0 if wander is None else at(wander[:, clock], own))
+        )
         if own is times:
             return values
         return np.stack(
-            [np.interp(times, own, values[:, i]) for i in range(values.shape[1])], axis=1
+            [np.interp(times, own, values[:, i]) for i in range(values.shape[1])],
+            axis=1,
         )
 
     out = {"t": t}
     # pose: at its own rate, empty cells between, held (stale) or interpolated
-    own = np.arange(0, seconds, 1 / sensors["pose_rate"]) if sensors["pose_rate"] < rate else t
+    own = (
+        np.arange(0, seconds, 1 / sensors["pose_rate"])
+        if sensors["pose_rate"] < rate
+        else t
+    )
     delay = 1e-3 * sensors["pose_delay"] + flown["pose_delay"][j]
     if flown["pose_jitter"][j]:
         delay = delay + flown["pose_jitter"][j] * rng.uniform(-1, 1, len(own))
@@ -335,7 +386,8 @@ def log_rows(rng, sensors, flown, j, ticks, unknown=(), hover=0.5):
     if "unknown_attitude" in wrong:
         pose[:, 3:7] = unknowns.turned(pose[:, 3:7], wrong["unknown_attitude"])
 
-    # IMU: the firmware's gyroscope, and the accelerometer with its own noise, vibration and filter
+    # IMU: the firmware's gyroscope, and the accelerometer with its own noise, vibration
+    # and filter
     tilt = np.array(sensors["tilt"])
     gyro = flown["gyro"][:, :, j].astype(float)
     accel = flown["specific"][:, :, j].astype(float)
@@ -348,7 +400,9 @@ def log_rows(rng, sensors, flown, j, ticks, unknown=(), hover=0.5):
     noise = sensors["accel"] * rng.standard_normal((samples, 3))
     noise += coloured(rng, samples, 3, 3.0, 0.02, SAMPLE)
     if sensors["colour"]:
-        noise += coloured(rng, samples, 3, 0.02, 0.4 * sensors["accel"] * sensors["colour"], SAMPLE)
+        noise += coloured(
+            rng, samples, 3, 0.02, 0.4 * sensors["accel"] * sensors["colour"], SAMPLE
+        )
     if sensors["vibration"]:
         noise += _vibration(rng, sensors, samples, sensors["vibration"])
     accel = _through(sensors["accel_cut"], accel + noise)
@@ -373,7 +427,9 @@ def log_rows(rng, sensors, flown, j, ticks, unknown=(), hover=0.5):
     voltage[np.concatenate([[False], seldom[1:] == seldom[:-1]])] = np.nan
     gyro = stream(gyro, t, 0) + wrong.get("unknown_gyroscope", 0.0)
     accel = stream(accel, t, 0) + wrong.get("unknown_accelerometer", 0.0)
-    values = np.concatenate([pose, gyro, accel, command, motors, voltage[:, None]], axis=1)
+    values = np.concatenate(
+        [pose, gyro, accel, command, motors, voltage[:, None]], axis=1
+    )
     for i, column in enumerate(COLUMNS[2:]):
         step = 10.0 ** -DECIMALS[column]
         if sensors["quantum"] > 1 and column not in GROUPS["c"]:

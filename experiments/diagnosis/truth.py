@@ -1,9 +1,10 @@
 """What acts in a case, and whether a report is right about it.
 
-The answers of a set are one JSON file, {"cases": {name: answer}}. An answer holds `category` (none,
-single, pair, unknown, not_testable, garbage or real), `effects`, and optionally `acceptable` (the
-names that are right for each effect: a list of lists, or {effect: names}), `expected` (the effects
-that the logs show) and `also_fine` (names that are no mistake).
+The answers of a set are one JSON file, {"cases": {name: answer}}. An answer holds
+`category` (none, single, pair, unknown, not_testable, garbage or real), `effects`, and
+optionally `acceptable` (the names that are right for each effect: a list of lists, or
+{effect: names}), `expected` (the effects that the logs show) and `also_fine` (names
+that are no mistake).
 """
 
 import json
@@ -12,15 +13,15 @@ from pathlib import Path
 
 NOTHING = ("none", "not_testable")
 CONTRADICTORY = ("garbage", "contradictory", "contradiction", "inconsistent", "refused")
-# Names that a true effect always carries: tilted thrust is drag in every sensor, air that pushes
-# also brakes.
+# Names that a true effect always carries: tilted thrust is drag in every sensor, air
+# that pushes also brakes.
 CARRIES = {"blade_flapping": "rotor_drag", "wind": "rotor_drag"}
 
 
 @dataclass(frozen=True)
 class Truth:
-    """`right` holds the acceptable names of each effect that shows, strongest first; `fine` what is
-    no mistake.
+    """`right` holds the acceptable names of each effect that shows, strongest first;
+    `fine` what is no mistake.
     """
 
     category: str
@@ -37,11 +38,17 @@ def truth_of(answer: dict) -> Truth:
     if isinstance(acceptable, dict):
         shown = answer.get("expected", effects)
         acceptable = [acceptable.get(effect, [effect]) for effect in shown]
-    fine = set(answer.get("also_fine", ())) | {CARRIES[e] for e in effects if e in CARRIES}
+    fine = set(answer.get("also_fine", ())) | {
+        CARRIES[e] for e in effects if e in CARRIES
+    }
     named = answer["category"] in ("single", "pair", "real")
     right = tuple(frozenset(names) for names in acceptable) if named else ()
     return Truth(
-        answer["category"], effects, right, frozenset(fine), answer.get("in_sensors", False)
+        answer["category"],
+        effects,
+        right,
+        frozenset(fine),
+        answer.get("in_sensors", False),
     )
 
 
@@ -51,8 +58,8 @@ def read_answers(path: Path) -> dict[str, dict]:
 
 
 def words_of(report: dict | None) -> list[str]:
-    """What a report says, best first: effects and "unknown", nothing for "none", "garbage" where it
-    was refused.
+    """What a report says, best first: effects and "unknown", nothing for "none",
+    "garbage" where it was refused.
     """
     if report is None:
         return ["garbage"]
@@ -60,17 +67,24 @@ def words_of(report: dict | None) -> list[str]:
     verdict = report.get("verdict")
     if verdict in CONTRADICTORY or (report.get("contradictions") and not words):
         return ["garbage"]
-    return ["unknown", *words] if verdict == "unknown" and "unknown" not in words else words
+    return (
+        ["unknown", *words]
+        if verdict == "unknown" and "unknown" not in words
+        else words
+    )
 
 
 def judge(truth: Truth, words: list[str]) -> dict:
-    """Whether the `words` of a report are right: {"right", "wrong_names", "false_unknown"}."""
+    """Whether the `words` of a report are right: {"right", "wrong_names",
+    "false_unknown"}.
+    """
     names = [w for w in words if w not in ("unknown", "garbage")]
     allowed = truth.fine.union(*truth.right)
     wrong = [n for n in names if n not in allowed]
     lost = "garbage" in words
     first = next(
-        (n for n in names if n not in truth.fine or any(n in r for r in truth.right)), None
+        (n for n in names if n not in truth.fine or any(n in r for r in truth.right)),
+        None,
     )
     if truth.category == "garbage":
         right = lost
@@ -91,19 +105,24 @@ def judge(truth: Truth, words: list[str]) -> dict:
 
 
 def right_names(truth: Truth) -> frozenset[str]:
-    """The classes of which the most probable one may be: those that are right count as one, and
-    where nothing need be named those that are no mistake count with "none", as in `judge`.
+    """The classes of which the most probable one may be: those that are right count as
+    one, and where nothing need be named those that are no mistake count with "none", as
+    in `judge`.
     """
     unnamed = {"unknown"} if truth.category == "unknown" else {"none"} | truth.fine
     return frozenset().union(*truth.right) or frozenset(unnamed)
 
 
-def top_probability(right, probabilities: dict[str, float]) -> tuple[float, bool] | None:
-    """(probability of the most probable class, whether it is the true one); the names that are
-    `right` count as one.
+def top_probability(
+    right, probabilities: dict[str, float]
+) -> tuple[float, bool] | None:
+    """(probability of the most probable class, whether it is the true one); the names
+    that are `right` count as one.
     """
     if not probabilities:
         return None
     together = sum(p for name, p in probabilities.items() if name in right)
-    best = max((p for name, p in probabilities.items() if name not in right), default=0.0)
+    best = max(
+        (p for name, p in probabilities.items() if name not in right), default=0.0
+    )
     return max(together, best), together >= best

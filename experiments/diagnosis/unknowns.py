@@ -1,12 +1,13 @@
-"""Causes outside the vocabulary, drawn by a generator: thousands of kinds, so that none can be
-written a detector for.
+"""Causes outside the vocabulary, drawn by a generator: thousands of kinds, so that none
+can be written a detector for.
 
-A kind is a site (a force, a torque, the motors, a sensor) and a function f of a random subset of
-place, motion, motors, voltage and time: a sum of random Fourier features (Rahimi, Recht 2007)
-without its mean and its linear part, as far as the inputs are normally distributed. What is left
-can't be taken over by a constant or a line in any input, which the vocabulary's effects are. It
-sets in at a random time. The `switching` form, for reported runs alone, is the sign of such a sum:
-knocks, relays, steps. Everything follows from the eight uniform draws of the cause.
+A kind is a site (a force, a torque, the motors, a sensor) and a function f of a random
+subset of place, motion, motors, voltage and time: a sum of random Fourier features
+(Rahimi, Recht 2007) without its mean and its linear part, as far as the inputs are
+normally distributed. What is left can't be taken over by a constant or a line in any
+input, which the vocabulary's effects are. It sets in at a random time. The `switching`
+form, for reported runs alone, is the sign of such a sum: knocks, relays, steps.
+Everything follows from the eight uniform draws of the cause.
 """
 
 from typing import NamedTuple
@@ -17,8 +18,8 @@ from experiments.diagnosis.vehicle import multiply, rotate_back
 
 
 class Site(NamedTuple):
-    """Where a kind acts: (smallest, largest) root mean square, its unit, whether in the logs
-    alone.
+    """Where a kind acts: (smallest, largest) root mean square, its unit, whether in the
+    logs alone.
     """
 
     sizes: tuple
@@ -42,18 +43,21 @@ FEATURES = 6
 # Inputs: name -> (number of values, the size of one that is usual in flight)
 INPUTS = {
     "place": (3, 0.3),  # m
-    "motion": (6, (0.6, 0.6, 0.4, 1.2, 1.2, 1.0)),  # body velocity m/s, body rates rad/s
+    # body velocity m/s, body rates rad/s
+    "motion": (6, (0.6, 0.6, 0.4, 1.2, 1.2, 1.0)),
     "motors": (4, 0.08),  # of the command, about hover
     "voltage": (1, 0.1),  # V, about 3.7
     "time": (1, 1.0),  # s
 }
-SCALE = np.concatenate([np.broadcast_to(size, count) for count, size in INPUTS.values()])
+SCALE = np.concatenate(
+    [np.broadcast_to(size, count) for count, size in INPUTS.values()]
+)
 SLOWEST, FASTEST = 0.3, 4.0  # Hz, of a kind that time has a part in
 
 
 class Generated:
-    """The functions of some bodies' causes: calls give values (n,) with a root mean square of about
-    one.
+    """The functions of some bodies' causes: calls give values (n,) with a root mean
+    square of about one.
     """
 
     def __init__(self, causes):
@@ -73,7 +77,9 @@ class Generated:
 
     @staticmethod
     def _draw(cause):
-        rng = np.random.default_rng((1e9 * np.asarray(cause["shape"])).astype(np.uint32))
+        rng = np.random.default_rng(
+            (1e9 * np.asarray(cause["shape"])).astype(np.uint32)
+        )
         names = list(INPUTS)
         chosen = set(rng.choice(names, size=rng.integers(1, 4), replace=False))
         if chosen == {"voltage"}:  # hardly moves within a flight
@@ -106,10 +112,12 @@ class Generated:
         )
 
     def __call__(self, inputs, time):
-        """Values (n,) at inputs (14, n), of which the last row is replaced by the time since the
-        onset.
+        """Values (n,) at inputs (14, n), of which the last row is replaced by the time
+        since the onset.
         """
-        x = np.concatenate([inputs, np.broadcast_to(time - self.onset, (1, inputs.shape[1]))])
+        x = np.concatenate(
+            [inputs, np.broadcast_to(time - self.onset, (1, inputs.shape[1]))]
+        )
         waves = np.cos(np.einsum("fin,in->fn", self.waves, x) + self.phases).sum(0)
         smooth = (waves - self.mean - (self.slope * x).sum(0)) * np.sqrt(2.0 / FEATURES)
         value = np.where(self.switching, np.sign(waves - self.mean), smooth)
@@ -117,16 +125,24 @@ class Generated:
 
 
 def inputs_of(position, q, velocity, rates, motors, voltage, hover):
-    """(14, n) what the functions depend on, each about normally distributed: positions, velocities
-    and rates (3, n), q and motors (4, n), voltage and hover command (n,).
+    """(14, n) what the functions depend on, each about normally distributed: positions,
+    velocities and rates (3, n), q and motors (4, n), voltage and hover command (n,).
     """
     middle = position - np.array([[0.0], [0.0], [0.6]])
-    rows = [middle, rotate_back(q, velocity), rates, motors - hover, voltage[None] - 3.7]
+    rows = [
+        middle,
+        rotate_back(q, velocity),
+        rates,
+        motors - hover,
+        voltage[None] - 3.7,
+    ]
     return np.concatenate(rows) / SCALE[:-1, None]
 
 
 class Unknowns:
-    """The unknown causes of a batch of `count` bodies: {site: [(columns, cause), …]}."""
+    """The unknown causes of a batch of `count` bodies: {site: [(columns, cause),
+    …]}.
+    """
 
     def __init__(self, causes, count, hover=0.5):
         self.count = count
@@ -146,7 +162,9 @@ class Unknowns:
 
     def look(self, position, q, velocity, rates, motors, voltage):
         """What the bodies do in this step; before `motors` and `wrench`."""
-        self.inputs = inputs_of(position, q, velocity, rates, motors, voltage, self.hover)
+        self.inputs = inputs_of(
+            position, q, velocity, rates, motors, voltage, self.hover
+        )
 
     def _values(self, site, time):
         columns, function, size = self.sites[site]
@@ -168,7 +186,9 @@ class Unknowns:
         if "unknown_force" in self.sites:
             columns, function, values = self._values("unknown_force", time)
             push = 1e-3 * function.axis * values
-            force[:, columns] = np.where(function.world, rotate_back(q[:, columns], push), push)
+            force[:, columns] = np.where(
+                function.world, rotate_back(q[:, columns], push), push
+            )
         if "unknown_torque" in self.sites:
             columns, function, values = self._values("unknown_torque", time)
             torque[:, columns] = 1e-3 * function.axis * values
@@ -176,13 +196,15 @@ class Unknowns:
 
 
 def misread(causes, inputs, times):
-    """{site: (n, 3)} by how much the sensors of one body are off at `times` (n,); `inputs` (14,
-    n).
+    """{site: (n, 3)} by how much the sensors of one body are off at `times` (n,);
+    `inputs` (14, n).
     """
     out = {}
     for cause in causes:
         function = Generated([cause])
-        values = np.array([function(inputs[:, k : k + 1], t)[0] for k, t in enumerate(times)])
+        values = np.array(
+            [function(inputs[:, k : k + 1], t)[0] for k, t in enumerate(times)]
+        )
         out[cause["effect"]] = cause["size"] * values[:, None] * function.axis[:, 0]
     return out
 

@@ -1,9 +1,9 @@
-"""The vehicle of the exam's plants: published constants, parameters per simulated body, and vector
-helpers.
+"""The vehicle of the exam's plants: published constants, parameters per simulated body,
+and vector helpers.
 
-Nothing is imported from `openjax`, so that a mistake in one is not repeated in the other. Arrays
-carry the body index last, (3, B) or (4, B). Frames: world z up, body x forward, y left, z up,
-quaternions wxyz body to world.
+Nothing is imported from `openjax`, so that a mistake in one is not repeated in the
+other. Arrays carry the body index last, (3, B) or (4, B). Frames: world z up, body x
+forward, y left, z up, quaternions wxyz body to world.
 """
 
 from dataclasses import dataclass
@@ -14,7 +14,8 @@ GRAVITY = 9.81
 MASS = 0.0321  # kg
 INERTIA = np.array([1.4e-5, 1.4e-5, 2.17e-5])  # kg m^2
 ARM = 0.043 / np.sqrt(2.0)  # m, x-configuration
-ROTOR_X = np.array([1.0, -1.0, -1.0, 1.0]) * ARM  # front right, rear right, rear left, front left
+# front right, rear right, rear left, front left
+ROTOR_X = np.array([1.0, -1.0, -1.0, 1.0]) * ARM
 ROTOR_Y = np.array([-1.0, -1.0, 1.0, 1.0]) * ARM
 SPIN = np.array([-1.0, 1.0, -1.0, 1.0])  # a clockwise rotor pushes the body along +z
 THRUST_CONSTANT = 2.350347e-8  # N s^2
@@ -32,8 +33,8 @@ OUTPUT_LIMIT = 32767.0
 
 @dataclass(frozen=True)
 class Told:
-    """What the simulator is told about a vehicle: mass kg, thrust constant N s^2, k_m/k_f m, motor
-    time s, inertia kg m^2.
+    """What the simulator is told about a vehicle: mass kg, thrust constant N s^2,
+    k_m/k_f m, motor time s, inertia kg m^2.
     """
 
     mass: float = MASS
@@ -50,8 +51,8 @@ class Told:
 
 
 def draw_told(rng):
-    """A vehicle of 27 to 45 g. A heavy one carries stronger motors; constants are off the published
-    ones by some per cent.
+    """A vehicle of 27 to 45 g. A heavy one carries stronger motors; constants are off
+    the published ones by some per cent.
     """
     mass = float(rng.uniform(0.027, 0.045))
     standard = mass < 0.037 and rng.random() < 0.6
@@ -60,10 +61,14 @@ def draw_told(rng):
         if standard
         else mass * GRAVITY / (4 * rng.uniform(0.5, 0.66) * MAX_SPEED**2)
     )
-    size = 1.0 if standard and rng.random() < 0.5 else mass / MASS * rng.uniform(0.93, 1.1)
+    size = (
+        1.0 if standard and rng.random() < 0.5 else mass / MASS * rng.uniform(0.93, 1.1)
+    )
     ratio = TORQUE_RATIO if rng.random() < 0.6 else rng.uniform(0.006, 0.02)
     time = MOTOR_TIME if standard and rng.random() < 0.5 else rng.uniform(0.02, 0.04)
-    moments = INERTIA * size if size == 1.0 else INERTIA * size * rng.uniform(0.97, 1.03, 3)
+    moments = (
+        INERTIA * size if size == 1.0 else INERTIA * size * rng.uniform(0.97, 1.03, 3)
+    )
     return Told(
         mass=round(mass, 5),
         thrust_constant=float(f"{thrust:.5g}") if not standard else THRUST_CONSTANT,
@@ -75,8 +80,8 @@ def draw_told(rng):
 
 
 def toml(told, source, sensors, command="thrust"):
-    """Text of the case's `vehicle.toml`: the vehicle as told, and what a laboratory knows of its
-    logger.
+    """Text of the case's `vehicle.toml`: the vehicle as told, and what a laboratory
+    knows of its logger.
     """
     lines = ["[vehicle]", 'name = "crazyflie-2.1"', f"mass = {told.mass:.5f}"]
     lines += [
@@ -89,7 +94,12 @@ def toml(told, source, sensors, command="thrust"):
     lines += ['spin = ["ccw", "cw", "ccw", "cw"]']
     if (told.torque_ratio, told.thrust_constant) != (TORQUE_RATIO, THRUST_CONSTANT):
         lines.append(f"torque_per_thrust = {told.torque_ratio:.4g}")
-    lines += ["", "[log]", f'source = "{source}"', f"motion_capture_rate = {sensors['pose_rate']}"]
+    lines += [
+        "",
+        "[log]",
+        f'source = "{source}"',
+        f"motion_capture_rate = {sensors['pose_rate']}",
+    ]
     lines.append(f'motor_rows = "{"mean" if sensors["motor"] == "mean" else "sample"}"')
     for name, value, nominal, unit in (
         ("thrust_constant", told.thrust_constant, THRUST_CONSTANT, "N s^2"),
@@ -142,7 +152,9 @@ NEUTRAL = {
     "wind_shear": 0.0,
     "wind_gust": 0.0,
     **{
-        f"{side}_{name}": value for side in ("ground", "ceiling") for name, value in SURFACE.items()
+        f"{side}_{name}": value
+        for side in ("ground", "ceiling")
+        for name, value in SURFACE.items()
     },
     "wake": 0.0,  # N
     "wake_height": 0.3,
@@ -161,8 +173,8 @@ NEUTRAL = {
 
 
 def nominal_parameters(told):
-    """Parameters of the bodies described by a list of `Told`, as told. Effects overwrite
-    entries.
+    """Parameters of the bodies described by a list of `Told`, as told. Effects
+    overwrite entries.
     """
     count = len(told)
 
@@ -181,7 +193,8 @@ def nominal_parameters(told):
         "tau_up": tau.copy(),
         "tau_down": tau.copy(),
         "rotor_gain": np.ones((4, count)),
-        "curve_map": rows([0.0, 1.0, 0.0]),  # offset, slope, curvature of the thrust in the command
+        # offset, slope, curvature of the thrust in the command
+        "curve_map": rows([0.0, 1.0, 0.0]),
         "com": np.zeros((3, count)),
         "wind": np.zeros((3, count)),
         "kp": rows(RATE_KP),
@@ -214,7 +227,11 @@ def rotate_back(q, v):
 def cross(a, b):
     """Cross product of (3, B) vectors."""
     return np.stack(
-        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+        [
+            a[1] * b[2] - a[2] * b[1],
+            a[2] * b[0] - a[0] * b[2],
+            a[0] * b[1] - a[1] * b[0],
+        ]
     )
 
 
@@ -233,20 +250,29 @@ def multiply(a, b):
 
 
 def turn(q, w, dt):
-    """Quaternion after turning with body rates w (3, B) for dt, second order and renormalised."""
+    """Quaternion after turning with body rates w (3, B) for dt, second order and
+    renormalised.
+    """
     h = w * (0.5 * dt)
     out = q + multiply(q, np.concatenate([-0.5 * (h * h).sum(axis=0)[None], h]))
     return out / np.sqrt((out * out).sum(axis=0))
 
 
 def mix(thrust, output):
-    """Firmware mixer: collective thrust (B,) 0..1 and outputs (3, B) in counts to motor commands
-    (4, B) in 0..1.
+    """Firmware mixer: collective thrust (B,) 0..1 and outputs (3, B) in counts to motor
+    commands (4, B) in 0..1.
     """
-    roll, pitch, yaw = np.minimum(np.maximum(output, -OUTPUT_LIMIT), OUTPUT_LIMIT) / 65536.0
+    roll, pitch, yaw = (
+        np.minimum(np.maximum(output, -OUTPUT_LIMIT), OUTPUT_LIMIT) / 65536.0
+    )
     r = roll / 2
     p = pitch / 2
     m = np.stack(
-        [thrust - r - p - yaw, thrust - r + p + yaw, thrust + r + p - yaw, thrust + r - p + yaw]
+        [
+            thrust - r - p - yaw,
+            thrust - r + p + yaw,
+            thrust + r + p - yaw,
+            thrust + r - p + yaw,
+        ]
     )
     return np.minimum(np.maximum(m, 0.0), 1.0)

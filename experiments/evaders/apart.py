@@ -1,7 +1,9 @@
-"""The judge that is kept apart: `python -m experiments.evaders.apart --policy P --json FILE`.
+"""The judge that is kept apart: `python -m experiments.evaders.apart --policy P --json
+FILE`.
 
-Evaders by splitting (`openjax.evaluation.judges.splitting`), on weights that are done: whoever
-chooses weights by it has a judge less. Records as `openjax exploit --json` writes them.
+Evaders by splitting (`openjax.evaluation.judges.splitting`), on weights that are done:
+whoever chooses weights by it has a judge less. Records as `openjax exploit --json`
+writes them.
 """
 
 from experiments.evaders.judged_game import game_parser, judged_game

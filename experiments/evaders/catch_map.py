@@ -1,9 +1,11 @@
-"""The map of what can be caught: `python -m experiments.evaders.catch_map NAME=FILE ...`.
+"""The map of what can be caught: `python -m experiments.evaders.catch_map NAME=FILE
+...`.
 
-Each FILE is what `openjax map --json FILE` wrote, by the names of `KINDS`: the whole map in an empty
-arena, and maps in which one thing is taken away; or, as `inertia`, what `experiments.evaders.forced`
-wrote. Losses are means over the cells that both maps have, which are flown from the same starts. Draws
-the eight small maps, and the page to move about in.
+Each FILE is what `openjax map --json FILE` wrote, by the names of `KINDS`: the whole
+map in an empty arena, and maps in which one thing is taken away; or, as `inertia`, what
+`experiments.evaders.forced` wrote. Losses are means over the cells that both maps have,
+which are flown from the same starts. Draws the eight small maps, and the page to move
+about in.
 """
 
 from collections.abc import Mapping
@@ -24,12 +26,17 @@ KINDS = {
     "sight": "seeing 90 degrees, one metre far",
     "messages": "a fifth of the messages lost, the rest .1 s late",
 }
-"""Maps, and how the page calls them; the first is the one that others are compared with."""
+"""Maps, and how the page calls them; the first is the one that others are compared
+with.
+"""
 WHO = ("scripted", "learned", "planner")
 INERTIA = ("points", "vehicles")
 """Who flies stack where it forces a capture for points, by the names of `forced`."""
 CERTAIN = 0.95
-BOUNDS = {"forced_below": "below the solid line", "planar_below": "below the dashed line"}
+BOUNDS = {
+    "forced_below": "below the solid line",
+    "planar_below": "below the dashed line",
+}
 
 
 def study(options) -> dict:
@@ -37,7 +44,8 @@ def study(options) -> dict:
     data = options.out.with_suffix(".json")
     stored = read_json(data) if data.exists() else {}
     files = {
-        name: read_json(Path(file)) for name, file in (item.split("=", 1) for item in options.maps)
+        name: read_json(Path(file))
+        for name, file in (item.split("=", 1) for item in options.maps)
     }
     inertia = files.pop("inertia", stored.get("inertia", {"teams": []}))
     return {"maps": stored.get("maps", {}) | files, "inertia": inertia}
@@ -55,8 +63,8 @@ def mean_rate(cells: list[dict]) -> float | None:
 
 
 def mean_difference(cells: Mapping, others: Mapping) -> float | None:
-    """Mean of the capture rates of other cells less those of the same cells; None where none is in
-    both.
+    """Mean of the capture rates of other cells less those of the same cells; None where
+    none is in both.
     """
     common = [key for key in cells if key in others]
     pairs = [others[key]["capture_rate"] - cells[key]["capture_rate"] for key in common]
@@ -85,7 +93,9 @@ def rows_of(results: Mapping) -> list[dict]:
         row["planner"]["gain"] = mean_difference(of_size["learned"], of_size["planner"])
         for kind in list(KINDS)[1:]:
             if kind in maps:
-                row[kind] = mean_difference(of_size["scripted"], by_cell(maps[kind]["cells"]))
+                row[kind] = mean_difference(
+                    of_size["scripted"], by_cell(maps[kind]["cells"])
+                )
         row |= {who: inertia.get(size, {}).get(who) for who in INERTIA}
         rows.append(row)
     return rows
@@ -99,13 +109,19 @@ def page(results: Mapping) -> Page:
         "by rules": "scripted.mean:.3f",
         "learned": "learned.mean:.3f",
         f"cells surely above {CERTAIN}, learned": "learned.certain",
-        **{f"{head}, learned": f"learned.{bound}:.3f" for bound, head in BOUNDS.items()},
+        **{
+            f"{head}, learned": f"learned.{bound}:.3f" for bound, head in BOUNDS.items()
+        },
         "planner less learned": "planner.gain:+.3f",
     }
-    losses = {kind: f"{kind}:+.3f" for kind in list(KINDS)[1:] if kind in results["maps"]}
+    losses = {
+        kind: f"{kind}:+.3f" for kind in list(KINDS)[1:] if kind in results["maps"]
+    }
     losses |= {f"stack forces, {who}": f"{who}:.2f" for who in INERTIA}
     short = Table(columns | losses, rows)
-    return Page("What can be caught", "Captures over speed ratios and capture radii.", short)
+    return Page(
+        "What can be caught", "Captures over speed ratios and capture radii.", short
+    )
 
 
 def draw(results: Mapping, path: Path) -> None:
@@ -119,7 +135,9 @@ def main(arguments: list[str]) -> None:
     """The command."""
     parser = page_parser(__doc__, "catch_map")
     parser.add_argument("maps", nargs="*", metavar="NAME=FILE")
-    parser.add_argument("--page", type=Path, help="file for the page to move about in (HTML)")
+    parser.add_argument(
+        "--page", type=Path, help="file for the page to move about in (HTML)"
+    )
     options = parser.parse_args(arguments)
     publish(options, study, page, draw)
     if options.page is not None:

@@ -1,10 +1,11 @@
-"""Policies against every evader: `python -m experiments.evaders.cross_play --policy NAME ...
-[--game own|honest|clamp]`.
+"""Policies against every evader: `python -m experiments.evaders.cross_play --policy
+NAME ... [--game own|honest|clamp]`.
 
-All evaders by name, on the six layouts and on uniform tasks, with the nominal vehicle, a slower one
-and the family of the preset `flight`. Nothing is chosen by any of it; held-out evaders were never
-trained on. Game "own": the policy's; "honest": no clamp on the speed, the rate loop at 500 Hz;
-"clamp": the paper's, at 100 Hz. Writes evaders.json and .md (`--out`: others).
+All evaders by name, on the six layouts and on uniform tasks, with the nominal vehicle,
+a slower one and the family of the preset `flight`. Nothing is chosen by any of it;
+held-out evaders were never trained on. Game "own": the policy's; "honest": no clamp on
+the speed, the rate loop at 500 Hz; "clamp": the paper's, at 100 Hz. Writes evaders.json
+and .md (`--out`: others).
 """
 
 import dataclasses
@@ -96,9 +97,16 @@ def fly(name: str, options) -> list[dict]:
     for vehicle in options.vehicles:
         bounds = jnp.asarray(vehicles()[vehicle])
         for i, evader in enumerate(SCRIPTED):  # one at a time: no other is worked out
-            flown = run(bounds, loaded.parameters, tasks, jnp.int32(i), jax.random.key(0))
+            flown = run(
+                bounds, loaded.parameters, tasks, jnp.int32(i), jax.random.key(0)
+            )
             for kind, own in part(jax.tree.map(np.asarray, flown)).items():
-                case = {"policy": name, "game": options.game, "vehicle": vehicle, "evader": evader}
+                case = {
+                    "policy": name,
+                    "game": options.game,
+                    "vehicle": vehicle,
+                    "evader": evader,
+                }
                 records.append({**case, "tasks": kind, **summary(own)})
     return records
 
@@ -118,25 +126,36 @@ def summary(statistics: EpisodeStatistics) -> dict:
 
 def study(options) -> dict:
     """Fly the policies."""
-    return {"flights": nested([record for name in options.policy for record in fly(name, options)])}
+    return {
+        "flights": nested(
+            [record for name in options.policy for record in fly(name, options)]
+        )
+    }
 
 
 def nested(records: list[dict]) -> list[dict]:
-    """Records as they are stored: for each policy, game and vehicle the `COUNTS` of each evader and
-    kind of tasks. One after the other, with all their names, they'd be a file of a megabyte.
+    """Records as they are stored: for each policy, game and vehicle the `COUNTS` of
+    each evader and kind of tasks. One after the other, with all their names, they'd be
+    a file of a megabyte.
     """
     flights = {}
     for record in records:
         case = tuple(record[name] for name in CASE)
         if case not in flights:
-            flights[case] = {**dict(zip(CASE, case, strict=True)), "counts": COUNTS, "evaders": {}}
+            flights[case] = {
+                **dict(zip(CASE, case, strict=True)),
+                "counts": COUNTS,
+                "evaders": {},
+            }
         tasks = flights[case]["evaders"].setdefault(record["evader"], {})
         tasks[record["tasks"]] = [round(record[name], 5) for name in COUNTS]
     return list(flights.values())
 
 
 def records_of(flights: list[dict]) -> list[dict]:
-    """The records again, one of each policy, game, vehicle, evader and kind of tasks."""
+    """The records again, one of each policy, game, vehicle, evader and kind of
+    tasks.
+    """
     records = []
     for flight in flights:
         case = {name: flight[name] for name in CASE}
@@ -150,8 +169,8 @@ def records_of(flights: list[dict]) -> list[dict]:
 
 
 def page(results: dict) -> Page:
-    """First what matters of each policy and vehicle, then capture rates and crashes by evader, then
-    how it was learnt.
+    """First what matters of each policy and vehicle, then capture rates and crashes by
+    evader, then how it was learnt.
     """
     by_policy = defaultdict(list)
     for record in records_of(results["flights"]):
@@ -167,12 +186,17 @@ def page(results: dict) -> Page:
         "worst evader, uniform tasks": "worst.uniform",
         "worst evader, layouts": "worst.layouts",
     }
-    rows = [dict(zip(CASE, name, strict=True)) | overview(own) for name, own in by_policy.items()]
+    rows = [
+        dict(zip(CASE, name, strict=True)) | overview(own)
+        for name, own in by_policy.items()
+    ]
     parts: list[Table | str] = [from_outside(), Table(columns, rows, title="Overview")]
     parts += [*told(results, "findings", "What was found"), everyone(by_policy)]
     for name, own in by_policy.items():
         if name[0] == DEFAULT_POLICY:
-            parts.append(by_evader(own, f"{name[0]}, {name[1]} game, {name[2]} vehicle"))
+            parts.append(
+                by_evader(own, f"{name[0]}, {name[1]} game, {name[2]} vehicle")
+            )
     if "runs" in results:
         parts.append(whole_runs(results["runs"]))
     parts += told(results, "tried", "What else was tried") + told(
@@ -195,7 +219,10 @@ def from_outside() -> Table:
     def rate(place: str) -> Callable:
         return lambda row: f"{row['capture_rate'][place]:.2f}".removeprefix("0")
 
-    columns = {"evaders from outside": "evader", **{place: rate(place) for place in places}}
+    columns = {
+        "evaders from outside": "evader",
+        **{place: rate(place) for place in places},
+    }
     prose = (
         f"Tried from outside, at {stored['commit']} on {stored['machine']}, with evaders of other "
         f"code: {stored['episodes_a_layout']} episodes a layout, {stored['uniform_tasks']} uniform "
@@ -205,15 +232,22 @@ def from_outside() -> Table:
 
 
 def summary_table(by_policy: dict[tuple, list[dict]]) -> Table:
-    """What stands on the page: evaders from outside, then this package's own scripted ones."""
+    """What stands on the page: evaders from outside, then this package's own scripted
+    ones.
+    """
     outside = from_outside()
     records = by_policy.get((DEFAULT_POLICY, "honest", "nominal"), [])
     rows = list(outside.records)
     trained = [name for name in SCRIPTED if name not in HELD_OUT]
-    for name, evaders in (("six that no training met", HELD_OUT), ("the other six", trained)):
+    for name, evaders in (
+        ("six that no training met", HELD_OUT),
+        ("the other six", trained),
+    ):
         least = {}
         for place in (*SCENARIOS, "uniform"):
-            cell = [r for r in records if r["tasks"] == place and r["evader"] in evaders]
+            cell = [
+                r for r in records if r["tasks"] == place and r["evader"] in evaders
+            ]
             least[place] = min((r["capture_rate"] for r in cell), default=math.nan)
         rows.append({"evader": f"own scripted evaders, {name}", "capture_rate": least})
     return Table(outside.columns, rows)
@@ -223,14 +257,15 @@ def told(results: dict, name: str, title: str) -> list[str]:
     """A section of what is told in words, if anything is."""
     found = results.get(name, ())
     lines = [
-        f"* {line}: {found[line]}" if isinstance(found, dict) else f"* {line}" for line in found
+        f"* {line}: {found[line]}" if isinstance(found, dict) else f"* {line}"
+        for line in found
     ]
     return ["\n".join([f"## {title}", "", *lines])] if lines else []
 
 
 def overview(records: list[dict]) -> dict:
-    """Of one policy and vehicle: the paper's evader on the layouts, the held-out ones, the worst
-    cells.
+    """Of one policy and vehicle: the paper's evader on the layouts, the held-out ones,
+    the worst cells.
     """
     places = {"layouts": [r for r in records if r["tasks"] in SCENARIOS]}
     places["uniform"] = [r for r in records if r["tasks"] == "uniform"]
@@ -258,7 +293,11 @@ def everyone(by_policy: dict[tuple, list[dict]]) -> Table:
         if (game, vehicle) == ("honest", "nominal"):
             rows.append({"policy": policy})
             for evader in SCRIPTED:
-                own = [r for r in records if r["evader"] == evader and r["tasks"] in SCENARIOS]
+                own = [
+                    r
+                    for r in records
+                    if r["evader"] == evader and r["tasks"] in SCENARIOS
+                ]
                 captures, episodes = (
                     sum(r[name] for r in own) for name in ("captures", "episodes")
                 )
@@ -266,7 +305,10 @@ def everyone(by_policy: dict[tuple, list[dict]]) -> Table:
                 rows[-1][evader] = f"{captures / episodes:.2f} [{low:.2f}, {high:.2f}]"
     prose = "Captures in the six layouts, 95 % interval; honest game, nominal vehicle."
     return Table(
-        {name: name for name in ("policy", *SCRIPTED)}, rows, "Everyone against everyone", prose
+        {name: name for name in ("policy", *SCRIPTED)},
+        rows,
+        "Everyone against everyone",
+        prose,
     )
 
 
@@ -274,22 +316,39 @@ def by_evader(records: list[dict], title: str) -> Table:
     """A row for each evader, a column for each kind of tasks."""
     rows = []
     for evader in dict.fromkeys(record["evader"] for record in records):
-        own = {record["tasks"]: record for record in records if record["evader"] == evader}
-        rates = {name: f"{r['capture_rate']:.3f}, {r['crash_rate']:.3f}" for name, r in own.items()}
+        own = {
+            record["tasks"]: record for record in records if record["evader"] == evader
+        }
+        rates = {
+            name: f"{r['capture_rate']:.3f}, {r['crash_rate']:.3f}"
+            for name, r in own.items()
+        }
         least = min(wilson(r["captures"], r["episodes"])[0] for r in own.values())
         rows.append({"evader": evader, "of": EVADERS[evader].of, **rates, "low": least})
     columns = {"evader": "evader", "used for": "of", **{name: name for name in own}}
-    prose = "The last column is the least lower end of the capture rates' 95 % intervals."
+    prose = (
+        "The last column is the least lower end of the capture rates' 95 % intervals."
+    )
     return Table(columns | {"least lower end": "low:.3f"}, rows, title, prose)
 
 
 def whole_runs(runs: list[dict]) -> Table:
-    """What training runs scored on their validation tasks, where best and at the end."""
+    """What training runs scored on their validation tasks, where best and at the
+    end.
+    """
     rows = []
     for run in runs:
-        shown = max(run["validations"], key=lambda row: row["score"]), run["validations"][-1]
+        shown = (
+            max(run["validations"], key=lambda row: row["score"]),
+            run["validations"][-1],
+        )
         rows += [{"run": run["run"], **row} for row in shown]
-    columns = {"run": "run", "M steps": "millions:.0f", "s": "seconds:.0f", "score": "score:.3f"}
+    columns = {
+        "run": "run",
+        "M steps": "millions:.0f",
+        "s": "seconds:.0f",
+        "score": "score:.3f",
+    }
     columns |= {
         "capture": "capture_rate:.3f",
         "crash": "crash_rate:.3f",
@@ -307,7 +366,10 @@ def main(arguments: list[str]) -> int:
     """Evaluate and write both files."""
     parser = page_parser(__doc__, "evaders")
     parser.add_argument(
-        "--policy", nargs="+", default=["flight", "evaders"], help="names, runs or files"
+        "--policy",
+        nargs="+",
+        default=["flight", "evaders"],
+        help="names, runs or files",
     )
     parser.add_argument("--game", choices=GAMES, default="honest")
     parser.add_argument("--physics", choices=("rigid", "stops"), default="rigid")

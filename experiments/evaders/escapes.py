@@ -1,9 +1,10 @@
-"""How evaders that plan get away: `python -m experiments.evaders.escapes --json FILE [--clock S]`.
+"""How evaders that plan get away: `python -m experiments.evaders.escapes --json FILE
+[--clock S]`.
 
-Records where everybody is in episodes against a planner, and says of the episodes without a
-capture, second by second, how fast the pursuers fly, how near they are, whether they see the
-evader, and how they stand round it. With `--clock` the time that the pursuers observe stands still
-from then on, and the planner knows it.
+Records where everybody is in episodes against a planner, and says of the episodes
+without a capture, second by second, how fast the pursuers fly, how near they are,
+whether they see the evader, and how they stand round it. With `--clock` the time that
+the pursuers observe stands still from then on, and the planner knows it.
 """
 
 import time
@@ -61,18 +62,24 @@ def moment(state: PursuitState) -> Moment:
     """What is kept of worlds (B, ...)."""
     drones = state.drones
     captured = state.statistics.captured
-    return Moment(drones.position, drones.velocity, state.evader_position, state.seen, captured)
+    return Moment(
+        drones.position, drones.velocity, state.evader_position, state.seen, captured
+    )
 
 
 def record(planner: Planner, parameters, tasks, key) -> Moment:
-    """An episode of the planner on each of tasks (B, ...), a moment each time it plans."""
-    flown = planner.fly_and_keep(parameters, planner.duel.start(tasks, key), key, moment)
+    """An episode of the planner on each of tasks (B, ...), a moment each time it
+    plans.
+    """
+    flown = planner.fly_and_keep(
+        parameters, planner.duel.start(tasks, key), key, moment
+    )
     return flown[1]
 
 
 def open_angle(moments: Moment) -> np.ndarray:
-    """(T, B) degrees, the widest angle from above between neighbouring pursuers round the
-    evader.
+    """(T, B) degrees, the widest angle from above between neighbouring pursuers round
+    the evader.
     """
     offset = moments.pursuers - moments.evader[:, :, None]
     angle = np.sort(np.arctan2(offset[..., 1], offset[..., 0]), axis=-1)
@@ -81,7 +88,9 @@ def open_angle(moments: Moment) -> np.ndarray:
 
 
 def summary(moments: Moment, game: PursuitSettings, replan: int) -> dict:
-    """Of one kind of tasks: captures, and medians over the episodes without one, for each second."""
+    """Of one kind of tasks: captures, and medians over the episodes without one, for
+    each second.
+    """
     free = ~moments.captured[-1]
     found = {"episodes": len(free), "captures": int((~free).sum())}
     if not free.any():
@@ -95,7 +104,10 @@ def summary(moments: Moment, game: PursuitSettings, replan: int) -> dict:
         "open_angle": open_angle(moments),
         "spread_in_height": np.ptp(height, axis=-1),
     }
-    shares = {"seen": moments.seen, "all_above_or_below": np.abs(side.sum(-1)) == side.shape[-1]}
+    shares = {
+        "seen": moments.seen,
+        "all_above_or_below": np.abs(side.sum(-1)) == side.shape[-1],
+    }
     second = round(1.0 / (game.time_step * replan))
 
     def each_second(value, over):
@@ -110,7 +122,9 @@ def main() -> None:
     """The command."""
     parser = game_parser(__doc__, episodes=10, uniform=24)
     parser.add_argument("--plans", type=int, default=PlannerSettings().plans)
-    parser.add_argument("--clock", type=float, help="seconds after which the observed time stops")
+    parser.add_argument(
+        "--clock", type=float, help="seconds after which the observed time stops"
+    )
     options = parser.parse_args()
     game = judged_game(options)
     settings = game.environment.settings
@@ -124,10 +138,15 @@ def main() -> None:
     for kind, tasks in game.part(game.tasks).items():
         began = time.monotonic()
         flown = fly(game.loaded.parameters, tasks, jax.random.key(options.seed))
-        own = summary(jax.tree.map(np.asarray, flown), settings, planner.settings.replan)
+        own = summary(
+            jax.tree.map(np.asarray, flown), settings, planner.settings.replan
+        )
         found["kinds"][kind] = own
         seconds = time.monotonic() - began
-        print(f"{kind}, {seconds:.0f} s: {own['captures']} of {own['episodes']} caught", flush=True)
+        print(
+            f"{kind}, {seconds:.0f} s: {own['captures']} of {own['episodes']} caught",
+            flush=True,
+        )
         write_json(options.json, found)
 
 

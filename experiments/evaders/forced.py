@@ -1,8 +1,10 @@
-"""What inertia takes away: `python -m experiments.evaders.forced --json FILE [--map FILE]`.
+"""What inertia takes away: `python -m experiments.evaders.forced --json FILE [--map
+FILE]`.
 
-In the cells of the map in which a theorem forces a capture for points (`openjax.baselines.stack`), it
-flies stack by points, who should catch in all of them, and stack by vehicles, from the same starts.
-With the map of a policy (`openjax map --json FILE`) its captures in the same cells stand beside.
+In the cells of the map in which a theorem forces a capture for points
+(`openjax.baselines.stack`), it flies stack by points, who should catch in all of them,
+and stack by vehicles, from the same starts. With the map of a policy (`openjax map
+--json FILE`) its captures in the same cells stand beside.
 """
 
 import argparse
@@ -26,8 +28,8 @@ from openjax.runs.machine import describe_machine
 from openjax.runs.options import MapCommand
 
 WITHIN = 0.95
-"""Cells count whose speed ratio is below this share of the bound: at the bound itself a capture takes
-for ever.
+"""Cells count whose speed ratio is below this share of the bound: at the bound itself a
+capture takes for ever.
 """
 
 
@@ -38,11 +40,19 @@ def forced_cells(command: MapCommand, size: int) -> list[Cell]:
         game = PursuitSettings(num_pursuers=size, capture_radius=cell.capture_radius)
         return cell.speed_ratio < WITHIN * stack_bound(game)
 
-    return [cell for cell in cells_of(command) if cell.num_pursuers == size and is_forced(cell)]
+    return [
+        cell
+        for cell in cells_of(command)
+        if cell.num_pursuers == size and is_forced(cell)
+    ]
 
 
-def fly(environment: Pursuit, act, command: MapCommand, cells: list[Cell]) -> np.ndarray:
-    """(cells, episodes) whether each episode ends with a capture; `act` observation -> (N, 4)."""
+def fly(
+    environment: Pursuit, act, command: MapCommand, cells: list[Cell]
+) -> np.ndarray:
+    """(cells, episodes) whether each episode ends with a capture; `act` observation ->
+    (N, 4).
+    """
 
     def one(key, cell):
         task = draw_task(environment.settings, command, key, cell)
@@ -71,7 +81,9 @@ def flown(size: int, command: MapCommand) -> dict:
     parameters = stack.parameters()
     kinds = {
         "points": fly(points, lambda seen: team.act({}, seen), command, cells),
-        "vehicles": fly(vehicles, lambda seen: stack.act(parameters, seen), command, cells),
+        "vehicles": fly(
+            vehicles, lambda seen: stack.act(parameters, seen), command, cells
+        ),
     }
     records = []
     for place, cell in enumerate(cells):
@@ -79,7 +91,10 @@ def flown(size: int, command: MapCommand) -> dict:
         for kind, caught in kinds.items():
             hits = int(caught[place].sum())
             interval = list(wilson(hits, command.episodes))
-            record[kind] = {"capture_rate": hits / command.episodes, "interval": interval}
+            record[kind] = {
+                "capture_rate": hits / command.episodes,
+                "interval": interval,
+            }
         records.append(record)
     return {
         "pursuers": size,
@@ -90,16 +105,23 @@ def flown(size: int, command: MapCommand) -> dict:
 
 def of_policy(path: Path, teams: list[dict]) -> list[dict]:
     """A policy's captures in the same cells, means by size of team."""
-    cells = {tuple(cell[name] for name in Cell._fields): cell for cell in read_json(path)["cells"]}
+    cells = {
+        tuple(cell[name] for name in Cell._fields): cell
+        for cell in read_json(path)["cells"]
+    }
     rows = []
     for team in teams:
-        same = [cells[tuple(own[name] for name in Cell._fields)] for own in team["cells"]]
+        same = [
+            cells[tuple(own[name] for name in Cell._fields)] for own in team["cells"]
+        ]
         row = {
             "pursuers": team["pursuers"],
             "scripted": float(np.mean([cell["capture_rate"] for cell in same])),
         }
         if all("learned" in cell for cell in same):
-            row["learned"] = float(np.mean([cell["learned"]["capture_rate"] for cell in same]))
+            row["learned"] = float(
+                np.mean([cell["learned"]["capture_rate"] for cell in same])
+            )
         rows.append(row)
     return rows
 
@@ -120,7 +142,9 @@ def main() -> None:
         began = time.monotonic()
         # of one size, so that no slot is empty
         found["teams"].append(flown(size, dataclasses.replace(command, sizes=(size,))))
-        row = {name: value for name, value in found["teams"][-1].items() if name != "cells"}
+        row = {
+            name: value for name, value in found["teams"][-1].items() if name != "cells"
+        }
         print(row, f"{time.monotonic() - began:.0f} s", flush=True)
         write_json(options.json, found)
     if options.map is not None:

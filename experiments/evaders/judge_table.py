@@ -1,8 +1,10 @@
-"""What `judge.sh` found: `python -m experiments.evaders.judge_table DIRECTORY [DIRECTORY ...]`.
+"""What `judge.sh` found: `python -m experiments.evaders.judge_table DIRECTORY
+[DIRECTORY ...]`.
 
-Prints, of each directory's policy, the least capture rates of all judges with the interval of the
-least over learners and planner, what the planners of `planner_price` find beside, crashes, and how
-long the paper's evader is free, as a multiple of the first directory's.
+Prints, of each directory's policy, the least capture rates of all judges with the
+interval of the least over learners and planner, what the planners of `planner_price`
+find beside, crashes, and how long the paper's evader is free, as a multiple of the
+first directory's.
 """
 
 import argparse
@@ -22,8 +24,12 @@ SECOND = "learners and planner"
 """The row that goals are about."""
 
 
-def rows_of(found: dict, of_each: Callable[[dict], str]) -> Iterator[tuple[str, list[str]]]:
-    """Names of judges and a cell for each kind of tasks; what hasn't flown is a dash."""
+def rows_of(
+    found: dict, of_each: Callable[[dict], str]
+) -> Iterator[tuple[str, list[str]]]:
+    """Names of judges and a cell for each kind of tasks; what hasn't flown is a
+    dash.
+    """
     kinds = JUDGES | {
         SECOND: lambda evader: evader.startswith(("learned", "planner")),
         **{name: lambda evader, name=name: evader == name for name in HELD_OUT},
@@ -48,8 +54,8 @@ def paper_steps(found: dict) -> dict[str, float]:
 
 
 def lines_of(directory: Path, today: dict[str, dict]) -> Iterator[str]:
-    """The lines of one directory; `today` are the paper's evader's steps by vehicles, to compare
-    with.
+    """The lines of one directory; `today` are the paper's evader's steps by vehicles,
+    to compare with.
     """
     for name in FILES:
         path = directory / f"{name}.json"
@@ -77,7 +83,9 @@ def lines_of(directory: Path, today: dict[str, dict]) -> Iterator[str]:
         found = read_json(path)
         for planner, seconds in found["seconds"].items():
             own = [record for record in found["records"] if record["evader"] == planner]
-            rates = {record["scenario"]: f"{record['capture_rate']:.2f}" for record in own}
+            rates = {
+                record["scenario"]: f"{record['capture_rate']:.2f}" for record in own
+            }
             cells = (rates.get(place, "-") for place in PLACES)
             yield f"| planner, {planner} ({seconds:.0f} s) | {' | '.join(cells)} |"
 

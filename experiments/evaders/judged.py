@@ -1,10 +1,12 @@
-"""Policies before the second judge: `python -m experiments.evaders.judged NAME=FILE ...`.
+"""Policies before the second judge: `python -m experiments.evaders.judged NAME=FILE
+...`.
 
-Each FILE is what `openjax exploit --policy NAME --json FILE` wrote: evaders that learned against
-the policy, one that plans in the true simulation, and the scripted ones; or what the programs
-`limit` and `apart` beside this one wrote. None of them trained the pursuers. The slower vehicle is
-`--effects experiments/flying/slower.toml`. Stores the least capture rate of each kind, makes the
-table of judged.md, and writes the rows of weights that ship into README and model cards.
+Each FILE is what `openjax exploit --policy NAME --json FILE` wrote: evaders that
+learned against the policy, one that plans in the true simulation, and the scripted
+ones; or what the programs `limit` and `apart` beside this one wrote. None of them
+trained the pursuers. The slower vehicle is `--effects experiments/flying/slower.toml`.
+Stores the least capture rate of each kind, makes the table of judged.md, and writes the
+rows of weights that ship into README and model cards.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -42,8 +44,12 @@ JUDGES: Mapping[str, Callable[[str], bool]] = {
     "both plan, evader last, as they see": lambda evader: (
         evader == "both plan, evader last, honest sight"
     ),
-    "both plan, pursuers last, points": lambda evader: evader == "both plan, pursuers last, points",
-    "both plan, evader last, points": lambda evader: evader == "both plan, evader last, points",
+    "both plan, pursuers last, points": lambda evader: (
+        evader == "both plan, pursuers last, points"
+    ),
+    "both plan, evader last, points": lambda evader: (
+        evader == "both plan, evader last, points"
+    ),
     "scripted ones, held out": lambda evader: evader in HELD_OUT,
     "the paper's": lambda evader: evader == "field",
 }
@@ -51,7 +57,9 @@ JUDGES: Mapping[str, Callable[[str], bool]] = {
 
 
 def row(policy: str, vehicle: str, judge: str, records: list[dict]) -> dict:
-    """The evader of a kind that is caught least in each kind of tasks, with intervals of 95 %."""
+    """The evader of a kind that is caught least in each kind of tasks, with intervals
+    of 95 %.
+    """
     worst = verdict(records)
     figures = ("capture_rate", "interval", "crash_rate")
     return {
@@ -60,7 +68,10 @@ def row(policy: str, vehicle: str, judge: str, records: list[dict]) -> dict:
         "judge": judge,
         "evaders": len({record["evader"] for record in records}),
         "shown": policy == DEFAULT_POLICY and vehicle == "nominal" and judge in FOR_ALL,
-        **{figure: {own["scenario"]: own[figure] for own in worst} for figure in figures},
+        **{
+            figure: {own["scenario"]: own[figure] for own in worst}
+            for figure in figures
+        },
     }
 
 
@@ -113,7 +124,8 @@ def page(results: Mapping) -> Page:
 
     columns = {
         "policy": lambda row: (
-            row["policy"] + ("" if row["vehicle"] == "nominal" else f", {row['vehicle']} vehicle")
+            row["policy"]
+            + ("" if row["vehicle"] == "nominal" else f", {row['vehicle']} vehicle")
         ),
         "caught least among": "judge",
         **{place: rate(place) for place in PLACES},
@@ -122,13 +134,15 @@ def page(results: Mapping) -> Page:
     rows = [row for row in results["rows"] if is_shown(row, results.get("hidden", []))]
     policies = [row["policy"] for row in rows]
     order = tuple(JUDGES)
-    rows.sort(key=lambda row: (policies.index(row["policy"]), order.index(row["judge"])))
+    rows.sort(
+        key=lambda row: (policies.index(row["policy"]), order.index(row["judge"]))
+    )
     return Page("The second judge", "Least capture rates.", Table(columns, rows))
 
 
 def is_shown(row: Mapping, hidden: Sequence[str]) -> bool:
-    """Whether the table has a row: of weights that don't ship, only what finds most, and what the
-    game allows.
+    """Whether the table has a row: of weights that don't ship, only what finds most,
+    and what the game allows.
     """
     finds_most = row["judge"] in tuple(JUDGES)[:2] or row["judge"].startswith(LIMITS)
     is_hidden = {row["policy"], f"{row['policy']}: {row['judge']}"} & set(hidden)
@@ -136,18 +150,27 @@ def is_shown(row: Mapping, hidden: Sequence[str]) -> bool:
 
 
 def write_summaries(rows: Sequence[Mapping]) -> None:
-    """The rows of weights that ship, and of those before them, on the pages that users read."""
+    """The rows of weights that ship, and of those before them, on the pages that users
+    read.
+    """
     heads = ["policy", "caught least among", *PLACES]
     lines = ["| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]
     order = tuple(JUDGES)
     policies = [row["policy"] for row in rows]
-    for row in sorted(rows, key=lambda r: (policies.index(r["policy"]), order.index(r["judge"]))):
+    for row in sorted(
+        rows, key=lambda r: (policies.index(r["policy"]), order.index(r["judge"]))
+    ):
         if row["shown"]:
-            rates = (f"{row['capture_rate'][place]:.2f}".removeprefix("0") for place in PLACES)
+            rates = (
+                f"{row['capture_rate'][place]:.2f}".removeprefix("0")
+                for place in PLACES
+            )
             lines.append(f"| {row['policy']} | {row['judge']} | {' | '.join(rates)} |")
     for page in SUMMARIES:
         path = RESULTS.parent.parent / page
-        before, begin, rest = path.read_text(encoding="utf-8").partition("<!-- judged -->")
+        before, begin, rest = path.read_text(encoding="utf-8").partition(
+            "<!-- judged -->"
+        )
         after = rest.partition("<!-- end of judged -->")[2]
         text = "\n".join([before + begin, *lines, "<!-- end of judged -->"])
         write_text(path, text + after)
@@ -157,7 +180,9 @@ def main(arguments: list[str]) -> None:
     """The command."""
     parser = page_parser(__doc__, "judged")
     parser.add_argument("exploited", nargs="*", metavar="NAME=FILE")
-    parser.add_argument("--hide", nargs="*", help="POLICY or 'POLICY: JUDGE': rows that stay out")
+    parser.add_argument(
+        "--hide", nargs="*", help="POLICY or 'POLICY: JUDGE': rows that stay out"
+    )
     options = parser.parse_args(arguments)
     publish(options, study, page)
     if options.out == RESULTS / "judged":

@@ -1,4 +1,6 @@
-"""The game and the tasks by which a policy is judged, for programs beside `openjax exploit`."""
+"""The game and the tasks by which a policy is judged, for programs beside `openjax
+exploit`.
+"""
 
 import argparse
 import dataclasses
@@ -41,25 +43,37 @@ class JudgedGame:
 
     @property
     def flown(self) -> dict:
-        """Whose game it was: policy, vehicle and effects, as `openjax exploit` stores them."""
+        """Whose game it was: policy, vehicle and effects, as `openjax exploit` stores
+        them.
+        """
         vehicle = self.options.vehicle or self.environment.settings.airframe
         effects = self.environment.effect_parameters
-        return {"policy": self.loaded.source, "vehicle": str(vehicle), "effects": effects}
+        return {
+            "policy": self.loaded.source,
+            "vehicle": str(vehicle),
+            "effects": effects,
+        }
 
     def records_kept(self, name: str, fly: Callable, found: dict, path: Path) -> None:
-        """Fly one evader, and write its records beside those that are `found`, and its seconds,
-        after every part of the tasks; `fly` (parameters, tasks, key) -> statistics (B,), traceable.
+        """Fly one evader, and write its records beside those that are `found`, and its
+        seconds, after every part of the tasks; `fly` (parameters, tasks, key) ->
+        statistics (B,), traceable.
         """
         self._keep(name, self._flown_in_parts(jax.jit(fly)), found, path)
 
-    def replanned_kept(self, name: str, judge: Replanning, found: dict, path: Path) -> None:
-        """The same of who plans again and again, `--slots` episodes side by side: one makes room
-        for the next as soon as its evader is caught, so that no crash after that is counted.
+    def replanned_kept(
+        self, name: str, judge: Replanning, found: dict, path: Path
+    ) -> None:
+        """The same of who plans again and again, `--slots` episodes side by side: one
+        makes room for the next as soon as its evader is caught, so that no crash after
+        that is counted.
         """
         self._keep(name, self._flown_in_slots(judge), found, path)
 
     def _keep(self, name, all_flown, found, path):
-        """Write records of all that has flown, {place: statistics ()}, each time there is more."""
+        """Write records of all that has flown, {place: statistics ()}, each time there
+        is more.
+        """
         began = time.monotonic()
         before = found["records"]
         for flown in all_flown:
@@ -94,11 +108,14 @@ class JudgedGame:
         together = min(self.options.together or order.size, order.size)
         flown = {}
         for begin in range(0, order.size, together):
-            # the last part is filled up with tasks that have been flown: one program for all
+            # the last part is filled up with tasks that have been flown: one program
+            # for all
             places = order[min(begin, order.size - together) :][:together]
             key = jax.random.fold_in(jax.random.key(self.options.seed), begin)
             tasks = jax.tree.map(lambda leaf, here=places: leaf[here], self.tasks)
-            statistics = jax.tree.map(np.asarray, fly(self.loaded.parameters, tasks, key))
+            statistics = jax.tree.map(
+                np.asarray, fly(self.loaded.parameters, tasks, key)
+            )
             for i, place in enumerate(places.tolist()):
                 flown[place] = jax.tree.map(operator.itemgetter(i), statistics)
             yield flown
@@ -108,12 +125,16 @@ class JudgedGame:
         slots = min(self.options.slots, order.size)
         length = self.environment.settings.episode_length
         key = jax.random.key(self.options.seed)
-        start = jax.jit(lambda tasks: judge.begin(judge.duel.start(tasks, key)))(self.tasks)
+        start = jax.jit(lambda tasks: judge.begin(judge.duel.start(tasks, key)))(
+            self.tasks
+        )
         replan = jax.jit(judge.replan)
 
         @jax.jit
         def begin(carry, slot, place):
-            return jax.tree.map(lambda leaf, new: leaf.at[slot].set(new[place]), carry, start)
+            return jax.tree.map(
+                lambda leaf, new: leaf.at[slot].set(new[place]), carry, start
+            )
 
         left = order.tolist()
         flies = [left.pop(0) for _ in range(slots)]
@@ -126,9 +147,12 @@ class JudgedGame:
             over = np.asarray(state.statistics.captured | (state.step >= length))
             before = len(flown)
             for slot in np.flatnonzero(over).tolist():
-                ended = jax.tree.map(lambda leaf, i=slot: np.asarray(leaf[i]), state.statistics)
+                ended = jax.tree.map(
+                    lambda leaf, i=slot: np.asarray(leaf[i]), state.statistics
+                )
                 flown.setdefault(flies[slot], ended)
-                # with none left, the slot flies on with what it has, and that isn't kept
+                # with none left, the slot flies on with what it has, and that isn't
+                # kept
                 if left:
                     flies[slot] = left.pop(0)
                     carry = begin(carry, slot, flies[slot])
@@ -137,25 +161,35 @@ class JudgedGame:
 
 
 def spread(sizes: Sequence[int]) -> np.ndarray:
-    """Places of things that lie kind after kind, in an order in which each beginning has of every
-    kind the share that the whole has.
+    """Places of things that lie kind after kind, in an order in which each beginning
+    has of every kind the share that the whole has.
     """
     share = np.concatenate([(np.arange(size) + 0.5) / size for size in sizes])
     return np.argsort(share, kind="stable")
 
 
-def game_parser(doc: str | None, episodes: int, uniform: int) -> argparse.ArgumentParser:
+def game_parser(
+    doc: str | None, episodes: int, uniform: int
+) -> argparse.ArgumentParser:
     """The options of `judged_game`."""
     parser = argparse.ArgumentParser(description=doc)
     parser.add_argument("--policy", default="evaders")
-    parser.add_argument("--vehicle", type=Path, help="vehicle.toml; by default the nominal one")
+    parser.add_argument(
+        "--vehicle", type=Path, help="vehicle.toml; by default the nominal one"
+    )
     parser.add_argument("--effects", type=Path, help="effects.toml")
     parser.add_argument("--episodes", type=int, default=episodes, help="of each layout")
     parser.add_argument("--uniform", type=int, default=uniform, help="uniform tasks")
-    parser.add_argument("--kinds", nargs="*", help="layouts and uniform; by default all")
-    parser.add_argument("--together", type=int, help="tasks that fly side by side; by default all")
     parser.add_argument(
-        "--slots", type=int, help="episodes side by side that end with the capture; for a CPU"
+        "--kinds", nargs="*", help="layouts and uniform; by default all"
+    )
+    parser.add_argument(
+        "--together", type=int, help="tasks that fly side by side; by default all"
+    )
+    parser.add_argument(
+        "--slots",
+        type=int,
+        help="episodes side by side that end with the capture; for a CPU",
     )
     parser.add_argument("--steps", type=int, help="of an episode, to try it")
     parser.add_argument("--seed", type=int, default=0)
@@ -164,7 +198,9 @@ def game_parser(doc: str | None, episodes: int, uniform: int) -> argparse.Argume
 
 
 def judged_game(options: argparse.Namespace) -> JudgedGame:
-    """As `openjax exploit` has it: one vehicle, honest physics, the reward counts for nothing."""
+    """As `openjax exploit` has it: one vehicle, honest physics, the reward counts for
+    nothing.
+    """
     cache_programs()
     loaded = load_policy(options.policy)
     own = loaded.settings.environment
@@ -183,6 +219,10 @@ def judged_game(options: argparse.Namespace) -> JudgedGame:
     if options.kinds:
         unknown = [kind for kind in options.kinds if kind not in kinds]
         if unknown:
-            raise UserError(f"--kinds {unknown[0]}: these are known: {', '.join(kinds)}")
+            raise UserError(
+                f"--kinds {unknown[0]}: these are known: {', '.join(kinds)}"
+            )
         kinds = {kind: kinds[kind] for kind in options.kinds}
-    return JudgedGame(environment, loaded.in_game(environment), *stacked(kinds), options)
+    return JudgedGame(
+        environment, loaded.in_game(environment), *stacked(kinds), options
+    )

@@ -1,8 +1,9 @@
 """What can be held at all: `python -m experiments.evaders.limit --json FILE`.
 
-Both sides plan in the true simulation, the pursuers with the policy among their plans; records as
-`openjax exploit --json` writes them, of the game in which the pursuers choose last, which bounds
-the captures from above, and of the one in which the evader does.
+Both sides plan in the true simulation, the pursuers with the policy among their plans;
+records as `openjax exploit --json` writes them, of the game in which the pursuers
+choose last, which bounds the captures from above, and of the one in which the evader
+does.
 """
 
 import argparse
@@ -39,7 +40,9 @@ def vehicles_flight(environment: Pursuit) -> VelocityFlight:
 
     def action(observation, state, velocity):
         drones = state.drones
-        known = jnp.concatenate([drones.position, drones.quaternion, drones.velocity], axis=-1)
+        known = jnp.concatenate(
+            [drones.position, drones.quaternion, drones.velocity], axis=-1
+        )
         return velocity_action(craft, observation.replace(self_state=known), velocity)
 
     return action
@@ -55,8 +58,8 @@ def ways_round_pillars(settings: PursuitSettings) -> Ways:
 
 
 def points_in(game: JudgedGame) -> tuple[Duel, VelocityFlight]:
-    """The same tasks with pursuers that have no inertia; in the policy's place they stay where they
-    are.
+    """The same tasks with pursuers that have no inertia; in the policy's place they
+    stay where they are.
     """
     settings = game.environment.settings
     points = Points(settings.max_speed, settings.time_step)
@@ -75,17 +78,33 @@ def limit_parser() -> argparse.ArgumentParser:
     """The options."""
     defaults = MatrixGameSettings()
     parser = game_parser(__doc__, episodes=16, uniform=48)
-    parser.add_argument("--plans", type=int, default=defaults.team_plans, help="of the pursuers")
     parser.add_argument(
-        "--direct_plans", type=int, default=defaults.direct_plans, help="beside, without the policy"
+        "--plans", type=int, default=defaults.team_plans, help="of the pursuers"
     )
-    parser.add_argument("--evader_plans", type=int, help="by default as many as --plans")
-    parser.add_argument("--pieces", type=int, default=defaults.pieces, help="of .2 s, of each plan")
-    parser.add_argument("--last", choices=SIDES, nargs="*", default=SIDES, help="who knows all")
     parser.add_argument(
-        "--sight", choices=("full", "honest"), default="full", help="of pursuers that plan"
+        "--direct_plans",
+        type=int,
+        default=defaults.direct_plans,
+        help="beside, without the policy",
     )
-    parser.add_argument("--points", action="store_true", help="pursuers without inertia")
+    parser.add_argument(
+        "--evader_plans", type=int, help="by default as many as --plans"
+    )
+    parser.add_argument(
+        "--pieces", type=int, default=defaults.pieces, help="of .2 s, of each plan"
+    )
+    parser.add_argument(
+        "--last", choices=SIDES, nargs="*", default=SIDES, help="who knows all"
+    )
+    parser.add_argument(
+        "--sight",
+        choices=("full", "honest"),
+        default="full",
+        help="of pursuers that plan",
+    )
+    parser.add_argument(
+        "--points", action="store_true", help="pursuers without inertia"
+    )
     return parser
 
 
@@ -98,7 +117,13 @@ def main() -> None:
     else:
         duel = Duel(game.environment, game.loaded.policy)
         flight = vehicles_flight(game.environment)
-    found = {**game.flown, "sight": options.sight, "plans": {}, "records": [], "seconds": {}}
+    found = {
+        **game.flown,
+        "sight": options.sight,
+        "plans": {},
+        "records": [],
+        "seconds": {},
+    }
     ways = ways_round_pillars(game.environment.settings)
     for side in options.last:
         name = f"both plan, {side} last" + HONEST * (options.sight == "honest")

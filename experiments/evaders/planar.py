@@ -1,14 +1,15 @@
 """The game of two points in a disc, solved: `python -m experiments.evaders.planar`.
 
-A pursuer of speed one and an evader of speed v > 1 in a disc of radius one; both know all. How near
-does the pursuer come? Below that distance as its reach it never captures, above it always does. N
-pursuers that fly one above another are one such pursuer (`openjax.baselines.stack`).
+A pursuer of speed one and an evader of speed v > 1 in a disc of radius one; both know
+all. How near does the pursuer come? Below that distance as its reach it never captures,
+above it always does. N pursuers that fly one above another are one such pursuer
+(`openjax.baselines.stack`).
 
-The state is the pursuer's radius, the evader's, and the angle between them. The distance W that is
-reached is the least of that now and of what both sides then choose: W = min(d, max_e min_p W'), by
-iteration on a grid, whose values between its points are interpolated. If the evader shows its step
-first, W comes out too small, if the pursuer does, too large; both errors shrink with the grid. Writes
-planar.json and .md.
+The state is the pursuer's radius, the evader's, and the angle between them. The
+distance W that is reached is the least of that now and of what both sides then choose:
+W = min(d, max_e min_p W'), by iteration on a grid, whose values between its points are
+interpolated. If the evader shows its step first, W comes out too small, if the pursuer
+does, too large; both errors shrink with the grid. Writes planar.json and .md.
 """
 
 import dataclasses
@@ -51,7 +52,9 @@ class Grid:
         """Radii of the pursuer and of the evader, and angles from 0 to pi."""
         return (
             np.linspace(0.0, 1.0, self.radii),
-            np.linspace(0.0, 1.0, self.evader_radii) if self.evader_radii > 1 else np.ones(1),
+            np.linspace(0.0, 1.0, self.evader_radii)
+            if self.evader_radii > 1
+            else np.ones(1),
             np.linspace(0.0, np.pi, 2 * self.radii - 1),
         )
 
@@ -59,7 +62,9 @@ class Grid:
 def moves(directions: int) -> np.ndarray:
     """(K, 2) unit vectors round the circle, and none."""
     angle = np.linspace(0.0, 2 * np.pi, directions, endpoint=False)
-    return np.stack([np.append(np.cos(angle), 0.0), np.append(np.sin(angle), 0.0)], axis=-1)
+    return np.stack(
+        [np.append(np.cos(angle), 0.0), np.append(np.sin(angle), 0.0)], axis=-1
+    )
 
 
 def polar(radius, move):
@@ -91,13 +96,17 @@ class PlanarGame:
         def improve(_, reached):
             return jnp.minimum(now, last(reached))
 
-        return jax.lax.fori_loop(0, round(self.grid.horizon / self.grid.step), improve, now)
+        return jax.lax.fori_loop(
+            0, round(self.grid.horizon / self.grid.step), improve, now
+        )
 
     def evader_first(self, reached: jax.Array) -> jax.Array:
         """W a step earlier, where the pursuer answers the evader's step."""
 
         def answered(radius, turn):
-            return self._least(lambda place: self._after(reached, place, (radius, turn)))
+            return self._least(
+                lambda place: self._after(reached, place, (radius, turn))
+            )
 
         return self._most(answered)
 
@@ -125,8 +134,11 @@ class PlanarGame:
         reach = self.grid.step * self.ratio
 
         def around(best, way):
-            # along the circle on which it is: on the wall a straight step would lead out of the disc
-            return jnp.maximum(best, value(evader, way * reach / jnp.maximum(evader, reach))), None
+            # along the circle on which it is: on the wall a straight step would lead
+            # out of the disc
+            return jnp.maximum(
+                best, value(evader, way * reach / jnp.maximum(evader, reach))
+            ), None
 
         def straight(best, move):
             return jnp.maximum(best, value(*polar(evader, move))), None
@@ -135,10 +147,14 @@ class PlanarGame:
         best = jax.lax.scan(around, least, jnp.array([-1.0, 0.0, 1.0]))[0]
         if self.grid.evader_radii == 1:
             return best
-        return jax.lax.scan(straight, best, jnp.asarray(moves(self.grid.directions)) * reach)[0]
+        return jax.lax.scan(
+            straight, best, jnp.asarray(moves(self.grid.directions)) * reach
+        )[0]
 
     def _after(self, reached, place, moved):
-        """W where a pursuer at `place` (radius, turn) meets an evader that `moved` likewise."""
+        """W where a pursuer at `place` (radius, turn) meets an evader that `moved`
+        likewise.
+        """
         between = jnp.abs(self.states[2] + moved[1] - place[1])
         between = jnp.where(between > jnp.pi, 2 * jnp.pi - between, between)
         values = zip((place[0], moved[0], between), self.grid.axes, strict=True)
@@ -156,8 +172,8 @@ def middle_distance(grid: Grid, ratio: jax.Array, evader_first: bool) -> jax.Arr
 
 
 def reached_from_the_middle(grid: Grid, ratios: tuple[float, ...]) -> list[list[float]]:
-    """For each ratio how near a pursuer comes that begins in the middle, wherever the evader is:
-    evader first, pursuer first.
+    """For each ratio how near a pursuer comes that begins in the middle, wherever the
+    evader is: evader first, pursuer first.
     """
     values = jnp.asarray(ratios, jnp.float32)
     found = [
@@ -168,7 +184,9 @@ def reached_from_the_middle(grid: Grid, ratios: tuple[float, ...]) -> list[list[
 
 
 def study(options) -> dict:
-    """Grids with the wall, finer and finer, and one pair in which the evader may leave it."""
+    """Grids with the wall, finer and finer, and one pair in which the evader may leave
+    it.
+    """
     wall = [Grid(radii, 1, options.directions) for radii in options.radii]
     free = [Grid(radii, radii, options.free_directions) for radii in options.free_radii]
     alike = [dataclasses.replace(grid, evader_radii=1) for grid in free]
@@ -188,8 +206,8 @@ def _record(grid, ratios):
 
 
 def limits(records: list[dict], i: int) -> np.ndarray:
-    """(2,) where both orders lead at the i-th ratio, if errors are proportional to the spacing of
-    the two finest grids.
+    """(2,) where both orders lead at the i-th ratio, if errors are proportional to the
+    spacing of the two finest grids.
     """
     coarse, fine = records[-2:]
     wide, narrow = (1.0 / (one["grid"]["radii"] - 1) for one in (coarse, fine))
@@ -198,11 +216,14 @@ def limits(records: list[dict], i: int) -> np.ndarray:
 
 
 def values(results: dict) -> list[dict]:
-    """By ratio: how near the pursuer comes to an evader that keeps to the wall, and to one that may
-    leave it, which is worth what coarser grids say.
+    """By ratio: how near the pursuer comes to an evader that keeps to the wall, and to
+    one that may leave it, which is worth what coarser grids say.
     """
     places = range(len(results["free_ratios"]))
-    worth = [np.mean(limits(results["free"], i) - limits(results["wall_alike"], i)) for i in places]
+    worth = [
+        np.mean(limits(results["free"], i) - limits(results["wall_alike"], i))
+        for i in places
+    ]
     rows = []
     for i, ratio in enumerate(results["ratios"]):
         both = limits(results["wall"], i)
@@ -231,8 +252,12 @@ def page(results: dict) -> Page:
         "on one ray": "ray:.3f",
     }
     rows = values(results)
-    shown = Table(columns, [row for row in rows if row["ratio"] not in (1.05, 1.4, 2.25)])
-    return Page("Two points in a disc", "Distances in radii.", [Table(columns, rows)], shown)
+    shown = Table(
+        columns, [row for row in rows if row["ratio"] not in (1.05, 1.4, 2.25)]
+    )
+    return Page(
+        "Two points in a disc", "Distances in radii.", [Table(columns, rows)], shown
+    )
 
 
 def main(arguments: list[str]) -> None:

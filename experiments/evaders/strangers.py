@@ -1,12 +1,15 @@
-"""Teams of strangers, and two evaders at once: `python -m experiments.evaders.strangers`.
+"""Teams of strangers, and two evaders at once: `python -m
+experiments.evaders.strangers`.
 
-Mixed teams of three, by the protocol of ad hoc teamwork (JaxAHT): a policy plays with teammates that
-it never trained with, one or two of them, each seat in turn; its captures are set beside those of
-three such teammates alone, on the same tasks. Intervals are bootstrapped over episodes within each
-teammate. Nothing was chosen by any of it.
+Mixed teams of three, by the protocol of ad hoc teamwork (JaxAHT): a policy plays with
+teammates that it never trained with, one or two of them, each seat in turn; its
+captures are set beside those of three such teammates alone, on the same tasks.
+Intervals are bootstrapped over episodes within each teammate. Nothing was chosen by any
+of it.
 
-Then four pursuers after two evaders: which of them goes for whom is chosen by evaders of the training,
-the figure is that against held-out ones. Writes strangers.json and .md.
+Then four pursuers after two evaders: which of them goes for whom is chosen by evaders
+of the training, the figure is that against held-out ones. Writes strangers.json and
+.md.
 """
 
 import dataclasses
@@ -30,34 +33,48 @@ from openjax.store.policies import load_policy
 
 EGOS = ("teams", "evaders")
 TEAMMATES = ("flight", "flight_seed_1", "flight_seed_2", "no_clamp_seed_0", "janosov")
-"""Those that neither of `EGOS` trained with: three seeds of one recipe, another recipe, a heuristic."""
+"""Those that neither of `EGOS` trained with: three seeds of one recipe, another recipe,
+a heuristic.
+"""
 SEEDS = ("flight", "flight_seed_1", "flight_seed_2")
 TRAINED_WITH = ("field", "greedy", "wall_runner", "slow_hugger")
 """Evaders of the training."""
 
 
 def game_of(policy: str, number: int, evaders: tuple[str, ...]) -> PursuitSettings:
-    """A policy's game with so many pursuers, nominal vehicles, and evaders 1.3 times as fast."""
+    """A policy's game with so many pursuers, nominal vehicles, and evaders 1.3 times as
+    fast.
+    """
     trained = load_policy(policy).settings.environment
     game = dataclasses.replace(
-        trained.of_one_team(number), evaders=evaders, vehicles=(), rare_vehicles=0.0, fall_outs=0.0
+        trained.of_one_team(number),
+        evaders=evaders,
+        vehicles=(),
+        rare_vehicles=0.0,
+        fall_outs=0.0,
     )
-    return dataclasses.replace(game, evader_speed=1.3 * game.max_speed, capture_radius=0.3)
+    return dataclasses.replace(
+        game, evader_speed=1.3 * game.max_speed, capture_radius=0.3
+    )
 
 
 def teams_of(egos: tuple[str, ...], mates: tuple[str, ...]) -> list[tuple[str, ...]]:
-    """All teams of three that are flown: of one policy, of an ego with one or two teammates, of
-    three seeds, and of three methods.
+    """All teams of three that are flown: of one policy, of an ego with one or two
+    teammates, of three seeds, and of three methods.
     """
     found = [(name,) * 3 for name in (*egos, *mates)]
     found += [(ego, mate, mate) for ego in egos for mate in mates]
     found += [(ego, ego, mate) for ego in egos for mate in mates]
     whole = (SEEDS, (*egos, mates[0]))
-    return found + [team for team in whole if len(team) == 3 and set(team) <= {*egos, *mates}]
+    return found + [
+        team for team in whole if len(team) == 3 and set(team) <= {*egos, *mates}
+    ]
 
 
 def fly_teams(options) -> dict:
-    """Captures and crashes (episodes,) of each team on the same tasks, by its members' names."""
+    """Captures and crashes (episodes,) of each team on the same tasks, by its members'
+    names.
+    """
     names = (*options.egos, *options.mates)
     game = game_of(options.egos[0], 3, HELD_OUT)
     environments = []
@@ -78,7 +95,9 @@ def fly_teams(options) -> dict:
         places = np.array([names.index(name) for name in team])
         # each seat in turn, as seats aren't alike to an evader that starts on one side
         members = np.stack([np.roll(places, i) for i in range(options.episodes)])
-        flown = fly(tuple(parameters), tasks, jnp.asarray(members), jax.random.key(options.seed))
+        flown = fly(
+            tuple(parameters), tasks, jnp.asarray(members), jax.random.key(options.seed)
+        )
         found[team] = np.asarray(flown.captured), np.asarray(flown.crashed)
         print(team, found[team][0].mean(), found[team][1].mean(), flush=True)
     return found
@@ -94,9 +113,11 @@ def record(captured: np.ndarray, crashed: np.ndarray) -> dict:
     }
 
 
-def with_strangers(flown: Mapping, ego: str, mates: tuple[str, ...], seats: int) -> dict:
-    """An ego on so many seats over all teammates: the mean of its captures, and of these less those
-    of three such teammates, with intervals.
+def with_strangers(
+    flown: Mapping, ego: str, mates: tuple[str, ...], seats: int
+) -> dict:
+    """An ego on so many seats over all teammates: the mean of its captures, and of
+    these less those of three such teammates, with intervals.
     """
     teams = [(ego,) * seats + (mate,) * (3 - seats) for mate in mates]
     own = np.stack([flown[team][0] for team in teams]).astype(float)
@@ -114,8 +135,8 @@ def with_strangers(flown: Mapping, ego: str, mates: tuple[str, ...], seats: int)
 
 
 def fly_two(options) -> list[dict]:
-    """Four pursuers after two evaders: a record for each choice of targets, against evaders of the
-    training and held-out ones.
+    """Four pursuers after two evaders: a record for each choice of targets, against
+    evaders of the training and held-out ones.
     """
     evaders = (*TRAINED_WITH, *HELD_OUT)
     loaded = load_policy(options.egos[0])
@@ -141,16 +162,27 @@ def fly_two(options) -> list[dict]:
     records = []
     for kind, names in {"training": TRAINED_WITH, "held out": HELD_OUT}.items():
         places = [evaders.index(name) for name in names]
-        kinds = jnp.asarray(generator.choice(places, size=(options.episodes, 2)), jnp.int32)
+        kinds = jnp.asarray(
+            generator.choice(places, size=(options.episodes, 2)), jnp.int32
+        )
         for i, name in enumerate(CHOICES):
             flown = fly(loaded.parameters, keys, kinds, jnp.int32(i))
             both = np.asarray(flown.caught).all(axis=1)
             own = record(both, np.asarray(flown.pursuers.crashed))
-            seconds = np.asarray(flown.steps).max(axis=1)[both] * environment.settings.time_step
+            seconds = (
+                np.asarray(flown.steps).max(axis=1)[both]
+                * environment.settings.time_step
+            )
             one = float(np.asarray(flown.caught).any(axis=1).mean())
             mean = float(seconds.mean()) if both.any() else None
             records.append(
-                {"evaders": kind, "choice": name, **own, "one_caught": one, "seconds": mean}
+                {
+                    "evaders": kind,
+                    "choice": name,
+                    **own,
+                    "one_caught": one,
+                    "seconds": mean,
+                }
             )
             print(records[-1], flush=True)
     return records
@@ -165,7 +197,9 @@ def study(options) -> dict:
         return {"teams": [], "strangers": [], "two": two}
     flown = fly_teams(options)
     return {
-        "teams": [{"members": list(team), **record(*own)} for team, own in flown.items()],
+        "teams": [
+            {"members": list(team), **record(*own)} for team, own in flown.items()
+        ],
         "strangers": [
             with_strangers(flown, ego, options.mates, seats)
             for ego in options.egos
@@ -186,7 +220,8 @@ def page(results: Mapping) -> Page:
     ]
     mixed = [row for row in results["teams"] if len(set(row["members"])) == 3]
     rows += [{**row, "team": ", ".join(row["members"])} for row in mixed]
-    chosen = chosen_choice(results["two"]["records"])  # None where that part wasn't flown
+    # None where that part wasn't flown
+    chosen = chosen_choice(results["two"]["records"])
     rows += [
         {
             **row,
@@ -206,7 +241,11 @@ def page(results: Mapping) -> Page:
     every = {"members": lambda row: ", ".join(row["members"])} | {
         head: columns[head] for head in ("captures", "95 %", "crash rate")
     }
-    two = {"evaders": "evaders", "who goes for whom": "choice", "one caught": "one_caught:.3f"}
+    two = {
+        "evaders": "evaders",
+        "who goes for whom": "choice",
+        "one caught": "one_caught:.3f",
+    }
     two |= {head: columns[head] for head in ("captures", "95 %", "crash rate")}
     parts = [
         short,
@@ -214,12 +253,17 @@ def page(results: Mapping) -> Page:
         Table(two, results["two"]["records"]),
     ]
     return Page(
-        "Teams of strangers, and two evaders", "Three pursuers, uniform tasks.", parts, short
+        "Teams of strangers, and two evaders",
+        "Three pursuers, uniform tasks.",
+        parts,
+        short,
     )
 
 
 def chosen_choice(records: list[dict]) -> str | None:
-    """The choice of targets that catches both most often among evaders of the training."""
+    """The choice of targets that catches both most often among evaders of the
+    training.
+    """
     own = [row for row in records if row["evaders"] == "training"]
     return max(own, key=lambda row: row["capture_rate"])["choice"] if own else None
 
@@ -227,7 +271,11 @@ def chosen_choice(records: list[dict]) -> str | None:
 def draw(results: Mapping, path: Path) -> None:
     """Captures of each ego with each teammate, beside three of that teammate."""
     rates = {tuple(row["members"]): row["capture_rate"] for row in results["teams"]}
-    mates = [team[0] for team in rates if len(set(team)) == 1 and team[0] not in _egos(results)]
+    mates = [
+        team[0]
+        for team in rates
+        if len(set(team)) == 1 and team[0] not in _egos(results)
+    ]
     figure = Figure(figsize=(9, 3.4), layout="constrained")
     axes = figure.subplots()
     place = np.arange(len(mates))
@@ -251,7 +299,9 @@ def _egos(results):
 def main(arguments: list[str]) -> None:
     """The command."""
     parser = page_parser(__doc__, "strangers")
-    parser.add_argument("--egos", nargs="+", default=EGOS, help="policies (the first flies two)")
+    parser.add_argument(
+        "--egos", nargs="+", default=EGOS, help="policies (the first flies two)"
+    )
     parser.add_argument("--mates", nargs="+", default=TEAMMATES)
     parser.add_argument("--only", choices=("teams", "two"), help="one of the two parts")
     parser.add_argument("--episodes", type=int, default=500)

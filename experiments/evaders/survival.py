@@ -1,8 +1,9 @@
 """How long evaders are free: `python -m experiments.evaders.survival FILE ...`.
 
-The files are those of `openjax exploit --json` and of `python -m experiments.evaders.limit --json`
-for one policy. Stores, of each kind of evaders, the share of episodes in which the one that is
-caught least is still free, over time, and draws the picture of judged.md.
+The files are those of `openjax exploit --json` and of `python -m
+experiments.evaders.limit --json` for one policy. Stores, of each kind of evaders, the
+share of episodes in which the one that is caught least is still free, over time, and
+draws the picture of judged.md.
 """
 
 from collections.abc import Mapping
@@ -35,7 +36,9 @@ def curves_of(records: list[dict]) -> list[dict]:
     curves = []
     for kind, belongs in JUDGES.items():
         for place in PLACES:
-            own = [r for r in records if r["scenario"] == place and belongs(r["evader"])]
+            own = [
+                r for r in records if r["scenario"] == place and belongs(r["evader"])
+            ]
             if own:
                 worst = max(own, key=lambda r: np.mean(r["capture_steps"]))
                 curves.append(

@@ -1,8 +1,8 @@
 """The page of teams: `python -m experiments.evaders.teams NAME=FILE ...`.
 
-Each FILE is what `openjax map --speed_ratios 1.3 --radii 0.3 --scenario uniform --json FILE` wrote:
-one cell for each size of team, by the names of `KINDS`. The table shows what a policy catches, alone
-and with what is taken from it.
+Each FILE is what `openjax map --speed_ratios 1.3 --radii 0.3 --scenario uniform --json
+FILE` wrote: one cell for each size of team, by the names of `KINDS`. The table shows
+what a policy catches, alone and with what is taken from it.
 """
 
 from collections.abc import Mapping
@@ -30,7 +30,9 @@ def study(options) -> dict:
     data = options.out.with_suffix(".json")
     stored = read_json(data)["maps"] if data.exists() else {}
     files = dict(item.split("=", 1) for item in options.maps)
-    return {"maps": stored | {name: read_json(Path(file)) for name, file in files.items()}}
+    return {
+        "maps": stored | {name: read_json(Path(file)) for name, file in files.items()}
+    }
 
 
 def rows_of(maps: Mapping) -> list[dict]:
@@ -48,13 +50,17 @@ def rows_of(maps: Mapping) -> list[dict]:
 def page(results: Mapping) -> Page:
     """One table by size of team."""
     columns = {
-        "pursuers": lambda row: f"{row['size']}{' (held out)' if row['held_out'] else ''}",
+        "pursuers": lambda row: (
+            f"{row['size']}{' (held out)' if row['held_out'] else ''}"
+        ),
         **{head: f"{kind}.capture_rate:.3f" for kind, head in KINDS.items()},
         "seconds": "sizes.capture_seconds:.2f",
         "crash rate": "sizes.crash_rate:.3f",
     }
     records = Table(columns, rows_of(results["maps"]))
-    return Page("One policy for any team", "Shares of episodes with a capture.", records)
+    return Page(
+        "One policy for any team", "Shares of episodes with a capture.", records
+    )
 
 
 def draw(results: Mapping, path: Path) -> None:
@@ -69,7 +75,9 @@ def draw(results: Mapping, path: Path) -> None:
         rates = np.array([cell["capture_rate"] for cell in cells])
         ends = np.array([cell["interval"] for cell in cells]).T
         off = np.abs(ends - rates)
-        captures.errorbar(sizes, rates, off, marker=marker, capsize=3, linewidth=1, label=head)
+        captures.errorbar(
+            sizes, rates, off, marker=marker, capsize=3, linewidth=1, label=head
+        )
         crashed = [cell["crash_rate"] for cell in cells]
         crashes.plot(sizes, crashed, marker=marker, linewidth=1, label=head)
     captures.set(xlabel="pursuers", ylabel="episodes with a capture")

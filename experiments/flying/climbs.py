@@ -1,9 +1,10 @@
-"""What the accelerometer tells of a drift of the height, on flights of real vehicles: `python -m
-experiments.flying.climbs --flights FOLDER ...`.
+"""What the accelerometer tells of a drift of the height, on flights of real vehicles:
+`python -m experiments.flying.climbs --flights FOLDER ...`.
 
-A folder is a case of `docs/log_format.md`, or holds several, with velocity, attitude and
-accelerometer. Each flight is judged as it is, as `openjax.flying.climb` judges a vehicle's own
-estimate, and again with drifts added to its velocity: up and down, early and late in the flight.
+A folder is a case of `docs/log_format.md`, or holds several, with velocity, attitude
+and accelerometer. Each flight is judged as it is, as `openjax.flying.climb` judges a
+vehicle's own estimate, and again with drifts added to its velocity: up and down, early
+and late in the flight.
 """
 
 from __future__ import annotations
@@ -30,7 +31,9 @@ DRIFTS = [(speed, within) for speed in (0.1, 0.2, 0.3, 0.5) for within in (2.0, 
 
 def airborne(flight) -> list[tuple[Pose, tuple]]:
     """Poses and specific forces of a flight, from take-off to landing."""
-    known = np.isfinite(np.c_[flight.velocity, flight.quaternion, flight.specific_force]).all(1)
+    known = np.isfinite(
+        np.c_[flight.velocity, flight.quaternion, flight.specific_force]
+    ).all(1)
     height = flight.position[:, 2]
     up = np.flatnonzero(height > np.nanmin(height) + RISEN)
     return [
@@ -66,7 +69,9 @@ def judged(rows, speed: float = 0.0, within: float = 1.0, begin: float = 0.0):
 
 
 def study(options) -> dict:
-    """Of each flight its largest sum; of each drift the share that is told, and how late."""
+    """Of each flight its largest sum; of each drift the share that is told, and how
+    late.
+    """
     flights = [
         airborne(flight)
         for folder in options.folders
@@ -81,12 +86,16 @@ def study(options) -> dict:
             late = []
             for begin in begins:
                 told = [
-                    judged(f, sign * speed, within, begin)[1] for f in flights for sign in (1, -1)
+                    judged(f, sign * speed, within, begin)[1]
+                    for f in flights
+                    for sign in (1, -1)
                 ]
                 late += [np.inf if t is None else t - begin for t in told]
             late = np.array(late)
             row[name] = float((late < SOON).mean())
-            row[f"{name}_seconds"] = float(np.median(late[late < SOON])) if row[name] else None
+            row[f"{name}_seconds"] = (
+                float(np.median(late[late < SOON])) if row[name] else None
+            )
         rows.append(row)
     return {
         "flights": len(flights),
@@ -108,11 +117,15 @@ def page(results) -> Page:
         "after (s), late": "late_seconds:.1f",
     }
     return Page(
-        "What an accelerometer tells of a drifting height", prose, Table(columns, results["rows"])
+        "What an accelerometer tells of a drifting height",
+        prose,
+        Table(columns, results["rows"]),
     )
 
 
 if __name__ == "__main__":
     parser = page_parser(__doc__, "flying_climbs")
-    parser.add_argument("--flights", dest="folders", type=Path, nargs="+", required=True)
+    parser.add_argument(
+        "--flights", dest="folders", type=Path, nargs="+", required=True
+    )
     publish(parser.parse_args(), study, page)

@@ -1,9 +1,9 @@
 """Estimates that go wrong so gently that no single pose shows it: `python -m
 experiments.flying.estimates [--each 6]`.
 
-Three vehicles hunt in simulated time, as in `experiments.flying.simulated`, by their own estimates
-alone or, where a camera goes wrong, by its poses, which the estimators on board follow. Kinds that
-nothing on board can tell are flown, too, and counted apart.
+Three vehicles hunt in simulated time, as in `experiments.flying.simulated`, by their
+own estimates alone or, where a camera goes wrong, by its poses, which the estimators on
+board follow. Kinds that nothing on board can tell are flown, too, and counted apart.
 """
 
 from __future__ import annotations
@@ -52,20 +52,30 @@ class EstimateDamage:
         """Values with noise."""
         return tuple(value + self._random.gauss(0.0, deviation) for value in values)
 
-    def moved(self, pose: Pose, way: float, speed: float = 0.0, height: bool = False) -> Pose:
-        """A pose shifted by `way`, its velocity by `speed`, each times the fault's amount."""
+    def moved(
+        self, pose: Pose, way: float, speed: float = 0.0, height: bool = False
+    ) -> Pose:
+        """A pose shifted by `way`, its velocity by `speed`, each times the fault's
+        amount.
+        """
         fault = self._fault
         angle = 40.0 * fault.time  # drawn
         level = (math.cos(angle), math.sin(angle), 0.0)
         axis = (0.0, 0.0, math.copysign(1.0, level[0])) if height else level
         away = [fault.amount * part for part in axis]
         return pose._replace(
-            position=tuple(p + way * a for p, a in zip(pose.position, away, strict=True)),
-            velocity=tuple(v + speed * a for v, a in zip(pose.velocity, away, strict=True)),
+            position=tuple(
+                p + way * a for p, a in zip(pose.position, away, strict=True)
+            ),
+            velocity=tuple(
+                v + speed * a for v, a in zip(pose.velocity, away, strict=True)
+            ),
         )
 
     def frozen(self, pose: Pose, gyroscope: bool, velocity: bool) -> Pose:
-        """The pose as it was, with 2 mm of noise; the gyroscope may live, the velocity be zero."""
+        """The pose as it was, with 2 mm of noise; the gyroscope may live, the velocity
+        be zero.
+        """
         held = self._held
         rates = pose.body_rates if gyroscope else self.noisy(held.body_rates, 0.02)
         return held._replace(
@@ -82,7 +92,9 @@ class EstimateDamage:
         parts = {
             name: tuple(
                 a + share * (b - a)
-                for a, b in zip(getattr(pose, name), getattr(self._held, name), strict=True)
+                for a, b in zip(
+                    getattr(pose, name), getattr(self._held, name), strict=True
+                )
             )
             for name in ("position", "velocity", "quaternion")
         }
@@ -113,14 +125,18 @@ DAMAGES = {
     "position wanders": lambda d, pose, t: d.moved(pose, math.sin(SWING * t)),
     "ways are too long": lambda d, pose, t: d.scaled(pose),
     "velocity is held": lambda d, pose, t: pose._replace(velocity=d._held.velocity),
-    "velocity is zero": lambda d, pose, t: pose._replace(velocity=d.noisy((0.0,) * 3, 0.01)),
+    "velocity is zero": lambda d, pose, t: pose._replace(
+        velocity=d.noisy((0.0,) * 3, 0.01)
+    ),
     "frozen, 2 mm of noise": lambda d, pose, t: d.frozen(pose, False, True),
     "frozen, the gyroscope lives": lambda d, pose, t: d.frozen(pose, True, True),
     "frozen, at rest": lambda d, pose, t: d.frozen(pose, False, False),
     "blends into a held pose": lambda d, pose, t: d.blended(pose, t),
     "camera blends into a held pose": lambda d, pose, t: d.blended(pose, t),
     "drifts with its velocity": lambda d, pose, t: d.moved(pose, t, 1.0),
-    "height drifts with its velocity": lambda d, pose, t: d.moved(pose, t, 1.0, height=True),
+    "height drifts with its velocity": lambda d, pose, t: d.moved(
+        pose, t, 1.0, height=True
+    ),
     "drifts gently with its velocity": lambda d, pose, t: d.moved(pose, *_gently(t)),
     "height drifts gently with its velocity": lambda d, pose, t: d.moved(
         pose, *_gently(t), height=True
@@ -128,7 +144,11 @@ DAMAGES = {
 }
 """(damage, true pose, seconds since it began) -> what is received, by kind."""
 GROUPS = {
-    "position or height drifts": ("position drifts", "height drifts", "position wanders"),
+    "position or height drifts": (
+        "position drifts",
+        "height drifts",
+        "position wanders",
+    ),
     "ways are too long": ("ways are too long",),
     "velocity is held or zero": ("velocity is held", "velocity is zero"),
     "all freezes": tuple(kind for kind in DAMAGES if kind.startswith("frozen")),
@@ -145,8 +165,9 @@ GROUPS = {
 }
 """The rows of the page."""
 UNTOLD = tuple(kind for kind in DAMAGES if "with its velocity" in kind)
-"""What nothing on board can tell where it is small, or sets in gently along the ground; teammates
-tell some of that, and the accelerometer some of the height."""
+"""What nothing on board can tell where it is small, or sets in gently along the ground;
+teammates tell some of that, and the accelerometer some of the height.
+"""
 TOLD = tuple(kind for kind in DAMAGES if kind not in UNTOLD)
 
 
@@ -161,7 +182,9 @@ class Arguments:
     seed: int = 0
     kinds: tuple[str, ...] = tuple(DAMAGES)
     later: float = 0.0
-    """By so much (s) each begins later: what is usual in the air has to be learnt first."""
+    """By so much (s) each begins later: what is usual in the air has to be learnt
+    first.
+    """
     out: Path = RESULTS / "flying_estimates.json"
     commit: str | None = None
     """Where git can't tell it."""
@@ -202,7 +225,9 @@ def main() -> None:
     for k, layout in enumerate(arguments.layouts):
         first = arguments.seed + k * arguments.each
         seeds = range(first, first + arguments.each)
-        records += fly(arguments.kinds, seeds, layout, arguments.policy, arguments.later)
+        records += fly(
+            arguments.kinds, seeds, layout, arguments.policy, arguments.later
+        )
         write_json(
             arguments.out,
             {

@@ -1,9 +1,9 @@
-"""Worlds side by side in simulated time, one fault each: three vehicles hunt in a layout, and at a
-drawn moment something goes wrong.
+"""Worlds side by side in simulated time, one fault each: three vehicles hunt in a
+layout, and at a drawn moment something goes wrong.
 
-The vehicles are openjax's with the firmware's watchdogs; policy, game, judge and state machine are
-those of `openjax fly`. In half of the flights there is motion capture, which the estimators on board
-follow as far as it is believed.
+The vehicles are openjax's with the firmware's watchdogs; policy, game, judge and state
+machine are those of `openjax fly`. In half of the flights there is motion capture,
+which the estimators on board follow as far as it is believed.
 """
 
 from __future__ import annotations
@@ -18,7 +18,14 @@ import jax
 import numpy as np
 
 import openjax
-from experiments.flying.faults import ASLEEP, ENDING, Fault, PoseDamage, draw_fault, outcome
+from experiments.flying.faults import (
+    ASLEEP,
+    ENDING,
+    Fault,
+    PoseDamage,
+    draw_fault,
+    outcome,
+)
 from openjax.flying.board import SILENCE
 from openjax.flying.controller import Pose
 from openjax.flying.estimation import see
@@ -43,18 +50,25 @@ OVER = "time is over"
 PILLARS = 8
 """Room for as many in each layout, so that the game is compiled once."""
 LAIN = 50
-"""A flight whose vehicles lay on the floor with their motors off for so many ticks is over."""
-PILOTS = ("loop stopped", "links stopped", "loop and links stopped", "loop and guard stopped")
-"""Somebody else flies after a tenth of a second. (Which one takes over is for real processes:
-`experiments.flying.real_time`.)
+"""A flight whose vehicles lay on the floor with their motors off for so many ticks is
+over.
+"""
+PILOTS = (
+    "loop stopped",
+    "links stopped",
+    "loop and links stopped",
+    "loop and guard stopped",
+)
+"""Somebody else flies after a tenth of a second. (Which one takes over is for real
+processes: `experiments.flying.real_time`.)
 """
 
 
 def fly(
     seeds: list[int], layout: str, policy_name: str, level_after: float = LEVEL_AFTER
 ) -> list[dict]:
-    """Fly one fault per seed, side by side; a record of each. A seed below zero is a flight without
-    fault.
+    """Fly one fault per seed, side by side; a record of each. A seed below zero is a
+    flight without fault.
     """
     worlds = Worlds([draw_fault(seed, LATEST) for seed in seeds], layout, policy_name)
     for firmware in worlds.swarm.firmware:
@@ -67,7 +81,9 @@ def fly(
 
 @dataclass(frozen=True)
 class CompiledGame:
-    """A policy's game for flights side by side; `first` has the task as its first argument."""
+    """A policy's game for flights side by side; `first` has the task as its first
+    argument.
+    """
 
     trained_in: PursuitSettings
     settings: PursuitSettings
@@ -115,12 +131,18 @@ class Worlds:
         self._damage = [damage(fault) for fault in faults]
         vehicles = VirtualVehicles(load_vehicle(), np.tile(starts, (len(faults), 1)))
         self._vehicles = vehicles
-        following = [fault.kind != "camera drifts" for fault in faults for _ in range(self.n)]
+        following = [
+            fault.kind != "camera drifts" for fault in faults for _ in range(self.n)
+        ]
         radio = functools.partial(self._received, "radio")
         camera = functools.partial(self._received, "camera")
         self.swarm = SimulatedSwarm(vehicles, following, radio, camera)
-        pillars = [(x, y, self._game.settings.pillar_radius) for x, y in scenario.pillars]
-        state = initial_state([tuple(s) for s in starts.tolist()], pillars, self._game.airframe)
+        pillars = [
+            (x, y, self._game.settings.pillar_radius) for x, y in scenario.pillars
+        ]
+        state = initial_state(
+            [tuple(s) for s in starts.tolist()], pillars, self._game.airframe
+        )
         state = state._replace(drones=(Drone(Mode.PURSUIT),) * self.n)
         self.states = [state] * len(faults)
         self._landing = [False] * len(faults)
@@ -139,8 +161,14 @@ class Worlds:
         first = w * self.n
         others = ()
         if fault.kind == "camera: bodies swapped":
-            places = [tuple(place) for place in report.position[first : first + self.n].tolist()]
-            turns = [tuple(turn) for turn in report.quaternion[first : first + self.n].tolist()]
+            places = [
+                tuple(place)
+                for place in report.position[first : first + self.n].tolist()
+            ]
+            turns = [
+                tuple(turn)
+                for turn in report.quaternion[first : first + self.n].tolist()
+            ]
             others = [
                 Pose(now, place, (0.0,) * 3, turn)
                 for place, turn in zip(places, turns, strict=True)
@@ -152,7 +180,11 @@ class Worlds:
         now = self.swarm.now
         samples = list(self.swarm.observe())
         flown = np.flatnonzero(self._down < LAIN).tolist()
-        awake = [w for w in flown if not (self.faults[w].kind == ASLEEP and self.faults[w].on(now))]
+        awake = [
+            w
+            for w in flown
+            if not (self.faults[w].kind == ASLEEP and self.faults[w].on(now))
+        ]
         over = set(range(len(self.faults))) - set(flown)
         self.swarm.asleep = {w * self.n + i for w in over for i in range(self.n)}
         for w in awake:
@@ -160,10 +192,17 @@ class Worlds:
             before = self.states[w].drones
             if self._landing[w]:  # who takes over knows no motion capture
                 seen = samples[first : first + self.n]
-                samples[first : first + self.n] = [s._replace(captured=None) for s in seen]
+                samples[first : first + self.n] = [
+                    s._replace(captured=None) for s in seen
+                ]
             self.states[w] = see(self.states[w], now, samples[first : first + self.n])
-            for i, (drone, old) in enumerate(zip(self.states[w].drones, before, strict=True)):
-                if drone.captured.pose is not old.captured.pose and drone.feeds_estimator:
+            for i, (drone, old) in enumerate(
+                zip(self.states[w].drones, before, strict=True)
+            ):
+                if (
+                    drone.captured.pose is not old.captured.pose
+                    and drone.feeds_estimator
+                ):
                     self.swarm.believed(first + i, drone.captured.pose)
         if any(Mode.PURSUIT in state.modes for state in self.states):
             self._play_on()
@@ -174,7 +213,9 @@ class Worlds:
         self.swarm.send(set_points)
         self.swarm.advance()
         report = self.swarm.vehicles.report
-        off = np.array([f.set_point(self.swarm.now).mode == 0 for f in self.swarm.firmware])
+        off = np.array(
+            [f.set_point(self.swarm.now).mode == 0 for f in self.swarm.firmware]
+        )
         self._tracks.append(np.column_stack([report.position, off]))
         down = ((report.position[:, 2] < 0.02) & off).reshape(-1, self.n).all(1)
         self._down = np.where(down, self._down + 1, 0)
@@ -211,9 +252,14 @@ class Worlds:
             self.states[w] = take_over(self.states[w], now)
             self._landing[w] = True
         action = None if self._landing[w] else fault.answered(self._actions[w], now)
-        actions = None if action is None else tuple(from_action(a, THRUST_LIMIT) for a in action)
+        actions = (
+            None
+            if action is None
+            else tuple(from_action(a, THRUST_LIMIT) for a in action)
+        )
         landing = on and (
-            fault.kind == "key" or (fault.kind == "guard stopped" and since > 2.0 * SILENCE)
+            fault.kind == "key"
+            or (fault.kind == "guard stopped" and since > 2.0 * SILENCE)
         )
         over = not landing and now >= SECONDS
         request = Request.LAND if landing or over else Request.NONE
@@ -223,12 +269,17 @@ class Worlds:
 
     def records(self, seeds) -> list[dict]:
         """What became of each flight."""
-        track = np.array(self._tracks).reshape(len(self._tracks), len(self.faults), self.n, 4)
-        return [{"seed": seed, **self._record(w, track[:, w])} for w, seed in enumerate(seeds)]
+        track = np.array(self._tracks).reshape(
+            len(self._tracks), len(self.faults), self.n, 4
+        )
+        return [
+            {"seed": seed, **self._record(w, track[:, w])}
+            for w, seed in enumerate(seeds)
+        ]
 
     def _record(self, w, track) -> dict:
-        """Where the vehicles of flight w were from its fault on. track (T, N, 4): true position
-        (m), motors off.
+        """Where the vehicles of flight w were from its fault on. track (T, N, 4): true
+        position (m), motors off.
         """
         fault = self.faults[w]
         drones = self.states[w].drones
@@ -238,13 +289,18 @@ class Worlds:
         seen = outcome(fault, 0.01 * np.arange(len(track)), position, off, begin)
         held = seen.pop("held")
         ended = any(d.reason not in ("", OVER) for d in drones)
-        crashed = np.array([f.crashed for f in self.swarm.firmware[w * self.n : (w + 1) * self.n]])
+        crashed = np.array(
+            [f.crashed for f in self.swarm.firmware[w * self.n : (w + 1) * self.n]]
+        )
         pairs = [position[:, i] - position[:, j] for i in range(3) for j in range(i)]
         return {
             "kind": fault.kind,
             "layout": self._layout,
             "captured_by_camera": fault.captured,
-            **{name: getattr(fault, name) for name in ("time", "vehicle", "duration", "amount")},
+            **{
+                name: getattr(fault, name)
+                for name in ("time", "vehicle", "duration", "amount")
+            },
             "ended": ended,
             "reasons": [d.reason for d in drones],
             **seen,

@@ -1,8 +1,8 @@
-"""Faults of a flight where they happen: in what a camera or a radio sends, in a link, a policy, a
-process, a key.
+"""Faults of a flight where they happen: in what a camera or a radio sends, in a link, a
+policy, a process, a key.
 
-A fault is drawn from its number: kind, moment, vehicle, amount. `PoseDamage` does to poses what the
-kind says.
+A fault is drawn from its number: kind, moment, vehicle, amount. `PoseDamage` does to
+poses what the kind says.
 """
 
 from __future__ import annotations
@@ -18,15 +18,17 @@ from openjax.flying.controller import Pose
 from openjax.flying.state import SafetySettings
 
 FOLLOWED = "camera drifts, the estimator follows"
-"""A limit: with nothing on board that sees the floor, a slow drift looks like a tilt that is wrong
-by two degrees.
+"""A limit: with nothing on board that sees the floor, a slow drift looks like a tilt
+that is wrong by two degrees.
 """
 ASLEEP = "all processes stand still for a while"
 """Another: meanwhile vehicles turn on as they were told last, then level, then stop."""
 BEYOND = (FOLLOWED, ASLEEP)
 """What nothing in these processes can mend."""
 GONE = ("drone gone", "link lost for a while", "drone restarts")
-"""Nothing reaches that vehicle nor comes from it, which may cost it; the others it mustn't."""
+"""Nothing reaches that vehicle nor comes from it, which may cost it; the others it
+mustn't.
+"""
 CAMERA = (
     "camera lost", "camera lost for a while", "camera frozen", "camera frozen, all", "camera: one frame wrong",
     "camera: four frames wrong", "camera moved", "camera: a number that is none", "camera: no attitude",
@@ -42,13 +44,16 @@ WILD = {
     "policy wild": lambda tick, n, shape: np.random.default_rng(10 * tick + n).uniform(
         -1.0, 1.0, shape
     ),
-    "policy huge": lambda tick, n, shape: np.random.default_rng(n).choice((-1e30, 1e30), shape),
+    "policy huge": lambda tick, n, shape: np.random.default_rng(n).choice(
+        (-1e30, 1e30), shape
+    ),
     "policy alternating": lambda tick, n, shape: (
-        np.random.default_rng(n).choice((-1.0, 1.0), shape) * (-1) ** (tick // (1 + n % 5))
+        np.random.default_rng(n).choice((-1.0, 1.0), shape)
+        * (-1) ** (tick // (1 + n % 5))
     ),
 }
-"""The policy's action (N, 4) at a tick of flight n: drawn anew; one extreme for good; from one to
-the other.
+"""The policy's action (N, 4) at a tick of flight n: drawn anew; one extreme for good;
+from one to the other.
 """
 OTHER = (
     "loop stopped", "links stopped", "guard stopped", "loop and links stopped", "loop and guard stopped",
@@ -56,21 +61,23 @@ OTHER = (
 )  # fmt: skip
 KINDS = (*CAMERA, *RADIO, *OTHER)
 PASSING = ("poses jump", "camera: yaw turned", "camera: bodies swapped")
-"""These may be over after a moment, as those of numbers that are none and of attitudes."""
+"""These may be over after a moment, as those of numbers that are none and of
+attitudes.
+"""
 START = 0.2
 """Nothing goes wrong before (s)."""
 MARGIN = 0.1
 FALL = 0.3
 ENDING = 5.0
-"""Out of the arena by more (m) is out; motors off above (m) is a fall; a flight must be over so
-long (s) after what ends it.
+"""Out of the arena by more (m) is out; motors off above (m) is a fall; a flight must be
+over so long (s) after what ends it.
 """
 
 
 @dataclass(frozen=True)
 class Fault:
-    """What goes wrong, when (s), with which vehicle, for how long (s), how much, in which
-    direction.
+    """What goes wrong, when (s), with which vehicle, for how long (s), how much, in
+    which direction.
     """
 
     kind: str
@@ -87,7 +94,9 @@ class Fault:
         return self.kind in CAMERA or self.direction < math.pi
 
     def losses(self, now: float) -> tuple[float, float]:
-        """Shares of a vehicle's set-points, and of what it sends, that are lost at `now` (s)."""
+        """Shares of a vehicle's set-points, and of what it sends, that are lost at
+        `now` (s).
+        """
         gone = float(self.kind in GONE)
         up, down = {
             "packets lost": (self.amount,) * 2,
@@ -97,8 +106,8 @@ class Fault:
         return up * self.on(now), down * self.on(now)
 
     def answered(self, action: np.ndarray, now: float) -> np.ndarray | None:
-        """What the policy is said to have answered (N, 4) at `now` (s) in place of `action`; None:
-        nothing.
+        """What the policy is said to have answered (N, 4) at `now` (s) in place of
+        `action`; None: nothing.
         """
         if not self.on(now) or not self.kind.startswith("policy"):
             return action
@@ -106,7 +115,8 @@ class Fault:
             return WILD[self.kind](
                 round(100 * now), self.vehicle + round(100 * self.time), action.shape
             )
-        action = np.array(action, np.float32)  # as networks answer: larger numbers are infinite
+        # as networks answer: larger numbers are infinite
+        action = np.array(action, np.float32)
         with np.errstate(over="ignore"):
             action[self.vehicle, round(100 * self.time) % 4] = self.number
         return None if self.kind == "policy silent" else action
@@ -117,8 +127,8 @@ class Fault:
 
 
 def draw_fault(seed: int, latest: float) -> Fault:
-    """The fault number `seed`, which begins by `latest` (s); the kinds take turns. None below
-    zero.
+    """The fault number `seed`, which begins by `latest` (s); the kinds take turns. None
+    below zero.
     """
     if seed < 0:
         return Fault("none", math.inf, 0)
@@ -128,9 +138,10 @@ def draw_fault(seed: int, latest: float) -> Fault:
     vehicle = rng.randrange(3)
     direction = rng.uniform(0.0, 2.0 * math.pi)
     number = rng.choice((math.nan, math.inf, -math.inf, 1e300))
-    duration = {"camera: one frame wrong": 0.0099, "camera: four frames wrong": 0.0399}.get(
-        kind, math.inf
-    )
+    duration = {
+        "camera: one frame wrong": 0.0099,
+        "camera: four frames wrong": 0.0399,
+    }.get(kind, math.inf)
     if kind.endswith("for a while"):
         duration = rng.uniform(0.05, 1.0)
     elif "none" in kind or "attitude" in kind or kind in PASSING:
@@ -151,8 +162,12 @@ class PoseDamage:
         self._past = defaultdict(lambda: deque(maxlen=50))
         self._field = self._random.randrange(100)
 
-    def __call__(self, source: str, i: int, now: float, pose: Pose, others) -> Pose | None:
-        """The pose received from `source`, "camera" or "radio"; `others`: true poses of all."""
+    def __call__(
+        self, source: str, i: int, now: float, pose: Pose, others
+    ) -> Pose | None:
+        """The pose received from `source`, "camera" or "radio"; `others`: true poses of
+        all.
+        """
         fault = self._fault
         self._past[source, i].append(pose)
         # from the start it is the whole system
@@ -163,7 +178,9 @@ class PoseDamage:
         if fault.kind not in names or not mine or not fault.on(now):
             self._held[source, i] = pose
             return pose
-        return self._damaged(fault.kind.replace("poses", "camera"), source, i, now, pose, others)
+        return self._damaged(
+            fault.kind.replace("poses", "camera"), source, i, now, pose, others
+        )
 
     def _damaged(self, kind, source, i, now, pose, others):
         fault = self._fault
@@ -185,7 +202,9 @@ class PoseDamage:
         if what.startswith("drifts"):
             return _shifted(pose, away, since)
         if what == "scaled":
-            return pose._replace(position=tuple(fault.amount * p for p in pose.position))
+            return pose._replace(
+                position=tuple(fault.amount * p for p in pose.position)
+            )
         if what == "no attitude":
             return pose._replace(quaternion=(0.0,) * 4)
         w, x, y, z = pose.quaternion
@@ -198,7 +217,9 @@ class PoseDamage:
             other = others[(i + 1) % len(others)]
             return pose._replace(position=other.position, quaternion=other.quaternion)
         if what == "late":
-            return self._earlier(source, i, round(100 * fault.amount))._replace(time=now)
+            return self._earlier(source, i, round(100 * fault.amount))._replace(
+                time=now
+            )
         if what == "restarts":
             return None if since < 0.5 * fault.amount else _shifted(pose, away, 1.0)
         if what == "clock steps":
@@ -228,11 +249,13 @@ def _shifted(pose: Pose, away, share: float) -> Pose:
 
 
 def outcome(fault: Fault, times, position, off, begin: float) -> dict:
-    """What became of the vehicles from `begin` (s) on; of one that is gone itself nothing is asked.
+    """What became of the vehicles from `begin` (s) on; of one that is gone itself
+    nothing is asked.
 
-    times (T,), position (T, N, 3) m and off (T, N), motors off, are the truth. `out`: farthest
-    beyond arena or ceiling (m); infinite where a position is no number. `seconds` until all stayed
-    on the floor with their motors off, None if they didn't; `held`: (N,) whom one can hold.
+    times (T,), position (T, N, 3) m and off (T, N), motors off, are the truth. `out`:
+    farthest beyond arena or ceiling (m); infinite where a position is no number.
+    `seconds` until all stayed on the floor with their motors off, None if they didn't;
+    `held`: (N,) whom one can hold.
     """
     held = (np.arange(off.shape[1]) != fault.vehicle) | (fault.kind not in GONE)
     late = times >= begin
@@ -254,8 +277,12 @@ def outcome(fault: Fault, times, position, off, begin: float) -> dict:
 
 
 def finite(row: dict) -> dict:
-    """A row as JSON has it: null for what is no finite number, and in `not_finite` what that
-    was.
+    """A row as JSON has it: null for what is no finite number, and in `not_finite` what
+    that was.
     """
-    odd = {name: str(x) for name, x in row.items() if isinstance(x, float) and not math.isfinite(x)}
+    odd = {
+        name: str(x)
+        for name, x in row.items()
+        if isinstance(x, float) and not math.isfinite(x)
+    }
     return {**row, **dict.fromkeys(odd), "not_finite": odd} if odd else row

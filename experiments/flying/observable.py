@@ -1,11 +1,12 @@
 """What teammates tell of a gentle drift of a vehicle's own estimate: `python -m
 experiments.flying.observable`.
 
-Position and velocity of an estimate drift together. A steady drift shows nowhere: thrust, attitude
-and gyroscope tell accelerations and turns, not speeds. While it sets in, the estimate accelerates
-as thrust doesn't explain. So does the air's drag, which nobody told the vehicle, and an attitude
-that is off by a tenth of a degree. Level accelerations of teams are simulated with these, and
-judged as `openjax.flying.drift` judges them, all flights at once.
+Position and velocity of an estimate drift together. A steady drift shows nowhere:
+thrust, attitude and gyroscope tell accelerations and turns, not speeds. While it sets
+in, the estimate accelerates as thrust doesn't explain. So does the air's drag, which
+nobody told the vehicle, and an attitude that is off by a tenth of a degree. Level
+accelerations of teams are simulated with these, and judged as `openjax.flying.drift`
+judges them, all flights at once.
 """
 
 from __future__ import annotations
@@ -30,15 +31,17 @@ VEHICLES = {
     "usual drag, attitude to .2 degrees": (0.4, 0.1, 0.2, 0.02),
     "much drag, attitude to .3 degrees": (0.8, 0.15, 0.3, 0.03),
 }
-"""Drag (1/s), air that moves (m/s), error of the attitude (degrees) and of the velocity (m/s, both
-rms). The sample Crazyflie's drag is .4/s.
+"""Drag (1/s), air that moves (m/s), error of the attitude (degrees) and of the velocity
+(m/s, both rms). The sample Crazyflie's drag is .4/s.
 """
 DRIFTS = {".1 m/s within 2 s": (0.1, 2.0), ".3 m/s within 2 s": (0.3, 2.0)}
 DRIFTS |= {".5 m/s within 2 s": (0.5, 2.0), ".5 m/s within 4 s": (0.5, 4.0)}
 FLIGHTS = 300
 
 
-def wandering(rng: np.random.Generator, time_constant: float, size: float) -> np.ndarray:
+def wandering(
+    rng: np.random.Generator, time_constant: float, size: float
+) -> np.ndarray:
     """(T, FLIGHTS, TEAM, 2) of a first-order Gauss-Markov process."""
     steps = round(SECONDS / PERIOD)
     share = PERIOD / time_constant
@@ -53,9 +56,9 @@ def wandering(rng: np.random.Generator, time_constant: float, size: float) -> np
 def unexplained(
     rng, vehicle, drift, hover: float = 0.0, begins: tuple[float, float] = BEGIN
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What thrust and attitude don't explain of the estimate's acceleration (m/s^2, world) and the
-    estimate's velocity (m/s), (T, FLIGHTS, TEAM, 2) each, and when the first vehicle's began to
-    drift (s).
+    """What thrust and attitude don't explain of the estimate's acceleration (m/s^2,
+    world) and the estimate's velocity (m/s), (T, FLIGHTS, TEAM, 2) each, and when the
+    first vehicle's began to drift (s).
 
     `hover`: how long (s) all hover before they hunt.
     """
@@ -71,7 +74,8 @@ def unexplained(
     begun = speed * np.clip((time[:, None] - begin) / seconds, 0.0, 1.0)
     estimate = velocity + wandering(rng, 0.3, error)
     estimate[:, :, 0] += begun[..., None] * direction
-    constant = rng.standard_normal((FLIGHTS, TEAM, 2))  # degrees: rotors, a battery's place
+    # degrees: rotors, a battery's place
+    constant = rng.standard_normal((FLIGHTS, TEAM, 2))
     lean = 9.81 * np.radians(wandering(rng, 5.0, tilt) + constant)
     thrust = np.gradient(velocity, PERIOD, axis=0)
     thrust = thrust + drag * (velocity - wandering(rng, 2.0, air)) + lean
@@ -79,7 +83,9 @@ def unexplained(
 
 
 def summed(rest: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-    """(T, FLIGHTS, TEAM) m/s, the sum over a window of what a constant and drag don't explain."""
+    """(T, FLIGHTS, TEAM) m/s, the sum over a window of what a constant and drag don't
+    explain.
+    """
     normal = np.zeros((*velocity.shape[1:], 2, 2)) + 0.3 * np.eye(2)
     moment = np.zeros((*velocity.shape[1:], 2))
     total = np.zeros(velocity.shape[1:])
@@ -111,7 +117,9 @@ def told(sums: np.ndarray) -> np.ndarray:
 
 
 def study(options) -> dict:
-    """For each vehicle how many flights without a drift would end, and which drifts are told."""
+    """For each vehicle how many flights without a drift would end, and which drifts are
+    told.
+    """
     rows = []
     for name, vehicle in VEHICLES.items():
         rng = np.random.default_rng(options.seed)
@@ -130,13 +138,19 @@ def page(results) -> Page:
     """The study's table."""
     prose = "Share of drifts that are told within six seconds, and of flights that end for none."
     columns = {"vehicle": "vehicle", "ended without a drift": "ended:.3f"}
-    columns |= {f"told: {drift}": (lambda row, d=drift: f"{row[d]:.2f}") for drift in DRIFTS}
-    return Page("What of a gentle drift can be told", prose, Table(columns, results["rows"]))
+    columns |= {
+        f"told: {drift}": (lambda row, d=drift: f"{row[d]:.2f}") for drift in DRIFTS
+    }
+    return Page(
+        "What of a gentle drift can be told", prose, Table(columns, results["rows"])
+    )
 
 
 if __name__ == "__main__":
     parser = page_parser(__doc__, "flying_drifts")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--hover", type=float, default=0.0, help="s, before they hunt")
-    parser.add_argument("--begin", type=float, nargs=2, default=BEGIN, help="s, of a drift")
+    parser.add_argument(
+        "--begin", type=float, nargs=2, default=BEGIN, help="s, of a drift"
+    )
     publish(parser.parse_args(), study, page)

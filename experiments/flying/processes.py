@@ -1,9 +1,9 @@
-"""One flight of real processes with its fault: `openjax fly` on a terminal of its own, real cflib
-over UDP.
+"""One flight of real processes with its fault: `openjax fly` on a terminal of its own,
+real cflib over UDP.
 
-At a drawn moment after the take-off a signal goes to a process, a key to the terminal, nonsense to
-a vehicle, or what motion capture or the vehicles send is damaged. JAX doesn't survive a fork: a
-flight is a fork of its worker that asks it for actions.
+At a drawn moment after the take-off a signal goes to a process, a key to the terminal,
+nonsense to a vehicle, or what motion capture or the vehicles send is damaged. JAX
+doesn't survive a fork: a flight is a fork of its worker that asks it for actions.
 """
 
 import contextlib
@@ -71,7 +71,11 @@ GROUPS = {
     "strangers, a second fly, nothing": ("strangers' packets", "none", "second fly", "none with camera"),
 }  # fmt: skip
 KINDS = [kind for kinds in GROUPS.values() for kind in kinds]
-DRAWN = (*GROUPS["motion capture"], *GROUPS["own estimates, links"], *GROUPS["the policy"][:-1])
+DRAWN = (
+    *GROUPS["motion capture"],
+    *GROUPS["own estimates, links"],
+    *GROUPS["the policy"][:-1],
+)
 """Faults as in simulated time."""
 ENDLESS = (*DRAWN, *GROUPS["strangers, a second fly, nothing"])
 """These needn't end a flight."""
@@ -83,8 +87,8 @@ SETTLE = 1.0
 
 
 def ends_flight(kind: str) -> bool:
-    """Whether a fault of this kind must end its flight; links and guard are deaf to a terminal's
-    signals.
+    """Whether a fault of this kind must end its flight; links and guard are deaf to a
+    terminal's signals.
     """
     name, _, target = kind.partition(" ")
     deaf = name in SIGNALS[2:] and target in ("links", "guard")
@@ -97,7 +101,10 @@ def fault_of(number: int, kind: str) -> Fault:
     time = rng.uniform(0.3, LATEST)
     vehicle = rng.randrange(3)
     if kind in DRAWN:
-        drawn = (draw_fault(seed, LATEST) for seed in range(1000 * number, 1000 * number + 1000))
+        drawn = (
+            draw_fault(seed, LATEST)
+            for seed in range(1000 * number, 1000 * number + 1000)
+        )
         return replace(next(like for like in drawn if like.kind == kind), time=time)
     if kind in START:
         kind, amount = START[kind]
@@ -113,10 +120,13 @@ def feed_of(fault: Fault, truth):
     def feed(update):
         due = time.perf_counter()
         while True:
-            now = max(time.perf_counter() - truth.take_off, -1.0)  # before the take-off, too
+            # before the take-off, too
+            now = max(time.perf_counter() - truth.take_off, -1.0)
             poses = truth.poses()
             for i, pose in enumerate(poses):
-                shaken = tuple((np.array(pose.position) + noise.normal(0, 5e-4, 3)).tolist())
+                shaken = tuple(
+                    (np.array(pose.position) + noise.normal(0, 5e-4, 3)).tolist()
+                )
                 seen = damage("camera", i, now, pose._replace(position=shaken), poses)
                 if seen is not None:
                     update(i, seen.position, seen.quaternion)
@@ -127,8 +137,8 @@ def feed_of(fault: Fault, truth):
 
 
 class RemoteGame:
-    """The game of a flight, played by the worker; `spoil` makes of each play what the policy is
-    said to have answered.
+    """The game of a flight, played by the worker; `spoil` makes of each play what the
+    policy is said to have answered.
     """
 
     def __init__(self, game, pipe, spoil):
@@ -195,14 +205,18 @@ class Flown:
             now = time.perf_counter()
             self._drain()
             status = self._ended(pid) if status is None else status
-            if injected is None and now - self._virtual.truth.take_off >= max(self.fault.time, 0.0):
+            if injected is None and now - self._virtual.truth.take_off >= max(
+                self.fault.time, 0.0
+            ):
                 injected = now
                 self._find(pid)
                 self._inject(pid)
             since = now - (injected or begin)
             over = status is not None and (settled or since > 0.2) and self._landed()
             settled = (settled or now) if over else 0.0
-            if (over and now - settled > SETTLE) or since > LONGEST + 25.0 * (injected is None):
+            if (over and now - settled > SETTLE) or since > LONGEST + 25.0 * (
+                injected is None
+            ):
                 break
         self._clean(pid, status)
         return self._record(status, injected, begin)
@@ -251,12 +265,16 @@ class Flown:
         return os.waitstatus_to_exitcode(status) if done else None
 
     def _find(self, pid):
-        """Process ids by role: links and guard are the loop's children, in this order."""
+        """Process ids by role: links and guard are the loop's children, in this
+        order.
+        """
         self._pids = {"loop": pid}
         with contextlib.suppress(OSError):
             children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
             spawned = [
-                int(c) for c in children if b"spawn_main" in Path(f"/proc/{c}/cmdline").read_bytes()
+                int(c)
+                for c in children
+                if b"spawn_main" in Path(f"/proc/{c}/cmdline").read_bytes()
             ]
             self._pids.update(zip(("links", "guard"), sorted(spawned), strict=False))
 
@@ -292,7 +310,9 @@ class Flown:
                 send(self._pids[role], getattr(signal, f"SIG{name}"))
 
     def _strangers(self):
-        """Scans, echoes, requests and noise from another address; set-points aren't among them."""
+        """Scans, echoes, requests and noise from another address; set-points aren't
+        among them.
+        """
         rng = random.Random(self._number)
         ports = [int(uri.rsplit(":", 1)[1]) for uri in self._virtual.uris]
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
@@ -333,10 +353,18 @@ class Flown:
         track = self._virtual.track()
         fault = self.fault
         seen = outcome(
-            fault, track["time"], track["position"], track["off"].astype(bool), injected or begin
+            fault,
+            track["time"],
+            track["position"],
+            track["off"].astype(bool),
+            injected or begin,
         )
         held = seen.pop("held")
-        said = [line for line in self._said.decode(errors="replace").splitlines() if line.strip()]
+        said = [
+            line
+            for line in self._said.decode(errors="replace").splitlines()
+            if line.strip()
+        ]
         row = {
             "number": self._number, "kind": self._kind, "time": round(min(max(fault.time, 0.0), 99.0), 2), "status": status,
             "took_off": not math.isinf(self._virtual.truth.take_off), **seen, "hard": bool(track["crashed"][held].any()),
@@ -357,7 +385,8 @@ class Flown:
             or row["left"]
         ):
             return False
-        if any(name in self._kind for name in STOPPED):  # the operator wants them to fall
+        # the operator wants them to fall
+        if any(name in self._kind for name in STOPPED):
             return row["seconds"] is not None and row["seconds"] < 1.5
         if self._kind == "second fly" and "has this vehicle" not in row["second"]:
             return False
@@ -368,6 +397,9 @@ class Flown:
 
 def _lives(pid) -> bool:
     try:
-        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] not in "ZX"
+        return (
+            Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0]
+            not in "ZX"
+        )
     except OSError:
         return False

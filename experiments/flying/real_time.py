@@ -1,8 +1,8 @@
-"""Faults at their source in real time: `python -m experiments.flying.real_time [--flights 100]
-[--processes 3]`.
+"""Faults at their source in real time: `python -m experiments.flying.real_time
+[--flights 100] [--processes 3]`.
 
-Each worker compiles the policy once and has virtual Crazyflies of its own, in a process that keeps
-where they truly were; what goes wrong is in `experiments.flying.processes`.
+Each worker compiles the policy once and has virtual Crazyflies of its own, in a process
+that keeps where they truly were; what goes wrong is in `experiments.flying.processes`.
 """
 
 import atexit
@@ -69,7 +69,11 @@ def page(results) -> Page:
     records = results["records"]
     for group, kinds in {**GROUPS, "all": KINDS}.items():
         mine = [r for r in records if r["kind"] in kinds]
-        ends = [r["seconds"] for r in mine if r["seconds"] is not None and ends_flight(r["kind"])]
+        ends = [
+            r["seconds"]
+            for r in mine
+            if r["seconds"] is not None and ends_flight(r["kind"])
+        ]
         asked = [any(name in r["kind"] for name in STOPPED) for r in mine]
         rows.append({
             "group": group, "flights": len(mine), "well": sum(r["well"] for r in mine),
@@ -94,7 +98,9 @@ def page(results) -> Page:
         for r in records
         if not r["well"]
     ]
-    return Page("Faults where they happen, in real time", prose, [Table(columns, rows), *ill])
+    return Page(
+        "Faults where they happen, in real time", prose, [Table(columns, rows), *ill]
+    )
 
 
 def fly(number: int, kind: str, policy: str) -> dict:
@@ -104,7 +110,9 @@ def fly(number: int, kind: str, policy: str) -> dict:
 
 @functools.cache
 def _made_once(policy):
-    """This process' virtual Crazyflies, how to fly them, and all that is compiled for it."""
+    """This process' virtual Crazyflies, how to fly them, and all that is compiled for
+    it.
+    """
     from experiments.flying.virtual import VirtualProcess
     from openjax.commands.fly import Arguments as FlyArguments
     from openjax.commands.fly import prepare

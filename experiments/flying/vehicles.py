@@ -1,10 +1,11 @@
-"""Policies on vehicles that they weren't made for: `python -m experiments.flying.vehicles [--policy
-NAME ...] [--number 1024]`.
+"""Policies on vehicles that they weren't made for: `python -m
+experiments.flying.vehicles [--policy NAME ...] [--number 1024]`.
 
-No clamp, rate loop at 500 Hz, solid contacts, drawn starts, the paper's evader. Vehicles: the
-nominal one; `table`, with motors 40 ms slower, commands 15 ms and poses 10 ms late, and drag; the
-family of the preset `flight`. Tasks: uniform validation ones and the six layouts. Nothing is chosen
-by the layouts. Writes experiments/results/vehicles.json and .md (`--out`: others).
+No clamp, rate loop at 500 Hz, solid contacts, drawn starts, the paper's evader.
+Vehicles: the nominal one; `table`, with motors 40 ms slower, commands 15 ms and poses
+10 ms late, and drag; the family of the preset `flight`. Tasks: uniform validation ones
+and the six layouts. Nothing is chosen by the layouts. Writes
+experiments/results/vehicles.json and .md (`--out`: others).
 """
 
 import dataclasses
@@ -40,14 +41,14 @@ FIGURES = {
 
 
 def vehicles(airframe: str = NOMINAL) -> dict[str, np.ndarray]:
-    """Bounds (R, 4) of each kind of an airframe's vehicles; only the family has any that are
-    rare.
+    """Bounds (R, 4) of each kind of an airframe's vehicles; only the family has any
+    that are rare.
     """
     family = vehicle_family(airframe)
     names = [entry.parameter for entry in family]
-    none = np.repeat([[find_parameter(name)[1].none] for name in names], 4, axis=1).astype(
-        np.float32
-    )
+    none = np.repeat(
+        [[find_parameter(name)[1].none] for name in names], 4, axis=1
+    ).astype(np.float32)
     one = none.copy()
     for name, value in TABLE.items():
         one[names.index(name)] = value
@@ -56,7 +57,9 @@ def vehicles(airframe: str = NOMINAL) -> dict[str, np.ndarray]:
 
 @functools.cache
 def program(settings, policy):
-    """The compiled evaluation: (parameters, tasks, key, bounds (R, 4)) -> Evaluation."""
+    """The compiled evaluation: (parameters, tasks, key, bounds (R, 4)) ->
+    Evaluation.
+    """
     vehicle = load_vehicle(settings.airframe)
 
     def run(parameters, tasks, key, bounds):
@@ -86,7 +89,9 @@ def game_of(own: PursuitSettings, airframe: str, physics: str) -> PursuitSetting
 
 
 def fly(name: str, options) -> dict[str, dict[str, dict]]:
-    """Summaries of a policy by kind of vehicle and kind of task. `options`: of the command."""
+    """Summaries of a policy by kind of vehicle and kind of task. `options`: of the
+    command.
+    """
     loaded = load_policy(name)
     own = loaded.settings.environment
     game = game_of(own, options.airframe or own.airframe, options.physics)
@@ -119,8 +124,13 @@ def finite(summary: dict) -> dict:
 
 def study(options) -> dict:
     """Fly the policies."""
-    drawn_by = {name: getattr(options, name) for name in ("number", "layouts", "airframe")}
-    return {**drawn_by, "policies": {name: fly(name, options) for name in options.policy}}
+    drawn_by = {
+        name: getattr(options, name) for name in ("number", "layouts", "airframe")
+    }
+    return {
+        **drawn_by,
+        "policies": {name: fly(name, options) for name in options.policy},
+    }
 
 
 def page(results: dict) -> Page:
@@ -139,20 +149,30 @@ def page(results: dict) -> Page:
         "motors 40 ms slower, commands 15 ms "
         "and poses 10 ms late, drag of .0125 N s/m; family: the vehicles of the preset flight, "
         "half of them rare ones. " + results.get("note", ""),
-        Table({"policy": "policy", "vehicle": "vehicle", "tasks": "tasks", **FIGURES}, rows),
+        Table(
+            {"policy": "policy", "vehicle": "vehicle", "tasks": "tasks", **FIGURES},
+            rows,
+        ),
         over_layouts(results),
     )
 
 
 def over_layouts(results: dict) -> Table:
-    """A row per policy: captures and crashes with each kind of vehicle, mean over the layouts."""
+    """A row per policy: captures and crashes with each kind of vehicle, mean over the
+    layouts.
+    """
     columns: dict[str, Column] = {"policy": "policy"}
     rows = []
     for name, kinds in results["policies"].items():
         row: dict = {"policy": name}
         for kind, found in kinds.items():
-            layouts = [summary for tasks, summary in found.items() if tasks in SCENARIOS]
-            for word, figure in (("captures", "capture_rate"), ("crashes", "crash_rate")):
+            layouts = [
+                summary for tasks, summary in found.items() if tasks in SCENARIOS
+            ]
+            for word, figure in (
+                ("captures", "capture_rate"),
+                ("crashes", "crash_rate"),
+            ):
                 head = f"{kind}: {word}"
                 row[head] = float(np.mean([summary[figure] for summary in layouts]))
                 columns[head] = lambda r, head=head: f"{r[head]:.3f}"
@@ -164,14 +184,23 @@ def main(arguments: list[str]) -> int:
     """Evaluate and write both files."""
     parser = page_parser(__doc__, "vehicles")
     parser.add_argument(
-        "--policy", nargs="+", default=["open", "flight"], help="names, runs or policy files"
+        "--policy",
+        nargs="+",
+        default=["open", "flight"],
+        help="names, runs or policy files",
     )
     parser.add_argument("--number", type=int, default=1024, help="uniform tasks")
-    parser.add_argument("--layouts", type=int, default=100, help="episodes of each layout; 0: none")
-    parser.add_argument("--physics", default="rigid")
-    parser.add_argument("--vehicles", nargs="+", choices=list(vehicles()), default=list(vehicles()))
     parser.add_argument(
-        "--airframe", choices=list(AIRFRAMES), help="what flies; default: the policy's own"
+        "--layouts", type=int, default=100, help="episodes of each layout; 0: none"
+    )
+    parser.add_argument("--physics", default="rigid")
+    parser.add_argument(
+        "--vehicles", nargs="+", choices=list(vehicles()), default=list(vehicles())
+    )
+    parser.add_argument(
+        "--airframe",
+        choices=list(AIRFRAMES),
+        help="what flies; default: the policy's own",
     )
     publish(parser.parse_args(arguments), study, page)
     return 0

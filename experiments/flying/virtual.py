@@ -1,5 +1,5 @@
-"""Virtual Crazyflies of an experiment, in a process of their own that keeps where they truly
-were.
+"""Virtual Crazyflies of an experiment, in a process of their own that keeps where they
+truly were.
 """
 
 from __future__ import annotations
@@ -35,19 +35,29 @@ class Truth:
 
     def write(self, now: float, report) -> None:
         """The vehicles are as `report` says at `now` (s)."""
-        of_all = (report.position, report.velocity, report.quaternion, report.body_rates)
-        self._numbers[1:] = np.column_stack([np.full(self.number, now), *of_all]).ravel().tolist()
+        of_all = (
+            report.position,
+            report.velocity,
+            report.quaternion,
+            report.body_rates,
+        )
+        self._numbers[1:] = (
+            np.column_stack([np.full(self.number, now), *of_all]).ravel().tolist()
+        )
 
     def poses(self) -> list[Pose]:
         """Of all vehicles."""
         rows = np.array(self._numbers[1:]).reshape(self.number, _POSE).tolist()
         return [
-            Pose(r[0], tuple(r[1:4]), tuple(r[4:7]), tuple(r[7:11]), tuple(r[11:14])) for r in rows
+            Pose(r[0], tuple(r[1:4]), tuple(r[4:7]), tuple(r[7:11]), tuple(r[11:14]))
+            for r in rows
         ]
 
 
 class VirtualProcess:
-    """Three virtual Crazyflies that can be put back to their stands; `uris`, `truth`."""
+    """Three virtual Crazyflies that can be put back to their stands; `uris`,
+    `truth`.
+    """
 
     def __init__(self, scenario: str):
         context = multiprocessing.get_context("spawn")
@@ -60,15 +70,15 @@ class VirtualProcess:
         self.uris = self._pipe.recv()
 
     def reset(self, fault: Fault) -> None:
-        """All on their stands, switched off and on; the fault's damage is done to what they
-        send.
+        """All on their stands, switched off and on; the fault's damage is done to what
+        they send.
         """
         self._pipe.send(fault)
         self._pipe.recv()
 
     def track(self) -> dict[str, np.ndarray]:
-        """Since the last reset: time (T,), position (T, N, 3), off and armed (T, N), crashed
-        (N,).
+        """Since the last reset: time (T,), position (T, N, 3), off and armed (T, N),
+        crashed (N,).
         """
         self._pipe.send(None)
         return self._pipe.recv()
@@ -105,7 +115,9 @@ class _Flown:
     def _reset(self, fault):
         self._fault, self._damage = fault, PoseDamage(fault)
         self._virtual.vehicles.reset()
-        for firmware, link in zip(self._virtual.firmware, self._virtual.links, strict=True):
+        for firmware, link in zip(
+            self._virtual.firmware, self._virtual.links, strict=True
+        ):
             firmware.restart()
             link.faults = link.faults.__class__()
         self._rows = []
@@ -116,13 +128,19 @@ class _Flown:
         """What vehicle i senses, as its log blocks tell it."""
         sensors = self._sensors(i)
         now = time.perf_counter() - self._truth.take_off
-        sensed = (sensors.position, sensors.velocity, sensors.quaternion, sensors.body_rates)
+        sensed = (
+            sensors.position,
+            sensors.velocity,
+            sensors.quaternion,
+            sensors.body_rates,
+        )
         pose = Pose(now, *(tuple(x.tolist()) for x in sensed))
         sent = self._damage("radio", i, now, pose, ())
         if sent is pose or sent is None:
             return sensors
         parts = [
-            np.array(p) for p in (sent.position, sent.velocity, sent.quaternion, sent.body_rates)
+            np.array(p)
+            for p in (sent.position, sent.velocity, sent.quaternion, sent.body_rates)
         ]
         return sensors.__class__(
             *parts, sensors.specific_force, sensors.motor_command, sensors.voltage
@@ -154,7 +172,9 @@ class _Flown:
                     "armed": armed,
                     "crashed": crashed,
                 }
-                self._pipe.send({name: np.array(values) for name, values in kinds.items()})
+                self._pipe.send(
+                    {name: np.array(values) for name, values in kinds.items()}
+                )
             else:
                 self._reset(asked)
                 self._pipe.send("ready")

@@ -1,9 +1,9 @@
 """The paper's behaviours, measured and drawn.
 
-The paper shows four by pictures: surrounding from both sides (wall), a shortcut instead of
-following (narrow_gap), finding the evader behind pillars (random, and hidden, where nobody sees it
-at the start), blocking all three ways out (passage). Here each is a number for every method, beside
-one episode from above.
+The paper shows four by pictures: surrounding from both sides (wall), a shortcut instead
+of following (narrow_gap), finding the evader behind pillars (random, and hidden, where
+nobody sees it at the start), blocking all three ways out (passage). Here each is a
+number for every method, beside one episode from above.
 """
 
 from pathlib import Path
@@ -45,8 +45,8 @@ MEASURES = {
 
 
 def measure(layout: str, paths: Any, statistics: Any) -> dict[str, float | None]:
-    """What `MEASURES` names, mean over B episodes; of those with a capture where only they tell
-    ("met", "shorter way").
+    """What `MEASURES` names, mean over B episodes; of those with a capture where only
+    they tell ("met", "shorter way").
 
     Args:
         layout: a name of `MEASURES`.
@@ -64,7 +64,9 @@ def measure(layout: str, paths: Any, statistics: Any) -> dict[str, float | None]
         # beyond the middle plane or in line with the wall: not merely on the way there
         there = x < 0.15
         sides = [np.any(there & (sign * y > END), axis=-1) for sign in (1.0, -1.0)]
-        return {"both sides": float(np.mean(np.any(sides[0] & sides[1] & before, axis=1)))}
+        return {
+            "both sides": float(np.mean(np.any(sides[0] & sides[1] & before, axis=1)))
+        }
     if layout == "passage":
         low, high = CORRIDORS
         ways = (y < low, (y > low) & (y < high), y > high)
@@ -78,7 +80,10 @@ def measure(layout: str, paths: Any, statistics: Any) -> dict[str, float | None]
             who = int(np.argmax(paths.captured[b, last]))
             velocity = evader[b, last] - evader[b, max(last - 5, 0)]
             met.append(np.dot(velocity, pursuers[b, last, who] - evader[b, last]) > 0.0)
-            ways.append(_way(pursuers[b, : last + 1, who]) / max(_way(evader[b, : last + 1]), 1e-6))
+            ways.append(
+                _way(pursuers[b, : last + 1, who])
+                / max(_way(evader[b, : last + 1]), 1e-6)
+            )
         return {"met": _mean(met), "shorter way": _mean(ways)}
     seen = np.asarray(paths.seen)
     first = np.where(seen.any(axis=1), seen.argmax(axis=1) + 1, seen.shape[1])
@@ -89,13 +94,19 @@ def measure(layout: str, paths: Any, statistics: Any) -> dict[str, float | None]
 def one_episode(paths: Any) -> dict[str, list]:
     """The first episode's paths up to a second after its capture, thinned out."""
     caught = np.asarray(paths.captured[0]).any(axis=-1)
-    end = min(int(np.argmax(caught)) + 100, len(caught)) if caught.any() else len(caught)
+    end = (
+        min(int(np.argmax(caught)) + 100, len(caught)) if caught.any() else len(caught)
+    )
 
     def thin(values):
         return np.round(np.asarray(values)[0, :end:EVERY], 3).tolist()
 
     capture = int(np.argmax(caught)) // EVERY if caught.any() else None
-    return {"pursuers": thin(paths.pursuers), "evader": thin(paths.evader), "capture": capture}
+    return {
+        "pursuers": thin(paths.pursuers),
+        "evader": thin(paths.evader),
+        "capture": capture,
+    }
 
 
 def _way(positions):
@@ -117,7 +128,9 @@ def page(results: dict) -> Page:
                 row[method] = [f["layouts"][layout]["behaviour"][name] for f in flown]
             rows.append(row)
     meanings = [
-        f"* {layout}, {n}: {text}" for layout, own in MEASURES.items() for n, text in own.items()
+        f"* {layout}, {n}: {text}"
+        for layout, own in MEASURES.items()
+        for n, text in own.items()
     ]
     columns = {"layout": "layout", "behaviour": "name"}
     return Page(
@@ -137,16 +150,21 @@ def draw(results: dict, path: Path) -> None:
     """One episode of every method's first seed on the paper's four layouts."""
     layouts = [layout for layout in MEASURES if layout != "hidden"]
     shown = [method for method in METHODS if flights_of(results, method)]
-    figure = Figure(figsize=(3.1 * len(shown), 3.3 * len(layouts)), layout="constrained")
+    figure = Figure(
+        figsize=(3.1 * len(shown), 3.3 * len(layouts)), layout="constrained"
+    )
     axes = figure.subplots(len(layouts), len(shown), squeeze=False)
     for i, layout in enumerate(layouts):
         for j, method in enumerate(shown):
             flown = flights_of(results, method)[0]["layouts"][layout]
-            told = ", ".join(f"{n} {x:.2g}" for n, x in flown["behaviour"].items() if x is not None)
+            told = ", ".join(
+                f"{n} {x:.2g}" for n, x in flown["behaviour"].items() if x is not None
+            )
             draw_from_above(axes[i, j], trajectory_of(flown["paths"], layout, told))
             axes[i, j].title.set_fontsize("x-small")
             axes[i, j].set(
-                xlabel=method if i == len(layouts) - 1 else "", ylabel=layout if j == 0 else ""
+                xlabel=method if i == len(layouts) - 1 else "",
+                ylabel=layout if j == 0 else "",
             )
     figure.savefig(path, dpi=70)
 
@@ -161,7 +179,9 @@ def trajectory_of(paths: dict, layout: str, title: str) -> Trajectory:
     return Trajectory(
         title=title,
         pursuer_position=pursuers,
-        pursuer_quaternion=np.broadcast_to([1.0, 0.0, 0.0, 0.0], (*pursuers.shape[:2], 4)),
+        pursuer_quaternion=np.broadcast_to(
+            [1.0, 0.0, 0.0, 0.0], (*pursuers.shape[:2], 4)
+        ),
         evader_position=np.array(paths["evader"]),
         captured=captured,
         crashed=np.zeros_like(captured),

@@ -1,5 +1,5 @@
-"""Flights for the paper's tables: many episodes of one policy in one compiled call, each with its
-own evader speed.
+"""Flights for the paper's tables: many episodes of one policy in one compiled call,
+each with its own evader speed.
 """
 
 import dataclasses
@@ -40,8 +40,8 @@ class Flights:
 
     evaluation: Evaluation  # (B,) each
     first: jax.Array
-    """(B, R) int32, first step with a capture within each radius; episode length + 1 where there is
-    none.
+    """(B, R) int32, first step with a capture within each radius; episode length + 1
+    where there is none.
     """
     paths: Paths
 
@@ -56,14 +56,17 @@ def fly(
     speeds: jax.Array,
     key: jax.Array,
 ) -> Flights:
-    """One episode per task (leading axis B), with evader speeds (B,) in m/s; `key` draws the start
-    attitudes.
+    """One episode per task (leading axis B), with evader speeds (B,) in m/s; `key`
+    draws the start attitudes.
 
-    A radius changes nothing but what counts as a capture, so each flight tells it for all `radii`
-    (m).
+    A radius changes nothing but what counts as a capture, so each flight tells it for
+    all `radii` (m).
     """
     settings = environment.settings
-    plain = {field.name: getattr(settings, field.name) for field in dataclasses.fields(settings)}
+    plain = {
+        field.name: getattr(settings, field.name)
+        for field in dataclasses.fields(settings)
+    }
     never = settings.episode_length + 1
     number = speeds.shape[0]
 
@@ -75,7 +78,9 @@ def fly(
         return observation, state, info
 
     def caught(state):
-        games = [dataclasses.replace(settings, capture_radius=radius) for radius in radii]
+        games = [
+            dataclasses.replace(settings, capture_radius=radius) for radius in radii
+        ]
         where = (state.drones.position, state.evader_position, state.in_sight)
         each = [captures(game, *where) for game in games]
         return jnp.any(jnp.stack(each), axis=-1)
@@ -85,17 +90,27 @@ def fly(
         predicted = policy.predict(parameters, observation)
         mean, _ = policy.distribution(parameters.actor, observation, predicted)
         last_seen = observation.last_seen
-        observation, state, info = jax.vmap(step)(state, policy.action(mean, observation), speeds)
+        observation, state, info = jax.vmap(step)(
+            state, policy.action(mean, observation), speeds
+        )
         now = jnp.where(jax.vmap(caught)(state), state.step[:, None], never)
-        guesses = jnp.stack([last_seen if predicted is None else predicted[:, 0], last_seen])
+        guesses = jnp.stack(
+            [last_seen if predicted is None else predicted[:, 0], last_seen]
+        )
         errors = errors + jnp.linalg.norm(guesses - state.evader_position, axis=-1)
-        paths = Paths(state.drones.position, state.evader_position, info.seen, info.captured)
+        paths = Paths(
+            state.drones.position, state.evader_position, info.seen, info.captured
+        )
         return (observation, state, jnp.minimum(first, now), errors), paths
 
-    observation, state = jax.vmap(environment.reset_to)(jax.random.split(key, number), tasks)
+    observation, state = jax.vmap(environment.reset_to)(
+        jax.random.split(key, number), tasks
+    )
     first = jnp.full((number, len(radii)), never, jnp.int32)
     start = (observation, state, first, jnp.zeros((2, number), jnp.float32))
-    (_, state, first, errors), paths = jax.lax.scan(one, start, length=settings.episode_length)
+    (_, state, first, errors), paths = jax.lax.scan(
+        one, start, length=settings.episode_length
+    )
     predicted, last_seen = errors / settings.episode_length
     return Flights(
         evaluation=Evaluation(

@@ -1,5 +1,5 @@
-"""The paper's tables: six methods on its layouts, its parts on layouts unlike its training, errors
-of the prediction.
+"""The paper's tables: six methods on its layouts, its parts on layouts unlike its
+training, errors of the prediction.
 """
 
 from collections.abc import Iterable
@@ -25,7 +25,10 @@ VARIANTS = ("OPEN", "MAPPO + predictor", "MAPPO + generator", "MAPPO")
 def page(results: dict) -> Page:
     """The three tables."""
     columns = {"layout": "layout", "method": "method"}
-    columns |= {name.replace("_", " "): beside_paper(name, form) for name, form in FIGURES.items()}
+    columns |= {
+        name.replace("_", " "): beside_paper(name, form)
+        for name, form in FIGURES.items()
+    }
     prediction = {
         "layout": "layout",
         "OPEN": "prediction_error:.4f",
@@ -43,11 +46,15 @@ def page(results: dict) -> Page:
         "rate: share of episodes in which any pursuer touches something solid or tips over.",
         (
             Table(
-                columns, cells(results, METHODS, "clamp", LAYOUTS), "Speed clamp, as in the paper"
+                columns,
+                cells(results, METHODS, "clamp", LAYOUTS),
+                "Speed clamp, as in the paper",
             ),
             verdicts(results),
             Table(
-                columns, cells(results, METHODS, "no clamp", LAYOUTS), "Honest physics: no clamp"
+                columns,
+                cells(results, METHODS, "no clamp", LAYOUTS),
+                "Honest physics: no clamp",
             ),
             Table(
                 columns,
@@ -68,7 +75,9 @@ def page(results: dict) -> Page:
 
 
 def captures(results: dict) -> Table:
-    """The page's table: a row per method, ours / the paper's capture rate in each layout."""
+    """The page's table: a row per method, ours / the paper's capture rate in each
+    layout.
+    """
     rows = []
     for method in METHODS:
         row = {"method": method}
@@ -88,12 +97,18 @@ def cells(
     for layout in layouts:
         for method in methods:
             records = [
-                f["layouts"][layout]["record"] for f in flights_of(results, method, condition)
+                f["layouts"][layout]["record"]
+                for f in flights_of(results, method, condition)
             ]
             if records:
-                seeds = {name: [record.get(name) for record in records] for name in records[0]}
+                seeds = {
+                    name: [record.get(name) for record in records]
+                    for name in records[0]
+                }
                 paper = (MAIN.get(layout, {}) | PARTS.get(layout, {})).get(method)
-                found.append({**seeds, "layout": layout, "method": method, "paper": paper})
+                found.append(
+                    {**seeds, "layout": layout, "method": method, "paper": paper}
+                )
     return found
 
 
@@ -114,7 +129,9 @@ def beside_paper(figure: str, form: str):
 
 
 def verdicts(results: dict) -> str:
-    """Where OPEN isn't the best, and where a method is below the paper's own value of it."""
+    """Where OPEN isn't the best, and where a method is below the paper's own value of
+    it.
+    """
     above_open = []
     below_paper = []
     for layout in MAIN:
@@ -130,7 +147,9 @@ def verdicts(results: dict) -> str:
                     above_open.append(f"{layout}: {method} has the better {name}")
                 mean, deviation = record["paper"][i]
                 if sign * (ours - mean) < -deviation - 5e-4:
-                    below_paper.append(f"{layout}, {method}: {name} {ours:.3g} against {mean:.3g}")
+                    below_paper.append(
+                        f"{layout}, {method}: {name} {ours:.3g} against {mean:.3g}"
+                    )
     best = "No method is better than OPEN in any cell."
     if above_open:
         best = f"OPEN is the best but for: {'; '.join(above_open)}."

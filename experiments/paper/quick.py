@@ -1,11 +1,11 @@
-"""The quick preset as a user with two cores meets it: the whole command, installed but nothing
-compiled, for several seeds.
+"""The quick preset as a user with two cores meets it: the whole command, installed but
+nothing compiled, for several seeds.
 
     python -m experiments.paper.quick [--seeds 0 1 2] [--at_once 1] [--options "..."]
 
-Each run has two cores of its own and an empty cache. Its policy is then flown on the validation
-tasks once more, with captures and crashes looked for in every physics step, and not only at those
-at which the policy steers.
+Each run has two cores of its own and an empty cache. Its policy is then flown on the
+validation tasks once more, with captures and crashes looked for in every physics step,
+and not only at those at which the policy steers.
 """
 
 import argparse
@@ -31,14 +31,32 @@ from openjax.pursuit import SCENARIOS, Pursuit
 from openjax.store.policies import LoadedPolicy, load_policy
 
 CORES = 2
-TRIED_ON = ("rows .30", "rows .35", "rows .33 to .40", "gates", "cluster", "six pillars", "crashes")
+TRIED_ON = (
+    "rows .30",
+    "rows .35",
+    "rows .33 to .40",
+    "gates",
+    "cluster",
+    "six pillars",
+    "crashes",
+)
 """What variants of the first flights were flown on; spacings in metres."""
 
 
 def train(options: argparse.Namespace, seed: int, cores: list[int]) -> dict:
-    """One run on those cores: what its table says, and the seconds of the whole command."""
+    """One run on those cores: what its table says, and the seconds of the whole
+    command.
+    """
     run = options.runs / f"seed_{seed}"
-    command = [sys.executable, "-m", "openjax.train", "--preset", "quick", "--seed", str(seed)]
+    command = [
+        sys.executable,
+        "-m",
+        "openjax.train",
+        "--preset",
+        "quick",
+        "--seed",
+        str(seed),
+    ]
     command += [
         "--out",
         str(run),
@@ -55,26 +73,37 @@ def train(options: argparse.Namespace, seed: int, cores: list[int]) -> dict:
     started = time.monotonic()
     with open(f"{run}.txt", "w") as log:
         pinned = ["taskset", "-c", ",".join(map(str, cores)), *command]
-        subprocess.run(pinned, env=environment, stdout=log, stderr=subprocess.STDOUT, check=True)
+        subprocess.run(
+            pinned, env=environment, stdout=log, stderr=subprocess.STDOUT, check=True
+        )
     seconds = round(time.monotonic() - started)
     print(f"seed {seed}: {seconds} s", flush=True)
-    return {"seed": seed, "jax": jax.__version__, "whole_command": seconds, **record(run)}
+    return {
+        "seed": seed,
+        "jax": jax.__version__,
+        "whole_command": seconds,
+        **record(run),
+    }
 
 
 def record(run: Path) -> dict:
-    """What the table of a run says, and its policy flown on the validation tasks once more."""
+    """What the table of a run says, and its policy flown on the validation tasks once
+    more.
+    """
     layouts = read_json(run / "layouts.json")
     loaded = load_policy(run)
     kept = {
-        name: layouts[name] for name in ("after", "open", "seconds", "steps") if name in layouts
+        name: layouts[name]
+        for name in ("after", "open", "seconds", "steps")
+        if name in layouts
     }
     step = loaded.settings.environment.time_step
     return {"time_step": step, **kept, "every_physics_step": fly_finely(loaded)}
 
 
 def fly_finely(loaded: LoadedPolicy) -> dict[str, float]:
-    """Rates on the validation tasks in an environment whose step is one physics step, the policy's
-    action held between.
+    """Rates on the validation tasks in an environment whose step is one physics step,
+    the policy's action held between.
     """
     own = loaded.settings.environment
     held = loaded.settings.environment.substeps
@@ -103,13 +132,17 @@ def fly_finely(loaded: LoadedPolicy) -> dict[str, float]:
             return (observation, state), None
 
         start = jax.vmap(game.reset_to)(keys, tasks)
-        return jax.lax.scan(one, start, None, length=own.episode_length)[0][1].statistics
+        return jax.lax.scan(one, start, None, length=own.episode_length)[0][
+            1
+        ].statistics
 
     statistics = episodes(keys, tasks)
     return {
         "capture_rate": float(jnp.mean(statistics.captured)),
         "crash_rate": float(jnp.mean(statistics.crashed)),
-        "capture_seconds": float(jnp.mean(statistics.capture_step)) * own.time_step / held,
+        "capture_seconds": float(jnp.mean(statistics.capture_step))
+        * own.time_step
+        / held,
     }
 
 
@@ -132,22 +165,32 @@ def page(results: dict) -> Page:
         "JAX": "jax",
         "whole command, s": "whole_command",
         "new tasks": _column("after", "validation"),
-        "... looked at every 10 ms": lambda run: _three(run.get("every_physics_step"), 1.0),
+        "... looked at every 10 ms": lambda run: _three(
+            run.get("every_physics_step"), 1.0
+        ),
         "far starts": _column("after", "validation_far"),
         **{f"`{name}`": _column("after", name) for name in SCENARIOS},
         "new tasks, `open`": _column("open", "validation"),
     }
     parts: list[Table | str] = [Table(columns, results["runs"])]
     if "trials" in results:
-        tried = {name: (lambda row, name=name: spread(row[name], ".2f")) for name in TRIED_ON}
+        tried = {
+            name: (lambda row, name=name: spread(row[name], ".2f")) for name in TRIED_ON
+        }
         parts.append(
-            Table({"variant": "variant", "updates": "updates", **tried}, *results["trials"])
+            Table(
+                {"variant": "variant", "updates": "updates", **tried},
+                *results["trials"],
+            )
         )
     parts.append("\n".join(f"* {found}" for found in results.get("findings", ())))
     prose = f"{results['preset']} Each cell: capture rate, seconds to the capture, crash rate. {results.get('note', '')}"
     todays = [run for run in results["runs"] if "recipe" not in run]
     return Page(
-        "The quick preset: what two CPU cores learn", prose, parts, Table(SHOWN, todays[:MOST])
+        "The quick preset: what two CPU cores learn",
+        prose,
+        parts,
+        Table(SHOWN, todays[:MOST]),
     )
 
 
@@ -206,7 +249,9 @@ def main() -> None:
         "--at_once", type=int, default=1, help="runs side by side, on two cores each"
     )
     parser.add_argument("--options", default="", help="more options of openjax.train")
-    parser.add_argument("--runs", type=Path, default=Path("runs/quick"), help="folder of the runs")
+    parser.add_argument(
+        "--runs", type=Path, default=Path("runs/quick"), help="folder of the runs"
+    )
     publish(parser.parse_args(), study, page)
 
 

@@ -1,9 +1,9 @@
-"""The paper's tables and figures, by the shipped weights: `python -m experiments.paper.tables
-[--episodes 100]`.
+"""The paper's tables and figures, by the shipped weights: `python -m
+experiments.paper.tables [--episodes 100]`.
 
-Flies every method once, all its layouts, capture radii and evader speeds in one compiled call, and
-stores what came of it in experiments/results/tables.json; the pages in `PAGES` are made from there.
-`--report` makes them again.
+Flies every method once, all its layouts, capture radii and evader speeds in one
+compiled call, and stores what came of it in experiments/results/tables.json; the pages
+in `PAGES` are made from there. `--report` makes them again.
 """
 
 import argparse
@@ -27,7 +27,14 @@ from openjax.evaluation.episodes import summarise
 from openjax.evaluation.evaluator import layout_slots, repeat_task, stacked
 from openjax.evaluation.result_tables import record_of
 from openjax.files import read_json, to_plain, write_text
-from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings, RewardSettings, Task, scenario_task
+from openjax.pursuit import (
+    SCENARIOS,
+    Pursuit,
+    PursuitSettings,
+    RewardSettings,
+    Task,
+    scenario_task,
+)
 from openjax.store.policies import LoadedPolicy, load_policy
 
 PAGES = {
@@ -61,10 +68,14 @@ def game_of(name: str, limit: str, physics: str) -> tuple[LoadedPolicy, Pursuit]
 def cells_of(evader_speed: float, episodes: int) -> list[tuple[str, float, int]]:
     """Layout, evader speed (m/s) and number of what a policy flies in one call."""
     cells = [(layout, evader_speed, episodes) for layout in LAYOUTS]
-    return cells + [(layout, speed, max(1, episodes // 2)) for layout, speed in sweeps.CELLS]
+    return cells + [
+        (layout, speed, max(1, episodes // 2)) for layout, speed in sweeps.CELLS
+    ]
 
 
-def tasks_of(game: PursuitSettings, cells: list[tuple[str, float, int]]) -> dict[int, Task]:
+def tasks_of(
+    game: PursuitSettings, cells: list[tuple[str, float, int]]
+) -> dict[int, Task]:
     """The tasks of each cell, by its place."""
     return {
         i: repeat_task(scenario_task(game, SCENARIOS[name]), n)
@@ -83,14 +94,16 @@ def call_of(name: str, seed: int, limit: str, physics: str, episodes: int) -> tu
         sweeps.RADII,
         loaded.parameters,
         stacked(tasks_of(game, cells))[0],
-        jnp.concatenate([jnp.full(number, speed, jnp.float32) for _, speed, number in cells]),
+        jnp.concatenate(
+            [jnp.full(number, speed, jnp.float32) for _, speed, number in cells]
+        ),
         jax.random.key(seed),
     )
 
 
 def of_policy(name: str, seed: int, limit: str, physics: str, episodes: int) -> dict:
-    """By layout: the record of a policy, what it did there, the paths of one episode; and its two
-    sweeps.
+    """By layout: the record of a policy, what it did there, the paths of one episode;
+    and its two sweeps.
     """
     call = call_of(name, seed, limit, physics, episodes)
     game = call[0].settings
@@ -99,10 +112,14 @@ def of_policy(name: str, seed: int, limit: str, physics: str, episodes: int) -> 
     parts = list(part(jax.tree.map(np.asarray, fly(*call))).values())
     layouts = {}
     for layout, part in zip(LAYOUTS, parts, strict=False):
-        row = record_of(layout, episodes, summarise(part.evaluation), ("last_seen_error",))
+        row = record_of(
+            layout, episodes, summarise(part.evaluation), ("last_seen_error",)
+        )
         layouts[layout] = {
             "record": row,
-            "behaviour": behaviours.measure(layout, part.paths, part.evaluation.statistics),
+            "behaviour": behaviours.measure(
+                layout, part.paths, part.evaluation.statistics
+            ),
             "paths": behaviours.one_episode(part.paths),
         }
     return {
@@ -112,20 +129,26 @@ def of_policy(name: str, seed: int, limit: str, physics: str, episodes: int) -> 
 
 
 def flights_to_keep(options: argparse.Namespace, alike: dict) -> list[dict]:
-    """What stands in the file already of methods that aren't flown anew, if it was flown alike."""
+    """What stands in the file already of methods that aren't flown anew, if it was
+    flown alike.
+    """
     stored = options.out / "tables.json"
     if not stored.exists() or len(options.methods) == len(LABELS):
         return []
     kept = read_json(stored)
     same = {name: kept.get(name) for name in alike} == alike
     return [
-        flight for flight in kept["flights"] if same and flight["method"] not in options.methods
+        flight
+        for flight in kept["flights"]
+        if same and flight["method"] not in options.methods
     ]
 
 
-def calls_of(options: argparse.Namespace) -> dict[tuple[str, str], list[tuple[str, int]]]:
-    """Policies and seeds by method and condition; heuristics fly without the clamp, too: no
-    training chose their speed.
+def calls_of(
+    options: argparse.Namespace,
+) -> dict[tuple[str, str], list[tuple[str, int]]]:
+    """Policies and seeds by method and condition; heuristics fly without the clamp,
+    too: no training chose their speed.
     """
     return {
         (label, condition): seeds_of(label)
@@ -143,7 +166,8 @@ def study(options: argparse.Namespace) -> None:
     wanted = calls_of(options)
     flights = flights_to_keep(options, alike)
     compiled = {}
-    for (label, condition), seeds in wanted.items():  # compiled side by side, and while others fly
+    # compiled side by side, and while others fly
+    for (label, condition), seeds in wanted.items():
         for name, seed in seeds[:1]:
             compiled[label, condition] = compile_ahead(
                 fly, *call_of(name, seed, LIMITS[condition], *rest)
@@ -155,14 +179,28 @@ def study(options: argparse.Namespace) -> None:
             begun = time.monotonic()
             flown = of_policy(name, seed, LIMITS[condition], *rest)
             if condition != "clamp" or (name, seed) != seeds[0]:
-                for layout in flown["layouts"].values():  # one episode of each method is drawn
+                # one episode of each method is drawn
+                for layout in flown["layouts"].values():
                     del layout["paths"]
-            about = {"method": label, "policy": name, "seed": seed, "condition": condition}
+            about = {
+                "method": label,
+                "policy": name,
+                "seed": seed,
+                "condition": condition,
+            }
             flights.append({**about, "seconds": time.monotonic() - begun, **flown})
-            print(f"{time.monotonic() - started:5.0f} s  {label}: {name}, {condition}", flush=True)
+            print(
+                f"{time.monotonic() - started:5.0f} s  {label}: {name}, {condition}",
+                flush=True,
+            )
         # after each, so that an interrupted study leaves what it has
         seconds = time.monotonic() - started
-        results = {**facts(options.commit), "seconds": seconds, **alike, "flights": flights}
+        results = {
+            **facts(options.commit),
+            "seconds": seconds,
+            **alike,
+            "flights": flights,
+        }
         # paths are long: no line for each number
         text = json.dumps(to_plain(results), allow_nan=False, separators=(",", ":"))
         write_text(options.out / "tables.json", text)
@@ -172,13 +210,23 @@ def main(arguments: list[str]) -> int:
     """Fly or read the flights, then write all pages."""
     parser = page_parser(__doc__, ".")
     parser.add_argument(
-        "--episodes", type=int, default=100, help="per seed and layout; half for the sweeps"
+        "--episodes",
+        type=int,
+        default=100,
+        help="per seed and layout; half for the sweeps",
     )
     parser.add_argument(
-        "--physics", choices=("rigid", "mjx"), default="rigid", help="mjx: the same, slower"
+        "--physics",
+        choices=("rigid", "mjx"),
+        default="rigid",
+        help="mjx: the same, slower",
     )
     parser.add_argument(
-        "--methods", nargs="+", choices=LABELS, default=list(LABELS), help="fly these anew"
+        "--methods",
+        nargs="+",
+        choices=LABELS,
+        default=list(LABELS),
+        help="fly these anew",
     )
     options = parser.parse_args(arguments)
     if not options.report:

@@ -1,12 +1,14 @@
 """Seconds that `environment.step` takes to compile, and its speed: `python -m
 experiments.speed.environment_step [--source SRC ...]`.
 
-Each SRC is a folder that holds a package `openjax`, timed in a process of its own and in turns, so
-that two versions are compared on one machine: `git archive COMMIT src assets | tar -x -C DIR`. The
-step is vmapped and runs in a scan, as in anybody's program. Prints a line of JSON for each.
+Each SRC is a folder that holds a package `openjax`, timed in a process of its own and
+in turns, so that two versions are compared on one machine: `git archive COMMIT src
+assets | tar -x -C DIR`. The step is vmapped and runs in a scan, as in anybody's
+program. Prints a line of JSON for each.
 
-With `--masked` each source is timed a second time with masks: a game of teams of any size, in which
-all slots are in use, and the evader's speed and the capture radius are the task's.
+With `--masked` each source is timed a second time with masks: a game of teams of any
+size, in which all slots are in use, and the evader's speed and the capture radius are
+the task's.
 """
 
 import argparse
@@ -29,8 +31,14 @@ def measure(worlds: int, steps: int, contacts: bool, masked: bool) -> dict:
     import openjax
 
     jax.config.update("jax_enable_compilation_cache", False)
-    teams = {"team_sizes": (3,), "evader_speeds": (0.8, 2.0), "capture_radii": (0.2, 0.4)}
-    environment = openjax.make(physics="rigid", contacts=contacts, **(teams if masked else {}))
+    teams = {
+        "team_sizes": (3,),
+        "evader_speeds": (0.8, 2.0),
+        "capture_radii": (0.2, 0.4),
+    }
+    environment = openjax.make(
+        physics="rigid", contacts=contacts, **(teams if masked else {})
+    )
     key = jax.random.key(0)
     state = jax.jit(jax.vmap(environment.reset))(jax.random.split(key, worlds))[1]
     pursuers = environment.settings.num_pursuers
@@ -38,7 +46,9 @@ def measure(worlds: int, steps: int, contacts: bool, masked: bool) -> dict:
     step = jax.vmap(environment.step, in_axes=(None, 0, 0))
 
     def fly(state):
-        return jax.lax.scan(lambda s, _: (step(key, s, action)[1], None), state, length=steps)[0]
+        return jax.lax.scan(
+            lambda s, _: (step(key, s, action)[1], None), state, length=steps
+        )[0]
 
     began = time.perf_counter()
     program = jax.jit(fly).lower(state).compile()
@@ -69,7 +79,9 @@ def main(arguments: list[str]) -> None:
     options = parser.parse_args(arguments)
     if options.here:
         contacts = not options.free
-        print(json.dumps(measure(options.worlds, options.steps, contacts, options.masked)))
+        print(
+            json.dumps(measure(options.worlds, options.steps, contacts, options.masked))
+        )
         return
     plain = [argument for argument in arguments if argument != "--masked"]
     ways = [plain, arguments] if options.masked else [plain]

@@ -1,10 +1,11 @@
-"""The first updates of a few small runs, bit for bit, and how large their programs are: to show of
-a change of structure that it changes no number.
+"""The first updates of a few small runs, bit for bit, and how large their programs are:
+to show of a change of structure that it changes no number.
 
     python -m experiments.speed.first_updates before.json              # in one checkout
     python -m experiments.speed.first_updates after.json before.json   # in another: what differs
 
-Leaves of the carry are compared as a multiset of checksums, so that they may change their names.
+Leaves of the carry are compared as a multiset of checksums, so that they may change
+their names.
 """
 
 import hashlib
@@ -23,7 +24,9 @@ SEEDS = 5
 UPDATES = 2
 SMALL = changed(
     TrainSettings(),
-    environment=dict(episode_length=12, physics="rigid", history_length=3, capture_radius=1.0),
+    environment=dict(
+        episode_length=12, physics="rigid", history_length=3, capture_radius=1.0
+    ),
     network=dict(features=8, heads=2),
     predictor=dict(units=4, windows=2, steps=1, horizons=(1, 2)),
     mappo=dict(minibatches=2, epochs=2, penalty_start=0.2),
@@ -32,7 +35,9 @@ SMALL = changed(
     rollout_length=4,
     total_steps=24 * 4 * 10,
 )
-REWARD = dict(first_capture=5.0, smoothness=2.0, crash=10.0, first_crash=9.0, lookahead=0.1)
+REWARD = dict(
+    first_capture=5.0, smoothness=2.0, crash=10.0, first_crash=9.0, lookahead=0.1
+)
 RUNS = {
     "plain": SMALL,
     "evaders": changed(
@@ -55,7 +60,9 @@ RUNS = {
     ),
     "bare": changed(
         SMALL,
-        environment=dict(speed_limit="none", substeps=2, physics="stops", reward=REWARD),
+        environment=dict(
+            speed_limit="none", substeps=2, physics="stops", reward=REWARD
+        ),
         network=dict(critic_input="observation", squash="sample"),
         predictor=dict(enabled=False),
         generator=dict(enabled=False),
@@ -78,13 +85,17 @@ def checksums(tree) -> list[str]:
 def equations(jaxpr) -> int:
     """How many a program has, those inside others too."""
     inside = [
-        sub for equation in jaxpr.eqns for sub in jax.extend.core.jaxprs_in_params(equation.params)
+        sub
+        for equation in jaxpr.eqns
+        for sub in jax.extend.core.jaxprs_in_params(equation.params)
     ]
     return len(jaxpr.eqns) + sum(map(equations, inside))
 
 
 def first_updates(settings: TrainSettings) -> dict:
-    """Checksums of the carry and the metrics after each seed's updates; the size of the step."""
+    """Checksums of the carry and the metrics after each seed's updates; the size of the
+    step.
+    """
     start = make_start(settings)
     step = make_training_step(settings)
     carry = jax.eval_shape(start, jax.random.key(0))
@@ -97,12 +108,16 @@ def first_updates(settings: TrainSettings) -> dict:
         for _ in range(UPDATES):
             carry, metrics = compiled(carry)
         record[f"seed {seed}, carry"] = checksums(carry)
-        record[f"seed {seed}, metrics"] = {name: float(metrics[name]) for name in sorted(metrics)}
+        record[f"seed {seed}, metrics"] = {
+            name: float(metrics[name]) for name in sorted(metrics)
+        }
     return record
 
 
 def main(file: str, before: str | None = None) -> int:
-    """Write the record; with that of before, say what differs. Returns the exit status."""
+    """Write the record; with that of before, say what differs. Returns the exit
+    status.
+    """
     records = {}
     for name, settings in RUNS.items():
         records[name] = first_updates(settings)

@@ -1,9 +1,11 @@
-"""openjax beside its peers: `python -m experiments.speed.peers [--worlds 131072] [--json FILE]`.
+"""openjax beside its peers: `python -m experiments.speed.peers [--worlds 131072]
+[--json FILE]`.
 
-Steps a second of drones (crazyflow, hyperdrone) and of a game (JaxMARL's simple_tag), and seconds
-until a tumbling drone is caught and held by a learner (Brax's PPO, rl-tools' SAC) on our physics.
-`pip install crazyflow hyperdrone jaxmarl brax rltools` has them; what isn't installed is left out
-with a line. Every call is compiled, warmed up and repeated; the median counts.
+Steps a second of drones (crazyflow, hyperdrone) and of a game (JaxMARL's simple_tag),
+and seconds until a tumbling drone is caught and held by a learner (Brax's PPO,
+rl-tools' SAC) on our physics. `pip install crazyflow hyperdrone jaxmarl brax rltools`
+has them; what isn't installed is left out with a line. Every call is compiled, warmed
+up and repeated; the median counts.
 """
 
 import argparse
@@ -38,12 +40,16 @@ def rate(run, *arguments, steps: int) -> float:
 
 
 def scanned(step, steps: int):
-    return jax.jit(lambda state: jax.lax.scan(lambda s, _: step(s), state, None, length=steps)[0])
+    return jax.jit(
+        lambda state: jax.lax.scan(lambda s, _: step(s), state, None, length=steps)[0]
+    )
 
 
 def openjax_drones(options, contacts: bool = True) -> dict:
     game = openjax.make(contacts=contacts)
-    state = jax.jit(jax.vmap(game.reset))(jax.random.split(jax.random.key(0), options.worlds))[1]
+    state = jax.jit(jax.vmap(game.reset))(
+        jax.random.split(jax.random.key(0), options.worlds)
+    )[1]
     command = action_to_command(jnp.broadcast_to(hover_action(VEHICLE), (3, 4)))
 
     def step(state):
@@ -53,7 +59,11 @@ def openjax_drones(options, contacts: bool = True) -> dict:
         return state.replace(drones=moved), None
 
     number = 3 * options.worlds * options.steps
-    return {"drone_steps_per_second": rate(scanned(step, options.steps), state, steps=number)}
+    return {
+        "drone_steps_per_second": rate(
+            scanned(step, options.steps), state, steps=number
+        )
+    }
 
 
 def crazyflow_drones(options) -> dict:
@@ -65,7 +75,9 @@ def crazyflow_drones(options) -> dict:
     )  # fmt: skip
     sim.mjx_data = None  # for pictures and contact queries: the step doesn't use it
     hover = float(sim.data.params.mass[0]) * 9.81
-    sim.body_rate_control(jnp.full((options.worlds, 3, 4), jnp.array([0.1, 0.1, 0.1, hover])))
+    sim.body_rate_control(
+        jnp.full((options.worlds, 3, 4), jnp.array([0.1, 0.1, 0.1, hover]))
+    )
     number = 3 * options.worlds * options.steps
 
     def run(data):
@@ -88,7 +100,9 @@ def hyperdrone_drones(options) -> dict:
             sim.step(action)
         sim.synchronize()
 
-    return {"drone_steps_per_second": rate(run, steps=3 * options.worlds * options.steps)}
+    return {
+        "drone_steps_per_second": rate(run, steps=3 * options.worlds * options.steps)
+    }
 
 
 def game_steps(options, environment, restarts: bool = True) -> dict:
@@ -97,15 +111,24 @@ def game_steps(options, environment, restarts: bool = True) -> dict:
     keys = jax.random.split(jax.random.key(0), options.worlds)
     state = jax.jit(jax.vmap(environment.reset))(keys)[1]
     actions = {
-        agent: environment.action_space(agent).sample(keys[0]) for agent in environment.agents
+        agent: environment.action_space(agent).sample(keys[0])
+        for agent in environment.agents
     }
 
     def step(state):
-        observed, state, reward, *_ = jax.vmap(advance, (0, 0, None))(keys, state, actions)
+        observed, state, reward, *_ = jax.vmap(advance, (0, 0, None))(
+            keys, state, actions
+        )
         return state, sum(jnp.sum(leaf) for leaf in jax.tree.leaves((observed, reward)))
 
-    run = jax.jit(lambda state: jax.lax.scan(lambda s, _: step(s), state, None, options.steps))
-    return {"environment_steps_per_second": rate(run, state, steps=options.worlds * options.steps)}
+    run = jax.jit(
+        lambda state: jax.lax.scan(lambda s, _: step(s), state, None, options.steps)
+    )
+    return {
+        "environment_steps_per_second": rate(
+            run, state, steps=options.worlds * options.steps
+        )
+    }
 
 
 def jaxmarl_tag(options, restarts: bool = True) -> dict:
@@ -123,7 +146,9 @@ CASES = {
     "openjax, the game without restarts": lambda options: game_steps(
         options, PursuitMultiAgentEnv(), restarts=False
     ),
-    "JaxMARL, simple_tag without restarts": lambda options: jaxmarl_tag(options, restarts=False),
+    "JaxMARL, simple_tag without restarts": lambda options: jaxmarl_tag(
+        options, restarts=False
+    ),
     "Brax's PPO, recovery": lambda options: recovery.brax_ppo(
         options.learning_steps, options.learning_worlds
     ),
@@ -138,7 +163,9 @@ def main(arguments) -> int:
     parser.add_argument("--steps", type=int, default=50, help="steps of a call")
     parser.add_argument("--learning_steps", type=int, default=10_000_000)
     parser.add_argument("--learning_worlds", type=int, default=2048)
-    parser.add_argument("--sac_steps", type=int, default=20_000, help="of a single drone")
+    parser.add_argument(
+        "--sac_steps", type=int, default=20_000, help="of a single drone"
+    )
     parser.add_argument("--only", nargs="*", default=list(CASES), choices=list(CASES))
     parser.add_argument("--json", type=Path, default=Path("peers.json"))
     options = parser.parse_args(arguments)
@@ -152,7 +179,8 @@ def main(arguments) -> int:
             result["left_out"][name] = why
             row = f"left out, {why}"
         print(f"{name}: {row}", flush=True)
-        write_json(options.json, result)  # after each, so that an interrupted study leaves some
+        # after each, so that an interrupted study leaves some
+        write_json(options.json, result)
     return 0
 
 

@@ -1,8 +1,9 @@
-"""A task for learners of other libraries: a tumbling drone is to be caught and held at a point.
+"""A task for learners of other libraries: a tumbling drone is to be caught and held at
+a point.
 
-Each learner sees what the drone does and commands thrust and body rates a hundred times a second.
-What counts are the seconds, compilation included, until it holds the drone for `HOLDS` of an
-episode.
+Each learner sees what the drone does and commands thrust and body rates a hundred times
+a second. What counts are the seconds, compilation included, until it holds the drone
+for `HOLDS` of an episode.
 """
 
 import time
@@ -20,13 +21,17 @@ FREE = make_drones_step("rigid", contacts=False)
 EPISODE = 300
 """Steps of 10 ms."""
 HOLDS = 0.5
-"""Share of an episode within .2 m and below .5 m/s: the way there takes about a second."""
+"""Share of an episode within .2 m and below .5 m/s: the way there takes about a
+second.
+"""
 SIZE = 18
 """Numbers that a learner sees."""
 
 
 def tumble(key):
-    """A drone anywhere within .5 m of the goal, in any attitude, turning at some rad/s."""
+    """A drone anywhere within .5 m of the goal, in any attitude, turning at some
+    rad/s.
+    """
     place, turn, rates = jax.random.split(key, 3)
     quaternion = jax.random.normal(turn, (4,))
     drone = hover_state(
@@ -38,7 +43,9 @@ def tumble(key):
 
 def see(drone):
     axes = jax.vmap(lambda axis: rotate(drone.quaternion, axis))(jnp.eye(3))
-    return jnp.concatenate([drone.position, axes.ravel(), drone.velocity, drone.body_rates / 10.0])
+    return jnp.concatenate(
+        [drone.position, axes.ravel(), drone.velocity, drone.body_rates / 10.0]
+    )
 
 
 def recover(drone, action):
@@ -49,7 +56,11 @@ def recover(drone, action):
     drone = jax.tree.map(lambda leaf: leaf[0], team)
     distance = jnp.linalg.norm(drone.position)
     speed = jnp.linalg.norm(drone.velocity)
-    reward = jnp.exp(-3.0 * distance) - 0.05 * speed - 0.01 * jnp.sum(drone.body_rates**2) / 10.0
+    reward = (
+        jnp.exp(-3.0 * distance)
+        - 0.05 * speed
+        - 0.01 * jnp.sum(drone.body_rates**2) / 10.0
+    )
     return drone, reward, (distance < 0.2) & (speed < 0.5)
 
 
@@ -85,7 +96,9 @@ def brax_ppo(steps: int, worlds: int = 2048) -> dict:
 
     def note(number, metrics):
         held = float(metrics["eval/episode_held"]) / EPISODE
-        curve.append({"steps": int(number), "seconds": time.perf_counter() - begin, "held": held})
+        curve.append(
+            {"steps": int(number), "seconds": time.perf_counter() - begin, "held": held}
+        )
 
     ppo.train(
         Recovery(), num_timesteps=steps, episode_length=EPISODE, progress_fn=note, num_evals=20,
@@ -102,7 +115,9 @@ class RecoveryEnv(gymnasium.Env):
     observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (SIZE,), np.float32)
     action_space = gymnasium.spaces.Box(-1.0, 1.0, (4,), np.float32)
     spec = gymnasium.envs.registration.EnvSpec("Recovery-v0", max_episode_steps=EPISODE)
-    """By which rl-tools knows how long an episode is: without it its program isn't compiled."""
+    """By which rl-tools knows how long an episode is: without it its program isn't
+    compiled.
+    """
 
     def __init__(self):
         self._tumble = jax.jit(tumble)
@@ -118,7 +133,9 @@ class RecoveryEnv(gymnasium.Env):
         return np.asarray(self._see(self._drone)), {}
 
     def step(self, action):
-        self._drone, reward, held = self._recover(self._drone, jnp.asarray(action, jnp.float32))
+        self._drone, reward, held = self._recover(
+            self._drone, jnp.asarray(action, jnp.float32)
+        )
         self._step += 1
         self.held[-1] += float(held) / EPISODE
         seen = np.asarray(self._see(self._drone))
@@ -146,7 +163,9 @@ def rl_tools_sac(steps: int) -> dict:
             break
         if number % (10 * EPISODE) == 0:
             held = max(float(np.mean(one.held[-10:])) for one in environments)
-            curve.append({"steps": number, "seconds": time.perf_counter() - begin, "held": held})
+            curve.append(
+                {"steps": number, "seconds": time.perf_counter() - begin, "held": held}
+            )
             if held >= HOLDS:
                 break
     return summary(curve)

@@ -1,12 +1,12 @@
-"""Seconds to the first update, and to a policy that catches: `python -m experiments.speed.seconds
-[--starts paper] [--seeds 1]`.
+"""Seconds to the first update, and to a policy that catches: `python -m
+experiments.speed.seconds [--starts paper] [--seeds 1]`.
 
-Runs of `openjax train`, one after the other. Each of `--starts`, a preset and its options in
-quotes, is run twice, until its first validation: first with nothing kept, then with compiled
-programs and traces kept. Then each of `--seeds` flies the first of them, all kept, until a
-validation is what is asked for (`--whole`: to its end, `--cold`: with nothing kept). Results are
-written after each run; `--go_on` adds to those that are there, and finds what was kept in the same
-`--cache`.
+Runs of `openjax train`, one after the other. Each of `--starts`, a preset and its
+options in quotes, is run twice, until its first validation: first with nothing kept,
+then with compiled programs and traces kept. Then each of `--seeds` flies the first of
+them, all kept, until a validation is what is asked for (`--whole`: to its end,
+`--cold`: with nothing kept). Results are written after each run; `--go_on` adds to
+those that are there, and finds what was kept in the same `--cache`.
 """
 
 import argparse
@@ -54,8 +54,12 @@ class Runner:
         for seed in seeds:
             yield from self.fly(starts[0], seed, self.enough)
 
-    def fly(self, start: str, seed: int, enough: Callable[[dict], bool]) -> Iterator[dict]:
-        """One run's curve, until a validation is enough; nothing where the time is over."""
+    def fly(
+        self, start: str, seed: int, enough: Callable[[dict], bool]
+    ) -> Iterator[dict]:
+        """One run's curve, until a validation is enough; nothing where the time is
+        over.
+        """
         if time.monotonic() >= self.ends:
             return
         cache = self.cache / re.sub(r"\W+", "_", f"{start} {seed if self.cold else ''}")
@@ -74,7 +78,13 @@ class Runner:
             end(process)
             if not validations(file):  # what was kept isn't all
                 shutil.rmtree(cache, ignore_errors=True)
-            yield {"start": start, "seed": seed, "kept": kept, **curve(file), "whole": whole(out)}
+            yield {
+                "start": start,
+                "seed": seed,
+                "kept": kept,
+                **curve(file),
+                "whole": whole(out),
+            }
 
 
 def begin(start: str, seed: int, out: Path, cache: Path) -> subprocess.Popen:
@@ -92,12 +102,14 @@ def begin(start: str, seed: int, out: Path, cache: Path) -> subprocess.Popen:
     ]
     command += ["--compare_with", "none", "--out", str(out)]
     with open(out.with_suffix(".log"), "w") as log:
-        return subprocess.Popen(command, env=environment, stdout=log, stderr=subprocess.STDOUT)
+        return subprocess.Popen(
+            command, env=environment, stdout=log, stderr=subprocess.STDOUT
+        )
 
 
 def end(process: subprocess.Popen) -> None:
-    """Ask a process to save within 10 s and end; what it compiles in the background isn't waited
-    for.
+    """Ask a process to save within 10 s and end; what it compiles in the background
+    isn't waited for.
     """
     process.terminate()
     with contextlib.suppress(subprocess.TimeoutExpired):
@@ -120,14 +132,16 @@ def curve(file: Path) -> dict:
     return {
         "first_update": trained[0]["seconds"] if trained else None,
         "update": float(np.median(seconds)) if len(seconds) else None,
-        "steps_per_second": float(np.median(steps) / np.median(seconds)) if len(seconds) else None,
+        "steps_per_second": float(np.median(steps) / np.median(seconds))
+        if len(seconds)
+        else None,
         "validations": validations(file),
     }
 
 
 def whole(out: Path) -> dict | None:
-    """Seconds of a run that came to its end; capture rate, crash rate and steps to the capture by
-    layout.
+    """Seconds of a run that came to its end; capture rate, crash rate and steps to the
+    capture by layout.
     """
     if not (out / "layouts.json").exists():
         return None
@@ -187,10 +201,17 @@ def page(results: dict) -> Page:
     }
     prose = f"Uniform validation tasks. An update is the median of a run's. {results['note']}"
     prose += medians(rows)
-    goals = {name: name for name in ("figure", "goal", "value", "machine", "page or command")}
-    parts = [Table(goals, results.get("goals", []), "Goals"), Table(columns, rows, "Runs")]
+    goals = {
+        name: name for name in ("figure", "goal", "value", "machine", "page or command")
+    }
+    parts = [
+        Table(goals, results.get("goals", []), "Goals"),
+        Table(columns, rows, "Runs"),
+    ]
     shown = [
-        goal for goal in results.get("goals", []) if "evaders.md" not in goal["page or command"]
+        goal
+        for goal in results.get("goals", [])
+        if "evaders.md" not in goal["page or command"]
     ]
     short = {name: name for name in ("figure", "goal", "value")}
     return Page(
@@ -202,16 +223,21 @@ def page(results: dict) -> Page:
 
 
 def medians(rows: list[dict]) -> str:
-    """A sentence for each start that three runs or more caught from, with all or nothing kept."""
+    """A sentence for each start that three runs or more caught from, with all or
+    nothing kept.
+    """
     prose = ""
     for start in dict.fromkeys(run["start"] for run in rows):
         for kept in ("all", "nothing"):
             own = [
                 run
                 for run in rows
-                if (run["start"], run["kept"]) == (start, kept) and run["validations"][1:]
+                if (run["start"], run["kept"]) == (start, kept)
+                and run["validations"][1:]
             ]
-            seconds = [run["reached"]["seconds"] if run["reached"] else np.inf for run in own]
+            seconds = [
+                run["reached"]["seconds"] if run["reached"] else np.inf for run in own
+            ]
             if len(own) > 2 and np.isfinite(np.median(seconds)):
                 prose += (
                     f" `{start}` with {kept} kept: {np.median(seconds):.1f} s in the median of "
@@ -226,7 +252,9 @@ def main(arguments: list[str]) -> int:
     parser.add_argument(
         "--starts", nargs="+", default=["paper"], help="presets, each with its options"
     )
-    parser.add_argument("--seeds", type=int, nargs="*", default=[], help="of runs until they catch")
+    parser.add_argument(
+        "--seeds", type=int, nargs="*", default=[], help="of runs until they catch"
+    )
     parser.add_argument("--whole", action="store_true", help="run those to their end")
     parser.add_argument(
         "--cold", action="store_true", help="run only those, each with nothing kept"
@@ -234,11 +262,17 @@ def main(arguments: list[str]) -> int:
     parser.add_argument(
         "--limit", type=float, default=float("inf"), help="s after which all is over"
     )
-    parser.add_argument("--longest", type=float, default=200.0, help="s that one run may take")
     parser.add_argument(
-        "--cache", type=Path, help="where programs are kept; by default for these runs alone"
+        "--longest", type=float, default=200.0, help="s that one run may take"
     )
-    parser.add_argument("--go_on", action="store_true", help="add to the results that are there")
+    parser.add_argument(
+        "--cache",
+        type=Path,
+        help="where programs are kept; by default for these runs alone",
+    )
+    parser.add_argument(
+        "--go_on", action="store_true", help="add to the results that are there"
+    )
     parser.add_argument("--note", default="")
     publish(parser.parse_args(arguments), study, page)
     return 0

@@ -1,4 +1,6 @@
-"""The exam of the diagnosis: the plant against closed forms, sensors against what they say."""
+"""The exam of the diagnosis: the plant against closed forms, sensors against what they
+say.
+"""
 
 import numpy as np
 import pytest
@@ -45,7 +47,12 @@ def steps(b, number, m=0.0):
     zero = np.zeros_like(b.rates)
     for _ in range(number):
         b.step(
-            np.full((4, b.count), m), np.full(b.count, 3.7), np.full(b.count, 0.6), zero, zero, 0.0
+            np.full((4, b.count), m),
+            np.full(b.count, 3.7),
+            np.full(b.count, 0.6),
+            zero,
+            zero,
+            0.0,
         )
 
 
@@ -65,7 +72,9 @@ def test_a_vehicle_without_thrust_falls_and_turns_as_mechanics_says():
     np.testing.assert_allclose(
         b.position[:, 0], [0.25, -0.1, 1.0 + 0.5 - 0.5 * 9.81 * 0.25], atol=1e-9
     )
-    np.testing.assert_allclose(b.velocity[:, 0], [0.5, -0.2, 1.0 - 9.81 * 0.5], atol=1e-9)
+    np.testing.assert_allclose(
+        b.velocity[:, 0], [0.5, -0.2, 1.0 - 9.81 * 0.5], atol=1e-9
+    )
     np.testing.assert_allclose(momentum(), before, rtol=0.01, atol=2e-7)
     assert energy() == pytest.approx(spin, rel=0.01)
 
@@ -77,7 +86,10 @@ def test_rotors_follow_a_step_with_their_lag_and_hover_carries_the_weight():
     share = b.rotor[0] / (vehicle.MAX_SPEED * 0.5)
     np.testing.assert_allclose(share, 1 - np.exp([-1.0, -0.5]), rtol=1e-6)
     heavy = told(mass=0.04, thrust_constant=3e-8)
-    b = body(vehicle.nominal_parameters([heavy]), speed=vehicle.MAX_SPEED * np.sqrt(heavy.hover))
+    b = body(
+        vehicle.nominal_parameters([heavy]),
+        speed=vehicle.MAX_SPEED * np.sqrt(heavy.hover),
+    )
     steps(b, 10, m=heavy.hover)
     np.testing.assert_allclose(b.specific[:, 0], [0, 0, vehicle.GRAVITY], atol=1e-9)
 
@@ -86,13 +98,17 @@ def test_each_effect_pushes_as_its_formula_says():
     def specific(effect, size, form, shape=(0.25,) * 8, **state):
         p = vehicle.nominal_parameters([told()])
         injection.inject(
-            {"effect": effect, "form": form, "size": size, "shape": list(shape)}, p, np.array([0])
+            {"effect": effect, "form": form, "size": size, "shape": list(shape)},
+            p,
+            np.array([0]),
         )
         b = body(p, speed=vehicle.MAX_SPEED * np.sqrt(told().hover), **state)
         steps(b, 1, m=told().hover)
         return b
 
-    assert specific("thrust_scale", 0.1, "plain").specific[2, 0] == pytest.approx(1.1 * 9.81)
+    assert specific("thrust_scale", 0.1, "plain").specific[2, 0] == pytest.approx(
+        1.1 * 9.81
+    )
     assert specific("mass", 0.1, "plain").specific[2, 0] == pytest.approx(9.81 / 1.1)
     drag = specific("rotor_drag", 0.01, "linear", velocity=[1.0, 0, 0])
     assert drag.specific[0, 0] == pytest.approx(-0.01 / 0.0321)
@@ -101,7 +117,9 @@ def test_each_effect_pushes_as_its_formula_says():
     offset = specific(
         "com_offset", 1.0, "torque", shape=(0.0,) * 8
     )  # 1 mm forward: weight x arm about y
-    assert offset.rates[1, 0] == pytest.approx(0.001 * 0.0321 * 9.81 / 1.4e-5 * 0.001, rel=1e-3)
+    assert offset.rates[1, 0] == pytest.approx(
+        0.001 * 0.0321 * 9.81 / 1.4e-5 * 0.001, rel=1e-3
+    )
     still = specific("wind", 1.0, "steady", shape=(0.0,) * 8)
     assert still.specific[0, 0] == pytest.approx(0.008 / 0.0321)
 
@@ -119,8 +137,8 @@ def test_the_firmware_filter_is_a_butterworth_and_starts_at_rest():
 
 @pytest.fixture(scope="module")
 def hovering():
-    """Two vehicles of different mass for 3 s, one holding a point, one on laps, in still air and
-    without noise.
+    """Two vehicles of different mass for 3 s, one holding a point, one on laps, in
+    still air and without noise.
     """
     many = [told(mass=0.03), told(mass=0.042, thrust_constant=3e-8, motor_time=0.03)]
     rng = np.random.default_rng(1)
@@ -128,13 +146,21 @@ def hovering():
     still = {k: np.zeros_like(x) for k, x in laps.items()}
     still["position"][:, 2] = 0.6
     set_up = sensors.draw(rng, "white", "pgacmv", "none")
-    set_up |= {"size": 1e-9, "gyro": 0.0, "gyro_bias": [0.0] * 3, "pose_delay": 0.0, "gust": 0.0}
+    set_up |= {
+        "size": 1e-9,
+        "gyro": 0.0,
+        "gyro_bias": [0.0] * 3,
+        "pose_delay": 0.0,
+        "gust": 0.0,
+    }
     air = sensors.stack([sensors.draw_air(rng, set_up, 300, 3.9) for _ in many])
     air["gyro_bias"] *= 0
     reference = {k: np.stack([still[k], laps[k]], axis=-1) for k in laps}
     arrival = np.repeat(10 * np.arange(300)[:, None], 2, axis=1)
     p = vehicle.nominal_parameters(many)
-    batch = plant.Batch(many, p, reference, ["geometric", "cascade"], np.arange(2), arrival, air)
+    batch = plant.Batch(
+        many, p, reference, ["geometric", "cascade"], np.arange(2), arrival, air
+    )
     return many, p, plant.fly(batch)
 
 
@@ -150,12 +176,16 @@ def test_hover_needs_the_weight_and_motion_agrees_with_the_sensors(hovering):
     accel = np.gradient(speed, 0.002, axis=0)[500:-5]
     accel[:, 2] += 9.81
     force = flown["specific"][500:-5, :, 1]
-    np.testing.assert_allclose(vehicle.rotate_back(q[500:-5].T, accel.T).T, force, atol=0.08)
+    np.testing.assert_allclose(
+        vehicle.rotate_back(q[500:-5].T, accel.T).T, force, atol=0.08
+    )
     turn = 2 * vehicle.multiply((q[:-1] * [1, -1, -1, -1]).T, q[1:].T)[1:].T / 0.002
     np.testing.assert_allclose(turn[500:-5], flown["rates"][501:-5, :, 1], atol=0.05)
 
 
-def test_the_measure_sees_nothing_in_a_true_model_and_a_wrong_thrust_by_its_size(hovering):
+def test_the_measure_sees_nothing_in_a_true_model_and_a_wrong_thrust_by_its_size(
+    hovering,
+):
     many, p, flown = hovering
     none = np.zeros(2, bool)
     assert measure.errors(flown, many, p, np.arange(2), none, none).max() < 2e-3
@@ -186,13 +216,19 @@ def test_drawn_sensors_have_the_noise_that_they_say(hovering):
         "pose_delay": 2.0,
         "quantum": 1.0,
     }
-    rows = log_of(flown, "white", **plain, size=1.0, accel=0.2, position=2e-4, velocity="smooth")
+    rows = log_of(
+        flown, "white", **plain, size=1.0, accel=0.2, position=2e-4, velocity="smooth"
+    )
     at = np.arange(300) * 5
     noise = rows["ax"] - flown["specific"][at, 0, 1]
     assert noise.std() == pytest.approx(0.2, rel=0.15)
-    late = rows["x"] - (flown["position"][at, 0, 1] - 0.002 * flown["velocity"][at, 0, 1])
+    late = rows["x"] - (
+        flown["position"][at, 0, 1] - 0.002 * flown["velocity"][at, 0, 1]
+    )
     assert late[10:].std() == pytest.approx(2.5e-4, rel=0.4)
-    filtered = log_of(flown, "filtered", **plain | {"accel_cut": 30.0}, size=1.0, accel=0.2)
+    filtered = log_of(
+        flown, "filtered", **plain | {"accel_cut": 30.0}, size=1.0, accel=0.2
+    )
     assert (filtered["ax"] - flown["specific"][at, 0, 1])[20:].std() < 0.13
     coarse = log_of(flown, "quantised", **plain | {"quantum": 20.0})
     steps_seen = np.round(coarse["qx"] / 2e-4)
@@ -212,7 +248,9 @@ def test_drawn_sensors_have_the_noise_that_they_say(hovering):
 
 
 def test_the_stranger_column_shares_no_kind_with_the_known_one():
-    known, strange = (cases.draw_cases(3, column, 250) for column in ("known", "stranger"))
+    known, strange = (
+        cases.draw_cases(3, column, 250) for column in ("known", "stranger")
+    )
     for read in (
         lambda c: c["sensors"]["kind"],
         lambda c: c["controller"],
@@ -221,35 +259,42 @@ def test_the_stranger_column_shares_no_kind_with_the_known_one():
     ):
         one, two = ({read(c) for c in column} - {None} for column in (known, strange))
         assert one and two and not one & two
-    assert {c["causes"][0]["effect"] for c in known if c["category"] == "single"} == set(
-        effects.EFFECTS
-    )
+    assert {
+        c["causes"][0]["effect"] for c in known if c["category"] == "single"
+    } == set(effects.EFFECTS)
     assert cases.draw_cases(3, "known", 250) == known
     for c in known:
         for cause in c["causes"]:
             needs = (
-                effects.EFFECTS[cause["effect"]].needs if cause["effect"] in effects.EFFECTS else ""
+                effects.EFFECTS[cause["effect"]].needs
+                if cause["effect"] in effects.EFFECTS
+                else ""
             )
             assert set(needs) <= set(c["sensors"]["channels"])
 
 
 def test_generated_kinds_differ_and_no_line_in_their_inputs_explains_them():
-    """Else a named effect, which is such a line, would be half right, and a detector for one kind
-    would find all.
+    """Else a named effect, which is such a line, would be half right, and a detector
+    for one kind would find all.
     """
     rng = np.random.default_rng(0)
     causes = [{"shape": rng.uniform(size=8), "form": "smooth"} for _ in range(40)]
     function = unknowns.Generated(causes)
     values = []
     for _ in range(600):
-        inputs = np.repeat(rng.standard_normal((len(unknowns.SCALE) - 1, 1)), 40, axis=1)
+        inputs = np.repeat(
+            rng.standard_normal((len(unknowns.SCALE) - 1, 1)), 40, axis=1
+        )
         values.append(np.r_[inputs[:, 0], function(inputs, 50.0 + 10 * rng.uniform())])
     values = np.array(values)
     x = np.c_[np.ones(600), values[:, :-40]]
     f = values[:, -40:]
     line = x @ np.linalg.lstsq(x, f, rcond=None)[0]
     explained = 1 - (f - line).var(0) / f.var(0)
-    assert np.median(explained) < 0.15 and np.abs(np.corrcoef(f.T) - np.eye(40)).max() < 0.6
+    assert (
+        np.median(explained) < 0.15
+        and np.abs(np.corrcoef(f.T) - np.eye(40)).max() < 0.6
+    )
     assert 0.5 < np.median(f.std(0)) < 1.5
 
 
@@ -259,7 +304,9 @@ def test_every_unknown_site_acts(hovering):
     for name, site in unknowns.SITES.items():
         own = cause | {"effect": name, "size": site.sizes[1]}
         if site.logs:
-            one, two = (log_of(flown, "white", unknown=unknown) for unknown in ([], [own]))
+            one, two = (
+                log_of(flown, "white", unknown=unknown) for unknown in ([], [own])
+            )
             wrong = {c for c in one if not np.allclose(one[c], two[c], equal_nan=True)}
             assert wrong and wrong <= set(sensors.GROUPS[site.logs]), name
             continue
@@ -283,8 +330,16 @@ def test_a_propeller_that_speeds_up_turns_the_body_and_keeps_the_whole_momentum(
     p["rotor_gain"][:, 0] = [1.0, 0.0, 1.0, 0.0]
     b = body(p)
     zero = np.zeros((3, 1))
-    b.step(np.array([[0.5], [0], [0.5], [0]]), np.array([3.7]), np.array([0.6]), zero, zero, 0.0)
-    spins = (-vehicle.SPIN[:, None] * b.rotor).sum() * 4e-8  # a clockwise rotor turns about -z
+    b.step(
+        np.array([[0.5], [0], [0.5], [0]]),
+        np.array([3.7]),
+        np.array([0.6]),
+        zero,
+        zero,
+        0.0,
+    )
+    # a clockwise rotor turns about -z
+    spins = (-vehicle.SPIN[:, None] * b.rotor).sum() * 4e-8
     assert b.rates[2, 0] * b.principal[2, 0] == pytest.approx(-spins, rel=1e-6)
 
 
@@ -296,7 +351,12 @@ def test_garbage_spoils_what_it_says_and_nothing_else(hovering):
         before = [{k: x.copy() for k, x in f.items()} for f in flights]
         wrong = garbage.spoil(kind, flights, np.random.default_rng(2))
         both = list(zip(flights, before, strict=True))
-        changed = {k for f, o in both for k in f if not np.array_equal(f[k], o[k], equal_nan=True)}
+        changed = {
+            k
+            for f, o in both
+            for k in f
+            if not np.array_equal(f[k], o[k], equal_nan=True)
+        }
         assert changed and changed <= set(wrong), kind
 
 
@@ -324,7 +384,9 @@ def test_written_cases_can_be_read_and_say_what_they_hold(tmp_path, monkeypatch)
         elif answer["effects"] == [
             "rotor_drag"
         ]:  # on laps it shows: the key may not call it hidden
-            assert answer["category"] == "single" and answer["expected"] == ["rotor_drag"]
+            assert answer["category"] == "single" and answer["expected"] == [
+                "rotor_drag"
+            ]
         mass = answer["told"]["mass"]
         assert (
             f"mass = {mass:.5f}"
@@ -333,7 +395,9 @@ def test_written_cases_can_be_read_and_say_what_they_hold(tmp_path, monkeypatch)
 
 
 def test_rows_that_see_little_of_the_motors_hide_torque(hovering):
-    """A key whose floor forgets this asks for torques that no reader of a slow log can see."""
+    """A key whose floor forgets this asks for torques that no reader of a slow log can
+    see.
+    """
     many, p, flown = hovering
     none = np.zeros(2, bool)
     left = {}
@@ -344,7 +408,9 @@ def test_rows_that_see_little_of_the_motors_hide_torque(hovering):
         rows = log_of(flown | {"motor": m}, "white", rate=rate, motor="snapshot")
         held, straight = measure.motors_of_log(rows, len(m))
         logged = np.stack([held, held], axis=-1)
-        seen = measure.errors(flown | {"motor": logged}, many, p, np.arange(2), none, none)
+        seen = measure.errors(
+            flown | {"motor": logged}, many, p, np.arange(2), none, none
+        )
         left[rate] = seen[3:6, 1].max()
         assert straight.shape == held.shape
     np.testing.assert_allclose(left[500], 0.0, atol=0.1)

@@ -25,8 +25,8 @@ FLIGHTS = {1: ("agile", "yaw", "fast"), 2: ("climb", "step", "agile"), 3: ("laps
 
 
 def fly(*numbers, causes=(), **changes):
-    """Vehicles told exactly, with hard manoeuvres in light turbulence; `changes` of their
-    sensors.
+    """Vehicles told exactly, with hard manoeuvres in light turbulence; `changes` of
+    their sensors.
     """
     drawn = sensors.draw(np.random.default_rng(3), "white", "psgacmv", "light")
     drawn |= {
@@ -61,8 +61,8 @@ def nominal():
 
 
 def _replay(vehicle, start, motors, commands, from_commands):
-    """Velocity and rates after each tick of 10 ms, replayed with the simulator's own functions at 2
-    ms.
+    """Velocity and rates after each tick of 10 ms, replayed with the simulator's own
+    functions at 2 ms.
     """
     dt = 0.002
 
@@ -75,7 +75,9 @@ def _replay(vehicle, start, motors, commands, from_commands):
             thrust = rotor_thrust(vehicle, rotor)
             reaction = rotor_reaction(vehicle, rotor)
             force, torque = total_wrench(vehicle, thrust, reaction)
-            new = rigid_step(vehicle, state, rotate(state.quaternion, force), torque, dt)
+            new = rigid_step(
+                vehicle, state, rotate(state.quaternion, force), torque, dt
+            )
             rotors = {"rotor_speed": rotor, "rate_integral": integral}
             return new.replace(**rotors, previous_body_rates=state.body_rates), None
 
@@ -87,8 +89,8 @@ def _replay(vehicle, start, motors, commands, from_commands):
 
 @pytest.mark.parametrize("from_commands", [False, True])
 def test_nominal_plant_agrees_with_the_rigid_simulator(nominal, from_commands):
-    # a wrong sign, unit, motor order, spin, gain or lag in either would show at many times the
-    # gusts
+    # a wrong sign, unit, motor order, spin, gain or lag in either would show at many
+    # times the gusts
     flown = nominal.flown
     bodies = nominal.columns[0]
     starts = np.arange(100, TICKS - 25, 20)
@@ -112,11 +114,14 @@ def test_nominal_plant_agrees_with_the_rigid_simulator(nominal, from_commands):
 
     def windows(name):
         cut = [
-            np.moveaxis(flown[name][5 * k : 5 * (k + length)][:, :, bodies], 2, 0) for k in starts
+            np.moveaxis(flown[name][5 * k : 5 * (k + length)][:, :, bodies], 2, 0)
+            for k in starts
         ]
         return np.stack(cut).reshape(-1, length, 5, 4)
 
-    replayed = jax.jit(jax.vmap(lambda s, m, c: _replay(load_vehicle(), s, m, c, from_commands)))
+    replayed = jax.jit(
+        jax.vmap(lambda s, m, c: _replay(load_vehicle(), s, m, c, from_commands))
+    )
     velocity, rates = replayed(start, windows("motor"), windows("applied"))
 
     def error(name, values, ticks):
@@ -135,20 +140,26 @@ def test_nominal_plant_agrees_with_the_rigid_simulator(nominal, from_commands):
 
 
 def test_a_case_does_not_depend_on_its_companions(nominal):
-    # otherwise the number of processes would change the flights, and a seed would mean nothing
+    # otherwise the number of processes would change the flights, and a seed would mean
+    # nothing
     alone = fly(2)
     among_others = nominal.flown["velocity"][:, :, nominal.columns[1]]
     np.testing.assert_array_equal(alone.flown["velocity"], among_others)
 
 
 def test_a_factor_stands_in_for_a_battery_only_while_its_voltage_stays(monkeypatch):
-    """Else the key would want a name that no reader of one steady flight could know, or let any
-    scale pass for a battery.
+    """Else the key would want a name that no reader of one steady flight could know, or
+    let any scale pass for a battery.
     """
     monkeypatch.setattr(cases, "TICKS", 400)
-    sag = effects.draw(np.random.default_rng(1), "battery_sag", "linear") | {"size": 1.2}
+    sag = effects.draw(np.random.default_rng(1), "battery_sag", "linear") | {
+        "size": 1.2
+    }
     for discharge, stands_in in ((0.0, True), (0.2, False)):
         flown = fly(3, causes=[sag], discharge=discharge, resistance=0.0)
         squares = {"truth": flown.replayed(0, flown.parameters)}
         floor = np.sqrt(squares["truth"]) + 0.02
-        assert answer_key.scale_stands_in(flown, 0, "battery_sag", squares, floor) == stands_in
+        assert (
+            answer_key.scale_stands_in(flown, 0, "battery_sag", squares, floor)
+            == stands_in
+        )

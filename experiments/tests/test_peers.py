@@ -1,4 +1,6 @@
-"""The study of peers leaves out what isn't installed, and its task can be recovered from."""
+"""The study of peers leaves out what isn't installed, and its task can be recovered
+from.
+"""
 
 import json
 import subprocess
@@ -27,7 +29,9 @@ def test_a_drone_is_held_where_it_hovers_at_the_goal():
     assert jax.eval_shape(see, drone).shape == (SIZE,)
     assert not bool(advance(drone, jnp.zeros(4))[2])
     still = drone.replace(
-        position=jnp.zeros(3), quaternion=jnp.array([1.0, 0, 0, 0]), body_rates=jnp.zeros(3)
+        position=jnp.zeros(3),
+        quaternion=jnp.array([1.0, 0, 0, 0]),
+        body_rates=jnp.zeros(3),
     )
     _, reward, held = advance(still, jnp.zeros(4))
     assert bool(held) and reward > 0.9
@@ -44,7 +48,10 @@ def test_gymnasium_environment_ends_by_its_time():
 def test_what_is_not_installed_is_left_out_with_a_line(tmp_path):
     file = tmp_path / "peers.json"
     done = subprocess.run(
-        [sys.executable, "-c", BLOCK, str(file)], capture_output=True, text=True, check=True
+        [sys.executable, "-c", BLOCK, str(file)],
+        capture_output=True,
+        text=True,
+        check=True,
     )
     assert done.stdout.count(": left out, ") == 6
     rows = json.loads(file.read_text())["rows"]

@@ -1,5 +1,5 @@
-"""openjax: multi-quadrotor pursuit-evasion in JAX, trained in one compiled step, with a diagnosis
-of the sim-to-real gap.
+"""openjax: multi-quadrotor pursuit-evasion in JAX, trained in one compiled step, with a
+diagnosis of the sim-to-real gap.
 
 import jax, openjax
 environment = openjax.make()
@@ -49,9 +49,9 @@ __getattr__, __dir__, __all__ = lazy_names(
 class _Package(types.ModuleType):
     """The package, whose functions `train` and `evaluate` stay what they are.
 
-    `python -m openjax.train` needs a module of that name, too. Whoever imports it (an editor, a
-    walk through all modules) has the import system bind it as an attribute of the package, in place
-    of the function; that is ignored.
+    `python -m openjax.train` needs a module of that name, too. Whoever imports it (an
+    editor, a walk through all modules) has the import system bind it as an attribute of
+    the package, in place of the function; that is ignored.
     """
 
     def __setattr__(self, name: str, value: object) -> None:

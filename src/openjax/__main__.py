@@ -23,7 +23,9 @@ COMMANDS = {
     "export": "write a policy as ONNX, jax.export or C99",
     "benchmark": "measure steps per second on this machine",
 }
-"""What each does; the module of the same name in `openjax.commands` holds its `main(arguments)`."""
+"""What each does; the module of the same name in `openjax.commands` holds its
+`main(arguments)`.
+"""
 
 
 def usage() -> str:
@@ -39,8 +41,8 @@ def usage() -> str:
 
 
 def main(arguments: Sequence[str]) -> int | None:
-    """Run the command that the first argument names; returns its exit status. Raises UserError for
-    an unknown one.
+    """Run the command that the first argument names; returns its exit status. Raises
+    UserError for an unknown one.
     """
     name = arguments[0] if arguments else "--help"
     if name in ("-h", "--help", "help"):

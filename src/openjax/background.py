@@ -9,8 +9,8 @@ import jax
 
 
 def in_background(make: Callable[[], Any]) -> Callable[..., Any]:
-    """Start to make something in a thread of its own; a function that waits for it and returns it,
-    or raises its error.
+    """Start to make something in a thread of its own; a function that waits for it and
+    returns it, or raises its error.
 
     Given seconds, it waits no longer and then raises `TimeoutError`.
     """
@@ -21,11 +21,12 @@ def in_background(make: Callable[[], Any]) -> Callable[..., Any]:
 
 
 def compile_ahead(function: Callable, *arguments) -> Callable[..., Any]:
-    """Start to compile a function of `jax.jit` for arguments of these shapes, dtypes and shardings.
+    """Start to compile a function of `jax.jit` for arguments of these shapes, dtypes
+    and shardings.
 
-    It's traced before this returns, as two threads that trace hold each other up; only the compiler
-    runs beside. JAX keeps what it compiled, so that a later call of `function` finds it; a call
-    before that compiles again.
+    It's traced before this returns, as two threads that trace hold each other up; only
+    the compiler runs beside. JAX keeps what it compiled, so that a later call of
+    `function` finds it; a call before that compiles again.
 
     Args:
       function: from `jax.jit`.
@@ -39,14 +40,15 @@ def compile_ahead(function: Callable, *arguments) -> Callable[..., Any]:
 
 @contextlib.contextmanager
 def quiet_compiler() -> Iterator[None]:
-    """Keep XLA from logging how long it takes, as an error to be filed; what does go wrong is
-    raised.
+    """Keep XLA from logging how long it takes, as an error to be filed; what does go
+    wrong is raised.
     """
     before = jax.config.jax_logging_level
     jax.config.update("jax_logging_level", "CRITICAL")
     try:
         yield
     finally:
-        # XLA's own level has no "as before": it is set by one that it knows, then JAX's is put back
+        # XLA's own level has no "as before": it is set by one that it knows, then JAX's
+        # is put back
         jax.config.update("jax_logging_level", before or "WARNING")
         jax.config.update("jax_logging_level", before)

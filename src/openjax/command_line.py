@@ -1,5 +1,5 @@
-"""Command lines from frozen dataclasses (tyro): help from docstrings, one-line errors, exit status
-2.
+"""Command lines from frozen dataclasses (tyro): help from docstrings, one-line errors,
+exit status 2.
 """
 
 import argparse
@@ -26,7 +26,11 @@ from openjax.ranges import check_intervals, ranged_fields
 
 Command = TypeVar("Command")
 
-_OF_THE_DISK = ("No space left on device", "Disk quota exceeded", "Read-only file system")
+_OF_THE_DISK = (
+    "No space left on device",
+    "Disk quota exceeded",
+    "Read-only file system",
+)
 
 LONGEST = 500
 """Characters of an error's line."""
@@ -41,8 +45,8 @@ KINDS = {
 
 
 def typed(command: str) -> str:
-    """`openjax NAME ...` as it can be typed here: where its environment isn't active, as after
-    `make train`, by the path of its script.
+    """`openjax NAME ...` as it can be typed here: where its environment isn't active,
+    as after `make train`, by the path of its script.
     """
     script = Path(sys.executable).with_name("openjax")
     if shutil.which("openjax") or not script.exists():
@@ -58,15 +62,15 @@ def parse(
     """The dataclass `command` filled from command-line arguments.
 
     Args:
-      command: frozen dataclass; nested dataclasses become `--outer.inner value`, underscores or
-      dashes alike.
+      command: frozen dataclass; nested dataclasses become `--outer.inner value`,
+      underscores or dashes alike.
       default: values of what isn't given.
       arguments: command line without the program's name.
       program: the name for the help text.
 
     Raises:
-      UserError: unknown option, unusable value or one outside its interval, in one line. `--help`
-      prints and exits with status 0.
+      UserError: unknown option, unusable value or one outside its interval, in one
+      line. `--help` prints and exits with status 0.
     """
     import tyro
 
@@ -94,8 +98,8 @@ def parse(
 
 
 def _rules_of_help():
-    """Rules for tyro by which `--help` shows the interval of a setting after what it means, and
-    breaks lines where the terminal ends, not where the source does.
+    """Rules for tyro by which `--help` shows the interval of a setting after what it
+    means, and breaks lines where the terminal ends, not where the source does.
     """
     from tyro.constructors import ConstructorRegistry
 
@@ -131,29 +135,34 @@ def _rules_of_help():
 
 
 def peek(arguments: Sequence[str], name: str) -> str | None:
-    """The value of `--name` before the real parsing, which needs it to choose its defaults."""
+    """The value of `--name` before the real parsing, which needs it to choose its
+    defaults.
+    """
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    # with underscores or dashes, as in the real parsing, which also says if the value is missing
+    # with underscores or dashes, as in the real parsing, which also says if the value
+    # is missing
     parser.add_argument(f"--{name}", f"--{name.replace('_', '-')}", nargs="?")
     return getattr(parser.parse_known_args(arguments)[0], name)
 
 
 def one_thread_for_matrices() -> None:
-    """Small matrices: more threads than one only wait for each other. It is read when NumPy is
-    loaded, so call it before.
+    """Small matrices: more threads than one only wait for each other. It is read when
+    NumPy is loaded, so call it before.
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
 def output_console() -> Console:
-    """Standard output as it is on a terminal; into a file, tables get the width that they need."""
+    """Standard output as it is on a terminal; into a file, tables get the width that
+    they need.
+    """
     console = Console(highlight=False)
     return console if console.is_terminal else Console(highlight=False, width=120)
 
 
 def run_command(main: Callable[[Sequence[str]], int | None]) -> None:
-    """Run a command's `main(arguments)` and exit: 0, its own status, or 2 with one line for
-    whatever isn't ours to mend.
+    """Run a command's `main(arguments)` and exit: 0, its own status, or 2 with one line
+    for whatever isn't ours to mend.
     """
     quiet_libraries()
     for stream in (sys.stdout, sys.stderr):  # a terminal may not know every character
@@ -181,8 +190,8 @@ def run_command(main: Callable[[Sequence[str]], int | None]) -> None:
 
 
 def one_line(error: BaseException) -> str | None:
-    """What to tell of an error that the user or the machine made, in one line; None: it's a mistake
-    in openjax.
+    """What to tell of an error that the user or the machine made, in one line; None:
+    it's a mistake in openjax.
     """
     text = " ".join(str(error).split())
     if isinstance(error, OSError):
@@ -193,7 +202,9 @@ def one_line(error: BaseException) -> str | None:
         text = "not enough memory"
     elif _is_out_of_device_memory(error):
         text = f"not enough memory on the device; fewer --num_envs need less ({text})"
-    elif type(error) is RuntimeError and text.startswith("Unable to initialize backend"):
+    elif type(error) is RuntimeError and text.startswith(
+        "Unable to initialize backend"
+    ):
         text = f"JAX finds no device: {text}"
     elif reason := next((reason for reason in _OF_THE_DISK if reason in text), None):
         # libraries that write in C++ tell it in an error of their own
@@ -210,22 +221,24 @@ def _is_out_of_device_memory(error):
 
 
 def _discard_output() -> None:
-    """Send what may still be in the buffer of standard output nowhere, so that the exit doesn't
-    trip over it.
+    """Send what may still be in the buffer of standard output nowhere, so that the exit
+    doesn't trip over it.
     """
     with contextlib.suppress(OSError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def quiet_libraries() -> None:
-    """Keep libraries' notes that no user can act on off the terminal; what matters comes as an
-    exception.
+    """Keep libraries' notes that no user can act on off the terminal; what matters
+    comes as an exception.
     """
     # 3: not even errors, as which XLA counts that it compiles slowly
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     for name in ("absl", "jax._src.xla_bridge", "asyncio"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
-    warnings.filterwarnings("ignore", message="Sharding info not provided when restoring")
+    warnings.filterwarnings(
+        "ignore", message="Sharding info not provided when restoring"
+    )
 
 
 def option_names(settings, prefix: str = "") -> list[str]:
@@ -239,24 +252,30 @@ def option_names(settings, prefix: str = "") -> list[str]:
         if dataclasses.is_dataclass(value):
             notes = getattr(hints[field.name], "__metadata__", ())
             has_no_prefix = "" in [getattr(note, "name", None) for note in notes]
-            names += option_names(value, prefix if has_no_prefix else f"{prefix}{field.name}.")
+            names += option_names(
+                value, prefix if has_no_prefix else f"{prefix}{field.name}."
+            )
         else:
             names.append(f"--{prefix}{field.name}")
     return names
 
 
 def _like_python(argument):
-    """tyro wants True, False and 1000000; people and TOML write true, false and 1e6, too."""
+    """tyro wants True, False and 1000000; people and TOML write true, false and 1e6,
+    too.
+    """
     if re.fullmatch(r"\d+(\.\d+)?e\d{1,2}", argument) and float(argument).is_integer():
         return str(int(float(argument)))
     return argument.capitalize() if argument in ("true", "false") else argument
 
 
 def _one_line(box: str) -> str:
-    """The message of tyro's box: what stands in it up to its first rule, below its title where no
-    box can be drawn.
+    """The message of tyro's box: what stands in it up to its first rule, below its
+    title where no box can be drawn.
     """
-    lines = [line.strip("╰╯│ ") for line in box.splitlines() if not line.startswith("╭")]
+    lines = [
+        line.strip("╰╯│ ") for line in box.splitlines() if not line.startswith("╭")
+    ]
     # paragraphs, between rules and empty lines
     groups = itertools.groupby(lines, key=lambda line: bool(line.strip("─-")))
     paragraphs = [" ".join(group) for says_something, group in groups if says_something]
@@ -265,7 +284,9 @@ def _one_line(box: str) -> str:
     message = " ".join(paragraphs[0].split()) if paragraphs else ""
     if wrong := re.match(r"Error parsing (--\S+): (.*?)\[?('[^']*')\]?\.?$", message):
         option, reason, value = wrong.groups()
-        kind = next((word for part, word in KINDS.items() if part in reason), "another value")
+        kind = next(
+            (word for part, word in KINDS.items() if part in reason), "another value"
+        )
         name = option.replace("-", "_").replace("__", "--", 1)
         return f"{name} is {value}; expected {kind}, see --help"
     return f"{message.rstrip('.')}; see --help"
@@ -283,8 +304,8 @@ def _unknown(argument, default, program):
     def last_part(option):
         return re.split(r"\.|--", option)[-1]
 
-    # a setting's own name often comes without its group, or with another: --n_pursuers for
-    # --environment.n_pursuers
+    # a setting's own name often comes without its group, or with another: --n_pursuers
+    # for --environment.n_pursuers
     close = [option for option in options if last_part(option) == last_part(name)]
     close = close or difflib.get_close_matches(name, options, n=1, cutoff=0.6)
     hint = f"did you mean {close[0]}?" if close else f"see {program} --help"

@@ -7,14 +7,14 @@ from collections.abc import Iterable
 class UserError(Exception):
     """Something a user asked for can't be done.
 
-    The message is one line: what was wrong, where, and what would be right. Commands print it and
-    exit with status 2.
+    The message is one line: what was wrong, where, and what would be right. Commands
+    print it and exit with status 2.
     """
 
 
 def suggestion(name: str, names: Iterable[str]) -> str:
-    """What an error can say of a name that isn't among the `names` that there are: the one that is
-    nearest, or all.
+    """What an error can say of a name that isn't among the `names` that there are: the
+    one that is nearest, or all.
     """
     names = list(names)
     close = difflib.get_close_matches(name, names, n=1, cutoff=0.5)

@@ -1,4 +1,6 @@
-"""Files that people hand in, read strictly; files that openjax writes, whole or not at all."""
+"""Files that people hand in, read strictly; files that openjax writes, whole or not at
+all.
+"""
 
 import contextlib
 import dataclasses
@@ -22,8 +24,8 @@ DEEPEST = 32
 """Levels of nesting in a TOML or JSON file."""
 
 WRITING = ".writing-"
-"""What the names of unfinished files begin with; only a process that was killed (SIGKILL) leaves
-one behind.
+"""What the names of unfinished files begin with; only a process that was killed
+(SIGKILL) leaves one behind.
 """
 
 
@@ -35,8 +37,8 @@ def read_toml(path: str | Path, what: str = "file") -> dict[str, Any]:
       what: names it in errors, for example `effects file`.
 
     Raises:
-      UserError: it's missing, too large, no TOML or nested too deep, or holds integers of more than
-      64 bits.
+      UserError: it's missing, too large, no TOML or nested too deep, or holds integers
+      of more than 64 bits.
     """
     return _read(path, what, "TOML", tomllib.loads)
 
@@ -54,8 +56,11 @@ def _read(path, what, language, parse: Callable[[str], Any]):
         if not path.is_file():
             raise UserError(f"{path}: is no file; the {what} is one")
         if path.stat().st_size > LARGEST_TEXT:
-            raise UserError(f"{path}: {path.stat().st_size} bytes are too many for a {what}")
-        text = path.read_text(encoding="utf-8-sig")  # editors of Windows begin with a mark
+            raise UserError(
+                f"{path}: {path.stat().st_size} bytes are too many for a {what}"
+            )
+        # editors of Windows begin with a mark
+        text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
         raise UserError(
             f"{path}: not readable as {language} (byte {error.start} is not UTF-8)"
@@ -95,12 +100,12 @@ def _check_plain(path, value):
 
 @contextlib.contextmanager
 def replacing(path: str | Path) -> Iterator[Path]:
-    """A path to write a file or folder to; it takes the place of `path` when the block ends without
-    an error.
+    """A path to write a file or folder to; it takes the place of `path` when the block
+    ends without an error.
 
-    Readers see what was there before or the whole of the new, also after a power failure; after an
-    error nothing of the new is left. Whatever the disk or the permissions have against it is an
-    `OSError`.
+    Readers see what was there before or the whole of the new, also after a power
+    failure; after an error nothing of the new is left. Whatever the disk or the
+    permissions have against it is an `OSError`.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -112,7 +117,9 @@ def replacing(path: str | Path) -> Iterator[Path]:
             _put_in_place(partial, path)
         except BaseException:
             with contextlib.suppress(OSError):
-                shutil.rmtree(partial) if partial.is_dir() else partial.unlink(missing_ok=True)
+                shutil.rmtree(partial) if partial.is_dir() else partial.unlink(
+                    missing_ok=True
+                )
             raise
 
 
@@ -148,7 +155,9 @@ def write_checked(path: str | Path, content: bytes) -> None:
 
 
 def read_checked(path: str | Path) -> bytes | None:
-    """The content of a file of `write_checked`; None where there is none, or it isn't whole."""
+    """The content of a file of `write_checked`; None where there is none, or it isn't
+    whole.
+    """
     try:
         written = Path(path).read_bytes()
     except OSError:
@@ -169,7 +178,8 @@ def to_plain(value: Any) -> Any:
     """Dataclasses, tuples and paths as JSON values (dict, list, str, numbers, None)."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {
-            field.name: to_plain(getattr(value, field.name)) for field in dataclasses.fields(value)
+            field.name: to_plain(getattr(value, field.name))
+            for field in dataclasses.fields(value)
         }
     if isinstance(value, dict):
         return {str(key): to_plain(entry) for key, entry in value.items()}
@@ -189,7 +199,8 @@ def write_json(path: str | Path, value: Any) -> None:
 
 
 def check_output(path: str | Path | None, option: str) -> None:
-    """Whether a file can be written later, asked before the work that leads to it; None is fine.
+    """Whether a file can be written later, asked before the work that leads to it; None
+    is fine.
 
     Raises:
       UserError: its folder is missing or can't be written to, or it's a folder itself.
@@ -214,8 +225,8 @@ def check_output(path: str | Path | None, option: str) -> None:
 
 
 def check_output_folder(path: str | Path, option: str) -> None:
-    """Whether a folder is there or can be made, and can be written to; changes nothing. Raises
-    UserError.
+    """Whether a folder is there or can be made, and can be written to; changes nothing.
+    Raises UserError.
     """
     path = Path(path).absolute()
     try:
@@ -232,16 +243,20 @@ def check_output_folder(path: str | Path, option: str) -> None:
 
 
 def check_new_folder(path: str | Path, option: str) -> None:
-    """Whether a folder can be made there, or is there and empty; changes nothing. Raises
-    UserError.
+    """Whether a folder can be made there, or is there and empty; changes nothing.
+    Raises UserError.
     """
     path = Path(path)
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
-        raise UserError(f"{option} {path}: exists and isn't an empty folder; name another one")
+        raise UserError(
+            f"{option} {path}: exists and isn't an empty folder; name another one"
+        )
     check_output_folder(path, option)
 
 
 def remove_unfinished(folder: Path) -> None:
     """Delete what killed processes left of files they were writing."""
     for path in folder.glob(f"{WRITING}*"):
-        shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
+        shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(
+            missing_ok=True
+        )

@@ -1,10 +1,12 @@
-"""Ctrl-C and SIGTERM: a command ends at once, by one line, and leaves no file half written.
+"""Ctrl-C and SIGTERM: a command ends at once, by one line, and leaves no file half
+written.
 
-Python runs a signal's handler between two of its own instructions, in the main thread. While XLA
-compiles there are none, for minutes. Here a thread hears of signals from the descriptor that
-Python's handler in C writes to (`signal.set_wakeup_fd`). An ordinary exit would wait for the
-compiler's threads, or end them in their middle ("FATAL: exception not rethrown"); so the process
-leaves by `os._exit`, after what must be given back.
+Python runs a signal's handler between two of its own instructions, in the main thread.
+While XLA compiles there are none, for minutes. Here a thread hears of signals from the
+descriptor that Python's handler in C writes to (`signal.set_wakeup_fd`). An ordinary
+exit would wait for the compiler's threads, or end them in their middle ("FATAL:
+exception not rethrown"); so the process leaves by `os._exit`, after what must be given
+back.
 """
 
 import contextlib
@@ -20,7 +22,9 @@ from pathlib import Path
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 PATIENCE = 5.0
-"""Seconds that everything together may take which is given back before the process ends."""
+"""Seconds that everything together may take which is given back before the process
+ends.
+"""
 SHOW_CURSOR = b"\r\x1b[?25h\n"
 """A live display hides the cursor, and leaves it in the middle of a line."""
 
@@ -47,8 +51,8 @@ _watch = _Watch()
 
 
 def install() -> None:
-    """From now on SIGINT and SIGTERM end this process at once; for commands, from their main
-    thread, before anything is loaded that takes its time.
+    """From now on SIGINT and SIGTERM end this process at once; for commands, from their
+    main thread, before anything is loaded that takes its time.
     """
     read, write = os.pipe()
     for descriptor in (read, write):
@@ -73,8 +77,8 @@ def _listen() -> None:
 
 
 def settle() -> None:
-    """Decide what the signals mean that have come by now. To be called before it is changed who
-    handles them: the thread that hears of them may not have had its turn.
+    """Decide what the signals mean that have come by now. To be called before it is
+    changed who handles them: the thread that hears of them may not have had its turn.
     """
     if not _watch.installed:
         return
@@ -91,8 +95,8 @@ def settle() -> None:
 
 @contextlib.contextmanager
 def patience(signals: int) -> Iterator[None]:
-    """How many signals are left to whoever else handles them, inside; the process ends at once at
-    the next one. Elsewhere all are.
+    """How many signals are left to whoever else handles them, inside; the process ends
+    at once at the next one. Elsewhere all are.
     """
     settle()
     before = _watch.patience
@@ -138,8 +142,8 @@ def undivided() -> Iterator[None]:
 
 @contextlib.contextmanager
 def as_exception() -> Iterator[None]:
-    """Inside, both signals raise KeyboardInterrupt: for loops in Python that end in good order.
-    To be entered in the main thread.
+    """Inside, both signals raise KeyboardInterrupt: for loops in Python that end in
+    good order. To be entered in the main thread.
     """
     before = {number: signal.getsignal(number) for number in SIGNALS}
     for number in SIGNALS:
@@ -153,11 +157,14 @@ def as_exception() -> Iterator[None]:
 
 
 def leave(number: int) -> None:
-    """End the process for the signal of this number. Returns only where nothing is installed."""
+    """End the process for the signal of this number. Returns only where nothing is
+    installed.
+    """
     if not _watch.installed:
         return
     _watch.leaving.acquire()
-    # a few steps that mustn't be parted may be under way; if they hang, the process ends anyhow
+    # a few steps that mustn't be parted may be under way; if they hang, the process
+    # ends anyhow
     _watch.undivided.acquire(timeout=PATIENCE)
     # in a thread of its own: whatever hangs there, the process ends
     cleaner = threading.Thread(target=_clean_up, daemon=True)
@@ -188,10 +195,11 @@ def _clean_up() -> None:
 class StopRequest:
     """What SIGINT and SIGTERM mean to a run; a context manager.
 
-    Where something is being learnt (`while_learning`), they ask to stop after the present update,
-    and a second one interrupts at once. Elsewhere, above all while something is compiled, a command
-    ends at once: its run goes on from what was saved. In a program of somebody else's, where
-    `install` wasn't called, they ask to stop there, too.
+    Where something is being learnt (`while_learning`), they ask to stop after the
+    present update, and a second one interrupts at once. Elsewhere, above all while
+    something is compiled, a command ends at once: its run goes on from what was saved.
+    In a program of somebody else's, where `install` wasn't called, they ask to stop
+    there, too.
     """
 
     def __init__(self):
@@ -217,8 +225,8 @@ class StopRequest:
 
     @contextlib.contextmanager
     def while_compiling(self) -> Iterator[None]:
-        """Where, inside `while_learning`, something is waited for: a signal ends the command at
-        once, also one that came before.
+        """Where, inside `while_learning`, something is waited for: a signal ends the
+        command at once, also one that came before.
         """
         with patience(0):
             if self.name is not None:

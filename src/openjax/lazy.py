@@ -1,5 +1,5 @@
-"""Packages whose names are loaded when first asked for: `openjax.learning.archive` alone needn't
-wait for MuJoCo.
+"""Packages whose names are loaded when first asked for: `openjax.learning.archive`
+alone needn't wait for MuJoCo.
 """
 
 import importlib

@@ -13,20 +13,20 @@ from openjax.errors import UserError, suggestion
 from openjax.ranges import check_intervals, shown
 
 ROOT = ": "
-"""What the name of a place ends in that is a file, and no setting: `a.toml: `, then `a.toml:
-motor.order`.
+"""What the name of a place ends in that is a file, and no setting: `a.toml: `, then
+`a.toml: motor.order`.
 """
 
 WORDS = {int: "a whole number", float: "a number", str: "text", bool: "true or false"}
 
 
 def from_plain(kind: Any, value: Any, where: str = "settings") -> Any:
-    """The inverse of `to_plain` for the annotated type `kind`; numbers are finite and lie in their
-    intervals.
+    """The inverse of `to_plain` for the annotated type `kind`; numbers are finite and
+    lie in their intervals.
 
     Raises:
-      UserError: an unknown key, a missing one, or a value that doesn't fit its annotation; `where`
-      names the place.
+      UserError: an unknown key, a missing one, or a value that doesn't fit its
+      annotation; `where` names the place.
     """
     if dataclasses.is_dataclass(kind):
         return _dataclass_from_plain(kind, value, where)
@@ -57,7 +57,9 @@ def _place(where, key):
 
 def _table(value, where):
     if not isinstance(value, dict):
-        raise UserError(f"{where.removesuffix(ROOT)} is {shown(value)}; expected a table")
+        raise UserError(
+            f"{where.removesuffix(ROOT)} is {shown(value)}; expected a table"
+        )
     return value
 
 
@@ -78,7 +80,9 @@ def _leaf_from_plain(kind, value, where):
         return float(value)
     if kind is Path and isinstance(value, str):
         return Path(value)
-    if kind in WORDS and (not isinstance(value, kind) or (kind is int and isinstance(value, bool))):
+    if kind in WORDS and (
+        not isinstance(value, kind) or (kind is int and isinstance(value, bool))
+    ):
         raise UserError(f"{where} is {shown(value)}; expected {WORDS[kind]}")
     if kind is float and not math.isfinite(value):
         raise UserError(f"{where} is {value}; expected a finite number")
@@ -102,7 +106,8 @@ def _dataclass_from_plain(kind, value, where):
             raise UserError(f"{root} lacks {name}")
     hints = typing.get_type_hints(kind, include_extras=True)
     values = {
-        key: from_plain(hints[key], entry, _place(where, key)) for key, entry in entries.items()
+        key: from_plain(hints[key], entry, _place(where, key))
+        for key, entry in entries.items()
     }
     filled = kind(**values)
     # once more, though most kinds check themselves: here the error names the file
@@ -112,7 +117,8 @@ def _dataclass_from_plain(kind, value, where):
 
 def _union_from_plain(arguments, value, where):
     reasons = []
-    # the exact match first: True is not 1, and 1 must not become 1.0 when int stands in the union
+    # the exact match first: True is not 1, and 1 must not become 1.0 when int stands in
+    # the union
     for argument in sorted(arguments, key=lambda kind: kind is not type(value)):
         try:
             return from_plain(argument, value, where)

@@ -1,5 +1,5 @@
-"""What this machine computes with: cores as devices; a formula or its hand-written kernel, and what
-kernels need of arrays.
+"""What this machine computes with: cores as devices; a formula or its hand-written
+kernel, and what kernels need of arrays.
 """
 
 import contextlib
@@ -18,24 +18,28 @@ MOST_CORES = 4
 def make_cores_devices() -> None:
     """Have JAX see a processor's cores as devices, before anything asks for them.
 
-    Worlds are shared out to devices whole, while most operations on all of them are too short for
-    several threads. It does nothing where there may be an accelerator, or the number of devices was
-    asked for.
+    Worlds are shared out to devices whole, while most operations on all of them are too
+    short for several threads. It does nothing where there may be an accelerator, or the
+    number of devices was asked for.
     """
     accelerator = can_compile_for_cuda() and jax.config.jax_platforms != "cpu"
     by_flag = "device_count" in os.environ.get("XLA_FLAGS", "")
     is_chosen = jax.config.jax_num_cpu_devices >= 0 or by_flag
     if not accelerator and not is_chosen:
         # those that this process may use: a container has fewer than the machine
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+        cores = (
+            len(os.sched_getaffinity(0))
+            if hasattr(os, "sched_getaffinity")
+            else os.cpu_count()
+        )
         with contextlib.suppress(RuntimeError):  # somebody asked before
             jax.config.update("jax_num_cpu_devices", min(cores or 1, MOST_CORES))
 
 
 @functools.cache
 def can_compile_for_cuda() -> bool:
-    """Whether JAX's CUDA compiler is installed: without it, nobody asks for kernels, and they
-    needn't be traced.
+    """Whether JAX's CUDA compiler is installed: without it, nobody asks for kernels,
+    and they needn't be traced.
     """
     if importlib.util.find_spec("jax_plugins") is None:
         return False
@@ -44,8 +48,8 @@ def can_compile_for_cuda() -> bool:
 
 
 def on_platform(reference: Callable, kernel: Callable, *static) -> Callable:
-    """A function of arrays that runs `kernel` on NVIDIA GPUs and `reference` elsewhere; `static`
-    come first.
+    """A function of arrays that runs `kernel` on NVIDIA GPUs and `reference` elsewhere;
+    `static` come first.
     """
 
     by_formula = functools.partial(reference, *static)
@@ -59,9 +63,11 @@ def on_platform(reference: Callable, kernel: Callable, *static) -> Callable:
     return run
 
 
-def whole_blocks(array: jax.Array, size: int, axis: int = 0, mode: str = "constant") -> jax.Array:
-    """`array` padded at the end of `axis` to a multiple of `size`, for a kernel that works on whole
-    blocks.
+def whole_blocks(
+    array: jax.Array, size: int, axis: int = 0, mode: str = "constant"
+) -> jax.Array:
+    """`array` padded at the end of `axis` to a multiple of `size`, for a kernel that
+    works on whole blocks.
     """
     extra = -array.shape[axis] % size
     widths = [(0, extra if i == axis else 0) for i in range(array.ndim)]

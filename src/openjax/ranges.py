@@ -2,8 +2,8 @@
 
     learning_rate: Annotated[float, Interval("(0, 1]")] = 5e-4
 
-`check_intervals` validates by them, `--help` shows them, and one test draws values from inside and
-outside of each.
+`check_intervals` validates by them, `--help` shows them, and one test draws values from
+inside and outside of each.
 """
 
 import dataclasses
@@ -22,8 +22,8 @@ _NOTATION = re.compile(r"([\[(])\s*([^,\s]+)\s*,\s*([^,\s]+)\s*([\])])")
 
 @dataclasses.dataclass(frozen=True)
 class Interval:
-    """The numbers that a setting may have, in the notation of mathematics: "[1, 8]", "(0, 1]".
-    Always bounded.
+    """The numbers that a setting may have, in the notation of mathematics: "[1, 8]",
+    "(0, 1]". Always bounded.
     """
 
     notation: str
@@ -63,7 +63,9 @@ Seed = Annotated[int, Interval("[0, 4294967295]")]
 
 @dataclasses.dataclass(frozen=True)
 class Ranged:
-    """A field of a settings class that holds one number, several, or, where `optional`, nothing."""
+    """A field of a settings class that holds one number, several, or, where `optional`,
+    nothing.
+    """
 
     name: str
     kind: type
@@ -86,7 +88,9 @@ def ranged_fields(settings: type) -> tuple[Ranged, ...]:
         kind = typing.get_args(hint)[0]
         optional = isinstance(kind, types.UnionType)
         if optional:
-            kind = next(entry for entry in typing.get_args(kind) if entry is not type(None))
+            kind = next(
+                entry for entry in typing.get_args(kind) if entry is not type(None)
+            )
         several = typing.get_origin(kind) is tuple
         if several:
             kind = typing.get_args(kind)[0]
@@ -124,8 +128,8 @@ def check_intervals(settings: Any, group: str = "") -> None:
 
 
 def changed(settings: Any, **changes) -> Any:
-    """`dataclasses.replace` for settings within settings: a dict stands for changes of the settings
-    under that name.
+    """`dataclasses.replace` for settings within settings: a dict stands for changes of
+    the settings under that name.
 
     `changed(preset("paper"), seed=1, environment=dict(reward=dict(crash=40.0)))`
 
@@ -136,7 +140,9 @@ def changed(settings: Any, **changes) -> Any:
     for name in changes:
         if name not in names:
             of = type(settings).__name__
-            raise UserError(f"{name}: {of} has no such setting; {suggestion(name, names)}")
+            raise UserError(
+                f"{name}: {of} has no such setting; {suggestion(name, names)}"
+            )
     for name, value in changes.items():
         if isinstance(value, dict):
             changes[name] = changed(getattr(settings, name), **value)

@@ -1,4 +1,6 @@
-"""`python -m openjax.sample_flights`: the command is `openjax.commands.sample_flights`."""
+"""`python -m openjax.sample_flights`: the command is
+`openjax.commands.sample_flights`.
+"""
 
 from openjax.__main__ import entry
 

@@ -1,5 +1,5 @@
-"""Stack with point pursuers: it catches every scripted evader inside its bound, and one gets away
-close outside.
+"""Stack with point pursuers: it catches every scripted evader inside its bound, and one
+gets away close outside.
 """
 
 import jax
@@ -19,12 +19,14 @@ EVADERS = ("field", "greedy", "greedy_near", "wall_runner", "way_points")
 
 
 def round_the_wall(settings, place):
-    """(3,) wish of an evader at (3,) `place` that runs round the wall, half-way between two
-    pursuers' heights.
+    """(3,) wish of an evader at (3,) `place` that runs round the wall, half-way between
+    two pursuers' heights.
     """
     between = settings.arena_height * jnp.array([1.0, 2.0]) / 3
     step = settings.evader_speed * STEP
-    up = jnp.clip((between[jnp.argmin(jnp.abs(between - place[2]))] - place[2]) / step, -1.0, 1.0)
+    up = jnp.clip(
+        (between[jnp.argmin(jnp.abs(between - place[2]))] - place[2]) / step, -1.0, 1.0
+    )
     radius = jnp.linalg.norm(place[:2])
     out = place[:2] / radius
     outward = jnp.clip((settings.arena_radius - MARGIN - radius) / step, 0.0, 1.0)
@@ -33,8 +35,8 @@ def round_the_wall(settings, place):
 
 
 def captures(number=64, wish=None, **changes):
-    """(kinds, number) whether each scripted evader is caught, from drawn starts in an empty arena;
-    (kinds, number) steps.
+    """(kinds, number) whether each scripted evader is caught, from drawn starts in an
+    empty arena; (kinds, number) steps.
 
     With a `wish` (settings, place -> (3,)) all do as it says.
     """
@@ -46,7 +48,9 @@ def captures(number=64, wish=None, **changes):
         task = uniform_task(settings, key)
         task = task.replace(pillar_active=jnp.zeros(1, bool))
         observation, state = environment.reset_to(key, task)
-        state = state.replace(evader=draw_evader(settings, key, task.pursuer_position, kind=kind))
+        state = state.replace(
+            evader=draw_evader(settings, key, task.pursuer_position, kind=kind)
+        )
 
         def one(world, _):
             observation, state = world
@@ -55,9 +59,9 @@ def captures(number=64, wish=None, **changes):
             observation, state, *_ = environment.step(key, state, action, wished)
             return (observation, state), None
 
-        return jax.lax.scan(one, (observation, state), length=settings.episode_length)[0][
-            1
-        ].statistics
+        return jax.lax.scan(one, (observation, state), length=settings.episode_length)[
+            0
+        ][1].statistics
 
     keys = jax.random.split(jax.random.key(0), number)
     kinds = jnp.arange(len(EVADERS))
@@ -74,11 +78,16 @@ def test_the_bound_of_the_papers_arena():
 
 
 def test_points_capture_more_than_on_one_ray():
-    for changes in ({}, {"num_pursuers": 8}, {"num_pursuers": 5, "capture_radius": 0.15}):
+    for changes in (
+        {},
+        {"num_pursuers": 8},
+        {"num_pursuers": 5, "capture_radius": 0.15},
+    ):
         settings = PursuitSettings(**changes)
         ratio = planar_bound(settings)
         assert ratio > stack_bound(settings) > 1.0
-        # nearest to an evader on the wall, of all straight lines that leave the ray to its side
+        # nearest to an evader on the wall, of all straight lines that leave the ray to
+        # its side
         turned = np.linspace(0.0, np.arccos(1.0 / ratio), 200)
         place = np.stack([np.cos(turned), np.sin(turned)], axis=-1)
         distance = np.linalg.norm(place - [1.0 / ratio, 0.0], axis=-1) - turned / ratio
@@ -99,8 +108,12 @@ def test_every_scripted_evader_is_caught_inside_the_bound():
 @pytest.mark.slow
 @pytest.mark.parametrize(("radius", "most"), [(0.29, 1.0), (0.285, 0.1)])
 def test_the_bound_is_tight(radius, most):
-    inside = PursuitSettings().evader_speed < stack_bound(PursuitSettings(capture_radius=radius))
-    caught = captures(wish=round_the_wall, capture_radius=radius)[0][EVADERS.index("greedy")]
+    inside = PursuitSettings().evader_speed < stack_bound(
+        PursuitSettings(capture_radius=radius)
+    )
+    caught = captures(wish=round_the_wall, capture_radius=radius)[0][
+        EVADERS.index("greedy")
+    ]
     assert inside == caught.all() and caught.mean() <= most
 
 

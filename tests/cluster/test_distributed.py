@@ -1,6 +1,6 @@
-"""Training on several devices and processes: the same result on the same worlds, resumed on another
-number of devices, and one clear line when a process is lost or the worlds can't be shared out.
-Virtual CPU devices, processes on loopback.
+"""Training on several devices and processes: the same result on the same worlds,
+resumed on another number of devices, and one clear line when a process is lost or the
+worlds can't be shared out. Virtual CPU devices, processes on loopback.
 """
 
 import os
@@ -32,8 +32,8 @@ OPTIONS = """
     --num_envs 32 --rollout_length 10 --restart_every 2 --restart_steps 10 --total_steps 100000000 --validation_episodes 2
 """.split()
 
-# The same run on one device and on four of one process, next to that of two processes with two
-# devices each.
+# The same run on one device and on four of one process, next to that of two processes
+# with two devices each.
 ONE_PROCESS = """
 import sys
 from pathlib import Path
@@ -131,7 +131,9 @@ with joined(membership) as processes:
 
 
 def environment_with(devices):
-    """The suite's own, with virtual devices, which may have threads as in a user's run."""
+    """The suite's own, with virtual devices, which may have threads as in a user's
+    run.
+    """
     flags = os.environ["XLA_FLAGS"].replace("--xla_cpu_multi_thread_eigen=false", "")
     flags += f" --xla_force_host_platform_device_count={devices}"
     return {**os.environ, "XLA_FLAGS": flags}
@@ -146,32 +148,58 @@ def free_address():
 def wait_for(happened, processes, seconds=480.0):
     deadline = time.monotonic() + seconds
     while not happened():
-        assert time.monotonic() < deadline and all(process.poll() is None for process in processes)
+        assert time.monotonic() < deadline and all(
+            process.poll() is None for process in processes
+        )
         time.sleep(0.01)
 
 
 def train(*options, **popen):
     return subprocess.Popen(
-        [sys.executable, "-m", "openjax.train", *OPTIONS, *map(str, options)], text=True, **popen
+        [sys.executable, "-m", "openjax.train", *OPTIONS, *map(str, options)],
+        text=True,
+        **popen,
     )
 
 
 @pytest.fixture(scope="module")
 def killed(tmp_path_factory):
-    """A run of two processes, the second killed after its first checkpoint: directory, the first's
-    end.
+    """A run of two processes, the second killed after its first checkpoint: directory,
+    the first's end.
     """
     directory = tmp_path_factory.mktemp("job")
     run = directory / "run"
     address = free_address()
     processes = []
     for i in range(2):
-        job = ("--coordinator_address", address, "--num_processes", 2, "--process_id", i)
-        options = (*job, "--devices", "all", "--out", run, "--validation_interval", UPDATES)
-        with open(directory / f"{i}.out", "w") as out, open(directory / f"{i}.err", "w") as err:
-            processes.append(train(*options, env=environment_with(2), stdout=out, stderr=err))
+        job = (
+            "--coordinator_address",
+            address,
+            "--num_processes",
+            2,
+            "--process_id",
+            i,
+        )
+        options = (
+            *job,
+            "--devices",
+            "all",
+            "--out",
+            run,
+            "--validation_interval",
+            UPDATES,
+        )
+        with (
+            open(directory / f"{i}.out", "w") as out,
+            open(directory / f"{i}.err", "w") as err,
+        ):
+            processes.append(
+                train(*options, env=environment_with(2), stdout=out, stderr=err)
+            )
     try:
-        wait_for(lambda: is_checkpoint(run / "checkpoints" / f"{UPDATES:09d}"), processes)
+        wait_for(
+            lambda: is_checkpoint(run / "checkpoints" / f"{UPDATES:09d}"), processes
+        )
         processes[1].send_signal(signal.SIGKILL)
         status = processes[0].wait(480)
     finally:
@@ -202,21 +230,34 @@ def test_only_the_first_process_writes_and_shows(killed):
         "steps/s",
     )  # what the first one tells, beside libraries' notes
     assert not [word for word in shown if word in other], other
-    updates = [record["update"] for record in read_metrics(run / "metrics.jsonl", "train")]
+    updates = [
+        record["update"] for record in read_metrics(run / "metrics.jsonl", "train")
+    ]
     assert updates[:UPDATES] == [1, 2, 3] and len(set(updates)) == len(updates)
 
 
 def test_any_number_of_devices_and_processes_trains_alike_and_goes_on_from_each_other(
     killed, tmp_path
 ):
-    command = [sys.executable, "-c", ONE_PROCESS, str(killed[0]), str(tmp_path), str(UPDATES)]
-    done = subprocess.run(command, env=environment_with(4), capture_output=True, text=True)
+    command = [
+        sys.executable,
+        "-c",
+        ONE_PROCESS,
+        str(killed[0]),
+        str(tmp_path),
+        str(UPDATES),
+    ]
+    done = subprocess.run(
+        command, env=environment_with(4), capture_output=True, text=True
+    )
     assert done.returncode == 0 and "same" in done.stdout, done.stderr[-3000:]
 
 
 def test_worlds_that_cannot_be_shared_out_are_an_error_of_one_line(tmp_path):
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    process = train("--devices", "all", "--out", tmp_path / "run", env=environment_with(3), **pipes)
+    process = train(
+        "--devices", "all", "--out", tmp_path / "run", env=environment_with(3), **pipes
+    )
     _, error = process.communicate()
     assert process.returncode == 2
     assert (
@@ -270,7 +311,11 @@ OPEN_MPI = {
         (SLURM, (None, None, None, True), Membership("gpu03:61447", 2, 1, "slurm")),
         (SLURM, (None, None, None, False), None),
         (SLURM, ("host:1234", 4, 3, True), Membership("host:1234", 4, 3, "deactivate")),
-        (OPEN_MPI, (None, None, None, True), Membership("10.0.0.1:61442", 2, 1, "ompi")),
+        (
+            OPEN_MPI,
+            (None, None, None, True),
+            Membership("10.0.0.1:61442", 2, 1, "ompi"),
+        ),
     ],
 )
 def test_membership_comes_from_the_command_line_or_the_manager(

@@ -1,5 +1,5 @@
-"""What changed between two sets of flights: on flown vehicles with a known change, and on trims
-made by hand for what only many flights show (days, sizes, classes).
+"""What changed between two sets of flights: on flown vehicles with a known change, and
+on trims made by hand for what only many flights show (days, sizes, classes).
 """
 
 import functools
@@ -44,7 +44,9 @@ def folders(tmp_path_factory):
     ]
     for name, effects, seed in flown:
         (root / name).mkdir()
-        for number, (flight, reference) in enumerate(references(seed=seed, duration=8.0).items()):
+        for number, (flight, reference) in enumerate(
+            references(seed=seed, duration=8.0).items()
+        ):
             columns = fly(VEHICLE, VEHICLE, reference, 10 * seed + number, effects)
             write_csv(root / name / f"{flight}.csv.gz", log_of(columns, flight))
     return root
@@ -63,8 +65,15 @@ def test_the_same_vehicle_has_not_changed(folders):
 
 def test_a_weak_rotor_is_found_with_its_size(folders):
     change = compared(folders, "rotor")
-    assert change.changed and change.rotors == (3,) and change.effects[0] == "motor_imbalance"
-    assert change.size.low < 0.15 < change.size.high and abs(change.size.value - 0.15) < 0.03
+    assert (
+        change.changed
+        and change.rotors == (3,)
+        and change.effects[0] == "motor_imbalance"
+    )
+    assert (
+        change.size.low < 0.15 < change.size.high
+        and abs(change.size.value - 0.15) < 0.03
+    )
 
 
 def test_a_heavier_vehicle_blames_no_rotor(folders):
@@ -88,13 +97,17 @@ def test_what_moves_no_trim_is_named_alone(folders, effect):
 
 def test_the_drag_is_that_of_the_effect(folders):
     drag = compared(folders, "rotor_drag").figures["drag_x"]
-    assert drag.low < EFFECTS["rotor_drag"].card.sample["d_xy"] / float(VEHICLE.mass) < drag.high
+    assert (
+        drag.low
+        < EFFECTS["rotor_drag"].card.sample["d_xy"] / float(VEHICLE.mass)
+        < drag.high
+    )
 
 
 @pytest.mark.parametrize("kept", [("m",), ("m", "x", "y", "z"), ("m", "a", "w")])
 def test_poor_logs_tell_as_much_about_trims(folders, tmp_path, kept):
-    """Motors alone, position without attitude, sensors without a pose: no gyroscope or orientation
-    is needed.
+    """Motors alone, position without attitude, sensors without a pose: no gyroscope or
+    orientation is needed.
     """
     for name in ("monday", "rotor"):
         (tmp_path / name).mkdir()
@@ -105,8 +118,13 @@ def test_poor_logs_tell_as_much_about_trims(folders, tmp_path, kept):
             if "x" in kept:
                 columns |= dict(zip("xyz", flight.position.T, strict=True))
             if "w" in kept:
-                columns |= {f"w{a}": v for a, v in zip("xyz", flight.body_rates.T, strict=True)}
-                columns |= {f"a{a}": v for a, v in zip("xyz", flight.specific_force.T, strict=True)}
+                columns |= {
+                    f"w{a}": v for a, v in zip("xyz", flight.body_rates.T, strict=True)
+                }
+                columns |= {
+                    f"a{a}": v
+                    for a, v in zip("xyz", flight.specific_force.T, strict=True)
+                }
             write_csv(
                 tmp_path / name / flight.log,
                 LogTable(flight.log, columns, np.full(len(flight), "0")),
@@ -115,7 +133,8 @@ def test_poor_logs_tell_as_much_about_trims(folders, tmp_path, kept):
     assert change.changed and change.rotors == (3,)
 
 
-# Trims by hand: what a rotor's factor does to them, with days that differ as real ones do.
+# Trims by hand: what a rotor's factor does to them, with days that differ as real ones
+# do.
 
 
 @pytest.fixture(scope="module")
@@ -125,7 +144,9 @@ def case(folders):
 
 def test_a_folder_of_several_vehicles_is_refused(case, tmp_path):
     for number, flight in enumerate(case.flights):
-        columns = {"t": flight.time} | {f"m{i + 1}": flight.motor_command[:, i] for i in range(4)}
+        columns = {"t": flight.time} | {
+            f"m{i + 1}": flight.motor_command[:, i] for i in range(4)
+        }
         vehicle = np.full(len(flight), str(number % 2))
         write_csv(tmp_path / flight.log, LogTable(flight.log, columns, vehicle))
     with pytest.raises(UserError, match="several vehicles"):
@@ -170,7 +191,9 @@ def test_the_spread_of_days_is_learnt_and_hides_what_is_smaller(case):
 
 
 def test_sizes_grow_with_the_change_and_intervals_hold_it(case):
-    old = [f for k in range(3) for f in trims(f"d{k}", offset=(0, 0.01 * k, 0, 0), seed=k)]
+    old = [
+        f for k in range(3) for f in trims(f"d{k}", offset=(0, 0.01 * k, 0, 0), seed=k)
+    ]
     sizes = []
     for rise in (0.05, 0.1, 0.2, 0.3):
         change = comparison.change_between(
@@ -193,7 +216,9 @@ def test_two_rotors_of_a_side_are_a_class_with_a_weight_there(case):
 
 
 def test_rotors_are_counted_as_logged(case, folders, tmp_path):
-    """A vehicle file that names the motors in another order moves the answer with it."""
+    """A vehicle file that names the motors in another order moves the answer with
+    it.
+    """
     order = '["rear_left", "front_left", "front_right", "rear_right"]'
     for name in ("monday", "rotor"):
         (tmp_path / name).mkdir()
@@ -210,7 +235,9 @@ def test_rotors_are_counted_as_logged(case, folders, tmp_path):
     assert change.rotors == (1,) and change.side == "rear left"
 
 
-def test_the_command_writes_page_and_numbers_and_spares_the_others(folders, tmp_path, capsys):
+def test_the_command_writes_page_and_numbers_and_spares_the_others(
+    folders, tmp_path, capsys
+):
     (tmp_path / "empty").mkdir()
     out = tmp_path / "out"
     answers = tmp_path / "answers.json"
@@ -227,7 +254,10 @@ def test_the_command_writes_page_and_numbers_and_spares_the_others(folders, tmp_
     )
     page = (out / "rotor" / "changes.html").read_text()
     assert "<svg" in page and "src=" not in page
-    assert "holds no flight log" in capsys.readouterr().err and not (out / "empty").exists()
+    assert (
+        "holds no flight log" in capsys.readouterr().err
+        and not (out / "empty").exists()
+    )
 
 
 def test_a_battery_that_nobody_logged_hides_a_tenth_of_hover():

@@ -1,5 +1,5 @@
-"""The validation tasks: the same for all runs, the far ones as far as an archive reaches, chosen by
-the uniform ones.
+"""The validation tasks: the same for all runs, the far ones as far as an archive
+reaches, chosen by the uniform ones.
 """
 
 import dataclasses
@@ -13,7 +13,12 @@ from hypothesis import strategies as st
 
 from openjax.evaluation.episodes import summarise
 from openjax.evaluation.evaluator import Evaluator
-from openjax.evaluation.validation import Validation, far_tasks, selection_score, uniform_tasks
+from openjax.evaluation.validation import (
+    Validation,
+    far_tasks,
+    selection_score,
+    uniform_tasks,
+)
 from openjax.learning import TrainSettings, build
 from openjax.policy import NetworkSettings, PredictorSettings
 from openjax.pursuit import Pursuit, PursuitSettings, RewardSettings
@@ -31,7 +36,8 @@ def far():
 
 def test_far_tasks_are_fair_and_leave_the_box_of_the_uniform_draw(far):
     narrow = far.replace(
-        pillar_position=far.pillar_position[:, :5], pillar_active=far.pillar_active[:, :5]
+        pillar_position=far.pillar_position[:, :5],
+        pillar_active=far.pillar_active[:, :5],
     )  # the sixth slot is there for the layouts alone
     assert not far.pillar_active[:, 5].any()
     assert jax.vmap(lambda task: starts_clear(SETTINGS, task))(narrow).all()
@@ -41,19 +47,22 @@ def test_far_tasks_are_fair_and_leave_the_box_of_the_uniform_draw(far):
     assert reach.max() <= SETTINGS.arena_radius - 0.1 + 1e-6
     assert np.abs(pursuers[..., 2] - 0.6).max() <= 0.1 + 1e-6
     assert (reach > np.hypot(START_X[1], 0.536)).any()
-    # from all sides, unlike uniform ones, and no longer with a gap between pursuers and evader
+    # from all sides, unlike uniform ones, and no longer with a gap between pursuers and
+    # evader
     assert (evader[:, 0] > 0.2).any() and (evader[:, 0] < -0.2).any()
     between = np.sum(pursuers[..., :2] * evader[:, None, :2], axis=-1)
     assert (between > 0).any()
 
 
 def test_fewer_tasks_are_the_first_of_more(far):
-    chex.assert_trees_all_equal(far_tasks(SETTINGS, 3, 6), jax.tree.map(lambda leaf: leaf[:3], far))
+    chex.assert_trees_all_equal(
+        far_tasks(SETTINGS, 3, 6), jax.tree.map(lambda leaf: leaf[:3], far)
+    )
 
 
 def test_uniform_tasks_fly_as_they_would_alone():
-    """The far tasks beside them change nothing that a checkpoint is chosen by, nor does what the
-    reward weighs.
+    """The far tasks beside them change nothing that a checkpoint is chosen by, nor does
+    what the reward weighs.
     """
     game = PursuitSettings(physics="rigid", episode_length=3)
     run = TrainSettings(
@@ -71,7 +80,9 @@ def test_uniform_tasks_fly_as_they_would_alone():
     validation = Validation(environment, policy, run.validation_episodes)
     uniform, far = (kind.evaluation for kind in validation(parameters))
     rewarded = dataclasses.replace(
-        game, max_pillars=6, reward=RewardSettings(smoothness=2.0, first_crash=5000.0, distance=3.0)
+        game,
+        max_pillars=6,
+        reward=RewardSettings(smoothness=2.0, first_crash=5000.0, distance=3.0),
     )
     evaluator = Evaluator(Pursuit(rewarded), policy, 4)
     tasks = {"alone": uniform_tasks(game, 4, 6)}
@@ -79,14 +90,18 @@ def test_uniform_tasks_fly_as_they_would_alone():
     together = summarise(uniform)
     by_itself = summarise(alone)
     assert abs(together.pop("episode_return") - by_itself.pop("episode_return")) > 1.0
-    assert selection_score(together, 3) == pytest.approx(selection_score(by_itself, 3), abs=1e-6)
+    assert selection_score(together, 3) == pytest.approx(
+        selection_score(by_itself, 3), abs=1e-6
+    )
     same = uniform.statistics.replace(episode_return=alone.statistics.episode_return)
     expected = jax.tree.leaves(alone)
     for leaf, other in zip(
         jax.tree.leaves(uniform.replace(statistics=same)), expected, strict=True
     ):
         np.testing.assert_allclose(leaf, other, rtol=1e-5, atol=1e-6)
-    assert not np.allclose(far.statistics.episode_return, uniform.statistics.episode_return)
+    assert not np.allclose(
+        far.statistics.episode_return, uniform.statistics.episode_return
+    )
 
 
 LENGTH = 800
@@ -99,7 +114,9 @@ SUMMARIES = st.fixed_dictionaries(
 @settings(deadline=None)
 @given(SUMMARIES, st.sampled_from([*RATES, "capture_step"]), st.floats(1e-3, 1))
 def test_what_is_better_scores_higher(summary, name, amount):
-    """Captures up, anything else down: never lower, and higher by what can be told apart."""
+    """Captures up, anything else down: never lower, and higher by what can be told
+    apart.
+    """
     good = 1.0 if name == "capture_rate" else -1.0
     low, high = (1.0, LENGTH) if name == "capture_step" else (0.0, 1.0)
     better = {
@@ -114,9 +131,13 @@ def test_what_is_better_scores_higher(summary, name, amount):
 @settings(deadline=None)
 @given(SUMMARIES, st.floats(1, LENGTH))
 def test_no_capture_step_makes_up_for_many_failures(summary, step):
-    """However much sooner: not for a twentieth of the captures, a tenth of the crashes, a hundredth
-    of the steps breached.
+    """However much sooner: not for a twentieth of the captures, a tenth of the crashes,
+    a hundredth of the steps breached.
     """
-    for name, change in {"capture_rate": -0.05, "crash_rate": 0.1, "collision_rate": 0.01}.items():
+    for name, change in {
+        "capture_rate": -0.05,
+        "crash_rate": 0.1,
+        "collision_rate": 0.01,
+    }.items():
         worse = {**summary, name: summary[name] + change, "capture_step": step}
         assert selection_score(worse, LENGTH) <= selection_score(summary, LENGTH) + 1e-9

@@ -1,5 +1,5 @@
-"""Garbage is called garbage: logs whose channels contradict each other are refused with the
-numbers. That good flights pass is tested with the other checks.
+"""Garbage is called garbage: logs whose channels contradict each other are refused with
+the numbers. That good flights pass is tested with the other checks.
 """
 
 import itertools
@@ -21,28 +21,39 @@ VEHICLE = load_vehicle()
 
 
 def refusals(columns):
-    (flight,), _ = flights_of(LogTable("flight.csv", columns, np.full(len(columns["t"]), "0")))
+    (flight,), _ = flights_of(
+        LogTable("flight.csv", columns, np.full(len(columns["t"]), "0"))
+    )
     kept, issues = check_flight(flight, VEHICLE)
     return kept, [i for i in issues if i.refused]
 
 
-@pytest.mark.parametrize("channel", [c for c in CHANNEL_COLUMNS if c != "battery_voltage"])
+@pytest.mark.parametrize(
+    "channel", [c for c in CHANNEL_COLUMNS if c != "battery_voltage"]
+)
 @pytest.mark.parametrize("how", ["shuffled", "of another time", "noise"])
 def test_a_channel_that_contradicts_the_others_is_garbage(channel, how, sample_columns):
     columns = sample_columns["flight_b"]
     rng = np.random.default_rng(1)
     rows = len(columns["t"])
-    order = rng.permutation(rows) if how == "shuffled" else np.roll(np.arange(rows), rows // 3)
+    order = (
+        rng.permutation(rows)
+        if how == "shuffled"
+        else np.roll(np.arange(rows), rows // 3)
+    )
     changed = dict(columns)
     for name in CHANNEL_COLUMNS[channel]:
         changed[name] = columns[name][order]
         if how == "noise":
-            changed[name] = columns[name].mean() + columns[name].std() * rng.standard_normal(rows)
+            changed[name] = columns[name].mean() + columns[
+                name
+            ].std() * rng.standard_normal(rows)
     if channel in ("motor_command", "command_thrust"):
         changed |= {n: np.clip(changed[n], 0.0, 1.0) for n in CHANNEL_COLUMNS[channel]}
     kept, found = refusals(changed)
     assert kept is None
-    assert all(any(c.isdigit() for c in issue.issue) for issue in found)  # with the numbers
+    # with the numbers
+    assert all(any(c.isdigit() for c in issue.issue) for issue in found)
 
 
 def test_noise_in_every_column_is_garbage(sample_columns):
@@ -52,7 +63,10 @@ def test_noise_in_every_column_is_garbage(sample_columns):
         n: v if n == "t" else np.nanmean(v) + np.nanstd(v) * rng.standard_normal(len(v))
         for n, v in columns.items()
     }
-    for names, low, high in ((CHANNEL_COLUMNS["motor_command"], 0, 1), (("cmd_thrust",), 0, 1)):
+    for names, low, high in (
+        (CHANNEL_COLUMNS["motor_command"], 0, 1),
+        (("cmd_thrust",), 0, 1),
+    ):
         noise |= {n: np.clip(noise[n], low, high) for n in names}
     length = np.sqrt(sum(noise[f"q{p}"] ** 2 for p in "wxyz"))
     noise |= {f"q{p}": noise[f"q{p}"] / length for p in "wxyz"}
@@ -67,8 +81,8 @@ def test_a_column_copied_over_another_is_garbage(sample_columns):
 
 
 def test_clocks_apart_filters_and_noise_are_no_contradiction(sample_columns):
-    """What honest sensors do: 100 ms between the streams, smoothing, and noise as strong as in bad
-    logs.
+    """What honest sensors do: 100 ms between the streams, smoothing, and noise as
+    strong as in bad logs.
     """
     columns = sample_columns["flight_c"]
     rng = np.random.default_rng(3)
@@ -92,7 +106,8 @@ def test_an_estimates_wandering_position_is_no_contradiction_while_hovering():
         for n in ("place", "lean")
     }
     slow = {n: v / v.std(0) for n, v in slow.items()}
-    place = [0.0, 0.0, 0.6] + 0.003 * slow["place"]  # m: what ultra-wideband ranges leave
+    # m: what ultra-wideband ranges leave
+    place = [0.0, 0.0, 0.6] + 0.003 * slow["place"]
     lean = 0.01 * slow["lean"]
     rates = np.gradient(lean, t, axis=0) + 0.01 * rng.standard_normal((len(t), 3))
     force = [0.0, 0.0, 9.81] + 0.05 * rng.standard_normal((len(t), 3))
@@ -112,14 +127,18 @@ def test_an_estimates_wandering_position_is_no_contradiction_while_hovering():
     assert kept is not None, found
 
 
-@pytest.mark.parametrize(("hover", "contradicts"), [(0.5, [False]), (0.85, []), (None, [True])])
+@pytest.mark.parametrize(
+    ("hover", "contradicts"), [(0.5, [False]), (0.85, []), (None, [True])]
+)
 def test_motors_at_their_limit_need_not_add_up_to_the_thrust(hover, contradicts):
-    """A light and a heavy vehicle, whose mixer is cut at full thrust; and motors that follow
-    another thrust.
+    """A light and a heavy vehicle, whose mixer is cut at full thrust; and motors that
+    follow another thrust.
     """
     rng = np.random.default_rng(6)
     steps = 3000
-    slow = sosfilt(butter(2, 2.0, fs=100.0, output="sos"), rng.standard_normal((steps, 3)), axis=0)
+    slow = sosfilt(
+        butter(2, 2.0, fs=100.0, output="sos"), rng.standard_normal((steps, 3)), axis=0
+    )
     thrust, roll, other = slow.T / slow.std(0)[:, None] * [[0.01], [0.05], [0.01]]
     center = hover or 0.5
     asked = (
@@ -130,15 +149,17 @@ def test_motors_at_their_limit_need_not_add_up_to_the_thrust(hover, contradicts)
     nothing = dict.fromkeys(
         ("position", "quaternion", "velocity", "body_rates", "force", "commands")
     )
-    logged = Signals(motor=np.clip(asked, 0.0, 1.0), thrust=(center + thrust)[:, None], **nothing)
+    logged = Signals(
+        motor=np.clip(asked, 0.0, 1.0), thrust=(center + thrust)[:, None], **nothing
+    )
     assert [bool(pair.bad.any()) for pair in pairs_of(logged)] == contradicts
 
 
 def test_what_most_flights_contradict_the_calm_ones_must_show_to_be_right(
     case_folder, sample_columns
 ):
-    """Swapped gyroscope columns in every log: where the vehicle hardly turns they don't show, and
-    aren't trusted.
+    """Swapped gyroscope columns in every log: where the vehicle hardly turns they don't
+    show, and aren't trusted.
     """
     swapped = {n: c | {"wx": c["wy"], "wy": c["wx"]} for n, c in sample_columns.items()}
     calm = {n: v[:300] for n, v in swapped["flight_a"].items()}
@@ -153,7 +174,8 @@ def test_what_most_flights_contradict_the_calm_ones_must_show_to_be_right(
     calm |= still | {"z": 0.5 + 0.001 * rng.standard_normal(300)}
     calm |= {m: 0.5 + 0.01 * rng.standard_normal(300) for m in ("m1", "m2", "m3", "m4")}
     calm |= {
-        a: (9.81 if a == "az" else 0.0) + 0.1 * rng.standard_normal(300) for a in ("ax", "ay", "az")
+        a: (9.81 if a == "az" else 0.0) + 0.1 * rng.standard_normal(300)
+        for a in ("ax", "ay", "az")
     }
     calm["cmd_thrust"] = (calm["m1"] + calm["m2"] + calm["m3"] + calm["m4"]) / 4
     assert refusals(calm)[1] == []
@@ -187,8 +209,12 @@ PATHS = {
 
 @pytest.mark.parametrize("imu", [True, False])
 @pytest.mark.parametrize("fault", PATHS)
-def test_a_position_moves_as_its_velocity_says_however_slowly(fault, imu, sample_columns):
-    """A figure of some decimetres in ten seconds is below the band of the other comparisons."""
+def test_a_position_moves_as_its_velocity_says_however_slowly(
+    fault, imu, sample_columns
+):
+    """A figure of some decimetres in ten seconds is below the band of the other
+    comparisons.
+    """
     damage, words = PATHS[fault]
     columns = damage(sample_columns["flight_b"])
     if not imu:
@@ -212,10 +238,13 @@ PARTS = ("qw", "qx", "qy", "qz")
 def test_parts_of_a_quaternion_that_are_swapped_are_named(pair, name, sample_columns):
     """In a single flight, where no other tells what is right."""
     columns = swapped(*pair)(sample_columns[name])
-    order = [dict(zip(pair, pair[::-1], strict=True)).get(part, part)[1] for part in PARTS]
+    order = [
+        dict(zip(pair, pair[::-1], strict=True)).get(part, part)[1] for part in PARTS
+    ]
     kept, found = refusals(columns)
     assert kept is None
-    if pair != ("qw", "qz"):  # a level vehicle's yaw: other axes of the world do the same
+    # a level vehicle's yaw: other axes of the world do the same
+    if pair != ("qw", "qz"):
         assert f"in the order {', '.join(order)}" in found[0].issue
 
 

@@ -1,5 +1,5 @@
-"""When motors act: a shift of a row is found and undone, another clock is a finding, and motors
-that are slow are neither.
+"""When motors act: a shift of a row is found and undone, another clock is a finding,
+and motors that are slow are neither.
 """
 
 import dataclasses
@@ -37,14 +37,18 @@ def tracks(sample_columns, tmp_path_factory):
 
 
 def moved(track: Track, late: float) -> Track:
-    """The track as a logger would write it whose motor commands stand `late` s too late."""
-    motor = [np.interp(track.time - late, track.time, column) for column in track.motor.T]
+    """The track as a logger would write it whose motor commands stand `late` s too
+    late.
+    """
+    motor = [
+        np.interp(track.time - late, track.time, column) for column in track.motor.T
+    ]
     return dataclasses.replace(track, motor=np.stack(motor, 1))
 
 
 def slower(track: Track, time: float) -> Track:
-    """The track as if its motors had a time constant that is longer by `time` s: the body answers
-    what motors did before.
+    """The track as if its motors had a time constant that is longer by `time` s: the
+    body answers what motors did before.
     """
     kept = np.exp(-track.dt / time)
     rates = track.body_rates.copy()
@@ -64,7 +68,9 @@ def test_motors_that_act_from_their_row_on_are_no_finding(tracks):
 
 
 def test_a_flight_that_turns_slowly_tells_no_clock_of_its_own():
-    """At 30 ms beside its peak the likeness of turns of about 1 Hz is still nine tenths of it."""
+    """At 30 ms beside its peak the likeness of turns of about 1 Hz is still nine tenths
+    of it.
+    """
     time = 0.01 * np.arange(2000)
     turns = [np.sin(2 * np.pi * f * time) for f in np.linspace(0.83, 1.37, 18)]
     slow = np.stack(turns, 1).reshape(len(time), 3, 6).sum(2)
@@ -73,7 +79,8 @@ def test_a_flight_that_turns_slowly_tells_no_clock_of_its_own():
     def offsets(late):  # of a slow flight, beside a fast one whose signals are at once
         signals = zip(("slow", "fast"), (slow, noise), (late, 0), strict=True)
         return clocks._offsets(
-            (SimpleNamespace(name=n, dt=0.01), np.roll(v, rows, 0), v) for n, v, rows in signals
+            (SimpleNamespace(name=n, dt=0.01), np.roll(v, rows, 0), v)
+            for n, v, rows in signals
         )
 
     assert offsets(3) == pytest.approx({"slow": 0.0, "fast": 0.0}, abs=0.003)
@@ -100,13 +107,19 @@ def test_rows_that_hold_what_acted_before_them_are_read_a_row_earlier(tracks):
 @pytest.mark.parametrize("late", [-0.25, -0.14, -0.08, 0.04, 0.08, 0.14, 0.25])
 @pytest.mark.parametrize("which", [slice(None), slice(1, 2)])
 def test_motors_on_another_clock_are_a_finding(tracks, late, which):
-    """In all flights or in one: commands are put where they act, and tell no torques."""
+    """In all flights or in one: commands are put where they act, and tell no
+    torques.
+    """
     rest = range(len(tracks))[which]
     mixed = [moved(t, late) if k in rest else t for k, t in enumerate(tracks)]
     found = read(mixed)
     assert not found.one_clock and list(found.findings) == ["motor clock"]
     words = found.findings["motor clock"]
-    assert words.count(" ms ") == len(rest) == words.count(" ms late" if late > 0 else " ms early")
+    assert (
+        words.count(" ms ")
+        == len(rest)
+        == words.count(" ms late" if late > 0 else " ms early")
+    )
     for number in rest:
         name = mixed[number].name
         assert found.late[name] == pytest.approx(late, abs=0.0076)
@@ -117,7 +130,9 @@ def test_flights_are_put_in_time_as_their_tracks_are(tracks):
     flight = Flight("a", "a", "0", tracks[0].time, motor_command=tracks[0].motor)
     case = Case("case", (flight, dataclasses.replace(flight, name="b")), None)
     first, second = case_on_gyroscope_clock(case, {"a": 0.02}).flights
-    np.testing.assert_allclose(first.motor_command[:-2], flight.motor_command[2:], atol=1e-9)
+    np.testing.assert_allclose(
+        first.motor_command[:-2], flight.motor_command[2:], atol=1e-9
+    )
     assert second.motor_command is flight.motor_command
 
 
@@ -131,7 +146,9 @@ def test_commands_that_motors_obey_before_they_were_sent_are_a_finding(tracks, l
     ]
     words = read_command_clock(mixed, 0.01)
     usual = -0.1 < late < 0.02
-    assert words.count(" ms late" if late > 0 else " ms early") == len(tracks) * (not usual)
+    assert words.count(" ms late" if late > 0 else " ms early") == len(tracks) * (
+        not usual
+    )
     assert bool(words) != usual
 
 
@@ -139,7 +156,9 @@ def test_motors_that_turn_nothing_tell_no_clock(tracks):
     rng = np.random.default_rng(0)
     calm = [
         dataclasses.replace(
-            t, motor=0.6 + 0.01 * rng.standard_normal(t.motor.shape), body_rates=0 * t.body_rates
+            t,
+            motor=0.6 + 0.01 * rng.standard_normal(t.motor.shape),
+            body_rates=0 * t.body_rates,
         )
         for t in tracks
     ]

@@ -1,5 +1,5 @@
-"""Whatever a log holds, a case is read or refused in one line: never a traceback, and one bad log
-never takes the others with it.
+"""Whatever a log holds, a case is read or refused in one line: never a traceback, and
+one bad log never takes the others with it.
 """
 
 import numpy as np
@@ -36,7 +36,9 @@ CELLS = st.sampled_from(
         "é",
     ]
 )
-EDITS = st.lists(st.tuples(st.floats(0, 1), st.integers(0, 40), CELLS), min_size=1, max_size=12)
+EDITS = st.lists(
+    st.tuples(st.floats(0, 1), st.integers(0, 40), CELLS), min_size=1, max_size=12
+)
 
 
 @settings(
@@ -73,9 +75,23 @@ def test_a_column_that_holds_one_value_is_a_finding_not_an_error(sample_columns,
 
 
 def test_logs_of_unlike_kinds_are_one_case(case_folder, sample_columns):
-    """A flight with all channels, one with the pose alone, one with inertial sensors alone."""
+    """A flight with all channels, one with the pose alone, one with inertial sensors
+    alone.
+    """
     pose = ("t", "x", "y", "z", "qw", "qx", "qy", "qz", "m1", "m2", "m3", "m4")
-    inertial = ("t", "ax", "ay", "az", "wx", "wy", "wz", "cmd_thrust", "cmd_wx", "cmd_wy", "cmd_wz")
+    inertial = (
+        "t",
+        "ax",
+        "ay",
+        "az",
+        "wx",
+        "wy",
+        "wz",
+        "cmd_thrust",
+        "cmd_wx",
+        "cmd_wy",
+        "cmd_wz",
+    )
     for name, kept in (("flight_b", pose), ("flight_c", inertial)):
         columns = {c: sample_columns[name][c] for c in kept}
         write_csv(case_folder / f"{name}.csv.gz", log_of([columns], name))

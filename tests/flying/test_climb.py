@@ -1,5 +1,6 @@
-"""A height that drifts gently, told by the accelerometer: of a vehicle that is pushed, leans and
-climbs, and in a flight."""
+"""A height that drifts gently, told by the accelerometer: of a vehicle that is pushed,
+leans and climbs, and in a flight.
+"""
 
 import itertools
 
@@ -18,27 +19,33 @@ PUSH = (0.5, 0.0, -0.8)
 
 def in_body(quaternion, vector):
     """A vector of the world in body axes."""
-    return tuple(Rotation.from_quat(quaternion, scalar_first=True).inv().apply(vector).tolist())
+    return tuple(
+        Rotation.from_quat(quaternion, scalar_first=True).inv().apply(vector).tolist()
+    )
 
 
 def felt(pose, following):
     """The specific force (m/s^2, body) between two poses."""
-    gain = [(b - a) / DT for a, b in zip(pose.velocity, following.velocity, strict=True)]
+    gain = [
+        (b - a) / DT for a, b in zip(pose.velocity, following.velocity, strict=True)
+    ]
     gain[2] += GRAVITY
     return in_body(pose.quaternion, gain)
 
 
 @pytest.fixture(scope="module")
 def flown():
-    """(pose, set-point, specific force) of six seconds, each with the force that has acted."""
+    """(pose, set-point, specific force) of six seconds, each with the force that has
+    acted.
+    """
     rows = list(flight(push=PUSH))
     forces = [felt(a[0], b[0]) for a, b in itertools.pairwise(rows)]
     return [(*row, force) for row, force in zip(rows[1:], forces, strict=False)]
 
 
 def judged(rows, speed=0.0, axis=2, begin=0.3, logged=True):
-    """The last innovations before the flight's end, or those that contradict the estimate, which
-    drifts by `speed` (m/s) within 2 s from `begin` (s) on.
+    """The last innovations before the flight's end, or those that contradict the
+    estimate, which drifts by `speed` (m/s) within 2 s from `begin` (s) on.
     """
     innovations = Innovations()
     way = 0.0
@@ -50,7 +57,9 @@ def judged(rows, speed=0.0, axis=2, begin=0.3, logged=True):
         position[axis] += way
         velocity[axis] += drift
         told = pose._replace(position=tuple(position), velocity=tuple(velocity))
-        innovations = innovations.after(told, sent, AIRFRAME).feeling(force if logged else None)
+        innovations = innovations.after(told, sent, AIRFRAME).feeling(
+            force if logged else None
+        )
         if innovations.verdict():
             break
     return innovations, pose

@@ -1,5 +1,5 @@
-"""Estimates that go wrong so gently that no single pose shows it, of a vehicle that does what its
-thrust, attitude and body rates say.
+"""Estimates that go wrong so gently that no single pose shows it, of a vehicle that
+does what its thrust, attitude and body rates say.
 """
 
 import math
@@ -7,7 +7,12 @@ import random
 
 import pytest
 
-from openjax.flying.controller import Pose, lift_acceleration, nominal_airframe, turned_on
+from openjax.flying.controller import (
+    Pose,
+    lift_acceleration,
+    nominal_airframe,
+    turned_on,
+)
 from openjax.flying.innovations import Innovations, turn_between
 from openjax.flying.judge import Verdict
 from openjax.flying.safety import step
@@ -21,8 +26,8 @@ BEGIN = 2.0
 
 
 def flight(seconds=6.0, push=(0.0, 0.0, 0.0)):
-    """(pose, set-point) of a vehicle that rolls, pitches and climbs to and fro; `push`: what else
-    accelerates it (m/s^2).
+    """(pose, set-point) of a vehicle that rolls, pitches and climbs to and fro; `push`:
+    what else accelerates it (m/s^2).
     """
     quaternion = (1.0, 0.0, 0.0, 0.0)
     position = (0.0, 0.0, 0.5)
@@ -39,16 +44,20 @@ def flight(seconds=6.0, push=(0.0, 0.0, 0.0)):
         quaternion = turned_on(quaternion, rates, DT)
         acceleration = lift_acceleration(quaternion, lift)
         faster = tuple(
-            v + DT * (a + p) for v, a, p in zip(velocity, acceleration, push, strict=True)
+            v + DT * (a + p)
+            for v, a, p in zip(velocity, acceleration, push, strict=True)
         )
         position = tuple(
-            p + DT * (v + w) / 2 for p, v, w in zip(position, velocity, faster, strict=True)
+            p + DT * (v + w) / 2
+            for p, v, w in zip(position, velocity, faster, strict=True)
         )
         velocity = faster
 
 
 def judged(damage=lambda pose, t, held, noise: pose, push=(0.0, 0.0, 0.0)):
-    """(verdict, s after something went wrong) of the first contradiction; (good, None) for none."""
+    """(verdict, s after something went wrong) of the first contradiction; (good, None)
+    for none.
+    """
     innovations = Innovations()
     noise = random.Random(0).gauss
     held = None

@@ -1,4 +1,6 @@
-"""Keys and signals: no stop is lost, whatever comes with it; a terminal that goes lands."""
+"""Keys and signals: no stop is lost, whatever comes with it; a terminal that goes
+lands.
+"""
 
 import itertools
 import os

@@ -1,4 +1,6 @@
-"""The loop without links: what its ticks leave behind, and what its record says of them."""
+"""The loop without links: what its ticks leave behind, and what its record says of
+them.
+"""
 
 import gc
 import time
@@ -21,8 +23,8 @@ STARTS = ((0.5, 0.3, 0.5), (0.5, 0.0, 0.5), (0.5, -0.3, 0.5))
 
 
 class Hovering:
-    """Links to three level vehicles that rise and sink as their thrust has it, and a game whose
-    policy hovers.
+    """Links to three level vehicles that rise and sink as their thrust has it, and a
+    game whose policy hovers.
     """
 
     airframe = nominal_airframe()
@@ -37,13 +39,18 @@ class Hovering:
         self.height = 0.0
         self.climb = 0.0
         self._nothing = np.zeros(3)
-        self._action = np.array([[2 * self.airframe.hover_thrust - 1, 0.0, 0.0, 0.0]] * 3)
+        self._action = np.array(
+            [[2 * self.airframe.hover_thrust - 1, 0.0, 0.0, 0.0]] * 3
+        )
 
     def observe(self):
         shake = 1e-4 * np.sin(1e3 * self.now)
         poses = [
             Pose(
-                self.now, (x + shake, y, self.height), (0.0, 0.0, self.climb), (1.0, 0.0, 0.0, 0.0)
+                self.now,
+                (x + shake, y, self.height),
+                (0.0, 0.0, self.climb),
+                (1.0, 0.0, 0.0, 0.0),
             )
             for x, y, _ in STARTS
         ]
@@ -90,8 +97,8 @@ def flight():
 
 
 def test_ticks_leave_half_a_kilobyte_each_and_nothing_to_collect(flight):
-    """The garbage collector is off in flight; two kilobytes a tick were 128 MB in eleven
-    minutes.
+    """The garbage collector is off in flight; two kilobytes a tick were 128 MB in
+    eleven minutes.
     """
     _, go_on = flight
     gc.collect()
@@ -114,8 +121,8 @@ def test_a_flight_may_end_before_its_first_tick():
 
 
 def test_poses_that_are_never_of_now_end_a_flight_that_hasnt_begun():
-    """A motion capture that stamps them by another clock: nothing flies, and the flight says
-    why.
+    """A motion capture that stamps them by another clock: nothing flies, and the flight
+    says why.
     """
     links = Hovering()
     flight = Flight(links, links, flight_state(links, 3, SafetySettings()), Plan())
@@ -131,14 +138,16 @@ def test_the_record_says_when_each_tick_was_due_and_done(flight):
     assert ticks.shape == (700, 3) and vehicles.shape == (700, 3, 7)
     timing = flight.record.timing()
     assert timing["ticks"] == 700 and timing["missed_deadlines"] == 0
-    assert timing["command_age_ms"]["p50"] == timing["measured_to_sent_ms"]["max"] == 1.0
+    assert (
+        timing["command_age_ms"]["p50"] == timing["measured_to_sent_ms"]["max"] == 1.0
+    )
     assert timing["due_to_sent_ms"]["p99"] == 1.5
 
 
 @pytest.mark.parametrize("waiting", [False, True])
 def test_a_tick_after_a_stall_gives_poses_time_to_arrive(waiting, monkeypatch):
-    """All processes stood still: the loop, which woke up first, took poses for lost that were a
-    millisecond away. By a clock of the test's own.
+    """All processes stood still: the loop, which woke up first, took poses for lost
+    that were a millisecond away. By a clock of the test's own.
     """
     links = Hovering()
     stall = 0.07

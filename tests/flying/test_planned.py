@@ -1,4 +1,6 @@
-"""A plan is flown as a game is: by the same safety, along its path, from begin to end."""
+"""A plan is flown as a game is: by the same safety, along its path, from begin to
+end.
+"""
 
 import numpy as np
 import pytest
@@ -10,7 +12,14 @@ from openjax.flying.estimation import see
 from openjax.flying.planned import PlannedFlight
 from openjax.flying.safety import decide
 from openjax.flying.set_point import from_action
-from openjax.flying.state import Drone, Event, Mode, Request, SafetySettings, initial_state
+from openjax.flying.state import (
+    Drone,
+    Event,
+    Mode,
+    Request,
+    SafetySettings,
+    initial_state,
+)
 from openjax.pursuit.environment import THRUST_LIMIT
 from openjax.vehicle import load_vehicle
 from openjax.virtual_crazyflie.simulated import SimulatedSwarm
@@ -18,7 +27,9 @@ from openjax.virtual_crazyflie.vehicles import VirtualVehicles
 
 
 def flown(segments, effects=None):
-    """Positions (T, 3) flown along segments in simulated time, the plan, and the last state."""
+    """Positions (T, 3) flown along segments in simulated time, the plan, and the last
+    state.
+    """
     vehicle = load_vehicle()
     plan = plan_of(segments)
     game = PlannedFlight(plan, airframe_of(vehicle))
@@ -36,7 +47,9 @@ def flown(segments, effects=None):
         poses = [d.estimate for d in state.drones]
         play = game.step(poses) if play else game.start(poses)
         actions = tuple(from_action(a, THRUST_LIMIT) for a in play.action)
-        state, sent = decide(state, Event(swarm.now, samples, actions, Request.NONE, ""))
+        state, sent = decide(
+            state, Event(swarm.now, samples, actions, Request.NONE, "")
+        )
         swarm.send(sent)
         swarm.advance()
         positions.append(vehicles.report.position[0])

@@ -21,15 +21,23 @@ from openjax.virtual_crazyflie.tables import Sensors
 pytestmark = [pytest.mark.slow, pytest.mark.real_time]
 
 NOTHING = np.zeros(3)
-STILL = Sensors(NOTHING, NOTHING, np.array([1.0, 0, 0, 0]), NOTHING, NOTHING, np.zeros(4))
+STILL = Sensors(
+    NOTHING, NOTHING, np.array([1.0, 0, 0, 0]), NOTHING, NOTHING, np.zeros(4)
+)
 HOVER = SetPoint(RATES, 0.0, 0.0, 0.0, 0.3)
 
 
 class Vehicle:
-    """A virtual firmware behind a radio: what it has to say goes down with acknowledgements."""
+    """A virtual firmware behind a radio: what it has to say goes down with
+    acknowledgements.
+    """
 
     def __init__(self):
-        self.firmware, self.answers, self.dead = VirtualFirmware(needs_arming=False), deque(), False
+        self.firmware, self.answers, self.dead = (
+            VirtualFirmware(needs_arming=False),
+            deque(),
+            False,
+        )
 
     def receive(self, raw):
         now = time.perf_counter()
@@ -61,7 +69,9 @@ def vehicles(monkeypatch):
                 vehicle = air[self._address[0]]
                 said = () if vehicle.dead else tuple(vehicle.receive(bytes(data)))
             time.sleep(1e-3)
-            return SimpleNamespace(ack=not vehicle.dead, data=said, retry=0, powerDet=False)
+            return SimpleNamespace(
+                ack=not vehicle.dead, data=said, retry=0, powerDet=False
+            )
 
         def ignore(self, *_):
             pass
@@ -73,8 +83,8 @@ def vehicles(monkeypatch):
 
 
 def send(links, seconds=2.0):
-    """Set-points at 100 Hz, and poses of motion capture where they can be sent; the longest time
-    (s) that they took.
+    """Set-points at 100 Hz, and poses of motion capture where they can be sent; the
+    longest time (s) that they took.
     """
     longest = 0.0
     end = time.perf_counter() + seconds
@@ -101,8 +111,8 @@ def check_the_others_fly_on(links, vehicles):
 
 
 def test_a_vehicle_that_doesnt_answer_keeps_no_other_waiting(vehicles):
-    """cflib waits two seconds for it, by when the others' watchdogs would have stopped their
-    motors.
+    """cflib waits two seconds for it, by when the others' watchdogs would have stopped
+    their motors.
     """
     swarm = Swarm(list(vehicles))
     swarm.connect()

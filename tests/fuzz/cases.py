@@ -25,7 +25,9 @@ _warm: set = set()
 def finite(tree) -> bool:
     """Whether every number of plain values, dataclasses or arrays is finite."""
     if dataclasses.is_dataclass(tree):
-        return all(finite(getattr(tree, field.name)) for field in dataclasses.fields(tree))
+        return all(
+            finite(getattr(tree, field.name)) for field in dataclasses.fields(tree)
+        )
     if isinstance(tree, dict):
         return all(map(finite, tree.values()))
     if isinstance(tree, tuple | list):
@@ -83,7 +85,8 @@ def _megabytes():
 
 def try_cases(kind: str, seeds: range) -> list[tuple[str, int, str, str]]:
     """Several cases: kind, seed, outcome, text."""
-    if kind not in _warm:  # what is loaded for the first of its kind isn't that case's fault
+    # what is loaded for the first of its kind isn't that case's fault
+    if kind not in _warm:
         try_case(kind, -1)
         _warm.add(kind)
     return [(kind, seed, *try_case(kind, seed)) for seed in seeds]

@@ -1,5 +1,5 @@
-"""Damaged checkpoints of a tiny run: what is restored must be bit for bit what was saved in it or
-in the one before.
+"""Damaged checkpoints of a tiny run: what is restored must be bit for bit what was
+saved in it or in the one before.
 """
 
 import random
@@ -20,8 +20,8 @@ TINY = """--preset quick --environment.time_step 0.01 --environment.substeps 1
 
 
 def make_checkpoints(folder: Path) -> None:
-    """Two checkpoints of a tiny training carry in `folder`/checkpoints, and all their bits in
-    `folder`/UPDATE.npz.
+    """Two checkpoints of a tiny training carry in `folder`/checkpoints, and all their
+    bits in `folder`/UPDATE.npz.
     """
     import jax
 
@@ -47,8 +47,8 @@ def _tiny_settings():
 
 
 def try_damages(folder: Path, seeds: range) -> list[str]:
-    """Damage the newest checkpoint (now and then either) and restore: `same`, `before`, `refused`
-    or what went wrong.
+    """Damage the newest checkpoint (now and then either) and restore: `same`, `before`,
+    `refused` or what went wrong.
     """
     import jax
 
@@ -59,7 +59,9 @@ def try_damages(folder: Path, seeds: range) -> list[str]:
     from openjax.store.leaves import abstract_like, named_leaves
 
     saved = {update: dict(np.load(folder / f"{update}.npz")) for update in (1, 2)}
-    abstract = abstract_like(jax.eval_shape(make_start(_tiny_settings()), jax.random.key(0)))
+    abstract = abstract_like(
+        jax.eval_shape(make_start(_tiny_settings()), jax.random.key(0))
+    )
     outcomes = []
     for seed in seeds:
         rng = random.Random(f"damage {seed}")
@@ -88,7 +90,11 @@ def try_damages(folder: Path, seeds: range) -> list[str]:
                     for name, leaf in leaves.items()
                 )
                 outcomes.append(
-                    "silently wrong" if not good else "same" if record.update == 2 else "before"
+                    "silently wrong"
+                    if not good
+                    else "same"
+                    if record.update == 2
+                    else "before"
                 )
             except UserError:
                 outcomes.append("refused")
@@ -103,5 +109,7 @@ def _plain(leaf):
     import jax.numpy as jnp
 
     return np.asarray(
-        jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf
+        jax.random.key_data(leaf)
+        if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+        else leaf
     )

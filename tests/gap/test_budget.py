@@ -1,5 +1,5 @@
-"""Numbers of the diagnosis that somebody chose, and those that decide, have budgets; no effect is
-named outside its file.
+"""Numbers of the diagnosis that somebody chose, and those that decide, have budgets; no
+effect is named outside its file.
 """
 
 import ast
@@ -11,7 +11,9 @@ import openjax.gap
 from openjax.vehicle.effects import EFFECTS
 
 ROOM = Path(openjax.gap.__file__).parent
-SOURCES = {path: path.read_text(encoding="utf-8") for path in sorted(ROOM.rglob("*.py"))}
+SOURCES = {
+    path: path.read_text(encoding="utf-8") for path in sorted(ROOM.rglob("*.py"))
+}
 # both may only fall
 NUMBERS = 170
 DECIDING = 11
@@ -27,14 +29,20 @@ def named_numbers(source: str) -> list[str]:
             for part in ast.walk(node.value)
         ):
             names = [
-                n.id for target in node.targets for n in ast.walk(target) if isinstance(n, ast.Name)
+                n.id
+                for target in node.targets
+                for n in ast.walk(target)
+                if isinstance(n, ast.Name)
             ]
             found += [name for name in names if name.isupper()]
     return found
 
 
 def test_named_numbers_are_within_their_budget():
-    assert len([n for source in SOURCES.values() for n in named_numbers(source)]) <= NUMBERS
+    assert (
+        len([n for source in SOURCES.values() for n in named_numbers(source)])
+        <= NUMBERS
+    )
 
 
 def test_few_numbers_decide_and_each_has_a_meaning_and_a_source():
@@ -48,7 +56,8 @@ def test_no_effect_is_named_outside_its_file():
     assert not [
         (path.name, hit)
         for path, source in SOURCES.items()
-        if path.parent.name in ("gap", "model", "channels")  # what decides which effect acts
+        # what decides which effect acts
+        if path.parent.name in ("gap", "model", "channels")
         for hit in pattern.findall(source)
     ]
 
@@ -57,6 +66,9 @@ def test_no_function_is_longer_than_one_thing_needs():
     long = []
     for path, source in SOURCES.items():
         for node in ast.walk(ast.parse(source)):
-            if isinstance(node, ast.FunctionDef) and node.end_lineno - node.lineno >= LONGEST:
+            if (
+                isinstance(node, ast.FunctionDef)
+                and node.end_lineno - node.lineno >= LONGEST
+            ):
                 long.append(f"{path.name}:{node.name}")
     assert not long

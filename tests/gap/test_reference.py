@@ -30,13 +30,14 @@ def test_mixed_columns_have_the_joint_distribution_that_the_reference_knows():
     mixing = known.mixing(names)
     expected = np.eye(3)
     expected[1:, 1:] = known.covariance
-    # A column of weights z ~ N(0, 1) on mixed columns is one of x ~ N(0, C) on the columns.
+    # A column of weights z ~ N(0, 1) on mixed columns is one of x ~ N(0, C) on the
+    # columns.
     np.testing.assert_allclose(mixing.T @ mixing, expected, rtol=1e-12)
 
 
 def test_another_day_knows_what_was_shown_less_what_days_move():
-    """By hand: normal numbers, of which the second is of its day alone, against conditioning the
-    joint normal distribution of both days.
+    """By hand: normal numbers, of which the second is of its day alone, against
+    conditioning the joint normal distribution of both days.
     """
     rng = np.random.default_rng(0)
     columns, measured = rng.normal(size=(20, 4)), rng.normal(size=20)
@@ -65,7 +66,9 @@ def test_without_an_effect_the_numbers_of_the_others_stay_known():
     names = ("rotor_drag d_xy", "motor_lag extra_up")
     theta = ABSENT.copy()
     theta[[PLACE[tuple(n.split(" "))] for n in names]] = 0.004, 0.003
-    known = Baseline(theta, ("rotor_drag",), names, np.diag([1e-6, 4e-6]), {}, {}, np.zeros(4))
+    known = Baseline(
+        theta, ("rotor_drag",), names, np.diag([1e-6, 4e-6]), {}, {}, np.zeros(4)
+    )
     without = with_some(known, ())
     assert without.numbers == (("motor_lag", "extra_up", 1.0),) and not without.effects
     assert without.theta[PLACE["rotor_drag", "d_xy"]] == 0.0
@@ -76,7 +79,9 @@ def test_without_an_effect_the_numbers_of_the_others_stay_known():
 def test_days_move_the_trims_and_an_unlogged_battery_moves_the_map_of_thrust():
     vehicle = load_vehicle()
     assert day_of("motor_imbalance", "m1", vehicle, silent=False) > 0.01
-    loud, silent = (day_of("thrust_curve", "curvature", vehicle, silent=s) for s in (False, True))
+    loud, silent = (
+        day_of("thrust_curve", "curvature", vehicle, silent=s) for s in (False, True)
+    )
     assert loud < 0.05 and silent > 0.1
 
 
@@ -89,8 +94,13 @@ def test_trims_that_the_reference_has_as_well_are_no_change():
     torque = np.asarray(vehicle.rotor_position)[:, :2].T @ there / 4.0
     np.testing.assert_allclose(torque, [-3e-4, 2e-4], rtol=1e-4)
     known = replace(baseline(), trim=1.2 * there)
-    assert trimmed_before(offset, ("com_offset", "wind"), known, vehicle) == {"com_offset"}
-    assert trimmed_before(offset, ("com_offset",), replace(known, trim=-there), vehicle) == set()
+    assert trimmed_before(offset, ("com_offset", "wind"), known, vehicle) == {
+        "com_offset"
+    }
+    assert (
+        trimmed_before(offset, ("com_offset",), replace(known, trim=-there), vehicle)
+        == set()
+    )
     assert trimmed_before(offset, ("com_offset",), None, vehicle) == set()
 
 
@@ -100,11 +110,14 @@ def test_trims_that_the_reference_has_as_well_are_no_change():
         (0.0, 0.001, False, True),
         (0.019, 0.001, True, False),
         (0.04, 0.001, True, True),
-        (0.003, 0.05, False, True),  # flights that don't show it don't say that it was there
+        # flights that don't show it don't say that it was there
+        (0.003, 0.05, False, True),
         (0.012, 0.05, False, False),
     ],
 )
-def test_a_delay_that_the_reference_has_as_well_is_no_change(before, error, acted, changed):
+def test_a_delay_that_the_reference_has_as_well_is_no_change(
+    before, error, acted, changed
+):
     def channel(value, error, acts):
         return SimpleNamespace(
             path="estimator",
@@ -119,7 +132,10 @@ def test_a_delay_that_the_reference_has_as_well_is_no_change(before, error, acte
 def test_what_is_left_beyond_the_reference_is_judged_by_the_measure_that_grew_most():
     before = {"rates": 0.1, "velocity": 0.02}
     grown = {"rates": 0.1, "velocity": 0.02 * float(np.exp(DECISION.left_over))}
-    assert changed_p(grown, before, grown) == (pytest.approx(DECISION.unknown), "velocity")
+    assert changed_p(grown, before, grown) == (
+        pytest.approx(DECISION.unknown),
+        "velocity",
+    )
     assert changed_p(before, before, before)[0] == 1.0
     assert changed_p({"position": 1.0}, before, {"position": 1.0}) == (1.0, "")
     # An effect that explains as much of what grew isn't quite of the library's form.

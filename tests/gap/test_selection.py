@@ -1,5 +1,5 @@
-"""The criterion against closed forms: differences of log density, shares that add up, probabilities
-of form errors.
+"""The criterion against closed forms: differences of log density, shares that add up,
+probabilities of form errors.
 """
 
 from dataclasses import replace
@@ -16,7 +16,9 @@ def judged(left: np.ndarray, blocks: int) -> Judged:
     starts = np.arange(0, len(left), len(left) // blocks)
     nats = -0.5 * np.add.reduceat(left**2, starts)
     none = np.zeros((2, 1))
-    return Judged(nats, np.ones((blocks, 6)), none, left, starts, none, none, np.arange(0))
+    return Judged(
+        nats, np.ones((blocks, 6)), none, left, starts, none, none, np.arange(0)
+    )
 
 
 def test_the_difference_of_two_hypotheses_has_the_error_that_repeated_noise_shows():
@@ -28,8 +30,8 @@ def test_the_difference_of_two_hypotheses_has_the_error_that_repeated_noise_show
     ])  # fmt: skip
     assert found[:, 0].mean() == pytest.approx(0.5 * (effect**2).sum(), rel=0.1)
     assert found[:, 1].mean() == pytest.approx(found[:, 0].std(), rel=0.25)
-    # A gain in one block alone is told: it is five standard errors there, though the rest of the
-    # flight says nothing.
+    # A gain in one block alone is told: it is five standard errors there, though the
+    # rest of the flight says nothing.
     assert np.median(found[:, 0] / found[:, 1]) > 2.0
 
 
@@ -55,7 +57,8 @@ def test_an_effect_that_nuisances_take_on_matters_as_what_it_does():
     rng = np.random.default_rng(3)
     f = rng.standard_normal(500)
     y = f + 0.5 * rng.standard_normal(500)
-    columns = np.array([y, f])  # with the effect, its column is taken off y and none is left
+    # with the effect, its column is taken off y and none is left
+    columns = np.array([y, f])
     error = np.array([[columns @ columns.T]])
 
     def of(taken):

@@ -1,7 +1,7 @@
 """JaxMARL's IPPO trains on the game unchanged: a stand-in for it makes the same calls.
 
-Written after JaxMARL's `baselines/IPPO/ippo_ff_mabrax.py` and `wrappers/baselines.py` (LogWrapper):
-what they ask of an environment, without their networks.
+Written after JaxMARL's `baselines/IPPO/ippo_ff_mabrax.py` and `wrappers/baselines.py`
+(LogWrapper): what they ask of an environment, without their networks.
 """
 
 import runpy
@@ -62,8 +62,12 @@ print("trained", actors)
 
 
 @pytest.mark.slow
-def test_the_example_hands_the_game_to_an_unchanged_trainer(tmp_path, monkeypatch, capsys):
-    (tmp_path / "jaxmarl.py").write_text("def make(name, **settings): raise ValueError(name)")
+def test_the_example_hands_the_game_to_an_unchanged_trainer(
+    tmp_path, monkeypatch, capsys
+):
+    (tmp_path / "jaxmarl.py").write_text(
+        "def make(name, **settings): raise ValueError(name)"
+    )
     script = tmp_path / "ippo.py"
     script.write_text(TRAINER)
     monkeypatch.syspath_prepend(tmp_path)

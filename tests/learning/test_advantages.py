@@ -1,4 +1,6 @@
-"""Advantages against a plain Python reference, with terminated and truncated episodes."""
+"""Advantages against a plain Python reference, with terminated and truncated
+episodes.
+"""
 
 import jax
 import numpy as np
@@ -32,7 +34,9 @@ def test_against_plain_python(trace):
     terminated[-1, 1] = True
     expected = [
         reference(
-            *(x[:, e] for x in (reward, value, next_value, terminated, truncated)), 0.9, trace
+            *(x[:, e] for x in (reward, value, next_value, terminated, truncated)),
+            0.9,
+            trace,
         )
         for e in range(20)
     ]

@@ -1,5 +1,5 @@
-"""The stage by the gradient through the simulation: its starts, what it counts, and that it learns
-it.
+"""The stage by the gradient through the simulation: its starts, what it counts, and
+that it learns it.
 """
 
 import dataclasses
@@ -11,9 +11,18 @@ import optax
 import pytest
 
 from openjax.learning import AnalyticSettings
-from openjax.learning.analytic_gradient import AnalyticGradient, compile_analytic, free_flight
+from openjax.learning.analytic_gradient import (
+    AnalyticGradient,
+    compile_analytic,
+    free_flight,
+)
 from openjax.learning.drawn_starts import APART, side_by_side
-from openjax.learning.smooth_measures import SMOOTH, breach_share, crash_depth, crash_share
+from openjax.learning.smooth_measures import (
+    SMOOTH,
+    breach_share,
+    crash_depth,
+    crash_share,
+)
 from openjax.policy import NetworkSettings, Policy, PredictorSettings
 from openjax.pursuit import Pursuit, PursuitSettings, uniform_task
 from openjax.pursuit.collisions import breaches
@@ -25,9 +34,13 @@ GAME = PursuitSettings(min_pillars=0, max_pillars=1)
 def test_all_stand_side_by_side():
     keys = jax.random.split(jax.random.key(0), 64)
     before = jax.jit(jax.vmap(lambda key: uniform_task(GAME, key)))(keys)
-    tasks = jax.jit(jax.vmap(lambda key, task: side_by_side(GAME, key, task)))(keys, before)
+    tasks = jax.jit(jax.vmap(lambda key, task: side_by_side(GAME, key, task)))(
+        keys, before
+    )
     position = np.asarray(tasks.pursuer_position)
-    apart = np.linalg.norm(position[:, :, None] - position[:, None], axis=-1) + 9 * np.eye(3)
+    apart = np.linalg.norm(
+        position[:, :, None] - position[:, None], axis=-1
+    ) + 9 * np.eye(3)
     moved = (position != np.asarray(before.pursuer_position)).any((1, 2))
     assert moved.mean() > 0.5
     assert (apart[moved].min(2) < GAME.drone_clearance + APART + 1e-4).all()
@@ -43,10 +56,14 @@ def test_all_stand_side_by_side():
 def stage():
     """A stage of a small network on a family of one effect, and its parameters."""
     game = PursuitSettings(
-        physics="rigid", max_pillars=4, vehicles=(("rotor_drag.d_xy", 0.0, 0.01, 0.0, 0.02),)
+        physics="rigid",
+        max_pillars=4,
+        vehicles=(("rotor_drag.d_xy", 0.0, 0.01, 0.0, 0.02),),
     )
     policy = Policy.for_environment(
-        Pursuit(game), NetworkSettings(features=8, heads=1), PredictorSettings(enabled=False)
+        Pursuit(game),
+        NetworkSettings(features=8, heads=1),
+        PredictorSettings(enabled=False),
     )
     how = AnalyticSettings(updates=6, worlds=4, learning_rate=3e-3, hold=0.0)
     environment = free_flight(Pursuit(game))
@@ -60,15 +77,19 @@ def stage():
 def test_smooth_breaches_are_those_of_the_game(stage):
     game = stage[0].game
     key = jax.random.split(jax.random.key(2), 3)
-    tasks = jax.jit(jax.vmap(lambda key: uniform_task(game, key)))(jax.random.split(key[0], 256))
+    tasks = jax.jit(jax.vmap(lambda key: uniform_task(game, key)))(
+        jax.random.split(key[0], 256)
+    )
     _, state = jax.jit(jax.vmap(stage[0].environment.reset_to))(
         jax.random.split(key[1], 256), tasks
     )
-    position = jax.random.uniform(key[2], (256, 3, 3), minval=-0.6, maxval=0.6) * jnp.array(
-        [2.0, 2.0, 2.2]
-    )
+    position = jax.random.uniform(
+        key[2], (256, 3, 3), minval=-0.6, maxval=0.6
+    ) * jnp.array([2.0, 2.0, 2.2])
     state = state.replace(drones=state.drones.replace(position=position))
-    counted = jax.vmap(lambda p, t: breaches(game, p, t.pillar_position, t.pillar_active).total)
+    counted = jax.vmap(
+        lambda p, t: breaches(game, p, t.pillar_position, t.pillar_active).total
+    )
     hard = np.asarray(counted(position, tasks))
     smooth = np.asarray(breach_share(game, state))
     assert 0.2 < (hard > 0).mean() < 0.9
@@ -77,7 +98,9 @@ def test_smooth_breaches_are_those_of_the_game(stage):
 
 
 def test_deep_crashes_are_learnt_from():
-    """Where the share of a crash is flat its depth isn't: it falls by one every `SMOOTH` metres."""
+    """Where the share of a crash is flat its depth isn't: it falls by one every
+    `SMOOTH` metres.
+    """
     gap = jnp.array([-0.2, -0.05, 0.0, 0.05, 0.2])
     slope = jax.vmap(jax.grad(crash_depth))(gap)
     np.testing.assert_allclose(slope, -crash_share(gap) / SMOOTH, rtol=1e-5)
@@ -91,11 +114,15 @@ def test_hard_starts_are_those_that_come_nearest(stage):
 
     @jax.jit
     def least(starts):
-        return gradient.fly(parameters.actor, parameters, starts, gradient.steps)[1].least.min(-1)
+        return gradient.fly(parameters.actor, parameters, starts, gradient.steps)[
+            1
+        ].least.min(-1)
 
     bounds = jnp.concatenate([gradient.bounds()] * gradient.settings.draws)
     all_of_them = np.sort(least(gradient.starts(key, bounds)))
-    hard = np.sort(least(jax.jit(gradient.hard_starts)(parameters.actor, parameters, key)))
+    hard = np.sort(
+        least(jax.jit(gradient.hard_starts)(parameters.actor, parameters, key))
+    )
     np.testing.assert_allclose(hard, all_of_them[: gradient.settings.worlds], atol=1e-4)
 
 
@@ -115,11 +142,15 @@ def test_gradient_is_that_of_the_loss_and_learning_follows_it(stage):
 
     def moved(size):
         return loss(
-            jax.tree.map(lambda leaf, along: leaf + size * along, parameters.actor, direction)
+            jax.tree.map(
+                lambda leaf, along: leaf + size * along, parameters.actor, direction
+            )
         )
 
     assert moved(step) - moved(-step) == pytest.approx(2 * step * steepness, rel=0.1)
-    updates = list(compile_analytic(gradient, parameters)(parameters, jax.random.key(4)))
+    updates = list(
+        compile_analytic(gradient, parameters)(parameters, jax.random.key(4))
+    )
     assert len(updates) == 6
     assert all(np.isfinite(list(parts.values())).all() for _, parts in updates)
     assert loss(updates[-1][0].actor) < value

@@ -28,9 +28,9 @@ TINY = TrainSettings(
 
 
 def test_a_training_step_simulates_exactly_the_steps_that_are_counted():
-    """The generator flies no episodes of its own: the world's step is traced once, in a scan of the
-    rollout's length over all worlds; any other use of it would be data that learning curves leave
-    out.
+    """The generator flies no episodes of its own: the world's step is traced once, in a
+    scan of the rollout's length over all worlds; any other use of it would be data that
+    learning curves leave out.
     """
     calls = []
 
@@ -41,7 +41,9 @@ def test_a_training_step_simulates_exactly_the_steps_that_are_counted():
 
     environment = Watched(TINY.environment)
     parts = build(TINY, environment)
-    carry = jax.eval_shape(lambda key: initial_carry(TINY, parts, key), jax.random.key(0))
+    carry = jax.eval_shape(
+        lambda key: initial_carry(TINY, parts, key), jax.random.key(0)
+    )
     jaxpr = jax.make_jaxpr(make_training_step(TINY, parts))(carry)
     assert len(calls) == 1
     lengths = [
@@ -51,6 +53,10 @@ def test_a_training_step_simulates_exactly_the_steps_that_are_counted():
     ]
     commands = (TINY.rollout_length, TINY.num_envs, TINY.environment.num_pursuers, 4)
     assert (
-        sum(length == TINY.rollout_length and commands in shapes for length, shapes in lengths) == 1
+        sum(
+            length == TINY.rollout_length and commands in shapes
+            for length, shapes in lengths
+        )
+        == 1
     )
     assert TINY.steps_per_update == TINY.rollout_length * TINY.num_envs

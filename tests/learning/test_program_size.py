@@ -1,5 +1,5 @@
-"""How large the programs of a training step are: a cold start waits for their compiler, so growth
-is to be seen when it comes.
+"""How large the programs of a training step are: a cold start waits for their compiler,
+so growth is to be seen when it comes.
 """
 
 import jax
@@ -9,8 +9,8 @@ from openjax.learning import make_start, preset
 from openjax.learning.training_step import make_phases
 
 MOST = {"fly": 6100, "learn_predictor": 2550, "learn_policy": 9800, "renew": 8900}
-"""Operations of the preset `paper` before the compiler sees them, a tenth above what they were;
-sizes do not matter.
+"""Operations of the preset `paper` before the compiler sees them, a tenth above what
+they were; sizes do not matter.
 """
 
 

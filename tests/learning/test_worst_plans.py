@@ -1,5 +1,5 @@
-"""The last stage's evaders that plan: what they try, that they fly the worst of it, and that the
-pursuers learn from that.
+"""The last stage's evaders that plan: what they try, that they fly the worst of it, and
+that the pursuers learn from that.
 """
 
 import dataclasses
@@ -30,7 +30,9 @@ def make_stage(updates):
 
 
 def test_what_evaders_try():
-    stage = dataclasses.replace(make_stage(4), planning=dataclasses.replace(HOW, plans=400))
+    stage = dataclasses.replace(
+        make_stage(4), planning=dataclasses.replace(HOW, plans=400)
+    )
     plan = jax.random.normal(jax.random.key(0), (5, 3, 3))
     tried = np.asarray(stage.candidates(jax.random.key(1), plan))
     assert tried.shape == (5, 400, 3, 3)
@@ -74,7 +76,9 @@ def test_the_worst_plan_is_the_worst_of_those_tried(flown):
     stage, parameters, carried = flown
     plan = 0.7 * jax.random.normal(jax.random.key(3), carried.plan.shape)
     key = jax.random.key(4)
-    worst, promised = jax.jit(stage.worst)(parameters.actor, parameters, carried.world, plan, key)
+    worst, promised = jax.jit(stage.worst)(
+        parameters.actor, parameters, carried.world, plan, key
+    )
     step = jax.jit(stage.environment.step)
     act = jax.jit(stage.usual.policy.act)
     for world in range(HOW.worlds):
@@ -86,10 +90,14 @@ def test_the_worst_plan_is_the_worst_of_those_tried(flown):
             for wish in jnp.repeat(pieces, stage.piece_steps, axis=0):
                 action = act(parameters, observation)
                 observation, state, *_ = step(None, state, action, wish)
-            lead = [jax.tree.map(lambda leaf: leaf[None], one) for one in (start[1], state)]
+            lead = [
+                jax.tree.map(lambda leaf: leaf[None], one) for one in (start[1], state)
+            ]
             promises.append(float(stage.promise(*lead)[0]))
         assert promised[world] == pytest.approx(max(promises), abs=1e-3)
-        np.testing.assert_allclose(worst[world], tried[int(np.argmax(promises))], atol=1e-5)
+        np.testing.assert_allclose(
+            worst[world], tried[int(np.argmax(promises))], atol=1e-5
+        )
 
 
 @pytest.mark.slow
@@ -97,7 +105,9 @@ def test_pursuers_learn_from_the_worst_plan(flown):
     stage, parameters, carried = flown
     update = jax.jit(stage.update)
     flights = jax.jit(stage.record)(parameters, jax.random.key(5))
-    actor, after, parts = update(parameters.actor, carried, parameters, flights, jax.random.key(6))
+    actor, after, parts = update(
+        parameters.actor, carried, parameters, flights, jax.random.key(6)
+    )
     assert jax.tree.structure(after) == jax.tree.structure(carried)
     assert all(np.isfinite(value) for value in parts.values())
     # worlds are a piece of the plan later, the plan is what is left of it

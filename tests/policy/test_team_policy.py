@@ -28,8 +28,8 @@ TEAMS = dataclasses.replace(GAME, num_pursuers=SIZE, team_sizes=(TEAM,))
 
 @pytest.fixture(scope="module")
 def networks():
-    """A policy, a function from parameters and an observation to mean and value, random parameters,
-    and an observation of `TEAM` pursuers in `SIZE` slots.
+    """A policy, a function from parameters and an observation to mean and value, random
+    parameters, and an observation of `TEAM` pursuers in `SIZE` slots.
     """
     game = Pursuit(TEAMS)
     network = NetworkSettings(features=16, heads=2, shared_encoder=True)
@@ -55,12 +55,16 @@ def alone(observation, number=TEAM):
 
 
 def test_empty_slots_change_nothing(networks):
-    """Three of five act, and are judged, as three; whatever stands in the empty slots."""
+    """Three of five act, and are judged, as three; whatever stands in the empty
+    slots.
+    """
     _, both, parameters, observation = networks
     expected = both(parameters, alone(observation))
     there = observation.others_there[..., None]
     for filling in (observation.others, 7.0):
-        filled = observation.replace(others=jnp.where(there, observation.others, filling))
+        filled = observation.replace(
+            others=jnp.where(there, observation.others, filling)
+        )
         for result, wanted in zip(both(parameters, filled), expected, strict=True):
             np.testing.assert_allclose(result[:TEAM], wanted, atol=1e-5)
 
@@ -74,7 +78,9 @@ def test_teammates_that_change_places_change_actions(networks):
         **{name: getattr(three, name)[order] for name in each},
         others=three.others[order][:, ::-1],
     )
-    for result, wanted in zip(both(parameters, moved), both(parameters, three), strict=True):
+    for result, wanted in zip(
+        both(parameters, moved), both(parameters, three), strict=True
+    ):
         assert np.ptp(wanted, axis=0).max() > 1e-3, "the test shows little"
         np.testing.assert_allclose(result, wanted[order], atol=1e-5)
 
@@ -103,10 +109,14 @@ def test_nothing_is_learnt_from_empty_slots(networks):
         )
         networks = (parameters.actor, parameters.critic)
         return jax.grad(
-            lambda networks: loss(MappoSettings(), policy, networks, batch, jnp.asarray(0.2))[0]
+            lambda networks: loss(
+                MappoSettings(), policy, networks, batch, jnp.asarray(0.2)
+            )[0]
         )(networks)
 
     action = 0.1 * jax.random.normal(jax.random.key(0), (SIZE, 4))
     of_three = jax.jit(gradient)(alone(observation), action[:TEAM])
     of_all = jax.jit(gradient)(observation, action)
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), of_all, of_three)
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), of_all, of_three
+    )

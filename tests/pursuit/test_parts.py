@@ -46,7 +46,9 @@ def test_a_wish_that_is_not_a_number_is_the_papers_evaders_own_rule():
 
 
 def test_an_evader_of_ones_own_knows_motions_and_draws():
-    """It flies as the first pursuer moves, plus noise, and remembers the noise in a fifth number."""
+    """It flies as the first pursuer moves, plus noise, and remembers the noise in a
+    fifth number.
+    """
 
     def shadow(scene, memory):
         noise = 0.1 * jax.random.uniform(scene.key, (3,))
@@ -71,10 +73,14 @@ def test_an_evader_of_ones_own_knows_motions_and_draws():
 
 
 def test_an_evader_of_ones_own_stays_within_speed_and_arena():
-    states, _, _ = stepped(make(GAME, evader=lambda scene, memory: (jnp.full(3, 99.0), memory)), 60)
+    states, _, _ = stepped(
+        make(GAME, evader=lambda scene, memory: (jnp.full(3, 99.0), memory)), 60
+    )
     speeds = [float(jnp.linalg.norm(state.evader_velocity)) for state in states]
     assert max(speeds) <= GAME.evader_speed * 1.001
-    assert all(0 < float(state.evader_position[2]) < GAME.arena_height for state in states)
+    assert all(
+        0 < float(state.evader_position[2]) < GAME.arena_height for state in states
+    )
 
 
 def test_settings_alone_do_not_make_an_evader_of_ones_own():
@@ -115,5 +121,7 @@ def test_an_observation_of_ones_own():
         return shipped.replace(self_state=own)
 
     states, observation, _ = stepped(Pursuit(GAME, observer=with_height))
-    np.testing.assert_array_equal(observation.self_state[:, -1], states[-1].drones.position[:, 2])
+    np.testing.assert_array_equal(
+        observation.self_state[:, -1], states[-1].drones.position[:, 2]
+    )
     assert observation.self_state.shape[-1] == GAME.self_size + 1

@@ -1,4 +1,6 @@
-"""Line of sight: hand-worked cases, symmetry, and a reference that walks along the segment."""
+"""Line of sight: hand-worked cases, symmetry, and a reference that walks along the
+segment.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -15,8 +17,8 @@ RADIUS = PursuitSettings().pillar_radius
 
 @pytest.fixture(scope="module")
 def sight():
-    """(B, 2) starts, (B, 2) ends and (B, P, 2) pillars with (B, P) in use, seen from above -> (B,)
-    bool.
+    """(B, 2) starts, (B, 2) ends and (B, P, 2) pillars with (B, P) in use, seen from
+    above -> (B,) bool.
     """
 
     def one(start, end, pillars, active):
@@ -35,7 +37,8 @@ def sight():
         ((-0.5, 0), (0.5, 0), (0, 0.05), False, True),
         ((-0.5, 0), (0.5, 0), (0, 0.099), True, False),
         ((-0.5, 0), (0.5, 0), (0, 0.101), True, True),
-        ((-0.5, 0), (0.5, 0), (0.55, 0), True, True),  # the foot point lies behind the target
+        # the foot point lies behind the target
+        ((-0.5, 0), (0.5, 0), (0.55, 0), True, True),
         ((-0.5, 0), (0.5, 0), (-0.55, 0), True, True),  # and behind the pursuer
         ((-0.5, 0), (0.5, 0), (0.45, 0.05), True, False),
         ((-0.5, -0.5), (0.5, 0.5), (0.1, -0.1), True, True),
@@ -84,10 +87,12 @@ def test_against_walking_along_the_segment(sight, points):
     share = np.linspace(0, 1, 4001)
     distance = np.linalg.norm(start + share[:, None] * (end - start) - pillar, axis=1)
     nearest = distance.argmin()
-    # where the nearest point is at an end or the distance the radius within rounding, both answers
-    # are right
+    # where the nearest point is at an end or the distance the radius within rounding,
+    # both answers are right
     foot = np.dot(pillar - start, end - start) / length**2
-    assume(min(abs(foot), abs(1 - foot)) > 1e-3 and abs(distance[nearest] - RADIUS) > 1e-4)
+    assume(
+        min(abs(foot), abs(1 - foot)) > 1e-3 and abs(distance[nearest] - RADIUS) > 1e-4
+    )
     clear = not (0 < nearest < 4000 and distance[nearest] < RADIUS)
     arrays = [jnp.asarray(x, jnp.float32)[None] for x in (start, end, [pillar])]
     assert bool(sight(*arrays, jnp.ones((1, 1), bool))[0]) == clear
@@ -109,21 +114,31 @@ def test_against_walking_along_the_segment(sight, points):
 def test_range_and_cone(target, angle, reach, seen):
     settings = PursuitSettings(sight_angle=angle, sight_range=reach)
     ahead = jnp.array([[1.0, 0.0, 0.0]])
-    assert bool(within_view(settings, jnp.zeros((1, 3)), ahead, jnp.array(target))[0]) == seen
+    assert (
+        bool(within_view(settings, jnp.zeros((1, 3)), ahead, jnp.array(target))[0])
+        == seen
+    )
 
 
 @pytest.mark.slow
 def test_who_looks_away_captures_unseen():
     """Limits of sight hide the evader from the pursuers, and nothing else."""
     settings = PursuitSettings(
-        physics="stops", start_attitude="level", max_pillars=0, min_pillars=0, sight_angle=90.0
+        physics="stops",
+        start_attitude="level",
+        max_pillars=0,
+        min_pillars=0,
+        sight_angle=90.0,
     )
     game = Pursuit(settings)
     _, state = game.reset(jax.random.key(0))
     near = jnp.array([[0.1, 0.0, 0.0], [0.5, 0.4, 0.0], [0.5, -0.4, 0.0]])
-    drones = state.drones.replace(position=state.evader_position + near)  # they look along x
+    # they look along x
+    drones = state.drones.replace(position=state.evader_position + near)
     observation, state, _, _, _, info = game.follow(state, jnp.zeros((3, 4)), drones)
     assert bool(info.captured[0]) and not bool(info.seen)
     assert np.all(observation.self_state[:, :3] == -5.0)
-    turned = drones.replace(quaternion=jnp.tile(jnp.array([0.0, 0.0, 0.0, 1.0]), (3, 1)))
+    turned = drones.replace(
+        quaternion=jnp.tile(jnp.array([0.0, 0.0, 0.0, 1.0]), (3, 1))
+    )
     assert bool(game.follow(state, jnp.zeros((3, 4)), turned)[-1].seen)

@@ -1,4 +1,6 @@
-"""ShortestPaths round pillars, against closed forms and against Dijkstra's algorithm on a fine grid."""
+"""ShortestPaths round pillars, against closed forms and against Dijkstra's algorithm on
+a fine grid.
+"""
 
 import functools
 import heapq
@@ -44,7 +46,8 @@ def length(task, position, target):
 def one_pillar():
     task = jax.jit(functools.partial(uniform_task, GAME))(jax.random.key(0))
     return task.replace(
-        pillar_position=jnp.zeros_like(task.pillar_position), pillar_active=jnp.arange(5) < 1
+        pillar_position=jnp.zeros_like(task.pillar_position),
+        pillar_active=jnp.arange(5) < 1,
     )
 
 
@@ -54,7 +57,8 @@ def test_round_one_pillar_it_is_two_tangents_and_an_arc():
     tangent = math.sqrt(far**2 - REACH**2)
     way = length(one_pillar(), [[far, 0.0, 0.5], [far, far, 0.5]], [-far, 0.0, 0.5])
     assert way[0] == pytest.approx(2 * tangent + REACH * (math.pi - 2 * bent), rel=0.01)
-    assert way[1] == pytest.approx(math.hypot(2 * far, far), rel=1e-4)  # nothing is between them
+    # nothing is between them
+    assert way[1] == pytest.approx(math.hypot(2 * far, far), rel=1e-4)
 
 
 def test_who_is_too_near_a_pillar_leaves_it():
@@ -67,8 +71,8 @@ def test_who_is_too_near_a_pillar_leaves_it():
 
 
 def on_a_grid(task, source):
-    """The lengths (m) of ways from a place to all cells; a step leads to any cell at most three
-    away in x and y.
+    """The lengths (m) of ways from a place to all cells; a step leads to any cell at
+    most three away in x and y.
     """
     places = np.arange(-0.9, 0.9 + CELL / 2, CELL)
     x, y = np.meshgrid(places, places, indexing="ij")
@@ -101,16 +105,22 @@ def cell(place):
 
 def test_round_rows_it_is_as_long_as_on_a_grid():
     keys = jax.random.split(jax.random.key(1), 6)
-    tasks = jax.jit(jax.vmap(lambda key: line_up_pillars(GAME, key, uniform_task(GAME, key))))(keys)
+    tasks = jax.jit(
+        jax.vmap(lambda key: line_up_pillars(GAME, key, uniform_task(GAME, key)))
+    )(keys)
     lengths = jax.vmap(length)(tasks, tasks.pursuer_position, tasks.evader_position)
     height = tasks.pursuer_position[..., 2] - tasks.evader_position[:, None, 2]
     differences = []
     for b, own in enumerate(np.sqrt(np.asarray(lengths**2 - height**2))):
-        grid = on_a_grid(jax.tree.map(lambda leaf, b=b: leaf[b], tasks), tasks.evader_position[b])
+        grid = on_a_grid(
+            jax.tree.map(lambda leaf, b=b: leaf[b], tasks), tasks.evader_position[b]
+        )
         grids = [grid.get(cell(place), math.inf) for place in tasks.pursuer_position[b]]
         # some start nearer a pillar than ways keep: no cell of the grid is theirs
         differences += [
-            mine - theirs for mine, theirs in zip(own, grids, strict=True) if math.isfinite(theirs)
+            mine - theirs
+            for mine, theirs in zip(own, grids, strict=True)
+            if math.isfinite(theirs)
         ]
     assert len(differences) > 12
     # polygons are longer ways than circles; a grid's cells stand aside of the places
@@ -126,7 +136,10 @@ def test_territory_is_where_the_evader_is_sooner_than_anybody_by_the_shortest_pa
     share = evader_territory(GAME, task, paths, position, task.evader_position)
     expected = []
     for x, y in np.asarray(arena_points(GAME)):
-        if any(math.dist((x, y), pillar) < GAME.pillar_radius for pillar in task.pillar_position):
+        if any(
+            math.dist((x, y), pillar) < GAME.pillar_radius
+            for pillar in task.pillar_position
+        ):
             continue
         place = jnp.array([x, y, task.evader_position[2]])
         way = float(length(task, position, place).min()) - GAME.capture_radius

@@ -39,8 +39,8 @@ def expand():
 
 
 def distances(tasks):
-    """Between pursuers, from pursuers and from the evader to the surface of the nearest pillar; (B,
-    ...) each.
+    """Between pursuers, from pursuers and from the evader to the surface of the nearest
+    pillar; (B, ...) each.
     """
     pursuers, evader, pillars = (
         np.asarray(x, np.float64)
@@ -52,7 +52,9 @@ def distances(tasks):
     ]
 
     def to_pillars(points):
-        distance = np.linalg.norm(points[:, :, None, :2] - pillars[:, None], axis=-1) - 0.1
+        distance = (
+            np.linalg.norm(points[:, :, None, :2] - pillars[:, None], axis=-1) - 0.1
+        )
         return np.where(np.asarray(tasks.pillar_active)[:, None], distance, np.inf)
 
     return between, to_pillars(pursuers), to_pillars(evader[:, None])
@@ -74,7 +76,9 @@ def test_uniform_tasks_start_in_their_box_and_clear(uniform):
     for positions in (pursuers.reshape(-1, 3), mirrored):
         low = positions.min(axis=0)
         high = positions.max(axis=0)
-        assert (low >= [0.1, -0.536, 0.5]).all() and (high <= np.float32([0.536, 0.536, 0.7])).all()
+        assert (low >= [0.1, -0.536, 0.5]).all() and (
+            high <= np.float32([0.536, 0.536, 0.7])
+        ).all()
         np.testing.assert_allclose(low, [0.1, -0.536, 0.5], atol=0.02)  # and fill it
         np.testing.assert_allclose(high, [0.536, 0.536, 0.7], atol=0.02)
 
@@ -89,12 +93,12 @@ def test_pillars_of_uniform_tasks(uniform):
     assert (np.linalg.norm(pillars[active], axis=-1) < 0.8).all()
     for cell, used in zip(cells[:500], active[:500], strict=True):
         assert len({tuple(c) for c in cell[used]}) == used.sum()
-    starts = np.concatenate([uniform.pursuer_position, uniform.evader_position[:, None]], axis=1)[
-        ..., :2
-    ]
-    same_cell = (np.round(starts / 0.2)[:, :, None] == cells[:, None]).all(axis=-1) & active[
-        :, None
-    ]
+    starts = np.concatenate(
+        [uniform.pursuer_position, uniform.evader_position[:, None]], axis=1
+    )[..., :2]
+    same_cell = (np.round(starts / 0.2)[:, :, None] == cells[:, None]).all(
+        axis=-1
+    ) & active[:, None]
     assert not same_cell.any()
 
 
@@ -114,19 +118,28 @@ def test_expansion_moves_vehicles_a_little_and_never_into_a_breach(uniform, expa
         for name in ("pillar_position", "pillar_active"):
             np.testing.assert_array_equal(getattr(tasks, name), getattr(uniform, name))
         for name in ("pursuer_position", "evader_position"):
-            moved = np.asarray(getattr(tasks, name)) - np.asarray(getattr(parents, name))
-            # the push back from the rim may turn a move along the axes into an oblique one
+            moved = np.asarray(getattr(tasks, name)) - np.asarray(
+                getattr(parents, name)
+            )
+            # the push back from the rim may turn a move along the axes into an oblique
+            # one
             assert np.linalg.norm(moved[..., :2], axis=-1).max() <= 0.1 * 2**0.5 + 1e-6
             assert np.abs(moved[..., 2]).max() <= 0.1 + 1e-6
         assert_clear(tasks)
-    positions = np.concatenate([tasks.pursuer_position, tasks.evader_position[:, None]], axis=1)
+    positions = np.concatenate(
+        [tasks.pursuer_position, tasks.evader_position[:, None]], axis=1
+    )
     assert np.linalg.norm(positions[..., :2], axis=-1).max() <= 0.8 + 1e-6
-    assert positions[..., 2].min() >= 0.5 - 1e-6 and positions[..., 2].max() <= 0.7 + 1e-6
+    assert (
+        positions[..., 2].min() >= 0.5 - 1e-6 and positions[..., 2].max() <= 0.7 + 1e-6
+    )
     assert positions[:, :3, 0].min() < 0.0
     assert (
         np.mean(
             np.any(
-                np.asarray(tasks.evader_position) != np.asarray(parents.evader_position), axis=-1
+                np.asarray(tasks.evader_position)
+                != np.asarray(parents.evader_position),
+                axis=-1,
             )
         )
         > 0.95
@@ -138,7 +151,9 @@ def test_expansion_of_a_task_without_room_is_the_task_itself(uniform):
     turn = 2 * np.pi / 3 * np.arange(3)
     pursuers = 0.5 * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
     ring = np.pi / 3 * np.arange(6)
-    pillars = pursuers[:, None] + 0.1705 * np.stack([np.cos(ring), np.sin(ring)], axis=-1)
+    pillars = pursuers[:, None] + 0.1705 * np.stack(
+        [np.cos(ring), np.sin(ring)], axis=-1
+    )
     task = Task(
         pursuer_position=jnp.asarray(np.c_[pursuers, np.full(3, 0.6)], jnp.float32),
         evader_position=jnp.array([0.0, 0.0, 0.6]),
@@ -146,11 +161,15 @@ def test_expansion_of_a_task_without_room_is_the_task_itself(uniform):
         pillar_active=jnp.ones(18, bool),
     )
     assert starts_clear(SETTINGS, task)
-    drawn = jax.jit(jax.vmap(lambda key: expand_task(SETTINGS, key, task)))(keys(20, 100))
+    drawn = jax.jit(jax.vmap(lambda key: expand_task(SETTINGS, key, task)))(
+        keys(20, 100)
+    )
     for name in ("pursuer_position", "evader_position"):
         np.testing.assert_array_equal(
             getattr(drawn, name),
-            np.tile(getattr(task, name), (100, 1, 1)).reshape(getattr(drawn, name).shape),
+            np.tile(getattr(task, name), (100, 1, 1)).reshape(
+                getattr(drawn, name).shape
+            ),
         )
 
 
@@ -160,9 +179,12 @@ def test_turning_keeps_all_distances(uniform):
         finite = np.isfinite(before)
         np.testing.assert_array_equal(np.isfinite(after), finite)
         np.testing.assert_allclose(after[finite], before[finite], atol=1e-5)
-    np.testing.assert_array_equal(turned.pursuer_position[..., 2], uniform.pursuer_position[..., 2])
+    np.testing.assert_array_equal(
+        turned.pursuer_position[..., 2], uniform.pursuer_position[..., 2]
+    )
     angle = np.arctan2(turned.evader_position[:, 1], turned.evader_position[:, 0])
-    assert np.histogram(angle, 8, (-np.pi, np.pi))[0].min() > DRAWS / 16  # from all sides
+    # from all sides
+    assert np.histogram(angle, 8, (-np.pi, np.pi))[0].min() > DRAWS / 16
 
 
 def test_shifted_pillars_leave_the_grid_and_keep_clear_of_starts(uniform):
@@ -188,7 +210,8 @@ def test_pillars_in_a_row_stand_between_the_sides(uniform):
     active = np.asarray(lined.pillar_active)
     np.testing.assert_array_equal(active, uniform.pillar_active)
     whole = (
-        np.asarray(lined.pillar_position != uniform.pillar_position).any(axis=-1) | ~active
+        np.asarray(lined.pillar_position != uniform.pillar_position).any(axis=-1)
+        | ~active
     ).all(axis=-1)
     assert whole.mean() > 0.1  # rows of which no pillar had to stay
     for pillars, used in zip(
@@ -198,7 +221,9 @@ def test_pillars_in_a_row_stand_between_the_sides(uniform):
         spacing = np.linalg.norm(step, axis=-1)
         np.testing.assert_allclose(spacing, spacing[0], atol=1e-5)
         assert 0.2 - 1e-5 <= spacing[0] <= 0.4 + 1e-5
-        np.testing.assert_allclose(step, np.broadcast_to(step[0], step.shape), atol=1e-5)
+        np.testing.assert_allclose(
+            step, np.broadcast_to(step[0], step.shape), atol=1e-5
+        )
         assert (
             np.abs(step[0, 0]) <= step[0, 1] + 1e-5
         )  # across the line between the sides, within 45 degrees
@@ -213,7 +238,8 @@ def test_close_starts_leave_little_room_beside_a_pillar_or_another_pursuer(unifo
     for name in ("evader_position", "pillar_position", "pillar_active"):
         np.testing.assert_array_equal(getattr(close, name), getattr(uniform, name))
     moved = np.asarray(close.pursuer_position != uniform.pursuer_position).any(axis=-1)
-    np.testing.assert_allclose(moved.mean(), 0.5, atol=0.1)  # fewer where there is no room
+    # fewer where there is no room
+    np.testing.assert_allclose(moved.mean(), 0.5, atol=0.1)
     between, pillars, _ = distances(close)
     to_pursuer = between.reshape(DRAWS, 3, 2).min(axis=-1) < 0.14 + 0.05 + 1e-5
     to_pillar = pillars.min(axis=-1) < 0.07 + 0.05 + 1e-5
@@ -225,13 +251,15 @@ def test_close_starts_leave_little_room_beside_a_pillar_or_another_pursuer(unifo
     assert_clear(close)
     moved = np.asarray(close.pursuer_position != uniform.pursuer_position).any(axis=-1)
     assert not moved[:, 0].any() and moved[:, 1:].mean() > 0.9
-    assert (distances(close)[0].reshape(DRAWS, 3, 2).min(axis=-1) < 0.14 + 0.05 + 1e-5)[moved].all()
+    assert (distances(close)[0].reshape(DRAWS, 3, 2).min(axis=-1) < 0.14 + 0.05 + 1e-5)[
+        moved
+    ].all()
 
 
 def test_scattered_starts_fill_the_arena_and_are_clear(uniform):
-    scattered = jax.jit(jax.vmap(lambda key, task: scatter_starts(SETTINGS, key, task)))(
-        keys(35), uniform
-    )
+    scattered = jax.jit(
+        jax.vmap(lambda key, task: scatter_starts(SETTINGS, key, task))
+    )(keys(35), uniform)
     assert_clear(scattered)
     pursuers = np.asarray(scattered.pursuer_position)
     evader = np.asarray(scattered.evader_position)
@@ -239,7 +267,8 @@ def test_scattered_starts_fill_the_arena_and_are_clear(uniform):
         radius = np.linalg.norm(points[:, :2], axis=-1)
         assert 0.75 < radius.max() <= 0.8 + 1e-6 and radius.min() < 0.1
         assert np.abs(points[:, 2] - 0.6).max() <= 0.1 + 1e-6
-    # all of the arena's sides, and from beside each other to farther apart than any uniform task
+    # all of the arena's sides, and from beside each other to farther apart than any
+    # uniform task
     assert np.abs(evader[:, :2].mean(axis=0)).max() < 0.05
     apart = np.linalg.norm(pursuers - evader[:, None], axis=-1)
     assert apart.min() < 0.3 and apart.max() > 1.5

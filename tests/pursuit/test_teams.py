@@ -1,4 +1,6 @@
-"""Teams of different sizes in one batch: empty slots of a world change nothing in it."""
+"""Teams of different sizes in one batch: empty slots of a world change nothing in
+it.
+"""
 
 import dataclasses
 
@@ -9,7 +11,12 @@ import pytest
 
 from openjax import Pursuit, PursuitSettings, UserError
 from openjax.pursuit import RewardSettings, Term, default_reward, expand_task, turn_task
-from openjax.pursuit.task import close_starts, scatter_starts, starts_clear, uniform_task
+from openjax.pursuit.task import (
+    close_starts,
+    scatter_starts,
+    starts_clear,
+    uniform_task,
+)
 
 REWARD = RewardSettings(
     smoothness=2.0, crash=9.0, first_crash=5.0, first_capture=7.0, lookahead=0.2
@@ -30,7 +37,9 @@ def flown(settings, task, actions):
     game = Pursuit(settings)
 
     def one(carry, action):
-        observation, state, reward, _, _, info = game.step(jax.random.key(0), carry, action)
+        observation, state, reward, _, _, info = game.step(
+            jax.random.key(0), carry, action
+        )
         return state, (observation, reward, info)
 
     @jax.jit
@@ -41,16 +50,24 @@ def flown(settings, task, actions):
     return record, state
 
 
-@pytest.mark.parametrize("physics", ["rigid", pytest.param("stops", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "physics", ["rigid", pytest.param("stops", marks=pytest.mark.slow)]
+)
 def test_three_of_five_fly_as_three(physics):
-    """Whatever the two empty slots do: steps, what is seen, rewards and counts are those of three."""
+    """Whatever the two empty slots do: steps, what is seen, rewards and counts are
+    those of three.
+    """
     alone = dataclasses.replace(ALONE, physics=physics)
     task = uniform_task(alone, jax.random.key(3)).replace(
-        evader=jnp.int32(0), evader_speed=jnp.float32(1.1), capture_radius=jnp.float32(0.55)
+        evader=jnp.int32(0),
+        evader_speed=jnp.float32(1.1),
+        capture_radius=jnp.float32(0.55),
     )
     empty = jnp.concatenate([task.pursuer_position, task.pursuer_position[:2]])
     wider = task.replace(pursuer_position=empty, active=jnp.arange(5) < 3)
-    actions = 0.3 * jax.random.normal(jax.random.key(1), (40, 5, 4)) + jnp.array([0.25, 0, 0, 0])
+    actions = 0.3 * jax.random.normal(jax.random.key(1), (40, 5, 4)) + jnp.array(
+        [0.25, 0, 0, 0]
+    )
     (seen, reward, info), end = flown(alone, task, actions[:, :3])
     teams = dataclasses.replace(alone, num_pursuers=5)
     (seen_by, reward_of, info_of), end_of = flown(teams, wider, actions)
@@ -69,18 +86,25 @@ def test_three_of_five_fly_as_three(physics):
     assert np.all(seen_by.others[:, :3, 2:] == -5.0)
     np.testing.assert_array_equal(seen_by.others_there[0, :3], [[1, 1, 0, 0]] * 3)
     jax.tree.map(
-        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4), end_of.statistics, end.statistics
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4),
+        end_of.statistics,
+        end.statistics,
     )
     np.testing.assert_allclose(info_of.captured[:, :3], info.captured)
 
 
 def test_tasks_draw_teams_speeds_and_radii():
-    settings = dataclasses.replace(TEAMS, evader_speeds=(0.8, 2.0), capture_radii=(0.2, 0.4))
+    settings = dataclasses.replace(
+        TEAMS, evader_speeds=(0.8, 2.0), capture_radii=(0.2, 0.4)
+    )
     keys = jax.random.split(jax.random.key(0), 300)
     tasks = jax.jit(jax.vmap(lambda key: uniform_task(settings, key)))(keys)
     sizes, counts = np.unique(np.sum(tasks.active, axis=1), return_counts=True)
     assert list(sizes) == [1, 3, 5] and counts.min() > 70
-    for numbers, low, high in ((tasks.evader_speed, 0.8, 2.0), (tasks.capture_radius, 0.2, 0.4)):
+    for numbers, low, high in (
+        (tasks.evader_speed, 0.8, 2.0),
+        (tasks.capture_radius, 0.2, 0.4),
+    ):
         assert low <= numbers.min() < low + 0.05 and high - 0.05 < numbers.max() <= high
     assert np.all(jax.vmap(lambda task: starts_clear(settings, task))(tasks))
 
@@ -105,7 +129,9 @@ def test_what_moves_starts_leaves_empty_slots_far_away():
 
 
 def test_a_term_of_ones_own_counts_nothing_for_empty_slots():
-    game = Pursuit(TEAMS, reward=(*default_reward(REWARD), Term(lambda t: jnp.ones(()), 3.0)))
+    game = Pursuit(
+        TEAMS, reward=(*default_reward(REWARD), Term(lambda t: jnp.ones(()), 3.0))
+    )
     task = uniform_task(TEAMS, jax.random.key(0)).replace(active=jnp.arange(5) < 1)
     _, state = jax.jit(game.reset_to)(jax.random.key(0), task)
     reward = jax.jit(game.step)(jax.random.key(0), state, jnp.zeros((5, 4)))[2]
@@ -113,7 +139,8 @@ def test_a_term_of_ones_own_counts_nothing_for_empty_slots():
 
 
 @pytest.mark.parametrize(
-    "changes", [{"team_sizes": (2, 6)}, {"evader_speeds": (1.0,)}, {"capture_radii": (0.4, 0.2)}]
+    "changes",
+    [{"team_sizes": (2, 6)}, {"evader_speeds": (1.0,)}, {"capture_radii": (0.4, 0.2)}],
 )
 def test_impossible_teams_are_refused(changes):
     with pytest.raises(UserError, match=next(iter(changes))):
@@ -121,7 +148,9 @@ def test_impossible_teams_are_refused(changes):
 
 
 def test_one_falls_out_and_the_others_fly_on_as_a_smaller_team():
-    """From its last step on nothing of it is left, and what the others see is what two would."""
+    """From its last step on nothing of it is left, and what the others see is what two
+    would.
+    """
     settings = dataclasses.replace(ALONE, fall_outs=1.0, fall_out_seconds=(0.03, 0.03))
     task = uniform_task(settings, jax.random.key(3)).replace(evader=jnp.int32(0))
     game = Pursuit(settings)

@@ -8,10 +8,16 @@ from openjax.runs.words import closing_words, layouts_like, opening_words
 
 
 def test_another_game_is_said_to_be_one_and_judged_by_layouts_like_it():
-    easy = preset("quick", environment=dict(evader_speed=0.8, min_pillars=0, max_pillars=3))
+    easy = preset(
+        "quick", environment=dict(evader_speed=0.8, min_pillars=0, max_pillars=3)
+    )
     assert [layout.name for layout in layouts_like(easy.environment)] == ["empty"]
     lines = closing_words(easy, Path("runs/train"), on_cpu=True)
-    assert len(lines) == 3 and "0.8 m/s instead of 1.3" in lines[1] and "0 to 3 pillars" in lines[1]
+    assert (
+        len(lines) == 3
+        and "0.8 m/s instead of 1.3" in lines[1]
+        and "0 to 3 pillars" in lines[1]
+    )
     assert "--scenario empty" in lines[2] and "--preset paper" in lines[2]
 
 
@@ -19,7 +25,8 @@ def test_the_papers_game_is_judged_by_all_six():
     paper = preset("paper")
     assert len(layouts_like(paper.environment)) == 6
     assert not any(
-        "Easier" in line for line in closing_words(paper, Path("runs/train"), on_cpu=False)
+        "Easier" in line
+        for line in closing_words(paper, Path("runs/train"), on_cpu=False)
     )
 
 

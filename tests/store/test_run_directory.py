@@ -1,5 +1,5 @@
-"""Run directories: one process at a time, nothing foreign overwritten, a killed start in nobody's
-way.
+"""Run directories: one process at a time, nothing foreign overwritten, a killed start
+in nobody's way.
 """
 
 import os

@@ -61,7 +61,14 @@ def test_what_was_traced_once_is_found_again_and_does_the_same(tmp_path, step, t
     )
     assert outcome(found, carry()) == expected
     with pytest.raises(AssertionError, match="traced again"):
-        recalled("step", jax.jit(never), lambda: (carry(),), carry(), "other settings", tmp_path)
+        recalled(
+            "step",
+            jax.jit(never),
+            lambda: (carry(),),
+            carry(),
+            "other settings",
+            tmp_path,
+        )
 
     # a damaged file is traced and written anew
     whole = file.read_bytes()
@@ -80,7 +87,12 @@ def test_a_program_that_cannot_be_kept_is_used_as_it_is(tmp_path):
 
     assert (
         recalled(
-            "told", told, lambda: (jnp.zeros(2),), Carry(jnp.zeros(()), jnp.zeros(())), "", tmp_path
+            "told",
+            told,
+            lambda: (jnp.zeros(2),),
+            Carry(jnp.zeros(()), jnp.zeros(())),
+            "",
+            tmp_path,
         )
         is told
     )

@@ -1,5 +1,5 @@
-"""Random crashes (floor, pillar, drone on drone, pillar and floor at once), by `rigid` and by
-MuJoCo C on the same model.
+"""Random crashes (floor, pillar, drone on drone, pillar and floor at once), by `rigid`
+and by MuJoCo C on the same model.
 """
 
 import jax
@@ -21,8 +21,8 @@ STEPS = 10
 
 
 def crashes(number, seed):
-    """Starts (B, 3, ...) of drones about to crash, each kind as often; none of them inside
-    anything.
+    """Starts (B, 3, ...) of drones about to crash, each kind as often; none of them
+    inside anything.
     """
     draw = np.random.default_rng(seed)
     pillar = draw.uniform(-0.6, 0.6, (number, PILLARS, 2))
@@ -40,18 +40,22 @@ def crashes(number, seed):
     position[beside, 0, :2] = pillar[beside, 0] + outward * draw.uniform(
         0.15, 0.19, (beside.sum(), 1)
     )
-    velocity[beside, 0, :2] = -outward * draw.uniform(0.3, 2, (beside.sum(), 1)) + draw.normal(
-        0, 0.5, (beside.sum(), 2)
-    )
+    velocity[beside, 0, :2] = -outward * draw.uniform(
+        0.3, 2, (beside.sum(), 1)
+    ) + draw.normal(0, 0.5, (beside.sum(), 2))
     position[both, 0, 2] = 0.05 + draw.uniform(0, 0.03, both.sum())
     velocity[both, 0, 2] = -draw.uniform(0.2, 2, both.sum())
     pair = kind == 2
     along = draw.normal(size=(pair.sum(), 3))
     along /= np.linalg.norm(along, axis=-1, keepdims=True)
-    position[pair, 1] = position[pair, 0] + along * draw.uniform(0.1, 0.15, (pair.sum(), 1))
+    position[pair, 1] = position[pair, 0] + along * draw.uniform(
+        0.1, 0.15, (pair.sum(), 1)
+    )
     velocity[pair, 0] += along * draw.uniform(0, 1.5, (pair.sum(), 1))
     velocity[pair, 1] -= along * draw.uniform(0, 1.5, (pair.sum(), 1))
-    to_pillar = np.linalg.norm(position[:, :, None, :2] - pillar[:, None], axis=-1) - 0.15
+    to_pillar = (
+        np.linalg.norm(position[:, :, None, :2] - pillar[:, None], axis=-1) - 0.15
+    )
     apart = [
         np.linalg.norm(position[:, i] - position[:, j], axis=-1)
         for i, j in ((0, 1), (0, 2), (1, 2))
@@ -69,8 +73,8 @@ def crashes(number, seed):
 
 
 def flown(start, dtype, steps=STEPS):
-    """Positions and velocities (B, T, 3, 3), attitudes and body rates over T `steps`, and those of
-    free flight.
+    """Positions and velocities (B, T, 3, 3), attitudes and body rates over T `steps`,
+    and those of free flight.
     """
     vehicle = load_vehicle(dtype=dtype)
 
@@ -92,16 +96,18 @@ def flown(start, dtype, steps=STEPS):
 
         return fly(True), fly(False)
 
-    arrays = [jnp.asarray(leaf, bool if leaf.dtype == bool else dtype) for leaf in start]
+    arrays = [
+        jnp.asarray(leaf, bool if leaf.dtype == bool else dtype) for leaf in start
+    ]
     return jax.tree.map(np.asarray, jax.jit(jax.vmap(one))(*arrays))
 
 
 def by_mujoco(start, free):
-    """Positions, velocities (B, T, 3, 3) over as many steps as `free` has, and what is touched (B,
-    T, 3, things) by MuJoCo C.
+    """Positions, velocities (B, T, 3, 3) over as many steps as `free` has, and what is
+    touched (B, T, 3, things) by MuJoCo C.
 
-    The spheres have no friction, so attitudes and thrusts, and with them free accelerations, are
-    those of free flight.
+    The spheres have no friction, so attitudes and thrusts, and with them free
+    accelerations, are those of free flight.
     """
     position, velocity, _, _, pillar, active = start
     model = mujoco.MjModel.from_xml_string(world_xml(Arena(), PILLARS, DRONES - 1, DT))

@@ -1,4 +1,6 @@
-"""Free flight, controller and motors against closed forms; precision and gradients of the step."""
+"""Free flight, controller and motors against closed forms; precision and gradients of
+the step.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -27,7 +29,9 @@ def vehicle():
 
 @pytest.fixture(scope="module")
 def fly(vehicle):
-    """fly(start, command (N, 4), 100 n): states of a flight by `rigid`, compiled once."""
+    """fly(start, command (N, 4), 100 n): states of a flight by `rigid`, compiled
+    once.
+    """
     step = make_drones_step("rigid", contacts=False)
 
     @jax.jit
@@ -59,20 +63,29 @@ def test_momentum_and_energy_without_forces():
         def advance(drone, _):
             return rigid_step(vehicle, drone, zero, zero, dt), None
 
-        end = jax.jit(lambda drone: jax.lax.scan(advance, drone, None, length=10_000)[0])(start)
+        end = jax.jit(
+            lambda drone: jax.lax.scan(advance, drone, None, length=10_000)[0]
+        )(start)
 
         def spin(drone):
             angular = vehicle.inertia * drone.body_rates
-            return rotate(drone.quaternion, angular), 0.5 * jnp.sum(drone.body_rates * angular)
+            return rotate(drone.quaternion, angular), 0.5 * jnp.sum(
+                drone.body_rates * angular
+            )
 
         (momentum0, energy0), (momentum1, energy1) = spin(start), spin(end)
     assert np.linalg.norm(end.body_rates - start.body_rates) > 1, (
         "the body must tumble for this to mean anything"
     )
-    np.testing.assert_allclose(momentum1, momentum0, atol=2e-3 * np.linalg.norm(momentum0))
+    np.testing.assert_allclose(
+        momentum1, momentum0, atol=2e-3 * np.linalg.norm(momentum0)
+    )
     np.testing.assert_allclose(energy1, energy0, rtol=2e-3)
-    np.testing.assert_allclose(end.velocity, [1, -2, 3 - 9.81], rtol=1e-9)  # a free fall
-    np.testing.assert_allclose(end.position, [1, -2, 3 - 0.5 * 9.81 * (1 + dt)], rtol=1e-9)
+    # a free fall
+    np.testing.assert_allclose(end.velocity, [1, -2, 3 - 9.81], rtol=1e-9)
+    np.testing.assert_allclose(
+        end.position, [1, -2, 3 - 0.5 * 9.81 * (1 + dt)], rtol=1e-9
+    )
 
 
 def test_hover_holds_for_eight_seconds(vehicle, fly):
@@ -121,14 +134,18 @@ def test_mixer_raises_the_right_motors(vehicle, axis, up):
 
 
 def test_rate_controller_by_hand(vehicle):
-    """One sample of the firmware's PID: 16-bit counts from errors in degrees per second."""
+    """One sample of the firmware's PID: 16-bit counts from errors in degrees per
+    second.
+    """
     state = jax.tree.map(lambda leaf: leaf[0], hover_state(vehicle, jnp.zeros((1, 3))))
     degree = np.pi / 180
     state = state.replace(
         body_rates=jnp.array([2.0, 0, 0]) * degree, previous_body_rates=jnp.array([1.0, 0, 0]) * degree,
         rate_integral=jnp.array([5.0, 40, 0]),
     )  # fmt: skip
-    motors, integral = rate_controller(vehicle, state, jnp.array([0.5, 12 * degree, 0, 0]), 0.01)
+    motors, integral = rate_controller(
+        vehicle, state, jnp.array([0.5, 12 * degree, 0, 0]), 0.01
+    )
     np.testing.assert_allclose(integral, [5.1, 33.3, 0], rtol=1e-5)
     roll = 250 * 10 + 500 * 5.1 - 2.5 * 100
     pitch = 500 * 33.3
@@ -142,7 +159,10 @@ def test_motor_lag_is_exact(vehicle):
     target = float(vehicle.max_rotor_speed) * np.sqrt(0.5)
     once = rotor_speed_step(vehicle, start, jnp.full(4, 0.5), 0.02)
     twice = rotor_speed_step(
-        vehicle, rotor_speed_step(vehicle, start, jnp.full(4, 0.5), 0.01), jnp.full(4, 0.5), 0.01
+        vehicle,
+        rotor_speed_step(vehicle, start, jnp.full(4, 0.5), 0.01),
+        jnp.full(4, 0.5),
+        0.01,
     )
     expected = target + (1000.0 - target) * np.exp(-0.02 / 0.025)
     np.testing.assert_allclose(once, expected, rtol=1e-5)
@@ -151,8 +171,9 @@ def test_motor_lag_is_exact(vehicle):
 
 @pytest.mark.slow
 def test_gradients_are_right_and_finite(vehicle):
-    """By MJX among solids as by the written-out equations; finite on the floor, where a contact
-    acts, and at full stop of a rotor, where the square root of the command has no slope.
+    """By MJX among solids as by the written-out equations; finite on the floor, where a
+    contact acts, and at full stop of a rotor, where the square root of the command has
+    no slope.
     """
     pillars = jnp.array([[0.5, 0.0]]), jnp.ones(1, bool)
 
@@ -179,8 +200,8 @@ def test_gradients_are_right_and_finite(vehicle):
 
 
 def test_precision_is_that_of_the_state(vehicle):
-    """No leaf changes its dtype or becomes weakly typed: a step is the carry of a scan, whatever
-    x64 says.
+    """No leaf changes its dtype or becomes weakly typed: a step is the carry of a scan,
+    whatever x64 says.
     """
     start = hover_state(vehicle, jnp.array([[0.0, 0, 0.5], [0.5, 0, 0.5]]))
     for physics, contacts in (("rigid", False), ("mjx", True)):
@@ -190,7 +211,9 @@ def test_precision_is_that_of_the_state(vehicle):
                 pillars = jnp.zeros((1, 2), jnp.float32), jnp.ones(1, bool)
                 command = jnp.zeros((2, 4))
                 end = jax.eval_shape(step, vehicle, start, command, *pillars)
-            for before, after in zip(jax.tree.leaves(start), jax.tree.leaves(end), strict=True):
+            for before, after in zip(
+                jax.tree.leaves(start), jax.tree.leaves(end), strict=True
+            ):
                 assert (after.dtype, after.shape, after.weak_type) == (
                     before.dtype,
                     before.shape,
@@ -199,7 +222,8 @@ def test_precision_is_that_of_the_state(vehicle):
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"physics": "warp"}, {"dt": 0.0}, {"substeps": 0}, {"effects": ("magic",)}]
+    "wrong",
+    [{"physics": "warp"}, {"dt": 0.0}, {"substeps": 0}, {"effects": ("magic",)}],
 )
 def test_an_impossible_step_is_refused(wrong):
     with pytest.raises(UserError):

@@ -1,4 +1,6 @@
-"""The step is a small program: what vmaps it into a program of their own waits for its compiler."""
+"""The step is a small program: what vmaps it into a program of their own waits for its
+compiler.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +22,8 @@ def equations(jaxpr) -> int:
     )
     jaxprs = [leaf for leaf in inner if isinstance(leaf, ClosedJaxpr | Jaxpr)]
     return len(jaxpr.eqns) + sum(
-        equations(inner.jaxpr if isinstance(inner, ClosedJaxpr) else inner) for inner in jaxprs
+        equations(inner.jaxpr if isinstance(inner, ClosedJaxpr) else inner)
+        for inner in jaxprs
     )
 
 
@@ -35,7 +38,9 @@ def test_environment_step():
 @pytest.mark.parametrize("drones", [3, 6])
 @pytest.mark.parametrize("pillars", [5, 10])
 def test_kernel_does_not_grow_with_drones_and_pillars(drones, pillars):
-    """4,295 equations with three drones and five pillars took a GPU's compiler half a minute."""
+    """4,295 equations with three drones and five pillars took a GPU's compiler half a
+    minute.
+    """
     step = make_drones_step("rigid").fused
     team = hover_state(VEHICLE, jnp.zeros((256, drones, 3)))
     command = jnp.zeros((256, drones, 4))

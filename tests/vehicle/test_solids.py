@@ -1,5 +1,5 @@
-"""Floor, pillars and other drones are solid: nothing is flown through, at speed or under full
-thrust.
+"""Floor, pillars and other drones are solid: nothing is flown through, at speed or
+under full thrust.
 """
 
 import jax
@@ -23,7 +23,9 @@ def turned(axis, angle):
 
 
 def gaps(position):
-    """Smallest gap (m) to floor, active pillars and each other over a flight (T, 3, 3)."""
+    """Smallest gap (m) to floor, active pillars and each other over a flight (T, 3,
+    3).
+    """
     pillar = np.linalg.norm(position[:, :, None, :2] - PILLARS[ACTIVE], axis=-1) - 0.15
     pillar = np.where(position[:, :, None, 2] < 1.2, pillar, np.inf)
     pairs = [
@@ -35,8 +37,8 @@ def gaps(position):
 
 @pytest.fixture(scope="module", params=["mjx", "rigid"])
 def fly(request):
-    """fly(position, velocity, quaternion, thrust) -> positions (150, 3, 3) and velocities of three
-    drones.
+    """fly(position, velocity, quaternion, thrust) -> positions (150, 3, 3) and
+    velocities of three drones.
     """
     vehicle = load_vehicle()
     step = make_drones_step(request.param)
@@ -46,17 +48,26 @@ def fly(request):
         command = jnp.zeros((3, 4)).at[:, 0].set(thrust)
 
         def advance(drones, _):
-            drones = step(vehicle, drones, command, jnp.asarray(PILLARS), jnp.asarray(ACTIVE))
+            drones = step(
+                vehicle, drones, command, jnp.asarray(PILLARS), jnp.asarray(ACTIVE)
+            )
             return drones, (drones.position, drones.velocity)
 
         return jax.lax.scan(
-            advance, hover_state(vehicle, position, quaternion, velocity), None, length=150
+            advance,
+            hover_state(vehicle, position, quaternion, velocity),
+            None,
+            length=150,
         )[1]
 
-    def run(position=START, velocity=((0, 0, 0),) * 3, quaternion=(LEVEL,) * 3, thrust=0.6):
+    def run(
+        position=START, velocity=((0, 0, 0),) * 3, quaternion=(LEVEL,) * 3, thrust=0.6
+    ):
         velocity = np.asarray(velocity, float)
         quaternion = np.asarray(quaternion)
-        return jax.tree.map(np.asarray, flight(np.asarray(position), velocity, quaternion, thrust))
+        return jax.tree.map(
+            np.asarray, flight(np.asarray(position), velocity, quaternion, thrust)
+        )
 
     return run
 
@@ -89,7 +100,9 @@ def test_nothing_is_entered(fly, case):
 
 
 def test_drones_stay_solid_between_floor_and_pillar(fly):
-    """A drone driven at 3 m/s into another that can't yield: soft for a moment, never passed."""
+    """A drone driven at 3 m/s into another that can't yield: soft for a moment, never
+    passed.
+    """
     onto = fly(
         position=[[0, 0.6, 0.08], [0, 0.6, 0.5], START[2]],
         velocity=[[0, 0, 0], [0, 0, -3], [0, 0, 0]],
@@ -104,7 +117,9 @@ def test_drones_stay_solid_between_floor_and_pillar(fly):
 
 @pytest.mark.parametrize("speed", [1.0, 2.0, 3.0])
 def test_no_gap_narrower_than_a_drone_is_passed(fly, speed):
-    """83 mm between the diagonal pillars at (0.5, 0.2) and (0.3, 0.4); a drone is 100 mm wide."""
+    """83 mm between the diagonal pillars at (0.5, 0.2) and (0.3, 0.4); a drone is 100
+    mm wide.
+    """
     across = np.array([0.2, -0.2]) / np.hypot(0.2, 0.2)
     through = np.array([1.0, 1.0]) / np.sqrt(2)
     draw = np.random.default_rng(1)
@@ -112,7 +127,8 @@ def test_no_gap_narrower_than_a_drone_is_passed(fly, speed):
         draw.uniform(-0.5, 0.5, 12), draw.uniform(-0.03, 0.03, 12), strict=True
     ):
         heading = (
-            np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]) @ through
+            np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+            @ through
         )
         start = np.array([0.4, 0.3]) + offset * across - 0.2 * heading
         pressed = turned([-heading[1], heading[0], 0], np.pi / 2)
@@ -130,7 +146,8 @@ def test_no_gap_narrower_than_a_drone_is_passed(fly, speed):
 
 def test_drones_keep_their_momentum_when_they_meet(fly):
     position, velocity = fly(
-        position=[[0, 0.3, 0.5], *START[1:]], velocity=[[0, 1, 0], [0, -0.5, 0], [0, 0, 0]]
+        position=[[0, 0.3, 0.5], *START[1:]],
+        velocity=[[0, 1, 0], [0, -0.5, 0], [0, 0, 0]],
     )
     met = np.argmin(np.linalg.norm(position[:, 0] - position[:, 1], axis=-1) > 0.102)
     np.testing.assert_allclose(velocity[met + 3, :2, 1].sum(), 0.5, atol=0.02)
@@ -147,25 +164,31 @@ def test_a_drone_on_the_floor_lies_still(fly):
 
 def test_an_inactive_pillar_is_not_there(fly):
     position, _ = fly(
-        position=[[0, 0, 0.5], *START[1:]], velocity=[[0, -2, 0], [0, 0, 0], [0, 0, 0]], thrust=0.62
+        position=[[0, 0, 0.5], *START[1:]],
+        velocity=[[0, -2, 0], [0, 0, 0], [0, 0, 0]],
+        thrust=0.62,
     )
     assert position[-1, 0, 1] < -0.6
 
 
 def test_solids_change_nothing_in_free_flight(fly):
-    """The flight by MJX among solids is that by the written-out equations, until something is
-    touched.
+    """The flight by MJX among solids is that by the written-out equations, until
+    something is touched.
     """
     vehicle = load_vehicle()
     step = make_drones_step("rigid", contacts=False)
     velocity = np.array([[0.2, 0.1, 0.3], [-0.1, 0.1, 0.2], [0.0, 0.2, 0.1]])
-    tilt = np.stack([turned([1, 1, 0], 0.1), turned([1, 0, 1], -0.2), turned([0, 1, 1], 0.1)])
+    tilt = np.stack(
+        [turned([1, 1, 0], 0.1), turned([1, 0, 1], -0.2), turned([0, 1, 1], 0.1)]
+    )
     command = jnp.zeros((3, 4)).at[:, 0].set(0.65)
 
     @jax.jit
     def flight(drones):
         def advance(drones, _):
-            drones = step(vehicle, drones, command, jnp.asarray(PILLARS), jnp.asarray(ACTIVE))
+            drones = step(
+                vehicle, drones, command, jnp.asarray(PILLARS), jnp.asarray(ACTIVE)
+            )
             return drones, (drones.position, drones.velocity)
 
         return jax.lax.scan(advance, drones, None, length=60)[1]

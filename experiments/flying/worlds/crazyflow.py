@@ -1,12 +1,13 @@
-"""crazyflow's brushless Crazyflie as a world (Schuck and others 2026, arXiv 2606.01478), and a
-policy's flights in it as a case.
+"""crazyflow's brushless Crazyflie as a world (Schuck and others 2026, arXiv
+2606.01478), and a policy's flights in it as a case.
 
     SCIPY_ARRAY_API=1 python -m experiments.flying.worlds.crazyflow OUT [--policy flight] [--layouts
     random passage hidden]
 
-Body, rotors, thrust curve and drag are crazyflow's, with its identified `cf21B_500`; all else is as
-in `experiments.flying.worlds.rotorpy`, with the gains of `brushless`. `openjax diagnose OUT` then
-says in what crazyflow differs from that vehicle. It is in no extra: `pip install crazyflow` (0.4).
+Body, rotors, thrust curve and drag are crazyflow's, with its identified `cf21B_500`;
+all else is as in `experiments.flying.worlds.rotorpy`, with the gains of `brushless`.
+`openjax diagnose OUT` then says in what crazyflow differs from that vehicle. It is in
+no extra: `pip install crazyflow` (0.4).
 """
 
 import argparse
@@ -37,7 +38,9 @@ motor_rows = "sample"
 
 
 class CrazyflowBodies(Bodies):
-    """Bodies whose equations are crazyflow's, with rotor speeds in revolutions a minute."""
+    """Bodies whose equations are crazyflow's, with rotor speeds in revolutions a
+    minute.
+    """
 
     def step(self, speeds, time):
         """As of `Bodies`; a rotor's speed has no bounds of its own."""
@@ -48,13 +51,15 @@ class CrazyflowBodies(Bodies):
 
     def _slope(self, s, speeds):
         x, velocity, q, rates, rotor = (part.T for part in np.split(s, (3, 6, 10, 13)))
-        x, q, velocity, rates, rotor = self.model(x, q, velocity, rates, speeds.T, rotor_vel=rotor)
+        x, q, velocity, rates, rotor = self.model(
+            x, q, velocity, rates, speeds.T, rotor_vel=rotor
+        )
         return np.concatenate([part.T for part in (x, velocity, q, rates, rotor)])
 
 
 class CrazyflowWorld(RotorPyWorld):
-    """Vehicles of crazyflow; `rows` are what was sampled at each tick: arrays (B, ...) by channel
-    of the log.
+    """Vehicles of crazyflow; `rows` are what was sampled at each tick: arrays (B, ...)
+    by channel of the log.
     """
 
     def make_bodies(self, start, firmware):
@@ -70,7 +75,9 @@ class CrazyflowWorld(RotorPyWorld):
         self._curve = load_params("first_principles", VEHICLE)["rpm2thrust"]
         hover = float(vehicle.mass * vehicle.gravity) / (4 * self._most)
         rotors = self.speeds(np.full((4, start["x"].shape[1]), hover))
-        return CrazyflowBodies(parametrize(dynamics, VEHICLE), start | {"rotor_speeds": rotors})
+        return CrazyflowBodies(
+            parametrize(dynamics, VEHICLE), start | {"rotor_speeds": rotors}
+        )
 
     def speeds(self, motors):
         """See `RotorPyWorld`."""
@@ -85,7 +92,10 @@ class CrazyflowWorld(RotorPyWorld):
 
     def fly(self, command):
         """See `RotorPyWorld`."""
-        row = {name: value.reshape(-1, value.shape[-1]) for name, value in self._seen.items()}
+        row = {
+            name: value.reshape(-1, value.shape[-1])
+            for name, value in self._seen.items()
+        }
         row["body_rates"] = (
             self.bodies.rates + self.air["gyro_bias"] + self.air["gyro"][5 * self.tick]
         ).T
@@ -118,17 +128,26 @@ def main() -> None:
         return worlds[0]
 
     statistics = play(loaded, game, tasks, keys, make_world)
-    rows = {n: np.stack([row[n] for row in worlds[0].rows], 1) for n in worlds[0].rows[0]}
+    rows = {
+        n: np.stack([row[n] for row in worlds[0].rows], 1) for n in worlds[0].rows[0]
+    }
     options.out.mkdir(parents=True)
     for i, layout in enumerate(options.layouts):
         vehicles = []
         for j in range(worlds[0].team * i, worlds[0].team * (i + 1)):
-            own = {c: x[j, :, k] for n, x in rows.items() for k, c in enumerate(CHANNEL_COLUMNS[n])}
+            own = {
+                c: x[j, :, k]
+                for n, x in rows.items()
+                for k, c in enumerate(CHANNEL_COLUMNS[n])
+            }
             vehicles.append({"t": PERIOD * np.arange(game.episode_length)} | own)
         write_csv(options.out / f"{layout}.csv.gz", log_of(vehicles, layout), {"t": 4})
         print(
             layout,
-            {n: float(getattr(statistics, n)[i]) for n in ("captured", "capture_step", "crashed")},
+            {
+                n: float(getattr(statistics, n)[i])
+                for n in ("captured", "capture_step", "crashed")
+            },
         )
     (options.out / "vehicle.toml").write_text(VEHICLE_TOML, encoding="utf-8")
 

@@ -1,5 +1,5 @@
-"""What a world is: it flies bodies by commands, and says where they are and where they are seen.
-And the game around it, which is `openjax.pursuit`'s own, without its physics.
+"""What a world is: it flies bodies by commands, and says where they are and where they
+are seen. And the game around it, which is `openjax.pursuit`'s own, without its physics.
 """
 
 import functools
@@ -9,29 +9,37 @@ from typing import Protocol
 import jax
 import numpy as np
 
-from openjax.pursuit import EpisodeStatistics, Pursuit, PursuitSettings, Task, action_to_command
+from openjax.pursuit import (
+    EpisodeStatistics,
+    Pursuit,
+    PursuitSettings,
+    Task,
+    action_to_command,
+)
 from openjax.vehicle import DroneState
 
 Poses = dict[str, np.ndarray]
-"""position (W, N, 3) m, quaternion (W, N, 4) wxyz, velocity (W, N, 3) m/s of N pursuers in W
-worlds, float32.
+"""position (W, N, 3) m, quaternion (W, N, 4) wxyz, velocity (W, N, 3) m/s of N pursuers
+in W worlds, float32.
 """
 
 
 class World(Protocol):
-    """W worlds with N vehicles each, at the start of their episodes. A tick is a control step, 10
-    ms.
+    """W worlds with N vehicles each, at the start of their episodes. A tick is a
+    control step, 10 ms.
     """
 
     def poses(self) -> Poses:
         """Where the vehicles are."""
 
     def measure(self) -> Poses:
-        """Where the vehicles are seen at this tick: late, noisy, as the world has it."""
+        """Where the vehicles are seen at this tick: late, noisy, as the world has
+        it.
+        """
 
     def fly(self, command: np.ndarray) -> None:
-        """One tick after sending `command` (W, N, 4): collective thrust in 0..1, body rates in
-        rad/s.
+        """One tick after sending `command` (W, N, 4): collective thrust in 0..1, body
+        rates in rad/s.
         """
 
 
@@ -39,7 +47,8 @@ def per_world(team: int, position, quaternion, velocity) -> Poses:
     """Poses of bodies in the last axis, (3, W * N) and so on, as `Poses`."""
     parts = {"position": position, "quaternion": quaternion, "velocity": velocity}
     return {
-        n: np.asarray(x).T.reshape(-1, team, len(x)).astype(np.float32) for n, x in parts.items()
+        n: np.asarray(x).T.reshape(-1, team, len(x)).astype(np.float32)
+        for n, x in parts.items()
     }
 
 
@@ -48,7 +57,10 @@ class SeenElsewhere:
 
     def reset(self, vehicle, drones: DroneState, key=None) -> DroneState:
         """Drones that are seen where they are."""
-        seen = {name: getattr(drones, name) for name in ("position", "quaternion", "velocity")}
+        seen = {
+            name: getattr(drones, name)
+            for name in ("position", "quaternion", "velocity")
+        }
         return drones.replace(effect_memory=seen)
 
     def seen(self, drones: DroneState, effect_parameters=None) -> DroneState:
@@ -85,13 +97,15 @@ def play(
 
 @functools.cache
 def _compiled(settings, policy):
-    """The game's start, its observation of measured poses, the policy, and the game's step with
-    poses from outside.
+    """The game's start, its observation of measured poses, the policy, and the game's
+    step with poses from outside.
     """
     game = Pursuit(settings, dynamics=SeenElsewhere())
 
     def observe(state, seen):
-        return game.observe(state.replace(drones=state.drones.replace(effect_memory=seen)))
+        return game.observe(
+            state.replace(drones=state.drones.replace(effect_memory=seen))
+        )
 
     def act(weights, observation):
         action = policy.act(weights, observation)

@@ -1,8 +1,9 @@
-"""The exam's plant as a world: vehicles that take a command every 10 ms; 1 kHz inside, no code of
-the simulator.
+"""The exam's plant as a world: vehicles that take a command every 10 ms; 1 kHz inside,
+no code of the simulator.
 
-A game needs the next state before it knows the next command, a speed limit after each tick, solid
-things and the wakes of a whole team: `diagnosis.plant.Flight` flies all of it, one tick at a time.
+A game needs the next state before it knows the next command, a speed limit after each
+tick, solid things and the wakes of a whole team: `diagnosis.plant.Flight` flies all of
+it, one tick at a time.
 """
 
 from dataclasses import dataclass
@@ -20,36 +21,45 @@ FORTUNE = 19  # of this room's random numbers; the exam's cases have others
 
 
 def rng_of(seed: int, number: int, *more: int) -> np.random.Generator:
-    """The random numbers of a vehicle; `more` tells its sensors, episodes and causes apart."""
+    """The random numbers of a vehicle; `more` tells its sensors, episodes and causes
+    apart.
+    """
     return np.random.default_rng(np.random.SeedSequence([FORTUNE, seed, number, *more]))
 
 
 def sensors_of(seed: int, number: int) -> dict:
-    """Sensors and air of a vehicle: light turbulence, white noise, every channel logged at 100
-    Hz.
+    """Sensors and air of a vehicle: light turbulence, white noise, every channel logged
+    at 100 Hz.
     """
     drawn = sensors.draw(rng_of(seed, number, 1), "white", "psgacmv", "light")
     return drawn | {"rate": 100, "pose_rate": 100, "dropped": 0.0}
 
 
-def air_of(drawn: dict, seed: int, number: int, ticks: int, worlds: range, team: int) -> dict:
-    """Air of the teams of `worlds`, each with its own gusts, noise and battery; bodies last."""
+def air_of(
+    drawn: dict, seed: int, number: int, ticks: int, worlds: range, team: int
+) -> dict:
+    """Air of the teams of `worlds`, each with its own gusts, noise and battery; bodies
+    last.
+    """
     bodies = []
     for world in worlds:
         rng = rng_of(seed, number, 3, world)
         voltage = drawn["voltage"] + rng.uniform(-0.15, 0.1)
         for _ in range(team):
-            bodies.append(sensors.draw_air(rng, drawn, ticks, voltage + rng.uniform(-0.02, 0.02)))
+            bodies.append(
+                sensors.draw_air(rng, drawn, ticks, voltage + rng.uniform(-0.02, 0.02))
+            )
     return sensors.stack(bodies)
 
 
 @dataclass
 class Solids:
-    """What can't be flown through: floor, pillars, and the other bodies of the same world.
+    """What can't be flown through: floor, pillars, and the other bodies of the same
+    world.
 
-    pillar (2, P, B) m and active (P, B) are those of each body's world; bodies of a world are
-    neighbours in the last axis, `team` of them. Impacts are inelastic and without friction, as in
-    `openjax.vehicle`.
+    pillar (2, P, B) m and active (P, B) are those of each body's world; bodies of a
+    world are neighbours in the last axis, `team` of them. Impacts are inelastic and
+    without friction, as in `openjax.vehicle`.
     """
 
     pillar: np.ndarray
@@ -57,8 +67,8 @@ class Solids:
     team: int
 
     def stop(self, position, velocity):
-        """Push bodies (3, B) out of what they touch, and take the approaching part of their
-        velocity, in place.
+        """Push bodies (3, B) out of what they touch, and take the approaching part of
+        their velocity, in place.
         """
         low = position[2] < RADIUS
         if low.any():
@@ -89,8 +99,8 @@ class Solids:
 
 
 class PlantWorld:
-    """Nominal vehicles in the exam's plant, each with its own noise and all with the same cause, or
-    none.
+    """Nominal vehicles in the exam's plant, each with its own noise and all with the
+    same cause, or none.
 
     Args:
       drones: (W, N, ...) at the start.
@@ -121,7 +131,9 @@ class PlantWorld:
         ticks += 1  # a pose is measured after the last step, too
         arrival = np.repeat(10 * np.arange(ticks)[:, None], count, axis=1)
         if cause is not None:
-            injection.inject(cause, parameters, everyone, arrival, rng_of(seed, number, 4, first))
+            injection.inject(
+                cause, parameters, everyone, arrival, rng_of(seed, number, 4, first)
+            )
         index = everyone.reshape(worlds, self.team)
         self.flight = plant.Flight(
             told,
@@ -130,7 +142,9 @@ class PlantWorld:
             arrival,
             np.asarray(drones.position, float).reshape(count, 3).T,
             np.asarray(drones.quaternion, float).reshape(count, 4).T,
-            partners=[np.roll(index, -shift, axis=1).ravel() for shift in range(1, self.team)],
+            partners=[
+                np.roll(index, -shift, axis=1).ravel() for shift in range(1, self.team)
+            ],
             solids=solids_of(tasks, self.team),
         )
         self.flight.look()
@@ -153,7 +167,9 @@ class PlantWorld:
 
 
 def solids_of(tasks: Task, team: int) -> Solids:
-    """What is solid in the worlds of `tasks`, for bodies of teams that are neighbours."""
+    """What is solid in the worlds of `tasks`, for bodies of teams that are
+    neighbours.
+    """
     pillars = np.asarray(tasks.pillar_position, float)  # (W, P, 2)
     return Solids(
         pillar=np.repeat(np.moveaxis(pillars, (0, 1, 2), (2, 1, 0)), team, axis=2),

@@ -1,12 +1,12 @@
-"""RotorPy 3 as a world (Folk, Paulos, Kumar 2023; the `dev` extra): its `Multirotor` and its own
-Crazyflie.
+"""RotorPy 3 as a world (Folk, Paulos, Kumar 2023; the `dev` extra): its `Multirotor`
+and its own Crazyflie.
 
-Rigid body, rotors, drag at the hubs and motor lag are RotorPy's, with its identified Crazyflie: 30
-g, motors of 72 ms, other thrust and torque constants. RotorPy integrates one vehicle at a time;
-`Bodies` evaluates the same equations for all at once, and a test holds it against
-`Multirotor.step`. The firmware's rate loop at 500 Hz and the sensors' noise are those of the exam's
-plant, since RotorPy's Crazyflie has no motor commands; commanded thrust is in units of the nominal
-vehicle's.
+Rigid body, rotors, drag at the hubs and motor lag are RotorPy's, with its identified
+Crazyflie: 30 g, motors of 72 ms, other thrust and torque constants. RotorPy integrates
+one vehicle at a time; `Bodies` evaluates the same equations for all at once, and a test
+holds it against `Multirotor.step`. The firmware's rate loop at 500 Hz and the sensors'
+noise are those of the exam's plant, since RotorPy's Crazyflie has no motor commands;
+commanded thrust is in units of the nominal vehicle's.
 """
 
 import numpy as np
@@ -24,25 +24,30 @@ MOST_THRUST = v.THRUST_CONSTANT * v.MAX_SPEED**2  # N, of a nominal rotor
 
 
 def crazyflie() -> dict:
-    """RotorPy's Crazyflie, with its rotors numbered and turning as the firmware has them."""
+    """RotorPy's Crazyflie, with its rotors numbered and turning as the firmware has
+    them.
+    """
     from rotorpy.vehicles.crazyflie_params import quad_params
 
     return quad_params | {"rotor_pos": hubs(), "rotor_directions": v.SPIN}
 
 
 class Bodies:
-    """What `Multirotor.step` does, for B vehicles at once: its equations with its numbers, by a
-    Runge-Kutta step.
+    """What `Multirotor.step` does, for B vehicles at once: its equations with its
+    numbers, by a Runge-Kutta step.
 
     Args:
-      model: RotorPy's `Multirotor`, with or without aerodynamics; wind and ground aren't known
-      here.
-      state: {"x": (3, B), "v": (3, B), "q": (4, B) as xyzw, "w": (3, B), "rotor_speeds": (4, B)}.
+      model: RotorPy's `Multirotor`, with or without aerodynamics; wind and ground
+      aren't known here.
+      state: {"x": (3, B), "v": (3, B), "q": (4, B) as xyzw, "w": (3, B),
+      "rotor_speeds": (4, B)}.
     """
 
     def __init__(self, model, state: dict[str, np.ndarray]):
         self.model = model
-        self.state = np.concatenate([state[name] for name in ("x", "v", "q", "w", "rotor_speeds")])
+        self.state = np.concatenate(
+            [state[name] for name in ("x", "v", "q", "w", "rotor_speeds")]
+        )
 
     @property
     def position(self) -> np.ndarray:
@@ -93,7 +98,9 @@ class Bodies:
         drag = 0.0
         if model.aero:
             air = v.rotate_back(attitude, s[3:6])
-            at_hubs = air[:, None] + np.cross(rates[:, None], hubs.T[:, :, None], axis=0)
+            at_hubs = air[:, None] + np.cross(
+                rates[:, None], hubs.T[:, :, None], axis=0
+            )
             drag = -np.sqrt((air * air).sum(axis=0)) * (model.drag_matrix @ air)
             force -= rotor * np.einsum("ij,jrb->irb", model.rotor_drag_matrix, at_hubs)
             force[2] += model.k_h * (at_hubs[0] ** 2 + at_hubs[1] ** 2)
@@ -129,7 +136,9 @@ class RotorPyWorld:
       first: number of the first episode, from which its noise is drawn.
     """
 
-    def __init__(self, drones: DroneState, tasks: Task, ticks: int, seed: int, first: int = 0):
+    def __init__(
+        self, drones: DroneState, tasks: Task, ticks: int, seed: int, first: int = 0
+    ):
         worlds, self.team = drones.position.shape[:2]
         count = worlds * self.team
         quaternion = np.asarray(drones.quaternion, float).reshape(count, 4).T
@@ -142,7 +151,9 @@ class RotorPyWorld:
         firmware = v.nominal_parameters([v.Told()] * count)
         self.bodies = self.make_bodies(start, firmware)
         drawn = sensors_of(seed, 0)
-        self.air = air_of(drawn, seed, 0, ticks + 1, range(first, first + worlds), self.team)
+        self.air = air_of(
+            drawn, seed, 0, ticks + 1, range(first, first + worlds), self.team
+        )
         self.firmware = Firmware(firmware, self.air["gyro_bias"].astype(float))
         self.solids = solids_of(tasks, self.team)
         self.tick = 0
@@ -153,9 +164,13 @@ class RotorPyWorld:
         """
         from rotorpy.vehicles.multirotor import Multirotor
 
-        model = Multirotor(crazyflie(), control_abstraction="cmd_motor_speeds", aero=True)
+        model = Multirotor(
+            crazyflie(), control_abstraction="cmd_motor_speeds", aero=True
+        )
         hover = np.sqrt(model.mass * v.GRAVITY / (4 * model.k_eta))
-        return Bodies(model, start | {"rotor_speeds": np.full((4, start["x"].shape[1]), hover)})
+        return Bodies(
+            model, start | {"rotor_speeds": np.full((4, start["x"].shape[1]), hover)}
+        )
 
     def speeds(self, motors) -> np.ndarray:
         """The rotors' speeds at which motor commands (4, B) settle."""
@@ -164,7 +179,10 @@ class RotorPyWorld:
     def poses(self) -> Poses:
         """Where the vehicles are."""
         return per_world(
-            self.team, self.bodies.position, self.bodies.quaternion, self.bodies.velocity
+            self.team,
+            self.bodies.position,
+            self.bodies.quaternion,
+            self.bodies.velocity,
         )
 
     def measure(self) -> Poses:
@@ -178,13 +196,19 @@ class RotorPyWorld:
         )
         quaternion /= np.sqrt((quaternion * quaternion).sum(axis=0))
         position = bodies.position - late * bodies.velocity + air["seen_position"][k]
-        return per_world(self.team, position, quaternion, bodies.velocity + air["seen_velocity"][k])
+        return per_world(
+            self.team, position, quaternion, bodies.velocity + air["seen_velocity"][k]
+        )
 
     def fly(self, command) -> None:
-        """One tick: five times the rate loop and RotorPy's equations, then solid things."""
+        """One tick: five times the rate loop and RotorPy's equations, then solid
+        things.
+        """
         command = command.reshape(-1, 4).T
         for part in range(PER_TICK):
-            noise = self.air["gyro_bias"] + self.air["gyro"][PER_TICK * self.tick + part]
+            noise = (
+                self.air["gyro_bias"] + self.air["gyro"][PER_TICK * self.tick + part]
+            )
             self.motors = self.firmware(command, self.bodies.rates + noise)
             self.bodies.step(self.speeds(self.motors), SAMPLE)
         self.solids.stop(self.bodies.position, self.bodies.velocity)

@@ -1,5 +1,6 @@
-"""Methods without a learned policy of their own: those that the paper compares with (Angelani,
-Janosov, potential field, DACOOP; see docs/methods.md), and stack, which forces a capture.
+"""Methods without a learned policy of their own: those that the paper compares with
+(Angelani, Janosov, potential field, DACOOP; see docs/methods.md), and stack, which
+forces a capture.
 """
 
 from openjax.baselines.craft_policy import CraftPolicy

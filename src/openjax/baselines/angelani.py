@@ -1,8 +1,10 @@
-"""Angelani (2012), Collective predation and escape strategies, Physical Review Letters 109, 118104.
+"""Angelani (2012), Collective predation and escape strategies, Physical Review Letters
+109, 118104.
 
-Self-propelled particles of constant speed, drawn to the nearest prey, aligned with their own kind
-and kept apart from it by a repulsion that a Fermi function switches on at close range. Its plane
-has neither walls nor obstacles: here they repel as another predator does.
+Self-propelled particles of constant speed, drawn to the nearest prey, aligned with
+their own kind and kept apart from it by a repulsion that a Fermi function switches on
+at close range. Its plane has neither walls nor obstacles: here they repel as another
+predator does.
 """
 
 import jax
@@ -31,18 +33,22 @@ class AngelaniParameters:
     """Distance from their surface at which that is half of its weight (m)."""
 
 
-def angelani(craft: Craft, parameters: AngelaniParameters, around: Surroundings) -> jax.Array:
+def angelani(
+    craft: Craft, parameters: AngelaniParameters, around: Surroundings
+) -> jax.Array:
     """Desired velocities (..., N, 3), m/s, world.
 
-    v = v_max N[N(r_e - r_i) + w_a N(sum_j v_j) + w_r sum_j N(r_i - r_j) / (1 + exp((d_ij - r_r) /
-    s)) + obstacles], N(x) = x / |x|.
+    v = v_max N[N(r_e - r_i) + w_a N(sum_j v_j) + w_r sum_j N(r_i - r_j) / (1 +
+    exp((d_ij - r_r) / s)) + obstacles], N(x) = x / |x|.
     """
 
     def fermi(distance, middle):
         return jax.nn.sigmoid((middle - distance) / parameters.width)
 
     distance = jnp.sqrt(jnp.sum(around.from_others**2, axis=-1) + 1e-12)
-    apart = fermi(distance, parameters.repulsion_range)[..., None] * unit(around.from_others)
+    apart = fermi(distance, parameters.repulsion_range)[..., None] * unit(
+        around.from_others
+    )
 
     near = fermi(around.obstacle_distance, parameters.obstacle_range)
     sideways = jnp.sum(near[..., None] * around.obstacle_normal, axis=-2)

@@ -1,10 +1,10 @@
-"""Artificial potential field with wall following, as in DACOOP (Zhang et al., 2022) after Koren and
-Borenstein (1991).
+"""Artificial potential field with wall following, as in DACOOP (Zhang et al., 2022)
+after Koren and Borenstein (1991).
 
-Attraction to the evader, repulsion from obstacles, and between pursuers a force that repels at
-close range and attracts at long. Where attraction and repulsion together point away from the evader
-(the local minimum that Koren and Borenstein describe), the pursuer flies along the obstacle
-instead.
+Attraction to the evader, repulsion from obstacles, and between pursuers a force that
+repels at close range and attracts at long. Where attraction and repulsion together
+point away from the evader (the local minimum that Koren and Borenstein describe), the
+pursuer flies along the obstacle instead.
 """
 
 import jax
@@ -12,14 +12,23 @@ import jax.numpy as jnp
 from flax import struct
 
 from openjax.baselines.parameters import parameter
-from openjax.baselines.surroundings import Craft, Surroundings, length, level, unit, upward
+from openjax.baselines.surroundings import (
+    Craft,
+    Surroundings,
+    length,
+    level,
+    unit,
+    upward,
+)
 
 SAFE_PURSUER = 0.14
-"""Distance between two pursuers at which their repulsion grows without bound (m): the game's safety
-distance.
+"""Distance between two pursuers at which their repulsion grows without bound (m): the
+game's safety distance.
 """
 NEAREST = 0.005
-"""Distances beyond the safe ones are taken to be at least this (m), so that forces stay finite."""
+"""Distances beyond the safe ones are taken to be at least this (m), so that forces stay
+finite.
+"""
 
 
 @struct.dataclass
@@ -31,11 +40,13 @@ class ApfParameters:
     influence: jax.Array = parameter(0.3, 0.05, 0.6)
     """rho: distance from a surface beyond which it doesn't repel (m)."""
     margin: jax.Array = parameter(0.14, 0.05, 0.25)
-    """Distance from a surface at which its repulsion grows without bound (m); the robot's radius in
-    the source.
+    """Distance from a surface at which its repulsion grows without bound (m); the
+    robot's radius in the source.
     """
     balance: jax.Array = parameter(0.2, 0.003, 1.0)
-    """lambda: of the force between pursuers, 1/2 - lambda / d: they keep 2 lambda apart (m)."""
+    """lambda: of the force between pursuers, 1/2 - lambda / d: they keep 2 lambda apart
+    (m).
+    """
 
 
 @struct.dataclass
@@ -60,7 +71,9 @@ def forces(parameters: ApfParameters, around: Surroundings) -> Forces:
     rho = jnp.asarray(parameters.influence)
     margin = jnp.asarray(parameters.margin)
     # an axis more: each pursuer's parameters hold for all of its obstacles
-    each = push(around.obstacle_distance, eta[..., None], rho[..., None], margin[..., None])
+    each = push(
+        around.obstacle_distance, eta[..., None], rho[..., None], margin[..., None]
+    )
     from_floor = push(around.floor_distance, eta, rho, margin)
     from_ceiling = push(around.ceiling_distance, eta, rho, margin)
 
@@ -78,11 +91,12 @@ def forces(parameters: ApfParameters, around: Surroundings) -> Forces:
 
 
 def apf(craft: Craft, parameters: ApfParameters, around: Surroundings) -> jax.Array:
-    """Desired velocities (..., N, 3), m/s, world: along the field, or along an obstacle that is in
-    the way.
+    """Desired velocities (..., N, 3), m/s, world: along the field, or along an obstacle
+    that is in the way.
     """
     field = forces(parameters, around)
-    # without the force between pursuers: it alone never holds anybody in a local minimum
+    # without the force between pursuers: it alone never holds anybody in a local
+    # minimum
     towards = field.attraction + field.repulsion
     blocked = jnp.sum(towards * field.attraction, axis=-1, keepdims=True) < 0.0
     along = wall_following(field, around.velocity)
@@ -93,9 +107,9 @@ def apf(craft: Craft, parameters: ApfParameters, around: Surroundings) -> jax.Ar
 def wall_following(field: Forces, velocity: jax.Array) -> jax.Array:
     """(..., N, 3) unit vector at right angles to the obstacles' repulsion.
 
-    The side is that to which the other pursuers push or, where they push less than the evader
-    pulls, that to which the pursuer flies anyhow. Inside the margin it turns half away from the
-    obstacle; its height is the field's.
+    The side is that to which the other pursuers push or, where they push less than the
+    evader pulls, that to which the pursuer flies anyhow. Inside the margin it turns
+    half away from the obstacle; its height is the field's.
     """
     away = unit(field.repulsion[..., :2])
     left = jnp.stack([-away[..., 1], away[..., 0]], axis=-1)

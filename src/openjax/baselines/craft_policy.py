@@ -1,5 +1,5 @@
-"""Learnt policies whose samples aren't commands: a velocity controller flies what they stand
-for.
+"""Learnt policies whose samples aren't commands: a velocity controller flies what they
+stand for.
 """
 
 import dataclasses
@@ -27,7 +27,10 @@ class CraftPolicy(Policy):
 
     @classmethod
     def for_environment(
-        cls, environment: Pursuit, network: NetworkSettings, predictor: PredictorSettings
+        cls,
+        environment: Pursuit,
+        network: NetworkSettings,
+        predictor: PredictorSettings,
     ) -> "CraftPolicy":
         """The policy for an environment; its mean starts at `start`.
 

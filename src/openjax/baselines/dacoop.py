@@ -1,11 +1,12 @@
-"""DACOOP (Zhang et al., 2022, Multi-robot cooperative pursuit via potential field-enhanced
-reinforcement learning).
+"""DACOOP (Zhang et al., 2022, Multi-robot cooperative pursuit via potential
+field-enhanced reinforcement learning).
 
-A network turns the two main parameters of the potential field at every step and for each pursuer:
-the scale of the obstacles' repulsion and the balance of the force between pursuers. As in the
-paper, MAPPO learns them in place of D3QN, so they are continuous. The network is the actor that
-plain MAPPO has; its two outputs, in -1..1, are positions between the ends of both ranges, on a
-logarithmic scale, and training starts from the field of `START`.
+A network turns the two main parameters of the potential field at every step and for
+each pursuer: the scale of the obstacles' repulsion and the balance of the force between
+pursuers. As in the paper, MAPPO learns them in place of D3QN, so they are continuous.
+The network is the actor that plain MAPPO has; its two outputs, in -1..1, are positions
+between the ends of both ranges, on a logarithmic scale, and training starts from the
+field of `START`.
 """
 
 import dataclasses
@@ -22,8 +23,8 @@ from openjax.pursuit import Observation
 
 LEARNED = ("repulsion", "balance")
 START = ApfParameters(repulsion=2e-3, influence=0.4, margin=0.08, balance=0.5)
-"""The field at the start of training; what isn't learnt stays, also of shipped weights, whatever a
-search finds.
+"""The field at the start of training; what isn't learnt stays, also of shipped weights,
+whatever a search finds.
 """
 
 
@@ -41,10 +42,12 @@ class DacoopPolicy(CraftPolicy):
         return tuple(math.atanh(min(max(place, -0.95), 0.95)) for place in places)
 
     def action(self, sample: jax.Array, observation: Observation) -> jax.Array:
-        """The action (..., N, 4) in -1..1 that a sample (..., N, 2) of the Gaussian, or its mean,
-        stands for.
+        """The action (..., N, 4) in -1..1 that a sample (..., N, 2) of the Gaussian, or
+        its mean, stands for.
         """
-        return velocity_action(self.craft, observation, self.desired(sample, observation))
+        return velocity_action(
+            self.craft, observation, self.desired(sample, observation)
+        )
 
     def desired(self, sample: jax.Array, observation: Observation) -> jax.Array:
         """Velocities (..., N, 3), m/s, world, that a sample stands for."""
@@ -58,7 +61,11 @@ def field_parameters(output: jax.Array) -> ApfParameters:
     for i, name in enumerate(LEARNED):
         low, high = ranges(ApfParameters)[name]
         learned[name] = low * (high / low) ** (0.5 * (output[..., i] + 1.0))
-    fixed = {name: getattr(START, name) for name in ranges(ApfParameters) if name not in LEARNED}
+    fixed = {
+        name: getattr(START, name)
+        for name in ranges(ApfParameters)
+        if name not in LEARNED
+    }
     return ApfParameters(**fixed, **learned)
 
 

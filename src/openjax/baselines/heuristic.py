@@ -20,7 +20,9 @@ from openjax.pursuit import Observation, Pursuit
 
 @dataclasses.dataclass(frozen=True)
 class Method:
-    """A rule that turns surroundings into desired velocities, and the kind of its parameters."""
+    """A rule that turns surroundings into desired velocities, and the kind of its
+    parameters.
+    """
 
     kind: type
     rule: Callable[[Craft, Any, Surroundings], jax.Array]
@@ -35,7 +37,9 @@ METHODS = {
 
 
 class WithoutNetwork:
-    """What isn't learnt, with the interface of `openjax.policy.Policy`; a subclass has `mean`."""
+    """What isn't learnt, with the interface of `openjax.policy.Policy`; a subclass has
+    `mean`.
+    """
 
     predictor = PredictorSettings(enabled=False)
 
@@ -89,14 +93,16 @@ class Heuristic(WithoutNetwork):
 
     def mean(self, actor: Any, observation: Observation) -> jax.Array:
         """Action (..., N, 4) in -1..1."""
-        desired = METHODS[self.name].rule(self.craft, actor, surroundings(self.craft, observation))
+        desired = METHODS[self.name].rule(
+            self.craft, actor, surroundings(self.craft, observation)
+        )
         return velocity_action(self.craft, observation, desired)
 
 
 @dataclasses.dataclass(frozen=True)
 class OwnController(WithoutNetwork):
-    """A pure function from an `Observation` to actions (N, 4). It is mapped over worlds, so it sees
-    the observation of one.
+    """A pure function from an `Observation` to actions (N, 4). It is mapped over
+    worlds, so it sees the observation of one.
     """
 
     function: Callable[[Observation], jax.Array]

@@ -1,5 +1,5 @@
-"""Named parameters of the methods: literature's value, range of the search, unit; and the values
-that the search found.
+"""Named parameters of the methods: literature's value, range of the search, unit; and
+the values that the search found.
 """
 
 import dataclasses
@@ -11,16 +11,16 @@ import jax.numpy as jnp
 from flax import struct
 
 FOUND = Path(__file__).with_name("parameters.json")
-"""{method: {parameter: value}}: the best of 512 sets each on training tasks, by capture rate, step
-and collisions.
+"""{method: {parameter: value}}: the best of 512 sets each on training tasks, by capture
+rate, step and collisions.
 """
 
 Parameters = TypeVar("Parameters")
 
 
 def parameter(default: float, low: float, high: float) -> Any:
-    """A field whose `default` is the literature's, searched between `low` and `high` on a
-    logarithmic scale.
+    """A field whose `default` is the literature's, searched between `low` and `high` on
+    a logarithmic scale.
     """
     return struct.field(default=default, metadata={"range": (low, high)})
 
@@ -31,8 +31,8 @@ def ranges(kind: type) -> dict[str, tuple[float, float]]:
 
 
 def best(method: str, kind: type[Parameters]) -> Parameters:
-    """A method's parameters as the search found them; the literature's where there is no result of
-    it.
+    """A method's parameters as the search found them; the literature's where there is
+    no result of it.
     """
     found = json.loads(FOUND.read_text(encoding="utf-8"))
     values = {field.name: field.default for field in dataclasses.fields(kind)}

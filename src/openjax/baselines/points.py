@@ -1,5 +1,5 @@
-"""Pursuers that are points, of whom theorems speak, and how they fly: games whose answer is known,
-and what a vehicle's inertia costs beside them.
+"""Pursuers that are points, of whom theorems speak, and how they fly: games whose
+answer is known, and what a vehicle's inertia costs beside them.
 """
 
 import dataclasses
@@ -16,8 +16,8 @@ from openjax.vehicle import DroneState
 
 @dataclasses.dataclass(frozen=True)
 class Points:
-    """Dynamics in which pursuers are points: the last three numbers of an action are a velocity, as
-    shares of `speed` (m/s).
+    """Dynamics in which pursuers are points: the last three numbers of an action are a
+    velocity, as shares of `speed` (m/s).
     """
 
     speed: float
@@ -27,7 +27,9 @@ class Points:
         """They start where they are."""
         return drones
 
-    def __call__(self, vehicle, drones: DroneState, command: jax.Array, *_) -> DroneState:
+    def __call__(
+        self, vehicle, drones: DroneState, command: jax.Array, *_
+    ) -> DroneState:
         """The points a step later; nothing is solid to them."""
         share = command[:, 1:] / jnp.pi
         velocity = self.speed * share / jnp.maximum(length(share), 1.0)
@@ -42,15 +44,20 @@ class Points:
 
 def game_of_points(**changes) -> Pursuit:
     """A game of points in an arena without pillars, if its tasks have none."""
-    fixed = {"physics": "stops", "speed_limit": "none", "min_pillars": 0, "max_pillars": 1}
+    fixed = {
+        "physics": "stops",
+        "speed_limit": "none",
+        "min_pillars": 0,
+        "max_pillars": 1,
+    }
     settings = PursuitSettings(**(fixed | changes))
     return Pursuit(settings, dynamics=Points(settings.max_speed, settings.time_step))
 
 
 @dataclasses.dataclass(frozen=True)
 class Team:
-    """A policy for `Points`, by a function from observations to velocities (..., N, 3) as shares of
-    the speed.
+    """A policy for `Points`, by a function from observations to velocities (..., N, 3)
+    as shares of the speed.
     """
 
     velocity: Callable[[Observation], jax.Array]
@@ -64,6 +71,10 @@ class Team:
 def stack_team(environment: Pursuit) -> Team:
     """Stack, by points that correct themselves within a step."""
     settings = environment.settings
-    craft = dataclasses.replace(Craft.of(environment), speed=settings.max_speed, response=0.0)
+    craft = dataclasses.replace(
+        Craft.of(environment), speed=settings.max_speed, response=0.0
+    )
     how = StackParameters(tolerance=0.05, gain=1.0 / settings.time_step)
-    return Team(lambda seen: stack(craft, how, surroundings(craft, seen)) / settings.max_speed)
+    return Team(
+        lambda seen: stack(craft, how, surroundings(craft, seen)) / settings.max_speed
+    )

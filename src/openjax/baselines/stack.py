@@ -1,18 +1,20 @@
-"""Stack: point pursuers that force a capture of a faster evader in an arena without pillars.
+"""Stack: point pursuers that force a capture of a faster evader in an arena without
+pillars.
 
-All N gather on the arena's axis at heights (2 i - 1) H / 2 N, keep the evader's angle about the
-axis, and move outwards. The evader is never farther than H / 2 N above or below one of these
-heights, so that pursuer has it within r once they are within s = sqrt(r^2 - (H / 2 N)^2) of it
-along the ray. A pursuer at radius x keeps the angle of an evader at radius y if v_p y >= v_e x; the
-worst is the wall, y = R, up to x = R - s. So a capture is forced within finite time if
+All N gather on the arena's axis at heights (2 i - 1) H / 2 N, keep the evader's angle
+about the axis, and move outwards. The evader is never farther than H / 2 N above or
+below one of these heights, so that pursuer has it within r once they are within s =
+sqrt(r^2 - (H / 2 N)^2) of it along the ray. A pursuer at radius x keeps the angle of an
+evader at radius y if v_p y >= v_e x; the worst is the wall, y = R, up to x = R - s. So
+a capture is forced within finite time if
 
     v_e / v_p < R / (R - sqrt(r^2 - (H / 2 N)^2)),
 
-1.331 for three pursuers, r = .3 m, R = .9 m, H = 1.2 m. (An evader between axis and pursuer has
-crossed s before.)
+1.331 for three pursuers, r = .3 m, R = .9 m, H = 1.2 m. (An evader between axis and
+pursuer has crossed s before.)
 
-They can do more (`planar_bound`): while they keep its angle, the evader at the wall must run to one
-side, and they dash at where it will be.
+They can do more (`planar_bound`): while they keep its angle, the evader at the wall
+must run to one side, and they dash at where it will be.
 """
 
 import math
@@ -30,8 +32,8 @@ LARGEST = 1000.0
 
 
 def stack_bound(settings: PursuitSettings) -> float:
-    """The ratio of speeds v_e / v_p below which stack forces a capture; 0 where a pursuer's height
-    isn't covered.
+    """The ratio of speeds v_e / v_p below which stack forces a capture; 0 where a
+    pursuer's height isn't covered.
     """
     half = settings.arena_height / (2 * settings.num_pursuers)
     if half >= settings.capture_radius:
@@ -41,18 +43,19 @@ def stack_bound(settings: PursuitSettings) -> float:
 
 
 def planar_bound(settings: PursuitSettings) -> float:
-    """The ratio of speeds v = v_e / v_p below which points that fly one above another capture; 0
-    where a pursuer's height isn't covered, at most `LARGEST`. How they do it isn't here.
+    """The ratio of speeds v = v_e / v_p below which points that fly one above another
+    capture; 0 where a pursuer's height isn't covered, at most `LARGEST`. How they do it
+    isn't here.
 
-    Up to the radius R / v they keep the evader's angle. From there it must run one way round the
-    wall, and they dash straight on, across the ray. They are nearest when it has come to the angle
-    a with cos a = 1 / v, at R (sin a - a / v); so leaves the lady in the lake (Isaacs, 1965), who
-    flees from the one that runs round. They capture if
+    Up to the radius R / v they keep the evader's angle. From there it must run one way
+    round the wall, and they dash straight on, across the ray. They are nearest when it
+    has come to the angle a with cos a = 1 / v, at R (sin a - a / v); so leaves the lady
+    in the lake (Isaacs, 1965), who flees from the one that runs round. They capture if
 
         sqrt(1 - 1 / v^2) - arccos(1 / v) / v < s / R.
 
-    It isn't proved that neither side does better; the game of both points solved on grids says the
-    same within their errors (`experiments.evaders.planar`).
+    It isn't proved that neither side does better; the game of both points solved on
+    grids says the same within their errors (`experiments.evaders.planar`).
     """
     half = settings.arena_height / (2 * settings.num_pursuers)
     if half >= settings.capture_radius:
@@ -70,16 +73,16 @@ def planar_bound(settings: PursuitSettings) -> float:
 
 
 def nearest_in_disc(ratio: float) -> float:
-    """How near a point comes to one in a disc that is `ratio` > 1 times as fast, in radii; see
-    `planar_bound`.
+    """How near a point comes to one in a disc that is `ratio` > 1 times as fast, in
+    radii; see `planar_bound`.
     """
     return math.sqrt(1.0 - ratio**-2) - math.acos(1.0 / ratio) / ratio
 
 
 @struct.dataclass
 class StackParameters:
-    """How well pursuers must stand on the ray before they move outwards, and how fast they correct
-    themselves.
+    """How well pursuers must stand on the ray before they move outwards, and how fast
+    they correct themselves.
     """
 
     tolerance: jax.Array = parameter(0.05, 0.005, 0.2)
@@ -99,16 +102,21 @@ def stack(craft: Craft, parameters: StackParameters, around: Surroundings) -> ja
     aside = jnp.stack([-out[..., 1], out[..., 0]], axis=-1)
     along = jnp.sum(place * out, axis=-1)
     across = jnp.sum(place * aside, axis=-1)
-    ready = (jnp.abs(height) < parameters.tolerance) & (jnp.abs(across) < parameters.tolerance)
+    ready = (jnp.abs(height) < parameters.tolerance) & (
+        jnp.abs(across) < parameters.tolerance
+    )
     # all must stand before any moves: the bound holds for a whole stack only
     ready = jnp.all(ready & (along > -parameters.tolerance), axis=-1, keepdims=True)
 
     def cut(speed, rest):
-        """Velocity at most what is left of the speed, and what then is left (both (...,))."""
+        """Velocity at most what is left of the speed, and what then is left (both
+        (...,)).
+        """
         speed = jnp.clip(speed, -rest, rest)
         return speed, jnp.sqrt(jnp.maximum(rest**2 - speed**2, 0.0))
 
-    # what keeps the ray comes first, then the height; moving outwards gets what speed is left
+    # what keeps the ray comes first, then the height; moving outwards gets what speed
+    # is left
     left = jnp.full_like(height, craft.speed)
     aside_speed, left = cut(-parameters.gain * across, left)
     up, left = cut(parameters.gain * height, left)
@@ -116,7 +124,9 @@ def stack(craft: Craft, parameters: StackParameters, around: Surroundings) -> ja
 
     # before that each flies to its place on the axis
     gather = -parameters.gain * place
-    size = jnp.sqrt(jnp.sum(gather**2, axis=-1) + (parameters.gain * height) ** 2 + 1e-12)
+    size = jnp.sqrt(
+        jnp.sum(gather**2, axis=-1) + (parameters.gain * height) ** 2 + 1e-12
+    )
     gather = gather * jnp.minimum(1.0, craft.speed / size)[..., None]
     rise = parameters.gain * height * jnp.minimum(1.0, craft.speed / size)
     level = jnp.where(ready[..., None], forwards, gather)

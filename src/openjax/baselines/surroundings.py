@@ -1,4 +1,6 @@
-"""What a pursuer knows of its surroundings, read out of its observation in plain terms."""
+"""What a pursuer knows of its surroundings, read out of its observation in plain
+terms.
+"""
 
 import dataclasses
 
@@ -14,7 +16,9 @@ from openjax.vehicle.solids import others
 
 QUATERNION = slice(3, 7)
 VELOCITY = slice(7, 10)
-"""Where they stand in a pursuer's own part of the observation (`openjax.pursuit.observation`)."""
+"""Where they stand in a pursuer's own part of the observation
+(`openjax.pursuit.observation`).
+"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,23 +30,23 @@ class Craft:
     arena_height: float = 1.2
     """m"""
     speed: float = 0.98
-    """Speed that the methods command (m/s): short of the largest by the velocity controller's
-    overshoot.
+    """Speed that the methods command (m/s): short of the largest by the velocity
+    controller's overshoot.
     """
     hover_thrust: float = 0.625
     """Collective thrust that carries the vehicle, as a share of the largest."""
     history_seconds: float = 0.09
     """Time between the first and the last frame of the observed history (s)."""
     response: float = 0.15
-    """Time that the velocity controller takes to fly what it is told (s). A method is asked what it
-    would do where all will be by then: a point mass, which it takes itself for, would turn at
-    once.
+    """Time that the velocity controller takes to fly what it is told (s). A method is
+    asked what it would do where all will be by then: a point mass, which it takes
+    itself for, would turn at once.
     """
 
     @classmethod
     def of(cls, environment: Pursuit) -> "Craft":
-        """The craft of an environment's pursuers; UserError where they don't observe in the world's
-        axes.
+        """The craft of an environment's pursuers; UserError where they don't observe in
+        the world's axes.
         """
         settings = environment.settings
         if settings.observe_in != "world":
@@ -50,7 +54,8 @@ class Craft:
                 f"environment.observe_in {settings.observe_in}: methods that fly velocities need "
                 "world"
             )
-        with jax.ensure_compile_time_eval():  # an environment may be made inside a compiled program
+        # an environment may be made inside a compiled program
+        with jax.ensure_compile_time_eval():
             hover = round(float(hover_share(environment.vehicle)), 6)
         return cls(
             arena_radius=settings.arena_radius,
@@ -65,21 +70,24 @@ class Craft:
 
 @struct.dataclass
 class Surroundings:
-    """N pursuers' surroundings after their response time, all flying straight on; leading axes as
-    in the observation. World frame, m and m/s.
+    """N pursuers' surroundings after their response time, all flying straight on;
+    leading axes as in the observation. World frame, m and m/s.
     """
 
     position: jax.Array  # (..., N, 3)
     velocity: jax.Array  # (..., N, 3)
     target: jax.Array
-    """(..., N, 3) the evader; while it is hidden where it was last seen, and the middle before."""
+    """(..., N, 3) the evader; while it is hidden where it was last seen, and the middle
+    before.
+    """
     target_velocity: jax.Array  # (..., N, 3) zero while it is hidden
     from_others: jax.Array  # (..., N, N - 1, 3) position relative to each other pursuer
-    from_others_velocity: jax.Array  # (..., N, N - 1, 3) velocity relative to each other pursuer
+    # (..., N, N - 1, 3) velocity relative to each other pursuer
+    from_others_velocity: jax.Array
     team_velocity: jax.Array  # (..., N, 3) mean velocity of all pursuers
     obstacle_normal: jax.Array
-    """(..., N, k + 1, 2) away from each pillar in sight and from the arena's wall, of unit
-    length.
+    """(..., N, k + 1, 2) away from each pillar in sight and from the arena's wall, of
+    unit length.
     """
     obstacle_distance: jax.Array
     """(..., N, k + 1) to their surface; infinite where there is no pillar."""
@@ -90,21 +98,23 @@ class Surroundings:
 def surroundings(craft: Craft, observation: Observation) -> Surroundings:
     """Read an observation of (..., N) pursuers.
 
-    The others' velocities are those of the observed history, mean over its length (0.09 s by
-    default): a pursuer measures no velocity but its own.
+    The others' velocities are those of the observed history, mean over its length (0.09
+    s by default): a pursuer measures no velocity but its own.
     """
     own = observation.position
     velocity = observation.self_state[..., VELOCITY]
     number = own.shape[-2]
     newest = observation.frames[..., -1, :]
-    # what is hidden is shown at HIDDEN exactly, far below any place; .9 allows for rounding
+    # what is hidden is shown at HIDDEN exactly, far below any place; .9 allows for
+    # rounding
     seen = newest[..., 1:2] > 0.9 * HIDDEN
     per_pursuer = (*own.shape[:-2], number, 3)
 
     def for_all(vector):
         return jnp.broadcast_to(vector[..., None, :], per_pursuer)
 
-    # a frame is time (1), evader's position and velocity (6) and the pursuers' positions
+    # a frame is time (1), evader's position and velocity (6) and the pursuers'
+    # positions
     moved = newest[..., 7:] - observation.frames[..., 0, 7:]
     velocities = moved.reshape(per_pursuer) / max(craft.history_seconds, 1e-6)
     apart_velocity = velocities[..., :, None, :] - velocities[..., others(number), :]
@@ -136,7 +146,8 @@ def _obstacles(craft, observation):
     to_pillar = jnp.where(observation.pillar_seen, across - pillar[..., 4], jnp.inf)
     radius = jnp.sqrt(jnp.sum(own[..., :2] ** 2, axis=-1, keepdims=True) + 1e-12)
     normal = jnp.concatenate(
-        [pillar[..., :2] / across[..., None], (-own[..., :2] / radius)[..., None, :]], axis=-2
+        [pillar[..., :2] / across[..., None], (-own[..., :2] / radius)[..., None, :]],
+        axis=-2,
     )
     distance = jnp.concatenate([to_pillar, craft.arena_radius - radius], axis=-1)
     # along today's normal: straight on, a drone might come out behind a pillar

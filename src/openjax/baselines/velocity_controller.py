@@ -1,9 +1,10 @@
-"""The velocity controller: a point mass's velocity as thrust and body rates of the real vehicle.
+"""The velocity controller: a point mass's velocity as thrust and body rates of the real
+vehicle.
 
-A desired velocity becomes an acceleration, that a direction and size of the thrust, and the body's
-z axis is turned there: the translational half of the geometric controller of Lee, Leok and
-McClamroch (2010), with the attitude loop left to the vehicle's own rate controller. A function of
-the observation alone, without memory.
+A desired velocity becomes an acceleration, that a direction and size of the thrust, and
+the body's z axis is turned there: the translational half of the geometric controller of
+Lee, Leok and McClamroch (2010), with the attitude loop left to the vehicle's own rate
+controller. A function of the observation alone, without memory.
 """
 
 import jax
@@ -15,8 +16,8 @@ from openjax.pursuit import Observation
 from openjax.pursuit.observation import rotation_axes
 
 VELOCITY_GAIN = 6.0
-"""1/s, velocity error to acceleration: slower than the attitude, whose lag is that of the motors
-(25 ms) and of the turn.
+"""1/s, velocity error to acceleration: slower than the attitude, whose lag is that of
+the motors (25 ms) and of the turn.
 """
 ATTITUDE_GAIN = 15.0
 """1/s, error of the body's z axis (rad) to body rates."""
@@ -25,8 +26,8 @@ LARGEST_TILT = 0.7
 YAW_GAIN = 2.0
 """1/s, yaw (rad) to yaw rate: the nose is turned to the world's x axis."""
 CLIMB_LIMITS = (-0.5, 0.3)
-"""Vertical acceleration in units of gravity; thrust over weight is 1.44 with the commanded thrust
-cut at 0.9.
+"""Vertical acceleration in units of gravity; thrust over weight is 1.44 with the
+commanded thrust cut at 0.9.
 """
 GRAVITY = 9.81
 """m/s^2"""
@@ -37,8 +38,8 @@ HEAVIEST = 0.8
 
 
 def check_flyable(name: str, craft: Craft, time_step: float) -> None:
-    """Raises UserError where the controller can't fly this craft with control steps of `time_step`
-    (s) for `name`.
+    """Raises UserError where the controller can't fly this craft with control steps of
+    `time_step` (s) for `name`.
     """
     if time_step > SLOWEST_CONTROL:
         raise UserError(
@@ -52,21 +53,27 @@ def check_flyable(name: str, craft: Craft, time_step: float) -> None:
         )
 
 
-def velocity_action(craft: Craft, observation: Observation, desired: jax.Array) -> jax.Array:
-    """(..., N, 4) action in -1..1 (thrust, body rates) that flies the desired velocities (..., N,
-    3) in m/s, world.
+def velocity_action(
+    craft: Craft, observation: Observation, desired: jax.Array
+) -> jax.Array:
+    """(..., N, 4) action in -1..1 (thrust, body rates) that flies the desired
+    velocities (..., N, 3) in m/s, world.
     """
     own = observation.self_state
     body_x, body_z = rotation_axes(own[..., QUATERNION])
-    thrust = VELOCITY_GAIN / GRAVITY * (desired - own[..., VELOCITY])  # in units of the weight
+    # in units of the weight
+    thrust = VELOCITY_GAIN / GRAVITY * (desired - own[..., VELOCITY])
     rise = 1.0 + jnp.clip(thrust[..., 2:], *CLIMB_LIMITS)
-    # height before the rest: what a limited tilt can't do is left of the horizontal part
+    # height before the rest: what a limited tilt can't do is left of the horizontal
+    # part
     lean = thrust[..., :2]
     lean = lean * jnp.minimum(1.0, LARGEST_TILT * rise / length(lean))
     thrust = jnp.concatenate([lean, rise], axis=-1)
-    # as much of it as the body's axis can do at present: who leans elsewhere turns first
+    # as much of it as the body's axis can do at present: who leans elsewhere turns
+    # first
     share = craft.hover_thrust * jnp.sum(thrust * body_z, axis=-1)
-    # the cross product is the axis about which to turn, as long as the sine of the angle
+    # the cross product is the axis about which to turn, as long as the sine of the
+    # angle
     turn = ATTITUDE_GAIN * jnp.cross(body_z, unit(thrust))
     yaw = jnp.arctan2(body_x[..., 1], body_x[..., 0])
     roll_rate = _dot(turn, body_x)

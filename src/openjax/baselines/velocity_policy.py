@@ -1,9 +1,9 @@
-"""A network that says where to fly, and a controller that flies there: the easier half of the
-paper's task.
+"""A network that says where to fly, and a controller that flies there: the easier half
+of the paper's task.
 
-The paper's policies command thrust and body rates, so they must learn to stay in the air before
-they can learn to chase. Here a sample is a velocity, which the baselines' velocity controller
-flies.
+The paper's policies command thrust and body rates, so they must learn to stay in the
+air before they can learn to chase. Here a sample is a velocity, which the baselines'
+velocity controller flies.
 """
 
 import dataclasses
@@ -29,8 +29,8 @@ class VelocityPolicy(CraftPolicy):
         return 0.0, 0.0, 0.0
 
     def action(self, sample: jax.Array, observation: Observation) -> jax.Array:
-        """The action (..., N, 4) in -1..1 that a sample (..., N, 3) of the Gaussian, or its mean,
-        stands for.
+        """The action (..., N, 4) in -1..1 that a sample (..., N, 3) of the Gaussian, or
+        its mean, stands for.
         """
         velocity = self.craft.speed * super().action(sample, observation)
         # components in -1..1 make a cube: its corners are cut to the largest speed

@@ -1,1 +1,3 @@
-"""The fit of the nominal vehicle to flights: thrust and torque constants, motor lag, inertia."""
+"""The fit of the nominal vehicle to flights: thrust and torque constants, motor lag,
+inertia.
+"""

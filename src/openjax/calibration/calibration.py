@@ -1,9 +1,10 @@
-"""Calibration: the nominal vehicle's own constants from flights, with intervals and with what can't
-be told.
+"""Calibration: the nominal vehicle's own constants from flights, with intervals and
+with what can't be told.
 
-The constants are parameters of effects, fitted all at once by the diagnosis' replay: through the
-simulator, with its sensors' nuisances and its coloured noise, beside what usually acts as well.
-Errors come from that noise, or from what flights disagree by where that is more.
+The constants are parameters of effects, fitted all at once by the diagnosis' replay:
+through the simulator, with its sensors' nuisances and its coloured noise, beside what
+usually acts as well. Errors come from that noise, or from what flights disagree by
+where that is more.
 """
 
 import dataclasses
@@ -27,15 +28,17 @@ FITTED = ("thrust_scale", "yaw_torque", "motor_lag", "inertia")
 # effects that usually act as well, and mustn't be taken for them
 BESIDE = ("rotor_drag", "com_offset", "ground_effect", "ceiling_effect", "downwash")
 ITERATIONS = 12
-# share of the prior's standard deviation: a constant with a larger one isn't told by these flights
+# share of the prior's standard deviation: a constant with a larger one isn't told by
+# these flights
 DETERMINED = 0.5
-# share of the rates' changes that motors explain: below, no constant that rates tell can be trusted
+# share of the rates' changes that motors explain: below, no constant that rates tell
+# can be trusted
 LEAST_EXPLAINED = 0.9
 HORIZON = 0.25  # s over which changes are explained
 YAW_INERTIA_RANGE = (0.7, 1.6)  # of nominal; what it may be where it is assumed
-# Relative error (standard deviation) that remains however long one flies: commands and states are
-# known every 10 ms only, and thrust differs by up to a per cent from flight to flight. Measured by
-# closed loop.
+# Relative error (standard deviation) that remains however long one flies: commands and
+# states are known every 10 ms only, and thrust differs by up to a per cent from flight
+# to flight. Measured by closed loop.
 MODEL_ERROR = {
     "thrust_constant": 0.005,
     "torque_constant": 0.005,
@@ -74,8 +77,8 @@ _ASSUMED_MASS = "for the assumed mass, which wasn't weighed"
 
 @dataclass(frozen=True)
 class Quantity:
-    """A fitted constant: value, 90 % interval and nominal value, each a tuple of length 1 (3 for
-    inertia).
+    """A fitted constant: value, 90 % interval and nominal value, each a tuple of length
+    1 (3 for inertia).
     """
 
     value: tuple[float, ...]
@@ -97,8 +100,8 @@ class Calibration:
     nuisances: dict[str, tuple[float, str]] = field(default_factory=dict)
     """What was fitted beside: {name: (value, unit)}."""
     explained: dict[str, tuple[float, float]] = field(default_factory=dict)
-    """{kind of channel: share of its changes that the nominal vehicle explains, and the fitted
-    one}.
+    """{kind of channel: share of its changes that the nominal vehicle explains, and the
+    fitted one}.
     """
     flights: tuple[str, ...] = ()
     seconds: float = 0.0
@@ -114,7 +117,8 @@ class Calibration:
 
 
 def calibrate(case: Case) -> Calibration:
-    """Fit thrust constant, torque constant, motor time constant and inertia to a case's flights.
+    """Fit thrust constant, torque constant, motor time constant and inertia to a case's
+    flights.
 
     Raises UserError if no flight holds motor commands and body rates.
     """
@@ -126,7 +130,9 @@ def calibrate(case: Case) -> Calibration:
         )
     evidence = gather(dataclasses.replace(case, flights=usable), library())
     exposure = evidence.motion.exposure
-    effects = [e for e in CARDS if e in FITTED or (e in BESIDE and exposure[e] >= UNEXPOSED)]
+    effects = [
+        e for e in CARDS if e in FITTED or (e in BESIDE and exposure[e] >= UNEXPOSED)
+    ]
     replay = _without_numbers(evidence.replay)
     fit = fit_set(replay, effects, iterations=ITERATIONS)
     nothing = fit_set(replay, ())
@@ -150,8 +156,8 @@ def calibrate(case: Case) -> Calibration:
 
 
 def _without_numbers(replay):
-    """A replay in which the vehicle's numbers are what is fitted, and no nuisances. A diagnosis
-    lets them vary beside every effect; they come first among the nuisances.
+    """A replay in which the vehicle's numbers are what is fitted, and no nuisances. A
+    diagnosis lets them vary beside every effect; they come first among the nuisances.
     """
     vehicle = len(replay.numbers)
     return dataclasses.replace(
@@ -164,13 +170,17 @@ def _without_numbers(replay):
 
 
 def logarithms(theta: np.ndarray, vehicle, duty_cycles: bool) -> dict[str, np.ndarray]:
-    """{constant: logarithms of its values over the nominal ones, (1,) or (2,)} at parameters theta
-    (P,). Yaw shows only the ratio of torque to inertia, which is told for the nominal inertia; with
-    duty cycles for the nominal thrust constant.
+    """{constant: logarithms of its values over the nominal ones, (1,) or (2,)} at
+    parameters theta (P,). Yaw shows only the ratio of torque to inertia, which is told
+    for the nominal inertia; with duty cycles for the nominal thrust constant.
     """
     at = {key: theta[place] for key, place in PLACE.items() if key[0] in FITTED}
     thrust = 1.0 + at["thrust_scale", "scale"]
-    torque = (1.0 if duty_cycles else thrust) * at["yaw_torque", "ratio"] / at["inertia", "zz"]
+    torque = (
+        (1.0 if duty_cycles else thrust)
+        * at["yaw_torque", "ratio"]
+        / at["inertia", "zz"]
+    )
     lag = 0.5 * (at["motor_lag", "extra_up"] + at["motor_lag", "extra_down"])
     found = {
         "thrust_constant": [thrust],
@@ -181,11 +191,14 @@ def logarithms(theta: np.ndarray, vehicle, duty_cycles: bool) -> dict[str, np.nd
     return {name: np.log(np.maximum(values, 1e-3)) for name, values in found.items()}
 
 
-def _quantities(evidence: Evidence, fit: SetFit, rates_fit: bool) -> dict[str, Quantity]:
+def _quantities(
+    evidence: Evidence, fit: SetFit, rates_fit: bool
+) -> dict[str, Quantity]:
     file = evidence.case.vehicle_file
     vehicle = evidence.vehicles[0]
     duty_cycles = file.motor.command == "pwm"
-    # where flights disagree by more than the noise explains, errors are as large as that
+    # where flights disagree by more than the noise explains, errors are as large as
+    # that
     robust = robust_deviation(fit.covariance, fit.grams[:, 1:, 0])
     wider = robust / np.sqrt(np.diag(fit.covariance))
     posterior = fit.covariance * np.outer(wider, wider)
@@ -209,8 +222,8 @@ def _quantities(evidence: Evidence, fit: SetFit, rates_fit: bool) -> dict[str, Q
 
 
 def _slopes(fit: SetFit, vehicle, duty_cycles: bool) -> dict[str, np.ndarray]:
-    """{constant: (1 or 2, F) slopes of its logarithms in the F fitted parameters}, by difference
-    quotients.
+    """{constant: (1 or 2, F) slopes of its logarithms in the F fitted parameters}, by
+    difference quotients.
     """
     step = 1e-5
     here = logarithms(fit.theta, vehicle, duty_cycles)
@@ -228,7 +241,8 @@ def _quantity(
 ) -> Quantity:
     nominal = np.atleast_1d(np.asarray(getattr(vehicle, name), float))
     value = nominal.copy()
-    # of the inertia x and y are fitted; z stays nominal, in the range in which it may be
+    # of the inertia x and y are fitted; z stays nominal, in the range in which it may
+    # be
     value[: len(logs)] *= np.exp(logs)
     reach = np.exp(REACH * deviations)
     fitted = zip(value[: len(logs)], reach, strict=True)
@@ -253,14 +267,16 @@ def _quantity(
 def _cannot_tell(
     evidence: Evidence, fit: SetFit, quantities: dict[str, Quantity], share: float
 ) -> list[str]:
-    """What these flights leave open, in words. `share` of the rates' changes that the fitted
-    vehicle explains.
+    """What these flights leave open, in words. `share` of the rates' changes that the
+    fitted vehicle explains.
     """
     file = evidence.case.vehicle_file
     out = []
     untold = []
     if file.motor.command == "pwm":
-        out.append(_UNKNOWN_MAP.format(scale=1.0 + fit.theta[PLACE["thrust_scale", "scale"]]))
+        out.append(
+            _UNKNOWN_MAP.format(scale=1.0 + fit.theta[PLACE["thrust_scale", "scale"]])
+        )
         untold.append("thrust_constant")
     if not file.mass_weighed:
         out.append(_NOT_WEIGHED.format(grams=float(evidence.vehicles[0].mass) * 1e3))
@@ -270,19 +286,27 @@ def _cannot_tell(
         untold += TOLD_BY_RATES
     hardly = [n for n in _ADVICE if n not in untold and not quantities[n].determined]
     return out + [
-        f"{n.replace('_', ' ')}: these flights hardly excite it; {_ADVICE[n]}" for n in hardly
+        f"{n.replace('_', ' ')}: these flights hardly excite it; {_ADVICE[n]}"
+        for n in hardly
     ]
 
 
 def _explained(replay, nothing: SetFit, fit: SetFit) -> dict[str, tuple[float, float]]:
-    """Per kind of channel the share of its changes over HORIZON that the nominal vehicle explains,
-    and the fitted one.
+    """Per kind of channel the share of its changes over HORIZON that the nominal
+    vehicle explains, and the fitted one.
     """
-    kinds = {"body rates": slice(0, 3), "velocity": slice(3, 6), "specific force": slice(8, 9)}
+    kinds = {
+        "body rates": slice(0, 3),
+        "velocity": slice(3, 6),
+        "specific force": slice(8, 9),
+    }
     steps = [max(round(HORIZON / t.dt), 1) for t in replay.tracks]
 
     def square(values, channels) -> float:
-        changes = (v[n:, channels] - v[:-n, channels] for v, n in zip(values, steps, strict=True))
+        changes = (
+            v[n:, channels] - v[:-n, channels]
+            for v, n in zip(values, steps, strict=True)
+        )
         return float(sum((c**2).sum() for c in changes))
 
     residuals = (residuals_of(nothing), residuals_of(fit))
@@ -290,5 +314,7 @@ def _explained(replay, nothing: SetFit, fit: SetFit) -> dict[str, tuple[float, f
     for kind, channels in kinds.items():
         if replay.usable[channels].all():
             whole = square(replay.measured, channels)
-            explained[kind] = tuple(1.0 - square(left, channels) / whole for left in residuals)
+            explained[kind] = tuple(
+                1.0 - square(left, channels) / whole for left in residuals
+            )
     return explained

@@ -1,9 +1,9 @@
-"""A training run on several devices, of one host or of many: the worlds are shared out, all else is
-the same on each.
+"""A training run on several devices, of one host or of many: the worlds are shared out,
+all else is the same on each.
 
 The step sees its own device's worlds and averages over all where it must
-(`openjax.learning.collectives`), so that one device and many give the same result on the same
-worlds, up to the order of sums.
+(`openjax.learning.collectives`), so that one device and many give the same result on
+the same worlds, up to the order of sums.
 """
 
 import dataclasses
@@ -25,8 +25,8 @@ _SHARED_OUT = ("observation", "state")
 
 
 def can_share_out(settings: TrainSettings, number: int) -> bool:
-    """Whether each of `number` devices gets the same share of the worlds, of every task and of
-    every minibatch.
+    """Whether each of `number` devices gets the same share of the worlds, of every task
+    and of every minibatch.
     """
     return number == 1 or settings.num_envs % (number * _group(settings)) == 0
 
@@ -35,8 +35,8 @@ def check_devices(settings: TrainSettings, number: int) -> None:
     """Whether the worlds can be shared out.
 
     Raises:
-      UserError: they can't, with the next number of worlds that could, and the numbers of devices
-      that can.
+      UserError: they can't, with the next number of worlds that could, and the numbers
+      of devices that can.
     """
     if not can_share_out(settings, number):
         unit = number * _group(settings)
@@ -54,7 +54,8 @@ def _group(settings):
 
 
 def check_memory(settings: TrainSettings, number: int) -> None:
-    """Whether what the worlds, a rollout and the archive hold at least fits into `number` devices.
+    """Whether what the worlds, a rollout and the archive hold at least fits into
+    `number` devices.
 
     Raises:
       UserError: it doesn't; said before anything is compiled.
@@ -102,11 +103,15 @@ def everywhere(number: int) -> jax.sharding.Sharding:
 def own_copy(tree: Any) -> Any:
     """Arrays that every device has whole, on this process' first device."""
     device = jax.local_devices()[0]
-    return jax.tree.map(lambda leaf: jax.device_put(leaf.addressable_data(0), device), tree)
+    return jax.tree.map(
+        lambda leaf: jax.device_put(leaf.addressable_data(0), device), tree
+    )
 
 
 def make_device_step(settings: TrainSettings, parts: Parts, number: int) -> Callable:
-    """The training step `carry -> (carry, metrics)` on `number` devices, not yet compiled."""
+    """The training step `carry -> (carry, metrics)` on `number` devices, not yet
+    compiled.
+    """
     if number == 1:
         return make_training_step(settings, parts)
     step = make_training_step(settings, parts, axis=AXIS)
@@ -118,8 +123,8 @@ def make_device_step(settings: TrainSettings, parts: Parts, number: int) -> Call
 def make_device_first_flights(
     flights: FirstFlights, together: int, number: int
 ) -> tuple[Callable, Callable, Any]:
-    """`flights.begin` and `make_first_flights` on `number` devices, not yet compiled; where the
-    leaves of their carry lie.
+    """`flights.begin` and `make_first_flights` on `number` devices, not yet compiled;
+    where the leaves of their carry lie.
     """
     if number == 1:
         return flights.begin, make_first_flights(flights, together), None
@@ -128,18 +133,23 @@ def make_device_first_flights(
     carry = FirstCarry(same, same, PartitionSpec(AXIS), same)
     begin = _shared_out(number, flights.begin, (same, same), carry)
     some = _shared_out(
-        number, make_first_flights(flights, together), (carry, same, same), (carry, same)
+        number,
+        make_first_flights(flights, together),
+        (carry, same, same),
+        (carry, same),
     )
-    at = {name: NamedSharding(_mesh(number), spec) for name, spec in vars(carry).items()}
+    at = {
+        name: NamedSharding(_mesh(number), spec) for name, spec in vars(carry).items()
+    }
     return begin, some, FirstCarry(**at)
 
 
 def compiler_options(number: int, brief: bool = False) -> dict:
     """For programs on `number` devices; a `brief` one runs for seconds alone.
 
-    On a GPU XLA tries each matrix product in dozens of ways. That is half of its work, and where it
-    doesn't, a training step takes three times as long. A brief program takes those of cuBLAS as
-    they are.
+    On a GPU XLA tries each matrix product in dozens of ways. That is half of its work,
+    and where it doesn't, a training step takes three times as long. A brief program
+    takes those of cuBLAS as they are.
     """
     backend = jax.default_backend()
     if backend == "gpu" and brief:
@@ -151,7 +161,9 @@ def compiler_options(number: int, brief: bool = False) -> dict:
 
 
 def _shared_out(number, function, takes, gives):
-    """A function of each device's share as one of the whole, as the specifications have it."""
+    """A function of each device's share as one of the whole, as the specifications have
+    it.
+    """
     # gradients are averaged in it; with the check on, they'd be summed before that
     return jax.shard_map(
         function, mesh=_mesh(number), in_specs=takes, out_specs=gives, check_vma=False
@@ -164,4 +176,6 @@ def _mesh(number):
 
 def _carry_of(shared_out, same):
     fields = TrainCarry.__dataclass_fields__
-    return TrainCarry(**{name: shared_out if name in _SHARED_OUT else same for name in fields})
+    return TrainCarry(
+        **{name: shared_out if name in _SHARED_OUT else same for name in fields}
+    )

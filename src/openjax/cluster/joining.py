@@ -1,5 +1,5 @@
-"""Joining a job of several processes: which place this one has, and the connections between
-them.
+"""Joining a job of several processes: which place this one has, and the connections
+between them.
 """
 
 import atexit
@@ -33,8 +33,8 @@ class Membership:
     num_processes: int
     process_id: int
     detection: str
-    """What JAX is to ask for this process' devices: `slurm`, `ompi`, or `deactivate` (all of the
-    host).
+    """What JAX is to ask for this process' devices: `slurm`, `ompi`, or `deactivate`
+    (all of the host).
     """
 
 
@@ -44,7 +44,8 @@ def find_membership(
     process_id: int | None,
     all_devices: bool,
 ) -> Membership | None:
-    """This process' place, from the command line or else from Slurm or Open MPI; None: it is alone.
+    """This process' place, from the command line or else from Slurm or Open MPI; None:
+    it is alone.
 
     Raises:
       UserError: the three make no sense, or one is missing and nothing else tells it.
@@ -75,7 +76,9 @@ def find_membership(
             "number less one"
         )
     if not all_devices:
-        raise UserError(f"{number} processes train on all of their devices; add --devices all")
+        raise UserError(
+            f"{number} processes train on all of their devices; add --devices all"
+        )
     return Membership(address, number, index, detection) if number > 1 else None
 
 
@@ -83,13 +86,15 @@ def _detected(place):
     """Who tells what is missing of address, number and id, and all three, as
     `jax.distributed.initialize` itself would find them.
 
-    Only its private part tells; the public one joins at once, and the processes' own connections
-    come before that.
+    Only its private part tells; the public one joins at once, and the processes' own
+    connections come before that.
     """
     from jax._src.clusters import ClusterEnv
 
     for name in _MANAGERS:
-        kind = next((kind for kind in ClusterEnv._cluster_types if kind.name == name), None)
+        kind = next(
+            (kind for kind in ClusterEnv._cluster_types if kind.name == name), None
+        )
         if kind is not None and kind.is_env_present():
             address, number, index = place
             parameters = ClusterEnv.auto_detect_unset_distributed_params(
@@ -101,8 +106,8 @@ def _detected(place):
 
 @contextlib.contextmanager
 def joined(membership: Membership | None) -> Iterator[Processes]:
-    """Join the job, before JAX touches a device; leave it together with the others, or tell them
-    what went wrong.
+    """Join the job, before JAX touches a device; leave it together with the others, or
+    tell them what went wrong.
 
     Raises:
       UserError: not all processes came in time, or a port is taken.
@@ -111,7 +116,9 @@ def joined(membership: Membership | None) -> Iterator[Processes]:
         yield Processes()
         return
     with _connected(membership) as (connections, address):
-        processes = Processes(membership.num_processes, membership.process_id, connections)
+        processes = Processes(
+            membership.num_processes, membership.process_id, connections
+        )
         _tune_alone()
         try:
             import jax
@@ -123,7 +130,8 @@ def joined(membership: Membership | None) -> Iterator[Processes]:
                 cluster_detection_method=membership.detection,
             )
             yield processes
-            processes.everyone()  # JAX's own barrier would not wait as long as process 0 draws
+            # JAX's own barrier would not wait as long as process 0 draws
+            processes.everyone()
             jax.distributed.shutdown()
             processes.leave()
         except BaseException as error:
@@ -138,14 +146,16 @@ def joined(membership: Membership | None) -> Iterator[Processes]:
                 status = 1
                 reason = f"{type(error).__name__}: {_one_line(error)}"
             processes.fail(status, reason)
-            # JAX would wait for the others at exit; once this error is told, nothing is left to do.
+            # JAX would wait for the others at exit; once this error is told, nothing is
+            # left to do.
             atexit.register(os._exit, status)
             raise
 
 
 def _tune_alone():
-    """Have XLA choose its GPU kernels in each process by itself. Shared, all processes wait for
-    each other's choices in every program, also in one that only process 0 compiles.
+    """Have XLA choose its GPU kernels in each process by itself. Shared, all processes
+    wait for each other's choices in every program, also in one that only process 0
+    compiles.
     """
     flags = os.environ.get("XLA_FLAGS", "")
     if "xla_gpu_shard_autotuning" not in flags:
@@ -158,8 +168,8 @@ def _one_line(error):
 
 @contextlib.contextmanager
 def _connected(membership):
-    """Connections by process (to all others on process 0, to process 0 elsewhere), and where JAX is
-    to look for its coordinator: at the port after process 0's own.
+    """Connections by process (to all others on process 0, to process 0 elsewhere), and
+    where JAX is to look for its coordinator: at the port after process 0's own.
     """
     host, _, port = membership.coordinator_address.rpartition(":")
     host = host.strip("[]")
@@ -175,12 +185,16 @@ def _connected(membership):
 
 
 def _listen(port):
-    """A server on all of this host's addresses. Raises UserError where the port is taken."""
+    """A server on all of this host's addresses. Raises UserError where the port is
+    taken.
+    """
     # hosts of a cluster may name each other by either kind of address
     both = socket.has_dualstack_ipv6()
     try:
         return socket.create_server(
-            ("", port), family=socket.AF_INET6 if both else socket.AF_INET, dualstack_ipv6=both
+            ("", port),
+            family=socket.AF_INET6 if both else socket.AF_INET,
+            dualstack_ipv6=both,
         )
     except OSError as error:
         raise UserError(
@@ -190,12 +204,12 @@ def _listen(port):
 
 @contextlib.contextmanager
 def _held_open(host, port):
-    """An address on this host that leads to another one, and whose connections stay open when that
-    is gone.
+    """An address on this host that leads to another one, and whose connections stay
+    open when that is gone.
 
-    JAX ends a process at once, by a stack trace, when its connection to the coordinator closes;
-    like this the process has time to say in one line what happened, which it learns from its own
-    connection.
+    JAX ends a process at once, by a stack trace, when its connection to the coordinator
+    closes; like this the process has time to say in one line what happened, which it
+    learns from its own connection.
     """
 
     def serve():
@@ -209,7 +223,9 @@ def _held_open(host, port):
                     continue
                 far.settimeout(None)
                 for source, sink in ((near, far), (far, near)):
-                    threading.Thread(target=_pump, args=(source, sink), daemon=True).start()
+                    threading.Thread(
+                        target=_pump, args=(source, sink), daemon=True
+                    ).start()
 
     with socket.create_server(("127.0.0.1", 0)) as server:
         threading.Thread(target=serve, daemon=True).start()
@@ -260,7 +276,8 @@ def _accept(server, number):
             ) from None
         connection.settimeout(10.0)
         reader = connection.makefile("rb")
-        with contextlib.suppress(OSError, ValueError, KeyError, TypeError):  # a stranger
+        # a stranger
+        with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
             greeting = json.loads(reader.readline(LINE))
             other = greeting["process"]
             if greeting["of"] == number and 1 <= other < number and other not in others:

@@ -1,10 +1,12 @@
-"""The processes of a job that trains on several hosts: what all of them know, and the loss of one.
+"""The processes of a job that trains on several hosts: what all of them know, and the
+loss of one.
 
-Arrays travel by JAX's own collectives. Beside these every process holds one TCP connection to
-process 0. Over it the processes agree on what only one of them knows (a signal, a clock, a score),
-and by it they notice a process that is gone. JAX's heartbeat (0.10) ends the others by a stack
-trace without a word of who was lost, whether or not it may recover, and its collectives time out
-while process 0 compiles or draws for minutes: so both are done here.
+Arrays travel by JAX's own collectives. Beside these every process holds one TCP
+connection to process 0. Over it the processes agree on what only one of them knows (a
+signal, a clock, a score), and by it they notice a process that is gone. JAX's heartbeat
+(0.10) ends the others by a stack trace without a word of who was lost, whether or not
+it may recover, and its collectives time out while process 0 compiles or draws for
+minutes: so both are done here.
 """
 
 import contextlib
@@ -43,9 +45,14 @@ class Processes:
     """
 
     def __init__(
-        self, number: int = 1, index: int = 0, connections: dict[int, Connection] | None = None
+        self,
+        number: int = 1,
+        index: int = 0,
+        connections: dict[int, Connection] | None = None,
     ):
-        """`connections` by process: to all others on process 0, to process 0 elsewhere."""
+        """`connections` by process: to all others on process 0, to process 0
+        elsewhere.
+        """
         self.number = number
         self.index = index
         self.advice = "start it again"
@@ -65,7 +72,9 @@ class Processes:
         return self.index == 0
 
     def everyone(self, value: Any = None) -> list:
-        """The values (JSON) of all processes in their order; waits until all have come here."""
+        """The values (JSON) of all processes in their order; waits until all have come
+        here.
+        """
         if not self._links:
             return [value]
         if not self.is_first:
@@ -87,19 +96,25 @@ class Processes:
             link.close(GRACE)
 
     def fail(self, status: int, text: str) -> None:
-        """Tell the others that this process ends with an exit status, and why; they end too."""
+        """Tell the others that this process ends with an exit status, and why; they end
+        too.
+        """
         # from here on no other process' end changes this one's
         self._ending.acquire(blocking=False)
         # what all did wrong, each reports by itself in the meantime
         self._send_all(
-            {"error": f"process {self.index} ended: {text}", "status": status, "after": GRACE}
+            {
+                "error": f"process {self.index} ended: {text}",
+                "status": status,
+                "after": GRACE,
+            }
         )
         for link in self._links.values():
             link.close(2 * GRACE)
 
     def await_verdict(self) -> None:
-        """After an error that a lost process may have caused: time for that news, which ends this
-        process.
+        """After an error that a lost process may have caused: time for that news, which
+        ends this process.
         """
         threading.Event().wait(GRACE if self._links else 0.0)
 
@@ -113,14 +128,16 @@ class Processes:
             self.end(other, message)
 
     def end(self, source: int, message: dict) -> None:
-        """Pass on what went wrong, say it and end: the main thread may wait for the lost process
-        for ever.
+        """Pass on what went wrong, say it and end: the main thread may wait for the
+        lost process for ever.
         """
         if not self._ending.acquire(blocking=False):
             return
         if self.is_first:
             self._send_all(message, but=source)
-        timer = threading.Timer(message["after"], _exit, (message["status"], message["error"]))
+        timer = threading.Timer(
+            message["after"], _exit, (message["status"], message["error"])
+        )
         timer.daemon = True
         timer.start()
 
@@ -131,7 +148,9 @@ class Processes:
 
 
 class _Link:
-    """A connection to another process: lines of JSON, and signs of life in both directions."""
+    """A connection to another process: lines of JSON, and signs of life in both
+    directions.
+    """
 
     def __init__(self, job: Processes, other: int, connection: Connection):
         self._job = job
@@ -147,10 +166,13 @@ class _Link:
 
     def start(self) -> None:
         for target in (self._read, self._beat):
-            threading.Thread(target=target, name=f"process {self._other}", daemon=True).start()
+            threading.Thread(
+                target=target, name=f"process {self._other}", daemon=True
+            ).start()
 
     def send(self, message: dict) -> None:
-        with contextlib.suppress(OSError), self._sending:  # what is wrong, the reader sees
+        # what is wrong, the reader sees
+        with contextlib.suppress(OSError), self._sending:
             self._socket.sendall(encoded(message))
 
     def close(self, seconds: float) -> None:
@@ -187,7 +209,8 @@ class _Link:
 
 
 def _exit(status, error):
-    show_cursor = "\x1b[?25h\n" if sys.stdout.isatty() else ""  # a live display hides it
+    # a live display hides it
+    show_cursor = "\x1b[?25h\n" if sys.stdout.isatty() else ""
     # past Python's own end, which would wait for the main thread
     os.write(2, f"{show_cursor}error: {error}\n".encode())
     os._exit(status)

@@ -1,9 +1,10 @@
 """Speed on this machine: `openjax benchmark [--envs 1024 4096] [--json FILE]`.
 
-Steps per second of the physics (rigid and MJX, each with and without solids), of the environment,
-of rollouts with the policy and of the whole training step, over a sweep of environment counts; and
-of the programs that the step is made of, which say where its time goes; the step on several
-devices, with `--devices 1 2 4`. Same command on CPU and GPU.
+Steps per second of the physics (rigid and MJX, each with and without solids), of the
+environment, of rollouts with the policy and of the whole training step, over a sweep of
+environment counts; and of the programs that the step is made of, which say where its
+time goes; the step on several devices, with `--devices 1 2 4`. Same command on CPU and
+GPU.
 """
 
 import dataclasses
@@ -48,15 +49,20 @@ def main(arguments: Sequence[str]) -> int:
     facts = {"command": " ".join([PROGRAM, *arguments]), "machine": machine}
     facts["compilation_cache"] = jax.config.jax_compilation_cache_dir is not None
     sweep = _sweep(command)
-    with Steps("measuring", {name: seconds for name, *_, seconds in sweep}, console) as steps:
+    with Steps(
+        "measuring", {name: seconds for name, *_, seconds in sweep}, console
+    ) as steps:
         for name, part, number, _ in sweep:
             steps.begin(name)
             for case in cases(command, part, number):
                 timing = time_compiled(case, command.seconds)
                 rows.append(_row(case, command.settings, timing))
                 console.print(_line(rows[-1]), soft_wrap=True)
-                # after each measurement, so that an interrupted sweep leaves what it has
-                write_json(command.json, {**facts, "settings": command.settings, "rows": rows})
+                # after each measurement, so that an interrupted sweep leaves what it
+                # has
+                write_json(
+                    command.json, {**facts, "settings": command.settings, "rows": rows}
+                )
     if told := _programs_and_step(rows):
         print(told)
     print(f"written to {command.json}")
@@ -77,8 +83,8 @@ def _default(arguments) -> BenchmarkCommand:
 
 
 def _sweep(command) -> list[tuple[str, str, int, float]]:
-    """(name, part, environments, seconds that it takes on two cores, about) of all that is
-    measured.
+    """(name, part, environments, seconds that it takes on two cores, about) of all that
+    is measured.
     """
     sweep = []
     for part in command.parts:
@@ -88,13 +94,16 @@ def _sweep(command) -> list[tuple[str, str, int, float]]:
             numbers = command.training_envs
             programs = 5 * len(command.devices)
         seconds = SECONDS[part] + programs * command.seconds
-        sweep += [(f"{part}, {number:,} environments", part, number, seconds) for number in numbers]
+        sweep += [
+            (f"{part}, {number:,} environments", part, number, seconds)
+            for number in numbers
+        ]
     return sweep
 
 
 def _programs_and_step(rows) -> str | None:
-    """How long the step's programs take beside the step as one; None where one of them wasn't
-    measured.
+    """How long the step's programs take beside the step as one; None where one of them
+    wasn't measured.
     """
     phases = [row["seconds"] for row in rows if row["part"].startswith("- ")]
     if not phases or None in phases:
@@ -107,15 +116,17 @@ def _programs_and_step(rows) -> str | None:
 
 
 def _row(case, settings, timing) -> dict:
-    """One measurement (a `Timing`); an environment step moves one world by one control step, all
-    its drones.
+    """One measurement (a `Timing`); an environment step moves one world by one control
+    step, all its drones.
     """
     drones = settings.environment.num_pursuers
     physics = settings.environment.physics
     if case.name in PHYSICS:
         physics = case.name.split("_")[0]
     # without seconds it ran out of memory
-    speed = None if timing.seconds is None else case.num_envs * case.steps / timing.seconds
+    speed = (
+        None if timing.seconds is None else case.num_envs * case.steps / timing.seconds
+    )
     return {
         "part": case.name,
         "physics": physics,

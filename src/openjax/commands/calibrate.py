@@ -1,5 +1,7 @@
-"""`openjax calibrate CASE_DIR`: fit the nominal vehicle's own constants to flights, with intervals
-and with what the flights can't tell, and write a `vehicle.toml` that trainer and diagnosis load."""
+"""`openjax calibrate CASE_DIR`: fit the nominal vehicle's own constants to flights,
+with intervals and with what the flights can't tell, and write a `vehicle.toml` that
+trainer and diagnosis load.
+"""
 
 import dataclasses
 import time
@@ -35,15 +37,19 @@ class Arguments:
 
 
 def run(arguments: Arguments, console: Console):
-    """Calibrate, print and write; returns the Calibration. Raises UserError; writes nothing
-    then.
+    """Calibrate, print and write; returns the Calibration. Raises UserError; writes
+    nothing then.
     """
     one_thread_for_matrices()
     from openjax.calibration.calibration import calibrate
     from openjax.flights.case import load_case
     from openjax.vehicle.vehicle_file import load_vehicle_file, save_vehicle_file
 
-    out = arguments.case / "vehicle_calibrated.toml" if arguments.out is None else arguments.out
+    out = (
+        arguments.case / "vehicle_calibrated.toml"
+        if arguments.out is None
+        else arguments.out
+    )
     if out.exists() and not arguments.overwrite:
         raise UserError(
             f"{out}: exists already; use --overwrite to replace it or --out for another file"
@@ -74,13 +80,16 @@ def run(arguments: Arguments, console: Console):
 
 def _print(result, console: Console) -> None:
     title = f"Calibrated on {len(result.flights)} flights, {result.seconds:.0f} s"
-    table = numbers_table(title, ("quantity", "value", "90 % interval", "of nominal", ""))
+    table = numbers_table(
+        title, ("quantity", "value", "90 % interval", "of nominal", "")
+    )
     for name, quantity in result.quantities.items():
         for i, value in enumerate(quantity.value):
             label = name.replace("_", " ")
             if len(quantity.value) > 1:
                 label += f" {('xx', 'yy', 'zz')[i]}"
-            # in yaw only the torque constant over the inertia shows: this is taken as nominal
+            # in yaw only the torque constant over the inertia shows: this is taken as
+            # nominal
             assumed = name == "inertia" and i == 2
             low, high = quantity.interval90[i]
             remark = "" if quantity.determined else "not determined: nominal kept"

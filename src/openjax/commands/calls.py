@@ -1,4 +1,6 @@
-"""The commands as functions: what `openjax.train(...)` and `openjax.evaluate(...)` do in Python."""
+"""The commands as functions: what `openjax.train(...)` and `openjax.evaluate(...)` do
+in Python.
+"""
 
 import time
 from collections.abc import Callable, Mapping
@@ -43,17 +45,18 @@ def train(
       out: directory of the run; None is runs/DATE.
       minutes: of learning; compiling comes before, the report after.
       start_from: policy whose networks the run starts with.
-      compare_with: policy that the final table and the animation show beside the trained one.
+      compare_with: policy that the final table and the animation show beside the
+      trained one.
       devices: how many, or "all".
       vehicle, effects: files to fly with, vehicle.toml and effects.toml.
       overwrite: replace a run that `out` already holds.
-      resume: directory of a run to go on with, in place of `out`; `settings` are its own by
-      default, and parts of one's own are to be the same.
-      environment: a game of one's own, with its evaders, reward, observations; its settings go
-      before those of the run.
+      resume: directory of a run to go on with, in place of `out`; `settings` are its
+      own by default, and parts of one's own are to be the same.
+      environment: a game of one's own, with its evaders, reward, observations; its
+      settings go before those of the run.
       policy: a network of one's own (`openjax.policy.Network`), or a whole policy.
-      learners: of one's own by name (`openjax.learning.Learner`), beside the shipped ones, or in
-      the place of `predictor`, `evaders` or `policy`, which is MAPPO.
+      learners: of one's own by name (`openjax.learning.Learner`), beside the shipped
+      ones, or in the place of `predictor`, `evaders` or `policy`, which is MAPPO.
 
     Returns:
       The best policy of the run.
@@ -75,7 +78,8 @@ def train(
         vehicle=_path(vehicle),
         effects=_path(effects),
         overwrite=overwrite,
-        traced_programs=False,  # a caller may have changed functions since they were loaded
+        # a caller may have changed functions since they were loaded
+        traced_programs=False,
         settings=settings or resumed or preset(default_preset()),
     )
     if resumed is not None:
@@ -86,10 +90,14 @@ def train(
 def _trained(command, parts):
     """The policy of a run, as `train` gives it."""
     with quiet_compiler():
-        status = start(command, ["(called from Python)"], time.monotonic(), Processes(), parts)
+        status = start(
+            command, ["(called from Python)"], time.monotonic(), Processes(), parts
+        )
     run = command.resume or command.out
     if status:
-        raise UserError(f"training in {run} stopped at a NaN; what is left to look at lies there")
+        raise UserError(
+            f"training in {run} stopped at a NaN; what is left to look at lies there"
+        )
     return load_policy(run, parts.environment, parts.policy)
 
 
@@ -111,23 +119,25 @@ def evaluate(
     """Fly a policy's mean on layouts as `openjax evaluate` does.
 
     Args:
-      policy: a loaded policy, what `openjax.load_policy` takes, or a pure function from the
-        `Observation` of one world to actions (N, 4) in -1..1, which flies the nominal game.
+      policy: a loaded policy, what `openjax.load_policy` takes, or a pure function from
+        the `Observation` of one world to actions (N, 4) in -1..1, which flies the
+        nominal game.
       scenario: a layout's name, a TOML file with an own one, "uniform", or "all"; see
         `openjax evaluate --help`.
       episodes: per layout.
       seed: draws the start attitudes.
       vehicle, effects: files to fly with, vehicle.toml and effects.toml.
-      opponent: evader to fly against: a name in `openjax.pursuit.evaders.SCRIPTED`, a file, or a
-      function of one's own, velocity(scene, memory) -> velocity (3,) in m/s, memory
-      (`openjax.pursuit.evaders.EvaderKind`); None: those of the policy's game.
-      changes: of the game that the policy was trained in, for example speed_limit="none".
+      opponent: evader to fly against: a name in `openjax.pursuit.evaders.SCRIPTED`, a
+      file, or a function of one's own, velocity(scene, memory) -> velocity (3,) in m/s,
+      memory (`openjax.pursuit.evaders.EvaderKind`); None: those of the policy's game.
+      changes: of the game that the policy was trained in, for example
+      speed_limit="none".
 
     Returns:
-      A record, or a list of them for "all": scenario, episodes; capture_rate, crash_rate in 0..1;
-      capture_step, and slowest_capture_step of the slowest hundredth, in control steps;
-      collision_rate, collision_parts (pillar, drone, bounds) and over_speed_rate, each the share of
-      steps in which any pursuer does so;
+      A record, or a list of them for "all": scenario, episodes; capture_rate,
+      crash_rate in 0..1; capture_step, and slowest_capture_step of the slowest
+      hundredth, in control steps; collision_rate, collision_parts (pillar, drone,
+      bounds) and over_speed_rate, each the share of steps in which any pursuer does so;
       prediction_error (m).
 
     Raises:
@@ -138,7 +148,9 @@ def evaluate(
     if isinstance(policy, str | Path):
         policy = load_policy(policy)
     elif not isinstance(policy, LoadedPolicy):
-        policy = own_controller(policy, changed(PursuitSettings(), **changes), "own controller")
+        policy = own_controller(
+            policy, changed(PursuitSettings(), **changes), "own controller"
+        )
     number = changes.pop("num_pursuers", None)
     command = EvaluateCommand(
         policy=(policy.source,),

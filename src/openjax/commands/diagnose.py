@@ -1,4 +1,6 @@
-"""Diagnose the sim-to-real gap of flights: `openjax diagnose CASE_DIR [CASE_DIR ...]`."""
+"""Diagnose the sim-to-real gap of flights: `openjax diagnose CASE_DIR [CASE_DIR
+...]`.
+"""
 
 import sys
 import traceback
@@ -12,7 +14,12 @@ import tyro
 from rich.panel import Panel
 from rich.text import Text
 
-from openjax.command_line import one_line, one_thread_for_matrices, output_console, parse
+from openjax.command_line import (
+    one_line,
+    one_thread_for_matrices,
+    output_console,
+    parse,
+)
 from openjax.errors import UserError
 from openjax.files import check_output, check_output_folder, replacing, write_json
 from openjax.show.progress import Steps
@@ -22,24 +29,26 @@ from openjax.vehicle.effect_names import effect_names
 PROGRAM = "openjax diagnose"
 SECONDS = 5.0
 """Of a case on a laptop, about."""
-_WITHOUT_HELP = f"Effects that are not to be looked for: any of {', '.join(effect_names())}."
+_WITHOUT_HELP = (
+    f"Effects that are not to be looked for: any of {', '.join(effect_names())}."
+)
 
 
 @dataclass(frozen=True)
 class Options:
-    """Diagnose the sim-to-real gap: where the simulator differs from flights, which effect causes
-    it, how far it shrinks.
+    """Diagnose the sim-to-real gap: where the simulator differs from flights, which
+    effect causes it, how far it shrinks.
 
-    Writes OUT/<case>/report.html, report.json and effects.toml (which `openjax train --effects`
-    flies with).
+    Writes OUT/<case>/report.html, report.json and effects.toml (which `openjax train
+    --effects` flies with).
     """
 
     cases: Annotated[tuple[Path, ...], tyro.conf.Positional]
     """Folders of flight logs, each with a vehicle.toml."""
     reference: tuple[Path, ...] = ()
-    """Folders of earlier flights of the same vehicle, one for each day: the vehicle is learnt from
-    them first, and report.html says what changed since; changes.html holds trims and rotors, for
-    which motor commands alone are enough.
+    """Folders of earlier flights of the same vehicle, one for each day: the vehicle is
+    learnt from them first, and report.html says what changed since; changes.html holds
+    trims and rotors, for which motor commands alone are enough.
     """
     out: Path = Path("diagnosis")
     """Where the reports go, one folder per case."""
@@ -56,13 +65,15 @@ def main(arguments: Sequence[str]) -> int:
     """Run the command; the exit status is 0, or 2 if nothing could be diagnosed."""
     options = parse(Options, Options(cases=tyro.MISSING), arguments, PROGRAM)
     if "--reference" in arguments and not options.reference:
-        raise UserError("--reference needs at least one folder of flights before the change")
+        raise UserError(
+            "--reference needs at least one folder of flights before the change"
+        )
     return run(options)
 
 
 def run(options: Options) -> int:
-    """Diagnose every case; a case that can't be used is named and the rest goes on. Raises
-    UserError for bad options.
+    """Diagnose every case; a case that can't be used is named and the rest goes on.
+    Raises UserError for bad options.
     """
     one_thread_for_matrices()
     cache_programs()
@@ -79,19 +90,27 @@ def run(options: Options) -> int:
     for i, (folder, name) in enumerate(zip(options.cases, names, strict=True)):
         try:
             # shows how long all that are still to come will take
-            with Steps("diagnosing", {case: SECONDS for case in names[i:]}, console) as steps:
+            with Steps(
+                "diagnosing", {case: SECONDS for case in names[i:]}, console
+            ) as steps:
                 steps.begin(name)
-                title, lines, prediction = answer(options, folder, name, partial(steps.begin, name))
+                title, lines, prediction = answer(
+                    options, folder, name, partial(steps.begin, name)
+                )
         except UserError as error:
             failed += 1
             print(f"error: {one_line(error)}", file=sys.stderr)
-        except Exception as error:  # a fault of the program in one case must not cost the others
+        except (
+            Exception
+        ) as error:  # a fault of the program in one case must not cost the others
             failed += 1
             print(f"error: {_unforeseen(name, error)}", file=sys.stderr)
         else:
             predictions[name] = prediction
             console.print(
-                Panel(Text("\n".join(lines)), title=f"{name}: {title}", title_align="left")
+                Panel(
+                    Text("\n".join(lines)), title=f"{name}: {title}", title_align="left"
+                )
             )
     if options.predictions is not None and predictions:
         write_json(options.predictions, predictions)
@@ -99,8 +118,8 @@ def run(options: Options) -> int:
 
 
 def _checked_names(options: Options) -> list[str]:
-    """What the cases are called; all that can be wrong with where they're written to is said before
-    the work.
+    """What the cases are called; all that can be wrong with where they're written to is
+    said before the work.
     """
     if not options.cases:
         raise UserError(
@@ -109,7 +128,9 @@ def _checked_names(options: Options) -> list[str]:
     names = [case.resolve().name for case in options.cases]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
-        raise UserError(f"two cases are called {twice!r}: their reports would overwrite each other")
+        raise UserError(
+            f"two cases are called {twice!r}: their reports would overwrite each other"
+        )
     check_output_folder(options.out, "--out")
     for name in names:
         if (options.out / name).exists() and not options.overwrite:
@@ -123,8 +144,8 @@ def _checked_names(options: Options) -> list[str]:
 def _diagnosis(
     options: Options, folder: Path, name: str, tell: Callable[[str], None]
 ) -> tuple[str, list[str], dict]:
-    """Title, lines and prediction of what causes a case's gap, after its report was written
-    whole.
+    """Title, lines and prediction of what causes a case's gap, after its report was
+    written whole.
     """
     from openjax.flights.case import load_case
     from openjax.gap.diagnosis import diagnose_case
@@ -132,14 +153,19 @@ def _diagnosis(
 
     case = load_case(folder)
     for issue in case.left_out():
-        print(f"warning: {name}/{issue.flight} is left out: {issue.issue}", file=sys.stderr)
+        print(
+            f"warning: {name}/{issue.flight} is left out: {issue.issue}",
+            file=sys.stderr,
+        )
     report = diagnose_case(case, options.without, tell)
     tell("writing the report")
     with replacing(options.out / name) as partial_folder:
         partial_folder.mkdir()
         write_report(report, partial_folder, options.html)
     written = options.out / name / ("report.html" if options.html else "report.json")
-    noted = [f"{issue.flight}: {issue.issue}" for issue in case.quality if not issue.refused]
+    noted = [
+        f"{issue.flight}: {issue.issue}" for issue in case.quality if not issue.refused
+    ]
     more = f" (and {len(noted) - 1} more in the report)" if len(noted) > 1 else ""
     remark = [f"Noted in the logs: {noted[0]}{more}."] if noted else []
     lines = [*remark, *report.in_words(), f"({report.seconds:.1f} s; {written})"]
@@ -164,15 +190,19 @@ def _changes(
     written = options.out / name / f"changes.{'html' if options.html else 'json'}"
     if diagnosis is None:
         title = "changed" if change.changed else "no change"
-        return title, [*report.in_words(change), f"({written})"], report.prediction(change)
+        return (
+            title,
+            [*report.in_words(change), f"({written})"],
+            report.prediction(change),
+        )
     trims = [f"Trims: {line}" for line in report.in_words(change)[:1]]
     lines = [*diagnosis.in_words(), *trims, f"({diagnosis.seconds:.1f} s; {written})"]
     return ", ".join(diagnosis.effects) or "no change", lines, diagnosis.prediction()
 
 
 def _since(options: Options, folder: Path, tell: Callable[[str], None]):
-    """The report of what changed since the reference; None where the logs hold too little for a
-    diagnosis, so that trims alone are compared.
+    """The report of what changed since the reference; None where the logs hold too
+    little for a diagnosis, so that trims alone are compared.
     """
     from openjax.flights.case import load_case
     from openjax.gap.diagnosis import diagnose_case

@@ -1,9 +1,9 @@
 """Evaluate a policy: `openjax evaluate --policy PATH --scenario NAME|FILE.toml`.
 
-Prints, and with `--json` writes, for each scenario: scenario, episodes, capture_rate, capture_step,
-slowest_capture_step (of the slowest hundredth of the episodes), collision_rate, collision_parts,
-crash_rate, over_speed_rate, prediction_error. From Python: `openjax.evaluate(policy, scenario)`,
-see `openjax.commands.calls.evaluate`.
+Prints, and with `--json` writes, for each scenario: scenario, episodes, capture_rate,
+capture_step, slowest_capture_step (of the slowest hundredth of the episodes),
+collision_rate, collision_parts, crash_rate, over_speed_rate, prediction_error. From
+Python: `openjax.evaluate(policy, scenario)`, see `openjax.commands.calls.evaluate`.
 """
 
 import dataclasses
@@ -38,28 +38,31 @@ class FlightOptions:
     """What is flown: policies on layouts, against an evader."""
 
     policy: tuple[str, ...] | None = None
-    """Runs' directories, policy files (.npz), checkpoints, or names of policies in the package
-    (flight, open ...) or of heuristics (angelani, janosov, apf, stack), or FILE.py:function for a
-    controller of one's own. By default evaders, or teams for another number of pursuers than three.
+    """Runs' directories, policy files (.npz), checkpoints, or names of policies in the
+    package (flight, open ...) or of heuristics (angelani, janosov, apf, stack), or
+    FILE.py:function for a controller of one's own. By default evaders, or teams for
+    another number of pursuers than three.
     """
     scenario: str = "all"
-    """wall, narrow_gap, random, passage, empty, hidden, a TOML file with an own layout, uniform
-    (another task in each episode, as in the validation of a run), or all six; these have three
-    pursuers: a policy of another number flies uniform instead.
+    """wall, narrow_gap, random, passage, empty, hidden, a TOML file with an own layout,
+    uniform (another task in each episode, as in the validation of a run), or all six;
+    these have three pursuers: a policy of another number flies uniform instead.
     """
     seed: Seed = 0
     """Draws the start attitudes."""
     opponent: str | None = None
-    """Evader to fly against: field, greedy, wall_runner, slow_hugger, heavy, pillar_hugger,
-    greedy_far, greedy_near, two_step, safe_place, way_points, frozen, a file that openjax exploit
-    wrote, or a function of one's own, FILE.py:function; by default those of the policy's game.
+    """Evader to fly against: field, greedy, wall_runner, slow_hugger, heavy,
+    pillar_hugger, greedy_far, greedy_near, two_step, safe_place, way_points, frozen, a
+    file that openjax exploit wrote, or a function of one's own, FILE.py:function; by
+    default those of the policy's game.
     """
     compilation_cache: bool = True
     """Keep compiled programs in the user's cache folder."""
 
     def start(self, environment: PursuitSettings | None = None) -> list["LoadedPolicy"]:
-        """The policies, loaded, after JAX was told where it keeps programs. Raises UserError where
-        there are none. `environment`: settings that were typed; None: none were.
+        """The policies, loaded, after JAX was told where it keeps programs. Raises
+        UserError where there are none. `environment`: settings that were typed; None:
+        none were.
         """
         if self.compilation_cache:
             cache_programs()
@@ -76,7 +79,8 @@ class FlightOptions:
         return [load_policy(name) for name in names]
 
     def pursuers_of(self, environment: PursuitSettings) -> int:
-        """How many pursuers are asked for: those of a layout's file, or of the settings.
+        """How many pursuers are asked for: those of a layout's file, or of the
+        settings.
 
         Raises:
           UserError: an unusable file.
@@ -92,23 +96,25 @@ class FlightOptions:
 class EvaluateCommand(FlightOptions):
     """Fly a policy's mean on a layout and count captures, collisions and crashes.
 
-    The game is the one that the policy was trained in; any --environment.setting can be changed,
-    for example --environment.speed_limit none or --environment.start_attitude level. Of several
-    policies, for example one per training seed, mean and standard deviation are shown too.
+    The game is the one that the policy was trained in; any --environment.setting can be
+    changed, for example --environment.speed_limit none or --environment.start_attitude
+    level. Of several policies, for example one per training seed, mean and standard
+    deviation are shown too.
     """
 
     episodes: Annotated[int, Interval("[1, 1000000]")] = 100
     """Episodes per scenario."""
     num_pursuers: Annotated[int | None, Interval("[1, 8]")] = None
-    """Pursuers; by default as many as in training. A policy for teams of any size flies three by
-    default, all episodes with one --environment.evader_speed and one --environment.capture_radius.
+    """Pursuers; by default as many as in training. A policy for teams of any size flies
+    three by default, all episodes with one --environment.evader_speed and one
+    --environment.capture_radius.
     """
     messages: MessageSettings = dataclasses.field(default_factory=MessageSettings)
     json: Path | None = None
     """File to write the records to: an object for one scenario, a list for all."""
     vehicle: Path | None = None
-    """Vehicle to fly: crazyflie, brushless, or a vehicle.toml; by default the airframe that the
-    policy was trained for.
+    """Vehicle to fly: crazyflie, brushless, or a vehicle.toml; by default the airframe
+    that the policy was trained for.
     """
     effects: Path | None = None
     """Physical effects to fly with (effects.toml)."""
@@ -130,8 +136,8 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def prepare(command: EvaluateCommand, arguments: Sequence[str]) -> list[tuple]:
-    """Each policy, and the command with that policy's own game as the default; all that can be
-    wrong was looked at.
+    """Each policy, and the command with that policy's own game as the default; all that
+    can be wrong was looked at.
 
     Raises:
       UserError: an unusable file or layout, or a game that a policy can't play.
@@ -142,21 +148,26 @@ def prepare(command: EvaluateCommand, arguments: Sequence[str]) -> list[tuple]:
     if command.num_pursuers is not None:
         typed = dataclasses.replace(typed, num_pursuers=command.num_pursuers)
     for loaded in command.start(typed):
-        default = dataclasses.replace(EvaluateCommand(), environment=loaded.settings.environment)
+        default = dataclasses.replace(
+            EvaluateCommand(), environment=loaded.settings.environment
+        )
         own = parse(EvaluateCommand, default, arguments, PROGRAM)
         _game(own, loaded)
         policies.append((own, loaded))
     return policies
 
 
-def fly_scenarios(command: EvaluateCommand, loaded, evaluators: dict) -> tuple[list[dict], list]:
-    """A record (see `openjax.evaluation.evaluator.FIELDS`) and the first episode's `Trajectory` per
-    scenario.
+def fly_scenarios(
+    command: EvaluateCommand, loaded, evaluators: dict
+) -> tuple[list[dict], list]:
+    """A record (see `openjax.evaluation.evaluator.FIELDS`) and the first episode's
+    `Trajectory` per scenario.
 
     Args:
       command: what to fly, with the game's settings.
       loaded: the policy.
-      evaluators: those already compiled, to be used again for policies of the same kind.
+      evaluators: those already compiled, to be used again for policies of the same
+      kind.
 
     Raises:
       UserError: an unusable layout, or a game that the policy can't play.
@@ -190,10 +201,16 @@ def fly_scenarios(command: EvaluateCommand, loaded, evaluators: dict) -> tuple[l
     with Steps(f"flying {loaded.source}", expected, output_console()) as steps:
 
         def tell(layout):
-            steps.begin(layout, "compiled first" if not compiled and layout == first else "")
+            steps.begin(
+                layout, "compiled first" if not compiled and layout == first else ""
+            )
 
-        flown = evaluators[kind].fly(loaded.parameters, tasks, jax.random.key(command.seed), tell)
-        return [kind.record() for kind in flown], [kind.trajectory(0, kind.name) for kind in flown]
+        flown = evaluators[kind].fly(
+            loaded.parameters, tasks, jax.random.key(command.seed), tell
+        )
+        return [kind.record() for kind in flown], [
+            kind.trajectory(0, kind.name) for kind in flown
+        ]
 
 
 def _settings(command):
@@ -202,7 +219,11 @@ def _settings(command):
     number = command.num_pursuers
     if settings.team_sizes:
         return settings.of_one_team(number or LAYOUT_PURSUERS)
-    return settings if number is None else dataclasses.replace(settings, num_pursuers=number)
+    return (
+        settings
+        if number is None
+        else dataclasses.replace(settings, num_pursuers=number)
+    )
 
 
 def _game(command, loaded):
@@ -225,7 +246,9 @@ def _game(command, loaded):
     trained = number if loaded.any_number else loaded.settings.environment.num_pursuers
     layouts = []
     if command.scenario == "all":
-        layouts = [layout for layout in SCENARIOS.values() if len(layout.pursuers) == trained]
+        layouts = [
+            layout for layout in SCENARIOS.values() if len(layout.pursuers) == trained
+        ]
     elif command.scenario != "uniform":
         layouts = [find_scenario(command.scenario, settings)]
     in_layout = len(layouts[0].pursuers) if layouts else number
@@ -247,21 +270,32 @@ def _game(command, loaded):
 
 
 def _environment(command, game, loaded):
-    """The game with all that the command, or a policy of a game of one's own, adds to it."""
+    """The game with all that the command, or a policy of a game of one's own, adds to
+    it.
+    """
     from openjax.store.environments import make_environment
 
     trained_in = loaded.environment
     if trained_in is None:
-        return make_environment(game, command.vehicle, command.effects, command.opponent)
+        return make_environment(
+            game, command.vehicle, command.effects, command.opponent
+        )
     if trained_in.evaders and not command.opponent:
-        game = dataclasses.replace(game, evaders=PursuitSettings().evaders)  # these come below
-    environment = make_environment(game, command.vehicle, command.effects, command.opponent)
+        # these come below
+        game = dataclasses.replace(game, evaders=PursuitSettings().evaders)
+    environment = make_environment(
+        game, command.vehicle, command.effects, command.opponent
+    )
     evaders = environment.evaders if command.opponent else trained_in.evaders
-    return dataclasses.replace(environment, observer=trained_in.observer, evaders=evaders)
+    return dataclasses.replace(
+        environment, observer=trained_in.observer, evaders=evaders
+    )
 
 
 def _show(command, results):
-    """Print the tables and write the file: a record, a list of them, or such a list by policy."""
+    """Print the tables and write the file: a record, a list of them, or such a list by
+    policy.
+    """
     from openjax.evaluation.result_tables import results_table, spread_table
     from openjax.runs.words import unlike_the_papers
 
@@ -270,12 +304,15 @@ def _show(command, results):
         settings = _settings(own)
         evaders = (own.opponent,) if own.opponent else settings.evaders
         game = unlike_the_papers(settings, evaders)
-        console.print(results_table(f"{source}, mean policy, seed {command.seed}", rows, game))
+        console.print(
+            results_table(f"{source}, mean policy, seed {command.seed}", rows, game)
+        )
     if len(results) > 1:
         console.print(spread_table([rows for *_, rows in results]))
     if command.json is not None:
         by_policy = {
-            source: rows if command.scenario == "all" else rows[0] for _, source, rows in results
+            source: rows if command.scenario == "all" else rows[0]
+            for _, source, rows in results
         }
         only = next(iter(by_policy.values()))
         write_json(command.json, only if len(results) == 1 else by_policy)

@@ -1,10 +1,10 @@
-"""`openjax export --policy open --format onnx --out DIR`: a policy for programs that don't know
-openjax.
+"""`openjax export --policy open --format onnx --out DIR`: a policy for programs that
+don't know openjax.
 
-All formats hold the mean policy of a whole team, predictor included: from the observation's arrays
-to actions (N, 4) in -1..1: collective thrust, roll, pitch and yaw rate; with `--own`, that of one
-pursuer, as a vehicle computes it on board. The result is compared with the policy itself before it
-is written.
+All formats hold the mean policy of a whole team, predictor included: from the
+observation's arrays to actions (N, 4) in -1..1: collective thrust, roll, pitch and yaw
+rate; with `--own`, that of one pursuer, as a vehicle computes it on board. The result
+is compared with the policy itself before it is written.
 """
 
 import dataclasses
@@ -27,7 +27,15 @@ TOLERANCE = 2e-5
 STEPS = {"flying games to compare on": 20.0, "writing and comparing": 10.0}
 """Seconds of each on a laptop, about."""
 NAMES = {"onnx": "policy.onnx", "jax": "policy.jax_export", "c": "policy.c"}
-EACH = ("self_state", "others", "pillars", "pillar_seen", "privileged", "position", "heading")
+EACH = (
+    "self_state",
+    "others",
+    "pillars",
+    "pillar_seen",
+    "privileged",
+    "position",
+    "heading",
+)
 """What each pursuer sees for itself; the rest of an observation is the team's."""
 
 
@@ -36,7 +44,9 @@ class Arguments:
     """Write a policy as ONNX, as a serialised JAX function, or as C."""
 
     policy: str = DEFAULT_POLICY
-    """A run's directory, a policy file (.npz), or the name of a policy in the package."""
+    """A run's directory, a policy file (.npz), or the name of a policy in the
+    package.
+    """
     format: Literal["onnx", "jax", "c"] = "onnx"
     """onnx: for onnxruntime and its kin (pip install onnx onnxruntime); jax: for
     jax.export.deserialize; c: C99.
@@ -52,8 +62,8 @@ class Arguments:
 
 
 def observations(policy, number: int, seed: int) -> dict:
-    """{field: array (number or more, ...)} of observations from games that the policy plays,
-    NumPy.
+    """{field: array (number or more, ...)} of observations from games that the policy
+    plays, NumPy.
     """
     import jax
     import jax.numpy as jnp
@@ -61,7 +71,9 @@ def observations(policy, number: int, seed: int) -> dict:
 
     from openjax.pursuit import Pursuit
 
-    settings = dataclasses.replace(policy.settings.environment, physics="rigid", vehicles=())
+    settings = dataclasses.replace(
+        policy.settings.environment, physics="rigid", vehicles=()
+    )
     environment = Pursuit(settings)
     worlds = 64
     steps = -(-number // worlds)  # rounded up
@@ -92,9 +104,11 @@ def observations(policy, number: int, seed: int) -> dict:
     return fields
 
 
-def export(arguments: Arguments, tell: Callable[[str], None] = lambda step: None) -> dict:
-    """Write the files; returns what FORMAT.json says. `tell` hears the steps. Raises UserError if
-    it can't be, or differs.
+def export(
+    arguments: Arguments, tell: Callable[[str], None] = lambda step: None
+) -> dict:
+    """Write the files; returns what FORMAT.json says. `tell` hears the steps. Raises
+    UserError if it can't be, or differs.
     """
     import jax
 
@@ -107,7 +121,8 @@ def export(arguments: Arguments, tell: Callable[[str], None] = lambda step: None
     tell(playing)
     samples, expected = _samples(policy, arguments)
     inputs = {
-        name: jax.ShapeDtypeStruct(array.shape[1:], array.dtype) for name, array in samples.items()
+        name: jax.ShapeDtypeStruct(array.shape[1:], array.dtype)
+        for name, array in samples.items()
     }
     tell(comparing)
     write = {"onnx": _onnx, "jax": _jax, "c": _c}[arguments.format]
@@ -150,8 +165,8 @@ def _samples(policy, arguments):
 
 
 def _difference(actions, expected, source):
-    """The largest of an action; None where nothing was compared. Raises UserError for one too
-    large.
+    """The largest of an action; None where nothing was compared. Raises UserError for
+    one too large.
     """
     if actions is None:
         return None
@@ -165,12 +180,15 @@ def _difference(actions, expected, source):
 
 def _described(inputs) -> dict:
     return {
-        name: {"shape": list(kind.shape), "type": str(kind.dtype)} for name, kind in inputs.items()
+        name: {"shape": list(kind.shape), "type": str(kind.dtype)}
+        for name, kind in inputs.items()
     }
 
 
 def _onnx(act, inputs, samples, source):
-    """The files, their actions on the sampled observations, and what to say about them."""
+    """The files, their actions on the sampled observations, and what to say about
+    them.
+    """
     import numpy as np
 
     from openjax.export.onnx_graph import onnx_model, size
@@ -179,11 +197,15 @@ def _onnx(act, inputs, samples, source):
     try:
         import onnxruntime
     except ImportError as error:
-        raise UserError("onnxruntime is missing: pip install onnx onnxruntime") from error
+        raise UserError(
+            "onnxruntime is missing: pip install onnx onnxruntime"
+        ) from error
     data = model.SerializeToString()
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
-    session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
+    session = onnxruntime.InferenceSession(
+        data, options, providers=["CPUExecutionProvider"]
+    )
     read = [value.name for value in session.get_inputs()]
     actions = []
     for i in range(len(samples["frames"])):
@@ -248,5 +270,6 @@ def main(arguments: Sequence[str]) -> None:
     if difference is not None:
         compared = f"differs by at most {difference:.1e} on {report['observations']} observations"
     console.print(
-        f"{parsed.out / report['file']}: {report['bytes'] / 1e6:.2f} MB, {compared}", soft_wrap=True
+        f"{parsed.out / report['file']}: {report['bytes'] / 1e6:.2f} MB, {compared}",
+        soft_wrap=True,
     )

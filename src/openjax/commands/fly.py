@@ -1,7 +1,8 @@
-"""`openjax fly --policy PATH --uri URI [URI ...]`: fly a policy on Crazyflies, real or virtual.
+"""`openjax fly --policy PATH --uri URI [URI ...]`: fly a policy on Crazyflies, real or
+virtual.
 
-A hundred times a second from poses to body rates and thrust, through the real `cflib`. The flight
-is written as a case that `openjax diagnose` reads.
+A hundred times a second from poses to body rates and thrust, through the real `cflib`.
+The flight is written as a case that `openjax diagnose` reads.
 """
 
 from __future__ import annotations
@@ -23,60 +24,71 @@ from openjax.store import default_policy, default_policy_line
 
 PROGRAM = "openjax fly"
 DRIFT = 0.1
-"""m/s, of an own estimate, that nothing on board tells (`experiments.flying.observable`)."""
+"""m/s, of an own estimate, that nothing on board tells
+(`experiments.flying.observable`).
+"""
 
 
 @dataclass(frozen=True)
 class Arguments:
-    """Fly a policy on as many Crazyflies as it has pursuers, and log it for the diagnosis.
+    """Fly a policy on as many Crazyflies as it has pursuers, and log it for the
+    diagnosis.
 
-    While it flies: space or q stops all motors; l, Ctrl-C, Ctrl-Z or a closed terminal land; h
-    waits.
+    While it flies: space or q stops all motors; l, Ctrl-C, Ctrl-Z or a closed terminal
+    land; h waits.
     """
 
     policy: str | None = None
-    """A run's directory, a policy file (.npz), or the name of a policy in the package; by default
-    evaders, or teams for a layout of another number of pursuers than three.
+    """A run's directory, a policy file (.npz), or the name of a policy in the package;
+    by default evaders, or teams for a layout of another number of pursuers than three.
     """
     plan: str | None = None
-    """Fly a plan instead, with one vehicle: identify (two minutes by which a vehicle shows what it
-    does), or a CSV of openjax plan.
+    """Fly a plan instead, with one vehicle: identify (two minutes by which a vehicle
+    shows what it does), or a CSV of openjax plan.
     """
     uri: tuple[str, ...] = tuple(f"udp://127.0.0.1:{UDP_PORT + i}" for i in range(3))
-    """One vehicle per pursuer: udp://HOST:PORT (virtual), radio://0/80/2M/E7E7E7E7E7 (real)."""
+    """One vehicle per pursuer: udp://HOST:PORT (virtual), radio://0/80/2M/E7E7E7E7E7
+    (real).
+    """
     evader_uri: str | None = None
-    """A further vehicle that flies the evader by the game's rule; without it the evader is a point
-    in the computer.
+    """A further vehicle that flies the evader by the game's rule; without it the evader
+    is a point in the computer.
     """
     scenario: str = "wall"
-    """Layout: a name or a TOML file. Pillars exist in the computer only, unless you put them up."""
+    """Layout: a name or a TOML file. Pillars exist in the computer only, unless you put
+    them up.
+    """
     episodes: Annotated[int, Interval("[1, 100000]")] = 1
-    """Games, one after the other. Between them all fly straight back: with real pillars leave it at
-    1.
+    """Games, one after the other. Between them all fly straight back: with real pillars
+    leave it at 1.
     """
     episode_seconds: Annotated[float | None, Interval("(0, 1e9]")] = None
     """End each game after this time; otherwise it lasts as long as in training."""
     out: Path | None = None
     """Folder for the logs, a case for openjax.diagnose; must not exist or be empty."""
     vehicle: Path | None = None
-    """What flies (crazyflie, brushless, or a vehicle.toml); by default the airframe that the policy
-    was trained for.
+    """What flies (crazyflie, brushless, or a vehicle.toml); by default the airframe
+    that the policy was trained for.
     """
     body_logs: Annotated[int | None, Interval("[0, 5]")] = None
-    """Log blocks of motors and accelerometer per vehicle, 0 to 5; default 5 over UDP, 1 over
-    radio.
+    """Log blocks of motors and accelerometer per vehicle, 0 to 5; default 5 over UDP, 1
+    over radio.
     """
     motion_capture: str | None = None
     """MODULE:FUNCTION that feeds poses; default: the vehicles' own estimates. See
     openjax.flying.motion_capture.
     """
     guard: bool = True
-    """A further process lands the vehicles if the others stop. Don't fly real ones without."""
+    """A further process lands the vehicles if the others stop. Don't fly real ones
+    without.
+    """
     guard_after: Annotated[float, Interval("[0.01, 60]")] = 0.1
-    """Silence of the loop, or of the links, after which the next process lands all (s)."""
+    """Silence of the loop, or of the links, after which the next process lands all
+    (s).
+    """
     watchdog: bool = True
-    """Let the firmware stop the motors 1 s after the last set-point (otherwise 2 s). It locks the
-    vehicle, also after the flight; the next one restarts it.
+    """Let the firmware stop the motors 1 s after the last set-point (otherwise 2 s). It
+    locks the vehicle, also after the flight; the next one restarts it.
     """
     safety: SafetySettings = field(default_factory=SafetySettings)
 
@@ -87,7 +99,8 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def fly(arguments: Arguments, prepared: Prepared | None = None) -> None:
-    """Fly. Raises UserError for what can't be, and where another process had to land the vehicles.
+    """Fly. Raises UserError for what can't be, and where another process had to land
+    the vehicles.
 
     Args:
       arguments: the command's.
@@ -115,15 +128,25 @@ def _fly(arguments: Arguments, prepared: Prepared | None) -> None:
         session.check()
         plan = Plan(arguments.episodes, arguments.episode_seconds or math.inf)
         flight = Flight(
-            session.links, flown.game, flown.state, plan, session.requests, session.watched
+            session.links,
+            flown.game,
+            flown.state,
+            plan,
+            session.requests,
+            session.watched,
         )
-        console.print("flying: space or q stops all motors; l, Ctrl-C or Ctrl-Z land; h waits")
+        console.print(
+            "flying: space or q stops all motors; l, Ctrl-C or Ctrl-Z land; h waits"
+        )
         samples, complaint = session.fly(flight)
-    if arguments.out is not None and samples:  # before a word is said: the terminal may be gone
+    # before a word is said: the terminal may be gone
+    if arguments.out is not None and samples:
         try:
             _write(arguments.out, flown, flight, samples, session.scheduler)
         except OSError as error:
-            complaint = "; ".join(filter(None, (complaint, f"no log: {one_line(error)}")))
+            complaint = "; ".join(
+                filter(None, (complaint, f"no log: {one_line(error)}"))
+            )
     _show(console, flight, arguments.plan is not None)
     if session.scheduler != "real time":
         console.print(
@@ -171,14 +194,20 @@ def prepare(arguments: Arguments) -> Prepared:
     _check_numbers(arguments, len(scenario.pursuers), settings.num_pursuers)
     vehicle = load_vehicle_file(arguments.vehicle or settings.airframe)
     session = _session(arguments)  # before the game, which takes its time to compile
-    # a layout may have more pillars than the policy was trained with; it observes the nearest ones
+    # a layout may have more pillars than the policy was trained with; it observes the
+    # nearest ones
     slots = max(settings.max_pillars, len(scenario.pillars))
-    game = Game(policy, scenario_task(dataclasses.replace(settings, max_pillars=slots), scenario))
+    game = Game(
+        policy,
+        scenario_task(dataclasses.replace(settings, max_pillars=slots), scenario),
+    )
     game.airframe = airframe_of(vehicle.vehicle)
     uris = uris_of(arguments)
     state = flight_state(game, len(uris), arguments.safety)
     remarks = _remarks(arguments, game, vehicle)
-    if arguments.policy is None and (line := default_policy_line(len(scenario.pursuers))):
+    if arguments.policy is None and (
+        line := default_policy_line(len(scenario.pursuers))
+    ):
         remarks = (line, *remarks)
     about = {"policy": policy.source, "scenario": scenario.name, "uris": uris}
     return Prepared(game, state, session, vehicle, about, remarks)
@@ -215,7 +244,12 @@ def _session(arguments: Arguments):
         # a radio has less room, which commands and poses need first
         body_logs = 5 if all(uri.startswith("udp:") for uri in uris) else 1
     return SessionSettings(
-        uris, body_logs, arguments.watchdog, arguments.guard, arguments.guard_after, feed
+        uris,
+        body_logs,
+        arguments.watchdog,
+        arguments.guard,
+        arguments.guard_after,
+        feed,
     )
 
 
@@ -223,7 +257,8 @@ def _remarks(arguments: Arguments, game, vehicle) -> tuple[str, ...]:
     """What somebody should know before the vehicles rise."""
     settings = game.settings
     length = min(
-        settings.episode_length * settings.time_step, arguments.episode_seconds or math.inf
+        settings.episode_length * settings.time_step,
+        arguments.episode_seconds or math.inf,
     )
     remarks = _time_remark(arguments, arguments.episodes * length)
     if vehicle.airframe == settings.airframe:
@@ -233,8 +268,8 @@ def _remarks(arguments: Arguments, game, vehicle) -> tuple[str, ...]:
 
 
 def _time_remark(arguments: Arguments, seconds: float) -> tuple[str, ...]:
-    """What nobody notices in a flight of so many seconds by own estimates alone, and that it will
-    be cut short, where it will.
+    """What nobody notices in a flight of so many seconds by own estimates alone, and
+    that it will be cut short, where it will.
     """
     if arguments.motion_capture is not None:
         return ()
@@ -259,7 +294,9 @@ def _write(out, flown, flight, samples, scheduler):
 
     policy = flown.about["policy"]
     described = dataclasses.replace(
-        flown.vehicle, path=None, log={"source": f"openjax.fly, policy {policy}", "floor_z": 0.0}
+        flown.vehicle,
+        path=None,
+        log={"source": f"openjax.fly, policy {policy}", "floor_z": 0.0},
     )
     about = {
         **flown.about,
@@ -320,7 +357,11 @@ def _show(console, flight, planned):
         f"({timing['missed_share']:.2%})"
     )
     for number, game in enumerate(() if planned else record.episodes):
-        caught = f"caught at step {game['capture_step']}" if game["capture_step"] else "not caught"
+        caught = (
+            f"caught at step {game['capture_step']}"
+            if game["capture_step"]
+            else "not caught"
+        )
         console.print(
             f"game {number}: {caught}, {game['steps']} steps, {game['breaches']} with a breach"
         )

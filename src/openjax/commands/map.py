@@ -1,10 +1,10 @@
 """What a policy catches: `openjax map --policy RUN`.
 
-It flies with teams of each size, after evaders of each speed, with each capture radius: after
-scripted evaders, after some that learned to escape from this policy, and, in some cells, after one
-that plans. The picture shows the share of captures in each cell, and the line below which a theorem
-forces one for points without inertia (`openjax.baselines.stack`); `--page` writes a page to move
-about in.
+It flies with teams of each size, after evaders of each speed, with each capture radius:
+after scripted evaders, after some that learned to escape from this policy, and, in some
+cells, after one that plans. The picture shows the share of captures in each cell, and
+the line below which a theorem forces one for points without inertia
+(`openjax.baselines.stack`); `--page` writes a page to move about in.
 """
 
 import dataclasses
@@ -29,8 +29,8 @@ ON_CPU = {
 
 
 def main(arguments: Sequence[str]) -> int:
-    """The command; returns its exit status. Raises UserError for a policy or a file that can't be
-    used.
+    """The command; returns its exit status. Raises UserError for a policy or a file
+    that can't be used.
     """
     command = parse(MapCommand, MapCommand(), arguments, PROGRAM)
     if command.compilation_cache:
@@ -56,7 +56,9 @@ def main(arguments: Sequence[str]) -> int:
     check_evaders(command.evaders)
     map_game(command, trained)
     console = output_console()
-    results = draw_map(command, loaded, lambda text: console.print(text, soft_wrap=True))
+    results = draw_map(
+        command, loaded, lambda text: console.print(text, soft_wrap=True)
+    )
     if command.json is not None:
         write_json(command.json, results)
     if command.page is not None:
@@ -66,13 +68,19 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _show(command, results, console):
-    """Draw the picture, of evaders that learned where there are some, and tell the least cell."""
+    """Draw the picture, of evaders that learned where there are some, and tell the
+    least cell.
+    """
     from openjax.runs.catch_map import cells_against
     from openjax.show.plots import plot_map
 
     who = "learned" if command.best_response else "scripted"
     cells = cells_against(results, who)
-    plot_map(command.out, cells, f"{command.policy}: captures, {command.scenario}, {who} evaders")
+    plot_map(
+        command.out,
+        cells,
+        f"{command.policy}: captures, {command.scenario}, {who} evaders",
+    )
     least = min(cells, key=lambda cell: cell["capture_rate"])
     console.print(
         f"{command.out}: {len(cells)} cells of {command.episodes} episodes; the least is "

@@ -16,13 +16,17 @@ PROGRAM = "openjax plan"
 
 @dataclass(frozen=True)
 class Arguments:
-    """Rank segments of flight by what they are expected to tell about a diagnosis' causes.
+    """Rank segments of flight by what they are expected to tell about a diagnosis'
+    causes.
 
-    Writes OUT/plan.csv, set-points for openjax fly --plan and for Crazyswarm2, and OUT/plan.json.
+    Writes OUT/plan.csv, set-points for openjax fly --plan and for Crazyswarm2, and
+    OUT/plan.json.
     """
 
     diagnosis: Annotated[str, tyro.conf.Positional]
-    """Folder of a report of openjax diagnose; or identify: the standard plan of two minutes."""
+    """Folder of a report of openjax diagnose; or identify: the standard plan of two
+    minutes.
+    """
     out: Path = Path("plan")
     """Folder to write to; must not exist or be empty."""
     vehicle: str | None = None
@@ -56,14 +60,22 @@ def make_plan(arguments: Arguments) -> list[str]:
     with replacing(arguments.out) as folder:
         folder.mkdir()
         write_plan(folder / "plan.csv", plan)
-        write_json(folder / "plan.json", {"sentence": said, "segments": promises, "fly": chosen})
+        write_json(
+            folder / "plan.json",
+            {"sentence": said, "segments": promises, "fly": chosen},
+        )
     rows = [
-        f"  {p['segment']:6} {p['value']:.3f}  {SEGMENTS[p['segment']].shows}" for p in promises
+        f"  {p['segment']:6} {p['value']:.3f}  {SEGMENTS[p['segment']].shows}"
+        for p in promises
     ]
     file = arguments.out / "plan.csv"
     seconds = len(plan) * PERIOD
     limit = SafetySettings().alone_time
-    lands = "" if seconds < limit else f" Without --motion_capture it lands after {limit:g} s."
+    lands = (
+        ""
+        if seconds < limit
+        else f" Without --motion_capture it lands after {limit:g} s."
+    )
     return [
         said,
         *rows,
@@ -86,4 +98,8 @@ def _advised(arguments: Arguments) -> tuple[str, list[dict], list[str]]:
             f"{arguments.diagnosis}: one cause is left, no flight is needed to tell it from others"
         )
     advice = advise(beliefs, vehicle_file)
-    return sentence(advice, report), [asdict(p) for p in advice.promises], list(advice.chosen)
+    return (
+        sentence(advice, report),
+        [asdict(p) for p in advice.promises],
+        list(advice.chosen),
+    )

@@ -1,5 +1,6 @@
-"""`openjax sample_flights OUT`: make a case of three sample flights, to try calibration and
-diagnosis on."""
+"""`openjax sample_flights OUT`: make a case of three sample flights, to try calibration
+and diagnosis on.
+"""
 
 import dataclasses
 from collections.abc import Collection, Sequence
@@ -16,7 +17,9 @@ from openjax.ranges import Interval, Seed
 from openjax.vehicle.effect_names import effect_names
 
 PROGRAM = "openjax sample_flights"
-DECIMALS = {"t": 2, "vbat": 3} | dict.fromkeys("x y z qw qx qy qz m1 m2 m3 m4".split(), 5)
+DECIMALS = {"t": 2, "vbat": 3} | dict.fromkeys(
+    "x y z qw qx qy qz m1 m2 m3 m4".split(), 5
+)
 _REST = 4
 _EFFECT_HELP = (
     "What the vehicle suffers from that the simulator doesn't know, one effect or several at once: "
@@ -26,7 +29,9 @@ _EFFECT_HELP = (
 
 @dataclass(frozen=True)
 class Arguments:
-    """Fly openjax's own vehicle through three manoeuvres and write the logs as a case."""
+    """Fly openjax's own vehicle through three manoeuvres and write the logs as a
+    case.
+    """
 
     out: Annotated[Path, tyro.conf.Positional]
     """Folder to write the case to; must not exist or be empty."""
@@ -38,8 +43,8 @@ class Arguments:
 
 
 def make_case(arguments: Arguments) -> list[Path]:
-    """Write the case; returns its files. Raises UserError for an unknown effect or a folder that
-    isn't empty.
+    """Write the case; returns its files. Raises UserError for an unknown effect or a
+    folder that isn't empty.
     """
     from openjax.flights.reading import LOG_COLUMNS, write_csv
     from openjax.flights.samples import fly, log_of, references
@@ -65,23 +70,31 @@ def make_case(arguments: Arguments) -> list[Path]:
         for number, (name, reference) in enumerate(flights.items()):
             # the vehicle that flies is the one that is described, but for the effects
             seed = 1000 * arguments.seed + number
-            columns = fly(described.vehicle, described.vehicle, reference, seed, effects)
+            columns = fly(
+                described.vehicle, described.vehicle, reference, seed, effects
+            )
             write_csv(folder / f"{name}.csv.gz", log_of(columns, name), decimals)
         save_vehicle_file(folder / "vehicle.toml", described)
     return sorted(arguments.out.iterdir())
 
 
-def _checked_effects(names: tuple[str, ...], library: Collection[str]) -> tuple[str, ...]:
-    """The effects that act. Raises UserError for one that there isn't, twice the same, or none
-    beside others.
+def _checked_effects(
+    names: tuple[str, ...], library: Collection[str]
+) -> tuple[str, ...]:
+    """The effects that act. Raises UserError for one that there isn't, twice the same,
+    or none beside others.
     """
     for name in names:
         if name not in ("none", *library):
-            raise UserError(f"--effect {name}: no such effect; {suggestion(name, library)}")
+            raise UserError(
+                f"--effect {name}: no such effect; {suggestion(name, library)}"
+            )
     is_unclear = "none" in names and len(names) > 1
     if len(set(names)) < len(names) or not names or is_unclear:
         typed = " ".join(names) or "nothing"
-        raise UserError(f"--effect {typed}: name none alone, or each effect that acts once")
+        raise UserError(
+            f"--effect {typed}: name none alone, or each effect that acts once"
+        )
     return tuple(name for name in names if name != "none")
 
 

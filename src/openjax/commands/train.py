@@ -1,8 +1,9 @@
 """Train pursuers: `openjax train [--preset NAME] [--out DIR] [--any.setting value]`.
 
-Writes a run directory (see `openjax.store.run_directory`) with logs, checkpoints, the best policy
-and pictures. Ctrl-C or SIGTERM saves and exits; `--resume DIR` goes on exactly where it stopped.
-From Python: `openjax.train(settings, out)`, see `openjax.commands.calls.train`.
+Writes a run directory (see `openjax.store.run_directory`) with logs, checkpoints, the
+best policy and pictures. Ctrl-C or SIGTERM saves and exits; `--resume DIR` goes on
+exactly where it stopped. From Python: `openjax.train(settings, out)`, see
+`openjax.commands.calls.train`.
 """
 
 import time
@@ -25,8 +26,8 @@ def main(arguments: Sequence[str]) -> int:
     from openjax.platform import make_cores_devices
     from openjax.runs.start import membership, read_command, start
 
-    # the same numbers by a kernel of JAX's own: written out, they're half of what there is to
-    # compile for a GPU
+    # the same numbers by a kernel of JAX's own: written out, they're half of what there
+    # is to compile for a GPU
     jax.config.update("jax_threefry_gpu_kernel_lowering", True)
     place = membership(arguments)
     if place is None and peek(arguments, "devices") != "all":
@@ -36,7 +37,9 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _help(arguments):
-    """The options and a preset's defaults, without waiting for JAX to find its devices."""
+    """The options and a preset's defaults, without waiting for JAX to find its
+    devices.
+    """
     from openjax.learning.presets import preset
     from openjax.runs.options import PROGRAM, TrainCommand
 

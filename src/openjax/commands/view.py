@@ -1,5 +1,5 @@
-"""Watch policies in three dimensions: `openjax view --policy flight open --scenario wall`, in a
-browser or as a file.
+"""Watch policies in three dimensions: `openjax view --policy flight open --scenario
+wall`, in a browser or as a file.
 """
 
 import dataclasses
@@ -20,21 +20,23 @@ from openjax.show.trajectory import Trajectory
 
 PROGRAM = "openjax view"
 OWN_NAMES = ("localhost", "127.0.0.1")
-"""Hosts that a browser may have asked for: a page elsewhere can't make its own name stand for this
-machine.
+"""Hosts that a browser may have asked for: a page elsewhere can't make its own name
+stand for this machine.
 """
 
 
 @dataclasses.dataclass(frozen=True)
 class ViewCommand(FlightOptions):
-    """Fly one episode of each layout with each policy, and show them in a browser: the page has all
-    in it.
+    """Fly one episode of each layout with each policy, and show them in a browser: the
+    page has all in it.
     """
 
     html: Path | None = None
     """Write the page to this file, to send to somebody, instead of serving it."""
     gif: Path | None = None
-    """Write an animation to this file instead, of the first layout with the first policy."""
+    """Write an animation to this file instead, of the first layout with the first
+    policy.
+    """
     mcap: Path | None = None
     """Write an MCAP file for Foxglove instead (pip install mcap)."""
     flights: Path | None = None
@@ -46,8 +48,8 @@ class ViewCommand(FlightOptions):
 
 
 def main(arguments: Sequence[str]) -> int:
-    """The command; returns its exit status. Raises UserError for an unusable policy, layout, file
-    or port.
+    """The command; returns its exit status. Raises UserError for an unusable policy,
+    layout, file or port.
     """
     command = parse(ViewCommand, ViewCommand(), arguments, PROGRAM)
     check_output(command.html, "--html")
@@ -64,7 +66,9 @@ def main(arguments: Sequence[str]) -> int:
 
         channels = []
         for policy, flight in flights:
-            channels += trajectory_channels(f"{Path(policy).name}/{flight.title}", flight)
+            channels += trajectory_channels(
+                f"{Path(policy).name}/{flight.title}", flight
+            )
         write_mcap(command.mcap, channels)
         console.print(_written(command.mcap))
     if command.gif is not None:
@@ -92,17 +96,20 @@ def _written(path: Path) -> str:
 
 
 def write_flights(command: ViewCommand) -> None:
-    """Write the flights of a case as MCAP. Raises UserError for an unusable case, or without a
-    file to write to.
+    """Write the flights of a case as MCAP. Raises UserError for an unusable case, or
+    without a file to write to.
     """
     from openjax.flights.case import load_case
     from openjax.flights.flight_channels import flight_channels
     from openjax.show.foxglove import write_mcap
 
     if command.mcap is None:
-        raise UserError("--flights shows logs in Foxglove: name the file to write, --mcap FILE")
+        raise UserError(
+            "--flights shows logs in Foxglove: name the file to write, --mcap FILE"
+        )
     nameless = not (command.flights / "vehicle.toml").exists()
-    case = load_case(command.flights, comparison=nameless)  # to look at, any vehicle will do
+    # to look at, any vehicle will do
+    case = load_case(command.flights, comparison=nameless)
     # one flight's channels at a time: a log of an hour holds millions of rows
     channels = (flight_channels(flight) for flight in case.flights)
     write_mcap(command.mcap, itertools.chain.from_iterable(channels))
@@ -117,19 +124,22 @@ def fly_all(command: ViewCommand) -> list[tuple[str, Trajectory]]:
     flights = []
     evaluators = {}
     shared = {
-        field.name: getattr(command, field.name) for field in dataclasses.fields(FlightOptions)
+        field.name: getattr(command, field.name)
+        for field in dataclasses.fields(FlightOptions)
     }
     for loaded in command.start():
         # each policy flies the game that it was trained in
-        own = EvaluateCommand(**shared, episodes=1, environment=loaded.settings.environment)
+        own = EvaluateCommand(
+            **shared, episodes=1, environment=loaded.settings.environment
+        )
         _, episodes = fly_scenarios(own, loaded, evaluators)
         flights += [(loaded.source, episode) for episode in episodes]
     return flights
 
 
 def page_server(page: str, port: int) -> ThreadingHTTPServer:
-    """A server of one page, to be used as a context manager, that this machine's browsers alone can
-    reach.
+    """A server of one page, to be used as a context manager, that this machine's
+    browsers alone can reach.
 
     Raises:
       UserError: the port isn't free.
@@ -138,7 +148,9 @@ def page_server(page: str, port: int) -> ThreadingHTTPServer:
 
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self):
-            host = self.headers.get("Host", "").rpartition(":")[0] or self.headers.get("Host", "")
+            host = self.headers.get("Host", "").rpartition(":")[0] or self.headers.get(
+                "Host", ""
+            )
             found = self.path == "/" and host in OWN_NAMES
             self.send_response(200 if found else 404)
             self.send_header("Content-Type", "text/html; charset=utf-8")

@@ -1,9 +1,9 @@
-"""`openjax virtual_crazyflie`: Crazyflies that are simulated, for everything that speaks to real
-ones.
+"""`openjax virtual_crazyflie`: Crazyflies that are simulated, for everything that
+speaks to real ones.
 
-They answer CRTP over UDP as `cflib` expects (`udp://127.0.0.1:19850` and on); inside fly openjax's
-vehicles in real time, rate loop at 500 Hz, with any effects, and a link with latency and loss to
-order.
+They answer CRTP over UDP as `cflib` expects (`udp://127.0.0.1:19850` and on); inside
+fly openjax's vehicles in real time, rate loop at 500 Hz, with any effects, and a link
+with latency and loss to order.
 """
 
 import math
@@ -36,11 +36,14 @@ class Arguments:
     port: Annotated[int, Interval("[0, 65535]")] = UDP_PORT
     """UDP port of the first; cflib's scan looks at 19850 to 19859."""
     scenario: str = "wall"
-    """They stand below the pursuers' starts of this layout (a name or a TOML file); more of them in
-    a row behind. middle: the first in the middle, where the plans of openjax fly --plan begin.
+    """They stand below the pursuers' starts of this layout (a name or a TOML file);
+    more of them in a row behind. middle: the first in the middle, where the plans of
+    openjax fly --plan begin.
     """
     vehicle: Path | None = None
-    """The vehicle inside: crazyflie, brushless, or a vehicle.toml; by default the Crazyflie 2.1."""
+    """The vehicle inside: crazyflie, brushless, or a vehicle.toml; by default the
+    Crazyflie 2.1.
+    """
     effects: Path | None = None
     """Physical effects that it suffers from (effects.toml)."""
     battery: Annotated[float, Interval("(0, 1]")] = 1.0
@@ -48,10 +51,14 @@ class Arguments:
     endurance: Annotated[float, Interval("(0, 100000]")] = 420.0
     """Seconds of hover that a full battery lasts."""
     needs_arming: bool = True
-    """Motors stay off until armed; False: armed from the start, as brushed Crazyflies are."""
+    """Motors stay off until armed; False: armed from the start, as brushed Crazyflies
+    are.
+    """
     seconds: Annotated[float | None, Interval("(0, 1e9]")] = None
     """End after this time; by default only when interrupted."""
-    link: Annotated[LinkFaults, tyro.conf.arg(name="")] = field(default_factory=LinkFaults)
+    link: Annotated[LinkFaults, tyro.conf.arg(name="")] = field(
+        default_factory=LinkFaults
+    )
 
 
 def make(arguments: Arguments):
@@ -70,7 +77,9 @@ def make(arguments: Arguments):
     stands += [(0.2 * i, -1.4) for i in range(arguments.number - len(stands))]
     effects = load_effects(arguments.effects)[1] if arguments.effects else {}
     vehicle = load_vehicle_file(arguments.vehicle).vehicle
-    vehicles = VirtualVehicles(vehicle, stands, effects, arguments.battery, arguments.endurance)
+    vehicles = VirtualVehicles(
+        vehicle, stands, effects, arguments.battery, arguments.endurance
+    )
     return VirtualCrazyflies(
         vehicles, arguments.host, arguments.port, arguments.link, arguments.needs_arming
     )

@@ -1,9 +1,9 @@
-"""What changed since last week: two sets of flights of one vehicle, compared with each other
-instead of with the simulator, so that what model and sensors share cancels.
+"""What changed since last week: two sets of flights of one vehicle, compared with each
+other instead of with the simulator, so that what model and sensors share cancels.
 
-`figures` reads what each flight says about its vehicle; `days` takes a day as a random effect;
-`causes` says what each cause would do, `weigh` how well each explains what differs; `result` is
-what comes out, `report` tells it.
+`figures` reads what each flight says about its vehicle; `days` takes a day as a random
+effect; `causes` says what each cause would do, `weigh` how well each explains what
+differs; `result` is what comes out, `report` tells it.
 """
 
 from collections.abc import Sequence
@@ -19,7 +19,13 @@ from openjax.comparison.days import (
     spread_of_charge,
     spread_of_days,
 )
-from openjax.comparison.figures import FIGURES, TRIMS, FlightFigures, figures_of, mixer_of
+from openjax.comparison.figures import (
+    FIGURES,
+    TRIMS,
+    FlightFigures,
+    figures_of,
+    mixer_of,
+)
 from openjax.comparison.result import SHOWN, Change, Interval
 from openjax.comparison.weigh import least_shown, weigh
 from openjax.errors import UserError
@@ -28,25 +34,30 @@ from openjax.flights.flight import Case, Issue
 
 
 def compare(flights: Path, references: Sequence[Path]) -> Change:
-    """What changed in the flights of a folder against those of one or more reference folders
-    (days).
+    """What changed in the flights of a folder against those of one or more reference
+    folders (days).
 
-    Raises UserError for a folder without a usable flight and for flights of several vehicles.
+    Raises UserError for a folder without a usable flight and for flights of several
+    vehicles.
     """
     new_case, new, quality = read(Path(flights))
     old: list[FlightFigures] = []
     for folder in references:
         case, figures, found = read(Path(folder))
         if {f.vehicle for f in case.flights} != {f.vehicle for f in new_case.flights}:
-            raise UserError(f"{folder}: holds flights of another vehicle than {flights}")
+            raise UserError(
+                f"{folder}: holds flights of another vehicle than {flights}"
+            )
         old += figures
         quality += found
-    return change_between(Path(flights).resolve().name, new, old, new_case, tuple(quality))
+    return change_between(
+        Path(flights).resolve().name, new, old, new_case, tuple(quality)
+    )
 
 
 def read(folder: Path) -> tuple[Case, list[FlightFigures], list[Issue]]:
-    """A folder's case, the figures of its flights by day, and what was left out. Raises UserError
-    as `compare`.
+    """A folder's case, the figures of its flights by day, and what was left out. Raises
+    UserError as `compare`.
     """
     case = load_case(folder, comparison=True)
     if len({f.vehicle for f in case.flights}) > 1:
@@ -74,8 +85,8 @@ def change_between(
     case: Case,
     quality: tuple[Issue, ...] = (),
 ) -> Change:
-    """`compare` for figures that are there already; `case` gives the vehicle's geometry and motor
-    order.
+    """`compare` for figures that are there already; `case` gives the vehicle's geometry
+    and motor order.
     """
     mixer = mixer_of(case.vehicle_of(case.flights[0]))
     battery = battery_of([*new, *old])
@@ -102,7 +113,10 @@ def change_between(
         side=ROTOR_PLACES[place[0]] if len(place) == 1 else SIDES.get(place, ""),
         causes=evidence.causes,
         causes_here=here,
-        places={tuple(sorted(logged[j] for j in p)): share for p, share in evidence.places.items()},
+        places={
+            tuple(sorted(logged[j] for j in p)): share
+            for p, share in evidence.places.items()
+        },
         size=evidence.size(within),
         figures={
             n: Interval(float(d), float(d - r), float(d + r))

@@ -1,5 +1,5 @@
-"""What a cause would do to a flight's figures: draws of its size, its place and how well real
-changes follow its pattern.
+"""What a cause would do to a flight's figures: draws of its size, its place and how
+well real changes follow its pattern.
 
     one rotor weaker by a share e     hover, roll, pitch and yaw move alike, signs by the rotor's
     place and spin two rotors weaker                 the sum of two such a weight beside a rotor or
@@ -9,8 +9,8 @@ changes follow its pattern.
     the angular acceleration per command gains                             the commands per rate
     error something else                    trims without a pattern
 
-A rotor that is weaker by e at the same command is given 1 / (1 - e) of it. What is cut, bent or
-taped on also shakes.
+A rotor that is weaker by e at the same command is given 1 / (1 - e) of it. What is cut,
+bent or taped on also shakes.
 """
 
 from dataclasses import dataclass
@@ -23,39 +23,50 @@ from openjax.comparison.figures import PLACES, TRIMS
 
 @dataclass(frozen=True)
 class Cause:
-    """What may have changed, how probable it is if something did, and the effects of the library
-    that it is.
+    """What may have changed, how probable it is if something did, and the effects of
+    the library that it is.
     """
 
     prior: float
     effects: tuple[str, ...] = ()
     damage: bool = False  # it also shakes
     figures: tuple[str, ...] = ()  # that it moves instead of the trims
-    usual: tuple[float, float] = (0.0, 0.0)  # mean and standard deviation of such a change
+    # mean and standard deviation of such a change
+    usual: tuple[float, float] = (0.0, 0.0)
     what: str = ""
 
 
-# People knock propellers and tape things on more often than they swap motors. Motors wear, drag is
-# added.
+# People knock propellers and tape things on more often than they swap motors. Motors
+# wear, drag is added.
 CAUSES = {
     "one rotor weaker": Cause(0.25, ("motor_imbalance",), damage=True),
     "two rotors weaker": Cause(0.2, ("motor_imbalance",), damage=True),
     "weight": Cause(0.15, ("mass", "com_offset"), damage=True),
     "whole vehicle": Cause(0.1, ("mass", "thrust_scale")),
-    "drag": Cause(0.08, ("rotor_drag",), False, ("drag_x", "drag_y"), (0.15, 0.3), "drag"),
+    "drag": Cause(
+        0.08, ("rotor_drag",), False, ("drag_x", "drag_y"), (0.15, 0.3), "drag"
+    ),
     "motors": Cause(0.06, ("motor_lag",), False, ("lag",), (0.2, 0.5), "motors' lag"),
-    "inertia": Cause(0.03, ("inertia",), False, ("torque_gain",), (0.0, 0.3), "inertia"),
-    "gains": Cause(0.06, ("rate_gains",), False, ("loop_gain",), (0.0, 0.5), "rate gains"),
+    "inertia": Cause(
+        0.03, ("inertia",), False, ("torque_gain",), (0.0, 0.3), "inertia"
+    ),
+    "gains": Cause(
+        0.06, ("rate_gains",), False, ("loop_gain",), (0.0, 0.5), "rate gains"
+    ),
     "something else": Cause(0.07),
 }
 LOOP_WITH_MOTORS = (
-    0.3  # standard deviation: a motors' change also moves the estimate of the loop's gain
+    # standard deviation: a motors' change also moves the estimate of the loop's gain
+    0.3
 )
-SHAKES = (0.4, 0.4)  # mean and standard deviation of the rise of the logarithm with a damage
+# mean and standard deviation of the rise of the logarithm with a damage
+SHAKES = (0.4, 0.4)
 USUAL_CHANGE = 0.15  # of a rotor's command, or of the weight
 STRONGER = 0.15  # share of changes the other way: a mended rotor, a weight taken off
-INEXACT = 0.25  # of each trim of a cause: real changes don't follow their pattern exactly
-LEAST_PARTNER = 0.25  # a second rotor that changed by less than this share of the first isn't one
+# of each trim of a cause: real changes don't follow their pattern exactly
+INEXACT = 0.25
+# a second rotor that changed by less than this share of the first isn't one
+LEAST_PARTNER = 0.25
 DRAWS = 2048  # of a cause's size and pattern
 
 ROTOR_PLACES = ("front right", "rear right", "rear left", "front left")
@@ -72,8 +83,8 @@ EVERYWHERE = (0, 1, 2, 3)
 
 @dataclass(frozen=True)
 class Hypotheses:
-    """Draws from all causes: change of the figures (N, F), prior weight, cause, place and size of
-    each.
+    """Draws from all causes: change of the figures (N, F), prior weight, cause, place
+    and size of each.
     """
 
     change: np.ndarray
@@ -90,7 +101,9 @@ class _Draws:
     def __init__(self, mixer: np.ndarray, trims: np.ndarray):
         even = np.clip(qmc.Sobol(11, seed=0).random(DRAWS), 1e-6, 1 - 1e-6)
         sign = np.where(even[:, 2] < STRONGER, -1.0, 1.0)
-        self.sizes = np.abs(norm.ppf(0.5 + 0.5 * even[:, :2])) * USUAL_CHANGE * sign[:, None]
+        self.sizes = (
+            np.abs(norm.ppf(0.5 + 0.5 * even[:, :2])) * USUAL_CHANGE * sign[:, None]
+        )
         self.places, self.normal = even[:, 3:5], norm.ppf(even[:, 5:])
         self.mixer = mixer
         self.trims = trims
@@ -99,7 +112,9 @@ class _Draws:
         }
         self.parts: list[tuple] = []
 
-    def add(self, cause: str, share: float, change: dict, place, size: np.ndarray) -> None:
+    def add(
+        self, cause: str, share: float, change: dict, place, size: np.ndarray
+    ) -> None:
         """Draws of a cause at a place; `change`: {figure: (DRAWS,)}."""
         table = np.zeros((DRAWS, len(PLACES)))
         for name, values in change.items():
@@ -110,25 +125,33 @@ class _Draws:
         where = np.broadcast_to(
             place if isinstance(place, np.ndarray) else self.place_of[place], DRAWS
         )
-        self.parts.append((table, weight, np.full(DRAWS, list(CAUSES).index(cause)), where, size))
+        self.parts.append(
+            (table, weight, np.full(DRAWS, list(CAUSES).index(cause)), where, size)
+        )
 
     def trims_of(self, factors: np.ndarray) -> dict:
-        """What rotor commands that rise by `factors` (DRAWS, 4) do to the trims, inexactly."""
+        """What rotor commands that rise by `factors` (DRAWS, 4) do to the trims,
+        inexactly.
+        """
         change = trims_with(self.mixer, self.trims, np.maximum(factors, 0.2))
-        return dict(zip(TRIMS, (change * (1.0 + INEXACT * self.normal[:, :4])).T, strict=True))
+        return dict(
+            zip(TRIMS, (change * (1.0 + INEXACT * self.normal[:, :4])).T, strict=True)
+        )
 
 
 def trims_with(mixer: np.ndarray, trims: np.ndarray, factors: np.ndarray) -> np.ndarray:
-    """Change (..., 4) of a reference's trims (4,) where the rotor commands of its level flight rise
-    by `factors` (..., 4).
+    """Change (..., 4) of a reference's trims (4,) where the rotor commands of its level
+    flight rise by `factors` (..., 4).
     """
     mixed = (np.linalg.solve(mixer, np.r_[1.0, trims[1:]]) * factors) @ mixer.T
-    return np.concatenate([np.log(mixed[..., :1]), mixed[..., 1:] / mixed[..., :1] - trims[1:]], -1)
+    return np.concatenate(
+        [np.log(mixed[..., :1]), mixed[..., 1:] / mixed[..., :1] - trims[1:]], -1
+    )
 
 
 def hypotheses_of(mixer: np.ndarray, trims: np.ndarray) -> Hypotheses:
-    """Draws for a vehicle of this `mixer` (4, 4) whose reference has these trims (4,), the first a
-    logarithm.
+    """Draws for a vehicle of this `mixer` (4, 4) whose reference has these trims (4,),
+    the first a logarithm.
     """
     draws = _Draws(mixer, trims)
     _rotors(draws)
@@ -138,7 +161,8 @@ def hypotheses_of(mixer: np.ndarray, trims: np.ndarray) -> Hypotheses:
             continue
         size = told.usual[0] + told.usual[1] * draws.normal[:, 0]
         each = {
-            n: size * (1 + INEXACT * draws.normal[:, k + 1]) for k, n in enumerate(told.figures)
+            n: size * (1 + INEXACT * draws.normal[:, k + 1])
+            for k, n in enumerate(told.figures)
         }
         if cause == "motors":
             each["loop_gain"] = LOOP_WITH_MOTORS * size * draws.normal[:, 2]
@@ -160,7 +184,9 @@ def _rotors(draws: _Draws) -> None:
     for rotor in range(4):
         factors = np.ones((DRAWS, 4))
         factors[:, rotor] += sizes[:, 0]
-        draws.add("one rotor weaker", 0.25, draws.trims_of(factors), (rotor,), lost[:, 0])
+        draws.add(
+            "one rotor weaker", 0.25, draws.trims_of(factors), (rotor,), lost[:, 0]
+        )
     for pair, side in SIDES.items():
         factors = np.ones((DRAWS, 4))
         factors[:, pair] += sizes
@@ -169,7 +195,9 @@ def _rotors(draws: _Draws) -> None:
             alone = np.abs(sizes[:, other]) < LEAST_PARTNER * np.abs(sizes[:, one])
             places[alone] = pair[one]
         share = 0.05 if side == "diagonal" else 0.225
-        draws.add("two rotors weaker", share, draws.trims_of(factors), places, lost.sum(1))
+        draws.add(
+            "two rotors weaker", share, draws.trims_of(factors), places, lost.sum(1)
+        )
 
 
 def _weights(draws: _Draws) -> None:
@@ -190,8 +218,8 @@ def _weights(draws: _Draws) -> None:
 
 
 def _beside(near: np.ndarray) -> tuple[int, ...]:
-    """The rotors beside a weight, from how near (4,) -1 to 1 it is to each: one, two of a side, or
-    all.
+    """The rotors beside a weight, from how near (4,) -1 to 1 it is to each: one, two of
+    a side, or all.
     """
     order = np.argsort(-near)
     if near[order[0]] < 0.3:

@@ -1,11 +1,11 @@
-"""Days as a random effect: figures of each day, how far normal days of a vehicle lie apart, and
-what the battery has in it.
+"""Days as a random effect: figures of each day, how far normal days of a vehicle lie
+apart, and what the battery has in it.
 
-A flight's trims (how hard it had to work to hover, and the roll, pitch and yaw that the mixer added
-to stay level) repeat within a day far better than from day to day: batteries, propellers and how
-the frame was put together shift them. The spread of days is learnt from the reference's days where
-it holds several, over a prior; flights of one folder whose trims are far apart count as several
-days.
+A flight's trims (how hard it had to work to hover, and the roll, pitch and yaw that the
+mixer added to stay level) repeat within a day far better than from day to day:
+batteries, propellers and how the frame was put together shift them. The spread of days
+is learnt from the reference's days where it holds several, over a prior; flights of one
+folder whose trims are far apart count as several days.
 """
 
 import dataclasses
@@ -17,37 +17,47 @@ from scipy.cluster.hierarchy import fcluster, linkage
 
 from openjax.comparison.figures import FIGURES, PLACES, FlightFigures
 
-DAY_SPREAD, WITHIN_DAY = np.array([(figure.day, figure.within) for figure in FIGURES.values()]).T
+DAY_SPREAD, WITHIN_DAY = np.array(
+    [(figure.day, figure.within) for figure in FIGURES.values()]
+).T
 HOVER = PLACES["hover"]
 PRIOR_DAYS = 6.0  # days of experience that this prior is worth
-SAME_DAY = 0.012  # of hover: roll and pitch trims further apart were flown on different days
-# 1/V of hover, prior mean and standard deviation: thrust commands are what the firmware's battery
-# compensation makes of them, and duty cycles with their voltage are turned into thrust by its map.
+# of hover: roll and pitch trims further apart were flown on different days
+SAME_DAY = 0.012
+# 1/V of hover, prior mean and standard deviation: thrust commands are what the
+# firmware's battery compensation makes of them, and duty cycles with their voltage are
+# turned into thrust by its map.
 VOLTAGE_SLOPE = (0.0, 0.05)
-# By what the logarithm of thrust per duty cycle differs between two days whose voltage isn't known:
-# the map's 1.4 times that of the voltage at hover, of batteries of 3.4 to 4.1 V under load.
+# By what the logarithm of thrust per duty cycle differs between two days whose voltage
+# isn't known: the map's 1.4 times that of the voltage at hover, of batteries of 3.4 to
+# 4.1 V under load.
 CHARGE = 1.4 * 0.2 / 3.7
 CHARGED = ("hover", "torque_gain")
 VOLTAGE_SPREAD = 0.1  # V, by which flights without a logged voltage may differ
 
 
 def days_told_apart(figures: Sequence[FlightFigures]) -> list[FlightFigures]:
-    """The flights of one folder with their days: those whose roll and pitch trims lie further apart
-    than flights of a day ever do count as flown on different days.
+    """The flights of one folder with their days: those whose roll and pitch trims lie
+    further apart than flights of a day ever do count as flown on different days.
     """
     if len(figures) < 2:
         return list(figures)
     trims = np.array([f.all()[0][1:3] for f in figures])
     error = max(float(np.median([f.all()[1][1:3].max() for f in figures])), 1e-9)
-    groups = fcluster(linkage(trims, "complete"), max(SAME_DAY, 3.0 * error), "distance")
+    groups = fcluster(
+        linkage(trims, "complete"), max(SAME_DAY, 3.0 * error), "distance"
+    )
     return [
-        dataclasses.replace(f, day=f"{f.day}#{g}") for f, g in zip(figures, groups, strict=True)
+        dataclasses.replace(f, day=f"{f.day}#{g}")
+        for f, g in zip(figures, groups, strict=True)
     ]
 
 
 @dataclass(frozen=True)
 class Days:
-    """Figures by day, hover as its logarithm; NaN where no flight of the day gives one."""
+    """Figures by day, hover as its logarithm; NaN where no flight of the day gives
+    one.
+    """
 
     days: np.ndarray  # (D, F)
     mean: np.ndarray  # (F,)
@@ -63,14 +73,15 @@ class Days:
 class Battery:
     """How hover follows the voltage."""
 
-    voltage: float  # V, at which hover is compared: the mean of all flights that logged it
+    # V, at which hover is compared: the mean of all flights that logged it
+    voltage: float
     slope: float  # 1/V, of the logarithm of hover
     error: float  # of the slope
 
 
 def battery_of(figures: Sequence[FlightFigures]) -> Battery:
-    """How hover follows the battery's voltage: flights of a day against each other, since neither
-    the day nor a change can enter there.
+    """How hover follows the battery's voltage: flights of a day against each other,
+    since neither the day nor a change can enter there.
     """
     mean, sigma = VOLTAGE_SLOPE
     xx = 0.0
@@ -91,12 +102,16 @@ def battery_of(figures: Sequence[FlightFigures]) -> Battery:
     precision = xx / noise + 1 / sigma**2
     voltage = float(np.mean(voltages)) if voltages else 0.0
     return Battery(
-        voltage, float((xy / noise + mean / sigma**2) / precision), float(precision**-0.5)
+        voltage,
+        float((xy / noise + mean / sigma**2) / precision),
+        float(precision**-0.5),
     )
 
 
 def by_day(figures: Sequence[FlightFigures], battery: Battery) -> Days:
-    """Means of each day's flights, weighted by their errors, at the voltage of `battery`."""
+    """Means of each day's flights, weighted by their errors, at the voltage of
+    `battery`.
+    """
     days = []
     variances = []
     for day in dict.fromkeys(f.day for f in figures):
@@ -114,7 +129,9 @@ def by_day(figures: Sequence[FlightFigures], battery: Battery) -> Days:
     return Days(days, mean, np.sqrt(np.nansum(variances, 0)) / count)
 
 
-def _at_voltage(flight: FlightFigures, battery: Battery) -> tuple[np.ndarray, np.ndarray]:
+def _at_voltage(
+    flight: FlightFigures, battery: Battery
+) -> tuple[np.ndarray, np.ndarray]:
     """Figures and errors (F,), the logarithm of hover at the battery's voltage."""
     value, error = (part.copy() for part in flight.all())
     error[HOVER] /= value[HOVER]
@@ -129,8 +146,8 @@ def _at_voltage(flight: FlightFigures, battery: Battery) -> tuple[np.ndarray, np
 
 
 def spread_of_charge(figures: Sequence[FlightFigures]) -> np.ndarray:
-    """Standard deviation (F,) of the difference of two days that a battery's unknown charge makes:
-    of duty cycles without a voltage.
+    """Standard deviation (F,) of the difference of two days that a battery's unknown
+    charge makes: of duty cycles without a voltage.
     """
     silent = any(f.duty and f.voltage is None for f in figures)
     out = np.zeros(len(FIGURES))
@@ -139,8 +156,8 @@ def spread_of_charge(figures: Sequence[FlightFigures]) -> np.ndarray:
 
 
 def spread_of_days(*sets: Days) -> tuple[np.ndarray, np.ndarray]:
-    """Standard deviation (F,) of normal days and the degrees of freedom (F,) behind it: the prior
-    and what the days of each set show.
+    """Standard deviation (F,) of normal days and the degrees of freedom (F,) behind it:
+    the prior and what the days of each set show.
     """
     freedom = np.full(len(FIGURES), PRIOR_DAYS)
     total = PRIOR_DAYS * DAY_SPREAD**2

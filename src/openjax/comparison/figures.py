@@ -1,7 +1,7 @@
-"""What one flight says about its vehicle without a model of it: how hard each rotor works, how
-strongly the air brakes, how late torques follow the motors, how noisy the sensors are. Poor in
-absolute terms (scales, biases and the simulator's misfit are in them), good for comparing flights
-with flights, where what is shared cancels.
+"""What one flight says about its vehicle without a model of it: how hard each rotor
+works, how strongly the air brakes, how late torques follow the motors, how noisy the
+sensors are. Poor in absolute terms (scales, biases and the simulator's misfit are in
+them), good for comparing flights with flights, where what is shared cancels.
 """
 
 from dataclasses import dataclass
@@ -19,17 +19,19 @@ BLOCK = 2.0  # s, over which rows of a flight count as one
 LOW = 2.5  # Hz, below which drag isn't covered by vibration
 TURNING = (1.0, 10.0)  # Hz, where motors turn the vehicle
 DELAYS = (0, 2, 4, 6)  # rows, of the commands as instruments
-# share of the regressors that commands must explain: weak instruments bias (Staiger, Stock 1997)
+# share of the regressors that commands must explain: weak instruments bias (Staiger,
+# Stock 1997)
 LEAST_EXCITED = 0.7
-ANSWERING = (4.0, 15.0)  # Hz, where the rate loop's proportional part outweighs its integral
+# Hz, where the rate loop's proportional part outweighs its integral
+ANSWERING = (4.0, 15.0)
 LAGS = np.geomspace(0.004, 0.2, 40)  # s, time constants that are tried
 
 
 @dataclass(frozen=True)
 class Figure:
-    """What a figure is in words, its unit and the factor to it (0: a logarithm, told as a change in
-    per cent), and its standard deviations over a vehicle's normal days and over flights within a
-    day.
+    """What a figure is in words, its unit and the factor to it (0: a logarithm, told as
+    a change in per cent), and its standard deviations over a vehicle's normal days and
+    over flights within a day.
     """
 
     words: str
@@ -39,10 +41,10 @@ class Figure:
     within: float
 
 
-# Trims, as shares of hover: 1 to 2.5 % over days, measured on published flights of two Crazyflies;
-# yaw more, because its torque is a hundredth of thrust times arm and a tilted motor shows in it.
-# Gains are the firmware's numbers, which no day moves: theirs is what the estimate repeats to in
-# flights of different kinds.
+# Trims, as shares of hover: 1 to 2.5 % over days, measured on published flights of two
+# Crazyflies; yaw more, because its torque is a hundredth of thrust times arm and a
+# tilted motor shows in it. Gains are the firmware's numbers, which no day moves: theirs
+# is what the estimate repeats to in flights of different kinds.
 FIGURES = {
     "hover": Figure("thrust command at hover", "%", 0.0, 0.012, 0.003),
     "roll": Figure("roll trim", "% of hover", 100.0, 0.02, 0.0025),
@@ -50,8 +52,12 @@ FIGURES = {
     "yaw": Figure("yaw trim", "% of hover", 100.0, 0.03, 0.005),
     "drag_x": Figure("drag along x", "1/s", 1.0, 0.04, 0.02),
     "drag_y": Figure("drag along y", "1/s", 1.0, 0.04, 0.02),
-    "lag": Figure("time constant from motors to angular acceleration", "%", 0.0, 0.1, 0.05),
-    "torque_gain": Figure("angular acceleration per motor command", "%", 0.0, 0.07, 0.03),
+    "lag": Figure(
+        "time constant from motors to angular acceleration", "%", 0.0, 0.1, 0.05
+    ),
+    "torque_gain": Figure(
+        "angular acceleration per motor command", "%", 0.0, 0.07, 0.03
+    ),
     "loop_gain": Figure("motor command per rate error", "%", 0.0, 0.02, 0.02),
     "shaking": Figure("gyroscope and motors above 20 Hz", "%", 0.0, 0.35, 0.1),
 }
@@ -63,12 +69,13 @@ TRIMS = ("hover", "roll", "pitch", "yaw")
 class FlightFigures:
     """One flight's figures: {name: (value, standard error)}.
 
-    hover: mean thrust command per specific thrust, as a fraction of a rotor's maximum at 1 g; roll,
-    pitch, yaw: the mixer's share of it that keeps the vehicle level (left, rear and clockwise
-    rotors harder: positive), also fractions of hover; drag_x, drag_y: 1/s. Logarithms of: lag, the
-    time constant in s from motors to angular acceleration; torque_gain, angular acceleration per
-    command; loop_gain, command per rate error; shaking, the rms of gyroscope and motors above 20
-    Hz. What the log can't give is missing.
+    hover: mean thrust command per specific thrust, as a fraction of a rotor's maximum
+    at 1 g; roll, pitch, yaw: the mixer's share of it that keeps the vehicle level
+    (left, rear and clockwise rotors harder: positive), also fractions of hover; drag_x,
+    drag_y: 1/s. Logarithms of: lag, the time constant in s from motors to angular
+    acceleration; torque_gain, angular acceleration per command; loop_gain, command per
+    rate error; shaking, the rms of gyroscope and motors above 20 Hz. What the log can't
+    give is missing.
     """
 
     name: str
@@ -78,25 +85,36 @@ class FlightFigures:
     duty: bool = False  # motors are duty cycles
 
     def all(self) -> tuple[np.ndarray, np.ndarray]:
-        """Values and standard errors (F,) in the order of FIGURES, NaN where the log gives none."""
+        """Values and standard errors (F,) in the order of FIGURES, NaN where the log
+        gives none.
+        """
         both = [self.values.get(n, (np.nan, np.nan)) for n in FIGURES]
         return tuple(np.array(part, float) for part in zip(*both, strict=True))
 
 
 def mixer_of(vehicle) -> np.ndarray:
-    """(4, 4) rows hover, roll, pitch, yaw: signs of each rotor's torque about x, y and z, and a
-    quarter each.
+    """(4, 4) rows hover, roll, pitch, yaw: signs of each rotor's torque about x, y and
+    z, and a quarter each.
     """
     place = np.asarray(vehicle.rotor_position, float)
     spin = np.asarray(vehicle.rotor_spin, float)
-    return np.stack([np.ones(4), np.sign(place[:, 1]), -np.sign(place[:, 0]), np.sign(spin)]) / 4.0
+    return (
+        np.stack(
+            [np.ones(4), np.sign(place[:, 1]), -np.sign(place[:, 0]), np.sign(spin)]
+        )
+        / 4.0
+    )
 
 
 def figures_of(flight: Flight, case: Case, day: str) -> FlightFigures | str:
     """The figures of a flight checked for a comparison, or why it has none."""
     vehicle = case.vehicle_of(flight)
     motor = flight.interpolated("motor_command")
-    voltage = None if flight.battery_voltage is None else flight.interpolated("battery_voltage")
+    voltage = (
+        None
+        if flight.battery_voltage is None
+        else flight.interpolated("battery_voltage")
+    )
     rows = _in_the_air(flight, case)
     if rows.sum() < 100 or flight.row_period * rows.sum() < 2.0:
         return "less than 2 s clear of the floor"
@@ -105,7 +123,9 @@ def figures_of(flight: Flight, case: Case, day: str) -> FlightFigures | str:
         return f"a motor is at its limit in {full:.0%} of the rows: no trim can be told"
     if case.vehicle_file.motor.command == "pwm":
         motor = pwm_thrust(motor, voltage, vehicle)
-    values = _trims(flight, motor, rows, mixer_of(vehicle)) | _dynamics(flight, case, vehicle)
+    values = _trims(flight, motor, rows, mixer_of(vehicle)) | _dynamics(
+        flight, case, vehicle
+    )
     mean = None if voltage is None else float(voltage[rows].mean())
     duty = case.vehicle_file.motor.command == "pwm"
     return FlightFigures(flight.name, day, values, mean, duty)
@@ -126,7 +146,9 @@ def _in_the_air(flight: Flight, case: Case) -> np.ndarray:
     return rows
 
 
-def _trims(flight: Flight, motor: np.ndarray, rows: np.ndarray, mixer: np.ndarray) -> dict:
+def _trims(
+    flight: Flight, motor: np.ndarray, rows: np.ndarray, mixer: np.ndarray
+) -> dict:
     mixed = motor @ mixer.T
     felt = _specific_thrust(flight)
     block = (flight.time // BLOCK).astype(int)[rows]
@@ -146,9 +168,9 @@ def _trims(flight: Flight, motor: np.ndarray, rows: np.ndarray, mixer: np.ndarra
 
 
 def _specific_thrust(flight: Flight) -> np.ndarray:
-    """m/s^2 (T,), by the path and the attitude where they are known: an accelerometer's bias would
-    be taken for a change of thrust. Without a path g: over a flight that starts and ends at rest it
-    is the mean.
+    """m/s^2 (T,), by the path and the attitude where they are known: an accelerometer's
+    bias would be taken for a change of thrust. Without a path g: over a flight that
+    starts and ends at rest it is the mean.
     """
     if flight.velocity is None:
         return np.full(len(flight), GRAVITY)
@@ -184,21 +206,26 @@ def _dynamics(flight: Flight, case: Case, vehicle) -> dict:
 
 
 def _drag(quaternion, velocity, force) -> dict:
-    """Lateral specific force against velocity, both in the body frame and below LOW: -d/m, 1/s."""
+    """Lateral specific force against velocity, both in the body frame and below LOW:
+    -d/m, 1/s.
+    """
     airspeed = to_body(quaternion, velocity)
     if force is None:
         force = specific_force_of(quaternion, velocity, 1 / RATE)
     out = {}
     for axis, name in enumerate(("drag_x", "drag_y")):
-        v, f = (in_band(a[:, axis : axis + 1], (0.15, LOW))[:, 0] for a in (airspeed, force))
+        v, f = (
+            in_band(a[:, axis : axis + 1], (0.15, LOW))[:, 0] for a in (airspeed, force)
+        )
         if v.std() > 0.15:
             out[name] = _slope(v, -f)
     return out
 
 
 def _torque(torque, rates) -> dict:
-    """The time constant from roll and pitch torques to angular accelerations: of all first-order
-    lags the one whose output correlates best, by quarters of the flight; and the gain behind it.
+    """The time constant from roll and pitch torques to angular accelerations: of all
+    first-order lags the one whose output correlates best, by quarters of the flight;
+    and the gain behind it.
     """
     if in_band(rates, TURNING).std(0).min() < 0.15:
         return {}
@@ -224,9 +251,9 @@ def _torque(torque, rates) -> dict:
 
 
 def _loop(torque, rates, commands) -> dict:
-    """How strongly the rate loop answers a rate error, beside what it answers to a change of the
-    rates, by quarters of the flight. In closed loop noise is in all three, so the commands are the
-    instruments (two-stage least squares).
+    """How strongly the rate loop answers a rate error, beside what it answers to a
+    change of the rates, by quarters of the flight. In closed loop noise is in all
+    three, so the commands are the instruments (two-stage least squares).
     """
     # motors hold from a row to the next: rates count in the middle
     after = np.concatenate([rates[1:], rates[-1:]])
@@ -236,7 +263,9 @@ def _loop(torque, rates, commands) -> dict:
     filtered = np.stack([in_band(values, ANSWERING) for values in signals], -1)
     gains = []
     for part in np.array_split(filtered, 4):
-        target, regressors, instruments = np.split(part.reshape(-1, len(signals)), (1, 3), axis=1)
+        target, regressors, instruments = np.split(
+            part.reshape(-1, len(signals)), (1, 3), axis=1
+        )
         excited = instruments @ np.linalg.lstsq(instruments, regressors, rcond=None)[0]
         if min((excited**2).sum(0) / (regressors**2).sum(0)) < LEAST_EXCITED:
             return {}
@@ -248,18 +277,26 @@ def _loop(torque, rates, commands) -> dict:
 
 
 def _shaking(gyro, motor) -> dict:
-    """Mean logarithm of the rms of gyroscope and motors above 20 Hz, sixths of the flight as
-    units.
+    """Mean logarithm of the rms of gyroscope and motors above 20 Hz, sixths of the
+    flight as units.
     """
-    parts = [np.array_split(in_band(values, (20.0, 45.0)), 6) for values in (gyro, motor)]
-    each = np.mean([[0.5 * np.log((p**2).sum(1).mean() + 1e-12) for p in own] for own in parts], 0)
-    return {"shaking": (float(each.mean()), float(each.std(ddof=1) / np.sqrt(len(each))))}
+    parts = [
+        np.array_split(in_band(values, (20.0, 45.0)), 6) for values in (gyro, motor)
+    ]
+    each = np.mean(
+        [[0.5 * np.log((p**2).sum(1).mean() + 1e-12) for p in own] for own in parts], 0
+    )
+    return {
+        "shaking": (float(each.mean()), float(each.std(ddof=1) / np.sqrt(len(each))))
+    }
 
 
 def _slope(x, y) -> tuple[float, float]:
     """Least-squares slope through the origin and its error, blocks as units."""
     parts = np.array_split(np.arange(len(x)), max(int(len(x) / (BLOCK * RATE)), 3))
-    xy, xx = (np.array([(a[p] * b[p]).sum() for p in parts]) for a, b in ((x, y), (x, x)))
+    xy, xx = (
+        np.array([(a[p] * b[p]).sum() for p in parts]) for a, b in ((x, y), (x, x))
+    )
     slope = xy.sum() / xx.sum()
     error = np.sqrt(((xy - slope * xx) ** 2).sum()) / xx.sum()
     return float(slope), float(error)

@@ -14,11 +14,12 @@ from openjax.show.pages import AFTER, BEFORE, GREY, STYLE, as_svg, filled
 
 
 def prediction(change: Change) -> dict:
-    """The case's entry in a predictions file: `probabilities` of no change and of each cause add up
-    to one.
+    """The case's entry in a predictions file: `probabilities` of no change and of each
+    cause add up to one.
     """
     causes = {
-        c.replace(" ", "_"): round(change.probability * p, 5) for c, p in change.causes.items()
+        c.replace(" ", "_"): round(change.probability * p, 5)
+        for c, p in change.causes.items()
     }
     return {
         "changed": change.changed,
@@ -34,7 +35,10 @@ def to_dict(change: Change) -> dict:
     """`changes.json`."""
 
     def interval(one: Interval) -> dict:
-        return {"value": round(one.value, 5), "interval90": [round(one.low, 5), round(one.high, 5)]}
+        return {
+            "value": round(one.value, 5),
+            "interval90": [round(one.low, 5), round(one.high, 5)],
+        }
 
     return prediction(change) | {
         "case": change.name,
@@ -52,9 +56,17 @@ def to_dict(change: Change) -> dict:
             "spread": {n: round(v, 4) for n, v in change.spread.items()},
         },
         "flights": [
-            {"flight": f.name, "set": name, "day": f.day.rpartition("/")[2], "voltage": f.voltage}
+            {
+                "flight": f.name,
+                "set": name,
+                "day": f.day.rpartition("/")[2],
+                "voltage": f.voltage,
+            }
             | {n: round(v[0], 5) for n, v in f.values.items()}
-            for name, figures in (("reference", change.reference), ("new", change.flights))
+            for name, figures in (
+                ("reference", change.reference),
+                ("new", change.flights),
+            )
             for f in figures
         ],
         "quality": [{"flight": i.flight, "issue": i.issue} for i in change.quality],
@@ -63,24 +75,36 @@ def to_dict(change: Change) -> dict:
 
 def in_words(change: Change) -> list[str]:
     """The answer in a few plain sentences."""
-    told = list(dict.fromkeys(_cause_in_words(change, cause) for cause in change.likely_causes))
-    chance = f"probability{'' if change.changed else ' of one:'} {change.probability:.2f}"
+    told = list(
+        dict.fromkeys(_cause_in_words(change, cause) for cause in change.likely_causes)
+    )
+    chance = (
+        f"probability{'' if change.changed else ' of one:'} {change.probability:.2f}"
+    )
     if not change.changed:
         lines = [f"No change that these flights can show ({chance})."]
-        lines += [f"Below the spread of days; if anything, {told[0]}."] * (change.probability > 0.2)
+        lines += [f"Below the spread of days; if anything, {told[0]}."] * (
+            change.probability > 0.2
+        )
     else:
         lines = [f"The vehicle changed ({chance}): {' or '.join(told)}."]
     if change.trims_changed:
-        value, low, high = (100 * v for v in (change.size.value, change.size.low, change.size.high))
+        value, low, high = (
+            100 * v for v in (change.size.value, change.size.low, change.size.high)
+        )
         end = " lost." if value > 0 else " (negative: it got stronger or lighter)."
-        lines.append(f"Size: {value:.0f} % [{low:.0f}, {high:.0f}] of a rotor's thrust{end}")
+        lines.append(
+            f"Size: {value:.0f} % [{low:.0f}, {high:.0f}] of a rotor's thrust{end}"
+        )
         if len(told) > 1:
             lines.append(
                 "These flights can't split the causes named; a weighed vehicle or another "
                 "propeller would."
             )
     elif change.changed:
-        moved = dict.fromkeys(n for c in change.likely_causes for n in CAUSES[c].figures)
+        moved = dict.fromkeys(
+            n for c in change.likely_causes for n in CAUSES[c].figures
+        )
         lines += [
             f"{FIGURES[n].words.capitalize()}: {_difference(n, change.figures[n])}."
             for n in moved
@@ -121,11 +145,13 @@ def _cause_in_words(change: Change, cause: str) -> str:
     if cause == "one rotor weaker" and several:
         return f"one of rotors {rotors} ({change.side}) is {weaker}"
     if cause.endswith("weaker"):
-        return (
-            f"rotor{'s' * several} {rotors} ({change.side}) {'are' if several else 'is'} {weaker}"
-        )
+        return f"rotor{'s' * several} {rotors} ({change.side}) {'are' if several else 'is'} {weaker}"
     if cause == "weight":
-        beside = f" at the {change.side}" if change.side and change.side != "diagonal" else ""
+        beside = (
+            f" at the {change.side}"
+            if change.side and change.side != "diagonal"
+            else ""
+        )
         return f"a weight was {'added' if more else 'taken off'}{beside}"
     if cause == "whole vehicle":
         return (
@@ -161,15 +187,16 @@ def html_of(change: Change) -> str:
     with rc_context(STYLE):
         picture = as_svg(draw(change), change.name)
     differences = [
-        (FIGURES[name].words, _difference(name, d)) for name, d in change.figures.items()
+        (FIGURES[name].words, _difference(name, d))
+        for name, d in change.figures.items()
     ]
     told = {"lines": in_words(change), "picture": picture, "differences": differences}
     return filled("changes.html.jinja", Path(__file__).parent, change=change, **told)
 
 
 def draw(change: Change):
-    """Trims of every flight, day by day, beside what days differ by; and where the change would
-    sit.
+    """Trims of every flight, day by day, beside what days differ by; and where the
+    change would sit.
     """
     figure = Figure(figsize=(11, 3.6), layout="constrained")
     axes = figure.subplots(1, 5, width_ratios=(1, 1, 1, 1, 1.3))
@@ -179,7 +206,9 @@ def draw(change: Change):
             days = list(dict.fromkeys(f.day for f in figures))
             for j, day in enumerate(days):
                 own = [f.values[name][0] for f in figures if f.day == day]
-                values = 100 * (np.array(own) / level - 1.0 if name == "hover" else np.array(own))
+                values = 100 * (
+                    np.array(own) / level - 1.0 if name == "hover" else np.array(own)
+                )
                 place = k + 0.6 * ((j + 0.5) / len(days) - 0.5)
                 axis.plot(
                     np.full(len(values), place),
@@ -193,15 +222,29 @@ def draw(change: Change):
                                 for f in change.reference])  # fmt: skip
         spread = 100 * change.spread[name]
         axis.axhspan(
-            middle - 1.645 * spread, middle + 1.645 * spread, color=AFTER, alpha=0.12, lw=0
+            middle - 1.645 * spread,
+            middle + 1.645 * spread,
+            color=AFTER,
+            alpha=0.12,
+            lw=0,
         )
-        axis.set(title=name, xticks=(0, 1), xticklabels=("reference", "new"), xlim=(-0.6, 1.6))
+        axis.set(
+            title=name,
+            xticks=(0, 1),
+            xticklabels=("reference", "new"),
+            xlim=(-0.6, 1.6),
+        )
     axes[0].set_ylabel("% of hover (band: 90 % of normal days)")
     places = sorted(change.places.items(), key=lambda item: -item[1])[:6]
     names = [
-        "all" if len(p) == 4 else "+".join(f"m{i}" for i in p) or "no rotor's" for p, _ in places
+        "all" if len(p) == 4 else "+".join(f"m{i}" for i in p) or "no rotor's"
+        for p, _ in places
     ]
     shares = [change.probability * share for _, share in places]
-    axes[4].barh(["no change", *names][::-1], [1 - change.probability, *shares][::-1], color=AFTER)
+    axes[4].barh(
+        ["no change", *names][::-1],
+        [1 - change.probability, *shares][::-1],
+        color=AFTER,
+    )
     axes[4].set(title="probability", xlim=(0, 1))
     return figure

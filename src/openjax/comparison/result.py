@@ -22,12 +22,13 @@ class Interval:
 class Change:
     """What differs between two sets of flights.
 
-    `probability` that the vehicle changed. `places` {rotors: p} and `causes` {cause: p} say how
-    probable each is if it did (`causes_here`: at the most probable place); rotors count 1 to 4 as
-    logged (m1..m4). `trims_changed`: the most probable cause moves the trims. `size` is the thrust
-    that was lost, as a share of one rotor's, at the most probable place (for a weight: its share of
-    a rotor's load); `figures` are the differences, their intervals with the spread of a day in
-    them; `least` is the loss of a single rotor that these flights would have shown.
+    `probability` that the vehicle changed. `places` {rotors: p} and `causes` {cause: p}
+    say how probable each is if it did (`causes_here`: at the most probable place);
+    rotors count 1 to 4 as logged (m1..m4). `trims_changed`: the most probable cause
+    moves the trims. `size` is the thrust that was lost, as a share of one rotor's, at
+    the most probable place (for a weight: its share of a rotor's load); `figures` are
+    the differences, their intervals with the spread of a day in them; `least` is the
+    loss of a single rotor that these flights would have shown.
     """
 
     name: str
@@ -49,8 +50,12 @@ class Change:
 
     @property
     def charge_unknown(self) -> bool:
-        """Whether a battery's charge may differ unseen: duty cycles without a voltage."""
-        return any(f.duty and f.voltage is None for f in (*self.reference, *self.flights))
+        """Whether a battery's charge may differ unseen: duty cycles without a
+        voltage.
+        """
+        return any(
+            f.duty and f.voltage is None for f in (*self.reference, *self.flights)
+        )
 
     @property
     def days(self) -> int:
@@ -59,8 +64,8 @@ class Change:
 
     @property
     def likely_causes(self) -> tuple[str, ...]:
-        """The most probable cause at the most probable place, and those that these flights can't
-        split from it.
+        """The most probable cause at the most probable place, and those that these
+        flights can't split from it.
         """
         top = max(self.causes_here.values())
         likely = [c for c, p in self.causes_here.items() if p > 0.25 * top]
@@ -73,6 +78,8 @@ class Change:
             return ()
         return tuple(
             dict.fromkeys(
-                effect for cause in self.likely_causes for effect in CAUSES[cause].effects
+                effect
+                for cause in self.likely_causes
+                for effect in CAUSES[cause].effects
             )
         )

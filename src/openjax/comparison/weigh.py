@@ -1,5 +1,5 @@
-"""Causes weighed against each other and against no change, by how well each, with the spread of a
-day, predicts the difference of all figures: one Bayesian model selection.
+"""Causes weighed against each other and against no change, by how well each, with the
+spread of a day, predicts the difference of all figures: one Bayesian model selection.
 """
 
 from dataclasses import dataclass
@@ -14,8 +14,8 @@ PRIOR_CHANGED = 0.5
 
 @dataclass(frozen=True)
 class Weighed:
-    """`changed`: probability that something changed; the rest holds if so: `posterior` (N,) of the
-    hypotheses.
+    """`changed`: probability that something changed; the rest holds if so: `posterior`
+    (N,) of the hypotheses.
     """
 
     changed: float
@@ -25,26 +25,35 @@ class Weighed:
     hypotheses: Hypotheses
 
     def place(self) -> tuple[tuple[int, ...], list[tuple[int, ...]]]:
-        """The smallest place that holds more than half of the probability, and the places within
-        it: a rotor, two rotors, a side (one or both of its rotors), else what is most probable.
+        """The smallest place that holds more than half of the probability, and the
+        places within it: a rotor, two rotors, a side (one or both of its rotors), else
+        what is most probable.
         """
         best = max(self.places, key=lambda p: self.places[p])
         if self.places[best] > 0.5:
             return best, [best]
         sides = {
-            side: [side, side[:1], side[1:]] for side, name in SIDES.items() if name != "diagonal"
+            side: [side, side[:1], side[1:]]
+            for side, name in SIDES.items()
+            if name != "diagonal"
         }
-        shares = {side: sum(self.places[p] for p in within) for side, within in sides.items()}
+        shares = {
+            side: sum(self.places[p] for p in within) for side, within in sides.items()
+        }
         side = max(shares, key=lambda p: shares[p])
         return (side, sides[side]) if shares[side] > 0.5 else (best, [best])
 
     def _within(self, places: list[tuple[int, ...]]) -> np.ndarray:
-        return np.isin(self.hypotheses.place, [self.hypotheses.places.index(p) for p in places])
+        return np.isin(
+            self.hypotheses.place, [self.hypotheses.places.index(p) for p in places]
+        )
 
     def causes_at(self, places: list[tuple[int, ...]]) -> dict[str, float]:
         """Probability of each cause at some places."""
         here = self._within(places)
-        each = np.bincount(self.hypotheses.cause[here], self.posterior[here], len(CAUSES))
+        each = np.bincount(
+            self.hypotheses.cause[here], self.posterior[here], len(CAUSES)
+        )
         return dict(zip(CAUSES, (each / each.sum()).tolist(), strict=True))
 
     def size(self, places: list[tuple[int, ...]]) -> Interval:
@@ -54,28 +63,32 @@ class Weighed:
         share = np.cumsum(self.posterior[here][order])
         values = self.hypotheses.size[here][order]
         low, middle, high = (
-            float(values[np.searchsorted(share, q * share[-1])]) for q in (0.05, 0.5, 0.95)
+            float(values[np.searchsorted(share, q * share[-1])])
+            for q in (0.05, 0.5, 0.95)
         )
         return Interval(middle, low, high)
 
 
 def weigh(
-    hypotheses: Hypotheses, difference: np.ndarray, scale: np.ndarray, freedom: np.ndarray
+    hypotheses: Hypotheses,
+    difference: np.ndarray,
+    scale: np.ndarray,
+    freedom: np.ndarray,
 ) -> Weighed:
-    """Posterior of every cause, place and size: Student's distribution around the change that each
-    predicts.
+    """Posterior of every cause, place and size: Student's distribution around the
+    change that each predicts.
 
-    difference, scale and freedom (F,) of the figures; what the logs don't give is NaN and tells
-    nothing.
+    difference, scale and freedom (F,) of the figures; what the logs don't give is NaN
+    and tells nothing.
     """
     given = np.isfinite(difference)
     scale = scale[given]
     freedom = freedom[given]
 
     def log_density(rest: np.ndarray) -> np.ndarray:
-        return -0.5 * ((freedom + 1.0) * np.log1p((rest[..., given] / scale) ** 2 / freedom)).sum(
-            -1
-        )
+        return -0.5 * (
+            (freedom + 1.0) * np.log1p((rest[..., given] / scale) ** 2 / freedom)
+        ).sum(-1)
 
     none = log_density(difference)
     # what would show only in figures that these logs lack can't be weighed
@@ -88,9 +101,12 @@ def weigh(
     total = posterior.sum() + (1.0 - PRIOR_CHANGED) * np.exp(none - top)
     changed = float(posterior.sum() / total)
     posterior /= posterior.sum()
-    causes = {c: float(posterior[hypotheses.cause == k].sum()) for k, c in enumerate(CAUSES)}
+    causes = {
+        c: float(posterior[hypotheses.cause == k].sum()) for k, c in enumerate(CAUSES)
+    }
     places = {
-        p: float(posterior[hypotheses.place == k].sum()) for k, p in enumerate(hypotheses.places)
+        p: float(posterior[hypotheses.place == k].sum())
+        for k, p in enumerate(hypotheses.places)
     }
     return Weighed(changed, causes, places, posterior, hypotheses)
 
@@ -102,8 +118,8 @@ def least_shown(
     scale: np.ndarray,
     freedom: np.ndarray,
 ) -> float:
-    """The loss of a single rotor that would just be said to be a change, whichever rotor it is, by
-    its trims alone.
+    """The loss of a single rotor that would just be said to be a change, whichever
+    rotor it is, by its trims alone.
     """
     worst = 0.0
     for rotor in range(4):
@@ -112,7 +128,9 @@ def least_shown(
         for _ in range(8):
             middle = 0.5 * (low + high)
             change = np.full(len(scale), np.nan)
-            change[: len(trims)] = trims_with(mixer, trims, 1.0 + middle * (np.arange(4) == rotor))
+            change[: len(trims)] = trims_with(
+                mixer, trims, 1.0 + middle * (np.arange(4) == rotor)
+            )
             shown = weigh(hypotheses, change, scale, freedom).changed > SHOWN
             low, high = (low, middle) if shown else (middle, high)
         worst = max(worst, high / (1.0 + high))

@@ -1,5 +1,5 @@
-"""Evaluation: whole episodes, validation tasks and scores. It knows nothing of how anybody
-learned.
+"""Evaluation: whole episodes, validation tasks and scores. It knows nothing of how
+anybody learned.
 """
 
 from openjax.lazy import lazy_names

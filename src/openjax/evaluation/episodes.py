@@ -21,7 +21,9 @@ class Evaluation:
 
     statistics: EpisodeStatistics  # (B,) each
     prediction_error: jax.Array
-    """(B,) m, mean distance between predicted and true next position; NaN without predictor"""
+    """(B,) m, mean distance between predicted and true next position; NaN without
+    predictor
+    """
     last_seen_error: jax.Array  # (B,) m, the same for keeping the last seen position
 
 
@@ -43,12 +45,15 @@ def make_evaluate(
     policy: Policy,
     trajectory: bool = False,
     messages: MessageSettings | None = None,
-) -> Callable[[PolicyParameters, Task, jax.Array], Evaluation | tuple[Evaluation, EpisodeRecord]]:
-    """`evaluate(parameters, tasks, key)`: one episode per task (leading axis B), to be compiled by
-    the caller.
+) -> Callable[
+    [PolicyParameters, Task, jax.Array], Evaluation | tuple[Evaluation, EpisodeRecord]
+]:
+    """`evaluate(parameters, tasks, key)`: one episode per task (leading axis B), to be
+    compiled by the caller.
 
-    With `trajectory` it returns positions of every step as well. Where `messages` get lost or are
-    late, each pursuer flies by what it believes, and prediction errors aren't told.
+    With `trajectory` it returns positions of every step as well. Where `messages` get
+    lost or are late, each pursuer flies by what it believes, and prediction errors
+    aren't told.
     """
     imperfect = messages is not None and not messages.perfect
     hearsay = Hearsay(messages, environment) if imperfect else None
@@ -88,13 +93,14 @@ class _Episodes:
         return evaluation, jax.tree.map(lambda x: jnp.moveaxis(x, 0, 1), record)
 
     def _step(self, parameters, carry, key):
-        """One step of all episodes; `errors` (2, B) m add up those of the prediction and of the
-        last seen position.
+        """One step of all episodes; `errors` (2, B) m add up those of the prediction
+        and of the last seen position.
         """
         observation, state, beliefs, errors = carry
         action, predicted = self._decide(parameters, observation, state, beliefs)
         last_seen = observation.last_seen
-        # what was predicted one step ahead is compared with where the evader is after the step
+        # what was predicted one step ahead is compared with where the evader is after
+        # the step
         step = jax.vmap(self.environment.step, in_axes=(None, 0, 0))
         observation, state, _, _, _, info = step(key, state, action)
         if self.hearsay is not None:
@@ -102,7 +108,10 @@ class _Episodes:
             beliefs = jax.vmap(self.hearsay.after)(beliefs, state, keys)
         guesses = [last_seen if predicted is None else predicted[:, 0], last_seen]
         errors = errors + jnp.stack(
-            [jnp.linalg.norm(guess - state.evader_position, axis=-1) for guess in guesses]
+            [
+                jnp.linalg.norm(guess - state.evader_position, axis=-1)
+                for guess in guesses
+            ]
         )
         record = None
         if self.trajectory:
@@ -118,8 +127,8 @@ class _Episodes:
         return (observation, state, beliefs, errors), record
 
     def _decide(self, parameters, observation, state, beliefs):
-        """Actions, and the positions predicted for the evader; None where each pursuer has its own
-        view.
+        """Actions, and the positions predicted for the evader; None where each pursuer
+        has its own view.
         """
         policy = self.policy
         if self.hearsay is not None:
@@ -132,8 +141,8 @@ class _Episodes:
 
 
 def summarise(evaluation: Evaluation) -> dict[str, float]:
-    """Captures, breaches, crashes and errors as means over the episodes, capture steps of the
-    slowest hundredth too.
+    """Captures, breaches, crashes and errors as means over the episodes, capture steps
+    of the slowest hundredth too.
     """
     statistics = evaluation.statistics
     hundredth = max(1, len(statistics.capture_step) // 100)
@@ -162,8 +171,8 @@ def summarise(evaluation: Evaluation) -> dict[str, float]:
 
 
 def wilson(hits: int, n: int) -> tuple[float, float]:
-    """95 % interval of a proportion (Wilson 1927), by the quantile 1.96 that all pages of results
-    have.
+    """95 % interval of a proportion (Wilson 1927), by the quantile 1.96 that all pages
+    of results have.
     """
     p = hits / n
     z = 1.96

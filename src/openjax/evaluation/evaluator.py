@@ -1,5 +1,5 @@
-"""Evaluation of policies on layouts and on validation tasks: episodes in batches of one size, as
-records and trajectories.
+"""Evaluation of policies on layouts and on validation tasks: episodes in batches of one
+size, as records and trajectories.
 """
 
 import dataclasses
@@ -16,7 +16,14 @@ from openjax.evaluation.episodes import Evaluation, make_evaluate, summarise
 from openjax.evaluation.message_settings import MessageSettings
 from openjax.evaluation.result_tables import record_of
 from openjax.policy import Policy, PolicyParameters
-from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings, Scenario, Task, scenario_task
+from openjax.pursuit import (
+    SCENARIOS,
+    Pursuit,
+    PursuitSettings,
+    Scenario,
+    Task,
+    scenario_task,
+)
 from openjax.pursuit.statistics import EpisodeStatistics
 from openjax.pursuit.task import capture_radius
 from openjax.pursuit.teams import FAR
@@ -24,7 +31,8 @@ from openjax.show.trajectory import Trajectory
 
 
 class Evaluator:
-    """Episodes of the mean policy, `batch` at a time: one compilation for whatever tasks come.
+    """Episodes of the mean policy, `batch` at a time: one compilation for whatever
+    tasks come.
 
     Args:
       environment: its settings say how many pursuers and pillar slots the tasks have.
@@ -51,11 +59,12 @@ class Evaluator:
         key: jax.Array,
         tell: Callable[[str], None] = lambda name: None,
     ) -> list["Flown"]:
-        """One episode per task; `kinds` are tasks by name, each with a leading axis of its own.
+        """One episode per task; `kinds` are tasks by name, each with a leading axis of
+        its own.
 
-        Kinds that fill whole batches are flown one by one (`tell` hears which), so that a kind's
-        result is the same alone and among others; else all are packed into as few batches as they
-        need.
+        Kinds that fill whole batches are flown one by one (`tell` hears which), so that
+        a kind's result is the same alone and among others; else all are packed into as
+        few batches as they need.
         """
         numbers = [tasks.evader_position.shape[0] for tasks in kinds.values()]
         if not any(number % self.batch for number in numbers):
@@ -75,7 +84,9 @@ class Evaluator:
         ]
 
     def _fly(self, parameters, tasks, key):
-        """Evaluation (B,) of the tasks on the host, and the device trajectories of each batch."""
+        """Evaluation (B,) of the tasks on the host, and the device trajectories of each
+        batch.
+        """
         number = tasks.evader_position.shape[0]
         evaluations = []
         records = []
@@ -83,7 +94,9 @@ class Evaluator:
             # the program knows one size: the last batch is filled up with the last task
             index = np.minimum(np.arange(start, start + self.batch), number - 1)
             part = jax.tree.map(operator.itemgetter(index), tasks)
-            evaluation, record = self._evaluate(parameters, part, jax.random.fold_in(key, i))
+            evaluation, record = self._evaluate(
+                parameters, part, jax.random.fold_in(key, i)
+            )
             asked_for = slice(min(self.batch, number - start))
             evaluation = jax.tree.map(np.asarray, evaluation)
             evaluations.append(jax.tree.map(operator.itemgetter(asked_for), evaluation))
@@ -91,16 +104,20 @@ class Evaluator:
             records.append(record)
         return jax.tree.map(lambda *parts: np.concatenate(parts), *evaluations), records
 
-    def compile_ahead(self, parameters: PolicyParameters, task: Task) -> Callable[[], None]:
-        """Start to compile for parameters and tasks of these shapes, of which `task` has a leading
-        axis of any length.
+    def compile_ahead(
+        self, parameters: PolicyParameters, task: Task
+    ) -> Callable[[], None]:
+        """Start to compile for parameters and tasks of these shapes, of which `task`
+        has a leading axis of any length.
         """
 
         def one_batch(leaf):
             return jax.ShapeDtypeStruct((self.batch, *leaf.shape[1:]), leaf.dtype)
 
         key = jax.random.fold_in(jax.random.key(0), 0)
-        return compile_ahead(self._evaluate, parameters, jax.tree.map(one_batch, task), key)
+        return compile_ahead(
+            self._evaluate, parameters, jax.tree.map(one_batch, task), key
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -147,7 +164,9 @@ class Flown:
 
 
 def _on_the_floor(position):
-    """Paths (T, N, 3) on which pursuers that have fallen out lie below where they did."""
+    """Paths (T, N, 3) on which pursuers that have fallen out lie below where they
+    did.
+    """
     position = np.array(position)
     for path in position.swapaxes(0, 1):
         # who has fallen out is parked far away, which no picture could show
@@ -170,20 +189,25 @@ def episode_figures(statistics: EpisodeStatistics) -> dict[str, np.ndarray]:
 
 
 def layout_slots(settings: PursuitSettings) -> int:
-    """Pillar slots that hold every layout and uniform task, so that one compiled evaluation serves
-    all.
+    """Pillar slots that hold every layout and uniform task, so that one compiled
+    evaluation serves all.
     """
-    return max(settings.max_pillars, *(len(scenario.pillars) for scenario in SCENARIOS.values()))
+    return max(
+        settings.max_pillars,
+        *(len(scenario.pillars) for scenario in SCENARIOS.values()),
+    )
 
 
 def repeat_task(task: Task, number: int) -> Task:
     """`number` copies along a new leading axis."""
-    return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (number, *leaf.shape)), task)
+    return jax.tree.map(
+        lambda leaf: jnp.broadcast_to(leaf, (number, *leaf.shape)), task
+    )
 
 
 def stacked(kinds: Mapping[str, Task]) -> tuple[Task, Callable[[Any], dict[str, Any]]]:
-    """Tasks of several kinds one after the other, and what parts a tree of results (B, ...) by
-    their names again.
+    """Tasks of several kinds one after the other, and what parts a tree of results (B,
+    ...) by their names again.
     """
     places = {}
     start = 0
@@ -206,5 +230,6 @@ def layout_tasks(
 ) -> dict[str, Task]:
     """So many times each layout, by name."""
     return {
-        layout.name: repeat_task(scenario_task(settings, layout), episodes) for layout in scenarios
+        layout.name: repeat_task(scenario_task(settings, layout), episodes)
+        for layout in scenarios
     }

@@ -8,8 +8,8 @@ from openjax.ranges import Interval, check_intervals
 
 @dataclass(frozen=True)
 class MessageSettings:
-    """Messages between pursuers. In every control step each sends to every other where it is, how
-    it flies, and where the evader is if it sees it.
+    """Messages between pursuers. In every control step each sends to every other where
+    it is, how it flies, and where the evader is if it sees it.
     """
 
     lost: Annotated[float, Interval("[0, 1]")] = 0.0

@@ -1,11 +1,13 @@
-"""A team whose messages are lost or late: each pursuer flies the policy by what it believes.
+"""A team whose messages are lost or late: each pursuer flies the policy by what it
+believes.
 
-A pursuer knows where it is itself, what it sees, and of the others what it was told last, and when.
-It takes the teammates to have flown on as they told, as a tenth of a second is a hand's breadth.
-The evader it takes to be where it saw it, or where the newest report has it; without a report in
-this step the evader counts as hidden. So each has its own view of the world, in which the policy
-acts for it alone. With perfect messages all views are the same, and those of a game in which what
-one sees is seen by all.
+A pursuer knows where it is itself, what it sees, and of the others what it was told
+last, and when. It takes the teammates to have flown on as they told, as a tenth of a
+second is a hand's breadth. The evader it takes to be where it saw it, or where the
+newest report has it; without a report in this step the evader counts as hidden. So each
+has its own view of the world, in which the policy acts for it alone. With perfect
+messages all views are the same, and those of a game in which what one sees is seen by
+all.
 """
 
 from dataclasses import dataclass
@@ -19,8 +21,8 @@ from openjax.pursuit import Observation, Pursuit, PursuitState
 from openjax.pursuit.observation import frame, frame_pursuers
 
 COAST = 0.3
-"""Seconds for which a teammate that isn't heard of is taken to fly on as it told: about twice the
-time in which a vehicle turns its velocity round.
+"""Seconds for which a teammate that isn't heard of is taken to fly on as it told: about
+twice the time in which a vehicle turns its velocity round.
 """
 
 
@@ -40,7 +42,8 @@ class Sent:
 class Beliefs:
     """What each of the N pursuers of a world takes it to be."""
 
-    position: jax.Array  # (N, N, 3) m, where each pursuer (second axis) was when it told
+    # (N, N, 3) m, where each pursuer (second axis) was when it told
+    position: jax.Array
     velocity: jax.Array  # (N, N, 3) m/s, at that time
     told: jax.Array  # (N, N) int32, the step of that time
     evader: jax.Array  # (N, 3) m, by the newest report
@@ -66,7 +69,9 @@ class Hearsay:
         return round(self.settings.late / self.environment.settings.time_step)
 
     def start(self, state: PursuitState) -> Beliefs:
-        """At an episode's start all know where all start, and who sees the evader tells it."""
+        """At an episode's start all know where all start, and who sees the evader tells
+        it.
+        """
         number = state.drones.position.shape[0]
 
         def each(leaf):
@@ -90,7 +95,9 @@ class Hearsay:
         )
 
     def after(self, beliefs: Beliefs, state: PursuitState, key: jax.Array) -> Beliefs:
-        """Beliefs after a step that ended with `state`; `key` draws which messages are lost."""
+        """Beliefs after a step that ended with `state`; `key` draws which messages are
+        lost.
+        """
         number = state.drones.position.shape[0]
         sent = _sent(state)
         line = jax.tree.map(
@@ -101,7 +108,8 @@ class Hearsay:
         is_itself = jnp.eye(number, dtype=bool)
         arrives = jax.random.uniform(key, (number, number)) >= self.settings.lost
         arrives &= ~is_itself
-        # a report counts that is newer than what one knows, and one's own eyes before any report
+        # a report counts that is newer than what one knows, and one's own eyes before
+        # any report
         has_report = jnp.any(arrives & arriving.sees, axis=-1)
         has_report &= arriving.step > beliefs.reported
         sees = state.sees
@@ -111,7 +119,9 @@ class Hearsay:
             return jnp.where(sees[:, None], by_itself, believed)
 
         evader = newest(sent.evader, arriving.evader, beliefs.evader)
-        velocity = newest(sent.evader_velocity, arriving.evader_velocity, beliefs.evader_velocity)
+        velocity = newest(
+            sent.evader_velocity, arriving.evader_velocity, beliefs.evader_velocity
+        )
         reported = jnp.where(has_report, arriving.step, beliefs.reported)
         seen = sees | has_report
         beliefs = _with_teammates(beliefs, sent, arriving, arrives).replace(
@@ -136,7 +146,12 @@ class Hearsay:
             place = self._place(belief, state.step)
             framed = frame_pursuers(settings, place, belief.last_seen, state.active)
             return frame(
-                settings, state.step, framed, belief.evader, belief.evader_velocity, belief.seen
+                settings,
+                state.step,
+                framed,
+                belief.evader,
+                belief.evader_velocity,
+                belief.seen,
             )
 
         # what is on the way has another leading axis than the pursuers'
@@ -144,7 +159,9 @@ class Hearsay:
         return jnp.concatenate([beliefs.frames[:, 1:], frames[:, None]], axis=1)
 
     def observations(self, beliefs: Beliefs, state: PursuitState) -> Observation:
-        """What each pursuer observes in its own view: observations (N, ...) of one pursuer each."""
+        """What each pursuer observes in its own view: observations (N, ...) of one
+        pursuer each.
+        """
 
         def view(i, belief):
             place = self._place(belief, state.step)

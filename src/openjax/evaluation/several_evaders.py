@@ -1,8 +1,9 @@
-"""Several evaders at once: each flees from all pursuers, and each pursuer goes for one of them.
+"""Several evaders at once: each flees from all pursuers, and each pursuer goes for one
+of them.
 
-A world has a state for each evader; the drones are the same in all of them. A pursuer acts by what
-it observes in the state of its target, where all others of the team seem to go for that one, too.
-Nobody goes for one that is caught.
+A world has a state for each evader; the drones are the same in all of them. A pursuer
+acts by what it observes in the state of its target, where all others of the team seem
+to go for that one, too. Nobody goes for one that is caught.
 """
 
 from collections.abc import Callable
@@ -14,14 +15,20 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int32
 
 from openjax.policy import Policy, PolicyParameters
-from openjax.pursuit import EpisodeStatistics, Pursuit, PursuitSettings, Task, uniform_task
+from openjax.pursuit import (
+    EpisodeStatistics,
+    Pursuit,
+    PursuitSettings,
+    Task,
+    uniform_task,
+)
 
 Choice = Callable[
     [Float[Array, "drones 3"], Float[Array, "evaders 3"], Bool[Array, " evaders"]],
     Int32[Array, " drones"],
 ]
-"""Positions of pursuers (N, 3) and evaders (M, 3) in m, who of these is free (M,) -> the target of
-each pursuer (N,). Where nobody is free, any will do.
+"""Positions of pursuers (N, 3) and evaders (M, 3) in m, who of these is free (M,) ->
+the target of each pursuer (N,). Where nobody is free, any will do.
 """
 
 
@@ -68,16 +75,21 @@ CHOICES = {"nearest": nearest, "one_by_one": one_by_one, "shared_out": shared_ou
 
 
 def several_tasks(settings: PursuitSettings, key: jax.Array, number: int) -> Task:
-    """(M, ...) a task for each of M evaders: a uniform one, with the other evaders where those of
-    other uniform tasks start. Pillars that one of them would start in are left away.
+    """(M, ...) a task for each of M evaders: a uniform one, with the other evaders
+    where those of other uniform tasks start. Pillars that one of them would start in
+    are left away.
     """
     first, *others = jax.random.split(key, number)
     task = uniform_task(settings, first)
     starts = [task.evader_position]
     starts += [uniform_task(settings, other).evader_position for other in others]
     starts = jnp.stack(starts)
-    offset = jnp.linalg.norm(task.pillar_position[:, None] - starts[None, :, :2], axis=-1)
-    clear = jnp.all(offset >= settings.pillar_radius + settings.pillar_clearance, axis=1)
+    offset = jnp.linalg.norm(
+        task.pillar_position[:, None] - starts[None, :, :2], axis=-1
+    )
+    clear = jnp.all(
+        offset >= settings.pillar_radius + settings.pillar_clearance, axis=1
+    )
     task = task.replace(pillar_active=task.pillar_active & clear)
     return jax.vmap(lambda start: task.replace(evader_position=start))(starts)
 
@@ -87,23 +99,28 @@ class Caught:
     """An episode after several evaders."""
 
     caught: jax.Array  # (M,) bool
-    steps: jax.Array  # (M,) int32, of each capture; the episode's length where there was none
+    # (M,) int32, of each capture; the episode's length where there was none
+    steps: jax.Array
     pursuers: EpisodeStatistics
-    """As in an episode after the first one alone: breaches and crashes are those of the whole."""
+    """As in an episode after the first one alone: breaches and crashes are those of the
+    whole.
+    """
 
 
 @dataclass(frozen=True, eq=False)
 class SeveralEvaders:
-    """The game of each evader of a world, the pursuers' policy, and who goes for whom."""
+    """The game of each evader of a world, the pursuers' policy, and who goes for
+    whom.
+    """
 
     environment: Pursuit
     policy: Policy
     choice: Choice
 
     def fly(self, parameters: PolicyParameters, tasks: Task, key: jax.Array) -> Caught:
-        """One episode of a world's M tasks (M, ...), which differ in their evaders alone; to be
-        mapped over worlds and compiled by the caller. `key` draws what a reset draws, and evaders,
-        each on its own.
+        """One episode of a world's M tasks (M, ...), which differ in their evaders
+        alone; to be mapped over worlds and compiled by the caller. `key` draws what a
+        reset draws, and evaders, each on its own.
         """
         game = self.environment
         number = tasks.evader_position.shape[0]

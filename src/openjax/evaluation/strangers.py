@@ -1,8 +1,8 @@
 """Teams of strangers: pursuers of several policies in one team.
 
-Each policy looks at the world as its own settings say, and takes the others for its like. So a
-world has a state for each policy, with its own frames and history; drones and evader are the same
-in all of them.
+Each policy looks at the world as its own settings say, and takes the others for its
+like. So a world has a state for each policy, with its own frames and history; drones
+and evader are the same in all of them.
 """
 
 import dataclasses
@@ -16,7 +16,13 @@ from openjax.policy import Policy, PolicyParameters
 from openjax.pursuit import EpisodeStatistics, Pursuit, PursuitSettings, Task
 
 OBSERVED = (
-    *("observed_pillars", "observe_time", "observe_position", "observe_game", "observe_in"),
+    *(
+        "observed_pillars",
+        "observe_time",
+        "observe_position",
+        "observe_game",
+        "observe_in",
+    ),
     *("observe_history", "observe_history_spacing"),
     *("history_length", "history_spacing", "history_pursuers"),
 )
@@ -25,7 +31,9 @@ OBSERVED = (
 
 def observed_by(game: PursuitSettings, policy: PursuitSettings) -> PursuitSettings:
     """A game as the pursuers of a policy observe it, who learned in another one."""
-    return dataclasses.replace(game, **{name: getattr(policy, name) for name in OBSERVED})
+    return dataclasses.replace(
+        game, **{name: getattr(policy, name) for name in OBSERVED}
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +63,9 @@ class Strangers:
         """
         keys = jax.random.split(key, members.shape[0])
         # each draws the same from the same key
-        worlds = tuple(jax.vmap(game.reset_to)(keys, tasks) for game in self.environments)
+        worlds = tuple(
+            jax.vmap(game.reset_to)(keys, tasks) for game in self.environments
+        )
         which = jnp.arange(members.shape[1])
 
         def one(worlds, _):
@@ -81,11 +91,15 @@ class Strangers:
         return jax.lax.scan(one, worlds, length=length)[0][0][1].statistics
 
 
-def bootstrap_mean(values: np.ndarray, seed: int = 0, draws: int = 5000) -> tuple[float, float]:
-    """95 % interval of the mean over strata (M) and their episodes (E), (M, E): episodes are drawn
-    anew within each stratum (the stratified bootstrap of Agarwal et al., 2021).
+def bootstrap_mean(
+    values: np.ndarray, seed: int = 0, draws: int = 5000
+) -> tuple[float, float]:
+    """95 % interval of the mean over strata (M) and their episodes (E), (M, E):
+    episodes are drawn anew within each stratum (the stratified bootstrap of Agarwal et
+    al., 2021).
 
-    Which strata there are isn't drawn: it is an interval for these M, not for others like them.
+    Which strata there are isn't drawn: it is an interval for these M, not for others
+    like them.
     """
     generator = np.random.default_rng(seed)
     strata, episodes = values.shape

@@ -1,8 +1,8 @@
-"""A JAX function as a plain C99 program: no allocation, no library but `math.h`, weights as const
-arrays.
+"""A JAX function as a plain C99 program: no allocation, no library but `math.h`,
+weights as const arrays.
 
-The function is traced and what doesn't depend on its inputs is computed, as for ONNX. Intermediate
-arrays share one workspace, which the caller provides.
+The function is traced and what doesn't depend on its inputs is computed, as for ONNX.
+Intermediate arrays share one workspace, which the caller provides.
 """
 
 import math
@@ -46,8 +46,8 @@ class CProgram:
 
 
 def _placed(buffers: list[Buffer]) -> int:
-    """Give all buffers their offsets, so that two that live at once don't overlap; the floats
-    needed.
+    """Give all buffers their offsets, so that two that live at once don't overlap; the
+    floats needed.
     """
     # the largest first, each into the first gap between those that live while it does
     placed: list[Buffer] = []
@@ -74,8 +74,8 @@ def c_program(
     prefix: str,
     about: str,
 ) -> CProgram:
-    """A C program of `function(**inputs)`, which returns one array; inputs that it doesn't read are
-    left out.
+    """A C program of `function(**inputs)`, which returns one array; inputs that it
+    doesn't read are left out.
 
     Args:
       function: to be traced.
@@ -117,8 +117,8 @@ def c_program(
 
 
 def _written(function, inputs, output):
-    """The statements of a function, the floats of workspace that they need, and the shape of its
-    result.
+    """The statements of a function, the floats of workspace that they need, and the
+    shape of its result.
     """
     traced = trace(function, inputs)
     writer = Writer()

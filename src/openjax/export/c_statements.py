@@ -1,8 +1,9 @@
-"""Statements of a C program, written operation by operation: what `openjax.export.c_program` puts
-into a file.
+"""Statements of a C program, written operation by operation: what
+`openjax.export.c_program` puts into a file.
 
-Products of matrices become calls of one function, other operations a loop nest each. Transposes,
-slices and broadcasts are arrays with other strides, as in NumPy, and cost nothing.
+Products of matrices become calls of one function, other operations a loop nest each.
+Transposes, slices and broadcasts are arrays with other strides, as in NumPy, and cost
+nothing.
 """
 
 import math
@@ -34,8 +35,8 @@ class Buffer:
 
 @dataclass(frozen=True)
 class Array:
-    """An array of the program, or a part of one: entry (i, j) is name[offset + i * strides[0] + j *
-    strides[1]], and so on.
+    """An array of the program, or a part of one: entry (i, j) is name[offset + i *
+    strides[0] + j * strides[1]], and so on.
     """
 
     name: str
@@ -51,7 +52,9 @@ class Array:
     def dense(self) -> bool:
         """Whether its entries follow one another row by row."""
         axes = zip(self.shape, self.strides, row_by_row(self.shape), strict=True)
-        return not self.number and all(size == 1 or own == whole for size, own, whole in axes)
+        return not self.number and all(
+            size == 1 or own == whole for size, own, whole in axes
+        )
 
     @property
     def start(self) -> str:
@@ -64,17 +67,25 @@ class Array:
             return self.number
         terms = [str(self.offset)] * (self.offset > 0)
         for index, size, stride in zip(indices, self.shape, self.strides, strict=False):
-            if index != "0" and size > 1 and stride:  # an axis of length one is repeated
+            # an axis of length one is repeated
+            if index != "0" and size > 1 and stride:
                 terms.append(index if stride == 1 else f"{index} * {stride}")
         return f"{self.name}[{' + '.join(terms) or '0'}]"
 
     def part(
-        self, starts: Sequence[int], shape: Sequence[int], steps: Sequence[int] | None = None
+        self,
+        starts: Sequence[int],
+        shape: Sequence[int],
+        steps: Sequence[int] | None = None,
     ) -> "Array":
         """Entries from `starts` on, every `steps`-th of each axis."""
         steps = steps or [1] * len(shape)
-        skipped = sum(start * stride for start, stride in zip(starts, self.strides, strict=True))
-        strides = tuple(step * stride for step, stride in zip(steps, self.strides, strict=True))
+        skipped = sum(
+            start * stride for start, stride in zip(starts, self.strides, strict=True)
+        )
+        strides = tuple(
+            step * stride for step, stride in zip(steps, self.strides, strict=True)
+        )
         offset = int(self.offset + skipped)
         return replace(self, shape=tuple(shape), strides=strides, offset=offset)
 
@@ -106,8 +117,8 @@ class Writer(Walk):
     # -- arrays
 
     def array(self, value) -> Array:
-        """A value as it is read; one number is written where it is used, rows that are alike are
-        kept once.
+        """A value as it is read; one number is written where it is used, rows that are
+        alike are kept once.
         """
         if isinstance(value, Array):
             return value
@@ -116,10 +127,14 @@ class Writer(Walk):
         strides = list(row_by_row(value.shape))
         for axis in range(value.ndim):
             one = value.take([0], axis)
-            if value.shape[axis] > 1 and np.array_equal(np.broadcast_to(one, value.shape), value):
+            if value.shape[axis] > 1 and np.array_equal(
+                np.broadcast_to(one, value.shape), value
+            ):
                 value = one
                 # outer axes are that much closer together now
-                strides = [s // shape[axis] if a < axis else s for a, s in enumerate(strides)]
+                strides = [
+                    s // shape[axis] if a < axis else s for a, s in enumerate(strides)
+                ]
                 strides[axis] = 0
         if value.size == 1:
             return Array("", shape, tuple(strides), number=literal(value.item()))
@@ -146,7 +161,10 @@ class Writer(Walk):
     def write(self, out: Array, form: str, values: Sequence[Array]) -> Array:
         """Write every entry of an array, which is the form of those of `values`."""
         arrays = [out, *values]
-        if all(array.number or (array.dense and array.shape == out.shape) for array in arrays):
+        if all(
+            array.number or (array.dense and array.shape == out.shape)
+            for array in arrays
+        ):
             # entry by entry in the order of memory: one loop does for all axes
             whole = (math.prod(out.shape),)
             arrays = [replace(array, shape=whole, strides=(1,)) for array in arrays]
@@ -170,18 +188,23 @@ class Writer(Walk):
     def _op_stop_gradient(self, operation):
         source = operation.equation.invars[0].aval.dtype.kind
         target = operation.equation.outvars[0].aval.dtype.kind
-        # all of C's values are floats: flags are 0 and 1, and other numbers would stay as they are
+        # all of C's values are floats: flags are 0 and 1, and other numbers would stay
+        # as they are
         if target == "b" and source != "b":
             raise UserError(
                 "the policy turns numbers into flags, which the C export doesn't know yet"
             )
         return operation.inputs[0]
 
-    _op_copy = _op_copy_p = _op_optimization_barrier = _op_convert_element_type = _op_stop_gradient
+    _op_copy = _op_copy_p = _op_optimization_barrier = _op_convert_element_type = (
+        _op_stop_gradient
+    )
 
     def _op_elementwise(self, operation):
         self.functions += math.prod(operation.shape) * (operation.name in FUNCTIONS)
-        return self._made(ELEMENTWISE[operation.name], operation.inputs, operation.shape)
+        return self._made(
+            ELEMENTWISE[operation.name], operation.inputs, operation.shape
+        )
 
     def _power(self, value, exponent, operation):
         factors = " * ".join(["{0}"] * abs(exponent)) or "1.0f"
@@ -208,7 +231,9 @@ class Writer(Walk):
 
     def _reshape(self, value, shape):
         value = self.array(value)
-        if [size for size in value.shape if size > 1] == [size for size in shape if size > 1]:
+        if [size for size in value.shape if size > 1] == [
+            size for size in shape if size > 1
+        ]:
             # only axes of length one come or go: the others keep their strides
             sized = zip(value.strides, value.shape, strict=True)
             strides = iter([stride for stride, size in sized if size > 1])
@@ -276,7 +301,9 @@ class Writer(Walk):
                 replace(array, offset=array.offset + k * size).start
                 for array, size in zip(arrays, sizes, strict=True)
             ]
-            self.emit(f"product({', '.join(places)}, {rows}, {inner}, {columns});", arrays)
+            self.emit(
+                f"product({', '.join(places)}, {rows}, {inner}, {columns});", arrays
+            )
         self.multiply_adds += batches * rows * inner * columns
         return out
 

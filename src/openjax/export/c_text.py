@@ -58,7 +58,10 @@ def loops(sizes, indices, body: str) -> str:
     if "\n" in body:
         body = "{\n" + indented(body) + "\n}"
     return "\n".join(
-        [*(4 * " " * k + head for k, head in enumerate(heads)), indented(body, len(heads))]
+        [
+            *(4 * " " * k + head for k, head in enumerate(heads)),
+            indented(body, len(heads)),
+        ]
     )
 
 
@@ -73,7 +76,8 @@ def literal(number: float) -> str:
         return "INFINITY" if number > 0 else "-INFINITY"
     if math.isnan(number):
         return "NAN"
-    # nine digits tell every float32 from its neighbours; a literal without a point would be an int
+    # nine digits tell every float32 from its neighbours; a literal without a point
+    # would be an int
     text = f"{np.float32(number):.9g}"
     text = text if any(c in text for c in ".e") else text + ".0"
     return f"({text}f)" if number < 0 else f"{text}f"
@@ -88,4 +92,6 @@ def number_rows(value: np.ndarray) -> str:
     """Entries of a const array (N,), eight to a line."""
     # brackets are for negative numbers within formulas
     literals = [literal(number).strip("()") for number in value.tolist()]
-    return "\n".join(", ".join(literals[k : k + 8]) + "," for k in range(0, len(literals), 8))
+    return "\n".join(
+        ", ".join(literals[k : k + 8]) + "," for k in range(0, len(literals), 8)
+    )

@@ -1,8 +1,8 @@
 """A JAX function as a plain ONNX graph, built node by node with `onnx.helper`.
 
-The function is traced, what doesn't depend on its inputs is computed, and each operation left
-becomes its ONNX counterpart. So it follows the networks wherever they go, as long as they keep to
-the operations below.
+The function is traced, what doesn't depend on its inputs is computed, and each
+operation left becomes its ONNX counterpart. So it follows the networks wherever they
+go, as long as they keep to the operations below.
 """
 
 import math
@@ -49,12 +49,16 @@ _ELEMENTWISE = {
     "copy_p": "Identity",
     "optimization_barrier": "Identity",
 }
-_REDUCE = {"reduce_sum": "ReduceSum", "reduce_max": "ReduceMax", "reduce_min": "ReduceMin"}
+_REDUCE = {
+    "reduce_sum": "ReduceSum",
+    "reduce_max": "ReduceMax",
+    "reduce_min": "ReduceMin",
+}
 
 
 class _Graph(Walk):
-    """Nodes and constants of a graph under construction. A value is a NumPy array or the name of a
-    tensor.
+    """Nodes and constants of a graph under construction. A value is a NumPy array or
+    the name of a tensor.
     """
 
     language = "ONNX"
@@ -75,7 +79,9 @@ class _Graph(Walk):
             return value
         self._count += 1
         name = f"c{self._count}"
-        self.initializers.append(self.numpy_helper.from_array(np.ascontiguousarray(value), name))
+        self.initializers.append(
+            self.numpy_helper.from_array(np.ascontiguousarray(value), name)
+        )
         return name
 
     def add(self, kind: str, inputs: Sequence, outputs: int = 1, **attributes):
@@ -123,7 +129,9 @@ class _Graph(Walk):
         return self.add("Min", [self.add("Max", [low, value]), high])
 
     def _op_convert_element_type(self, operation):
-        kind = self.helper.np_dtype_to_tensor_dtype(np.dtype(operation.parameters["new_dtype"]))
+        kind = self.helper.np_dtype_to_tensor_dtype(
+            np.dtype(operation.parameters["new_dtype"])
+        )
         return self.add("Cast", operation.inputs, to=kind)
 
     def _op_broadcast_in_dim(self, operation):
@@ -157,7 +165,9 @@ class _Graph(Walk):
 
     def _op_reduce_sum(self, operation):
         axes = _whole(operation.parameters["axes"])
-        return self.add(_REDUCE[operation.name], [operation.inputs[0], axes], keepdims=0)
+        return self.add(
+            _REDUCE[operation.name], [operation.inputs[0], axes], keepdims=0
+        )
 
     _op_reduce_max = _op_reduce_min = _op_reduce_sum
 
@@ -166,12 +176,15 @@ def _whole(numbers):
     return np.array(list(numbers), np.int64)
 
 
-def onnx_model(function: Callable, inputs: dict[str, jax.ShapeDtypeStruct], output: str):
-    """An ONNX model of `function(**inputs)`, which returns one array; inputs that it doesn't read
-    are left out.
+def onnx_model(
+    function: Callable, inputs: dict[str, jax.ShapeDtypeStruct], output: str
+):
+    """An ONNX model of `function(**inputs)`, which returns one array; inputs that it
+    doesn't read are left out.
 
     Raises:
-      UserError: onnx isn't installed, or the function uses an operation that isn't covered.
+      UserError: onnx isn't installed, or the function uses an operation that isn't
+      covered.
     """
     try:
         from onnx import TensorProto, checker, helper

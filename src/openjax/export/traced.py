@@ -1,5 +1,5 @@
-"""A traced JAX function, walked operation by operation: what the exports to other languages have in
-common.
+"""A traced JAX function, walked operation by operation: what the exports to other
+languages have in common.
 """
 
 import math
@@ -45,14 +45,15 @@ class Operation:
 
 
 class Walk:
-    """Goes through a jaxpr. What doesn't depend on its inputs is computed; each operation left is a
-    call of a method that is named after the primitive: `_op_pad` and so on, or `_op_elementwise`
-    for the primitives in `elementwise`.
+    """Goes through a jaxpr. What doesn't depend on its inputs is computed; each
+    operation left is a call of a method that is named after the primitive: `_op_pad`
+    and so on, or `_op_elementwise` for the primitives in `elementwise`.
 
-    A value is a NumPy array, or whatever those methods make and `inputs` give. A language says how
-    it writes the parts of which the operations below are made: `_reshape(value, shape)`,
-    `_transpose(value, order)`, `_join(values, shape, axis)`, `_power(value, exponent, operation)`,
-    and `_product(first, second, shape)` of matrices, or of as many batches of them.
+    A value is a NumPy array, or whatever those methods make and `inputs` give. A
+    language says how it writes the parts of which the operations below are made:
+    `_reshape(value, shape)`, `_transpose(value, order)`, `_join(values, shape, axis)`,
+    `_power(value, exponent, operation)`, and `_product(first, second, shape)` of
+    matrices, or of as many batches of them.
     """
 
     language = ""
@@ -67,13 +68,17 @@ class Walk:
         return self._transpose(operation.inputs[0], operation.parameters["permutation"])
 
     def _op_concatenate(self, operation: Operation):
-        return self._join(operation.inputs, operation.shape, operation.parameters["dimension"])
+        return self._join(
+            operation.inputs, operation.shape, operation.parameters["dimension"]
+        )
 
     def _op_stack(self, operation: Operation):
         shape = operation.shape
         axis = operation.parameters["axis"]
         apart = (*shape[:axis], 1, *shape[axis + 1 :])
-        return self._join([self._reshape(value, apart) for value in operation.inputs], shape, axis)
+        return self._join(
+            [self._reshape(value, apart) for value in operation.inputs], shape, axis
+        )
 
     def _op_integer_pow(self, operation: Operation):
         return self._power(operation.inputs[0], operation.parameters["y"], operation)
@@ -85,9 +90,11 @@ class Walk:
         sums, batches = operation.parameters["dimension_numbers"]
         sizes = []
         factors = []
-        # each factor as matrices: axes of a kind are joined, and what is summed over stands last on
-        # the left side, first on the right
-        for side, (value, shape) in enumerate(zip(operation.inputs, operation.shapes, strict=True)):
+        # each factor as matrices: axes of a kind are joined, and what is summed over
+        # stands last on the left side, first on the right
+        for side, (value, shape) in enumerate(
+            zip(operation.inputs, operation.shapes, strict=True)
+        ):
             batch = batches[side]
             summed = sums[side]
             free = [axis for axis in range(len(shape)) if axis not in (*batch, *summed)]
@@ -100,16 +107,28 @@ class Walk:
         shape = (*sizes[0][:-1], sizes[1][-1])
         first, second = factors
         product = self._product(first, second, shape)
-        return product if shape == operation.shape else self._reshape(product, operation.shape)
+        return (
+            product
+            if shape == operation.shape
+            else self._reshape(product, operation.shape)
+        )
 
     def _as_matrices(self, value, shape, order, matrix):
-        """A value with its axes in another order and joined to those of `matrix`; what is known is
-        moved here, and not by the program.
+        """A value with its axes in another order and joined to those of `matrix`; what
+        is known is moved here, and not by the program.
         """
         if order != sorted(order):
-            value = np.transpose(value, order) if _known(value) else self._transpose(value, order)
+            value = (
+                np.transpose(value, order)
+                if _known(value)
+                else self._transpose(value, order)
+            )
         if matrix != tuple(shape[axis] for axis in order):
-            value = np.reshape(value, matrix) if _known(value) else self._reshape(value, matrix)
+            value = (
+                np.reshape(value, matrix)
+                if _known(value)
+                else self._reshape(value, matrix)
+            )
         return value
 
     def run(self, jaxpr, consts, inputs) -> list:
@@ -135,7 +154,9 @@ class Walk:
             return self.run(branch.jaxpr, branch.consts, inputs[1:])
         if name in _INLINE:
             inner = next(
-                parameters[key] for key in ("jaxpr", "call_jaxpr", "fun_jaxpr") if key in parameters
+                parameters[key]
+                for key in ("jaxpr", "call_jaxpr", "fun_jaxpr")
+                if key in parameters
             )
             consts = getattr(inner, "consts", ())
             return self.run(getattr(inner, "jaxpr", inner), consts, inputs)
@@ -143,7 +164,9 @@ class Walk:
             results = equation.primitive.bind(*inputs, **parameters)
             results = results if equation.primitive.multiple_results else [results]
             return [np.asarray(value) for value in results]
-        rule = getattr(self, f"_op_{'elementwise' if name in self.elementwise else name}", None)
+        rule = getattr(
+            self, f"_op_{'elementwise' if name in self.elementwise else name}", None
+        )
         # refused, and not left out: a policy that is nearly right is worse than none
         if rule is None:
             raise UserError(
@@ -160,12 +183,14 @@ def _known(value) -> bool:
 
 
 def outer_padding(operation: Operation) -> tuple[list[int], list[int]]:
-    """What a `pad` adds before and after each axis. Raises UserError where it adds between entries,
-    or takes away.
+    """What a `pad` adds before and after each axis. Raises UserError where it adds
+    between entries, or takes away.
     """
     low, high, between = zip(*operation.parameters["padding_config"], strict=True)
     if any(between) or min(*low, *high, 0) < 0:
-        raise UserError("the policy pads between entries or cuts, which no export knows yet")
+        raise UserError(
+            "the policy pads between entries or cuts, which no export knows yet"
+        )
     return list(low), list(high)
 
 

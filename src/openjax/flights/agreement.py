@@ -1,9 +1,10 @@
-"""Do a flight's channels agree with each other? What one says, another must show: attitude and
-gyroscope, position and velocity, the path's acceleration and the attitude's thrust, the
-accelerometer and the path, motors, commands and what follows them. A log whose channels contradict
-each other isn't diagnosed, whatever made it: swapped axes, a wrong convention, unit or motor order,
-rows out of order, columns of another flight, noise in place of data. Where another labelling or
-convention mends a pair, that is what is said.
+"""Do a flight's channels agree with each other? What one says, another must show:
+attitude and gyroscope, position and velocity, the path's acceleration and the
+attitude's thrust, the accelerometer and the path, motors, commands and what follows
+them. A log whose channels contradict each other isn't diagnosed, whatever made it:
+swapped axes, a wrong convention, unit or motor order, rows out of order, columns of
+another flight, noise in place of data. Where another labelling or convention mends a
+pair, that is what is said.
 """
 
 import dataclasses
@@ -11,7 +12,14 @@ import dataclasses
 import numpy as np
 
 from openjax.flights.flight import Finding, Flight, Issue
-from openjax.flights.mending import UPRIGHT, agrees, attitudes, convention_of, frames_of, mend
+from openjax.flights.mending import (
+    UPRIGHT,
+    agrees,
+    attitudes,
+    convention_of,
+    frames_of,
+    mend,
+)
 from openjax.flights.motor_order import MOTORS, order_findings, torques_fit
 from openjax.flights.pairs import AGREE, Pair, Signals, pairs_of
 from openjax.flights.plausible import (
@@ -34,10 +42,13 @@ UNITS = {
 
 
 def check_agreement(flight: Flight, vehicle) -> list[Issue]:
-    """Findings on a flight that has passed the other checks (sorted, finite, airborne); every one
-    refuses it. `vehicle` gives the rotors' places and spins.
+    """Findings on a flight that has passed the other checks (sorted, finite, airborne);
+    every one refuses it. `vehicle` gives the rotors' places and spins.
     """
-    found = [("garbage", text, ()) for text in (*copied_columns(flight), *rows_at_random(flight))]
+    found = [
+        ("garbage", text, ())
+        for text in (*copied_columns(flight), *rows_at_random(flight))
+    ]
     grid = clock_of(flight)
     if grid is not None and not found:
         signals = Signals.of(flight, grid)
@@ -49,24 +60,31 @@ def check_agreement(flight: Flight, vehicle) -> list[Issue]:
             or list(path_findings(signals))
             or order_findings(signals, vehicle)
         )
-    return [Issue(flight.name, text, True, kind, tuple(against)) for kind, text, against in found]
+    return [
+        Issue(flight.name, text, True, kind, tuple(against))
+        for kind, text, against in found
+    ]
 
 
 def shown_right(flight: Flight, vehicle) -> set[str]:
-    """The comparisons (`Issue.against`) that a flight without a finding moves enough to fail, and
-    passes.
+    """The comparisons (`Issue.against`) that a flight without a finding moves enough to
+    fail, and passes.
     """
     grid = clock_of(flight)
     if grid is None:
         return set()
     signals = Signals.of(flight, grid)
-    shown = {pair.what for pair in pairs_of(signals) if pair.tells.sum() >= min(2, len(pair.tells))}
+    shown = {
+        pair.what
+        for pair in pairs_of(signals)
+        if pair.tells.sum() >= min(2, len(pair.tells))
+    }
     return shown | ({MOTORS} if torques_fit(signals, vehicle) else set())
 
 
 def other_frames(flight: Flight) -> str:
-    """In what other axes of world and body the rows of a flight are, in words; nothing where no
-    others agree.
+    """In what other axes of world and body the rows of a flight are, in words; nothing
+    where no others agree.
     """
     grid = clock_of(flight)
     return "" if grid is None else frames_of(Signals.of(flight, grid))
@@ -86,7 +104,9 @@ def _contradictions(signals: Signals) -> list[Finding]:
 
 
 def _unit(pair: Pair) -> list[Finding]:
-    """Columns of a pair that agrees but for its size, where a wrong unit explains that."""
+    """Columns of a pair that agrees but for its size, where a wrong unit explains
+    that.
+    """
     found = pair.agreement
     follows = (found.correlation > AGREE) & (found.reference > 1e-9)
     if not follows.any():
@@ -98,7 +118,8 @@ def _unit(pair: Pair) -> list[Finding]:
                 wanted = "m" if pair.unit == "m/s^2" else pair.unit
                 text = f"{columns}: in {unit} ({times:.0f} times too large); the log format wants {wanted}"
                 return [("units", text, [pair.what])]
-    # noise and an estimator's lag cost correlation, and change a gain of rms values by as much
+    # noise and an estimator's lag cost correlation, and change a gain of rms values by
+    # as much
     clear = pair.tells & (found.correlation > CLEAR)
     if pair.holds != "body_rates" or clear.sum() < 2:
         return []
@@ -122,12 +143,18 @@ def _inverted(signals: Signals) -> list[Finding]:
             return [("quaternion", words, ["the attitude's thrust"])]
     text = f"by its attitude the vehicle flies upside down (mean cosine of its tilt {upright:.2f})"
     return [
-        ("quaternion", f"{text}: qw, qx, qy, qz hold something else", ["the attitude's thrust"])
+        (
+            "quaternion",
+            f"{text}: qw, qx, qy, qz hold something else",
+            ["the attitude's thrust"],
+        )
     ]
 
 
 def _upside_down(signals: Signals) -> list[Finding]:
-    """Axes of world and body by which gravity points the right way, and nothing disagrees."""
+    """Axes of world and body by which gravity points the right way, and nothing
+    disagrees.
+    """
     if signals.force is None or np.median(signals.force[:, 2]) > 0.0:
         return []
     words = frames_of(signals)

@@ -1,9 +1,10 @@
 """The attitude where none was logged, from gyroscope, accelerometer and path.
 
-What the accelerometer feels, turned into the world, is the path's acceleration and gravity. The
-gyroscope says how the body turned meanwhile, so one rotation of each flight is free (Wahba's
-problem, solved by Kabsch 1976), and a slow error of the gyroscope: a linear spline, fitted by
-Gauss-Newton steps. No dynamics are assumed: what acts on the vehicle is left as it is.
+What the accelerometer feels, turned into the world, is the path's acceleration and
+gravity. The gyroscope says how the body turned meanwhile, so one rotation of each
+flight is free (Wahba's problem, solved by Kabsch 1976), and a slow error of the
+gyroscope: a linear spline, fitted by Gauss-Newton steps. No dynamics are assumed: what
+acts on the vehicle is left as it is.
 """
 
 import dataclasses
@@ -16,7 +17,8 @@ from openjax.flights.track import GRAVITY
 
 STEP = 0.01  # s of the clock on which rates are integrated
 WINDOW = 0.2  # s over which the path's acceleration is a change of velocity
-START = 8.0  # s from which the first rotation is taken: a gyroscope hardly drifts meanwhile
+# s from which the first rotation is taken: a gyroscope hardly drifts meanwhile
+START = 8.0
 KNOTS = 1.0  # s between knots of the gyroscope's slow error
 WANDER = 0.03  # rad by which integrated rates drift in a second: bias, gain and noise
 FELT = 0.3  # m/s^2 by which a window's mean force and acceleration may differ
@@ -55,7 +57,8 @@ def _attitude(part: Flight) -> np.ndarray:
     size = round(WINDOW / STEP)
     windows = len(time) // size - 1
     ends = size * np.arange(windows + 1)
-    # an accelerometer feels what holds the vehicle against gravity, as if it accelerated upwards
+    # an accelerometer feels what holds the vehicle against gravity, as if it
+    # accelerated upwards
     wanted = np.diff(velocity[ends], axis=0) / WINDOW + [0.0, 0.0, GRAVITY]
     turned = _integrated(rates)
     early = slice(0, max(int(START / WINDOW), FEWEST))
@@ -75,16 +78,18 @@ def _attitude(part: Flight) -> np.ndarray:
             break
     # without jumps between q and -q, so that rows between may be interpolated
     found = attitude.as_quat(scalar_first=True)
-    found[1:] *= np.cumprod(np.where((found[1:] * found[:-1]).sum(1) < 0.0, -1.0, 1.0))[:, None]
+    found[1:] *= np.cumprod(np.where((found[1:] * found[:-1]).sum(1) < 0.0, -1.0, 1.0))[
+        :, None
+    ]
     at = np.clip(part.time, time[0], time[-1])
     out = np.stack([np.interp(at, time, column) for column in found.T], 1)
     return out / np.linalg.norm(out, axis=1, keepdims=True)
 
 
 def _step(attitude: Rotation, force: np.ndarray, windows, total: np.ndarray):
-    """One Gauss-Newton step: change (3,) of the accelerometer's bias, and (knots, 3) rad by which
-    the attitude turns in the world. `windows`: ends, wanted forces (W, 3) and weights (W, knots) of
-    the knots; `total` (knots, 3): turned so far.
+    """One Gauss-Newton step: change (3,) of the accelerometer's bias, and (knots, 3)
+    rad by which the attitude turns in the world. `windows`: ends, wanted forces (W, 3)
+    and weights (W, knots) of the knots; `total` (knots, 3): turned so far.
     """
     ends, wanted, weights = windows
     felt = _means(attitude.apply(force), ends)
@@ -92,8 +97,11 @@ def _step(attitude: Rotation, force: np.ndarray, windows, total: np.ndarray):
     turn = _means(attitude.as_matrix().reshape(-1, 9), ends).reshape(-1, 3, 3)
     knots = weights.shape[1]
     by_bias = -turn / FELT
-    by_turn = np.stack([np.cross(axis, felt) for axis in np.eye(3)], 2) / FELT  # (W, 3, 3)
-    columns = np.einsum("wk,wij->wikj", weights, by_turn).reshape(len(felt), 3, 3 * knots)
+    # (W, 3, 3)
+    by_turn = np.stack([np.cross(axis, felt) for axis in np.eye(3)], 2) / FELT
+    columns = np.einsum("wk,wij->wikj", weights, by_turn).reshape(
+        len(felt), 3, 3 * knots
+    )
     columns = np.concatenate([by_bias, columns], 2).reshape(-1, 3 + 3 * knots)
     # The gyroscope's error walks at random from knot to knot.
     walk = np.kron(np.diff(np.eye(knots), axis=0), np.eye(3)) / WANDER
@@ -128,7 +136,9 @@ def _kabsch(vectors: np.ndarray, targets: np.ndarray) -> Rotation:
 def _means(values: np.ndarray, ends: np.ndarray) -> np.ndarray:
     """Means (W, C) of rows (T, C) between ends (W + 1,), by the trapezoidal rule."""
     middle = 0.5 * (values[1:] + values[:-1])
-    return np.add.reduceat(middle[: ends[-1]], ends[:-1], axis=0) / np.diff(ends)[:, None]
+    return (
+        np.add.reduceat(middle[: ends[-1]], ends[:-1], axis=0) / np.diff(ends)[:, None]
+    )
 
 
 def _hats(time: np.ndarray, knots: int) -> np.ndarray:

@@ -1,5 +1,5 @@
-"""Loading a case: every log of a folder is read, checked and either kept or refused with the
-reason.
+"""Loading a case: every log of a folder is read, checked and either kept or refused
+with the reason.
 """
 
 import dataclasses
@@ -29,42 +29,58 @@ SHOWN = 3  # files that are named where none is a log
 
 
 def load_case(path: str | Path, dtype=jnp.float32, comparison: bool = False) -> Case:
-    """Read a case folder: its `vehicle.toml` and its logs (of any format that is known). For a
-    `comparison` with other flights motor commands alone are enough, and without a vehicle file the
-    nominal vehicle is taken.
+    """Read a case folder: its `vehicle.toml` and its logs (of any format that is
+    known). For a `comparison` with other flights motor commands alone are enough, and
+    without a vehicle file the nominal vehicle is taken.
 
-    Logs that can't be used are left out and named in `quality` (`refused`). Raises UserError for a
-    folder that isn't a case, an unusable vehicle file, or if no log is left.
+    Logs that can't be used are left out and named in `quality` (`refused`). Raises
+    UserError for a folder that isn't a case, an unusable vehicle file, or if no log is
+    left.
     """
     path = Path(path)
     if not path.is_dir():
         what = "is a file" if path.exists() else "no such folder"
-        raise UserError(f"{path}: {what}; a case is a folder of flight logs with a vehicle.toml")
+        raise UserError(
+            f"{path}: {what}; a case is a folder of flight logs with a vehicle.toml"
+        )
     logs = find_logs(path)
     if not logs:
-        raise UserError(f"{path}: holds no flight log{_held_instead(path)}{_cases_inside(path)}")
+        raise UserError(
+            f"{path}: holds no flight log{_held_instead(path)}{_cases_inside(path)}"
+        )
     described = (path / "vehicle.toml").exists()
     if not described and not comparison:
-        raise UserError(f"{path}: no vehicle.toml; an empty one there means the nominal Crazyflie")
-    vehicle_file = load_vehicle_file(path / "vehicle.toml" if described else None, dtype)
-    mapping = load_mapping(path / MAPPING_FILE) if (path / MAPPING_FILE).exists() else None
+        raise UserError(
+            f"{path}: no vehicle.toml; an empty one there means the nominal Crazyflie"
+        )
+    vehicle_file = load_vehicle_file(
+        path / "vehicle.toml" if described else None, dtype
+    )
+    mapping = (
+        load_mapping(path / MAPPING_FILE) if (path / MAPPING_FILE).exists() else None
+    )
     read = [_read(log, vehicle_file, mapping) for log in logs]
     kept, issues = _usable(read, vehicle_file, comparison)
     issues += _not_flown(vehicle_file, read)
     if not kept:
         reasons = [i for i in issues if i.refused]
-        first = f"{reasons[0].flight}: {reasons[0].issue}" if reasons else "no vehicle in any log"
+        first = (
+            f"{reasons[0].flight}: {reasons[0].issue}"
+            if reasons
+            else "no vehicle in any log"
+        )
         more = f" (and {len(reasons) - 1} more)" if len(reasons) > 1 else ""
         raise UserError(f"{path}: no flight can be used: {first}{more}")
-    # A thrust error is told from the mass only where every vehicle that flew was weighed.
+    # A thrust error is told from the mass only where every vehicle that flew was
+    # weighed.
     weighed = all(vehicle_file.mass_weighed_of(flight.vehicle) for flight in kept)
     vehicle_file = dataclasses.replace(vehicle_file, mass_weighed=weighed)
     return Case(path.resolve().name, tuple(kept), vehicle_file, tuple(issues), path)
 
 
 def _not_flown(vehicle_file: VehicleFile, read) -> list[Issue]:
-    """What the vehicle file says of vehicles that are in none of the logs: an id with another
-    spelling, whose mass would go unnoticed.
+    """What the vehicle file says of vehicles that are in none of the logs: an id with
+    another spelling, whose mass would go unnoticed.
     """
     flown = sorted({flight.vehicle for flights, _ in read for flight in flights})
     others = sorted(set(vehicle_file.vehicles) - set(flown))
@@ -79,19 +95,25 @@ def _held_instead(path: Path) -> str:
     """What a folder without a log holds, in words, and what a log is."""
     others = sorted(file.name for file in path.iterdir() if file.name not in NO_LOGS)
     known = f"known are {', '.join(importer.name for importer in importers())}"
-    shown = ", ".join(others[:SHOWN]) + f" and {len(others) - SHOWN} more" * (len(others) > SHOWN)
+    shown = ", ".join(others[:SHOWN]) + f" and {len(others) - SHOWN} more" * (
+        len(others) > SHOWN
+    )
     return f": {known}; it holds {shown}" if others else f"; {known}"
 
 
 def _cases_inside(path):
     """In words: which cases a folder holds, where somebody gave the one above."""
     cases = sorted(file.parent.name for file in path.glob("*/vehicle.toml"))
-    return f"; cases are folders in it: {cases[0]}, in all {len(cases)}" if cases else ""
+    return (
+        f"; cases are folders in it: {cases[0]}, in all {len(cases)}" if cases else ""
+    )
 
 
-def _usable(read, vehicle_file: VehicleFile, comparison: bool) -> tuple[list[Flight], list[Issue]]:
-    """Of what was `read` of all logs the flights that can be used, checked and mended, and what was
-    found.
+def _usable(
+    read, vehicle_file: VehicleFile, comparison: bool
+) -> tuple[list[Flight], list[Issue]]:
+    """Of what was `read` of all logs the flights that can be used, checked and mended,
+    and what was found.
     """
     flights = [flight for found, _ in read for flight in found]
     issues = [issue for _, found in read for issue in found]
@@ -99,17 +121,21 @@ def _usable(read, vehicle_file: VehicleFile, comparison: bool) -> tuple[list[Fli
     for name, original in copies.items():
         text = f"the same values as {original}: a copy, left out"
         issues.append(Issue(name, text, refused=True, kind="duplicate"))
-    checked = [_check(f, vehicle_file, comparison) for f in flights if f.log not in copies]
+    checked = [
+        _check(f, vehicle_file, comparison) for f in flights if f.log not in copies
+    ]
     issues += [issue for _, found in checked for issue in found]
-    kept, found = _trusted([f for f, _ in checked if f is not None], issues, vehicle_file)
+    kept, found = _trusted(
+        [f for f, _ in checked if f is not None], issues, vehicle_file
+    )
     return kept, issues + found
 
 
 def _trusted(
     flights: list[Flight], issues: list[Issue], vehicle_file: VehicleFile
 ) -> tuple[list[Flight], list[Issue]]:
-    """The flights without those that are too calm to show what most others contradict: columns are
-    mixed up for a case.
+    """The flights without those that are too calm to show what most others contradict:
+    columns are mixed up for a case.
     """
     failed = Counter(what for issue in issues for what in issue.against)
     if not failed:
@@ -119,7 +145,9 @@ def _trusted(
     out = []
     found = []
     for flight, right in zip(flights, shown, strict=True):
-        doubts = [what for what in failed if what not in right and failed[what] > passed[what]]
+        doubts = [
+            what for what in failed if what not in right and failed[what] > passed[what]
+        ]
         if not doubts:
             out.append(flight)
         else:
@@ -134,7 +162,9 @@ def _trusted(
 def _check(
     flight: Flight, vehicle_file: VehicleFile, comparison: bool
 ) -> tuple[Flight | None, list[Issue]]:
-    """One flight checked and mended, None where it can't be used, and what was found."""
+    """One flight checked and mended, None where it can't be used, and what was
+    found.
+    """
     vehicle = vehicle_file.vehicle_of(flight.vehicle)
     try:
         return check_flight(flight, vehicle, vehicle_file.log, comparison)
@@ -149,7 +179,9 @@ def _read(
 ) -> tuple[list[Flight], list[Issue]]:
     """The flights of one log, and what was found."""
     try:
-        flights, remarks = flights_of(read_log(log, mapping), vehicle_file.motor_permutation)
+        flights, remarks = flights_of(
+            read_log(log, mapping), vehicle_file.motor_permutation
+        )
     except LogError as error:
         return [], [Issue(log.name, str(error), refused=True, kind="reading")]
     return flights, [Issue(log.name, remark, kind="columns") for remark in remarks]

@@ -1,5 +1,5 @@
-"""Checks of flight logs: what can be mended is mended and named, what can't be used is refused with
-a reason.
+"""Checks of flight logs: what can be mended is mended and named, what can't be used is
+refused with a reason.
 """
 
 import dataclasses
@@ -21,31 +21,35 @@ from openjax.flights.sampling import (
 )
 
 SHORTEST = 2.0  # s airborne: windows of 0.5 s, and a few of them
-BELOW = 0.3  # m below the floor, where nothing flies: more than an origin on a table is off by
+# m below the floor, where nothing flies: more than an origin on a table is off by
+BELOW = 0.3
 AT_REST = 0.02  # command below which a motor doesn't turn
 LONG_REST = 1.0  # s
-SATURATED = 0.01  # share of rows at one largest value from which that is the sensor's end
+# share of rows at one largest value from which that is the sensor's end
+SATURATED = 0.01
 OFTEN = 0.05  # share from which the sensor is of no use
 LEAST_RANGE = {"body_rates": 0.3, "specific_force": 15.0}  # rad/s, m/s^2
-NOWHERE = 20.0  # m: beyond, three coordinates that are one number are a mark, and no place
+# m: beyond, three coordinates that are one number are a mark, and no place
+NOWHERE = 20.0
 GROUND_CLEARANCE = 0.02  # m above the floor
 
 
 def check_flight(
     flight: Flight, vehicle, log: dict | None = None, comparison: bool = False
 ) -> tuple[Flight | None, list[Issue]]:
-    """Check one flight as read. Returns it sorted, cleaned and cut to its airborne part, or None if
-    it can't be used, and the findings. `vehicle` is the nominal vehicle, `log` the vehicle file's
-    `[log]` table (floor_z). For a `comparison` of flights with flights the motor commands alone are
-    enough, and every airborne stretch is kept, not only the longest.
+    """Check one flight as read. Returns it sorted, cleaned and cut to its airborne
+    part, or None if it can't be used, and the findings. `vehicle` is the nominal
+    vehicle, `log` the vehicle file's `[log]` table (floor_z). For a `comparison` of
+    flights with flights the motor commands alone are enough, and every airborne stretch
+    is kept, not only the longest.
     """
     issues: list[Issue] = []
 
     def note(kind: str, text: str) -> None:
         issues.append(Issue(flight.name, text, kind=kind))
 
-    # in this order: time before what is cut by it, motors before sensors that stand still with
-    # them, ranges before anything is derived from values that can't be
+    # in this order: time before what is cut by it, motors before sensors that stand
+    # still with them, ranges before anything is derived from values that can't be
     try:
         _has_what_is_needed(flight, comparison)
         checked = _while_motors_turn(_in_time(_with_forces(flight, note), note), note)
@@ -59,7 +63,10 @@ def check_flight(
         _above_floor(checked, 0.0 if floor is None else float(floor))
         _has_what_is_needed(checked, comparison)
     except Refused as refused:
-        return None, [*issues, Issue(flight.name, str(refused), refused=True, kind=refused.kind)]
+        return None, [
+            *issues,
+            Issue(flight.name, str(refused), refused=True, kind=refused.kind),
+        ]
     found = check_agreement(checked, vehicle)
     return (None if found else checked), issues + found
 
@@ -78,7 +85,9 @@ def duplicates(flights: list[Flight]) -> dict[str, str]:
 def _has_what_is_needed(flight: Flight, comparison: bool) -> None:
     if comparison:
         if not flight.has_motors:
-            raise Refused("columns", "holds no motor commands (m1..m4), which a comparison needs")
+            raise Refused(
+                "columns", "holds no motor commands (m1..m4), which a comparison needs"
+            )
         return
     # A gyroscope beside the motors shows what torques do; nothing less shows anything.
     if not (flight.has_pose or flight.body_rates is not None):
@@ -87,14 +96,18 @@ def _has_what_is_needed(flight: Flight, comparison: bool) -> None:
         raise Refused("columns", f"needs position and orientation ({pose}) or {imu}")
     if not (flight.has_motors or flight.has_commands):
         raise Refused(
-            "columns", "holds no commands: needs m1..m4, or cmd_thrust and cmd_wx, cmd_wy, cmd_wz"
+            "columns",
+            "holds no commands: needs m1..m4, or cmd_thrust and cmd_wx, cmd_wy, cmd_wz",
         )
 
 
 def _with_forces(flight: Flight, note) -> Flight:
     """The flight, noted where it holds nothing that a force moves."""
     if not (flight.has_pose or flight.has_imu):
-        note("columns", "no accelerometer, nor a pose: torques alone can be told; log ax, ay, az")
+        note(
+            "columns",
+            "no accelerometer, nor a pose: torques alone can be told; log ax, ay, az",
+        )
     return flight
 
 
@@ -117,7 +130,10 @@ def _in_time(flight: Flight, note) -> Flight:
             "frozen, or too coarse",
         )
     if repeated.any():
-        note("time", f"{repeated.sum()} rows repeat the time of the row before and are left out")
+        note(
+            "time",
+            f"{repeated.sum()} rows repeat the time of the row before and are left out",
+        )
         flight = flight.rows(np.r_[True, ~repeated])
     step = flight.row_period
     _refuse_units(step)
@@ -126,16 +142,22 @@ def _in_time(flight: Flight, note) -> Flight:
     if len(gaps):
         longest = gaps[np.argmax(steps[gaps])]
         number = f"{len(gaps)} gap{'s' * (len(gaps) > 1)}"
-        where = f"the longest {steps[longest]:.2f} s after t = {flight.time[longest]:.2f}"
+        where = (
+            f"the longest {steps[longest]:.2f} s after t = {flight.time[longest]:.2f}"
+        )
         note("gaps", f"{number} in time, {where}")
     return flight
 
 
 def _while_motors_turn(flight: Flight, note) -> Flight:
-    """Without the time before motors first turn and after they last do: what stands still there is
-    a vehicle on the ground, not a frozen sensor.
+    """Without the time before motors first turn and after they last do: what stands
+    still there is a vehicle on the ground, not a frozen sensor.
     """
-    drive = flight.motor_command if flight.motor_command is not None else flight.command_thrust
+    drive = (
+        flight.motor_command
+        if flight.motor_command is not None
+        else flight.command_thrust
+    )
     if drive is None:
         return flight
     turning = np.flatnonzero((drive.reshape(len(drive), -1) > AT_REST).any(1))
@@ -150,8 +172,8 @@ def _while_motors_turn(flight: Flight, note) -> Flight:
 
 
 def _sorted(flight: Flight, note) -> Flight:
-    """Rows out of order are sorted: a few, or any number of one recording, whose rows are then
-    evenly apart. Others are several recordings.
+    """Rows out of order are sorted: a few, or any number of one recording, whose rows
+    are then evenly apart. Others are several recordings.
     """
     backwards = int((np.diff(flight.time) < 0).sum())
     if not backwards:
@@ -164,8 +186,12 @@ def _sorted(flight: Flight, note) -> Flight:
 
 
 def _written_once(flight: Flight, note) -> Flight:
-    """Without rows that repeat the one before in every column, as where a log was written twice."""
-    logged = [getattr(flight, c) for c in CHANNEL_COLUMNS if getattr(flight, c) is not None]
+    """Without rows that repeat the one before in every column, as where a log was
+    written twice.
+    """
+    logged = [
+        getattr(flight, c) for c in CHANNEL_COLUMNS if getattr(flight, c) is not None
+    ]
     table = np.column_stack([flight.time, *(v.reshape(len(v), -1) for v in logged)])
     same = (table[1:] == table[:-1]) | (np.isnan(table[1:]) & np.isnan(table[:-1]))
     again = np.r_[False, same.all(1)]
@@ -178,20 +204,30 @@ def _written_once(flight: Flight, note) -> Flight:
 def _refuse_units(step: float) -> None:
     """Refuse rows that are too far apart or too close, in seconds."""
     if step > SLOWEST:
-        for unit, factor in (("milliseconds", 1e3), ("microseconds", 1e6), ("nanoseconds", 1e9)):
+        for unit, factor in (
+            ("milliseconds", 1e3),
+            ("microseconds", 1e6),
+            ("nanoseconds", 1e9),
+        ):
             if 5e-4 <= step / factor <= SLOWEST:
                 raise Refused(
-                    "units", f"t is in {unit} (rows {step:g} apart); the log format wants seconds"
+                    "units",
+                    f"t is in {unit} (rows {step:g} apart); the log format wants seconds",
                 )
-        raise Refused("time", f"rows are {step:g} s apart; at least 20 rows per second are needed")
+        raise Refused(
+            "time", f"rows are {step:g} s apart; at least 20 rows per second are needed"
+        )
     if step < 2e-4:
         raise Refused(
-            "units", f"rows are {step:g} s apart: t is not in seconds, or the clock is corrupt"
+            "units",
+            f"rows are {step:g} s apart: t is not in seconds, or the clock is corrupt",
         )
 
 
 def _of_unit_length(quaternion: np.ndarray, note) -> np.ndarray:
-    """Quaternions (T, 4) normalised, without flips; those far from unit length are not sampled."""
+    """Quaternions (T, 4) normalised, without flips; those far from unit length are not
+    sampled.
+    """
     norm = np.linalg.norm(quaternion, axis=1)
     norm[norm == 0.0] = np.nan
     off = np.abs(norm - 1.0)
@@ -201,7 +237,10 @@ def _of_unit_length(quaternion: np.ndarray, note) -> np.ndarray:
     unit = quaternion / norm[:, None]
     bad = off > 0.05
     if bad.any():
-        note("quaternion", f"{bad.sum()} quaternions far from unit length are taken as not sampled")
+        note(
+            "quaternion",
+            f"{bad.sum()} quaternions far from unit length are taken as not sampled",
+        )
         unit[bad] = np.nan
     elif np.nanmax(off) > 2e-3:
         note(
@@ -212,8 +251,8 @@ def _of_unit_length(quaternion: np.ndarray, note) -> np.ndarray:
 
 
 def _in_range(flight: Flight, note) -> Flight:
-    """Values that no flight of such a vehicle has: units and corrupt columns that show by their
-    size alone.
+    """Values that no flight of such a vehicle has: units and corrupt columns that show
+    by their size alone.
     """
     changes = {}
     motor = flight.motor_command
@@ -225,25 +264,34 @@ def _in_range(flight: Flight, note) -> Flight:
     if flight.quaternion is not None:
         changes["quaternion"] = _of_unit_length(flight.quaternion, note)
     if flight.position is not None and np.nanmax(np.abs(flight.position)) > 100.0:
-        span = np.nanmax(np.ptp(flight.position[np.isfinite(flight.position).all(1)], axis=0))
+        span = np.nanmax(
+            np.ptp(flight.position[np.isfinite(flight.position).all(1)], axis=0)
+        )
         if span > 20.0:
-            raise Refused("units", f"x, y, z span {span:.0f}: in cm or mm? The log format wants m")
+            raise Refused(
+                "units", f"x, y, z span {span:.0f}: in cm or mm? The log format wants m"
+            )
     if flight.body_rates is not None:
         _refuse_degrees(flight.body_rates)
     voltage = flight.battery_voltage
     if voltage is not None:
         middle = float(np.nanmedian(voltage))
         if middle > 100:
-            raise Refused("units", f"vbat is {middle:.0f}: in mV? The log format wants V")
+            raise Refused(
+                "units", f"vbat is {middle:.0f}: in mV? The log format wants V"
+            )
         if not 2.0 < middle < 30.0:
-            note("corrupt", f"vbat is {middle:.2g} V, which no battery in flight has; left out")
+            note(
+                "corrupt",
+                f"vbat is {middle:.2g} V, which no battery in flight has; left out",
+            )
             changes["battery_voltage"] = None
     return dataclasses.replace(flight, **changes) if changes else flight
 
 
 def _refuse_degrees(body_rates: np.ndarray) -> None:
-    """Refuse body rates (T, 3) that are none in rad/s: ten turns a second are beyond the full scale
-    of such gyroscopes.
+    """Refuse body rates (T, 3) that are none in rad/s: ten turns a second are beyond
+    the full scale of such gyroscopes.
     """
     fastest = np.nanmax(np.abs(body_rates))
     if fastest > 60.0:
@@ -252,8 +300,8 @@ def _refuse_degrees(body_rates: np.ndarray) -> None:
 
 
 def _without_saturated(flight: Flight, note) -> Flight:
-    """A sensor at the end of its range reads what it can, not what there is: not sampled, or of no
-    use where that is often so.
+    """A sensor at the end of its range reads what it can, not what there is: not
+    sampled, or of no use where that is often so.
     """
     changes = {}
     for channel in ("body_rates", "specific_force"):
@@ -267,7 +315,9 @@ def _without_saturated(flight: Flight, note) -> Flight:
         if share < SATURATED or most < LEAST_RANGE[channel] or not _piled_up(size):
             continue
         columns = zip(CHANNEL_COLUMNS[channel], at_end.any(0), strict=True)
-        text = f"{', '.join(c for c, ends in columns if ends)} read {most:g} or -{most:g}"
+        text = (
+            f"{', '.join(c for c, ends in columns if ends)} read {most:g} or -{most:g}"
+        )
         text += f" in {share:.0%} of the rows, the sensor's end"
         if share < OFTEN:
             note("corrupt", f"{text}: taken as not sampled there")
@@ -281,16 +331,16 @@ def _without_saturated(flight: Flight, note) -> Flight:
 
 
 def _piled_up(size: np.ndarray) -> bool:
-    """Whether many more readings are the largest than the one below: else it is the peak of a
-    motion, which a coarse sensor reads often.
+    """Whether many more readings are the largest than the one below: else it is the
+    peak of a motion, which a coarse sensor reads often.
     """
     _, counts = np.unique(size[np.isfinite(size)], return_counts=True)
     return len(counts) > 1 and bool(counts[-1] > 5 * counts[-2])
 
 
 def _without_lost_poses(flight: Flight, note) -> Flight:
-    """Cameras that lost a body write zeros, or a number that is no place, -999 for one: such a pose
-    isn't sampled.
+    """Cameras that lost a body write zeros, or a number that is no place, -999 for one:
+    such a pose isn't sampled.
     """
     place = flight.position
     if place is not None:
@@ -308,7 +358,10 @@ def _without_lost_poses(flight: Flight, note) -> Flight:
     lost = (flight.quaternion == 0.0).all(1)
     if not lost.any():
         return flight
-    note("corrupt", f"{lost.sum()} poses whose quaternion is zero are taken as not sampled")
+    note(
+        "corrupt",
+        f"{lost.sum()} poses whose quaternion is zero are taken as not sampled",
+    )
     channels = [c for c in ("position", "quaternion") if getattr(flight, c) is not None]
     changes = {c: np.where(lost[:, None], np.nan, getattr(flight, c)) for c in channels}
     return dataclasses.replace(flight, **changes)
@@ -324,16 +377,22 @@ def _share_of_one(values: np.ndarray, columns: str) -> None:
             if high > 2100
             else "a pulse width in microseconds"
         )
-        raise Refused("units", f"{columns} reach {high:.0f}: {hint}; the log format wants 0..1")
+        raise Refused(
+            "units", f"{columns} reach {high:.0f}: {hint}; the log format wants 0..1"
+        )
     if high > 1.02:
         hint = "a wrong scale or corrupt"
         if high > 101:
             hint = "8-bit counts"
         elif high > 2:
             hint = "per cent"
-        raise Refused("units", f"{columns} reach {high:.3g}: {hint}; the log format wants 0..1")
+        raise Refused(
+            "units", f"{columns} reach {high:.3g}: {hint}; the log format wants 0..1"
+        )
     if low < -0.02:
-        raise Refused("corrupt", f"{columns} go down to {low:.3g}; commands lie in 0..1")
+        raise Refused(
+            "corrupt", f"{columns} go down to {low:.3g}; commands lie in 0..1"
+        )
 
 
 def _without_flips(quaternion: np.ndarray) -> np.ndarray:
@@ -345,12 +404,18 @@ def _without_flips(quaternion: np.ndarray) -> np.ndarray:
     return quaternion * sign[:, None]
 
 
-def _airborne(flight: Flight, floor_z: float | None, note, every: bool = False) -> Flight:
-    """Cut to the longest airborne stretch, or to `every` one of a useful length. Off the ground:
-    motors give at least 40 % of their usual command, and the vehicle isn't at rest on the floor;
-    shorter dips (half a second) are manoeuvres.
+def _airborne(
+    flight: Flight, floor_z: float | None, note, every: bool = False
+) -> Flight:
+    """Cut to the longest airborne stretch, or to `every` one of a useful length. Off
+    the ground: motors give at least 40 % of their usual command, and the vehicle isn't
+    at rest on the floor; shorter dips (half a second) are manoeuvres.
     """
-    drive = flight.motor_command if flight.motor_command is not None else flight.command_thrust
+    drive = (
+        flight.motor_command
+        if flight.motor_command is not None
+        else flight.command_thrust
+    )
     drive = drive if drive.ndim == 1 else drive.mean(1)
     rows = np.isfinite(drive)
     drive = np.interp(flight.time, flight.time[rows], drive[rows])
@@ -375,7 +440,8 @@ def _airborne(flight: Flight, floor_z: float | None, note, every: bool = False) 
     airborne = flight.time[stop - 1] - flight.time[start]
     if airborne < SHORTEST:
         raise Refused(
-            "short", f"airborne for {airborne:.1f} s only; at least {SHORTEST:g} s are needed"
+            "short",
+            f"airborne for {airborne:.1f} s only; at least {SHORTEST:g} s are needed",
         )
     if every:
         kept = np.zeros(len(flight), bool)
@@ -405,9 +471,11 @@ def _above_floor(flight: Flight, floor: float) -> None:
         )
 
 
-def _long_runs(flags: np.ndarray, time: np.ndarray, shortest: float = 0.5) -> np.ndarray:
-    """`flags` (T,) without runs of less than `shortest` s: a dip of thrust in the air is a
-    manoeuvre.
+def _long_runs(
+    flags: np.ndarray, time: np.ndarray, shortest: float = 0.5
+) -> np.ndarray:
+    """`flags` (T,) without runs of less than `shortest` s: a dip of thrust in the air
+    is a manoeuvre.
     """
     kept = flags.copy()
     for start, stop in runs_of(flags):

@@ -1,9 +1,11 @@
-"""When motors act: their commands against the turning of the body, without any fit of what acts.
+"""When motors act: their commands against the turning of the body, without any fit of
+what acts.
 
-Torques turn the body at once: the angular acceleration that motors would make, through their lag,
-is where the cross-correlation with what the gyroscope reads is largest (Knapp, Carter 1976). It may
-come later than the motors' lag says, as slow motors and late links do. It can't come earlier: then
-a row of commands holds what acted before it, or the two streams are on different clocks.
+Torques turn the body at once: the angular acceleration that motors would make, through
+their lag, is where the cross-correlation with what the gyroscope reads is largest
+(Knapp, Carter 1976). It may come later than the motors' lag says, as slow motors and
+late links do. It can't come earlier: then a row of commands holds what acted before it,
+or the two streams are on different clocks.
 """
 
 import dataclasses
@@ -23,8 +25,8 @@ from openjax.flights.track import (
     turn_increments,
 )
 
-# What a row of motor commands may hold: their mean from its time until the next row, their mean
-# since the last row, or a single one.
+# What a row of motor commands may hold: their mean from its time until the next row,
+# their mean since the last row, or a single one.
 ROWS = ("mean", "mean_before", "sample")
 BAND = (0.7, 8.0)  # Hz: above trims, below what single samples of motors hide
 EDGE = 0.4  # s at either end that the filter spoils
@@ -33,11 +35,12 @@ FINER = 4  # steps of an offset in a row of the grid
 LOUD = 3.0  # times the median size, at which the signals are cut
 FOLLOWS = 0.25  # mean squared correlation from which motors and turning belong together
 BETTER = 0.9  # share of it that a peak at another offset may have, and be as good
-# s that motors may seem early: half a row where rows are single samples, and EARLY of a motor that
-# is faster than assumed. The largest in 120 cases of four simulators was .0025.
+# s that motors may seem early: half a row where rows are single samples, and EARLY of a
+# motor that is faster than assumed. The largest in 120 cases of four simulators was
+# .0025.
 EARLY = 0.0015
-# Share of a flight's likeness at its own offset that it has at the common one of all flights, from
-# which it tells no other: where a flight hardly turns the curve is flat.
+# Share of a flight's likeness at its own offset that it has at the common one of all
+# flights, from which it tells no other: where a flight hardly turns the curve is flat.
 TELLS = 0.85
 SLOWEST_ROW = 0.004  # s: rows that are shorter hide nothing by a row's shift
 # s that motors may seem late by: a time constant of .13 s looks like .05 in this band
@@ -48,9 +51,9 @@ APART = 0.03  # s by which flights of one logger may differ
 
 @dataclass(frozen=True)
 class MotorClock:
-    """`late` {flight and vehicle: s by which its motor commands stand later in the log than they act};
-    `one_clock`: whether motors and gyroscope share one, but for a row; `findings` in words, by
-    name.
+    """`late` {flight and vehicle: s by which its motor commands stand later in the log
+    than they act}; `one_clock`: whether motors and gyroscope share one, but for a row;
+    `findings` in words, by name.
     """
 
     late: dict[str, float]
@@ -59,11 +62,15 @@ class MotorClock:
 
 
 def read_motor_clock(
-    tracks: Sequence[Track], vehicles, row: float, rows: str = "mean", gyroscope: bool = True
+    tracks: Sequence[Track],
+    vehicles,
+    row: float,
+    rows: str = "mean",
+    gyroscope: bool = True,
 ) -> MotorClock:
-    """Compare motors and turning of all tracks of one case with their nominal `vehicles`. `row`: s
-    between the log's own rows; `rows`: what is said of them, see ROWS; without `gyroscope` the
-    attitude says how the body turns.
+    """Compare motors and turning of all tracks of one case with their nominal
+    `vehicles`. `row`: s between the log's own rows; `rows`: what is said of them, see
+    ROWS; without `gyroscope` the attitude says how the body turns.
     """
     both = zip(tracks, vehicles, strict=True)
     turning = (_turning(t, v, gyroscope) for t, v in both if t.motor is not None)
@@ -81,7 +88,9 @@ def read_motor_clock(
             "the last one, and are read one row earlier"
         )
         return MotorClock(by_a_row, True, {"motor rows": text})
-    words = _in_words({flight: time for flight, time in late.items() if abs(time) > least})
+    words = _in_words(
+        {flight: time for flight, time in late.items() if abs(time) > least}
+    )
     text = (
         f"motors and {'gyroscope' if gyroscope else 'attitude'} don't share a clock: motor "
         f"commands are {words}; they are moved by that, and torques, lags and latencies can't be "
@@ -93,8 +102,8 @@ def read_motor_clock(
 
 
 def _least(row: float, rows: str) -> float:
-    """s by which motors may seem early: half a row, of the grid's where the log's own are shorter,
-    and another half where rows are single samples.
+    """s by which motors may seem early: half a row, of the grid's where the log's own
+    are shorter, and another half where rows are single samples.
     """
     half = 0.5 * (row if row >= SLOWEST_ROW else GRID_PERIOD)
     return half + EARLY + (0.5 * row if rows == "sample" else 0.0)
@@ -109,8 +118,8 @@ def _in_words(late: dict[str, float]) -> str:
 
 
 def on_gyroscope_clock(track: Track, clock: MotorClock) -> Track:
-    """The track with its motor commands when they act. Without one clock they tell the thrust and
-    no torques.
+    """The track with its motor commands when they act. Without one clock they tell the
+    thrust and no torques.
     """
     late = clock.late.get(_flight_of(track), 0.0)
     if track.motor is None or (late == 0.0 and clock.one_clock):
@@ -125,7 +134,9 @@ def on_gyroscope_clock(track: Track, clock: MotorClock) -> Track:
 
 
 def case_on_gyroscope_clock(case: Case, late: Mapping[str, float]) -> Case:
-    """A case whose flights hold their motor commands when they act, see `MotorClock.late`."""
+    """A case whose flights hold their motor commands when they act, see
+    `MotorClock.late`.
+    """
     flights = []
     for flight in case.flights:
         moved = late.get(flight.name, 0.0)
@@ -140,12 +151,14 @@ def case_on_gyroscope_clock(case: Case, late: Mapping[str, float]) -> Case:
 
 
 def read_command_clock(tracks: Sequence[Track], row: float) -> str:
-    """What is wrong with the clock of commanded thrust against the motors, which follow it after
-    the link's delay; empty where nothing is.
+    """What is wrong with the clock of commanded thrust against the motors, which follow
+    it after the link's delay; empty where nothing is.
     """
     both = [t for t in tracks if t.command is not None and t.motor is not None]
     pairs = ((t, t.motor.mean(1)[:, None], t.command[:, :1]) for t in both)
-    late = {f: -d for f, d in _offsets(pairs).items() if not -1.5 * row - EARLY < d < LINK}
+    late = {
+        f: -d for f, d in _offsets(pairs).items() if not -1.5 * row - EARLY < d < LINK
+    }
     return (
         f"commands and motors don't share a clock: commands are {_in_words(late)}; they aren't "
         "used, and link and rate controller can't be told from these logs"
@@ -160,8 +173,8 @@ def _flight_of(track: Track) -> str:
 
 
 def _offsets(signals) -> dict[str, float]:
-    """{flight and vehicle: s by which one signal (T, C) is later than the other}, of `signals`
-    (track, that one, the other) that are alike.
+    """{flight and vehicle: s by which one signal (T, C) is later than the other}, of
+    `signals` (track, that one, the other) that are alike.
     """
     likeness: dict[str, list] = {}
     for track, late, early in signals:
@@ -169,7 +182,8 @@ def _offsets(signals) -> dict[str, float]:
             likeness.setdefault(_flight_of(track), []).append((found, track.dt / FINER))
     curves = {}
     for flight, parts in likeness.items():
-        # Stretches of one flight may have rows of another length: all on the grid of the shortest.
+        # Stretches of one flight may have rows of another length: all on the grid of
+        # the shortest.
         reach = min(len(part) // 2 * step for part, step in parts)
         step = parts[0][1]
         grid = step * np.arange(-int(reach / step), int(reach / step) + 1)
@@ -177,7 +191,8 @@ def _offsets(signals) -> dict[str, float]:
         if whole.max() >= FOLLOWS:
             curves[flight] = whole, step
     out = {flight: _peak(*curve) for flight, curve in curves.items()}
-    if len(curves) > 1:  # one logger has one clock, unless a flight tells another one clearly
+    # one logger has one clock, unless a flight tells another one clearly
+    if len(curves) > 1:
         reach = min(len(whole) // 2 * step for whole, step in curves.values())
         step = min(step for _, step in curves.values())
         grid = step * np.arange(-int(reach / step), int(reach / step) + 1)
@@ -190,8 +205,8 @@ def _offsets(signals) -> dict[str, float]:
 
 
 def _peak(whole: np.ndarray, step: float) -> float:
-    """The offset, s, of the highest peak of a curve (N,) around zero; of peaks that are as high
-    that of the one in the middle, as where a flight is periodic.
+    """The offset, s, of the highest peak of a curve (N,) around zero; of peaks that are
+    as high that of the one in the middle, as where a flight is periodic.
     """
     best, middle = int(np.argmax(whole)), len(whole) // 2
     high = find_peaks(whole, BETTER * whole[best], distance=int(APART / step))[0]
@@ -206,18 +221,24 @@ def _on(grid: np.ndarray, values: np.ndarray, step: float) -> np.ndarray:
 
 
 def _likeness(late: np.ndarray, early: np.ndarray, dt: float) -> np.ndarray | None:
-    """Squared correlation, with its sign, of two signals (T, C) at offsets up to REACH in steps of
-    a row / FINER; mean of the columns.
+    """Squared correlation, with its sign, of two signals (T, C) at offsets up to REACH
+    in steps of a row / FINER; mean of the columns.
     """
     edge = int(EDGE / dt)
     if len(late) < 4 * edge:
         return None
-    band = butter(2, (BAND[0], min(BAND[1], 0.4 / dt)), "bandpass", fs=1 / dt, output="sos")
+    band = butter(
+        2, (BAND[0], min(BAND[1], 0.4 / dt)), "bandpass", fs=1 / dt, output="sos"
+    )
     passed = (sosfiltfilt(band, v, axis=0)[edge:-edge] for v in (late, early))
     # The one turn at a start outweighs a whole flight.
-    late, early = (np.clip(v, -u, u) for v in passed for u in [LOUD * np.median(np.abs(v), 0)])
+    late, early = (
+        np.clip(v, -u, u) for v in passed for u in [LOUD * np.median(np.abs(v), 0)]
+    )
     size = 1 << int(np.ceil(np.log2(2 * len(late))))
-    spectrum = np.fft.rfft(late, size, axis=0) * np.conj(np.fft.rfft(early, size, axis=0))
+    spectrum = np.fft.rfft(late, size, axis=0) * np.conj(
+        np.fft.rfft(early, size, axis=0)
+    )
     steps = int(REACH / dt) * FINER
     cross = FINER * np.fft.irfft(spectrum, FINER * size, axis=0)
     cross = np.concatenate([cross[-steps:], cross[: steps + 1]])
@@ -226,20 +247,24 @@ def _likeness(late: np.ndarray, early: np.ndarray, dt: float) -> np.ndarray | No
     return (np.abs(correlation) * correlation).mean(1)
 
 
-def _turning(track: Track, vehicle, gyroscope: bool) -> tuple[Track, np.ndarray, np.ndarray]:
-    """The track, its angular acceleration and that which its motors make, but for their units,
-    (T - 1, 3).
+def _turning(
+    track: Track, vehicle, gyroscope: bool
+) -> tuple[Track, np.ndarray, np.ndarray]:
+    """The track, its angular acceleration and that which its motors make, but for their
+    units, (T - 1, 3).
     """
     rates = track.body_rates
     if not gyroscope or rates is None:
         turned = turn_increments(track.quaternion) / track.dt
-        rates = 0.5 * (np.concatenate([turned[:1], turned]) + np.concatenate([turned, turned[-1:]]))
+        rates = 0.5 * (
+            np.concatenate([turned[:1], turned]) + np.concatenate([turned, turned[-1:]])
+        )
     return track, np.diff(rates, axis=0) / track.dt, _torques(track, vehicle)[:-1]
 
 
 def _torques(track: Track, vehicle) -> np.ndarray:
-    """Torques (T, 3), but for their unit, that motors make in each row through their lag: the mean
-    over the row of a first-order answer to a command that is held.
+    """Torques (T, 3), but for their unit, that motors make in each row through their
+    lag: the mean over the row of a first-order answer to a command that is held.
     """
     place = np.asarray(vehicle.rotor_position, float)
     spin = np.asarray(vehicle.rotor_spin, float)

@@ -1,5 +1,5 @@
-"""Conventions of other programs in which a whole log, or its attitude, may be written: what the
-channels would be in the log format's, and what to do about it, in words.
+"""Conventions of other programs in which a whole log, or its attitude, may be written:
+what the channels would be in the log format's, and what to do about it, in words.
 """
 
 import dataclasses
@@ -13,7 +13,8 @@ from openjax.flights.pairs import Signals
 from openjax.flights.track import rotation
 
 RECIPE = "the recipe stands in the page of the log format, under Rows in NED"
-# Both turn back what they turn: half a turn about x, and about the line between north and east.
+# Both turn back what they turn: half a turn about x, and about the line between north
+# and east.
 DOWN = Rotation.from_quat([1.0, 0.0, 0.0, 0.0])
 NORTH = Rotation.from_quat([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0])
 
@@ -25,12 +26,14 @@ class Convention:
     words: str
     """What is the matter, and what would be right."""
     convert: Callable[[Signals], Signals]
-    """The signals as they are in the log format's convention, if they were logged in this one."""
+    """The signals as they are in the log format's convention, if they were logged in
+    this one.
+    """
 
 
 def upright(signals: Signals) -> bool:
-    """Whether the body's z is up most of the time, as in a flight; what is compared in a band of
-    frequencies can't tell a world that stands on its head.
+    """Whether the body's z is up most of the time, as in a flight; what is compared in
+    a band of frequencies can't tell a world that stands on its head.
     """
     if signals.quaternion is None:
         return True
@@ -43,14 +46,18 @@ def other_pitch(signals: Signals) -> Signals:
     if signals.quaternion is not None:
         attitude = Rotation.from_quat(signals.quaternion, scalar_first=True)
         angles = attitude.as_euler("ZYX") * [1.0, -1.0, 1.0]
-        changes["quaternion"] = Rotation.from_euler("ZYX", angles).as_quat(scalar_first=True)
+        changes["quaternion"] = Rotation.from_euler("ZYX", angles).as_quat(
+            scalar_first=True
+        )
     if signals.body_rates is not None:
         changes["body_rates"] = signals.body_rates * [1.0, -1.0, 1.0]
     return dataclasses.replace(signals, **changes)
 
 
 def turned(signals: Signals, world: Rotation | None, body: Rotation | None) -> Signals:
-    """With the world's and the body's axes turned, those of every channel that is in them."""
+    """With the world's and the body's axes turned, those of every channel that is in
+    them.
+    """
     changes = {}
     for names, turn in (
         (("position", "velocity"), world),

@@ -1,7 +1,9 @@
-"""The text of a CSV log before its numbers are read: unpacked, decoded, and its header found.
+"""The text of a CSV log before its numbers are read: unpacked, decoded, and its header
+found.
 
-Loggers and spreadsheets put things around a table: comments above the header, Excel's `sep=;`,
-semicolons with decimal commas, UTF-16, a row of units, a comma at the end of each line.
+Loggers and spreadsheets put things around a table: comments above the header, Excel's
+`sep=;`, semicolons with decimal commas, UTF-16, a row of units, a comma at the end of
+each line.
 """
 
 import gzip
@@ -14,11 +16,13 @@ from typing import NamedTuple
 
 from openjax.errors import UserError
 
-# What one log may hold: a quarter of an hour at 1 kHz is 256 MB of text and a million rows.
+# What one log may hold: a quarter of an hour at 1 kHz is 256 MB of text and a million
+# rows.
 LARGEST = 256 << 20  # bytes of text
 MOST_ROWS = 2_000_000
 CHUNK = 1 << 20  # bytes that are unpacked at once
-LONGEST_HEADER = 1 << 16  # bytes: a header of a firmware's some hundred names has 10,000
+# bytes: a header of a firmware's some hundred names has 10,000
+LONGEST_HEADER = 1 << 16
 GZIP = b"\x1f\x8b"
 ZIP = b"PK\x03\x04"  # also of spreadsheets
 WIDE = (b"\xff\xfe", b"\xfe\xff")  # how a text in UTF-16 begins
@@ -35,8 +39,8 @@ class LogError(UserError):
 
 
 class Header(NamedTuple):
-    """The names of a table's columns, what separates its cells, and in which of its lines, from 0
-    on, the names stand.
+    """The names of a table's columns, what separates its cells, and in which of its
+    lines, from 0 on, the names stand.
     """
 
     names: list[str]
@@ -45,8 +49,8 @@ class Header(NamedTuple):
 
 
 def text_of(path: Path) -> str:
-    """A file's text with line ends of one kind. Stops unpacking at LARGEST bytes or MOST_ROWS
-    lines. Raises LogError for what is no text.
+    """A file's text with line ends of one kind. Stops unpacking at LARGEST bytes or
+    MOST_ROWS lines. Raises LogError for what is no text.
     """
     chunks = []
     size = 0
@@ -103,7 +107,9 @@ def find_header(lines: list[str], delimiter: str = "") -> Header:
         (at, line), *below = below
     line = line.removeprefix(COMMENT)  # where numpy.savetxt puts the names
     delimiter = delimiter or max(SEPARATORS, key=line.count)
-    names = [name.strip().strip('"') for name in unquoted(line, delimiter).split(delimiter)]
+    names = [
+        name.strip().strip('"') for name in unquoted(line, delimiter).split(delimiter)
+    ]
     return Header(names, delimiter, at)
 
 
@@ -113,7 +119,9 @@ def _holds_names(line: str) -> bool:
 
 
 def unquoted(line: str, delimiter: str) -> str:
-    """A line without quotes around its cells, and without the delimiters that stand in them."""
+    """A line without quotes around its cells, and without the delimiters that stand in
+    them.
+    """
     if '"' not in line:
         return line
     parts = line.split('"')
@@ -126,7 +134,9 @@ def _opened(path: Path, stack: ExitStack) -> io.BufferedIOBase:
     with path.open("rb") as file:
         start = file.read(len(ZIP))
     if start == ZIP:
-        raise LogError("is a zip archive or a spreadsheet: unpack it, or save it as CSV")
+        raise LogError(
+            "is a zip archive or a spreadsheet: unpack it, or save it as CSV"
+        )
     packed = start.startswith(GZIP)
     return stack.enter_context(gzip.open(path) if packed else path.open("rb"))
 

@@ -15,8 +15,9 @@ OUTSIDE = 6.0  # standard deviations by which it is off
 
 
 def derive_velocity(flight: Flight, note) -> Flight:
-    """Velocity from position where it wasn't logged: local quadratic fits over about 50 ms
-    (Savitzky-Golay)."""
+    """Velocity from position where it wasn't logged: local quadratic fits over about 50
+    ms (Savitzky-Golay).
+    """
     if flight.velocity is not None or flight.position is None:
         return flight
     time, position = flight.sampled("position")
@@ -33,12 +34,15 @@ def derive_velocity(flight: Flight, note) -> Flight:
 
 
 def mend_velocity(flight: Flight, note) -> Flight:
-    """A velocity that somebody differentiated row by row is wrong beside rows that are missing:
-    there it is taken from the position, where it is far off its slope for such rows alone.
+    """A velocity that somebody differentiated row by row is wrong beside rows that are
+    missing: there it is taken from the position, where it is far off its slope for such
+    rows alone.
     """
     if flight.velocity is None or flight.position is None:
         return flight
-    rows = np.flatnonzero(np.isfinite(flight.position).all(1) & np.isfinite(flight.velocity).all(1))
+    rows = np.flatnonzero(
+        np.isfinite(flight.position).all(1) & np.isfinite(flight.velocity).all(1)
+    )
     if len(rows) < 10 * BESIDE_GAP:
         return flight
     time = flight.time[rows]
@@ -65,13 +69,16 @@ def mend_velocity(flight: Flight, note) -> Flight:
     return dataclasses.replace(flight, velocity=velocity)
 
 
-def _slopes(time: np.ndarray, values: np.ndarray, half: int) -> tuple[np.ndarray, np.ndarray]:
-    """Derivatives (R, C) of values (R, C) by local quadratic fits over 2 `half` + 1 rows
-    (Savitzky-Golay, for uneven steps too), and how far in time (R,) each fit reaches.
+def _slopes(
+    time: np.ndarray, values: np.ndarray, half: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Derivatives (R, C) of values (R, C) by local quadratic fits over 2 `half` + 1
+    rows (Savitzky-Golay, for uneven steps too), and how far in time (R,) each fit
+    reaches.
     """
-    index = np.clip(np.arange(len(time)), half, len(time) - half - 1)[:, None] + np.arange(
-        -half, half + 1
-    )
+    index = np.clip(np.arange(len(time)), half, len(time) - half - 1)[
+        :, None
+    ] + np.arange(-half, half + 1)
     dt = time[index] - time[:, None]
     basis = np.stack([np.ones_like(dt), dt, dt**2], -1)
     normal = np.einsum("rki,rkj->rij", basis, basis)
@@ -82,8 +89,8 @@ def _slopes(time: np.ndarray, values: np.ndarray, half: int) -> tuple[np.ndarray
 
 
 def derive_rates(flight: Flight, note) -> Flight:
-    """Body rates from the attitude where no gyroscope was logged: w = 2 (q* dq/dt), local quadratic
-    fits.
+    """Body rates from the attitude where no gyroscope was logged: w = 2 (q* dq/dt),
+    local quadratic fits.
     """
     if flight.body_rates is not None or flight.quaternion is None:
         return flight
@@ -104,13 +111,15 @@ def derive_rates(flight: Flight, note) -> Flight:
 
 
 def _enough(attitude: np.ndarray, step: float) -> int:
-    """Rows to either side over which the slope of attitudes (R, 4) is no noisier than RATE_NOISE: a
-    wide fit takes the edge off every turn, and an estimator's attitude, which is smooth, doesn't
-    need it.
+    """Rows to either side over which the slope of attitudes (R, 4) is no noisier than
+    RATE_NOISE: a wide fit takes the edge off every turn, and an estimator's attitude,
+    which is smooth, doesn't need it.
     """
-    # Third differences hold little motion; of white noise s they are sqrt(20) s, and their median
-    # size .6745 of that.
-    noise = float(np.median(np.abs(np.diff(attitude, 3, axis=0)))) / (0.6745 * np.sqrt(20.0))
+    # Third differences hold little motion; of white noise s they are sqrt(20) s, and
+    # their median size .6745 of that.
+    noise = float(np.median(np.abs(np.diff(attitude, 3, axis=0)))) / (
+        0.6745 * np.sqrt(20.0)
+    )
     half = 1
     while half < len(attitude) // 2 and 2.0 * noise / step > RATE_NOISE * np.sqrt(
         half * (half + 1) * (2 * half + 1) / 3.0

@@ -1,9 +1,9 @@
-"""The flight container: what one vehicle's log holds, as arrays in the frames and units of the log
-format.
+"""The flight container: what one vehicle's log holds, as arrays in the frames and units
+of the log format.
 
-A case is a set of flights of the same vehicle(s) with one vehicle file. World frame: x east, y
-north, z up. Body frame: x forward, y left, z up. SI units. Quaternions are scalar-first and rotate
-body to world.
+A case is a set of flights of the same vehicle(s) with one vehicle file. World frame: x
+east, y north, z up. Body frame: x forward, y left, z up. SI units. Quaternions are
+scalar-first and rotate body to world.
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ if TYPE_CHECKING:
 
 Array = np.ndarray
 
-# Channel of a Flight, which is None where it wasn't logged: its columns in the log format.
+# Channel of a Flight, which is None where it wasn't logged: its columns in the log
+# format.
 CHANNEL_COLUMNS = {
     "position": ("x", "y", "z"),
     "quaternion": ("qw", "qx", "qy", "qz"),
@@ -43,9 +44,10 @@ SENSORS = ("position", "quaternion", "velocity", "body_rates", "specific_force")
 class Issue:
     """One finding about a flight's data.
 
-    `flight` is the log's file name (with the vehicle's id where several flew), `issue` says in
-    words what was found, `refused` whether the flight can't be used because of it, and `kind` is a
-    short name of the check. `against` names the comparisons of channels that failed.
+    `flight` is the log's file name (with the vehicle's id where several flew), `issue`
+    says in words what was found, `refused` whether the flight can't be used because of
+    it, and `kind` is a short name of the check. `against` names the comparisons of
+    channels that failed.
     """
 
     flight: str
@@ -57,9 +59,9 @@ class Issue:
 
 @dataclass(frozen=True, eq=False)
 class Flight:
-    """One vehicle's flight, T rows sorted by time, float64. A channel that wasn't logged is None; a
-    value that wasn't sampled at a row (slower channels) is NaN. Motors are in the nominal order:
-    front right, rear right, rear left, front left.
+    """One vehicle's flight, T rows sorted by time, float64. A channel that wasn't
+    logged is None; a value that wasn't sampled at a row (slower channels) is NaN.
+    Motors are in the nominal order: front right, rear right, rear left, front left.
     """
 
     name: str  # log file name; "FILE:ID" where several vehicles share the file
@@ -67,25 +69,32 @@ class Flight:
     vehicle: str  # vehicle id, "0" by default
     time: Array  # (T,) s
     position: Array | None = None  # (T, 3) m, world, of the tracked frame
-    quaternion: Array | None = None  # (T, 4) wxyz, body to world, unit, without sign flips
+    # (T, 4) wxyz, body to world, unit, without sign flips
+    quaternion: Array | None = None
     velocity: Array | None = None  # (T, 3) m/s, world
     body_rates: Array | None = None  # (T, 3) rad/s, gyroscope
-    specific_force: Array | None = None  # (T, 3) m/s^2, body, accelerometer (+9.81 on z at rest)
+    # (T, 3) m/s^2, body, accelerometer (+9.81 on z at rest)
+    specific_force: Array | None = None
     command_thrust: Array | None = (
         None  # (T,) commanded collective thrust, as a share of the largest
     )
     command_body_rates: Array | None = None  # (T, 3) rad/s, commanded body rates
-    motor_command: Array | None = None  # (T, 4) 0..1, meaning by the vehicle file's `motor_command`
+    # (T, 4) 0..1, meaning by the vehicle file's `motor_command`
+    motor_command: Array | None = None
     battery_voltage: Array | None = None  # (T,) V, under load
-    velocity_derived: bool = False  # True: differentiated from position by the reader, not logged
+    # True: differentiated from position by the reader, not logged
+    velocity_derived: bool = False
     body_rates_derived: bool = (
         False  # True: differentiated from the attitude by the reader, no gyroscope
     )
-    attitude_derived: bool = False  # True: of gyroscope, accelerometer and path by the reader
+    # True: of gyroscope, accelerometer and path by the reader
+    attitude_derived: bool = False
     pose_age: float = (
-        0.0  # s by which a pose may be older than its row, because the log held the last one
+        # s by which a pose may be older than its row, because the log held the last one
+        0.0
     )
-    fingerprint: str = ""  # hash of the whole log's values, the same for copies under other names
+    # hash of the whole log's values, the same for copies under other names
+    fingerprint: str = ""
 
     def __len__(self) -> int:
         return len(self.time)
@@ -98,7 +107,9 @@ class Flight:
     @property
     def row_period(self) -> float:
         """s, median step between rows."""
-        return float(np.median(np.diff(self.time))) if len(self.time) > 1 else float("nan")
+        return (
+            float(np.median(np.diff(self.time))) if len(self.time) > 1 else float("nan")
+        )
 
     @property
     def has_pose(self) -> bool:
@@ -120,8 +131,12 @@ class Flight:
         """Whether commanded thrust and body rates are logged."""
         return self.command_thrust is not None and self.command_body_rates is not None
 
-    def sampled(self, channel: str) -> tuple[Float[Array, " samples"], Float[Array, "samples ..."]]:
-        """Times (S,) and values (S, ...) of the rows at which `channel` was sampled in full."""
+    def sampled(
+        self, channel: str
+    ) -> tuple[Float[Array, " samples"], Float[Array, "samples ..."]]:
+        """Times (S,) and values (S, ...) of the rows at which `channel` was sampled in
+        full.
+        """
         values = getattr(self, channel)
         if values is None:
             raise ValueError(f"{self.name}: no channel {channel}")
@@ -131,8 +146,9 @@ class Flight:
     def holes(
         self, channel: str, least: float = HOLE, samples: float = 10.0
     ) -> Float[Array, "holes 2"]:
-        """(H, 2) s, begin and end of where `channel` wasn't sampled for so long that no line may
-        stand for it: for more than `least` s, and more than so many of its `samples`.
+        """(H, 2) s, begin and end of where `channel` wasn't sampled for so long that no
+        line may stand for it: for more than `least` s, and more than so many of its
+        `samples`.
         """
         at = np.r_[self.time[0], self.sampled(channel)[0], self.time[-1]]
         steps = np.diff(at)
@@ -142,7 +158,9 @@ class Flight:
     def in_holes(
         self, channels: Iterable[str], least: float = HOLE, samples: float = 10.0
     ) -> Bool[Array, " rows"]:
-        """(T,) which rows lie in a hole, see `holes`, of one of the channels that were logged."""
+        """(T,) which rows lie in a hole, see `holes`, of one of the channels that were
+        logged.
+        """
         inside = np.zeros(len(self), bool)
         for channel in channels:
             if getattr(self, channel) is not None:
@@ -153,11 +171,11 @@ class Flight:
     def interpolated(
         self, channel: str, time: Float[Array, " times"] | None = None
     ) -> Float[Array, ...]:
-        """`channel` at `time` (S,) (default: every row), linearly between its samples, held at the
-        ends.
+        """`channel` at `time` (S,) (default: every row), linearly between its samples,
+        held at the ends.
 
-        Quaternions are interpolated componentwise and normalised, which is exact to second order in
-        the step.
+        Quaternions are interpolated componentwise and normalised, which is exact to
+        second order in the step.
         """
         time = self.time if time is None else time
         at, values = self.sampled(channel)
@@ -167,24 +185,36 @@ class Flight:
             out /= np.linalg.norm(out, axis=1, keepdims=True)
         return out.reshape((len(time), *values.shape[1:]))
 
-    def stretches(self, max_step: float | None = None, min_duration: float = 0.0) -> list[slice]:
-        """Slices of rows without a gap in time longer than `max_step` s (default 5 row periods)."""
+    def stretches(
+        self, max_step: float | None = None, min_duration: float = 0.0
+    ) -> list[slice]:
+        """Slices of rows without a gap in time longer than `max_step` s (default 5 row
+        periods).
+        """
         max_step = 5.0 * self.row_period if max_step is None else max_step
         breaks = np.flatnonzero(np.diff(self.time) > max_step) + 1
         edges = [0, *breaks.tolist(), len(self.time)]
         slices = [slice(a, b) for a, b in itertools.pairwise(edges)]
-        return [s for s in slices if self.time[s.stop - 1] - self.time[s.start] >= min_duration]
+        return [
+            s
+            for s in slices
+            if self.time[s.stop - 1] - self.time[s.start] >= min_duration
+        ]
 
     def rows(self, rows: slice | Array) -> Flight:
         """The flight with a subset of its rows."""
-        cut = {c: getattr(self, c)[rows] for c in CHANNEL_COLUMNS if getattr(self, c) is not None}
+        cut = {
+            c: getattr(self, c)[rows]
+            for c in CHANNEL_COLUMNS
+            if getattr(self, c) is not None
+        }
         return dataclasses.replace(self, time=self.time[rows], **cut)
 
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """Flights of the same vehicle(s), their vehicle file, and what the checks found, refused
-    flights included.
+    """Flights of the same vehicle(s), their vehicle file, and what the checks found,
+    refused flights included.
     """
 
     name: str
@@ -194,16 +224,22 @@ class Case:
     path: Path | None = None
 
     def others(self, flight: Flight) -> tuple[Flight, ...]:
-        """The other vehicles that flew together with `flight` (neighbours, for downwash)."""
-        return tuple(f for f in self.flights if f.log == flight.log and f.vehicle != flight.vehicle)
+        """The other vehicles that flew together with `flight` (neighbours, for
+        downwash).
+        """
+        return tuple(
+            f
+            for f in self.flights
+            if f.log == flight.log and f.vehicle != flight.vehicle
+        )
 
     def left_out(self) -> tuple[Issue, ...]:
         """What refused a log or a vehicle of it."""
         return tuple(issue for issue in self.quality if issue.refused)
 
     def vehicle_of(self, flight: Flight):
-        """The nominal `Vehicle` of this flight: the vehicle file's, with `[vehicles.<id>]`
-        applied.
+        """The nominal `Vehicle` of this flight: the vehicle file's, with
+        `[vehicles.<id>]` applied.
         """
         return self.vehicle_file.vehicle_of(flight.vehicle)
 

@@ -1,5 +1,5 @@
-"""Logged flights as channels of an MCAP file: where the vehicle is, and every number that was
-logged, to be plotted.
+"""Logged flights as channels of an MCAP file: where the vehicle is, and every number
+that was logged, to be plotted.
 """
 
 import numpy as np
@@ -9,8 +9,8 @@ from openjax.show.foxglove import Channel, pose_channel
 
 
 def flight_channels(flight: Flight) -> list[Channel]:
-    """The pose of a flight where it was logged, and its rows under the names of the log format;
-    what wasn't sampled at a row is left out.
+    """The pose of a flight where it was logged, and its rows under the names of the log
+    format; what wasn't sampled at a row is left out.
     """
     name = f"/{flight.name.split('.')[0]}/{flight.vehicle}"
     columns = {}
@@ -25,6 +25,8 @@ def flight_channels(flight: Flight) -> list[Channel]:
     channels = [Channel(f"{name}/log", "openjax.LogRow", rows)]
     if flight.position is not None:
         channels.append(
-            pose_channel(f"{name}/pose", flight.time, flight.position, flight.quaternion)
+            pose_channel(
+                f"{name}/pose", flight.time, flight.position, flight.quaternion
+            )
         )
     return channels

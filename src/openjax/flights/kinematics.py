@@ -1,10 +1,11 @@
-"""Sensors against each other, without any dynamics: what rigid-body kinematics alone says about a
-log.
+"""Sensors against each other, without any dynamics: what rigid-body kinematics alone
+says about a log.
 
-Attitude's rate against the gyroscope gives the gyroscope's gain; the path's acceleration against
-the accelerometer, turned into the world, gives the tilt of the world in which motion capture
-reports. A sensor that is off by more than sensors usually are is a finding about the sensors, is
-corrected before the physics is read, and is no cause.
+Attitude's rate against the gyroscope gives the gyroscope's gain; the path's
+acceleration against the accelerometer, turned into the world, gives the tilt of the
+world in which motion capture reports. A sensor that is off by more than sensors usually
+are is a finding about the sensors, is corrected before the physics is read, and is no
+cause.
 """
 
 import dataclasses
@@ -24,8 +25,10 @@ EDGE = 0.3  # s at either end that a filter spoils
 SLOW = 2.0  # Hz, below which path and accelerometer are compared
 CLEAR = 5.0  # jackknife standard errors by which a finding must exceed nothing
 LEAST = 0.1  # rad/s or m/s^2 rms in the band: an axis that hardly moves shows no gain
-WANDER = 0.015  # s: clocks that are less apart cost no correlation worth mentioning at 2 Hz
-COHERENT = 0.97  # correlation below which the two streams don't fit well enough to compare gains
+# s: clocks that are less apart cost no correlation worth mentioning at 2 Hz
+WANDER = 0.015
+# correlation below which the two streams don't fit well enough to compare gains
+COHERENT = 0.97
 ONE_CLOCK = 0.93  # below which they don't share a clock
 
 
@@ -36,22 +39,27 @@ class Kinematics:
     gain: float
     """Of the gyroscope, 1 where it isn't clearly another."""
     tilt: np.ndarray | None
-    """(2,) rad by which the world leans about its x and y axes; None where that isn't clear."""
+    """(2,) rad by which the world leans about its x and y axes; None where that isn't
+    clear.
+    """
     one_clock: bool
-    """Whether attitude and gyroscope can be compared sample by sample: what their streams leave of
-    each other is noise, not time.
+    """Whether attitude and gyroscope can be compared sample by sample: what their
+    streams leave of each other is noise, not time.
     """
     findings: dict[str, str]
     """What is off by more than usual, in words, by name."""
     motor_clock: bool = True
     """The same of motors and gyroscope, see `MotorClock`."""
     motors_late: Mapping[str, float] = field(default_factory=dict)
-    """{flight and vehicle: s by which its motor commands stand later in the log than they act}."""
+    """{flight and vehicle: s by which its motor commands stand later in the log than
+    they act}.
+    """
 
 
 def read_kinematics(tracks: list[Track], limits) -> Kinematics:
-    """Compare the sensors of all tracks of one case. `limits`: `gyroscope_gain` that a sensor may
-    be off by, `world_tilt` in degrees, and the `standard_errors` from which a tilt is clear.
+    """Compare the sensors of all tracks of one case. `limits`: `gyroscope_gain` that a
+    sensor may be off by, `world_tilt` in degrees, and the `standard_errors` from which
+    a tilt is clear.
     """
     streams = _streams(tracks, _turning, BAND)
     gain, error, coherence, turning = _gains(streams)
@@ -61,7 +69,9 @@ def read_kinematics(tracks: list[Track], limits) -> Kinematics:
     tilt = None
     findings = {}
     if words := _unusual(gain, error, limits.gyroscope_gain):
-        findings["gyroscope gain"] = f"the gyroscope reads {words} times the rate of the attitude"
+        findings["gyroscope gain"] = (
+            f"the gyroscope reads {words} times the rate of the attitude"
+        )
     scale = _gains(_streams(tracks, _accelerating, (BAND[0], SLOW)))
     if words := _unusual(scale[0], scale[1], limits.gyroscope_gain):
         findings["scale"] = (
@@ -77,7 +87,11 @@ def read_kinematics(tracks: list[Track], limits) -> Kinematics:
     if (world := _world(tracks)) is not None:
         lean, lean_error = world
         size = float(np.hypot(*lean))
-        tilt = lean if size >= limits.standard_errors * float(np.hypot(*lean_error)) else None
+        tilt = (
+            lean
+            if size >= limits.standard_errors * float(np.hypot(*lean_error))
+            else None
+        )
         # of the error's two axes what lies along the lean
         along = lean / max(size, 1e-12)
         error_along = float(np.sqrt(along**2 @ lean_error**2))
@@ -86,12 +100,15 @@ def read_kinematics(tracks: list[Track], limits) -> Kinematics:
                 f"motion capture's world leans by {np.degrees(size):.1f} degrees against gravity "
                 f"({np.degrees(lean[0]):+.1f} about x, {np.degrees(lean[1]):+.1f} about y)"
             )
-    return Kinematics(_of_one_chip(gain, error, limits.standard_errors), tilt, one_clock, findings)
+    return Kinematics(
+        _of_one_chip(gain, error, limits.standard_errors), tilt, one_clock, findings
+    )
 
 
 def _of_one_chip(gain: np.ndarray, error: np.ndarray, standard_errors: float) -> float:
-    """The gain of all axes (3,) by their precision, where it differs from 1 by more than so many
-    standard errors, which cover what the axes disagree by (Birge 1932); else 1.
+    """The gain of all axes (3,) by their precision, where it differs from 1 by more
+    than so many standard errors, which cover what the axes disagree by (Birge 1932);
+    else 1.
     """
     known = np.isfinite(gain)
     if not known.any():
@@ -105,15 +122,18 @@ def _of_one_chip(gain: np.ndarray, error: np.ndarray, standard_errors: float) ->
 
 
 def _unusual(gain: np.ndarray, error: np.ndarray, usual: float) -> str:
-    """The axes whose gain is clearly off by more than sensors usually are, where these are two or
-    more.
+    """The axes whose gain is clearly off by more than sensors usually are, where these
+    are two or more.
     """
     away = np.abs(gain - 1.0)  # NaN where it isn't known
     off = (away > CLEAR * error) & (away > usual)
-    # of a single axis it may be the calibration of that; two or more say that it is the unit
+    # of a single axis it may be the calibration of that; two or more say that it is the
+    # unit
     if off.sum() < 2:
         return ""
-    return ", ".join(f"{a} {g:.3f}" for a, g, o in zip("xyz", gain, off, strict=True) if o)
+    return ", ".join(
+        f"{a} {g:.3f}" for a, g, o in zip("xyz", gain, off, strict=True) if o
+    )
 
 
 def corrected(track: Track, kinematics: Kinematics) -> Track:
@@ -142,10 +162,14 @@ def _turning(track: Track) -> tuple[np.ndarray, np.ndarray] | None:
 
 
 def _accelerating(track: Track) -> tuple[np.ndarray, np.ndarray] | None:
-    """What the accelerometer feels (T, 3) and the acceleration of the position (T, 3), m/s^2 in the
-    world.
+    """What the accelerometer feels (T, 3) and the acceleration of the position (T, 3),
+    m/s^2 in the world.
     """
-    if track.quaternion is None or track.position is None or track.specific_force is None:
+    if (
+        track.quaternion is None
+        or track.position is None
+        or track.specific_force is None
+    ):
         return None
     felt = to_world(track.quaternion, track.specific_force)
     velocity = np.gradient(track.position, track.dt, axis=0)
@@ -153,8 +177,8 @@ def _accelerating(track: Track) -> tuple[np.ndarray, np.ndarray] | None:
 
 
 def _streams(tracks, signals_of, band) -> list[tuple[float, np.ndarray, np.ndarray]]:
-    """Row period (s) and two signals (T, 3) in `band` without the ends, of each track that has them
-    and is long enough to be filtered.
+    """Row period (s) and two signals (T, 3) in `band` without the ends, of each track
+    that has them and is long enough to be filtered.
     """
     out = []
     for track in tracks:
@@ -169,8 +193,8 @@ def _streams(tracks, signals_of, band) -> list[tuple[float, np.ndarray, np.ndarr
 
 
 def _gains(streams) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Gain (3,) of the second signal over the first, its error (3,) and their correlation (3,),
-    axis by axis; whether an axis moves enough (3,).
+    """Gain (3,) of the second signal over the first, its error (3,) and their
+    correlation (3,), axis by axis; whether an axis moves enough (3,).
     """
     sums = []  # per granule: (4, 3) sums of squares and products, and rows
     for dt, a, b in streams:
@@ -195,12 +219,18 @@ def _gains(streams) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     error = _jackknife(sums, gain_of)
     # The quieter of the two: noise alone is no motion.
     moving = np.sqrt(np.minimum(total[0], total[2]) / total[3]) > LEAST
-    return np.where(moving & (coherence > COHERENT), gain, np.nan), error, coherence, moving
+    return (
+        np.where(moving & (coherence > COHERENT), gain, np.nan),
+        error,
+        coherence,
+        moving,
+    )
 
 
 def _wander(streams) -> float:
-    """s (rms) by which the clocks of two signals are apart: an error of time grows with how fast a
-    signal changes, noise doesn't. Least squares over granules, each axis with a noise of its own.
+    """s (rms) by which the clocks of two signals are apart: an error of time grows with
+    how fast a signal changes, noise doesn't. Least squares over granules, each axis
+    with a noise of its own.
     """
     found = []
     left = []
@@ -214,27 +244,39 @@ def _wander(streams) -> float:
                 noise[axis] = len(a[part])
                 found.append([*noise, (slope[part, axis] ** 2).sum()])
                 left.append(((a - b)[part, axis] ** 2).sum())
-    return float(np.sqrt(nnls(np.array(found), np.array(left))[0][-1])) if found else 0.0
+    return (
+        float(np.sqrt(nnls(np.array(found), np.array(left))[0][-1])) if found else 0.0
+    )
 
 
 def _jackknife(sums: np.ndarray, statistic) -> np.ndarray:
-    """Standard error of a statistic of the sum of `sums` (N, ...), by leaving each out."""
+    """Standard error of a statistic of the sum of `sums` (N, ...), by leaving each
+    out.
+    """
     left_out = np.array([statistic(sums.sum(0) - s) for s in sums])
-    return np.sqrt((len(sums) - 1) / len(sums) * ((left_out - left_out.mean(0)) ** 2).sum(0))
+    return np.sqrt(
+        (len(sums) - 1) / len(sums) * ((left_out - left_out.mean(0)) ** 2).sum(0)
+    )
 
 
 def _world(tracks) -> tuple[np.ndarray, np.ndarray] | None:
-    """Tilt (2,) rad of the world about x and y and its error: the accelerometer, turned into the
-    world, less the path's acceleration and gravity, is fixed in the world; the accelerometer's bias
-    (per flight) is fixed in the body.
+    """Tilt (2,) rad of the world about x and y and its error: the accelerometer, turned
+    into the world, less the path's acceleration and gravity, is fixed in the world; the
+    accelerometer's bias (per flight) is fixed in the body.
     """
     grams = []
     flights = list(dict.fromkeys(t.flight for t in tracks))
     for track in tracks:
-        if track.quaternion is None or track.velocity is None or track.specific_force is None:
+        if (
+            track.quaternion is None
+            or track.velocity is None
+            or track.specific_force is None
+        ):
             return None
         turn = rotation(track.quaternion)
-        rest = to_world(track.quaternion, track.specific_force) - np.array([0.0, 0.0, GRAVITY])
+        rest = to_world(track.quaternion, track.specific_force) - np.array(
+            [0.0, 0.0, GRAVITY]
+        )
         low = butter(2, SLOW, fs=1.0 / track.dt, output="sos")
         edge = int(EDGE / track.dt)
         size = max(int(BLOCK / track.dt), 1)
@@ -247,7 +289,9 @@ def _world(tracks) -> tuple[np.ndarray, np.ndarray] | None:
         own = 2 + 3 * flights.index(track.flight)
         bias[:, :, own : own + 3] = turn
         both = np.concatenate([bias, rest[:, :, None]], 2).reshape(len(track), -1)
-        both = sosfiltfilt(low, both, axis=0)[edge:-edge].reshape(-1, 3, bias.shape[2] + 1)
+        both = sosfiltfilt(low, both, axis=0)[edge:-edge].reshape(
+            -1, 3, bias.shape[2] + 1
+        )
         for k in range(0, len(both) - size // 2, size):
             part = both[k : k + size].reshape(-1, both.shape[2])
             grams.append(part.T @ part)

@@ -1,5 +1,5 @@
-"""Which other axes, convention or labelling of a channel makes channels agree that contradict each
-other.
+"""Which other axes, convention or labelling of a channel makes channels agree that
+contradict each other.
 """
 
 import dataclasses
@@ -25,27 +25,32 @@ RELABELLINGS = [
 WANTED = "the log format wants w, x, y, z from body to world"
 INVERSE = np.array([1.0, -1.0, -1.0, -1.0])
 QUATERNIONS = {
-    f"the quaternion is in the order x, y, z, w; {WANTED}": lambda q: q[:, [3, 0, 1, 2]],
+    f"the quaternion is in the order x, y, z, w; {WANTED}": lambda q: q[
+        :, [3, 0, 1, 2]
+    ],
     f"the quaternion is from world to body; {WANTED}": lambda q: q * INVERSE,
     f"the quaternion is in the order x, y, z, w and from world to body; {WANTED}": lambda q: (
         q[:, [3, 0, 1, 2]] * INVERSE
     ),
 }
 UPRIGHT = 0.5  # mean cosine of the tilt of whatever flies by thrust
-FOLLOWED = 0.7  # correlation of turning and gyroscope from which an attitude is tried in full
+# correlation of turning and gyroscope from which an attitude is tried in full
+FOLLOWED = 0.7
 
 
 def agrees(signals: Signals, bad: list[Pair]) -> bool:
-    """Whether with other `signals` no pair disagrees, and the `bad` ones clearly fit."""
+    """Whether with other `signals` no pair disagrees, and the `bad` ones clearly
+    fit.
+    """
     pairs = {pair.what: pair for pair in pairs_of(signals)}
-    return all(pair.what in pairs and pairs[pair.what].fits for pair in bad) and not any(
-        pair.bad.any() for pair in pairs.values()
-    )
+    return all(
+        pair.what in pairs and pairs[pair.what].fits for pair in bad
+    ) and not any(pair.bad.any() for pair in pairs.values())
 
 
 def mend(signals: Signals, bad: list[Pair]) -> tuple[str, str] | None:
-    """Kind and words of a convention or labelling of one channel that makes the disagreeing pairs
-    agree.
+    """Kind and words of a convention or labelling of one channel that makes the
+    disagreeing pairs agree.
     """
     if signals.quaternion is not None:
         for words, convert in QUATERNIONS.items():
@@ -55,7 +60,10 @@ def mend(signals: Signals, bad: list[Pair]) -> tuple[str, str] | None:
     if signals.velocity is not None and signals.quaternion is not None:
         world = to_body(signals.quaternion * [1.0, -1.0, -1.0, -1.0], signals.velocity)
         if agrees(dataclasses.replace(signals, velocity=world), bad):
-            return "axes", "vx, vy, vz are in the body frame; the log format wants the world frame"
+            return (
+                "axes",
+                "vx, vy, vz are in the body frame; the log format wants the world frame",
+            )
     for pair in bad:
         if pair.holds and (words := _relabelled(signals, pair, bad)):
             return "axes", words
@@ -67,14 +75,17 @@ def mend(signals: Signals, bad: list[Pair]) -> tuple[str, str] | None:
 
 
 def convention_of(signals: Signals, bad: list[Pair]) -> str:
-    """Of another program's conventions one that makes the disagreeing pairs agree, in words."""
+    """Of another program's conventions one that makes the disagreeing pairs agree, in
+    words.
+    """
     others = ((c.words, c.convert(signals)) for c in CONVENTIONS)
     return next((w for w, other in others if upright(other) and agrees(other, bad)), "")
 
 
 def attitudes(signals: Signals) -> Iterator[tuple[str, np.ndarray]]:
-    """(what is wrong, the attitude (T, 4) without it): the usual conventions, other signs of the
-    angles, and any order of the quaternion, where the gyroscope says how it must turn.
+    """(what is wrong, the attitude (T, 4) without it): the usual conventions, other
+    signs of the angles, and any order of the quaternion, where the gyroscope says how
+    it must turn.
     """
     for words, convert in QUATERNIONS.items():
         yield words, convert(signals.quaternion)
@@ -106,8 +117,8 @@ def _turns_with(signals: Signals, attitude: np.ndarray) -> bool:
 
 
 def _relabelled(signals: Signals, pair: Pair, bad: list[Pair]) -> str:
-    """Which axes of a pair's channel hold what, if the best of all 48 labellings of it makes the
-    disagreeing pairs agree.
+    """Which axes of a pair's channel hold what, if the best of all 48 labellings of it
+    makes the disagreeing pairs agree.
     """
     values = getattr(signals, pair.holds)
     names = CHANNEL_COLUMNS.get(pair.holds, CHANNEL_COLUMNS["command_body_rates"])
@@ -118,7 +129,9 @@ def _relabelled(signals: Signals, pair: Pair, bad: list[Pair]) -> str:
         if pair.holds == "position" and signals.velocity is not None:
             changes["velocity"] = signals.velocity[:, order] * signs
         other = next(
-            p for p in pairs_of(dataclasses.replace(signals, **changes)) if p.what == pair.what
+            p
+            for p in pairs_of(dataclasses.replace(signals, **changes))
+            if p.what == pair.what
         )
         score = float(other.agreement.correlation.sum())
         if score > most + 1e-9:
@@ -129,13 +142,15 @@ def _relabelled(signals: Signals, pair: Pair, bad: list[Pair]) -> str:
         return ""
     # values[:, order[i]] is what column i should hold
     held = {order[i]: f"{'minus ' if signs[i] < 0 else ''}{'xyz'[i]}" for i in range(3)}
-    words = ", ".join(f"{names[k]} holds {held[k]}" for k in range(3) if held[k] != "xyz"[k])
+    words = ", ".join(
+        f"{names[k]} holds {held[k]}" for k in range(3) if held[k] != "xyz"[k]
+    )
     return f"{pair.holds.replace('_', ' ')} axes: {words}, by {pair.what}"
 
 
 def frames_of(signals: Signals) -> str:
-    """In what other axes of world and body signals are, in words; nothing where no others agree.
-    Without an attitude gravity alone tells, of the body's axes.
+    """In what other axes of world and body signals are, in words; nothing where no
+    others agree. Without an attitude gravity alone tells, of the body's axes.
     """
     if signals.quaternion is None and signals.force is None:
         return ""

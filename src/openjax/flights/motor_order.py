@@ -15,15 +15,18 @@ OFFSETS = range(-20, 21, 2)  # rows by which the motors' clock may be off
 
 
 def order_findings(signals: Signals, vehicle) -> list[Finding]:
-    """Motors in another order or with other spins, or whose torques the body doesn't follow at
-    all.
+    """Motors in another order or with other spins, or whose torques the body doesn't
+    follow at all.
     """
     torques = _torques(signals, vehicle)
     if not torques:
         return []
-    logged, (rotors, best) = torques[IDENTITY], max(torques.items(), key=lambda item: item[1].sum())
-    # The right order explains every axis; an offset mass or weak motor can spoil one or two, and
-    # isn't an order.
+    logged, (rotors, best) = (
+        torques[IDENTITY],
+        max(torques.items(), key=lambda item: item[1].sum()),
+    )
+    # The right order explains every axis; an offset mass or weak motor can spoil one or
+    # two, and isn't an order.
     if (
         best.min() > 0.4
         and best.mean() > 0.65
@@ -31,7 +34,9 @@ def order_findings(signals: Signals, vehicle) -> list[Finding]:
         and (best - logged).sum() > 0.6
     ):
         return [("motors", _order_in_words(*rotors), [MOTORS])]
-    if (in_band(signals.rates[:, :2], TURNING).std(0) > 0.3).all() and logged[:2].max() < 0.15:
+    if (in_band(signals.rates[:, :2], TURNING).std(0) > 0.3).all() and logged[
+        :2
+    ].max() < 0.15:
         text = f"correlation {logged[0]:.2f} in roll and {logged[1]:.2f} in pitch"
         text += f" while the body turns at {signals.rates[:, :2].std():.1f} rad/s"
         return [
@@ -51,20 +56,23 @@ def torques_fit(signals: Signals, vehicle) -> bool:
 
 
 def _torques(signals: Signals, vehicle) -> dict[tuple, np.ndarray]:
-    """{(order, spin's sign): correlation (3,) of the angular acceleration with the torques that
-    motors in this order make}.
+    """{(order, spin's sign): correlation (3,) of the angular acceleration with the
+    torques that motors in this order make}.
     """
     if signals.motor is None or signals.rates is None:
         return {}
     place = np.asarray(vehicle.rotor_position, float)
     spin = np.asarray(vehicle.rotor_spin, float)
-    mixing = np.stack([place[:, 1], -place[:, 0], spin])  # roll, pitch and yaw torque per thrust
+    # roll, pitch and yaw torque per thrust
+    mixing = np.stack([place[:, 1], -place[:, 0], spin])
     measured = in_band(np.gradient(signals.rates, 1 / RATE, axis=0), TURNING)
-    lagged = in_band(first_order(signals.motor, float(vehicle.motor_time_constant)), TURNING)
+    lagged = in_band(
+        first_order(signals.motor, float(vehicle.motor_time_constant)), TURNING
+    )
     if (lagged.std(0) < 1e-6).all():
         return {}
-    # Motors are correlated, so whole torques are scored: by the moments of angular acceleration and
-    # motors at each offset.
+    # Motors are correlated, so whole torques are scored: by the moments of angular
+    # acceleration and motors at each offset.
     shifted = np.stack([np.roll(lagged, lag, 0) for lag in OFFSETS])
     cross = np.einsum("ti,ltj->lij", measured, shifted)
     among = np.einsum("lti,ltj->lij", shifted, shifted)
@@ -79,7 +87,9 @@ def _torques(signals: Signals, vehicle) -> dict[tuple, np.ndarray]:
 
 def _order_in_words(order: tuple[int, ...], flip: float) -> str:
     if order == IDENTITY[0]:
-        text = "the rotors' spin is opposite: yaw accelerates against the torque of m1..m4"
+        text = (
+            "the rotors' spin is opposite: yaw accelerates against the torque of m1..m4"
+        )
         return f"{text}; reverse motor.spin in vehicle.toml"
     names = ("front_right", "rear_right", "rear_left", "front_left")
     words = ", ".join(f"m{i + 1} {names[o]}" for i, o in enumerate(order))

@@ -1,7 +1,8 @@
 """Pairs of a flight's channels that must follow each other, and how well they do.
 
-Each pair is compared in a low band, with a clock offset free for every few seconds, and speaks only
-where the one that leads moves by more than sensors, latencies and the air explain.
+Each pair is compared in a low band, with a clock offset free for every few seconds, and
+speaks only where the one that leads moves by more than sensors, latencies and the air
+explain.
 """
 
 from __future__ import annotations
@@ -26,12 +27,14 @@ LAG = 0.2  # s, largest clock offset and latency between honest streams
 # share of the correlation to be expected below which two channels contradict each other
 AGREE = 0.5
 FITS = 0.75  # share above which another labelling is what was meant
-TELLS = 0.5  # correlation that the sensors' noise must leave for a comparison to tell anything
-FULL = 0.98  # motor command that counts as the largest: a rotor has nothing left to trim with
-# Motion (rms in the band) that is more than what else moves the channel that must follow: a pose
-# that a filter makes is off by a few cm/s and some hundredths of a radian; floor, wakes and a
-# battery change the thrust by some per cent of hover; a loop at rest opposes the air. Commanded
-# thrust and motors (per cent) are exact.
+# correlation that the sensors' noise must leave for a comparison to tell anything
+TELLS = 0.5
+# motor command that counts as the largest: a rotor has nothing left to trim with
+FULL = 0.98
+# Motion (rms in the band) that is more than what else moves the channel that must
+# follow: a pose that a filter makes is off by a few cm/s and some hundredths of a
+# radian; floor, wakes and a battery change the thrust by some per cent of hover; a loop
+# at rest opposes the air. Commanded thrust and motors (per cent) are exact.
 MOVED = {
     "rate": 0.15,
     "velocity": 0.1,
@@ -45,7 +48,9 @@ MOVED = {
 
 @dataclass(frozen=True, eq=False)
 class Signals:
-    """A flight's channels (T, C) on the common clock; None where they weren't logged."""
+    """A flight's channels (T, C) on the common clock; None where they weren't
+    logged.
+    """
 
     position: np.ndarray | None
     quaternion: np.ndarray | None
@@ -64,9 +69,17 @@ class Signals:
             "body_rates": flight.body_rates_derived,
             "quaternion": flight.attitude_derived,
         }
-        channels = ("position", "quaternion", "velocity", "body_rates", "specific_force")
+        channels = (
+            "position",
+            "quaternion",
+            "velocity",
+            "body_rates",
+            "specific_force",
+        )
         channels += ("motor_command", "command_thrust", "command_body_rates")
-        return cls(*(None if derived.get(c) else on_clock(flight, c, grid) for c in channels))
+        return cls(
+            *(None if derived.get(c) else on_clock(flight, c, grid) for c in channels)
+        )
 
     @cached_property
     def rates(self) -> Vectors | None:
@@ -92,15 +105,18 @@ class Signals:
             return np.gradient(self.velocity, 1 / RATE, axis=0), 1
         if self.position is None:
             return None, 2
-        return np.gradient(np.gradient(self.position, 1 / RATE, axis=0), 1 / RATE, axis=0), 2
+        return np.gradient(
+            np.gradient(self.position, 1 / RATE, axis=0), 1 / RATE, axis=0
+        ), 2
 
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """`measured` (T, C) and what it must agree with, both in `unit`. `names` of the measured
-    columns; `holds` the channel of `Signals` that they are, where another labelling of it may be
-    right; `derivatives`: how many times each was differentiated from what its sensor gives, None
-    for commands; `least`: rms of the reference in the band from which it tells.
+    """`measured` (T, C) and what it must agree with, both in `unit`. `names` of the
+    measured columns; `holds` the channel of `Signals` that they are, where another
+    labelling of it may be right; `derivatives`: how many times each was differentiated
+    from what its sensor gives, None for commands; `least`: rms of the reference in the
+    band from which it tells.
     """
 
     names: tuple[str, ...]
@@ -121,17 +137,25 @@ class Pair:
     @property
     def tells(self) -> Bool[np.ndarray, " columns"]:
         """(C,) whether the reference moves enough for a column to contradict it."""
-        return (self.agreement.reference > self.least) & (self.agreement.expected > TELLS)
+        return (self.agreement.reference > self.least) & (
+            self.agreement.expected > TELLS
+        )
 
     @property
     def bad(self) -> Bool[np.ndarray, " columns"]:
         """(C,) whether a column contradicts its reference."""
-        return self.tells & (self.agreement.correlation < AGREE * self.agreement.expected)
+        return self.tells & (
+            self.agreement.correlation < AGREE * self.agreement.expected
+        )
 
     @property
     def fits(self) -> bool:
-        """Whether all columns that could contradict their reference clearly follow it."""
-        followed = self.agreement.correlation[self.tells] / self.agreement.expected[self.tells]
+        """Whether all columns that could contradict their reference clearly follow
+        it.
+        """
+        followed = (
+            self.agreement.correlation[self.tells] / self.agreement.expected[self.tells]
+        )
         return bool(len(followed) and followed.min() > FITS)
 
     def in_words(self) -> str:
@@ -159,12 +183,30 @@ def pairs_of(s: Signals) -> Iterator[Pair]:
     if turned is not None and s.body_rates is not None:
         least = MOVED["rate"]
         what = "the attitude's rate"
-        yield Pair(rates, s.body_rates, what, turned, WIDE, least, "rad/s", (0, 1), "body_rates")
+        yield Pair(
+            rates,
+            s.body_rates,
+            what,
+            turned,
+            WIDE,
+            least,
+            "rad/s",
+            (0, 1),
+            "body_rates",
+        )
     if s.position is not None and s.velocity is not None:
         path = np.gradient(s.position, 1 / RATE, axis=0)
         what = "the position's rate"
         yield Pair(
-            velocity, s.velocity, what, path, LOW, MOVED["velocity"], "m/s", (0, 1), "velocity"
+            velocity,
+            s.velocity,
+            what,
+            path,
+            LOW,
+            MOVED["velocity"],
+            "m/s",
+            (0, 1),
+            "velocity",
         )
     along = None
     if acceleration is not None and s.quaternion is not None:
@@ -183,26 +225,40 @@ def pairs_of(s: Signals) -> Iterator[Pair]:
             (order, 0),
             "position",
         )
-        # Sideways a late or tilted attitude feels accelerations that aren't there: the vertical
-        # alone tells.
-        along = to_body(s.quaternion, acceleration + np.array([0.0, 0.0, GRAVITY]))[:, 2:]
+        # Sideways a late or tilted attitude feels accelerations that aren't there: the
+        # vertical alone tells.
+        along = to_body(s.quaternion, acceleration + np.array([0.0, 0.0, GRAVITY]))[
+            :, 2:
+        ]
         if s.force is not None:
             # Sideways the attitude tells how wrong the path's acceleration is.
             off = in_band(acceleration[:, :2] - lift[:, :2], LOW).std(0).mean()
             least = max(MOVED["force"], 2.0 * float(off))
             what = "the path's acceleration"
-            yield Pair(("az",), s.force[:, 2:], what, along, LOW, least, "m/s^2", (0, order))
+            yield Pair(
+                ("az",), s.force[:, 2:], what, along, LOW, least, "m/s^2", (0, order)
+            )
     yield from _caused(s, along, order)
     if s.commands is not None and s.rates is not None and not s.saturated:
         least = MOVED["command"]
         what = "the body rates"
-        yield Pair(commands, s.commands, what, s.rates, LOW, least, "rad/s", (None, 0), "commands")
+        yield Pair(
+            commands,
+            s.commands,
+            what,
+            s.rates,
+            LOW,
+            least,
+            "rad/s",
+            (None, 0),
+            "commands",
+        )
 
 
 def _caused(s: Signals, along: np.ndarray | None, order: int) -> Iterator[Pair]:
     """Motors with the force that they make and the thrust that was asked for. What the
-    accelerometer or else the path feels is moved by floor, wakes and gusts, too: it must follow
-    where the motors do much.
+    accelerometer or else the path feels is moved by floor, wakes and gusts, too: it
+    must follow where the motors do much.
     """
     if s.motor is None:
         return
@@ -212,7 +268,9 @@ def _caused(s: Signals, along: np.ndarray | None, order: int) -> Iterator[Pair]:
         asked = collective * np.median(felt) / max(float(np.median(collective)), 1e-3)
         what = "what the motors would make"
         least = MOVED["thrust"]
-        yield Pair(("the force felt",), felt, what, asked, LOW, least, "m/s^2", (order, None))
+        yield Pair(
+            ("the force felt",), felt, what, asked, LOW, least, "m/s^2", (order, None)
+        )
     if s.thrust is not None and not s.saturated:
         what = "m1 + m2 + m3 + m4"
         yield Pair(
@@ -229,10 +287,13 @@ def _caused(s: Signals, along: np.ndarray | None, order: int) -> Iterator[Pair]:
 
 @dataclass(frozen=True)
 class Agreement:
-    """How well `measured` follows `reference`, axis by axis, in the band of the comparison."""
+    """How well `measured` follows `reference`, axis by axis, in the band of the
+    comparison.
+    """
 
     correlation: np.ndarray  # (C,) at the best clock offset of each window, pooled
-    expected: np.ndarray  # (C,) what the white part of the measured signal leaves of a perfect one
+    # (C,) what the white part of the measured signal leaves of a perfect one
+    expected: np.ndarray
     reference: np.ndarray  # (C,) rms of the reference in the band
     measured: np.ndarray  # (C,) rms of the measured signal in the band
 
@@ -243,9 +304,9 @@ def agreement(
     band: tuple[float, float],
     derivatives: tuple[int | None, int | None] = (0, 0),
 ) -> Agreement:
-    """Compare (T, C) with (T, C) on the common clock in `band` Hz. `derivatives` says how many
-    times each was differentiated from what its sensor gives; None: a command, which has no
-    noise.
+    """Compare (T, C) with (T, C) on the common clock in `band` Hz. `derivatives` says
+    how many times each was differentiated from what its sensor gives; None: a command,
+    which has no noise.
     """
     y = in_band(measured, band)
     x = in_band(reference, band)
@@ -259,7 +320,8 @@ def agreement(
         scale = np.sqrt((own**2).sum(0) * (other**2).sum(0)) + 1e-12
         inner = slice(shift, len(part) - shift)
         each = [
-            (own[inner] * np.roll(other, lag, 0)[inner]).sum(0) for lag in range(-shift, shift + 1)
+            (own[inner] * np.roll(other, lag, 0)[inner]).sum(0)
+            for lag in range(-shift, shift + 1)
         ]
         best = int(np.argmax((np.array(each) / scale).sum(1)))
         moved = np.roll(other, best - shift, 0)[inner]
@@ -270,18 +332,25 @@ def agreement(
     noise_y = _noise(measured, band, derivatives[0])
     noise_x = np.minimum(_noise(reference, band, derivatives[1]), rms_x)
     moved = np.sqrt(rms_x**2 - noise_x**2)
-    expected = moved**2 / (np.maximum(rms_x, 1e-12) * np.sqrt(moved**2 + noise_y**2 + 1e-24))
+    expected = moved**2 / (
+        np.maximum(rms_x, 1e-12) * np.sqrt(moved**2 + noise_y**2 + 1e-24)
+    )
     correlation = products / np.sqrt(np.maximum(powers.prod(0), 1e-24))
     return Agreement(correlation, expected, moved, rms_y)
 
 
-def _noise(values: np.ndarray, band: tuple[float, float], derivatives: int | None) -> np.ndarray:
-    """Noise (C,) in the band, if all above 20 Hz is the white noise of what was differentiated."""
+def _noise(
+    values: np.ndarray, band: tuple[float, float], derivatives: int | None
+) -> np.ndarray:
+    """Noise (C,) in the band, if all above 20 Hz is the white noise of what was
+    differentiated.
+    """
     if derivatives is None:
         return np.zeros(values.shape[1])
     high = (20.0, 45.0)
     power = [
-        np.mean(np.sin(2 * np.pi * np.linspace(*b, 50) / RATE) ** (2 * derivatives)) * (b[1] - b[0])
+        np.mean(np.sin(2 * np.pi * np.linspace(*b, 50) / RATE) ** (2 * derivatives))
+        * (b[1] - b[0])
         for b in (band, high)
     ]
     return in_band(values, high).std(0) * np.sqrt(power[0] / power[1])

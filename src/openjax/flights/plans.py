@@ -1,8 +1,10 @@
-"""Plans of set-points as CSV files: rows of 10 ms, for `openjax fly --plan` and for Crazyswarm2.
+"""Plans of set-points as CSV files: rows of 10 ms, for `openjax fly --plan` and for
+Crazyswarm2.
 
 Columns: t (s); x, y, z (m), vx, vy, vz (m/s), ax, ay, az (m/s^2), world; yaw (rad), as
-Crazyswarm2's `cmdFullState` takes them; then what is added to the commands of a controller of
-thrust and body rates: thrust (share of the largest), wx, wy, wz (rad/s); segment's name.
+Crazyswarm2's `cmdFullState` takes them; then what is added to the commands of a
+controller of thrust and body rates: thrust (share of the largest), wx, wy, wz (rad/s);
+segment's name.
 """
 
 from collections.abc import Iterable
@@ -75,28 +77,36 @@ def write_plan(path: Path, plan: SetPoints) -> None:
 
 
 def read_plan(name_or_path: str | Path) -> SetPoints:
-    """The standard plan by its name, or a plan's CSV. Raises UserError where that can't be
-    flown.
+    """The standard plan by its name, or a plan's CSV. Raises UserError where that can't
+    be flown.
     """
     if str(name_or_path) == STANDARD and not Path(name_or_path).exists():
         return plan_of()
     path = Path(name_or_path)
     if not path.is_file():
-        raise UserError(f"{path}: no such plan; {STANDARD!r} or a CSV of openjax plan is needed")
+        raise UserError(
+            f"{path}: no such plan; {STANDARD!r} or a CSV of openjax plan is needed"
+        )
     lines = path.read_text(encoding="utf-8").splitlines()
     if not lines or tuple(lines[0].split(",")) != COLUMNS:
-        raise UserError(f"{path}: not a plan; its first line must be {','.join(COLUMNS)}")
+        raise UserError(
+            f"{path}: not a plan; its first line must be {','.join(COLUMNS)}"
+        )
     cells = [line.split(",") for line in lines[1:] if line]
     if not cells:
         raise UserError(f"{path}: a plan without rows; write one with openjax plan")
     try:
         numbers = np.array([row[:-1] for row in cells], float)
     except ValueError:
-        raise UserError(f"{path}: a plan has {len(COLUMNS) - 1} numbers in every row") from None
+        raise UserError(
+            f"{path}: a plan has {len(COLUMNS) - 1} numbers in every row"
+        ) from None
     if numbers.shape[1] != len(COLUMNS) - 1:
         raise UserError(f"{path}: a plan has {len(COLUMNS) - 1} numbers in every row")
     if not (np.abs(numbers[:, 1:]) < FARTHEST).all():
-        raise UserError(f"{path}: a number of the plan is not finite or beyond {FARTHEST:g}")
+        raise UserError(
+            f"{path}: a number of the plan is not finite or beyond {FARTHEST:g}"
+        )
     if not np.allclose(np.diff(numbers[:, 0]), PERIOD, atol=1e-3):
         raise UserError(f"{path}: a plan's rows must be {1e3 * PERIOD:g} ms apart")
     return SetPoints(

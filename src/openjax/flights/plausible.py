@@ -1,5 +1,5 @@
-"""What each channel of a flying quadrotor must look like by itself, or beside its own sum: gravity,
-a path, an order in time.
+"""What each channel of a flying quadrotor must look like by itself, or beside its own
+sum: gravity, a path, an order in time.
 """
 
 import itertools
@@ -11,36 +11,50 @@ from openjax.flights.flight import CHANNEL_COLUMNS, Finding, Flight
 from openjax.flights.pairs import Signals
 from openjax.flights.signals import RATE
 
-RANDOM = 0.5  # share of the variance from row to row at which a continuous signal has no order
+# share of the variance from row to row at which a continuous signal has no order
+RANDOM = 0.5
 LEAST_ROWS = 100
-# Standard deviation above which the rows of a continuous channel can't be its sensor's noise, in
-# its unit.
+# Standard deviation above which the rows of a continuous channel can't be its sensor's
+# noise, in its unit.
 CONTINUOUS = {"position": 0.05, "quaternion": 0.03, "velocity": 0.25}
 MOVES = 0.05  # m, which a path must do for a velocity to contradict it
 DRIFT = 0.03  # m/s by which an estimated velocity may be off on the mean
 PATH_ERROR = 0.03  # m by which an estimated path may be off
-GAINS = (0.7, 1.4)  # of a path over what its velocity adds up to: beyond, one isn't the other
+# of a path over what its velocity adds up to: beyond, one isn't the other
+GAINS = (0.7, 1.4)
 CLEARLY = 2.0  # standard errors by which it must be: estimators of small moves drift
 
 
 def gravity_findings(force: np.ndarray | None) -> list[Finding]:
-    """A flying quadrotor's specific force points along body z, about 9.81 m/s^2 up, whatever its
-    attitude.
+    """A flying quadrotor's specific force points along body z, about 9.81 m/s^2 up,
+    whatever its attitude.
     """
     if force is None:
         return []
     mean = np.median(force, 0)
     size = float(np.linalg.norm(mean))
     axis = int(np.argmax(np.abs(mean)))
-    unit = "in g" if 0.6 < size < 2.0 else "in thousandths of g" if 600 < size < 2000 else ""
+    unit = (
+        "in g"
+        if 0.6 < size < 2.0
+        else "in thousandths of g"
+        if 600 < size < 2000
+        else ""
+    )
     if unit:
         return [
-            ("units", f"ax, ay, az are {unit} (mean {size:.2f}); the log format wants m/s^2", ())
+            (
+                "units",
+                f"ax, ay, az are {unit} (mean {size:.2f}); the log format wants m/s^2",
+                (),
+            )
         ]
     if not 4.0 < size < 30.0:
         why = "gravity was taken out" if size < 0.6 else "wrong unit or corrupt"
         text = f"the mean specific force is {size:.3g} m/s^2 and not near 9.81: {why}"
-        return [("units", f"{text}; the log format wants +9.81 m/s^2 on z at hover", ())]
+        return [
+            ("units", f"{text}; the log format wants +9.81 m/s^2 on z at hover", ())
+        ]
     if axis != 2 or mean[2] < 0:
         sign = "minus " if mean[axis] < 0 else ""
         text = f"accelerometer axes: a{'xyz'[axis]} holds {sign}z (median {mean[axis]:.1f} m/s^2)"
@@ -66,8 +80,8 @@ def path_findings(signals: Signals) -> Iterator[Finding]:
 
 
 def _gain(path: np.ndarray, other: np.ndarray) -> tuple[float, float]:
-    """How far another path (T,) m moves where this one does, a steady drift aside, and the standard
-    error of that: infinite where this one hardly moves.
+    """How far another path (T,) m moves where this one does, a steady drift aside, and
+    the standard error of that: infinite where this one hardly moves.
     """
     time = np.arange(len(path)) / RATE
     columns = np.stack([path - path.mean(), time - time.mean()], 1)
@@ -90,18 +104,22 @@ def copied_columns(flight: Flight) -> Iterator[str]:
     """Columns of one channel that hold the same values."""
     for channel in ("position", "velocity", "body_rates", "specific_force"):
         if getattr(flight, channel) is not None:
-            columns = zip(CHANNEL_COLUMNS[channel], flight.sampled(channel)[1].T, strict=True)
+            columns = zip(
+                CHANNEL_COLUMNS[channel], flight.sampled(channel)[1].T, strict=True
+            )
             for (a, one), (b, other) in itertools.combinations(columns, 2):
                 if np.ptp(one) > 0 and np.array_equal(one, other):
                     yield f"contradictory: {a} and {b} hold the same values in every row"
 
 
 def rows_at_random(flight: Flight) -> Iterator[str]:
-    """Channels without order in time: half the mean square step from row to row is the variance
-    itself.
+    """Channels without order in time: half the mean square step from row to row is the
+    variance itself.
     """
     for channel, least in CONTINUOUS.items():
-        if getattr(flight, channel) is None or (channel == "velocity" and flight.velocity_derived):
+        if getattr(flight, channel) is None or (
+            channel == "velocity" and flight.velocity_derived
+        ):
             continue
         time, values = flight.sampled(channel)
         near = np.diff(time) < 0.03  # s: longer steps say nothing about continuity
@@ -112,7 +130,9 @@ def rows_at_random(flight: Flight) -> Iterator[str]:
         ratio = 0.5 * (steps**2).mean(0) / np.maximum(spread**2, 1e-18)
         bad = (ratio > RANDOM) & (spread > least)
         if bad.any():
-            names = ", ".join(n for n, b in zip(CHANNEL_COLUMNS[channel], bad, strict=True) if b)
+            names = ", ".join(
+                n for n, b in zip(CHANNEL_COLUMNS[channel], bad, strict=True) if b
+            )
             yield (
                 f"contradictory: the rows of {names} follow each other at random "
                 f"({100 * ratio[bad].max():.0f} % of "

@@ -1,5 +1,5 @@
-"""Reading flight logs: a CSV file (plain or gzipped) becomes a table of columns, a table becomes
-flights.
+"""Reading flight logs: a CSV file (plain or gzipped) becomes a table of columns, a
+table becomes flights.
 
 Importers of other formats make the same table, so that everything behind it is shared.
 """
@@ -25,15 +25,22 @@ from openjax.flights.csv_text import (
 )
 from openjax.flights.flight import CHANNEL_COLUMNS, Flight
 
-LOG_COLUMNS = ("t", "vehicle", *(c for columns in CHANNEL_COLUMNS.values() for c in columns))
+LOG_COLUMNS = (
+    "t",
+    "vehicle",
+    *(c for columns in CHANNEL_COLUMNS.values() for c in columns),
+)
 
-WHOLE = ("quaternion", "motor_command")  # channels of which a part is a mistake, not a choice
-# The micro-SD logger of the Crazyflie writes at most some hundred variables; swarms are of tens.
+# channels of which a part is a mistake, not a choice
+WHOLE = ("quaternion", "motor_command")
+# The micro-SD logger of the Crazyflie writes at most some hundred variables; swarms are
+# of tens.
 MOST_COLUMNS = 2_000
 MOST_VEHICLES = 200
 NAMES_SHOWN = 12  # of columns in one message
 LONGEST_NAME = 40  # characters of a name or a cell in a message
-LARGEST_VALUE = 1e6  # no sensor's reading in SI units is larger; squares of what is would overflow
+# no sensor's reading in SI units is larger; squares of what is would overflow
+LARGEST_VALUE = 1e6
 NOTHING = ("na", "n/a", "#n/a", "null", "none", "-", "--")
 """What is written where there is no number, beside nan."""
 
@@ -58,8 +65,8 @@ def read_csv(
     time: str = "t",
     above: int = 0,
 ) -> LogTable:
-    """Read a `.csv` or `.csv.gz` log. Columns outside `known` are left out with a remark, whatever
-    they hold; the column `time` must be there.
+    """Read a `.csv` or `.csv.gz` log. Columns outside `known` are left out with a
+    remark, whatever they hold; the column `time` must be there.
 
     Args:
       path: the file.
@@ -68,8 +75,8 @@ def read_csv(
       time: the one that must be there.
       above: lines above the header that aren't the table's.
 
-    Raises LogError if it isn't such a file: unreadable, no header, a cell of a known column that is
-    no number.
+    Raises LogError if it isn't such a file: unreadable, no header, a cell of a known
+    column that is no number.
     """
     path = Path(path)
     lines = text_of(path).split("\n")
@@ -84,7 +91,9 @@ def read_csv(
     remarks += found
     unknown = [n for n in names if n and n not in known]
     if unknown:
-        remarks.append(f"unknown column{'s' * (len(unknown) > 1)} left out: {_listed(unknown)}")
+        remarks.append(
+            f"unknown column{'s' * (len(unknown) > 1)} left out: {_listed(unknown)}"
+        )
     values = _numbers(numbered, header, kept, number)
     remarks += _not_numbers(np.isinf(values), [names[i] for i in kept])
     values[np.isinf(values)] = np.nan
@@ -121,8 +130,8 @@ def _numbers(
 
 
 def _not_numbers(bad: np.ndarray, names: list[str]) -> list[str]:
-    """Remarks on the columns `names` in which some rows (R, columns) are written as no number; one
-    for columns of which it is as many.
+    """Remarks on the columns `names` in which some rows (R, columns) are written as no
+    number; one for columns of which it is as many.
     """
     columns_of: dict[int, list[str]] = {}
     for name, count in zip(names, bad.sum(0).tolist(), strict=True):
@@ -135,7 +144,9 @@ def _not_numbers(bad: np.ndarray, names: list[str]) -> list[str]:
     ]
 
 
-def _vehicles(numbered: list[tuple[int, str]], delimiter: str, column: int) -> np.ndarray:
+def _vehicles(
+    numbered: list[tuple[int, str]], delimiter: str, column: int
+) -> np.ndarray:
     """(R,) ids of a column; "0" where it is empty."""
     cells = (line.split(delimiter, column + 1)[column] for _, line in numbered)
     return np.array([cell.strip(' \t"') or "0" for cell in cells])
@@ -144,19 +155,23 @@ def _vehicles(numbered: list[tuple[int, str]], delimiter: str, column: int) -> n
 def flights_of(
     table: LogTable, motor_permutation: tuple[int, ...] = (0, 1, 2, 3)
 ) -> tuple[list[Flight], list[str]]:
-    """The table's flights, one per vehicle, as logged (not yet sorted, checked or cut), motors in
-    the nominal order; and remarks on columns that couldn't be used. Raises LogError without
-    time.
+    """The table's flights, one per vehicle, as logged (not yet sorted, checked or cut),
+    motors in the nominal order; and remarks on columns that couldn't be used. Raises
+    LogError without time.
     """
     if "t" not in table.columns:
         raise LogError(
             f"no column t; the log has {_listed(table.columns)}: name it in columns.toml"
         )
     remarks = list(table.remarks)
-    read = {c: _channel(table, c, names, remarks) for c, names in CHANNEL_COLUMNS.items()}
+    read = {
+        c: _channel(table, c, names, remarks) for c, names in CHANNEL_COLUMNS.items()
+    }
     channels = {c: v for c, v in read.items() if v is not None}
     if "motor_command" in channels:
-        channels["motor_command"] = channels["motor_command"][:, list(motor_permutation)]
+        channels["motor_command"] = channels["motor_command"][
+            :, list(motor_permutation)
+        ]
     fingerprint = _fingerprint(channels)
     ids = list(dict.fromkeys(table.vehicle.tolist()))
     if len(ids) > MOST_VEHICLES:
@@ -167,23 +182,32 @@ def flights_of(
     flights = []
     for vehicle_id in ids:
         rows = np.flatnonzero(table.vehicle == vehicle_id)
-        # in the long format a vehicle's rows hold what it logged, and nothing of the others'
-        logged = {c: v[rows] for c, v in channels.items() if not np.isnan(v[rows]).all()}
+        # in the long format a vehicle's rows hold what it logged, and nothing of the
+        # others'
+        logged = {
+            c: v[rows] for c, v in channels.items() if not np.isnan(v[rows]).all()
+        }
         name = table.name if len(ids) == 1 else f"{table.name}:{vehicle_id}"
         time = table.columns["t"][rows]
         flights.append(
-            Flight(name, table.name, vehicle_id, time, fingerprint=fingerprint, **logged)
+            Flight(
+                name, table.name, vehicle_id, time, fingerprint=fingerprint, **logged
+            )
         )
     return flights, remarks
 
 
-def _channel(table: LogTable, channel: str, names, remarks: list[str]) -> np.ndarray | None:
+def _channel(
+    table: LogTable, channel: str, names, remarks: list[str]
+) -> np.ndarray | None:
     """(T,) or (T, columns) of one channel; None where it wasn't logged."""
     found = [n for n in names if n in table.columns]
     if len(found) < len(names):
         missing = ", ".join(n for n in names if n not in table.columns)
         if found and channel in WHOLE:
-            raise LogError(f"{', '.join(found)} without {missing}: log {missing}, or none of them")
+            raise LogError(
+                f"{', '.join(found)} without {missing}: log {missing}, or none of them"
+            )
         if found:
             remarks.append(
                 f"{', '.join(found)} without {missing}: {channel} is left out; log {missing}"
@@ -201,10 +225,12 @@ def _channel(table: LogTable, channel: str, names, remarks: list[str]) -> np.nda
     return values[:, 0] if len(names) == 1 else values
 
 
-def write_csv(path: str | Path, table: LogTable, decimals: dict[str, int] | None = None) -> None:
-    """Write a table as a log (gzipped where the name ends in `.gz`, with no time stamp in it: same
-    data, same bytes). `decimals` per column; 6 where it isn't named. A NaN becomes an empty
-    cell.
+def write_csv(
+    path: str | Path, table: LogTable, decimals: dict[str, int] | None = None
+) -> None:
+    """Write a table as a log (gzipped where the name ends in `.gz`, with no time stamp
+    in it: same data, same bytes). `decimals` per column; 6 where it isn't named. A NaN
+    becomes an empty cell.
     """
     decimals = decimals or {}
     names = [n for n in LOG_COLUMNS if n in table.columns or n == "vehicle"]
@@ -248,12 +274,14 @@ def _check_header(header: Header, time: str) -> None:
 
 
 def _check_separator(line: str, delimiter: str, time: str) -> None:
-    """Raises LogError where a header's cells are separated by something else than they are read
-    by.
+    """Raises LogError where a header's cells are separated by something else than they
+    are read by.
     """
     other = max(SEPARATORS, key=line.count)
     if line.count(other) > 1:
-        raise LogError(f"columns are separated by {other!r}, and columns.toml says {delimiter!r}")
+        raise LogError(
+            f"columns are separated by {other!r}, and columns.toml says {delimiter!r}"
+        )
     if len(line.split()) > 2 and time in line.split():
         raise LogError("columns are separated by spaces; the log format wants ','")
 
@@ -265,17 +293,23 @@ def _listed(names: Iterable[str], most: int = NAMES_SHOWN) -> str:
     return ", ".join(names[:most]) + more
 
 
-def _whole_lines(lines: list[str], header: Header) -> tuple[list[tuple[int, str]], list[str]]:
-    """The lines below the header that aren't blank, each with its number in the file, and a remark
-    where the last was cut off: power went while it was written.
+def _whole_lines(
+    lines: list[str], header: Header
+) -> tuple[list[tuple[int, str]], list[str]]:
+    """The lines below the header that aren't blank, each with its number in the file,
+    and a remark where the last was cut off: power went while it was written.
     """
     delimiter = header.delimiter
     cells = len(header.names)
     rows = enumerate(lines[header.line + 1 :], header.line + 2)
-    numbered = [(number, unquoted(line, delimiter)) for number, line in rows if line.strip()]
+    numbered = [
+        (number, unquoted(line, delimiter)) for number, line in rows if line.strip()
+    ]
     # a delimiter at the end of each line but the header's, as a loop in C writes it
     if numbered and all(line.count(delimiter) == cells for _, line in numbered[:2]):
-        numbered = [(number, line.rstrip().removesuffix(delimiter)) for number, line in numbered]
+        numbered = [
+            (number, line.rstrip().removesuffix(delimiter)) for number, line in numbered
+        ]
     remarks = []
     if len(numbered) > 1 and numbered[-1][1].count(delimiter) + 1 < cells:
         del numbered[-1]
@@ -296,7 +330,9 @@ def _without_units(
     kept: list[int],
     number: Callable[[str], float],
 ) -> tuple[list[tuple[int, str]], list[str]]:
-    """The lines without a first one that holds units or other words, and a remark on it."""
+    """The lines without a first one that holds units or other words, and a remark on
+    it.
+    """
     row, first = numbered[0]
     cells = first.split(header.delimiter)
     written = [cells[i] for i in kept if cells[i].strip()]
@@ -307,8 +343,8 @@ def _without_units(
 
 
 def _number(cell: str) -> float:
-    """A cell's number: NaN where it is empty, infinite where somebody wrote that it is none, so
-    that the two can be told apart. Raises ValueError for anything else.
+    """A cell's number: NaN where it is empty, infinite where somebody wrote that it is
+    none, so that the two can be told apart. Raises ValueError for anything else.
     """
     try:
         value = float(cell)
@@ -349,15 +385,13 @@ def _why_not(
                 continue
             if [cell.strip() for cell in cells] == names:
                 return f"line {row} is the header again: several recordings in one file"
-            return (
-                f"line {row}, column {names[i]}: {cells[i].strip()[:LONGEST_NAME]!r} is no number"
-            )
+            return f"line {row}, column {names[i]}: {cells[i].strip()[:LONGEST_NAME]!r} is no number"
     return f"not a table of numbers ({error})"
 
 
 def _fingerprint(channels: dict[str, np.ndarray]) -> str:
-    """Hash of the values without time or file layout, so that a renamed, shifted or repacked copy
-    is the same.
+    """Hash of the values without time or file layout, so that a renamed, shifted or
+    repacked copy is the same.
     """
     digest = hashlib.sha256()
     for name in (

@@ -1,10 +1,10 @@
-"""Sample flights: openjax's own vehicle flown through manoeuvres, logged as a laboratory would log
-them.
+"""Sample flights: openjax's own vehicle flown through manoeuvres, logged as a
+laboratory would log them.
 
-Physics at 1 kHz, rate loop at 500 Hz on a noisy gyroscope, off-board commands every 10 ms from a
-position controller that knows the nominal vehicle only. Rows every 10 ms: sensors at t, commands
-issued at t, motors averaged over the 10 ms that begin at t. Noise and biases are of the size of a
-Crazyflie's IMU and a motion-capture system.
+Physics at 1 kHz, rate loop at 500 Hz on a noisy gyroscope, off-board commands every 10
+ms from a position controller that knows the nominal vehicle only. Rows every 10 ms:
+sensors at t, commands issued at t, motors averaged over the 10 ms that begin at t.
+Noise and biases are of the size of a Crazyflie's IMU and a motion-capture system.
 """
 
 from collections.abc import Mapping
@@ -38,8 +38,8 @@ SUBSTEPS = 2  # per rate loop: 1 kHz
 
 @dataclass(frozen=True)
 class SensorModel:
-    """Noise (standard deviation per sample) and constant biases (standard deviation over
-    flights).
+    """Noise (standard deviation per sample) and constant biases (standard deviation
+    over flights).
     """
 
     gyro_noise: float = 0.02  # rad/s
@@ -54,8 +54,8 @@ class SensorModel:
 
 @dataclass(frozen=True)
 class Turbulence:
-    """Forces and torques of uneven air, root mean squares per axis, each forgotten within a time.
-    The usual ones are those of a quiet hall.
+    """Forces and torques of uneven air, root mean squares per axis, each forgotten
+    within a time. The usual ones are those of a quiet hall.
     """
 
     force: float = 7e-4  # N
@@ -90,16 +90,19 @@ class Reference:
 def references(
     seed: int = 0, duration: float = 10.0, neighbour: bool = False
 ) -> dict[str, Reference]:
-    """Three flights that expose a vehicle: waypoints down to 6 cm above the floor and near 1.1 m, a
-    fast Lissajous figure with turning yaw, and doublets on every axis around hover, from a full to
-    a low battery. With `neighbour` a second vehicle sweeps back and forth 35 to 55 cm above.
+    """Three flights that expose a vehicle: waypoints down to 6 cm above the floor and
+    near 1.1 m, a fast Lissajous figure with turning yaw, and doublets on every axis
+    around hover, from a full to a low battery. With `neighbour` a second vehicle sweeps
+    back and forth 35 to 55 cm above.
     """
     rng = np.random.default_rng(seed)
     t = np.arange(0.0, duration, PERIOD)
     zero = np.zeros((len(t), 4))
 
     leg = 1.6  # s
-    corners = rng.uniform([-0.6, -0.6, 0.3], [0.6, 0.6, 1.0], (int(duration / leg) + 2, 3))
+    corners = rng.uniform(
+        [-0.6, -0.6, 0.3], [0.6, 0.6, 1.0], (int(duration / leg) + 2, 3)
+    )
     corners[3::3, 2] = rng.uniform(0.06, 0.1, len(corners[3::3]))
     corners[2::3, 2] = rng.uniform(1.05, 1.12, len(corners[2::3]))
     waypoints = _minimum_jerk(corners, t, leg)
@@ -118,7 +121,9 @@ def references(
         axis = k % 4
         sign = 1 if (k // 4) % 2 == 0 else -1
         at = (t >= begin) & (t < begin + 0.16)
-        doublets[at, axis] += sign * size[axis] * np.where(t[at] < begin + 0.08, 1.0, -1.0)
+        doublets[at, axis] += (
+            sign * size[axis] * np.where(t[at] < begin + 0.08, 1.0, -1.0)
+        )
     hover = np.tile([0.0, 0.0, 0.7], (len(t), 1))
 
     flights = {
@@ -157,16 +162,24 @@ def fly(
     sensors: SensorModel | None = None,
     air: Turbulence | None = None,
 ) -> list[dict[str, Shaped[np.ndarray, " rows"]]]:
-    """Fly `plant` with `effects` ({name: {parameter: value}}) along `reference`, under a controller
-    that assumes the vehicle `assumed`, in still air or turbulent `air`. Returns the columns of the
-    log for each vehicle, {name: (T,)}.
+    """Fly `plant` with `effects` ({name: {parameter: value}}) along `reference`, under
+    a controller that assumes the vehicle `assumed`, in still air or turbulent `air`.
+    Returns the columns of the log for each vehicle, {name: (T,)}.
     """
     sensors = SensorModel() if sensors is None else sensors
     names = tuple(sorted(effects or {}))
-    parameters = composition.complete_parameters(composition.resolve(names), effects, jnp.float32)
+    parameters = composition.complete_parameters(
+        composition.resolve(names), effects, jnp.float32
+    )
     velocity = np.gradient(reference.position, PERIOD, axis=0)
     acceleration = np.gradient(velocity, PERIOD, axis=0)
-    wanted = (reference.position, velocity, acceleration, reference.yaw, reference.extra_command)
+    wanted = (
+        reference.position,
+        velocity,
+        acceleration,
+        reference.yaw,
+        reference.extra_command,
+    )
     wanted = tuple(jnp.asarray(w, jnp.float32) for w in wanted)
     start = jnp.float32(reference.open_circuit_voltage)
     length, count = reference.position.shape[:2]
@@ -183,13 +196,15 @@ def fly(
 
 
 def log_of(columns: list[dict[str, Shaped[np.ndarray, "..."]]], name: str) -> LogTable:
-    """The vehicles' columns as one log in the long format, sorted by time; vehicles are "0", "1",
-    ...
+    """The vehicles' columns as one log in the long format, sorted by time; vehicles are
+    "0", "1", ...
     """
     time = np.concatenate([c["t"] for c in columns])
     order = np.argsort(time, kind="stable")
     joined = {n: np.concatenate([c[n] for c in columns])[order] for n in columns[0]}
-    vehicle = np.concatenate([np.full(len(c["t"]), str(i)) for i, c in enumerate(columns)])[order]
+    vehicle = np.concatenate(
+        [np.full(len(c["t"]), str(i)) for i, c in enumerate(columns)]
+    )[order]
     return LogTable(name, joined, vehicle)
 
 
@@ -211,23 +226,30 @@ def _fly(
     key, bias_key, memory_key = jax.random.split(key, 3)
     gyro_bias = sensors.gyro_bias * jax.random.normal(bias_key, (count, 3))
     drones = hover_state(plant, target[0][0], velocity=target[1][0])
-    memory = jax.vmap(lambda d, k: composition.initial_memory(effects, plant, d, PERIOD, k))(
-        drones, jax.random.split(memory_key, count)
-    )
+    memory = jax.vmap(
+        lambda d, k: composition.initial_memory(effects, plant, d, PERIOD, k)
+    )(drones, jax.random.split(memory_key, count))
     drones = drones.replace(effect_memory=memory)
 
     def contexts(drones, load, air_time, dt):
-        """Of every drone. The cell gives less with charge (0.02 V/s is a short, hard flight) and
-        with load.
+        """Of every drone. The cell gives less with charge (0.02 V/s is a short, hard
+        flight) and with load.
         """
         under_load = voltage - 0.004 * air_time - 0.5 * load
 
         def build(d, near, v):
             return make_context(
-                flown, d, others_position=near, battery_voltage=v, air_time=air_time, dt=dt
+                flown,
+                d,
+                others_position=near,
+                battery_voltage=v,
+                air_time=air_time,
+                dt=dt,
             )
 
-        return jax.vmap(build)(drones, drones.position[others(count)], under_load), under_load
+        return jax.vmap(build)(
+            drones, drones.position[others(count)], under_load
+        ), under_load
 
     def row(carry, inputs):
         drones, integral, force, load, key = carry
@@ -247,12 +269,18 @@ def _fly(
             gyro = drones.body_rates + gyro_bias + sensors.gyro_noise * noise
 
             def control(d, g, c):
-                return rate_controller(flown, d.replace(body_rates=g), c, PERIOD / RATE_LOOPS)
+                return rate_controller(
+                    flown, d.replace(body_rates=g), c, PERIOD / RATE_LOOPS
+                )
 
             motor, rate_integral = jax.vmap(control)(drones, gyro, command)
-            drones = drones.replace(rate_integral=rate_integral, previous_body_rates=gyro)
+            drones = drones.replace(
+                rate_integral=rate_integral, previous_body_rates=gyro
+            )
             for _ in range(SUBSTEPS):
-                context, _ = contexts(drones, load, air_time, PERIOD / RATE_LOOPS / SUBSTEPS)
+                context, _ = contexts(
+                    drones, load, air_time, PERIOD / RATE_LOOPS / SUBSTEPS
+                )
                 drones, force = jax.vmap(partial(_physics, flown, effects, parameters))(
                     drones, motor, context, gust
                 )
@@ -261,12 +289,21 @@ def _fly(
         noise = jax.random.normal(noise_key, (RATE_LOOPS, count, 3))
         (after, force_after), motors = jax.lax.scan(rate_loop, (drones, force), noise)
         motors = motors.mean(0)
-        memory = jax.vmap(lambda d: composition.record(effects, d.effect_memory, d, PERIOD))(after)
+        memory = jax.vmap(
+            lambda d: composition.record(effects, d.effect_memory, d, PERIOD)
+        )(after)
         after = after.replace(effect_memory=memory)
-        # What motion capture and estimator deliver is what the controller sees; the IMU knows the
-        # moment itself.
+        # What motion capture and estimator deliver is what the controller sees; the IMU
+        # knows the moment itself.
         pose = (seen.position, seen.quaternion, seen.velocity)
-        log = (*pose, drones.body_rates + gyro_bias, force / flown.mass, sent, motors, under_load)
+        log = (
+            *pose,
+            drones.body_rates + gyro_bias,
+            force / flown.mass,
+            sent,
+            motors,
+            under_load,
+        )
         return (after, integral, force_after, motors.mean(-1), key), log
 
     hover = jnp.zeros((count, 3)).at[:, 2].set(flown.mass * flown.gravity)
@@ -276,29 +313,38 @@ def _fly(
     return jax.lax.scan(row, start, (target, air_time, gusts))[1]
 
 
-def _physics(vehicle, effects, parameters, drone: DroneState, motor_command, context, gust):
-    """One physics step of one drone; its state, and the force without gravity in the body frame
-    (3,) N. `gust` (6,): force in the world's axes and torque of turbulent air, or None.
+def _physics(
+    vehicle, effects, parameters, drone: DroneState, motor_command, context, gust
+):
+    """One physics step of one drone; its state, and the force without gravity in the
+    body frame (3,) N. `gust` (6,): force in the world's axes and torque of turbulent
+    air, or None.
     """
-    motor_command = composition.change_motor_command(effects, parameters, motor_command, context)
+    motor_command = composition.change_motor_command(
+        effects, parameters, motor_command, context
+    )
     speed = rotor_speed_step(vehicle, drone.rotor_speed, motor_command, context.dt)
     force, torque = composition.wrench(effects, parameters, vehicle, speed, context)
     if gust is not None:
         force = force + rotate_inverse(drone.quaternion, gust[:3])
         torque = torque + gust[3:]
-    drone = rigid_step(vehicle, drone, rotate(drone.quaternion, force), torque, context.dt)
+    drone = rigid_step(
+        vehicle, drone, rotate(drone.quaternion, force), torque, context.dt
+    )
     return drone.replace(rotor_speed=speed), force
 
 
 def _position_controller(assumed: Vehicle, state: DroneState, integral, target):
     """Command (4,) of a position controller and its integral (3,) m s: PID to a wanted
-    acceleration, thrust along body z, attitude error to body rates. Gains are for a vehicle of this
-    size.
+    acceleration, thrust along body z, attitude error to body rates. Gains are for a
+    vehicle of this size.
     """
     position, velocity, acceleration, yaw, extra = target
     error = position - state.position
     integral = jnp.clip(integral + error * PERIOD, -0.5, 0.5)
-    pull = acceleration + 9.0 * error + 5.0 * (velocity - state.velocity) + 5.0 * integral
+    pull = (
+        acceleration + 9.0 * error + 5.0 * (velocity - state.velocity) + 5.0 * integral
+    )
     pull = jnp.clip(pull, -6.0, 6.0) + jnp.array([0.0, 0.0, 1.0]) * assumed.gravity
     up = rotate(state.quaternion, jnp.array([0.0, 0.0, 1.0]))
     thrust = assumed.mass * jnp.dot(pull, up) / (4 * max_rotor_thrust(assumed))
@@ -312,7 +358,9 @@ def _position_controller(assumed: Vehicle, state: DroneState, integral, target):
     return jnp.clip(command, limit * jnp.array([0.05, -1, -1, -1]), limit), integral
 
 
-def _columns(rows, rng: np.random.Generator, sensors: SensorModel) -> dict[str, np.ndarray]:
+def _columns(
+    rows, rng: np.random.Generator, sensors: SensorModel
+) -> dict[str, np.ndarray]:
     """The log's columns of one vehicle: true rows through the sensors."""
     position, quaternion, velocity, gyro, specific_force, command, motors, voltage = (
         np.asarray(r, float) for r in rows
@@ -322,7 +370,9 @@ def _columns(rows, rng: np.random.Generator, sensors: SensorModel) -> dict[str, 
     def noisy(values, size):
         return values + size * rng.standard_normal(values.shape)
 
-    specific_force = specific_force + sensors.accelerometer_bias * rng.standard_normal(3)
+    specific_force = specific_force + sensors.accelerometer_bias * rng.standard_normal(
+        3
+    )
 
     def shaken(attitudes):
         return _turned(attitudes, noisy(np.zeros((count, 3)), sensors.attitude_noise))
@@ -341,7 +391,9 @@ def _columns(rows, rng: np.random.Generator, sensors: SensorModel) -> dict[str, 
         columns |= dict(zip(names, values.T, strict=True))
     # a battery is logged at 10 Hz
     every_tenth = np.arange(count) % 10 == 0
-    return columns | {"vbat": np.where(every_tenth, noisy(voltage, sensors.voltage_noise), np.nan)}
+    return columns | {
+        "vbat": np.where(every_tenth, noisy(voltage, sensors.voltage_noise), np.nan)
+    }
 
 
 def _turned(quaternion: np.ndarray, rotation: np.ndarray) -> np.ndarray:
@@ -355,8 +407,8 @@ def _turned(quaternion: np.ndarray, rotation: np.ndarray) -> np.ndarray:
 
 
 def _minimum_jerk(points: np.ndarray, t: np.ndarray, leg: float) -> np.ndarray:
-    """Positions (T, 3) along legs of `leg` seconds between points, at rest at each (10 s^3 - 15 s^4
-    + 6 s^5).
+    """Positions (T, 3) along legs of `leg` seconds between points, at rest at each (10
+    s^3 - 15 s^4 + 6 s^5).
     """
     k = np.minimum((t / leg).astype(int), len(points) - 2)
     s = np.clip(t / leg - k, 0.0, 1.0)[:, None]

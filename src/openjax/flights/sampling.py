@@ -1,4 +1,6 @@
-"""When a sensor was sampled: rows that hold no new sample of it, and clocks of its own."""
+"""When a sensor was sampled: rows that hold no new sample of it, and clocks of its
+own.
+"""
 
 import dataclasses
 
@@ -8,7 +10,8 @@ from openjax.flights.flight import CHANNEL_COLUMNS, SENSORS, Flight, Refused
 from openjax.flights.shapes import Chosen
 
 FROZEN = 0.5  # s without a change of a sensor that has noise
-HELD = 0.1  # share of rows that repeat the one before, from which a sensor is slower than the rows
+# share of rows that repeat the one before, from which a sensor is slower than the rows
+HELD = 0.1
 SLOWEST = 0.05  # s between rows of a flight
 IN_STEP = 50  # poses from which a clock of their own is looked for
 IN_PHASE = 0.25  # concentration of their phases (0 to 1) from which they have one
@@ -16,9 +19,9 @@ EDGE = 0.03  # cycles of that clock by which its phase may be wrong
 
 
 def several_recordings(time: np.ndarray, in_order: np.ndarray | None = None) -> str:
-    """What is wrong with the order of times (T,), in s: nothing if few rows are out of it, or if
-    all are those of one recording, shuffled. `in_order`: the same sorted, less rows that stand
-    twice.
+    """What is wrong with the order of times (T,), in s: nothing if few rows are out of
+    it, or if all are those of one recording, shuffled. `in_order`: the same sorted,
+    less rows that stand twice.
     """
     steps = np.diff(time)
     backwards = int((steps < 0).sum())
@@ -33,17 +36,19 @@ def several_recordings(time: np.ndarray, in_order: np.ndarray | None = None) -> 
 
 
 def _even(time: np.ndarray) -> bool:
-    """Whether times (T,), sorted, are those of one recording: two that were put together leave
-    steps of all lengths, or a gap between them.
+    """Whether times (T,), sorted, are those of one recording: two that were put
+    together leave steps of all lengths, or a gap between them.
     """
     steps = np.diff(time)
     middle = float(np.median(steps))
-    return bool((steps > 0.5 * middle).mean() > 0.95 and steps.max() < max(5.0 * middle, 0.5))
+    return bool(
+        (steps > 0.5 * middle).mean() > 0.95 and steps.max() < max(5.0 * middle, 0.5)
+    )
 
 
 def drop_frozen(flight: Flight, note) -> Flight:
-    """Constant columns refuse or drop their channel; frozen stretches become not sampled; holes are
-    named.
+    """Constant columns refuse or drop their channel; frozen stretches become not
+    sampled; holes are named.
     """
     changes = {}
     holes: dict[str, list[str]] = {}
@@ -58,7 +63,11 @@ def drop_frozen(flight: Flight, note) -> Flight:
             if frozen.any():
                 changes[channel] = _unsampled(values, frozen)
                 rows = rows[~frozen[rows]]
-        if channel != "battery_voltage" and len(rows) > 1 and (hole := _hole(flight.time, rows)):
+        if (
+            channel != "battery_voltage"
+            and len(rows) > 1
+            and (hole := _hole(flight.time, rows))
+        ):
             holes.setdefault(hole, []).append(names)
     for hole, names in holes.items():
         note("gaps", f"{', '.join(names)}: {hole}")
@@ -66,7 +75,9 @@ def drop_frozen(flight: Flight, note) -> Flight:
 
 
 def _standing_still(flight: Flight, channel: str, rows, note) -> np.ndarray:
-    """(T,) rows in which a sensor is frozen; of columns that never change nothing can be used."""
+    """(T,) rows in which a sensor is frozen; of columns that never change nothing can
+    be used.
+    """
     columns = CHANNEL_COLUMNS[channel]
     values = getattr(flight, channel)
     table = values.reshape(len(values), -1)
@@ -78,7 +89,8 @@ def _standing_still(flight: Flight, channel: str, rows, note) -> np.ndarray:
     if len(dead):
         names = ", ".join(columns[i] for i in dead)
         raise Refused(
-            "corrupt", f"{names}: the same value {table[rows[0], dead[0]]:g} in every row"
+            "corrupt",
+            f"{names}: the same value {table[rows[0], dead[0]]:g} in every row",
         )
     frozen = _frozen(table, rows, flight.time, together)
     if frozen.any():
@@ -93,8 +105,9 @@ def _standing_still(flight: Flight, channel: str, rows, note) -> np.ndarray:
 
 
 def _may_stand_still(flight: Flight, channel: str, column: int) -> bool:
-    """Whether one column may hold one value while the others of its channel change, as where a
-    simulated vehicle stays in a plane: what follows from it then stands still, too.
+    """Whether one column may hold one value while the others of its channel change, as
+    where a simulated vehicle stays in a plane: what follows from it then stands still,
+    too.
     """
     other = {"position": "velocity", "velocity": "position"}.get(channel)
     if other is None:
@@ -104,25 +117,31 @@ def _may_stand_still(flight: Flight, channel: str, column: int) -> bool:
 
 
 def _hole(time: np.ndarray, rows: np.ndarray) -> str:
-    """Where the longest stretch without samples is, in words, if rows are there meanwhile: else it
-    is a gap in time, named already.
+    """Where the longest stretch without samples is, in words, if rows are there
+    meanwhile: else it is a gap in time, named already.
     """
     steps = np.diff(time[rows])
     hole = int(np.argmax(steps))
-    if rows[hole + 1] - rows[hole] <= 1 or steps[hole] <= max(0.2, 10 * np.median(steps)):
+    if rows[hole + 1] - rows[hole] <= 1 or steps[hole] <= max(
+        0.2, 10 * np.median(steps)
+    ):
         return ""
     return f"not sampled for {steps[hole]:.2f} s after t = {time[rows][hole]:.2f}"
 
 
 def drop_held_rows(flight: Flight, note) -> Flight:
-    """Without the rows of a logger that was faster than all it logged, motors and commands as well:
-    they repeat the one before in every column but the time's and the battery's. Longer stretches
-    without a change are a stand, or frozen.
+    """Without the rows of a logger that was faster than all it logged, motors and
+    commands as well: they repeat the one before in every column but the time's and the
+    battery's. Longer stretches without a change are a stand, or frozen.
     """
     logged = [
-        c for c in CHANNEL_COLUMNS if c != "battery_voltage" and getattr(flight, c) is not None
+        c
+        for c in CHANNEL_COLUMNS
+        if c != "battery_voltage" and getattr(flight, c) is not None
     ]
-    table = np.column_stack([getattr(flight, c).reshape(len(flight), -1) for c in logged])
+    table = np.column_stack(
+        [getattr(flight, c).reshape(len(flight), -1) for c in logged]
+    )
     same = (table[1:] == table[:-1]) | (np.isnan(table[1:]) & np.isnan(table[:-1]))
     held = np.r_[False, same.all(1)]
     for begin, end in runs_of(held):
@@ -130,20 +149,29 @@ def drop_held_rows(flight: Flight, note) -> Flight:
             held[begin:end] = False
     if held.mean() < HELD or np.median(np.diff(flight.time[~held])) > SLOWEST:
         return flight
-    note("held", f"{held.mean():.0%} of the rows repeat the one before in every column: left out")
+    note(
+        "held",
+        f"{held.mean():.0%} of the rows repeat the one before in every column: left out",
+    )
     return flight.rows(~held)
 
 
 def drop_repeats(flight: Flight, note) -> Flight:
-    """A sensor that is slower than the rows and whose last sample was written again counts as
-    sampled where it changed. A sample that appears in a row may be older than it by up to a row.
+    """A sensor that is slower than the rows and whose last sample was written again
+    counts as sampled where it changed. A sample that appears in a row may be older than
+    it by up to a row.
     """
     changes = {}
-    for group in (("position", "quaternion", "velocity"), ("body_rates", "specific_force")):
+    for group in (
+        ("position", "quaternion", "velocity"),
+        ("body_rates", "specific_force"),
+    ):
         logged = [c for c in group if getattr(flight, c) is not None]
         if not logged:
             continue
-        together = np.concatenate([getattr(flight, c).reshape(len(flight), -1) for c in logged], 1)
+        together = np.concatenate(
+            [getattr(flight, c).reshape(len(flight), -1) for c in logged], 1
+        )
         repeated = np.r_[False, (np.diff(together, axis=0) == 0).all(1)]
         if repeated.mean() < HELD:
             continue
@@ -160,15 +188,26 @@ def drop_repeats(flight: Flight, note) -> Flight:
 
 
 def put_in_step(flight: Flight, note) -> Flight:
-    """Poses at the times of their rows, where the camera is slower than the log: a row says only
-    that a new pose came since the last one, and the camera's own clock is regular. Poses are on a
-    line through their rows; a held one is half a row late on the mean.
+    """Poses at the times of their rows, where the camera is slower than the log: a row
+    says only that a new pose came since the last one, and the camera's own clock is
+    regular. Poses are on a line through their rows; a held one is half a row late on
+    the mean.
     """
-    logged = [c for c in ("position", "quaternion", "velocity") if getattr(flight, c) is not None]
+    logged = [
+        c
+        for c in ("position", "quaternion", "velocity")
+        if getattr(flight, c) is not None
+    ]
     if not logged:
         return flight
     rows = np.flatnonzero(
-        np.all([np.isfinite(getattr(flight, c).reshape(len(flight), -1)).all(1) for c in logged], 0)
+        np.all(
+            [
+                np.isfinite(getattr(flight, c).reshape(len(flight), -1)).all(1)
+                for c in logged
+            ],
+            0,
+        )
     )
     if len(rows) < IN_STEP or len(rows) > (1.0 - HELD) * len(flight):
         return flight
@@ -181,7 +220,9 @@ def put_in_step(flight: Flight, note) -> Flight:
     for channel in logged:
         values = getattr(flight, channel)
         moved = np.full_like(values, np.nan)
-        moved[rows] = np.stack([np.interp(seen, own, column) for column in values[rows].T], 1)
+        moved[rows] = np.stack(
+            [np.interp(seen, own, column) for column in values[rows].T], 1
+        )
         changes[channel] = moved
     rate = (len(own) - 1) / (own[-1] - own[0])
     note(
@@ -192,9 +233,9 @@ def put_in_step(flight: Flight, note) -> Flight:
 
 
 def _regular_clock(times: np.ndarray, row: float) -> np.ndarray | None:
-    """Times (S,) of a regular clock whose ticks were seen at times (S,) up to a `row` s apart from
-    it, later where rows are missing; None where they have none. Its rate is where the phases of
-    what was seen agree most (Rayleigh's periodogram).
+    """Times (S,) of a regular clock whose ticks were seen at times (S,) up to a `row` s
+    apart from it, later where rows are missing; None where they have none. Its rate is
+    where the phases of what was seen agree most (Rayleigh's periodogram).
     """
     since = times - times[0]
     usual = (len(times) - 1) / since[-1]
@@ -219,10 +260,12 @@ def _unsampled(values: np.ndarray, rows: np.ndarray) -> np.ndarray:
     return left
 
 
-def _frozen(table: np.ndarray, rows: np.ndarray, time: np.ndarray, together: bool) -> np.ndarray:
-    """(T,) True in runs of at least FROZEN seconds in which a column (all columns if `together`)
-    doesn't change though it does elsewhere. Runs at the column's extremes are saturation, not a
-    frozen sensor.
+def _frozen(
+    table: np.ndarray, rows: np.ndarray, time: np.ndarray, together: bool
+) -> np.ndarray:
+    """(T,) True in runs of at least FROZEN seconds in which a column (all columns if
+    `together`) doesn't change though it does elsewhere. Runs at the column's extremes
+    are saturation, not a frozen sensor.
     """
     values = table[rows]
     still = np.diff(values, axis=0) == 0
@@ -240,6 +283,8 @@ def _frozen(table: np.ndarray, rows: np.ndarray, time: np.ndarray, together: boo
 
 
 def runs_of(flags: Chosen) -> list[tuple[int, int]]:
-    """First row and the one after the last of every stretch in which `flags` (T,) hold."""
+    """First row and the one after the last of every stretch in which `flags` (T,)
+    hold.
+    """
     edges = np.flatnonzero(np.diff(np.r_[0, flags, 0]))
     return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))

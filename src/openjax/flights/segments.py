@@ -1,8 +1,8 @@
 """Segments of flight that tell causes apart, and the plan of two minutes made of them.
 
-Each excites what others leave still: turning on the spot, agility, steps, climbs, fast passes in
-two headings, the floor, the ceiling, and a hover on a used battery. All stay within a box that the
-safety of `openjax fly` allows.
+Each excites what others leave still: turning on the spot, agility, steps, climbs, fast
+passes in two headings, the floor, the ceiling, and a hover on a used battery. All stay
+within a box that the safety of `openjax fly` allows.
 """
 
 from collections.abc import Callable
@@ -19,7 +19,8 @@ MIDDLE = 0.6  # m
 EASE = 1.5  # s in which a segment begins and ends, at the middle
 DITHER = 0.5  # rad/s, pseudo-random on top of what tracking asks for
 HELD = (0.04, 0.16)  # s, shortest and longest that it holds: 3 to 12 Hz
-DOUBLETS = (0.08, 1.5, 1.5, 1.0)  # of thrust (share of the largest) and body rates, rad/s
+# of thrust (share of the largest) and body rates, rad/s
+DOUBLETS = (0.08, 1.5, 1.5, 1.0)
 FULL = 4.0  # V, open circuit
 EMPTY = 3.6
 
@@ -59,8 +60,8 @@ def _middle(t):
 
 
 def _dither(t: np.ndarray) -> np.ndarray:
-    """Commands (T, 4): body rates that jump between -1, 0 and 1 times DITHER at random moments, the
-    same in every flight.
+    """Commands (T, 4): body rates that jump between -1, 0 and 1 times DITHER at random
+    moments, the same in every flight.
     """
     rng = np.random.default_rng(1)
     out = np.zeros((len(t), 4))
@@ -74,8 +75,8 @@ def _dither(t: np.ndarray) -> np.ndarray:
 
 
 def _doublets(t: np.ndarray) -> np.ndarray:
-    """Commands (T, 4): every half second a step there and one back, on each axis in turn and then
-    with the other sign.
+    """Commands (T, 4): every half second a step there and one back, on each axis in
+    turn and then with the other sign.
     """
     out = np.zeros((len(t), 4))
     for number, begin in enumerate(np.arange(EASE, t[-1] - EASE, 0.5)):
@@ -83,7 +84,9 @@ def _doublets(t: np.ndarray) -> np.ndarray:
         sign = 1.0 if number // 4 % 2 else -1.0
         half = 0.08
         inside = (t >= begin) & (t < begin + 2.0 * half)
-        out[inside, axis] = sign * DOUBLETS[axis] * np.where(t[inside] < begin + half, 1.0, -1.0)
+        out[inside, axis] = (
+            sign * DOUBLETS[axis] * np.where(t[inside] < begin + half, 1.0, -1.0)
+        )
     return out
 
 
@@ -104,7 +107,9 @@ def _still(t, ease):
 
 
 def _climbing(t, ease):
-    height = 0.5 * (HIGHEST - 0.15 + 0.35) - MIDDLE + 0.3 * np.sin(2.0 * np.pi * 0.5 * t)
+    height = (
+        0.5 * (HIGHEST - 0.15 + 0.35) - MIDDLE + 0.3 * np.sin(2.0 * np.pi * 0.5 * t)
+    )
     return _middle(t) + ease * _at(0.0 * t, 0.0, height), 0.0 * t
 
 
@@ -124,9 +129,15 @@ def _level(height):
 
 
 SEGMENTS: dict[str, Segment] = {
-    "yaw": Segment(20.0, "turning on the spot with small random body rates", _turning, _dither),
-    "agile": Segment(20.0, "a quick figure with small random body rates", _agile, _dither),
-    "step": Segment(20.0, "doublets of thrust and of every body rate in hover", _still, _doublets),
+    "yaw": Segment(
+        20.0, "turning on the spot with small random body rates", _turning, _dither
+    ),
+    "agile": Segment(
+        20.0, "a quick figure with small random body rates", _agile, _dither
+    ),
+    "step": Segment(
+        20.0, "doublets of thrust and of every body rate in hover", _still, _doublets
+    ),
     "climb": Segment(15.0, "quick climbs and descents", _climbing),
     "fast": Segment(20.0, "fast straight passes, nose first and side first", _fast),
     "low": Segment(10.0, "slow passes just above the floor", _level(LOWEST)),

@@ -1,4 +1,6 @@
-"""Signals of a flight on one even clock, for the checks that compare channels with each other."""
+"""Signals of a flight on one even clock, for the checks that compare channels with each
+other.
+"""
 
 from functools import lru_cache
 
@@ -20,8 +22,9 @@ FADE = 0.5  # s
 
 
 def clock_of(flight: Flight) -> Times | None:
-    """The common clock over the longest stretch without gaps, and without holes in a channel, over
-    which nothing may be drawn; None if that is too short to tell anything.
+    """The common clock over the longest stretch without gaps, and without holes in a
+    channel, over which nothing may be drawn; None if that is too short to tell
+    anything.
     """
     steps = np.diff(flight.time)
     wide = np.flatnonzero(steps > max(0.1, 5 * flight.row_period))
@@ -46,8 +49,8 @@ def _longest_without(gaps: np.ndarray, time: np.ndarray) -> tuple[float, float]:
 
 
 def on_clock(flight: Flight, channel: str, grid: Times) -> Columns | None:
-    """A channel (T, C) on the common clock; fast channels are averaged over the clock's period
-    first.
+    """A channel (T, C) on the common clock; fast channels are averaged over the clock's
+    period first.
     """
     values = getattr(flight, channel)
     if values is None:
@@ -61,16 +64,23 @@ def on_clock(flight: Flight, channel: str, grid: Times) -> Columns | None:
         width = round(1 / (RATE * step))
         values = uniform_filter1d(values, width, axis=0, mode="nearest")
     out = np.stack([np.interp(grid, at, column) for column in values.T], 1)
-    return out / np.linalg.norm(out, axis=1, keepdims=True) if channel == "quaternion" else out
+    return (
+        out / np.linalg.norm(out, axis=1, keepdims=True)
+        if channel == "quaternion"
+        else out
+    )
 
 
-def in_band(values: Columns, band: tuple[float, float]) -> Float[np.ndarray, "inner columns"]:
-    """`values` (T, C) between two frequencies, without delay, and without the ends where that isn't
-    right.
+def in_band(
+    values: Columns, band: tuple[float, float]
+) -> Float[np.ndarray, "inner columns"]:
+    """`values` (T, C) between two frequencies, without delay, and without the ends
+    where that isn't right.
     """
     # rows at the ends where filter and differences aren't trustworthy
     edge = min(20, len(values) // 8)
-    # faded in and out: a filter this slow would carry the last row's noise far into the flight
+    # faded in and out: a filter this slow would carry the last row's noise far into the
+    # flight
     fade = _fade(len(values))[:, None]
     faded = fade * (values - values.mean(0))
     return sosfiltfilt(_bandpass(band), faded, axis=0)[edge:-edge]
@@ -87,14 +97,18 @@ def _fade(rows: int) -> np.ndarray:
 
 
 def rates_of(quaternion: Quaternions) -> Vectors:
-    """Body rates (T, 3) rad/s of attitudes (T, 4) on the common clock, by central differences."""
+    """Body rates (T, 3) rad/s of attitudes (T, 4) on the common clock, by central
+    differences.
+    """
     attitude = Rotation.from_quat(quaternion, scalar_first=True)
     rates = (attitude[:-2].inv() * attitude[2:]).as_rotvec() * RATE / 2
     return np.concatenate([rates[:1], rates, rates[-1:]])
 
 
 def first_order(values: Columns, time_constant: float) -> Columns:
-    """`values` (T, C) behind a first-order lag of `time_constant` s, settled at the start."""
+    """`values` (T, C) behind a first-order lag of `time_constant` s, settled at the
+    start.
+    """
     blend = -np.expm1(-1 / (RATE * time_constant))
     start = (1.0 - blend) * values[:1]
     return lfilter([0.0, blend], [1.0, blend - 1.0], values, axis=0, zi=start)[0]

@@ -1,8 +1,8 @@
 """A flight on a uniform clock: the arrays that the replay runs on.
 
-Replays step from row to row, so a flight is put on an even time grid once: rows between 100 Hz and
-50 Hz are kept, faster logs are averaged down to 100 Hz, and a longer gap splits a flight into two
-tracks.
+Replays step from row to row, so a flight is put on an even time grid once: rows between
+100 Hz and 50 Hz are kept, faster logs are averaged down to 100 Hz, and a longer gap
+splits a flight into two tracks.
 """
 
 from dataclasses import dataclass, replace
@@ -29,8 +29,9 @@ EARLY = 25.0  # per cent of them that may come before the rows that are made for
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """One stretch of one vehicle's flight, T rows of period `dt`. Units and frames are those of
-    `Flight`; motors are fractions of the maximal rotor thrust. What wasn't logged is None.
+    """One stretch of one vehicle's flight, T rows of period `dt`. Units and frames are
+    those of `Flight`; motors are fractions of the maximal rotor thrust. What wasn't
+    logged is None.
     """
 
     name: str
@@ -47,12 +48,14 @@ class Track:
     voltage: Array | None  # (T,)
     neighbours: Array  # (K, T, 3) m, positions of the vehicles that flew along
     pose_age: float = 0.0  # s by which the pose may be older than its row, see `Flight`
-    motors_logged: bool = True  # False: made by the nominal rate controller from the commands
+    # False: made by the nominal rate controller from the commands
+    motors_logged: bool = True
     # of logs faster than the grid: times (S,) s, mean of the motors (S,)
     fast_thrust: tuple[Array, Array] | None = None
     attitude_derived: bool = False  # of gyroscope, accelerometer and path, not measured
     ceiling: float | None = None  # m above the floor; None: no ceiling is known
-    missing: Array | None = None  # (T,) rows that weren't logged: lines between their neighbours
+    # (T,) rows that weren't logged: lines between their neighbours
+    missing: Array | None = None
 
     def __len__(self) -> int:
         return len(self.time)
@@ -64,8 +67,8 @@ def tracks_of(case: Case) -> list[Track]:
 
 
 def flight_tracks(flight: Flight, case: Case) -> list[Track]:
-    """The stretches of one flight without gaps, on a uniform grid. A long hole in a channel is one,
-    too, unless nothing is left without.
+    """The stretches of one flight without gaps, on a uniform grid. A long hole in a
+    channel is one, too, unless nothing is left without.
     """
     whole = flight.rows(~flight.in_holes(CHANNELS))
     return _stretches(whole, flight, case) or _stretches(flight, flight, case)
@@ -75,11 +78,15 @@ def _stretches(flight: Flight, logged: Flight, case: Case) -> list[Track]:
     """Tracks of rows of a flight as it was `logged`."""
     found = []
     for number, stretch in enumerate(
-        flight.stretches(max_step=max(MAX_GAP, 3 * flight.row_period), min_duration=MIN_DURATION)
+        flight.stretches(
+            max_step=max(MAX_GAP, 3 * flight.row_period), min_duration=MIN_DURATION
+        )
     ):
         part = flight.rows(stretch)
         found.append(
-            _on_grid(part, logged, case, f"{flight.name}#{number}" if number else flight.name)
+            _on_grid(
+                part, logged, case, f"{flight.name}#{number}" if number else flight.name
+            )
         )
     return found
 
@@ -98,8 +105,8 @@ def _on_grid(part: Flight, flight: Flight, case: Case, name: str) -> Track:
             return None
         if not faster or channel in ("position", "quaternion"):
             return part.interpolated(channel, grid)
-        # Faster logs: the mean around a grid point; of commands, which hold until the next row, the
-        # mean that follows it.
+        # Faster logs: the mean around a grid point; of commands, which hold until the
+        # next row, the mean that follows it.
         at, values = part.sampled(channel)
         flat = values.reshape(len(values), -1)
         means = _means(at, flat, grid if ahead else grid - 0.5 * period, period, ahead)
@@ -150,7 +157,10 @@ def _on_grid(part: Flight, flight: Flight, case: Case, name: str) -> Track:
 def _missing(logged: Array, grid: Array, period: float) -> Array:
     """(T,) the rows of a grid with no logged row within half a period and a bit."""
     after = np.clip(np.searchsorted(logged, grid), 1, len(logged) - 1)
-    return np.minimum(np.abs(grid - logged[after - 1]), np.abs(logged[after] - grid)) > 0.6 * period
+    return (
+        np.minimum(np.abs(grid - logged[after - 1]), np.abs(logged[after] - grid))
+        > 0.6 * period
+    )
 
 
 def held_means(
@@ -159,17 +169,19 @@ def held_means(
     begin: Float[Array, " periods"],
     period: float,
 ) -> Float[Array, " periods"]:
-    """Means (G,) of values (S,) at times `at` (S,) s, each held until the next, over `period` s
-    from `begin` (G,) s on.
+    """Means (G,) of values (S,) at times `at` (S,) s, each held until the next, over
+    `period` s from `begin` (G,) s on.
     """
     return _means(at, values[:, None], begin, period, True)[:, 0]
 
 
 def _means(at, values, begin, period, held):
-    """Means (G, C) of samples (S, C) over periods, of samples that are `held` until the next or of
-    lines between them.
+    """Means (G, C) of samples (S, C) over periods, of samples that are `held` until the
+    next or of lines between them.
     """
-    step = np.diff(at)[:, None] * (values[:-1] if held else 0.5 * (values[1:] + values[:-1]))
+    step = np.diff(at)[:, None] * (
+        values[:-1] if held else 0.5 * (values[1:] + values[:-1])
+    )
     whole = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(step, 0)])
     begin = np.clip(begin, at[0], at[-1] - 0.5 * period)
     end = np.clip(begin + period, at[0], at[-1])
@@ -181,8 +193,8 @@ def _means(at, values, begin, period, held):
 
 
 def _command_phase(part: Flight, period: float) -> float:
-    """When within a period (s, from the first row on) new commands begin: rows of the grid that
-    begin there hold one each.
+    """When within a period (s, from the first row on) new commands begin: rows of the
+    grid that begin there hold one each.
 
     A row that mixed two could not tell which of them had arrived.
     """
@@ -202,12 +214,14 @@ def _command_phase(part: Flight, period: float) -> float:
 
 
 def pwm_thrust(duty: Motors, voltage: Times | None, vehicle) -> Motors:
-    """Thrust fraction (T, 4) that a duty cycle gives: motor voltage U = duty x battery, and the
-    public map of the Crazyflie firmware's battery compensation, U = -0.0006239 g^2 + 0.088 g for g
-    grams of thrust of all four rotors.
+    """Thrust fraction (T, 4) that a duty cycle gives: motor voltage U = duty x battery,
+    and the public map of the Crazyflie firmware's battery compensation, U = -0.0006239
+    g^2 + 0.088 g for g grams of thrust of all four rotors.
     """
     volts = duty * (3.7 if voltage is None else voltage[:, None])
-    grams = (0.088 - np.sqrt(np.maximum(0.088**2 - 4 * 0.0006239 * volts, 0.0))) / (2 * 0.0006239)
+    grams = (0.088 - np.sqrt(np.maximum(0.088**2 - 4 * 0.0006239 * volts, 0.0))) / (
+        2 * 0.0006239
+    )
     newtons = grams * 1e-3 * GRAVITY / 4
     return newtons / float(vehicle.thrust_constant * vehicle.max_rotor_speed**2)
 
@@ -220,7 +234,9 @@ def smooth(
     if n < 2:
         return values
     window = np.hanning(n + 2)[1:-1]
-    return convolve1d(values, window / window.sum(), axis=0, mode="nearest", origin=n % 2 - 1)
+    return convolve1d(
+        values, window / window.sum(), axis=0, mode="nearest", origin=n % 2 - 1
+    )
 
 
 def rotation(quaternion: Quaternions) -> Float[Array, "rows 3 3"]:
@@ -238,12 +254,15 @@ def to_world(quaternion: Quaternions, vector: Vectors) -> Vectors:
     return np.einsum("tij,tj->ti", rotation(quaternion), vector)
 
 
-def specific_force_of(quaternion: Quaternions, velocity: Vectors, period: float) -> Vectors:
-    """Force per mass (T, 3), m/s^2 in the body frame, that a path with velocities (T, 3) every
-    `period` s needs.
+def specific_force_of(
+    quaternion: Quaternions, velocity: Vectors, period: float
+) -> Vectors:
+    """Force per mass (T, 3), m/s^2 in the body frame, that a path with velocities (T,
+    3) every `period` s needs.
     """
     return to_body(
-        quaternion, np.gradient(velocity, period, axis=0) + np.array([0.0, 0.0, GRAVITY])
+        quaternion,
+        np.gradient(velocity, period, axis=0) + np.array([0.0, 0.0, GRAVITY]),
     )
 
 
@@ -255,14 +274,22 @@ def turn_increments(quaternion: Quaternions) -> Float[Array, "turns 3"]:
 
 def earlier(values: Columns, delay: float, track: Track) -> Columns:
     """Rows (T, C) of a track as they were `delay` s earlier."""
-    return np.stack([np.interp(track.time - delay, track.time, column) for column in values.T], 1)
+    return np.stack(
+        [np.interp(track.time - delay, track.time, column) for column in values.T], 1
+    )
 
 
 def undelayed(track: Track, delay: float) -> Track:
     """The track with its pose `delay` s younger than logged."""
-    pose = [n for n in ("position", "quaternion", "velocity") if getattr(track, n) is not None]
+    pose = [
+        n
+        for n in ("position", "quaternion", "velocity")
+        if getattr(track, n) is not None
+    ]
     moved = {n: earlier(getattr(track, n), -delay, track) for n in pose}
     moved["quaternion"] /= np.linalg.norm(moved["quaternion"], axis=1, keepdims=True)
     if len(track.neighbours):  # the same cameras saw them
-        moved["neighbours"] = np.stack([earlier(p, -delay, track) for p in track.neighbours])
+        moved["neighbours"] = np.stack(
+            [earlier(p, -delay, track) for p in track.neighbours]
+        )
     return replace(track, **moved)

@@ -1,9 +1,10 @@
-"""What the three processes of a flight know of each other: a page of shared memory that outlives
-any of them.
+"""What the three processes of a flight know of each other: a page of shared memory that
+outlives any of them.
 
-The loop flies through the links. If it falls silent the links' process lands the vehicles; if that
-one is silent too the guard does, over links of its own; if both are gone the loop does. Whoever
-flies writes its state here, so that the next one can go on from it.
+The loop flies through the links. If it falls silent the links' process lands the
+vehicles; if that one is silent too the guard does, over links of its own; if both are
+gone the loop does. Whoever flies writes its state here, so that the next one can go on
+from it.
 """
 
 import contextlib
@@ -20,13 +21,23 @@ from openjax.interruption import SIGNALS
 SILENCE = 0.1
 """Silence of a process after which the next one flies (s): ten ticks."""
 _MODES = tuple(Mode)
-# Where things stand in the page: five words, a beat and a process id of each of the three roles,
-# and then of each vehicle mode, trim, whether it has a pose, and the 14 numbers of that.
+# Where things stand in the page: five words, a beat and a process id of each of the
+# three roles, and then of each vehicle mode, trim, whether it has a pose, and the 14
+# numbers of that.
 _BEATS = 5
 _PIDS = 8
 _HEAD = 11
 _EACH = 17
-DEAF = ("SIGHUP", "SIGINT", "SIGTSTP", "SIGTERM", "SIGQUIT", "SIGTTOU", "SIGTTIN", "SIGPIPE")
+DEAF = (
+    "SIGHUP",
+    "SIGINT",
+    "SIGTSTP",
+    "SIGTERM",
+    "SIGQUIT",
+    "SIGTTOU",
+    "SIGTTIN",
+    "SIGPIPE",
+)
 """Signals that a terminal, or its end, sends to all that it started."""
 
 
@@ -95,8 +106,8 @@ class Board:
         self._numbers[_PIDS + role] = 0.0
 
     def end_process(self, role: Role) -> None:
-        """Kill the process of `role`, should there be one: if it woke up, two would fly. Returns
-        once it has given back all that it held, a radio dongle above all.
+        """Kill the process of `role`, should there be one: if it woke up, two would
+        fly. Returns once it has given back all that it held, a radio dongle above all.
         """
         pid = int(self._numbers[_PIDS + role])
         if pid:
@@ -114,31 +125,41 @@ class Board:
             known = drone.estimate is not None
             # a row has its place for a pose's 14 numbers, known or not
             pose = numbers_of(drone.estimate) if known else (0.0,) * 14
-            numbers += [float(_MODES.index(drone.mode)), drone.trim, float(known), *pose]
+            numbers += [
+                float(_MODES.index(drone.mode)),
+                drone.trim,
+                float(known),
+                *pose,
+            ]
         self._numbers[_HEAD:] = numbers
         self.flying = state.flying
-        # the beat comes last: who takes over for a silent process finds a page that is whole
+        # the beat comes last: who takes over for a silent process finds a page that is
+        # whole
         self.beat(role, time)
 
     def read(self, state: State, time: float) -> State:
-        """`state` with what was written last, moved on to `time` (s): vehicles go on turning as
-        they were told.
+        """`state` with what was written last, moved on to `time` (s): vehicles go on
+        turning as they were told.
         """
         drones = []
         for i, drone in enumerate(state.drones):
             start = _HEAD + _EACH * i
             mode, trim, known, *numbers = self._numbers[start : start + _EACH]
             pose = moved_on(pose_of(numbers), time) if known else None
-            drones.append(drone._replace(mode=_MODES[int(mode)], trim=trim, estimate=pose))
+            drones.append(
+                drone._replace(mode=_MODES[int(mode)], trim=trim, estimate=pose)
+            )
         # from now on: that no action came while nobody flew is no reason to stop
         return state._replace(drones=tuple(drones), time=time, action_time=time)
 
 
 def start_deaf(process) -> None:
-    """Start a process of multiprocessing that no Ctrl-C ends, in many lines, while it loads what it
-    needs: signals that are blocked here are blocked there until it can `stand_alone`.
+    """Start a process of multiprocessing that no Ctrl-C ends, in many lines, while it
+    loads what it needs: signals that are blocked here are blocked there until it can
+    `stand_alone`.
     """
-    # Python starts its resource tracker with the first process, and unblocks signals for it
+    # Python starts its resource tracker with the first process, and unblocks signals
+    # for it
     resource_tracker.ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
     try:
@@ -148,8 +169,8 @@ def start_deaf(process) -> None:
 
 
 def stand_alone() -> None:
-    """Make this process its own: no terminal's signal reaches it, nor the end of whoever started
-    it.
+    """Make this process its own: no terminal's signal reaches it, nor the end of
+    whoever started it.
     """
     os.setsid()
     for name in DEAF:

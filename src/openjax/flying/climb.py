@@ -1,13 +1,14 @@
 """Whether a vehicle's estimated climb is the one that its accelerometer feels.
 
-A height that drifts together with its velocity looks like flight to thrust and attitude: the
-floor's cushion, another vehicle's wake and an emptier battery accelerate by as much. The
-accelerometer feels all of these. What it doesn't feel are its own offset, which is learnt in
-flight, and an error of the attitude, which counts upwards only by its square. So what the estimate
-climbs beyond it is summed up, smoothed over a pause in which clocks may differ, and bounded.
+A height that drifts together with its velocity looks like flight to thrust and
+attitude: the floor's cushion, another vehicle's wake and an emptier battery accelerate
+by as much. The accelerometer feels all of these. What it doesn't feel are its own
+offset, which is learnt in flight, and an error of the attitude, which counts upwards
+only by its square. So what the estimate climbs beyond it is summed up, smoothed over a
+pause in which clocks may differ, and bounded.
 
-Along the ground the attitude's error counts in full, .17 m/s^2 a degree: there the accelerometer
-tells no more than thrust does.
+Along the ground the attitude's error counts in full, .17 m/s^2 a degree: there the
+accelerometer tells no more than thrust does.
 """
 
 import math
@@ -36,7 +37,8 @@ class Climb(NamedTuple):
 
     time: float = -math.inf  # s, of the last pose
     speed: float = 0.0  # m/s, upwards, of that
-    felt: float = math.nan  # m/s^2, upwards, by the accelerometer; no number where it isn't known
+    # m/s^2, upwards, by the accelerometer; no number where it isn't known
+    felt: float = math.nan
     offset: float = 0.0  # m/s^2, as learnt
     age: float = 0.0  # s, for how long
     summed: float = 0.0  # m/s
@@ -44,8 +46,8 @@ class Climb(NamedTuple):
     height: float = 0.0  # m, what the sum has added to the height
 
     def after(self, pose: Pose, force: Vector | None) -> "Climb":
-        """With the next pose and the specific force (m/s^2, body) that is felt there. Where a pose
-        or a force is missing, nothing changes.
+        """With the next pose and the specific force (m/s^2, body) that is felt there.
+        Where a pose or a force is missing, nothing changes.
         """
         dt = pose.time - self.time
         speed = pose.velocity[2]

@@ -1,9 +1,9 @@
-"""Flying to a point: position and velocity to a set-point, for take-off, waiting, landing and
-getting out of trouble.
+"""Flying to a point: position and velocity to a set-point, for take-off, waiting,
+landing and getting out of trouble.
 
-A cascade of proportional loops; what it asks for beyond hovering is small, so it needs no more of
-the vehicle than the thrust at which it hovers. Plain numbers instead of arrays: it runs a few times
-per tick, where JAX would cost more.
+A cascade of proportional loops; what it asks for beyond hovering is small, so it needs
+no more of the vehicle than the thrust at which it hovers. Plain numbers instead of
+arrays: it runs a few times per tick, where JAX would cost more.
 """
 
 import functools
@@ -43,7 +43,13 @@ class Pose(NamedTuple):
 
 def numbers_of(pose: Pose) -> tuple[float, ...]:
     """The 14 numbers of a pose, in the order of its fields."""
-    return (pose.time, *pose.position, *pose.velocity, *pose.quaternion, *pose.body_rates)
+    return (
+        pose.time,
+        *pose.position,
+        *pose.velocity,
+        *pose.quaternion,
+        *pose.body_rates,
+    )
 
 
 def pose_of(numbers: Sequence[float]) -> Pose:
@@ -95,7 +101,9 @@ def nominal_airframe() -> Airframe:
 
 
 def roll_pitch_yaw(quaternion) -> Vector:
-    """Angles (rad) of a quaternion wxyz, in the order yaw, pitch, roll about moving axes."""
+    """Angles (rad) of a quaternion wxyz, in the order yaw, pitch, roll about moving
+    axes.
+    """
     w, x, y, z = quaternion
     return (
         math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
@@ -117,14 +125,16 @@ def up(quaternion) -> float:
 
 
 def level_acceleration(quaternion) -> Vector:
-    """The acceleration (m/s^2, world) of a vehicle at this attitude that holds its height."""
+    """The acceleration (m/s^2, world) of a vehicle at this attitude that holds its
+    height.
+    """
     # at more than 72 degrees no rotor holds it; .3 keeps the number finite
     return lift_acceleration(quaternion, 1.0 / max(up(quaternion), 0.3))
 
 
 def lift_acceleration(quaternion, lift: float) -> Vector:
-    """The acceleration (m/s^2, world) at an attitude (4,) with a thrust that is `lift` times the
-    weight.
+    """The acceleration (m/s^2, world) at an attitude (4,) with a thrust that is `lift`
+    times the weight.
     """
     x, y, z = body_axis(quaternion)
     return lift * GRAVITY * x, lift * GRAVITY * y, lift * GRAVITY * z - GRAVITY
@@ -135,12 +145,16 @@ def moved_on(pose: Pose, time: float) -> Pose:
     age = time - pose.time
     if age == 0.0:
         return pose
-    position = tuple(p + age * v for p, v in zip(pose.position, pose.velocity, strict=True))
+    position = tuple(
+        p + age * v for p, v in zip(pose.position, pose.velocity, strict=True)
+    )
     quaternion = turned_on(pose.quaternion, pose.body_rates, age)
     return pose._replace(time=time, position=position, quaternion=quaternion)
 
 
-def turned_on(quaternion, rates: Vector, duration: float) -> tuple[float, float, float, float]:
+def turned_on(
+    quaternion, rates: Vector, duration: float
+) -> tuple[float, float, float, float]:
     """The attitude, wxyz, after turning at body rates (rad/s) for `duration` (s)."""
     # to first order: nothing turns far in the hundredths of a second between two poses
     w, x, y, z = quaternion
@@ -164,10 +178,12 @@ def wanted_velocity(position: Vector, target: Vector, speed: float) -> Vector:
 
 
 def wanted_acceleration(velocity: Vector, target: Vector) -> Vector:
-    """The acceleration (m/s^2, world) that leads from a velocity to the `target`, within the
-    tilt limit.
+    """The acceleration (m/s^2, world) that leads from a velocity to the `target`,
+    within the tilt limit.
     """
-    ax, ay, az = (VELOCITY_GAIN * (w - v) for w, v in zip(target, velocity, strict=True))
+    ax, ay, az = (
+        VELOCITY_GAIN * (w - v) for w, v in zip(target, velocity, strict=True)
+    )
     # height first: the tilt that is left for the rest follows from the lift
     az = min(max(az, -CLIMB_LIMIT), CLIMB_LIMIT)
     level = math.hypot(ax, ay)
@@ -177,14 +193,18 @@ def wanted_acceleration(velocity: Vector, target: Vector) -> Vector:
 
 
 def accelerate(
-    quaternion, acceleration: Vector, airframe: Airframe, trim: float, mode: int = ANGLES
+    quaternion,
+    acceleration: Vector,
+    airframe: Airframe,
+    trim: float,
+    mode: int = ANGLES,
 ) -> SetPoint:
     """The set-point for an acceleration (m/s^2, world) at an attitude, yaw to zero.
 
-    The thrust is what of it the body's axis can do at present: a vehicle that still leans elsewhere
-    first turns, then pushes (Lee, Leok, McClamroch 2010, "Geometric tracking control of a quadrotor
-    UAV on SE(3)"). `trim` is added to the hover thrust. `mode` RATES tracks the angles here instead
-    of on board.
+    The thrust is what of it the body's axis can do at present: a vehicle that still
+    leans elsewhere first turns, then pushes (Lee, Leok, McClamroch 2010, "Geometric
+    tracking control of a quadrotor UAV on SE(3)"). `trim` is added to the hover thrust.
+    `mode` RATES tracks the angles here instead of on board.
     """
     ax, ay, az = acceleration
     roll, pitch, yaw = roll_pitch_yaw(quaternion)
@@ -194,7 +214,10 @@ def accelerate(
     # a positive pitch leans the thrust forward, a positive roll to the right
     wanted_pitch = math.atan2(forward, GRAVITY + az)
     wanted_roll = math.asin(min(max(-left / lift, -1.0), 1.0))
-    along = sum(a * b for a, b in zip(body_axis(quaternion), (ax, ay, GRAVITY + az), strict=True))
+    along = sum(
+        a * b
+        for a, b in zip(body_axis(quaternion), (ax, ay, GRAVITY + az), strict=True)
+    )
     thrust = (airframe.hover_thrust + trim) * max(along, 0.0) / GRAVITY
     yaw_rate = -YAW_GAIN * yaw
     # where rates are sent nobody on board tracks the angles

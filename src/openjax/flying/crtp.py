@@ -1,8 +1,10 @@
-"""CRTP, the protocol between a Crazyflie and a ground station: ports, types, packed numbers.
+"""CRTP, the protocol between a Crazyflie and a ground station: ports, types, packed
+numbers.
 
 Facts from Bitcraze's protocol documentation
 (https://www.bitcraze.io/documentation/repository/crazyflie-firmware/
-master/functional-areas/crtp/); a packet is one byte of header and up to 30 bytes of data.
+master/functional-areas/crtp/); a packet is one byte of header and up to 30 bytes of
+data.
 """
 
 import math
@@ -11,11 +13,13 @@ from enum import IntEnum, IntFlag
 from typing import NamedTuple
 
 PROTOCOL_VERSION = 12
-"""The version answered: tables of contents with 16-bit ids (4 and up), arming by the supervisor's
-port (12).
+"""The version answered: tables of contents with 16-bit ids (4 and up), arming by the
+supervisor's port (12).
 """
 MAX_LOG_DATA = 26
-"""Bytes of variables in one log packet; the rest is the block's id and the time stamp."""
+"""Bytes of variables in one log packet; the rest is the block's id and the time
+stamp.
+"""
 FULL_SCALE = 65535
 """Motor commands, thrust set-points: 16 bit."""
 
@@ -57,7 +61,9 @@ class SupervisorCommand(IntEnum):
 
 
 class LogCommand(IntEnum):
-    """First byte of a packet on the log port's channel 1, with 16-bit ids of variables."""
+    """First byte of a packet on the log port's channel 1, with 16-bit ids of
+    variables.
+    """
 
     DELETE = 2
     START = 3  # with a period in units of 10 ms
@@ -76,7 +82,9 @@ class Packet(NamedTuple):
     data: bytes
 
     def encode(self) -> bytes:
-        """The packet as it is sent. The two middle bits of the header are set, as ever."""
+        """The packet as it is sent. The two middle bits of the header are set, as
+        ever.
+        """
         return bytes([(self.port << 4) | 0x0C | self.channel]) + self.data
 
 
@@ -96,7 +104,11 @@ LOG_TYPES = {
     "float": (7, "f"),
     "FP16": (8, "e"),
 }
-PARAMETER_TYPES = {"uint8_t": (0x08, "B"), "uint16_t": (0x09, "H"), "float": (0x06, "f")}
+PARAMETER_TYPES = {
+    "uint8_t": (0x08, "B"),
+    "uint16_t": (0x09, "H"),
+    "float": (0x06, "f"),
+}
 READ_ONLY = 0x40
 """Added to a parameter's type in the table of contents."""
 LOG_FORMATS = dict(LOG_TYPES.values())
@@ -115,8 +127,8 @@ def pack_number(fmt: str, value: float) -> bytes:
 
 
 def compress_quaternion(wxyz) -> int:
-    """A unit quaternion (4,) wxyz in 32 bits: which component is largest, then sign and 9 bits of
-    the others.
+    """A unit quaternion (4,) wxyz in 32 bits: which component is largest, then sign and
+    9 bits of the others.
     """
     w, x, y, z = map(float, wxyz)
     xyzw = (x, y, z, w)
@@ -125,9 +137,11 @@ def compress_quaternion(wxyz) -> int:
     packed = largest
     for i, value in enumerate(xyzw):
         if i != largest:
-            # q and -q are one attitude: signs are those of the one whose largest is positive
+            # q and -q are one attitude: signs are those of the one whose largest is
+            # positive
             negative = int((value < 0) != (xyzw[largest] < 0))
-            # a component that isn't the largest is at most 1 / sqrt(2), for which 511 stands
+            # a component that isn't the largest is at most 1 / sqrt(2), for which 511
+            # stands
             size_in_bits = min(round(511 * abs(value) / size * 2**0.5), 511)
             packed = packed << 10 | negative << 9 | size_in_bits
     return packed

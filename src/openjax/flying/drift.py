@@ -1,13 +1,14 @@
 """Whether a vehicle's estimated velocity drifts gently, told by its teammates.
 
-While a drift sets in, the estimate accelerates as thrust and attitude don't explain. So do the
-air's drag, which nobody told the vehicle, and an attitude that is off by a tenth of a degree. A
-constant and a drag for each level axis are therefore learnt in flight, by least squares that forget
-(Ljung 1999, "System identification", 11.2), and what they leave is summed up. How large such sums
-are where nothing drifts, the teammates say: they fly alike, in the same air.
+While a drift sets in, the estimate accelerates as thrust and attitude don't explain. So
+do the air's drag, which nobody told the vehicle, and an attitude that is off by a tenth
+of a degree. A constant and a drag for each level axis are therefore learnt in flight,
+by least squares that forget (Ljung 1999, "System identification", 11.2), and what they
+leave is summed up. How large such sums are where nothing drifts, the teammates say:
+they fly alike, in the same air.
 
-The height is left out. There the floor's cushion, another vehicle's wake and an emptier battery
-accelerate by more than a drift does.
+The height is left out. There the floor's cushion, another vehicle's wake and an emptier
+battery accelerate by more than a drift does.
 """
 
 import math
@@ -17,26 +18,28 @@ from typing import NamedTuple
 from openjax.flying.controller import Vector
 
 WINDOW = 1.5
-"""What constant and drag leave is summed up over this time constant (s): a gentle drift takes about
-as long to set in.
+"""What constant and drag leave is summed up over this time constant (s): a gentle drift
+takes about as long to set in.
 """
 FORGETTING = 6.0
-"""Time constant (s) with which constant and drag are learnt: longer than the window, or they learn
-the drift.
+"""Time constant (s) with which constant and drag are learnt: longer than the window, or
+they learn the drift.
 """
 LEARNT = 4.0
-"""In the first of a flight (s) the sums don't count: they say how badly constant and drag are known
-yet.
+"""In the first of a flight (s) the sums don't count: they say how badly constant and
+drag are known yet.
 """
 SPREAD = 0.05
-"""Information that never fades, so that a vehicle at rest is taken to have no drag (m^2/s^2)."""
+"""Information that never fades, so that a vehicle at rest is taken to have no drag
+(m^2/s^2).
+"""
 FLOOR = 0.15
-"""Smaller sums (m/s) are no drift, whatever the teammates' are: an attitude's error of .2 degrees
-that comes within the window accelerates by .05 m/s.
+"""Smaller sums (m/s) are no drift, whatever the teammates' are: an attitude's error of
+.2 degrees that comes within the window accelerates by .05 m/s.
 """
 RATIO = 4.0
-"""Nor are sums that aren't so many times the teammates' root mean square: of flights of 30 s without
-a drift, at most one in fifty was ended (`experiments.flying.observable`).
+"""Nor are sums that aren't so many times the teammates' root mean square: of flights of
+30 s without a drift, at most one in fifty was ended (`experiments.flying.observable`).
 """
 
 
@@ -78,15 +81,21 @@ class Drift(NamedTuple):
     age: float = 0.0  # s
 
     def after(self, unexplained: Vector, velocity: Vector, dt: float) -> "Drift":
-        """After `dt` (s) with an acceleration (m/s^2, world) that thrust didn't explain."""
+        """After `dt` (s) with an acceleration (m/s^2, world) that thrust didn't
+        explain.
+        """
         # x and y of the velocity; the third, the height, is left out
         level = list(zip(self.fits, unexplained, velocity, strict=False))
         kept = math.exp(-dt / WINDOW)
         summed = tuple(
             kept * total + dt * (acceleration - fit.at(speed))
-            for total, (fit, acceleration, speed) in zip(self.summed, level, strict=False)
+            for total, (fit, acceleration, speed) in zip(
+                self.summed, level, strict=False
+            )
         )
-        fits = tuple(fit.after(acceleration, speed, dt) for fit, acceleration, speed in level)
+        fits = tuple(
+            fit.after(acceleration, speed, dt) for fit, acceleration, speed in level
+        )
         worth = dt if self.age > LEARNT else 0.0
         squares = self.squares + worth * sum(part**2 for part in summed)
         return Drift(fits, summed, squares, self.age + dt)
@@ -98,17 +107,21 @@ class Drift(NamedTuple):
 
     @property
     def usual(self) -> float:
-        """Root mean square of its sums (m/s); infinite before they are worth something."""
+        """Root mean square of its sums (m/s); infinite before they are worth
+        something.
+        """
         seconds = self.age - LEARNT
         return math.sqrt(self.squares / seconds) if seconds > 1.0 else math.inf
 
 
 def drifting(drifts: Sequence[Drift]) -> tuple[bool, ...]:
-    """Of each vehicle, whether its sum is larger than what its teammates' are. Nobody tells that of
-    a lone one.
+    """Of each vehicle, whether its sum is larger than what its teammates' are. Nobody
+    tells that of a lone one.
     """
     usual = [drift.usual for drift in drifts]
-    largest = [max((*usual[:i], *usual[i + 1 :]), default=math.inf) for i in range(len(usual))]
+    largest = [
+        max((*usual[:i], *usual[i + 1 :]), default=math.inf) for i in range(len(usual))
+    ]
     return tuple(
         drift.age > LEARNT and drift.size > max(FLOOR, RATIO * others)
         for drift, others in zip(drifts, largest, strict=True)

@@ -1,4 +1,6 @@
-"""Which vehicle a URI means, however it is written; and that nobody else commands it."""
+"""Which vehicle a URI means, however it is written; and that nobody else commands
+it.
+"""
 
 import contextlib
 import re
@@ -50,8 +52,8 @@ def _udp(parts) -> Endpoint:
 
 
 def _address(host: str) -> str:
-    """A host's IPv4 address, as `cflib` speaks no other; all addresses of this machine are one.
-    The name itself where nobody knows it.
+    """A host's IPv4 address, as `cflib` speaks no other; all addresses of this machine
+    are one. The name itself where nobody knows it.
     """
     try:
         address = socket.gethostbyname(host)
@@ -72,7 +74,9 @@ def _radio(parts) -> Endpoint:
     number = int(channel) if channel else CHANNEL
     rate = rate.upper() or RATE
     address = (address or ADDRESS).upper().rjust(10, "0")
-    known = rate in RATES and 0 <= number <= 125 and re.fullmatch("[0-9A-F]{10}", address)
+    known = (
+        rate in RATES and 0 <= number <= 125 and re.fullmatch("[0-9A-F]{10}", address)
+    )
     if not parts.netloc or not known:
         raise ValueError
     vehicle = f"{number}/{rate}/{address}"
@@ -81,8 +85,8 @@ def _radio(parts) -> Endpoint:
 
 
 def endpoints_of(uris: Sequence[str]) -> list[Endpoint]:
-    """The vehicles of these URIs. Raises UserError for what is no URI, and for a vehicle that is
-    named twice.
+    """The vehicles of these URIs. Raises UserError for what is no URI, and for a
+    vehicle that is named twice.
     """
     endpoints = [endpoint_of(uri) for uri in uris]
     first: dict[str, str] = {}
@@ -97,15 +101,17 @@ def endpoints_of(uris: Sequence[str]) -> list[Endpoint]:
 
 @contextlib.contextmanager
 def sole_command(uris: Sequence[str]) -> Iterator[None]:
-    """Hold the vehicles against another `fly` on this machine, until this process ends. UserError:
-    one has them.
+    """Hold the vehicles against another `fly` on this machine, until this process ends.
+    UserError: one has them.
 
-    A name in Linux's abstract namespace ends with its process; elsewhere only the vehicles' own
-    word protects them.
+    A name in Linux's abstract namespace ends with its process; elsewhere only the
+    vehicles' own word protects them.
     """
     with contextlib.ExitStack() as stack:
         for uri, endpoint in zip(uris, endpoints_of(uris), strict=True):
-            name = stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_STREAM))
+            name = stack.enter_context(
+                socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+            )
             try:
                 name.bind(f"\0openjax.fly {endpoint.name}")
             except OSError as error:

@@ -1,4 +1,6 @@
-"""What is seen: each vehicle's estimate brought to now, by what of its poses can be believed."""
+"""What is seen: each vehicle's estimate brought to now, by what of its poses can be
+believed.
+"""
 
 import math
 from collections.abc import Sequence
@@ -11,17 +13,19 @@ from openjax.flying.set_point import as_sent
 from openjax.flying.state import FLYING, SPIN_UP, Drone, Mode, PoseSample, State
 
 CHECKED = (Mode.TRANSFER, Mode.READY, Mode.PURSUIT, Mode.HOLD, Mode.LAND)
-"""Modes in which nothing but air carries a vehicle, so that thrust tells its acceleration."""
+"""Modes in which nothing but air carries a vehicle, so that thrust tells its
+acceleration.
+"""
 SMOOTHING = 0.02
 """Time constant of the low-pass of velocities from motion capture (s)."""
 
 
 def see(state: State, time: float, samples: Sequence[PoseSample]) -> State:
-    """The state with each vehicle's estimate at `time` (s): the newest good pose moved on, or
-    reckoned from the last one.
+    """The state with each vehicle's estimate at `time` (s): the newest good pose moved
+    on, or reckoned from the last one.
 
-    Motion capture is what a vehicle is flown by, until it is lost; from then on its own estimate
-    is.
+    Motion capture is what a vehicle is flown by, until it is lost; from then on its own
+    estimate is.
     """
     # a loop that stood still mustn't be reckoned over in one step
     state = state._replace(time=time, dt=min(max(time - state.time, 0.0), 0.1))
@@ -30,15 +34,17 @@ def see(state: State, time: float, samples: Sequence[PoseSample]) -> State:
     drift = drifting([drone.innovations.drift for drone in drones])
     return state._replace(
         drones=tuple(
-            _without_drift(state, drone) if drifts and sample.captured is None else drone
+            _without_drift(state, drone)
+            if drifts and sample.captured is None
+            else drone
             for drone, drifts, sample in zip(drones, drift, samples, strict=True)
         )
     )
 
 
 def _without_drift(state, drone) -> Drone:
-    """The drone whose own estimate drifts: none is believed any more in this flight, and it is where
-    the last one was, as fast as thrust and drag explain.
+    """The drone whose own estimate drifts: none is believed any more in this flight,
+    and it is where the last one was, as fast as thrust and drag explain.
     """
     if drone.contradiction or drone.mode not in CHECKED:
         return drone
@@ -56,7 +62,9 @@ def _estimated(state, drone, sample) -> Drone:
     """The drone with its estimate now, after what was newly told of it."""
     now = state.time
     limits = state.limits
-    moving = drone.mode in FLYING and not (drone.mode is Mode.LIFT and now - drone.since < SPIN_UP)
+    moving = drone.mode in FLYING and not (
+        drone.mode is Mode.LIFT and now - drone.since < SPIN_UP
+    )
     by_capture = sample.captured is not None and not drone.capture_fault
     own = _own(state, drone, sample, by_capture, moving)
     drone = _consistent(state, drone, own, sample.force)
@@ -67,7 +75,9 @@ def _estimated(state, drone, sample) -> Drone:
     if source.fresh(now, limits) and not contradicted:
         estimate = moved_on(source.pose, max(now, source.pose.time))
         level = level_acceleration(estimate.quaternion)
-        return drone._replace(estimate=estimate, seen=source.pose.time, acceleration=level)
+        return drone._replace(
+            estimate=estimate, seen=source.pose.time, acceleration=level
+        )
     return drone if drone.estimate is None else _reckoned(state, drone)
 
 
@@ -76,7 +86,9 @@ def _reckoned(state, drone) -> Drone:
     # without a pose nothing tells how it turns
     old = drone.estimate
     dt = state.dt
-    velocity = tuple(v + dt * a for v, a in zip(old.velocity, drone.acceleration, strict=True))
+    velocity = tuple(
+        v + dt * a for v, a in zip(old.velocity, drone.acceleration, strict=True)
+    )
     position = tuple(p + dt * v for p, v in zip(old.position, velocity, strict=True))
     estimate = old._replace(time=state.time, position=position, velocity=velocity)
     return drone._replace(estimate=estimate)
@@ -85,31 +97,39 @@ def _reckoned(state, drone) -> Drone:
 def _consistent(state, drone, own, force) -> Drone:
     """The drone after its newest own estimate, with what its accelerometer feels.
 
-    If its innovations contradict that, none is believed any more in this flight, nor motion capture
-    where it tells the same: what the estimator on board follows can't confirm it.
+    If its innovations contradict that, none is believed any more in this flight, nor
+    motion capture where it tells the same: what the estimator on board follows can't
+    confirm it.
     """
     if drone.contradiction:
         return drone._replace(own=drone.own._replace(verdict=drone.contradiction))
     if drone.mode not in CHECKED:
         return drone._replace(own=own, innovations=Innovations())
     if own.pose is drone.own.pose:
-        # what told nothing but wrong poses until it was lost may tell believable ones, of another
-        # place, once anything can have happened
+        # what told nothing but wrong poses until it was lost may tell believable ones,
+        # of another place, once anything can have happened
         lost = own.verdict and not any(
             track.fresh(state.time, state.limits) for track in (own, drone.captured)
         )
-        return drone._replace(own=own, contradiction=own.verdict if lost else Verdict.GOOD)
+        return drone._replace(
+            own=own, contradiction=own.verdict if lost else Verdict.GOOD
+        )
     refused = bool(drone.own.verdict)
-    innovations = drone.innovations.after(own.pose, as_sent(drone.sent), state.airframe, refused)
+    innovations = drone.innovations.after(
+        own.pose, as_sent(drone.sent), state.airframe, refused
+    )
     innovations = innovations.feeling(force)
     verdict = innovations.verdict()
     seen = drone.captured
     if not verdict:
         return drone._replace(own=own, innovations=innovations)
     drone = drone._replace(
-        own=drone.own._replace(verdict=verdict), innovations=innovations, contradiction=verdict
+        own=drone.own._replace(verdict=verdict),
+        innovations=innovations,
+        contradiction=verdict,
     )
-    # motion capture tells otherwise than the estimate, so it isn't what the estimate followed
+    # motion capture tells otherwise than the estimate, so it isn't what the estimate
+    # followed
     if seen.pose is not None and not follows(seen.pose, own.pose, state.limits):
         return drone
     # neither is believed any more: back to where the sums say that the vehicle is
@@ -118,26 +138,32 @@ def _consistent(state, drone, own, force) -> Drone:
 
 
 def _own(state, drone, sample, by_capture, moving) -> Track:
-    """The drone's own estimates after the newest one, which motion capture must confirm where they
-    were lost or wrong.
+    """The drone's own estimates after the newest one, which motion capture must confirm
+    where they were lost or wrong.
     """
     now = state.time
     limits = state.limits
     before = drone.own
     if by_capture and before.fresh(now, limits):
-        # what it is flown by is motion capture: that says nothing of where its own leads
+        # what it is flown by is motion capture: that says nothing of where its own
+        # leads
         return before.after(sample.own, now, limits, moving, None)
     own = before.after(sample.own, now, limits, moving, drone.estimate)
     seen = drone.captured
-    to_confirm = moving and by_capture and own.pose is not before.pose and seen.fresh(now, limits)
+    to_confirm = (
+        moving
+        and by_capture
+        and own.pose is not before.pose
+        and seen.fresh(now, limits)
+    )
     if to_confirm and agree(seen.pose, own.pose, limits) is Verdict.APART:
         return own._replace(pose=before.pose, verdict=Verdict.JUMPED)
     return own
 
 
 def _captured(state, drone, sample, moving) -> Drone:
-    """The drone after the newest of motion capture: whether it is believed, and told to the
-    estimator on board.
+    """The drone after the newest of motion capture: whether it is believed, and told to
+    the estimator on board.
     """
     now = state.time
     limits = state.limits
@@ -160,7 +186,9 @@ def _captured(state, drone, sample, moving) -> Drone:
         innovations = Innovations()
     elif captured.pose is seen and seen is not drone.captured.pose:
         refused = bool(drone.captured.verdict)
-        innovations = innovations.after(seen, as_sent(drone.sent), state.airframe, refused)
+        innovations = innovations.after(
+            seen, as_sent(drone.sent), state.airframe, refused
+        )
         capture_fault = innovations.verdict()
     if capture_fault:
         captured = captured._replace(pose=drone.captured.pose, verdict=capture_fault)
@@ -172,8 +200,8 @@ def _captured(state, drone, sample, moving) -> Drone:
 
 
 def _with_motion(pose, last, estimate) -> Pose:
-    """A pose of motion capture with the velocity from differences, smoothed, and the body rates of
-    the gyroscope.
+    """A pose of motion capture with the velocity from differences, smoothed, and the
+    body rates of the gyroscope.
     """
     if last is None or pose.time <= last.time:
         return pose if last is None else last
@@ -187,5 +215,6 @@ def _with_motion(pose, last, estimate) -> Pose:
         for p, q, v in zip(pose.position, last.position, last.velocity, strict=True)
     )
     return pose._replace(
-        velocity=velocity, body_rates=pose.body_rates if estimate is None else estimate.body_rates
+        velocity=velocity,
+        body_rates=pose.body_rates if estimate is None else estimate.body_rates,
     )

@@ -1,8 +1,9 @@
-"""What a flight leaves behind: a case that `openjax diagnose` reads, and `flight.json` about the
-flight.
+"""What a flight leaves behind: a case that `openjax diagnose` reads, and `flight.json`
+about the flight.
 
-One log per game, with all vehicles in it: a row for each moment at which something was sampled on
-board. Commands are those in force at that moment, as sent: body rates and thrust.
+One log per game, with all vehicles in it: a row for each moment at which something was
+sampled on board. Commands are those in force at that moment, as sent: body rates and
+thrust.
 """
 
 import json
@@ -36,7 +37,8 @@ _COMMAND = CHANNEL_COLUMNS["command_thrust"] + CHANNEL_COLUMNS["command_body_rat
 def write_case(
     folder: Path, samples, record: FlightRecord, vehicle: VehicleFile, about: dict
 ) -> list[Path]:
-    """Write the case: one log per game long enough, vehicle.toml, flight.json. Returns the files.
+    """Write the case: one log per game long enough, vehicle.toml, flight.json. Returns
+    the files.
 
     Args:
       folder: to write to; it must exist.
@@ -57,13 +59,18 @@ def write_case(
 
     def write(game):
         path, ticks = game
-        write_csv(path, _table(path.name, samples, sent[ticks], commands[ticks]), DECIMALS)
+        write_csv(
+            path, _table(path.name, samples, sent[ticks], commands[ticks]), DECIMALS
+        )
         return path
 
-    with ThreadPoolExecutor(4) as pool:  # half of the time is zlib's, which lets others run
+    # half of the time is zlib's, which lets others run
+    with ThreadPoolExecutor(4) as pool:
         files = list(pool.map(write, games))
     save_vehicle_file(folder / "vehicle.toml", vehicle)
-    text = json.dumps({**about, "timing": record.timing(), "games": record.episodes}, indent=1)
+    text = json.dumps(
+        {**about, "timing": record.timing(), "games": record.episodes}, indent=1
+    )
     (folder / "flight.json").write_text(text + "\n", encoding="utf-8")
     return [*files, folder / "vehicle.toml", folder / "flight.json"]
 
@@ -80,7 +87,9 @@ def _table(name: str, samples, sent: np.ndarray, commands: np.ndarray) -> LogTab
     rows = [_rows(vehicle, sent, commands[:, i]) for i, vehicle in enumerate(samples)]
     log = log_of(rows, name)
     # a column that nobody filled in would say that there was such a sensor
-    filled = {n: column for n, column in log.columns.items() if not np.isnan(column).all()}
+    filled = {
+        n: column for n, column in log.columns.items() if not np.isnan(column).all()
+    }
     return LogTable(name, filled, log.vehicle)
 
 
@@ -102,23 +111,30 @@ class _Source(NamedTuple):
 
 
 def _sources(vehicle: Samples) -> list[_Source]:
-    """All that was recorded of a vehicle; what comes later replaces what came before."""
+    """All that was recorded of a vehicle; what comes later replaces what came
+    before.
+    """
     own = np.column_stack([vehicle.poses[:, 3:], vehicle.poses[:, 1]])
     poses = _Source(vehicle.poses[:, 2], (*_POSE, "vbat"), own)
     bodies = _Source(vehicle.bodies[:, 0], _BODY, vehicle.bodies[:, 1:])
     if not len(vehicle.seen):
         return [poses, bodies]
-    # motion capture in place of the estimate on board, of which body rates and voltage stay
+    # motion capture in place of the estimate on board, of which body rates and voltage
+    # stay
     poses = _Source(poses.when, poses.names[10:], own[:, 10:])
     seen = _Source(vehicle.seen[:, 0], _POSE[:10], vehicle.seen[:, 1:11])
     return [poses, bodies, seen]
 
 
 def _rows(vehicle: Samples, sent, commands) -> dict[str, np.ndarray]:
-    """The rows of one vehicle, by column: one for each moment at which something was measured."""
+    """The rows of one vehicle, by column: one for each moment at which something was
+    measured.
+    """
     sources = [source.during(sent[0], sent[-1]) for source in _sources(vehicle)]
     times = np.unique(np.concatenate([source.when for source in sources]))
-    rows = {n: np.full(len(times), np.nan) for n in ("t", *_POSE, *_BODY, *_COMMAND, "vbat")}
+    rows = {
+        n: np.full(len(times), np.nan) for n in ("t", *_POSE, *_BODY, *_COMMAND, "vbat")
+    }
     rows["t"] = times - sent[0]
     for source in sources:
         at = np.searchsorted(times, source.when)

@@ -9,8 +9,8 @@ from openjax.flying.ticks import PERIOD
 
 
 class FlightRecord:
-    """What happened at every tick of a flight with `vehicles`; as numbers, since objects would take
-    two kilobytes a tick.
+    """What happened at every tick of a flight with `vehicles`; as numbers, since
+    objects would take two kilobytes a tick.
 
     Attributes:
       episodes: notes on each game.
@@ -27,30 +27,35 @@ class FlightRecord:
         """Add a row.
 
         Args:
-          tick: when it was due, when its last set-point left (s), and the game (-1: none).
-          arrivals, measured: when each vehicle's newest pose arrived and was measured (s).
+          tick: when it was due, when its last set-point left (s), and the game (-1:
+          none).
+          arrivals, measured: when each vehicle's newest pose arrived and was measured
+          (s).
           set_points: each vehicle's.
         """
         self._rows.extend(tick)
         for arrival, seen, s in zip(arrivals, measured, set_points, strict=True):
-            # what a packet holds, not what was asked for: a diagnosis must know what was sent
+            # what a packet holds, not what was asked for: a diagnosis must know what
+            # was sent
             s = s if s.mode == OFF else as_sent(s)
-            self._rows.extend((arrival, seen, s.mode, s.thrust, s.roll, s.pitch, s.yaw_rate))
+            self._rows.extend(
+                (arrival, seen, s.mode, s.thrust, s.roll, s.pitch, s.yaw_rate)
+            )
 
     def table(self) -> tuple[np.ndarray, np.ndarray]:
-        """(T, 3) due, sent, game; (T, N, 7) arrival, measured, mode, thrust, roll, pitch, yaw rate
-        as they fit into packets.
+        """(T, 3) due, sent, game; (T, N, 7) arrival, measured, mode, thrust, roll,
+        pitch, yaw rate as they fit into packets.
         """
         rows = np.array(self._rows).reshape(-1, self._width)
         # the number of vehicles is spelt out: a flight may end before its first tick
         return rows[:, :3], rows[:, 3:].reshape(len(rows), self._width // 7, 7)
 
     def timing(self) -> dict:
-        """Command age (ms) and missed deadlines of all ticks. A tick's deadline is the next tick's
-        due time; a tick that was left out is a missed one.
+        """Command age (ms) and missed deadlines of all ticks. A tick's deadline is the
+        next tick's due time; a tick that was left out is a missed one.
 
-        `measured_to_sent_ms` counts from the moment on board, as far as the fastest packet of the
-        flight tells it.
+        `measured_to_sent_ms` counts from the moment on board, as far as the fastest
+        packet of the flight tells it.
         """
         ticks, vehicles = self.table()
         if not len(ticks):
@@ -75,4 +80,7 @@ class FlightRecord:
 
 def _percentiles(values) -> dict:
     at = np.percentile(values, [50, 99, 99.9, 100])
-    return {n: round(float(v), 3) for n, v in zip(("p50", "p99", "p99.9", "max"), at, strict=True)}
+    return {
+        n: round(float(v), 3)
+        for n, v in zip(("p50", "p99", "p99.9", "max"), at, strict=True)
+    }

@@ -1,8 +1,8 @@
-"""The game around vehicles that fly somewhere else: what the pursuers observe, what the policy
-answers, where the evader goes.
+"""The game around vehicles that fly somewhere else: what the pursuers observe, what the
+policy answers, where the evader goes.
 
-The whole tick (the game's step, the observation, predictor and actor) is one function, compiled
-ahead.
+The whole tick (the game's step, the observation, predictor and actor) is one function,
+compiled ahead.
 """
 
 import dataclasses
@@ -31,19 +31,25 @@ class Play(NamedTuple):
 
 
 def game_functions(policy):
-    """The game's settings and airframe, and its two steps as pure functions of arrays, to compile
-    or to map.
+    """The game's settings and airframe, and its two steps as pure functions of arrays,
+    to compile or to map.
 
-    first(task, poses (N, 13)) -> state, action (N, 4): an episode begins with the pursuers at
-    `poses`. tick(state, action, poses, evader (3,), evader_measured ()) -> state, action, *fields
-    of `Play` but the first: one control step later they are at `poses`.
+    first(task, poses (N, 13)) -> state, action (N, 4): an episode begins with the
+    pursuers at `poses`. tick(state, action, poses, evader (3,), evader_measured ()) ->
+    state, action, *fields of `Play` but the first: one control step later they are at
+    `poses`.
     """
-    # what shapes a training world, but not a measured one: the vehicles drawn for it, the clamp
-    settings = dataclasses.replace(policy.settings.environment, vehicles=(), speed_limit="none")
+    # what shapes a training world, but not a measured one: the vehicles drawn for it,
+    # the clamp
+    settings = dataclasses.replace(
+        policy.settings.environment, vehicles=(), speed_limit="none"
+    )
     environment = Pursuit(settings)
 
     def drones_of(poses):
-        position, quaternion, velocity, body_rates = jnp.split(poses, (3, 7, 10), axis=1)
+        position, quaternion, velocity, body_rates = jnp.split(
+            poses, (3, 7, 10), axis=1
+        )
         quaternion = quaternion / jnp.linalg.norm(quaternion, axis=1, keepdims=True)
         return {
             "position": position,
@@ -105,7 +111,8 @@ class Game:
         nowhere = np.zeros(3, np.float32)
         not_measured = np.zeros((), bool)
 
-        # the state as one array: as a tree of some thirty the call takes half as long again
+        # the state as one array: as a tree of some thirty the call takes half as long
+        # again
         def begin(poses):
             state, action = first(task, poses)
             return ravel_pytree((state, action))[0], action
@@ -137,14 +144,22 @@ class Game:
         )
 
     def step(self, poses: list[Pose], evader: np.ndarray | None = None) -> Play:
-        """One control step later the pursuers are at `poses`, the evader, if it is measured, at
-        (3,) `evader`.
+        """One control step later the pursuers are at `poses`, the evader, if it is
+        measured, at (3,) `evader`.
         """
         measured = np.asarray(evader is not None)
-        place = np.zeros(3, np.float32) if evader is None else np.asarray(evader, np.float32)
+        place = (
+            np.zeros(3, np.float32)
+            if evader is None
+            else np.asarray(evader, np.float32)
+        )
         self._flat, results = self._tick(self._flat, pose_array(poses), place, measured)
-        action, position, velocity, captured, over, breaches, crashed = map(np.asarray, results)
-        return Play(action, position, velocity, bool(captured), bool(over), breaches, crashed)
+        action, position, velocity, captured, over, breaches, crashed = map(
+            np.asarray, results
+        )
+        return Play(
+            action, position, velocity, bool(captured), bool(over), breaches, crashed
+        )
 
 
 def pose_array(poses) -> np.ndarray:

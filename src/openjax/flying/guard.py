@@ -1,12 +1,12 @@
-"""The guard: a process that waits for nothing else, and lands all vehicles should loop and links
-fall silent.
+"""The guard: a process that waits for nothing else, and lands all vehicles should loop
+and links fall silent.
 
-It has a session and signals of its own, watches loop and links, and is watched by the loop, which
-lands without it.
+It has a session and signals of its own, watches loop and links, and is watched by the
+loop, which lands without it.
 
-Over UDP its links are open from the start. A radio dongle belongs to one process: there the guard
-can only open it once the links' process has ended. The links' process, which has it, is the first
-to take over for a loop that stops.
+Over UDP its links are open from the start. A radio dongle belongs to one process: there
+the guard can only open it once the links' process has ended. The links' process, which
+has it, is the first to take over for a loop that stops.
 """
 
 from __future__ import annotations
@@ -24,18 +24,20 @@ from openjax.flying.takeover import disarm, fly_down
 CHECK = 0.004
 """s between two looks: short beside the silence after which somebody else flies."""
 OPENING = 0.5
-"""s that nobody takes over from the guard while it opens a dongle: half of what the firmware's
-watchdog waits.
+"""s that nobody takes over from the guard while it opens a dongle: half of what the
+firmware's watchdog waits.
 """
 
 
 class Guard:
-    """The loop's end of the guard's process: start it before take-off, close it at the end.
+    """The loop's end of the guard's process: start it before take-off, close it at the
+    end.
 
     Args:
       board: of the session.
       links: the guard's own, not open yet.
-      state: of the loop's state machine; settings, pillars and airframe are taken from it.
+      state: of the loop's state machine; settings, pillars and airframe are taken from
+      it.
     """
 
     def __init__(self, board: Board, links: RawLinks, state: State):
@@ -49,12 +51,19 @@ class Guard:
     def wait(self, timeout: float = 20.0) -> None:
         """Return once it watches, which takes a second, or doesn't by then (s)."""
         deadline = time.monotonic() + timeout
-        while not self.lives() and time.monotonic() < deadline and self._process.is_alive():
+        while (
+            not self.lives()
+            and time.monotonic() < deadline
+            and self._process.is_alive()
+        ):
             time.sleep(0.02)
 
     def lives(self) -> bool:
         """Whether anything was heard of it lately."""
-        return self._board.silent(Role.GUARD, time.perf_counter()) < 2.0 * self._board.silence
+        return (
+            self._board.silent(Role.GUARD, time.perf_counter())
+            < 2.0 * self._board.silence
+        )
 
     def close(self) -> None:
         """End it; the vehicles are down or someone else's."""
@@ -83,7 +92,9 @@ def watch(board: Board, parent: int, links: RawLinks, state: State) -> None:
             board.pilot = Role.GUARD
             board.beat(Role.GUARD, now + OPENING)
             board.end_process(Role.LINKS)
-            say("openjax fly: nothing from the links' process, the guard lands all vehicles")
+            say(
+                "openjax fly: nothing from the links' process, the guard lands all vehicles"
+            )
             links.open()
             fly_down(board, Role.GUARD, links, state)
         # on the floor, but armed: whoever comes near must not be met by a motor
@@ -91,6 +102,10 @@ def watch(board: Board, parent: int, links: RawLinks, state: State) -> None:
             board.end_process(Role.LINKS)
             links.open()
             disarm(links, board, Role.GUARD)
-        elif not board.flying and os.getppid() != parent and (links_silent or not board.armed):
+        elif (
+            not board.flying
+            and os.getppid() != parent
+            and (links_silent or not board.armed)
+        ):
             break
     os._exit(0)  # the links' threads would take a second each

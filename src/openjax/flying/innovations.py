@@ -1,9 +1,10 @@
-"""Whether a vehicle's own estimate agrees with itself, with its gyroscope, and with what was sent.
+"""Whether a vehicle's own estimate agrees with itself, with its gyroscope, and with
+what was sent.
 
-A single pose says little: a drift of .3 m/s moves it by 3 mm. So what a pose adds to the last one
-is compared with what it should add, and the differences, the innovations, are summed up with a
-forgetting time (Mehra and Peschon 1971, "An innovations approach to fault detection and diagnosis
-in dynamic systems", Automatica 7):
+A single pose says little: a drift of .3 m/s moves it by 3 mm. So what a pose adds to
+the last one is compared with what it should add, and the differences, the innovations,
+are summed up with a forgetting time (Mehra and Peschon 1971, "An innovations approach
+to fault detection and diagnosis in dynamic systems", Automatica 7):
 
 * the way, with the velocity that the same estimate tells;
 * the change of velocity, with thrust and attitude;
@@ -11,8 +12,8 @@ in dynamic systems", Automatica 7):
 * the gyroscope, with the body rates that were sent;
 * the climb, with the accelerometer (`openjax.flying.climb`), where it is logged.
 
-A drift along the ground, of position and velocity together, that sets in gently passes all of them.
-Teammates tell some of these (`openjax.flying.drift`), a second source all.
+A drift along the ground, of position and velocity together, that sets in gently passes
+all of them. Teammates tell some of these (`openjax.flying.drift`), a second source all.
 """
 
 import math
@@ -38,43 +39,49 @@ class Memory(NamedTuple):
 
 
 WAY = Memory(1.2, 0.095)
-"""Of position against velocity (m): one is off the other by .08 m/s. Errors of 8 mm and 4 cm/s that
-have nothing to do with each other reach .09.
+"""Of position against velocity (m): one is off the other by .08 m/s. Errors of 8 mm and
+4 cm/s that have nothing to do with each other reach .09.
 """
 SPEED = Memory(0.1, 0.2)
-"""Of velocity against thrust (m/s): a disturbance of 2 m/s^2 that sets in at once, as no drag
-does.
+"""Of velocity against thrust (m/s): a disturbance of 2 m/s^2 that sets in at once, as
+no drag does.
 """
 RISING = 0.3
 """The same upwards (m/s), where the floor's cushion pushes."""
 SINKING = 0.7
-"""The same downwards (m/s), where the wake of another vehicle pushes: .2 N (Shi et al. 2020) on
-30 g.
+"""The same downwards (m/s), where the wake of another vehicle pushes: .2 N (Shi et al.
+2020) on 30 g.
 """
 STEP = 0.2
-"""Of one pose's velocity against thrust (m/s): no wake pushes so much between two poses."""
+"""Of one pose's velocity against thrust (m/s): no wake pushes so much between two
+poses.
+"""
 TURN = Memory(1.0, 0.08)
 """Of attitude against gyroscope (rad): one is off the other by .08 rad/s."""
 RATE = Memory(0.2, 1.5)
 """Mean difference of the gyroscope from the body rates that were sent (rad/s)."""
 SETTLED = 0.3
-"""Velocity isn't judged in a flight's first moments (s), in which it is learnt what thrust doesn't
-explain: drag, wind or a weight that isn't known.
+"""Velocity isn't judged in a flight's first moments (s), in which it is learnt what
+thrust doesn't explain: drag, wind or a weight that isn't known.
 """
 BIAS = 3.0
 """From then on that is learnt with this time constant (s) only."""
 RECENT = 0.5
-"""How long (s) it is remembered by how much the velocity left what thrust explains: a vehicle whose
-estimate is refused flies on without that.
+"""How long (s) it is remembered by how much the velocity left what thrust explains: a
+vehicle whose estimate is refused flies on without that.
 """
 RATE_LAG = 0.04
 """Time constant of the rate loop (s)."""
 LONGEST = 0.025
-"""After a longer pause (s) between two poses nobody knows what happened: no innovation."""
+"""After a longer pause (s) between two poses nobody knows what happened: no
+innovation.
+"""
 
 
 class Innovations(NamedTuple):
-    """The sums of one source of a vehicle's poses, and what the next ones are made of."""
+    """The sums of one source of a vehicle's poses, and what the next ones are made
+    of.
+    """
 
     pose: Pose | None = None
     way: Vector = ZERO  # m, world
@@ -87,16 +94,18 @@ class Innovations(NamedTuple):
     age: float = 0.0  # s, for how long that is learnt
     thrust: float = 0.0  # share of the maximum that the motors have reached
     rates: Vector = ZERO  # rad/s, that the rate loop should have reached
-    drift: Drift = Drift()  # what neither thrust nor drag explains, of the level velocity
-    climb: Climb = Climb()  # what the accelerometer doesn't feel, of the upward velocity
+    # what neither thrust nor drag explains, of the level velocity
+    drift: Drift = Drift()
+    # what the accelerometer doesn't feel, of the upward velocity
+    climb: Climb = Climb()
 
     def after(
         self, pose: Pose, sent: SetPoint, airframe: Airframe, refused: bool = False
     ) -> "Innovations":
         """With the next pose; `sent` has acted since the last one.
 
-        `refused`: whether poses between them came and weren't believed. Then this one must follow
-        from the last believable one, however long that is ago.
+        `refused`: whether poses between them came and weren't believed. Then this one
+        must follow from the last believable one, however long that is ago.
         """
         last = self.pose
         longest = math.inf if refused else LONGEST
@@ -106,14 +115,19 @@ class Innovations(NamedTuple):
         # what motors and rate loop have made of what was sent, as two low-passes
         reached = _share(dt, airframe.motor_time_constant)
         thrust = self.thrust + reached * (sent.thrust - self.thrust)
-        asked = (sent.roll, sent.pitch, sent.yaw_rate) if sent.mode == RATES else pose.body_rates
+        asked = (
+            (sent.roll, sent.pitch, sent.yaw_rate)
+            if sent.mode == RATES
+            else pose.body_rates
+        )
         rates = _towards(self.rates, asked, _share(dt, RATE_LAG))
         # the trapezoidal rule: exact for an acceleration that stays
         mean = _towards(last.velocity, pose.velocity, 0.5)
         way = _difference(_difference(pose.position, last.position), _times(dt, mean))
         lift = lift_acceleration(pose.quaternion, thrust / airframe.hover_thrust)
         gain = _times(1.0 / dt, _difference(pose.velocity, last.velocity))
-        # the bias is what thrust has not explained so far: drag, wind, an unknown weight
+        # the bias is what thrust has not explained so far: drag, wind, an unknown
+        # weight
         beyond_thrust = _difference(gain, lift)
         unexplained = _difference(beyond_thrust, self.bias)
         step = _times(dt, unexplained)
@@ -137,14 +151,14 @@ class Innovations(NamedTuple):
         )
 
     def feeling(self, force: Vector | None) -> "Innovations":
-        """With the specific force (m/s^2, body) that the accelerometer feels at the newest pose;
-        None: it isn't known.
+        """With the specific force (m/s^2, body) that the accelerometer feels at the
+        newest pose; None: it isn't known.
         """
         return self._replace(climb=self.climb.after(self.pose, force))
 
     def corrected(self) -> Pose:
-        """The newest pose without what was summed up: where the vehicle is if what it is compared
-        with is right.
+        """The newest pose without what was summed up: where the vehicle is if what it
+        is compared with is right.
         """
         way = self.way
         recent = self.recent
@@ -175,8 +189,8 @@ class Innovations(NamedTuple):
 
 def turn_between(start: Sequence[float], end: Sequence[float]) -> Vector:
     """The small rotation (rad, body) from one attitude wxyz to another."""
-    # the vector part of conj(before) * after, which is half of a small rotation; `sign` also
-    # chooses between q and -q
+    # the vector part of conj(before) * after, which is half of a small rotation; `sign`
+    # also chooses between q and -q
     a, b, c, d = start
     w, x, y, z = end
     scalar = a * w + b * x + c * y + d * z
@@ -189,7 +203,9 @@ def turn_between(start: Sequence[float], end: Sequence[float]) -> Vector:
 
 
 def _turn_beyond_gyroscope(last: Pose, pose: Pose) -> Vector:
-    """The turn (rad, body) from one pose to the next that the gyroscope doesn't tell."""
+    """The turn (rad, body) from one pose to the next that the gyroscope doesn't
+    tell.
+    """
     mean = _towards(last.body_rates, pose.body_rates, 0.5)
     turn = turn_between(last.quaternion, pose.quaternion)
     return _difference(turn, _times(pose.time - last.time, mean))

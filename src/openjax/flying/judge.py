@@ -1,8 +1,9 @@
-"""Whether a pose may be flown by: a measurement against what a vehicle can have done since the last
-good one.
+"""Whether a pose may be flown by: a measurement against what a vehicle can have done
+since the last good one.
 
-`judge` compares a pose with the last good one of the same source, `agree` motion capture with the
-vehicle's own estimate. Both are pure. What they don't accept is a lost pose, whatever sent it.
+`judge` compares a pose with the last good one of the same source, `agree` motion
+capture with the vehicle's own estimate. Both are pure. What they don't accept is a lost
+pose, whatever sent it.
 """
 
 import math
@@ -38,10 +39,10 @@ class PoseLimits:
     """Bounds of a believable pose. The first four are physics, the others accuracies of
     measurements.
 
-    A bound is an accuracy plus the most that can have happened since the last good pose. While its
-    source tells something, however wrong, what can happen grows for `horizon` seconds only: by then
-    the vehicle is landed by reckoning, level and slow, and `drift` is what that may lose. While
-    nothing is heard, anything can happen.
+    A bound is an accuracy plus the most that can have happened since the last good
+    pose. While its source tells something, however wrong, what can happen grows for
+    `horizon` seconds only: by then the vehicle is landed by reckoning, level and slow,
+    and `drift` is what that may lose. While nothing is heard, anything can happen.
     """
 
     acceleration: float
@@ -51,14 +52,18 @@ class PoseLimits:
     body_rate: float = math.radians(2000.0)
     """Full scale of the gyroscope on board (rad/s); BMI088 data sheet."""
     horizon: float = 0.06
-    """How long (s) a vehicle is flown without a good pose; `SafetySettings.pose_timeout`."""
+    """How long (s) a vehicle is flown without a good pose;
+    `SafetySettings.pose_timeout`.
+    """
     drift: float = 0.25
     """Error of the reckoned velocity (m/s): 1.5 degrees of tilt for a second."""
     position: float = 0.03
-    """Error of one position (m): three times what `locSrv.extPosStdDev` is set to on board."""
+    """Error of one position (m): three times what `locSrv.extPosStdDev` is set to on
+    board.
+    """
     velocity: float = 0.3
-    """Error of one velocity (m/s): half of a position's error in the time constant of the
-    velocity's low-pass.
+    """Error of one velocity (m/s): half of a position's error in the time constant of
+    the velocity's low-pass.
     """
     angle: float = 0.15
     """Error of one attitude (rad)."""
@@ -67,28 +72,35 @@ class PoseLimits:
     unit: float = 0.02
     """How far a quaternion's length may be from one: 9 bits a component on board."""
     apart: float = 0.1
-    """Distance (m) between motion capture and the own estimate: 5 standard errors of two of .01 m,
-    and 30 ms at 1 m/s.
+    """Distance (m) between motion capture and the own estimate: 5 standard errors of
+    two of .01 m, and 30 ms at 1 m/s.
     """
     turned: float = math.radians(20.0)
-    """Angle (rad) between them: a body marked by hand stands within 10 degrees, as does an estimate
-    of the yaw.
+    """Angle (rad) between them: a body marked by hand stands within 10 degrees, as does
+    an estimate of the yaw.
     """
 
 
 def pose_limits(airframe: Airframe, horizon: float) -> PoseLimits:
     """The limits of a vehicle's poses. `horizon`: see `PoseLimits`."""
-    return PoseLimits(airframe.acceleration, airframe.angular_acceleration, horizon=horizon)
+    return PoseLimits(
+        airframe.acceleration, airframe.angular_acceleration, horizon=horizon
+    )
 
 
 def judge(
-    pose: Pose, last: Pose | None, unseen: float, limits: PoseLimits, expected: Pose | None = None
+    pose: Pose,
+    last: Pose | None,
+    unseen: float,
+    limits: PoseLimits,
+    expected: Pose | None = None,
 ) -> Verdict:
     """What is wrong with a pose.
 
     Args:
       pose: the newest.
-      last: the last good one of the same source; None if there is none, as on the ground.
+      last: the last good one of the same source; None if there is none, as on the
+      ground.
       unseen: for how long its source told nothing before it (s).
       limits: bounds.
       expected: where reckoning has the vehicle by now; without it, where `last` leads.
@@ -144,9 +156,9 @@ class Track(NamedTuple):
     ) -> "Track":
         """The track after its source's newest pose at `time` (s).
 
-        A pose that isn't newer than the last good one, or old, or from the future, changes nothing.
-        Of a vehicle that isn't `moving` any pose is believed that is one. `expected`: see `judge`;
-        at any time.
+        A pose that isn't newer than the last good one, or old, or from the future,
+        changes nothing. Of a vehicle that isn't `moving` any pose is believed that is
+        one. `expected`: see `judge`; at any time.
         """
         last = self.pose
         if pose is None or not abs(time - pose.time) <= limits.horizon:
@@ -157,7 +169,9 @@ class Track(NamedTuple):
             return self
         else:
             expected = None if expected is None else moved_on(expected, pose.time)
-            verdict = judge(pose, last, pose.time - max(self.heard, last.time), limits, expected)
+            verdict = judge(
+                pose, last, pose.time - max(self.heard, last.time), limits, expected
+            )
         return Track(last if verdict else pose, verdict, pose.time)
 
 
@@ -168,8 +182,8 @@ def at_one_time(a: Pose, b: Pose) -> tuple[Pose, Pose]:
 
 
 def agree(captured: Pose, estimate: Pose, limits: PoseLimits) -> Verdict:
-    """Whether motion capture and the vehicle's own estimate tell the same, at the later one's
-    time.
+    """Whether motion capture and the vehicle's own estimate tell the same, at the later
+    one's time.
     """
     captured, estimate = at_one_time(captured, estimate)
     near = math.dist(captured.position, estimate.position) <= limits.apart
@@ -178,11 +192,11 @@ def agree(captured: Pose, estimate: Pose, limits: PoseLimits) -> Verdict:
 
 
 def follows(captured: Pose, estimate: Pose, limits: PoseLimits) -> bool:
-    """Whether the estimator on board may be told a pose of motion capture: errors explain the
-    distance from its own, at the later one's time.
+    """Whether the estimator on board may be told a pose of motion capture: errors
+    explain the distance from its own, at the later one's time.
 
-    An estimator that is told late or drifting poses takes their error for a velocity, by which it
-    would have to land.
+    An estimator that is told late or drifting poses takes their error for a velocity,
+    by which it would have to land.
     """
     captured, estimate = at_one_time(captured, estimate)
     return math.dist(estimate.position, captured.position) <= limits.position
@@ -190,6 +204,7 @@ def follows(captured: Pose, estimate: Pose, limits: PoseLimits) -> bool:
 
 def angle_between(a, b) -> float:
     """The angle (rad) of the rotation between two unit quaternions wxyz."""
-    # the absolute value, since q and -q are one attitude; cut, since rounding may leave more than 1
+    # the absolute value, since q and -q are one attitude; cut, since rounding may leave
+    # more than 1
     cosine = abs(sum(p * q for p, q in zip(a, b, strict=True)))
     return 2.0 * math.acos(min(cosine, 1.0))

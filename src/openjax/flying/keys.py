@@ -1,5 +1,5 @@
-"""What the person at the terminal wants: keys, and the signals that a terminal sends, as requests
-to the loop.
+"""What the person at the terminal wants: keys, and the signals that a terminal sends,
+as requests to the loop.
 """
 
 from __future__ import annotations
@@ -18,16 +18,17 @@ STOP = b" qQ"
 LAND = b"lL"
 HOLD = b"hH"
 LANDING = ("SIGHUP", "SIGINT", "SIGTSTP", "SIGTERM", "SIGQUIT")
-"""Ctrl-C, Ctrl-Z, Ctrl-\\ , a closed terminal, and kill: all of them land, however often they
-come.
+"""Ctrl-C, Ctrl-Z, Ctrl-\\ , a closed terminal, and kill: all of them land, however
+often they come.
 """
 
 
 class Operator:
     """Keys and signals while vehicles fly; a context manager.
 
-    Space or q stops all motors, l lands, h waits; signals land. Keys are read byte by byte from the
-    terminal itself, and of all that have come since the last look the strongest counts.
+    Space or q stops all motors, l lands, h waits; signals land. Keys are read byte by
+    byte from the terminal itself, and of all that have come since the last look the
+    strongest counts.
 
     Args:
       terminal: a file descriptor; keys are read only if it is a terminal.
@@ -58,7 +59,8 @@ class Operator:
         return self
 
     def __exit__(self, *_):
-        # what has come by now was this object's to hear, and mustn't be taken for an unheard signal
+        # what has come by now was this object's to hear, and mustn't be taken for an
+        # unheard signal
         settle()
         self._restore.close()
 

@@ -1,7 +1,7 @@
 """Where a vehicle may stop, turn back, part and wait, and what it can follow.
 
-Plain mechanics of poses, limits in `SafetySettings`: nothing here knows who flies a vehicle, or
-why. That is `openjax.flying.safety`'s.
+Plain mechanics of poses, limits in `SafetySettings`: nothing here knows who flies a
+vehicle, or why. That is `openjax.flying.safety`'s.
 """
 
 import math
@@ -22,7 +22,9 @@ WALL_RETURN = 0.5
 CEILING_RETURN = 0.4
 """... and from ceiling or floor."""
 FASTEST_PUSH = 0.5
-"""Vehicles that are too close part by at most this (m/s) beyond what they close in by."""
+"""Vehicles that are too close part by at most this (m/s) beyond what they close in
+by.
+"""
 ROUNDS = 20
 """Resting places are pushed apart at most so often: crowded ones may have no answer."""
 
@@ -30,10 +32,11 @@ ROUNDS = 20
 def stopping_point(
     settings: SafetySettings, pose: Pose, acceleration: Vector | None = None
 ) -> Vector:
-    """Where a vehicle comes to rest that brakes now (m): its acceleration fades with the time
-    constant `reaction`, and as slowly the braking sets in.
+    """Where a vehicle comes to rest that brakes now (m): its acceleration fades with
+    the time constant `reaction`, and as slowly the braking sets in.
 
-    `acceleration`: at present (m/s^2, world); that of level flight at its tilt, if it isn't known.
+    `acceleration`: at present (m/s^2, world); that of level flight at its tilt, if it
+    isn't known.
     """
     lag = settings.reaction
     present = acceleration or level_acceleration(pose.quaternion)
@@ -47,8 +50,8 @@ def stopping_point(
 def fence_velocity(
     settings: SafetySettings, pose: Pose, acceleration: Vector | None = None
 ) -> Vector | None:
-    """The velocity (m/s) that keeps a vehicle in the arena; None while it could still stop inside.
-    See `stopping_point`.
+    """The velocity (m/s) that keeps a vehicle in the arena; None while it could still
+    stop inside. See `stopping_point`.
     """
     x, y, z = stopping_point(settings, pose, acceleration)
     out = math.hypot(x, y)
@@ -68,11 +71,11 @@ def fence_velocity(
 def parting_velocity(
     settings: SafetySettings, i: int, poses: Sequence[Pose | None]
 ) -> Vector | None:
-    """The velocity (m/s) that keeps vehicle i off the others; None while all could still stop
-    apart.
+    """The velocity (m/s) that keeps vehicle i off the others; None while all could
+    still stop apart.
 
-    Two vehicles that close in at `c` and both brake at `braking` need `c * reaction + c**2 / (4 *
-    braking)` to stop.
+    Two vehicles that close in at `c` and both brake at `braking` need `c * reaction +
+    c**2 / (4 * braking)` to stop.
     """
     own = poses[i]
     wanted = None
@@ -82,7 +85,10 @@ def parting_velocity(
         distance = math.dist(own.position, other.position)
         if distance < 1e-6:  # no way leads apart from there
             continue
-        away = tuple((p - q) / distance for p, q in zip(own.position, other.position, strict=True))
+        away = tuple(
+            (p - q) / distance
+            for p, q in zip(own.position, other.position, strict=True)
+        )
         approach = zip(away, own.velocity, other.velocity, strict=True)
         # along the line between them; what moves apart needs no room
         closing = max(sum(a * (w - v) for a, v, w in approach), 0.0)
@@ -91,16 +97,20 @@ def parting_velocity(
         if lack > 0.0:
             # half of the approach: the other brakes the other half
             push = 0.5 * closing + min(lack / settings.reaction, FASTEST_PUSH)
-            wanted = tuple(w + push * a for w, a in zip(wanted or own.velocity, away, strict=True))
+            wanted = tuple(
+                w + push * a for w, a in zip(wanted or own.velocity, away, strict=True)
+            )
     return wanted
 
 
-def within_reach(action: SetPoint, sent: SetPoint, airframe: Airframe, dt: float) -> SetPoint:
-    """The action within its bounds, and no farther from what was sent `dt` (s) before than the
-    vehicle can follow.
+def within_reach(
+    action: SetPoint, sent: SetPoint, airframe: Airframe, dt: float
+) -> SetPoint:
+    """The action within its bounds, and no farther from what was sent `dt` (s) before
+    than the vehicle can follow.
 
-    Its rates can't change faster than its largest angular acceleration, its thrust than its motors'
-    time constant.
+    Its rates can't change faster than its largest angular acceleration, its thrust than
+    its motors' time constant.
     """
 
     def near(value, old, room):
@@ -123,8 +133,8 @@ def within_reach(action: SetPoint, sent: SetPoint, airframe: Airframe, dt: float
 def resting_places(
     settings: SafetySettings, pillars: Sequence[Vector], poses: Sequence[Pose | None]
 ) -> list[Vector]:
-    """Where vehicles may wait or land: near where they would stop, inside, off the pillars, apart
-    (m).
+    """Where vehicles may wait or land: near where they would stop, inside, off the
+    pillars, apart (m).
 
     Args:
       settings: limits.
@@ -132,7 +142,9 @@ def resting_places(
       poses: of the vehicles; None for one that was never seen.
     """
     nowhere = (0.0, 0.0, 0.0)
-    stops = [nowhere if pose is None else stopping_point(settings, pose) for pose in poses]
+    stops = [
+        nowhere if pose is None else stopping_point(settings, pose) for pose in poses
+    ]
     reach = settings.arena_radius - CLEARANCE
     low = HEADROOM
     high = settings.arena_height - HEADROOM
@@ -145,7 +157,8 @@ def resting_places(
                 place = _pushed(place, (x, y), radius + CLEARANCE)
             for j, other in enumerate(places):
                 if j != i:
-                    # each of the two goes half of the way, from one place in opposite directions
+                    # each of the two goes half of the way, from one place in opposite
+                    # directions
                     place = _pushed(place, other, APART, 0.5, 1.0 if i < j else -1.0)
             # the wall last, so that no push leads out of the arena
             inside = min(1.0, reach / max(math.hypot(*place[:2]), 1e-6))
@@ -157,8 +170,9 @@ def resting_places(
 
 
 def _pushed(place, other, distance, share=1.0, direction=1.0) -> Vector:
-    """The place (x, y, z) moved on its level by a share of what it lacks of a distance from
-    another; out of the very same place along x, forwards or backwards by `direction`.
+    """The place (x, y, z) moved on its level by a share of what it lacks of a distance
+    from another; out of the very same place along x, forwards or backwards by
+    `direction`.
     """
     dx = place[0] - other[0]
     dy = place[1] - other[1]

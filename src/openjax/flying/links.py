@@ -1,10 +1,11 @@
-"""The vehicles' links in a process of their own (`openjax.flying.links_process`), so that `cflib`'s
-threads never keep the loop waiting: the loop's end of them.
+"""The vehicles' links in a process of their own (`openjax.flying.links_process`), so
+that `cflib`'s threads never keep the loop waiting: the loop's end of them.
 
-`cflib` has two Python threads per vehicle. In one interpreter with the loop they take it from each
-other, for milliseconds in one tick of a hundred. Here poses come up as they arrive, a record each;
-set-points go down, a datagram for all vehicles, which is answered with the time at which the last
-one had left. Everything else (arming, recording, the samples at the end) is a call over a pipe.
+`cflib` has two Python threads per vehicle. In one interpreter with the loop they take
+it from each other, for milliseconds in one tick of a hundred. Here poses come up as
+they arrive, a record each; set-points go down, a datagram for all vehicles, which is
+answered with the time at which the last one had left. Everything else (arming,
+recording, the samples at the end) is a call over a pipe.
 """
 
 import contextlib
@@ -46,15 +47,16 @@ class LinksGone(UserError):
 
 
 class Links:
-    """Crazyflies, real or virtual, over links in another process; to the loop what it flies.
+    """Crazyflies, real or virtual, over links in another process; to the loop what it
+    flies.
 
     Args:
       uris, body_logs, watchdog: as of `openjax.flying.swarm.Swarm`.
-      state: before the flight, from which the links' process lands all if the loop stops; without
-      it nobody does.
-      silence: of the loop, after which it does (s). If the links' process doesn't pass on
-      set-points for half as long again it is taken for dead: vehicles go on turning as they were
-      told last.
+      state: before the flight, from which the links' process lands all if the loop
+      stops; without it nobody does.
+      silence: of the loop, after which it does (s). If the links' process doesn't pass
+      on set-points for half as long again it is taken for dead: vehicles go on turning
+      as they were told last.
     """
 
     def __init__(
@@ -102,7 +104,9 @@ class Links:
         connection = Connection(self._uris, self._body_logs, self._watchdog, timeout)
         ends = Ends(self._contacts, stream, commands, control)
         arguments = (connection, ends, self.board, os.getpid(), self._state)
-        self._process = context.Process(target=serve, args=arguments, name="openjax links")
+        self._process = context.Process(
+            target=serve, args=arguments, name="openjax links"
+        )
         start_deaf(self._process)
         for end in (stream, commands, control):
             end.close()
@@ -127,7 +131,9 @@ class Links:
             self._process = None
 
     def _call(self, name: str, *arguments, timeout: float = 30.0):
-        """The result of a method of the swarm over there. UserError: there is no answer."""
+        """The result of a method of the swarm over there. UserError: there is no
+        answer.
+        """
         try:
             with self._lock:
                 self._calls += 1
@@ -155,9 +161,13 @@ class Links:
             data = self._rest + data
             whole = len(data) - len(data) % POSE_RECORD.size
             self._rest = data[whole:]
-            for vehicle, supervisor, arrival, voltage, *numbers in POSE_RECORD.iter_unpack(
-                data[:whole]
-            ):
+            for (
+                vehicle,
+                supervisor,
+                arrival,
+                voltage,
+                *numbers,
+            ) in POSE_RECORD.iter_unpack(data[:whole]):
                 force = tuple(numbers[:3])
                 self._samples[vehicle] = PoseSample(
                     own=pose_of(numbers[3:]),

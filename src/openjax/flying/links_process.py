@@ -1,7 +1,7 @@
 """The links' process: `cflib`'s threads live here, and what leads to the loop and back.
 
-Should the loop stop, it lands the vehicles (`openjax.flying.takeover`). The loop's end of it is
-`openjax.flying.links`.
+Should the loop stop, it lands the vehicles (`openjax.flying.takeover`). The loop's end
+of it is `openjax.flying.links`.
 """
 
 import contextlib
@@ -26,8 +26,8 @@ from openjax.flying.swarm import Member, Swarm
 from openjax.flying.takeover import disarm, fly_down
 
 POSE_RECORD = struct.Struct("<iI19d")
-"""Vehicle, supervisor; arrival, voltage, specific force (NaN: unknown), and of the pose time,
-position, velocity, quaternion, body rates.
+"""Vehicle, supervisor; arrival, voltage, specific force (NaN: unknown), and of the pose
+time, position, velocity, quaternion, body rates.
 """
 _NO_FORCE = (math.nan,) * 3
 """Of a vehicle whose pose block doesn't hold it."""
@@ -65,8 +65,8 @@ class Ends(NamedTuple):
 def serve(
     connection: Connection, ends: Ends, board: Board, parent: int, state: State | None
 ) -> None:
-    """The links' process. Should the loop stop, it lands the vehicles; with nothing in the air it
-    ends with the loop.
+    """The links' process. Should the loop stop, it lands the vehicles; with nothing in
+    the air it ends with the loop.
     """
     stand_alone()
     board.enter(Role.LINKS)
@@ -87,7 +87,10 @@ def serve(
     gc.collect()
     gc.disable()
     threading.Thread(
-        target=_send_on, args=(swarm, ends.commands, board), daemon=True, name="set-points"
+        target=_send_on,
+        args=(swarm, ends.commands, board),
+        daemon=True,
+        name="set-points",
     ).start()
     ends.control.send((None, swarm.pose_blocks()))
     with contextlib.suppress(EOFError, OSError):
@@ -100,8 +103,8 @@ def _say_nothing(_) -> None:
 
 
 def _pass_on(swarm: Swarm, contacts, stream: socket.socket) -> None:
-    """Have all poses go up the stream as they arrive, and when anything was heard of a vehicle into
-    `contacts`.
+    """Have all poses go up the stream as they arrive, and when anything was heard of a
+    vehicle into `contacts`.
     """
     lock = threading.Lock()
     stream.setblocking(False)
@@ -125,7 +128,11 @@ def _answer(swarm: Swarm, control, board: Board) -> None:
     while True:
         number, name, arguments = control.recv()
         disarming = name in ("disarm", "close")
-        result = disarm(swarm, board, Role.LINKS) if disarming else getattr(swarm, name)(*arguments)
+        result = (
+            disarm(swarm, board, Role.LINKS)
+            if disarming
+            else getattr(swarm, name)(*arguments)
+        )
         if number:
             control.send((number, result))
         if name == "close":
@@ -148,15 +155,17 @@ def _send_on(swarm: Swarm, commands: socket.socket, board: Board) -> None:
 
 
 def _watch(swarm: Swarm, board: Board, parent: int, state: State | None) -> None:
-    """Beat; land for a loop that is silent; end the process once the loop's has and nothing
-    flies.
+    """Beat; land for a loop that is silent; end the process once the loop's has and
+    nothing flies.
     """
     while True:
         time.sleep(CHECK)
         now = time.perf_counter()
         board.beat(Role.LINKS, now)
         silent = board.silent(Role.LOOP, now)
-        left = board.pilot is Role.LINKS or (board.pilot is Role.LOOP and silent > board.silence)
+        left = board.pilot is Role.LINKS or (
+            board.pilot is Role.LOOP and silent > board.silence
+        )
         if left and board.flying and state is not None:
             say(
                 f"openjax fly: the loop, heard {silent:.2f} s ago, left all vehicles to the links' "

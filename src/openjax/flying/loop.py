@@ -1,6 +1,8 @@
-"""The loop: a hundred times a second from poses to set-points, through take-off, games and landing.
+"""The loop: a hundred times a second from poses to set-points, through take-off, games
+and landing.
 
-When a tick is due is `openjax.flying.ticks`', what is noted of it `openjax.flying.flight_record`'s.
+When a tick is due is `openjax.flying.ticks`', what is noted of it
+`openjax.flying.flight_record`'s.
 """
 
 import gc
@@ -18,7 +20,14 @@ from openjax.flying.game import Game
 from openjax.flying.links import Links
 from openjax.flying.safety import decide
 from openjax.flying.set_point import RATES, from_action
-from openjax.flying.state import Event, Mode, Request, SafetySettings, State, initial_state
+from openjax.flying.state import (
+    Event,
+    Mode,
+    Request,
+    SafetySettings,
+    State,
+    initial_state,
+)
 from openjax.flying.ticks import TickSchedule, await_poses, measured_times
 from openjax.pursuit.environment import THRUST_LIMIT
 
@@ -29,8 +38,8 @@ SETTLE = 0.3
 
 
 def flight_state(game: Game, number: int, safety: SafetySettings) -> State:
-    """The state in which `number` vehicles stand before a game: pursuers, then, where it's a
-    vehicle, the evader.
+    """The state in which `number` vehicles stand before a game: pursuers, then, where
+    it's a vehicle, the evader.
     """
     task = game.task
     settings = game.settings
@@ -56,13 +65,14 @@ class Flight:
     """One flight: take-off, games, landing.
 
     Args:
-      vehicles: links to them; the pursuers first, then, where it's a vehicle, the evader.
+      vehicles: links to them; the pursuers first, then, where it's a vehicle, the
+      evader.
       game: the policy and its game.
       state: before it, see `flight_state`.
       plan: what to fly.
       requests: asked at every tick for what the operator wants.
-      watched: called after every tick with time and state; if it returns anything, all land for
-      that reason.
+      watched: called after every tick with time and state; if it returns anything, all
+      land for that reason.
     """
 
     def __init__(
@@ -97,7 +107,9 @@ class Flight:
             self._since = perf_counter()
             while not self.over:
                 self.tick(perf_counter(), schedule.due)
-                due = schedule.next(perf_counter(), measured_times(self.vehicles.observe()))
+                due = schedule.next(
+                    perf_counter(), measured_times(self.vehicles.observe())
+                )
                 self.record.skipped = schedule.skipped
                 await_poses(self.vehicles, due)
         finally:
@@ -107,7 +119,8 @@ class Flight:
     @property
     def over(self) -> bool:
         """Whether all that flew is down, or nothing is going to fly."""
-        # half a second for the first poses to come, before which all stand on the ground
+        # half a second for the first poses to come, before which all stand on the
+        # ground
         if self.state.flying or self.state.time - self._since < 0.5:
             return False
         return self.state.all_in(Mode.LANDED, Mode.STOPPED) or any(
@@ -125,7 +138,9 @@ class Flight:
             if drone.captured.pose is not old.captured.pose:
                 self.vehicles.believed(i, drone.captured.pose, drone.feeds_estimator)
         # the operator before the watch, the watch before the plan
-        request = self._requests() or (Request.LAND if self._alarm else self._planned(time))
+        request = self._requests() or (
+            Request.LAND if self._alarm else self._planned(time)
+        )
         actions = None
         if self._episode >= 0 or request is Request.PURSUE:
             actions = self._actions(time, request is Request.PURSUE)
@@ -135,7 +150,9 @@ class Flight:
         sent = self.vehicles.send(set_points)
         self._alarm = self._watched(time, self.state)
         # after the set-points have left: they mustn't wait for it
-        self.record.keep((due, sent, self._episode), arrivals, measured_times(samples), set_points)
+        self.record.keep(
+            (due, sent, self._episode), arrivals, measured_times(samples), set_points
+        )
         if self._episode >= 0 and not any(m is Mode.PURSUIT for m in self.state.modes):
             self._end_episode("safety")
 
@@ -145,7 +162,9 @@ class Flight:
         plan = self.plan
         waited = time - self._since
         # each vehicle must have said where it stands before any rises
-        if state.all_in(Mode.GROUND) and all(d.estimate is not None for d in state.drones):
+        if state.all_in(Mode.GROUND) and all(
+            d.estimate is not None for d in state.drones
+        ):
             return Request.TRANSFER
         if state.all_in(Mode.READY) and self._episode < 0:
             if time - max(d.since for d in state.drones) < SETTLE:
@@ -157,22 +176,30 @@ class Flight:
         if any(mode in underway for mode in state.modes) and waited > TRANSFER:
             self._alarm = f"not all at their starts after {TRANSFER:g} s"
             return Request.LAND
-        if self._episode >= 0 and (self._play.over or time - self._begun > plan.episode_seconds):
+        if self._episode >= 0 and (
+            self._play.over or time - self._begun > plan.episode_seconds
+        ):
             self._end_episode("over")
             self._since = time
             return Request.TRANSFER  # back to the starts, also to land there
         return Request.NONE
 
     def _actions(self, time, first):
-        """The set-points that the policy, and the evader's rule, ask for; they know of poses only
-        what was believed.
+        """The set-points that the policy, and the evader's rule, ask for; they know of
+        poses only what was believed.
         """
         poses = [drone.estimate for drone in self.state.drones]
         if first:
             self._play = self.game.start(poses[: self._pursuers])
             self._episode = len(self.record.episodes)
             self._begun = time
-            notes = {"capture_step": None, "breaches": 0, "crash": False, "steps": 0, "end": ""}
+            notes = {
+                "capture_step": None,
+                "breaches": 0,
+                "crash": False,
+                "steps": 0,
+                "end": "",
+            }
             self.record.episodes.append(notes | {"over_speed": 0})
         else:
             evader = np.array(poses[-1].position) if self._evader_flies else None
@@ -197,11 +224,15 @@ class Flight:
         notes["over_speed"] += fastest > 1.01 * self.game.settings.max_speed
 
     def _steer_evader(self, pose):
-        """The set-point of an evader that is a vehicle, at `pose`: to the velocity of its rule."""
+        """The set-point of an evader that is a vehicle, at `pose`: to the velocity of
+        its rule.
+        """
         wanted = tuple(float(v) for v in self._play.evader_velocity)
         acceleration = wanted_acceleration(pose.velocity, wanted)
         trim = self.state.drones[-1].trim
-        return accelerate(pose.quaternion, acceleration, self.state.airframe, trim, RATES)
+        return accelerate(
+            pose.quaternion, acceleration, self.state.airframe, trim, RATES
+        )
 
     def _end_episode(self, why):
         self.record.episodes[-1]["end"] = why

@@ -7,10 +7,10 @@ The adapter of a laboratory is one function that runs for as long as there are p
             for vehicle, body in enumerate(frame.bodies):
                 update(vehicle, body.position, body.quaternion)      # metres, wxyz, body to world
 
-and `openjax fly --motion_capture my_lab:poses`. Velocities are differences, smoothed; body rates
-come from the gyroscope on board. Each pose that was believed, and is near what the vehicle knows,
-is also sent to it, for the estimator on board, by which the vehicle lands should motion capture
-fail, or the loop.
+and `openjax fly --motion_capture my_lab:poses`. Velocities are differences, smoothed;
+body rates come from the gyroscope on board. Each pose that was believed, and is near
+what the vehicle knows, is also sent to it, for the estimator on board, by which the
+vehicle lands should motion capture fail, or the loop.
 """
 
 import dataclasses
@@ -36,12 +36,15 @@ def find_feed(name: str) -> Callable:
     """The function MODULE:FUNCTION; modules in the present folder are found too. Raises
     UserError.
     """
-    # a console script's path begins with where it is installed, not with where it is called
+    # a console script's path begins with where it is installed, not with where it is
+    # called
     sys.path.insert(0, str(Path.cwd()))
     try:
         found = pkgutil.resolve_name(name)
     except (ImportError, AttributeError, ValueError) as error:
-        raise UserError(f"--motion_capture {name}: no such MODULE:FUNCTION ({error})") from error
+        raise UserError(
+            f"--motion_capture {name}: no such MODULE:FUNCTION ({error})"
+        ) from error
     finally:
         sys.path.pop(0)
     if not callable(found):
@@ -65,9 +68,11 @@ class MotionCaptured(Links):
             target=function, args=(self.update,), daemon=True, name="motion capture"
         ).start()
 
-    def update(self, vehicle: int, position, quaternion, at: float | None = None) -> None:
-        """Vehicle `vehicle` was seen at position (3,) m, attitude (4,) wxyz, at `at` (s, host
-        clock; default now).
+    def update(
+        self, vehicle: int, position, quaternion, at: float | None = None
+    ) -> None:
+        """Vehicle `vehicle` was seen at position (3,) m, attitude (4,) wxyz, at `at`
+        (s, host clock; default now).
 
         It is judged before anything flies by it, see `openjax.flying.judge`.
         """
@@ -79,8 +84,8 @@ class MotionCaptured(Links):
         self._arrived.set()
 
     def believed(self, vehicle: int, pose: Pose, feeds_estimator: bool) -> None:
-        """This pose of motion capture was judged good: it is kept, and sent to the vehicle if it
-        `feeds_estimator`.
+        """This pose of motion capture was judged good: it is kept, and sent to the
+        vehicle if it `feeds_estimator`.
         """
         if self._recording:
             self._seen[vehicle].extend(numbers_of(pose))
@@ -96,7 +101,8 @@ class MotionCaptured(Links):
         """What was recorded of each vehicle, here and on board."""
         both = zip(super().samples(), self._seen, strict=True)
         return [
-            dataclasses.replace(s, seen=np.frombuffer(seen).reshape(-1, 14)) for s, seen in both
+            dataclasses.replace(s, seen=np.frombuffer(seen).reshape(-1, 14))
+            for s, seen in both
         ]
 
     def wait(self, until: float) -> None:
@@ -107,7 +113,9 @@ class MotionCaptured(Links):
     def observe(self) -> tuple[PoseSample, ...]:
         """What is known of each vehicle now."""
         own = super().observe()
-        return tuple(s._replace(captured=p) for p, s in zip(self._captured, own, strict=True))
+        return tuple(
+            s._replace(captured=p) for p, s in zip(self._captured, own, strict=True)
+        )
 
     def arrivals(self) -> tuple[float, ...]:
         """When each vehicle's newest pose of motion capture arrived (s, host)."""

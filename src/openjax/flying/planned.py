@@ -1,6 +1,8 @@
-"""A plan of set-points in a game's place: what `openjax fly --plan` flies with one vehicle.
+"""A plan of set-points in a game's place: what `openjax fly --plan` flies with one
+vehicle.
 
-It answers as `openjax.flying.game.Game` does, so the loop, its safety and its logs are the same.
+It answers as `openjax.flying.game.Game` does, so the loop, its safety and its logs are
+the same.
 """
 
 import math
@@ -22,11 +24,13 @@ from openjax.flying.game import Play
 from openjax.flying.set_point import RATES
 
 YAW_GAIN = 3.0
-"""Yaw rate asked for per yaw error (1/s): twice the controller's, which only keeps the nose where
-it is.
+"""Yaw rate asked for per yaw error (1/s): twice the controller's, which only keeps the
+nose where it is.
 """
 LIFT_GAIN = 0.05
-"""Share of the hovering thrust by which a height error of 1 m for 1 s changes the trim."""
+"""Share of the hovering thrust by which a height error of 1 m for 1 s changes the
+trim.
+"""
 MOST_TRIM = 0.1
 """Largest trim, as a share of full thrust."""
 FASTEST = 10.0
@@ -38,7 +42,9 @@ class PlannedFlight:
 
     def __init__(self, plan: SetPoints, airframe: Airframe):
         self.airframe = airframe
-        self.settings = SimpleNamespace(num_pursuers=1, pillar_radius=0.0, max_speed=FASTEST)
+        self.settings = SimpleNamespace(
+            num_pursuers=1, pillar_radius=0.0, max_speed=FASTEST
+        )
         self.task = SimpleNamespace(
             pursuer_position=plan.position[:1],
             evader_position=np.zeros(3),
@@ -72,8 +78,8 @@ class PlannedFlight:
         )
 
     def _action(self, pose: Pose) -> np.ndarray:
-        """(4,) thrust and body rates of a controller that follows the row, and what the plan adds,
-        in -1..1 as a policy's.
+        """(4,) thrust and body rates of a controller that follows the row, and what the
+        plan adds, in -1..1 as a policy's.
         """
         plan = self._plan
         row = self._row
@@ -81,13 +87,21 @@ class PlannedFlight:
         self._trim += LIFT_GAIN * PERIOD * float(error[2])
         self._trim = min(max(self._trim, -MOST_TRIM), MOST_TRIM)
         wanted = plan.velocity[row] + POSITION_GAIN * error
-        pull = np.array(wanted_acceleration(pose.velocity, tuple(wanted))) + plan.acceleration[row]
-        sent = accelerate(pose.quaternion, tuple(pull), self.airframe, self._trim, RATES)
+        pull = (
+            np.array(wanted_acceleration(pose.velocity, tuple(wanted)))
+            + plan.acceleration[row]
+        )
+        sent = accelerate(
+            pose.quaternion, tuple(pull), self.airframe, self._trim, RATES
+        )
         yaw = roll_pitch_yaw(pose.quaternion)[2]
         turn = math.remainder(plan.yaw[row] - yaw, 2.0 * math.pi)
-        # what the plan itself turns until the next row is asked for beside the error's share
+        # what the plan itself turns until the next row is asked for beside the error's
+        # share
         ahead = plan.yaw[min(row + 1, len(plan) - 1)] - plan.yaw[row]
         rates = np.array([sent.roll, sent.pitch, YAW_GAIN * turn + ahead / PERIOD])
         thrust = sent.thrust + plan.extra[row, 0]
         rates = rates + plan.extra[row, 1:]
-        return np.clip(np.concatenate([[2.0 * thrust - 1.0], rates / math.pi]), -1.0, 1.0)
+        return np.clip(
+            np.concatenate([[2.0 * thrust - 1.0], rates / math.pi]), -1.0, 1.0
+        )

@@ -15,8 +15,8 @@ LISTENING = 0.5
 POSE_RATE = 1000.0 / PERIOD_MS
 """Own estimates that a vehicle sends a second (Hz)."""
 LEAST_SHARE = 0.8
-"""Least share of these that must arrive: a vehicle lands after 60 ms without one, and .2**6 of the
-time six in a row are lost.
+"""Least share of these that must arrive: a vehicle lands after 60 ms without one, and
+.2**6 of the time six in a row are lost.
 """
 MOST_TILT = math.radians(10.0)
 """More tilted (rad) than a floor, or a body marked by hand, is ever off level."""
@@ -45,8 +45,8 @@ def poses_arriving(links) -> list[float]:
 def faults(
     state: State, samples: Sequence[PoseSample], rates: Sequence[float], guarded: bool
 ) -> list[str]:
-    """What speaks against taking off, a line each; vehicles are counted from 0 in the order of
-    --uri.
+    """What speaks against taking off, a line each; vehicles are counted from 0 in the
+    order of --uri.
 
     Args:
       state: before the flight, for starts and settings.
@@ -56,8 +56,12 @@ def faults(
     """
     lines = []
     if not guarded:
-        lines.append("the guard's process isn't there; try again, with fewer programs running")
-    for i, (sample, start, rate) in enumerate(zip(samples, state.starts, rates, strict=True)):
+        lines.append(
+            "the guard's process isn't there; try again, with fewer programs running"
+        )
+    for i, (sample, start, rate) in enumerate(
+        zip(samples, state.starts, rates, strict=True)
+    ):
         found = [
             *_firmware_faults(state.settings, sample, rate),
             *_pose_faults(state, sample, start),
@@ -67,15 +71,17 @@ def faults(
 
 
 def _firmware_faults(settings, sample, rate) -> Iterator[str]:
-    """What its firmware, battery and link say against it. Of the firmware's bits the first fault
-    only: the others follow from it.
+    """What its firmware, battery and link say against it. Of the firmware's bits the
+    first fault only: the others follow from it.
     """
     bits = sample.supervisor
     if bits & (Supervisor.TUMBLED | Supervisor.CRASHED):
         yield "its firmware says tumbled or crashed; look at it, put it upright, restart it"
     elif bits & Supervisor.LOCKED:
         yield "its firmware is locked after an emergency stop; restart it"
-    elif bits & Supervisor.FLYING or (bits & Supervisor.ARMED and not bits & Supervisor.AUTO_ARM):
+    elif bits & Supervisor.FLYING or (
+        bits & Supervisor.ARMED and not bits & Supervisor.AUTO_ARM
+    ):
         yield "it is armed or flies already; end the program that commands it"
     elif not bits & (Supervisor.CAN_BE_ARMED | Supervisor.CAN_FLY):
         yield "its firmware can't be armed; look at its console"
@@ -91,7 +97,8 @@ def _firmware_faults(settings, sample, rate) -> Iterator[str]:
 
 def _pose_faults(state, sample, start: Vector) -> Iterator[str]:
     """What its poses say against it. A pose that can't be one hides all else."""
-    # motion capture says where a vehicle is, where there is one: the own estimate follows it
+    # motion capture says where a vehicle is, where there is one: the own estimate
+    # follows it
     pose = sample.captured or sample.own
     limits = state.limits
     for source in (sample.own, sample.captured):

@@ -1,4 +1,6 @@
-"""Links without `cflib`'s vehicle around them, for whoever takes over from the links' process."""
+"""Links without `cflib`'s vehicle around them, for whoever takes over from the links'
+process.
+"""
 
 import math
 import struct
@@ -18,15 +20,19 @@ from openjax.flying.swarm import (
 
 
 class RawLinks:
-    """Links without `cflib`'s vehicle around them: packets of the pose block in, set-points out.
+    """Links without `cflib`'s vehicle around them: packets of the pose block in,
+    set-points out.
 
     Args:
       uris: of the vehicles.
       pose_blocks: ids of their pose blocks, which other links have set up.
-      watchdog: whether those feed the firmware's watchdog, which bites if nobody goes on.
+      watchdog: whether those feed the firmware's watchdog, which bites if nobody goes
+      on.
     """
 
-    def __init__(self, uris: Sequence[str], pose_blocks: Sequence[int], watchdog: bool = True):
+    def __init__(
+        self, uris: Sequence[str], pose_blocks: Sequence[int], watchdog: bool = True
+    ):
         self._members: list[Member] = []
         self._blocks = tuple(pose_blocks)
         self._links = dict.fromkeys(uris)
@@ -44,10 +50,12 @@ class RawLinks:
             cflib.crtp.init_drivers()
         self._members = self._members or [Member(uri) for uri in self._links]
         for uri, link in self._links.items():
-            # a dongle belongs to one process: as long as the links' process has it, it can't be
-            # opened
+            # a dongle belongs to one process: as long as the links' process has it, it
+            # can't be opened
             if link is None and (uri.startswith("udp:") or not udp_only):
-                self._links[uri] = cflib.crtp.get_link_driver(uri, lambda *_: None, lambda *_: None)
+                self._links[uri] = cflib.crtp.get_link_driver(
+                    uri, lambda *_: None, lambda *_: None
+                )
                 never_wait(self._links[uri])
 
     def observe(self) -> tuple[PoseSample, ...]:
@@ -58,12 +66,18 @@ class RawLinks:
             while (packet := link.receive_packet(0)) is not None:
                 member.last_contact = time.perf_counter()
                 data = bytes(packet.data)
-                if (packet.port, packet.channel) != (Port.LOG, 2) or data[:1] != bytes([block]):
+                if (packet.port, packet.channel) != (Port.LOG, 2) or data[:1] != bytes(
+                    [block]
+                ):
                     continue
                 # block, three bytes of time, and the variables
                 if len(data) == 4 + struct.calcsize(self._layout):
                     values = dict(
-                        zip(self._names, struct.unpack(self._layout, data[4:]), strict=True)
+                        zip(
+                            self._names,
+                            struct.unpack(self._layout, data[4:]),
+                            strict=True,
+                        )
                     )
                     member.pose_arrived(int.from_bytes(data[1:4], "little"), values)
         return tuple(member.sample() for member in self._members)

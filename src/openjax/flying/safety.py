@@ -2,19 +2,20 @@
 
 Two parts:
 
-* decisions: who flies each vehicle, the policy or the controller that lifts, waits and lands;
+* decisions: who flies each vehicle, the policy or the controller that lifts, waits and
+  lands;
 * steering: how a vehicle is flown in each mode.
 
 What is possible, where a vehicle could still stop and what it can follow, is
 `openjax.flying.limits`'.
 
-`see` (`openjax.flying.estimation`) judges the poses and brings each vehicle's estimate to now;
-`decide` does the rest; `step` is both. Nothing here reads a clock or touches a link, so that
-thousands of faults can be flown in simulated time.
+`see` (`openjax.flying.estimation`) judges the poses and brings each vehicle's estimate
+to now; `decide` does the rest; `step` is both. Nothing here reads a clock or touches a
+link, so that thousands of faults can be flown in simulated time.
 
-A vehicle in trouble lands; all others stop where they are, wait a moment, and land too. Troubles:
-its pose is lost, its link is silent, its battery low, it is too fast, too tilted, or outside the
-arena; no action came in time; a key.
+A vehicle in trouble lands; all others stop where they are, wait a moment, and land too.
+Troubles: its pose is lost, its link is silent, its battery low, it is too fast, too
+tilted, or outside the arena; no action came in time; a key.
 """
 
 import math
@@ -50,28 +51,32 @@ from openjax.flying.state import (
 )
 
 ASIDE = 0.08
-"""How far (m) a vehicle may move sideways in the test lift: a hover that starts beside its trim."""
+"""How far (m) a vehicle may move sideways in the test lift: a hover that starts beside
+its trim.
+"""
 RISEN = 0.04
 """The test lift is over this close (m) to its height."""
 LOW = 0.05
 """Below this height (m) a landing settles."""
 SETTLING = 0.75
-"""A landing ends level for so long (s): from .4 m it comes down at 1.1 m/s. So far may the floor be
-from where it is thought.
+"""A landing ends level for so long (s): from .4 m it comes down at 1.1 m/s. So far may
+the floor be from where it is thought.
 """
 SETTLING_LIFT = 0.85
 """It is then carried by this share of its weight."""
 TRIM_GAIN = 0.25
-"""Share of full thrust by which a climb that is off by 1 m/s for 1 s changes the trim."""
+"""Share of full thrust by which a climb that is off by 1 m/s for 1 s changes the
+trim.
+"""
 TRIM_LIMIT = 0.15
 """Largest trim, as a share of full thrust."""
 _DOWN = (Mode.GROUND, Mode.LANDED)
 _UNTROUBLED = (Mode.LIFT, Mode.TRANSFER, Mode.READY, Mode.PURSUIT)
 
 
-# -----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------
 # Decisions: who flies each vehicle
-# -----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------
 
 
 def step(state: State, event: Event) -> tuple[State, tuple[SetPoint, ...]]:
@@ -80,10 +85,14 @@ def step(state: State, event: Event) -> tuple[State, tuple[SetPoint, ...]]:
 
 
 def decide(state: State, event: Event) -> tuple[State, tuple[SetPoint, ...]]:
-    """The state after a tick whose poses were seen already, and the set-point of each vehicle."""
+    """The state after a tick whose poses were seen already, and the set-point of each
+    vehicle.
+    """
     now = event.time
     actions = event.actions
-    finite = actions is not None and all(math.isfinite(x) for action in actions for x in action)
+    finite = actions is not None and all(
+        math.isfinite(x) for action in actions for x in action
+    )
     action_time = now if finite else state.action_time
     # requests first, so that troubles have the last word
     drones = _requested(state, event)
@@ -97,7 +106,9 @@ def decide(state: State, event: Event) -> tuple[State, tuple[SetPoint, ...]]:
     else:
         # the clock of the actions starts with the game
         action_time = now
-    state = state._replace(drones=_react(state, drones, troubles), action_time=action_time)
+    state = state._replace(
+        drones=_react(state, drones, troubles), action_time=action_time
+    )
     moved = tuple(
         steer(state, i, actions[i] if finite else None, sample)
         for i, sample in enumerate(event.samples)
@@ -119,18 +130,23 @@ def _requested(state, event) -> tuple[Drone, ...]:
     if answer is not None:
         anchors = resting_places_of(state)
     elif event.request is Request.TRANSFER:
-        # who was in trouble, or landed for some reason, never rises again in this flight
+        # who was in trouble, or landed for some reason, never rises again in this
+        # flight
         able = (*_DOWN, Mode.HOLD, Mode.PURSUIT, Mode.READY)
-        if all(d.mode in able and not d.reason and d.estimate is not None for d in drones):
+        if all(
+            d.mode in able and not d.reason and d.estimate is not None for d in drones
+        ):
             answer = _transfer
     if answer is None:
         return drones
-    return tuple(answer(state, event, d, a) for d, a in zip(drones, anchors, strict=True))
+    return tuple(
+        answer(state, event, d, a) for d, a in zip(drones, anchors, strict=True)
+    )
 
 
 def _land(state, event, drone, anchor) -> Drone:
-    """The drone on its way down to its anchor; one that lands already, or may not fly, stays as it
-    is.
+    """The drone on its way down to its anchor; one that lands already, or may not fly,
+    stays as it is.
     """
     reason = event.reason or "asked to land"
     if drone.mode is Mode.GROUND:
@@ -142,7 +158,9 @@ def _land(state, event, drone, anchor) -> Drone:
 
 def _hold(state, event, drone, anchor) -> Drone:
     """The drone waiting at its anchor, if it flies and isn't in trouble."""
-    return drone.to(Mode.HOLD, event.time, anchor) if drone.mode in _UNTROUBLED else drone
+    return (
+        drone.to(Mode.HOLD, event.time, anchor) if drone.mode in _UNTROUBLED else drone
+    )
 
 
 def _transfer(state, event, drone, start) -> Drone:
@@ -151,15 +169,19 @@ def _transfer(state, event, drone, start) -> Drone:
         return drone.to(Mode.TRANSFER, event.time, start)
     x, y, z = drone.estimate.position
     tracks = (drone.own, drone.captured)
-    stand = tuple(None if track.pose is None else track.pose.position for track in tracks)
-    return drone.to(Mode.LIFT, event.time, (x, y, z + state.settings.lift))._replace(stand=stand)
+    stand = tuple(
+        None if track.pose is None else track.pose.position for track in tracks
+    )
+    return drone.to(Mode.LIFT, event.time, (x, y, z + state.settings.lift))._replace(
+        stand=stand
+    )
 
 
 def lift_fault(state: State, drone: Drone) -> str:
     """What speaks against a vehicle's poses in its test lift; empty while nothing does.
 
-    Each source must rise, stay above its stand, and not rise past where a fall still does no harm;
-    both by the same.
+    Each source must rise, stay above its stand, and not rise past where a fall still
+    does no harm; both by the same.
     """
     settings = state.settings
     moves = []
@@ -172,7 +194,9 @@ def lift_fault(state: State, drone: Drone) -> str:
     if any(math.hypot(x, y) > ASIDE for x, y, _ in moves):
         return "the test lift went sideways: do the poses' axes and yaw agree with the vehicle's?"
     if len(moves) == 2 and math.dist(moves[0], moves[1]) > ASIDE / 2:
-        return "motion capture and own estimate rose differently: do axes and scale agree?"
+        return (
+            "motion capture and own estimate rose differently: do axes and scale agree?"
+        )
     if state.time - drone.since > settings.lift_time:
         return (
             f"not {settings.lift:g} m up after {settings.lift_time:g} s: do the poses' z and the "
@@ -194,7 +218,10 @@ def _trouble(state, drone, sample) -> tuple[Mode, str] | None:
     if drone.mode is Mode.LIFT:  # from there it may fall
         fault = lost or lift_fault(state, drone)
         return (Mode.STOPPED, fault) if fault else None
-    if drone.over_since is not None and state.time - drone.over_since > state.settings.tumble_time:
+    if (
+        drone.over_since is not None
+        and state.time - drone.over_since > state.settings.tumble_time
+    ):
         return Mode.STOPPED, "tumbled"
     # who lands already goes on landing, whatever else is wrong with it
     fault = lost
@@ -235,15 +262,17 @@ def _unfit(state, drone) -> str:
 
 
 def _react(state, drones, troubles) -> tuple[Drone, ...]:
-    """The drones after troubles: those in trouble as told; the others stop, wait, and land. A test
-    lift ends at once.
+    """The drones after troubles: those in trouble as told; the others stop, wait, and
+    land. A test lift ends at once.
     """
     now = state.time
     team = any(d.reason for d in drones) or any(troubles)
     anchors = resting_places_of(state) if team else [None] * len(drones)
     risen = all(d.mode is Mode.LIFT and _risen(d, now) for d in drones) and not team
     reacted = []
-    for drone, trouble, anchor, start in zip(drones, troubles, anchors, state.starts, strict=True):
+    for drone, trouble, anchor, start in zip(
+        drones, troubles, anchors, state.starts, strict=True
+    ):
         waited = now - drone.since > state.settings.hold_time
         if trouble is not None and trouble[0] is not drone.mode:
             mode, reason = trouble
@@ -272,13 +301,15 @@ def resting_places_of(state: State) -> list[Vector]:
     return resting_places(state.settings, state.pillars, poses)
 
 
-# -----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------
 # Steering: by the policy within its limits, or by the controller
-# -----------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------
 
 
 def steer(state: State, i: int, action: SetPoint | None, sample: PoseSample) -> Drone:
-    """Vehicle i after this tick, with its set-point. `action`: the policy's, where there is one."""
+    """Vehicle i after this tick, with its set-point. `action`: the policy's, where
+    there is one.
+    """
     drone = _watched(state, state.drones[i], sample)._replace(sent=MOTORS_OFF)
     now = state.time
     if drone.mode not in FLYING or drone.estimate is None:
@@ -331,7 +362,9 @@ def _pursue(state, drone, i, action) -> SetPoint:
     aimed = estimate if parting is None else estimate._replace(velocity=parting)
     sent = state.drones[i].sent
     # until its motors have followed it turns on
-    turned = turned_on(estimate.quaternion, estimate.body_rates, state.airframe.motor_time_constant)
+    turned = turned_on(
+        estimate.quaternion, estimate.body_rates, state.airframe.motor_time_constant
+    )
     lift = max(sent.thrust, LEAST_THRUST) / state.airframe.hover_thrust
     present = lift_acceleration(turned, lift)
     wanted = (
@@ -342,7 +375,9 @@ def _pursue(state, drone, i, action) -> SetPoint:
     if wanted is None:
         return within_reach(action, sent, state.airframe, state.dt)
     acceleration = wanted_acceleration(estimate.velocity, wanted)
-    return accelerate(estimate.quaternion, acceleration, state.airframe, drone.trim, RATES)
+    return accelerate(
+        estimate.quaternion, acceleration, state.airframe, drone.trim, RATES
+    )
 
 
 def _go(state, drone, i) -> Drone:
@@ -356,17 +391,23 @@ def _go(state, drone, i) -> Drone:
         # by reckoning: the vehicle does what it is asked for, and is level else
         share = min(state.dt / state.settings.reaction, 1.0)
         change = zip(drone.acceleration, acceleration, strict=True)
-        drone = drone._replace(acceleration=tuple(a + share * (b - a) for a, b in change))
+        drone = drone._replace(
+            acceleration=tuple(a + share * (b - a) for a, b in change)
+        )
         attitude = _yaw_only(attitude)
     else:
         # not lower: on the floor a vehicle that doesn't climb isn't too heavy
         if estimate.position[2] > (0.02 if drone.mode is Mode.LIFT else 0.1):
             error = min(max(wanted[2] - estimate.velocity[2], -0.3), 0.3)
-            trim = min(max(drone.trim + TRIM_GAIN * state.dt * error, -TRIM_LIMIT), TRIM_LIMIT)
+            trim = min(
+                max(drone.trim + TRIM_GAIN * state.dt * error, -TRIM_LIMIT), TRIM_LIMIT
+            )
             drone = drone._replace(trim=trim)
         if drone.mode is Mode.TRANSFER and _arrived(estimate, drone.anchor):
             drone = drone.to(Mode.READY, state.time)
-    return drone._replace(sent=accelerate(attitude, acceleration, airframe, drone.trim, ANGLES))
+    return drone._replace(
+        sent=accelerate(attitude, acceleration, airframe, drone.trim, ANGLES)
+    )
 
 
 def _wanted(state, drone, i) -> Vector:

@@ -1,5 +1,5 @@
-"""A session: all that a flight needs and that must be given back, whatever happens: command, links,
-guard, motion capture.
+"""A session: all that a flight needs and that must be given back, whatever happens:
+command, links, guard, motion capture.
 """
 
 from __future__ import annotations
@@ -43,9 +43,13 @@ class SessionSettings:
     body_logs: int = 1
     """Log blocks of motors and accelerometer, 0 to 5: one is what a radio carries."""
     watchdog: bool = True
-    """Whether the firmware's watchdog stops the motors once nothing feeds it any more."""
+    """Whether the firmware's watchdog stops the motors once nothing feeds it any
+    more.
+    """
     guard: bool = True
-    """Whether a process of its own watches, and lands all should loop and links fall silent."""
+    """Whether a process of its own watches, and lands all should loop and links fall
+    silent.
+    """
     silence: float = SILENCE
     """Of the loop, after which the links' process lands the vehicles (s)."""
     feed: Callable | None = None
@@ -65,12 +69,18 @@ class Session:
         self._state = state
         kind = Links if settings.feed is None else MotionCaptured
         self.links = kind(
-            settings.uris, settings.body_logs, settings.watchdog, state, settings.silence
+            settings.uris,
+            settings.body_logs,
+            settings.watchdog,
+            state,
+            settings.silence,
         )
         self.requests = Operator()
         self._guard: Guard | None = None
         self.scheduler = "ordinary"
-        """What of the real-time scheduler was granted, see `openjax.flying.real_time`."""
+        """What of the real-time scheduler was granted, see
+        `openjax.flying.real_time`.
+        """
         self._raw_links: RawLinks | None = None
         self._stack = contextlib.ExitStack()
 
@@ -85,7 +95,8 @@ class Session:
                 self.links.feed(settings.feed)
             self._wait_for_poses()
             blocks = self.links.pose_blocks()
-            # the loop's own, should links and guard both go; over a dongle they open only then
+            # the loop's own, should links and guard both go; over a dongle they open
+            # only then
             self._raw_links = RawLinks(settings.uris, blocks, settings.watchdog)
             if settings.guard:
                 self._guard = Guard(self.links.board, self._raw_links, self._state)
@@ -100,8 +111,8 @@ class Session:
         self._stack.close()
 
     def check(self) -> None:
-        """All that must be so before take-off. UserError: something isn't; where there is more,
-        each stands in a line.
+        """All that must be so before take-off. UserError: something isn't; where there
+        is more, each stands in a line.
         """
         self._wait_for_poses()
         # first, as it takes half a second: what is judged is what is known after it
@@ -116,8 +127,8 @@ class Session:
             raise UserError(f"no take-off for these {len(found)} reasons")
 
     def fly(self, flight: Flight) -> tuple[list, str]:
-        """Arm and fly; what was recorded of each vehicle, and why another process landed, if one
-        did.
+        """Arm and fly; what was recorded of each vehicle, and why another process
+        landed, if one did.
         """
         complaint = ""
         samples = []
@@ -128,14 +139,17 @@ class Session:
                 flight.run()
             except Exception as error:  # whatever it is, vehicles are in the air
                 complaint = f"{error}; {self._left_to_others()}"
-            with contextlib.suppress(UserError):  # the links are gone: the guard disarms
+            # the links are gone: the guard disarms
+            with contextlib.suppress(UserError):
                 if not self.links.disarm():
                     complaint = "; ".join(filter(None, (complaint, STILL_ARMED)))
                 samples = self.links.samples()
         return samples, complaint
 
     def watched(self, moment: float, state: State) -> str:
-        """Tell the others that the loop lives and what it knows; why it must land, if it must."""
+        """Tell the others that the loop lives and what it knows; why it must land, if
+        it must.
+        """
         self.links.board.write(Role.LOOP, moment, state)
         if self._guard is not None and not self._guard.lives():
             return "the guard is gone"
@@ -152,7 +166,9 @@ class Session:
                 raise UserError("a vehicle can't be armed; look at its console")
 
     def _left_to_others(self) -> str:
-        """Return once the vehicles are down; land them here if nobody else does. What happened."""
+        """Return once the vehicles are down; land them here if nobody else does. What
+        happened.
+        """
         board = self.links.board
         lander = Role.LINKS
         if board.pilot is Role.LOOP:
@@ -163,9 +179,13 @@ class Session:
             board.beat(Role.LOOP, now)
             self._listen()
             lander = max(lander, board.pilot)
-            if all(board.silent(role, now) > board.silence for role in (Role.LINKS, Role.GUARD)):
+            if all(
+                board.silent(role, now) > board.silence
+                for role in (Role.LINKS, Role.GUARD)
+            ):
                 lander = Role.LOOP
-                # should one of them wake up, two would fly, and a dongle serves one process
+                # should one of them wake up, two would fly, and a dongle serves one
+                # process
                 for role in (Role.LINKS, Role.GUARD):
                     board.end_process(role)
                 self._raw_links.open()
@@ -179,7 +199,9 @@ class Session:
             self.links.board.stopped = True
 
     def _wait_for_poses(self):
-        """Return once each vehicle has a pose that is fresh. UserError: one has none."""
+        """Return once each vehicle has a pose that is fresh. UserError: one has
+        none.
+        """
         deadline = time.monotonic() + POSES
         while True:
             now = time.perf_counter()
@@ -190,6 +212,10 @@ class Session:
                 return
             if time.monotonic() > deadline:
                 uris: Sequence[str] = self._settings.uris
-                silent = ", ".join(uri for uri, missing in zip(uris, old, strict=True) if missing)
-                raise UserError(f"no pose from {silent} within {POSES:g} s; is its position known?")
+                silent = ", ".join(
+                    uri for uri, missing in zip(uris, old, strict=True) if missing
+                )
+                raise UserError(
+                    f"no pose from {silent} within {POSES:g} s; is its position known?"
+                )
             self.links.wait(now + 0.02)

@@ -1,5 +1,5 @@
-"""Set-points: what a vehicle is asked for, and what of it fits into the packet that `cflib`
-sends.
+"""Set-points: what a vehicle is asked for, and what of it fits into the packet that
+`cflib` sends.
 """
 
 import math
@@ -25,8 +25,8 @@ MOST_THRUST = _MOST / _COUNTS
 
 
 class SetPoint(NamedTuple):
-    """Roll, pitch (rad or, by `mode`, rad/s; body frame, pitch positive nose down), yaw rate
-    (rad/s), thrust 0..1 of the four rotors' maximum.
+    """Roll, pitch (rad or, by `mode`, rad/s; body frame, pitch positive nose down), yaw
+    rate (rad/s), thrust 0..1 of the four rotors' maximum.
     """
 
     mode: int = OFF
@@ -40,11 +40,11 @@ MOTORS_OFF = SetPoint()
 
 
 def manual_arguments(set_point: SetPoint) -> tuple[float, float, float, float, bool]:
-    """Arguments of `cflib`'s `send_setpoint_manual` for a set-point that isn't off: degrees, thrust
-    in percent.
+    """Arguments of `cflib`'s `send_setpoint_manual` for a set-point that isn't off:
+    degrees, thrust in percent.
 
-    `cflib` turns pitch around for the firmware, whose pitch points the other way, so here it's
-    openjax's.
+    `cflib` turns pitch around for the firmware, whose pitch points the other way, so
+    here it's openjax's.
     """
     percent = 100.0 * (set_point.thrust * _COUNTS - _LEAST) / (_MOST - _LEAST)
     return (
@@ -57,18 +57,21 @@ def manual_arguments(set_point: SetPoint) -> tuple[float, float, float, float, b
 
 
 def as_sent(set_point: SetPoint) -> SetPoint:
-    """The set-point with the thrust that is left of it in a packet: that is what a log should
-    hold.
+    """The set-point with the thrust that is left of it in a packet: that is what a log
+    should hold.
     """
-    return set_point._replace(thrust=min(max(set_point.thrust, LEAST_THRUST), MOST_THRUST))
+    return set_point._replace(
+        thrust=min(max(set_point.thrust, LEAST_THRUST), MOST_THRUST)
+    )
 
 
 def from_action(action, thrust_limit: float) -> SetPoint:
-    """The set-point of a policy's action (4,) in -1..1: thrust, roll, pitch and yaw rate up to pi
-    rad/s.
+    """The set-point of a policy's action (4,) in -1..1: thrust, roll, pitch and yaw
+    rate up to pi rad/s.
 
-    The same numbers as `openjax.pursuit.environment.action_to_command`, without a trip to JAX. What
-    is infinite isn't cut to full thrust, but NaN, as whoever sends set-points refuses.
+    The same numbers as `openjax.pursuit.environment.action_to_command`, without a trip
+    to JAX. What is infinite isn't cut to full thrust, but NaN, as whoever sends
+    set-points refuses.
     """
     thrust, roll, pitch, yaw = (
         min(max(float(x), -1.0), 1.0) if math.isfinite(x) else math.nan for x in action

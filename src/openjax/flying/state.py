@@ -1,5 +1,5 @@
-"""What is known and wanted of the vehicles of a flight: limits, modes, requests, samples of poses,
-and the state of all.
+"""What is known and wanted of the vehicles of a flight: limits, modes, requests,
+samples of poses, and the state of all.
 """
 
 import math
@@ -19,7 +19,9 @@ from openjax.vehicle.arena import Arena
 SPIN_UP = 0.3
 """A vehicle that lifts off may stand still for so long (s)."""
 FORCE_AGE = 0.025
-"""An accelerometer's sample tells of a pose that was measured no longer (s) before or after it."""
+"""An accelerometer's sample tells of a pose that was measured no longer (s) before or
+after it.
+"""
 _NOTHING_SEEN = Track()
 _NOTHING_SUMMED = Innovations()
 
@@ -37,8 +39,8 @@ class SafetySettings:
     outside: Annotated[float, Interval("[0, 100]")] = 0.3
     """Farther out of the arena than this (m) something is wrong: all land."""
     separation: Annotated[float, Interval("[0, 10]")] = 0.16
-    """Vehicles in pursuit that couldn't stop at this distance (m) any more brake and part. 0
-    switches it off.
+    """Vehicles in pursuit that couldn't stop at this distance (m) any more brake and
+    part. 0 switches it off.
     """
     speed_limit: Annotated[float, Interval("(0, 100]")] = 2.5
     """Faster than this (m/s) something is wrong: all land."""
@@ -51,19 +53,25 @@ class SafetySettings:
     reaction: Annotated[float, Interval("(0, 10]")] = 0.12
     """Time constant with which the acceleration follows what is asked for (s)."""
     pose_timeout: Annotated[float, Interval("(0, 60]")] = 0.06
-    """Without a good pose for longer (s) a vehicle is flown by reckoning no more: it lands."""
+    """Without a good pose for longer (s) a vehicle is flown by reckoning no more: it
+    lands.
+    """
     link_timeout: Annotated[float, Interval("(0, 60]")] = 0.3
     """A link silent for longer (s) is gone."""
     alone_time: Annotated[float, Interval("(0, 1e9]")] = 40.0
-    """All land after so long in the air by the vehicles' own estimates alone (s): nothing tells a
-    slow drift of theirs.
+    """All land after so long in the air by the vehicles' own estimates alone (s):
+    nothing tells a slow drift of theirs.
     """
     action_timeout: Annotated[float, Interval("(0, 60]")] = 0.035
     """Without a new action of the policy for longer (s): all stop where they are."""
     battery_low: Annotated[float, Interval("[0, 100]")] = 3.2
-    """Voltage under load at which a vehicle lands (V), if it is as low for `battery_time`."""
+    """Voltage under load at which a vehicle lands (V), if it is as low for
+    `battery_time`.
+    """
     battery_time: Annotated[float, Interval("[0, 60]")] = 0.5
-    """How long the voltage must be low (s): a sudden climb takes it down for a moment."""
+    """How long the voltage must be low (s): a sudden climb takes it down for a
+    moment.
+    """
     battery_start: Annotated[float, Interval("[0, 100]")] = 3.7
     """No vehicle takes off with less, measured without load (V)."""
     stand: Annotated[float, Interval("(0, 1000]")] = 0.15
@@ -84,8 +92,9 @@ class SafetySettings:
 
     @property
     def landing_time(self) -> float:
-        """A landing that takes longer (s) ends with the motors off: by then a vehicle that began at
-        the highest place that is allowed is near the floor, whatever its pose says.
+        """A landing that takes longer (s) ends with the motors off: by then a vehicle
+        that began at the highest place that is allowed is near the floor, whatever its
+        pose says.
         """
         return (self.arena_height + self.outside) / self.landing_speed
 
@@ -131,12 +140,12 @@ class PoseSample(NamedTuple):
     supervisor: int = Supervisor.ARMED | Supervisor.CAN_FLY
     """The firmware's word on its state."""
     captured: Pose | None = None
-    """The newest of motion capture, whose velocity and body rates mean nothing; None where there is
-    no motion capture.
+    """The newest of motion capture, whose velocity and body rates mean nothing; None
+    where there is no motion capture.
     """
     force: Vector | None = None
-    """The newest specific force of its accelerometer (m/s^2, body), measured within `FORCE_AGE` of
-    its own estimate; None where none is logged.
+    """The newest specific force of its accelerometer (m/s^2, body), measured within
+    `FORCE_AGE` of its own estimate; None where none is logged.
     """
 
 
@@ -157,13 +166,16 @@ class Drone(NamedTuple):
 
     mode: Mode = Mode.GROUND
     since: float = 0.0  # s, when the mode began
-    estimate: Pose | None = None  # where it is now: the newest pose, moved on to this tick
+    # where it is now: the newest pose, moved on to this tick
+    estimate: Pose | None = None
     own: Track = _NOTHING_SEEN  # its own estimates
     innovations: Innovations = _NOTHING_SUMMED  # of its own estimates
     captured_innovations: Innovations = _NOTHING_SUMMED  # of motion capture
-    contradiction: Verdict = Verdict.GOOD  # why its own aren't believed any more in this flight
+    # why its own aren't believed any more in this flight
+    contradiction: Verdict = Verdict.GOOD
     captured: Track = _NOTHING_SEEN  # motion capture, with velocity and rates
-    feeds_estimator: bool = True  # whether the estimator on board is to follow the newest of it
+    # whether the estimator on board is to follow the newest of it
+    feeds_estimator: bool = True
     seen: float = -math.inf  # s, when the pose that it is flown by was measured
     capture_fault: str = ""  # why motion capture isn't believed any more in this flight
     # own and captured position before the lift, where there is one
@@ -171,7 +183,8 @@ class Drone(NamedTuple):
     acceleration: Vector = (0.0, 0.0, 0.0)  # m/s^2, what dead reckoning takes it to be
     anchor: Vector = (0.0, 0.0, 0.0)  # where it waits or lands
     trim: float = 0.0  # of the hover thrust
-    alone_since: float | None = None  # s, when its own estimate became all that there is
+    # s, when its own estimate became all that there is
+    alone_since: float | None = None
     low_since: float | None = None  # battery
     over_since: float | None = None  # upside down
     reason: str = ""  # why it left the pursuit
@@ -180,8 +193,8 @@ class Drone(NamedTuple):
     def to(
         self, mode: Mode, time: float, anchor: Vector | None = None, reason: str = ""
     ) -> "Drone":
-        """The drone in another mode from `time` (s) on; anchor and reason stay what they were
-        unless given.
+        """The drone in another mode from `time` (s) on; anchor and reason stay what
+        they were unless given.
         """
         return self._replace(
             mode=mode,
@@ -225,7 +238,9 @@ def initial_state(
     airframe: Airframe | None = None,
     settings: SafetySettings | None = None,
 ) -> State:
-    """All vehicles on the ground; they are to start at `starts` (m); pillars are x, y, radius."""
+    """All vehicles on the ground; they are to start at `starts` (m); pillars are x, y,
+    radius.
+    """
     airframe = airframe or nominal_airframe()
     settings = settings or SafetySettings()
     limits = pose_limits(airframe, settings.pose_timeout)

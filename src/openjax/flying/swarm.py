@@ -1,5 +1,5 @@
-"""The vehicles over `cflib`: connections, log blocks in, set-points out. `cflib` is GPLv3 and an
-extra.
+"""The vehicles over `cflib`: connections, log blocks in, set-points out. `cflib` is
+GPLv3 and an extra.
 """
 
 import contextlib
@@ -37,8 +37,8 @@ BODY_BLOCK = (
 WATCHDOG_PERIOD = 0.1
 """s between two words to the firmware's watchdog."""
 CONNECTING = 3
-"""Attempts to connect: over UDP nothing is sent again, and one lost answer leaves `cflib`
-waiting.
+"""Attempts to connect: over UDP nothing is sent again, and one lost answer leaves
+`cflib` waiting.
 """
 BOOT = {"udp": 0.2, "radio": 5.0}
 """How long a restarted vehicle takes until it answers (s)."""
@@ -51,8 +51,8 @@ _WRAP = 1 << 24
 
 
 class _Clock:
-    """On-board milliseconds (24 bit) to host seconds: the packet that came through fastest sets the
-    difference.
+    """On-board milliseconds (24 bit) to host seconds: the packet that came through
+    fastest sets the difference.
     """
 
     def __init__(self):
@@ -63,12 +63,14 @@ class _Clock:
 
     def host(self, stamp: int, arrival: float) -> float:
         """Host seconds of a time stamp that came at `arrival` (s)."""
-        # only a step back by half of the range is a new turn: packets may overtake each other
+        # only a step back by half of the range is a new turn: packets may overtake each
+        # other
         if self._stamp is not None and stamp < self._stamp - _WRAP // 2:
             self._base += _WRAP
         self._stamp = stamp
         on_board = 1e-3 * (stamp + self._base)
-        # the smallest difference so far, let up by as much as clocks may have parted since
+        # the smallest difference so far, let up by as much as clocks may have parted
+        # since
         if math.isfinite(self.offset):
             self.offset += DRIFT * (arrival - self._last)
         self.offset = min(self.offset, arrival - on_board)
@@ -81,14 +83,14 @@ class Samples:
     """What was recorded of one vehicle; times are host seconds. NumPy."""
 
     poses: np.ndarray
-    """(K, 16) own estimates: arrival, voltage (V), when measured, position, velocity, quaternion,
-    body rates.
+    """(K, 16) own estimates: arrival, voltage (V), when measured, position, velocity,
+    quaternion, body rates.
     """
     bodies: np.ndarray
     """(K, 8): when measured, m1..m4 0..1, the specific force (m/s^2)."""
     seen: np.ndarray
-    """(K, 14) by motion capture, where there is one: when measured, position, velocity, quaternion,
-    body rates.
+    """(K, 14) by motion capture, where there is one: when measured, position, velocity,
+    quaternion, body rates.
     """
 
 
@@ -103,7 +105,8 @@ class Member:
         self.last_contact = perf_counter()
         self.voltage = math.nan
         self.supervisor = 0
-        self.felt: tuple = (-math.inf, None)  # host s, the newest specific force (m/s^2, body)
+        # host s, the newest specific force (m/s^2, body)
+        self.felt: tuple = (-math.inf, None)
         self.error: str | None = None
         self.poses = array("d")  # rows as in `Samples`
         self.bodies = array("d")
@@ -111,7 +114,8 @@ class Member:
         self.listener: Callable[[bool], None] = lambda new_pose: None
         self.crazyflie = None
         self.blocks: list = []
-        self.phases: dict = {}  # when in the period each block of motors was sampled last (ms)
+        # when in the period each block of motors was sampled last (ms)
+        self.phases: dict = {}
 
     def sample(self) -> PoseSample:
         """What is known of it."""
@@ -128,7 +132,8 @@ class Member:
         """A pose block, called by cflib's thread."""
         now = perf_counter()
         values = [data[name] for name, _ in POSE_BLOCK]
-        # in millimetres, mm/s, degrees/s and millivolts, so that all fits into one packet
+        # in millimetres, mm/s, degrees/s and millivolts, so that all fits into one
+        # packet
         pose = Pose(
             self._onboard.host(stamp, now),
             tuple(1e-3 * v for v in values[:3]),
@@ -162,8 +167,8 @@ class Member:
 
 
 def send_set_point(crazyflie, set_point: SetPoint) -> None:
-    """Send one vehicle its set-point. `crazyflie`: its own, or its link: it needs no more than
-    `send_packet`.
+    """Send one vehicle its set-point. `crazyflie`: its own, or its link: it needs no
+    more than `send_packet`.
     """
     from cflib.crazyflie.commander import Commander
 
@@ -175,11 +180,12 @@ def send_set_point(crazyflie, set_point: SetPoint) -> None:
 
 
 def never_wait(link) -> None:
-    """Have packets wait for a link, and never who sends them: the newest of each kind, in the place
-    of an older one.
+    """Have packets wait for a link, and never who sends them: the newest of each kind,
+    in the place of an older one.
 
-    A radio's link has room for one until its vehicle acknowledges; `cflib` waits two seconds for a
-    vehicle that doesn't, and meanwhile sends the others nothing. Over UDP nothing waits.
+    A radio's link has room for one until its vehicle acknowledges; `cflib` waits two
+    seconds for a vehicle that doesn't, and meanwhile sends the others nothing. Over UDP
+    nothing waits.
     """
     room = getattr(link, "out_queue", None)
 
@@ -209,17 +215,18 @@ def _restart(uri: str, crazyflie) -> None:
 
 
 class Swarm:
-    """Crazyflies, real or virtual, in one process. `openjax.flying.links` runs it in one of its
-    own.
+    """Crazyflies, real or virtual, in one process. `openjax.flying.links` runs it in
+    one of its own.
 
     Args:
-      uris: as `cflib` writes them: `radio://0/80/2M/E7E7E7E7E7`, `udp://127.0.0.1:19850`.
-      body_logs: log blocks of motors and accelerometer for each vehicle, spread over the 10 ms;
-      more of them tell the diagnosis more exactly when a command arrived, and take more of the
-      link. 0 to 5.
-      watchdog: feed the firmware's emergency-stop watchdog: motors stop 1 s after the last
-      set-point, instead of 2 s. Once it was fed it bites, also after a normal flight, and the
-      vehicle is locked; `connect` restarts such vehicles.
+      uris: as `cflib` writes them: `radio://0/80/2M/E7E7E7E7E7`,
+      `udp://127.0.0.1:19850`.
+      body_logs: log blocks of motors and accelerometer for each vehicle, spread over
+      the 10 ms; more of them tell the diagnosis more exactly when a command arrived,
+      and take more of the link. 0 to 5.
+      watchdog: feed the firmware's emergency-stop watchdog: motors stop 1 s after the
+      last set-point, instead of 2 s. Once it was fed it bites, also after a normal
+      flight, and the vehicle is locked; `connect` restarts such vehicles.
     """
 
     def __init__(self, uris: Sequence[str], body_logs: int = 1, watchdog: bool = True):
@@ -241,9 +248,14 @@ class Swarm:
             raise UserError(
                 f"{error.name or 'cflib'} is missing: pip install cflib (it is GPLv3)"
             ) from error
-        for name in ("cflib.crazyflie", "cflib.crazyflie.toccache", "cflib.crazyflie.log"):
+        for name in (
+            "cflib.crazyflie",
+            "cflib.crazyflie.toccache",
+            "cflib.crazyflie.log",
+        ):
             logging.getLogger(name).setLevel(logging.CRITICAL)
-        # cflib's list of drivers is the process' own: a second call would add them again
+        # cflib's list of drivers is the process' own: a second call would add them
+        # again
         if not cflib.crtp.CLASSES:
             cflib.crtp.init_drivers()
         try:
@@ -267,7 +279,9 @@ class Swarm:
         if member.uri.startswith("udp:"):
             question = "does openjax virtual_crazyflie run"
         why = member.error or "locked"
-        raise UserError(f"{member.uri}: no connection ({why}); {question}, is the URI right?")
+        raise UserError(
+            f"{member.uri}: no connection ({why}); {question}, is the URI right?"
+        )
 
     def _answers(self, member, make, timeout) -> bool:
         """Whether the vehicle has told all that `cflib` asks for."""
@@ -299,7 +313,9 @@ class Swarm:
                 block = LogConfig(f"openjax{number}", PERIOD_MS)
                 for name, fetch_as in kind:
                     block.add_variable(name, fetch_as)
-                arrived = member.pose_arrived if kind is POSE_BLOCK else member.body_arrived
+                arrived = (
+                    member.pose_arrived if kind is POSE_BLOCK else member.body_arrived
+                )
                 block.data_received_cb.add_callback(arrived)
                 try:
                     member.crazyflie.log.add_config(block)
@@ -314,19 +330,27 @@ class Swarm:
             if perf_counter() > deadline:
                 raise UserError(f"the log blocks didn't start within {timeout:g} s")
             sleep(0.01)
-        # once more, in step: a vehicle samples every 1 or 2 ms, and blocks that share a sample
-        # leave a gap elsewhere
+        # once more, in step: a vehicle samples every 1 or 2 ms, and blocks that share a
+        # sample leave a gap elsewhere
         for _ in range(TRIES):
             self._start_in_step()
             sleep(5e-3 * PERIOD_MS)
-            if all(len(set(m.phases.values())) == self._body_logs for m in self.members):
+            if all(
+                len(set(m.phases.values())) == self._body_logs for m in self.members
+            ):
                 break
 
     def _start_in_step(self):
-        """All poses at the same moment, the blocks of motors spread evenly over the 10 ms."""
+        """All poses at the same moment, the blocks of motors spread evenly over the 10
+        ms.
+        """
         begin = perf_counter() + 0.01
         for number in range(1 + self._body_logs):
-            due = begin + 1e-3 * PERIOD_MS * (number - 0.5) / self._body_logs if number else begin
+            due = (
+                begin + 1e-3 * PERIOD_MS * (number - 0.5) / self._body_logs
+                if number
+                else begin
+            )
             while perf_counter() < due:
                 sleep(1e-4)
             for member in self.members:
@@ -337,7 +361,8 @@ class Swarm:
         for member in self.members:
             if member.crazyflie is not None and member.crazyflie.link is not None:
                 with warnings.catch_warnings():
-                    warnings.simplefilter("ignore")  # older firmware: cflib falls back by itself
+                    # older firmware: cflib falls back by itself
+                    warnings.simplefilter("ignore")
                     member.crazyflie.supervisor.send_arming_request(on)
 
     def pose_blocks(self) -> tuple[int, ...]:
@@ -370,16 +395,19 @@ class Swarm:
             member.recording = True
 
     def samples(self) -> list[tuple[bytes, bytes]]:
-        """What was recorded of each vehicle until now: poses and bodies, rows of float64 as in
-        `Samples`.
+        """What was recorded of each vehicle until now: poses and bodies, rows of
+        float64 as in `Samples`.
         """
-        return [(member.poses.tobytes(), member.bodies.tobytes()) for member in self.members]
+        return [
+            (member.poses.tobytes(), member.bodies.tobytes()) for member in self.members
+        ]
 
     def close(self) -> None:
         """Motors off, disarmed, links closed."""
         self.arm(False)
         for member in self.members:
             if member.crazyflie is not None:
-                with contextlib.suppress(OSError, struct.error):  # the link is gone already
+                # the link is gone already
+                with contextlib.suppress(OSError, struct.error):
                     member.crazyflie.close_link()
                 member.crazyflie = None

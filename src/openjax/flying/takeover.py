@@ -1,7 +1,7 @@
 """Landing by another process than the loop: wait where all are, land, disarm, say so.
 
-The links' process and the guard do this for a loop that stops, and the loop for both of these
-(`openjax.flying.board` says who flies).
+The links' process and the guard do this for a loop that stops, and the loop for both of
+these (`openjax.flying.board` says who flies).
 """
 
 import time
@@ -22,8 +22,8 @@ TICK = 0.01
 
 
 def take_over(state: State, moment: float) -> State:
-    """The state in which another process goes on flying from `moment` (s) on: all stop where they
-    are, wait, and land.
+    """The state in which another process goes on flying from `moment` (s) on: all stop
+    where they are, wait, and land.
     """
 
     def handed_over(drone, anchor):
@@ -53,7 +53,8 @@ def fly_down(
       role: whose process this is; it gives up should another one take over.
       vehicles: links.
       state: any of this flight, for its settings, pillars and airframe.
-      listen: called at each tick; has the board say so if the operator wants all motors off.
+      listen: called at each tick; has the board say so if the operator wants all motors
+      off.
     """
     board.pilot = role
     now = due = time.perf_counter()
@@ -74,14 +75,17 @@ def fly_down(
         say("openjax fly: all vehicles are down and disarmed")
         time.sleep(3.0 * board.silence)
         for other in Role:  # what still hangs would only be in the way
-            if other is not role and board.silent(other, time.perf_counter()) > 3.0 * board.silence:
+            if (
+                other is not role
+                and board.silent(other, time.perf_counter()) > 3.0 * board.silence
+            ):
                 board.end_process(other)
     return state
 
 
 def disarm(vehicles: Swarm | RawLinks, board: Board, role: Role) -> bool:
-    """Ask all to disarm until they have, or nothing is heard of it; whether all have. `role`: whose
-    process this is.
+    """Ask all to disarm until they have, or nothing is heard of it; whether all have.
+    `role`: whose process this is.
     """
     deadline = time.perf_counter() + DISARMING
     while True:
@@ -92,7 +96,9 @@ def disarm(vehicles: Swarm | RawLinks, board: Board, role: Role) -> bool:
         time.sleep(0.03)
         # a vehicle that arms by itself always says that it is armed
         either = Supervisor.ARMED | Supervisor.AUTO_ARM
-        armed = any(s.supervisor & either == Supervisor.ARMED for s in vehicles.observe())
+        armed = any(
+            s.supervisor & either == Supervisor.ARMED for s in vehicles.observe()
+        )
         if not armed or time.perf_counter() > deadline:
             board.armed = armed
             return not armed

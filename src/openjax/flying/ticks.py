@@ -10,11 +10,13 @@ from openjax.flying.links import Links
 PERIOD = 0.01
 """Of the ticks (s)."""
 MARGIN = 2.0e-3
-"""A tick is due this long after the newest poses were measured (s), as far as the fastest packets
-tell.
+"""A tick is due this long after the newest poses were measured (s), as far as the
+fastest packets tell.
 """
 EARLY = 3.0e-3
-"""A tick begins as soon as all poses are there, up to this much before it is due (s)."""
+"""A tick begins as soon as all poses are there, up to this much before it is due
+(s).
+"""
 PATIENCE = 5.0e-3
 """It begins without them this long after it could have begun (s)."""
 GONE = 0.1
@@ -22,10 +24,11 @@ GONE = 0.1
 
 
 class TickSchedule:
-    """When the ticks are due: every 10 ms, just after the moments at which poses are measured.
+    """When the ticks are due: every 10 ms, just after the moments at which poses are
+    measured.
 
-    Those moments are regular, unlike arrivals: the vehicles send by clocks of their own, which
-    drift a little.
+    Those moments are regular, unlike arrivals: the vehicles send by clocks of their
+    own, which drift a little.
     """
 
     def __init__(self, first: float):
@@ -34,13 +37,14 @@ class TickSchedule:
         self._in_step = False
 
     def next(self, time: float, measured: Sequence[float]) -> float:
-        """The next tick's time, after one that ended at `time` and knew poses measured at
-        `measured` (s).
+        """The next tick's time, after one that ended at `time` and knew poses measured
+        at `measured` (s).
         """
         ages = sorted((self.due - t) % PERIOD for t in measured if time - t < GONE)
         shift = 0.0
         if ages:
-            # poses come in a bunch: the newest of a bunch is the one after the longest pause
+            # poses come in a bunch: the newest of a bunch is the one after the longest
+            # pause
             pauses = [ages[0] + PERIOD - ages[-1]]
             pauses += [older - newer for newer, older in itertools.pairwise(ages)]
             newest = ages[pauses.index(max(pauses))]
@@ -49,7 +53,8 @@ class TickSchedule:
             # slowly, once in step: one late packet mustn't move the ticks
             shift = min(max(0.02 * error, -1e-4), 1e-4) if self._in_step else error
             self._in_step = True
-        # by a late tick the schedule isn't moved: the next one is due when it would have been
+        # by a late tick the schedule isn't moved: the next one is due when it would
+        # have been
         self.due += PERIOD - shift
         while self.due < time - PERIOD:  # that one can't be caught up with any more
             self.due += PERIOD
@@ -58,8 +63,8 @@ class TickSchedule:
 
 
 def await_poses(vehicles: Links, due: float) -> None:
-    """Return around `due` (s): as soon as each vehicle's newest pose is there that was measured
-    before.
+    """Return around `due` (s): as soon as each vehicle's newest pose is there that was
+    measured before.
     """
     begun = perf_counter()
     latest = max(due, begun) + PATIENCE
@@ -80,6 +85,8 @@ def await_poses(vehicles: Links, due: float) -> None:
 
 
 def measured_times(samples) -> tuple[float, ...]:
-    """When each vehicle's newest pose was measured (s); minus infinity where there is none."""
+    """When each vehicle's newest pose was measured (s); minus infinity where there is
+    none.
+    """
     poses = (sample.captured or sample.own for sample in samples)
     return tuple(-math.inf if pose is None else pose.time for pose in poses)

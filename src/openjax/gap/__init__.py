@@ -1,5 +1,5 @@
-"""What separates flights from the simulator: calibrating and diagnosing. Reading and checking:
-`openjax.flights`.
+"""What separates flights from the simulator: calibrating and diagnosing. Reading and
+checking: `openjax.flights`.
 """
 
 import importlib

@@ -1,4 +1,6 @@
-"""The numbers that decide, read once from `decision.toml`: each with its meaning and its source."""
+"""The numbers that decide, read once from `decision.toml`: each with its meaning and
+its source.
+"""
 
 import tomllib
 from dataclasses import make_dataclass

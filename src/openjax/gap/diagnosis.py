@@ -32,7 +32,10 @@ from openjax.gap.where import locate
 
 
 def diagnose_case(
-    case: Case, without: Iterable[str] = (), progress=None, reference: Sequence[Case] = ()
+    case: Case,
+    without: Iterable[str] = (),
+    progress=None,
+    reference: Sequence[Case] = (),
 ) -> Report:
     """Diagnose the flights of a case.
 
@@ -40,8 +43,8 @@ def diagnose_case(
       case: see `openjax.gap.load_case`.
       without: effects that the library must do without.
       progress: called with a text as the work goes on.
-      reference: flights of the same vehicle while nothing was wrong with it, a case for each day;
-      told is then what changed since.
+      reference: flights of the same vehicle while nothing was wrong with it, a case for
+      each day; told is then what changed since.
 
     Raises:
       UserError: the flights are too short or hold no commands.
@@ -49,7 +52,10 @@ def diagnose_case(
     begin = time.perf_counter()
     baseline = read_reference(joined(reference), progress) if reference else None
     evidence = gather(case, library(without), progress, baseline)
-    if baseline is not None and (both := borne_out(evidence)).effects != baseline.effects:
+    if (
+        baseline is not None
+        and (both := borne_out(evidence)).effects != baseline.effects
+    ):
         evidence = gather(case, library(without), progress, both)
     if progress:
         progress("identifying what the vehicle does")
@@ -81,22 +87,26 @@ def conclude(evidence: Evidence) -> Report:
     if check.mostly:  # what acts is something else
         old |= set(selection.effects)
     likely = [e for e, p in acting.items() if p >= 0.5 and e not in old]
-    parts = worth_naming(lambda named: split(evidence, selection, check.predicted, named), likely)
+    parts = worth_naming(
+        lambda named: split(evidence, selection, check.predicted, named), likely
+    )
     present = {e: acting[e] for e in parts.effects}
     unnamed = (set(likely) | old) - set(present)
     weights = Counter()
     for effects, weight in selection.weights.items():
         weights[effects - unnamed] += weight
     possible = evidence.library.effects
-    chances = probabilities(present, parts.largest, check.probability, weights, possible)
+    chances = probabilities(
+        present, parts.largest, check.probability, weights, possible
+    )
     sure = max((share.interval90[0] for share in parts.effects.values()), default=0.0)
     chances = agreeing(chances, words(check, parts) or ("none",), sure)
     return _report(evidence, selection, check, parts, chances)
 
 
 def worth_naming(shares_of: Callable[[list[str]], Split], named: list[str]) -> Split:
-    """The shares of those of the effects `named` that have one, and that make held-out predictions
-    no worse; `shares_of` splits the gap.
+    """The shares of those of the effects `named` that have one, and that make held-out
+    predictions no worse; `shares_of` splits the gap.
     """
     parts = shares_of(named)
     while named:
@@ -123,8 +133,13 @@ def not_testable(evidence: Evidence) -> list[str]:
     """Effects of the library that, at a usual size, these flights would not show."""
     motion = evidence.motion
     missing = [e for e in evidence.library.physics if motion.exposure[e] < DETECTABLE]
-    if motion.gusts is not None:  # what is felt of a wake isn't the mean that the effect holds
-        missing += [e for e in evidence.library.physics if CARDS[e].of_others and e not in missing]
+    # what is felt of a wake isn't the mean that the effect holds
+    if motion.gusts is not None:
+        missing += [
+            e
+            for e in evidence.library.physics
+            if CARDS[e].of_others and e not in missing
+        ]
     logged = {c.path for c in evidence.channels} | {"physics"}
     missing += [e for e in evidence.library.effects if path_of(e) not in logged]
     return missing + [e for c in evidence.channels for e in c.undetectable()]
@@ -136,14 +151,22 @@ def _report(
     """The report of a selection, checked and split into shares."""
     effects = words(check, parts)
     missing = [e for e in not_testable(evidence) if e not in effects]
-    nothing = "not_testable" if len(missing) >= len(evidence.library.effects) // 2 else "none"
+    nothing = (
+        "not_testable" if len(missing) >= len(evidence.library.effects) // 2 else "none"
+    )
     named = [e for e in effects if e != "unknown"]
-    equivalent = {e: selection.equivalent[e] for e in named if e in selection.equivalent}
+    equivalent = {
+        e: selection.equivalent[e] for e in named if e in selection.equivalent
+    }
     second = _runner_up(chances, effects, equivalent)
     others = [o for e in named for o in equivalent.get(e, ())]
     return Report(
         case=evidence.case.name,
-        verdict=nothing if not effects else "unknown" if effects[0] == "unknown" else "effect",
+        verdict=nothing
+        if not effects
+        else "unknown"
+        if effects[0] == "unknown"
+        else "effect",
         effects=effects,
         probabilities=chances,
         shares=parts,
@@ -161,7 +184,9 @@ def _report(
         rest=check.in_words(),
         sensors=tuple(evidence.sensors.findings.values()),
         contradictions=tuple(
-            f"{i.flight}: {i.issue}" for i in evidence.case.quality if i.kind == "garbage"
+            f"{i.flight}: {i.issue}"
+            for i in evidence.case.quality
+            if i.kind == "garbage"
         ),
         nuisances=_nuisances(evidence, selection),
         reference=_reference_in_words(evidence, named),
@@ -171,8 +196,8 @@ def _report(
 
 
 def _reference_in_words(evidence: Evidence, named) -> str:
-    """What the named effects' parameters were in the reference flights, and what may differ between
-    days that nothing tells.
+    """What the named effects' parameters were in the reference flights, and what may
+    differ between days that nothing tells.
     """
     if evidence.baseline is None:
         return ""
@@ -195,8 +220,13 @@ def _reference_in_words(evidence: Evidence, named) -> str:
 
 
 def _runner_up(chances, effects, equivalent) -> str:
-    """The likeliest cause that is neither named nor would do as well; empty if hardly likely."""
-    said = {*(effects or ("none",)), *(o for others in equivalent.values() for o in others)}
+    """The likeliest cause that is neither named nor would do as well; empty if hardly
+    likely.
+    """
+    said = {
+        *(effects or ("none",)),
+        *(o for others in equivalent.values() for o in others),
+    }
     second = max((e for e in chances if e not in said), key=chances.get, default="")
     return second if second and chances[second] > 0.01 else ""
 
@@ -213,8 +243,8 @@ def _next_flight(evidence: Evidence, effects) -> str:
 
 
 def _nuisances(evidence: Evidence, selection: Selection) -> dict[str, str]:
-    """What the vehicle's numbers and the sensors' mounting took, in usual sizes; a number at its
-    bound says so.
+    """What the vehicle's numbers and the sensors' mounting took, in usual sizes; a
+    number at its bound says so.
     """
     names = np.array(evidence.replay.nuisance_names)[evidence.replay.shared]
     known = () if evidence.baseline is None else evidence.baseline.names

@@ -1,11 +1,17 @@
-"""Everything that a case's flights say about causes, before any decision, channel by channel."""
+"""Everything that a case's flights say about causes, before any decision, channel by
+channel.
+"""
 
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from openjax.errors import UserError
-from openjax.flights.clocks import on_gyroscope_clock, read_command_clock, read_motor_clock
+from openjax.flights.clocks import (
+    on_gyroscope_clock,
+    read_command_clock,
+    read_motor_clock,
+)
 from openjax.flights.flight import Case
 from openjax.flights.kinematics import Kinematics, corrected, read_kinematics
 from openjax.flights.track import Track, tracks_of, undelayed
@@ -49,16 +55,16 @@ class Evidence:
 
     @property
     def charge_unknown(self) -> bool:
-        """Whether a battery's charge acts unseen: motors are duty cycles, and no voltage was
-        logged.
+        """Whether a battery's charge acts unseen: motors are duty cycles, and no
+        voltage was logged.
         """
         silent = any(t.voltage is None for t in self.tracks)
         return silent and self.case.vehicle_file.motor.command == "pwm"
 
     @property
     def measured(self) -> dict[tuple[str, str], tuple[float, float]]:
-        """{(effect, parameter): (value, standard deviation)} of what the torques' response tells
-        without a model of the loop, of effects that these logs can show.
+        """{(effect, parameter): (value, standard deviation)} of what the torques'
+        response tells without a model of the loop, of effects that these logs can show.
         """
         found = self.identification
         if found is None or not found.trusted:
@@ -68,8 +74,8 @@ class Evidence:
         return {key: found.estimates.of(*key) for key in names}
 
     def support(self, theta: np.ndarray) -> float:
-        """Nats by which what the replay doesn't weigh speaks for parameters theta (P,): the
-        identified torques, where they are trusted, and gusts under other vehicles.
+        """Nats by which what the replay doesn't weigh speaks for parameters theta (P,):
+        the identified torques, where they are trusted, and gusts under other vehicles.
         """
         return self._of_torques(theta) + self._of_gusts(theta)
 
@@ -88,11 +94,15 @@ class Evidence:
 
 
 def gather(
-    case: Case, library: Library, progress=None, baseline: Baseline | None = None, reference=False
+    case: Case,
+    library: Library,
+    progress=None,
+    baseline: Baseline | None = None,
+    reference=False,
 ) -> Evidence:
-    """Read a case by all its channels. `baseline`: what the vehicle is like while nothing acts;
-    `reference`: these flights are to tell that. Raises UserError where no stretch of flight is long
-    enough.
+    """Read a case by all its channels. `baseline`: what the vehicle is like while
+    nothing acts; `reference`: these flights are to tell that. Raises UserError where no
+    stretch of flight is long enough.
     """
     tell = progress or (lambda text: None)
     if case.vehicle_file.mass_weighed:
@@ -115,12 +125,16 @@ def gather(
     if motion.gusts is not None:
         told = {"gusts under others": motion.gusts.in_words()}
         sensors = replace(sensors, findings=sensors.findings | told)
-    return Evidence(case, library, tracks, vehicles, sensors, channels, motion, baseline)
+    return Evidence(
+        case, library, tracks, vehicles, sensors, channels, motion, baseline
+    )
 
 
-def _motors(case: Case, tracks, vehicles, sensors: Kinematics) -> tuple[list[Track], Kinematics]:
-    """The tracks with motor commands when they act, and what the sensors say with what the motors'
-    clock says.
+def _motors(
+    case: Case, tracks, vehicles, sensors: Kinematics
+) -> tuple[list[Track], Kinematics]:
+    """The tracks with motor commands when they act, and what the sensors say with what
+    the motors' clock says.
     """
     row = min(f.row_period for f in case.flights)
     if apart := read_command_clock(tracks, row):
@@ -129,7 +143,9 @@ def _motors(case: Case, tracks, vehicles, sensors: Kinematics) -> tuple[list[Tra
     clock = read_motor_clock(tracks, vehicles, row, motor_rows(case))
     if not sensors.one_clock:
         # Forces are compared with the pose: motors are put on its clock.
-        pose = read_motor_clock(tracks, vehicles, row, motor_rows(case), gyroscope=False)
+        pose = read_motor_clock(
+            tracks, vehicles, row, motor_rows(case), gyroscope=False
+        )
         clock = replace(pose, one_clock=pose.one_clock and clock.one_clock)
     findings = sensors.findings | clock.findings
     sensors = replace(
@@ -140,7 +156,9 @@ def _motors(case: Case, tracks, vehicles, sensors: Kinematics) -> tuple[list[Tra
 
 def _tracks(case: Case) -> tuple[list[Track], list]:
     """The stretches of all flights and their nominal vehicles."""
-    tracks = [t for t in tracks_of(case) if t.motor is not None or t.command is not None]
+    tracks = [
+        t for t in tracks_of(case) if t.motor is not None or t.command is not None
+    ]
     if not tracks:
         raise UserError(
             f"{case.name}: no flight has 2 s without a gap, with body rates and commands or motors"
@@ -149,9 +167,11 @@ def _tracks(case: Case) -> tuple[list[Track], list]:
     return tracks, [case.vehicle_of(flights[t.name.split("#")[0]]) for t in tracks]
 
 
-def _sensors(tracks: list[Track], library: Library) -> tuple[list[Track], Pose | None, Kinematics]:
-    """The tracks as sensors that agree would have them, the pose's channel, and what the sensors
-    say of each other.
+def _sensors(
+    tracks: list[Track], library: Library
+) -> tuple[list[Track], Pose | None, Kinematics]:
+    """The tracks as sensors that agree would have them, the pose's channel, and what
+    the sensors say of each other.
     """
     pose = read_pose(tracks, library)
     moved = pose is not None and pose.names and pose.late

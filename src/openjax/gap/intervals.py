@@ -1,7 +1,8 @@
 """Parameters of the named effects with their 90 % intervals.
 
-An interval is the fit's, or what flights disagree by where that is more, and never narrower than
-what forms that aren't quite the library's leave: some per cent of the effect.
+An interval is the fit's, or what flights disagree by where that is more, and never
+narrower than what forms that aren't quite the library's leave: some per cent of the
+effect.
 """
 
 import numpy as np
@@ -48,34 +49,41 @@ def _estimate(estimated: Estimated, parameter: Parameter, vehicle) -> Estimate:
         unit=parameter.unit,
         interval90=(low, high),
         usual=parameter.usual(vehicle),
-        # before it is cut: an interval beyond the domain still holds what lies at its edge
+        # before it is cut: an interval beyond the domain still holds what lies at its
+        # edge
         may_be_none=bool(start <= parameter.none <= end),
     )
 
 
 def interval(estimated: Estimated, parameter) -> tuple[float, float]:
-    """The 90 % interval. A number that multiplies something (it does nothing at 1) stays positive:
-    its logarithm is normal.
+    """The 90 % interval. A number that multiplies something (it does nothing at 1)
+    stays positive: its logarithm is normal.
     """
     value = estimated.value
     below = REACH * estimated.below
     above = REACH * estimated.above
     if parameter.none == 1.0 and value > 0.0:
-        return value * float(np.exp(-below / value)), value * float(np.exp(above / value))
+        return value * float(np.exp(-below / value)), value * float(
+            np.exp(above / value)
+        )
     return value - below, value + above
 
 
 def _of_physics(fit: SetFit, effect: str, parameter) -> Estimated:
-    """A parameter of the fit. Forms may be wrong by a share of the effect's largest parameter of
-    that unit.
+    """A parameter of the fit. Forms may be wrong by a share of the effect's largest
+    parameter of that unit.
     """
     known = EFFECTS[effect].parameters
     deviation = robust_deviation(fit.covariance, fit.grams[:, 1:, 0])
-    deviation = float(deviation[fit.index.tolist().index(PLACE[effect, parameter.name])])
+    deviation = float(
+        deviation[fit.index.tolist().index(PLACE[effect, parameter.name])]
+    )
     away = [
         abs(float(fit.theta[PLACE[effect, p.name]]) - known[p.name].none)
         for p in CARDS[effect].fitted
         if known[p.name].unit == known[parameter.name].unit
     ]
-    error = float(np.linalg.norm((deviation, DECISION.form_error * max(away), parameter.error)))
+    error = float(
+        np.linalg.norm((deviation, DECISION.form_error * max(away), parameter.error))
+    )
     return Estimated(float(fit.theta[PLACE[effect, parameter.name]]), error, error)

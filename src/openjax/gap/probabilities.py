@@ -1,8 +1,8 @@
 """How sure the words are: the probability of each cause to be the strongest.
 
-Two uncertainties, each with a number of its own: whether an effect acts (how often its set is
-chosen, `selection`), and which part is the largest (the shares' bootstrap). What remains goes to
-sets chosen otherwise, to nothing and to the unknown.
+Two uncertainties, each with a number of its own: whether an effect acts (how often its
+set is chosen, `selection`), and which part is the largest (the shares' bootstrap). What
+remains goes to sets chosen otherwise, to nothing and to the unknown.
 """
 
 from collections.abc import Collection
@@ -13,14 +13,18 @@ from openjax.vehicle.effects import EFFECTS
 
 
 def probabilities(
-    present, largest, unknown: float, weights, possible: Collection[str] = tuple(EFFECTS)
+    present,
+    largest,
+    unknown: float,
+    weights,
+    possible: Collection[str] = tuple(EFFECTS),
 ) -> dict[str, float]:
     """{cause, "none", "unknown": probability of being the strongest}, whose sum is one.
 
-    present: {named effect: probability that it acts}. largest: {effect or "unexplained": how often
-    it is the largest part}. unknown: probability that what is unexplained is real. weights:
-    {effects: how often that set was chosen}. possible: effects that may act; a mass that was
-    weighed may not.
+    present: {named effect: probability that it acts}. largest: {effect or
+    "unexplained": how often it is the largest part}. unknown: probability that what is
+    unexplained is real. weights: {effects: how often that set was chosen}. possible:
+    effects that may act; a mass that was weighed may not.
     """
     chance = dict.fromkeys((*EFFECTS, "none", "unknown"), 0.0)
     sure = (1.0 - unknown) if present else 1.0
@@ -37,21 +41,26 @@ def probabilities(
     for name, weight in shared.items():
         chance[name] += left * weight / total
     causes = {*possible, "none", "unknown"}
-    return reliable(tempered(chance, DECISION.temperature), DECISION.reliability, causes)
+    return reliable(
+        tempered(chance, DECISION.temperature), DECISION.reliability, causes
+    )
 
 
-def reliable(chance: dict[str, float], share: float, causes: Collection[str]) -> dict[str, float]:
-    """Probabilities of a choice that is right in no more than a `share` of the cases, however often
-    draws repeat it: what is left goes to all `causes` alike.
+def reliable(
+    chance: dict[str, float], share: float, causes: Collection[str]
+) -> dict[str, float]:
+    """Probabilities of a choice that is right in no more than a `share` of the cases,
+    however often draws repeat it: what is left goes to all `causes` alike.
     """
     alike = (1.0 - share) / len(causes)
     return {name: share * p + alike * (name in causes) for name, p in chance.items()}
 
 
 def agreeing(chance: dict[str, float], said, sure: float) -> dict[str, float]:
-    """Probabilities that agree with the words `said`. Where draws of blocks choose nothing, though
-    a share's interval begins at `sure`, they say that an effect is weak in some flights, not that
-    none acts. What isn't named is at most as likely as what is.
+    """Probabilities that agree with the words `said`. Where draws of blocks choose
+    nothing, though a share's interval begins at `sure`, they say that an effect is weak
+    in some flights, not that none acts. What isn't named is at most as likely as what
+    is.
     """
     chance = dict(chance)
     named = max(said, key=lambda name: chance[name])
@@ -66,8 +75,8 @@ def agreeing(chance: dict[str, float], said, sure: float) -> dict[str, float]:
 
 
 def tempered(chance: dict[str, float], temperature: float) -> dict[str, float]:
-    """Probabilities as sure as they are right in known cases: their logarithms over one temperature
-    (Guo et al. 2017).
+    """Probabilities as sure as they are right in known cases: their logarithms over one
+    temperature (Guo et al. 2017).
     """
     flat = {name: max(p, 0.0) ** (1.0 / temperature) for name, p in chance.items()}
     total = sum(flat.values())

@@ -1,5 +1,5 @@
-"""Flights of the same vehicle while nothing was wrong with it: what the vehicle is like, and what
-of a case is a change since then.
+"""Flights of the same vehicle while nothing was wrong with it: what the vehicle is
+like, and what of a case is a change since then.
 """
 
 from collections.abc import Sequence
@@ -17,30 +17,43 @@ from openjax.gap.evidence import Evidence, gather
 from openjax.gap.model.baseline import COLOURED, FORM, Baseline, day_of, transferred
 from openjax.gap.model.cross_validation import Equations
 from openjax.gap.model.hypotheses import SetFit, fit_set
-from openjax.gap.model.library import ABSENT, CARDS, PLACE, THETA, Library, library, places
+from openjax.gap.model.library import (
+    ABSENT,
+    CARDS,
+    PLACE,
+    THETA,
+    Library,
+    library,
+    places,
+)
 from openjax.gap.model.table import build, with_effects
 from openjax.gap.residual import measure, residuals_of
 from openjax.gap.selection import searched
 from openjax.vehicle.effects import EFFECTS
 from openjax.vehicle.effects.effect import VERY_RARE
 
-# Of what is left of a case's flights before any effect: by which they must be better without what
-# the reference has. A lag of 70 ms and motors at a limit made it .2 and .4 % of themselves.
+# Of what is left of a case's flights before any effect: by which they must be better
+# without what the reference has. A lag of 70 ms and motors at a limit made it .2 and .4
+# % of themselves.
 SPOKEN_AGAINST = 0.01
 ROUNDS = 3  # of the fit, between which nuisances are worked out anew
 # What trims of a day look like, and so nothing that another day has as well.
 OF_DAYS = tuple(e for e, card in CARDS.items() if card.trim is not None)
 # Rare names of what a vehicle with nothing wrong has as well, as flapping of drag.
 LASTING = tuple(e for e in FORM if e not in OF_DAYS)  # what no day moves
-OTHER_NAMES = tuple(e for e in CARDS if CARDS[e].log_odds <= VERY_RARE and e not in FORM)
+OTHER_NAMES = tuple(
+    e for e in CARDS if CARDS[e].log_odds <= VERY_RARE and e not in FORM
+)
 
 
 def read_reference(case: Case, progress=None) -> Baseline:
-    """What the vehicle is like, by all flights of a reference case: the effects that a diagnosis
-    would choose, of which those of the vehicle's form stay, and the numbers that every vehicle has.
-    Raises UserError as `gather`.
+    """What the vehicle is like, by all flights of a reference case: the effects that a
+    diagnosis would choose, of which those of the vehicle's form stay, and the numbers
+    that every vehicle has. Raises UserError as `gather`.
     """
-    effects = Library(tuple(e for e in library().effects if e not in (*OF_DAYS, *OTHER_NAMES)))
+    effects = Library(
+        tuple(e for e in library().effects if e not in (*OF_DAYS, *OTHER_NAMES))
+    )
     evidence = gather(case, effects, progress, reference=True)
     search = searched(evidence)
     best = search.choose(np.ones((1, len(search.nothing.judged.nats))))[0].fit
@@ -51,53 +64,69 @@ def read_reference(case: Case, progress=None) -> Baseline:
     theta = ABSENT.copy()
     for name, moved in zip(names, mean, strict=True):
         key = PLACE[tuple(name.split(" "))]
-        theta[key] = fit.theta[key] + moved  # of an effect that the fit hasn't that is "absent"
+        # of an effect that the fit hasn't that is "absent"
+        theta[key] = fit.theta[key] + moved
     channels = {c.path: c for c in evidence.channels}
     trim = _trim_of_a_day(fit, evidence.vehicles[0])
     return Baseline(theta, kept, names, covariance, measures, channels, trim)
 
 
 def borne_out(evidence: Evidence) -> Baseline:
-    """The baseline of a case's evidence, with those of its effects that the case's flights don't
-    speak against: what the vehicle has it has in both, and what only the reference's flights made
-    it look like goes.
+    """The baseline of a case's evidence, with those of its effects that the case's
+    flights don't speak against: what the vehicle has it has in both, and what only the
+    reference's flights made it look like goes.
     """
     replay, baseline = evidence.replay, evidence.baseline
     subsets = [
-        s for n in range(len(baseline.effects) + 1) for s in combinations(baseline.effects, n)
+        s
+        for n in range(len(baseline.effects) + 1)
+        for s in combinations(baseline.effects, n)
     ]
     thetas = np.array([with_some(baseline, s).theta for s in subsets])
-    left = [y[None] - p for y, p in zip(replay.measured, replay.predict(thetas), strict=True)]
+    left = [
+        y[None] - p
+        for y, p in zip(replay.measured, replay.predict(thetas), strict=True)
+    ]
     squares = np.diag(replay.grams(left).sum(0))
     kept = np.flatnonzero(squares <= (1.0 + SPOKEN_AGAINST) * squares.min())
-    return with_some(baseline, subsets[max(kept, key=lambda k: (len(subsets[k]), -squares[k]))])
+    return with_some(
+        baseline, subsets[max(kept, key=lambda k: (len(subsets[k]), -squares[k]))]
+    )
 
 
 def with_some(baseline: Baseline, effects) -> Baseline:
-    """A baseline with only these of its effects; the numbers that are no effect's stay."""
+    """A baseline with only these of its effects; the numbers that are no effect's
+    stay.
+    """
     gone = set(baseline.effects) - set(effects)
     theta = baseline.theta.copy()
     theta[places(gone)] = ABSENT[places(gone)]
     rows = [k for k, n in enumerate(baseline.names) if n.split(" ")[0] not in gone]
     names = tuple(baseline.names[k] for k in rows)
     covariance = baseline.covariance[np.ix_(rows, rows)]
-    return replace(baseline, theta=theta, effects=effects, names=names, covariance=covariance)
+    return replace(
+        baseline, theta=theta, effects=effects, names=names, covariance=covariance
+    )
 
 
 def trim_of(theta: np.ndarray, effects, vehicle) -> np.ndarray:
-    """(4,) by which share each rotor seems to push more than told, for those of the `effects` of
-    theta (P,) that trims of a day look like.
+    """(4,) by which share each rotor seems to push more than told, for those of the
+    `effects` of theta (P,) that trims of a day look like.
     """
     out = np.zeros(4)
     for effect in (e for e in effects if e in OF_DAYS):
-        values = {p.name: float(theta[PLACE[effect, p.name]]) for p in CARDS[effect].fitted}
+        values = {
+            p.name: float(theta[PLACE[effect, p.name]]) for p in CARDS[effect].fitted
+        }
         out += CARDS[effect].trim(values, vehicle)
     return out
 
 
-def trimmed_before(theta: np.ndarray, named, baseline: Baseline | None, vehicle) -> set[str]:
-    """Those of the `named` effects that are no change: trims that are more the reference's than not,
-    though no day need have the trims of another one.
+def trimmed_before(
+    theta: np.ndarray, named, baseline: Baseline | None, vehicle
+) -> set[str]:
+    """Those of the `named` effects that are no change: trims that are more the
+    reference's than not, though no day need have the trims of another one.
     """
     trims = set(named) & set(OF_DAYS)
     if baseline is None or not trims:
@@ -112,7 +141,11 @@ def _trim_of_a_day(fit: SetFit, vehicle) -> np.ndarray:
     table = build(fit, None)
     equations = Equations(table, with_effects(table))
     taken = equations.solve(table.total)[2][len(fit.index) :]
-    shared = [n for n, s in zip(fit.replay.nuisance_names, fit.replay.shared, strict=True) if s]
+    shared = [
+        n
+        for n, s in zip(fit.replay.nuisance_names, fit.replay.shared, strict=True)
+        if s
+    ]
     found = dict(zip(shared, taken.tolist(), strict=True))
     theta = ABSENT.copy()
     for e, p, size in fit.replay.numbers:
@@ -121,21 +154,29 @@ def _trim_of_a_day(fit: SetFit, vehicle) -> np.ndarray:
     return trim_of(theta, OF_DAYS, vehicle)
 
 
-def _another_day(evidence: Evidence, fit: SetFit, effects) -> tuple[tuple[str, ...], ...]:
-    """Names, mean and covariance of the numbers of the `effects` (away from the fit, in their
-    units) and of the other numbers of a vehicle that no day moves, as they are on another day. The
-    other nuisances aren't transferred: what they take depends on what is flown, as in closed loop
-    they also take what feedback makes of gusts.
+def _another_day(
+    evidence: Evidence, fit: SetFit, effects
+) -> tuple[tuple[str, ...], ...]:
+    """Names, mean and covariance of the numbers of the `effects` (away from the fit, in
+    their units) and of the other numbers of a vehicle that no day moves, as they are on
+    another day. The other nuisances aren't transferred: what they take depends on what
+    is flown, as in closed loop they also take what feedback makes of gusts.
     """
     table = build(fit, None)
     equations = Equations(table, with_effects(table))
     columns, model = equations.columns, equations.model
     inside = len(fit.index)
     sizes = {f"{e} {p}": size for e, p, size in fit.replay.numbers}
-    shared = [n for n, s in zip(fit.replay.nuisance_names, fit.replay.shared, strict=True) if s]
+    shared = [
+        n
+        for n, s in zip(fit.replay.nuisance_names, fit.replay.shared, strict=True)
+        if s
+    ]
     names = [" ".join(THETA[i]) for i in fit.index]
     kept = [n.split(" ")[0] in effects for n in names]
-    kept += [n in sizes and n not in names and n.split(" ")[0] in LASTING for n in shared]
+    kept += [
+        n in sizes and n not in names and n.split(" ")[0] in LASTING for n in shared
+    ]
     names += shared
     unit = np.array([1.0] * inside + [sizes.get(n, 1.0) for n in shared])
     # Of the parameters themselves, whatever the columns' units.
@@ -145,7 +186,9 @@ def _another_day(evidence: Evidence, fit: SetFit, effects) -> tuple[tuple[str, .
     push = table.total[columns, 0] / COLOURED - hessian @ around
     days = np.ones(len(columns))
     for k in np.flatnonzero(kept):
-        day = day_of(*names[k].split(" "), evidence.vehicles[0], evidence.charge_unknown)
+        day = day_of(
+            *names[k].split(" "), evidence.vehicles[0], evidence.charge_unknown
+        )
         days[k] = day / unit[k]
     found, covariance = transferred(hessian, push, precision, ~np.array(kept), days)
     unit = unit[kept]
@@ -155,8 +198,8 @@ def _another_day(evidence: Evidence, fit: SetFit, effects) -> tuple[tuple[str, .
 
 
 def joined(cases: Sequence[Case]) -> Case:
-    """The flights of several folders of one vehicle as one case. Raises UserError where the
-    vehicles differ.
+    """The flights of several folders of one vehicle as one case. Raises UserError where
+    the vehicles differ.
     """
     first = cases[0]
     for case in cases[1:]:
@@ -166,7 +209,9 @@ def joined(cases: Sequence[Case]) -> Case:
                 "reference is of one vehicle"
             )
     flights = [
-        replace(f, name=f"{c.name}/{f.name}", log=f"{c.name}/{f.log}") if len(cases) > 1 else f
+        replace(f, name=f"{c.name}/{f.name}", log=f"{c.name}/{f.log}")
+        if len(cases) > 1
+        else f
         for c in cases
         for f in c.flights
     ]
@@ -175,9 +220,10 @@ def joined(cases: Sequence[Case]) -> Case:
 
 
 def differs(channel: Channel, effect: str, baseline: Baseline | None) -> bool:
-    """Whether a channel tells another size of an effect than the reference does: a parameter is
-    further away than the errors of both, and than forms may be wrong by. A reference in which it
-    doesn't act says the same only where it is nearer to the case than to nothing.
+    """Whether a channel tells another size of an effect than the reference does: a
+    parameter is further away than the errors of both, and than forms may be wrong by. A
+    reference in which it doesn't act says the same only where it is nearer to the case
+    than to nothing.
     """
     before = baseline.channels.get(channel.path) if baseline is not None else None
     if before is None:
@@ -188,7 +234,9 @@ def differs(channel: Channel, effect: str, baseline: Baseline | None) -> bool:
         none = EFFECTS[effect].parameters[parameter.name].none
         apart = abs(here.value - there.value)
         error = np.hypot(max(here.below, here.above), max(there.below, there.above))
-        least = max(DECISION.standard_errors * error, DECISION.form_error * abs(here.value))
+        least = max(
+            DECISION.standard_errors * error, DECISION.form_error * abs(here.value)
+        )
         if apart > least or (not acted and apart > abs(there.value - none)):
             return True
     return False

@@ -1,10 +1,11 @@
-"""What the chosen effects leave: whether it is more than sensors, air and errors of form leave.
+"""What the chosen effects leave: whether it is more than sensors, air and errors of
+form leave.
 
-Things that should agree are held against each other: measured motion and replay, attitude and
-gyroscope, path and accelerometer, position and velocity. How much is left of each, given what is
-left of the others, is told in standard deviations of cases of several worlds in which nothing
-unknown acts. The p-value of the largest is conformal over those (Vovk et al. 2005;
-`residual.json`).
+Things that should agree are held against each other: measured motion and replay,
+attitude and gyroscope, path and accelerometer, position and velocity. How much is left
+of each, given what is left of the others, is told in standard deviations of cases of
+several worlds in which nothing unknown acts. The p-value of the largest is conformal
+over those (Vovk et al. 2005; `residual.json`).
 """
 
 import json
@@ -31,23 +32,26 @@ HORIZONS = {
     "estimator": (0.1, "attitude and gyroscope disagree"),
     "position": (0.1, "position and velocity disagree"),
 }
-# By how much of its own size an effect may be left, where it isn't quite of the library's form: of
-# 51 development cases with a cause 4 are then called unknown, and 6 without (seed 886).
+# By how much of its own size an effect may be left, where it isn't quite of the
+# library's form: of 51 development cases with a cause 4 are then called unknown, and 6
+# without (seed 886).
 FORM_LEFT = 0.3
-# Share of what grew that effects leave where they aren't what acts: those named beside an unknown
-# cause left .71 to 1, those that act .54 at most (seeds 890 to 893).
+# Share of what grew that effects leave where they aren't what acts: those named beside
+# an unknown cause left .71 to 1, those that act .54 at most (seeds 890 to 893).
 MOSTLY = 0.65
-# Of HORIZONS what another vehicle's gusts shake; where there are any, rows under it don't count.
+# Of HORIZONS what another vehicle's gusts shake; where there are any, rows under it
+# don't count.
 HELD_FROM_GUSTS = ("velocity", "rates")
 CALIBRATION = Path(__file__).with_name("residual.json")
 
 
 @dataclass(frozen=True)
 class Check:
-    """`measures` {name: value} and the one that stands out most, `where`; its `p_value` among cases
-    without an unknown cause; `predicted` (9,): share of each motion channel's squared error beyond
-    what such cases leave, where the check rejects; `mostly`: whether it does, and effects of the
-    motion explain little of what it finds.
+    """`measures` {name: value} and the one that stands out most, `where`; its `p_value`
+    among cases without an unknown cause; `predicted` (9,): share of each motion
+    channel's squared error beyond what such cases leave, where the check rejects;
+    `mostly`: whether it does, and effects of the motion explain little of what it
+    finds.
     """
 
     measures: dict[str, float]
@@ -63,8 +67,8 @@ class Check:
 
     @property
     def probability(self) -> float:
-        """That something acts which no effect explains: posterior odds are the prior's over the
-        p-value.
+        """That something acts which no effect explains: posterior odds are the prior's
+        over the p-value.
         """
         return DECISION.unknown / (DECISION.unknown + self.p_value)
 
@@ -78,8 +82,8 @@ class Check:
 
 
 def check_residual(evidence: Evidence, fit: SetFit, nothing: SetFit) -> Check:
-    """Whether a fit leaves no more than what cases without an unknown cause leave; `nothing`: the
-    fit of no effect.
+    """Whether a fit leaves no more than what cases without an unknown cause leave;
+    `nothing`: the fit of no effect.
     """
     measured, axes = measure(evidence, residuals_of(fit))
     before = {}
@@ -90,7 +94,10 @@ def check_residual(evidence: Evidence, fit: SetFit, nothing: SetFit) -> Check:
         before = _comparable(evidence)
         unnamed, _ = measure(evidence, residuals_of(nothing))
         p_value, name = changed_p(measured, before, unnamed)
-        mostly = bool(name) and unexplained(measured[name], before[name], unnamed[name]) > MOSTLY
+        mostly = (
+            bool(name)
+            and unexplained(measured[name], before[name], unnamed[name]) > MOSTLY
+        )
     rejects = p_value <= DECISION.unknown
     predicted = beyond(axes, before) if rejects else np.zeros(9)
     where = HORIZONS.get(name, (0.0, ""))[1]
@@ -106,8 +113,8 @@ def residuals_of(fit: SetFit) -> list[Float[np.ndarray, "_ channels"]]:
 
 
 def disturbances(track: Track, residual: Rows) -> Rows:
-    """A residual as accelerations (T, 9): angular (body), linear (body, from the velocity),
-    specific force (body).
+    """A residual as accelerations (T, 9): angular (body), linear (body, from the
+    velocity), specific force (body).
     """
     out = np.zeros_like(residual)
     out[:, RATES] = np.gradient(residual[:, RATES], track.dt, axis=0)
@@ -121,8 +128,8 @@ def disturbances(track: Track, residual: Rows) -> Rows:
 def measure(
     evidence: Evidence, residuals: list[Float[np.ndarray, "_ channels"]]
 ) -> tuple[dict[str, float], dict[str, Float[np.ndarray, " 3"]]]:
-    """{name: measure} of what is left, and {name: (3,) the same by axis}, of which a measure is the
-    largest.
+    """{name: measure} of what is left, and {name: (3,) the same by axis}, of which a
+    measure is the largest.
     """
     dt = evidence.tracks[0].dt
     skip = int(SKIP / dt)
@@ -138,7 +145,9 @@ def measure(
 
 
 def _calm(rows: Chosen, step: int) -> Chosen:
-    """(T - step,) whether none of the rows from each one to the one a step later is chosen."""
+    """(T - step,) whether none of the rows from each one to the one a step later is
+    chosen.
+    """
     before = np.concatenate([[0], np.cumsum(rows)])
     return before[step + 1 :] == before[: -step - 1]
 
@@ -156,40 +165,56 @@ def beyond(axes: dict[str, np.ndarray], reference: dict[str, float]) -> np.ndarr
     return out
 
 
-def _series(evidence: Evidence, residuals: list[np.ndarray]) -> dict[str, list[np.ndarray]]:
-    """{name of HORIZONS: what is left (T, 3) of each track, added up} of what was logged."""
+def _series(
+    evidence: Evidence, residuals: list[np.ndarray]
+) -> dict[str, list[np.ndarray]]:
+    """{name of HORIZONS: what is left (T, 3) of each track, added up} of what was
+    logged.
+    """
     usable = evidence.replay.usable
     tracks = evidence.replay.tracks
     motion = {"rates": RATES, "velocity": VELOCITY}
-    out = {n: [r[:, axes] for r in residuals] for n, axes in motion.items() if usable[axes.start]}
+    out = {
+        n: [r[:, axes] for r in residuals]
+        for n, axes in motion.items()
+        if usable[axes.start]
+    }
     out |= {c.path: c.fit.residual for c in evidence.channels if c.path in HORIZONS}
     if all(t.position is not None and t.velocity is not None for t in tracks):
         out["position"] = [
-            t.position - (np.cumsum(t.velocity, 0) - 0.5 * t.velocity) * t.dt for t in tracks
+            t.position - (np.cumsum(t.velocity, 0) - 0.5 * t.velocity) * t.dt
+            for t in tracks
         ]
-        felt = all(t.specific_force is not None and t.quaternion is not None for t in tracks)
+        felt = all(
+            t.specific_force is not None and t.quaternion is not None for t in tracks
+        )
         if felt and evidence.sensors.one_clock:
             out["accelerometer"] = [_path_against_accelerometer(t) for t in tracks]
     return out
 
 
 def _path_against_accelerometer(track: Track) -> np.ndarray:
-    """Velocity (T, 3) body axes by which the accelerometer and the path's acceleration come apart,
-    its bias aside.
+    """Velocity (T, 3) body axes by which the accelerometer and the path's acceleration
+    come apart, its bias aside.
     """
-    apart = track.specific_force - specific_force_of(track.quaternion, track.velocity, track.dt)
+    apart = track.specific_force - specific_force_of(
+        track.quaternion, track.velocity, track.dt
+    )
     return np.cumsum(apart - apart.mean(0), 0) * track.dt
 
 
 def _comparable(evidence: Evidence) -> dict[str, float]:
-    """The reference's measures, of which those of forces and torques say nothing where a battery
-    that nobody logged makes another thrust of every duty cycle, and those of the pose nothing where
-    it was moved in time in one of both alone.
+    """The reference's measures, of which those of forces and torques say nothing where
+    a battery that nobody logged makes another thrust of every duty cycle, and those of
+    the pose nothing where it was moved in time in one of both alone.
     """
     before = evidence.baseline
     silent = ("velocity", "rates") if evidence.charge_unknown else ()
     here = {c.path: c for c in evidence.channels}
-    moved = [p["estimator"].acting() if "estimator" in p else {} for p in (here, before.channels)]
+    moved = [
+        p["estimator"].acting() if "estimator" in p else {}
+        for p in (here, before.channels)
+    ]
     silent += ("estimator", "position") if bool(moved[0]) != bool(moved[1]) else ()
     return {n: v for n, v in before.measures.items() if n not in silent}
 
@@ -197,9 +222,10 @@ def _comparable(evidence: Evidence) -> dict[str, float]:
 def changed_p(
     measured: dict[str, float], before: dict[str, float], unnamed: dict[str, float]
 ) -> tuple[float, str]:
-    """As `conformal_p`, against the same vehicle's reference: by the measure that grew most. What
-    other flights make it grow by has an exponential tail. Effects that aren't quite of the
-    library's form leave a share of what they explain of the measures `unnamed` of no effect.
+    """As `conformal_p`, against the same vehicle's reference: by the measure that grew
+    most. What other flights make it grow by has an exponential tail. Effects that
+    aren't quite of the library's form leave a share of what they explain of the
+    measures `unnamed` of no effect.
     """
     grown = {}
     for name in (n for n in measured if n in before):
@@ -214,15 +240,17 @@ def changed_p(
 
 
 def unexplained(measure: float, reference: float, unnamed: float) -> float:
-    """Share of what a measure's square has grown by since the reference that the fit leaves."""
+    """Share of what a measure's square has grown by since the reference that the fit
+    leaves.
+    """
     left = measure**2 - reference**2
     return left / max(unnamed**2 - reference**2, left, 1e-24)
 
 
 def conformal_p(measured: dict[str, float]) -> tuple[float, str]:
-    """Share of cases without an unknown cause, this one among them, that stand out as much, and by
-    which measure this one does. Beyond the largest the tail is exponential, as long as that of the
-    upper quarter (Pickands 1975).
+    """Share of cases without an unknown cause, this one among them, that stand out as
+    much, and by which measure this one does. Beyond the largest the tail is
+    exponential, as long as that of the upper quarter (Pickands 1975).
     """
     value, name = standing_out(measured)
     known = np.array([standing_out(case)[0] for case in calibration()])
@@ -233,21 +261,30 @@ def conformal_p(measured: dict[str, float]) -> tuple[float, str]:
 
 
 def standing_out(measured: dict[str, float]) -> tuple[float, str]:
-    """How far one of a case's measures stands out at most of what the others of its logs lead to
-    expect, in standard deviations, and which; logs without anything to hold against each other
-    stand out nowhere. What makes a sensor noisy raises all that it has a part in; so each logarithm
-    is told given the others, as of a normal distribution.
+    """How far one of a case's measures stands out at most of what the others of its
+    logs lead to expect, in standard deviations, and which; logs without anything to
+    hold against each other stand out nowhere. What makes a sensor noisy raises all that
+    it has a part in; so each logarithm is told given the others, as of a normal
+    distribution.
     """
     names, (mean, covariance) = list(HORIZONS), usual()
     rows = [k for k, n in enumerate(names) if n in measured]
     precision = np.linalg.inv(covariance[np.ix_(rows, rows)])
-    far = precision @ (logarithms(measured)[rows] - mean[rows]) / np.sqrt(np.diag(precision))
-    return max(zip(far.tolist(), (names[k] for k in rows), strict=True), default=(-np.inf, ""))
+    far = (
+        precision
+        @ (logarithms(measured)[rows] - mean[rows])
+        / np.sqrt(np.diag(precision))
+    )
+    return max(
+        zip(far.tolist(), (names[k] for k in rows), strict=True), default=(-np.inf, "")
+    )
 
 
 def logarithms(measured: dict[str, float]) -> np.ndarray:
     """(measures,) in the order of HORIZONS, NaN where there is none."""
-    return np.log([max(measured[n], 1e-12) if n in measured else np.nan for n in HORIZONS])
+    return np.log(
+        [max(measured[n], 1e-12) if n in measured else np.nan for n in HORIZONS]
+    )
 
 
 @lru_cache(maxsize=1)
@@ -258,8 +295,8 @@ def calibration() -> list[dict[str, float]]:
 
 @lru_cache(maxsize=1)
 def usual() -> tuple[np.ndarray, np.ndarray]:
-    """Mean (measures,) and covariance (measures, measures) of the logarithms over the calibration's
-    cases that have them.
+    """Mean (measures,) and covariance (measures, measures) of the logarithms over the
+    calibration's cases that have them.
     """
     logs = np.ma.masked_invalid([logarithms(case) for case in calibration()])
     return logs.mean(0).filled(0.0), np.ma.cov(logs, rowvar=False).filled(0.0)

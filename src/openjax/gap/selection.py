@@ -1,12 +1,13 @@
-"""Which physics effects act: all small sets weighed by the model linearised, the best of them
-fitted, then the most plausible set that isn't clearly worse.
+"""Which physics effects act: all small sets weighed by the model linearised, the best
+of them fitted, then the most plausible set that isn't clearly worse.
 
-The score of a set of effects is its log predictive density on stretches left out (Vehtari, Gelman,
-Gabry 2017) plus the log prior odds of its effects. Chosen is the set of the
-largest prior odds among those that these flights can't tell from the best: the difference is within
-its standard errors, or too small to matter (the one-standard-error rule of Breiman et al. 1984,
-with a region of practical equivalence). How often each set is chosen when blocks of flight are
-weighed anew by a Bayesian bootstrap is its probability; named is the most probable one.
+The score of a set of effects is its log predictive density on stretches left out
+(Vehtari, Gelman, Gabry 2017) plus the log prior odds of its effects. Chosen is the set
+of the largest prior odds among those that these flights can't tell from the best: the
+difference is within its standard errors, or too small to matter (the one-standard-error
+rule of Breiman et al. 1984, with a region of practical equivalence). How often each set
+is chosen when blocks of flight are weighed anew by a Bayesian bootstrap is its
+probability; named is the most probable one.
 """
 
 from __future__ import annotations
@@ -28,19 +29,20 @@ from openjax.gap.model.library import CARDS, PLACE, places
 from openjax.gap.model.table import Model, Table, build, with_effects
 from openjax.gap.shapes import Squares
 
-# Nats that an effect of usual size must promise: its gain is then expected at two standard errors,
-# as the gain of a true effect is half the square of what it does, and its standard error that
-# square's root.
+# Nats that an effect of usual size must promise: its gain is then expected at two
+# standard errors, as the gain of a true effect is half the square of what it does, and
+# its standard error that square's root.
 DETECTABLE = 2.0 * DECISION.standard_errors**2
 NOTHING = frozenset()
 Measured = Mapping[tuple[str, str], tuple[float, float]]
 REACH = 1.645  # standard deviations of a 90 % interval
 LARGEST = 3  # effects of a set
-# Growth of the gap that counts where nuisances are as the best set has them. With .05, errors of the
-# rate loop's form are named as inertia; with .15 or .2 as much is right on the cases tried.
+# Growth of the gap that counts where nuisances are as the best set has them. With .05,
+# errors of the rate loop's form are named as inertia; with .15 or .2 as much is right
+# on the cases tried.
 DOES = 0.15
-# Sets that are fitted in full, of those that the model promises as linearised around nothing, and
-# then around the best of these.
+# Sets that are fitted in full, of those that the model promises as linearised around
+# nothing, and then around the best of these.
 FITTED = 10
 FITTED_AGAIN = 6
 SCREENED = 4  # times as many are weighed with bounded nuisances before that
@@ -51,8 +53,8 @@ ROUNDS = 10  # of the chosen set's last fit, between which nuisances are worked 
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """A fitted set of effects, judged on stretches left out; `support`: nats by which the torques'
-    response in closed loop speaks for it.
+    """A fitted set of effects, judged on stretches left out; `support`: nats by which
+    the torques' response in closed loop speaks for it.
     """
 
     fit: SetFit
@@ -71,9 +73,9 @@ class Hypothesis:
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """The hypothesis `chosen` and `table` around it; `effects` that it names, strongest first;
-    `weights` {effects: share of the draws in which that set is chosen}; `equivalent` {effect:
-    others that would do as well in its place}.
+    """The hypothesis `chosen` and `table` around it; `effects` that it names, strongest
+    first; `weights` {effects: share of the draws in which that set is chosen};
+    `equivalent` {effect: others that would do as well in its place}.
     """
 
     chosen: Hypothesis
@@ -98,16 +100,22 @@ def select(evidence: Evidence) -> Selection:
     search = searched(evidence)
     weights = search.weights()
     chosen = search.visited[max(weights, key=weights.get)]
-    without = {e: search.of_set(set(chosen.effects) - {e}, chosen.fit) for e in chosen.effects}
+    without = {
+        e: search.of_set(set(chosen.effects) - {e}, chosen.fit) for e in chosen.effects
+    }
     gains = {
-        e: growth(h.judged.squares.sum(0), chosen.judged.squares.sum(0)) for e, h in without.items()
+        e: growth(h.judged.squares.sum(0), chosen.judged.squares.sum(0))
+        for e, h in without.items()
     }
     ordered = tuple(sorted(gains, key=lambda e: -gains[e]))
     chosen = replace(
-        chosen, fit=fit_set(chosen.fit.replay, chosen.effects, chosen.fit.theta, rounds=ROUNDS)
+        chosen,
+        fit=fit_set(chosen.fit.replay, chosen.effects, chosen.fit.theta, rounds=ROUNDS),
     )
     table = build(chosen.fit, {})
-    return Selection(chosen, table, ordered, weights, search.equivalents(chosen, ordered), search)
+    return Selection(
+        chosen, table, ordered, weights, search.equivalents(chosen, ordered), search
+    )
 
 
 def searched(evidence: Evidence) -> Search:
@@ -120,7 +128,9 @@ def searched(evidence: Evidence) -> Search:
 
 
 def testable(evidence: Evidence) -> dict[str, SetFit]:
-    """{effect: its fit alone} of the physics effects that show, or would at their usual size."""
+    """{effect: its fit alone} of the physics effects that show, or would at their usual
+    size.
+    """
     motion = evidence.motion
     return {
         e: fit
@@ -130,44 +140,52 @@ def testable(evidence: Evidence) -> dict[str, SetFit]:
 
 
 def difference(better: Judged, other: Judged) -> tuple[float, float, float]:
-    """By how much the log density of one hypothesis exceeds another's on stretches left out, the
-    standard error, and which share of its square white residuals would leave.
+    """By how much the log density of one hypothesis exceeds another's on stretches left
+    out, the standard error, and which share of its square white residuals would leave.
 
-    Given what the two predict, only noise is random: its variance is that of white residuals or,
-    where that is more, what the residuals of the better one show block by block (cluster-robust,
-    Liang and Zeger 1986). So an effect that acts in one block in ten is judged by that block.
+    Given what the two predict, only noise is random: its variance is that of white
+    residuals or, where that is more, what the residuals of the better one show block by
+    block (cluster-robust, Liang and Zeger 1986). So an effect that acts in one block in
+    ten is judged by that block.
     """
     change = other.left - better.left
     cross = np.add.reduceat(change * better.left, better.starts)
     energy = np.add.reduceat(change * change, better.starts)
     square = max(float((cross**2).sum()), float(energy.sum()), 1e-12)
-    return float((cross + 0.5 * energy).sum()), square**0.5, float(energy.sum()) / square
+    return (
+        float((cross + 0.5 * energy).sum()),
+        square**0.5,
+        float(energy.sum()) / square,
+    )
 
 
 def growth(
     squares: Squares, floor: Float[np.ndarray, " channels"]
 ) -> Float[np.ndarray, "*sets"] | np.floating:
-    """By how many floors a gap of squared errors (..., channels) is larger than one of the squares
-    `floor` (channels,).
+    """By how many floors a gap of squared errors (..., channels) is larger than one of
+    the squares `floor` (channels,).
     """
     return np.sqrt((squares / floor).mean(-1)) - 1.0
 
 
 def matters(squares, floor, nothing, least: float = DECISION.least_gap):
-    """Whether a gap of squares (..., channels) is so much larger than `floor` that it matters beside
-    what `nothing` (channels,) leaves.
+    """Whether a gap of squares (..., channels) is so much larger than `floor` that it
+    matters beside what `nothing` (channels,) leaves.
     """
-    return growth(squares, floor) > np.maximum(least, DECISION.form_error * growth(nothing, floor))
+    return growth(squares, floor) > np.maximum(
+        least, DECISION.form_error * growth(nothing, floor)
+    )
 
 
 def worse(gain, error, gaps, beside):
-    """Whether a set is clearly worse than the best: by so many nats `gain` with their standard
-    `error`, and so that it matters. `gaps` are squares of the set, the best and nothing.
+    """Whether a set is clearly worse than the best: by so many nats `gain` with their
+    standard `error`, and so that it matters. `gaps` are squares of the set, the best
+    and nothing.
 
-    Nuisances take a part of what an effect does, as a wrong moment of inertia looks like a nuisance
-    of some per cent. Whether an effect matters is also asked of `beside`, the same squares with
-    nuisances as the best set has them; whether it is needed, of the nats alone, in which nuisances
-    are free.
+    Nuisances take a part of what an effect does, as a wrong moment of inertia looks
+    like a nuisance of some per cent. Whether an effect matters is also asked of
+    `beside`, the same squares with nuisances as the best set has them; whether it is
+    needed, of the nats alone, in which nuisances are free.
     """
     clear = (gain > DECISION.standard_errors * error) & matters(*gaps)
     return clear | ((gain > REACH * error) & matters(*beside, DOES))
@@ -179,10 +197,11 @@ def log_odds(effects) -> float:
 
 
 def practical(fit: SetFit, measured: Measured) -> bool:
-    """Whether every effect of a set is clearly of a size that matters in practice: of some parameter
-    the 90 % interval is further from doing nothing than its card says (a region of practical
-    equivalence on the parameter, Kruschke 2018). Intervals are the replay's and, of what the
-    torques' response tells, those that are `measured`: {(effect, parameter): (value, deviation)}.
+    """Whether every effect of a set is clearly of a size that matters in practice: of
+    some parameter the 90 % interval is further from doing nothing than its card says (a
+    region of practical equivalence on the parameter, Kruschke 2018). Intervals are the
+    replay's and, of what the torques' response tells, those that are `measured`:
+    {(effect, parameter): (value, deviation)}.
     """
     found = fit.parameters()
 
@@ -190,12 +209,19 @@ def practical(fit: SetFit, measured: Measured) -> bool:
         place = PLACE[effect, parameter]
         least = size * fit.replay.grown[place]
         estimates = [found[effect][parameter]]
-        estimates += [measured[effect, parameter]] if (effect, parameter) in measured else []
-        return any(abs(v - fit.replay.absent[place]) - REACH * d > least for v, d in estimates)
+        estimates += (
+            [measured[effect, parameter]] if (effect, parameter) in measured else []
+        )
+        return any(
+            abs(v - fit.replay.absent[place]) - REACH * d > least for v, d in estimates
+        )
 
     return all(
         not CARDS[e].practical
-        or any(matters_of(e, parameter, size) for parameter, size in CARDS[e].practical.items())
+        or any(
+            matters_of(e, parameter, size)
+            for parameter, size in CARDS[e].practical.items()
+        )
         for e in fit.effects
     )
 
@@ -214,7 +240,9 @@ def within_bounds(fit: SetFit, effect: str) -> bool:
 
 @dataclass(eq=False)
 class Search:
-    """`singles` {effect: its fit alone} are those that may act; `visited` {effects: hypothesis}."""
+    """`singles` {effect: its fit alone} are those that may act; `visited` {effects:
+    hypothesis}.
+    """
 
     evidence: Evidence
     singles: dict[str, SetFit]
@@ -253,24 +281,38 @@ class Search:
             self.of_set({effect}, self.nothing.fit)
 
     def beyond_bounds(self) -> frozenset:
-        """Effects that leave their physical bounds in the visited set of the largest score."""
+        """Effects that leave their physical bounds in the visited set of the largest
+        score.
+        """
         best = max(self.visited.values(), key=lambda h: h.score).fit
         return frozenset(e for e in best.effects if not within_bounds(best, e))
 
-    def enumerate(self, near: Hypothesis, most: int, without: frozenset = NOTHING) -> None:
-        """Fit and judge the most promising sets of up to LARGEST effects that weren't visited yet,
-        by the model linearised around the hypothesis `near`, and what is left of each when one of
-        its effects goes; sets with an effect of `without` aside.
+    def enumerate(
+        self, near: Hypothesis, most: int, without: frozenset = NOTHING
+    ) -> None:
+        """Fit and judge the most promising sets of up to LARGEST effects that weren't
+        visited yet, by the model linearised around the hypothesis `near`, and what is
+        left of each when one of its effects goes; sets with an effect of `without`
+        aside.
         """
         table = build(near.fit, self.singles)
-        models = {key: self._model(table, key) for key in self.sets() if not key & without}
+        models = {
+            key: self._model(table, key) for key in self.sets() if not key & without
+        }
 
         def ranked(keys, promise_of):
             score = {
-                k: promise_of(table, models[k]) - len(models[k].free) + log_odds(k) + self.heard(k)
+                k: promise_of(table, models[k])
+                - len(models[k].free)
+                + log_odds(k)
+                + self.heard(k)
                 for k in keys
             }
-            return [k for k in sorted(keys, key=lambda k: -score[k]) if score[k] > score[NOTHING]]
+            return [
+                k
+                for k in sorted(keys, key=lambda k: -score[k])
+                if score[k] > score[NOTHING]
+            ]
 
         likely = ranked(models, screened)[: SCREENED * most]
         best = ranked([NOTHING, *(k for k in likely if k != NOTHING)], promise)
@@ -280,7 +322,9 @@ class Search:
             self.of_set(key, near.fit)
 
     def heard(self, key: frozenset) -> float:
-        """Nats by which the torques' response speaks for a set with each effect as it was alone."""
+        """Nats by which the torques' response speaks for a set with each effect as it
+        was alone.
+        """
         theta = self.nothing.fit.theta.copy()
         for effect in key:
             own = places((effect,))
@@ -290,7 +334,9 @@ class Search:
     def _model(self, table: Table, key: frozenset) -> Model:
         """A set in the table of another one."""
         before = set(table.fit.effects)
-        come, gone = ([e for e in CARDS if e in change] for change in (key - before, before - key))
+        come, gone = (
+            [e for e in CARDS if e in change] for change in (key - before, before - key)
+        )
         return with_effects(table, come, gone)
 
     def sets(self) -> list[frozenset]:
@@ -301,11 +347,13 @@ class Search:
     @property
     def best(self) -> Hypothesis:
         """Of the visited sets that are possible the one of the largest score."""
-        return max((h for h in self.visited.values() if possible(h.fit)), key=lambda h: h.score)
+        return max(
+            (h for h in self.visited.values() if possible(h.fit)), key=lambda h: h.score
+        )
 
     def clearly_worse(self, other: Hypothesis, best: Hypothesis) -> bool:
-        """Whether flights tell a hypothesis from the best one, and it leaves a gap so much larger
-        that it matters.
+        """Whether flights tell a hypothesis from the best one, and it leaves a gap so
+        much larger that it matters.
         """
         gain, error, _ = difference(best.judged, other.judged)
         if best.support - other.support > DETECTABLE:
@@ -316,8 +364,8 @@ class Search:
         return bool(worse(gain, error, gaps, beside))
 
     def equivalents(self, chosen: Hypothesis, named) -> dict[str, list[str]]:
-        """For each named effect those in whose place, of the sets visited, flights don't tell the
-        difference.
+        """For each named effect those in whose place, of the sets visited, flights
+        don't tell the difference.
         """
         out = {}
         for effect in named:
@@ -333,18 +381,23 @@ class Search:
         return out
 
     def choose(self, weights: Float[np.ndarray, "draws blocks"]) -> list[Hypothesis]:
-        """For each row of blocks' weights (D, B) the hypothesis of the largest prior odds that
-        isn't clearly worse than the best. Of equal odds it is the one with the most evidence: its
-        density, worth as many nats as blocks bear out (Pauli, Racugno, Ventura 2011), less what its
-        parameters cost (Occam's factor).
+        """For each row of blocks' weights (D, B) the hypothesis of the largest prior
+        odds that isn't clearly worse than the best. Of equal odds it is the one with
+        the most evidence: its density, worth as many nats as blocks bear out (Pauli,
+        Racugno, Ventura 2011), less what its parameters cost (Occam's factor).
         """
         measured = self.evidence.measured
-        sets = [h for h in self.visited.values() if possible(h.fit) and practical(h.fit, measured)]
+        sets = [
+            h
+            for h in self.visited.values()
+            if possible(h.fit) and practical(h.fit, measured)
+        ]
         odds, costs = np.array([(h.log_odds, h.fit.cost) for h in sets]).T
         pairs = [[difference(a.judged, b.judged) for b in sets] for a in sets]
         _, errors, trust = np.moveaxis(np.array(pairs), 2, 0)
         response = np.array([h.support for h in sets])
-        density = weights @ np.array([h.judged.nats for h in sets]).T + response  # (D, sets)
+        # (D, sets)
+        density = weights @ np.array([h.judged.nats for h in sets]).T + response
         nothing = sets.index(self.nothing)
         chosen = []
         squares = np.array([h.judged.squares for h in sets])
@@ -352,11 +405,16 @@ class Search:
         for weight, nats in zip(weights, density, strict=True):
             best = int(np.argmax(nats + odds))
             if best not in beside:
-                beside[best] = np.array([h.judged.squares_beside(sets[best].judged) for h in sets])
-            gaps, own = (np.einsum("b,sbc->sc", weight, s) for s in (squares, beside[best]))
+                beside[best] = np.array(
+                    [h.judged.squares_beside(sets[best].judged) for h in sets]
+                )
+            gaps, own = (
+                np.einsum("b,sbc->sc", weight, s) for s in (squares, beside[best])
+            )
             told = (nats[best] - nats, errors[best])
             out = worse(*told, *((g, g[best], g[nothing]) for g in (gaps, own)))
-            # The response judges by itself: it counts no blocks, and its intervals hold the forms'.
+            # The response judges by itself: it counts no blocks, and its intervals hold
+            # the forms'.
             out |= response[best] - response > DETECTABLE
             usual = ~out & (odds == odds[~out].max())
             first = int(np.argmax(np.where(usual, nats, -np.inf)))
@@ -365,8 +423,8 @@ class Search:
         return chosen
 
     def weights(self) -> dict[frozenset, float]:
-        """{effects: share of the draws in which that set is chosen}, of a Bayesian bootstrap over
-        blocks (Rubin 1981).
+        """{effects: share of the draws in which that set is chosen}, of a Bayesian
+        bootstrap over blocks (Rubin 1981).
         """
         blocks = len(self.nothing.judged.nats)
         drawn = np.random.default_rng(0).dirichlet(np.ones(blocks), DRAWS) * blocks

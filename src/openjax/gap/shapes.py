@@ -1,6 +1,7 @@
 """Shapes in types: NumPy's arrays of the diagnosis.
 
-Channels are the nine of a row: angular velocity, velocity and specific force, three axes each.
+Channels are the nine of a row: angular velocity, velocity and specific force, three
+axes each.
 """
 
 import numpy as np

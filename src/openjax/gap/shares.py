@@ -1,12 +1,13 @@
-"""How the gap splits: what each accepted effect, the sensors and the unexplained rest take of it,
-on stretches that no parameter was fitted to.
+"""How the gap splits: what each accepted effect, the sensors and the unexplained rest
+take of it, on stretches that no parameter was fitted to.
 
-The gap is the rms over channels of each channel's prediction error over its floor: velocity over
-0.25 s as path and accelerometer say it, body rates over 0.05 s, the pose against the gyroscope over
-0.1 s, the motor commands from the body-rate commands. The floor is what is left with all accepted
-effects, less what the residual check finds in excess of noise. A share is what the gap's square
-grows by when one part goes and all others stay (its usefulness, Darlington 1968), in proportion to
-that of all parts, so that shares add up to one with what is unexplained.
+The gap is the rms over channels of each channel's prediction error over its floor:
+velocity over 0.25 s as path and accelerometer say it, body rates over 0.05 s, the pose
+against the gyroscope over 0.1 s, the motor commands from the body-rate commands. The
+floor is what is left with all accepted effects, less what the residual check finds in
+excess of noise. A share is what the gap's square grows by when one part goes and all
+others stay (its usefulness, Darlington 1968), in proportion to that of all parts, so
+that shares add up to one with what is unexplained.
 """
 
 from dataclasses import dataclass
@@ -26,7 +27,8 @@ METRIC = (
     "s by path and by accelerometer, body rates over 0.05 s, pose against gyroscope over 0.1 s, "
     "motor commands from body-rate commands)"
 )
-# Nuisances that are the sensors' and the clocks': how they are mounted, biased, filtered and timed.
+# Nuisances that are the sensors' and the clocks': how they are mounted, biased,
+# filtered and timed.
 SENSORS = (
     "frame tilt",
     "level of the world",
@@ -92,14 +94,16 @@ class Split:
 def split(
     evidence: Evidence, selection: Selection, predicted: Float[np.ndarray, "9"], named
 ) -> Split:
-    """Shares of the `named` effects, of all paths. `predicted` (9,): share of each motion channel's
-    squared error that the residual check finds in excess of noise.
+    """Shares of the `named` effects, of all paths. `predicted` (9,): share of each
+    motion channel's squared error that the residual check finds in excess of noise.
     """
-    channels, squares = _squares_of_sets(evidence, selection, named)  # (sets, blocks, channels)
+    # (sets, blocks, channels)
+    channels, squares = _squares_of_sets(evidence, selection, named)
     known = dict(zip(ERRORS, predicted, strict=True))
     left = 1.0 - np.array([known.get(n, 0.0) for n in channels])
     blocks = squares.shape[1]
-    # the first row are the flights as they are, the others draws of a Bayesian bootstrap
+    # the first row are the flights as they are, the others draws of a Bayesian
+    # bootstrap
     drawn = np.random.default_rng(0).dirichlet(np.ones(blocks), DRAWS)
     weights = np.concatenate([np.full((1, blocks), 1.0 / blocks), drawn])
     values, before = shares_of_squares(squares, weights, left)
@@ -127,24 +131,29 @@ def shares_of_squares(
     weights: Float[np.ndarray, "draws blocks"],
     floor_share: Float[np.ndarray, " channels"],
 ):
-    """Shares (draws, parts + 1), what is unexplained last, and the gap's square before and after
-    (draws, 2).
+    """Shares (draws, parts + 1), what is unexplained last, and the gap's square before
+    and after (draws, 2).
 
-    squares (sets, blocks, channels): of all parts, none, none but the sensors, and all without each
-    part. weights (draws, blocks). floor_share (channels,): of the squares that all parts leave,
-    what is floor.
+    squares (sets, blocks, channels): of all parts, none, none but the sensors, and all
+    without each part. weights (draws, blocks). floor_share (channels,): of the squares
+    that all parts leave, what is floor.
     """
     level = np.einsum("db,sbc->dsc", weights, squares)
     floor = level[:, :1] * floor_share + 1e-30
     level = (level / floor).mean(2)  # (draws, sets)
     after, raw, before = level[:, :3].T
     whole = np.maximum(raw, before) - 1.0
-    sure = whole > 2.0 * DECISION.least_gap  # without a gap, all there is are the sensors
-    unexplained = np.where(sure, np.clip((after - 1.0) / np.where(sure, whole, 1.0), 0.0, 1.0), 0.0)
+    # without a gap, all there is are the sensors
+    sure = whole > 2.0 * DECISION.least_gap
+    unexplained = np.where(
+        sure, np.clip((after - 1.0) / np.where(sure, whole, 1.0), 0.0, 1.0), 0.0
+    )
     useful = np.maximum(level[:, 3:] - after[:, None], 0.0) * sure[:, None]
     useful[:, -1] += 1e-12  # the sensors take all where nothing else is of use
     shares = useful / useful.sum(1, keepdims=True) * (1.0 - unexplained)[:, None]
-    return np.concatenate([shares, unexplained[:, None]], 1), np.stack([before, after], 1)
+    return np.concatenate([shares, unexplained[:, None]], 1), np.stack(
+        [before, after], 1
+    )
 
 
 def _gap(square: np.ndarray) -> Gap:
@@ -171,8 +180,8 @@ def _squares_of_sets(
     """
     table = selection.table
     found = left_out(table, with_effects(table))
-    # Numbers of the vehicle and what feedback makes of gusts are no sensor's fault and no effect:
-    # they stay.
+    # Numbers of the vehicle and what feedback makes of gusts are no sensor's fault and
+    # no effect: they stay.
     sensors = np.array([n.startswith(SENSORS) for n in evidence.replay.nuisance_names])
     never = [e for e in selection.fit.effects if e not in named]
 
@@ -191,15 +200,17 @@ def _squares_of_sets(
 
 
 def _other_squares(evidence: Evidence, named, table) -> dict[str, np.ndarray]:
-    """{channel: (blocks,) mean squared errors} of pose, rate loop and radio with the effects
-    `named`.
+    """{channel: (blocks,) mean squared errors} of pose, rate loop and radio with the
+    effects `named`.
     """
     counts = [int((table.track_of == k).sum()) for k in range(len(evidence.tracks))]
     out: dict[str, np.ndarray] = {}
     for channel in evidence.channels:
         for name, series in channel.residuals(named).items():
             blocks = []
-            for track, errors, count in zip(evidence.tracks, series, counts, strict=True):
+            for track, errors, count in zip(
+                evidence.tracks, series, counts, strict=True
+            ):
                 # of some channels one number is known of a whole flight
                 used = errors[int(SKIP / track.dt) :]
                 if len(errors) == 1:

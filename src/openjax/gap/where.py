@@ -1,5 +1,5 @@
-"""Where the gap lies: channel by regime, in units of the noise floor, before and after the named
-effects.
+"""Where the gap lies: channel by regime, in units of the noise floor, before and after
+the named effects.
 """
 
 from dataclasses import dataclass, replace
@@ -46,11 +46,14 @@ class Place:
 
 
 def locate(evidence: Evidence, fit: SetFit, named=()) -> list[Place]:
-    """The table, largest share first. `fit` is the physics part of the verdict, `named` all named
-    effects.
+    """The table, largest share first. `fit` is the physics part of the verdict, `named`
+    all named effects.
     """
     names = [e for e in named if e in fit.effects]
-    masks = [{r: m[int(SKIP / t.dt) :] for r, m in regimes_of(t).items()} for t in evidence.tracks]
+    masks = [
+        {r: m[int(SKIP / t.dt) :] for r, m in regimes_of(t).items()}
+        for t in evidence.tracks
+    ]
     inside = {r: np.concatenate([m[r] for m in masks]) for r in REGIMES}
     seconds = {r: int(m.sum()) * evidence.tracks[0].dt for r, m in inside.items()}
     places = []
@@ -60,16 +63,22 @@ def locate(evidence: Evidence, fit: SetFit, named=()) -> list[Place]:
         for regime in (r for r in REGIMES if seconds[r] >= LEAST_TIME):
             b, a = (float(p[inside[regime]].mean() / floor) for p in powers[:2])
             excess = max(b - 1.0, 0.0) * seconds[regime]
-            places.append(Place(channel, regime, excess, b**0.5, a**0.5, seconds[regime]))
+            places.append(
+                Place(channel, regime, excess, b**0.5, a**0.5, seconds[regime])
+            )
     total = sum(p.share for p in places) or 1.0
-    return sorted((replace(p, share=p.share / total) for p in places), key=lambda p: -p.share)
+    return sorted(
+        (replace(p, share=p.share / total) for p in places), key=lambda p: -p.share
+    )
 
 
 def before_and_after(
     fit: SetFit, named
-) -> tuple[list[Float[np.ndarray, "_ channels"]], list[Float[np.ndarray, "_ channels"]]]:
-    """Residuals (T, 9) of each track without the `named` effects of a fit, all else as with them,
-    and with them: the same before as the gap's.
+) -> tuple[
+    list[Float[np.ndarray, "_ channels"]], list[Float[np.ndarray, "_ channels"]]
+]:
+    """Residuals (T, 9) of each track without the `named` effects of a fit, all else as
+    with them, and with them: the same before as the gap's.
     """
     after = residuals_of(fit)
     without = fit.theta.copy()
@@ -79,8 +88,12 @@ def before_and_after(
     return [a + m[0] - m[1] for a, m in zip(after, moved, strict=True)], after
 
 
-def _motion_powers(evidence: Evidence, fit: SetFit, named) -> dict[str, list[np.ndarray]]:
-    """{channel: squared smoothed disturbances (rows,) before, after and at the floor}."""
+def _motion_powers(
+    evidence: Evidence, fit: SetFit, named
+) -> dict[str, list[np.ndarray]]:
+    """{channel: squared smoothed disturbances (rows,) before, after and at the
+    floor}.
+    """
     both = []
     for residuals in before_and_after(fit, named):
         rows = []
@@ -91,7 +104,8 @@ def _motion_powers(evidence: Evidence, fit: SetFit, named) -> dict[str, list[np.
             rows.append(calm[int(SKIP / track.dt) :] ** 2)
         both.append(np.concatenate(rows))
     return {
-        name: [both[0][:, k], both[1][:, k], both[1][:, k]] for k, name in enumerate(CHANNELS[:6])
+        name: [both[0][:, k], both[1][:, k], both[1][:, k]]
+        for k, name in enumerate(CHANNELS[:6])
     }
 
 
@@ -114,8 +128,12 @@ def _other_powers(evidence: Evidence, named) -> dict[str, list[np.ndarray]]:
     return found
 
 
-def _mean_squares(evidence: Evidence, errors: dict, scale: dict[str, float]) -> np.ndarray:
-    """(rows,) mean over a channel's series of their squared errors, each in units of its scale."""
+def _mean_squares(
+    evidence: Evidence, errors: dict, scale: dict[str, float]
+) -> np.ndarray:
+    """(rows,) mean over a channel's series of their squared errors, each in units of
+    its scale.
+    """
     rows = []
     for number, track in enumerate(evidence.tracks):
         scaled = [series[number] / scale[name] for name, series in errors.items()]
@@ -132,5 +150,7 @@ def in_words(places: list[Place]) -> str:
         kind, _, axis = place.channel.partition("_")
         name = f"{words[kind]} {axis}" if kind in words else place.channel
         regime = place.regime.replace("_", " ")
-        parts.append(f"{name} in {regime} flight ({place.before:.1f} times the noise floor)")
+        parts.append(
+            f"{name} in {regime} flight ({place.before:.1f} times the noise floor)"
+        )
     return "; ".join(parts) or "no channel stands out of the noise"

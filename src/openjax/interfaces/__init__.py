@@ -1,5 +1,5 @@
-"""The game behind other libraries' interfaces: Gymnasium, PettingZoo, JaxMARL. Each is thin; the
-game stays what it is.
+"""The game behind other libraries' interfaces: Gymnasium, PettingZoo, JaxMARL. Each is
+thin; the game stays what it is.
 
 With this package imported, Gymnasium knows the game by the name "openjax/Pursuit-v0".
 """

@@ -1,4 +1,6 @@
-"""Observations as flat vectors, for libraries that want arrays instead of structures."""
+"""Observations as flat vectors, for libraries that want arrays instead of
+structures.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -20,17 +22,20 @@ def flat_size(settings: PursuitSettings) -> int:
 def flat_observation(observation: Observation) -> jax.Array:
     """(..., N, D) what each of N pursuers observes, in one vector.
 
-    In this order: its own state (see `Observation.self_state`), the other pursuers, the nearest
-    pillars, and its position relative to where the evader was last seen (m). What isn't seen is -5.
+    In this order: its own state (see `Observation.self_state`), the other pursuers, the
+    nearest pillars, and its position relative to where the evader was last seen (m).
+    What isn't seen is -5.
     """
-    # the axes of worlds and pursuers stay; what each sees of others and pillars becomes one row
+    # the axes of worlds and pursuers stay; what each sees of others and pillars becomes
+    # one row
     lead = observation.self_state.shape[:-1]
     parts = (
         observation.self_state,
         observation.others.reshape(*lead, -1),
         observation.pillars.reshape(*lead, -1),
         turned_back(
-            observation.heading, observation.position - observation.last_seen[..., None, :]
+            observation.heading,
+            observation.position - observation.last_seen[..., None, :],
         ),
     )
     return jnp.concatenate(parts, axis=-1)

@@ -1,5 +1,5 @@
-"""One world as a Gymnasium `Env`, many as a `VectorEnv`; one agent flies the whole team (`pip
-install gymnasium`).
+"""One world as a Gymnasium `Env`, many as a `VectorEnv`; one agent flies the whole team
+(`pip install gymnasium`).
 """
 
 import jax
@@ -15,8 +15,8 @@ from openjax.pursuit import Pursuit, make
 
 
 class _Team:
-    """The team as one agent: flat observation and action, spaces and pure functions of one
-    world.
+    """The team as one agent: flat observation and action, spaces and pure functions of
+    one world.
     """
 
     def __init__(self, environment: Pursuit | None, changes: dict):
@@ -30,7 +30,9 @@ class _Team:
         self._number = settings.num_pursuers
         size = (self._number * flat_size(settings),)
         self.observation_space = spaces.Box(-np.inf, np.inf, size, np.float32)
-        self.action_space = spaces.Box(-1.0, 1.0, (self._number * ACTION_SIZE,), np.float32)
+        self.action_space = spaces.Box(
+            -1.0, 1.0, (self._number * ACTION_SIZE,), np.float32
+        )
 
     def reset(self, key):
         observation, state = self.environment.reset(key)
@@ -48,10 +50,12 @@ class _Team:
 
 
 class PursuitEnv(Env):
-    """One world in which one agent flies the whole team: `gymnasium.make("openjax/Pursuit-v0")`.
+    """One world in which one agent flies the whole team:
+    `gymnasium.make("openjax/Pursuit-v0")`.
 
-    Observation (N * D,) float32: all pursuers' vectors (`flat_observation`). Action (N * 4,) in
-    -1..1: theirs. The reward is their mean. `info` says whether somebody captured or crashed.
+    Observation (N * D,) float32: all pursuers' vectors (`flat_observation`). Action (N
+    * 4,) in -1..1: theirs. The reward is their mean. `info` says whether somebody
+    captured or crashed.
 
     Args:
       environment: the game; None is the nominal one.
@@ -74,7 +78,9 @@ class PursuitEnv(Env):
         self._step = jax.jit(team.step)
 
     def reset(self, *, seed: int | None = None, options: dict | None = None):
-        """Start an episode; `seed` determines it and those that follow. `options` are ignored."""
+        """Start an episode; `seed` determines it and those that follow. `options` are
+        ignored.
+        """
         # Gymnasium's generator draws our key, so that its seed determines all episodes
         super().reset(seed=seed)
         key = jax.random.key(int(self.np_random.integers(2**31)))
@@ -87,15 +93,22 @@ class PursuitEnv(Env):
         observation, self._state, *rest = self._step(self._state, action)
         reward, terminated, truncated, events = jax.device_get(rest)
         info = {name: bool(value) for name, value in events.items()}
-        return np.array(observation), float(reward), bool(terminated), bool(truncated), info
+        return (
+            np.array(observation),
+            float(reward),
+            bool(terminated),
+            bool(truncated),
+            info,
+        )
 
 
 class PursuitVectorEnv(VectorEnv):
     """E worlds at once, as one compiled function.
 
-    Observations (E, N * D) float32 are all pursuers' vectors (`flat_observation`), actions (E, N *
-    4) in -1..1 theirs, the reward (E,) is their mean. Worlds start anew in the step that ends them
-    (`AutoresetMode.SAME_STEP`): the last observation of the episode is in `infos["final_obs"]`.
+    Observations (E, N * D) float32 are all pursuers' vectors (`flat_observation`),
+    actions (E, N * 4) in -1..1 theirs, the reward (E,) is their mean. Worlds start anew
+    in the step that ends them (`AutoresetMode.SAME_STEP`): the last observation of the
+    episode is in `infos["final_obs"]`.
 
     Args:
       num_envs: worlds E.
@@ -108,7 +121,9 @@ class PursuitVectorEnv(VectorEnv):
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}  # noqa: RUF012
 
-    def __init__(self, num_envs: int = 1, environment: Pursuit | None = None, **changes):
+    def __init__(
+        self, num_envs: int = 1, environment: Pursuit | None = None, **changes
+    ):
         team = _Team(environment, changes)
         self.environment = team.environment
         self.num_envs = num_envs
@@ -123,7 +138,9 @@ class PursuitVectorEnv(VectorEnv):
         self._step = jax.jit(jax.vmap(team.step))
 
     def reset(self, *, seed: int | None = None, options: dict | None = None):
-        """Start all worlds anew; `seed` determines them and what follows. `options` are ignored."""
+        """Start all worlds anew; `seed` determines them and what follows. `options` are
+        ignored.
+        """
         if seed is not None:
             self._key = jax.random.key(seed)
         observation, self._state = self._reset(self._keys())
@@ -140,7 +157,8 @@ class PursuitVectorEnv(VectorEnv):
         infos = {name: np.array(value) for name, value in info.items()}
         infos |= {f"_{name}": np.ones(self.num_envs, bool) for name in info}
         if over.any():
-            # all worlds start anew, and those that are over take theirs: one compiled program
+            # all worlds start anew, and those that are over take theirs: one compiled
+            # program
             fresh_observation, fresh = self._reset(self._keys())
             infos["final_obs"] = to_numpy(observation)
             infos["_final_obs"] = over

@@ -1,8 +1,8 @@
-"""The game with JaxMARL's manners: dictionaries by agent, `step` that starts anew where an episode
-ends.
+"""The game with JaxMARL's manners: dictionaries by agent, `step` that starts anew where
+an episode ends.
 
-It has the methods of `jaxmarl.environments.MultiAgentEnv` without needing JaxMARL: everything is
-pure, so its trainers can map and compile it.
+It has the methods of `jaxmarl.environments.MultiAgentEnv` without needing JaxMARL:
+everything is pure, so its trainers can map and compile it.
 """
 
 import functools
@@ -16,8 +16,8 @@ from openjax.pursuit.spaces import Box
 
 
 class PursuitMultiAgentEnv:
-    """Agents `pursuer_0` ...; each observes (D,) float32 (`flat_observation`) and acts with (4,) in
-    -1..1.
+    """Agents `pursuer_0` ...; each observes (D,) float32 (`flat_observation`) and acts
+    with (4,) in -1..1.
 
     Args:
       environment: the game; None is the nominal one.
@@ -28,8 +28,12 @@ class PursuitMultiAgentEnv:
         self.num_agents = self.environment.settings.num_pursuers
         self.agents = [f"pursuer_{i}" for i in range(self.num_agents)]
         size = flat_size(self.environment.settings)
-        self.observation_spaces = {agent: Box(-jnp.inf, jnp.inf, (size,)) for agent in self.agents}
-        self.action_spaces = {agent: Box(-1.0, 1.0, (ACTION_SIZE,)) for agent in self.agents}
+        self.observation_spaces = {
+            agent: Box(-jnp.inf, jnp.inf, (size,)) for agent in self.agents
+        }
+        self.action_spaces = {
+            agent: Box(-1.0, 1.0, (ACTION_SIZE,)) for agent in self.agents
+        }
 
     @property
     def name(self) -> str:
@@ -52,10 +56,14 @@ class PursuitMultiAgentEnv:
 
     @functools.partial(jax.jit, static_argnums=0)
     def step(
-        self, key: jax.Array, state: PursuitState, actions: dict[str, jax.Array], reset_state=None
+        self,
+        key: jax.Array,
+        state: PursuitState,
+        actions: dict[str, jax.Array],
+        reset_state=None,
     ):
-        """`step_env`, and a new episode (of `reset_state`, where given) in place of one that has
-        ended.
+        """`step_env`, and a new episode (of `reset_state`, where given) in place of one
+        that has ended.
         """
         key, reset_key = jax.random.split(key)
         observations, state, rewards, dones, infos = self.step_env(key, state, actions)
@@ -69,14 +77,16 @@ class PursuitMultiAgentEnv:
         )
         return observations, state, rewards, dones, infos
 
-    def step_env(self, key: jax.Array, state: PursuitState, actions: dict[str, jax.Array]):
-        """One control step: observations, state, rewards, dones (with `__all__`), infos, all by
-        agent.
+    def step_env(
+        self, key: jax.Array, state: PursuitState, actions: dict[str, jax.Array]
+    ):
+        """One control step: observations, state, rewards, dones (with `__all__`),
+        infos, all by agent.
 
-        `infos` say of each agent (N,) whether it captured or crashed, and whether the end is a time
-        limit that nobody observes (`truncated`). Such an end is no end to a value: where the
-        settings don't observe time, `infos["final_obs"]` has this step's observations by agent, as
-        `step` returns those of the next start.
+        `infos` say of each agent (N,) whether it captured or crashed, and whether the
+        end is a time limit that nobody observes (`truncated`). Such an end is no end to
+        a value: where the settings don't observe time, `infos["final_obs"]` has this
+        step's observations by agent, as `step` returns those of the next start.
         """
         action = jnp.stack([actions[agent] for agent in self.agents])
         observation, state, reward, terminated, truncated, info = self.environment.step(
@@ -87,7 +97,8 @@ class PursuitMultiAgentEnv:
         observations = self._by_agent(flat_observation(observation))
         # of each agent, as JaxMARL's wrappers stack what is in `infos`
         cut = jnp.broadcast_to(truncated, info.captured.shape)
-        infos = {"captured": info.captured, "crashed": info.crashed, "truncated": cut}  # (N,) each
+        # (N,) each
+        infos = {"captured": info.captured, "crashed": info.crashed, "truncated": cut}
         if not self.environment.settings.observe_time:
             infos["final_obs"] = observations
         return observations, state, self._by_agent(reward), dones, infos

@@ -11,8 +11,8 @@ from openjax.pursuit import Pursuit
 
 
 class PursuitParallelEnv(ParallelEnv):
-    """Agents `pursuer_0` ... act together; each observes (D,) float32 (`flat_observation`) and acts
-    with (4,) in -1..1.
+    """Agents `pursuer_0` ... act together; each observes (D,) float32
+    (`flat_observation`) and acts with (4,) in -1..1.
 
     Every pursuer gets its own reward. An episode ends for all at once, after
     `settings.episode_length` steps.
@@ -33,7 +33,9 @@ class PursuitParallelEnv(ParallelEnv):
         self.possible_agents = [f"pursuer_{i}" for i in range(settings.num_pursuers)]
         self.agents: list[str] = []
         self.render_mode = None
-        self._observation_space = spaces.Box(-np.inf, np.inf, (flat_size(settings),), np.float32)
+        self._observation_space = spaces.Box(
+            -np.inf, np.inf, (flat_size(settings),), np.float32
+        )
         self._action_space = spaces.Box(-1.0, 1.0, (ACTION_SIZE,), np.float32)
         self._key = jax.random.key(0)
         self._state = None
@@ -49,7 +51,9 @@ class PursuitParallelEnv(ParallelEnv):
         return self._action_space
 
     def reset(self, seed: int | None = None, options: dict | None = None):
-        """Start an episode; `seed` determines it and those that follow. `options` are ignored."""
+        """Start an episode; `seed` determines it and those that follow. `options` are
+        ignored.
+        """
         if seed is not None:
             self._key = jax.random.key(seed)
         self._key, key = jax.random.split(self._key)
@@ -64,7 +68,9 @@ class PursuitParallelEnv(ParallelEnv):
             [jnp.asarray(actions[agent], jnp.float32) for agent in self.possible_agents]
         )
         # any key will do: the game draws nothing after its reset
-        observation, self._state, *results = self._step(jax.random.key(0), self._state, action)
+        observation, self._state, *results = self._step(
+            jax.random.key(0), self._state, action
+        )
         reward, terminated, truncated, info = to_numpy(results)
         infos = [
             {"captured": bool(captured), "crashed": bool(crashed)}

@@ -1,5 +1,5 @@
-"""The networks' activation as a formula that XLA and the kernels share, and the arithmetic that
-kernels do it with.
+"""The networks' activation as a formula that XLA and the kernels share, and the
+arithmetic that kernels do it with.
 """
 
 from collections.abc import Callable
@@ -24,8 +24,8 @@ PLAIN = Arithmetic(jnp.tanh, lambda a, b, c: a * b + c)
 def kernel_arithmetic(dtype: jnp.dtype, interpret: bool) -> Arithmetic:
     """What a kernel computes with whose results are stored as `dtype`.
 
-    The GPU's own tanh errs by less than a bfloat16 can show. Triton's compiler leaves products and
-    sums apart unless told.
+    The GPU's own tanh errs by less than a bfloat16 can show. Triton's compiler leaves
+    products and sums apart unless told.
     """
     if interpret:
         return PLAIN
@@ -45,8 +45,8 @@ def _multiply_add(a, b, c):
 
 
 def activation(x: jax.Array, arithmetic: Arithmetic = PLAIN) -> jax.Array:
-    """x sigmoid(1.702 x), the cheap approximation of GELU (Hendrycks and Gimpel, 2016), by one
-    tanh.
+    """x sigmoid(1.702 x), the cheap approximation of GELU (Hendrycks and Gimpel, 2016),
+    by one tanh.
     """
     # sigmoid(2 z) = (1 + tanh z) / 2
     half = 0.5 * x

@@ -1,10 +1,11 @@
 """Attention of one query per sample over a few entities that are embedded on the fly.
 
-Entities other than the pursuer itself are described by a few numbers each, so their embeddings, a
-linear layer and an activation, cost less to compute again than to read back. On a GPU a
-hand-written kernel (Pallas, Triton) therefore embeds them in registers, forward and backward, and
-nothing as large as samples x entities x features reaches memory: XLA's own fusions moved several
-times as many bytes. Elsewhere the same formula is left to XLA.
+Entities other than the pursuer itself are described by a few numbers each, so their
+embeddings, a linear layer and an activation, cost less to compute again than to read
+back. On a GPU a hand-written kernel (Pallas, Triton) therefore embeds them in
+registers, forward and backward, and nothing as large as samples x entities x features
+reaches memory: XLA's own fusions moved several times as many bytes. Elsewhere the same
+formula is left to XLA.
 """
 
 import functools
@@ -16,20 +17,28 @@ import jax.numpy as jnp
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton as pallas_triton
 
-from openjax.kernels.activation import activation, activation_and_slope, kernel_arithmetic
+from openjax.kernels.activation import (
+    activation,
+    activation_and_slope,
+    kernel_arithmetic,
+)
 from openjax.platform import on_platform, whole_blocks
 
 ROWS = 8
-"""Samples that one program of the kernel works on at a time: with more, the backward kernel's
-registers spill.
+"""Samples that one program of the kernel works on at a time: with more, the backward
+kernel's registers spill.
 """
 
 BLOCK = 64
-"""Samples of one program of the backward kernel, which adds up their gradients of the weights."""
+"""Samples of one program of the backward kernel, which adds up their gradients of the
+weights.
+"""
 
 FORWARD_WARPS = 4
 BACKWARD_WARPS = 8
-"""Groups of 32 threads of a program; the backward one holds twice as much in its registers."""
+"""Groups of 32 threads of a program; the backward one holds twice as much in its
+registers.
+"""
 
 
 class EntityKind(NamedTuple):
@@ -49,8 +58,8 @@ class Layout(NamedTuple):
 
     @property
     def entities(self) -> list[tuple[int, int, int]]:
-        """(row of the first input, size, row of the first weight) of every entity but the pursuer
-        itself.
+        """(row of the first input, size, row of the first weight) of every entity but
+        the pursuer itself.
         """
         rows = []
         row = 0
@@ -76,22 +85,26 @@ class Operands(NamedTuple):
     token: jax.Array
     """(B, features), the pursuer itself"""
     inputs: jax.Array
-    """(input_rows + entities, B) float32: all entities' numbers, then the biases (a large negative
-    one masks); samples last, so that a kernel reads neighbours' numbers in one go
+    """(input_rows + entities, B) float32: all entities' numbers, then the biases (a
+    large negative one masks); samples last, so that a kernel reads neighbours' numbers
+    in one go
     """
     inverse: jax.Array
     """(entities, B) float32, by which the linear layer's output is scaled"""
     weights: jax.Array
-    """(sum of size + 2 over kinds, features) float32: per kind its matrix W, then b and c"""
+    """(sum of size + 2 over kinds, features) float32: per kind its matrix W, then b and
+    c
+    """
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(1,))
 def attend(operands: Operands, layout: Layout) -> jax.Array:
-    """Weighted mean of entities for each head, (B, heads * features) in the type of the queries.
+    """Weighted mean of entities for each head, (B, heads * features) in the type of the
+    queries.
 
-    Entity 0 is the token; entity m is activation(inverse_m (W' x_m + b) + c) with the weights of
-    its kind. With score s_hm = scale * query_h . e_m + bias_m, the result of head h is sum_m
-    softmax(s_h)_m e_m.
+    Entity 0 is the token; entity m is activation(inverse_m (W' x_m + b) + c) with the
+    weights of its kind. With score s_hm = scale * query_h . e_m + bias_m, the result of
+    head h is sum_m softmax(s_h)_m e_m.
     """
     return on_platform(_reference, forward_by_kernel, layout)(operands)
 
@@ -99,12 +112,12 @@ def attend(operands: Operands, layout: Layout) -> jax.Array:
 def attend_one_by_one(
     queries: list[jax.Array], entities: list[jax.Array], biases: list[jax.Array | float]
 ) -> list[jax.Array]:
-    """The same mean from arrays of their own for every head and entity, as XLA's CPU compiler wants
-    them.
+    """The same mean from arrays of their own for every head and entity, as XLA's CPU
+    compiler wants them.
 
-    Batches of tiny products are loops without vector instructions there, and so is whatever is
-    fused with a slice or a concatenation of entities; sums over features and (B, features) arrays
-    alone run at full width.
+    Batches of tiny products are loops without vector instructions there, and so is
+    whatever is fused with a slice or a concatenation of entities; sums over features
+    and (B, features) arrays alone run at full width.
 
     Args:
       queries: (B, features) of each head, scaled.
@@ -124,7 +137,9 @@ def attend_one_by_one(
         top = jax.lax.stop_gradient(functools.reduce(jnp.maximum, scores))
         parts = [jnp.exp(score - top) for score in scores]
         inverse = 1.0 / functools.reduce(jnp.add, parts)
-        weighted = [(part * inverse) * e for part, e in zip(parts, entities, strict=True)]
+        weighted = [
+            (part * inverse) * e for part, e in zip(parts, entities, strict=True)
+        ]
         means.append(functools.reduce(jnp.add, weighted))
     return means
 
@@ -136,7 +151,8 @@ def _attend_forward(operands, layout):
 def _attend_backward(layout, operands, gradient):
     backward = on_platform(_reference_backward, backward_by_kernel, layout)
     dquery, dtoken, dinverse, dweights = backward(operands, gradient)
-    # what is observed has no gradient here: zeros, as a custom rule must say something for each
+    # what is observed has no gradient here: zeros, as a custom rule must say something
+    # for each
     dinputs = jnp.zeros_like(operands.inputs)
     return (Operands(dquery, dtoken, dinputs, dinverse, dweights),)
 
@@ -151,9 +167,12 @@ def _reference(layout, operands):
     entities = [token.astype(jnp.float32)]
     for m, (row, size, weight) in enumerate(layout.entities):
         linear = (
-            inputs[row : row + size].T @ weights[weight : weight + size] + weights[weight + size]
+            inputs[row : row + size].T @ weights[weight : weight + size]
+            + weights[weight + size]
         )
-        entities.append(activation(inverse[m][:, None] * linear + weights[weight + size + 1]))
+        entities.append(
+            activation(inverse[m][:, None] * linear + weights[weight + size + 1])
+        )
     entities = jnp.stack(entities, axis=1)
     heads = query.reshape(batch, layout.heads, layout.features).astype(jnp.float32)
     score = layout.scale * jnp.einsum("bhf,bmf->bhm", heads, entities)
@@ -165,7 +184,9 @@ def _reference(layout, operands):
 
 def _reference_backward(layout, operands, gradient):
     def of_differentiable(query, token, inverse, weights):
-        return _reference(layout, Operands(query, token, operands.inputs, inverse, weights))
+        return _reference(
+            layout, Operands(query, token, operands.inputs, inverse, weights)
+        )
 
     query, token, _, inverse, weights = operands
     _, pullback = jax.vjp(of_differentiable, query, token, inverse, weights)
@@ -189,7 +210,9 @@ class _Entities(NamedTuple):
         row, size, weight = self.layout.entities[m]
         linear = self.w_ref[weight + size, :][None, :]
         for i in range(size):
-            linear = self.add(self.x(row + i)[:, None], self.w_ref[weight + i, :][None, :], linear)
+            linear = self.add(
+                self.x(row + i)[:, None], self.w_ref[weight + i, :][None, :], linear
+            )
         shift = self.w_ref[weight + size + 1, :][None, :]
         return linear, self.add(self.inverse(m)[:, None], linear, shift)
 
@@ -198,7 +221,10 @@ class _Entities(NamedTuple):
         scores = [jnp.sum(query * entity, axis=1) for entity in embedded]
         # the pursuer itself, the first one, is always there and has no bias
         biases = [self.x(self.layout.input_rows + m) for m in range(len(embedded) - 1)]
-        return [scores[0], *(score + bias for score, bias in zip(scores[1:], biases, strict=True))]
+        return [
+            scores[0],
+            *(score + bias for score, bias in zip(scores[1:], biases, strict=True)),
+        ]
 
 
 def _softmax(scores):
@@ -210,10 +236,14 @@ def _softmax(scores):
     return [p / total for p in parts]
 
 
-def _forward_kernel(layout, arithmetic, q_ref, token_ref, x_ref, inverse_ref, w_ref, out_ref):
+def _forward_kernel(
+    layout, arithmetic, q_ref, token_ref, x_ref, inverse_ref, w_ref, out_ref
+):
     f = layout.features
     add = arithmetic.multiply_add
-    entities = _Entities(layout, add, lambda row: x_ref[row, :], lambda m: inverse_ref[m, :], w_ref)
+    entities = _Entities(
+        layout, add, lambda row: x_ref[row, :], lambda m: inverse_ref[m, :], w_ref
+    )
     embedded = [token_ref[...].astype(jnp.float32)]
     for m in range(len(layout.entities)):
         _, normal = entities.linear(m)
@@ -247,7 +277,11 @@ def _backward_kernel(
     def block(j, sums):
         rows = pl.ds(j * ROWS, ROWS)
         entities = _Entities(
-            layout, add, lambda row: x_ref[row, rows], lambda m: inverse_ref[m, rows], w_ref
+            layout,
+            add,
+            lambda row: x_ref[row, rows],
+            lambda m: inverse_ref[m, rows],
+            w_ref,
         )
         # forward once more: to embed them again costs less than to have kept them
         embedded = [token_ref[rows, :].astype(jnp.float32)]
@@ -266,13 +300,19 @@ def _backward_kernel(
             weight = _softmax(entities.scores(query, embedded))
             dweight = [jnp.sum(gradient * entity, axis=1) for entity in embedded]
             # the softmax's own derivative: w_m (d_m - sum w d)
-            mean = functools.reduce(jnp.add, [w * d for w, d in zip(weight, dweight, strict=True)])
+            mean = functools.reduce(
+                jnp.add, [w * d for w, d in zip(weight, dweight, strict=True)]
+            )
             dquery = jnp.zeros_like(query)
             for m, entity in enumerate(embedded):
                 dscore = (weight[m] * (dweight[m] - mean))[:, None]
                 dquery = add(dscore, entity, dquery)
-                dembedded[m] = add(weight[m][:, None], gradient, add(dscore, query, dembedded[m]))
-            dq_ref[rows, h * f : (h + 1) * f] = (dquery * layout.scale).astype(dq_ref.dtype)
+                dembedded[m] = add(
+                    weight[m][:, None], gradient, add(dscore, query, dembedded[m])
+                )
+            dq_ref[rows, h * f : (h + 1) * f] = (dquery * layout.scale).astype(
+                dq_ref.dtype
+            )
         dtoken_ref[rows, :] = dembedded[0].astype(dtoken_ref.dtype)
         # of the weights a row each, summed over samples only when all blocks are done
         sums = list(sums)
@@ -281,7 +321,9 @@ def _backward_kernel(
             dinverse_ref[m, rows] = jnp.sum(dnormal * linears[m], axis=1)
             dlinear = dnormal * entities.inverse(m)[:, None]
             for i in range(size):
-                sums[weight + i] = add(dlinear, entities.x(row + i)[:, None], sums[weight + i])
+                sums[weight + i] = add(
+                    dlinear, entities.x(row + i)[:, None], sums[weight + i]
+                )
             sums[weight + size] = sums[weight + size] + dlinear
             sums[weight + size + 1] = sums[weight + size + 1] + dnormal
         return tuple(sums)
@@ -292,8 +334,8 @@ def _backward_kernel(
 
 
 def _in_blocks(operands, rows):
-    """The operands filled up to whole blocks of samples, and the specifications of these blocks:
-    (B, n) by rows, (n, B) by columns, all weights in each.
+    """The operands filled up to whole blocks of samples, and the specifications of
+    these blocks: (B, n) by rows, (n, B) by columns, all weights in each.
     """
     operands = Operands(
         query=whole_blocks(operands.query, rows),
@@ -325,30 +367,37 @@ def forward_by_kernel(layout, operands, interpret=False):
     operands, specs = _in_blocks(operands, ROWS)
     query = operands.query
     mean = pl.pallas_call(
-        functools.partial(_forward_kernel, layout, kernel_arithmetic(query.dtype, interpret)),
+        functools.partial(
+            _forward_kernel, layout, kernel_arithmetic(query.dtype, interpret)
+        ),
         out_shape=jax.ShapeDtypeStruct(query.shape, query.dtype),
         grid=(query.shape[0] // ROWS,),
         in_specs=list(specs),
         out_specs=specs.query,
         interpret=interpret,
-        compiler_params=pallas_triton.CompilerParams(num_warps=FORWARD_WARPS, num_stages=1),
+        compiler_params=pallas_triton.CompilerParams(
+            num_warps=FORWARD_WARPS, num_stages=1
+        ),
         name="attend",
     )(*operands)
     return mean[:batch]
 
 
 def backward_by_kernel(layout, operands, gradient, interpret=False):
-    """The reference's gradients of query, token, inverse and weights, by a kernel; `interpret` runs
-    it without a GPU.
+    """The reference's gradients of query, token, inverse and weights, by a kernel;
+    `interpret` runs it without a GPU.
     """
     batch = operands.token.shape[0]
     operands, specs = _in_blocks(operands, BLOCK)
-    # samples that only fill the last block have no gradient, so they add nothing to the sums
+    # samples that only fill the last block have no gradient, so they add nothing to the
+    # sums
     gradient = whole_blocks(gradient, BLOCK)
     query, token, _, inverse, weights = operands
     programs = token.shape[0] // BLOCK
     dquery, dtoken, dinverse, parts = pl.pallas_call(
-        functools.partial(_backward_kernel, layout, kernel_arithmetic(query.dtype, interpret)),
+        functools.partial(
+            _backward_kernel, layout, kernel_arithmetic(query.dtype, interpret)
+        ),
         out_shape=(
             jax.ShapeDtypeStruct(query.shape, query.dtype),
             jax.ShapeDtypeStruct(token.shape, token.dtype),
@@ -365,7 +414,9 @@ def backward_by_kernel(layout, operands, gradient, interpret=False):
             pl.BlockSpec((1, *weights.shape), lambda i: (i, 0, 0)),
         ),
         interpret=interpret,
-        compiler_params=pallas_triton.CompilerParams(num_warps=BACKWARD_WARPS, num_stages=1),
+        compiler_params=pallas_triton.CompilerParams(
+            num_warps=BACKWARD_WARPS, num_stages=1
+        ),
         name="attend_backward",
     )(*operands, gradient)
     return dquery[:batch], dtoken[:batch], dinverse[:, :batch], jnp.sum(parts, axis=0)

@@ -1,9 +1,10 @@
 """Evaluating a function of small arrays component by component.
 
-A GPU kernel handles many drones side by side, but has no vectors of three for each of them. So the
-function of one drone is traced, and its operations are done again on arrays of objects whose every
-component is a block of drones: what only moves components (slices, stacks, transposes) costs
-nothing, and the kernel needs no second set of formulas.
+A GPU kernel handles many drones side by side, but has no vectors of three for each of
+them. So the function of one drone is traced, and its operations are done again on
+arrays of objects whose every component is a block of drones: what only moves components
+(slices, stacks, transposes) costs nothing, and the kernel needs no second set of
+formulas.
 """
 
 import functools
@@ -16,7 +17,11 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 _CALLS = ("jit", "pjit", "closed_call", "custom_jvp_call")
-_REDUCTIONS = {"reduce_sum": operator.add, "reduce_or": operator.or_, "reduce_and": operator.and_}
+_REDUCTIONS = {
+    "reduce_sum": operator.add,
+    "reduce_or": operator.or_,
+    "reduce_and": operator.and_,
+}
 _ELEMENTWISE = frozenset(
     "abs add and atan2 clamp convert_element_type copy cos div eq exp expm1 ge gt integer_pow le "
     "log lt max min mul ne "
@@ -39,14 +44,15 @@ def _numbers(array):
 
 
 def evaluate(traced: ClosedJaxpr, arguments: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """What a traced function gives for `arguments`, arrays of objects of its inputs' shapes.
+    """What a traced function gives for `arguments`, arrays of objects of its inputs'
+    shapes.
 
-    A component is a number, a scalar or a block (all of one shape) of the input's type; so are the
-    results'.
+    A component is a number, a scalar or a block (all of one shape) of the input's type;
+    so are the results'.
 
     Raises:
-      NotImplementedError: the function holds an operation that mixes components in a way not known
-      here.
+      NotImplementedError: the function holds an operation that mixes components in a
+      way not known here.
     """
     return _evaluate(traced.jaxpr, traced.consts, arguments)
 
@@ -73,7 +79,9 @@ def _apply(equation, inputs):
     name = equation.primitive.name
     parameters = equation.params
     if name in _CALLS:
-        inner = parameters["jaxpr"] if "jaxpr" in parameters else parameters["call_jaxpr"]
+        inner = (
+            parameters["jaxpr"] if "jaxpr" in parameters else parameters["call_jaxpr"]
+        )
         return _evaluate(inner.jaxpr, inner.consts, inputs)
     if name in _ELEMENTWISE:
         return [_each(functools.partial(_bind, equation), inputs)]
@@ -84,11 +92,15 @@ def _apply(equation, inputs):
     if name == "reduce" and _is_sum(parameters["jaxpr"]):
         # several sums at once: the arrays first, then as many starts, which are zero
         arrays = inputs[: len(inputs) // 2]
-        return [_total(operator.add, array, parameters["dimensions"]) for array in arrays]
+        return [
+            _total(operator.add, array, parameters["dimensions"]) for array in arrays
+        ]
     if name == "unstack":
         axis = parameters["axis"]
         array = inputs[0]
-        return [np.squeeze(part, axis) for part in np.split(array, array.shape[axis], axis)]
+        return [
+            np.squeeze(part, axis) for part in np.split(array, array.shape[axis], axis)
+        ]
     if name not in _MOVES:
         raise NotImplementedError(f"component by component: {name}")
     return [_MOVES[name](inputs, parameters)]
@@ -101,13 +113,17 @@ def _is_sum(combination):
 
 def _slice(inputs, parameters):
     strides = parameters["strides"] or (1,) * inputs[0].ndim
-    ranges = zip(parameters["start_indices"], parameters["limit_indices"], strides, strict=True)
+    ranges = zip(
+        parameters["start_indices"], parameters["limit_indices"], strides, strict=True
+    )
     return inputs[0][tuple(slice(start, stop, step) for start, stop, step in ranges)]
 
 
 def _broadcast(inputs, parameters):
     shape = [1] * len(parameters["shape"])
-    for axis, size in zip(parameters["broadcast_dimensions"], inputs[0].shape, strict=True):
+    for axis, size in zip(
+        parameters["broadcast_dimensions"], inputs[0].shape, strict=True
+    ):
         shape[axis] = size
     return np.broadcast_to(inputs[0].reshape(shape), parameters["shape"])
 
@@ -115,26 +131,37 @@ def _broadcast(inputs, parameters):
 _MOVES = {
     "slice": _slice,
     "broadcast_in_dim": _broadcast,
-    "squeeze": lambda inputs, parameters: np.squeeze(inputs[0], tuple(parameters["dimensions"])),
+    "squeeze": lambda inputs, parameters: np.squeeze(
+        inputs[0], tuple(parameters["dimensions"])
+    ),
     "reshape": lambda inputs, parameters: inputs[0].reshape(parameters["new_sizes"]),
-    "transpose": lambda inputs, parameters: inputs[0].transpose(parameters["permutation"]),
-    "concatenate": lambda inputs, parameters: np.concatenate(inputs, parameters["dimension"]),
+    "transpose": lambda inputs, parameters: inputs[0].transpose(
+        parameters["permutation"]
+    ),
+    "concatenate": lambda inputs, parameters: np.concatenate(
+        inputs, parameters["dimension"]
+    ),
     "stack": lambda inputs, parameters: np.stack(inputs, parameters["axis"]),
     "rev": lambda inputs, parameters: np.flip(inputs[0], parameters["dimensions"]),
 }
 
 
 def _each(function, arrays):
-    """The function of the arrays' components one by one, in an array of their common shape."""
+    """The function of the arrays' components one by one, in an array of their common
+    shape.
+    """
     shape = np.broadcast_shapes(*(array.shape for array in arrays))
     flat = (np.broadcast_to(array, shape).ravel() for array in arrays)
-    return split(function(operands) for operands in zip(*flat, strict=True)).reshape(shape)
+    return split(function(operands) for operands in zip(*flat, strict=True)).reshape(
+        shape
+    )
 
 
 def _bind(equation, operands):
     """One operation on single components, which are made alike in shape."""
     if all(isinstance(operand, np.generic) for operand in operands):
-        # of numbers alone: worked out here, or the kernel would work it out for every sample
+        # of numbers alone: worked out here, or the kernel would work it out for every
+        # sample
         with jax.ensure_compile_time_eval():
             return np.asarray(equation.primitive.bind(*operands, **equation.params))[()]
     shape = np.broadcast_shapes(*(np.shape(operand) for operand in operands))

@@ -1,8 +1,9 @@
-"""Bias, layer normalisation and activation of a hidden layer in one pass over its samples.
+"""Bias, layer normalisation and activation of a hidden layer in one pass over its
+samples.
 
-Left to XLA, the backward pass reads every layer several times (once for each of the sums over
-features and over samples); on a GPU a kernel (Pallas, Triton) holds a block of samples in registers
-and reads it once. Elsewhere the same formula is left to XLA.
+Left to XLA, the backward pass reads every layer several times (once for each of the
+sums over features and over samples); on a GPU a kernel (Pallas, Triton) holds a block
+of samples in registers and reads it once. Elsewhere the same formula is left to XLA.
 """
 
 import functools
@@ -12,7 +13,11 @@ import jax.numpy as jnp
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton as pallas_triton
 
-from openjax.kernels.activation import activation, activation_and_slope, kernel_arithmetic
+from openjax.kernels.activation import (
+    activation,
+    activation_and_slope,
+    kernel_arithmetic,
+)
 from openjax.platform import on_platform, whole_blocks
 
 ROWS = 64
@@ -41,8 +46,8 @@ def normalise(x: jax.Array, affine: jax.Array, activate: bool = True) -> jax.Arr
 
 
 def normalised_layer(x: jax.Array, kernel: jax.Array, affine: jax.Array) -> jax.Array:
-    """`normalise(x @ kernel, affine)` with centred weights, whose output needs no centring: half
-    the sums, forward and backward.
+    """`normalise(x @ kernel, affine)` with centred weights, whose output needs no
+    centring: half the sums, forward and backward.
 
     Args:
       x: (B, inputs), whose type is that of the product.
@@ -65,7 +70,9 @@ def _forward(x, affine, activate):
 
 
 def _backward(activate, saved, gradient):
-    return on_platform(_reference_backward, backward_by_kernel, activate)(*saved, gradient)
+    return on_platform(_reference_backward, backward_by_kernel, activate)(
+        *saved, gradient
+    )
 
 
 normalise.defvjp(_forward, _backward)
@@ -78,7 +85,9 @@ def _standardised(x, bias):
     x = x.astype(jnp.float32) + bias
     features = x.shape[-1]
     centred = x - jnp.sum(x, axis=-1, keepdims=True) / features
-    inverse = jax.lax.rsqrt(jnp.sum(centred * centred, axis=-1, keepdims=True) / features + EPSILON)
+    inverse = jax.lax.rsqrt(
+        jnp.sum(centred * centred, axis=-1, keepdims=True) / features + EPSILON
+    )
     return centred * inverse, inverse
 
 
@@ -96,11 +105,17 @@ def _reference_backward(activate, x, affine, gradient):
 
 def _forward_kernel(activate, arithmetic, x_ref, affine_ref, out_ref):
     standard, _ = _standardised(x_ref[...], affine_ref[0, :][None, :])
-    out = arithmetic.multiply_add(standard, affine_ref[1, :][None, :], affine_ref[2, :][None, :])
-    out_ref[...] = (activation(out, arithmetic) if activate else out).astype(out_ref.dtype)
+    out = arithmetic.multiply_add(
+        standard, affine_ref[1, :][None, :], affine_ref[2, :][None, :]
+    )
+    out_ref[...] = (activation(out, arithmetic) if activate else out).astype(
+        out_ref.dtype
+    )
 
 
-def _backward_kernel(activate, arithmetic, x_ref, affine_ref, g_ref, dx_ref, daffine_ref):
+def _backward_kernel(
+    activate, arithmetic, x_ref, affine_ref, g_ref, dx_ref, daffine_ref
+):
     standard, inverse = _standardised(x_ref[...], affine_ref[0, :][None, :])
     scale = affine_ref[1, :][None, :]
     dout = g_ref[...].astype(jnp.float32)
@@ -108,7 +123,8 @@ def _backward_kernel(activate, arithmetic, x_ref, affine_ref, g_ref, dx_ref, daf
         out = arithmetic.multiply_add(standard, scale, affine_ref[2, :][None, :])
         dout = dout * activation_and_slope(out, arithmetic)[1]
     dstandard = dout * scale
-    # layer normalisation lets nothing through along its two directions, the mean and the output
+    # layer normalisation lets nothing through along its two directions, the mean and
+    # the output
     features = standard.shape[-1]
     mean = jnp.sum(dstandard, axis=-1, keepdims=True) / features
     along = jnp.sum(dstandard * standard, axis=-1, keepdims=True) / features
@@ -124,7 +140,9 @@ def forward_by_kernel(activate, x, affine, interpret=False):
     padded = whole_blocks(x, ROWS)
     block = pl.BlockSpec((ROWS, x.shape[1]), lambda i: (i, 0))
     out = pl.pallas_call(
-        functools.partial(_forward_kernel, activate, kernel_arithmetic(x.dtype, interpret)),
+        functools.partial(
+            _forward_kernel, activate, kernel_arithmetic(x.dtype, interpret)
+        ),
         out_shape=jax.ShapeDtypeStruct(padded.shape, padded.dtype),
         grid=(padded.shape[0] // ROWS,),
         in_specs=[block, pl.BlockSpec(affine.shape, lambda i: (0, 0))],
@@ -138,14 +156,17 @@ def forward_by_kernel(activate, x, affine, interpret=False):
 
 def backward_by_kernel(activate, x, affine, gradient, interpret=False):
     """The reference's gradients, by a kernel; `interpret` runs it without a GPU."""
-    # samples that only fill the last block have no gradient, so they add nothing to the sums
+    # samples that only fill the last block have no gradient, so they add nothing to the
+    # sums
     padded = whole_blocks(x, ROWS)
     padded_gradient = whole_blocks(gradient, ROWS)
     programs = padded.shape[0] // ROWS
     features = x.shape[1]
     block = pl.BlockSpec((ROWS, features), lambda i: (i, 0))
     dx, parts = pl.pallas_call(
-        functools.partial(_backward_kernel, activate, kernel_arithmetic(x.dtype, interpret)),
+        functools.partial(
+            _backward_kernel, activate, kernel_arithmetic(x.dtype, interpret)
+        ),
         out_shape=(
             jax.ShapeDtypeStruct(padded.shape, padded.dtype),
             jax.ShapeDtypeStruct((programs, 3, features), jnp.float32),

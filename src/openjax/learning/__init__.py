@@ -1,5 +1,5 @@
-"""Learning: rollout, advantages, MAPPO, predictor update, task archive and generator, schedule, the
-compiled training step.
+"""Learning: rollout, advantages, MAPPO, predictor update, task archive and generator,
+schedule, the compiled training step.
 """
 
 from openjax.lazy import lazy_names

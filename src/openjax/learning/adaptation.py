@@ -1,10 +1,12 @@
-"""Adapting a policy to one diagnosed vehicle by the gradient through the simulation: the programs,
-which are compiled before the diagnosis is known. `openjax.learning.fine_tuning` runs them.
+"""Adapting a policy to one diagnosed vehicle by the gradient through the simulation:
+the programs, which are compiled before the diagnosis is known.
+`openjax.learning.fine_tuning` runs them.
 
-Two things are learnt at once, from flights of half a second. From drawn starts, leaning and close
-to things: to touch nothing. From moments of the policy's flights with the nominal vehicle: to fly
-the diagnosed vehicle, settled in flight, where and as fast as the policy flew the nominal one. The
-simulator's derivative says in one update what MAPPO has to find by trying.
+Two things are learnt at once, from flights of half a second. From drawn starts, leaning
+and close to things: to touch nothing. From moments of the policy's flights with the
+nominal vehicle: to fly the diagnosed vehicle, settled in flight, where and as fast as
+the policy flew the nominal one. The simulator's derivative says in one update what
+MAPPO has to find by trying.
 """
 
 import dataclasses
@@ -46,27 +48,33 @@ from openjax.pursuit import (
     uniform_task,
 )
 from openjax.vehicle import Vehicle, load_vehicle
-from openjax.vehicle.family import REST, adapted_family, draw_vehicles, family_bounds, known_effects
+from openjax.vehicle.family import (
+    REST,
+    adapted_family,
+    draw_vehicles,
+    family_bounds,
+    known_effects,
+)
 from openjax.vehicle.parameters import NOMINAL
 
 RATE_LOOP = 0.002
 """Period of a Crazyflie's rate loop (s)."""
 HISTORY = 12
-"""Frames of its own flight that an adapted policy sees at least: with late commands and slow motors
-one isn't enough.
+"""Frames of its own flight that an adapted policy sees at least: with late commands and
+slow motors one isn't enough.
 """
 STEPS = 50
 """Control steps of the flights that are learnt from."""
 FLIGHT = 400
 """Control steps of the flights with the nominal vehicle that these begin in."""
 SETTLE = 40
-"""Control steps that the diagnosed vehicle flies up to such a moment, so that its controllers,
-rotors and the policy's memories are those of that vehicle, and not of one that has just been
-changed in flight.
+"""Control steps that the diagnosed vehicle flies up to such a moment, so that its
+controllers, rotors and the policy's memories are those of that vehicle, and not of one
+that has just been changed in flight.
 """
 LAG = 6
-"""Control steps by which the diagnosed vehicle may follow late: one that hears late can't help it,
-and would learn to overdo what it does if it were to catch up.
+"""Control steps by which the diagnosed vehicle may follow late: one that hears late
+can't help it, and would learn to overdo what it does if it were to catch up.
 """
 NEAR_POSITION = 0.02
 """Distance (m) from the nominal vehicle's flight that counts as one ..."""
@@ -75,8 +83,8 @@ NEAR_VELOCITY = 0.1
 
 
 def adapting_game(game: PursuitSettings) -> PursuitSettings:
-    """The game as vehicles fly it, whatever a policy was trained in: no clamp, the rate loop at 500
-    Hz, solid pillars.
+    """The game as vehicles fly it, whatever a policy was trained in: no clamp, the rate
+    loop at 500 Hz, solid pillars.
     """
     return dataclasses.replace(
         game,
@@ -91,8 +99,12 @@ def adapting_game(game: PursuitSettings) -> PursuitSettings:
     )
 
 
-def starting_parameters(parameters: PolicyParameters, trained: TrainSettings) -> PolicyParameters:
-    """A policy as it begins in `adapting_game`, without its critic; it acts as before."""
+def starting_parameters(
+    parameters: PolicyParameters, trained: TrainSettings
+) -> PolicyParameters:
+    """A policy as it begins in `adapting_game`, without its critic; it acts as
+    before.
+    """
     game = trained.environment
     grown = with_longer_history(
         parameters.replace(critic={}), trained.predictor, game, adapting_game(game)
@@ -105,9 +117,13 @@ class Flights:
     """Moments of flights with the nominal vehicle, and how that flew on from each."""
 
     state: PursuitState
-    """(W, ...) where the nominal vehicle was; with vehicles of the bounds that are adapted to"""
+    """(W, ...) where the nominal vehicle was; with vehicles of the bounds that are
+    adapted to
+    """
     position: jax.Array
-    """(LAG + T, W, N, 3) m, after the LAG steps before the moment and the steps that followed"""
+    """(LAG + T, W, N, 3) m, after the LAG steps before the moment and the steps that
+    followed
+    """
     velocity: jax.Array
     """(LAG + T, W, N, 3) m/s"""
 
@@ -123,8 +139,8 @@ class Adaptation:
     fly: Callable[[PolicyParameters, jax.Array, jax.Array], Flights]
     """(parameters, key, bounds) -> moments of flights."""
     update: Callable[..., tuple[TrainState, dict[str, jax.Array]]]
-    """(actor, parameters, flights, key, bounds) -> actor, metrics; the actor with its optimiser's
-    state, the parameters are the policy's before.
+    """(actor, parameters, flights, key, bounds) -> actor, metrics; the actor with its
+    optimiser's state, the parameters are the policy's before.
     """
     evaluate: Callable[[PolicyParameters, Task, jax.Array, jax.Array], Evaluation]
     """(parameters, tasks, key, bounds) -> one episode per task."""
@@ -147,7 +163,9 @@ def make_adaptation(trained: TrainSettings, settings: AdaptSettings) -> Adaptati
     )
     fly = jax.jit(stage.fly)
     update = jax.jit(stage.update)
-    return Adaptation(settings, game, policy, optimiser, fly, update, jax.jit(stage.evaluate))
+    return Adaptation(
+        settings, game, policy, optimiser, fly, update, jax.jit(stage.evaluate)
+    )
 
 
 @dataclass(frozen=True)
@@ -169,18 +187,24 @@ class _Stage:
         return Pursuit(game or self.free, self.vehicle, vehicle_bounds=bounds)
 
     def fly(self, parameters, key, bounds):
-        """Moments of flights with the nominal vehicle, in which vehicles of the bounds fly on."""
+        """Moments of flights with the nominal vehicle, in which vehicles of the bounds
+        fly on.
+        """
         nominal = self.pursuit(bounds_of({}, {}, rest=0.0))
         # more than an update takes, so that these differ
         number = 4 * self.worlds
         task_key, reset_key, moment_key, vehicle_key = jax.random.split(key, 4)
-        tasks = jax.vmap(lambda key: _task(self.free, key))(jax.random.split(task_key, number))
-        _, start = jax.vmap(nominal.reset_to)(jax.random.split(reset_key, number), tasks)
+        tasks = jax.vmap(lambda key: _task(self.free, key))(
+            jax.random.split(task_key, number)
+        )
+        _, start = jax.vmap(nominal.reset_to)(
+            jax.random.split(reset_key, number), tasks
+        )
         moment = jax.random.randint(moment_key, (number,), SETTLE, FLIGHT - STEPS)
         fly_on = mean_step(nominal, self.policy, parameters)
 
-        # the nominal vehicle's flights: their states at each world's moment and SETTLE steps before
-        # it, and the tracks
+        # the nominal vehicle's flights: their states at each world's moment and SETTLE
+        # steps before it, and the tracks
         def one(carry, step):
             observation, state, at_settling, at_moment = carry
             at_settling = _recorded(moment - SETTLE == step, state, at_settling)
@@ -190,7 +214,9 @@ class _Stage:
             return (observation, state, at_settling, at_moment), track
 
         first = (jax.vmap(nominal.observe)(start), start, start, start)
-        (_, _, at_settling, at_moment), tracks = jax.lax.scan(one, first, jnp.arange(FLIGHT))
+        (_, _, at_settling, at_moment), tracks = jax.lax.scan(
+            one, first, jnp.arange(FLIGHT)
+        )
         steps = moment + jnp.arange(-LAG, STEPS)[:, None]
         position, velocity = (track[steps, jnp.arange(number)] for track in tracks)
         settled = self._settle(parameters, at_settling, vehicle_key, bounds)
@@ -216,16 +242,20 @@ class _Stage:
         return settled
 
     def _begin(self, flights, key, bounds):
-        """Half of the worlds at starts, half in flight, all with vehicles of the bounds; and the
-        flights to follow.
+        """Half of the worlds at starts, half in flight, all with vehicles of the
+        bounds; and the flights to follow.
         """
         pursuit = self.pursuit(bounds)
         worlds = self.worlds
         task_key, reset_key, moment_key = jax.random.split(key, 3)
         task_keys = jax.random.split(task_key, worlds)
         tasks = jax.vmap(lambda key: draw_start(self.free, key))(task_keys)
-        _, starts = jax.vmap(pursuit.reset_to)(jax.random.split(reset_key, worlds), tasks)
-        chosen = jax.random.choice(moment_key, flights.position.shape[1], (worlds,), replace=False)
+        _, starts = jax.vmap(pursuit.reset_to)(
+            jax.random.split(reset_key, worlds), tasks
+        )
+        chosen = jax.random.choice(
+            moment_key, flights.position.shape[1], (worlds,), replace=False
+        )
         moments = jax.tree.map(lambda leaf: leaf[chosen], flights.state)
         state = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), starts, moments)
         return pursuit, state, flights.position[:, chosen], flights.velocity[:, chosen]
@@ -249,10 +279,16 @@ class _Stage:
         team = state.drones.position.shape[:2]  # worlds, pursuers
         observation = jax.vmap(pursuit.observe)(state)
         first = (observation, state, jnp.full(team, jnp.inf), jnp.zeros(team))
-        (_, end, least, breach), (path, speed) = jax.lax.scan(one, first, None, length=STEPS)
+        (_, end, least, breach), (path, speed) = jax.lax.scan(
+            one, first, None, length=STEPS
+        )
         crash = jnp.mean(crash_share(least), axis=-1)
-        # only at the end: a dive saves some starts. Flights follow the nominal vehicle's speeds
-        fast = jnp.sqrt(jnp.sum(end.drones.velocity[:worlds] ** 2, axis=-1) + 1e-9) - FASTEST
+        # only at the end: a dive saves some starts. Flights follow the nominal
+        # vehicle's speeds
+        fast = (
+            jnp.sqrt(jnp.sum(end.drones.velocity[:worlds] ** 2, axis=-1) + 1e-9)
+            - FASTEST
+        )
         low = LOWEST - end.drones.position[:worlds, :, 2]
         off = off_the_flight(path[:, worlds:], speed[:, worlds:], position, velocity)
         parts = {
@@ -283,17 +319,19 @@ def off_the_flight(
     target: Float[Array, "all worlds pursuers 3"],
     target_velocity: Float[Array, "all worlds pursuers 3"],
 ) -> Float[Array, "steps worlds pursuers"]:
-    """(T, W, N) how far flights (T, W, N, 3) are from those that are wanted (LAG + T, W, N, 3), at
-    the lag that suits best.
+    """(T, W, N) how far flights (T, W, N, 3) are from those that are wanted (LAG + T,
+    W, N, 3), at the lag that suits best.
 
-    In multiples of `NEAR_POSITION` and `NEAR_VELOCITY`, less one where it is large and half the
-    square where it is small.
+    In multiples of `NEAR_POSITION` and `NEAR_VELOCITY`, less one where it is large and
+    half the square where it is small.
     """
 
     def at(lag):
         part = slice(LAG - lag, LAG - lag + position.shape[0])
         off = jnp.sum(((position - target[part]) / NEAR_POSITION) ** 2, axis=-1)
-        off = off + jnp.sum(((velocity - target_velocity[part]) / NEAR_VELOCITY) ** 2, axis=-1)
+        off = off + jnp.sum(
+            ((velocity - target_velocity[part]) / NEAR_VELOCITY) ** 2, axis=-1
+        )
         return jnp.sqrt(1.0 + off) - 1.0
 
     # every other lag: between them a flight moves less than `NEAR_POSITION`
@@ -301,8 +339,8 @@ def off_the_flight(
 
 
 def _recorded(is_due, state, record):
-    """The states (W, ...) in `record`, with those of worlds that are due (W,) in place of older
-    ones.
+    """The states (W, ...) in `record`, with those of worlds that are due (W,) in place
+    of older ones.
     """
 
     def newest(is_due, state, record):
@@ -312,20 +350,30 @@ def _recorded(is_due, state, record):
 
 
 def _in_its_place(settled: PursuitState, nominal: PursuitState) -> PursuitState:
-    """States `nominal` whose vehicles, as one would find them in flight, are those of `settled`.
+    """States `nominal` whose vehicles, as one would find them in flight, are those of
+    `settled`.
 
-    Where they are and how they move, and what their sensors still show of that, is from `nominal`;
-    rotors, controllers, commands on the way, effects, and what the policy remembers of the vehicle
-    from `settled`.
+    Where they are and how they move, and what their sensors still show of that, is from
+    `nominal`; rotors, controllers, commands on the way, effects, and what the policy
+    remembers of the vehicle from `settled`.
     """
-    kinematic = ("position", "quaternion", "velocity", "body_rates", "previous_body_rates")
-    sensors = {name for name, effect in known_effects().items() if effect.sensor is not None}
+    kinematic = (
+        "position",
+        "quaternion",
+        "velocity",
+        "body_rates",
+        "previous_body_rates",
+    )
+    sensors = {
+        name for name, effect in known_effects().items() if effect.sensor is not None
+    }
     memory = {
         name: nominal.drones.effect_memory[name] if name in sensors else memory
         for name, memory in settled.drones.effect_memory.items()
     }
     drones = settled.drones.replace(
-        **{name: getattr(nominal.drones, name) for name in kinematic}, effect_memory=memory
+        **{name: getattr(nominal.drones, name) for name in kinematic},
+        effect_memory=memory,
     )
     return nominal.replace(
         vehicles=settled.vehicles,
@@ -344,7 +392,7 @@ def _task(game, key):
 def bounds_of(
     values, intervals, rest: float = REST, airframe: str = NOMINAL
 ) -> Float[Array, "ranges 4"]:
-    """(R, 4) bounds of the family of a diagnosed vehicle; see `adapted_family`. Of nothing found
-    and no rest: nominal.
+    """(R, 4) bounds of the family of a diagnosed vehicle; see `adapted_family`. Of
+    nothing found and no rest: nominal.
     """
     return jnp.asarray(family_bounds(adapted_family(values, intervals, rest, airframe)))

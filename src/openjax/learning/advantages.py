@@ -1,5 +1,5 @@
-"""Generalised advantage estimation (Schulman et al., 2016) with terminated and truncated
-episodes.
+"""Generalised advantage estimation (Schulman et al., 2016) with terminated and
+truncated episodes.
 """
 
 import jax
@@ -23,11 +23,13 @@ def generalised_advantages(
       value: of the state in which the step was taken.
       next_value: of the state it led to, before any reset; ignored where terminated.
       terminated: the episode ended for good: nothing comes after.
-      truncated: the episode was cut: the value of the state it led to stands for the rest.
+      truncated: the episode was cut: the value of the state it led to stands for the
+      rest.
       discount: gamma.
       trace: lambda.
     """
-    # a cut episode has a value after it but no advantage: what came next is another episode's
+    # a cut episode has a value after it but no advantage: what came next is another
+    # episode's
     goes_on = 1.0 - terminated.astype(reward.dtype)
     error = reward + discount * goes_on * next_value - value
     decay = discount * trace * goes_on * (1.0 - truncated.astype(reward.dtype))
@@ -37,5 +39,7 @@ def generalised_advantages(
         advantage = error + decay * following
         return advantage, advantage
 
-    _, advantage = jax.lax.scan(backwards, jnp.zeros_like(error[0]), (error, decay), reverse=True)
+    _, advantage = jax.lax.scan(
+        backwards, jnp.zeros_like(error[0]), (error, decay), reverse=True
+    )
     return advantage

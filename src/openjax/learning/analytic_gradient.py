@@ -1,12 +1,13 @@
-"""The last stage of a policy that is to be flown: the gradient through the simulation (analytic
-policy gradient).
+"""The last stage of a policy that is to be flown: the gradient through the simulation
+(analytic policy gradient).
 
-MAPPO is a poor teacher of what is decided within tenths of a second. Starts lean by up to 36
-degrees, some beside a pillar or another pursuer; its noise averages out in the motors, and a crash
-says little of what would have avoided it. The equations of motion know. Here the actor follows the
-gradient of smooth crashes, breaches and speeds over the limit through half seconds of free flight,
-from the hardest of many leaning starts and from moments of its own flights (Xu et al. 2022,
-short-horizon actor-critic, without the critic). All else is held to what it did.
+MAPPO is a poor teacher of what is decided within tenths of a second. Starts lean by up
+to 36 degrees, some beside a pillar or another pursuer; its noise averages out in the
+motors, and a crash says little of what would have avoided it. The equations of motion
+know. Here the actor follows the gradient of smooth crashes, breaches and speeds over
+the limit through half seconds of free flight, from the hardest of many leaning starts
+and from moments of its own flights (Xu et al. 2022, short-horizon actor-critic, without
+the critic). All else is held to what it did.
 """
 
 import dataclasses
@@ -61,16 +62,18 @@ HORIZON = 0.5
 """Seconds that are learnt at once."""
 CRASH_IN_FLIGHT = 4.0
 BREACH_AT_START = 0.5
-"""Weights beside the crashes from starts: an episode has one start, and many half seconds after
-it.
+"""Weights beside the crashes from starts: an episode has one start, and many half
+seconds after it.
 """
 REST = 0.9
-"""Share of the capture radius within which a pursuer needn't come nearer to the evader."""
+"""Share of the capture radius within which a pursuer needn't come nearer to the
+evader.
+"""
 
 
 class Encounter(NamedTuple):
-    """What the pursuers of B worlds met in some steps, all smooth and (B, N) unless said
-    otherwise.
+    """What the pursuers of B worlds met in some steps, all smooth and (B, N) unless
+    said otherwise.
     """
 
     least: jax.Array
@@ -82,8 +85,8 @@ class Encounter(NamedTuple):
     excess: jax.Array
     """mean excess of speed, in units of `FAST`"""
     distance: jax.Array
-    """(B,) m, mean length of the nearest pursuers' paths to the evader, beyond where they may
-    rest
+    """(B,) m, mean length of the nearest pursuers' paths to the evader, beyond where
+    they may rest
     """
     free: jax.Array
     """(B,) share of the steps in which nobody has caught the evader"""
@@ -111,8 +114,8 @@ def no_encounter(shape: tuple[int, int]) -> Encounter:
 
 @dataclass(frozen=True)
 class AnalyticGradient:
-    """A policy's game in free flight, and what is learnt in it. `World`s are observations and
-    states (B, ...).
+    """A policy's game in free flight, and what is learnt in it. `World`s are
+    observations and states (B, ...).
     """
 
     settings: AnalyticSettings
@@ -132,15 +135,20 @@ class AnalyticGradient:
 
     @property
     def moments(self) -> int:
-        """How often a flight is looked at: after each `HORIZON` but the episode's last."""
-        # what is learnt from a moment takes another `HORIZON`, which has to end with the episode
+        """How often a flight is looked at: after each `HORIZON` but the episode's
+        last.
+        """
+        # what is learnt from a moment takes another `HORIZON`, which has to end with
+        # the episode
         return max(1, self.game.episode_length // self.steps - 1)
 
     def inputs(self, parameters: PolicyParameters, observation):
-        """What the actor acts on: observations and predictions, without a gradient through the
-        predictor.
+        """What the actor acts on: observations and predictions, without a gradient
+        through the predictor.
         """
-        return observation, jax.lax.stop_gradient(self.policy.predict(parameters, observation))
+        return observation, jax.lax.stop_gradient(
+            self.policy.predict(parameters, observation)
+        )
 
     def fly(
         self,
@@ -150,15 +158,15 @@ class AnalyticGradient:
         steps: int,
         wish: Float[Array, "worlds 3"] | None = None,
     ) -> tuple[Any, "Encounter"]:
-        """Worlds some steps later, and what their pursuers met in these; `wish` is where the
-        evaders fly, see `mean_step`.
+        """Worlds some steps later, and what their pursuers met in these; `wish` is
+        where the evaders fly, see `mean_step`.
         """
         fly_on = mean_step(self.environment, self.policy, parameters)
         # found once: pillars stand still
         paths = jax.vmap(functools.partial(shortest_paths, self.game))(world[1].task)
 
-        # only the worlds between steps are kept, the rest is worked out again on the way back: it
-        # would take many times the memory
+        # only the worlds between steps are kept, the rest is worked out again on the
+        # way back: it would take many times the memory
         @jax.checkpoint
         def moved(world):
             observation, state = world
@@ -173,7 +181,9 @@ class AnalyticGradient:
         return jax.lax.scan(one, (world, nothing), None, length=steps)[0]
 
     def _met(self, met, state, paths, steps):
-        """What pursuers have met so far, with what the step that ended with `state` adds."""
+        """What pursuers have met so far, with what the step that ended with `state`
+        adds.
+        """
         limit = self.settings.speed_from * self.game.max_speed
         radius = capture_radius(self.game, state.task)
         rest = REST * radius
@@ -183,7 +193,9 @@ class AnalyticGradient:
         beyond_rest = jax.nn.relu(distance - rest)
         return Encounter(
             least=jnp.minimum(met.least, nearest_gap(self.game, state)),
-            upright=jnp.minimum(met.upright, rotation_axes(state.drones.quaternion)[1][..., 2]),
+            upright=jnp.minimum(
+                met.upright, rotation_axes(state.drones.quaternion)[1][..., 2]
+            ),
             breach=met.breach + breach_share(self.game, state) / steps,
             excess=met.excess + jax.nn.relu(speed(state.drones) - limit) / FAST / steps,
             distance=met.distance + nearest_distance(beyond_rest) / steps,
@@ -203,7 +215,9 @@ class AnalyticGradient:
         task_key, reset_key = jax.random.split(key)
         number = bounds.shape[0]
         return jax.vmap(one)(
-            jax.random.split(task_key, number), jax.random.split(reset_key, number), bounds
+            jax.random.split(task_key, number),
+            jax.random.split(reset_key, number),
+            bounds,
         )
 
     def flights(self, parameters: PolicyParameters, key: PRNGKeyArray, bounds: Bounds):
@@ -213,15 +227,21 @@ class AnalyticGradient:
             world = self.fly(parameters.actor, parameters, world, self.steps)[0]
             return world, world
 
-        worlds = jax.lax.scan(segment, self.starts(key, bounds), None, length=self.moments)[1]
+        worlds = jax.lax.scan(
+            segment, self.starts(key, bounds), None, length=self.moments
+        )[1]
         return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), worlds)
 
     def hard_starts(self, actor: Any, parameters: PolicyParameters, key: PRNGKeyArray):
-        """Of `settings.draws` times as many starts those with the least gaps on the actor's way:
-        few of all come near a crash.
+        """Of `settings.draws` times as many starts those with the least gaps on the
+        actor's way: few of all come near a crash.
         """
-        starts = self.starts(key, jnp.concatenate([self.bounds()] * self.settings.draws))
-        least = jnp.min(self.fly(actor, parameters, starts, self.steps)[1].least, axis=-1)
+        starts = self.starts(
+            key, jnp.concatenate([self.bounds()] * self.settings.draws)
+        )
+        least = jnp.min(
+            self.fly(actor, parameters, starts, self.steps)[1].least, axis=-1
+        )
         hardest = jax.lax.top_k(-least, self.settings.worlds)[1]
         return jax.tree.map(lambda leaf: leaf[hardest], starts)
 
@@ -232,7 +252,9 @@ class AnalyticGradient:
         settings = self.settings
         number = starts[1].step.shape[0]
         observation, predicted = self.inputs(parameters, flying[0])
-        before, log_std = self.policy.distribution(parameters.actor, observation, predicted)
+        before, log_std = self.policy.distribution(
+            parameters.actor, observation, predicted
+        )
         mean, _ = self.policy.distribution(actor, observation, predicted)
         change = (mean - before) * jnp.exp(-log_std)
         # starts and flights by one program, the starts first
@@ -244,8 +266,8 @@ class AnalyticGradient:
         parts = {
             "crashes_from_starts": (1.0, crash_depth(met.least[:number])),
             "breaches_from_starts": (BREACH_AT_START, met.breach[:number]),
-            # a dive saves some of those that start tilted towards something, so there the speed is
-            # free but for its end
+            # a dive saves some of those that start tilted towards something, so there
+            # the speed is free but for its end
             "ends": (END, jax.nn.relu(fast) + jax.nn.relu(low)),
             "crashes_in_flight": (CRASH_IN_FLIGHT, crash_share(met.least[number:])),
             "breaches_in_flight": (settings.breach, met.breach[number:]),
@@ -263,18 +285,27 @@ class AnalyticGradient:
         """Worlds along the policy's flights, of which each update learns from some."""
         return self.flights(parameters, key, self.bounds())
 
-    def gradient(self, actor: Any, parameters: PolicyParameters, flights, key: PRNGKeyArray):
+    def gradient(
+        self, actor: Any, parameters: PolicyParameters, flights, key: PRNGKeyArray
+    ):
         """The actor's gradient, and the loss's parts."""
         start_key, choice_key = jax.random.split(key)
         moments = flights[1].step.shape[0]
         chosen = jax.random.randint(choice_key, (self.settings.worlds,), 0, moments)
         flying = jax.tree.map(lambda leaf: leaf[chosen], flights)
         starts = self.hard_starts(actor, parameters, start_key)
-        gradient, parts = jax.grad(self.loss, has_aux=True)(actor, parameters, starts, flying)
+        gradient, parts = jax.grad(self.loss, has_aux=True)(
+            actor, parameters, starts, flying
+        )
         return finite_or_zero(gradient), parts
 
     def update(
-        self, actor: Any, state: Any, parameters: PolicyParameters, flights, key: PRNGKeyArray
+        self,
+        actor: Any,
+        state: Any,
+        parameters: PolicyParameters,
+        flights,
+        key: PRNGKeyArray,
     ):
         """The actor and its optimiser's state after an update, and the loss's parts."""
         gradient, parts = self.gradient(actor, parameters, flights, key)
@@ -282,18 +313,24 @@ class AnalyticGradient:
         return optax.apply_updates(actor, change), state, parts
 
     def bounds(self) -> Bounds:
-        """(B, R, 4) of each world's vehicles: the game's family, and a share of nominal ones."""
-        return partly_nominal(self.game.vehicles, self.settings.worlds, self.settings.nominal)
+        """(B, R, 4) of each world's vehicles: the game's family, and a share of nominal
+        ones.
+        """
+        return partly_nominal(
+            self.game.vehicles, self.settings.worlds, self.settings.nominal
+        )
 
     @functools.cached_property
     def optimiser(self) -> optax.GradientTransformation:
         """Adam with clipped gradients; its step size falls linearly to a twentieth."""
-        return clipped_descent(falling_rate(self.settings.learning_rate, self.settings.updates))
+        return clipped_descent(
+            falling_rate(self.settings.learning_rate, self.settings.updates)
+        )
 
 
 def free_flight(environment: Pursuit) -> Pursuit:
-    """`environment` as it is learnt in: nothing is solid while the gradient is taken, a crash is
-    told by the gap.
+    """`environment` as it is learnt in: nothing is solid while the gradient is taken, a
+    crash is told by the gap.
     """
     free = dataclasses.replace(
         environment.settings, physics="rigid", contacts=False, reward=RewardSettings()
@@ -304,7 +341,9 @@ def free_flight(environment: Pursuit) -> Pursuit:
 
 @runtime_checkable
 class GradientStage(Protocol):
-    """A last stage of a run: `AnalyticGradient`, or `openjax.learning.worst_plans.WorstPlans`."""
+    """A last stage of a run: `AnalyticGradient`, or
+    `openjax.learning.worst_plans.WorstPlans`.
+    """
 
     settings: AnalyticSettings
 
@@ -315,20 +354,27 @@ class GradientStage(Protocol):
         """What is carried from update to update beside the actor."""
 
     def update(
-        self, actor: Any, state: Any, parameters: PolicyParameters, flights, key: PRNGKeyArray
+        self,
+        actor: Any,
+        state: Any,
+        parameters: PolicyParameters,
+        flights,
+        key: PRNGKeyArray,
     ) -> tuple[Any, Any, dict[str, Scalar]]:
         """Actor and state after an update, and parts of the loss."""
 
 
 def compile_analytic(
     stage: GradientStage, parameters: PolicyParameters
-) -> Callable[[PolicyParameters, jax.Array], Iterator[tuple[PolicyParameters, dict[str, float]]]]:
-    """Start to compile the stage for parameters of these shapes (or abstract ones), in the
-    background.
+) -> Callable[
+    [PolicyParameters, jax.Array], Iterator[tuple[PolicyParameters, dict[str, float]]]
+]:
+    """Start to compile the stage for parameters of these shapes (or abstract ones), in
+    the background.
 
     Returns:
-      the stage, which waits for the compiler: (parameters, key) -> after every update the
-      parameters and its metrics.
+      the stage, which waits for the compiler: (parameters, key) -> after every update
+      the parameters and its metrics.
     """
     key = jax.eval_shape(lambda: jax.random.key(0))
     record = jax.jit(stage.record)
@@ -351,7 +397,8 @@ def compile_analytic(
         flights = record(parameters, flight_key)
         for number in range(stage.settings.updates):
             step_key = jax.random.fold_in(update_key, number)
-            # `parameters` stay those from before: what flew the moments, and what is held to
+            # `parameters` stay those from before: what flew the moments, and what is
+            # held to
             actor, state, parts = update(actor, state, parameters, flights, step_key)
             yield parameters.replace(actor=actor), jax.device_get(parts)
 

@@ -13,7 +13,9 @@ from jaxtyping import Array, Bool, Float, Int32, PRNGKeyArray
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class TaskArchive:
-    """Tasks (any pytree) with leading axis C (capacity). Used slots come first, newest first."""
+    """Tasks (any pytree) with leading axis C (capacity). Used slots come first, newest
+    first.
+    """
 
     tasks: Any
     success: Float[Array, " capacity"]
@@ -29,7 +31,9 @@ class TaskArchive:
 def empty_archive(task: Any, capacity: int) -> TaskArchive:
     """An archive without tasks, for tasks like `task`."""
     return TaskArchive(
-        tasks=jax.tree.map(lambda leaf: jnp.zeros((capacity, *leaf.shape), leaf.dtype), task),
+        tasks=jax.tree.map(
+            lambda leaf: jnp.zeros((capacity, *leaf.shape), leaf.dtype), task
+        ),
         success=jnp.zeros((capacity,), jnp.float32),
         size=jnp.zeros((), jnp.int32),
     )
@@ -42,31 +46,36 @@ def insert(
     accepted: Bool[Array, " new"],
     descriptor: Callable[[Any], Float[Array, "tasks features"]],
 ) -> TaskArchive:
-    """Add the accepted ones of M tasks; where there are more than slots, keep the spread.
+    """Add the accepted ones of M tasks; where there are more than slots, keep the
+    spread.
 
-    Every task's novelty is its distance to the nearest *newer* one, and the most novel stay: of a
-    cluster the newest member survives and the older ones go first. One matrix product, no host, no
-    sequential choice; farthest-point sampling, which the paper's code runs on the host, has the
-    same aim.
+    Every task's novelty is its distance to the nearest *newer* one, and the most novel
+    stay: of a cluster the newest member survives and the older ones go first. One
+    matrix product, no host, no sequential choice; farthest-point sampling, which the
+    paper's code runs on the host, has the same aim.
 
     Args:
       archive: C slots.
       tasks: leading axis M, newest last.
       success: their success rates.
       accepted: which of them enter.
-      descriptor: of tasks (M, ...) the (M, D) numbers by whose distance they are told apart.
+      descriptor: of tasks (M, ...) the (M, D) numbers by whose distance they are told
+      apart.
     """
     capacity = archive.success.shape[0]
     m = success.shape[0]
     chex.assert_tree_shape_prefix(tasks, (m,))
     # newest first, as the archive is
-    pool = jax.tree.map(lambda new, old: jnp.concatenate([new[::-1], old]), tasks, archive.tasks)
+    pool = jax.tree.map(
+        lambda new, old: jnp.concatenate([new[::-1], old]), tasks, archive.tasks
+    )
     pool_success = jnp.concatenate([success[::-1], archive.success])
     used = jnp.concatenate([accepted[::-1], jnp.arange(capacity) < archive.size])
 
     features = descriptor(pool)
-    # |a - b|^2 = |a|^2 + |b|^2 - 2 ab, all pairs by one matrix product; in full precision, as what
-    # is left of it between close tasks is a small difference of large numbers
+    # |a - b|^2 = |a|^2 + |b|^2 - 2 ab, all pairs by one matrix product; in full
+    # precision, as what is left of it between close tasks is a small difference of
+    # large numbers
     squared = jnp.sum(features**2, axis=-1)
     product = jnp.matmul(features, features.T, precision=jax.lax.Precision.HIGHEST)
     distance = squared[:, None] + squared[None] - 2.0 * product
@@ -78,7 +87,8 @@ def insert(
 
     # the newest of all has nobody newer: its novelty is infinite, and it always stays
     slot = jax.lax.top_k(novelty, capacity)[1]
-    # back to newest first, unused last: sorted by age, with the unused ones moved behind all
+    # back to newest first, unused last: sorted by age, with the unused ones moved
+    # behind all
     total = m + capacity
     slot = jnp.sort(jnp.where(used[slot], slot, slot + total)) % total
     return TaskArchive(
@@ -89,8 +99,8 @@ def insert(
 
 
 def draw(archive: TaskArchive, key: PRNGKeyArray) -> Any:
-    """One used task (leaves without the archive's leading axis), uniformly; of an empty archive
-    zeros: check `size` first.
+    """One used task (leaves without the archive's leading axis), uniformly; of an empty
+    archive zeros: check `size` first.
     """
     slot = jax.random.randint(key, (), 0, jnp.maximum(archive.size, 1))
     return jax.tree.map(lambda leaf: leaf[slot], archive.tasks)

@@ -1,7 +1,8 @@
 """Environments spread over devices: what a training step needs to know of the others.
 
-A training step sees its own device's environments only. With `axis=None` there is one device and
-these functions do nothing. Everything else (parameters, archive, keys) is the same on every device.
+A training step sees its own device's environments only. With `axis=None` there is one
+device and these functions do nothing. Everything else (parameters, archive, keys) is
+the same on every device.
 """
 
 import jax
@@ -30,7 +31,9 @@ def gather_over_devices(tree, axis: str | None):
     return jax.tree.map(lambda x: jax.lax.all_gather(x, axis, tiled=True), tree)
 
 
-def own_share(x: Shaped[Array, " whole *rest"], axis: str | None) -> Shaped[Array, " share *rest"]:
+def own_share(
+    x: Shaped[Array, " whole *rest"], axis: str | None
+) -> Shaped[Array, " share *rest"]:
     """This device's part of an array that all devices have whole."""
     if axis is None:
         return x
@@ -39,17 +42,19 @@ def own_share(x: Shaped[Array, " whole *rest"], axis: str | None) -> Shaped[Arra
     return jax.lax.dynamic_slice_in_dim(x, first, share)
 
 
-def own_keys(key: PRNGKeyArray, number: int, axis: str | None) -> Key[Array, " {number}"]:
-    """This device's (number,) keys out of one split for all devices: the same ones however many
-    devices there are.
+def own_keys(
+    key: PRNGKeyArray, number: int, axis: str | None
+) -> Key[Array, " {number}"]:
+    """This device's (number,) keys out of one split for all devices: the same ones
+    however many devices there are.
     """
     devices = 1 if axis is None else jax.lax.axis_size(axis)
     return own_share(jax.random.split(key, number * devices), axis)
 
 
 def minibatches(tree, number: int):
-    """Leaves (T, E, ...) as (number, E / number, T, ...): whole trajectories of world e in
-    minibatch e mod `number`.
+    """Leaves (T, E, ...) as (number, E / number, T, ...): whole trajectories of world e
+    in minibatch e mod `number`.
 
     So each device of several holds its share of every minibatch.
     """
@@ -66,8 +71,8 @@ def minibatches(tree, number: int):
 def joint_moments(
     x: Float[Array, "..."], axis: str | None, counted: jax.Array | None = None
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Mean () and standard deviation () over all elements on all devices, or those `counted`, bool
-    like x.
+    """Mean () and standard deviation () over all elements on all devices, or those
+    `counted`, bool like x.
     """
     # the mean of the devices' means: all of them have about as many `counted`
     mean = mean_over_devices(team_mean(counted, x), axis)

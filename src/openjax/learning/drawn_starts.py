@@ -1,4 +1,6 @@
-"""Starts to learn from by the gradient through the simulation, and which worlds need a new one."""
+"""Starts to learn from by the gradient through the simulation, and which worlds need a
+new one.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -22,32 +24,42 @@ from openjax.pursuit.teams import parked
 CLOSE = 0.45
 """Share of the starts in which most pursuers stand close to something."""
 MOST = 0.7
-"""Share of the pursuers that do: with some left where they are, not all starts are tight."""
+"""Share of the pursuers that do: with some left where they are, not all starts are
+tight.
+"""
 SIDE_BY_SIDE = 0.35
-"""Share of the starts in which all stand side by side; what is left of both are uniform ones."""
+"""Share of the starts in which all stand side by side; what is left of both are uniform
+ones.
+"""
 APART = 0.1
 """Farthest gap beyond the safety distance of pursuers side by side (m)."""
 SCATTERED = 0.5
-"""Share of the tasks that start anywhere: who knows the uniform ones alone dives where the evader
-is far, into the floor.
+"""Share of the tasks that start anywhere: who knows the uniform ones alone dives where
+the evader is far, into the floor.
 """
 OUTSIDE = 1.2
-"""A pursuer is lost where it is farther out than this share of the arena's radius or height."""
+"""A pursuer is lost where it is farther out than this share of the arena's radius or
+height.
+"""
 
 
 def side_by_side(settings: PursuitSettings, key: PRNGKeyArray, task: Task) -> Task:
-    """A task whose pursuers all start beside one before them; as it was where that would breach
-    something.
+    """A task whose pursuers all start beside one before them; as it was where that
+    would breach something.
     """
     position = task.pursuer_position
-    for i, pursuer_key in enumerate(jax.random.split(key, position.shape[0] - 1), start=1):
+    for i, pursuer_key in enumerate(
+        jax.random.split(key, position.shape[0] - 1), start=1
+    ):
         which_key, direction_key, gap_key = jax.random.split(pursuer_key, 3)
         # rather beside than above one another
         away = jax.random.normal(direction_key, (3,)) * jnp.array([1.0, 1.0, 0.3])
         gap = settings.drone_clearance + jax.random.uniform(gap_key, (), maxval=APART)
         neighbour = position[jax.random.randint(which_key, (), 0, i)]
         position = position.at[i].set(neighbour + gap * away / jnp.linalg.norm(away))
-    to_axis = jnp.linalg.norm(position[:, None, :2] - task.pillar_position[None], axis=-1)
+    to_axis = jnp.linalg.norm(
+        position[:, None, :2] - task.pillar_position[None], axis=-1
+    )
     room = settings.pillar_radius + settings.pillar_clearance
     if task.active is not None:
         to_axis = jnp.where(task.active[:, None], to_axis, jnp.inf)
@@ -64,19 +76,25 @@ def draw_start(settings: PursuitSettings, key: PRNGKeyArray) -> Task:
     task_key, turn_key, start_key, choice_key = jax.random.split(key, 4)
     task = turn_task(turn_key, uniform_task(settings, task_key))
     near = close_starts(settings, start_key, task, MOST)
-    beside = side_by_side(settings, start_key, task) if settings.num_pursuers > 1 else near
+    beside = (
+        side_by_side(settings, start_key, task) if settings.num_pursuers > 1 else near
+    )
     kind = jax.random.uniform(choice_key)
     return jax.tree.map(
-        lambda a, b, c: jnp.where(kind < CLOSE, a, jnp.where(kind < CLOSE + SIDE_BY_SIDE, b, c)),
+        lambda a, b, c: jnp.where(
+            kind < CLOSE, a, jnp.where(kind < CLOSE + SIDE_BY_SIDE, b, c)
+        ),
         near,
         beside,
         task,
     )
 
 
-def draw_anywhere(settings: PursuitSettings, tasks: GeneratorSettings, key: PRNGKeyArray) -> Task:
-    """A task like the uniform ones that a generator with settings `tasks` draws, turned; with its
-    starts, or with any others.
+def draw_anywhere(
+    settings: PursuitSettings, tasks: GeneratorSettings, key: PRNGKeyArray
+) -> Task:
+    """A task like the uniform ones that a generator with settings `tasks` draws,
+    turned; with its starts, or with any others.
     """
     task_key, pillar_key, turn_key, start_key, choice_key = jax.random.split(key, 5)
     task = vary_pillars(tasks, settings, pillar_key, uniform_task(settings, task_key))
@@ -89,7 +107,10 @@ def draw_anywhere(settings: PursuitSettings, tasks: GeneratorSettings, key: PRNG
 def is_lost(settings: PursuitSettings, state: PursuitState) -> Bool[Array, " worlds"]:
     """(W,) whether a pursuer of worlds (W, ...) has crashed or is far outside."""
     position = state.drones.position
-    lost = jnp.sum(position[..., :2] ** 2, axis=-1) > (OUTSIDE * settings.arena_radius) ** 2
+    lost = (
+        jnp.sum(position[..., :2] ** 2, axis=-1)
+        > (OUTSIDE * settings.arena_radius) ** 2
+    )
     lost |= position[..., 2] > OUTSIDE * settings.arena_height
     lost |= nearest_gap(settings, state) < 0.0
     if state.active is not None:

@@ -1,10 +1,11 @@
 """Evaders that learn, by PPO, to be caught as late as they can be.
 
-Payoff is the time to the capture and not whether there is one: where captures are forced, every
-evader would be as good as any other. A game names `learned` among its evaders as often as there are
-networks; the world of one of them is flown by its samples, and it learns from these until it is
-caught. `openjax.learning.training_step` has them learn while the pursuers do. They judge nobody:
-`openjax.evaluation.judges` shares nothing with them.
+Payoff is the time to the capture and not whether there is one: where captures are
+forced, every evader would be as good as any other. A game names `learned` among its
+evaders as often as there are networks; the world of one of them is flown by its
+samples, and it learns from these until it is caught. `openjax.learning.training_step`
+has them learn while the pursuers do. They judge nobody: `openjax.evaluation.judges`
+shares nothing with them.
 """
 
 import functools
@@ -89,7 +90,9 @@ class EvaderLearning:
         """Of each network."""
         settings = self.settings
         steps = self.updates * settings.epochs * settings.minibatches
-        rate = optax.linear_schedule(settings.learning_rate, settings.learning_rate_end, steps)
+        rate = optax.linear_schedule(
+            settings.learning_rate, settings.learning_rate_end, steps
+        )
         return clipped_adam(1.0, rate)
 
     def start(self, key: PRNGKeyArray) -> LearningEvaders:
@@ -97,10 +100,12 @@ class EvaderLearning:
         (`openjax.pursuit.evaders.init_network`).
         """
         numbers = jnp.arange(self.number)
-        init = jax.vmap(functools.partial(init_network, own_axes=self.settings.own_axes))
-        actor_keys, critic_keys = jax.vmap(lambda key: jax.random.split(key, self.number))(
-            jax.random.split(key)
+        init = jax.vmap(
+            functools.partial(init_network, own_axes=self.settings.own_axes)
         )
+        actor_keys, critic_keys = jax.vmap(
+            lambda key: jax.random.split(key, self.number)
+        )(jax.random.split(key))
         actor = init(actor_keys, numbers)
         critic = init(critic_keys, numbers)
         log_std = jnp.full((self.number, 3), self.settings.initial_log_std, jnp.float32)
@@ -124,20 +129,26 @@ class EvaderLearning:
         which = learned_place(settings.evaders, state.evader.kind)
 
         def one(which, state):
-            return features(networks, which, scene_of(settings, state), state.evader.memory)
+            return features(
+                networks, which, scene_of(settings, state), state.evader.memory
+            )
 
         return which, jax.vmap(one)(which, state)
 
     def act(
-        self, evaders: LearningEvaders, state: PursuitState, noise: Float[Array, "worlds 3"]
+        self,
+        evaders: LearningEvaders,
+        state: PursuitState,
+        noise: Float[Array, "worlds 3"],
     ) -> tuple[Float[Array, "worlds 3"], EvaderSamples]:
-        """Wishes (E, 3) in worlds (E, ...), NaN where none of the networks acts, and the samples;
-        noise (E, 3).
+        """Wishes (E, 3) in worlds (E, ...), NaN where none of the networks acts, and
+        the samples; noise (E, 3).
         """
         flying = evaders.flying
         which, seen = self.see(flying, state)
         mean = outputs_of(flying, which, seen)[0]
-        # earlier selves tremble as much as the others do on average: how they once did isn't kept
+        # earlier selves tremble as much as the others do on average: how they once did
+        # isn't kept
         usual = jnp.mean(evaders.log_std, 0)
         spread = jnp.concatenate(
             [evaders.log_std, jnp.broadcast_to(usual, (self.settings.past, 3))]
@@ -146,9 +157,12 @@ class EvaderLearning:
         log_std = jax.nn.one_hot(which, self.number + self.settings.past) @ spread
         sample = mean + jnp.exp(log_std) * noise
         log_prob = jax.vmap(gaussian_log_prob)(sample, mean, log_std)
-        samples = EvaderSamples(seen, which, sample, log_prob, ~state.statistics.captured)
+        samples = EvaderSamples(
+            seen, which, sample, log_prob, ~state.statistics.captured
+        )
         desired = jnp.where((which >= 0)[:, None], sample, jnp.nan)
-        # a program of its own: the compiler doesn't fuse the evaders' rules with the physics
+        # a program of its own: the compiler doesn't fuse the evaders' rules with the
+        # physics
         return jax.lax.optimization_barrier(desired), samples
 
     def learn(
@@ -159,10 +173,11 @@ class EvaderLearning:
         key: PRNGKeyArray,
         axis: str | None = None,
     ) -> LearningEvaders:
-        """The evaders after all epochs on samples (T, E, ...), which ended in worlds `last` (E,
-        ...).
+        """The evaders after all epochs on samples (T, E, ...), which ended in worlds
+        `last` (E, ...).
 
-        `key` shuffles, the same on all devices; `axis` is the name of the devices' axis.
+        `key` shuffles, the same on all devices; `axis` is the name of the devices'
+        axis.
         """
         batch = self._batch(evaders, samples, last, axis)
 
@@ -190,14 +205,16 @@ class EvaderLearning:
         return self._remember(evaders, jax.random.fold_in(key, 1))
 
     def _remember(self, evaders, key):
-        """Now and then one of the actors takes a place in the pool, and other earlier selves
-        fly.
+        """Now and then one of the actors takes a place in the pool, and other earlier
+        selves fly.
         """
         due = evaders.update % self.settings.pool_every == 0
         network_key, place_key, past_key = jax.random.split(key, 3)
         network = jax.random.randint(network_key, (), 0, self.number)
         place = jax.random.randint(place_key, (), 0, self.settings.pool)
-        drawn = jax.random.randint(past_key, (self.settings.past,), 0, self.settings.pool)
+        drawn = jax.random.randint(
+            past_key, (self.settings.past,), 0, self.settings.pool
+        )
 
         def renewed(pool, actor):
             return pool.at[place].set(jnp.where(due, actor[network], pool[place]))
@@ -210,16 +227,16 @@ class EvaderLearning:
         return jax.nn.one_hot(which, self.number)
 
     def _gradient(self, networks, worlds, part):
-        """Of the networks' losses, each from its own worlds alone: some of them at a time, as often
-        as the busiest one needs.
+        """Of the networks' losses, each from its own worlds alone: some of them at a
+        time, as often as the busiest one needs.
 
-        worlds: the networks' numbers of worlds (K,) and all worlds (K, W), each network's own ones
-        first; part: see `_loss`.
+        worlds: the networks' numbers of worlds (K,) and all worlds (K, W), each
+        network's own ones first; part: see `_loss`.
         """
         number, order = worlds
         total_worlds = order.shape[1]
-        # a network meets about as many worlds as one of the game's evaders: so many at a time, and
-        # where they aren't a divisor of all, somewhat more
+        # a network meets about as many worlds as one of the game's evaders: so many at
+        # a time, and where they aren't a divisor of all, somewhat more
         kinds = len(self.environment.settings.evaders)
         parts = max(n for n in range(1, kinds + 1) if total_worlds % n == 0)
         some = total_worlds // parts
@@ -229,41 +246,50 @@ class EvaderLearning:
             taken_worlds = jax.tree.map(lambda leaf: leaf[order[:, place]], part)
             belongs = place < number[:, None]
             gradient = jax.vmap(jax.grad(self._loss))(networks, belongs, taken_worlds)
-            # a mean over all worlds: `weight` makes up for how few of them are a network's
-            return jax.tree.map(lambda total, some: total + some / total_worlds, total, gradient)
+            # a mean over all worlds: `weight` makes up for how few of them are a
+            # network's
+            return jax.tree.map(
+                lambda total, some: total + some / total_worlds, total, gradient
+            )
 
         rounds = jnp.max(-(-number // some))  # rounded up
         return jax.lax.fori_loop(0, rounds, add, jax.tree.map(jnp.zeros_like, networks))
 
     def _loss(self, networks, belongs, part):
-        """() of one network, the sum over worlds of the mean over steps; belongs (n,) whether a
-        world is the network's; part: seen, sample, log_prob, weight, advantage, target, all (n, T,
-        ...).
+        """() of one network, the sum over worlds of the mean over steps; belongs (n,)
+        whether a world is the network's; part: seen, sample, log_prob, weight,
+        advantage, target, all (n, T, ...).
         """
         actor, critic, log_std = networks
         seen, sample, log_prob, weight, advantage, target = part
         weight = belongs[:, None] * weight
-        log_ratio = gaussian_log_prob(sample, outputs(actor, seen)[0], log_std) - log_prob
-        # samples of other networks count for nothing, and mustn't overflow: zero times infinity is
-        # no number
+        log_ratio = (
+            gaussian_log_prob(sample, outputs(actor, seen)[0], log_std) - log_prob
+        )
+        # samples of other networks count for nothing, and mustn't overflow: zero times
+        # infinity is no number
         ratio = jnp.exp(jnp.where(weight > 0.0, log_ratio, 0.0))
         clipped = jnp.clip(
             ratio, 1.0 - self.settings.clip_epsilon, 1.0 + self.settings.clip_epsilon
         )
         surrogate = jnp.minimum(ratio * advantage, clipped * advantage)
         error = (outputs(critic, seen)[1] - target) ** 2
-        # weighted too: before the first of its worlds begins, a network's noise stays as it is
+        # weighted too: before the first of its worlds begins, a network's noise stays
+        # as it is
         entropy = self.settings.entropy_coefficient * gaussian_entropy(log_std)
         return jnp.sum(jnp.mean(weight * (0.5 * error - surrogate - entropy), axis=1))
 
     def _batch(self, evaders, samples, last, axis):
-        """What gradient steps need, minibatch by minibatch: see `_gradient` and `_loss`."""
+        """What gradient steps need, minibatch by minibatch: see `_gradient` and
+        `_loss`.
+        """
         settings = self.settings
         critic = evaders.critic
         value = outputs_of(critic, samples.which, samples.seen)[1]
         which, seen = self.see(evaders.flying, last)
         last_value = outputs_of(critic, which, seen)[1]
-        # a capture ends what an evader learns from, though the pursuers' episode goes on
+        # a capture ends what an evader learns from, though the pursuers' episode goes
+        # on
         caught = jnp.concatenate([~samples.flying[1:], last.statistics.captured[None]])
         advantage = generalised_advantages(
             REWARD * (~caught).astype(jnp.float32),
@@ -275,19 +301,32 @@ class EvaderLearning:
             settings.gae_lambda,
         )
         # a world keeps its evader until the rollout's end
-        flying = samples.flying[..., None] * self._by_network(samples.which[0])  # (T, E, K)
-        # each network's samples weigh as much in all, however soon its worlds are caught
-        scale = 1.0 / jnp.maximum(mean_over_devices(jnp.mean(flying, (0, 1)), axis), 1e-4)
+        # (T, E, K)
+        flying = samples.flying[..., None] * self._by_network(samples.which[0])
+        # each network's samples weigh as much in all, however soon its worlds are
+        # caught
+        scale = 1.0 / jnp.maximum(
+            mean_over_devices(jnp.mean(flying, (0, 1)), axis), 1e-4
+        )
         weight = jnp.sum(scale * flying, axis=-1)
 
         def mean(x):
             """Of what each sample's network met, (T, E)."""
-            by_network = mean_over_devices(jnp.mean(scale * flying * x[..., None], (0, 1)), axis)
+            by_network = mean_over_devices(
+                jnp.mean(scale * flying * x[..., None], (0, 1)), axis
+            )
             return self._by_network(samples.which[0]) @ by_network
 
         centred = advantage - mean(advantage)
         normal = centred / (jnp.sqrt(mean(centred**2)) + 1e-8)
-        batch = samples.seen, samples.sample, samples.log_prob, weight, normal, advantage + value
+        batch = (
+            samples.seen,
+            samples.sample,
+            samples.log_prob,
+            weight,
+            normal,
+            advantage + value,
+        )
         which = minibatches(samples.which[:1], settings.minibatches)[..., 0]  # (M, W)
         belongs = which[:, None] == jnp.arange(self.number)[:, None]  # (M, K, W)
         # False comes before True: a network's own worlds first

@@ -1,5 +1,5 @@
-"""Fine-tuning a policy to one diagnosed vehicle: the updates one after the other, and which of the
-policies on the way is kept.
+"""Fine-tuning a policy to one diagnosed vehicle: the updates one after the other, and
+which of the policies on the way is kept.
 """
 
 from collections.abc import Callable
@@ -36,11 +36,12 @@ def fine_tune(
     key: PRNGKeyArray,
     score: Callable[[PolicyParameters], np.ndarray],
 ) -> Tuned:
-    """Train `parameters` (from `starting_parameters`) on vehicles within `bounds` (R, 4), and keep
-    the best on the way.
+    """Train `parameters` (from `starting_parameters`) on vehicles within `bounds` (R,
+    4), and keep the best on the way.
 
-    `score` gives the scores of episodes (B,), of the same tasks and vehicles each time; what isn't
-    clearly better than the first parameters, by the differences of single episodes, isn't kept.
+    `score` gives the scores of episodes (B,), of the same tasks and vehicles each time;
+    what isn't clearly better than the first parameters, by the differences of single
+    episodes, isn't kept.
     """
     settings = adaptation.settings
     bounds = jnp.asarray(bounds)
@@ -60,14 +61,15 @@ def fine_tune(
             candidate = parameters.replace(actor=actor.parameters)
             scores = np.asarray(score(candidate))
             looks[update] = float(scores.mean())
-            # better than the best so far by the mean, and than the first ones beyond doubt: each
-            # look is another chance to be lucky
+            # better than the best so far by the mean, and than the first ones beyond
+            # doubt: each look is another chance to be lucky
             if looks[update] > looks[best_update] and clearly_better(first, scores):
                 best = candidate
                 best_update = update
     # fetched at the end: to wait for every update's numbers would leave the device idle
     history = [
-        {name: float(value) for name, value in row.items()} for row in jax.device_get(history)
+        {name: float(value) for name, value in row.items()}
+        for row in jax.device_get(history)
     ]
     return Tuned(best, best_update, history, looks)
 
@@ -77,8 +79,8 @@ def clearly_better(
     scores: Float[np.ndarray, " episodes"],
     errors: float = 2.0,
 ) -> bool:
-    """Whether the scores (B,) of the same episodes rose by more than so many standard errors of
-    their differences.
+    """Whether the scores (B,) of the same episodes rose by more than so many standard
+    errors of their differences.
     """
     gain = np.asarray(scores, float) - np.asarray(first, float)
     return bool(gain.mean() > errors * gain.std() / np.sqrt(len(gain)))

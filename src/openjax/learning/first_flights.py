@@ -1,10 +1,10 @@
-"""The first stage of a run: to fly, and to go after the evader, by the gradient through the
-simulation.
+"""The first stage of a run: to fly, and to go after the evader, by the gradient through
+the simulation.
 
-From scratch MAPPO spends half of its data on learning to fly. The equations of motion teach that in
-seconds: how far the nearest pursuer is from the evader over the next moments has a gradient, and so
-have near misses (`openjax.learning.analytic_gradient`). What has none, waiting or cutting off, is
-left to MAPPO.
+From scratch MAPPO spends half of its data on learning to fly. The equations of motion
+teach that in seconds: how far the nearest pursuer is from the evader over the next
+moments has a gradient, and so have near misses (`openjax.learning.analytic_gradient`).
+What has none, waiting or cutting off, is left to MAPPO.
 """
 
 import dataclasses
@@ -29,7 +29,11 @@ from openjax.learning.gradient_step import (
     renewed,
     weighted_sum,
 )
-from openjax.learning.settings import AnalyticSettings, FirstFlightsSettings, GeneratorSettings
+from openjax.learning.settings import (
+    AnalyticSettings,
+    FirstFlightsSettings,
+    GeneratorSettings,
+)
 from openjax.learning.smooth_measures import crash_share, tip_share
 from openjax.policy import Policy, PolicyParameters
 from openjax.pursuit import Pursuit
@@ -39,12 +43,14 @@ from openjax.vehicle.family import narrowed_bounds
 PHYSICS_STEP = 0.01
 """Seconds of a physics step: finer ones teach nothing more."""
 LOW = 0.25
-"""Height (m) below which the end of a moment costs: the gap to the floor is felt too late."""
+"""Height (m) below which the end of a moment costs: the gap to the floor is felt too
+late.
+"""
 
 
 def first_game(environment: Pursuit, stage: FirstFlightsSettings) -> Pursuit:
-    """`environment` as it is learnt in: in free flight, with control steps of its own and episodes
-    as long.
+    """`environment` as it is learnt in: in free flight, with control steps of its own
+    and episodes as long.
     """
     free = free_flight(environment)
     game = free.settings
@@ -72,8 +78,8 @@ class FirstCarry:
 
 @dataclass(frozen=True)
 class FirstFlights:
-    """How a fresh actor learns to fly. `World`s are observations and states (B, ...), a device's
-    share of them all.
+    """How a fresh actor learns to fly. `World`s are observations and states (B, ...), a
+    device's share of them all.
     """
 
     settings: FirstFlightsSettings
@@ -91,7 +97,9 @@ class FirstFlights:
         return AnalyticGradient(AnalyticSettings(), self.environment, self.policy)
 
     def start(self, key: PRNGKeyArray):
-        """Worlds at the starts of uniform tasks and of scattered ones, their vehicles nominal."""
+        """Worlds at the starts of uniform tasks and of scattered ones, their vehicles
+        nominal.
+        """
         game = self.environment.settings
 
         task_keys, reset_keys = (
@@ -105,22 +113,26 @@ class FirstFlights:
         return jax.vmap(environment.reset_to)(reset_keys, tasks)
 
     def loss(self, actor: Any, parameters: PolicyParameters, world, risen: Scalar):
-        """What is learnt (); worlds after it and its parts. `risen` () is how far the penalties
-        have risen, 0 to 1.
+        """What is learnt (); worlds after it and its parts. `risen` () is how far the
+        penalties have risen, 0 to 1.
         """
         settings = self.settings
         is_fast_possible = self.environment.settings.speed_limit == "none"
         end, met = self.stage.fly(actor, parameters, world, settings.steps)
-        # with whole penalties from the start, pursuers stay away from the evader for good
+        # with whole penalties from the start, pursuers stay away from the evader for
+        # good
         penalty = settings.penalty_start + (1.0 - settings.penalty_start) * risen
         parts = {
             "free": (1.0, met.free),
-            # along the shortest path: by the straight line they wait in sight of the evader, on the
-            # wrong side of a row of pillars
+            # along the shortest path: by the straight line they wait in sight of the
+            # evader, on the wrong side of a row of pillars
             "distance": (settings.distance, met.distance),
-            # felt from farther than a touch, or they never leave such a place either: over 5 cm
-            # they go round rows and hardly crash, over 1 cm they do neither
-            "crashes": (penalty * settings.crash, crash_share(met.least, settings.crash_smooth)),
+            # felt from farther than a touch, or they never leave such a place either:
+            # over 5 cm they go round rows and hardly crash, over 1 cm they do neither
+            "crashes": (
+                penalty * settings.crash,
+                crash_share(met.least, settings.crash_smooth),
+            ),
             "tips": (risen * settings.crash, tip_share(met.upright)),
             "breaches": (penalty * settings.breach, met.breach),
             "speed": (settings.speed * is_fast_possible, met.excess),
@@ -129,7 +141,9 @@ class FirstFlights:
         total, means = weighted_sum(parts)
         return total, (end, means)
 
-    def update(self, carry: FirstCarry, key: PRNGKeyArray) -> tuple[FirstCarry, dict[str, Scalar]]:
+    def update(
+        self, carry: FirstCarry, key: PRNGKeyArray
+    ) -> tuple[FirstCarry, dict[str, Scalar]]:
         """The carry after an update, and the parts of the loss."""
         parameters = carry.parameters
         world = carry.world
@@ -138,21 +152,29 @@ class FirstFlights:
             parameters.actor, parameters, world, risen
         )
         gradient, parts = mean_over_devices((gradient, parts), self.axis)
-        # penalties wait for pursuers that catch: who fears a crash before that never comes near
+        # penalties wait for pursuers that catch: who fears a crash before that never
+        # comes near
         step = 1.0 / (self.settings.penalty_ramp * max(self.settings.updates, 1))
         risen = jnp.minimum(
-            risen + jnp.where(parts["free"] < self.settings.penalty_free, step, 0.0), 1.0
+            risen + jnp.where(parts["free"] < self.settings.penalty_free, step, 0.0),
+            1.0,
         )
         change, state = self.optimiser.update(finite_or_zero(gradient), carry.optimiser)
-        parameters = parameters.replace(actor=optax.apply_updates(parameters.actor, change))
+        parameters = parameters.replace(
+            actor=optax.apply_updates(parameters.actor, change)
+        )
         start_key, choice_key = jax.random.split(key)
-        drawn = jax.random.uniform(choice_key, (self.settings.worlds,)) < self.settings.anew
+        drawn = (
+            jax.random.uniform(choice_key, (self.settings.worlds,)) < self.settings.anew
+        )
         over = self._over(end[1]) | own_share(drawn, self.axis)
         world = renewed(over, end, self.start(start_key))
         return FirstCarry(parameters, state, world, risen), parts
 
     def _over(self, state):
-        """(B,) worlds that end: crashed, far outside, or too late for another moment."""
+        """(B,) worlds that end: crashed, far outside, or too late for another
+        moment.
+        """
         game = self.environment.settings
         late = state.step > game.episode_length - self.settings.steps
         return is_lost(game, state) | late
@@ -168,17 +190,22 @@ class FirstFlights:
     def begin(self, parameters: PolicyParameters, key: PRNGKeyArray) -> FirstCarry:
         """The carry of `update` before the first one."""
         return FirstCarry(
-            parameters, self.optimiser.init(parameters.actor), self.start(key), jnp.zeros(())
+            parameters,
+            self.optimiser.init(parameters.actor),
+            self.start(key),
+            jnp.zeros(()),
         )
 
 
 def make_first_flights(flights: FirstFlights, together: int) -> Callable:
-    """`together` updates as one function (carry, key, updates done) -> carry, mean parts of the
-    loss; to be compiled.
+    """`together` updates as one function (carry, key, updates done) -> carry, mean
+    parts of the loss; to be compiled.
     """
 
     def some(carry, key, done):
-        keys = jax.vmap(lambda i: jax.random.fold_in(key, i))(done + jnp.arange(together))
+        keys = jax.vmap(lambda i: jax.random.fold_in(key, i))(
+            done + jnp.arange(together)
+        )
         carry, parts = jax.lax.scan(flights.update, carry, keys)
         return carry, jax.tree.map(jnp.mean, parts)
 

@@ -40,9 +40,9 @@ def generate_task(
 ) -> Task:
     """Draw one task: with probability p an archived one, expanded, else a uniform one.
 
-    A share `close` of its pursuers is put close to a pillar or to another one (not in the paper).
-    Where there are several evaders it has one of them, as its success rate is that of a task and an
-    evader.
+    A share `close` of its pursuers is put close to a pillar or to another one (not in
+    the paper). Where there are several evaders it has one of them, as its success rate
+    is that of a task and an evader.
     """
     task = _archived_or_uniform(settings, environment, archive, key)
     if close is None:
@@ -53,7 +53,9 @@ def generate_task(
 def _archived_or_uniform(settings, environment, archive, key):
     uniform_key, turn_key, choice_key, draw_key, expand_key = jax.random.split(key, 5)
     uniform = uniform_task(environment, uniform_key)
-    uniform = vary_pillars(settings, environment, jax.random.fold_in(uniform_key, 1), uniform)
+    uniform = vary_pillars(
+        settings, environment, jax.random.fold_in(uniform_key, 1), uniform
+    )
     if len(set(environment.evaders)) > 1:
         kind = jax.random.randint(
             jax.random.fold_in(uniform_key, 2), (), 0, len(environment.evaders)
@@ -64,8 +66,11 @@ def _archived_or_uniform(settings, environment, archive, key):
         uniform = turn_task(turn_key, uniform)
     if not settings.enabled:
         return uniform
-    # both are drawn and one is taken: mapped over worlds, a branch would work out both, too
-    expanded = expand_task(environment, expand_key, draw(archive, draw_key), settings.wall_distance)
+    # both are drawn and one is taken: mapped over worlds, a branch would work out both,
+    # too
+    expanded = expand_task(
+        environment, expand_key, draw(archive, draw_key), settings.wall_distance
+    )
     local = (jax.random.uniform(choice_key) < settings.expansion) & (archive.size > 0)
     return jax.tree.map(lambda a, b: jnp.where(local, a, b), expanded, uniform)
 
@@ -75,12 +80,12 @@ def successes(
     statistics: EpisodeStatistics,
     penalty_share: Scalar | float = 1.0,
 ) -> Bool[Array, "*worlds"]:
-    """Whether episodes count as solved: captured, and (by setting) with few collisions. Any leading
-    axes.
+    """Whether episodes count as solved: captured, and (by setting) with few collisions.
+    Any leading axes.
 
-    `penalty_share` is the share of the penalties that counts by now (0 to 1). As it grows, the
-    tolerated collision rate falls from one to the setting: before the penalties teach to avoid
-    collisions, they'd keep the archive empty.
+    `penalty_share` is the share of the penalties that counts by now (0 to 1). As it
+    grows, the tolerated collision rate falls from one to the setting: before the
+    penalties teach to avoid collisions, they'd keep the archive empty.
     """
     return statistics.captured & (
         statistics.collision_rate <= settings.collision_tolerance**penalty_share
@@ -101,15 +106,16 @@ def select(
       archive: the archive so far.
       tasks: leading axis M.
       success: (M,) success rate of each.
-      complete: (M,) bool, its episodes ran their full length (the first ones start late).
+      complete: (M,) bool, its episodes ran their full length (the first ones start
+      late).
     """
     unsolved = (success >= settings.success_low) & (success <= settings.success_high)
     return insert(archive, tasks, success, unsolved & complete, task_descriptor)
 
 
 def vary_pillars(settings, environment, key, task):
-    """Other pillars than the paper's uniform tasks have: some of them in a row, all off the
-    grid.
+    """Other pillars than the paper's uniform tasks have: some of them in a row, all off
+    the grid.
     """
     choice_key, row_key, shift_key = jax.random.split(key, 3)
     if settings.row_share:

@@ -1,8 +1,9 @@
-"""What the three stages by the gradient through the simulation have in common: before MAPPO
-(`first_flights`), after it (`analytic_gradient`), and for a diagnosed vehicle (`adaptation`).
+"""What the three stages by the gradient through the simulation have in common: before
+MAPPO (`first_flights`), after it (`analytic_gradient`), and for a diagnosed vehicle
+(`adaptation`).
 
-Each flies the policy's mean for some steps, adds up weighted parts of what its pursuers met, and
-lets the actor follow the gradient.
+Each flies the policy's mean for some steps, adds up weighted parts of what its pursuers
+met, and lets the actor follow the gradient.
 """
 
 from collections.abc import Callable, Mapping
@@ -40,8 +41,8 @@ def falling_rate(rate: float, updates: int) -> optax.Schedule:
 
 
 def finite_or_zero(gradient: Any) -> Any:
-    """A gradient through the simulation, zero where it isn't finite: a world that tumbles may have
-    none.
+    """A gradient through the simulation, zero where it isn't finite: a world that
+    tumbles may have none.
     """
     finite = jnp.isfinite(optax.global_norm(gradient))
     return jax.tree.map(lambda leaf: jnp.where(finite, leaf, 0.0), gradient)
@@ -59,7 +60,9 @@ def renewed(over: Bool[Array, " worlds"], world: Any, fresh: Any) -> Any:
 def weighted_sum(
     parts: Mapping[str, tuple[float | Scalar, Float[Array, "..."]]],
 ) -> tuple[Scalar, dict[str, Scalar]]:
-    """() sum of the weighted means of a loss's parts, {name: (weight, values)}; and the means."""
+    """() sum of the weighted means of a loss's parts, {name: (weight, values)}; and the
+    means.
+    """
     means = {name: jnp.mean(values) for name, (_, values) in parts.items()}
     return sum(weight * means[name] for name, (weight, _) in parts.items()), means
 
@@ -67,10 +70,11 @@ def weighted_sum(
 def mean_step(
     environment: Pursuit, policy: Policy, parameters: PolicyParameters
 ) -> Callable[..., tuple[Observation, PursuitState]]:
-    """A control step of worlds (W, ...) by the policy's mean: (actor, observation, state, wish) ->
-    observation, state; the predictor of `parameters` has no gradient.
+    """A control step of worlds (W, ...) by the policy's mean: (actor, observation,
+    state, wish) -> observation, state; the predictor of `parameters` has no gradient.
 
-    `wish` (W, 3) is where the evaders fly, as a share of their speed; None or NaN: their own rule.
+    `wish` (W, 3) is where the evaders fly, as a share of their speed; None or NaN:
+    their own rule.
     """
     step = jax.vmap(environment.step, in_axes=(None, 0, 0, 0))
 
@@ -78,7 +82,9 @@ def mean_step(
         predicted = jax.lax.stop_gradient(policy.predict(parameters, observation))
         mean, _ = policy.distribution(actor, observation, predicted)
         # no key: the game draws nothing after its reset
-        observation, state, *_ = step(None, state, policy.action(mean, observation), wish)
+        observation, state, *_ = step(
+            None, state, policy.action(mean, observation), wish
+        )
         return observation, state
 
     return fly_on

@@ -13,9 +13,9 @@ from openjax.ranges import changed
 
 
 def quick() -> TrainSettings:
-    """Minutes on two CPU cores: the paper's evader and starts, any number of pillars up to five,
-    and 25 commands a second instead of 100. The gradient through the simulation teaches to fly and
-    to chase, then MAPPO goes on.
+    """Minutes on two CPU cores: the paper's evader and starts, any number of pillars up
+    to five, and 25 commands a second instead of 100. The gradient through the
+    simulation teaches to fly and to chase, then MAPPO goes on.
     """
     return TrainSettings(
         environment=PursuitSettings(
@@ -24,18 +24,24 @@ def quick() -> TrainSettings:
             min_pillars=0,
             # with three, pursuers don't know where a row ends
             observed_pillars=5,
-            # fewer, longer steps: the same noise tries more, and there is less to learn from a
-            # second
+            # fewer, longer steps: the same noise tries more, and there is less to learn
+            # from a second
             time_step=0.04,
             substeps=4,
             episode_length=200,
             history_length=5,
-            reward=RewardSettings(crash=10.0, first_crash=300.0, margin=0.03, lookahead=0.15),
+            reward=RewardSettings(
+                crash=10.0, first_crash=300.0, margin=0.03, lookahead=0.15
+            ),
         ),
-        # in so short a run the mean policy learns faster this way; over longer ones the other is
-        # better
+        # in so short a run the mean policy learns faster this way; over longer ones the
+        # other is better
         network=NetworkSettings(
-            features=64, heads=2, squash="sample", initial_log_std=-3.0, critic_encoder="layers"
+            features=64,
+            heads=2,
+            squash="sample",
+            initial_log_std=-3.0,
+            critic_encoder="layers",
         ),
         predictor=PredictorSettings(units=16, horizons=(1, 2, 3, 5, 10)),
         # its critic knows nothing when it begins, and its actor is good already
@@ -49,8 +55,8 @@ def quick() -> TrainSettings:
             clip_epsilon_end=0.2,
             discount=0.99,
         ),
-        # a crash that is felt from afar: pursuers go round rows of pillars, and don't try gaps
-        # under half a metre
+        # a crash that is felt from afar: pursuers go round rows of pillars, and don't
+        # try gaps under half a metre
         first_flights=FirstFlightsSettings(
             updates=800,
             worlds=128,
@@ -60,9 +66,11 @@ def quick() -> TrainSettings:
             crash_smooth=0.05,
             breach=4.0,
         ),
-        # few tasks reach the archive in so short a run; drawn from too often, they'd be all that is
-        # learnt
-        generator=GeneratorSettings(capacity=500, expansion=0.3, pillar_shift=0.1, row_share=0.25),
+        # few tasks reach the archive in so short a run; drawn from too often, they'd be
+        # all that is learnt
+        generator=GeneratorSettings(
+            capacity=500, expansion=0.3, pillar_shift=0.1, row_share=0.25
+        ),
         num_envs=640,
         rollout_length=20,
         total_steps=640_000,
@@ -77,9 +85,14 @@ def paper() -> TrainSettings:
         environment=PursuitSettings(
             physics="rigid",
             observe_position=True,
-            observe_in="heading",  # turned, the game looks the same: half of the steps to .99
+            # turned, the game looks the same: half of the steps to .99
+            observe_in="heading",
             reward=RewardSettings(
-                collision=40.0, crash=20.0, first_crash=5000.0, margin=0.03, lookahead=0.15
+                collision=40.0,
+                crash=20.0,
+                first_crash=5000.0,
+                margin=0.03,
+                lookahead=0.15,
             ),
         ),
         network=NetworkSettings(heads=2, compute_type="bfloat16", shared_encoder=True),
@@ -92,7 +105,10 @@ def paper() -> TrainSettings:
             penalty_ramp=0.7,
         ),
         generator=GeneratorSettings(
-            wall_distance=0.05, pillar_shift=0.1, row_share=0.25, collision_tolerance=0.002
+            wall_distance=0.05,
+            pillar_shift=0.1,
+            row_share=0.25,
+            collision_tolerance=0.002,
         ),
         num_envs=5120,
         total_steps=350_000_000,
@@ -105,9 +121,9 @@ def paper() -> TrainSettings:
 
 
 def flight() -> TrainSettings:
-    """Policies to be flown: no clamp on the speed, the rate loop at 500 Hz, every pursuer its own
-    vehicle; at last half seconds by the gradient through the simulation. Five minutes on one large
-    accelerator.
+    """Policies to be flown: no clamp on the speed, the rate loop at 500 Hz, every
+    pursuer its own vehicle; at last half seconds by the gradient through the
+    simulation. Five minutes on one large accelerator.
     """
     from openjax.vehicle.family import vehicle_family
 
@@ -121,17 +137,18 @@ def flight() -> TrainSettings:
             vehicles=vehicle_family(),
             rare_vehicles=0.5,
             observe_history=12,
-            # Without the clamp, a first crash at 5,000 teaches to stay away from rows of pillars,
-            # and so does all that is dear near a pillar. The last stage sees to crashes, breaches
-            # and speeds over the limit
+            # Without the clamp, a first crash at 5,000 teaches to stay away from rows
+            # of pillars, and so does all that is dear near a pillar. The last stage
+            # sees to crashes, breaches and speeds over the limit
             reward=dict(collision=15.0, margin=0.02, crash=40.0, first_crash=1000.0),
         ),
         mappo=dict(step_subsampling=1, penalty_ramp=0.75),
-        # Starts force collisions. If they counted against success, the archive would hold such
-        # starts instead of the tasks whose evader nobody reaches
+        # Starts force collisions. If they counted against success, the archive would
+        # hold such starts instead of the tasks whose evader nobody reaches
         generator=dict(row_share=0.6, success_low=0.25, collision_tolerance=1.0),
         analytic=dict(updates=200),
-        # flown from the start, the whole family teaches to hover out of harm's way and nothing else
+        # flown from the start, the whole family teaches to hover out of harm's way and
+        # nothing else
         vehicles_start=0.18,
         vehicles_ramp=0.14,
         total_steps=400_000_000,
@@ -139,9 +156,9 @@ def flight() -> TrainSettings:
     )
 
 
-# The distance pays for going near a pillar, captures for the last centimetres: a step of it alone
-# costs too much. Breaches that count .02 m early make a way between pillars .4 m apart cost as much
-# as a capture pays
+# The distance pays for going near a pillar, captures for the last centimetres: a step
+# of it alone costs too much. Breaches that count .02 m early make a way between pillars
+# .4 m apart cost as much as a capture pays
 _PAY_OF_CAPTURES = dict(
     distance=0.5,
     first_capture=500.0,
@@ -153,10 +170,11 @@ _PAY_OF_CAPTURES = dict(
 
 
 def evaders() -> TrainSettings:
-    """Policies to be flown after evaders that fight back: first the paper's, then scripted ones,
-    slow at first, and some that learn while the pursuers do, beside their earlier selves; at last
-    evaders that plan, by the gradient through the simulation. One run for one large accelerator;
-    how far it has been flown: experiments/results/judged.md.
+    """Policies to be flown after evaders that fight back: first the paper's, then
+    scripted ones, slow at first, and some that learn while the pursuers do, beside
+    their earlier selves; at last evaders that plan, by the gradient through the
+    simulation. One run for one large accelerator; how far it has been flown:
+    experiments/results/judged.md.
     """
     return changed(
         flight(),
@@ -169,17 +187,26 @@ def evaders() -> TrainSettings:
                 *["learned"] * 8,
             ),
             observe_in="heading",
-            # Who knows the time risks less and less as it passes: pursuers flew .70 m/s at first
-            # and .33 in the eighth second, and an evader that lasted so long was safe
+            # Who knows the time risks less and less as it passes: pursuers flew .70 m/s
+            # at first and .33 in the eighth second, and an evader that lasted so long
+            # was safe
             observe_time=False,
             min_pillars=0,
             reward=_PAY_OF_CAPTURES,
         ),
-        # as long as a breach costs less than a step in reach pays, pursuers learn to hold an evader
-        # from beyond the wall
-        mappo=dict(target_kl=0.02, step_subsampling=2, entropy_coefficient=2e-3, penalty_ramp=0.5),
-        analytic=dict(updates=250, look_every=50, worlds=256, learning_rate=8e-4, hold=0.01),
-        # after plans of .8 s a planner got away in .42 of `random`, after these of 1.2 s in .16
+        # as long as a breach costs less than a step in reach pays, pursuers learn to
+        # hold an evader from beyond the wall
+        mappo=dict(
+            target_kl=0.02,
+            step_subsampling=2,
+            entropy_coefficient=2e-3,
+            penalty_ramp=0.5,
+        ),
+        analytic=dict(
+            updates=250, look_every=50, worlds=256, learning_rate=8e-4, hold=0.01
+        ),
+        # after plans of .8 s a planner got away in .42 of `random`, after these of 1.2
+        # s in .16
         worst_plans=dict(worlds=512, pieces=6),
         evader_learning=dict(past=3),
         vehicles_start=0.08,
@@ -193,9 +220,9 @@ def evaders() -> TrainSettings:
 
 
 def teams() -> TrainSettings:
-    """One policy for teams of one to eight pursuers, in honest physics: sizes, the evader's speed
-    and the capture radius are drawn for each task; two, five and seven pursuers are held out.
-    Minutes on one large accelerator.
+    """One policy for teams of one to eight pursuers, in honest physics: sizes, the
+    evader's speed and the capture radius are drawn for each task; two, five and seven
+    pursuers are held out. Minutes on one large accelerator.
     """
     return changed(
         evaders(),
@@ -204,14 +231,15 @@ def teams() -> TrainSettings:
             team_sizes=(1, 3, 4, 6, 8),
             evader_speeds=(0.8, 2.0),
             capture_radii=(0.2, 0.4),
-            # whoever remains flies on as a smaller team, and two learn in no other way: with three
-            # of ten, the time observed and no pay of later captures, two caught .92 and the two
-            # left of three .95
+            # whoever remains flies on as a smaller team, and two learn in no other way:
+            # with three of ten, the time observed and no pay of later captures, two
+            # caught .92 and the two left of three .95
             fall_outs=0.6,
             observe_game=True,
             history_pursuers="pooled",
             evaders=("field", "field", "greedy", "wall_runner", "slow_hugger"),
-            # every pursuer is the nominal vehicle, which shows in one frame how it answers
+            # every pursuer is the nominal vehicle, which shows in one frame how it
+            # answers
             vehicles=(),
             rare_vehicles=0.0,
             observe_history=0,
@@ -221,8 +249,8 @@ def teams() -> TrainSettings:
         vehicles_start=0.0,
         vehicles_ramp=0.0,
         validation_start=0.0,
-        # eight slots are two and a half times the samples of three; somewhat more than half are in
-        # use
+        # eight slots are two and a half times the samples of three; somewhat more than
+        # half are in use
         num_envs=3840,
         # three and a half minutes on one H100 or H200; at 180 M captures still rise
         total_steps=300_000_000,
@@ -230,9 +258,9 @@ def teams() -> TrainSettings:
 
 
 def mappo() -> TrainSettings:
-    """The paper's plain MAPPO, without predictor and generator, with penalties under which it
-    learns to catch: where a first crash costs 5,000, only the generator's tasks lead past
-    hovering.
+    """The paper's plain MAPPO, without predictor and generator, with penalties under
+    which it learns to catch: where a first crash costs 5,000, only the generator's
+    tasks lead past hovering.
     """
     return changed(
         paper(),
@@ -253,13 +281,14 @@ def dacoop() -> TrainSettings:
 
 
 PRESETS = {
-    recipe.__name__: recipe for recipe in (quick, paper, flight, evaders, teams, mappo, dacoop)
+    recipe.__name__: recipe
+    for recipe in (quick, paper, flight, evaders, teams, mappo, dacoop)
 }
 
 
 def preset(name: str, **changes) -> TrainSettings:
-    """A preset's settings, with fields changed; those of settings within them by a dict, as in
-    `changed`.
+    """A preset's settings, with fields changed; those of settings within them by a
+    dict, as in `changed`.
 
     Raises:
       UserError: no such preset.

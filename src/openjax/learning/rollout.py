@@ -16,8 +16,8 @@ from openjax.pursuit.shapes import Scalar
 
 @struct.dataclass
 class Rollout:
-    """T steps of E worlds with N pursuers. Of the history only the newest frame of each step is
-    kept.
+    """T steps of E worlds with N pursuers. Of the history only the newest frame of each
+    step is kept.
     """
 
     observation: Observation  # (T, E, ...), before the step; `frames` (T, E, 1, F)
@@ -34,7 +34,9 @@ class Rollout:
 
 
 def newest_frame(observation: Observation) -> Observation:
-    """The observation with the newest frame only: the others are the frames of earlier steps."""
+    """The observation with the newest frame only: the others are the frames of earlier
+    steps.
+    """
     return observation.replace(frames=observation.frames[..., -1:, :])
 
 
@@ -46,8 +48,8 @@ class Players:
     policy: Policy
     parameters: PolicyParameters
     evaders: Callable[[PursuitState, jax.Array], tuple[jax.Array, Any]] | None = None
-    """worlds (E, ...), noise (E, 3) -> desired velocities (E, 3) of evaders that learn, and their
-    samples; None: none learns
+    """worlds (E, ...), noise (E, 3) -> desired velocities (E, 3) of evaders that learn,
+    and their samples; None: none learns
     """
     hold: int = 1
     """Steps for which an evader that learns flies a decision."""
@@ -79,7 +81,9 @@ def collect(
       the rollout, and observation and state after it.
     """
     pursuers = players.environment.settings.num_pursuers
-    chex.assert_shape(noise.pursuers, (None, None, pursuers, players.policy.sample_size))
+    chex.assert_shape(
+        noise.pursuers, (None, None, pursuers, players.policy.sample_size)
+    )
     chex.assert_tree_shape_prefix(world, noise.pursuers.shape[1:2])
     step = _step(players, penalty_share)
     if not players.evaders:
@@ -95,7 +99,8 @@ def collect(
         world, record = jax.lax.scan(fly_on, world, noise.pursuers)
         return world, (record, samples)
 
-    # two scans, one in the other: the evaders decide once, and their decision is flown `hold` steps
+    # two scans, one in the other: the evaders decide once, and their decision is flown
+    # `hold` steps
     held = noise.pursuers.reshape(-1, players.hold, *noise.pursuers.shape[1:])
     noise = noise.replace(pursuers=held)
     (observation, state), (record, samples) = jax.lax.scan(decide, world, noise)
@@ -104,11 +109,13 @@ def collect(
 
 
 def _step(players, penalty_share):
-    """A control step of worlds (E, ...): worlds, noise (E, N, A) and desired velocities of evaders
-    that learn -> worlds after it, record.
+    """A control step of worlds (E, ...): worlds, noise (E, N, A) and desired velocities
+    of evaders that learn -> worlds after it, record.
     """
     policy = players.policy
-    move = jax.vmap(players.environment.step, in_axes=(None, 0, 0, 0 if players.evaders else None))
+    move = jax.vmap(
+        players.environment.step, in_axes=(None, 0, 0, 0 if players.evaders else None)
+    )
 
     def step(world, noise, desired=None):
         observation, state = world
@@ -123,7 +130,8 @@ def _step(players, penalty_share):
             predicted=predicted,
             action=action,
             log_prob=log_prob,
-            # the reward holds the whole penalties: the share that doesn't count yet is given back
+            # the reward holds the whole penalties: the share that doesn't count yet is
+            # given back
             reward=reward - (1.0 - penalty_share) * info.penalty,
             terminated=terminated,
             truncated=truncated,
@@ -138,6 +146,8 @@ def _sample(players, observation, noise):
     """Predictions, samples of the policy and their log probabilities."""
     policy = players.policy
     predicted = policy.predict(players.parameters, observation)
-    mean, log_std = policy.distribution(players.parameters.actor, observation, predicted)
+    mean, log_std = policy.distribution(
+        players.parameters.actor, observation, predicted
+    )
     action = mean + jnp.exp(log_std) * noise
     return predicted, action, gaussian_log_prob(action, mean, log_std)

@@ -21,26 +21,26 @@ class MappoSettings:
     learning_rate: Annotated[float, Interval("(0, 1]")] = 5e-4
     """Adam step size at the start; falls linearly to zero over `total_steps`."""
     actor_start: Annotated[float, Interval("[0, 1]")] = 0.0
-    """Share of the run before the actor begins to learn: a run that starts from a policy without
-    its critic learns that first.
+    """Share of the run before the actor begins to learn: a run that starts from a
+    policy without its critic learns that first.
     """
     epochs: Annotated[int, Interval("[1, 1000]")] = 4
     """Passes over each iteration's rollouts."""
     minibatches: Annotated[int, Interval("[1, 100000]")] = 16
     """Gradient steps of one pass, each on as many worlds."""
     step_subsampling: Annotated[int, Interval("[1, 100000]")] = 1
-    """A gradient step sees every n-th step of its trajectories, from a first one drawn each time:
-    consecutive steps are so alike that fewer of them teach nearly as much. Divides
-    `rollout_length`.
+    """A gradient step sees every n-th step of its trajectories, from a first one drawn
+    each time: consecutive steps are so alike that fewer of them teach nearly as much.
+    Divides `rollout_length`.
     """
     clip_epsilon: Annotated[float, Interval("(0, 10]")] = 0.1
     """Clip range of the probability ratio at the start of the run."""
     clip_epsilon_end: Annotated[float, Interval("(0, 10]")] = 0.1
     """Clip range at the end of the run, to which it changes linearly."""
     target_kl: Annotated[float, Interval("[0, 10]")] = 0.0
-    """Divergence (nats) of the learning policy from the one that flew, near which the actor's step
-    size keeps it; 0: steps aren't scaled. A run that starts from a policy with little noise needs
-    it.
+    """Divergence (nats) of the learning policy from the one that flew, near which the
+    actor's step size keeps it; 0: steps aren't scaled. A run that starts from a policy
+    with little noise needs it.
     """
     entropy_coefficient: Annotated[float, Interval("[0, 10]")] = 1e-3
     """Weight of the entropy."""
@@ -55,13 +55,15 @@ class MappoSettings:
     value_coefficient: Annotated[float, Interval("(0, 1000]")] = 1.0
     """Weight of the value loss; it matters where actor and critic share an encoder."""
     value_norm_decay: Annotated[float, Interval("[0, 1)")] = 0.95
-    """Share of the old mean and variance of the returns that value normalisation keeps per
-    iteration.
+    """Share of the old mean and variance of the returns that value normalisation keeps
+    per iteration.
     """
     reward_scale: Annotated[float, Interval("(0, 1e6]")] = 0.1
     """By which rewards are multiplied before they are learnt from."""
     penalty_start: Annotated[float, Interval("[0, 1]")] = 1.0
-    """Share of the penalties (collision, speed, crash) that counts at the start of the run."""
+    """Share of the penalties (collision, speed, crash) that counts at the start of the
+    run.
+    """
     penalty_ramp: Annotated[float, Interval("[0, 1]")] = 0.5
     """Share of the run over which the penalties rise linearly to their whole size."""
 
@@ -78,16 +80,16 @@ class GeneratorSettings:
     capacity: Annotated[int, Interval("[1, 10000000]")] = 5000
     """Tasks in the archive."""
     turn: bool = True
-    """Turn uniform tasks about the arena's axis, so that they come from all sides (the paper's come
-    from one).
+    """Turn uniform tasks about the arena's axis, so that they come from all sides (the
+    paper's come from one).
     """
     pillar_shift: Annotated[float, Interval("[0, 10]")] = 0.0
-    """Pillars of uniform tasks are moved by up to this along x and y (m), off the grid on which the
-    paper's stand.
+    """Pillars of uniform tasks are moved by up to this along x and y (m), off the grid
+    on which the paper's stand.
     """
     row_share: Annotated[float, Interval("[0, 1]")] = 0.0
-    """Share of the uniform tasks whose pillars stand in a row between the two sides (none of the
-    paper's).
+    """Share of the uniform tasks whose pillars stand in a row between the two sides
+    (none of the paper's).
     """
     expansion: Annotated[float, Interval("[0, 1]")] = 0.7
     """Probability p of local expansion of an archived task, else a uniform one."""
@@ -96,13 +98,15 @@ class GeneratorSettings:
     success_high: Annotated[float, Interval("[0, 1]")] = 0.9
     """Largest success rate of a task that enters the archive."""
     wall_distance: Annotated[float, Interval("[0, 10]")] = 0.1
-    """Expanded starts keep this far from the arena's wall (m); 0.1 in the released code."""
+    """Expanded starts keep this far from the arena's wall (m); 0.1 in the released
+    code.
+    """
     episodes_per_task: Annotated[int, Interval("[1, 100000]")] = 4
     """Environments that share one task, so that its success rate can be told."""
     collision_tolerance: Annotated[float, Interval("(0, 1]")] = 1.0
-    """An episode counts as success if it captures and its collision rate stays below this (1:
-    capture alone), once the penalties count in full; before that, more is tolerated (this to the
-    power of the penalties' share).
+    """An episode counts as success if it captures and its collision rate stays below
+    this (1: capture alone), once the penalties count in full; before that, more is
+    tolerated (this to the power of the penalties' share).
     """
 
     def __post_init__(self):
@@ -131,11 +135,14 @@ class EvaderLearningSettings:
     entropy_coefficient: Annotated[float, Interval("[0, 10]")] = 1e-3
     """Weight of the entropy."""
     hold: Annotated[int, Interval("[1, 1000]")] = 4
-    """Control steps for which a decision is flown while it is learnt; divides `rollout_length`.
-    Noise that is new in each step averages out before an evader has moved 2 cm.
+    """Control steps for which a decision is flown while it is learnt; divides
+    `rollout_length`. Noise that is new in each step averages out before an evader has
+    moved 2 cm.
     """
     discount: Annotated[float, Interval("[0, 1]")] = 0.99
-    """Of a decision: where one holds for 40 ms, it sees 4 s ahead. A trap takes one to three."""
+    """Of a decision: where one holds for 40 ms, it sees 4 s ahead. A trap takes one to
+    three.
+    """
     gae_lambda: Annotated[float, Interval("[0, 1]")] = 0.95
     """Lambda of the generalised advantage estimate."""
     initial_log_std: Annotated[float, Interval("[-10, 2]")] = -0.5
@@ -143,14 +150,14 @@ class EvaderLearningSettings:
     own_axes: bool = False
     """Evaders see in axes of their own, x away from the arena's axis."""
     past: Annotated[int, Interval("[0, 64]")] = 0
-    """How many of a game's learned evaders, the last ones, are earlier selves of the others: who
-    only meets the newest ones unlearns what beat the older ones.
+    """How many of a game's learned evaders, the last ones, are earlier selves of the
+    others: who only meets the newest ones unlearns what beat the older ones.
     """
     pool: Annotated[int, Interval("[1, 1000]")] = 32
     """Earlier networks that are kept, from which those are drawn."""
     pool_every: Annotated[int, Interval("[1, 1000000]")] = 10
-    """Updates after which one of the kept networks is replaced, and all earlier selves are drawn
-    anew.
+    """Updates after which one of the kept networks is replaced, and all earlier selves
+    are drawn anew.
     """
 
     def __post_init__(self):
@@ -174,30 +181,32 @@ class FirstFlightsSettings:
     learning_rate: Annotated[float, Interval("(0, 1]")] = 4e-3
     """Adam step size at the start; falls to a twentieth."""
     anew: Annotated[float, Interval("[0, 1]")] = 0.15
-    """Share of the worlds that start anew after each update, beside those that have to."""
+    """Share of the worlds that start anew after each update, beside those that have
+    to.
+    """
     distance: Annotated[float, Interval("[0, 1000]")] = 3.0
-    """Weight of the nearest pursuer's mean way to the evader (m). What is minimised is this, the
-    share of the time in which the evader is free, and what follows.
+    """Weight of the nearest pursuer's mean way to the evader (m). What is minimised is
+    this, the share of the time in which the evader is free, and what follows.
     """
     crash: Annotated[float, Interval("[0, 1000]")] = 20.0
-    """Weight, at the end of the stage, of the share of pursuers that touch something or tip
-    over.
+    """Weight, at the end of the stage, of the share of pursuers that touch something or
+    tip over.
     """
     crash_smooth: Annotated[float, Interval("[0.001, 1]")] = 0.012
-    """Distance (m) over which a touch counts from all to none: a longer one is felt earlier, and
-    closes narrower ways.
+    """Distance (m) over which a touch counts from all to none: a longer one is felt
+    earlier, and closes narrower ways.
     """
     breach: Annotated[float, Interval("[0, 1000]")] = 10.0
     """Weight, at the end of the stage, of the mean number of breaches."""
     speed: Annotated[float, Interval("[0, 1000]")] = 1.0
     """Weight of speeds over the limit."""
     penalty_start: Annotated[float, Interval("[0, 1]")] = 0.2
-    """Share of the weights of crashes and breaches at the start: who fears them then stays away
-    from the evader.
+    """Share of the weights of crashes and breaches at the start: who fears them then
+    stays away from the evader.
     """
     penalty_free: Annotated[float, Interval("[0, 1]")] = 0.62
-    """Share of the time below which the evader must be free in an update for these weights to rise
-    in it, and for tips over to begin to count.
+    """Share of the time below which the evader must be free in an update for these
+    weights to rise in it, and for tips over to begin to count.
     """
     penalty_ramp: Annotated[float, Interval("(0, 1]")] = 0.4
     """Share of the stage's updates that must be such until the weights are whole."""
@@ -215,7 +224,9 @@ class AnalyticSettings:
     updates: Annotated[int, Interval("[0, 1000000]")] = 0
     """Updates of the actor; 0: there is no such stage."""
     look_every: Annotated[int, Interval("[1, 1000000]")] = 200
-    """Updates between validations; the best of all is kept, what it was before among them."""
+    """Updates between validations; the best of all is kept, what it was before among
+    them.
+    """
     worlds: Annotated[int, Interval("[1, 65536]")] = 640
     """Starts in an update, and as many moments of flights."""
     draws: Annotated[int, Interval("[1, 1000]")] = 4
@@ -223,12 +234,12 @@ class AnalyticSettings:
     learning_rate: Annotated[float, Interval("(0, 1]")] = 3e-4
     """Adam step size at the start; falls linearly to a twentieth."""
     hold: Annotated[float, Interval("[0, 1000]")] = 0.04
-    """Weight of the squared change of the actions in flight, in standard deviations of the
-    policy's.
+    """Weight of the squared change of the actions in flight, in standard deviations of
+    the policy's.
     """
     breach: Annotated[float, Interval("[0, 1000]")] = 2.0
-    """Weight of the breaches per step in flight, beside the share of pursuers that touch something
-    from a start.
+    """Weight of the breaches per step in flight, beside the share of pursuers that
+    touch something from a start.
     """
     speed: Annotated[float, Interval("[0, 1000]")] = 0.6
     """Weight of speeds over the limit in flight."""
@@ -243,7 +254,9 @@ class AnalyticSettings:
 
 @dataclass(frozen=True)
 class WorstPlansSettings:
-    """What the last stage learns from evaders' plans; see `openjax.learning.worst_plans`."""
+    """What the last stage learns from evaders' plans; see
+    `openjax.learning.worst_plans`.
+    """
 
     worlds: Annotated[int, Interval("[0, 65536]")] = 0
     """Worlds in which an evader plans; 0: the last stage has none of them."""
@@ -252,16 +265,16 @@ class WorstPlansSettings:
     pieces: Annotated[int, Interval("[2, 100]")] = 4
     """Velocities of a plan, one after the other."""
     piece_seconds: Annotated[float, Interval("(0, 10]")] = 0.2
-    """For how long each is flown (s): four see .8 s ahead, in which an evader crosses half of the
-    arena.
+    """For how long each is flown (s): four see .8 s ahead, in which an evader crosses
+    half of the arena.
     """
     distance: Annotated[float, Interval("[0, 1000]")] = 1.0
-    """Weight of the nearest pursuer's mean path to the evader (m), beside the share of the plan in
-    which it is free.
+    """Weight of the nearest pursuer's mean path to the evader (m), beside the share of
+    the plan in which it is free.
     """
     territory: Annotated[float, Interval("[0, 1000]")] = 0.0
-    """Weight of the share of the arena that the evader can be at before any pursuer, beside the
-    same: it is what those can change who aren't the nearest.
+    """Weight of the share of the arena that the evader can be at before any pursuer,
+    beside the same: it is what those can change who aren't the nearest.
     """
     unseen: Annotated[float, Interval("[0, 1000]")] = 0.0
     """Weight of how well the evader hides from all of them, beside the same."""
@@ -270,8 +283,8 @@ class WorstPlansSettings:
     breach: Annotated[float, Interval("[0, 1000]")] = 2.0
     """Weight of the breaches per step, beside the same."""
     hold_unseen: Annotated[float, Interval("[0, 1000]")] = 0.3
-    """As `analytic.hold`, where nobody sees the evader: nothing is learnt there, and what was is
-    held.
+    """As `analytic.hold`, where nobody sees the evader: nothing is learnt there, and
+    what was is held.
     """
 
     def __post_init__(self):
@@ -283,8 +296,8 @@ class AdaptSettings:
     """How a policy is fine-tuned."""
 
     worlds: Annotated[int | None, Interval("[1, 65536]")] = None
-    """Worlds of each kind of flight in an update; by default 320 on an accelerator, 8 on a CPU:
-    enough to see it work.
+    """Worlds of each kind of flight in an update; by default 320 on an accelerator, 8
+    on a CPU: enough to see it work.
     """
     updates: Annotated[int, Interval("[1, 1000000]")] = 120
     """Updates of the actor."""
@@ -293,8 +306,8 @@ class AdaptSettings:
     learning_rate: Annotated[float, Interval("(0, 1]")] = 3e-4
     """Adam step size at the start; falls linearly to a twentieth."""
     follow: Annotated[float, Interval("[0, 1000]")] = 0.1
-    """Weight of flying where the nominal vehicle would, beside the share of pursuers that touch
-    something.
+    """Weight of flying where the nominal vehicle would, beside the share of pursuers
+    that touch something.
     """
 
     def __post_init__(self):
@@ -303,8 +316,8 @@ class AdaptSettings:
 
 @dataclass(frozen=True)
 class TrainSettings:
-    """Everything that determines a run. A run's result depends on nothing else but the machine's
-    arithmetic.
+    """Everything that determines a run. A run's result depends on nothing else but the
+    machine's arithmetic.
     """
 
     environment: PursuitSettings = field(default_factory=PursuitSettings)
@@ -315,46 +328,49 @@ class TrainSettings:
     first_flights: FirstFlightsSettings = field(default_factory=FirstFlightsSettings)
     analytic: AnalyticSettings = field(default_factory=AnalyticSettings)
     worst_plans: WorstPlansSettings = field(default_factory=WorstPlansSettings)
-    evader_learning: EvaderLearningSettings = field(default_factory=EvaderLearningSettings)
+    evader_learning: EvaderLearningSettings = field(
+        default_factory=EvaderLearningSettings
+    )
     num_envs: Annotated[int, Interval("[1, 16777216]")] = 2560
     """Worlds that are simulated at once."""
     rollout_length: Annotated[int, Interval("[1, 100000]")] = 80
-    """Control steps per iteration; divides the episode's length, so that episodes end between
-    rollouts.
+    """Control steps per iteration; divides the episode's length, so that episodes end
+    between rollouts.
     """
     total_steps: Annotated[int, Interval("[1, 1e15]")] = 400_000_000
     """Environment steps of the run (one step moves one world, all its pursuers)."""
     restart_every: Annotated[int, Interval("[0, 100000]")] = 0
-    """The worlds of every n-th task are started anew after `restart_steps` already, so that more is
-    learnt of starts, the hardest part of an episode; 0: none are.
+    """The worlds of every n-th task are started anew after `restart_steps` already, so
+    that more is learnt of starts, the hardest part of an episode; 0: none are.
     """
     restart_steps: Annotated[int, Interval("[1, 100000]")] = 160
-    """Multiple of `rollout_length`; the value of what would have come is estimated, as after every
-    rollout.
+    """Multiple of `rollout_length`; the value of what would have come is estimated, as
+    after every rollout.
     """
     restart_close: Annotated[float, Interval("[0, 1]")] = 0.0
-    """Share of the pursuers in worlds that are started anew which start close to a pillar or
-    another pursuer.
+    """Share of the pursuers in worlds that are started anew which start close to a
+    pillar or another pursuer.
     """
     vehicles_start: Annotated[float, Interval("[0, 1]")] = 0.0
     """Share of the run, at its start, in which all vehicles are nominal."""
     vehicles_ramp: Annotated[float, Interval("[0, 1]")] = 0.0
-    """Share of the run after that over which the family `environment.vehicles` grows about the
-    nominal vehicle to its whole size.
+    """Share of the run after that over which the family `environment.vehicles` grows
+    about the nominal vehicle to its whole size.
     """
     evaders_start: Annotated[float, Interval("[0, 1]")] = 0.0
     """Share of the run, at its start, in which all evaders are the first of
     `environment.evaders`.
     """
     evaders_ramp: Annotated[float, Interval("[0, 1]")] = 0.0
-    """Share of the run after that over which the others come in, slow ones first, until they have
-    their whole odds and speed.
+    """Share of the run after that over which the others come in, slow ones first, until
+    they have their whole odds and speed.
     """
     evaders_validation: tuple[str, ...] = ()
     """Evaders of the validation; none: those of the training."""
     validation_start: Annotated[float, Interval("[0, 1]")] = 0.0
-    """Share of the run before which a checkpoint ranks behind all later ones: the validation's
-    evaders are scripted, and who beats them early hasn't met what others learn late.
+    """Share of the run before which a checkpoint ranks behind all later ones: the
+    validation's evaders are scripted, and who beats them early hasn't met what others
+    learn late.
     """
     validation_interval: Annotated[int, Interval("[1, 1000000]")] = 50
     """Iterations between validations, on uniform tasks that are never trained on."""
@@ -392,8 +408,12 @@ class TrainSettings:
             f"num_envs {self.num_envs} must be a multiple of {unit} (start groups times episodes "
             "per task" + (", times restart_every)" if self.restart_every else ")"),
         )
-        # with 1 all worlds would start anew in their middle, and no episode would be whole
-        yield self.restart_every != 1, "restart_every is 1; 0 (never) or at least 2 are possible"
+        # with 1 all worlds would start anew in their middle, and no episode would be
+        # whole
+        yield (
+            self.restart_every != 1,
+            "restart_every is 1; 0 (never) or at least 2 are possible",
+        )
         yield (
             self.restart_steps >= rollout and self.restart_steps % rollout == 0,
             f"restart_steps {self.restart_steps} must be a multiple of rollout_length {rollout}",
@@ -418,13 +438,17 @@ class TrainSettings:
             "attention would be right",
         )
         yield (
-            not sizes or not self.predictor.enabled or self.environment.history_pursuers != "each",
+            not sizes
+            or not self.predictor.enabled
+            or self.environment.history_pursuers != "each",
             "predictor: frames of each pursuer are for teams of one size; "
             "environment.history_pursuers pooled would be right",
         )
 
     def _demands_of_evaders(self):
-        """Evaders that learn decide evenly within a rollout, and one of them is no earlier self."""
+        """Evaders that learn decide evenly within a rollout, and one of them is no
+        earlier self.
+        """
         rollout = self.rollout_length
         hold = self.evader_learning.hold
         learned = self.environment.evaders.count("learned")
@@ -440,7 +464,9 @@ class TrainSettings:
         )
 
     def _demands_of_learners(self):
-        """Minibatches, subsampled steps and the predictor's windows fit into a rollout."""
+        """Minibatches, subsampled steps and the predictor's windows fit into a
+        rollout.
+        """
         rollout = self.rollout_length
         for name, number in self.minibatches.items():
             yield (
@@ -462,8 +488,8 @@ class TrainSettings:
 
     @property
     def start_groups(self) -> int:
-        """Groups of environments by start time; one of them ends its episodes after each
-        rollout.
+        """Groups of environments by start time; one of them ends its episodes after
+        each rollout.
         """
         return self.environment.episode_length // self.rollout_length
 
@@ -474,12 +500,16 @@ class TrainSettings:
 
     @property
     def world_unit(self) -> int:
-        """Number of worlds that holds the same share of every start group, task and restart."""
+        """Number of worlds that holds the same share of every start group, task and
+        restart.
+        """
         return self.start_groups * self.episodes_per_task * max(1, self.restart_every)
 
     @property
     def minibatches(self) -> dict[str, int]:
-        """Minibatches of the learners that part the worlds, by the group of their settings."""
+        """Minibatches of the learners that part the worlds, by the group of their
+        settings.
+        """
         minibatches = {"mappo": self.mappo.minibatches}
         if "learned" in self.environment.evaders:
             minibatches["evader_learning"] = self.evader_learning.minibatches
@@ -493,7 +523,9 @@ class TrainSettings:
         # counted in rollouts; not at the age at which the episode ends anyhow
         every = self.restart_steps // self.rollout_length
         ages = tuple(range(every, self.start_groups, every))
-        return Schedule(self.start_groups, self.episodes_per_task, self.restart_every, ages)
+        return Schedule(
+            self.start_groups, self.episodes_per_task, self.restart_every, ages
+        )
 
     @property
     def steps_per_update(self) -> int:

@@ -1,7 +1,8 @@
-"""What pursuers meet in flight, as smooth numbers: how near a crash is, a breach, the evader.
+"""What pursuers meet in flight, as smooth numbers: how near a crash is, a breach, the
+evader.
 
-A crash or a capture is a step, which has no gradient. Here each goes from none to whole over a
-distance, so that the actor feels it before it comes.
+A crash or a capture is a step, which has no gradient. Here each goes from none to whole
+over a distance, so that the actor feels it before it comes.
 """
 
 import functools
@@ -23,8 +24,9 @@ Pursuers = Float[Array, "worlds pursuers"]
 """A number of each pursuer of each world."""
 
 SMOOTH = 0.012
-"""Distance (m) over which a crash goes from sure to none in what is learnt: gaps between pillars of
-a row aren't wide. First flights feel it from farther (`crash_smooth`).
+"""Distance (m) over which a crash goes from sure to none in what is learnt: gaps
+between pillars of a row aren't wide. First flights feel it from farther
+(`crash_smooth`).
 """
 SMOOTH_BREACH = 0.008
 """The same for a breach of a safety distance or a bound (m)."""
@@ -37,18 +39,20 @@ SMOOTH_NEAREST = 0.15
 SMOOTH_SIGHT = 0.05
 """The same for whether a line of sight passes a pillar (m)."""
 FAST = 0.05
-"""Speed (m/s) above where the speed begins to cost that costs as much as a crash in every step
-would.
+"""Speed (m/s) above where the speed begins to cost that costs as much as a crash in
+every step would.
 """
 
 
 def nearest_gap(game: PursuitSettings, state: PursuitState) -> Pursuers:
-    """(W, N) m, from each pursuer of worlds (W, ...) to the nearest solid thing: pillar, pursuer or
-    floor.
+    """(W, N) m, from each pursuer of worlds (W, ...) to the nearest solid thing:
+    pillar, pursuer or floor.
     """
     position = state.drones.position
     task = state.task
-    to_pillar = jax.vmap(lambda p, q: pillar_distance(game, p, q))(position, task.pillar_position)
+    to_pillar = jax.vmap(lambda p, q: pillar_distance(game, p, q))(
+        position, task.pillar_position
+    )
     active = task.pillar_active[:, None]
     gap = jnp.min(to_pillar, axis=-1, where=active, initial=jnp.inf) - DRONE_RADIUS
     if game.num_pursuers > 1:
@@ -57,17 +61,19 @@ def nearest_gap(game: PursuitSettings, state: PursuitState) -> Pursuers:
     return jnp.minimum(gap, position[..., 2] - DRONE_RADIUS)
 
 
-def crash_share(gap: Float[Array, "*worlds"], smooth: float = SMOOTH) -> Float[Array, "*worlds"]:
-    """How much of a crash a least gap (m) counts as, from 1 to 0 over `smooth` (m): it has a
-    gradient before a touch.
+def crash_share(
+    gap: Float[Array, "*worlds"], smooth: float = SMOOTH
+) -> Float[Array, "*worlds"]:
+    """How much of a crash a least gap (m) counts as, from 1 to 0 over `smooth` (m): it
+    has a gradient before a touch.
     """
     # half of one at three times the gap that counts as a touch
     return jax.nn.sigmoid((3 * TOUCH - gap) / smooth)
 
 
 def crash_depth(gap: Float[Array, "*worlds"]) -> Float[Array, "*worlds"]:
-    """The same that goes on to grow, by 1 every `SMOOTH`: what would crash by far is learnt from,
-    too.
+    """The same that goes on to grow, by 1 every `SMOOTH`: what would crash by far is
+    learnt from, too.
     """
     return jax.nn.softplus((3 * TOUCH - gap) / SMOOTH)
 
@@ -83,10 +89,17 @@ def breach_share(game: PursuitSettings, state: PursuitState) -> Pursuers:
     """
     position = state.drones.position
     task = state.task
-    to_pillar = jax.vmap(lambda p, q: pillar_distance(game, p, q))(position, task.pillar_position)
-    to_pillar = jnp.where(task.pillar_active[:, None], to_pillar, jnp.inf) - game.pillar_clearance
+    to_pillar = jax.vmap(lambda p, q: pillar_distance(game, p, q))(
+        position, task.pillar_position
+    )
+    to_pillar = (
+        jnp.where(task.pillar_active[:, None], to_pillar, jnp.inf)
+        - game.pillar_clearance
+    )
     to_drone = jax.vmap(drone_distance)(position) - game.drone_clearance
-    to_wall = game.arena_radius - jnp.sqrt(jnp.sum(position[..., :2] ** 2, axis=-1) + 1e-12)
+    to_wall = game.arena_radius - jnp.sqrt(
+        jnp.sum(position[..., :2] ** 2, axis=-1) + 1e-12
+    )
     to_ceiling = game.arena_height - position[..., 2]
 
     def near(distance):
@@ -97,9 +110,11 @@ def breach_share(game: PursuitSettings, state: PursuitState) -> Pursuers:
     return total if state.active is None else jnp.where(state.active, total, 0.0)
 
 
-def evader_distance(game: PursuitSettings, state: PursuitState, paths: ShortestPaths) -> Pursuers:
-    """(W, N) m, shortest paths from pursuers of worlds (W, ...) to the evader, whose flight has no
-    gradient: its answers are a cliff.
+def evader_distance(
+    game: PursuitSettings, state: PursuitState, paths: ShortestPaths
+) -> Pursuers:
+    """(W, N) m, shortest paths from pursuers of worlds (W, ...) to the evader, whose
+    flight has no gradient: its answers are a cliff.
     """
     evader = jax.lax.stop_gradient(state.evader_position)
     return jax.vmap(functools.partial(path_length, game))(
@@ -107,9 +122,11 @@ def evader_distance(game: PursuitSettings, state: PursuitState, paths: ShortestP
     )
 
 
-def territory_share(game: PursuitSettings, state: PursuitState, paths: ShortestPaths) -> Worlds:
-    """(W,) share of the arena that the evader of worlds (W, ...) can be at before any pursuer; its
-    flight has no gradient.
+def territory_share(
+    game: PursuitSettings, state: PursuitState, paths: ShortestPaths
+) -> Worlds:
+    """(W,) share of the arena that the evader of worlds (W, ...) can be at before any
+    pursuer; its flight has no gradient.
     """
 
     def one(state, paths):
@@ -120,15 +137,19 @@ def territory_share(game: PursuitSettings, state: PursuitState, paths: ShortestP
 
 
 def hidden_share(game: PursuitSettings, state: PursuitState) -> Worlds:
-    """(W,) how well pillars hide the evader of worlds (W, ...) from all pursuers, from 0 to 1; its
-    flight has no gradient.
+    """(W,) how well pillars hide the evader of worlds (W, ...) from all pursuers, from
+    0 to 1; its flight has no gradient.
     """
 
     def one(state):
         task = state.task
         target = jax.lax.stop_gradient(state.evader_position)
         room = sight_room(
-            game, state.drones.position, target, task.pillar_position, task.pillar_active
+            game,
+            state.drones.position,
+            target,
+            task.pillar_position,
+            task.pillar_active,
         )
         return jax.nn.sigmoid(-jnp.max(room) / SMOOTH_SIGHT)
 
@@ -136,8 +157,8 @@ def hidden_share(game: PursuitSettings, state: PursuitState) -> Worlds:
 
 
 def nearest_distance(distance: Pursuers) -> Worlds:
-    """(W,) m, a smooth least of distances (W, N): where one pursuer is near, others needn't be, and
-    may go round.
+    """(W,) m, a smooth least of distances (W, N): where one pursuer is near, others
+    needn't be, and may go round.
     """
     # less the logarithm of their number: of equal distances it is that distance
     number = distance.shape[-1]
@@ -146,8 +167,8 @@ def nearest_distance(distance: Pursuers) -> Worlds:
 
 
 def free_share(radius: float | jax.Array, distance: Pursuers) -> Worlds:
-    """(W,) how free the evader at distances (W, N) is, from 0 to 1: smooth, and felt from afar;
-    capture radius () or (W,) m.
+    """(W,) how free the evader at distances (W, N) is, from 0 to 1: smooth, and felt
+    from afar; capture radius () or (W,) m.
     """
     # half free a little inside the capture radius, so that pursuers come in all the way
     return jax.nn.sigmoid((jnp.min(distance, axis=-1) - 0.95 * radius) / SMOOTH_CAPTURE)

@@ -11,8 +11,8 @@ from jaxtyping import Array, Int32, PRNGKeyArray
 
 @struct.dataclass
 class TrainState:
-    """One network. Flax's own would carry the optimiser itself, which would make every build a
-    carry of another type.
+    """One network. Flax's own would carry the optimiser itself, which would make every
+    build a carry of another type.
     """
 
     parameters: Any
@@ -22,10 +22,12 @@ class TrainState:
     def updated(
         self, optimiser: optax.GradientTransformation, gradient: Any, **others: Any
     ) -> "TrainState":
-        """One step against `gradient`, a tree like the parameters; `others` is what else the
-        optimiser's update takes.
+        """One step against `gradient`, a tree like the parameters; `others` is what
+        else the optimiser's update takes.
         """
-        update, state = optimiser.update(gradient, self.optimiser, self.parameters, **others)
+        update, state = optimiser.update(
+            gradient, self.optimiser, self.parameters, **others
+        )
         return TrainState(optax.apply_updates(self.parameters, update), state)
 
 
@@ -36,11 +38,11 @@ def clipped_adam(
 ) -> optax.GradientTransformationExtraArgs:
     """Adam of gradients cut at norm `max_norm`, and one more transformation behind it.
 
-    On one vector instead of dozens of small arrays: on a GPU their updates cost by number, not by
-    size.
+    On one vector instead of dozens of small arrays: on a GPU their updates cost by
+    number, not by size.
     """
-    # PPO's usual epsilon, a thousand times Adam's own: where a gradient has nearly vanished, its
-    # noise isn't blown up to whole steps
+    # PPO's usual epsilon, a thousand times Adam's own: where a gradient has nearly
+    # vanished, its noise isn't blown up to whole steps
     steps = [optax.clip_by_global_norm(max_norm), optax.adam(rate, eps=1e-5)]
     if last is not None:
         steps.append(last)
@@ -50,8 +52,8 @@ def clipped_adam(
 def shuffled(
     key: PRNGKeyArray, epochs: int, minibatches: int
 ) -> Int32[Array, " {epochs*minibatches}"]:
-    """(epochs * minibatches,) the minibatches in the order in which they are learnt from, each once
-    in an epoch.
+    """(epochs * minibatches,) the minibatches in the order in which they are learnt
+    from, each once in an epoch.
     """
     keys = jax.random.split(key, epochs)
     return jax.vmap(lambda key: jax.random.permutation(key, minibatches))(keys).ravel()
@@ -63,11 +65,11 @@ _OLD_LEAF = re.compile(f"{_NETWORK}/parameters/(.+)")
 
 
 def policy_leaf(name: str) -> str | None:
-    """The path in `PolicyParameters` of a leaf of a training carry: `actor/params/x` for
-    `policy/actor/params/x`.
+    """The path in `PolicyParameters` of a leaf of a training carry: `actor/params/x`
+    for `policy/actor/params/x`.
 
-    None for one that isn't of the policy. In carries from when each network lay beside its
-    optimiser it is `actor/parameters/params/x`.
+    None for one that isn't of the policy. In carries from when each network lay beside
+    its optimiser it is `actor/parameters/params/x`.
     """
     # old runs can't be resumed, but their policies load
     match = _LEAF.fullmatch(name) or _OLD_LEAF.fullmatch(name)

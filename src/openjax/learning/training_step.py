@@ -1,5 +1,5 @@
-"""The compiled training step: rollout, predictor update, policy update, selection of tasks; one
-function of one carry.
+"""The compiled training step: rollout, predictor update, policy update, selection of
+tasks; one function of one carry.
 """
 
 import functools
@@ -16,7 +16,11 @@ from jaxtyping import PRNGKeyArray
 
 import openjax.baselines  # noqa: F401  registers its policies
 from openjax.learning.archive import TaskArchive, empty_archive
-from openjax.learning.collectives import gather_over_devices, mean_over_devices, own_keys
+from openjax.learning.collectives import (
+    gather_over_devices,
+    mean_over_devices,
+    own_keys,
+)
 from openjax.learning.evader_learning import EvaderLearning
 from openjax.learning.generator import generate_task, select, successes, task_like
 from openjax.learning.learners.evasion import EvaderLearner
@@ -54,8 +58,8 @@ class Parts:
 
     environment: Pursuit
     policy: Policy
-    """Whatever has `init`, `predict`, `distribution`, `action`, `value` and `evaluate`; see
-    `openjax.policy.Policy`.
+    """Whatever has `init`, `predict`, `distribution`, `action`, `value` and `evaluate`;
+    see `openjax.policy.Policy`.
     """
     learners: Mapping[str, Learner]
     """By name, in the order in which they learn."""
@@ -69,9 +73,9 @@ def build(
 ) -> Parts:
     """The parts of a run; those that aren't given are the ones that the settings name.
 
-    A `policy` may be a network alone (`openjax.policy.Network`). Own `learners` stand beside the
-    shipped ones, or in the place of the one whose name they have: `predictor`, `evaders`, `policy`
-    (which is MAPPO).
+    A `policy` may be a network alone (`openjax.policy.Network`). Own `learners` stand
+    beside the shipped ones, or in the place of the one whose name they have:
+    `predictor`, `evaders`, `policy` (which is MAPPO).
     """
     environment = environment or Pursuit(settings.environment)
     policy = policy or make_policy(environment, settings.network, settings.predictor)
@@ -99,19 +103,23 @@ def shipped_learners(
 def make_start(
     settings: TrainSettings, parts: Parts | None = None
 ) -> Callable[[jax.Array], TrainCarry]:
-    """The start of a run, key -> carry, by `jax.jit`: fresh networks, uniform tasks, an empty
-    archive, staggered starts.
+    """The start of a run, key -> carry, by `jax.jit`: fresh networks, uniform tasks, an
+    empty archive, staggered starts.
 
     `jax.eval_shape` of it tells the carry's shapes; it is traced once for both.
     """
     return jax.jit(functools.partial(initial_carry, settings, parts or build(settings)))
 
 
-def initial_carry(settings: TrainSettings, parts: Parts, key: PRNGKeyArray) -> TrainCarry:
+def initial_carry(
+    settings: TrainSettings, parts: Parts, key: PRNGKeyArray
+) -> TrainCarry:
     """The carry of a run's start; `parts` are what `build` gives."""
     # vehicles and evaders as at the beginning of their curricula
     environment = _starting(settings, parts.environment, 0.0)
-    archive = empty_archive(task_like(parts.environment.settings), settings.generator.capacity)
+    archive = empty_archive(
+        task_like(parts.environment.settings), settings.generator.capacity
+    )
     key, policy_key, task_key, reset_key = jax.random.split(key, 4)
     tasks = _tasks(
         settings,
@@ -123,9 +131,11 @@ def initial_carry(settings: TrainSettings, parts: Parts, key: PRNGKeyArray) -> T
     observation, state = jax.vmap(environment.reset_to)(
         jax.random.split(reset_key, settings.num_envs), tasks
     )
-    # staggered: the groups begin in the middle of an episode, so that from the first update on one
-    # of them ends its episodes with each rollout
-    state = state.replace(step=settings.schedule.age(settings.num_envs) * settings.rollout_length)
+    # staggered: the groups begin in the middle of an episode, so that from the first
+    # update on one of them ends its episodes with each rollout
+    state = state.replace(
+        step=settings.schedule.age(settings.num_envs) * settings.rollout_length
+    )
     observation = jax.vmap(environment.observe)(state)
     policy = parts.policy.init(policy_key, jax.tree.map(lambda x: x[0], observation))
     learners = {
@@ -144,7 +154,9 @@ def initial_carry(settings: TrainSettings, parts: Parts, key: PRNGKeyArray) -> T
 
 
 def _number_of(name):
-    """A number for a learner of one's own, by which its keys differ from those of others."""
+    """A number for a learner of one's own, by which its keys differ from those of
+    others.
+    """
     return zlib.crc32(name.encode())
 
 
@@ -157,21 +169,24 @@ def _start_key(name, policy_key):
 class Phases:
     """The training step in parts, one after the other.
 
-    Metrics are () by name, counted over the rollout or over the episodes that ended with it.
+    Metrics are () by name, counted over the rollout or over the episodes that ended
+    with it.
     """
 
     fly: Callable[[TrainCarry], tuple[TrainCarry, Flown, dict[str, jax.Array]]]
     """carry -> carry after a rollout, what is learnt from it, metrics"""
-    learn: tuple[Callable[[TrainCarry, Flown], tuple[TrainCarry, dict[str, jax.Array]]], ...]
+    learn: tuple[
+        Callable[[TrainCarry, Flown], tuple[TrainCarry, dict[str, jax.Array]]], ...
+    ]
     """(carry, flown) -> carry after an update, metrics; one for each learner"""
     renew: Callable[[TrainCarry], tuple[TrainCarry, dict[str, jax.Array]]]
-    """carry -> carry whose worlds have new tasks where their episodes have just ended, metrics of
-    these episodes
+    """carry -> carry whose worlds have new tasks where their episodes have just ended,
+    metrics of these episodes
     """
 
     def __call__(self, carry: TrainCarry) -> tuple[TrainCarry, dict[str, Scalar]]:
-        """The whole step; its operations bear the parts' names, by which a profile tells them
-        apart.
+        """The whole step; its operations bear the parts' names, by which a profile
+        tells them apart.
         """
         carry, flown, metrics = _named(self.fly)(carry)
         for learn in self.learn:
@@ -188,8 +203,8 @@ def _named(phase):
 def make_phases(
     settings: TrainSettings, parts: Parts | None = None, axis: str | None = None
 ) -> Phases:
-    """The parts of the training step; `axis` names the axis of devices when they run under
-    `shard_map`.
+    """The parts of the training step; `axis` names the axis of devices when they run
+    under `shard_map`.
     """
     step = _Step(settings, parts or build(settings), axis)
     learn = tuple(step.learning(name) for name in step.parts.learners)
@@ -199,8 +214,8 @@ def make_phases(
 def make_training_step(
     settings: TrainSettings, parts: Parts | None = None, axis: str | None = None
 ) -> Callable[[TrainCarry], tuple[TrainCarry, dict[str, jax.Array]]]:
-    """The training step `carry -> (carry, metrics)` as one function; compile it with `jax.jit(step,
-    donate_argnums=0)`.
+    """The training step `carry -> (carry, metrics)` as one function; compile it with
+    `jax.jit(step, donate_argnums=0)`.
 
     Args:
       settings: of the run.
@@ -236,14 +251,17 @@ class _Step:
         hold = settings.evader_learning.hold
         if act is not None:
             decisions = (steps // hold, 3)
-            draws = jax.vmap(lambda k: jax.random.normal(jax.random.fold_in(k, 1), decisions))(keys)
+            draws = jax.vmap(
+                lambda k: jax.random.normal(jax.random.fold_in(k, 1), decisions)
+            )(keys)
             noise = noise.replace(evaders=jnp.moveaxis(draws, 1, 0))
         players = Players(self.parts.environment, policy, carry.policy, act, hold)
         world = (carry.observation, carry.state)
         progress = self._progress(carry)
         share = penalty_share_at(settings, progress)
         rollout, observation, state = collect(players, world, noise, share)
-        # a rollout keeps the newest frame of each step only: windows begin in the history before it
+        # a rollout keeps the newest frame of each step only: windows begin in the
+        # history before it
         flown = Flown(
             rollout=rollout,
             frames=carry.state.frames,
@@ -258,8 +276,8 @@ class _Step:
         return carry.replace(observation=observation, state=state), flown, metrics
 
     def _evaders(self, carry):
-        """How evaders that learn fly, (worlds, noise) -> desired velocities, samples; None where
-        none does.
+        """How evaders that learn fly, (worlds, noise) -> desired velocities, samples;
+        None where none does.
         """
         for name, learner in self.parts.learners.items():
             if hasattr(learner, "act"):
@@ -272,8 +290,12 @@ class _Step:
 
         def learn(carry, flown):
             key = self._learner_key(carry, name)
-            state, policy, metrics = learner.learn(carry.learners[name], carry.policy, flown, key)
-            return carry.replace(policy=policy, learners={**carry.learners, name: state}), metrics
+            state, policy, metrics = learner.learn(
+                carry.learners[name], carry.policy, flown, key
+            )
+            return carry.replace(
+                policy=policy, learners={**carry.learners, name: state}
+            ), metrics
 
         learn.__name__ = f"learn_{name}"
         return learn
@@ -283,22 +305,24 @@ class _Step:
         schedule = self.settings.schedule
         axis = self.axis
         progress = self._progress(carry)
-        # the episodes that begin now fly as this moment of the run asks for, those under way as
-        # they began
+        # the episodes that begin now fly as this moment of the run asks for, those
+        # under way as they began
         starting = _starting(settings, self.parts.environment, progress)
-        # one group of worlds ends its episodes with each rollout: tasks are judged by whole
-        # episodes, and no rollout has a reset in its middle
+        # one group of worlds ends its episodes with each rollout: tasks are judged by
+        # whole episodes, and no rollout has a reset in its middle
         group = schedule.ending(carry.update)
         ended = schedule.members(carry.state, group)
         archive, metrics = _selection(
             settings, carry.archive, ended, penalty_share_at(settings, progress), axis
         )
-        # new worlds for those that end, and for those that are started anew within the episodes of
-        # other groups
+        # new worlds for those that end, and for those that are started anew within the
+        # episodes of other groups
         numbers = ended.step.shape[0], schedule.restarts(carry.state.step.shape[0])
         keys = self._key(carry, 4), self._key(carry, 5)
         fresh = self._fresh(starting, archive, keys, numbers)
-        observation, state = schedule.renewed((carry.observation, carry.state), fresh, group)
+        observation, state = schedule.renewed(
+            (carry.observation, carry.state), fresh, group
+        )
         carry = carry.replace(
             observation=observation,
             state=state,
@@ -309,16 +333,18 @@ class _Step:
         return carry, metrics
 
     def _fresh(self, environment, archive, keys, numbers):
-        """Observations and states of this device's worlds at the start of newly drawn tasks, of
-        both `numbers` in one; `keys` of tasks and resets.
+        """Observations and states of this device's worlds at the start of newly drawn
+        tasks, of both `numbers` in one; `keys` of tasks and resets.
 
-        Of the second ones some pursuers start close to something. All are drawn at once, by a
-        program half as large.
+        Of the second ones some pursuers start close to something. All are drawn at
+        once, by a program half as large.
         """
         settings = self.settings
         share = settings.episodes_per_task
         task_numbers = [number // share for number in numbers]
-        close = jnp.repeat(jnp.array([0.0, settings.restart_close]), np.array(task_numbers))
+        close = jnp.repeat(
+            jnp.array([0.0, settings.restart_close]), np.array(task_numbers)
+        )
         task_key, reset_key = keys
 
         def of_worlds(key, numbers):
@@ -329,17 +355,21 @@ class _Step:
             )
             return jnp.concatenate(list(parts))
 
-        tasks = _tasks(settings, environment, archive, of_worlds(task_key, task_numbers), close)
+        tasks = _tasks(
+            settings, environment, archive, of_worlds(task_key, task_numbers), close
+        )
         return jax.vmap(environment.reset_to)(of_worlds(reset_key, numbers), tasks)
 
     def _key(self, carry, number):
-        """One of the keys of this step: of the next step, noise, windows, shuffling, tasks,
-        resets.
+        """One of the keys of this step: of the next step, noise, windows, shuffling,
+        tasks, resets.
         """
         return jax.random.split(carry.key, 6)[number]
 
     def _learner_key(self, carry, name):
-        """The key of a learner in this step; shipped ones have the windows' and the shuffling's."""
+        """The key of a learner in this step; shipped ones have the windows' and the
+        shuffling's.
+        """
         if name == "predictor":
             return self._key(carry, 2)
         key = self._key(carry, 3)
@@ -353,8 +383,8 @@ class _Step:
 
 
 def penalty_share_at(settings, progress):
-    """Share of the penalties that counts when a share `progress` of the run is done: a ramp from
-    its start to one.
+    """Share of the penalties that counts when a share `progress` of the run is done: a
+    ramp from its start to one.
     """
     start = settings.mappo.penalty_start
     return start + (1.0 - start) * jnp.minimum(
@@ -363,8 +393,8 @@ def penalty_share_at(settings, progress):
 
 
 def _starting(settings, environment, progress):
-    """The environment whose episodes start with the vehicles and evaders of that moment of the
-    run.
+    """The environment whose episodes start with the vehicles and evaders of that moment
+    of the run.
     """
 
     def grown(start, ramp):
@@ -381,16 +411,22 @@ def _starting(settings, environment, progress):
 
 
 def _tasks(settings, environment, archive, keys, close=None):
-    """One task per key, repeated for the environments that share it; shares `close` of pursuers
-    start close to something.
+    """One task per key, repeated for the environments that share it; shares `close` of
+    pursuers start close to something.
     """
-    draw = functools.partial(generate_task, settings.generator, environment.settings, archive)
+    draw = functools.partial(
+        generate_task, settings.generator, environment.settings, archive
+    )
     tasks = jax.vmap(draw)(keys, close if settings.restart_close else None)
-    return jax.tree.map(lambda x: jnp.repeat(x, settings.episodes_per_task, axis=0), tasks)
+    return jax.tree.map(
+        lambda x: jnp.repeat(x, settings.episodes_per_task, axis=0), tasks
+    )
 
 
 def _selection(settings, archive, ended, penalty_share, axis):
-    """Put unsolved tasks of ended episodes into the archive; and what these episodes were like."""
+    """Put unsolved tasks of ended episodes into the archive; and what these episodes
+    were like.
+    """
     statistics = ended.statistics
     complete = statistics.steps >= settings.environment.episode_length
     share = settings.episodes_per_task
@@ -416,14 +452,20 @@ def _selection(settings, archive, ended, penalty_share, axis):
     }
     if "learned" in settings.environment.evaders:
         by_network = learned_place(settings.environment.evaders, ended.evader.kind) >= 0
-        counted |= {"learned": by_network, "learned_capture_rate": by_network & statistics.captured}
-    # worlds that were started anew within their episode flew a shorter one, which is no fair sample
+        counted |= {
+            "learned": by_network,
+            "learned_capture_rate": by_network & statistics.captured,
+        }
+    # worlds that were started anew within their episode flew a shorter one, which is no
+    # fair sample
     lasting = settings.schedule.lasting(statistics.steps.shape[0])
     counted = {
-        name: jnp.mean(value.astype(jnp.float32)[lasting]) for name, value in counted.items()
+        name: jnp.mean(value.astype(jnp.float32)[lasting])
+        for name, value in counted.items()
     }
     counted = mean_over_devices(counted, axis)
     if "learned" in counted:
-        # shares of all episodes so far: one by the other is the rate among the learned ones'
+        # shares of all episodes so far: one by the other is the rate among the learned
+        # ones'
         counted["learned_capture_rate"] /= jnp.maximum(counted["learned"], 1e-6)
     return archive, counted | {"archive_size": archive.size.astype(jnp.float32)}

@@ -1,14 +1,16 @@
-"""The last stage against evaders that plan: the gradient of the pursuers' loss at the plan that is
-worst for them.
+"""The last stage against evaders that plan: the gradient of the pursuers' loss at the
+plan that is worst for them.
 
-An evader that learns beside the pursuers finds some of their weaknesses, and an evader that plans
-in the true simulation against the true policy finds others: those of the next second, without
-having to learn anything. Here evaders plan, and the pursuers follow the gradient through the
-simulation along the plan that came out worst. The gradient of a maximum is the gradient at the
-place of the maximum (Danskin 1966, The theory of max-min), so the plan itself needs none; training
-networks against their worst inputs works the same way (Madry et al. 2018, arXiv 1706.06083).
+An evader that learns beside the pursuers finds some of their weaknesses, and an evader
+that plans in the true simulation against the true policy finds others: those of the
+next second, without having to learn anything. Here evaders plan, and the pursuers
+follow the gradient through the simulation along the plan that came out worst. The
+gradient of a maximum is the gradient at the place of the maximum (Danskin 1966, The
+theory of max-min), so the plan itself needs none; training networks against their worst
+inputs works the same way (Madry et al. 2018, arXiv 1706.06083).
 
-It shares no code with the planner of `openjax.evaluation.judges`, which judges what is learnt here.
+It shares no code with the planner of `openjax.evaluation.judges`, which judges what is
+learnt here.
 """
 
 import dataclasses
@@ -32,7 +34,11 @@ from openjax.learning.gradient_step import (
     renewed,
     weighted_sum,
 )
-from openjax.learning.settings import AnalyticSettings, GeneratorSettings, WorstPlansSettings
+from openjax.learning.settings import (
+    AnalyticSettings,
+    GeneratorSettings,
+    WorstPlansSettings,
+)
 from openjax.learning.smooth_measures import crash_share
 from openjax.policy import PolicyParameters
 from openjax.pursuit import Pursuit, PursuitSettings, PursuitState
@@ -43,12 +49,17 @@ Plans = Float[Array, "worlds plans pieces 3"]
 Plan = Float[Array, "worlds pieces 3"]
 
 AHEAD = 0.15
-"""Seconds after which pursuers are thought to be where their velocity leads, at a plan's end."""
+"""Seconds after which pursuers are thought to be where their velocity leads, at a
+plan's end.
+"""
 NOMINAL = 0.5
-"""Share of the worlds whose vehicles are nominal ones: evaders are judged against these."""
+"""Share of the worlds whose vehicles are nominal ones: evaders are judged against
+these.
+"""
 WARM_UP = 15
-"""Updates in which the step size rises: Adam's first steps are of full size whatever the gradient,
-and one of them undoes a policy (captures of a planner fell from .44 to .06).
+"""Updates in which the step size rises: Adam's first steps are of full size whatever
+the gradient, and one of them undoes a policy (captures of a planner fell from .44 to
+.06).
 """
 
 
@@ -60,7 +71,9 @@ class Planned:
     world: Any
     """Observations and states (B, ...)"""
     plan: jax.Array
-    """(B, pieces, 3) the rest of the last plan of each, NaN or zero where there is none"""
+    """(B, pieces, 3) the rest of the last plan of each, NaN or zero where there is
+    none
+    """
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,8 +146,8 @@ class WorstPlans:
         return jax.vmap(one)(jax.random.split(key, worlds), bounds)
 
     def candidates(self, key: PRNGKeyArray, plan: Plan) -> Plans:
-        """The rest of the last plan and the same a piece later, to stay, the evader's own rule
-        (NaN), straight ways, and ways that turn after a piece as often as not.
+        """The rest of the last plan and the same a piece later, to stay, the evader's
+        own rule (NaN), straight ways, and ways that turn after a piece as often as not.
         """
         planning = self.planning
         number = plan.shape[0]
@@ -144,7 +157,9 @@ class WorstPlans:
         drawn = _unit(jax.random.normal(way_key, (*shape, 3)))
         turns = jax.random.bernoulli(turn_key, 0.5, shape)
         # the last piece at which a way turned is the one that it flies
-        turned = jax.lax.cummax(jnp.where(turns, jnp.arange(planning.pieces), 0), axis=2)
+        turned = jax.lax.cummax(
+            jnp.where(turns, jnp.arange(planning.pieces), 0), axis=2
+        )
         bent = jnp.take_along_axis(drawn, turned[..., None], axis=2)
         ways = _unit(jax.random.normal(straight_key, (number, straight, 1, 3)))
         parts = [
@@ -158,10 +173,16 @@ class WorstPlans:
         return jnp.concatenate(parts, axis=1)
 
     def worst(
-        self, actor: Any, parameters: PolicyParameters, world, plan: Plan, key: PRNGKeyArray
+        self,
+        actor: Any,
+        parameters: PolicyParameters,
+        world,
+        plan: Plan,
+        key: PRNGKeyArray,
     ) -> tuple[Plan, Float[Array, " worlds"]]:
-        """The plan of those tried that is worst for the pursuers of worlds (B, ...), and what it
-        promises the evader, see `promise`; `plan` is the rest of the last one.
+        """The plan of those tried that is worst for the pursuers of worlds (B, ...),
+        and what it promises the evader, see `promise`; `plan` is the rest of the last
+        one.
         """
         tried = self.candidates(key, plan)
         number = self.planning.plans
@@ -182,9 +203,11 @@ class WorstPlans:
         chosen = jnp.take_along_axis(tried, best[:, None, None, None], axis=1)[:, 0]
         return chosen, jnp.max(promised, axis=1)
 
-    def promise(self, start: PursuitState, end: PursuitState) -> Float[Array, " worlds"]:
-        """(W,) how good the end of a plan is for the evader: steps free first, then the room that
-        is left.
+    def promise(
+        self, start: PursuitState, end: PursuitState
+    ) -> Float[Array, " worlds"]:
+        """(W,) how good the end of a plan is for the evader: steps free first, then the
+        room that is left.
         """
         newly = end.statistics.captured & ~start.statistics.captured
         free = jnp.where(newly, end.statistics.capture_step - start.step, self.steps)
@@ -196,14 +219,16 @@ class WorstPlans:
     def loss(
         self, actor: Any, parameters: PolicyParameters, world, plan: Plan
     ) -> tuple[Scalar, tuple[Any, dict[str, Scalar]]]:
-        """What is learnt () while evaders fly their plans; the worlds after the plans' first piece,
-        and the loss's parts.
+        """What is learnt () while evaders fly their plans; the worlds after the plans'
+        first piece, and the loss's parts.
         """
         planning = self.planning
         policy = self.usual.policy
 
         def piece(world, wish):
-            world, met = self.flight.fly(actor, parameters, world, self.piece_steps, wish)
+            world, met = self.flight.fly(
+                actor, parameters, world, self.piece_steps, wish
+            )
             return world, (world, met)
 
         # one body for all pieces: each would take a GPU's compiler half a minute
@@ -213,15 +238,18 @@ class WorstPlans:
         before, log_std = policy.distribution(parameters.actor, observation, predicted)
         mean, _ = policy.distribution(actor, observation, predicted)
         change = (mean - before) * jnp.exp(-log_std)
-        # the gradient knows where the evader is, and who doesn't see it can't learn from that: they
-        # would unlearn to search
+        # the gradient knows where the evader is, and who doesn't see it can't learn
+        # from that: they would unlearn to search
         seen = world[1].seen.astype(jnp.float32)
-        hold = jnp.where(world[1].seen, self.settings.hold, planning.hold_unseen)[:, None]
+        hold = jnp.where(world[1].seen, self.settings.hold, planning.hold_unseen)[
+            :, None
+        ]
         parts = {
             "free": (1.0, seen * jnp.mean(met.free, axis=0)),
             "distance": (planning.distance, seen * jnp.mean(met.distance, axis=0)),
             "territory": (planning.territory, seen * jnp.mean(met.territory, axis=0)),
-            # where nobody sees it, too: to look where it was last seen is what is to be learnt
+            # where nobody sees it, too: to look where it was last seen is what is to be
+            # learnt
             "unseen": (planning.unseen, met.unseen),
             "crashes": (planning.crash, crash_share(jnp.min(met.least, axis=0))),
             "breaches": (planning.breach, met.breach),
@@ -232,11 +260,18 @@ class WorstPlans:
         return total, (after, means)
 
     def update(
-        self, actor: Any, state: Planned, parameters: PolicyParameters, flights, key: PRNGKeyArray
+        self,
+        actor: Any,
+        state: Planned,
+        parameters: PolicyParameters,
+        flights,
+        key: PRNGKeyArray,
     ) -> tuple[Any, Planned, dict[str, Scalar]]:
         """Actor and state after an update, and parts of both losses."""
         plan_key, usual_key, start_key = jax.random.split(key, 3)
-        plan, promised = self.worst(actor, parameters, state.world, state.plan, plan_key)
+        plan, promised = self.worst(
+            actor, parameters, state.world, state.plan, plan_key
+        )
         gradient, (world, parts) = jax.grad(self.loss, has_aux=True)(
             actor, parameters, state.world, plan
         )
@@ -255,15 +290,17 @@ class WorstPlans:
         )
 
     def _over(self, state: PursuitState) -> Bool[Array, " worlds"]:
-        """(B,) worlds that start anew: the evader is caught, a pursuer crashed or left, or there is
-        no time for another plan.
+        """(B,) worlds that start anew: the evader is caught, a pursuer crashed or left,
+        or there is no time for another plan.
         """
         late = state.step > self.game.episode_length - self.steps
         return is_lost(self.game, state) | state.statistics.captured | late
 
 
 def planning_game(environment: Pursuit) -> Pursuit:
-    """`environment` with an evader that flies as it's told, without limits of acceleration."""
+    """`environment` with an evader that flies as it's told, without limits of
+    acceleration.
+    """
     settings = dataclasses.replace(environment.settings, evaders=("field",))
     return dataclasses.replace(environment, settings=settings, evaders=None)
 

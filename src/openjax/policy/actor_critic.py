@@ -21,18 +21,23 @@ class Actor(nn.Module):
 
     @nn.compact
     def __call__(
-        self, observation: Observation, predicted: Float[Array, "*worlds horizons 3"] | None
+        self,
+        observation: Observation,
+        predicted: Float[Array, "*worlds horizons 3"] | None,
     ) -> tuple[
         Float[Array, "*worlds pursuers sample"],
         Float[Array, " sample"],
         Float[Array, "*worlds pursuers features"],
     ]:
-        """Mean, log standard deviation, and what the encoder made of the observation; predicted
-        positions in m.
+        """Mean, log standard deviation, and what the encoder made of the observation;
+        predicted positions in m.
         """
         settings = self.settings
         hidden = Encoder(
-            settings.features, settings.heads, jnp.dtype(settings.compute_type), name="encoder"
+            settings.features,
+            settings.heads,
+            jnp.dtype(settings.compute_type),
+            name="encoder",
         )(
             own_features(observation, predicted),
             observation.others,
@@ -71,8 +76,8 @@ class Critic(nn.Module):
         predicted: Float[Array, "*worlds horizons 3"] | None,
         encoded: Float[Array, "*worlds pursuers features"] | None = None,
     ) -> Float[Array, "*worlds pursuers"]:
-        """Values; `encoded` is what the actor's encoder made of the observation, if the encoder is
-        shared.
+        """Values; `encoded` is what the actor's encoder made of the observation, if the
+        encoder is shared.
         """
         settings = self.settings
         dtype = jnp.dtype(settings.compute_type)
@@ -81,7 +86,9 @@ class Critic(nn.Module):
             hidden = encoded
             if sees_state:
                 hidden = padded(
-                    jnp.concatenate([encoded, observation.privileged.astype(dtype)], axis=-1)
+                    jnp.concatenate(
+                        [encoded, observation.privileged.astype(dtype)], axis=-1
+                    )
                 )
         else:
             itself = own_features(observation, predicted)
@@ -94,12 +101,17 @@ class Critic(nn.Module):
             hidden.reshape(math.prod(leading), hidden.shape[-1])
         )
         value = nn.Dense(
-            1, dtype=jnp.float32, kernel_init=nn.initializers.orthogonal(1.0), name="value"
+            1,
+            dtype=jnp.float32,
+            kernel_init=nn.initializers.orthogonal(1.0),
+            name="value",
         )(hidden)
         return value.reshape(leading)
 
     def _encoded(self, itself, observation, dtype):
-        """What an encoder of the critic's own makes of a pursuer's own part and the rest."""
+        """What an encoder of the critic's own makes of a pursuer's own part and the
+        rest.
+        """
         settings = self.settings
         leading = itself.shape[:-1]
         if settings.critic_encoder == "attention":
@@ -124,7 +136,9 @@ class Critic(nn.Module):
 def own_features(
     observation: Observation, predicted: Float[Array, "*worlds horizons 3"] | None
 ) -> Float[Array, "*worlds pursuers own"]:
-    """A pursuer's own part: its state and, relative to it, the predicted evader positions (m)."""
+    """A pursuer's own part: its state and, relative to it, the predicted evader
+    positions (m).
+    """
     if predicted is None:
         return observation.self_state
     relative = observation.position[..., :, None, :] - predicted[..., None, :, :]

@@ -8,23 +8,29 @@ import jax
 import jax.numpy as jnp
 from jax.typing import DTypeLike
 
-from openjax.kernels.attention import EntityKind, Layout, Operands, attend, attend_one_by_one
+from openjax.kernels.attention import (
+    EntityKind,
+    Layout,
+    Operands,
+    attend,
+    attend_one_by_one,
+)
 from openjax.kernels.normalisation import normalise, normalised_layer
 from openjax.platform import can_compile_for_cuda
 
 MASKED = -1e4
-"""Added to the score of an entity that isn't there, whose weight is then zero in single precision;
-finite, since infinities less each other are no numbers.
+"""Added to the score of an entity that isn't there, whose weight is then zero in single
+precision; finite, since infinities less each other are no numbers.
 """
 
 
 class SelfAttention(nn.Module):
     """Multi-head attention of the pursuer itself over itself and all other entities.
 
-    Only the own token's output is used, so one query suffices, and the key projection is folded
-    into the query's, the value projection into the output's: score and mean are taken in the space
-    of the embeddings. Algebraically the same as projecting keys and values of every entity (a bias
-    of the keys cancels in the softmax).
+    Only the own token's output is used, so one query suffices, and the key projection
+    is folded into the query's, the value projection into the output's: score and mean
+    are taken in the space of the embeddings. Algebraically the same as projecting keys
+    and values of every entity (a bias of the keys cancels in the softmax).
     """
 
     features: int
@@ -40,8 +46,9 @@ class SelfAttention(nn.Module):
         pillar_seen: jax.Array,
         others_there: jax.Array | None = None,
     ) -> jax.Array:
-        """token (B, F), the pursuer's own embedded; others (B, A, O), pillars (B, k, 5) as
-        observed; pillar_seen (B, k) and others_there (B, A) bool, None: all are -> (B, F).
+        """token (B, F), the pursuer's own embedded; others (B, A, O), pillars (B, k, 5)
+        as observed; pillar_seen (B, k) and others_there (B, A) bool, None: all are ->
+        (B, F).
         """
         f = self.features
         h = self.heads
@@ -51,7 +58,8 @@ class SelfAttention(nn.Module):
         def kernel(name, shape, init=orthogonal):
             return self.param(name, init, shape, jnp.float32)
 
-        # parameters are the usual four matrices; products of two of them are what is worked with
+        # parameters are the usual four matrices; products of two of them are what is
+        # worked with
         query = jnp.einsum(
             "ahd,fhd->ahf",
             kernel("query", (f, f)).reshape(f, h, width),
@@ -75,19 +83,21 @@ class SelfAttention(nn.Module):
         return self._one_by_one(token, query, output, entities)
 
     def _embedding(self, kernel, name, size):
-        """Parameters that embed entities of a kind, of so many numbers: weights with the bias in
-        their last row, scale and shift.
+        """Parameters that embed entities of a kind, of so many numbers: weights with
+        the bias in their last row, scale and shift.
         """
         f = self.features
-        weights = kernel(f"{name}_kernel", (size, f), nn.initializers.orthogonal(2**0.5))
+        weights = kernel(
+            f"{name}_kernel", (size, f), nn.initializers.orthogonal(2**0.5)
+        )
         bias = kernel(f"{name}_bias", (1, f), nn.initializers.zeros_init())
         scale = kernel(f"{name}_scale", (f,), nn.initializers.ones_init())
         shift = kernel(f"{name}_shift", (1, f), nn.initializers.zeros_init())
         return jnp.concatenate([weights, bias]), scale, shift
 
     def _one_by_one(self, token, query, output, kinds):
-        """Entity by entity and head by head: matrix products of whole batches, which a CPU is good
-        at.
+        """Entity by entity and head by head: matrix products of whole batches, which a
+        CPU is good at.
         """
         # the pursuer itself is one of the entities, and always there
         embedded = [token.astype(jnp.float32)]
@@ -105,7 +115,8 @@ class SelfAttention(nn.Module):
         ]
         means = attend_one_by_one(queries, embedded, biases)
         return sum(
-            means[h].astype(self.dtype) @ output[h].astype(self.dtype) for h in range(self.heads)
+            means[h].astype(self.dtype) @ output[h].astype(self.dtype)
+            for h in range(self.heads)
         )
 
     def _fused(self, token, query, output, entities):
@@ -140,21 +151,22 @@ class SelfAttention(nn.Module):
 def normalised_linear(x: jax.Array, linear: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Layer normalisation of a linear layer, without its output.
 
-    Mean and variance over the features of W' x are a linear and a quadratic form of the few numbers
-    x, so centred weights and the inverse standard deviation give the normalised output.
+    Mean and variance over the features of W' x are a linear and a quadratic form of the
+    few numbers x, so centred weights and the inverse standard deviation give the
+    normalised output.
 
     Args:
       x: (..., size).
       linear: (size + 1, F), the bias last.
 
     Returns:
-      inverse standard deviations (...) and weights (size + 1, F): their product with [x, 1] is
-      LayerNorm(linear' [x, 1]).
+      inverse standard deviations (...) and weights (size + 1, F): their product with
+      [x, 1] is LayerNorm(linear' [x, 1]).
     """
     x = jnp.concatenate([x, jnp.ones_like(x[..., :1])], axis=-1)
     centred = linear - jnp.mean(linear, axis=1, keepdims=True)
-    # in full precision: a variance of large and small weights is a difference, and a GPU's products
-    # of float32 are rounded to ten bits
+    # in full precision: a variance of large and small weights is a difference, and a
+    # GPU's products of float32 are rounded to ten bits
     exact = functools.partial(jnp.matmul, precision=jax.lax.Precision.HIGHEST)
     covariance = exact(centred, centred.T) / linear.shape[1]
     variance = jnp.sum(exact(x, covariance) * x, axis=-1)
@@ -162,8 +174,8 @@ def normalised_linear(x: jax.Array, linear: jax.Array) -> tuple[jax.Array, jax.A
 
 
 class Encoder(nn.Module):
-    """Embeds self, other pursuers and pillars by an MLP per kind, attends, adds the self embedding,
-    one more MLP.
+    """Embeds self, other pursuers and pillars by an MLP per kind, attends, adds the
+    self embedding, one more MLP.
     """
 
     features: int
@@ -179,22 +191,31 @@ class Encoder(nn.Module):
         pillar_seen: jax.Array,
         others_there: jax.Array | None = None,
     ) -> jax.Array:
-        """self_state (..., S), others (..., A, O), pillars (..., k, 5), pillar_seen (..., k) and
-        others_there (..., A) bool, None: all are -> (..., F).
+        """self_state (..., S), others (..., A, O), pillars (..., k, 5), pillar_seen
+        (..., k) and others_there (..., A) bool, None: all are -> (..., F).
         """
         leading = self_state.shape[:-1]
         rows = len(leading)
 
         def flat(x):
-            # not -1: with a single pursuer there are no others, and nothing to tell the size from
+            # not -1: with a single pursuer there are no others, and nothing to tell the
+            # size from
             return x.reshape(math.prod(leading), *x.shape[rows:])
 
-        token = HiddenLayer(self.features, self.dtype, name="self_1")(flat(padded(self_state)))
+        token = HiddenLayer(self.features, self.dtype, name="self_1")(
+            flat(padded(self_state))
+        )
         token = HiddenLayer(self.features, self.dtype, name="self_2")(token)
-        attention = SelfAttention(self.features, self.heads, self.dtype, name="attention")
+        attention = SelfAttention(
+            self.features, self.heads, self.dtype, name="attention"
+        )
         there = None if others_there is None else flat(others_there)
-        hidden = token + attention(token, flat(others), flat(pillars), flat(pillar_seen), there)
-        hidden = normalise(hidden, affine_parameters(self, "norm", self.features), activate=False)
+        hidden = token + attention(
+            token, flat(others), flat(pillars), flat(pillar_seen), there
+        )
+        hidden = normalise(
+            hidden, affine_parameters(self, "norm", self.features), activate=False
+        )
         hidden = HiddenLayer(self.features, self.dtype, name="hidden")(hidden)
         return hidden.reshape(*leading, self.features)
 
@@ -217,8 +238,8 @@ class HiddenLayer(nn.Module):
 
 
 def padded(x: jax.Array) -> jax.Array:
-    """(..., S) with zeros up to a multiple of 8: else XLA copies all samples to pad them for the
-    matrix unit.
+    """(..., S) with zeros up to a multiple of 8: else XLA copies all samples to pad
+    them for the matrix unit.
     """
     extra = -x.shape[-1] % 8
     if not extra:
@@ -227,7 +248,9 @@ def padded(x: jax.Array) -> jax.Array:
 
 
 def affine_parameters(module: nn.Module, name: str, features: int) -> jax.Array:
-    """(3, features) bias, scale and shift of a layer, for `normalise`; they start as 0, 1, 0."""
+    """(3, features) bias, scale and shift of a layer, for `normalise`; they start as 0,
+    1, 0.
+    """
 
     def start(key, shape, dtype):
         return jnp.zeros(shape, dtype).at[1].set(1.0)

@@ -1,5 +1,5 @@
-"""A policy for a game in which it observes more of its own history: the same policy until it learns
-to use it.
+"""A policy for a game in which it observes more of its own history: the same policy
+until it learns to use it.
 """
 
 from collections.abc import Mapping
@@ -19,11 +19,11 @@ def with_longer_history(
     old: PursuitSettings,
     new: PursuitSettings,
 ) -> PolicyParameters:
-    """`parameters` of a policy trained in the game `old`, for the game `new`, which observes as
-    long a history or longer.
+    """`parameters` of a policy trained in the game `old`, for the game `new`, which
+    observes as long a history or longer.
 
-    The first layer's weights for the additional, older frames are zero. The critic, which may see
-    other privileged numbers as well, is left out where the history grows.
+    The first layer's weights for the additional, older frames are zero. The critic,
+    which may see other privileged numbers as well, is left out where the history grows.
 
     Raises:
       UserError: the policy isn't made of networks.
@@ -33,14 +33,16 @@ def with_longer_history(
         return parameters
     if not (isinstance(parameters.actor, Mapping) and "params" in parameters.actor):
         raise UserError("the policy has no networks that could learn")
-    # the history comes last in the own state, its oldest frame first: the new rows stand before it
+    # the history comes last in the own state, its oldest frame first: the new rows
+    # stand before it
     place = old.self_size - old.observe_history * OWN_FRAME
     inputs = old.self_size + (3 * len(predictor.horizons) if predictor.enabled else 0)
 
     def grown(actor: Any) -> Any:
         params = dict(actor["params"])
         encoder = dict(params["encoder"])
-        # without the rows for the encoder's padding, which are added anew for the new length
+        # without the rows for the encoder's padding, which are added anew for the new
+        # length
         kernel = encoder["self_1"]["kernel"][:inputs]
         zeros = jnp.zeros((more, kernel.shape[1]), kernel.dtype)
         kernel = jnp.concatenate([kernel[:place], zeros, kernel[place:]])

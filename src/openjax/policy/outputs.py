@@ -6,11 +6,15 @@ from openjax.policy.settings import NetworkSettings, PredictorSettings
 from openjax.pursuit import Pursuit
 
 OUTPUTS: dict[str, type[Policy]] = {"commands": Policy}
-"""The kind of policy for each name; `openjax.baselines` adds those that its controller flies."""
+"""The kind of policy for each name; `openjax.baselines` adds those that its controller
+flies.
+"""
 
 
 def register_output(name: str, kind: type[Policy]) -> None:
-    """From now on `make_policy` makes a policy of this kind where settings name that output."""
+    """From now on `make_policy` makes a policy of this kind where settings name that
+    output.
+    """
     OUTPUTS[name] = kind
 
 

@@ -13,16 +13,20 @@ from openjax.pursuit import Observation
 
 @runtime_checkable
 class Network(Protocol):
-    """What acts and what judges, as pure functions of their parameters. Observations have any
-    leading axes.
+    """What acts and what judges, as pure functions of their parameters. Observations
+    have any leading axes.
     """
 
     def init(self, key: jax.Array, observation: Observation) -> tuple[Any, Any]:
-        """Fresh parameters of actor and critic for observations shaped like this one of a world."""
+        """Fresh parameters of actor and critic for observations shaped like this one of
+        a world.
+        """
 
-    def distribution(self, actor: Any, observation: Observation) -> tuple[jax.Array, jax.Array]:
-        """Mean (..., N, 4) and log standard deviation (4,) of the Gaussian over actions: collective
-        thrust, roll, pitch and yaw rate; samples are cut to -1..1.
+    def distribution(
+        self, actor: Any, observation: Observation
+    ) -> tuple[jax.Array, jax.Array]:
+        """Mean (..., N, 4) and log standard deviation (4,) of the Gaussian over
+        actions: collective thrust, roll, pitch and yaw rate; samples are cut to -1..1.
         """
 
     def value(self, critic: Any, observation: Observation) -> jax.Array:
@@ -31,12 +35,16 @@ class Network(Protocol):
 
 @dataclass(frozen=True)
 class OwnPolicy:
-    """A `Network` with the interface of `openjax.policy.Policy`; nothing predicts the evader."""
+    """A `Network` with the interface of `openjax.policy.Policy`; nothing predicts the
+    evader.
+    """
 
     own: Network
     network: NetworkSettings = field(default_factory=NetworkSettings)
     """Says nothing here."""
-    predictor: PredictorSettings = field(default_factory=lambda: PredictorSettings(enabled=False))
+    predictor: PredictorSettings = field(
+        default_factory=lambda: PredictorSettings(enabled=False)
+    )
     sample_size: int = 4
 
     def init(self, key: jax.Array, observation: Observation) -> PolicyParameters:
@@ -53,7 +61,9 @@ class OwnPolicy:
         """Mean (..., N, 4) and log standard deviation (4,)."""
         return self.own.distribution(actor, observation)
 
-    def action(self, sample: jax.Array, observation: Observation | None = None) -> jax.Array:
+    def action(
+        self, sample: jax.Array, observation: Observation | None = None
+    ) -> jax.Array:
         """The sample, cut to -1..1."""
         return jnp.clip(sample, -1.0, 1.0)
 
@@ -67,7 +77,9 @@ class OwnPolicy:
         self, actor: Any, critic: Any, observation: Observation, predicted: None
     ) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Mean, log standard deviation and value."""
-        return *self.own.distribution(actor, observation), self.own.value(critic, observation)
+        return *self.own.distribution(actor, observation), self.own.value(
+            critic, observation
+        )
 
     def act(self, parameters: PolicyParameters, observation: Observation) -> jax.Array:
         """The mean's action (..., N, 4)."""

@@ -19,7 +19,9 @@ from openjax.pursuit import Observation, Pursuit, hover_action
 
 @struct.dataclass
 class PolicyParameters:
-    """Parameters of the three networks; `predictor` is empty where it is switched off."""
+    """Parameters of the three networks; `predictor` is empty where it is switched
+    off.
+    """
 
     actor: Any
     critic: Any
@@ -39,10 +41,16 @@ class Policy:
 
     @classmethod
     def for_environment(
-        cls, environment: Pursuit, network: NetworkSettings, predictor: PredictorSettings
+        cls,
+        environment: Pursuit,
+        network: NetworkSettings,
+        predictor: PredictorSettings,
     ) -> "Policy":
-        """The policy for an environment: its arena's size, and a start that hovers its vehicle."""
-        with jax.ensure_compile_time_eval():  # an environment may be made inside a compiled program
+        """The policy for an environment: its arena's size, and a start that hovers its
+        vehicle.
+        """
+        # an environment may be made inside a compiled program
+        with jax.ensure_compile_time_eval():
             hover = np.asarray(hover_action(environment.vehicle), np.float64)
         # before the tanh, which has no inverse at its ends
         hover = np.arctanh(np.clip(hover, -0.99, 0.99))
@@ -74,14 +82,15 @@ class Policy:
             predictor = self._predictor.init(
                 predictor_key, observation.frames, observation.last_seen
             )
-        # in this order: the actor sees what the predictor predicts, the critic what the actor's
-        # encoder makes of it
+        # in this order: the actor sees what the predictor predicts, the critic what the
+        # actor's encoder makes of it
         parameters = PolicyParameters(actor={}, critic={}, predictor=predictor)
         predicted = self.predict(parameters, observation)
         actor = self._actor.init(actor_key, observation, predicted)
         encoded = self._actor.apply(actor, observation, predicted)[2]
         return parameters.replace(
-            actor=actor, critic=self._critic.init(critic_key, observation, predicted, encoded)
+            actor=actor,
+            critic=self._critic.init(critic_key, observation, predicted, encoded),
         )
 
     def predict(
@@ -90,7 +99,9 @@ class Policy:
         """Predicted evader positions in the world (m); None without a predictor."""
         if not self.predictor.enabled:
             return None
-        return self.predict_from(parameters.predictor, observation.frames, observation.last_seen)
+        return self.predict_from(
+            parameters.predictor, observation.frames, observation.last_seen
+        )
 
     def predict_from(
         self,
@@ -98,8 +109,8 @@ class Policy:
         frames: Float[Array, "*worlds window features"],
         last_seen: Float[Array, "*worlds 3"],
     ) -> Float[Array, "*worlds horizons 3"]:
-        """Positions (m) predicted from windows of frames, oldest first, and last seen positions
-        (m).
+        """Positions (m) predicted from windows of frames, oldest first, and last seen
+        positions (m).
         """
         return self._predictor.apply(predictor, frames, last_seen)
 
@@ -109,7 +120,9 @@ class Policy:
         observation: Observation,
         predicted: Float[Array, "*worlds horizons 3"] | None,
     ) -> tuple[Float[Array, "*worlds pursuers sample"], Float[Array, " sample"]]:
-        """Mean and log standard deviation of the Gaussian over samples; see `action`."""
+        """Mean and log standard deviation of the Gaussian over samples; see
+        `action`.
+        """
         return self._actor.apply(actor, observation, predicted)[:2]
 
     @property
@@ -127,7 +140,11 @@ class Policy:
         Policies whose samples aren't commands work the four out from the `observation`
         (`openjax.baselines.dacoop`).
         """
-        return jnp.clip(sample, -1.0, 1.0) if self.network.squash == "mean" else jnp.tanh(sample)
+        return (
+            jnp.clip(sample, -1.0, 1.0)
+            if self.network.squash == "mean"
+            else jnp.tanh(sample)
+        )
 
     def value(
         self,
@@ -152,7 +169,11 @@ class Policy:
     ]:
         """`distribution` and `value`: mean, log standard deviation, value."""
         mean, log_std, encoded = self._actor.apply(actor, observation, predicted)
-        return mean, log_std, self._critic.apply(critic, observation, predicted, encoded)
+        return (
+            mean,
+            log_std,
+            self._critic.apply(critic, observation, predicted, encoded),
+        )
 
     def act(
         self, parameters: PolicyParameters, observation: Observation

@@ -1,4 +1,6 @@
-"""The evader prediction network: an LSTM over the last frames (the paper's section IV-B1)."""
+"""The evader prediction network: an LSTM over the last frames (the paper's section
+IV-B1).
+"""
 
 import flax.linen as nn
 import jax
@@ -9,7 +11,9 @@ from openjax.policy.settings import PredictorSettings
 
 
 class EvaderPredictor(nn.Module):
-    """Future evader positions from a window of frames; see `openjax.pursuit.observation.frame`."""
+    """Future evader positions from a window of frames; see
+    `openjax.pursuit.observation.frame`.
+    """
 
     settings: PredictorSettings
     arena_radius: float
@@ -17,27 +21,31 @@ class EvaderPredictor(nn.Module):
 
     @nn.compact
     def __call__(
-        self, frames: Float[Array, "*worlds window features"], last_seen: Float[Array, "*worlds 3"]
+        self,
+        frames: Float[Array, "*worlds window features"],
+        last_seen: Float[Array, "*worlds 3"],
     ) -> Float[Array, "*worlds horizons 3"]:
-        """Positions (m, world) from frames, oldest first, and where the evader was last seen
-        (m).
+        """Positions (m, world) from frames, oldest first, and where the evader was last
+        seen (m).
         """
         units = self.settings.units
         horizons = self.settings.horizons
         # all frames' projections in one product; only the recurrent part is sequential
         inputs = nn.Dense(4 * units, name="input")(frames)
-        recurrent = self.param("recurrent", nn.initializers.orthogonal(), (units, 4 * units))
+        recurrent = self.param(
+            "recurrent", nn.initializers.orthogonal(), (units, 4 * units)
+        )
         hidden = cell = jnp.zeros((*frames.shape[:-2], units), jnp.float32)
         for i in range(frames.shape[-2]):
             gates = inputs[..., i, :] + hidden @ recurrent
             in_gate, forget_gate, candidate, out_gate = jnp.split(gates, 4, axis=-1)
-            # one more, so that a fresh cell forgets little (Jozefowicz et al. 2015, An empirical
-            # exploration of recurrent network architectures)
+            # one more, so that a fresh cell forgets little (Jozefowicz et al. 2015, An
+            # empirical exploration of recurrent network architectures)
             kept = jax.nn.sigmoid(forget_gate + 1.0) * cell
             cell = kept + jax.nn.sigmoid(in_gate) * jnp.tanh(candidate)
             hidden = jax.nn.sigmoid(out_gate) * jnp.tanh(cell)
-        # small, so that a fresh predictor says what it is relative to: where the evader was last
-        # seen, or the arena's middle
+        # small, so that a fresh predictor says what it is relative to: where the evader
+        # was last seen, or the arena's middle
         initial = nn.initializers.orthogonal(0.1)
         output = nn.Dense(3 * len(horizons), kernel_init=initial, name="output")(hidden)
         output = output.reshape(*output.shape[:-1], len(horizons), 3)
@@ -45,6 +53,9 @@ class EvaderPredictor(nn.Module):
             [self.arena_radius, self.arena_radius, self.arena_height / 2], jnp.float32
         )
         if self.settings.relative:
-            # within a horizon the evader moves a tenth of the arena or so: outputs of one order
+            # within a horizon the evader moves a tenth of the arena or so: outputs of
+            # one order
             return last_seen[..., None, :] + 0.1 * scale * output
-        return jnp.array([0.0, 0.0, self.arena_height / 2], jnp.float32) + scale * output
+        return (
+            jnp.array([0.0, 0.0, self.arena_height / 2], jnp.float32) + scale * output
+        )

@@ -21,27 +21,27 @@ class NetworkSettings:
     initial_log_std: Annotated[float, Interval("[-10, 2]")] = -0.5
     """Start of the Gaussian policy's state-independent log standard deviation."""
     squash: Literal["mean", "sample"] = "mean"
-    """What the tanh bounds. "mean": exploration is added after it and cut at the bounds, so that
-    the mean policy does what the exploring one does on average; "sample": exploration passes
-    through the tanh, which shifts that average.
+    """What the tanh bounds. "mean": exploration is added after it and cut at the
+    bounds, so that the mean policy does what the exploring one does on average;
+    "sample": exploration passes through the tanh, which shifts that average.
     """
     output: Literal["commands", "velocity", "field"] = "commands"
-    """What the actor puts out. "commands": thrust and body rates; "velocity": a velocity, which a
-    controller flies; "field": parameters of a potential field, whose force that controller flies
-    (DACOOP).
+    """What the actor puts out. "commands": thrust and body rates; "velocity": a
+    velocity, which a controller flies; "field": parameters of a potential field, whose
+    force that controller flies (DACOOP).
     """
     critic_input: Literal["state", "observation"] = "state"
     """"state": the critic also sees the true evader, its velocity and the own position;
     "observation": what the actor sees.
     """
     critic_encoder: Literal["attention", "layers"] = "attention"
-    """What the critic begins with, unless it shares the actor's encoder. "attention": an encoder
-    like the actor's; "layers": two layers, twice as wide as `features`, on all that it sees: a
-    third of the work on a CPU.
+    """What the critic begins with, unless it shares the actor's encoder. "attention":
+    an encoder like the actor's; "layers": two layers, twice as wide as `features`, on
+    all that it sees: a third of the work on a CPU.
     """
     shared_encoder: bool = False
-    """The critic is a layer on the actor's encoder, which halves the cost of an update; what it
-    sees beside the actor joins behind the encoder. False: an encoder each.
+    """The critic is a layer on the actor's encoder, which halves the cost of an update;
+    what it sees beside the actor joins behind the encoder. False: an encoder each.
     """
 
     def __post_init__(self):
@@ -65,17 +65,17 @@ class PredictorSettings:
     units: Annotated[int, Interval("[1, 8192]")] = 64
     """Width of the LSTM."""
     horizons: Annotated[tuple[int, ...], Interval("[1, 10000]")] = (1, 5, 10, 20, 40)
-    """Control steps ahead at which positions are predicted; the first is 1. The paper's are 1 to
-    5.
+    """Control steps ahead at which positions are predicted; the first is 1. The paper's
+    are 1 to 5.
     """
     relative: bool = True
-    """Predict the displacement from where the evader was last seen; False: positions in the arena,
-    as in the paper.
+    """Predict the displacement from where the evader was last seen; False: positions in
+    the arena, as in the paper.
     """
     loss: Literal["scaled", "squared"] = "scaled"
-    """Mean squared error. "scaled": in units of how far the evader flies in that time, without the
-    windows that end before it was first seen; "squared": in metres, of all windows, as in the
-    paper.
+    """Mean squared error. "scaled": in units of how far the evader flies in that time,
+    without the windows that end before it was first seen; "squared": in metres, of all
+    windows, as in the paper.
     """
     learning_rate: Annotated[float, Interval("(0, 1]")] = 1e-3
     """Adam step size; 1e-4 in the paper."""

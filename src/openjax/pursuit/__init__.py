@@ -1,5 +1,5 @@
-"""The game: tasks, evader, sensing, observation, reward, test layouts, and the environment made of
-them.
+"""The game: tasks, evader, sensing, observation, reward, test layouts, and the
+environment made of them.
 """
 
 from openjax.lazy import lazy_names

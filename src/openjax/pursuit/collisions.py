@@ -10,7 +10,9 @@ from openjax.pursuit.shapes import Active, Each, Pillars, Team, Which
 from openjax.vehicle.solids import DRONE_RADIUS
 
 TOUCH = 1e-3
-"""A gap between solids below this (m) counts as touching: contacts are soft by a fraction of it."""
+"""A gap between solids below this (m) counts as touching: contacts are soft by a
+fraction of it.
+"""
 
 
 @struct.dataclass
@@ -51,15 +53,17 @@ def breaches(
     pillar_active: Active,
     margin: float = 0.0,
 ) -> Breaches:
-    """Count the breaches of each of N pursuers at (N, 3) positions; `margin` (m) widens every
-    limit.
+    """Count the breaches of each of N pursuers at (N, 3) positions; `margin` (m) widens
+    every limit.
     """
     to_pillar = pillar_distance(settings, position, pillar_position)
     near_pillar = pillar_active[None] & (to_pillar < settings.pillar_clearance + margin)
     near_drone = drone_distance(position) < settings.drone_clearance + margin
     # the floor is none of these bounds: touching it is a crash
     above = position[:, 2] > settings.arena_height - margin
-    outside = jnp.sum(position[:, :2] ** 2, axis=-1) > (settings.arena_radius - margin) ** 2
+    outside = (
+        jnp.sum(position[:, :2] ** 2, axis=-1) > (settings.arena_radius - margin) ** 2
+    )
     return Breaches(
         pillar=jnp.sum(near_pillar, axis=-1).astype(jnp.float32),
         drone=jnp.sum(near_drone, axis=-1).astype(jnp.float32),
@@ -75,16 +79,17 @@ def crashed(
     pillar_active: Active,
     margin: float = 0.0,
 ) -> Which:
-    """(N,) whether each pursuer touches the floor or anything solid, or is tilted beyond 90
-    degrees.
+    """(N,) whether each pursuer touches the floor or anything solid, or is tilted
+    beyond 90 degrees.
 
-    `body_z_up` (N,) is the world z component of the body's z axis. `margin` widens every limit (m;
-    and the cosine).
+    `body_z_up` (N,) is the world z component of the body's z axis. `margin` widens
+    every limit (m; and the cosine).
     """
     reach = DRONE_RADIUS + TOUCH + margin
     on_floor = position[:, 2] < reach
     on_pillar = jnp.any(
-        pillar_active & (pillar_distance(settings, position, pillar_position) < reach), axis=-1
+        pillar_active & (pillar_distance(settings, position, pillar_position) < reach),
+        axis=-1,
     )
     # two radii, but one touch and one margin
     on_drone = jnp.any(drone_distance(position) < DRONE_RADIUS + reach, axis=-1)

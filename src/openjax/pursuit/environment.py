@@ -39,7 +39,16 @@ from openjax.pursuit.reward import (
 )
 from openjax.pursuit.sensing import line_of_sight, within_view
 from openjax.pursuit.settings import PursuitSettings
-from openjax.pursuit.shapes import Actions, Active, Commands, Each, Flag, Pillars, Scalar, Vector
+from openjax.pursuit.shapes import (
+    Actions,
+    Active,
+    Commands,
+    Each,
+    Flag,
+    Pillars,
+    Scalar,
+    Vector,
+)
 from openjax.pursuit.shortest_paths import shortest_paths
 from openjax.pursuit.spaces import Box
 from openjax.pursuit.state import PursuitState
@@ -58,8 +67,8 @@ from openjax.vehicle import (
 from openjax.vehicle.family import draw_vehicles, family_effects
 
 THRUST_LIMIT = 0.9
-"""The commanded thrust is cut here, as a fraction of the maximum (the paper's simulator does
-so).
+"""The commanded thrust is cut here, as a fraction of the maximum (the paper's simulator
+does so).
 """
 
 
@@ -69,8 +78,8 @@ def hover_action(vehicle: Vehicle) -> Float[Array, "4"]:
 
 
 def action_to_command(action: Float[Array, "*drones 4"]) -> Float[Array, "*drones 4"]:
-    """(..., 4) action in -1..1 to command: collective thrust 0..0.9 of the maximum, body rates up
-    to pi rad/s.
+    """(..., 4) action in -1..1 to command: collective thrust 0..0.9 of the maximum,
+    body rates up to pi rad/s.
     """
     action = jnp.clip(action, -1.0, 1.0)
     thrust = jnp.minimum(0.5 * (action[..., :1] + 1.0), THRUST_LIMIT)
@@ -81,7 +90,9 @@ def action_to_command(action: Float[Array, "*drones 4"]) -> Float[Array, "*drone
 class Dynamics(Protocol):
     """What moves the pursuers: `openjax.vehicle.DronesStep`, or a world outside."""
 
-    def reset(self, vehicle: Vehicle, drones: DroneState, key: PRNGKeyArray) -> DroneState:
+    def reset(
+        self, vehicle: Vehicle, drones: DroneState, key: PRNGKeyArray
+    ) -> DroneState:
         """The drones (leading axis N) at the start of an episode."""
 
     def __call__(
@@ -106,15 +117,16 @@ class Observer(Protocol):
     def __call__(
         self, settings: PursuitSettings, state: PursuitState, seen_drones: DroneState
     ) -> Observation:
-        """The observation of all N pursuers; `seen_drones` is what sensors tell of them. The
-        shapes of `self_state`, `others`, `pillars` and `privileged` are free but for N.
+        """The observation of all N pursuers; `seen_drones` is what sensors tell of
+        them. The shapes of `self_state`, `others`, `pillars` and `privileged` are free
+        but for N.
         """
 
 
 @dataclass(frozen=True, eq=False)
 class Pursuit:
-    """Pursuit-evasion by N quadrotors, as pure functions: map them with `jax.vmap`, compile them
-    with `jax.jit`.
+    """Pursuit-evasion by N quadrotors, as pure functions: map them with `jax.vmap`,
+    compile them with `jax.jit`.
     """
 
     settings: PursuitSettings | None = None
@@ -128,15 +140,17 @@ class Pursuit:
     vehicle_bounds: jax.Array | None = None
     """(R, 4) bounds of `settings.vehicles` that go before those written there."""
     evader_share: jax.Array | None = None
-    """() from 0 to 1, how far a curriculum over `settings.evaders` has come; None is 1. See
-    `openjax.pursuit.evaders`.
+    """() from 0 to 1, how far a curriculum over `settings.evaders` has come; None is 1.
+    See `openjax.pursuit.evaders`.
     """
     dynamics: Dynamics | None = None
-    """What moves the pursuers; None: the physics that the settings name, with the effects."""
+    """What moves the pursuers; None: the physics that the settings name, with the
+    effects.
+    """
     evaders: tuple[Evader, ...] | None = None
-    """Who flies away, one of them in each episode: names, rows, or functions of one's own
-    (`openjax.pursuit.evaders.EvaderKind`); they go before those that the settings name. None:
-    these.
+    """Who flies away, one of them in each episode: names, rows, or functions of one's
+    own (`openjax.pursuit.evaders.EvaderKind`); they go before those that the settings
+    name. None: these.
     """
     reward: tuple[Term, ...] | None = None
     """The reward's terms; None: `openjax.pursuit.default_reward(settings.reward)`."""
@@ -153,7 +167,9 @@ class Pursuit:
         complete = {
             "evaders": evaders,
             "settings": settings,
-            "vehicle": load_vehicle(settings.airframe) if self.vehicle is None else self.vehicle,
+            "vehicle": load_vehicle(settings.airframe)
+            if self.vehicle is None
+            else self.vehicle,
             "effects": tuple(self.effects),
             "effect_parameters": self.effect_parameters or {},
             "dynamics": self.dynamics
@@ -183,18 +199,24 @@ class Pursuit:
     @property
     def terms(self) -> tuple[Term, ...]:
         """The reward's terms."""
-        return default_reward(self.settings.reward) if self.reward is None else self.reward
+        return (
+            default_reward(self.settings.reward) if self.reward is None else self.reward
+        )
 
     @property
     def action_space(self) -> Box:
-        """Actions (N, 4) of all pursuers: collective thrust, roll, pitch and yaw rate, in -1..1."""
+        """Actions (N, 4) of all pursuers: collective thrust, roll, pitch and yaw rate,
+        in -1..1.
+        """
         return Box(-1.0, 1.0, (self.settings.num_pursuers, 4))
 
     @property
     def observation_space(self) -> Observation:
         """An `Observation` whose leaves are the boxes of its arrays."""
         kinds = jax.eval_shape(lambda key: self.reset(key)[0], jax.random.key(0))
-        return jax.tree.map(lambda kind: Box(-jnp.inf, jnp.inf, kind.shape, kind.dtype), kinds)
+        return jax.tree.map(
+            lambda kind: Box(-jnp.inf, jnp.inf, kind.shape, kind.dtype), kinds
+        )
 
     def reset(self, key: PRNGKeyArray) -> tuple[Observation, PursuitState]:
         """Start an episode of a uniformly drawn task.
@@ -208,11 +230,14 @@ class Pursuit:
         task_key, reset_key = jax.random.split(key)
         return self.reset_to(reset_key, uniform_task(self.settings, task_key))
 
-    def reset_to(self, key: PRNGKeyArray, task: Task) -> tuple[Observation, PursuitState]:
+    def reset_to(
+        self, key: PRNGKeyArray, task: Task
+    ) -> tuple[Observation, PursuitState]:
         """Start an episode of `task`.
 
         Args:
-          key: () typed key; draws start attitudes and vehicles and drives random effects.
+          key: () typed key; draws start attitudes and vehicles and drives random
+          effects.
           task: with the settings' number of pursuers and pillar slots.
 
         Returns:
@@ -225,16 +250,24 @@ class Pursuit:
         chex.assert_shape(task.pillar_position, (*task.pillar_active.shape, 2))
         # each draw has a key of its own, so that one that is added changes no other
         attitude_key, effect_key = jax.random.split(key)
-        vehicle_key, evader_key, fall_out_key = (jax.random.fold_in(key, i) for i in (2, 3, 4))
+        vehicle_key, evader_key, fall_out_key = (
+            jax.random.fold_in(key, i) for i in (2, 3, 4)
+        )
         quaternion = start_attitude(settings, attitude_key)
         hovering = functools.partial(hover_state, self.vehicle)
         drones = jax.vmap(hovering)(task.pursuer_position, quaternion)
         drones = self.dynamics.reset(self.vehicle, drones, effect_key)
-        action = jnp.broadcast_to(hover_action(self.vehicle), (settings.num_pursuers, 4))
-        in_sight, in_view, seen = self._sights(task, task.active, drones, task.evader_position)
+        action = jnp.broadcast_to(
+            hover_action(self.vehicle), (settings.num_pursuers, 4)
+        )
+        in_sight, in_view, seen = self._sights(
+            task, task.active, drones, task.evader_position
+        )
         still = jnp.zeros(3, jnp.float32)
         step = jnp.zeros((), jnp.int32)
-        last_seen = jnp.where(seen, task.evader_position, jnp.array(settings.middle, jnp.float32))
+        last_seen = jnp.where(
+            seen, task.evader_position, jnp.array(settings.middle, jnp.float32)
+        )
         framed = frame_pursuers(settings, task.pursuer_position, last_seen, task.active)
         first = frame(settings, step, framed, task.evader_position, still, seen)
         state = PursuitState(
@@ -254,7 +287,9 @@ class Pursuit:
             statistics=empty_statistics(settings.episode_length),
             gone_after=draw_fall_out(settings, fall_out_key, task.active),
             in_view=in_view,
-            paths=shortest_paths(settings, task) if settings.reward.needs_paths else None,
+            paths=shortest_paths(settings, task)
+            if settings.reward.needs_paths
+            else None,
         )
         return self.observe(state), state
 
@@ -272,15 +307,21 @@ class Pursuit:
     def _draw_evader(self, key, task):
         """The evader of an episode; the one that the task names, where it names one."""
         rows = self.evader_rows
-        return draw_row(rows, key, task.pursuer_position, self.evader_share, task.evader)
+        return draw_row(
+            rows, key, task.pursuer_position, self.evader_share, task.evader
+        )
 
     def _first_own_history(self, drones, action):
-        """What pursuers remember of themselves at the start; None where that isn't observed."""
+        """What pursuers remember of themselves at the start; None where that isn't
+        observed.
+        """
         settings = self.settings
         if not settings.observe_history:
             return None
         first = own_frame(drones.quaternion, drones.velocity, action)
-        return _repeated(first, settings.observe_history * settings.observe_history_spacing)
+        return _repeated(
+            first, settings.observe_history * settings.observe_history_spacing
+        )
 
     def with_bounds(self, vehicle_bounds: Float[Array, "ranges 4"]) -> "Pursuit":
         """The same game with vehicles drawn within these bounds (R, 4)."""
@@ -291,8 +332,8 @@ class Pursuit:
         return dataclasses.replace(self, evader_share=share)
 
     def observe(self, state: PursuitState) -> Observation:
-        """The observation of a state; effects on the sensors act on what a pursuer knows of all
-        pursuers.
+        """The observation of a state; effects on the sensors act on what a pursuer
+        knows of all pursuers.
         """
         return self._observe(state, self._seen(state.drones, state.vehicles))
 
@@ -300,13 +341,15 @@ class Pursuit:
         return (self.observer or observe)(self.settings, state, seen_drones)
 
     def _parameters(self, vehicles):
-        """Parameters of all effects: those drawn for the episode, and this environment's own, which
-        go first.
+        """Parameters of all effects: those drawn for the episode, and this
+        environment's own, which go first.
         """
         return {**vehicles, **self.effect_parameters}
 
     def _active_after(self, state):
-        """(N,) which slots are in use after a step that begins with `state`; None: all are."""
+        """(N,) which slots are in use after a step that begins with `state`; None: all
+        are.
+        """
         if state.gone_after is None:
             return state.active
         return still_there(state.task.active, state.gone_after, state.step + 1)
@@ -319,15 +362,18 @@ class Pursuit:
         return sees if active is None else sees & active
 
     def _sights(self, task, active, drones, evader):
-        """(N,) to whom of the drones nothing hides the evader at (3,), (N,) who also looks its way
-        (None: looking isn't part of the game), and () whether somebody sees it.
+        """(N,) to whom of the drones nothing hides the evader at (3,), (N,) who also
+        looks its way (None: looking isn't part of the game), and () whether somebody
+        sees it.
         """
         in_sight = self._in_sight(task, active, drones.position, evader)
         in_view = self._in_view(in_sight, drones, evader)
         return in_sight, in_view, jnp.any(in_sight if in_view is None else in_view)
 
     def _in_view(self, in_sight, drones, evader):
-        """(N,) which of those in sight have the evader at (3,) in view; None: all of them."""
+        """(N,) which of those in sight have the evader at (3,) in view; None: all of
+        them.
+        """
         if not self.settings.limited_sight:
             return None
         ahead = rotation_axes(drones.quaternion)[0]
@@ -346,13 +392,13 @@ class Pursuit:
         """One control step.
 
         Args:
-          key: for an interface like other environments'; the game itself draws nothing after its
-          reset, and None will do.
+          key: for an interface like other environments'; the game itself draws nothing
+          after its reset, and None will do.
           state: of this step's start.
           action: (N, 4) in -1..1: collective thrust, roll, pitch and yaw rate; see
           `action_to_command`.
-          wish: (3,) where an evader from outside flies, as a share of its speed (at most length
-          one); None or NaN: its own rule.
+          wish: (3,) where an evader from outside flies, as a share of its speed (at
+          most length one); None or NaN: its own rule.
 
         Returns:
           observation, state, reward (N,), terminated (), truncated (), info.
@@ -362,8 +408,8 @@ class Pursuit:
         return self.follow(state, action, self.move(state, action), wish)
 
     def move(self, state: PursuitState, action: Actions) -> DroneState:
-        """The pursuers (leading axis N) a control step after `state`, in which they fly `action`
-        (N, 4) in -1..1: the part of `step` that is physics.
+        """The pursuers (leading axis N) a control step after `state`, in which they fly
+        `action` (N, 4) in -1..1: the part of `step` that is physics.
         """
         settings = self.settings
         task = state.task
@@ -377,8 +423,11 @@ class Pursuit:
             self._parameters(state.vehicles),
         )
         if settings.speed_limit == "clamp":
-            # as the paper's simulator does; the small number keeps the root's gradient finite
-            speed = jnp.sqrt(jnp.sum(drones.velocity**2, axis=-1, keepdims=True) + 1e-12)
+            # as the paper's simulator does; the small number keeps the root's gradient
+            # finite
+            speed = jnp.sqrt(
+                jnp.sum(drones.velocity**2, axis=-1, keepdims=True) + 1e-12
+            )
             drones = drones.replace(
                 velocity=drones.velocity * jnp.minimum(1.0, settings.max_speed / speed)
             )
@@ -391,16 +440,19 @@ class Pursuit:
         drones: DroneState,
         wish: Vector | None = None,
     ) -> tuple[Observation, PursuitState, Each, Flag, Flag, StepInfo]:
-        """The game's part of a step that began at `state` with `action` and ended with the pursuers
-        as `drones`.
+        """The game's part of a step that began at `state` with `action` and ended with
+        the pursuers as `drones`.
 
-        `step` is `move` and this; where the pursuers are flown by something else, real vehicles
-        say, this alone. Returns what `step` does.
+        `step` is `move` and this; where the pursuers are flown by something else, real
+        vehicles say, this alone. Returns what `step` does.
         """
         settings = self.settings
         before = state
-        # the evader answers to the pursuers as they were at the step's start, while they moved
-        velocity, evader_state = evader_velocity(settings, self.evader_rows, before, wish)
+        # the evader answers to the pursuers as they were at the step's start, while
+        # they moved
+        velocity, evader_state = evader_velocity(
+            settings, self.evader_rows, before, wish
+        )
         evader = before.evader_position + settings.time_step * velocity
         step = before.step + 1
         active = self._active_after(before)
@@ -427,13 +479,22 @@ class Pursuit:
             step=step,
         )
         info, rewards = self._outcome(before, state, active)
-        state = state.replace(statistics=count(before.statistics, step, info, rewards, active))
+        state = state.replace(
+            statistics=count(before.statistics, step, info, rewards, active)
+        )
         terminated, truncated = self._end(step)
-        return self._observe(state, seen_drones), state, rewards, terminated, truncated, info
+        return (
+            self._observe(state, seen_drones),
+            state,
+            rewards,
+            terminated,
+            truncated,
+            info,
+        )
 
     def _outcome(self, start, state, active):
-        """What happened in a step from `start` to `state` to the slots that are `active`, and its
-        rewards.
+        """What happened in a step from `start` to `state` to the slots that are
+        `active`, and its rewards.
         """
         info = self._events(state).of_team(active)
         transition = Transition(self.settings, start, state, info)
@@ -451,7 +512,11 @@ class Pursuit:
         body_z_up = rotation_axes(drones.quaternion)[1][:, 2]
         return StepInfo(
             captured=captures(
-                settings, position, state.evader_position, state.in_sight, task.capture_radius
+                settings,
+                position,
+                state.evader_position,
+                state.in_sight,
+                task.capture_radius,
             ),
             seen=state.seen,
             breaches=breaches(settings, position, pillars, pillar_active),
@@ -464,8 +529,8 @@ class Pursuit:
     def _end(self, step):
         """() whether the episode ends for good with this step, and whether it is cut.
 
-        An observed horizon is part of the task, so its end is terminal; an unobserved one only cuts
-        the episode.
+        An observed horizon is part of the task, so its end is terminal; an unobserved
+        one only cuts the episode.
         """
         over = step >= self.settings.episode_length
         never = jnp.zeros((), bool)
@@ -489,13 +554,14 @@ def make(
 
     Args:
       settings: the game; None is the paper's.
-      evader: a name in `openjax.pursuit.evaders.EVADERS`, short for `evaders=(name,)`; a row, or a
-      function of one's own.
-      changes: fields of `PursuitSettings`: `make(num_pursuers=4, reward=dict(crash=20.0))`.
+      evader: a name in `openjax.pursuit.evaders.EVADERS`, short for `evaders=(name,)`;
+      a row, or a function of one's own.
+      changes: fields of `PursuitSettings`: `make(num_pursuers=4,
+      reward=dict(crash=20.0))`.
 
     Raises:
-      UserError: no such setting, a value that it can't have, an evader that nobody knows, or the
-        learned one, which is more than a name.
+      UserError: no such setting, a value that it can't have, an evader that nobody
+        knows, or the learned one, which is more than a name.
     """
     if evader == "learned":
         raise UserError(

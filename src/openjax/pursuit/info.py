@@ -17,7 +17,9 @@ class StepInfo:
     seen: jax.Array
     """() bool: some pursuer sees the evader."""
     breaches: Breaches
-    """(N,) how many each: of the distance to pillars, to other pursuers, of the arena's bounds."""
+    """(N,) how many each: of the distance to pillars, to other pursuers, of the arena's
+    bounds.
+    """
     over_speed: jax.Array
     """(N,) bool: faster than `max_speed`."""
     crashed: jax.Array
@@ -26,7 +28,9 @@ class StepInfo:
     """(N,) the reward's penalties, at most 0."""
 
     def of_team(self, active: Which | None) -> "StepInfo":
-        """The same, where nothing happens to empty slots: `active` (N,) says which aren't."""
+        """The same, where nothing happens to empty slots: `active` (N,) says which
+        aren't.
+        """
         each = {
             name: of_team(active, getattr(self, name))
             for name in ("captured", "breaches", "over_speed", "crashed")

@@ -10,7 +10,15 @@ from jaxtyping import Array, Float
 from openjax.pursuit.axes import rotation_axes, turned_back
 from openjax.pursuit.collisions import pillar_distance
 from openjax.pursuit.settings import HIDDEN, PursuitSettings
-from openjax.pursuit.shapes import Actions, Count, Flag, Quaternions, Team, Vector, Which
+from openjax.pursuit.shapes import (
+    Actions,
+    Count,
+    Flag,
+    Quaternions,
+    Team,
+    Vector,
+    Which,
+)
 from openjax.pursuit.state import PursuitState
 from openjax.pursuit.task import capture_radius, evader_speed
 from openjax.pursuit.teams import of_team
@@ -18,28 +26,34 @@ from openjax.vehicle import DroneState
 from openjax.vehicle.family import standard_parameters
 
 PRESS = 0.2
-"""Distance (m) of a pursuer from which on it presses less than it would nearer still."""
+"""Distance (m) of a pursuer from which on it presses less than it would nearer
+still.
+"""
 
 
 @struct.dataclass
 class Observation:
-    """Observation of N pursuers. Relative positions point from the entity to the pursuer (p_i -
-    p_entity), in metres.
+    """Observation of N pursuers. Relative positions point from the entity to the
+    pursuer (p_i - p_entity), in metres.
     """
 
     self_state: jax.Array
-    """(N, S) evader, quaternion wxyz, velocity, body x, body z axis, t/T x 4 [, position] [,
-    evader's speed and capture radius] [, history]
+    """(N, S) evader, quaternion wxyz, velocity, body x, body z axis, t/T x 4 [,
+    position] [, evader's speed and capture radius] [, history]
     """
     others: jax.Array
-    """(N, N - 1, O) other pursuers: relative position [, relative velocity, body z axis]"""
+    """(N, N - 1, O) other pursuers: relative position [, relative velocity, body z
+    axis]
+    """
     pillars: jax.Array
-    """(N, k, 5) nearest pillars: position relative to their centre (3), height, radius"""
+    """(N, k, 5) nearest pillars: position relative to their centre (3), height,
+    radius
+    """
     pillar_seen: jax.Array
     """(N, k) bool, slots in use"""
     privileged: jax.Array
-    """(N, Q) true relative evader position, its velocity, own position, seen [, own velocity,
-    vehicle]
+    """(N, Q) true relative evader position, its velocity, own position, seen [, own
+    velocity, vehicle]
     """
     position: jax.Array
     """(N, 3) own positions, to express predicted positions relative to them"""
@@ -48,8 +62,8 @@ class Observation:
     frames: jax.Array
     """(n, F) history for the predictor, oldest first"""
     heading: jax.Array | None = None
-    """(N, 2) cosine and sine of the yaw by which each pursuer's vectors are turned back, all but
-    `position`; None: by none
+    """(N, 2) cosine and sine of the yaw by which each pursuer's vectors are turned
+    back, all but `position`; None: by none
     """
     active: jax.Array | None = None
     """(N,) bool, slots of pursuers in use, the others observe zeros; None: all are"""
@@ -65,8 +79,8 @@ def frame(
     velocity: Vector,
     is_seen: Flag,
 ) -> Float[Array, " frame"]:
-    """(F,) one frame of the predictor's history: t/T, evader position and velocity (-5 where
-    unseen), pursuers. Without `observe_time` t/T stays zero.
+    """(F,) one frame of the predictor's history: t/T, evader position and velocity (-5
+    where unseen), pursuers. Without `observe_time` t/T stays zero.
     """
     elapsed = step if settings.observe_time else jnp.zeros_like(step)
     time = elapsed.astype(jnp.float32)[None] / settings.episode_length
@@ -77,11 +91,13 @@ def frame(
 def frame_pursuers(
     settings: PursuitSettings, position: Team, evader: Vector, active: Which | None
 ) -> Float[Array, "kept 3"]:
-    """(M, 3) m, what a frame of the history holds of pursuers at (N, 3): all of them, or two.
+    """(M, 3) m, what a frame of the history holds of pursuers at (N, 3): all of them,
+    or two.
 
-    Pooled, these are the nearest one's place relative to the evader, as far as one knows where that
-    is, and the sum of all such places, each divided by its squared distance: whence evaders that
-    flee feel pressed. `active` (N,) says which slots are in use.
+    Pooled, these are the nearest one's place relative to the evader, as far as one
+    knows where that is, and the sum of all such places, each divided by its squared
+    distance: whence evaders that flee feel pressed. `active` (N,) says which slots are
+    in use.
     """
     if settings.history_pursuers == "each":
         return position
@@ -99,16 +115,20 @@ def frame_pursuers(
 def own_frame(
     quaternion: Quaternions, velocity: Team, action: Actions
 ) -> Float[Array, "drones own_frame"]:
-    """(N, OWN_FRAME) what N pursuers remember of a moment: (N, 3) velocity, body x and z axes, the
-    action before it.
+    """(N, OWN_FRAME) what N pursuers remember of a moment: (N, 3) velocity, body x and
+    z axes, the action before it.
     """
     return jnp.concatenate([velocity, *rotation_axes(quaternion), action], axis=-1)
 
 
-def observe(settings: PursuitSettings, state: PursuitState, seen_drones: DroneState) -> Observation:
-    """The observation of all N pursuers in `state`; the evader seen by one is seen by all.
+def observe(
+    settings: PursuitSettings, state: PursuitState, seen_drones: DroneState
+) -> Observation:
+    """The observation of all N pursuers in `state`; the evader seen by one is seen by
+    all.
 
-    `seen_drones` is what sensors tell of `state.drones`; only the critic sees these themselves.
+    `seen_drones` is what sensors tell of `state.drones`; only the critic sees these
+    themselves.
     """
     n = settings.num_pursuers
     task = state.task
@@ -117,9 +137,13 @@ def observe(settings: PursuitSettings, state: PursuitState, seen_drones: DroneSt
     turned = functools.partial(turned_back, heading)
 
     def of_others(values):
-        """(N, N - 1, ...) of (N, ...): for each pursuer the values of all but itself."""
+        """(N, N - 1, ...) of (N, ...): for each pursuer the values of all but
+        itself.
+        """
         # slices and no index: the gradient of an index is a scatter
-        return jnp.stack([jnp.concatenate([values[:i], values[i + 1 :]]) for i in range(n)])
+        return jnp.stack(
+            [jnp.concatenate([values[:i], values[i + 1 :]]) for i in range(n)]
+        )
 
     others = turned(position[:, None] - of_others(position))
     active = state.active
@@ -172,13 +196,15 @@ def _own_part(settings, state, seen_drones, turned):
         parts.append(turned(position))
     if settings.observe_game:
         speed = evader_speed(settings, state.task) / settings.max_speed
-        numbers = jnp.stack([speed, capture_radius(settings, state.task)]).astype(jnp.float32)
+        numbers = jnp.stack([speed, capture_radius(settings, state.task)]).astype(
+            jnp.float32
+        )
         parts.append(jnp.broadcast_to(numbers, (len(position), 2)))
     if settings.observe_history:
         spacing = settings.observe_history_spacing
         history = jnp.moveaxis(state.own_history[spacing - 1 :: spacing], 0, 1)
-        # the past is seen in today's axes: velocity, body x and z axes are vectors, the command is
-        # none
+        # the past is seen in today's axes: velocity, body x and z axes are vectors, the
+        # command is none
         vectors = [turned(history[..., i : i + 3]) for i in (0, 3, 6)]
         history = jnp.concatenate([*vectors, history[..., 9:]], axis=-1)
         parts.append(history.reshape(len(position), -1))
@@ -207,8 +233,8 @@ def _privileged_part(settings, state, turned):
 def _quaternion(body_x, body_z):
     """Unit quaternions (N, 4) wxyz, w > 0, of attitudes with these body axes (N, 3)."""
     body_y = jnp.cross(body_z, body_x)
-    # the branch of the formula for w away from zero: upright axes have no half turn about the
-    # vertical, and what has tipped over has crashed
+    # the branch of the formula for w away from zero: upright axes have no half turn
+    # about the vertical, and what has tipped over has crashed
     trace = body_x[:, 0] + body_y[:, 1] + body_z[:, 2]
     w = 0.5 * jnp.sqrt(jnp.maximum(1.0 + trace, 1e-3))
     x = body_y[:, 2] - body_z[:, 1]
@@ -218,19 +244,25 @@ def _quaternion(body_x, body_z):
 
 
 def _nearest_pillars(settings, position, pillar_position, pillar_active):
-    """The k nearest active pillars of each pursuer: (N, k, 5) features, and (N, k) in use."""
+    """The k nearest active pillars of each pursuer: (N, k, 5) features, and (N, k) in
+    use.
+    """
     n = settings.num_pursuers
     k = settings.observed_pillars
     slots = pillar_position.shape[0]
     # a network has inputs for k pillars, a task may have fewer slots
     if slots < k:
-        pillar_position = jnp.concatenate([pillar_position, jnp.zeros((k - slots, 2), jnp.float32)])
+        pillar_position = jnp.concatenate(
+            [pillar_position, jnp.zeros((k - slots, 2), jnp.float32)]
+        )
         pillar_active = jnp.concatenate([pillar_active, jnp.zeros(k - slots, bool)])
     distance = pillar_distance(settings, position, pillar_position)
     distance = jnp.where(pillar_active[None], distance, jnp.inf)
-    # rank by counting nearer ones: for a handful of pillars much cheaper on an accelerator than a
-    # sort
-    earlier = jnp.arange(distance.shape[1])[:, None] < jnp.arange(distance.shape[1])[None]
+    # rank by counting nearer ones: for a handful of pillars much cheaper on an
+    # accelerator than a sort
+    earlier = (
+        jnp.arange(distance.shape[1])[:, None] < jnp.arange(distance.shape[1])[None]
+    )
     nearer = (distance[:, :, None] < distance[:, None, :]) | (
         (distance[:, :, None] == distance[:, None, :]) & earlier[None]
     )
@@ -242,7 +274,9 @@ def _nearest_pillars(settings, position, pillar_position, pillar_active):
         [
             position[:, None, :2] - axis,
             # a pillar's centre is at half of its height
-            jnp.broadcast_to(position[:, None, 2:] - settings.arena_height / 2, (n, k, 1)),
+            jnp.broadcast_to(
+                position[:, None, 2:] - settings.arena_height / 2, (n, k, 1)
+            ),
             jnp.full((n, k, 1), settings.arena_height, jnp.float32),
             jnp.full((n, k, 1), settings.pillar_radius, jnp.float32),
         ],

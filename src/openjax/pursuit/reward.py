@@ -1,6 +1,8 @@
-"""The reward: terms with weights, those of the paper's section IV-A and what was added to them.
+"""The reward: terms with weights, those of the paper's section IV-A and what was added
+to them.
 
-A term of one's own is a function of a `Transition`; `Pursuit(settings, reward=(...))` takes it.
+A term of one's own is a function of a `Transition`; `Pursuit(settings, reward=(...))`
+takes it.
 """
 
 import functools
@@ -16,7 +18,16 @@ from openjax.pursuit.axes import rotation_axes
 from openjax.pursuit.collisions import breaches, crashed
 from openjax.pursuit.info import StepInfo
 from openjax.pursuit.settings import PursuitSettings, RewardSettings
-from openjax.pursuit.shapes import Active, Each, Flag, Pillars, Scalar, Team, Vector, Which
+from openjax.pursuit.shapes import (
+    Active,
+    Each,
+    Flag,
+    Pillars,
+    Scalar,
+    Team,
+    Vector,
+    Which,
+)
 from openjax.pursuit.shortest_paths import evader_territory, path_length
 from openjax.pursuit.state import PursuitState
 from openjax.pursuit.teams import of_team
@@ -26,8 +37,9 @@ OVER_SPEED = 1.01
 
 
 FREE = 1.0
-"""Seconds for which an evader has to be free before another capture of it counts: to let go of it
-for as long costs more than a capture pays, at the default weights and a `recapture` below 600.
+"""Seconds for which an evader has to be free before another capture of it counts: to
+let go of it for as long costs more than a capture pays, at the default weights and a
+`recapture` below 600.
 """
 
 
@@ -38,16 +50,16 @@ def captures(
     in_sight: Which,
     radius: float | Scalar | None = None,
 ) -> Which:
-    """(N,) whether each pursuer has the evader within the capture radius, with a clear line of
-    sight; `radius` () m goes before the settings' one.
+    """(N,) whether each pursuer has the evader within the capture radius, with a clear
+    line of sight; `radius` () m goes before the settings' one.
     """
     radius = settings.capture_radius if radius is None else radius
     return in_sight & (jnp.sum((position - evader) ** 2, axis=-1) < radius**2)
 
 
 def over_speed(settings: PursuitSettings, velocity: Team) -> Which:
-    """(N,) whether each pursuer of (N, 3) velocities is faster than 1.01 times the maximal
-    speed.
+    """(N,) whether each pursuer of (N, 3) velocities is faster than 1.01 times the
+    maximal speed.
     """
     return jnp.sum(velocity**2, axis=-1) > (OVER_SPEED * settings.max_speed) ** 2
 
@@ -81,15 +93,18 @@ class Term:
 
 
 def total_reward(terms: tuple[Term, ...], transition: Transition) -> tuple[Each, Each]:
-    """(N,) reward of each pursuer, the sum of the terms in their order, penalties last; and (N,)
-    the sum of its penalties. Empty slots have none.
+    """(N,) reward of each pursuer, the sum of the terms in their order, penalties last;
+    and (N,) the sum of its penalties. Empty slots have none.
     """
-    # penalties apart, as a training may let them grow; always in one order, which rounds alike
+    # penalties apart, as a training may let them grow; always in one order, which
+    # rounds alike
     nothing = jnp.zeros(transition.settings.num_pursuers, jnp.float32)
 
     def total(is_penalty):
         values = [
-            term.weight * term.function(transition) for term in terms if term.penalty == is_penalty
+            term.weight * term.function(transition)
+            for term in terms
+            if term.penalty == is_penalty
         ]
         return functools.reduce(operator.add, values) if values else nothing
 
@@ -101,10 +116,11 @@ def total_reward(terms: tuple[Term, ...], transition: Transition) -> tuple[Each,
 def default_reward(weights: RewardSettings) -> tuple[Term, ...]:
     """The game's own terms, those that have a weight.
 
-    A capture by any rewards all; distance to the evader, breaches, speed, crashes and the change of
-    the squashed command count for each.
+    A capture by any rewards all; distance to the evader, breaches, speed, crashes and
+    the change of the squashed command count for each.
     """
-    # the order stays: sums of floats depend on it, and first updates are compared to the bit
+    # the order stays: sums of floats depend on it, and first updates are compared to
+    # the bit
     terms = (
         Term(captured, weights.capture),
         Term(evader_distance, -weights.distance),
@@ -156,7 +172,9 @@ def evader_path(transition: Transition) -> Each:
 
 
 def territory(transition: Transition) -> Scalar:
-    """() share of the arena that the evader can be at before any pursuer has it in reach."""
+    """() share of the arena that the evader can be at before any pursuer has it in
+    reach.
+    """
     state = transition.state
     position = state.drones.position
     return evader_territory(
@@ -170,7 +188,9 @@ def unseen(transition: Transition) -> Flag:
 
 
 def recapture(transition: Transition) -> Flag:
-    """() whether this is a later capture, of an evader that was free for `FREE` seconds."""
+    """() whether this is a later capture, of an evader that was free for `FREE`
+    seconds.
+    """
     before = transition.before.statistics
     was_free = before.free_steps * transition.settings.time_step >= FREE
     return captured(transition) & before.captured & was_free
@@ -184,14 +204,18 @@ def steadiness(transition: Transition) -> Each:
 
 
 def breach_number(transition: Transition) -> Each:
-    """(N,) breaches of safety distances and bounds, early by the reward's margin and lookahead."""
+    """(N,) breaches of safety distances and bounds, early by the reward's margin and
+    lookahead.
+    """
     settings = transition.settings
     weights = settings.reward
     drones = transition.state.drones
     pillars, pillar_active = transition.pillars
     breach = transition.info.breaches
     if weights.margin != 0.0:
-        breach = breaches(settings, drones.position, pillars, pillar_active, weights.margin)
+        breach = breaches(
+            settings, drones.position, pillars, pillar_active, weights.margin
+        )
     if weights.lookahead != 0.0:
         ahead = drones.position + weights.lookahead * drones.velocity
         soon = breaches(settings, ahead, pillars, pillar_active)
@@ -206,8 +230,8 @@ def speeding(transition: Transition) -> Which:
 
 
 def crashing(transition: Transition) -> Which:
-    """(N,) whether each touches something or tips over, early by the reward's margin and
-    lookahead.
+    """(N,) whether each touches something or tips over, early by the reward's margin
+    and lookahead.
     """
     settings = transition.settings
     weights = settings.reward
@@ -226,5 +250,7 @@ def crashing(transition: Transition) -> Which:
 
 
 def first_crash(transition: Transition) -> Which:
-    """(N,) whether each crashes now, in an episode without a crash before; never early."""
+    """(N,) whether each crashes now, in an episode without a crash before; never
+    early.
+    """
     return transition.info.crashed & ~transition.before.statistics.crashed

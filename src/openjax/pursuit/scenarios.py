@@ -37,13 +37,16 @@ def _layout(name, pillars, pursuers, evader):
     def lift(xy):
         return (*xy, FLIGHT_HEIGHT)
 
-    return Scenario(name, tuple(pillars), tuple(lift(xy) for xy in pursuers), lift(evader))
+    return Scenario(
+        name, tuple(pillars), tuple(lift(xy) for xy in pursuers), lift(evader)
+    )
 
 
 # The starts of the layouts "empty" and "hidden", close together on the right.
 _RIGHT = ((0.6, 0.0), (0.8, 0.0), (0.8, -0.2))
 
-# The first five are the released code's; in "hidden" nobody sees the evader at the start.
+# The first five are the released code's; in "hidden" nobody sees the evader at the
+# start.
 SCENARIOS: dict[str, Scenario] = {
     layout.name: layout
     for layout in (
@@ -61,13 +64,27 @@ SCENARIOS: dict[str, Scenario] = {
         ),
         _layout(
             "random",
-            ((0.6, 0.4), (-0.6, 0.4), (-0.2, 0.4), (0.0, 0.2), (-0.2, -0.4), (0.0, -0.2)),
+            (
+                (0.6, 0.4),
+                (-0.6, 0.4),
+                (-0.2, 0.4),
+                (0.0, 0.2),
+                (-0.2, -0.4),
+                (0.0, -0.2),
+            ),
             ((0.6, 0.0), (0.8, 0.0), (0.8, -0.2)),
             (-0.8, 0.0),
         ),
         _layout(
             "passage",
-            ((0.0, 0.3), (0.2, 0.3), (-0.2, 0.3), (0.0, -0.2), (0.2, -0.2), (-0.2, -0.2)),
+            (
+                (0.0, 0.3),
+                (0.2, 0.3),
+                (-0.2, 0.3),
+                (0.0, -0.2),
+                (0.2, -0.2),
+                (-0.2, -0.2),
+            ),
             ((0.6, 0.0), (0.8, 0.2), (0.8, -0.2)),
             (0.0, 0.6),
         ),
@@ -112,12 +129,12 @@ def scenario_task(settings: PursuitSettings, scenario: Scenario) -> Task:
 def find_scenario(name_or_path: str, settings: PursuitSettings) -> Scenario:
     """A scenario by its name, or read from a TOML file.
 
-    The file holds `pillars` (list of [x, y]), `pursuers` (list of [x, y, z]) and `evader` ([x, y,
-    z]), in metres, and optionally a `name`.
+    The file holds `pillars` (list of [x, y]), `pursuers` (list of [x, y, z]) and
+    `evader` ([x, y, z]), in metres, and optionally a `name`.
 
     Raises:
-      UserError: no such name or file, a wrong entry, a pillar outside the arena or over a start, a
-      start outside.
+      UserError: no such name or file, a wrong entry, a pillar outside the arena or over
+      a start, a start outside.
     """
     if name_or_path in SCENARIOS:
         return SCENARIOS[name_or_path]
@@ -144,7 +161,8 @@ def _faults(layout: Scenario, settings: PursuitSettings) -> list[str]:
         *((f"pursuer {i + 1}", p) for i, p in enumerate(pursuers)),
         ("the evader", layout.evader),
     ]
-    # where a drone would stand inside the pillar; a start that only breaches is a fair task
+    # where a drone would stand inside the pillar; a start that only breaches is a fair
+    # task
     reach = settings.pillar_radius + DRONE_RADIUS
     faults = []
     if not 1 <= len(pursuers) <= 8:

@@ -1,4 +1,6 @@
-"""Who sees the evader: line of sight past the pillars, within range and cone; a team shares it."""
+"""Who sees the evader: line of sight past the pillars, within range and cone; a team
+shares it.
+"""
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,11 +17,11 @@ def line_of_sight(
     pillar_position: Pillars,
     pillar_active: Active,
 ) -> Bool[Array, " places"]:
-    """(N,) whether the segment from each (N, 3) position to the (3,) target is clear of pillars,
-    seen from above.
+    """(N,) whether the segment from each (N, 3) position to the (3,) target is clear of
+    pillars, seen from above.
 
-    A pillar blocks it if its axis is closer to the segment than its radius and the foot point lies
-    on the segment.
+    A pillar blocks it if its axis is closer to the segment than its radius and the foot
+    point lies on the segment.
     """
     square, between = _from_axes(position, target, pillar_position, pillar_active)
     return ~jnp.any(between & (square < settings.pillar_radius**2), axis=-1)
@@ -32,8 +34,9 @@ def sight_room(
     pillar_position: Pillars,
     pillar_active: Active,
 ) -> Float[Array, " places"]:
-    """(N,) m, how far the segment from each (N, 3) position to the (3,) target passes the surface
-    of the pillars between them: negative where it is blocked, a pillar's radius at most.
+    """(N,) m, how far the segment from each (N, 3) position to the (3,) target passes
+    the surface of the pillars between them: negative where it is blocked, a pillar's
+    radius at most.
     """
     square, between = _from_axes(position, target, pillar_position, pillar_active)
     # the small number keeps the root's gradient finite on a pillar's axis
@@ -42,8 +45,9 @@ def sight_room(
 
 
 def _from_axes(position, target, pillar_position, pillar_active):
-    """(N, P) m², squares of how far pillars' axes are from the lines to the target, from above:
-    pillars are as high as the arena; (N, P) which of the pillars stand between.
+    """(N, P) m², squares of how far pillars' axes are from the lines to the target,
+    from above: pillars are as high as the arena; (N, P) which of the pillars stand
+    between.
     """
     start = position[:, None, :2]
     segment = target[None, None, :2] - start
@@ -61,12 +65,16 @@ def within_view(
     ahead: Float[Array, "places 3"],
     target: Vector,
 ) -> Bool[Array, " places"]:
-    """(N,) whether the (3,) target is within `sight_range` of each (N, 3) position and within the
-    cone of `sight_angle` about each axis (N, 3), of length one.
+    """(N,) whether the (3,) target is within `sight_range` of each (N, 3) position and
+    within the cone of `sight_angle` about each axis (N, 3), of length one.
     """
     offset = target - position
     distance = jnp.sqrt(jnp.sum(offset**2, axis=-1) + 1e-12)
     # a whole turn is everywhere, what lies exactly behind included
-    least = np.cos(np.deg2rad(settings.sight_angle) / 2) if settings.sight_angle < 360.0 else -2.0
+    least = (
+        np.cos(np.deg2rad(settings.sight_angle) / 2)
+        if settings.sight_angle < 360.0
+        else -2.0
+    )
     in_cone = jnp.sum(offset * ahead, axis=-1) >= least * distance
     return (distance <= settings.sight_range) & in_cone

@@ -10,7 +10,9 @@ from openjax.ranges import Interval, check_intervals
 from openjax.vehicle.arena import Arena
 
 HIDDEN = -5.0
-"""What stands in an observation for something that isn't seen (the paper's marker value)."""
+"""What stands in an observation for something that isn't seen (the paper's marker
+value).
+"""
 
 OWN_FRAME = 13
 """Numbers in a frame of the own history: velocity, body x and z axes, command."""
@@ -21,38 +23,41 @@ LAYOUT_PURSUERS = 3
 
 @dataclass(frozen=True)
 class RewardSettings:
-    """Weights of the reward. Paper, section IV-A; the speed penalty is the released code's, at the
-    collision's weight.
+    """Weights of the reward. Paper, section IV-A; the speed penalty is the released
+    code's, at the collision's weight.
     """
 
     capture: Annotated[float, Interval("[0, 1e6]")] = 6.0
     """To every pursuer, in each step in which any pursuer captures."""
     first_capture: Annotated[float, Interval("[0, 1e6]")] = 0.0
-    """To every pursuer, once, at an episode's first capture: where the evader gets away again, a
-    step in reach of it is worth less than closing in costs (not in the paper).
+    """To every pursuer, once, at an episode's first capture: where the evader gets away
+    again, a step in reach of it is worth less than closing in costs (not in the paper).
     """
     recapture: Annotated[float, Interval("[0, 1e6]")] = 0.0
-    """The same for each later capture of an evader that was free for a second: most steps of a
-    training come after a capture, and who can't tell learns that there is little to win (not in the
-    paper).
+    """The same for each later capture of an evader that was free for a second: most
+    steps of a training come after a capture, and who can't tell learns that there is
+    little to win (not in the paper).
     """
     distance: Annotated[float, Interval("[0, 1e6]")] = 0.1
     """Subtracted per metre between pursuer and evader."""
     nearest: Annotated[float, Interval("[0, 1e6]")] = 0.0
-    """Subtracted, of all pursuers, per metre between the evader and the nearest of them: who isn't
-    the nearest loses nothing by going round (not in the paper).
+    """Subtracted, of all pursuers, per metre between the evader and the nearest of
+    them: who isn't the nearest loses nothing by going round (not in the paper).
     """
     path: Annotated[float, Interval("[0, 1e6]")] = 0.0
-    """Subtracted per metre of the shortest path round the pillars between pursuer and evader: who
-    minds the straight line alone waits behind a wall, opposite to the evader (not in the paper).
+    """Subtracted per metre of the shortest path round the pillars between pursuer and
+    evader: who minds the straight line alone waits behind a wall, opposite to the
+    evader (not in the paper).
     """
     territory: Annotated[float, Interval("[0, 1e6]")] = 0.0
-    """Subtracted, of all pursuers, times the share of the arena that the evader can be at before
-    any of them: who comes from the other side takes some of it away (not in the paper).
+    """Subtracted, of all pursuers, times the share of the arena that the evader can be
+    at before any of them: who comes from the other side takes some of it away (not in
+    the paper).
     """
     unseen: Annotated[float, Interval("[0, 1e6]")] = 0.0
-    """Subtracted, of all pursuers, in each step in which nobody sees the evader: in a notch between
-    two pillars it is safe from a team that waits all round and doesn't look in (not in the paper).
+    """Subtracted, of all pursuers, in each step in which nobody sees the evader: in a
+    notch between two pillars it is safe from a team that waits all round and doesn't
+    look in (not in the paper).
     """
     collision: Annotated[float, Interval("[0, 1e6]")] = 10.0
     """Subtracted per breach of a safety distance or an arena bound."""
@@ -61,21 +66,21 @@ class RewardSettings:
     smoothness: Annotated[float, Interval("[0, 1e6]")] = 0.0
     """Weight of `exp(-|a_t - a_{t-1}|)`; 2.0 in the paper's second stage."""
     crash: Annotated[float, Interval("[0, 1e6]")] = 0.0
-    """Subtracted in each step in which a pursuer touches something solid or tips over (not in the
-    paper).
+    """Subtracted in each step in which a pursuer touches something solid or tips over
+    (not in the paper).
     """
     first_crash: Annotated[float, Interval("[0, 1e6]")] = 0.0
-    """Subtracted once, of the pursuers that crash first in an episode, and not early by margin or
-    lookahead: while they count a start close to a pillar as a crash anyhow, nothing else would be
-    lost by touching it (not in the paper).
+    """Subtracted once, of the pursuers that crash first in an episode, and not early by
+    margin or lookahead: while they count a start close to a pillar as a crash anyhow,
+    nothing else would be lost by touching it (not in the paper).
     """
     margin: Annotated[float, Interval("[0, 1]")] = 0.0
-    """The reward counts breaches, floor and tilt (as a cosine) this much early; the metrics don't
-    (m; not in the paper).
+    """The reward counts breaches, floor and tilt (as a cosine) this much early; the
+    metrics don't (m; not in the paper).
     """
     lookahead: Annotated[float, Interval("[0, 10]")] = 0.0
-    """The reward also counts the breaches that come within this time at the present velocities (s;
-    not in the paper).
+    """The reward also counts the breaches that come within this time at the present
+    velocities (s; not in the paper).
     """
 
     def __post_init__(self):
@@ -89,15 +94,17 @@ class RewardSettings:
 
 @dataclass(frozen=True)
 class PursuitSettings:
-    """The pursuit-evasion game. Lengths in metres, times in seconds; numbers of the paper unless
-    said otherwise.
+    """The pursuit-evasion game. Lengths in metres, times in seconds; numbers of the
+    paper unless said otherwise.
     """
 
     num_pursuers: Annotated[int, Interval("[1, 8]")] = 3
-    """Number of pursuing quadrotors, 1 to 8; with `team_sizes` the number of slots for them."""
+    """Number of pursuing quadrotors, 1 to 8; with `team_sizes` the number of slots for
+    them.
+    """
     team_sizes: Annotated[tuple[int, ...], Interval("[1, 8]")] = ()
-    """Sizes of teams, one of which is drawn for each uniform task with equal odds; the other slots
-    for pursuers stay empty. Empty: all are in use.
+    """Sizes of teams, one of which is drawn for each uniform task with equal odds; the
+    other slots for pursuers stay empty. Empty: all are in use.
     """
     min_pillars: Annotated[int, Interval("[0, 32]")] = 4
     """Fewest pillars of a uniform task."""
@@ -114,45 +121,52 @@ class PursuitSettings:
     evader_speed: Annotated[float, Interval("(0, 100]")] = 1.3
     """Speed of the evader (m/s)."""
     evader_speeds: Annotated[tuple[float, ...], Interval("(0, 100]")] = ()
-    """Lowest and highest speed of the evader (m/s), between which that of each uniform task is
-    drawn, in place of `evader_speed`; empty: none is drawn.
+    """Lowest and highest speed of the evader (m/s), between which that of each uniform
+    task is drawn, in place of `evader_speed`; empty: none is drawn.
     """
     fall_outs: Annotated[float, Interval("[0, 1]")] = 0.0
-    """Share of the episodes of two or more pursuers in which one of them falls out, and is gone."""
+    """Share of the episodes of two or more pursuers in which one of them falls out, and
+    is gone.
+    """
     fall_out_seconds: Annotated[tuple[float, ...], Interval("[0, 1000]")] = (0.5, 4.0)
     """Earliest and latest time at which a pursuer falls out (s)."""
     capture_radii: Annotated[tuple[float, ...], Interval("(0, 10]")] = ()
-    """Smallest and largest capture radius (m), the same in place of `capture_radius`."""
+    """Smallest and largest capture radius (m), the same in place of
+    `capture_radius`.
+    """
     sight_range: Annotated[float, Interval("(0, 1000]")] = 1000.0
-    """Distance (m) up to which a pursuer sees the evader, if no pillar is between (not in the
-    paper). It limits neither captures nor what the evader sees.
+    """Distance (m) up to which a pursuer sees the evader, if no pillar is between (not
+    in the paper). It limits neither captures nor what the evader sees.
     """
     sight_angle: Annotated[float, Interval("(0, 360]")] = 360.0
-    """Angle (degrees) by which the cone opens about a pursuer's body x axis in which it sees the
-    evader, if no pillar is between (not in the paper). It limits neither captures nor what the
-    evader sees.
+    """Angle (degrees) by which the cone opens about a pursuer's body x axis in which it
+    sees the evader, if no pillar is between (not in the paper). It limits neither
+    captures nor what the evader sees.
     """
     evader_norm: Literal["euclidean", "axis"] = "euclidean"
-    """How the evader's force becomes a velocity; "axis" normalises by the largest component (up to
-    3**0.5 faster).
+    """How the evader's force becomes a velocity; "axis" normalises by the largest
+    component (up to 3**0.5 faster).
     """
     evaders: tuple[str, ...] = ("field",)
-    """Evaders, one of which is drawn for each episode with equal odds; a name that comes twice is
-    drawn twice as often. "field" is the paper's; each "learned" is a network of its own, which
-    learns while the pursuers do; see `openjax.pursuit.evaders`.
+    """Evaders, one of which is drawn for each episode with equal odds; a name that
+    comes twice is drawn twice as often. "field" is the paper's; each "learned" is a
+    network of its own, which learns while the pursuers do; see
+    `openjax.pursuit.evaders`.
     """
     max_speed: Annotated[float, Interval("(0, 100]")] = 1.0
     """Maximal speed of a pursuer (m/s)."""
     speed_limit: Literal["clamp", "none"] = "clamp"
-    """"clamp": the velocity's norm is cut after each step, as in the paper's simulator; "none":
-    honest physics.
+    """"clamp": the velocity's norm is cut after each step, as in the paper's simulator;
+    "none": honest physics.
     """
     pillar_clearance: Annotated[float, Interval("[0, 10]")] = 0.07
     """A drone's centre closer than this to a pillar's surface is a collision."""
     drone_clearance: Annotated[float, Interval("[0, 10]")] = 0.14
     """Two drones' centres closer than this are a collision."""
     start_attitude: Literal["drawn", "level"] = "drawn"
-    """"drawn": roll, pitch within 36 degrees, yaw in 0 to 36 degrees; "level": identity."""
+    """"drawn": roll, pitch within 36 degrees, yaw in 0 to 36 degrees; "level":
+    identity.
+    """
     episode_length: Annotated[int, Interval("[1, 100000]")] = 800
     """Control steps per episode."""
     time_step: Annotated[float, Interval("[0.0001, 0.1]")] = 0.01
@@ -160,44 +174,47 @@ class PursuitSettings:
     substeps: Annotated[int, Interval("[1, 100]")] = 1
     """Physics (and rate controller) steps per control step."""
     physics: Literal["rigid", "mjx", "stops"] = "rigid"
-    """"rigid": MuJoCo's equations written out, contacts included; "mjx": MuJoCo MJX, the reference,
-    many times slower; "stops": free flight, and drones are put back out of floor, pillars and one
-    another once per control step.
+    """"rigid": MuJoCo's equations written out, contacts included; "mjx": MuJoCo MJX,
+    the reference, many times slower; "stops": free flight, and drones are put back out
+    of floor, pillars and one another once per control step.
     """
     contacts: bool = True
-    """Floor, pillars and other drones are solid; False: free flight, in which nothing is
-    touched.
+    """Floor, pillars and other drones are solid; False: free flight, in which nothing
+    is touched.
     """
     airframe: str = "crazyflie"
-    """The nominal vehicle: "crazyflie" is the Crazyflie 2.1, "brushless" the Crazyflie 2.1
-    Brushless; others after `openjax.vehicle.register_airframe`.
+    """The nominal vehicle: "crazyflie" is the Crazyflie 2.1, "brushless" the Crazyflie
+    2.1 Brushless; others after `openjax.vehicle.register_airframe`.
     """
     vehicles: tuple[tuple[str, float, float, float, float], ...] = ()
-    """Family from which every pursuer's vehicle is drawn in each episode: parameters of effects
-    (`motor_lag.extra_up`), each with its range and the wider range of the rare; see
-    `openjax.vehicle.family`. Empty: the nominal vehicle.
+    """Family from which every pursuer's vehicle is drawn in each episode: parameters of
+    effects (`motor_lag.extra_up`), each with its range and the wider range of the rare;
+    see `openjax.vehicle.family`. Empty: the nominal vehicle.
     """
     rare_vehicles: Annotated[float, Interval("[0, 1]")] = 0.0
     """Share of the vehicles of which one effect is drawn from its wider range."""
     observed_pillars: Annotated[int, Interval("[1, 32]")] = 3
     """Nearest pillars that a pursuer observes."""
     observe_time: bool = True
-    """Observe t/T; then the end of an episode is terminal, otherwise it is a truncation."""
+    """Observe t/T; then the end of an episode is terminal, otherwise it is a
+    truncation.
+    """
     observe_position: bool = False
-    """Also observe the own position in the arena (not in the paper, where the arena's bounds stay
-    unseen).
+    """Also observe the own position in the arena (not in the paper, where the arena's
+    bounds stay unseen).
     """
     observe_game: bool = False
-    """Also observe the evader's speed, as a multiple of the pursuers', and the capture radius in m
-    (not in the paper, where both are the same in all games).
+    """Also observe the evader's speed, as a multiple of the pursuers', and the capture
+    radius in m (not in the paper, where both are the same in all games).
     """
     observe_in: Literal["world", "heading"] = "world"
-    """Axes of what a pursuer observes. "heading": its own, but upright: a game turned about the
-    arena's axis looks the same, at any yaw (not in the paper).
+    """Axes of what a pursuer observes. "heading": its own, but upright: a game turned
+    about the arena's axis looks the same, at any yaw (not in the paper).
     """
     observe_history: Annotated[int, Interval("[0, 1000]")] = 0
-    """Also observe this many of the last frames of the own velocity, attitude and command (not in
-    the paper): they show how this vehicle answers, and which commands are still on their way.
+    """Also observe this many of the last frames of the own velocity, attitude and
+    command (not in the paper): they show how this vehicle answers, and which commands
+    are still on their way.
     """
     observe_history_spacing: Annotated[int, Interval("[1, 1000]")] = 1
     """Control steps between two of these frames."""
@@ -206,8 +223,8 @@ class PursuitSettings:
     history_spacing: Annotated[int, Interval("[1, 1000]")] = 1
     """Control steps between two frames of the history."""
     history_pursuers: Literal["each", "pooled"] = "each"
-    """What these frames hold of the pursuers. "each": all positions, as in the paper; "pooled":
-    where the nearest one is and whence all press, for teams of any size.
+    """What these frames hold of the pursuers. "each": all positions, as in the paper;
+    "pooled": where the nearest one is and whence all press, for teams of any size.
     """
     reward: RewardSettings = field(default_factory=RewardSettings)
 
@@ -223,7 +240,8 @@ class PursuitSettings:
             # only here: it knows the effects, which are written in JAX
             from openjax.vehicle.family import checked_ranges
 
-            # files and Python hand in plain tuples; from here on their numbers have names
+            # files and Python hand in plain tuples; from here on their numbers have
+            # names
             object.__setattr__(self, "vehicles", checked_ranges(self.vehicles))
         check_evaders(self.evaders)
 
@@ -258,7 +276,9 @@ class PursuitSettings:
                 )
 
     def of_one_team(self, number: int) -> "PursuitSettings":
-        """The same game with one size of team, one speed of the evader and one capture radius."""
+        """The same game with one size of team, one speed of the evader and one capture
+        radius.
+        """
         alike = {"team_sizes": (), "evader_speeds": (), "capture_radii": ()}
         return dataclasses.replace(self, num_pursuers=number, **alike)
 
@@ -275,22 +295,26 @@ class PursuitSettings:
 
     @property
     def middle(self) -> tuple[float, float, float]:
-        """The arena's middle (m), where the evader is taken to be until it is first seen."""
+        """The arena's middle (m), where the evader is taken to be until it is first
+        seen.
+        """
         return (0.0, 0.0, self.arena_height / 2)
 
     @property
     def frame_size(self) -> int:
-        """Numbers in one frame of the history: time, evader position and velocity, pursuer
-        positions, or what is pooled of them.
+        """Numbers in one frame of the history: time, evader position and velocity,
+        pursuer positions, or what is pooled of them.
         """
         pursuers = self.num_pursuers if self.history_pursuers == "each" else 2
         return 1 + 3 + 3 + 3 * pursuers
 
     @property
     def self_size(self) -> int:
-        """Numbers of a pursuer's own part of the observation, without the predicted positions."""
-        # in the order of `Observation.self_state`: evader, quaternion, velocity, two axes, time,
-        # position, the game's numbers, history
+        """Numbers of a pursuer's own part of the observation, without the predicted
+        positions.
+        """
+        # in the order of `Observation.self_state`: evader, quaternion, velocity, two
+        # axes, time, position, the game's numbers, history
         always = 3 + 4 + 3 + 3 + 3
         time = 4 if self.observe_time else 0
         position = 3 if self.observe_position else 0
@@ -300,5 +324,6 @@ class PursuitSettings:
     @property
     def privileged_size(self) -> int:
         """Numbers of the privileged part of the observation, for the critic."""
-        # evader, its velocity, own position, seen; own velocity and vehicle where these are drawn
+        # evader, its velocity, own position, seen; own velocity and vehicle where these
+        # are drawn
         return 3 + 3 + 3 + 1 + (3 + len(self.vehicles) if self.vehicles else 0)

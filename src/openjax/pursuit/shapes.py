@@ -1,5 +1,5 @@
-"""Shapes in types: what the arrays of one world are. More worlds are a leading axis of all of them,
-mapped by `jax.vmap`.
+"""Shapes in types: what the arrays of one world are. More worlds are a leading axis of
+all of them, mapped by `jax.vmap`.
 """
 
 from jaxtyping import Array, Bool, Float, Int32

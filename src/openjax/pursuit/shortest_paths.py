@@ -1,9 +1,9 @@
-"""How far it is to the evader for who can't fly through pillars: shortest paths in the plane, by a
-visibility graph.
+"""How far it is to the evader for who can't fly through pillars: shortest paths in the
+plane, by a visibility graph.
 
-A shortest path round discs is straight but for where it bends about one. Here the discs, pillars
-with their safety distance, are polygons, and a path bends at their corners (Lozano-Perez and Wesley
-1979, An algorithm for planning collision-free paths).
+A shortest path round discs is straight but for where it bends about one. Here the
+discs, pillars with their safety distance, are polygons, and a path bends at their
+corners (Lozano-Perez and Wesley 1979, An algorithm for planning collision-free paths).
 """
 
 import jax
@@ -19,9 +19,9 @@ from openjax.pursuit.task import Task, capture_radius, evader_speed
 CORNERS = 6
 """Of the polygon about each pillar."""
 ROOM = 0.03
-"""How much farther from a pillar than the safety distance a path keeps (m). Nearer, the shares of
-crashes and breaches that a first flight counts early cost more than a path through saves: pursuers
-then stand before it.
+"""How much farther from a pillar than the safety distance a path keeps (m). Nearer, the
+shares of crashes and breaches that a first flight counts early cost more than a path
+through saves: pursuers then stand before it.
 """
 TOLL = 3.0
 """What a path through a pillar costs (m): more than any path round."""
@@ -33,12 +33,14 @@ SMOOTH = 0.1
 
 @struct.dataclass
 class ShortestPaths:
-    """The shortest paths of a task with P pillar slots, between the C = P * CORNERS corners."""
+    """The shortest paths of a task with P pillar slots, between the C = P * CORNERS
+    corners.
+    """
 
     corner: jax.Array  # (C, 2) m
     toll: jax.Array  # (C,) m
-    """Of corners that no path may pass: outside the arena, in another pillar's reach, of no
-    pillar.
+    """Of corners that no path may pass: outside the arena, in another pillar's reach,
+    of no pillar.
     """
     length: jax.Array  # (C, C) m, of the shortest path from one to another
     to_point: jax.Array  # (C, M) m, from a corner to each of `arena_points`
@@ -48,8 +50,8 @@ def shortest_paths(settings: PursuitSettings, task: Task) -> ShortestPaths:
     """All corners and the shortest paths between them."""
     reach = _reach(settings)
     angle = 2.0 * np.pi * np.arange(CORNERS) / CORNERS
-    # so far out that the edges between corners touch the circle, and a thousandth beyond: an edge
-    # on the circle itself would count as crossing it
+    # so far out that the edges between corners touch the circle, and a thousandth
+    # beyond: an edge on the circle itself would count as crossing it
     radius = 1.001 * reach / np.cos(np.pi / CORNERS)
     around = radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     corner = (task.pillar_position[:, None] + around).reshape(-1, 2)
@@ -59,7 +61,8 @@ def shortest_paths(settings: PursuitSettings, task: Task) -> ShortestPaths:
     toll = TOLL * (closed | ~jnp.repeat(task.pillar_active, CORNERS))
     direct = _straight(settings, task, corner[:, None], corner[None]) + toll
 
-    # Floyd and Warshall: after step k, the shortest paths that bend at the first k corners only
+    # Floyd and Warshall: after step k, the shortest paths that bend at the first k
+    # corners only
     def shortened(k, length):
         return jnp.minimum(length, length[:, k, None] + length[k])
 
@@ -73,12 +76,17 @@ def shortest_paths(settings: PursuitSettings, task: Task) -> ShortestPaths:
 
 
 def path_length(
-    settings: PursuitSettings, task: Task, paths: ShortestPaths, position: Team, target: Vector
+    settings: PursuitSettings,
+    task: Task,
+    paths: ShortestPaths,
+    position: Team,
+    target: Vector,
 ) -> Each:
-    """(N,) m, of the shortest path from each of (N, 3) positions to (3,) a target; its gradient
-    points along the path.
+    """(N,) m, of the shortest path from each of (N, 3) positions to (3,) a target; its
+    gradient points along the path.
     """
-    # a path's first bend is one of the corners, or the target itself, from which nothing is left
+    # a path's first bend is one of the corners, or the target itself, from which
+    # nothing is left
     from_corner = _straight(settings, task, paths.corner, target[:2])
     through_corners = jnp.min(paths.length + from_corner, axis=-1, initial=jnp.inf)
     rest = jnp.append(paths.toll + through_corners, 0.0)
@@ -86,21 +94,27 @@ def path_length(
     here = jax.lax.stop_gradient(position[:, None, :2])
     best = jnp.argmin(_straight(settings, task, here, bend) + rest, axis=-1)
 
-    # which bend is best has no gradient; how far it is has one, straight towards the bend
+    # which bend is best has no gradient; how far it is has one, straight towards the
+    # bend
     bend, rest = jax.lax.stop_gradient((bend[best], rest[best]))
-    # the small number keeps the root's gradient finite where a pursuer stands at its bend
+    # the small number keeps the root's gradient finite where a pursuer stands at its
+    # bend
     level = jnp.sqrt(jnp.sum((position[:, :2] - bend) ** 2, axis=-1) + 1e-9) + rest
     return jnp.sqrt(level**2 + (position[:, 2] - target[2]) ** 2)
 
 
-def arena_points(settings: PursuitSettings, number: int = POINTS) -> Float[Array, "points 2"]:
-    """(M, 2) m, points spread evenly over the arena: Vogel's sunflower (1979, A better way to
-    construct the sunflower head).
+def arena_points(
+    settings: PursuitSettings, number: int = POINTS
+) -> Float[Array, "points 2"]:
+    """(M, 2) m, points spread evenly over the arena: Vogel's sunflower (1979, A better
+    way to construct the sunflower head).
     """
     index = np.arange(number)
     radius = settings.arena_radius * np.sqrt((index + 0.5) / number)
     angle = index * np.pi * (3.0 - np.sqrt(5.0))
-    return jnp.asarray(radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], -1), jnp.float32)
+    return jnp.asarray(
+        radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], -1), jnp.float32
+    )
 
 
 def evader_territory(
@@ -110,14 +124,16 @@ def evader_territory(
     position: Team,
     target: Vector,
 ) -> Scalar:
-    """() share of the arena that the evader at (3,) is at before any of the pursuers at (N, 3) has
-    it within the capture radius: smooth, in the plane, and with the evader flying straight.
+    """() share of the arena that the evader at (3,) is at before any of the pursuers at
+    (N, 3) has it within the capture radius: smooth, in the plane, and with the evader
+    flying straight.
 
     Empty slots' pursuers are parked too far to count.
     """
     points = arena_points(settings)
     here = position[:, None, :2]
-    # whoever of the team is sooner at a corner is sooner wherever the path leads from there
+    # whoever of the team is sooner at a corner is sooner wherever the path leads from
+    # there
     to_corner = jnp.min(_straight(settings, task, here, paths.corner), axis=0)
     round_pillars = jnp.min(
         (to_corner + paths.toll)[:, None] + paths.to_point, axis=0, initial=jnp.inf
@@ -128,13 +144,15 @@ def evader_territory(
     evader = jnp.sqrt(jnp.sum((points - target[:2]) ** 2, axis=-1) + 1e-12)
     first = jax.nn.sigmoid((pursuers - evader / evader_speed(settings, task)) / SMOOTH)
     to_axis = jnp.sum((points[:, None] - task.pillar_position) ** 2, axis=-1)
-    inside = jnp.any((to_axis < settings.pillar_radius**2) & task.pillar_active, axis=-1)
+    inside = jnp.any(
+        (to_axis < settings.pillar_radius**2) & task.pillar_active, axis=-1
+    )
     return jnp.mean(first, where=~inside)
 
 
 def _straight(settings, task, start, end):
-    """(...,) m, from (..., 2) to (..., 2), with the toll of each pillar that is nearer on the path
-    than at both its ends.
+    """(...,) m, from (..., 2) to (..., 2), with the toll of each pillar that is nearer
+    on the path than at both its ends.
     """
     along = end - start
     square = jnp.sum(along**2, axis=-1)

@@ -24,22 +24,34 @@ class PursuitState:
     evader_position: jax.Array  # (3,) m, world
     evader_velocity: jax.Array  # (3,) m/s, world
     evader: EvaderState | None
-    """which evader it is, and its memory; None where all are the paper's, which has none"""
-    last_seen: jax.Array  # (3,) where the evader was last seen; the arena's middle before that
-    in_sight: jax.Array  # (N,) bool, between which pursuers and the evader no pillar stands
+    """which evader it is, and its memory; None where all are the paper's, which has
+    none
+    """
+    # (3,) where the evader was last seen; the arena's middle before that
+    last_seen: jax.Array
+    # (N,) bool, between which pursuers and the evader no pillar stands
+    in_sight: jax.Array
     frames: jax.Array  # (n * spacing, F) history, oldest first
     own_history: jax.Array | None
-    """(H * spacing, N, OWN_FRAME) as seen, oldest first; None where it isn't observed"""
+    """(H * spacing, N, OWN_FRAME) as seen, oldest first; None where it isn't
+    observed
+    """
     previous_action: jax.Array  # (N, 4) squashed command of the last step
     step: jax.Array  # () int32, control steps since the start
     statistics: EpisodeStatistics
     gone_after: jax.Array | None = None
-    """(N,) int32, the last step in which each pursuer is there; None: nobody falls out"""
+    """(N,) int32, the last step in which each pursuer is there; None: nobody falls
+    out
+    """
     in_view: jax.Array | None = None
-    """(N,) bool, which of those in sight have it in range and cone; None: these have no limits"""
+    """(N,) bool, which of those in sight have it in range and cone; None: these have no
+    limits
+    """
 
     paths: ShortestPaths | None = None
-    """round the task's pillars; None where no term of the settings' reward asks for them"""
+    """round the task's pillars; None where no term of the settings' reward asks for
+    them
+    """
 
     @property
     def active(self) -> Bool[Array, "*worlds drones"] | None:

@@ -63,7 +63,8 @@ def count(
     reward: Each,
     active: Which | None = None,
 ) -> EpisodeStatistics:
-    """Add one step; `step` () is its number, counted from 1, `reward` (N,) is the pursuers'.
+    """Add one step; `step` () is its number, counted from 1, `reward` (N,) is the
+    pursuers'.
 
     `active` (N,): slots in use, None: all; nothing of the others is in `info`.
     """
@@ -79,7 +80,8 @@ def count(
         capture_step=jnp.where(first, step, statistics.capture_step),
         captured=statistics.captured | captured,
         free_steps=jnp.where(captured, 0, statistics.free_steps + 1),
-        # steps, not breaches: a rate is the share of steps in which anything is breached
+        # steps, not breaches: a rate is the share of steps in which anything is
+        # breached
         collision_steps=statistics.collision_steps + any_of(breach.total),
         pillar_steps=statistics.pillar_steps + any_of(breach.pillar),
         drone_steps=statistics.drone_steps + any_of(breach.drone),

@@ -12,37 +12,47 @@ from openjax.pursuit.shapes import Flag, Quaternions, Scalar, Team
 from openjax.pursuit.teams import draw_team, of_team, parked
 
 START_X = (0.1, 0.536)
-"""Uniform tasks: pursuers start at x in this range, the evader at the mirrored one (m)."""
+"""Uniform tasks: pursuers start at x in this range, the evader at the mirrored one
+(m).
+"""
 START_Y = 0.536
-"""Uniform tasks: all start at |y| up to this (m): a corner is .76 m from the axis, inside the
-arena's .9 m.
+"""Uniform tasks: all start at |y| up to this (m): a corner is .76 m from the axis,
+inside the arena's .9 m.
 """
 START_Z = 0.1
 """Uniform tasks: |z - H/2| at the start at most (m)."""
 PILLAR_GRID = 0.2
 """Pillars of uniform tasks stand on the cells of a grid of this width (m) ..."""
 PILLAR_REACH = 0.8
-"""... whose centre is closer to the axis than this (m): a pillar then stands inside the arena."""
+"""... whose centre is closer to the axis than this (m): a pillar then stands inside the
+arena.
+"""
 ROW_OFFSET = 0.2
 """Pillars in a row: its middle is up to this far from the axis along x and y (m)."""
 ROW_SPACING = (0.2, 0.4)
-"""Pillars in a row: distance of the axes of neighbours (m), from touching ones to a way of 6 cm
-that breaches nothing.
+"""Pillars in a row: distance of the axes of neighbours (m), from touching ones to a way
+of 6 cm that breaches nothing.
 """
 EXPANSION = 0.1
-"""Local expansion moves each vehicle by up to this along each axis (m): the paper's delta."""
+"""Local expansion moves each vehicle by up to this along each axis (m): the paper's
+delta.
+"""
 WALL_DISTANCE = 0.1
-"""Local expansion keeps starts this far from the arena's wall (m): the released code's."""
+"""Local expansion keeps starts this far from the arena's wall (m): the released
+code's.
+"""
 CLOSE = 0.05
-"""Close starts are up to this much farther from a pillar or another pursuer than the safety
-distance (m).
+"""Close starts are up to this much farther from a pillar or another pursuer than the
+safety distance (m).
 """
 NEIGHBOURS = 0.75
 """Scattered pursuers start at most this far from their middle along x and y (m)."""
 OUTSIDE = 2.0
 """Where an empty slot is taken to be when tasks are told apart (m, along each axis)."""
 CANDIDATES = 8
-"""Draws of a start among which the first good one is taken; more for more than three pursuers."""
+"""Draws of a start among which the first good one is taken; more for more than three
+pursuers.
+"""
 
 
 @struct.dataclass
@@ -54,8 +64,8 @@ class Task:
     pillar_position: jax.Array  # (P, 2) m, axis of each pillar
     pillar_active: jax.Array  # (P,) bool, slots in use
     evader: jax.Array | None = None
-    """() int32, the place of its evader in the settings' `evaders`; None: it is drawn at the
-    reset.
+    """() int32, the place of its evader in the settings' `evaders`; None: it is drawn
+    at the reset.
     """
     active: jax.Array | None = None
     """(N,) bool, the slots of pursuers in use, the first ones; None: all are."""
@@ -65,18 +75,26 @@ class Task:
     """() m; None: the settings' one."""
 
     def with_starts(self, position: Team) -> "Task":
-        """The same with pursuers that start at (N, 3) m; empty slots stay where they're parked."""
+        """The same with pursuers that start at (N, 3) m; empty slots stay where they're
+        parked.
+        """
         return self.replace(pursuer_position=parked(position, self.active))
 
 
-def evader_speed(settings: PursuitSettings, task: Task) -> float | Float[Array, "*worlds"]:
+def evader_speed(
+    settings: PursuitSettings, task: Task
+) -> float | Float[Array, "*worlds"]:
     """m/s, of the evader in a task."""
     return settings.evader_speed if task.evader_speed is None else task.evader_speed
 
 
-def capture_radius(settings: PursuitSettings, task: Task) -> float | Float[Array, "*worlds"]:
+def capture_radius(
+    settings: PursuitSettings, task: Task
+) -> float | Float[Array, "*worlds"]:
     """m, in a task."""
-    return settings.capture_radius if task.capture_radius is None else task.capture_radius
+    return (
+        settings.capture_radius if task.capture_radius is None else task.capture_radius
+    )
 
 
 def empty_task(settings: PursuitSettings) -> Task:
@@ -93,8 +111,8 @@ def empty_task(settings: PursuitSettings) -> Task:
 
 
 def task_descriptor(tasks: Task) -> Float[Array, "tasks features"]:
-    """(M, D) what tells M tasks apart: all start positions and the pillars in use (m), and the
-    numbers of its own that a task has.
+    """(M, D) what tells M tasks apart: all start positions and the pillars in use (m),
+    and the numbers of its own that a task has.
     """
     # two tasks that differ in slots that aren't used are the same
     pillars = jnp.where(tasks.pillar_active[..., None], tasks.pillar_position, 0.0)
@@ -113,16 +131,24 @@ def task_descriptor(tasks: Task) -> Float[Array, "tasks features"]:
 
 
 def starts_clear(settings: PursuitSettings, task: Task) -> Flag:
-    """Whether no pursuer starts in a breach and the evader starts outside all pillars. () bool."""
-    breach = breaches(settings, task.pursuer_position, task.pillar_position, task.pillar_active)
-    clear_of_evader = _clear_of(settings, task.pillar_position, task.evader_position[None, :2])
+    """Whether no pursuer starts in a breach and the evader starts outside all pillars.
+    () bool.
+    """
+    breach = breaches(
+        settings, task.pursuer_position, task.pillar_position, task.pillar_active
+    )
+    clear_of_evader = _clear_of(
+        settings, task.pillar_position, task.evader_position[None, :2]
+    )
     is_breach = jnp.any(of_team(task.active, breach.total) > 0)
     is_over_evader = jnp.any(task.pillar_active & ~clear_of_evader)
     return ~(is_breach | is_over_evader)
 
 
 def pillar_cells() -> Float[np.ndarray, "cells 2"]:
-    """(cells, 2) centres of the grid cells on which a uniform task may put a pillar (m)."""
+    """(cells, 2) centres of the grid cells on which a uniform task may put a pillar
+    (m).
+    """
     steps = np.arange(-4, 5) * PILLAR_GRID
     x, y = np.meshgrid(steps, steps, indexing="ij")
     cells = np.stack([x.ravel(), y.ravel()], axis=-1)
@@ -133,9 +159,9 @@ def pillar_cells() -> Float[np.ndarray, "cells 2"]:
 def uniform_task(settings: PursuitSettings, key: PRNGKeyArray) -> Task:
     """Draw a task uniformly: the paper's global exploration.
 
-    Pursuers on one side, the evader on the other, pillars on distinct free cells of a grid. Among a
-    few draws of the pursuers' starts the first without a breach is taken; cells too close to a
-    start stay free.
+    Pursuers on one side, the evader on the other, pillars on distinct free cells of a
+    grid. Among a few draws of the pursuers' starts the first without a breach is taken;
+    cells too close to a start stay free.
     """
     n = settings.num_pursuers
     position_key, evader_key, number_key, cell_key = jax.random.split(key, 4)
@@ -144,8 +170,8 @@ def uniform_task(settings: PursuitSettings, key: PRNGKeyArray) -> Task:
     high = jnp.array([START_X[1], START_Y, middle + START_Z], jnp.float32)
     # each further pursuer about halves the chance that all are apart
     draws = CANDIDATES * 2 ** max(0, n - 3)
-    # all candidates at once and the first good one: a loop that draws until one is good would have
-    # no fixed length
+    # all candidates at once and the first good one: a loop that draws until one is good
+    # would have no fixed length
     candidates = jax.random.uniform(position_key, (draws, n, 3), jnp.float32, low, high)
     active = draw_team(settings, key)
     apart = jax.vmap(
@@ -158,13 +184,17 @@ def uniform_task(settings: PursuitSettings, key: PRNGKeyArray) -> Task:
 
     cells = jnp.asarray(pillar_cells(), jnp.float32)
     vehicles = jnp.concatenate([pursuers, evader[None]])[:, :2]
-    holds_vehicle = jnp.all(jnp.abs(cells[:, None] - vehicles[None]) <= PILLAR_GRID / 2, axis=-1)
+    holds_vehicle = jnp.all(
+        jnp.abs(cells[:, None] - vehicles[None]) <= PILLAR_GRID / 2, axis=-1
+    )
     free = _clear_of(settings, cells, vehicles) & ~jnp.any(holds_vehicle, axis=-1)
-    # the first ones of a random order are a draw without replacement; cells that aren't free come
-    # last
+    # the first ones of a random order are a draw without replacement; cells that aren't
+    # free come last
     rank = jnp.where(free, jax.random.uniform(cell_key, (cells.shape[0],)), -1.0)
     chosen = jax.lax.top_k(rank, settings.max_pillars)[1]
-    number = jax.random.randint(number_key, (), settings.min_pillars, settings.max_pillars + 1)
+    number = jax.random.randint(
+        number_key, (), settings.min_pillars, settings.max_pillars + 1
+    )
     # fewer than drawn where not enough cells are free
     in_use = (jnp.arange(settings.max_pillars) < number) & free[chosen]
     return Task(
@@ -179,19 +209,26 @@ def uniform_task(settings: PursuitSettings, key: PRNGKeyArray) -> Task:
 
 
 def _between(ends, key, number):
-    """() drawn between two ends, by the `number`-th key folded from a task's; None without ends."""
+    """() drawn between two ends, by the `number`-th key folded from a task's; None
+    without ends.
+    """
     if not ends:
         return None
     return jax.random.uniform(jax.random.fold_in(key, number), (), jnp.float32, *ends)
 
 
 def expand_task(
-    settings: PursuitSettings, key: PRNGKeyArray, task: Task, wall_distance: float = WALL_DISTANCE
+    settings: PursuitSettings,
+    key: PRNGKeyArray,
+    task: Task,
+    wall_distance: float = WALL_DISTANCE,
 ) -> Task:
-    """Move every vehicle of a task a little and keep its pillars: the paper's local expansion.
+    """Move every vehicle of a task a little and keep its pillars: the paper's local
+    expansion.
 
-    Starts stay `wall_distance` (m) from the arena's wall and within 0.1 m of half its height. Among
-    a few draws the first that starts clear is taken, else the task itself.
+    Starts stay `wall_distance` (m) from the arena's wall and within 0.1 m of half its
+    height. Among a few draws the first that starts clear is taken, else the task
+    itself.
     """
 
     def draw(key):
@@ -205,7 +242,9 @@ def expand_task(
             radius = jnp.linalg.norm(moved[..., :2], axis=-1, keepdims=True)
             reach = settings.arena_radius - wall_distance
             xy = moved[..., :2] * jnp.minimum(1.0, reach / jnp.maximum(radius, 1e-6))
-            return jnp.concatenate([xy, _start_height(settings, moved[..., 2:])], axis=-1)
+            return jnp.concatenate(
+                [xy, _start_height(settings, moved[..., 2:])], axis=-1
+            )
 
         moved = task.replace(evader_position=move(evader_key, task.evader_position))
         return moved.with_starts(move(pursuer_key, task.pursuer_position))
@@ -216,31 +255,35 @@ def expand_task(
 def close_starts(
     settings: PursuitSettings, key: PRNGKeyArray, task: Task, share: float | Scalar
 ) -> Task:
-    """Put a `share` (0 to 1) of the pursuers next to a pillar or another pursuer: starts that leave
-    the least room.
+    """Put a `share` (0 to 1) of the pursuers next to a pillar or another pursuer:
+    starts that leave the least room.
 
-    They stand 0 to 0.05 m outside its safety distance, in any direction, within 0.1 m of half the
-    arena's height. One is placed after the other: beside a pillar, or beside a pursuer whose start
-    is settled, with equal odds where there are both. Among a few draws the first that starts clear
-    is taken, else the task itself.
+    They stand 0 to 0.05 m outside its safety distance, in any direction, within 0.1 m
+    of half the arena's height. One is placed after the other: beside a pillar, or
+    beside a pursuer whose start is settled, with equal odds where there are both. Among
+    a few draws the first that starts clear is taken, else the task itself.
     """
     start = task.pursuer_position
     n = task.pursuer_position.shape[0]
     no_pillar = ~jnp.any(task.pillar_active)
 
     def place(position, i, key):
-        """All positions (N, 3) after pursuer i was put beside a pillar or one of those before
-        it.
+        """All positions (N, 3) after pursuer i was put beside a pillar or one of those
+        before it.
         """
         kind_key, which_key, direction_key, gap_key = jax.random.split(key, 4)
-        pillar = jax.random.categorical(which_key, jnp.where(task.pillar_active, 0.0, -jnp.inf))
+        pillar = jax.random.categorical(
+            which_key, jnp.where(task.pillar_active, 0.0, -jnp.inf)
+        )
         beside = jnp.append(task.pillar_position[pillar], position[i, 2])
         by_pursuer = (jax.random.bernoulli(kind_key) | no_pillar) & (i > 0)
         # the pillar's key once more: of the two draws only one is used
         settled = jax.random.randint(which_key, (), 0, max(i, 1))
         anchor = jnp.where(by_pursuer, position[settled], beside)
         clearance = jnp.where(
-            by_pursuer, settings.drone_clearance, settings.pillar_radius + settings.pillar_clearance
+            by_pursuer,
+            settings.drone_clearance,
+            settings.pillar_radius + settings.pillar_clearance,
         )
         # normal numbers point in all directions alike
         away = jax.random.normal(direction_key, (3,))
@@ -254,7 +297,8 @@ def close_starts(
         choice_key, place_key = jax.random.split(key)
         moved = jax.random.uniform(choice_key, (n,)) < share
         position = start
-        # one after the other, so that nobody is put beside a start that moves away again
+        # one after the other, so that nobody is put beside a start that moves away
+        # again
         for i, key in enumerate(jax.random.split(place_key, n)):
             position = jnp.where(moved[i], place(position, i, key), position)
         return task.with_starts(position)
@@ -263,24 +307,27 @@ def close_starts(
 
 
 def scatter_starts(settings: PursuitSettings, key: PRNGKeyArray, task: Task) -> Task:
-    """Start evader and pursuers anywhere up to `WALL_DISTANCE` from the arena's wall, the pursuers
-    more or less together.
+    """Start evader and pursuers anywhere up to `WALL_DISTANCE` from the arena's wall,
+    the pursuers more or less together.
 
-    Uniform tasks keep both within 0.76 m of the axis and 1.1 m of each other along x. Among a few
-    draws the first that starts clear is taken, else the task itself.
+    Uniform tasks keep both within 0.76 m of the axis and 1.1 m of each other along x.
+    Among a few draws the first that starts clear is taken, else the task itself.
     """
     reach = settings.arena_radius - WALL_DISTANCE
     n = task.pursuer_position.shape[0]
 
     def draw(key):
         middle_key, apart_key, offset_key, height_key = jax.random.split(key, 4)
-        # columns are places: the pursuers' middle, the evader; the root, so that equal shares are
-        # equal areas
+        # columns are places: the pursuers' middle, the evader; the root, so that equal
+        # shares are equal areas
         share, turn = jax.random.uniform(middle_key, (2, 2))
         angle = 2.0 * np.pi * turn
         xy = reach * jnp.sqrt(share) * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
-        offset = jax.random.uniform(offset_key, (n, 2), minval=-NEIGHBOURS, maxval=NEIGHBOURS)
-        # one factor for all: in some tasks they start together, in others all over the arena
+        offset = jax.random.uniform(
+            offset_key, (n, 2), minval=-NEIGHBOURS, maxval=NEIGHBOURS
+        )
+        # one factor for all: in some tasks they start together, in others all over the
+        # arena
         pursuers = xy[:, 0] + offset * jax.random.uniform(apart_key)
         from_axis = jnp.linalg.norm(pursuers, axis=-1, keepdims=True)
         pursuers = pursuers * jnp.minimum(1.0, reach / jnp.maximum(from_axis, 1e-6))
@@ -306,25 +353,31 @@ def _first_clear(settings, draw, key, task):
     clear = jax.vmap(lambda candidate: starts_clear(settings, candidate))(candidates)
     first = jnp.argmax(clear)
     return jax.tree.map(
-        lambda drawn, seed: jnp.where(jnp.any(clear), drawn[first], seed), candidates, task
+        lambda drawn, seed: jnp.where(jnp.any(clear), drawn[first], seed),
+        candidates,
+        task,
     )
 
 
-def shift_pillars(settings: PursuitSettings, key: PRNGKeyArray, task: Task, reach: float) -> Task:
-    """Move each pillar by up to `reach` (m) along x and y; those that would come too close to a
-    start stay.
+def shift_pillars(
+    settings: PursuitSettings, key: PRNGKeyArray, task: Task, reach: float
+) -> Task:
+    """Move each pillar by up to `reach` (m) along x and y; those that would come too
+    close to a start stay.
     """
-    offset = jax.random.uniform(key, task.pillar_position.shape, jnp.float32, -reach, reach)
+    offset = jax.random.uniform(
+        key, task.pillar_position.shape, jnp.float32, -reach, reach
+    )
     return _move_pillars(settings, task, task.pillar_position + offset)
 
 
 def line_up_pillars(settings: PursuitSettings, key: PRNGKeyArray, task: Task) -> Task:
-    """Put the pillars of a uniform task in a row across the arena, between the pursuers' side and
-    the evader's.
+    """Put the pillars of a uniform task in a row across the arena, between the
+    pursuers' side and the evader's.
 
-    The row's middle lies within 0.2 m of the axis along x and y, it is turned by up to 45 degrees,
-    and its pillars stand 0.2 m (touching) to 0.4 m apart. Those that would come too close to a
-    start or to the wall stay.
+    The row's middle lies within 0.2 m of the axis along x and y, it is turned by up to
+    45 degrees, and its pillars stand 0.2 m (touching) to 0.4 m apart. Those that would
+    come too close to a start or to the wall stay.
     """
     middle_key, angle_key, spacing_key = jax.random.split(key, 3)
     middle = jax.random.uniform(middle_key, (2,), jnp.float32, -ROW_OFFSET, ROW_OFFSET)
@@ -338,25 +391,35 @@ def line_up_pillars(settings: PursuitSettings, key: PRNGKeyArray, task: Task) ->
 
 
 def _move_pillars(settings, task, moved):
-    """The task with those pillars moved that stay within reach of the axis and clear of all
-    starts.
+    """The task with those pillars moved that stay within reach of the axis and clear of
+    all starts.
     """
-    vehicles = jnp.concatenate([task.pursuer_position, task.evader_position[None]])[:, :2]
+    vehicles = jnp.concatenate([task.pursuer_position, task.evader_position[None]])[
+        :, :2
+    ]
     inside = jnp.linalg.norm(moved, axis=-1) < PILLAR_REACH
     # each pillar by itself: a row may have gaps
-    accepted = (_clear_of(settings, moved, vehicles) & inside & task.pillar_active)[:, None]
-    return task.replace(pillar_position=jnp.where(accepted, moved, task.pillar_position))
+    accepted = (_clear_of(settings, moved, vehicles) & inside & task.pillar_active)[
+        :, None
+    ]
+    return task.replace(
+        pillar_position=jnp.where(accepted, moved, task.pillar_position)
+    )
 
 
 def _clear_of(settings, pillars, vehicles):
-    """(P,) whether pillars at (P, 2) keep their distance from all vehicles at (K, 2)."""
+    """(P,) whether pillars at (P, 2) keep their distance from all vehicles at (K,
+    2).
+    """
     distance = jnp.linalg.norm(pillars[:, None] - vehicles[None], axis=-1)
-    return jnp.all(distance >= settings.pillar_radius + settings.pillar_clearance, axis=-1)
+    return jnp.all(
+        distance >= settings.pillar_radius + settings.pillar_clearance, axis=-1
+    )
 
 
 def turn_task(key: PRNGKeyArray, task: Task) -> Task:
-    """Turn a whole task about the arena's axis by a random angle: the game looks the same from
-    every side.
+    """Turn a whole task about the arena's axis by a random angle: the game looks the
+    same from every side.
     """
     angle = jax.random.uniform(key, (), jnp.float32, -np.pi, np.pi)
     cosine = jnp.cos(angle)
@@ -369,14 +432,15 @@ def turn_task(key: PRNGKeyArray, task: Task) -> Task:
         return jnp.concatenate([xy, position[..., 2:]], axis=-1)
 
     turned = task.replace(
-        evader_position=turn(task.evader_position), pillar_position=turn(task.pillar_position)
+        evader_position=turn(task.evader_position),
+        pillar_position=turn(task.pillar_position),
     )
     return turned.with_starts(turn(task.pursuer_position))
 
 
 def start_attitude(settings: PursuitSettings, key: PRNGKeyArray) -> Quaternions:
-    """(N, 4) start quaternions wxyz: roll and pitch within 36 degrees, yaw in 0 to 36 degrees; or
-    all level.
+    """(N, 4) start quaternions wxyz: roll and pitch within 36 degrees, yaw in 0 to 36
+    degrees; or all level.
     """
     n = settings.num_pursuers
     if settings.start_attitude == "level":

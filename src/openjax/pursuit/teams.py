@@ -1,7 +1,9 @@
-"""Teams of different sizes in one batch: a world has N slots for pursuers, and some may be empty.
+"""Teams of different sizes in one batch: a world has N slots for pursuers, and some may
+be empty.
 
-An empty slot keeps a drone, as shapes are the same in all worlds. It is parked far from everything
-and held there, so that it is near nothing; what isn't told by distances is masked.
+An empty slot keeps a drone, as shapes are the same in all worlds. It is parked far from
+everything and held there, so that it is near nothing; what isn't told by distances is
+masked.
 """
 
 from typing import TypeVar
@@ -15,15 +17,16 @@ from openjax.pursuit.shapes import Scalar, Team, Which
 from openjax.vehicle import DroneState
 
 FAR = 1000.0
-"""Empty slots are parked at least this far from the arena's axis, and from each other a hundredth
-of it (m).
+"""Empty slots are parked at least this far from the arena's axis, and from each other a
+hundredth of it (m).
 """
 T = TypeVar("T")
 
 
 def draw_team(settings: PursuitSettings, key: PRNGKeyArray) -> Which | None:
-    """(N,) bool, the slots in use, the first ones: a team of one of `team_sizes`, with equal odds;
-    None where there are none of these, and all slots are in use. `key` is the task's.
+    """(N,) bool, the slots in use, the first ones: a team of one of `team_sizes`, with
+    equal odds; None where there are none of these, and all slots are in use. `key` is
+    the task's.
     """
     if not settings.team_sizes:
         return None
@@ -35,19 +38,23 @@ def draw_team(settings: PursuitSettings, key: PRNGKeyArray) -> Which | None:
 def draw_fall_out(
     settings: PursuitSettings, key: PRNGKeyArray, active: Which | None
 ) -> Int32[Array, " drones"] | None:
-    """(N,) int32, the last step in which each pursuer of a team is there; None where the settings
-    have nobody fall out. `active` (N,): slots in use.
+    """(N,) int32, the last step in which each pursuer of a team is there; None where
+    the settings have nobody fall out. `active` (N,): slots in use.
     """
     if not settings.fall_outs:
         return None
     number = settings.num_pursuers
     active = jnp.ones(number, bool) if active is None else active
     whether_key, which_key, when_key = jax.random.split(key, 3)
-    chosen = jnp.argmax(jnp.where(active, jax.random.uniform(which_key, (number,)), -1.0))
+    chosen = jnp.argmax(
+        jnp.where(active, jax.random.uniform(which_key, (number,)), -1.0)
+    )
     low, high = settings.fall_out_seconds
     seconds = jax.random.uniform(when_key, minval=low, maxval=high)
     last = jnp.round(seconds / settings.time_step).astype(jnp.int32)
-    falls = jax.random.bernoulli(whether_key, settings.fall_outs) & (jnp.sum(active) > 1)
+    falls = jax.random.bernoulli(whether_key, settings.fall_outs) & (
+        jnp.sum(active) > 1
+    )
     is_gone = falls & (jnp.arange(number) == chosen)
     return jnp.where(is_gone, last, settings.episode_length)
 
@@ -80,8 +87,8 @@ def parked(position: Team, active: Which | None) -> Team:
 
 
 def held(active: Which | None, drones: DroneState) -> DroneState:
-    """The drones (leading axis N), those of empty slots at rest where they are parked; how they
-    turn doesn't matter.
+    """The drones (leading axis N), those of empty slots at rest where they are parked;
+    how they turn doesn't matter.
     """
     if active is None:
         return drones
@@ -104,7 +111,9 @@ def of_team(active: Which | None, value: T) -> T:
 def team_mean(
     active: Bool[Array, "*steps drones"] | None, value: Shaped[Array, "*steps drones"]
 ) -> Scalar:
-    """() mean of the numbers (..., N) of pursuers, without those of empty slots (..., N)."""
+    """() mean of the numbers (..., N) of pursuers, without those of empty slots (...,
+    N).
+    """
     if active is None:
         return jnp.mean(value)
     return jnp.sum(jnp.where(active, value, 0.0)) / jnp.maximum(jnp.sum(active), 1)

@@ -2,18 +2,25 @@
 
 from pathlib import Path
 
-FIGURES = ("capture_rate", "capture_step", "collision_rate", "crash_rate", "over_speed_rate")
+FIGURES = (
+    "capture_rate",
+    "capture_step",
+    "collision_rate",
+    "crash_rate",
+    "over_speed_rate",
+)
 """Of episodes, in the order in which they are told."""
 WHICH = ("nominal", "before", "after")
-"""Whose: the policy's as it was, with the nominal and with the diagnosed vehicle, and the adapted
-policy's with that one.
+"""Whose: the policy's as it was, with the nominal and with the diagnosed vehicle, and
+the adapted policy's with that one.
 """
 
 
 def in_words(results: dict) -> list[str]:
     """What was found and gained."""
     effects = (
-        ", ".join(results["effects"]) or "no effect: the simulator is right to within the noise"
+        ", ".join(results["effects"])
+        or "no effect: the simulator is right to within the noise"
     )
     changes = []
     for name in FIGURES:
@@ -38,7 +45,8 @@ def in_words(results: dict) -> list[str]:
 
 def page(results: dict) -> str:
     """One self-contained HTML page."""
-    from openjax.show.pages import filled  # with matplotlib: not before the compiler has begun
+    # with matplotlib: not before the compiler has begun
+    from openjax.show.pages import filled
 
     values = {
         "words": in_words(results),
@@ -62,7 +70,9 @@ def _picture(results):
     }
     with rc_context(STYLE):
         figure = Figure(figsize=(11, 3.2), layout="constrained")
-        for axes, (name, title) in zip(figure.subplots(1, len(shown)), shown.items(), strict=True):
+        for axes, (name, title) in zip(
+            figure.subplots(1, len(shown)), shown.items(), strict=True
+        ):
             course = [row[name] for row in results["history"]]
             axes.plot(range(1, len(course) + 1), course)
             axes.set(title=title, xlabel="update", ylim=(0, None))

@@ -1,5 +1,5 @@
-"""What `openjax adapt` does: a diagnosis beside the compiler, vehicles drawn from it, fine-tuning,
-figures of both policies.
+"""What `openjax adapt` does: a diagnosis beside the compiler, vehicles drawn from it,
+fine-tuning, figures of both policies.
 """
 
 import contextlib
@@ -40,25 +40,31 @@ STEPS = {"diagnosing and compiling": 60.0, "fine-tuning": 90.0, "measuring": 10.
 ON_CPU = {"diagnosing and compiling": 80.0, "fine-tuning": 240.0, "measuring": 25.0}
 """... and without."""
 LOSSES = ("crash_rate", "collision_rate", "capture_step")
-"""Figures that a vehicle can make worse, of which adapting is to win back what it can."""
+"""Figures that a vehicle can make worse, of which adapting is to win back what it
+can.
+"""
 ERRORS = 2.0
-"""A loss is one that is larger than so many standard errors of the differences of single
-episodes.
+"""A loss is one that is larger than so many standard errors of the differences of
+single episodes.
 """
 
 
 def check(command: AdaptCommand) -> None:
-    """What can be wrong with flights and policy is told before anything is compiled. Raises
-    UserError.
+    """What can be wrong with flights and policy is told before anything is compiled.
+    Raises UserError.
     """
     if isinstance(load_policy(command.policy).policy, Heuristic):
-        raise UserError(f"--policy {command.policy}: a heuristic has no networks that could learn")
+        raise UserError(
+            f"--policy {command.policy}: a heuristic has no networks that could learn"
+        )
     (load_case if command.flights.is_dir() else load_effects)(command.flights)
 
 
-def adapt(command: AdaptCommand, tell: Callable[[str], None] = lambda step: None) -> dict:
-    """Do all of it and write it down; `tell` hears the steps. Raises UserError for flights that
-    can't be diagnosed or an unusable policy.
+def adapt(
+    command: AdaptCommand, tell: Callable[[str], None] = lambda step: None
+) -> dict:
+    """Do all of it and write it down; `tell` hears the steps. Raises UserError for
+    flights that can't be diagnosed or an unusable policy.
     """
     started = time.monotonic()
     seconds = {}
@@ -105,29 +111,36 @@ class _Programs:
         self.adaptation = make_adaptation(self.loaded.settings, command.training)
         self.game = self.adaptation.game
         self._key = jax.random.key(command.seed)
-        # half to choose a checkpoint by, half to measure it on: the chosen one is best on the first
-        # half in part by luck
+        # half to choose a checkpoint by, half to measure it on: the chosen one is best
+        # on the first half in part by luck
         tasks = uniform_tasks(self.game, 2 * command.episodes, self.game.max_pillars)
         self._chosen_by = jax.tree.map(lambda leaf: leaf[: command.episodes], tasks)
         self._measured_on = jax.tree.map(lambda leaf: leaf[command.episodes :], tasks)
-        self._parameters = starting_parameters(self.loaded.parameters, self.loaded.settings)
+        self._parameters = starting_parameters(
+            self.loaded.parameters, self.loaded.settings
+        )
         self._nominal = bounds_of({}, {}, rest=0.0)
         self.ready = compile_programs(
             self.adaptation, self._parameters, self._chosen_by, self._nominal
         )
 
     def _fly(self, parameters, tasks, number, bounds) -> dict:
-        """Figures (B,) of a policy's episodes; the same `number` draws the same ones."""
+        """Figures (B,) of a policy's episodes; the same `number` draws the same
+        ones.
+        """
         key = jax.random.fold_in(self._key, number)
-        return episode_figures(self.adaptation.evaluate(parameters, tasks, key, bounds).statistics)
+        return episode_figures(
+            self.adaptation.evaluate(parameters, tasks, key, bounds).statistics
+        )
 
     def fine_tune(self, vehicle: _Diagnosed):
-        """The best of the policy's updates (see `openjax.learning.fine_tuning.fine_tune`), by
-        `selection_score`.
+        """The best of the policy's updates (see
+        `openjax.learning.fine_tuning.fine_tune`), by `selection_score`.
 
-        Speeds over the limit count as far as they are more than in the same episode of the policy
-        as it was with the nominal vehicle: to fly as fast with the diagnosed one is what is wanted,
-        and a vehicle that made a policy slower did nothing good by it.
+        Speeds over the limit count as far as they are more than in the same episode of
+        the policy as it was with the nominal vehicle: to fly as fast with the diagnosed
+        one is what is wanted, and a vehicle that made a policy slower did nothing good
+        by it.
         """
         # the same draws for all that is compared, here and in each look
         usual = self._fly(self._parameters, self._chosen_by, 1, self._nominal)
@@ -139,7 +152,9 @@ class _Programs:
             )
             return selection_score(flown, self.game.episode_length)
 
-        return fine_tune(self.adaptation, self._parameters, vehicle.bounds, self._key, scores)
+        return fine_tune(
+            self.adaptation, self._parameters, vehicle.bounds, self._key, scores
+        )
 
     def measure(self, vehicle: _Diagnosed, tuned) -> dict[str, dict]:
         """Figures (B,) of `WHICH` on tasks that no checkpoint was chosen by."""
@@ -161,7 +176,9 @@ def _results(command, vehicle, flown, tuned) -> dict:
         effect, _, key = name.partition(".")
         if effect in vehicle.values:
             value = vehicle.values[effect].get(key)
-            parameters.append({"parameter": name, "value": value, "low": low, "high": high})
+            parameters.append(
+                {"parameter": name, "value": value, "low": low, "high": high}
+            )
     return {
         "command": f"openjax adapt {command.flights} --policy {command.policy} --out {command.out}",
         "machine": describe_machine(),
@@ -200,8 +217,8 @@ def _write(command, programs, vehicle, tuned, results):
 
 
 def won_back(flown: dict) -> dict[str, float | None]:
-    """Of each loss, before against nominal, the share that is none any more after; None where there
-    was none beyond chance.
+    """Of each loss, before against nominal, the share that is none any more after; None
+    where there was none beyond chance.
 
     Args:
       flown: {"nominal", "before", "after": figures (B,) of the same episodes}.
@@ -212,24 +229,34 @@ def won_back(flown: dict) -> dict[str, float | None]:
         loss = flown["before"][name] - flown["nominal"][name]
         loss_left = flown["after"][name] - flown["nominal"][name]
         beyond_chance = loss.mean() > ERRORS * loss.std() / len(loss) ** 0.5
-        shares[name] = float(1.0 - loss_left.mean() / loss.mean()) if beyond_chance else None
+        shares[name] = (
+            float(1.0 - loss_left.mean() / loss.mean()) if beyond_chance else None
+        )
     return shares
 
 
 @contextlib.contextmanager
 def _diagnosis(command: AdaptCommand) -> Iterator[Callable[[], Path]]:
-    """A diagnosis that runs beside the compiler; what is given waits for the effects file that it
-    writes.
+    """A diagnosis that runs beside the compiler; what is given waits for the effects
+    file that it writes.
     """
     if not command.flights.is_dir():
         yield lambda: command.flights
         return
     out = command.out / "diagnosis"
     name = command.flights.resolve().name
-    # a process of its own: within one, the diagnosis and the tracing of programs would take turns
+    # a process of its own: within one, the diagnosis and the tracing of programs would
+    # take turns
     shutil.rmtree(out, ignore_errors=True)
     process = subprocess.Popen(
-        [sys.executable, "-m", "openjax.diagnose", str(command.flights), "--out", str(out)],
+        [
+            sys.executable,
+            "-m",
+            "openjax.diagnose",
+            str(command.flights),
+            "--out",
+            str(out),
+        ],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
         text=True,
@@ -239,7 +266,9 @@ def _diagnosis(command: AdaptCommand) -> Iterator[Callable[[], Path]]:
     def effects():
         complaint = process.communicate()[1].strip()
         if process.returncode != 0:
-            last = complaint.splitlines()[-1] if complaint else "it ended without a word"
+            last = (
+                complaint.splitlines()[-1] if complaint else "it ended without a word"
+            )
             raise UserError(f"{name}: no diagnosis: {last.removeprefix('error: ')}")
         return out / name / "effects.toml"
 
@@ -252,7 +281,9 @@ def _diagnosis(command: AdaptCommand) -> Iterator[Callable[[], Path]]:
 
 
 def compile_programs(adaptation, parameters, tasks, bounds):
-    """Start to compile flights, update and evaluation; a function that waits for all."""
+    """Start to compile flights, update and evaluation; a function that waits for
+    all.
+    """
     key = jax.random.key(0)
     flights = jax.eval_shape(adaptation.fly, parameters, key, bounds)
     state = jax.eval_shape(adaptation.optimiser.init, parameters.actor)

@@ -1,5 +1,5 @@
-"""What `openjax benchmark` times, and how: physics, environment, rollout and the training step,
-each as one function.
+"""What `openjax benchmark` times, and how: physics, environment, rollout and the
+training step, each as one function.
 """
 
 import dataclasses
@@ -36,14 +36,18 @@ class Case(NamedTuple):
 
 
 def cases(command: BenchmarkCommand, part: str, num_envs: int) -> Iterator[Case]:
-    """The cases of a part, made one at a time: together they wouldn't fit into memory."""
+    """The cases of a part, made one at a time: together they wouldn't fit into
+    memory.
+    """
     settings = command.settings
     steps = command.steps
     if part == "training":
         for number in command.devices:
             fitting = fitting_settings(settings, num_envs, number)
             for name, function, arguments in _training(fitting, number):
-                yield Case(name, fitting.num_envs, fitting.rollout_length, function, arguments)
+                yield Case(
+                    name, fitting.num_envs, fitting.rollout_length, function, arguments
+                )
         return
     if part == "rollout":
         function, arguments = _rollout(settings, num_envs, steps)
@@ -55,14 +59,18 @@ def cases(command: BenchmarkCommand, part: str, num_envs: int) -> Iterator[Case]
 
 
 def _training(settings, devices):
-    """The whole training step, then, of one device, the programs that it is made of: (name,
-    function, its arguments).
+    """The whole training step, then, of one device, the programs that it is made of:
+    (name, function, its arguments).
     """
     # what is timed begins where a run does; later updates take as long
     carry = make_start(settings)(jax.random.key(0))
     if devices > 1:
         step = make_device_step(settings, build(settings), devices)
-        yield f"training, {devices} devices", step, (place(carry, carry_shardings(devices)),)
+        yield (
+            f"training, {devices} devices",
+            step,
+            (place(carry, carry_shardings(devices)),),
+        )
         return
     phases = training_step.make_phases(settings)
     yield "training", training_step.make_training_step(settings), (carry,)
@@ -75,9 +83,11 @@ def _training(settings, devices):
     yield "- renew", phases.renew, (carry,)
 
 
-def fitting_settings(settings: TrainSettings, num_envs: int, devices: int = 1) -> TrainSettings:
-    """The settings with the nearest number of environments from above that they and so many devices
-    allow.
+def fitting_settings(
+    settings: TrainSettings, num_envs: int, devices: int = 1
+) -> TrainSettings:
+    """The settings with the nearest number of environments from above that they and so
+    many devices allow.
     """
     for number in range(num_envs, num_envs + 10_000):
         try:
@@ -102,8 +112,12 @@ def _physics(part, settings, num_envs, steps):
         contacts=not part.endswith("_free"),
     )
     tasks = uniform_tasks(game, num_envs, game.max_pillars)
-    drones = jax.jit(jax.vmap(lambda task: hover_state(vehicle, task.pursuer_position)))(tasks)
-    command = action_to_command(jnp.broadcast_to(hover_action(vehicle), (game.num_pursuers, 4)))
+    drones = jax.jit(
+        jax.vmap(lambda task: hover_state(vehicle, task.pursuer_position))
+    )(tasks)
+    command = action_to_command(
+        jnp.broadcast_to(hover_action(vehicle), (game.num_pursuers, 4))
+    )
     command = command.at[:, 1:].add(0.1)
 
     def run(drones, tasks):
@@ -118,9 +132,13 @@ def _physics(part, settings, num_envs, steps):
 
 def _environment(settings, num_envs, steps):
     environment = Pursuit(settings.environment)
-    state = jax.jit(jax.vmap(environment.reset))(jax.random.split(jax.random.key(0), num_envs))[1]
+    state = jax.jit(jax.vmap(environment.reset))(
+        jax.random.split(jax.random.key(0), num_envs)
+    )[1]
     key = jax.random.key(1)
-    action = 0.1 * jax.random.normal(key, (num_envs, settings.environment.num_pursuers, 4))
+    action = 0.1 * jax.random.normal(
+        key, (num_envs, settings.environment.num_pursuers, 4)
+    )
     action = jnp.tanh(action + hover_action(environment.vehicle))
 
     def run(state, action):
@@ -129,7 +147,9 @@ def _environment(settings, num_envs, steps):
                 key, state, action
             )
             # Observation and reward are used, else the compiler would leave them out.
-            used = sum(jnp.sum(leaf) for leaf in jax.tree.leaves(observation)) + jnp.sum(reward)
+            used = sum(
+                jnp.sum(leaf) for leaf in jax.tree.leaves(observation)
+            ) + jnp.sum(reward)
             return state, used
 
         return jax.lax.scan(one, state, None, length=steps)
@@ -146,9 +166,16 @@ def _rollout(settings, num_envs, steps):
     parameters = jax.jit(parts.policy.init)(jax.random.key(1), first)
 
     def run(parameters, observation, state, key):
-        shape = (steps, num_envs, settings.environment.num_pursuers, parts.policy.sample_size)
+        shape = (
+            steps,
+            num_envs,
+            settings.environment.num_pursuers,
+            parts.policy.sample_size,
+        )
         players = Players(environment, parts.policy, parameters)
-        return collect(players, (observation, state), Noise(jax.random.normal(key, shape)))
+        return collect(
+            players, (observation, state), Noise(jax.random.normal(key, shape))
+        )
 
     return run, (parameters, observation, state, jax.random.key(2))
 
@@ -165,14 +192,17 @@ class Timing:
     """Of all calls."""
     calls: int
     memory: int | None
-    """Bytes for arguments, results and temporaries of one call, by the compiler's account."""
+    """Bytes for arguments, results and temporaries of one call, by the compiler's
+    account.
+    """
 
 
 def time_compiled(case: Case, min_seconds: float) -> Timing:
-    """Compile a case's function, run it once to warm up, then time three calls or more, for at
-    least `min_seconds`.
+    """Compile a case's function, run it once to warm up, then time three calls or more,
+    for at least `min_seconds`.
 
-    Each call gets the same arguments and is waited for, so that all calls do the same work.
+    Each call gets the same arguments and is waited for, so that all calls do the same
+    work.
     """
     start = time.perf_counter()
     compiled = jax.jit(case.function).lower(*case.arguments).compile()
@@ -195,7 +225,9 @@ def time_compiled(case: Case, min_seconds: float) -> Timing:
         if "RESOURCE_EXHAUSTED" not in str(error):
             raise
         return Timing(compile_seconds, None, None, 0, memory)
-    return Timing(compile_seconds, float(np.median(times)), max(times), len(times), memory)
+    return Timing(
+        compile_seconds, float(np.median(times)), max(times), len(times), memory
+    )
 
 
 def _memory(compiled):
@@ -205,4 +237,6 @@ def _memory(compiled):
         return None
     produced = analysis.output_size_in_bytes + analysis.temp_size_in_bytes
     # results that are written into an argument's place take no more
-    return int(analysis.argument_size_in_bytes + produced - analysis.alias_size_in_bytes)
+    return int(
+        analysis.argument_size_in_bytes + produced - analysis.alias_size_in_bytes
+    )

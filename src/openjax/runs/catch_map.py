@@ -1,6 +1,6 @@
-"""What `openjax map` does: a policy flies with teams of each size, after evaders of each speed,
-with each capture radius; how many episodes of each cell end with a capture, and what a theorem
-forces.
+"""What `openjax map` does: a policy flies with teams of each size, after evaders of
+each speed, with each capture radius; how many episodes of each cell end with a capture,
+and what a theorem forces.
 """
 
 import dataclasses
@@ -17,7 +17,13 @@ import numpy as np
 from openjax.baselines.stack import planar_bound, stack_bound
 from openjax.errors import UserError
 from openjax.evaluation.episodes import make_evaluate, wilson
-from openjax.pursuit import EpisodeStatistics, Pursuit, PursuitSettings, Task, uniform_task
+from openjax.pursuit import (
+    EpisodeStatistics,
+    Pursuit,
+    PursuitSettings,
+    Task,
+    uniform_task,
+)
 from openjax.runs.machine import describe_machine
 from openjax.runs.map_evaders import Flight, MapEvaders, least_caught
 from openjax.runs.options import MapCommand
@@ -41,15 +47,19 @@ def cells_of(command: MapCommand) -> list[Cell]:
     """All cells, team by team."""
     return [
         Cell(*values)
-        for values in itertools.product(command.sizes, command.speed_ratios, command.radii)
+        for values in itertools.product(
+            command.sizes, command.speed_ratios, command.radii
+        )
     ]
 
 
 def map_game(command: MapCommand, trained: PursuitSettings) -> PursuitSettings:
-    """The game of all cells: a policy's, with slots for the largest team, and nominal vehicles.
+    """The game of all cells: a policy's, with slots for the largest team, and nominal
+    vehicles.
 
     Raises:
-      UserError: nothing is asked for, or another number of pursuers than the policy flies with.
+      UserError: nothing is asked for, or another number of pursuers than the policy
+      flies with.
     """
     for name in ("sizes", "speed_ratios", "radii"):
         if not getattr(command, name):
@@ -77,9 +87,11 @@ def map_game(command: MapCommand, trained: PursuitSettings) -> PursuitSettings:
     )
 
 
-def draw_task(game: PursuitSettings, command: MapCommand, key: jax.Array, cell: jax.Array) -> Task:
-    """A uniform task in a cell (3,), without pillars where these are left away. Tasks of one key
-    differ in nothing else.
+def draw_task(
+    game: PursuitSettings, command: MapCommand, key: jax.Array, cell: jax.Array
+) -> Task:
+    """A uniform task in a cell (3,), without pillars where these are left away. Tasks
+    of one key differ in nothing else.
     """
     number, ratio, radius = cell
     task = uniform_task(game, key)
@@ -88,11 +100,15 @@ def draw_task(game: PursuitSettings, command: MapCommand, key: jax.Array, cell: 
         active = jnp.arange(game.num_pursuers) < number
     if command.scenario == "empty":
         task = task.replace(pillar_active=jnp.zeros_like(task.pillar_active))
-    task = task.replace(active=active, evader_speed=ratio * game.max_speed, capture_radius=radius)
+    task = task.replace(
+        active=active, evader_speed=ratio * game.max_speed, capture_radius=radius
+    )
     return task.with_starts(task.pursuer_position)
 
 
-def draw_map(command: MapCommand, loaded: LoadedPolicy, tell: Callable[[str], None]) -> dict:
+def draw_map(
+    command: MapCommand, loaded: LoadedPolicy, tell: Callable[[str], None]
+) -> dict:
     """Fly all cells.
 
     Args:
@@ -101,11 +117,12 @@ def draw_map(command: MapCommand, loaded: LoadedPolicy, tell: Callable[[str], No
       tell: shows a line of progress.
 
     Returns:
-      policy, evaders, scenario, what is taken away, cells (see `cell_record`), how evaders learned,
-      seconds, machine.
+      policy, evaders, scenario, what is taken away, cells (see `cell_record`), how
+      evaders learned, seconds, machine.
 
     Raises:
-      UserError: a game that the policy can't play, or a file of evaders that can't be used.
+      UserError: a game that the policy can't play, or a file of evaders that can't be
+      used.
     """
     began = time.monotonic()
     game = map_game(command, loaded.settings.environment)
@@ -167,8 +184,8 @@ def _records(flyer, game, cells, flights):
 
 
 def cells_against(found: Mapping, evaders: str) -> list[dict]:
-    """The cells of a map (see `draw_map`) that evaders of one kind flew, with their figures:
-    "scripted", "learned", or "planner".
+    """The cells of a map (see `draw_map`) that evaders of one kind flew, with their
+    figures: "scripted", "learned", or "planner".
     """
     if evaders == "scripted":
         return list(found["cells"])
@@ -206,27 +223,33 @@ class _Flyer:
             key = jax.random.fold_in(first, 1 + start)
             statistics = fly(flight.networks, keys[episode], own, key)
             parts.append(jax.tree.map(np.asarray, statistics))
-            self.tell(f"{flight.name}: {min(start + batch, number)} of {number} episodes")
+            self.tell(
+                f"{flight.name}: {min(start + batch, number)} of {number} episodes"
+            )
         flown = jax.tree.map(lambda *leaves: np.concatenate(leaves)[:number], *parts)
         starts = range(0, number, episodes)
         return [
-            jax.tree.map(lambda leaf, start=start: leaf[start : start + episodes], flown)
+            jax.tree.map(
+                lambda leaf, start=start: leaf[start : start + episodes], flown
+            )
             for start in starts
         ]
 
 
 def _of_least_caught(statistics):
-    """(E,) of (E, L): of each half of the episodes, those of the learner that is caught least in
-    the other half.
+    """(E,) of (E, L): of each half of the episodes, those of the learner that is caught
+    least in the other half.
     """
     chosen = least_caught(statistics.captured)
     return jax.tree.map(lambda leaf: leaf[np.arange(len(chosen)), chosen], statistics)
 
 
-def cell_record(game: PursuitSettings, cell: Cell, statistics: EpisodeStatistics) -> dict:
-    """A cell's figures with scripted evaders, and the speed ratios below which a theorem forces a
-    capture for points (`openjax.baselines.stack`): all on one ray, and as the game in a plane has
-    it.
+def cell_record(
+    game: PursuitSettings, cell: Cell, statistics: EpisodeStatistics
+) -> dict:
+    """A cell's figures with scripted evaders, and the speed ratios below which a
+    theorem forces a capture for points (`openjax.baselines.stack`): all on one ray, and
+    as the game in a plane has it.
     """
     points = dataclasses.replace(
         game, num_pursuers=cell.num_pursuers, capture_radius=cell.capture_radius
@@ -240,11 +263,15 @@ def cell_record(game: PursuitSettings, cell: Cell, statistics: EpisodeStatistics
 
 
 def figures(game: PursuitSettings, statistics: EpisodeStatistics) -> dict:
-    """Captures of episodes (E,) with their 95 % interval, crashes and mean capture time (s, of
-    those that capture).
+    """Captures of episodes (E,) with their 95 % interval, crashes and mean capture time
+    (s, of those that capture).
     """
     caught = statistics.captured
-    seconds = statistics.capture_step[caught].mean() * game.time_step if caught.any() else None
+    seconds = (
+        statistics.capture_step[caught].mean() * game.time_step
+        if caught.any()
+        else None
+    )
     return {
         "episodes": len(caught),
         "capture_rate": float(caught.mean()),

@@ -1,5 +1,5 @@
-"""The stages of a run by the gradient through the simulation, before MAPPO and after it, compiled
-while other things are.
+"""The stages of a run by the gradient through the simulation, before MAPPO and after
+it, compiled while other things are.
 """
 
 import dataclasses
@@ -18,7 +18,11 @@ from openjax.cluster.devices import (
     own_copy,
 )
 from openjax.learning import build
-from openjax.learning.analytic_gradient import AnalyticGradient, compile_analytic, free_flight
+from openjax.learning.analytic_gradient import (
+    AnalyticGradient,
+    compile_analytic,
+    free_flight,
+)
 from openjax.learning.first_flights import FirstFlights, first_game
 from openjax.learning.settings import TrainSettings
 from openjax.learning.worst_plans import WorstPlans, planning_game
@@ -31,18 +35,28 @@ TOGETHER = 100
 """Updates of the first stage in one call: some seconds on a CPU."""
 
 
-def compile_last_stage(settings: TrainSettings, environment: Pursuit, policy: Any) -> Callable:
-    """The stage after MAPPO, compiled for parameters of these shapes; see `compile_analytic`."""
+def compile_last_stage(
+    settings: TrainSettings, environment: Pursuit, policy: Any
+) -> Callable:
+    """The stage after MAPPO, compiled for parameters of these shapes; see
+    `compile_analytic`.
+    """
     exact = _exact(settings, environment)
     if not settings.worst_plans.worlds:
         stage = AnalyticGradient(settings.analytic, free_flight(environment), exact)
     else:
         # networks that learned with the policy aren't in its file
-        names = tuple(name for name in environment.settings.evaders if name != "learned")
-        scripted = dataclasses.replace(environment.settings, evaders=names or ("field",))
+        names = tuple(
+            name for name in environment.settings.evaders if name != "learned"
+        )
+        scripted = dataclasses.replace(
+            environment.settings, evaders=names or ("field",)
+        )
         game = free_flight(dataclasses.replace(environment, settings=scripted))
         usual = AnalyticGradient(settings.analytic, game, exact)
-        stage = WorstPlans(settings.worst_plans, planning_game(game), usual, settings.generator)
+        stage = WorstPlans(
+            settings.worst_plans, planning_game(game), usual, settings.generator
+        )
     return compile_analytic(stage, abstract_like(policy))
 
 
@@ -60,20 +74,23 @@ def compile_first_flights(
     say: Callable[[str], None],
     over: Callable[[], bool],
     keep: Callable | None = None,
-) -> tuple[Callable[[], Any], Callable[[PolicyParameters, jax.Array], PolicyParameters | None]]:
-    """Start to compile the stage before MAPPO for parameters of these shapes, in the background.
+) -> tuple[
+    Callable[[], Any], Callable[[PolicyParameters, jax.Array], PolicyParameters | None]
+]:
+    """Start to compile the stage before MAPPO for parameters of these shapes, in the
+    background.
 
     Args:
       flights: the stage.
-      policy: the parameters' shapes and dtypes; on several devices of one process, these share the
-      worlds.
+      policy: the parameters' shapes and dtypes; on several devices of one process,
+      these share the worlds.
       say: hears how it goes.
       over: is asked every few seconds whether to stop.
       keep: `recalled` for the run, where traces are kept.
 
     Returns:
-      a function that waits for the compiler, and the stage: (fresh parameters, key) -> parameters;
-      None where it was over before it began.
+      a function that waits for the compiler, and the stage: (fresh parameters, key) ->
+      parameters; None where it was over before it began.
     """
     updates = flights.settings.updates
     devices = _number_of_devices(policy, flights.settings.worlds)
@@ -86,7 +103,8 @@ def compile_first_flights(
         if over():
             return None
         started = time.monotonic()
-        # a copy, as the first call takes the carry's buffers, and the parameters are needed below
+        # a copy, as the first call takes the carry's buffers, and the parameters are
+        # needed below
         parameters_there, key = place((own_copy(parameters), key), at)
         carry = begin(parameters_there, key)
         for first in range(0, updates, TOGETHER):
@@ -94,7 +112,8 @@ def compile_first_flights(
                 break
             carry, parts = some(carry, key, place(jnp.int32(first), at))
             done = min(first + TOGETHER, updates)
-            loss = {name: float(value) for name, value in parts.items()}  # waits for them
+            # waits for them
+            loss = {name: float(value) for name, value in parts.items()}
             seconds_left = (time.monotonic() - started) * (updates / done - 1.0)
             say(
                 f"{done} of {updates} updates, {duration(seconds_left)} left | evader out of reach "
@@ -107,8 +126,8 @@ def compile_first_flights(
 
 
 def _compiling(flights, policy, devices, at, keep):
-    """Some updates and the start of the stage, as the background compiles them for arguments that
-    lie `at` a sharding.
+    """Some updates and the start of the stage, as the background compiles them for
+    arguments that lie `at` a sharding.
     """
     begin, some, shardings = make_device_first_flights(
         flights, min(TOGETHER, flights.settings.updates), devices
@@ -117,7 +136,9 @@ def _compiling(flights, policy, devices, at, keep):
     policy, key, done = abstract_like((policy, key, done), at)
     carry = abstract_like(jax.eval_shape(begin, policy, key), shardings)
     if keep is not None and devices == 1:
-        some = keep("first_flights", jax.jit(some), lambda: (carry, key, done), carry=carry)
+        some = keep(
+            "first_flights", jax.jit(some), lambda: (carry, key, done), carry=carry
+        )
     options = compiler_options(devices, brief=True)
     some = jax.jit(some, donate_argnums=0, compiler_options=options)
     lowered_some = some.lower(carry, key, done)
@@ -127,17 +148,21 @@ def _compiling(flights, policy, devices, at, keep):
 
 
 def _number_of_devices(policy, worlds):
-    """How many devices share worlds whose policy lies on some of this process; 1 where they
-    can't.
+    """How many devices share worlds whose policy lies on some of this process; 1 where
+    they can't.
     """
-    places = {getattr(leaf, "sharding", None) for leaf in jax.tree.leaves(policy)} - {None}
-    number = max((len(at.device_set) for at in places if at.is_fully_addressable), default=1)
+    places = {getattr(leaf, "sharding", None) for leaf in jax.tree.leaves(policy)} - {
+        None
+    }
+    number = max(
+        (len(at.device_set) for at in places if at.is_fully_addressable), default=1
+    )
     return number if worlds % number == 0 else 1
 
 
 def _exact(settings: TrainSettings, environment: Pursuit) -> Policy:
-    """The run's policy in float32: tens of steps of the simulation follow each action, too far for
-    rough arithmetic.
+    """The run's policy in float32: tens of steps of the simulation follow each action,
+    too far for rough arithmetic.
     """
     policy = build(settings, environment).policy
     network = dataclasses.replace(policy.network, compute_type="float32")

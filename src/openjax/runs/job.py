@@ -1,5 +1,5 @@
-"""What a training run is made of: settings, own parts, where it starts and how long it may last.
-`openjax.runs.training` goes about it.
+"""What a training run is made of: settings, own parts, where it starts and how long it
+may last. `openjax.runs.training` goes about it.
 """
 
 import dataclasses
@@ -36,8 +36,14 @@ class OwnParts:
 
     @property
     def names(self) -> list[str]:
-        """What they are: a run that was begun with them goes on with the same ones only."""
-        parts = [field.name for field in dataclasses.fields(self) if getattr(self, field.name)]
+        """What they are: a run that was begun with them goes on with the same ones
+        only.
+        """
+        parts = [
+            field.name
+            for field in dataclasses.fields(self)
+            if getattr(self, field.name)
+        ]
         return parts + [f"learner {name}" for name in self.learners or ()]
 
 
@@ -71,12 +77,14 @@ class TrainingJob:
     @functools.cached_property
     def parts(self) -> Parts:
         """Environment, policy and learners."""
-        return build(self.settings, self.environment, self.own.policy, self.own.learners)
+        return build(
+            self.settings, self.environment, self.own.policy, self.own.learners
+        )
 
     @property
     def made_from(self) -> str:
-        """What the run's programs depend on, beside the package's sources; the seed comes in as a
-        key.
+        """What the run's programs depend on, beside the package's sources; the seed
+        comes in as a key.
         """
         game = self.environment
         settings = dataclasses.replace(self.settings, seed=0)
@@ -84,20 +92,30 @@ class TrainingJob:
         leaves = jax.tree.leaves((game.vehicle, game.effect_parameters))
         arrays = [np.asarray(leaf).tolist() for leaf in leaves]
         names = str(jax.tree.structure(game.effect_parameters))
-        return repr((self.devices, settings, game.settings, game.effects, names, arrays))
+        return repr(
+            (self.devices, settings, game.settings, game.effects, names, arrays)
+        )
 
     @property
     def keep(self) -> Callable | None:
-        """`recalled` for the run's programs; None where traces aren't kept, or where functions of
-        one's own are in them, whose text nobody knows.
+        """`recalled` for the run's programs; None where traces aren't kept, or where
+        functions of one's own are in them, whose text nobody knows.
         """
         game = self.environment
-        if self.traced is None or self.own.names or game.evaders or game.reward or game.observer:
+        if (
+            self.traced is None
+            or self.own.names
+            or game.evaders
+            or game.reward
+            or game.observer
+        ):
             return None
         return functools.partial(recalled, made_from=self.made_from, folder=self.traced)
 
     def check(self) -> None:
-        """Raises UserError for what doesn't fit together, before any directory is touched."""
+        """Raises UserError for what doesn't fit together, before any directory is
+        touched.
+        """
         check_devices(self.settings, self.devices)
         check_memory(self.settings, self.devices)
         if self.start_from is not None:
@@ -107,7 +125,9 @@ class TrainingJob:
             other = load_policy(self.compare_with)
             other.in_game(game_for(self.environment, other))
         if self.own.policy is not None:
-            stages = self.settings.first_flights.updates or self.settings.analytic.updates
+            stages = (
+                self.settings.first_flights.updates or self.settings.analytic.updates
+            )
             if stages:
                 raise UserError(
                     "first_flights.updates and analytic.updates must be 0 for a policy of one's "
@@ -116,12 +136,14 @@ class TrainingJob:
 
 
 def start_parameters(job: TrainingJob, fresh: PolicyParameters) -> PolicyParameters:
-    """Those of the policy that the run starts from; `fresh` ones where it has no critic, or one of
-    another game.
+    """Those of the policy that the run starts from; `fresh` ones where it has no
+    critic, or one of another game.
     """
     loaded = load_policy(job.start_from)
     if isinstance(loaded.policy, Heuristic):
-        raise UserError(f"--start_from {job.start_from}: a heuristic has no networks to start from")
+        raise UserError(
+            f"--start_from {job.start_from}: a heuristic has no networks to start from"
+        )
     settings = loaded.settings
     axes = job.settings.environment.observe_in
     policy_axes = settings.environment.observe_in
@@ -132,10 +154,14 @@ def start_parameters(job: TrainingJob, fresh: PolicyParameters) -> PolicyParamet
             "(--environment.observe_in)"
         )
     old = with_longer_history(
-        loaded.parameters, settings.predictor, settings.environment, job.settings.environment
+        loaded.parameters,
+        settings.predictor,
+        settings.environment,
+        job.settings.environment,
     )
     leaves = named_leaves(old.replace(critic={}))
     filled = fill(fresh.replace(critic={}), leaves, f"--start_from {job.start_from}")
-    # a critic may see other numbers in another game; it is learnt anew sooner than an actor
+    # a critic may see other numbers in another game; it is learnt anew sooner than an
+    # actor
     fits = jax.tree.map(jnp.shape, old.critic) == jax.tree.map(jnp.shape, fresh.critic)
     return filled.replace(critic=old.critic if fits else fresh.critic)

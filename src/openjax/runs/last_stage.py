@@ -1,4 +1,6 @@
-"""The stage after MAPPO of a run: its policy may become better by it, and can't become worse."""
+"""The stage after MAPPO of a run: its policy may become better by it, and can't become
+worse.
+"""
 
 import time
 from collections.abc import Callable, Iterator
@@ -15,26 +17,30 @@ from openjax.store.policy_files import fill, load_policy_file, save_policy_file
 from openjax.store.run_directory import RunDirectory
 
 TOLERANCE = 0.03
-"""What a stage against evaders that plan may lose on the validation's scripted ones and still be
-kept: they can't tell what it is for. Pursuers that press harder breach safety distances in a third
-of a hundredth more of the steps, which is half of this.
+"""What a stage against evaders that plan may lose on the validation's scripted ones and
+still be kept: they can't tell what it is for. Pursuers that press harder breach safety
+distances in a third of a hundredth more of the steps, which is half of this.
 """
 
 
 def keep_best(
     directory: RunDirectory,
-    learn: Callable[[PolicyParameters, jax.Array], Iterator[tuple[PolicyParameters, dict]]],
+    learn: Callable[
+        [PolicyParameters, jax.Array], Iterator[tuple[PolicyParameters, dict]]
+    ],
     validate: Callable[[PolicyParameters], dict],
     job: TrainingJob,
     over: Callable[[], bool],
 ) -> str:
-    """Take a run's policy through the last stage, and keep the best of what it becomes and what it
-    was.
+    """Take a run's policy through the last stage, and keep the best of what it becomes
+    and what it was.
 
     Args:
-      directory: the run's; `policy.npz` is what the stage starts from, and what it writes.
+      directory: the run's; `policy.npz` is what the stage starts from, and what it
+      writes.
       learn: (parameters, key) -> after each update the parameters and its metrics.
-      validate: parameters -> summary of validation tasks by which no checkpoint was chosen.
+      validate: parameters -> summary of validation tasks by which no checkpoint was
+      chosen.
       job: the run's; its settings and parts are looked at.
       over: is asked after each update whether to stop.
 
@@ -62,17 +68,27 @@ def keep_best(
         scores.append(selection_score(looks[-1], length))
         if _is_better(settings, scores, best):
             best = len(looks) - 1
-            better = {"far_validation_score": scores[best], "analytic_updates": len(history)}
+            better = {
+                "far_validation_score": scores[best],
+                "analytic_updates": len(history),
+            }
             # at once: a stage that is ended early leaves the best of what it was
             save_policy_file(
-                directory.policy, parameters, settings, {**notes, **better}, storage="float32"
+                directory.policy,
+                parameters,
+                settings,
+                {**notes, **better},
+                storage="float32",
             )
     facts = {
         "seconds": round(time.monotonic() - began, 1),
         "kept": looks[best]["update"],
         "validation_scores": scores,
     }
-    write_json(directory.path / "analytic.json", {**facts, "validation": looks, "history": history})
+    write_json(
+        directory.path / "analytic.json",
+        {**facts, "validation": looks, "history": history},
+    )
     return _in_words(facts, len(history), scores[best])
 
 
@@ -82,9 +98,13 @@ def _is_looked_at(stage, update):
 
 
 def _in_words(facts, updates, score):
-    """What became of the policy in that many updates; `score` is that of the one that is kept."""
+    """What became of the policy in that many updates; `score` is that of the one that
+    is kept.
+    """
     scores = facts["validation_scores"]
-    course = f"{scores[0]:.4f} -> {score:.4f} after {facts['kept']} of {updates} updates"
+    course = (
+        f"{scores[0]:.4f} -> {score:.4f} after {facts['kept']} of {updates} updates"
+    )
     if not facts["kept"]:
         most = max(scores[1:], default=scores[0])
         course = f"{scores[0]:.4f}, at most {most:.4f} after it, not kept"

@@ -1,5 +1,5 @@
-"""The host's side of training: the compiled step, log, evaluate, checkpoint, stop when asked or at
-a NaN.
+"""The host's side of training: the compiled step, log, evaluate, checkpoint, stop when
+asked or at a NaN.
 
 Works on any carry; it knows nothing of what is trained.
 """
@@ -26,7 +26,9 @@ NOT_FINITE = "not_finite"
 
 
 class NotFiniteError(Exception):
-    """A NaN appeared; the message is one line that says where and what is left to look at."""
+    """A NaN appeared; the message is one line that says where and what is left to look
+    at.
+    """
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,14 +45,15 @@ class Plan:
     time_limit: float = float("inf")
     """Seconds of training time (compilation included) after which to stop."""
     validate_start: bool = False
-    """Validate before the first update, too: what a run starts from may be the best there will
-    be.
+    """Validate before the first update, too: what a run starts from may be the best
+    there will be.
     """
     overlap: bool | None = None
-    """Start an update before the last one's metrics are read: an accelerator then never waits for
-    the host.
+    """Start an update before the last one's metrics are read: an accelerator then never
+    waits for the host.
 
-    None: on accelerators. On a CPU nothing is gained, and a NaN stops the run one update sooner.
+    None: on accelerators. On a CPU nothing is gained, and a NaN stops the run one
+    update sooner.
     """
 
 
@@ -75,11 +78,12 @@ class Outcome:
 
 
 def guarded(step: Callable[[Any], tuple[Any, dict]]) -> Callable:
-    """`step`, a pure function carry -> (carry, metrics by name), with a check of its result for NaN
-    in the same program.
+    """`step`, a pure function carry -> (carry, metrics by name), with a check of its
+    result for NaN in the same program.
 
     Returns:
-      carry -> (carry, metrics, (L,) bool: which of the leaves of `float_leaves(carry)` hold a NaN).
+      carry -> (carry, metrics, (L,) bool: which of the leaves of `float_leaves(carry)`
+      hold a NaN).
       Infinities are left alone: they're legitimate as bounds.
     """
 
@@ -104,7 +108,8 @@ def float_leaves(carry: Any) -> dict[str, jax.Array]:
 class Loop:
     """Training until the plan is done, a time limit, a signal or a NaN.
 
-    Several processes run it together: each comes to the same decisions after the same update.
+    Several processes run it together: each comes to the same decisions after the same
+    update.
     """
 
     step: Callable
@@ -138,9 +143,16 @@ class Loop:
         self._started = self._saved_at = time.monotonic()
         best = self.checkpoints.best()
         self._best_score = best.score if best else -float("inf")
-        overlap = jax.devices()[0].platform != "cpu" if plan.overlap is None else plan.overlap
+        overlap = (
+            jax.devices()[0].platform != "cpu" if plan.overlap is None else plan.overlap
+        )
         reason, _ = self._decide()
-        if plan.validate_start and self.evaluate is not None and update == 0 and reason is None:
+        if (
+            plan.validate_start
+            and self.evaluate is not None
+            and update == 0
+            and reason is None
+        ):
             self._save(0, carry, validate=True)
         if reason is None:
             self.progress.phase("compiling the training step", announce=False)
@@ -176,25 +188,34 @@ class Loop:
     def _finish(self, carry, reached, results):
         """Read, write and show the results of an update.
 
-        Raises NotFiniteError for a NaN, and leaves the carry, which `reached` one update more where
-        updates overlap.
+        Raises NotFiniteError for a NaN, and leaves the carry, which `reached` one
+        update more where updates overlap.
         """
         update = results.number
         broken = np.asarray(results.broken)
-        values = {name: float(value) for name, value in jax.device_get(results.metrics).items()}
+        values = {
+            name: float(value)
+            for name, value in jax.device_get(results.metrics).items()
+        }
         self._log("train", update, values)
         if broken.any():
-            leaves = [name for name, bad in zip(float_leaves(carry), broken, strict=True) if bad]
+            leaves = [
+                name
+                for name, bad in zip(float_leaves(carry), broken, strict=True)
+                if bad
+            ]
             raise self._leave_broken_state(carry, reached, update, leaves, values)
         self.progress.phase("training", announce=update == self.first_update + 1)
         self.progress.update(update * self.plan.steps_per_update, values)
 
     def _decide(self):
-        """Why to stop, and whether a checkpoint is late: a signal to any process counts, and the
-        first one's clock.
+        """Why to stop, and whether a checkpoint is late: a signal to any process
+        counts, and the first one's clock.
         """
         late = time.monotonic() - self._saved_at > self.plan.checkpoint_seconds
-        asked = self.everyone([self.stop.name, self._elapsed() >= self.plan.time_limit, late])
+        asked = self.everyone(
+            [self.stop.name, self._elapsed() >= self.plan.time_limit, late]
+        )
         signals = [name for name, _, _ in asked if name is not None]
         # hosts' clocks differ, and all must decide alike
         _, over, late = asked[0]
@@ -202,7 +223,9 @@ class Loop:
         return signals[0] if signals else limit, late
 
     def _save(self, update, carry, validate=False):
-        """Write a checkpoint, with its score on the validation tasks where it is to have one."""
+        """Write a checkpoint, with its score on the validation tasks where it is to
+        have one.
+        """
         score = None
         if validate and self.evaluate is not None:
             self.progress.phase("evaluating on validation tasks", announce=False)
@@ -220,7 +243,8 @@ class Loop:
         save_state(place / f"{reached:09d}", carry, {"update": reached})
         # JSON has no NaN
         metrics = {
-            name: value if np.isfinite(value) else str(value) for name, value in values.items()
+            name: value if np.isfinite(value) else str(value)
+            for name, value in values.items()
         }
         report = {
             "update": update,
@@ -237,4 +261,6 @@ class Loop:
         names = ", ".join(leaves[:3])
         if len(leaves) > 3:
             names += f" and {len(leaves) - 3} more"
-        return NotFiniteError(f"NaN in update {update} in {names}; the state is in {place}, {good}")
+        return NotFiniteError(
+            f"NaN in update {update} in {names}; the state is in {place}, {good}"
+        )

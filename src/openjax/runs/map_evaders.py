@@ -1,5 +1,5 @@
-"""Evaders of a map that know the team: some learn against the policy, each by one network for all
-cells, and one plans.
+"""Evaders of a map that know the team: some learn against the policy, each by one
+network for all cells, and one plans.
 """
 
 import dataclasses
@@ -50,8 +50,13 @@ class MapEvaders:
 
     @property
     def duel(self) -> Duel:
-        """The game with an evader that is told where to fly; its own rule is the cheapest one."""
-        return Duel(Pursuit(dataclasses.replace(self.game, evaders=("field",))), self.loaded.policy)
+        """The game with an evader that is told where to fly; its own rule is the
+        cheapest one.
+        """
+        return Duel(
+            Pursuit(dataclasses.replace(self.game, evaders=("field",))),
+            self.loaded.policy,
+        )
 
     @property
     def response(self) -> BestResponse:
@@ -62,8 +67,12 @@ class MapEvaders:
         def draw_task(key):
             keys = jax.random.split(key, 4)
             cell = [jax.random.choice(keys[0], sizes)]
-            for key, values in zip(keys[1:3], (command.speed_ratios, command.radii), strict=True):
-                cell.append(jax.random.uniform(key, (), minval=min(values), maxval=max(values)))
+            for key, values in zip(
+                keys[1:3], (command.speed_ratios, command.radii), strict=True
+            ):
+                cell.append(
+                    jax.random.uniform(key, (), minval=min(values), maxval=max(values))
+                )
             return self.draw(keys[3], jnp.stack(cell))
 
         return BestResponse(command.learning, self.duel, draw_task)
@@ -89,7 +98,9 @@ class MapEvaders:
             return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), flown)
 
         learners = len(evaders.world_axes)
-        return Flight("evaders that learned", fly, self.command.episodes, evaders, learners)
+        return Flight(
+            "evaders that learned", fly, self.command.episodes, evaders, learners
+        )
 
     @property
     def planned(self) -> Flight:
@@ -98,7 +109,9 @@ class MapEvaders:
         planner = Planner(command.planning, self.duel)
 
         def fly(_, tasks, key):
-            return planner.fly(self.loaded.parameters, planner.duel.start(tasks, key), key)
+            return planner.fly(
+                self.loaded.parameters, planner.duel.start(tasks, key), key
+            )
 
         episodes = min(command.planner_episodes, command.episodes)
         # wider than others, as nothing but the ends of its plans is kept
@@ -106,7 +119,9 @@ class MapEvaders:
         return Flight("an evader that plans", fly, episodes, width=width)
 
     def evaders(self, tell: Callable[[str], None]) -> tuple[Evaders, list[dict]]:
-        """Those of the command's file, or new ones, and what was told while they learned."""
+        """Those of the command's file, or new ones, and what was told while they
+        learned.
+        """
         command = self.command
         learners, curve = (
             self.learn(tell) if command.learned is None else self.load(command.learned)
@@ -118,9 +133,17 @@ class MapEvaders:
 
     def save(self, path: Path, evaders: Evaders, curve: list[dict]) -> None:
         """Write those that learned, for `load`."""
-        notes = {"policy": self.loaded.source, "scenario": self.command.scenario, "curve": curve}
-        stored = {"map_evaders": {"actor": evaders.actor, "world_axes": evaders.world_axes}}
-        save_policy_file(path, stored, {"environment": self.game}, notes, storage="float32")
+        notes = {
+            "policy": self.loaded.source,
+            "scenario": self.command.scenario,
+            "curve": curve,
+        }
+        stored = {
+            "map_evaders": {"actor": evaders.actor, "world_axes": evaders.world_axes}
+        }
+        save_policy_file(
+            path, stored, {"environment": self.game}, notes, storage="float32"
+        )
 
     def load(self, path: Path) -> tuple[Evaders, list[dict]]:
         """What `save` wrote; they can fly, not learn on.
@@ -132,7 +155,9 @@ class MapEvaders:
             raise UserError(
                 f"--learned {path}: no such file; openjax map writes one by --evaders_out"
             )
-        leaves, _, notes = load_policy_file(path, "file of a map's evaders", "openjax map")
+        leaves, _, notes = load_policy_file(
+            path, "file of a map's evaders", "openjax map"
+        )
         if "map_evaders/world_axes" not in leaves:
             raise UserError(
                 f"--learned {path}: holds no evaders of a map; openjax map writes one by "
@@ -142,16 +167,18 @@ class MapEvaders:
         settings = dataclasses.replace(self.command.learning, learners=learners)
         response = dataclasses.replace(self.response, settings=settings)
         kinds = jax.eval_shape(response.start, jax.random.key(0)).evaders
-        abstract = {"map_evaders": {"actor": kinds.actor, "world_axes": kinds.world_axes}}
+        abstract = {
+            "map_evaders": {"actor": kinds.actor, "world_axes": kinds.world_axes}
+        }
         stored = fill(abstract, leaves, str(path))["map_evaders"]
         evaders = jax.tree.map(lambda kind: jnp.zeros(kind.shape, kind.dtype), kinds)
         return evaders.replace(**stored), notes.get("curve", [])
 
 
 def least_caught(captured: np.ndarray) -> np.ndarray:
-    """(E,) the place of the learner that flies each of a cell's episodes (E, L) that end with a
-    capture or not: the one that is caught least in the other half of them, as whoever is chosen by
-    the episodes that count looks better than it is.
+    """(E,) the place of the learner that flies each of a cell's episodes (E, L) that
+    end with a capture or not: the one that is caught least in the other half of them,
+    as whoever is chosen by the episodes that count looks better than it is.
     """
     even = np.arange(len(captured)) % 2 == 0
     if len(captured) < 2:

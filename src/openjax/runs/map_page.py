@@ -1,5 +1,5 @@
-"""The map of what can be caught as a page to move about in, for a reader who knows neither game
-theory nor drones.
+"""The map of what can be caught as a page to move about in, for a reader who knows
+neither game theory nor drones.
 """
 
 from collections.abc import Mapping
@@ -9,7 +9,14 @@ from openjax.runs.catch_map import cells_against
 from openjax.show.pages import filled
 
 SHOWN = (
-    *("num_pursuers", "speed_ratio", "capture_radius", "episodes", "capture_rate", "interval"),
+    *(
+        "num_pursuers",
+        "speed_ratio",
+        "capture_radius",
+        "episodes",
+        "capture_rate",
+        "interval",
+    ),
     *("capture_seconds", "crash_rate", "forced_below", "planar_below", "planner"),
 )
 """What a page has of a cell."""
@@ -17,15 +24,17 @@ WHO = {
     "learned": "one that learned to escape from this team",
     "scripted": "one that flies by rules",
 }
-"""Kinds of evaders (`openjax.runs.catch_map.cells_against`), and how the page calls them."""
+"""Kinds of evaders (`openjax.runs.catch_map.cells_against`), and how the page calls
+them.
+"""
 
 
 def map_page(maps: Mapping[str, dict]) -> str:
     """One HTML page that needs nothing else.
 
     Args:
-      maps: what `openjax.runs.catch_map.draw_map` returns, by what was flown in a few words; the
-      first is shown first.
+      maps: what `openjax.runs.catch_map.draw_map` returns, by what was flown in a few
+      words; the first is shown first.
     """
     first = next(iter(maps.values()))
     plain = []

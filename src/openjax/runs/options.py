@@ -1,5 +1,5 @@
-"""Options of the commands whose work is done in this room, without JAX, so that their help comes
-at once.
+"""Options of the commands whose work is done in this room, without JAX, so that their
+help comes at once.
 """
 
 import dataclasses
@@ -26,78 +26,86 @@ MAY_CHANGE = ("total_steps", "validation_interval", "validation_episodes")
 class TrainCommand:
     """Train pursuers to capture a faster evader.
 
-    Every setting of the run can be given, such as --mappo.epochs 2. The defaults shown are those of
-    the preset quick, or of the one given: openjax train --preset paper --help.
+    Every setting of the run can be given, such as --mappo.epochs 2. The defaults shown
+    are those of the preset quick, or of the one given: openjax train --preset paper
+    --help.
     """
 
     preset: str | None = None
-    """quick: minutes on two CPU cores, coarser steps; paper: the paper's task on an accelerator;
-    flight: policies to be flown, every pursuer another vehicle; evaders: the same against evaders
-    that fight back; teams: one policy for one to eight pursuers; mappo: without predictor and
-    generator; dacoop: parameters of a potential field. By default quick without an accelerator,
-    else paper.
+    """quick: minutes on two CPU cores, coarser steps; paper: the paper's task on an
+    accelerator; flight: policies to be flown, every pursuer another vehicle; evaders:
+    the same against evaders that fight back; teams: one policy for one to eight
+    pursuers; mappo: without predictor and generator; dacoop: parameters of a potential
+    field. By default quick without an accelerator, else paper.
     """
     out: Path | None = None
     """Directory of the run; by default runs/DATE-PRESET."""
     steps: Annotated[int | None, Interval("[1, 1e15]")] = None
     """Environment steps of the whole run, short for --total_steps."""
     minutes: Annotated[float | None, Interval("(0, 1000000]")] = None
-    """Learn for so long: compiling comes before it, the report after. A resumed run has it anew."""
+    """Learn for so long: compiling comes before it, the report after. A resumed run has
+    it anew.
+    """
     resume: Path | None = None
     """Go on with the run in this directory, exactly where it stopped."""
     start_from: str | None = None
-    """Start with the networks of this policy (a run, a policy file or a name) instead of fresh
-    ones.
+    """Start with the networks of this policy (a run, a policy file or a name) instead
+    of fresh ones.
     """
     overwrite: bool = False
     """Replace the run that --out already holds."""
     effects: Path | None = None
     """Physical effects to fly with (effects.toml, as the diagnosis writes it)."""
     vehicle: Path | None = None
-    """Vehicle to fly: crazyflie, brushless, or a vehicle.toml, as the calibration writes it; by
-    default the settings' airframe.
+    """Vehicle to fly: crazyflie, brushless, or a vehicle.toml, as the calibration
+    writes it; by default the settings' airframe.
     """
     opponent: str | None = None
-    """Evader to train against: field, greedy, wall_runner and others (openjax evaluate --help), or
-    a file that openjax exploit wrote, or FILE.py:function; short for --environment.evaders.
+    """Evader to train against: field, greedy, wall_runner and others (openjax evaluate
+    --help), or a file that openjax exploit wrote, or FILE.py:function; short for
+    --environment.evaders.
     """
     devices: str | None = None
-    """Number of devices to train on, or all (of all processes); by default one accelerator, or up
-    to four cores.
+    """Number of devices to train on, or all (of all processes); by default one
+    accelerator, or up to four cores.
     """
     coordinator_address: str | None = None
     """With several processes: host:port of process 0. Slurm and Open MPI tell it."""
     num_processes: Annotated[int | None, Interval("[1, 100000]")] = None
-    """How many processes train together, for example one per host. Slurm and Open MPI tell it."""
+    """How many processes train together, for example one per host. Slurm and Open MPI
+    tell it.
+    """
     process_id: Annotated[int | None, Interval("[0, 99999]")] = None
     """Which of them this one is, from 0. Slurm and Open MPI tell it."""
     compilation_cache: bool = True
-    """Keep compiled programs in the user's cache folder, so that the next run starts sooner."""
+    """Keep compiled programs in the user's cache folder, so that the next run starts
+    sooner.
+    """
     traced_programs: bool = True
     """Keep traced programs there, too, so that the next run traces nothing."""
     layout_episodes: Annotated[int | None, Interval("[1, 100000]")] = None
-    """Episodes per layout in the final table; by default 100 on an accelerator, 32 on a CPU, and 1
-    where all are alike, as starts are level.
+    """Episodes per layout in the final table; by default 100 on an accelerator, 32 on a
+    CPU, and 1 where all are alike, as starts are level.
     """
     compare_with: str | None = None
-    """Policy (a name, a file, a run) that the final table and the animation show beside the trained
-    one, or none; by default open after the preset quick.
+    """Policy (a name, a file, a run) that the final table and the animation show beside
+    the trained one, or none; by default open after the preset quick.
     """
-    settings: Annotated[tyro.conf.FlagConversionOff[TrainSettings], tyro.conf.arg(name="")] = (
-        dataclasses.field(default_factory=TrainSettings)
-    )
+    settings: Annotated[
+        tyro.conf.FlagConversionOff[TrainSettings], tyro.conf.arg(name="")
+    ] = dataclasses.field(default_factory=TrainSettings)
 
 
 @dataclasses.dataclass(frozen=True)
 class ExploitCommand:
-    """Train evaders against a fixed policy, and count the captures of them and of all scripted
-    evaders.
+    """Train evaders against a fixed policy, and count the captures of them and of all
+    scripted evaders.
     """
 
     policy: str | None = None
-    """A run's directory, a policy file (.npz), a checkpoint, the name of a policy in the package
-    or of a heuristic, or FILE.py:function for a controller of one's own. By default evaders, or
-    teams for another number of pursuers than three.
+    """A run's directory, a policy file (.npz), a checkpoint, the name of a policy in
+    the package or of a heuristic, or FILE.py:function for a controller of one's own. By
+    default evaders, or teams for another number of pursuers than three.
     """
     out: Path = Path("evader.npz")
     """File to write the strongest learned evader to."""
@@ -110,8 +118,8 @@ class ExploitCommand:
     seed: Seed = 0
     """Draws the evaders' first parameters, their tasks and the start attitudes."""
     minutes: Annotated[float | None, Interval("(0, 100000]")] = None
-    """Stop learning after this time, which begins when all is compiled; by default only when all
-    steps are done.
+    """Stop learning after this time, which begins when all is compiled; by default only
+    when all steps are done.
     """
     compilation_cache: bool = True
     """Keep compiled programs in the user's cache folder."""
@@ -122,8 +130,8 @@ class ExploitCommand:
     planner: tyro.conf.FlagConversionOff[bool] = True
     """Fly an evader that plans in the true simulation, too."""
     planning: PlannerSettings = dataclasses.field(default_factory=PlannerSettings)
-    learning: Annotated[BestResponseSettings, tyro.conf.arg(name="")] = dataclasses.field(
-        default_factory=BestResponseSettings
+    learning: Annotated[BestResponseSettings, tyro.conf.arg(name="")] = (
+        dataclasses.field(default_factory=BestResponseSettings)
     )
     environment: tyro.conf.FlagConversionOff[PursuitSettings] = dataclasses.field(
         default_factory=PursuitSettings
@@ -135,13 +143,15 @@ class MapCommand:
     """Map what a policy catches: over teams, speeds of the evader and capture radii."""
 
     policy: str = TEAM_POLICY
-    """A run's directory, a policy file (.npz), a checkpoint, or the name of a policy in the
-    package; one of the preset teams flies with any number of pursuers.
+    """A run's directory, a policy file (.npz), a checkpoint, or the name of a policy in
+    the package; one of the preset teams flies with any number of pursuers.
     """
     out: Path = Path("map.png")
     """File for the picture: a small map for each size of team."""
     page: Path | None = None
-    """File for a page to move about in (.html), for a reader who knows no game theory."""
+    """File for a page to move about in (.html), for a reader who knows no game
+    theory.
+    """
     json: Path | None = None
     """File to write all cells to."""
     sizes: Annotated[tuple[int, ...], Interval("[1, 8]")] = (1, 2, 3, 4, 5, 6, 7, 8)
@@ -157,22 +167,30 @@ class MapCommand:
     scenario: Literal["empty", "uniform"] = "empty"
     """Uniform tasks, with their pillars or without."""
     evaders: tuple[str, ...] = HELD_OUT
-    """One of them is drawn for each episode; by default those that no preset trains with."""
+    """One of them is drawn for each episode; by default those that no preset trains
+    with.
+    """
     episodes: Annotated[int, Interval("[1, 1000000]")] = 200
     """Episodes of each cell."""
     messages: MessageSettings = dataclasses.field(default_factory=MessageSettings)
     fall_outs: Annotated[float, Interval("[0, 1]")] = 0.0
-    """Share of the episodes of two or more pursuers in which one of them is gone after 2 s."""
+    """Share of the episodes of two or more pursuers in which one of them is gone after
+    2 s.
+    """
     sight_range: Annotated[float, Interval("(0, 1000]")] = PursuitSettings.sight_range
     """Distance up to which a pursuer sees the evader (m)."""
     sight_angle: Annotated[float, Interval("(0, 360]")] = PursuitSettings.sight_angle
-    """Opening angle of the cone about its body x axis within which a pursuer sees it (degrees)."""
+    """Opening angle of the cone about its body x axis within which a pursuer sees it
+    (degrees).
+    """
     best_response: tyro.conf.FlagConversionOff[bool] = True
-    """Let evaders learn against the policy, one network for all cells, and fly them in all cells,
-    too; by default not on a CPU.
+    """Let evaders learn against the policy, one network for all cells, and fly them in
+    all cells, too; by default not on a CPU.
     """
     learned: Path | None = None
-    """File of evaders that learned in a map before (--evaders_out), in place of learning."""
+    """File of evaders that learned in a map before (--evaders_out), in place of
+    learning.
+    """
     evaders_out: Path | None = None
     """File to write those that learned to (.npz)."""
     minutes: Annotated[float | None, Interval("(0, 100000]")] = None
@@ -186,7 +204,9 @@ class MapCommand:
     planner_share: Annotated[float, Interval("[0, 1]")] = 0.1
     """Share of the cells in which an evader that plans flies, too."""
     planner_episodes: Annotated[int, Interval("[1, 1000000]")] = 50
-    """Its episodes in each of them, the first of the cell's: each takes hundreds of others."""
+    """Its episodes in each of them, the first of the cell's: each takes hundreds of
+    others.
+    """
     planning: PlannerSettings = dataclasses.field(default_factory=PlannerSettings)
     batch: Annotated[int, Interval("[1, 1000000]")] = 8192
     """Episodes that are flown at once."""
@@ -201,14 +221,16 @@ class AdaptCommand:
     """Diagnose flights and fine-tune a policy to the vehicle that flew them."""
 
     flights: Annotated[Path, tyro.conf.Positional] = Path("flights")
-    """Folder of flight logs with a vehicle.toml, or an effects.toml of a diagnosis made before."""
+    """Folder of flight logs with a vehicle.toml, or an effects.toml of a diagnosis made
+    before.
+    """
     policy: str = DEFAULT_POLICY
     """A run, a policy file or the name of a policy in the package."""
     out: Path = Path("adapted")
     """Directory for what is found."""
     episodes: Annotated[int | None, Interval("[1, 1000000]")] = None
-    """Episodes by which the policies are measured; by default 1024 on an accelerator, 128 on a
-    CPU.
+    """Episodes by which the policies are measured; by default 1024 on an accelerator,
+    128 on a CPU.
     """
     seed: Seed = 0
     """Draws the worlds in which the policy is fine-tuned and measured."""
@@ -219,25 +241,31 @@ class AdaptCommand:
     training: AdaptSettings = dataclasses.field(default_factory=AdaptSettings)
 
 
-Part = Literal["rigid_free", "rigid", "mjx_free", "mjx", "environment", "rollout", "training"]
+Part = Literal[
+    "rigid_free", "rigid", "mjx_free", "mjx", "environment", "rollout", "training"
+]
 PARTS = get_args(Part)
 
 
 @dataclasses.dataclass(frozen=True)
 class BenchmarkCommand:
-    """Measure steps per second of each layer, from the physics to the whole training step."""
+    """Measure steps per second of each layer, from the physics to the whole training
+    step.
+    """
 
     preset: str | None = None
-    """quick, paper, flight, mappo or dacoop: networks and learner; by default what fits the
-    machine.
+    """quick, paper, flight, mappo or dacoop: networks and learner; by default what fits
+    the machine.
     """
     envs: Annotated[tuple[int, ...], Interval("[1, 16777216]")] = ()
     """Environment counts; by default a sweep that fits the machine."""
     training_envs: Annotated[tuple[int, ...], Interval("[1, 16777216]")] = ()
-    """Environment counts of the training step; by default those that fit the machine."""
+    """Environment counts of the training step; by default those that fit the
+    machine.
+    """
     devices: Annotated[tuple[int, ...], Interval("[1, 65536]")] = (1,)
-    """Numbers of devices on which the training step is measured; its worlds are shared out to
-    them.
+    """Numbers of devices on which the training step is measured; its worlds are shared
+    out to them.
     """
     parts: tuple[Part, ...] = PARTS
     """What to measure."""
@@ -247,6 +275,6 @@ class BenchmarkCommand:
     """Shortest time to measure each."""
     json: Path = Path("benchmark.json")
     """File of the results."""
-    settings: Annotated[tyro.conf.FlagConversionOff[TrainSettings], tyro.conf.arg(name="")] = (
-        dataclasses.field(default_factory=TrainSettings)
-    )
+    settings: Annotated[
+        tyro.conf.FlagConversionOff[TrainSettings], tyro.conf.arg(name="")
+    ] = dataclasses.field(default_factory=TrainSettings)

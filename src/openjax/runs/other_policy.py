@@ -1,5 +1,5 @@
-"""Another policy in the game of a run, which it wasn't trained for: beside the run's own it shows
-what the run was worth.
+"""Another policy in the game of a run, which it wasn't trained for: beside the run's
+own it shows what the run was worth.
 """
 
 import dataclasses
@@ -29,8 +29,8 @@ _OF_THE_POLICY = (
 
 
 def game_for(environment: Pursuit, policy: LoadedPolicy) -> Pursuit:
-    """A game for another policy than it was made for, which sees and steers as it was trained to;
-    episodes last as long.
+    """A game for another policy than it was made for, which sees and steers as it was
+    trained to; episodes last as long.
     """
     settings = environment.settings
     trained = policy.settings.environment
@@ -38,10 +38,14 @@ def game_for(environment: Pursuit, policy: LoadedPolicy) -> Pursuit:
         settings,
         **{name: getattr(trained, name) for name in _OF_THE_POLICY},
         # as many seconds, in steps of its own
-        episode_length=round(settings.episode_length * settings.time_step / trained.time_step),
+        episode_length=round(
+            settings.episode_length * settings.time_step / trained.time_step
+        ),
         max_pillars=layout_slots(settings),
     )
-    return dataclasses.replace(environment, settings=settings, dynamics=None, observer=None)
+    return dataclasses.replace(
+        environment, settings=settings, dynamics=None, observer=None
+    )
 
 
 def compare(
@@ -51,7 +55,8 @@ def compare(
     episodes: int,
     validation: int,
 ) -> tuple[list[dict], list[Trajectory]]:
-    """Fly a policy in the game of a run: `validation` of the uniform validation tasks, and layouts.
+    """Fly a policy in the game of a run: `validation` of the uniform validation tasks,
+    and layouts.
 
     Args:
       policy: another one than the run's.
@@ -61,8 +66,8 @@ def compare(
       validation: number of tasks.
 
     Returns:
-      records as of `Flown.record`, that of the validation tasks first, their capture steps in steps
-      of the run; and the first episode of each.
+      records as of `Flown.record`, that of the validation tasks first, their capture
+      steps in steps of the run; and the first episode of each.
 
     Raises:
       UserError: the policy can't play this game.
@@ -70,7 +75,11 @@ def compare(
     game = game_for(environment, policy)
     settings = game.settings
     policy = policy.in_game(game)
-    tasks = {"validation": uniform_tasks(environment.settings, validation, settings.max_pillars)}
+    tasks = {
+        "validation": uniform_tasks(
+            environment.settings, validation, settings.max_pillars
+        )
+    }
     tasks |= layout_tasks(settings, scenarios, episodes)
     # all in one batch, which is flown once
     evaluator = Evaluator(game, policy.policy, validation + episodes * len(scenarios))

@@ -1,5 +1,5 @@
-"""A run's report: its first and its best policy, and another one, in layouts and validation tasks;
-table and pictures.
+"""A run's report: its first and its best policy, and another one, in layouts and
+validation tasks; table and pictures.
 """
 
 import dataclasses
@@ -32,14 +32,17 @@ def report(
     outcome: Outcome,
     progress: Progress,
 ) -> Table:
-    """Evaluate the first and the best policy on the layouts, draw the best one's flights; the table
-    of both.
+    """Evaluate the first and the best policy on the layouts, draw the best one's
+    flights; the table of both.
     """
     settings = job.settings
     layouts = layouts_like(settings.environment)
     abstract = jax.eval_shape(lambda: outcome.carry.policy)
     rows = {}
-    for moment, path in (("before", directory.start_policy), ("after", directory.policy)):
+    for moment, path in (
+        ("before", directory.start_policy),
+        ("after", directory.policy),
+    ):
         progress.phase(f"evaluating the policy {moment} training on the layouts")
         parameters = fill(abstract, load_policy_file(path)[0], str(path))
         flown, pictured = _fly(validation, parameters, layouts, job.layout_episodes)
@@ -59,12 +62,18 @@ def report(
     _draw(directory, flights, other_flights)
     progress.phase("done", announce=False)
     return before_after_table(
-        rows["before"], rows["after"], settings.environment.time_step, job.compare_with, other_rows
+        rows["before"],
+        rows["after"],
+        settings.environment.time_step,
+        job.compare_with,
+        other_rows,
     )
 
 
 def _compare(job, layouts, validation, progress):
-    """Records and flights of the policy beside which the run's is shown; none without one."""
+    """Records and flights of the policy beside which the run's is shown; none without
+    one.
+    """
     if job.compare_with is None:
         return [], []
     progress.phase(f"evaluating {job.compare_with} in the same game")
@@ -79,8 +88,9 @@ def _compare(job, layouts, validation, progress):
 
 
 def _fly(validation, parameters, layouts, episodes):
-    """Validation tasks and layouts, flown by a policy; and what to draw of them: (kind, episode,
-    title), a flight of each layout, or some validation tasks where no layout fits the game.
+    """Validation tasks and layouts, flown by a policy; and what to draw of them: (kind,
+    episode, title), a flight of each layout, or some validation tasks where no layout
+    fits the game.
     """
     flown = validation(parameters)
     if not layouts:
@@ -99,11 +109,15 @@ def _draw(directory, flights, other_flights):
 
     plot_training(directory.path / "training.png", directory.path / METRICS_FILE)
     plot_trajectories(directory.path / "trajectories.png", flights)
-    # a chase that ends well shows what the game is about; beside it the other policy's, from the
-    # same start
+    # a chase that ends well shows what the game is about; beside it the other policy's,
+    # from the same start
     captured = [flight for flight in flights if flight.capture_index is not None]
     chosen = (captured or flights)[0]
-    beside = [flight for flight in other_flights if flight.title.startswith(f"{chosen.title}, ")]
+    beside = [
+        flight
+        for flight in other_flights
+        if flight.title.startswith(f"{chosen.title}, ")
+    ]
     if beside:
         chosen = dataclasses.replace(chosen, title=f"{chosen.title}, this run")
     animate(directory.path / "chase.gif", [chosen, *beside])
@@ -120,11 +134,11 @@ def before_after_table(
     other: str | None = None,
     other_rows: Sequence[dict] = (),
 ) -> Table:
-    """Captures, collisions and crashes before and after training; last what the policy `other` does
-    in the same game.
+    """Captures, collisions and crashes before and after training; last what the policy
+    `other` does in the same game.
 
-    Capture steps are of `time_step` seconds in all records. Beside another policy there is no room
-    for collisions.
+    Capture steps are of `time_step` seconds in all records. Beside another policy there
+    is no room for collisions.
     """
     columns = [
         ("capture\nrate", "capture_rate", 1.0, ".2f"),
@@ -137,7 +151,9 @@ def before_after_table(
         del columns[2]
         last.append(f"policy {other}:\nrate, seconds, crash")
     heads = ["", *(head for head, *_ in columns), *last]
-    table = numbers_table("Before and after training, in the game that was trained", heads)
+    table = numbers_table(
+        "Before and after training, in the game that was trained", heads
+    )
     by_scenario = {row["scenario"]: row for row in other_rows}
 
     def numbers(row):

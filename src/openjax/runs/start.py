@@ -1,5 +1,5 @@
-"""What `openjax train` was asked for, checked, and the start of a run: everything before the first
-array.
+"""What `openjax train` was asked for, checked, and the start of a run: everything
+before the first array.
 """
 
 import contextlib
@@ -27,7 +27,13 @@ from openjax.store.checkpoints import Checkpoints
 from openjax.store.compiled_programs import cache_programs
 from openjax.store.environments import is_evader_file, make_environment
 from openjax.store.policies import known_policies
-from openjax.store.run_directory import RunDirectory, check_free, create_run, locked, open_run
+from openjax.store.run_directory import (
+    RunDirectory,
+    check_free,
+    create_run,
+    locked,
+    open_run,
+)
 from openjax.vehicle.vehicle_file import copy_vehicle_file, load_vehicle_file
 
 
@@ -57,15 +63,17 @@ def read_command(arguments: Sequence[str]) -> TrainCommand:
 
 
 def membership(arguments: Sequence[str]) -> Membership | None:
-    """The place among several processes that the command line or the job's manager gives to this
-    one.
+    """The place among several processes that the command line or the job's manager
+    gives to this one.
 
-    It's needed before the command line can be read in full, as a preset depends on the devices.
+    It's needed before the command line can be read in full, as a preset depends on the
+    devices.
     """
     if {"-h", "--help"} & set(arguments):
         return None
 
-    # not by tyro, which isn't asked before the devices are known; nine digits hold any job's number
+    # not by tyro, which isn't asked before the devices are known; nine digits hold any
+    # job's number
     def number(name):
         text = peek(arguments, name)
         if text is not None and not (text.isdecimal() and len(text) <= 9):
@@ -105,7 +113,8 @@ def start(
     job, directory, files = prepare(command, arguments, started, processes, parts)
     if command.traced_programs and cache is not None:
         job = dataclasses.replace(job, traced=cache / "traced")
-    _check_same(job.settings, processes)  # a mistake shows before any process changes a file
+    # a mistake shows before any process changes a file
+    _check_same(job.settings, processes)
     with locked(directory.path) if processes.is_first else contextlib.nullcontext():
         if command.resume is None and processes.is_first:
             create_run(directory.path, command.overwrite)
@@ -135,8 +144,8 @@ def prepare(
     processes: Processes,
     parts: OwnParts = ALL_SHIPPED,
 ) -> tuple[TrainingJob, RunDirectory, dict[str, Path]]:
-    """What to train, where, and the files to copy there, by their names; nothing is changed yet.
-    Arguments as of `start`.
+    """What to train, where, and the files to copy there, by their names; nothing is
+    changed yet. Arguments as of `start`.
 
     Raises:
       UserError: whatever can be wrong with the files or the settings.
@@ -172,7 +181,11 @@ def prepare(
         own=parts,
     )
     job.check()
-    return job, directory, {name: path for name, path in files.items() if path is not None}
+    return (
+        job,
+        directory,
+        {name: path for name, path in files.items() if path is not None},
+    )
 
 
 def _has_begun(run):
@@ -184,8 +197,8 @@ def _environment(game, files):
     environment = make_environment(
         game, files["vehicle.toml"], files["effects.toml"], files["evader.npz"]
     )
-    # a scripted evader, or a vehicle that is known by name, is in the settings; a function isn't in
-    # any file of the run
+    # a scripted evader, or a vehicle that is known by name, is in the settings; a
+    # function isn't in any file of the run
     if not is_evader_file(files["evader.npz"]):
         files["evader.npz"] = None
     if files["vehicle.toml"] and load_vehicle_file(files["vehicle.toml"]).path is None:
@@ -194,8 +207,8 @@ def _environment(game, files):
 
 
 def other_compiler(facts: dict) -> str | None:
-    """What to say of a run whose last process, by its facts, had another JAX than this one; None
-    where it had the same, or nobody noted it.
+    """What to say of a run whose last process, by its facts, had another JAX than this
+    one; None where it had the same, or nobody noted it.
     """
     machine = facts.get("machine")
     versions = machine.get("versions") if isinstance(machine, dict) else None
@@ -209,8 +222,8 @@ def other_compiler(facts: dict) -> str | None:
 
 
 def _files(command, resumed):
-    """What the run flies with by its name in a run's directory: vehicle, effects, evader; None
-    where there is none.
+    """What the run flies with by its name in a run's directory: vehicle, effects,
+    evader; None where there is none.
     """
     options = {
         "vehicle.toml": command.vehicle,
@@ -218,15 +231,20 @@ def _files(command, resumed):
         "evader.npz": command.opponent,
     }
     # an option goes before what a resumed run has kept
-    return {name: path or (resumed and resumed.optional(name)) for name, path in options.items()}
+    return {
+        name: path or (resumed and resumed.optional(name))
+        for name, path in options.items()
+    }
 
 
 def _check_parts(parts, files, stored):
-    """Raises UserError for parts of one's own that don't go with files, or with the run that is
-    resumed, whose `stored` facts these are.
+    """Raises UserError for parts of one's own that don't go with files, or with the run
+    that is resumed, whose `stored` facts these are.
     """
     if parts.environment is not None and any(files.values()):
-        raise UserError("an environment of one's own has its vehicle, effects and evader already")
+        raise UserError(
+            "an environment of one's own has its vehicle, effects and evader already"
+        )
     # a new run may have any; one that is resumed and says nothing had none
     first = stored.get("own_parts", []) if stored else parts.names
     if first != parts.names:
@@ -237,8 +255,8 @@ def _check_parts(parts, files, stored):
 
 
 def _free_directory(command, processes):
-    """Where a new run is written, the same for all processes. Raises UserError where it can't
-    be.
+    """Where a new run is written, the same for all processes. Raises UserError where it
+    can't be.
     """
     name = f"{time.strftime('%Y%m%d-%H%M%S')}-{command.preset or default_preset()}"
     out = Path(processes.of_first(str(command.out or Path("runs") / name)))
@@ -249,7 +267,9 @@ def _free_directory(command, processes):
 def _layout_episodes(environment):
     """How often each layout is flown where nobody says."""
     settings = environment.settings
-    differ = settings.start_attitude == "drawn" or settings.vehicles or environment.effects
+    differ = (
+        settings.start_attitude == "drawn" or settings.vehicles or environment.effects
+    )
     if not differ:  # one episode says all
         return 1
     return 32 if jax.default_backend() == "cpu" else 100
@@ -258,25 +278,34 @@ def _layout_episodes(environment):
 def _comparison(command, stored):
     """The policy to compare with; None for none."""
     if command.compare_with is not None:
-        return None if command.compare_with == "none" else _lasting(command.compare_with)
+        return (
+            None if command.compare_with == "none" else _lasting(command.compare_with)
+        )
     if command.resume is not None:
         return stored.get("compare_with")
     # beside a run of minutes, a policy of hours shows what more time is worth
-    fits = command.settings.environment.num_pursuers == TrainSettings().environment.num_pursuers
+    fits = (
+        command.settings.environment.num_pursuers
+        == TrainSettings().environment.num_pursuers
+    )
     return "open" if fits and (command.preset or default_preset()) == "quick" else None
 
 
 def _lasting(start_from):
     """The name of a policy, or a path that also holds in other folders."""
     # what isn't there is left as it was typed, and the error that follows names it so
-    if start_from is None or start_from in known_policies() or not Path(start_from).exists():
+    if (
+        start_from is None
+        or start_from in known_policies()
+        or not Path(start_from).exists()
+    ):
         return start_from
     return str(Path(start_from).absolute())
 
 
 def _check_same(settings, processes):
-    """Raises UserError where processes were started with different settings: their results would
-    drift apart.
+    """Raises UserError where processes were started with different settings: their
+    results would drift apart.
     """
     here = {"settings": to_plain(settings), "JAX": jax.__version__}
     for other, there in enumerate(processes.everyone(here)):
@@ -288,8 +317,8 @@ def _check_same(settings, processes):
 
 
 def check_resumed(command: TrainCommand, stored: TrainSettings) -> None:
-    """Raises UserError for options that don't go with --resume, and settings that a run can't take
-    up in its middle.
+    """Raises UserError for options that don't go with --resume, and settings that a run
+    can't take up in its middle.
     """
     resume = command.resume
     if command.out is not None and command.out.resolve() != resume.resolve():
@@ -297,7 +326,10 @@ def check_resumed(command: TrainCommand, stored: TrainSettings) -> None:
     if command.overwrite:
         raise UserError("--resume and --overwrite exclude each other")
     options = ["start_from", "effects", "vehicle", "opponent"]
-    if "own" in stored.environment.evaders and open_run(resume).optional("evader.npz") is None:
+    if (
+        "own" in stored.environment.evaders
+        and open_run(resume).optional("evader.npz") is None
+    ):
         options.remove("opponent")  # a function isn't in the run's files
     given = [name for name in options if getattr(command, name) is not None]
     for name in (*given, *different_settings(command.settings, stored)):
@@ -309,8 +341,8 @@ def check_resumed(command: TrainCommand, stored: TrainSettings) -> None:
 
 
 def _devices(text, settings, stored):
-    """How many; where nobody says, as many as the run had (`stored`, None for a new one), or as
-    many cores as the worlds can be shared out to.
+    """How many; where nobody says, as many as the run had (`stored`, None for a new
+    one), or as many cores as the worlds can be shared out to.
     """
     available = len(jax.devices())
     if text is None and jax.default_backend() == "cpu" and jax.process_count() == 1:

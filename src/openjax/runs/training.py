@@ -42,14 +42,16 @@ from openjax.store.policy_files import fill, save_policy_file
 from openjax.store.run_directory import RunDirectory
 
 EARLY = 10.0
-"""Taken from the score of a checkpoint before `validation_start`: no policy's score is as low."""
+"""Taken from the score of a checkpoint before `validation_start`: no policy's score is
+as low.
+"""
 _SOON = 3.0
 """Seconds after which a training step that isn't ready doesn't come from the cache."""
 
 
 def run_job(job: TrainingJob, directory: RunDirectory, console: Console) -> int:
-    """Train from the last checkpoint on, or from the start where there is none, then write the
-    report.
+    """Train from the last checkpoint on, or from the start where there is none, then
+    write the report.
 
     Returns:
       the exit status: 0, or 1 after a NaN.
@@ -59,7 +61,9 @@ def run_job(job: TrainingJob, directory: RunDirectory, console: Console) -> int:
     title = f"openjax.train → {directory.path}"
     with contextlib.ExitStack() as stack:
         stop = stack.enter_context(StopRequest())
-        progress = stack.enter_context(Progress(title, job.settings.total_steps, console))
+        progress = stack.enter_context(
+            Progress(title, job.settings.total_steps, console)
+        )
         run = _Run(job, directory, stop, progress)
         stack.enter_context(interruption.clean_up(run.checkpoints.abandon))
         stack.enter_context(interruption.last_words(run.last_words))
@@ -71,7 +75,9 @@ def run_job(job: TrainingJob, directory: RunDirectory, console: Console) -> int:
         table = None if outcome is None else run.finish(outcome)
     if table is not None:
         console.print(table)
-        for line in closing_words(job.settings, directory.path, jax.default_backend() == "cpu"):
+        for line in closing_words(
+            job.settings, directory.path, jax.default_backend() == "cpu"
+        ):
             console.print(line, soft_wrap=True)
         console.print(
             f"run, policy and pictures are in {directory.path}, the chase in chase.gif",
@@ -81,10 +87,16 @@ def run_job(job: TrainingJob, directory: RunDirectory, console: Console) -> int:
 
 
 class _Run:
-    """One process' part of a run: what its steps share, and the programs as they get ready."""
+    """One process' part of a run: what its steps share, and the programs as they get
+    ready.
+    """
 
     def __init__(
-        self, job: TrainingJob, directory: RunDirectory, stop: StopRequest, progress: Progress
+        self,
+        job: TrainingJob,
+        directory: RunDirectory,
+        stop: StopRequest,
+        progress: Progress,
     ):
         self.job = job
         self.directory = directory
@@ -98,18 +110,23 @@ class _Run:
         self.first_update = 0
         """Updates that were done before this process began."""
         self.taught = False
-        """Whether first flights have taught the policy something that isn't validated yet."""
+        """Whether first flights have taught the policy something that isn't validated
+        yet.
+        """
         self.began = float("inf")
         """When learning began (`time.monotonic`), from which on a time limit counts."""
-        # programs that are made in the background, each a function that waits for the compiler
+        # programs that are made in the background, each a function that waits for the
+        # compiler
         self.first_flights = None
         self.validation = None
         self.last_stage = None
-        self.processes.advice = f"go on with openjax train --resume {directory.path} --devices all"
+        self.processes.advice = (
+            f"go on with openjax train --resume {directory.path} --devices all"
+        )
 
     def train(self) -> Outcome | None:
-        """Compile and train; None where a signal or the time limit came before anything was learnt.
-        Raises NotFiniteError.
+        """Compile and train; None where a signal or the time limit came before anything
+        was learnt. Raises NotFiniteError.
         """
         job = self.job
         settings = self.settings
@@ -120,10 +137,14 @@ class _Run:
             self.progress.message(
                 "all updates are done; --total_steps N goes on to more. Its report is made anew"
             )
-        self.progress.phase("compiling the start: networks, first tasks", announce=latest is None)
+        self.progress.phase(
+            "compiling the start: networks, first tasks", announce=latest is None
+        )
         start, step, self.abstract = _programs(job)
         # takes longest, so it comes first
-        step_ready = _nothing_to_wait_for if done else compile_ahead(step, self.abstract)
+        step_ready = (
+            _nothing_to_wait_for if done else compile_ahead(step, self.abstract)
+        )
         self.first_flights = self._first_flights()
         carry, self.first_update, seconds = self._first_carry(start)
         if self.processes.is_first:
@@ -134,7 +155,9 @@ class _Run:
             self.progress.message(f"{limit}; ending as soon as the compiler does")
             return None
         with self._metrics() as metrics:
-            self.progress.phase("compiling the training step", announce=not (done or over))
+            self.progress.phase(
+                "compiling the training step", announce=not (done or over)
+            )
             self._compile_beside(_nothing_to_wait_for if over else step_ready)
             self.began = min(self.began, time.monotonic())
             loop = self._loop(step, metrics, seconds)
@@ -160,7 +183,9 @@ class _Run:
     def last_words(self) -> str:
         """What there is of the run, and how it goes on, should it end now."""
         update = self.checkpoints.last_finished()
-        saved = "nothing was learnt yet" if update is None else f"saved at update {update}"
+        saved = (
+            "nothing was learnt yet" if update is None else f"saved at update {update}"
+        )
         return f"{saved}; go on with {typed(f'openjax train --resume {self.directory.path}')}"
 
     def _plan(self, seconds):
@@ -176,37 +201,50 @@ class _Run:
         )
 
     def finish(self, outcome: Outcome) -> Table | None:
-        """Write the best policy, then the report, whose table it is; None where a signal ended the
-        run.
+        """Write the best policy, then the report, whose table it is; None where a
+        signal ended the run.
         """
         settings = self.settings
-        signals = [name for name in self.processes.everyone(self.stop.name) if name is not None]
+        signals = [
+            name for name in self.processes.everyone(self.stop.name) if name is not None
+        ]
         if not self.processes.is_first:
             return None
         self._save_best()
-        if outcome.update == self.first_update and settings.total_updates > outcome.update:
+        if (
+            outcome.update == self.first_update
+            and settings.total_updates > outcome.update
+        ):
             when = f"before its first update, {outcome.seconds:.0f} s after the start"
-            self.progress.message(f"MAPPO did not begin: {outcome.stopped_by} came {when}")
+            self.progress.message(
+                f"MAPPO did not begin: {outcome.stopped_by} came {when}"
+            )
         if not signals and settings.analytic.updates:
             self.progress.phase("learning by the gradient through the simulation")
             self.progress.message(self._learn_last())
         if asked := (*signals, self.stop.name)[0]:
             self.progress.message(f"{asked}: {self.last_words()}")
             return None
-        return report(self.job, self.directory, self.validation(), outcome, self.progress)
+        return report(
+            self.job, self.directory, self.validation(), outcome, self.progress
+        )
 
     def _learn_last(self):
         """The last stage; what to tell of it."""
 
         def validate(parameters):
-            # the far tasks: by the uniform ones the best of many checkpoints was chosen, in part by
-            # luck
+            # the far tasks: by the uniform ones the best of many checkpoints was
+            # chosen, in part by luck
             return summarise(self._await_validation()(parameters)[1].evaluation)
 
         learn = self.last_stage()
         with self.stop.while_learning():
             return keep_best(
-                self.directory, learn, validate, self.job, lambda: self.stop.name is not None
+                self.directory,
+                learn,
+                validate,
+                self.job,
+                lambda: self.stop.name is not None,
             )
 
     def _await_validation(self):
@@ -225,7 +263,9 @@ class _Run:
         return compile_first_flights(flights, policy, say, self._over, self.job.keep)
 
     def _over(self):
-        """Whether the run is to end: a signal to any process counts, and the first one's clock."""
+        """Whether the run is to end: a signal to any process counts, and the first
+        one's clock.
+        """
         late = time.monotonic() - self.began >= self.job.time_limit
         asked = self.processes.everyone([self.stop.name, late])
         return any(name is not None for name, _ in asked) or asked[0][1]
@@ -237,9 +277,13 @@ class _Run:
         checkpoints = self.checkpoints
         checkpoints.remove_unfinished()
         if self.processes.of_first(checkpoints.any_finished()):
-            carry, record = checkpoints.restore_latest(self.abstract, self.progress.message)
+            carry, record = checkpoints.restore_latest(
+                self.abstract, self.progress.message
+            )
             self.taught = awaits_validation(record, settings, job.facts["start_from"])
-            self.progress.message(f"resumed at update {record.update} of {settings.total_updates}")
+            self.progress.message(
+                f"resumed at update {record.update} of {settings.total_updates}"
+            )
             return carry, record.update, float(record.notes.get("seconds", 0.0))
         carry = start(jax.random.key(settings.seed))
         if job.start_from is not None:
@@ -259,8 +303,12 @@ class _Run:
                 self._prepare_validation()
             ready()
             self.began = time.monotonic()
-            self.progress.phase("learning to fly by the gradient through the simulation")
-            policy = learn(carry.policy, jax.random.fold_in(jax.random.key(settings.seed), 1))
+            self.progress.phase(
+                "learning to fly by the gradient through the simulation"
+            )
+            policy = learn(
+                carry.policy, jax.random.fold_in(jax.random.key(settings.seed), 1)
+            )
             self.taught = policy is not None
             if self.taught:
                 carry = carry.replace(policy=policy)
@@ -271,15 +319,20 @@ class _Run:
         if not self.processes.is_first:
             return contextlib.nullcontext()
         steps = self.first_update * self.settings.steps_per_update
-        writer = MetricsWriter(self.directory.path, self.first_update or None, resumed_steps=steps)
+        writer = MetricsWriter(
+            self.directory.path, self.first_update or None, resumed_steps=steps
+        )
         return contextlib.closing(writer)
 
     def _compile_beside(self, step_ready):
-        """Wait for the training step; what is needed later is compiled in the background."""
+        """Wait for the training step; what is needed later is compiled in the
+        background.
+        """
         first = self.processes.is_first
         settings = self.settings
-        # while an accelerator's compiler works for long, validation is made beside it; else its
-        # tracing would only hold up the first update, and on a CPU both would share the same cores
+        # while an accelerator's compiler works for long, validation is made beside it;
+        # else its tracing would only hold up the first update, and on a CPU both would
+        # share the same cores
         if jax.default_backend() != "cpu":
             try:
                 step_ready(_SOON)
@@ -299,8 +352,8 @@ class _Run:
             self.validation = in_background(self._ready_validation)
 
     def _ready_validation(self):
-        """The validation, compiled; and what else is needed soon after the first update is
-        loaded.
+        """The validation, compiled; and what else is needed soon after the first update
+        is loaded.
         """
         load_orbax()
         settings = self.settings
@@ -315,20 +368,29 @@ class _Run:
         return validation
 
     def _evaluate(self, carry):
-        """Score and metrics of a carry on the validation tasks; the same in all processes."""
+        """Score and metrics of a carry on the validation tasks; the same in all
+        processes.
+        """
         if not self.processes.is_first:
             return self.processes.of_first()
-        # a copy: on several devices the carry's leaves lie elsewhere than the validation's
+        # a copy: on several devices the carry's leaves lie elsewhere than the
+        # validation's
         validation = self._await_validation()
-        uniform, far = (summarise(kind.evaluation) for kind in validation(own_copy(carry.policy)))
+        uniform, far = (
+            summarise(kind.evaluation) for kind in validation(own_copy(carry.policy))
+        )
         settings = self.settings
         score = selection_score(uniform, settings.environment.episode_length)
         if int(carry.update) < settings.validation_start * settings.total_updates:
             score -= EARLY
-        return self.processes.of_first((score, {**flat_metrics(uniform, far), "score": score}))
+        return self.processes.of_first(
+            (score, {**flat_metrics(uniform, far), "score": score})
+        )
 
     def _save_best(self):
-        """Write the policy of the best checkpoint, or of the latest where none was evaluated."""
+        """Write the policy of the best checkpoint, or of the latest where none was
+        evaluated.
+        """
         leaves, record = self.checkpoints.load_best(policy_leaf, self.progress.message)
         notes = {
             "update": record.update,
@@ -338,7 +400,9 @@ class _Run:
             **self.job.facts,
         }
         parameters = fill(self.abstract.policy, leaves, str(record.path))
-        save_policy_file(self.directory.policy, parameters, self.settings, notes, storage="float32")
+        save_policy_file(
+            self.directory.policy, parameters, self.settings, notes, storage="float32"
+        )
 
 
 def _nothing_to_wait_for(*_):
@@ -348,8 +412,9 @@ def _nothing_to_wait_for(*_):
 def awaits_validation(
     record: CheckpointRecord, settings: TrainSettings, started_from: str | None
 ) -> bool:
-    """Whether a run was stopped after its first flights and before its start was validated: that
-    comes when it is resumed, as what a run starts from may be the best there will be.
+    """Whether a run was stopped after its first flights and before its start was
+    validated: that comes when it is resumed, as what a run starts from may be the best
+    there will be.
 
     Args:
       record: of the checkpoint that it goes on from.
@@ -361,17 +426,21 @@ def awaits_validation(
 
 
 def _programs(job):
-    """The run's start and its step, from earlier runs' traces where they're kept, and the kind of
-    the carry.
+    """The run's start and its step, from earlier runs' traces where they're kept, and
+    the kind of the carry.
     """
     settings = job.settings
     shardings = carry_shardings(job.devices)
     start = make_start(settings, job.parts)
-    abstract = abstract_like(jax.eval_shape(start, jax.random.key(settings.seed)), shardings)
+    abstract = abstract_like(
+        jax.eval_shape(start, jax.random.key(settings.seed)), shardings
+    )
     same = everywhere(job.devices)
     step = guarded(make_device_step(settings, job.parts, job.devices))
     # where kept traces have been tried
-    can_keep = job.devices == 1 or (jax.default_backend() == "cpu" and jax.process_count() == 1)
+    can_keep = job.devices == 1 or (
+        jax.default_backend() == "cpu" and jax.process_count() == 1
+    )
     if can_keep and (keep := job.keep):
         step = keep("step", step, lambda: (abstract,), carry=abstract)
         fresh = start
@@ -380,8 +449,8 @@ def _programs(job):
             program = keep("start", fresh, lambda: (key,), carry=abstract)
             return jax.jit(program, out_shardings=shardings)(key)
 
-    # without shardings, the compiler may move a leaf, and the next call would compile again; all
-    # processes can read the rest
+    # without shardings, the compiler may move a leaf, and the next call would compile
+    # again; all processes can read the rest
     options = {
         "out_shardings": (shardings, same, same),
         "compiler_options": compiler_options(job.devices),

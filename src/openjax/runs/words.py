@@ -1,5 +1,5 @@
-"""What a run says in words: what is trained, and at its end what a crash is, what isn't the
-paper's, and what to type next.
+"""What a run says in words: what is trained, and at its end what a crash is, what isn't
+the paper's, and what to type next.
 """
 
 from pathlib import Path
@@ -17,8 +17,8 @@ NAMED = 3
 
 
 def opening_words(settings: TrainSettings) -> str:
-    """Which preset this is, or comes nearest to, and what that is: nobody should take another game
-    for the paper's.
+    """Which preset this is, or comes nearest to, and what that is: nobody should take
+    another game for the paper's.
     """
     changed = {
         name: [leaf for leaf in different_settings(settings, make()) if leaf != "seed"]
@@ -44,8 +44,8 @@ def different_settings(settings: TrainSettings, other: TrainSettings) -> list[st
 def layouts_like(game: PursuitSettings) -> list[Scenario]:
     """The test layouts that a policy of this game can be judged by.
 
-    They have its pursuers, and at most a fifth more pillars than it was trained with, as in the
-    paper (6 for 5).
+    They have its pursuers, and at most a fifth more pillars than it was trained with,
+    as in the paper (6 for 5).
     """
     most = 1.2 * game.max_pillars
     return [
@@ -71,7 +71,9 @@ def closing_words(settings: TrainSettings, run: Path, on_cpu: bool) -> list[str]
         view += f" --scenario {layouts[-1].name}"
     steps = [f"{typed(view)} (in a browser)"]
     if on_cpu:
-        steps.append(typed("openjax train --preset paper (the real game, two minutes on a GPU)"))
+        steps.append(
+            typed("openjax train --preset paper (the real game, two minutes on a GPU)")
+        )
     steps.append(f"{typed('openjax sample_flights flights')}, then")
     steps.append(typed("openjax diagnose flights (from flight logs to a cause)"))
     return [*lines, "\n  ".join(["Next:", *steps])]
@@ -83,8 +85,8 @@ def _pillars(game):
 
 
 def unlike_the_papers(game: PursuitSettings, evaders: tuple[str, ...]) -> str:
-    """How a game differs from the paper's, as a sentence; empty where it doesn't. `evaders`: names
-    or files of those who fly, its own or others.
+    """How a game differs from the paper's, as a sentence; empty where it doesn't.
+    `evaders`: names or files of those who fly, its own or others.
     """
     paper = PursuitSettings()
     words = []
@@ -103,7 +105,9 @@ def unlike_the_papers(game: PursuitSettings, evaders: tuple[str, ...]) -> str:
     if _pillars(game) != _pillars(paper):
         words.append(f"{_pillars(game)} pillars instead of {_pillars(paper)}")
     if game.observed_pillars != paper.observed_pillars:
-        words.append(f"{game.observed_pillars} pillars in view instead of {paper.observed_pillars}")
+        words.append(
+            f"{game.observed_pillars} pillars in view instead of {paper.observed_pillars}"
+        )
     if game.start_attitude != paper.start_attitude:
         words.append("level starts instead of tilted ones")
     if game.time_step > paper.time_step:

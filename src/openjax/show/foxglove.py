@@ -1,8 +1,9 @@
-"""MCAP files that Foxglove opens: poses, scenes and numbers in its well-known schemas, as JSON.
+"""MCAP files that Foxglove opens: poses, scenes and numbers in its well-known schemas,
+as JSON.
 
-Schemas are those of github.com/foxglove/foxglove-sdk (foxglove.PoseInFrame, foxglove.SceneUpdate),
-which Foxglove knows by their names; numbers are in one of our own, to be plotted. Needs the `mcap`
-library.
+Schemas are those of github.com/foxglove/foxglove-sdk (foxglove.PoseInFrame,
+foxglove.SceneUpdate), which Foxglove knows by their names; numbers are in one of our
+own, to be plotted. Needs the `mcap` library.
 """
 
 import json
@@ -25,14 +26,21 @@ EVADER = {"r": 0.85, "g": 0.3, "b": 0.2, "a": 1.0}
 
 _VECTOR = {"type": "object", "properties": {a: {"type": "number"} for a in "xyz"}}
 _QUATERNION = {"type": "object", "properties": {a: {"type": "number"} for a in "xyzw"}}
-_POSE = {"type": "object", "properties": {"position": _VECTOR, "orientation": _QUATERNION}}
+_POSE = {
+    "type": "object",
+    "properties": {"position": _VECTOR, "orientation": _QUATERNION},
+}
 _TIME = {
     "type": "object",
     "title": "time",
     "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}},
 }
 SCHEMAS = {
-    "foxglove.PoseInFrame": {"timestamp": _TIME, "frame_id": {"type": "string"}, "pose": _POSE},
+    "foxglove.PoseInFrame": {
+        "timestamp": _TIME,
+        "frame_id": {"type": "string"},
+        "pose": _POSE,
+    },
     "foxglove.SceneUpdate": {
         "deletions": {"type": "array", "items": {"type": "object"}},
         "entities": {"type": "array", "items": {"type": "object"}},
@@ -56,7 +64,9 @@ def write_mcap(path: Path, channels: Iterable[Channel]) -> None:
     try:
         from mcap.writer import Writer
     except ImportError as error:
-        raise UserError(f"{path}: writing MCAP needs the mcap library: pip install mcap") from error
+        raise UserError(
+            f"{path}: writing MCAP needs the mcap library: pip install mcap"
+        ) from error
     with replacing(path) as partial, partial.open("wb") as file:
         writer = Writer(file)
         writer.start(profile="", library="openjax")
@@ -67,7 +77,9 @@ def write_mcap(path: Path, channels: Iterable[Channel]) -> None:
             number = writer.register_channel(channel.topic, "json", schema_id)
             for time, message in channel.messages:
                 stamp = round(1e9 * time)
-                text = json.dumps(_stamped(channel.schema, message, stamp), allow_nan=False)
+                text = json.dumps(
+                    _stamped(channel.schema, message, stamp), allow_nan=False
+                )
                 writer.add_message(number, stamp, text.encode(), stamp)
         writer.finish()
 
@@ -91,26 +103,34 @@ def pose(position, quaternion=(1.0, 0.0, 0.0, 0.0)) -> dict:
 
 
 def pose_channel(topic: str, time, position, quaternion=None) -> Channel:
-    """The poses of one vehicle: times (T,) s, positions (T, 3) m, attitudes (T, 4) wxyz or None;
-    rows that weren't sampled are left out.
+    """The poses of one vehicle: times (T,) s, positions (T, 3) m, attitudes (T, 4) wxyz
+    or None; rows that weren't sampled are left out.
     """
-    attitude = np.tile([1.0, 0.0, 0.0, 0.0], (len(time), 1)) if quaternion is None else quaternion
+    attitude = (
+        np.tile([1.0, 0.0, 0.0, 0.0], (len(time), 1))
+        if quaternion is None
+        else quaternion
+    )
     rows = np.flatnonzero(np.isfinite(position).all(1) & np.isfinite(attitude).all(1))
     messages = [
-        (float(time[k]), {"frame_id": WORLD, "pose": pose(position[k], attitude[k])}) for k in rows
+        (float(time[k]), {"frame_id": WORLD, "pose": pose(position[k], attitude[k])})
+        for k in rows
     ]
     return Channel(topic, "foxglove.PoseInFrame", messages)
 
 
 def trajectory_channels(name: str, flight: Trajectory) -> list[Channel]:
-    """An episode: a pose for each drone, and a scene with drones and pillars. `name` begins the
-    topics.
+    """An episode: a pose for each drone, and a scene with drones and pillars. `name`
+    begins the topics.
     """
     every = max(1, round(LONGEST_STEP / flight.time_step))
     steps = np.arange(0, flight.end(seconds=2.0), every)
     time = steps * flight.time_step
     drones = {
-        f"pursuer_{k + 1}": (flight.pursuer_position[steps, k], flight.pursuer_quaternion[steps, k])
+        f"pursuer_{k + 1}": (
+            flight.pursuer_position[steps, k],
+            flight.pursuer_quaternion[steps, k],
+        )
         for k in range(flight.pursuer_position.shape[1])
     }
     drones["evader"] = (flight.evader_position[steps], None)
@@ -123,7 +143,9 @@ def trajectory_channels(name: str, flight: Trajectory) -> list[Channel]:
         entities = []
         for drone, (position, _) in drones.items():
             colour = EVADER if drone == "evader" else PURSUER
-            entities.append(_entity(drone, "spheres", position[row], 2 * RADIUS, colour))
+            entities.append(
+                _entity(drone, "spheres", position[row], 2 * RADIUS, colour)
+            )
         scenes.append((float(moment), {"entities": entities}))
     if len(scenes):
         # in the first scene only: what stands stays
@@ -155,6 +177,12 @@ def _pillars(flight: Trajectory) -> list[dict]:
     height = flight.arena_height
     wide = 2 * flight.pillar_radius
     return [
-        _entity(f"pillar_{k + 1}", "cylinders", (*at, height / 2), (wide, wide, height), PILLAR)
+        _entity(
+            f"pillar_{k + 1}",
+            "cylinders",
+            (*at, height / 2),
+            (wide, wide, height),
+            PILLAR,
+        )
         for k, at in enumerate(np.asarray(flight.pillar_position, float))
     ]

@@ -14,14 +14,15 @@ METRICS_FILE = "metrics.jsonl"
 class MetricsWriter:
     """Appends records to `DIR/metrics.jsonl` and `DIR/tensorboard`.
 
-    Each record is one write to an unbuffered file, so nothing logged is lost with the process, and
-    nothing is kept in memory.
+    Each record is one write to an unbuffered file, so nothing logged is lost with the
+    process, and nothing is kept in memory.
 
     Args:
       directory: the run's directory.
-      resumed_update: records of later updates are removed first (they come again); None starts
-      afresh.
-      resumed_steps: environment steps done at `resumed_update`, where TensorBoard's curves go on.
+      resumed_update: records of later updates are removed first (they come again); None
+      starts afresh.
+      resumed_steps: environment steps done at `resumed_update`, where TensorBoard's
+      curves go on.
       tensorboard: False leaves the event files out.
     """
 
@@ -45,19 +46,26 @@ class MetricsWriter:
         if tensorboard:
             from tensorboardX import SummaryWriter
 
-            # has TensorBoard forget what a killed process logged after its last checkpoint
+            # has TensorBoard forget what a killed process logged after its last
+            # checkpoint
             purge_step = None if resumed_update is None else resumed_steps + 1
             self._events = SummaryWriter(
                 str(directory / "tensorboard"), purge_step=purge_step, flush_secs=10
             )
 
     def write(
-        self, event: str, update: int, steps: int, seconds: float, values: dict[str, float]
+        self,
+        event: str,
+        update: int,
+        steps: int,
+        seconds: float,
+        values: dict[str, float],
     ) -> None:
         """Log one record.
 
         Args:
-          event: what it's about: `train` or `validation`; the prefix of the TensorBoard tags.
+          event: what it's about: `train` or `validation`; the prefix of the TensorBoard
+          tags.
           update: training updates done.
           steps: environment steps done.
           seconds: training time so far, without the time between a kill and its resume.
@@ -70,7 +78,10 @@ class MetricsWriter:
             "steps": int(steps),
             "seconds": round(seconds, 3),
         }
-        record |= {name: value if math.isfinite(value) else None for name, value in numbers.items()}
+        record |= {
+            name: value if math.isfinite(value) else None
+            for name, value in numbers.items()
+        }
         self._file.write((json.dumps(record) + "\n").encode())
         if self._events is not None:
             for name, value in numbers.items():
@@ -85,8 +96,8 @@ class MetricsWriter:
 
 
 def read_metrics(path: Path, event: str | None = None) -> Iterator[dict]:
-    """Records of a metrics file, optionally of one event only; a half-written last line is passed
-    over.
+    """Records of a metrics file, optionally of one event only; a half-written last line
+    is passed over.
     """
     with open(path, "rb") as lines:
         for line in lines:

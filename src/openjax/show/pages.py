@@ -1,5 +1,5 @@
-"""Pages in one file, nothing to fetch from elsewhere, with figures in SVG that take their colours
-from the page.
+"""Pages in one file, nothing to fetch from elsewhere, with figures in SVG that take
+their colours from the page.
 """
 
 import io
@@ -25,7 +25,14 @@ STYLE = {
     "axes.spines.right": False,
     "legend.frameon": False,
     **dict.fromkeys(
-        ("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color"), INK
+        (
+            "text.color",
+            "axes.labelcolor",
+            "axes.edgecolor",
+            "xtick.color",
+            "ytick.color",
+        ),
+        INK,
     ),
 }
 
@@ -33,12 +40,14 @@ STYLE = {
 def filled(template: str, folder: Path, **values) -> str:
     """A template of a folder with its values and the pages' looks."""
     loader = jinja2.FileSystemLoader([folder, Path(__file__).parent])
-    # escaped, as names come from people's files; a name that is missing is an error, not a gap
+    # escaped, as names come from people's files; a name that is missing is an error,
+    # not a gap
     environment = jinja2.Environment(
         loader=loader, autoescape=True, undefined=jinja2.StrictUndefined
     )
     page = environment.get_template(template).render(**values)
-    return re.sub(r"(?<=\d) %", "\u00a0%", page)  # a number and its sign stay on one line
+    # a number and its sign stay on one line
+    return re.sub(r"(?<=\d) %", "\u00a0%", page)
 
 
 def small_figure(height: float) -> tuple[Figure, Axes]:
@@ -54,8 +63,8 @@ def add_legend(axes: Axes) -> None:
 
 
 def as_svg(figure: Figure, salt: str) -> str:
-    """The figure as an element for a page: text stays text, ink takes the page's colour, sizes are
-    the page's.
+    """The figure as an element for a page: text stays text, ink takes the page's
+    colour, sizes are the page's.
     """
     data = io.StringIO()
     # without salt and date the same figure would be another file each time
@@ -64,4 +73,6 @@ def as_svg(figure: Figure, salt: str) -> str:
     text = data.getvalue()
     # without the XML declaration, which only a file of its own has
     text = text[text.index("<svg") :].replace(INK, "currentColor")
-    return re.sub(r'<svg ([^>]*?)height="[^"]*"([^>]*?)width="[^"]*"', r"<svg \1\2", text, count=1)
+    return re.sub(
+        r'<svg ([^>]*?)height="[^"]*"([^>]*?)width="[^"]*"', r"<svg \1\2", text, count=1
+    )

@@ -1,4 +1,6 @@
-"""Pictures of a run: trajectories from above, and training curves. Drawn without a display."""
+"""Pictures of a run: trajectories from above, and training curves. Drawn without a
+display.
+"""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -35,8 +37,8 @@ _CURVES = (
 
 
 def plot_trajectories(path: Path, trajectories: Sequence[Trajectory]) -> None:
-    """One panel per episode from above: paths, starts (hollow), pillars and the first capture
-    (star).
+    """One panel per episode from above: paths, starts (hollow), pillars and the first
+    capture (star).
     """
     columns = min(3, len(trajectories))
     rows = -(-len(trajectories) // columns)
@@ -53,7 +55,11 @@ def plot_trajectories(path: Path, trajectories: Sequence[Trajectory]) -> None:
         for artist, label in zip(artists, labels, strict=True):
             legend.setdefault(label, artist)
     figure.legend(
-        legend.values(), legend, loc="outside lower center", ncols=len(legend), fontsize="small"
+        legend.values(),
+        legend,
+        loc="outside lower center",
+        ncols=len(legend),
+        fontsize="small",
     )
     _save(figure, path)
 
@@ -65,19 +71,27 @@ def draw_from_above(axes: Axes, trajectory: Trajectory) -> None:
         axes.add_patch(Circle(pillar, trajectory.pillar_radius, color="0.6"))
     limit = 1.08 * trajectory.arena_radius
     axes.set(
-        xlim=(-limit, limit), ylim=(-limit, limit), aspect="equal", xlabel="x [m]", ylabel="y [m]"
+        xlim=(-limit, limit),
+        ylim=(-limit, limit),
+        aspect="equal",
+        xlabel="x [m]",
+        ylabel="y [m]",
     )
     capture = trajectory.capture_index
     end = trajectory.end()
     for i in range(trajectory.pursuer_position.shape[1]):
         position = trajectory.pursuer_position[:end, i]
         color = PURSUER_COLORS[i % len(PURSUER_COLORS)]
-        axes.plot(*position[:, :2].T, color=color, linewidth=1.2, label=f"pursuer {i + 1}")
+        axes.plot(
+            *position[:, :2].T, color=color, linewidth=1.2, label=f"pursuer {i + 1}"
+        )
         axes.plot(*position[0, :2], "o", color=color, fillstyle="none")
         axes.plot(*position[-1, :2], "o", color=color, markersize=4)
         crash = trajectory.crash_of(i)
         if crash is not None and crash < end:
-            axes.plot(*position[crash, :2], "X", color="black", markersize=9, label="crash")
+            axes.plot(
+                *position[crash, :2], "X", color="black", markersize=9, label="crash"
+            )
     evader = trajectory.evader_position[:end]
     axes.plot(*evader[:, :2].T, color=EVADER_COLOR, linewidth=1.2, label="evader")
     axes.plot(*evader[0, :2], "o", color=EVADER_COLOR, fillstyle="none")
@@ -87,7 +101,13 @@ def draw_from_above(axes: Axes, trajectory: Trajectory) -> None:
     else:
         captured_at = trajectory.evader_position[capture, :2]
         axes.add_patch(
-            Circle(captured_at, trajectory.capture_radius, fill=False, color="0.5", linestyle=":")
+            Circle(
+                captured_at,
+                trajectory.capture_radius,
+                fill=False,
+                color="0.5",
+                linestyle=":",
+            )
         )
         axes.plot(
             *captured_at,
@@ -102,19 +122,23 @@ def draw_from_above(axes: Axes, trajectory: Trajectory) -> None:
 
 
 def plot_map(path: Path, cells: Sequence[dict], title: str) -> None:
-    """A small map for each size of team: captures over capture radius and speed ratio, the line
-    below which a theorem forces one, and, dashed, the one below which points can force one that fly
-    one above another.
+    """A small map for each size of team: captures over capture radius and speed ratio,
+    the line below which a theorem forces one, and, dashed, the one below which points
+    can force one that fly one above another.
 
     cells: records of `openjax.runs.catch_map.cell_record`.
     """
     sizes = sorted({cell["num_pursuers"] for cell in cells})
     columns = min(4, len(sizes))
     rows = -(-len(sizes) // columns)
-    figure = Figure(figsize=(3.1 * columns + 1.2, 3.0 * rows + 0.5), layout="constrained")
+    figure = Figure(
+        figsize=(3.1 * columns + 1.2, 3.0 * rows + 0.5), layout="constrained"
+    )
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
     for axes, size in zip(panels, sizes, strict=False):
-        image = _draw_map(axes, [cell for cell in cells if cell["num_pursuers"] == size])
+        image = _draw_map(
+            axes, [cell for cell in cells if cell["num_pursuers"] == size]
+        )
         axes.set_title(f"{size} pursuer{'s' if size > 1 else ''}", fontsize="medium")
     for axes in panels[len(sizes) :]:
         axes.set_axis_off()
@@ -130,7 +154,9 @@ def _draw_map(axes, cells):
     radii = sorted({cell["capture_radius"] for cell in cells})
     ratios = sorted({cell["speed_ratio"] for cell in cells})
     rates = np.full((len(ratios), len(radii)), np.nan)
-    bounds = {name: dict.fromkeys(radii, 0.0) for name in ("forced_below", "planar_below")}
+    bounds = {
+        name: dict.fromkeys(radii, 0.0) for name in ("forced_below", "planar_below")
+    }
     for cell in cells:
         row = ratios.index(cell["speed_ratio"])
         column = radii.index(cell["capture_radius"])
@@ -141,26 +167,37 @@ def _draw_map(axes, cells):
         # the colour map is dark below its middle
         color = "white" if cell["capture_rate"] < 0.5 else "black"
         axes.text(column, row, text, ha="center", va="center", fontsize=6, color=color)
-    image = axes.imshow(rates, origin="lower", vmin=0, vmax=1, cmap="viridis", aspect="auto")
+    image = axes.imshow(
+        rates, origin="lower", vmin=0, vmax=1, cmap="viridis", aspect="auto"
+    )
     axes.set_xticks(range(len(radii)), [f"{radius:g}" for radius in radii], fontsize=7)
     axes.set_yticks(range(len(ratios)), [f"{ratio:g}" for ratio in ratios], fontsize=7)
-    # a picture's axes count cells: a ratio between two of them lies between their middles
+    # a picture's axes count cells: a ratio between two of them lies between their
+    # middles
     ends = {"left": -0.5, "right": len(ratios) - 0.5}
     edges = np.arange(len(radii) + 1) - 0.5
     for forced, style in zip(bounds.values(), ("-", "--"), strict=True):
         height = np.interp(list(forced.values()), ratios, range(len(ratios)), **ends)
-        axes.stairs(height, edges, baseline=None, color="red", linewidth=1.5, linestyle=style)
+        axes.stairs(
+            height, edges, baseline=None, color="red", linewidth=1.5, linestyle=style
+        )
     return image
 
 
 def plot_training(path: Path, metrics_path: Path) -> None:
-    """Training curves and the validation results of a metrics file, over environment steps."""
+    """Training curves and the validation results of a metrics file, over environment
+    steps.
+    """
     training = list(read_metrics(metrics_path, "train"))
     evaluation = list(read_metrics(metrics_path, "validation"))
     figure = Figure(figsize=(11, 6), layout="constrained")
     curves = (
         (training, {"color": "tab:blue", "linewidth": 1}, "training"),
-        (evaluation, {"color": "tab:orange", "marker": "o", "markersize": 3}, "validation tasks"),
+        (
+            evaluation,
+            {"color": "tab:orange", "marker": "o", "markersize": 3},
+            "validation tasks",
+        ),
     )
     for axes, (name, label) in zip(figure.subplots(2, 3).ravel(), _CURVES, strict=True):
         for records, style, legend in curves:

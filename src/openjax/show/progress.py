@@ -1,5 +1,5 @@
-"""What a run, or another command that takes its time, shows on the terminal: a live display, or
-plain lines into a file.
+"""What a run, or another command that takes its time, shows on the terminal: a live
+display, or plain lines into a file.
 """
 
 import math
@@ -28,8 +28,8 @@ LONG = 30.0
 
 
 class _Display:
-    """What `_render` returns, drawn again and again on a terminal while it is entered; into a file
-    it draws nothing.
+    """What `_render` returns, drawn again and again on a terminal while it is entered;
+    into a file it draws nothing.
     """
 
     def __init__(self, console: Console, stays: bool):
@@ -38,7 +38,10 @@ class _Display:
         self._spinner = Spinner("dots")
         transient = not (stays and terminal)
         self._live = Live(
-            get_renderable=self._render, console=console, auto_refresh=terminal, transient=transient
+            get_renderable=self._render,
+            console=console,
+            auto_refresh=terminal,
+            transient=transient,
         )
 
     def __enter__(self):
@@ -69,7 +72,8 @@ class Progress(_Display):
         self._values: dict[str, float] = {}
         self._validation: dict[str, float] = {}
         self._last_line = 0.0
-        super().__init__(console or Console(highlight=False), stays=True)  # which draws it
+        # which draws it
+        super().__init__(console or Console(highlight=False), stays=True)
         self._lines = not self._console.is_terminal
 
     def phase(self, text: str, announce: bool = True) -> None:
@@ -135,13 +139,17 @@ class Progress(_Display):
         if self._values or self._validation:
             table = Table.grid(padding=(0, 3))
             table.add_row(
-                "", Text("training", style="bold"), Text("validation tasks", style="bold")
+                "",
+                Text("training", style="bold"),
+                Text("validation tasks", style="bold"),
             )
             training = _shown(self._values)
             validation = _shown(self._validation)
             for label in _SHOWN.values():
                 if label in training or label in validation:
-                    table.add_row(Text(label), training.get(label, ""), validation.get(label, ""))
+                    table.add_row(
+                        Text(label), training.get(label, ""), validation.get(label, "")
+                    )
             rows.append(table)
         return Panel(Group(*rows), title=self._title, title_align="left")
 
@@ -173,17 +181,19 @@ def duration(seconds: float) -> str:
     """Minutes and seconds, 3:02, and hours where there are any."""
     minutes, seconds = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02d}:{seconds:02d}" if hours else f"{minutes}:{seconds:02d}"
+    return (
+        f"{hours}:{minutes:02d}:{seconds:02d}" if hours else f"{minutes}:{seconds:02d}"
+    )
 
 
 class Steps(_Display):
-    """One line on a terminal; into a file, how long it will take, if that is long. Use as a context
-    manager.
+    """One line on a terminal; into a file, how long it will take, if that is long. Use
+    as a context manager.
 
     Args:
       title: what is done.
-      expected: {step: seconds on a usual machine}, in the order in which they come. What the steps
-        so far took against this tells how long the rest takes here.
+      expected: {step: seconds on a usual machine}, in the order in which they come.
+        What the steps so far took against this tells how long the rest takes here.
       console: where to draw.
     """
 
@@ -199,12 +209,14 @@ class Steps(_Display):
 
     def __enter__(self):
         if self._total > LONG and not self._console.is_terminal:
-            self._console.print(f"{self._title}: about {duration(self._total)} ...", soft_wrap=True)
+            self._console.print(
+                f"{self._title}: about {duration(self._total)} ...", soft_wrap=True
+            )
         return super().__enter__()
 
     def begin(self, step: str, note: str = "") -> None:
-        """The step before is done, and `step` begins; one that isn't in `expected` takes no time of
-        its own.
+        """The step before is done, and `step` begins; one that isn't in `expected`
+        takes no time of its own.
         """
         if step != self._step:
             self._done += self._expected.get(self._step, 0.0)

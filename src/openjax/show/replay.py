@@ -1,4 +1,6 @@
-"""Flown episodes as one HTML page that needs nothing else: to watch, and to send to somebody."""
+"""Flown episodes as one HTML page that needs nothing else: to watch, and to send to
+somebody.
+"""
 
 import json
 from collections.abc import Sequence
@@ -22,9 +24,13 @@ def replay_page(flights: Sequence[tuple[str, Trajectory]]) -> str:
     Args:
       flights: (policy's name, episode) pairs; an episode's title is its layout's name.
     """
-    data = json.dumps([_plain(policy, flight) for policy, flight in flights], separators=(",", ":"))
+    data = json.dumps(
+        [_plain(policy, flight) for policy, flight in flights], separators=(",", ":")
+    )
     # within a script element "<" may only stand escaped
-    return TEMPLATE.read_text(encoding="utf-8").replace("@DATA@", data.replace("<", "\\u003c"))
+    return TEMPLATE.read_text(encoding="utf-8").replace(
+        "@DATA@", data.replace("<", "\\u003c")
+    )
 
 
 def write_replay(path: Path, flights: Sequence[tuple[str, Trajectory]]) -> None:
@@ -33,8 +39,8 @@ def write_replay(path: Path, flights: Sequence[tuple[str, Trajectory]]) -> None:
 
 
 def _plain(policy: str, flight: Trajectory) -> dict:
-    """An episode up to two seconds after its capture: lengths in mm, quaternions in thousandths,
-    times in frames.
+    """An episode up to two seconds after its capture: lengths in mm, quaternions in
+    thousandths, times in frames.
     """
     every = max(1, round(LONGEST_STEP / flight.time_step))
     steps = slice(0, flight.end(seconds=2.0), every)
@@ -46,7 +52,9 @@ def _plain(policy: str, flight: Trajectory) -> dict:
         """The frame of a step; None for no step, or one after the last frame."""
         return None if index is None or index // every >= len(poses) else index // every
 
-    poses = np.concatenate([flight.pursuer_position, flight.pursuer_quaternion], axis=-1)[steps]
+    poses = np.concatenate(
+        [flight.pursuer_position, flight.pursuer_quaternion], axis=-1
+    )[steps]
     plain = {
         "layout": flight.title,
         "policy": policy,
@@ -64,14 +72,20 @@ def _plain(policy: str, flight: Trajectory) -> dict:
         "seen": [] if flight.seen is None else _spans(flight.seen[steps]),
     }
     if flight.predicted is not None:
-        horizons = np.linspace(0, flight.predicted.shape[1] - 1, AHEAD).round().astype(int)
-        plain |= {"predicted": thousandths(flight.predicted[steps][:, horizons]), "ahead": AHEAD}
+        horizons = (
+            np.linspace(0, flight.predicted.shape[1] - 1, AHEAD).round().astype(int)
+        )
+        plain |= {
+            "predicted": thousandths(flight.predicted[steps][:, horizons]),
+            "ahead": AHEAD,
+        }
     return plain
 
 
 def _spans(flags: np.ndarray) -> list[list[int]]:
     """[first, last] of each run of true flags (T,)."""
-    # with a zero before and after, edges come in pairs: where a run begins, and one past its end
+    # with a zero before and after, edges come in pairs: where a run begins, and one
+    # past its end
     padded = np.concatenate([[0], np.asarray(flags, int), [0]])
     edges = np.flatnonzero(np.diff(padded))
     return [[int(first), int(end) - 1] for first, end in edges.reshape(-1, 2)]

@@ -15,7 +15,9 @@ class Trajectory:
     evader_position: np.ndarray  # (T, 3)
     captured: np.ndarray  # (T, N) bool, pursuers that capture in this step
     crashed: np.ndarray
-    """(T, N) bool, pursuers that touch something solid or lie on their side in this step"""
+    """(T, N) bool, pursuers that touch something solid or lie on their side in this
+    step
+    """
     pillar_position: np.ndarray  # (P, 2), those in use
     arena_radius: float
     arena_height: float
@@ -41,7 +43,9 @@ class Trajectory:
         return _first(self.crashed[:, pursuer])
 
     def end(self, seconds: float = 1.0) -> int:
-        """Number of steps worth showing: up to so many seconds after the first capture, or all."""
+        """Number of steps worth showing: up to so many seconds after the first capture,
+        or all.
+        """
         steps = len(self.evader_position)
         if self.capture_index is None:
             return steps

@@ -1,5 +1,5 @@
-"""Animations of an episode, drawn in perspective by Pillow: the same on every machine, without
-display or OpenGL.
+"""Animations of an episode, drawn in perspective by Pillow: the same on every machine,
+without display or OpenGL.
 """
 
 from collections.abc import Sequence
@@ -19,7 +19,9 @@ FRAMES_PER_SECOND = 12.5
 WIDTH = 560
 HEIGHT = 400
 FINER = 2
-"""Frames are drawn so many times as large and then reduced, so that edges are smooth."""
+"""Frames are drawn so many times as large and then reduced, so that edges are
+smooth.
+"""
 AZIMUTH, ELEVATION, OPENING = np.radians((60.0, 42.0, 45.0))
 """Where the camera looks from, and its vertical field of view."""
 DISTANCE = 3.3
@@ -29,16 +31,16 @@ TRAIL = 1.2
 ARM = 0.065
 ROTOR = 0.035
 BALL = 0.045
-"""Metres from a vehicle's centre to a rotor, a rotor's radius, the evader's: larger than they are,
-to be seen.
+"""Metres from a vehicle's centre to a rotor, a rotor's radius, the evader's: larger
+than they are, to be seen.
 """
 _ROTORS = np.array([[1, 1, 0], [-1, 1, 0], [-1, -1, 0], [1, -1, 0]]) / np.sqrt(2)
 _LETTERS = 20  # pixels
 
 
 def animate(path: Path, trajectories: Sequence[Trajectory]) -> None:
-    """Write an animated GIF up to a second after the first capture; time, capture and crash stand
-    above it.
+    """Write an animated GIF up to a second after the first capture; time, capture and
+    crash stand above it.
 
     Args:
       path: the .gif file.
@@ -49,8 +51,8 @@ def animate(path: Path, trajectories: Sequence[Trajectory]) -> None:
         every = max(1, round(1.0 / (FRAMES_PER_SECOND * flight.time_step)))
         films.append([_frame(flight, step) for step in range(0, flight.end(), every)])
     frames = _stacked(films)
-    # one palette for all frames, from six of them, by the method that gives small coloured things
-    # their colours, too
+    # one palette for all frames, from six of them, by the method that gives small
+    # coloured things their colours, too
     sample = np.concatenate(frames[:: max(1, len(frames) // 6)])
     palette = Image.fromarray(sample).quantize(255, method=Image.Quantize.MAXCOVERAGE)
     images = [
@@ -68,18 +70,30 @@ def animate(path: Path, trajectories: Sequence[Trajectory]) -> None:
 
 
 def _stacked(films):
-    """Frames of films, each below the one before; those that end sooner keep their last frame."""
+    """Frames of films, each below the one before; those that end sooner keep their last
+    frame.
+    """
     length = max(map(len, films))
-    return [np.concatenate([film[min(i, len(film) - 1)] for film in films]) for i in range(length)]
+    return [
+        np.concatenate([film[min(i, len(film) - 1)] for film in films])
+        for i in range(length)
+    ]
 
 
 def caption(trajectory: Trajectory, step: int) -> tuple[str, str]:
-    """What is written above the frame of a step: title and time; and what happened until then."""
+    """What is written above the frame of a step: title and time; and what happened
+    until then.
+    """
     events = []
-    for word, index in (("caught", trajectory.capture_index), ("crashed", trajectory.crash_index)):
+    for word, index in (
+        ("caught", trajectory.capture_index),
+        ("crashed", trajectory.crash_index),
+    ):
         if index is not None and index <= step:
             events.append(f"{word} at {(index + 1) * trajectory.time_step:.1f} s")
-    return f"{trajectory.title}: {(step + 1) * trajectory.time_step:.1f} s", ", ".join(events)
+    return f"{trajectory.title}: {(step + 1) * trajectory.time_step:.1f} s", ", ".join(
+        events
+    )
 
 
 def _frame(trajectory, step):
@@ -111,12 +125,14 @@ def draw(trajectory: Trajectory, step: int) -> Image.Image:
 
 
 def _things(pen, trajectory, step):
-    """(place, function that draws it, outlines of its shadow) of all that stands or flies in the
-    scene.
+    """(place, function that draws it, outlines of its shadow) of all that stands or
+    flies in the scene.
     """
     for place in trajectory.pillar_position:
         yield place, partial(pen.pillar, place, trajectory.pillar_radius), ()
-    bodies = Rotation.from_quat(trajectory.pursuer_quaternion[step], scalar_first=True).as_matrix()
+    bodies = Rotation.from_quat(
+        trajectory.pursuer_quaternion[step], scalar_first=True
+    ).as_matrix()
     for i, body in enumerate(bodies):
         color = _rgb(PURSUER_COLORS[i % len(PURSUER_COLORS)])
         path = trajectory.pursuer_position[:, i]
@@ -142,7 +158,9 @@ def _trail(pen, path, step, color, time_step):
 
 
 class _Pen:
-    """Draws into an image what is given in metres, as a camera above the arena's edge sees it."""
+    """Draws into an image what is given in metres, as a camera above the arena's edge
+    sees it.
+    """
 
     def __init__(self, image: Image.Image, radius: float, height: float):
         self._draw = ImageDraw.Draw(image, "RGBA")
@@ -155,11 +173,14 @@ class _Pen:
         down = (-se * ca, -se * sa, -ce)
         forward = (ce * ca, ce * sa, -se)
         self._axes = np.array([right, down, forward])
-        # looks at a point somewhat below half the height: the floor's near edge needs room
+        # looks at a point somewhat below half the height: the floor's near edge needs
+        # room
         self._camera = (0, 0, 0.38 * height) - DISTANCE * radius * self._axes[2]
 
     def depth(self, place) -> float:
-        """What hides what: how far off along the floor, as pillars reach all the way up."""
+        """What hides what: how far off along the floor, as pillars reach all the way
+        up.
+        """
         return float(self._axes[2, :2] @ place[:2])
 
     def _pixels(self, points):

@@ -17,4 +17,6 @@ def default_policy_line(num_pursuers: int) -> str:
     """What is said of it; nothing of the usual one."""
     if num_pursuers == LAYOUT_PURSUERS:
         return ""
-    return f"policy {TEAM_POLICY}: {DEFAULT_POLICY} flies {LAYOUT_PURSUERS} pursuers only"
+    return (
+        f"policy {TEAM_POLICY}: {DEFAULT_POLICY} flies {LAYOUT_PURSUERS} pursuers only"
+    )

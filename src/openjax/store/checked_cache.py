@@ -1,9 +1,9 @@
 """The cache of compiled programs, each entry with its checksum.
 
-JAX runs what it finds in its cache: a flipped bit there ends the process, or changes a number, and
-half an entry is never replaced. An entry of this cache is loaded only whole. JAX has no public way
-to be given a cache, so the function of its module that makes one is replaced; a JAX without it
-keeps its own.
+JAX runs what it finds in its cache: a flipped bit there ends the process, or changes a
+number, and half an entry is never replaced. An entry of this cache is loaded only
+whole. JAX has no public way to be given a cache, so the function of its module that
+makes one is replaced; a JAX without it keeps its own.
 """
 
 import contextlib
@@ -31,7 +31,9 @@ class CheckedCache(CacheInterface):
         file = self._path / f"{key}{ENTRY}"
         content = read_checked(file)
         if content is None and file.exists():
-            logging.getLogger(__name__).warning("%s is damaged, and is compiled anew", file)
+            logging.getLogger(__name__).warning(
+                "%s is damaged, and is compiled anew", file
+            )
         return content
 
     def put(self, key: str, value: bytes) -> None:
@@ -41,7 +43,9 @@ class CheckedCache(CacheInterface):
 
 
 def use_checked_cache() -> None:
-    """Have JAX keep its compiled programs in a `CheckedCache` of the folder that it's told of."""
+    """Have JAX keep its compiled programs in a `CheckedCache` of the folder that it's
+    told of.
+    """
     if not isinstance(compilation_cache._cache, CheckedCache):
         compilation_cache.reset_cache()
         compilation_cache.get_file_cache = lambda path: (CheckedCache(path), path)

@@ -1,11 +1,13 @@
 """One checkpoint on disk: it appears whole or not at all, and a changed byte is found.
 
-It is a folder of orbax's and, written after it, NAME.sha256 with the checksums of all its files: it
-counts once that is there, and only while they agree. Orbax stands behind this module only.
+It is a folder of orbax's and, written after it, NAME.sha256 with the checksums of all
+its files: it counts once that is there, and only while they agree. Orbax stands behind
+this module only.
 
-A carry is any pytree of arrays; optimiser states, typed random keys and counters are leaves like
-all others, so nothing can be forgotten. Leaves are stored under their path in the tree, which makes
-a carry of another shape a readable error instead of a wrong run.
+A carry is any pytree of arrays; optimiser states, typed random keys and counters are
+leaves like all others, so nothing can be forgotten. Leaves are stored under their path
+in the tree, which makes a carry of another shape a readable error instead of a wrong
+run.
 """
 
 import functools
@@ -31,8 +33,8 @@ class DamagedError(UserError):
 
 
 def save_state(path: Path, carry: Any, notes: dict | None = None) -> None:
-    """Write one carry to the directory `path`, in place of what is there; it appears whole or not
-    at all.
+    """Write one carry to the directory `path`, in place of what is there; it appears
+    whole or not at all.
     """
     path = Path(path)
     if jax.process_index() == 0:
@@ -45,17 +47,23 @@ def load_state(path: Path, abstract: Any) -> Any:
     `abstract_like`).
 
     Raises:
-      UserError: not a checkpoint, a damaged one (`DamagedError`), or one of another shape.
+      UserError: not a checkpoint, a damaged one (`DamagedError`), or one of another
+      shape.
     """
     path = Path(path).absolute()
     check_state(path)
     stored = load_orbax().metadata(path).metadata
-    expected = {name: leaf for name, leaf in named_leaves(abstract).items() if leaf.size}
+    expected = {
+        name: leaf for name, leaf in named_leaves(abstract).items() if leaf.size
+    }
     _check_same_shapes(path, stored, expected)
     arrays = load_orbax().load(path, expected)
-    # Orbax can't write arrays without elements; they hold nothing, so they are made anew.
+    # Orbax can't write arrays without elements; they hold nothing, so they are made
+    # anew.
     leaves = [
-        arrays[name] if leaf.size else jnp.zeros(leaf.shape, leaf.dtype, device=leaf.sharding)
+        arrays[name]
+        if leaf.size
+        else jnp.zeros(leaf.shape, leaf.dtype, device=leaf.sharding)
         for name, leaf in named_leaves(abstract).items()
     ]
     return jax.tree.unflatten(jax.tree.structure(abstract), leaves)
@@ -94,18 +102,24 @@ def load_arrays(
         is_key = jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
         return np.asarray(jax.random.key_data(leaf) if is_key else leaf)
 
-    return {names[name]: plain(leaf) for name, leaf in loaded.items() if names[name] is not None}
+    return {
+        names[name]: plain(leaf)
+        for name, leaf in loaded.items()
+        if names[name] is not None
+    }
 
 
 def is_checkpoint(path: Path) -> bool:
-    """True for a finished checkpoint, whether its files are still as they were written or not."""
+    """True for a finished checkpoint, whether its files are still as they were written
+    or not.
+    """
     path = Path(path)
     return path.is_dir() and _checksums_file(path).is_file()
 
 
 def start_save(path: Path, carry: Any, notes: dict) -> Any:
-    """Hand a carry to orbax, which writes it beside what follows; `commit` waits for it. Its arrays
-    are copied then.
+    """Hand a carry to orbax, which writes it beside what follows; `commit` waits for
+    it. Its arrays are copied then.
     """
     arrays = {name: leaf for name, leaf in named_leaves(carry).items() if leaf.size}
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -116,44 +130,58 @@ def commit(path: Path, started: Any) -> None:
     """Wait until orbax has written a checkpoint, and seal it by its checksums."""
     started.result()
     if jax.process_index() == 0:
-        # on the disk before the checksums are, as a checkpoint counts once these are there
+        # on the disk before the checksums are, as a checkpoint counts once these are
+        # there
         for written in (*_files(path), path, path.parent):
             flush(written)
-        lines = [f"{_checksum(file)}  {file.relative_to(path).as_posix()}" for file in _files(path)]
+        lines = [
+            f"{_checksum(file)}  {file.relative_to(path).as_posix()}"
+            for file in _files(path)
+        ]
         write_text(_checksums_file(path), "\n".join(lines) + "\n")
 
 
 def check_state(path: Path) -> None:
-    """Raises UserError where no checkpoint is, and DamagedError where its files aren't as they were
-    written.
+    """Raises UserError where no checkpoint is, and DamagedError where its files aren't
+    as they were written.
     """
     if not is_checkpoint(path):
-        raise UserError(f"{path} is no checkpoint; expected a directory written by openjax.train")
+        raise UserError(
+            f"{path} is no checkpoint; expected a directory written by openjax.train"
+        )
     try:
         lines = _checksums_file(path).read_text(encoding="utf-8").splitlines()
         expected = {}
         for line in lines:
             checksum, _, name = line.partition("  ")
             expected[name] = checksum
-        actual = {file.relative_to(path).as_posix(): _checksum(file) for file in _files(path)}
+        actual = {
+            file.relative_to(path).as_posix(): _checksum(file) for file in _files(path)
+        }
         # names that only one of them has, or with another checksum
         different = sorted(dict(expected.items() ^ actual.items()))
     except (OSError, UnicodeDecodeError) as error:
         raise DamagedError(f"checkpoint {path} is damaged ({error})") from error
     if different or not expected:
         where = different[0] if different else _CHECKSUMS
-        raise DamagedError(f"checkpoint {path} is damaged: {where[:80]} isn't as it was written")
+        raise DamagedError(
+            f"checkpoint {path} is damaged: {where[:80]} isn't as it was written"
+        )
 
 
 def remove_state(path: Path) -> None:
-    """Delete a checkpoint; its checksums go first, so that a half-deleted one is none."""
+    """Delete a checkpoint; its checksums go first, so that a half-deleted one is
+    none.
+    """
     _checksums_file(path).unlink(missing_ok=True)
     shutil.rmtree(path, ignore_errors=True)
 
 
 @functools.cache
 def load_orbax():
-    """Loaded late: it takes a second or two, which pass while a run's programs are compiled."""
+    """Loaded late: it takes a second or two, which pass while a run's programs are
+    compiled.
+    """
     from orbax.checkpoint.experimental import v1
 
     return v1

@@ -1,5 +1,5 @@
-"""Checkpoints of a run: the last few and the best are kept, the last good one is found again after
-any kill or damage.
+"""Checkpoints of a run: the last few and the best are kept, the last good one is found
+again after any kill or damage.
 """
 
 import dataclasses
@@ -28,7 +28,9 @@ from openjax.store.checkpoint_files import (
 )
 
 _DIGITS = 9
-"""Of an update in a checkpoint's name: names of one length are sorted as their numbers are."""
+"""Of an update in a checkpoint's name: names of one length are sorted as their numbers
+are.
+"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,7 +49,8 @@ class CheckpointRecord:
 class Checkpoints:
     """The checkpoints of one run: the last few and the best by validation are kept.
 
-    Of several processes all write and read their part, in the same order; they share the directory.
+    Of several processes all write and read their part, in the same order; they share
+    the directory.
 
     Args:
       directory: where they lie; made with the first of them.
@@ -55,12 +58,15 @@ class Checkpoints:
       processes: that share the directory; None: this one alone.
     """
 
-    def __init__(self, directory: Path, keep_last: int = 2, processes: Processes | None = None):
+    def __init__(
+        self, directory: Path, keep_last: int = 2, processes: Processes | None = None
+    ):
         self.directory = Path(directory).absolute()
         self.keep_last = keep_last
         self._processes = processes or Processes()
         self._pending: Callable[[], None] | None = None
-        self._known: dict[str, CheckpointRecord] = {}  # a finished checkpoint doesn't change
+        # a finished checkpoint doesn't change
+        self._known: dict[str, CheckpointRecord] = {}
         self._damaged: dict[str, str] = {}
 
     def records(self) -> list[CheckpointRecord]:
@@ -80,20 +86,24 @@ class Checkpoints:
 
     def any_finished(self) -> bool:
         """Whether there is a checkpoint, damaged or not."""
-        return any(is_checkpoint(path) for path in self.directory.glob("[0-9]" * _DIGITS))
+        return any(
+            is_checkpoint(path) for path in self.directory.glob("[0-9]" * _DIGITS)
+        )
 
     def last_finished(self) -> int | None:
-        """The update of the newest checkpoint, damaged or not; by the names of files alone, so that
-        it may be asked at any time.
+        """The update of the newest checkpoint, damaged or not; by the names of files
+        alone, so that it may be asked at any time.
         """
         paths = self.directory.glob("[0-9]" * _DIGITS)
-        return max((int(path.name) for path in paths if is_checkpoint(path)), default=None)
+        return max(
+            (int(path.name) for path in paths if is_checkpoint(path)), default=None
+        )
 
     def load_best(
         self, name_of: Callable[[str], str | None], warn: Callable[[str], None]
     ) -> tuple[dict[str, np.ndarray], CheckpointRecord]:
-        """Leaves (see `load_arrays`) of the best checkpoint, or of the latest where none has a
-        score.
+        """Leaves (see `load_arrays`) of the best checkpoint, or of the latest where
+        none has a score.
 
         One that is damaged is passed over with a warning.
 
@@ -109,9 +119,13 @@ class Checkpoints:
         raise UserError(f"{self.directory} holds no checkpoint that can be read")
 
     def best(self) -> CheckpointRecord | None:
-        """The highest score, the later one of equals; None while nothing was evaluated."""
+        """The highest score, the later one of equals; None while nothing was
+        evaluated.
+        """
         scored = [record for record in self.records() if record.score is not None]
-        return max(scored, key=lambda record: (record.score, record.update), default=None)
+        return max(
+            scored, key=lambda record: (record.score, record.update), default=None
+        )
 
     def latest(self) -> CheckpointRecord | None:
         """The newest committed checkpoint."""
@@ -119,13 +133,18 @@ class Checkpoints:
         return records[-1] if records else None
 
     def save(
-        self, update: int, carry: Any, score: float | None = None, notes: dict | None = None
+        self,
+        update: int,
+        carry: Any,
+        score: float | None = None,
+        notes: dict | None = None,
     ) -> None:
-        """Start writing a checkpoint; returns when the arrays are copied, so that the carry may be
-        donated.
+        """Start writing a checkpoint; returns when the arrays are copied, so that the
+        carry may be donated.
 
-        A second save of the same update is ignored: training is deterministic, the content would be
-        the same. Only a score that the first one lacked is worth writing it again.
+        A second save of the same update is ignored: training is deterministic, the
+        content would be the same. Only a score that the first one lacked is worth
+        writing it again.
         """
         # one at a time: copies of two carries at once may not fit into memory
         self.wait()
@@ -144,12 +163,13 @@ class Checkpoints:
         if not is_checkpoint(path) or path.name in self._damaged:
             return False
         return score is None or any(
-            record.path == path and record.score is not None for record in self.records()
+            record.path == path and record.score is not None
+            for record in self.records()
         )
 
     def abandon(self) -> None:
-        """Before the process is ended: let the checkpoint under way get on disk, and delete what
-        else is unfinished.
+        """Before the process is ended: let the checkpoint under way get on disk, and
+        delete what else is unfinished.
         """
         pending = self._pending
         if pending is not None:
@@ -157,8 +177,8 @@ class Checkpoints:
         self.remove_unfinished()
 
     def wait(self) -> None:
-        """Block until the checkpoint under way is on disk, then drop the ones that are no longer
-        kept.
+        """Block until the checkpoint under way is on disk, then drop the ones that are
+        no longer kept.
         """
         if self._pending is None:
             return
@@ -175,8 +195,11 @@ class Checkpoints:
                 remove_state(record.path)
                 self._known.pop(record.path.name, None)
 
-    def restore_latest(self, abstract: Any, warn=lambda text: None) -> tuple[Any, CheckpointRecord]:
-        """The newest checkpoint that can be read; damaged ones are passed over with a warning.
+    def restore_latest(
+        self, abstract: Any, warn=lambda text: None
+    ) -> tuple[Any, CheckpointRecord]:
+        """The newest checkpoint that can be read; damaged ones are passed over with a
+        warning.
 
         Raises:
           UserError: there is none, or it holds a carry of another shape.
@@ -195,10 +218,14 @@ class Checkpoints:
                 failure = "damaged"
             except UserError:
                 raise
-            except Exception as error:  # orbax and tensorstore raise many kinds on damaged files
+            except (
+                Exception
+            ) as error:  # orbax and tensorstore raise many kinds on damaged files
                 failure = type(error).__name__
             # where one process can't read its part, all go on to the one before
-            failures = [failure for failure in self._processes.everyone(failure) if failure]
+            failures = [
+                failure for failure in self._processes.everyone(failure) if failure
+            ]
             if not failures:
                 return carry, records[name]
             warn(f"{path} can't be read ({failures[0]}), using the one before it")
@@ -221,5 +248,7 @@ def _record(path):
     try:
         notes = dict(load_orbax().metadata(path.absolute()).custom_metadata or {})
     except Exception as error:  # orbax and tensorstore raise many kinds
-        raise DamagedError(f"checkpoint {path} can't be read ({type(error).__name__})") from error
+        raise DamagedError(
+            f"checkpoint {path} can't be read ({type(error).__name__})"
+        ) from error
     return CheckpointRecord(path, int(path.name), notes.pop("score", None), notes)

@@ -1,5 +1,5 @@
-"""Compiled programs: kept in a folder of the user's own, so that a machine compiles each of them
-once.
+"""Compiled programs: kept in a folder of the user's own, so that a machine compiles
+each of them once.
 """
 
 import contextlib
@@ -12,7 +12,9 @@ import sys
 from pathlib import Path
 
 CACHE_SIZE = 2 * 2**30
-"""Bytes that the cache of compiled programs may take; what was used longest ago goes first."""
+"""Bytes that the cache of compiled programs may take; what was used longest ago goes
+first.
+"""
 
 _LOGGER = logging.getLogger(__name__)
 _WORTH_KEEPING = 0.5
@@ -20,15 +22,17 @@ _WORTH_KEEPING = 0.5
 
 
 def cache_programs() -> Path | None:
-    """Have JAX keep compiled programs in the user's cache folder, each with a checksum, and take
-    them from there next time.
+    """Have JAX keep compiled programs in the user's cache folder, each with a checksum,
+    and take them from there next time.
 
-    JAX itself knows a program again by its code, its compiler and its devices; the folder is this
-    processor's, as code for one need not run on another that shares the home. Where JAX was already
-    told of a folder (JAX_COMPILATION_CACHE_DIR), that one is used.
+    JAX itself knows a program again by its code, its compiler and its devices; the
+    folder is this processor's, as code for one need not run on another that shares the
+    home. Where JAX was already told of a folder (JAX_COMPILATION_CACHE_DIR), that one
+    is used.
 
     Returns:
-      the folder; None where no folder of the user's own can be written to, so that nothing is kept.
+      the folder; None where no folder of the user's own can be written to, so that
+      nothing is kept.
     """
     import jax
 
@@ -42,7 +46,8 @@ def cache_programs() -> Path | None:
         return None
     if chosen is not None and folder.exists() and not _is_private(folder):
         _LOGGER.warning(
-            "others can write to %s, and so run what they like here: chmod go-w it", folder
+            "others can write to %s, and so run what they like here: chmod go-w it",
+            folder,
         )
     use_checked_cache()
     jax.config.update("jax_compilation_cache_dir", str(folder))
@@ -54,17 +59,18 @@ def cache_programs() -> Path | None:
 
 
 def _own_folder():
-    """A folder that only this user can write to, as a program in it is run; None where none can be
-    had.
+    """A folder that only this user can write to, as a program in it is run; None where
+    none can be had.
     """
     import jax
 
-    with contextlib.suppress(OSError, RuntimeError):  # RuntimeError: a user without a home
+    # RuntimeError: a user without a home
+    with contextlib.suppress(OSError, RuntimeError):
         top = _user_cache() / "openjax"
         top.mkdir(mode=0o700, parents=True, exist_ok=True)
         if _is_private(top):
-            # by JAX's version too: what another one compiled is never asked for again, and is
-            # deleted in its turn
+            # by JAX's version too: what another one compiled is never asked for again,
+            # and is deleted in its turn
             folder = top / f"{jax.__version__}-{_processor_key()}"
             folder.mkdir(exist_ok=True)
             _bound(top, CACHE_SIZE)
@@ -73,7 +79,9 @@ def _own_folder():
 
 
 def _is_private(folder):
-    """Whether it's a folder, no link to one, this user's, and nobody else can write to it."""
+    """Whether it's a folder, no link to one, this user's, and nobody else can write to
+    it.
+    """
     status = folder.lstat()
     return (
         stat.S_ISDIR(status.st_mode)
@@ -102,8 +110,8 @@ def _processor_key():
 
 
 def _bound(folder, size):
-    """Delete the files of a folder that were used longest ago, until they take at most `size`
-    bytes.
+    """Delete the files of a folder that were used longest ago, until they take at most
+    `size` bytes.
     """
     files = [(path.stat(), path) for path in folder.rglob("*") if path.is_file()]
 

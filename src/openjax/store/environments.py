@@ -35,13 +35,15 @@ SAME = (
 
 
 def with_airframe(settings: PursuitSettings, vehicle: Path | None) -> PursuitSettings:
-    """The game of the airframe that a vehicle file, or a name, says; a family of the former one
-    becomes the new one's.
+    """The game of the airframe that a vehicle file, or a name, says; a family of the
+    former one becomes the new one's.
 
     Raises:
       UserError: a file that can't be used.
     """
-    airframe = settings.airframe if vehicle is None else load_vehicle_file(vehicle).airframe
+    airframe = (
+        settings.airframe if vehicle is None else load_vehicle_file(vehicle).airframe
+    )
     # a vehicle of one's own is no airframe by name: it flies in the game as it is
     if airframe == settings.airframe or airframe not in AIRFRAMES:
         return settings
@@ -56,8 +58,9 @@ def make_environment(
     effects: Path | None,
     opponent: str | Path | Evader | None = None,
 ) -> Pursuit:
-    """The game with the vehicle of a vehicle.toml, or of an airframe's name, the effects of an
-    effects.toml, and one evader, where given: a scripted one's name, or see `find_opponent`.
+    """The game with the vehicle of a vehicle.toml, or of an airframe's name, the
+    effects of an effects.toml, and one evader, where given: a scripted one's name, or
+    see `find_opponent`.
 
     Raises:
       UserError: a file that can't be used, or an evader that nobody knows.
@@ -78,21 +81,27 @@ def make_environment(
 
 
 def is_evader_file(opponent: Any) -> bool:
-    """Whether it is a file that `openjax exploit` wrote, neither a scripted evader's name nor
-    code.
+    """Whether it is a file that `openjax exploit` wrote, neither a scripted evader's
+    name nor code.
     """
     named = isinstance(opponent, str | Path) and str(opponent) not in SCRIPTED
     return named and not is_own_code(opponent)
 
 
 def save_evader(
-    path: Path, evader: tuple[Any, jax.Array], hold: int, game: PursuitSettings, notes: dict
+    path: Path,
+    evader: tuple[Any, jax.Array],
+    hold: int,
+    game: PursuitSettings,
+    notes: dict,
 ) -> None:
-    """Write a learned evader, its actor and whether it sees in the world's axes, how many control
-    steps it holds a decision, and the game that it learned.
+    """Write a learned evader, its actor and whether it sees in the world's axes, how
+    many control steps it holds a decision, and the game that it learned.
     """
     actor, world_axes = evader
-    stored = {"evader": {"actor": actor, "world_axes": world_axes, "hold": jnp.int32(hold)}}
+    stored = {
+        "evader": {"actor": actor, "world_axes": world_axes, "hold": jnp.int32(hold)}
+    }
     save_policy_file(path, stored, {"environment": game}, notes, storage="float32")
 
 
@@ -100,8 +109,8 @@ def find_opponent(evader: str | Path | Evader, game: PursuitSettings) -> Evader:
     """An evader that isn't one of the library's.
 
     Args:
-      evader: a function or row of one's own, or `FILE.py:function`, or a file that `openjax
-        exploit` wrote.
+      evader: a function or row of one's own, or `FILE.py:function`, or a file that
+        `openjax exploit` wrote.
       game: that it shall play.
 
     Raises:
@@ -138,11 +147,17 @@ def find_opponent(evader: str | Path | Evader, game: PursuitSettings) -> Evader:
             f"{game.max_pillars}; environment.max_pillars {slots} would be right"
         )
     # the network's sizes are those of its biases
-    width, outputs = (leaves[f"evader/actor/bias_{layer}"].shape[-1] for layer in (0, 2))
+    width, outputs = (
+        leaves[f"evader/actor/bias_{layer}"].shape[-1] for layer in (0, 2)
+    )
     sizes = (number_of_senses(game.num_pursuers, slots), width, outputs)
     actor = jax.eval_shape(lambda key: init_network(key, 1, sizes), jax.random.key(0))
-    one = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), actor)
+    one = jax.tree.map(
+        lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), actor
+    )
     scalar = {"world_axes": jnp.bool_, "hold": jnp.int32}
     abstract = {name: jax.ShapeDtypeStruct((), kind) for name, kind in scalar.items()}
     stored = fill({"evader": {"actor": one, **abstract}}, leaves, str(path))["evader"]
-    return learned_opponent(stored["actor"], stored["world_axes"], int(stored["hold"]), slots)
+    return learned_opponent(
+        stored["actor"], stored["world_axes"], int(stored["hold"]), slots
+    )

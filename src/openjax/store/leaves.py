@@ -1,4 +1,6 @@
-"""Leaves of a pytree of arrays: by their names, by their kinds, and on their devices."""
+"""Leaves of a pytree of arrays: by their names, by their kinds, and on their
+devices.
+"""
 
 from typing import Any
 
@@ -10,12 +12,15 @@ import numpy as np
 def named_leaves(tree: Any) -> dict[str, Any]:
     """Leaves by their path, for example `actor/params/Dense_0/kernel`."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
-    return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
+    return {
+        jax.tree_util.keystr(path, simple=True, separator="/"): leaf
+        for path, leaf in leaves
+    }
 
 
 def place(carry: Any, shardings: Any = None) -> Any:
-    """Commit every leaf to its devices, so that a fresh and a restored carry hit the same compiled
-    step.
+    """Commit every leaf to its devices, so that a fresh and a restored carry hit the
+    same compiled step.
 
     Args:
       carry: pytree of arrays.
@@ -30,13 +35,16 @@ def place(carry: Any, shardings: Any = None) -> Any:
             numbers = put(jax.random.key_data(leaf), sharding)
             return jax.random.wrap_key_data(numbers, impl=jax.random.key_impl(leaf))
         # each process has the whole carry, and hands in its own devices' share
-        return jax.make_array_from_callback(leaf.shape, sharding, np.asarray(leaf).__getitem__)
+        return jax.make_array_from_callback(
+            leaf.shape, sharding, np.asarray(leaf).__getitem__
+        )
 
     return jax.tree.map(put, carry, jax.tree.broadcast(shardings, carry))
 
 
 def abstract_like(carry: Any, shardings: Any = None) -> Any:
-    """Shapes, dtypes and shardings of a carry that `place` put, or would put, on its devices.
+    """Shapes, dtypes and shardings of a carry that `place` put, or would put, on its
+    devices.
 
     Args:
       carry: pytree of arrays, or of their shapes and dtypes.
@@ -44,7 +52,9 @@ def abstract_like(carry: Any, shardings: Any = None) -> Any:
     """
     shardings = first_device() if shardings is None else shardings
     return jax.tree.map(
-        lambda leaf, sharding: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding),
+        lambda leaf, sharding: jax.ShapeDtypeStruct(
+            leaf.shape, leaf.dtype, sharding=sharding
+        ),
         carry,
         jax.tree.broadcast(shardings, carry),
     )

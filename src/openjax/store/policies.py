@@ -1,5 +1,5 @@
-"""Policies from wherever they lie: a policy file, a run, a checkpoint, or one shipped with the
-package.
+"""Policies from wherever they lie: a policy file, a run, a checkpoint, or one shipped
+with the package.
 """
 
 import dataclasses
@@ -46,7 +46,9 @@ _OF_THE_WORLD = (
 )
 """Settings that a policy can't see, and is used to."""
 _DRAWN = {"evader_speed": "evader_speeds", "capture_radius": "capture_radii"}
-"""Those of them that a training may draw, and from where; a policy for teams sees them."""
+"""Those of them that a training may draw, and from where; a policy for teams sees
+them.
+"""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -54,7 +56,8 @@ class LoadedPolicy:
     """A trained policy or a heuristic, called with observations of its game:
     `openjax.make(policy.settings.environment)`.
 
-    It goes into `jax.jit` and `jax.vmap` as it is; two are the same only if they're one object.
+    It goes into `jax.jit` and `jax.vmap` as it is; two are the same only if they're one
+    object.
     """
 
     policy: Policy | Heuristic | OwnController
@@ -63,7 +66,9 @@ class LoadedPolicy:
     """What it was trained with; of a heuristic, the game's defaults."""
     source: str
     environment: Pursuit | None = None
-    """Its game, where that has parts of one's own; None: the one that the settings name."""
+    """Its game, where that has parts of one's own; None: the one that the settings
+    name.
+    """
 
     @property
     def is_heuristic(self) -> bool:
@@ -76,8 +81,8 @@ class LoadedPolicy:
         return bool(self.settings.environment.team_sizes)
 
     def of_team(self, number: int) -> "LoadedPolicy":
-        """The policy in the game of so many pursuers; itself where it flies with one number
-        only.
+        """The policy in the game of so many pursuers; itself where it flies with one
+        number only.
         """
         if not self.any_number:
             return self
@@ -87,7 +92,8 @@ class LoadedPolicy:
         )
 
     def in_game(self, environment: Pursuit) -> "LoadedPolicy":
-        """The policy for another game than its own: another arena, vehicle or number of pillars.
+        """The policy for another game than its own: another arena, vehicle or number of
+        pillars.
 
         Raises:
           UserError: it can't play that one.
@@ -99,7 +105,13 @@ class LoadedPolicy:
             return self  # it takes what it is given
         game = environment.settings
         trained = self.settings.environment
-        fixed = ["self_size", "observe_in", "observed_pillars", "history_length", "frame_size"]
+        fixed = [
+            "self_size",
+            "observe_in",
+            "observed_pillars",
+            "history_length",
+            "frame_size",
+        ]
         if not self.any_number:
             fixed.insert(0, "num_pursuers")  # first, as the sizes follow from it
         for name in fixed:
@@ -110,17 +122,23 @@ class LoadedPolicy:
                     f"{getattr(game, name)}: pursuers, observation and history must stay as in "
                     "training"
                 )
-        if isinstance(self.policy, CraftPolicy):  # its controller flies another arena, or vehicle
+        # its controller flies another arena, or vehicle
+        if isinstance(self.policy, CraftPolicy):
             craft = Craft.of(environment)
             check_flyable(
-                f"the policy's output {self.settings.network.output}", craft, game.time_step
+                f"the policy's output {self.settings.network.output}",
+                craft,
+                game.time_step,
             )
-            return dataclasses.replace(self, policy=dataclasses.replace(self.policy, craft=craft))
+            return dataclasses.replace(
+                self, policy=dataclasses.replace(self.policy, craft=craft)
+            )
         return self
 
     def outside_of_training(self, environment: Pursuit) -> list[str]:
-        """In words, how a game differs from all that the policy was trained in: arena, radii,
-        speeds, steps and vehicle. A heuristic, and a controller of one's own, learned in none.
+        """In words, how a game differs from all that the policy was trained in: arena,
+        radii, speeds, steps and vehicle. A heuristic, and a controller of one's own,
+        learned in none.
         """
         if not isinstance(self.policy, Policy | OwnPolicy):
             return []
@@ -129,7 +147,9 @@ class LoadedPolicy:
         words = []
         for name in _OF_THE_WORLD:
             value = getattr(game, name)
-            ends = getattr(trained, _DRAWN.get(name, ""), ()) or (getattr(trained, name),)
+            ends = getattr(trained, _DRAWN.get(name, ""), ()) or (
+                getattr(trained, name),
+            )
             if not ends[0] <= value <= ends[-1]:
                 span = " to ".join(f"{end:g}" for end in ends)
                 words.append(f"{name} {value:g} instead of {span}")
@@ -138,12 +158,14 @@ class LoadedPolicy:
         if game.airframe != trained.airframe:
             words.append(f"the {game.airframe} instead of the {trained.airframe}")
         elif environment.effects and not trained.vehicles:
-            words.append(f"{', '.join(environment.effects)}, which no vehicle in training had")
+            words.append(
+                f"{', '.join(environment.effects)}, which no vehicle in training had"
+            )
         return words
 
     def __call__(self, observation: Observation) -> jax.Array:
-        """The mean policy's action (..., N, 4) in -1..1: collective thrust, roll, pitch and yaw
-        rate.
+        """The mean policy's action (..., N, 4) in -1..1: collective thrust, roll, pitch
+        and yaw rate.
 
         Raises:
           UserError: the observation is that of another game.
@@ -153,7 +175,12 @@ class LoadedPolicy:
             return self.policy.act(self.parameters, observation)
         axes = "world" if observation.heading is None else "heading"
         sizes = (observation.self_state.shape[-1], *observation.frames.shape[-2:], axes)
-        expected = (game.self_size, game.history_length, game.frame_size, game.observe_in)
+        expected = (
+            game.self_size,
+            game.history_length,
+            game.frame_size,
+            game.observe_in,
+        )
         if sizes != expected:
             raise UserError(
                 f"policy {self.source} observes {expected} (own state, history, axes), "
@@ -170,14 +197,15 @@ def load_policy(
     """Load a policy.
 
     Args:
-      name_or_path: a name from `known_policies()` (`DEFAULT_POLICY` if none is given), a policy
-        file (.npz), a run's directory (its best policy) or a checkpoint's directory inside a run,
-        or `FILE.py:function`, see `own_controller`.
-      environment, policy: those of one's own that a run was trained with (`openjax.train`), as its
-      files hold numbers alone.
+      name_or_path: a name from `known_policies()` (`DEFAULT_POLICY` if none is given),
+        a policy file (.npz), a run's directory (its best policy) or a checkpoint's
+        directory inside a run, or `FILE.py:function`, see `own_controller`.
+      environment, policy: those of one's own that a run was trained with
+      (`openjax.train`), as its files hold numbers alone.
 
     Raises:
-      UserError: nothing of that kind is there, or it's of another shape than its settings say.
+      UserError: nothing of that kind is there, or it's of another shape than its
+      settings say.
     """
     path = Path(name_or_path)
     source = str(name_or_path)
@@ -188,7 +216,9 @@ def load_policy(
         return _heuristic(source)
     if is_own_code(source):
         what = "function {}(observation) that gives actions (N, 4)"
-        return own_controller(own_code("--policy", source, (), what), PursuitSettings(), source)
+        return own_controller(
+            own_code("--policy", source, (), what), PursuitSettings(), source
+        )
     if str(name_or_path) in shipped_policies():
         return _from_file(WEIGHTS / f"{name_or_path}.npz", source)
     if is_run(path):
@@ -210,20 +240,24 @@ def load_policy(
 
 
 def known_policies() -> list[str]:
-    """Names that `load_policy` knows: heuristics and the policies inside the package."""
+    """Names that `load_policy` knows: heuristics and the policies inside the
+    package.
+    """
     return [*METHODS, *shipped_policies()]
 
 
 def own_controller(
     function: Callable[[Observation], jax.Array], game: PursuitSettings, source: str
 ) -> LoadedPolicy:
-    """A pure function from the `Observation` of one world to actions (N, 4) in -1..1 as a policy
-    for this game.
+    """A pure function from the `Observation` of one world to actions (N, 4) in -1..1 as
+    a policy for this game.
     """
     nothing = PolicyParameters(actor={}, critic={}, predictor={})
     # which fits all games
     whole = dict.fromkeys(("rollout_length", "restart_steps"), game.episode_length)
-    settings = TrainSettings(environment=game, predictor=OwnController.predictor, **whole)
+    settings = TrainSettings(
+        environment=game, predictor=OwnController.predictor, **whole
+    )
     return LoadedPolicy(OwnController(function), nothing, settings, source)
 
 
@@ -267,15 +301,21 @@ def _from_run(run, source):
 def _build(settings, leaves, source):
     game = settings.environment
     # learned evaders' networks aren't in a policy's file
-    scripted = tuple(name for name in game.evaders if name in SCRIPTED) or PursuitSettings().evaders
+    scripted = (
+        tuple(name for name in game.evaders if name in SCRIPTED)
+        or PursuitSettings().evaders
+    )
     settings = dataclasses.replace(
         settings, environment=dataclasses.replace(game, evaders=scripted)
     )
     if jax.default_backend() == "cpu":  # CPUs emulate bfloat16, slowly
         settings = dataclasses.replace(
-            settings, network=dataclasses.replace(settings.network, compute_type="float32")
+            settings,
+            network=dataclasses.replace(settings.network, compute_type="float32"),
         )
-    policy, abstract = _untrained(settings.environment, settings.network, settings.predictor)
+    policy, abstract = _untrained(
+        settings.environment, settings.network, settings.predictor
+    )
     if not any(name.startswith("critic/") for name in leaves):
         # Shipped without: flying needs no critic.
         abstract = abstract.replace(critic={})
@@ -284,9 +324,11 @@ def _build(settings, leaves, source):
 
 
 @functools.lru_cache(maxsize=8)
-def _untrained(game: PursuitSettings, network: NetworkSettings, predictor: PredictorSettings):
-    """The networks of these settings and the kinds of their parameters, which take a second to
-    trace.
+def _untrained(
+    game: PursuitSettings, network: NetworkSettings, predictor: PredictorSettings
+):
+    """The networks of these settings and the kinds of their parameters, which take a
+    second to trace.
     """
     environment = Pursuit(game)
     policy = make_policy(environment, network, predictor)

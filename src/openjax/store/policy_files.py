@@ -1,8 +1,9 @@
 """Trained policies as one small file: arrays and settings in a .npz, no pickle.
 
-A file holds the leaves of a parameter tree under their paths, the settings that rebuild everything
-around them, and a note of where they come from. Floating-point arrays are stored as float16 by
-default (half the size, about three decimal digits), other kinds stay as they are.
+A file holds the leaves of a parameter tree under their paths, the settings that rebuild
+everything around them, and a note of where they come from. Floating-point arrays are
+stored as float16 by default (half the size, about three decimal digits), other kinds
+stay as they are.
 """
 
 import json
@@ -27,7 +28,11 @@ WEIGHTS = Path(__file__).resolve().parents[1] / "weights"
 
 
 def save_policy_file(
-    path: Path, parameters: Any, settings: Any, notes: dict | None = None, storage: str = "float16"
+    path: Path,
+    parameters: Any,
+    settings: Any,
+    notes: dict | None = None,
+    storage: str = "float16",
 ) -> None:
     """Write a policy.
 
@@ -48,9 +53,13 @@ def save_policy_file(
     arrays = {}
     for name, leaf in named_leaves(parameters).items():
         # NumPy's files know no bfloat16
-        array = np.asarray(leaf.astype(jnp.float32) if leaf.dtype == jnp.bfloat16 else leaf)
+        array = np.asarray(
+            leaf.astype(jnp.float32) if leaf.dtype == jnp.bfloat16 else leaf
+        )
         header["dtypes"][name] = str(leaf.dtype)
-        arrays[name] = array.astype(storage) if np.issubdtype(array.dtype, np.floating) else array
+        arrays[name] = (
+            array.astype(storage) if np.issubdtype(array.dtype, np.floating) else array
+        )
     arrays[_HEADER] = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
     with replacing(path) as partial:
         np.savez_compressed(partial, **arrays)
@@ -59,8 +68,8 @@ def save_policy_file(
 def load_policy_file(
     path: Path, kind: str = "policy file", writer: str = "openjax.train"
 ) -> tuple[dict[str, np.ndarray], dict, dict]:
-    """Leaves by path in their original dtype, the settings and the notes as plain values; `kind`
-    and `writer` for errors.
+    """Leaves by path in their original dtype, the settings and the notes as plain
+    values; `kind` and `writer` for errors.
 
     Raises:
       UserError: no policy file, or one of another format.
@@ -71,7 +80,8 @@ def load_policy_file(
         if not isinstance(header, dict) or header.get("format") != _FORMAT:
             raise UserError(f"{path} isn't of the format {_FORMAT!r}")
         leaves = {
-            name: array.astype(_dtype(header["dtypes"][name])) for name, array in stored.items()
+            name: array.astype(_dtype(header["dtypes"][name]))
+            for name, array in stored.items()
         }
         settings = header["settings"]
         notes = header["notes"]
@@ -85,9 +95,12 @@ def load_policy_file(
             f"{path} is no {kind}, or it's damaged ({type(error).__name__}); expected one written "
             f"by {writer} (.npz)"
         ) from error
-    # float16 turns what is larger than 65,504 into infinity, and a flipped bit may do it, too
+    # float16 turns what is larger than 65,504 into infinity, and a flipped bit may do
+    # it, too
     broken = [
-        name for name, leaf in leaves.items() if not np.isfinite(leaf.astype(np.float32)).all()
+        name
+        for name, leaf in leaves.items()
+        if not np.isfinite(leaf.astype(np.float32)).all()
     ]
     if broken:
         raise UserError(f"{path} holds numbers that aren't finite, in {broken[0]}")

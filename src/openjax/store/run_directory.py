@@ -1,4 +1,5 @@
-"""The directory of one run: what lies where, and that no run is overwritten by accident.
+"""The directory of one run: what lies where, and that no run is overwritten by
+accident.
 
 settings.json      everything that determines the run; a policy or checkpoint needs nothing else
 vehicle.toml, effects.toml   copies of what it flew with, if not the nominal vehicle
@@ -20,7 +21,13 @@ from pathlib import Path
 from typing import Any
 
 from openjax.errors import UserError
-from openjax.files import WRITING, check_output_folder, read_json, remove_unfinished, write_json
+from openjax.files import (
+    WRITING,
+    check_output_folder,
+    read_json,
+    remove_unfinished,
+    write_json,
+)
 from openjax.learning import TrainSettings
 from openjax.plain import from_plain
 
@@ -74,8 +81,12 @@ class RunDirectory:
         return path if path.exists() else None
 
     def write_settings(self, settings: Any, facts: dict) -> None:
-        """Record the settings (nested dataclass) and facts like machine and command line."""
-        write_json(self.settings_file, {"format": _FORMAT, "settings": settings, **facts})
+        """Record the settings (nested dataclass) and facts like machine and command
+        line.
+        """
+        write_json(
+            self.settings_file, {"format": _FORMAT, "settings": settings, **facts}
+        )
 
     def read_facts(self) -> dict:
         """What `write_settings` was told beside the settings."""
@@ -85,12 +96,15 @@ class RunDirectory:
         """The settings of the run.
 
         Raises:
-          UserError: not written by openjax, or with settings that this version doesn't know.
+          UserError: not written by openjax, or with settings that this version doesn't
+          know.
         """
         stored = read_json(self.settings_file)
         if not isinstance(stored, dict) or stored.get("format") != _FORMAT:
             raise UserError(f"{self.settings_file} isn't of the format {_FORMAT!r}")
-        return from_plain(TrainSettings, stored.get("settings"), f"{self.settings_file}: ")
+        return from_plain(
+            TrainSettings, stored.get("settings"), f"{self.settings_file}: "
+        )
 
 
 def is_run(path: Path) -> bool:
@@ -118,8 +132,8 @@ def check_free(path: Path, overwrite: bool) -> None:
     What a run left that was killed before it had settings is in nobody's way.
 
     Raises:
-      UserError: it holds a run and `overwrite` is False, or it holds other things, or can't be
-      written to.
+      UserError: it holds a run and `overwrite` is False, or it holds other things, or
+      can't be written to.
     """
     path = Path(path)
     if path.exists() and not path.is_dir():
@@ -136,16 +150,16 @@ def check_free(path: Path, overwrite: bool) -> None:
 
 
 def create_run(path: Path, overwrite: bool) -> RunDirectory:
-    """An empty run directory; with `overwrite` a run that is there is removed, and only its own
-    files.
+    """An empty run directory; with `overwrite` a run that is there is removed, and only
+    its own files.
 
     Call it inside `locked`.
     """
     check_free(path, overwrite)
     path = Path(path)
     path.mkdir(parents=True, exist_ok=True)
-    # the settings file goes first: what is left of a half-removed run is no run that could be
-    # resumed
+    # the settings file goes first: what is left of a half-removed run is no run that
+    # could be resumed
     for name in _FILES:
         (path / name).unlink(missing_ok=True)
     for name in _FOLDERS:
@@ -156,15 +170,16 @@ def create_run(path: Path, overwrite: bool) -> RunDirectory:
 
 @contextlib.contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """Keep the directory, which is made where it isn't there, for this process; its end gives it
-    free, also a kill.
+    """Keep the directory, which is made where it isn't there, for this process; its end
+    gives it free, also a kill.
 
     Raises:
       UserError: another process trains there.
     """
     path = Path(path)
     path.mkdir(parents=True, exist_ok=True)
-    # the file stays: a process that opens it while another one removes it would hold nothing
+    # the file stays: a process that opens it while another one removes it would hold
+    # nothing
     with open(path / _LOCK, "a") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -1,5 +1,5 @@
-"""A drone: parameters from its MJCF, rotors, rate controller, dynamics with solids, optional
-effects.
+"""A drone: parameters from its MJCF, rotors, rate controller, dynamics with solids,
+optional effects.
 """
 
 from openjax.lazy import lazy_names

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Arena:
-    """A cylinder with vertical pillars in it, all as high as it is and rounded above. Lengths in m;
-    the paper's.
+    """A cylinder with vertical pillars in it, all as high as it is and rounded above.
+    Lengths in m; the paper's.
     """
 
     radius: float = 0.9

@@ -1,5 +1,5 @@
-"""How the bodies of N drones move under the wrenches on them, in free flight and among solid
-things.
+"""How the bodies of N drones move under the wrenches on them, in free flight and among
+solid things.
 """
 
 import functools
@@ -24,8 +24,8 @@ from openjax.vehicle.state import DroneState
 
 @dataclass(frozen=True)
 class Bodies:
-    """The drones of one world over `dt` seconds; what stops drones of "stops" comes after the step,
-    they fly freely here.
+    """The drones of one world over `dt` seconds; what stops drones of "stops" comes
+    after the step, they fly freely here.
     """
 
     physics: str
@@ -41,15 +41,16 @@ class Bodies:
         torque: Team,
         around: Surroundings | None,
     ) -> DroneState:
-        """The drones (leading axis N) after `dt`; the leaves of `vehicle` are those of all drones
-        or, with that axis, of each.
+        """The drones (leading axis N) after `dt`; the leaves of `vehicle` are those of
+        all drones or, with that axis, of each.
 
-        force (N, 3) N in the world without gravity, torque (N, 3) N m in the body frame; `around`
-        each drone is what `self.around` says.
+        force (N, 3) N in the world without gravity, torque (N, 3) N m in the body
+        frame; `around` each drone is what `self.around` says.
         """
         move = self.rigid
         if self.physics == "mjx":
-            # a world without contacts holds no shapes, and is the same for any number of them
+            # a world without contacts holds no shapes, and is the same for any number
+            # of them
             solid = around is not None
             pillars = around.pillar_position.shape[1] if solid else 0
             others = around.other_position.shape[1] if solid else 0
@@ -61,13 +62,16 @@ class Bodies:
     def around(
         self, drones: DroneState, pillar_position: Pillars, pillar_active: Active
     ) -> Surroundings | None:
-        """What each drone (leading axis N) may touch in this step; None where nothing is solid.
+        """What each drone (leading axis N) may touch in this step; None where nothing
+        is solid.
 
         pillar_position (P, 2) m, pillar_active (P,): which of them are in use.
         """
         if not self.contacts or self.physics == "stops":
             return None
-        return surroundings(drones.position, drones.velocity, pillar_position, pillar_active)
+        return surroundings(
+            drones.position, drones.velocity, pillar_position, pillar_active
+        )
 
     def rigid(
         self,
@@ -77,7 +81,9 @@ class Bodies:
         torque: Vector,
         around: Surroundings | None,
     ) -> DroneState:
-        """One drone by the written-out equations, in free flight if nothing is `around`."""
+        """One drone by the written-out equations, in free flight if nothing is
+        `around`.
+        """
 
         def contact(free):
             return contact_acceleration(
@@ -91,11 +97,15 @@ class Bodies:
     def _mjx(self, world, vehicle, drone, force, torque, around):
         shapes = None
         if around is not None:
-            met = encounters(self.arena, drone.position, drone.velocity, around, self.dt)
+            met = encounters(
+                self.arena, drone.position, drone.velocity, around, self.dt
+            )
             shapes = place_solids(met)
         return mjx_step(world, vehicle, shapes, drone, force, torque, self.dt)
 
 
 def vehicles_axis(vehicle: Vehicle) -> int | None:
-    """0 where the leaves of `vehicle` are those of each drone, None where all drones are alike."""
+    """0 where the leaves of `vehicle` are those of each drone, None where all drones
+    are alike.
+    """
     return 0 if vehicle.mass.ndim else None

@@ -1,7 +1,8 @@
 """What contacts with solid things do to a drone: MuJoCo's soft contacts, written out.
 
 `contact_acceleration` does it for one drone and all things around it at once,
-`looped_contact_acceleration` for a block of drones and one thing after the other, as a kernel does.
+`looped_contact_acceleration` for a block of drones and one thing after the other, as a
+kernel does.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,18 +23,18 @@ def contact_acceleration(
     around: Surroundings,
     dt: Seconds,
 ) -> Vector:
-    """What contacts add over a step of dt seconds to the `acceleration` (3,) m/s^2 that a drone
-    would have without them.
+    """What contacts add over a step of dt seconds to the `acceleration` (3,) m/s^2 that
+    a drone would have without them.
 
-    MuJoCo's soft contacts (its documentation, "Computation": constraint model, primal problem)
-    written out for a sphere without friction. They act on its centre along the normals, so its mass
-    cancels and three unknowns are left,
+    MuJoCo's soft contacts (its documentation, "Computation": constraint model, primal
+    problem) written out for a sphere without friction. They act on its centre along the
+    normals, so its mass cancels and three unknowns are left,
 
         argmin_a |a - a_free|^2 / 2 + sum_i w_i min(0, n_i a - r_i)^2 / 2,
 
-    with weights w_i = d / (1 - d) of the impedance d and reference accelerations r_i = -(b n_i v +
-    k gap_i) / d. As the MJCF's solver does, this takes one Newton step from a_free: exact unless
-    the step brings in another contact.
+    with weights w_i = d / (1 - d) of the impedance d and reference accelerations r_i =
+    -(b n_i v + k gap_i) / d. As the MJCF's solver does, this takes one Newton step from
+    a_free: exact unless the step brings in another contact.
     """
     met = encounters(arena, position, velocity, around, dt)
     reference = _reference(met.things, met.normal, met.shown, velocity, dt)
@@ -49,17 +50,18 @@ def looped_contact_acceleration(
     groups: Sequence[tuple[int, Callable[[jax.Array], Thing]]],
     dt: Seconds,
 ) -> Components:
-    """`contact_acceleration` of a block of drones, by loops over their things: a small program
-    where compiling an unrolled one would take half a minute.
+    """`contact_acceleration` of a block of drones, by loops over their things: a small
+    program where compiling an unrolled one would take half a minute.
 
-    Vectors are their three components, each a block of drones. `groups`: (number, function of an
-    index that gives the thing beside each drone of the block).
+    Vectors are their three components, each a block of drones. `groups`: (number,
+    function of an index that gives the thing beside each drone of the block).
     """
 
     def add(totals, thing):
         least, sums = totals
         normal, gap, gap_ahead = approach(position, velocity, thing, dt)
-        shown = shown_gap(gap, gap_ahead, True)  # where nothing is hit, the sums aren't used
+        # where nothing is hit, the sums aren't used
+        shown = shown_gap(gap, gap_ahead, True)
         reference = _reference(thing, normal, shown, velocity, dt)
         terms = _terms(thing, normal, shown, _along(normal, acceleration) - reference)
         sums = tuple(a + b for a, b in zip(sums, terms, strict=True))
@@ -79,7 +81,9 @@ def _fold(function, start, groups):
         def one(k, value, thing=thing):
             return function(value, thing(k))
 
-        start = one(0, start) if number == 1 else jax.lax.fori_loop(0, number, one, start)
+        start = (
+            one(0, start) if number == 1 else jax.lax.fori_loop(0, number, one, start)
+        )
     return start
 
 
@@ -89,19 +93,28 @@ def _along(normal, vector):
 
 
 def _reference(thing, normal, gap, velocity, dt):
-    """The acceleration along the normal that a contact asks for (m/s^2), shown a `gap`."""
+    """The acceleration along the normal that a contact asks for (m/s^2), shown a
+    `gap`.
+    """
     # divided in the drones' precision, as what it is compared with
-    stiffness, damping, impedance = (jnp.asarray(number, gap.dtype) for number in thing.contact)
-    return -(damping / dt * _along(normal, velocity) + stiffness / dt**2 * gap) / impedance
+    stiffness, damping, impedance = (
+        jnp.asarray(number, gap.dtype) for number in thing.contact
+    )
+    return (
+        -(damping / dt * _along(normal, velocity) + stiffness / dt**2 * gap) / impedance
+    )
 
 
 def _terms(thing, normal, gap, lacking):
-    """What one contact adds to the pull (3,) and to the matrix (xx, yy, zz, xy, xz, yz) of the
-    Newton step, where the free acceleration is `lacking` (< 0) against the reference.
+    """What one contact adds to the pull (3,) and to the matrix (xx, yy, zz, xy, xz, yz)
+    of the Newton step, where the free acceleration is `lacking` (< 0) against the
+    reference.
     """
     x, y, z = normal
     impedance = jnp.asarray(thing.contact.impedance, gap.dtype)
-    weight = jnp.where((gap < 0.0) & (lacking < 0.0), impedance / (1.0 - impedance), 0.0)
+    weight = jnp.where(
+        (gap < 0.0) & (lacking < 0.0), impedance / (1.0 - impedance), 0.0
+    )
     pulls = [weight * lacking * part for part in normal]
     # the matrix is symmetric: six of its nine entries
     entries = ((x, x), (y, y), (z, z), (x, y), (x, z), (y, z))
@@ -109,8 +122,11 @@ def _terms(thing, normal, gap, lacking):
 
 
 def _newton_step(sums):
-    """The solution of (1 + sum_i w_i n_i n_i^T) step = -pull, by an LDL^T factorisation."""
-    # written out: a kernel knows no solver, and three unknowns aren't worth a call of LAPACK
+    """The solution of (1 + sum_i w_i n_i n_i^T) step = -pull, by an LDL^T
+    factorisation.
+    """
+    # written out: a kernel knows no solver, and three unknowns aren't worth a call of
+    # LAPACK
     *pull, xx, yy, zz, xy, xz, yz = sums
     xx = 1.0 + xx
     yy = 1.0 + yy
@@ -128,8 +144,8 @@ def _newton_step(sums):
 
 
 def _sums(terms):
-    """The sum of each over the things, by one loop: as many loops as sums would find the contacts
-    anew in each. No gradient.
+    """The sum of each over the things, by one loop: as many loops as sums would find
+    the contacts anew in each. No gradient.
     """
 
     def add(one, other):

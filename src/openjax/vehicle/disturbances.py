@@ -1,8 +1,8 @@
-"""What differs from flight to flight and moment to moment: gusts, sensor noise, commands and poses
-that come unevenly.
+"""What differs from flight to flight and moment to moment: gusts, sensor noise,
+commands and poses that come unevenly.
 
-Effects like those of `openjax.vehicle.effects`, for flying with only: they're random, so no
-diagnosis looks for them.
+Effects like those of `openjax.vehicle.effects`, for flying with only: they're random,
+so no diagnosis looks for them.
 """
 
 import jax
@@ -13,12 +13,14 @@ from openjax.vehicle.parameters import hover_command
 from openjax.vehicle.rigid_body import quaternion_multiply, rotate_inverse
 
 LONGEST_JITTER = 0.01
-"""s, one control step: a command that comes later than the next one is lost rather than late."""
+"""s, one control step: a command that comes later than the next one is lost rather than
+late.
+"""
 
 
 def _draw(memory):
-    """A key to draw with, and the memory's next one. Keys are stored as plain numbers, so that a
-    state is arrays alone.
+    """A key to draw with, and the memory's next one. Keys are stored as plain numbers,
+    so that a state is arrays alone.
     """
     draw, carry = jax.random.split(jax.random.wrap_key_data(memory["key"]))
     return draw, jax.random.key_data(carry)
@@ -32,13 +34,16 @@ def _jitter_memory(vehicle, state, dt, key):
 
 
 def _jitter_command(parameters, memory, command, context):
-    """A command that comes late by part of a step: the mean of the old and the new one over that
-    step.
+    """A command that comes late by part of a step: the mean of the old and the new one
+    over that step.
     """
     draw, key = _draw(memory)
     late = parameters["longest"] * jax.random.uniform(draw, (), command.dtype)
     part = jnp.clip(late / context.dt, 0.0, 1.0)
-    return command + part * (memory["previous"] - command), {"previous": command, "key": key}
+    return command + part * (memory["previous"] - command), {
+        "previous": command,
+        "key": key,
+    }
 
 
 COMMAND_JITTER = Effect(
@@ -60,11 +65,14 @@ COMMAND_JITTER = Effect(
 
 def _gust_wrench(parameters, context):
     """Forces in the world that rise and fall, at rates without a common period."""
-    # no ratio of small whole numbers, so that no flight sees the three axes repeat together
+    # no ratio of small whole numbers, so that no flight sees the three axes repeat
+    # together
     ratios = jnp.array([1.0, 1.31, 0.77], context.velocity.dtype)
     angle = parameters["rate"] * context.air_time * ratios
     size = jnp.stack([parameters["x"], parameters["y"], parameters["z"]])
-    force = rotate_inverse(context.quaternion, size * jnp.sin(angle + parameters["phase"]))
+    force = rotate_inverse(
+        context.quaternion, size * jnp.sin(angle + parameters["phase"])
+    )
     return force, jnp.zeros_like(force)
 
 
@@ -106,8 +114,8 @@ def _noise_record(memory, state):
 
 
 def _noise_sensor(parameters, memory, state):
-    """White noise on pose and velocity; a pose that is older by up to `jitter` is where the drone
-    was then.
+    """White noise on pose and velocity; a pose that is older by up to `jitter` is where
+    the drone was then.
     """
     position, velocity, angle = jnp.split(memory["noise"], 3)
     # what was measured `late` ago is shown as if it were measured now
@@ -118,7 +126,9 @@ def _noise_sensor(parameters, memory, state):
         state.quaternion, jnp.concatenate([jnp.ones_like(turn[:1]), turn])
     )
     return state.replace(
-        position=state.position - late * state.velocity + parameters["position"] * position,
+        position=state.position
+        - late * state.velocity
+        + parameters["position"] * position,
         velocity=state.velocity + parameters["velocity"] * velocity,
         quaternion=quaternion * jax.lax.rsqrt(jnp.sum(quaternion * quaternion)),
     )

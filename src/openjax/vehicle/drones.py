@@ -35,7 +35,8 @@ def motors(
     context: Context | None,
     dt: Seconds,
 ) -> tuple[DroneState, Vector, Vector]:
-    """One drone up to the wrench on its body, its controller and rotors dt seconds later.
+    """One drone up to the wrench on its body, its controller and rotors dt seconds
+    later.
 
     Args:
       effects: those that act, with their `parameters` {effect: {name: ()}}.
@@ -46,11 +47,13 @@ def motors(
       dt: seconds.
 
     Returns:
-      the drone with its new rotors and controller, force (3,) N in the world without gravity,
-      torque (3,) N m about the centre of mass, body frame.
+      the drone with its new rotors and controller, force (3,) N in the world without
+      gravity, torque (3,) N m about the centre of mass, body frame.
     """
     motor_command, integral = rate_controller(vehicle, drone, command, dt)
-    motor_command = composition.change_motor_command(effects, parameters, motor_command, context)
+    motor_command = composition.change_motor_command(
+        effects, parameters, motor_command, context
+    )
     speed = rotor_speed_step(vehicle, drone.rotor_speed, motor_command, dt)
     force, torque = composition.wrench(effects, parameters, vehicle, speed, context)
     drone = drone.replace(
@@ -61,8 +64,8 @@ def motors(
 
 @dataclass(frozen=True)
 class DronesStep:
-    """The step of N drones of one world, made by `make_drones_step`. Its methods are pure, to be
-    mapped.
+    """The step of N drones of one world, made by `make_drones_step`. Its methods are
+    pure, to be mapped.
     """
 
     physics: str
@@ -83,19 +86,20 @@ class DronesStep:
     ) -> DroneState:
         """`drones` (leading axis N) after one step of `dt` seconds.
 
-        command (N, 4) as for `rate_controller`, pillar_position (P, 2) m, pillar_active (P,) bool,
-        effect_parameters {effect: {parameter: () or (N,) array}} for the effects of this step, of
-        all drones or of each; what is left out has no effect. The arithmetic is done in the
-        precision of the drones' state.
+        command (N, 4) as for `rate_controller`, pillar_position (P, 2) m, pillar_active
+        (P,) bool, effect_parameters {effect: {parameter: () or (N,) array}} for the
+        effects of this step, of all drones or of each; what is left out has no effect.
+        The arithmetic is done in the precision of the drones' state.
 
         Raises:
-          UserError: parameters of other effects than this step's, or drones without the memory of
-          its effects.
+          UserError: parameters of other effects than this step's, or drones without the
+          memory of its effects.
         """
         dtype = drones.position.dtype
         vehicle = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), vehicle)
         command = jnp.asarray(command, dtype)
-        # the plain step of training has a kernel of its own; with effects it is put together below
+        # the plain step of training has a kernel of its own; with effects it is put
+        # together below
         if self.physics == "rigid" and not self.effects:
             memory = drones.effect_memory  # of other effects than this step's, if any
             around = (pillar_position, pillar_active) if self.contacts else None
@@ -111,7 +115,9 @@ class DronesStep:
         command, drones = self._receive(vehicle, parameters, drones, command)
 
         def substep(drones):
-            drones, force, torque = self._turn_motors(vehicle, parameters, command, drones)
+            drones, force, torque = self._turn_motors(
+                vehicle, parameters, command, drones
+            )
             around = self._bodies.around(drones, pillar_position, pillar_active)
             return self._bodies(vehicle, drones, force, torque, around)
 
@@ -126,7 +132,8 @@ class DronesStep:
         return FusedStep(self._accelerate, self.arena, self._bodies.dt, self.substeps)
 
     def reset(self, vehicle: Vehicle, drones: DroneState, key=None) -> DroneState:
-        """`drones` (leading axis N) with the effects' memory as at the start of an episode.
+        """`drones` (leading axis N) with the effects' memory as at the start of an
+        episode.
 
         Raises:
           UserError: an effect is random and there is no `key`.
@@ -135,13 +142,15 @@ class DronesStep:
 
         def memory(drone, n):
             drone_key = None if key is None else jax.random.fold_in(key, n)
-            return composition.initial_memory(self.effects, vehicle, drone, self.dt, drone_key)
+            return composition.initial_memory(
+                self.effects, vehicle, drone, self.dt, drone_key
+            )
 
         return drones.replace(effect_memory=jax.vmap(memory)(drones, number))
 
     def seen(self, drones: DroneState, effect_parameters=None) -> DroneState:
-        """What the off-board controller sees of `drones` (leading axis N): they themselves without
-        sensor effects.
+        """What the off-board controller sees of `drones` (leading axis N): they
+        themselves without sensor effects.
         """
         if not self.effects:
             return drones
@@ -156,14 +165,22 @@ class DronesStep:
 
     def _parameters(self, values, drones):
         """Parameters (N,) of every effect."""
-        parameters = composition.complete_parameters(self.effects, values, drones.position.dtype)
+        parameters = composition.complete_parameters(
+            self.effects, values, drones.position.dtype
+        )
         number = drones.position.shape[0]
         return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (number,)), parameters)
 
     def _body(self, vehicle, parameters):
-        """The vehicles that really fly: with effects, every leaf has the drones' axis first."""
+        """The vehicles that really fly: with effects, every leaf has the drones' axis
+        first.
+        """
         change = functools.partial(composition.change_body, self.effects)
-        return jax.vmap(change, (0, None))(parameters, vehicle) if self.effects else vehicle
+        return (
+            jax.vmap(change, (0, None))(parameters, vehicle)
+            if self.effects
+            else vehicle
+        )
 
     def _contexts(self, vehicle, drones, dt) -> Context:
         neighbours = drones.position[others(drones.position.shape[0])]
@@ -178,17 +195,25 @@ class DronesStep:
                 dt=dt,
             )
 
-        return jax.vmap(context, (vehicles_axis(vehicle), 0, 0))(vehicle, drones, neighbours)
+        return jax.vmap(context, (vehicles_axis(vehicle), 0, 0))(
+            vehicle, drones, neighbours
+        )
 
     def _receive(self, vehicle, parameters, drones, command):
-        """The commands that reach the rate controllers, and the drones with the memory of it."""
+        """The commands that reach the rate controllers, and the drones with the memory
+        of it.
+        """
         contexts = self._contexts(vehicle, drones, self.dt)
         change = functools.partial(composition.change_command, self.effects)
-        command, memory = jax.vmap(change)(parameters, drones.effect_memory, command, contexts)
+        command, memory = jax.vmap(change)(
+            parameters, drones.effect_memory, command, contexts
+        )
         return command, drones.replace(effect_memory=memory)
 
     def _turn_motors(self, vehicle, parameters, command, drones):
-        """The drones with their rotors a substep later, and the force and torque on each."""
+        """The drones with their rotors a substep later, and the force and torque on
+        each.
+        """
         dt = self.dt / self.substeps
         contexts = self._contexts(vehicle, drones, dt)
         turn = functools.partial(motors, self.effects, dt=dt)
@@ -196,22 +221,30 @@ class DronesStep:
         return turn(vehicle, parameters, drones, command, contexts)
 
     def _accelerate(self, vehicle, drone, command):
-        """One drone without effects up to its accelerations in free flight; see `FusedStep`."""
-        drone, force, torque = motors((), vehicle, {}, drone, command, None, self._bodies.dt)
+        """One drone without effects up to its accelerations in free flight; see
+        `FusedStep`.
+        """
+        drone, force, torque = motors(
+            (), vehicle, {}, drone, command, None, self._bodies.dt
+        )
         acceleration, angular = accelerations(vehicle, drone, force, torque)
         return drone, acceleration, angular
 
     def _remember(self, drones):
         """The drones with the effects' memory at the end of a step."""
         record = functools.partial(composition.record, self.effects, dt=self.dt)
-        return drones.replace(effect_memory=jax.vmap(record)(drones.effect_memory, drones))
+        return drones.replace(
+            effect_memory=jax.vmap(record)(drones.effect_memory, drones)
+        )
 
 
 def _repeated(substep, drones, number):
     """`drones` after so many substeps; a single one isn't worth a loop."""
     if number == 1:
         return substep(drones)
-    drones, _ = jax.lax.scan(lambda drones, _: (substep(drones), None), drones, length=number)
+    drones, _ = jax.lax.scan(
+        lambda drones, _: (substep(drones), None), drones, length=number
+    )
     return drones
 
 
@@ -227,19 +260,20 @@ def make_drones_step(
 ) -> DronesStep:
     """Make the step of N drones of one world.
 
-    Within a substep: controller on the present state, motors, rotor speeds, wrench from the updated
-    rotor speeds, body.
+    Within a substep: controller on the present state, motors, rotor speeds, wrench from
+    the updated rotor speeds, body.
 
     Args:
-      physics: "mjx": MuJoCo MJX. "rigid": the same equations written out, many times faster. In
-      both floor, pillars and other drones are solid. "stops": free flight, and drones are put back
-      out of solid things once per step.
+      physics: "mjx": MuJoCo MJX. "rigid": the same equations written out, many times
+      faster. In both floor, pillars and other drones are solid. "stops": free flight,
+      and drones are put back out of solid things once per step.
       dt: seconds of a step.
       substeps: by which it is divided; the rate controller runs in each.
       effects: beyond the nominal vehicle, by name or of type `Effect`.
       contacts: off: nothing is solid.
-      max_pillars, num_drones: with both, the MJX model for so many is built here instead of at the
-      first step. Sizes otherwise are those of the arrays that the step gets.
+      max_pillars, num_drones: with both, the MJX model for so many is built here
+      instead of at the first step. Sizes otherwise are those of the arrays that the
+      step gets.
       arena: sizes the pillars.
 
     Raises:
@@ -253,6 +287,13 @@ def make_drones_step(
         raise UserError(
             f"dt {dt} with {substeps} substeps: dt > 0 and substeps >= 1 would be right"
         )
-    if physics == "mjx" and contacts and max_pillars is not None and num_drones is not None:
+    if (
+        physics == "mjx"
+        and contacts
+        and max_pillars is not None
+        and num_drones is not None
+    ):
         make_world(arena, max_pillars, num_drones - 1, dt / substeps, True)
-    return DronesStep(physics, dt, substeps, contacts, arena, composition.resolve(effects))
+    return DronesStep(
+        physics, dt, substeps, contacts, arena, composition.resolve(effects)
+    )

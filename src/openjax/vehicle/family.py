@@ -1,5 +1,5 @@
-"""Families of vehicles: ranges from which the parameters of effects are drawn, one vehicle per
-pursuer and episode.
+"""Families of vehicles: ranges from which the parameters of effects are drawn, one
+vehicle per pursuer and episode.
 """
 
 import functools
@@ -18,14 +18,14 @@ from openjax.vehicle.effects.registry import EFFECTS, find_effect
 from openjax.vehicle.parameters import NOMINAL, find_mjcf
 
 REST = 0.35
-"""The part of the family's ranges that remains for what a diagnosis didn't find: it can't rule out
-that a little of it acts.
+"""The part of the family's ranges that remains for what a diagnosis didn't find: it
+can't rule out that a little of it acts.
 """
 
 
 class VehicleRange(NamedTuple):
-    """Where one parameter of an effect is drawn from: uniformly in its range, now and then in a
-    wider one.
+    """Where one parameter of an effect is drawn from: uniformly in its range, now and
+    then in a wider one.
     """
 
     parameter: str
@@ -43,15 +43,17 @@ def known_effects() -> dict[str, Effect]:
 
 
 def find_parameter(name: str) -> tuple[Effect, Parameter]:
-    """The effect and the parameter behind `effect.parameter`. Raises UserError if there is none."""
+    """The effect and the parameter behind `effect.parameter`. Raises UserError if there
+    is none.
+    """
     effect_name, _, parameter = name.partition(".")
     effect = find_effect(effect_name, parameter, "vehicles: ", known_effects())
     return effect, effect.parameters[parameter]
 
 
 def checked_ranges(entries: Iterable[Iterable]) -> tuple[VehicleRange, ...]:
-    """The ranges that entries (parameter, low, high, rare low, rare high) hold: files and settings
-    that a person writes have plain tuples.
+    """The ranges that entries (parameter, low, high, rare low, rare high) hold: files
+    and settings that a person writes have plain tuples.
 
     Raises:
       UserError: an unknown parameter, one that comes twice, or a range that isn't.
@@ -96,18 +98,22 @@ def family_bounds(ranges: Sequence[VehicleRange]) -> np.ndarray:
 
 
 def narrowed_bounds(ranges: Sequence[VehicleRange], share) -> jax.Array:
-    """(R, 4) bounds of the family of which only this `share` () is left about the nominal
-    vehicle.
+    """(R, 4) bounds of the family of which only this `share` () is left about the
+    nominal vehicle.
     """
     parameters = [find_parameter(entry.parameter)[1] for entry in ranges]
-    # about the nominal vehicle, not about the range's middle: a family needn't hold it in the
-    # middle
+    # about the nominal vehicle, not about the range's middle: a family needn't hold it
+    # in the middle
     none = np.array([[parameter.none] for parameter in parameters], np.float32)
     return none + share * (family_bounds(ranges) - none)
 
 
-def partly_nominal(ranges: Sequence[VehicleRange], worlds: int, share: float) -> jax.Array:
-    """(W, R, 4) bounds of the family for each world; this share of them has nominal vehicles."""
+def partly_nominal(
+    ranges: Sequence[VehicleRange], worlds: int, share: float
+) -> jax.Array:
+    """(W, R, 4) bounds of the family for each world; this share of them has nominal
+    vehicles.
+    """
     if not ranges:
         return jnp.zeros((worlds, 0, 4))
     is_nominal = jnp.arange(worlds)[:, None, None] < share * worlds
@@ -122,18 +128,20 @@ def draw_vehicles(
     rare: float = 0.0,
     bounds: jax.Array | None = None,
 ) -> dict[str, dict[str, jax.Array]]:
-    """Effect parameters {effect: {parameter: (number,)}} of `number` vehicles, each drawn by
-    itself.
+    """Effect parameters {effect: {parameter: (number,)}} of `number` vehicles, each
+    drawn by itself.
 
-    With probability `rare` one effect of a vehicle, any with equal odds, is drawn from its rare
-    bounds. `bounds` (R, 4) take the place of those in `ranges`: they may be known only after the
-    program was compiled.
+    With probability `rare` one effect of a vehicle, any with equal odds, is drawn from
+    its rare bounds. `bounds` (R, 4) take the place of those in `ranges`: they may be
+    known only after the program was compiled.
     """
     if not ranges:
         return {}
     names = [effect.name for effect in family_effects(ranges)]
     bounds = family_bounds(ranges) if bounds is None else bounds
-    owner = np.array([names.index(entry.parameter.partition(".")[0]) for entry in ranges])
+    owner = np.array(
+        [names.index(entry.parameter.partition(".")[0]) for entry in ranges]
+    )
     value_key, chosen_key, rare_key = jax.random.split(key, 3)
     # one draw serves both widths: which of them holds is chosen afterwards
     share = jax.random.uniform(value_key, (number, len(ranges)))
@@ -152,24 +160,27 @@ def draw_vehicles(
 
 
 def standard_parameters(ranges: Sequence[VehicleRange], parameters: dict) -> jax.Array:
-    """(N, R) parameters of `ranges` in units of their effects' usual ranges, zero where there is no
-    effect.
+    """(N, R) parameters of `ranges` in units of their effects' usual ranges, zero where
+    there is no effect.
 
-    The units don't depend on the family's bounds, so that a network that has learnt one family can
-    be shown another.
+    The units don't depend on the family's bounds, so that a network that has learnt one
+    family can be shown another.
     """
     columns = []
     for entry in ranges:
         effect, _, name = entry.parameter.partition(".")
         _, parameter = find_parameter(entry.parameter)
         low, high = parameter.prior
-        columns.append((parameters[effect][name] - parameter.none) / (0.5 * (high - low)))
+        columns.append(
+            (parameters[effect][name] - parameter.none) / (0.5 * (high - low))
+        )
     return jnp.stack(columns, axis=-1)
 
 
 @functools.cache
 def vehicle_family(airframe: str = NOMINAL) -> tuple[VehicleRange, ...]:
-    """The family of an airframe: what its vehicles differ by, from `assets`, which has the sources.
+    """The family of an airframe: what its vehicles differ by, from `assets`, which has
+    the sources.
 
     Raises:
       UserError: no such airframe, or its file holds no ranges.
@@ -195,17 +206,18 @@ def adapted_family(
     rest: float = REST,
     airframe: str = NOMINAL,
 ) -> tuple[VehicleRange, ...]:
-    """The family of one vehicle that was diagnosed: what was found, within its intervals, and a
-    share of all else.
+    """The family of one vehicle that was diagnosed: what was found, within its
+    intervals, and a share of all else.
 
-    It holds every parameter there is, so that families of any two diagnoses differ in their bounds
-    only.
+    It holds every parameter there is, so that families of any two diagnoses differ in
+    their bounds only.
 
     Args:
       values: {effect: {parameter: value}} of the effects that were found.
-      intervals: their 90 % intervals, where known; else a tenth of the value either way.
-      rest: the part of the airframe's family that remains for effects that weren't found: flights
-      can't rule them out.
+      intervals: their 90 % intervals, where known; else a tenth of the value either
+      way.
+      rest: the part of the airframe's family that remains for effects that weren't
+      found: flights can't rule them out.
       airframe: that was diagnosed.
     """
     usual = {entry.parameter: entry for entry in vehicle_family(airframe)}
@@ -216,7 +228,8 @@ def adapted_family(
             name = f"{effect.name}.{key}"
             none = parameter.none
             if found is None:
-                # an effect that the airframe's family lacks stays as the nominal vehicle has it
+                # an effect that the airframe's family lacks stays as the nominal
+                # vehicle has it
                 whole = usual.get(name, VehicleRange(name, none, none, none, none))
                 low = none + rest * (whole.low - none)
                 high = none + rest * (whole.high - none)
@@ -226,5 +239,7 @@ def adapted_family(
                 about = (value - margin, value + margin)
                 low, high = intervals.get(effect.name, {}).get(key, about)
             # one vehicle has no rare cousins: the wider range is the same
-            family.append(VehicleRange(name, float(low), float(high), float(low), float(high)))
+            family.append(
+                VehicleRange(name, float(low), float(high), float(low), float(high))
+            )
     return tuple(family)

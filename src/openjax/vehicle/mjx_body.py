@@ -1,9 +1,9 @@
 """The body of one drone among solid things, its accelerations found by MuJoCo MJX.
 
-Each drone has its own small world: itself as the only moving body, and floor, pillars and other
-drones as shapes that are put in place anew in every step. Mapping this world over drones costs far
-less than one model that holds them all (its matrices grow with the square of the number of drones),
-and only true state is carried between steps.
+Each drone has its own small world: itself as the only moving body, and floor, pillars
+and other drones as shapes that are put in place anew in every step. Mapping this world
+over drones costs far less than one model that holds them all (its matrices grow with
+the square of the number of drones), and only true state is carried between steps.
 """
 
 from __future__ import annotations
@@ -33,9 +33,11 @@ if TYPE_CHECKING:
 
 @cache
 def _mjx():
-    """The module `mujoco.mjx`, loaded when it is first needed: the other physics does without it.
+    """The module `mujoco.mjx`, loaded when it is first needed: the other physics does
+    without it.
 
-    It prints two lines when its optional backend is not installed, which is not used here.
+    It prints two lines when its optional backend is not installed, which is not used
+    here.
     """
     with contextlib.redirect_stdout(io.StringIO()):
         return importlib.import_module("mujoco.mjx")
@@ -48,11 +50,14 @@ class World(NamedTuple):
     data: mjx.Data
 
 
-def world_xml(arena: Arena, n_pillars: int, n_others: int, dt: float, contacts: bool = True) -> str:
+def world_xml(
+    arena: Arena, n_pillars: int, n_others: int, dt: float, contacts: bool = True
+) -> str:
     """MJCF of one drone; a step lasts dt seconds. The drone's geom comes after those of
     `solids_xml`.
 
-    One Newton iteration finds the contact forces for the things that are hit, without a loop.
+    One Newton iteration finds the contact forces for the things that are hit, without a
+    loop.
     """
     # whoever flies brings its own mass and inertia along; see `mjx_step`
     nominal = read_mjcf(str(find_mjcf(NOMINAL)))
@@ -76,11 +81,15 @@ def world_xml(arena: Arena, n_pillars: int, n_others: int, dt: float, contacts: 
 
 
 @lru_cache(maxsize=32)
-def make_world(arena: Arena, n_pillars: int, n_others: int, dt: float, contacts: bool) -> World:
-    """The compiled world; numpy arrays, so that it can be closed over by compiled code of any
-    precision.
+def make_world(
+    arena: Arena, n_pillars: int, n_others: int, dt: float, contacts: bool
+) -> World:
+    """The compiled world; numpy arrays, so that it can be closed over by compiled code
+    of any precision.
     """
-    model = mujoco.MjModel.from_xml_string(world_xml(arena, n_pillars, n_others, dt, contacts))
+    model = mujoco.MjModel.from_xml_string(
+        world_xml(arena, n_pillars, n_others, dt, contacts)
+    )
     device = jax.local_devices()[0]  # of several processes each builds its own
 
     def build():
@@ -88,8 +97,8 @@ def make_world(arena: Arena, n_pillars: int, n_others: int, dt: float, contacts:
         mjx_data = _mjx().make_data(mjx_model, device)
         return jax.tree.map(np.asarray, World(mjx_model, mjx_data))
 
-    # A thread of its own knows nothing of the caller's trace or mesh, which may span other
-    # processes' devices.
+    # A thread of its own knows nothing of the caller's trace or mesh, which may span
+    # other processes' devices.
     with ThreadPoolExecutor(max_workers=1) as pool:
         return pool.submit(build).result()
 
@@ -98,18 +107,19 @@ def _as_dtype(tree, dtype):
     def convert(leaf):
         # indices and flags keep their types
         kind = dtype if np.issubdtype(leaf.dtype, np.floating) else leaf.dtype
-        # empty arrays are made here: closed over by a shard_map, they crash the compiler of JAX
-        # 0.11
+        # empty arrays are made here: closed over by a shard_map, they crash the
+        # compiler of JAX 0.11
         return jnp.asarray(leaf, kind) if leaf.size else jnp.zeros(leaf.shape, kind)
 
     return jax.tree.map(convert, tree)
 
 
 def _forward(model, data, contacts: bool):
-    """MJX's forward dynamics without what this world has none of: tendons, actuators, sensors,
-    cameras.
+    """MJX's forward dynamics without what this world has none of: tendons, actuators,
+    sensors, cameras.
 
-    The barrier keeps XLA from computing each collision once per entry of the contacts' Jacobian.
+    The barrier keeps XLA from computing each collision once per entry of the contacts'
+    Jacobian.
     """
     mjx = _mjx()
     for stage in (mjx.kinematics, mjx.com_pos, mjx.crb, mjx.factor_m, mjx.collision):
@@ -129,11 +139,12 @@ def mjx_step(
     torque_body: Vector,
     dt: Seconds,
 ) -> DroneState:
-    """`rigid_step` by MJX among `shapes` of `place_solids`, (n, 3) m (None: contact-free); dt must
-    be the world's.
+    """`rigid_step` by MJX among `shapes` of `place_solids`, (n, 3) m (None:
+    contact-free); dt must be the world's.
 
-    MJX gives the accelerations; velocities and positions are advanced as its Euler integrator does
-    it. Gradients are those of free flight: what contacts add is a constant to them.
+    MJX gives the accelerations; velocities and positions are advanced as its Euler
+    integrator does it. Gradients are those of free flight: what contacts add is a
+    constant to them.
     """
     dtype = drone.position.dtype
     model, data = _as_dtype(world, dtype)
@@ -146,7 +157,9 @@ def mjx_step(
         opt=model.opt.replace(gravity=gravity),
     )
     if shapes is not None:
-        model = model.replace(geom_pos=jnp.concatenate([shapes, jnp.zeros((1, 3), dtype)]))
+        model = model.replace(
+            geom_pos=jnp.concatenate([shapes, jnp.zeros((1, 3), dtype)])
+        )
     data = data.replace(
         qpos=jnp.concatenate([drone.position, drone.quaternion]),
         qvel=jnp.concatenate([drone.velocity, drone.body_rates]),
@@ -155,9 +168,11 @@ def mjx_step(
     data = _forward(model, data, shapes is not None)
     qacc = data.qacc_smooth
     if shapes is not None:
-        # The solver's line search leaves float32 noise of some 1e-3 m/s^2 even where nothing is
-        # touched.
-        contact = jnp.where(jnp.any(data.qfrc_constraint != 0), data.qacc - data.qacc_smooth, 0.0)
+        # The solver's line search leaves float32 noise of some 1e-3 m/s^2 even where
+        # nothing is touched.
+        contact = jnp.where(
+            jnp.any(data.qfrc_constraint != 0), data.qacc - data.qacc_smooth, 0.0
+        )
         qacc = qacc + jax.lax.stop_gradient(contact)
     qacc = qacc.astype(dtype)
     return euler_step(drone, qacc[:3], qacc[3:], dt)

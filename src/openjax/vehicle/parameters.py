@@ -16,9 +16,9 @@ AIRFRAMES: dict[str, str | Path] = {
     NOMINAL: "crazyflie.xml",
     "brushless": "crazyflie_brushless.xml",
 }
-"""The MJCF of each airframe that settings and vehicle files may name, with its family beside it:
-the Crazyflie 2.1 and the Crazyflie 2.1 Brushless, in the package's assets, and what
-`register_airframe` put there.
+"""The MJCF of each airframe that settings and vehicle files may name, with its family
+beside it: the Crazyflie 2.1 and the Crazyflie 2.1 Brushless, in the package's assets,
+and what `register_airframe` put there.
 """
 
 ROTORS = ("rotor_1", "rotor_2", "rotor_3", "rotor_4")
@@ -37,8 +37,8 @@ _NUMBERS = {
 
 @flax.struct.dataclass
 class Vehicle:
-    """One vehicle: a pytree of arrays. A copy with replaced leaves is another vehicle. Body frame:
-    x forward, y left, z up, origin at the centre of mass.
+    """One vehicle: a pytree of arrays. A copy with replaced leaves is another vehicle.
+    Body frame: x forward, y left, z up, origin at the centre of mass.
     """
 
     mass: Scalar  # kg
@@ -46,12 +46,15 @@ class Vehicle:
     rotor_position: Hubs
     """m, body frame, m1 front right, m2 rear right, m3 rear left, m4 front left"""
     rotor_spin: Rotors
-    """+1: reaction torque on the body along +z (clockwise rotor), -1: counter-clockwise"""
+    """+1: reaction torque on the body along +z (clockwise rotor), -1:
+    counter-clockwise
+    """
     thrust_constant: Scalar  # N s^2, thrust = thrust_constant * speed^2
     torque_constant: Scalar  # N m s^2, torque = spin * torque_constant * speed^2
     max_rotor_speed: Scalar  # rad/s
     motor_time_constant: Scalar  # s, while the rotor speeds up
-    motor_slowdown_ratio: Scalar  # time constant of slowing down / of speeding up, 1 nominally
+    # time constant of slowing down / of speeding up, 1 nominally
+    motor_slowdown_ratio: Scalar
     gravity: Scalar  # m/s^2
     rate_kp: Vector  # motor counts per deg/s; roll, pitch, yaw
     rate_ki: Vector  # motor counts per deg
@@ -60,8 +63,8 @@ class Vehicle:
 
 
 def assets_directory() -> Path:
-    """Where the MJCF files lie: inside the installed package, or at the top of the source tree.
-    UserError: nowhere.
+    """Where the MJCF files lie: inside the installed package, or at the top of the
+    source tree. UserError: nowhere.
     """
     here = Path(__file__).resolve()
     for candidate in (here.parents[1] / "assets", here.parents[3] / "assets"):
@@ -95,15 +98,19 @@ def read_mjcf(path: str) -> dict[str, np.ndarray]:
         )
     actuators = [_find(model, path, "actuator", name) for name in ROTORS]
     sites = [_find(model, path, "site", name) for name in ROTORS]
-    # of a gear's six numbers the last is the torque about z per thrust, signed by the rotor's spin
+    # of a gear's six numbers the last is the torque about z per thrust, signed by the
+    # rotor's spin
     torque_per_thrust = model.actuator_gear[actuators, 5]
-    numbers = {name: _number(model, path, name, size) for name, size in _NUMBERS.items()}
+    numbers = {
+        name: _number(model, path, name, size) for name, size in _NUMBERS.items()
+    }
     return {
         "mass": model.body_mass[body],
         "inertia": model.body_inertia[body].copy(),
         "rotor_position": model.site_pos[sites],
         "rotor_spin": np.sign(torque_per_thrust),
-        "torque_constant": np.abs(torque_per_thrust).mean() * numbers["thrust_constant"],
+        "torque_constant": np.abs(torque_per_thrust).mean()
+        * numbers["thrust_constant"],
         "motor_slowdown_ratio": np.float64(1.0),
         "gravity": -model.opt.gravity[2],
         **numbers,
@@ -112,7 +119,9 @@ def read_mjcf(path: str) -> dict[str, np.ndarray]:
 
 def _find(model, path, kind, name):
     """The index of a named part of a model. Raises UserError where it has none."""
-    index = mujoco.mj_name2id(model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), name)
+    index = mujoco.mj_name2id(
+        model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), name
+    )
     if index < 0:
         raise UserError(f"{path}: has no {kind} named {name!r}, which a vehicle needs")
     return index
@@ -124,26 +133,31 @@ def _number(model, path, name, size):
     start = model.numeric_adr[index]
     count = model.numeric_size[index]
     if count != size:
-        raise UserError(f"{path}: numeric {name!r} holds {count} values, {size} would be right")
+        raise UserError(
+            f"{path}: numeric {name!r} holds {count} values, {size} would be right"
+        )
     values = np.array(model.numeric_data[start : start + count])
     return values[0] if size == 1 else values
 
 
 def register_airframe(name: str, mjcf: str | Path) -> None:
-    """From now on `name` is an airframe: settings, vehicle files and commands of this process may
-    name it. A run that was trained with it is resumed by a process that has registered it, too.
+    """From now on `name` is an airframe: settings, vehicle files and commands of this
+    process may name it. A run that was trained with it is resumed by a process that has
+    registered it, too.
 
     Args:
       name: other than that of a shipped one.
-      mjcf: its file. Where vehicles are to be drawn from its family, STEM_family.toml lies beside
-      it (see `openjax.vehicle.family`).
+      mjcf: its file. Where vehicles are to be drawn from its family, STEM_family.toml
+      lies beside it (see `openjax.vehicle.family`).
 
     Raises:
       UserError: the name is taken by another file, or the file isn't a vehicle.
     """
     path = Path(mjcf).resolve()
     if AIRFRAMES.get(name, path) != path:
-        raise UserError(f"airframe {name}: there is one of that name ({AIRFRAMES[name]})")
+        raise UserError(
+            f"airframe {name}: there is one of that name ({AIRFRAMES[name]})"
+        )
     read_mjcf(str(path))  # says now what is wrong with it, and not when a game is made
     AIRFRAMES[name] = path
 
@@ -155,11 +169,15 @@ def check_airframe(name: str) -> None:
 
 
 def find_mjcf(name_or_path: str | Path) -> Path:
-    """The MJCF file of an airframe: one of `AIRFRAMES`, or a file. UserError: there is none."""
+    """The MJCF file of an airframe: one of `AIRFRAMES`, or a file. UserError: there is
+    none.
+    """
     known = AIRFRAMES.get(str(name_or_path))
     path = Path(name_or_path) if known is None else assets_directory() / known
     if not path.is_file():
-        raise UserError(f"{path}: no such MJCF file, nor an airframe ({', '.join(AIRFRAMES)})")
+        raise UserError(
+            f"{path}: no such MJCF file, nor an airframe ({', '.join(AIRFRAMES)})"
+        )
     return path
 
 
@@ -170,7 +188,9 @@ def load_vehicle(airframe: str | Path = NOMINAL, dtype=jnp.float32) -> Vehicle:
       UserError: the file is missing, isn't MJCF or lacks a part of a vehicle.
     """
     numbers = read_mjcf(str(find_mjcf(airframe).resolve()))
-    return Vehicle(**{name: jnp.asarray(value, dtype) for name, value in numbers.items()})
+    return Vehicle(
+        **{name: jnp.asarray(value, dtype) for name, value in numbers.items()}
+    )
 
 
 def hover_rotor_speed(vehicle: Vehicle) -> Scalar:
@@ -184,7 +204,9 @@ def max_rotor_thrust(vehicle: Vehicle) -> Scalar:
 
 
 def hover_share(vehicle: Vehicle) -> Scalar:
-    """Collective thrust that carries the level vehicle, () as a share of the largest."""
+    """Collective thrust that carries the level vehicle, () as a share of the
+    largest.
+    """
     return vehicle.mass * vehicle.gravity / (4 * max_rotor_thrust(vehicle))
 
 

@@ -1,9 +1,10 @@
 """The rigid step of many worlds in one GPU kernel.
 
-XLA splits the step into some ten kernels (more with contacts), each of which reads and writes all
-drones' states; with tens of thousands of drones most of the time is spent on starting them. Here
-every drone's state is read once and written once. One thread holds one drone, and reads where the
-others of its world are; loops over pillars and other drones keep the program small.
+XLA splits the step into some ten kernels (more with contacts), each of which reads and
+writes all drones' states; with tens of thousands of drones most of the time is spent on
+starting them. Here every drone's state is read once and written once. One thread holds
+one drone, and reads where the others of its world are; loops over pillars and other
+drones keep the program small.
 """
 
 import functools
@@ -31,8 +32,8 @@ from openjax.vehicle.solids import (
 from openjax.vehicle.state import DroneState
 
 WORTH = 16384
-"""Worlds from which the kernel is taken: it saves microseconds a step, and takes the compiler
-seconds.
+"""Worlds from which the kernel is taken: it saves microseconds a step, and takes the
+compiler seconds.
 """
 DRONES = 128
 """Drones of one program."""
@@ -42,9 +43,12 @@ WARPS = 4
 class FusedStep(NamedTuple):
     """What a step does to one drone: hashable, since compiled code is kept for each."""
 
-    accelerate: Callable[[Vehicle, DroneState, jax.Array], tuple[DroneState, jax.Array, jax.Array]]
-    """(vehicle, drone, command (4,)) -> the drone with its controller and rotors a substep later,
-    its accelerations (3,) m/s^2 world and (3,) rad/s^2 body in free flight.
+    accelerate: Callable[
+        [Vehicle, DroneState, jax.Array], tuple[DroneState, jax.Array, jax.Array]
+    ]
+    """(vehicle, drone, command (4,)) -> the drone with its controller and rotors a
+    substep later, its accelerations (3,) m/s^2 world and (3,) rad/s^2 body in free
+    flight.
     """
     arena: Arena
     dt: float
@@ -58,9 +62,15 @@ class FusedStep(NamedTuple):
         moved, acceleration, angular = self.accelerate(vehicle, drone, command)
         if around is not None:
             extra = contact_acceleration(
-                self.arena, drone.position, drone.velocity, acceleration, around, self.dt
+                self.arena,
+                drone.position,
+                drone.velocity,
+                acceleration,
+                around,
+                self.dt,
             )
-            # as by MJX, gradients are those of free flight: what contacts add is a constant to them
+            # as by MJX, gradients are those of free flight: what contacts add is a
+            # constant to them
             acceleration = acceleration + jax.lax.stop_gradient(extra)
         return euler_step(moved, acceleration, angular, self.dt)
 
@@ -70,11 +80,11 @@ def step_many(
 ) -> DroneState:
     """The n drones (leading axis) of one world after a step.
 
-    The drones are of one vehicle and have no effect memory. `pillars`: position (P, 2) m and active
-    (P,) bool, or None for free flight, in which drones don't notice each other. On NVIDIA GPUs in
-    one kernel, elsewhere mapped. May be mapped further, over worlds (still one kernel) and vehicles
-    (not); derivatives are those of `looped_step`, and whatever isn't float32 is done by
-    `mapped_step`.
+    The drones are of one vehicle and have no effect memory. `pillars`: position (P, 2)
+    m and active (P,) bool, or None for free flight, in which drones don't notice each
+    other. On NVIDIA GPUs in one kernel, elsewhere mapped. May be mapped further, over
+    worlds (still one kernel) and vehicles (not); derivatives are those of
+    `looped_step`, and whatever isn't float32 is done by `mapped_step`.
     """
     if drones.position.dtype != jnp.float32:
         return mapped_step(step, vehicle, drones, command, pillars or ())
@@ -91,8 +101,8 @@ def step_many(
 def mapped_step(
     step: FusedStep, vehicle: Vehicle, drones: DroneState, command, pillars
 ) -> DroneState:
-    """The n drones of one world after a step, by the formulas as they stand; `pillars` () in free
-    flight.
+    """The n drones of one world after a step, by the formulas as they stand; `pillars`
+    () in free flight.
     """
     for _ in range(step.substeps):
         around = None
@@ -106,15 +116,18 @@ def mapped_step(
 def looped_step(
     step: FusedStep, vehicle: Vehicle, drones: DroneState, command, pillars
 ) -> DroneState:
-    """The same by a loop over the substeps, each of which is done again in the backward pass.
+    """The same by a loop over the substeps, each of which is done again in the backward
+    pass.
 
-    A gradient through substeps written out one after the other takes five times as long on a CPU,
-    and to compile.
+    A gradient through substeps written out one after the other takes five times as long
+    on a CPU, and to compile.
     """
 
     @jax.checkpoint
     def substep(drones, _):
-        return mapped_step(step._replace(substeps=1), vehicle, drones, command, pillars), None
+        return mapped_step(
+            step._replace(substeps=1), vehicle, drones, command, pillars
+        ), None
 
     drones, _ = jax.lax.scan(substep, drones, length=step.substeps)
     return drones
@@ -137,12 +150,18 @@ def _many_worlds(step):
         vehicle, drones, command, pillars = arguments
         # the kernel holds one vehicle's numbers: of many vehicles it isn't taken
         if any(jax.tree.leaves(in_batched[0])):
-            axes = jax.tree.map(lambda batched: 0 if batched else None, tuple(in_batched))
+            axes = jax.tree.map(
+                lambda batched: 0 if batched else None, tuple(in_batched)
+            )
             stepped = jax.vmap(mapped, axes)(vehicle, drones, command, pillars)
         else:
 
             def flat(leaf, batched):
-                leaf = leaf if batched else jnp.broadcast_to(leaf, (axis_size, *leaf.shape))
+                leaf = (
+                    leaf
+                    if batched
+                    else jnp.broadcast_to(leaf, (axis_size, *leaf.shape))
+                )
                 return leaf.reshape(-1, *leaf.shape[2:])
 
             # two axes of worlds become one, and two again afterwards
@@ -161,9 +180,15 @@ def _many_worlds(step):
 
 
 def kernel_call(
-    step: FusedStep, vehicle: Vehicle, drones: DroneState, command, pillars, interpret=False
+    step: FusedStep,
+    vehicle: Vehicle,
+    drones: DroneState,
+    command,
+    pillars,
+    interpret=False,
 ) -> DroneState:
-    """`step` of W worlds of n drones by the kernel; `interpret` runs it anywhere, slowly.
+    """`step` of W worlds of n drones by the kernel; `interpret` runs it anywhere,
+    slowly.
 
     drones (W, n, ...), command (W, n, 4), pillars () or (W, P, 2) and (W, P).
     """
@@ -172,7 +197,9 @@ def kernel_call(
     single = step._replace(substeps=1)  # drones see where the others are after each
 
     def substep(drones, _):
-        return _one_call(single, vehicle, _Worlds(drones, command, pillars), interpret), None
+        return _one_call(
+            single, vehicle, _Worlds(drones, command, pillars), interpret
+        ), None
 
     drones, _ = jax.lax.scan(substep, drones, length=step.substeps)
     return drones
@@ -186,15 +213,20 @@ class _Worlds(NamedTuple):
     pillars: tuple
 
     def rows(self):
-        """Leaves of the drones and the commands, drones of all worlds one below the other, in whole
-        blocks.
+        """Leaves of the drones and the commands, drones of all worlds one below the
+        other, in whole blocks.
         """
         number = self.command.shape[0] * self.command.shape[1]
         leaves = jax.tree.leaves((self.drones, self.command))
-        return [whole_blocks(leaf.reshape(number, -1), DRONES, mode="edge") for leaf in leaves]
+        return [
+            whole_blocks(leaf.reshape(number, -1), DRONES, mode="edge")
+            for leaf in leaves
+        ]
 
     def around(self):
-        """What each drone looks up: where all drones and pillars are; nothing in free flight."""
+        """What each drone looks up: where all drones and pillars are; nothing in free
+        flight.
+        """
         if not self.pillars:
             return []
         position, active = self.pillars
@@ -209,7 +241,10 @@ class _Worlds(NamedTuple):
         """The drones again from their leaves' rows."""
         leaves, structure = jax.tree.flatten(self.drones)
         number = self.command.shape[0] * self.command.shape[1]
-        whole = [row[:number].reshape(leaf.shape) for row, leaf in zip(rows, leaves, strict=True)]
+        whole = [
+            row[:number].reshape(leaf.shape)
+            for row, leaf in zip(rows, leaves, strict=True)
+        ]
         return structure.unflatten(whole)
 
 
@@ -218,12 +253,14 @@ def _one_call(step, vehicle, worlds, interpret):
     rows = worlds.rows()
     around = worlds.around()
     constants = jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(vehicle)])
-    size = 1 << (constants.shape[0] - 1).bit_length()  # a block's size is a power of two
+    # a block's size is a power of two
+    size = 1 << (constants.shape[0] - 1).bit_length()
     constants = jnp.pad(constants, (0, size - constants.shape[0]))
     moved = rows[:-1]
     blocks = [pl.BlockSpec((DRONES, leaf.shape[1]), lambda i: (i, 0)) for leaf in rows]
     whole = [pl.BlockSpec(leaf.shape, lambda i: (0, 0)) for leaf in around]
-    # position and velocity, the first leaf and the third, aren't written over where others look
+    # position and velocity, the first leaf and the third, aren't written over where
+    # others look
     looked_up = {0, 2} if around else set()
     moved = pl.pallas_call(
         _kernel(step, vehicle, worlds),
@@ -231,7 +268,9 @@ def _one_call(step, vehicle, worlds, interpret):
         grid=(rows[0].shape[0] // DRONES,),
         in_specs=[pl.BlockSpec(constants.shape, lambda i: (0,)), *blocks, *whole],
         out_specs=blocks[:-1],
-        input_output_aliases={i + 1: i for i in range(len(moved)) if i not in looked_up},
+        input_output_aliases={
+            i + 1: i for i in range(len(moved)) if i not in looked_up
+        },
         interpret=interpret,
         compiler_params=pallas_triton.CompilerParams(num_warps=WARPS, num_stages=1),
         name="rigid_step",
@@ -240,29 +279,41 @@ def _one_call(step, vehicle, worlds, interpret):
 
 
 def _kernel(step, vehicle, worlds):
-    """The program of a block of drones, each of which is done component by component."""
-    drone, command = jax.tree.map(lambda leaf: leaf[0, 0], (worlds.drones, worlds.command))
+    """The program of a block of drones, each of which is done component by
+    component.
+    """
+    drone, command = jax.tree.map(
+        lambda leaf: leaf[0, 0], (worlds.drones, worlds.command)
+    )
     leaves = jax.tree.leaves(drone)
     accelerate = jax.make_jaxpr(step.accelerate)(vehicle, drone, command)
     move = functools.partial(euler_step, dt=step.dt)
     move = jax.make_jaxpr(move)(drone, drone.position, drone.position)
 
     def kernel(constants_ref, *refs):
-        state = [[ref[:, i] for i in range(ref.shape[1])] for ref in refs[: len(leaves)]]
+        state = [
+            [ref[:, i] for i in range(ref.shape[1])] for ref in refs[: len(leaves)]
+        ]
         command = split(refs[len(leaves)][:, i] for i in range(4))
         around = refs[len(leaves) + 1 : -len(leaves)]
         constants = _numbers(constants_ref, jax.tree.leaves(vehicle))
 
         def substep(_, state):
             parts = [
-                split(row).reshape(leaf.shape) for row, leaf in zip(state, leaves, strict=True)
+                split(row).reshape(leaf.shape)
+                for row, leaf in zip(state, leaves, strict=True)
             ]
             *turned, free, angular = evaluate(accelerate, [*constants, *parts, command])
             if around:
                 before = jax.tree.structure(drone).unflatten(parts)
-                free = free + _contacts(step, before, free, worlds.command.shape[:2], around)
+                free = free + _contacts(
+                    step, before, free, worlds.command.shape[:2], around
+                )
             moved = evaluate(move, [*turned, free, angular])
-            return [[jnp.broadcast_to(part, (DRONES,)) for part in leaf.ravel()] for leaf in moved]
+            return [
+                [jnp.broadcast_to(part, (DRONES,)) for part in leaf.ravel()]
+                for leaf in moved
+            ]
 
         if step.substeps == 1:  # not worth a loop
             state = substep(0, state)
@@ -287,13 +338,15 @@ def _numbers(constants_ref, leaves):
 
 
 def _contacts(step, drone, free, sizes, around):
-    """What contacts add to the accelerations in free flight of a block of drones, components (3,);
-    `sizes`: worlds, and drones in each.
+    """What contacts add to the accelerations in free flight of a block of drones,
+    components (3,); `sizes`: worlds, and drones in each.
     """
     position_ref, velocity_ref, pillar_ref, active_ref = around
     worlds, n = sizes
-    number = pl.program_id(0) * DRONES + jnp.arange(DRONES)  # of a drone among those of all worlds
-    world = jnp.minimum(jax.lax.div(number, n), worlds - 1)  # the last block may be partly empty
+    # of a drone among those of all worlds
+    number = pl.program_id(0) * DRONES + jnp.arange(DRONES)
+    # the last block may be partly empty
+    world = jnp.minimum(jax.lax.div(number, n), worlds - 1)
     index = jax.lax.rem(number, n)
     place = tuple(drone.position)
 
@@ -306,11 +359,14 @@ def _contacts(step, drone, free, sizes, around):
         where = tuple(position_ref[row, i] for i in range(3))
         return other_drone(where, tuple(velocity_ref[row, i] for i in range(3)))
 
-    groups = (  # the loops first: what comes before one makes it larger for the compiler
+    # the loops first: what comes before one makes it larger for the compiler
+    groups = (
         (active_ref.shape[1], pillar_beside),
         (n - 1, drone_beside),
         (1, lambda _: floor(place)),
     )
     return split(
-        looped_contact_acceleration(place, tuple(drone.velocity), tuple(free), groups, step.dt)
+        looped_contact_acceleration(
+            place, tuple(drone.velocity), tuple(free), groups, step.dt
+        )
     )

@@ -5,14 +5,14 @@ import jax.numpy as jnp
 from openjax.vehicle.parameters import Vehicle
 from openjax.vehicle.shapes import Rotors, Seconds, Vector
 
-# below this motor command a rotor is asked to stand still: keeps the slope of the square root
-# finite
+# below this motor command a rotor is asked to stand still: keeps the slope of the
+# square root finite
 _SMALLEST_COMMAND = 1e-8
 
 
 def commanded_rotor_speed(vehicle: Vehicle, motor_command: Rotors) -> Rotors:
-    """Speed asked for by a motor command in 0..1, which is a share of the largest thrust: (4,)
-    rad/s.
+    """Speed asked for by a motor command in 0..1, which is a share of the largest
+    thrust: (4,) rad/s.
     """
     on = motor_command > _SMALLEST_COMMAND
     root = jnp.sqrt(jnp.where(on, motor_command, 1.0))
@@ -24,7 +24,8 @@ def rotor_speed_step(
 ) -> Rotors:
     """Rotor speeds after dt seconds of a constant motor command, (4,) rad/s.
 
-    T dw/dt = w_commanded - w, solved exactly; T may differ between speeding up and slowing down.
+    T dw/dt = w_commanded - w, solved exactly; T may differ between speeding up and
+    slowing down.
     """
     target = commanded_rotor_speed(vehicle, motor_command)
     slowing = target < rotor_speed
@@ -45,11 +46,14 @@ def rotor_reaction(vehicle: Vehicle, rotor_speed: Rotors) -> Rotors:
     return vehicle.rotor_spin * vehicle.torque_constant * jnp.square(rotor_speed)
 
 
-def total_wrench(vehicle: Vehicle, thrust: Rotors, reaction: Rotors) -> tuple[Vector, Vector]:
-    """Force (3,) N and torque about the centre of mass (3,) N m of the rotors, body frame.
+def total_wrench(
+    vehicle: Vehicle, thrust: Rotors, reaction: Rotors
+) -> tuple[Vector, Vector]:
+    """Force (3,) N and torque about the centre of mass (3,) N m of the rotors, body
+    frame.
 
-    thrust (4,) N acts along body z at the hubs; reaction (4,) N m are the signed torques of
-    `rotor_reaction`.
+    thrust (4,) N acts along body z at the hubs; reaction (4,) N m are the signed
+    torques of `rotor_reaction`.
     """
     x = vehicle.rotor_position[:, 0]
     y = vehicle.rotor_position[:, 1]

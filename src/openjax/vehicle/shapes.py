@@ -1,5 +1,5 @@
-"""Shapes in types: what one drone's arrays are. More drones or worlds are leading axes of all of
-them, mapped by `jax.vmap`.
+"""Shapes in types: what one drone's arrays are. More drones or worlds are leading axes
+of all of them, mapped by `jax.vmap`.
 """
 
 from jaxtyping import Array, Bool, Float
@@ -11,8 +11,8 @@ Quaternion = Float[Array, "4"]
 Rotors = Float[Array, "4"]
 """In the order of `Vehicle.rotor_position`."""
 Command = Float[Array, "4"]
-"""Collective thrust in 0..1, a share of four times the largest rotor thrust; roll, pitch and yaw
-rate in rad/s.
+"""Collective thrust in 0..1, a share of four times the largest rotor thrust; roll,
+pitch and yaw rate in rad/s.
 """
 Commands = Float[Array, "drones 4"]
 Hubs = Float[Array, "4 3"]

@@ -1,15 +1,16 @@
-"""Solid things around a drone: the floor, vertical pillars, the other drones; and what the solver
-of contacts is shown of them.
+"""Solid things around a drone: the floor, vertical pillars, the other drones; and what
+the solver of contacts is shown of them.
 
-A test of present positions would let a drone sink in by the way of one step before anything stops
-it. So the solver is shown each thing moved along the present normal of contact to where its surface
-will be, seen from the drone, at the end of the step if nothing intervened. A contact then stops the
-drone at the surface, in the step in which it would have passed it. While one thing is hit, whatever
-else is near is shown as just touching: it may not be approached faster because of that impact,
-which keeps a drone from being squeezed through a gap narrower than itself.
+A test of present positions would let a drone sink in by the way of one step before
+anything stops it. So the solver is shown each thing moved along the present normal of
+contact to where its surface will be, seen from the drone, at the end of the step if
+nothing intervened. A contact then stops the drone at the surface, in the step in which
+it would have passed it. While one thing is hit, whatever else is near is shown as just
+touching: it may not be approached faster because of that impact, which keeps a drone
+from being squeezed through a gap narrower than itself.
 
-The same contacts are solved by MuJoCo MJX (`place_solids`, `mjx_body`) and, written out, by
-`openjax.vehicle.contacts`.
+The same contacts are solved by MuJoCo MJX (`place_solids`, `mjx_body`) and, written
+out, by `openjax.vehicle.contacts`.
 """
 
 from collections.abc import Sequence
@@ -48,8 +49,8 @@ class Surroundings:
 
 
 class Contact(NamedTuple):
-    """A contact in MuJoCo's direct form: acceleration along the normal >= -stiffness * gap -
-    damping * speed, `gap` being the one at the end of the step.
+    """A contact in MuJoCo's direct form: acceleration along the normal >= -stiffness *
+    gap - damping * speed, `gap` being the one at the end of the step.
     """
 
     stiffness: Gaps  # in 1/dt^2
@@ -59,7 +60,9 @@ class Contact(NamedTuple):
 
 @flax.struct.dataclass
 class Thing:
-    """One solid thing beside a drone, or arrays over many; what doesn't vary is a float."""
+    """One solid thing beside a drone, or arrays over many; what doesn't vary is a
+    float.
+    """
 
     place: Components  # m, where its shape stands
     level: Gaps  # m, height of its point nearest to the drone
@@ -70,11 +73,11 @@ class Thing:
 
 @flax.struct.dataclass
 class Encounters:
-    """One drone beside its solid things: floor, P pillars, K other drones, in this order (M = 1 + P
-    + K).
+    """One drone beside its solid things: floor, P pillars, K other drones, in this
+    order (M = 1 + P + K).
 
-    Vectors are their three components, each an array over the things: so a processor works on eight
-    of them at once.
+    Vectors are their three components, each an array over the things: so a processor
+    works on eight of them at once.
     """
 
     things: Thing  # arrays over the things
@@ -83,21 +86,25 @@ class Encounters:
     shown: Gaps  # m, the gap that the solver of contacts is shown; < 0: it acts
 
 
-# Fixed things: stiffness and damping together cancel the approach in one step and close 0.4 of the
-# gap, below the half at which a resting drone would chatter.
+# Fixed things: stiffness and damping together cancel the approach in one step and close
+# 0.4 of the gap, below the half at which a resting drone would chatter.
 _FIXED = Contact(0.4, 0.6, 0.99)
-# Other drones: each of the pair takes half of the approach, an inelastic impact of equal masses
-# that keeps their momentum; a low impedance, since the other gives way too.
+# Other drones: each of the pair takes half of the approach, an inelastic impact of
+# equal masses that keeps their momentum; a low impedance, since the other gives way
+# too.
 _DRONE = Contact(0.5, 0.0, 0.5)
 _STILL = (0.0, 0.0, 0.0)  # m/s
 
-_NEAR = 0.04  # m, gap within which a thing counts as near: the way of a fast drone in one step
+# m, gap within which a thing counts as near: the way of a fast drone in one step
+_NEAR = 0.04
 _TOUCHING = -1e-6  # m, gap at which a contact acts but doesn't push
 
 
-def solids_xml(arena: Arena, n_pillars: int, n_others: int, dt: float) -> tuple[str, str]:
-    """MJCF of the shapes (floor, pillars, other drones) and of their contact pairs with the geom
-    "drone".
+def solids_xml(
+    arena: Arena, n_pillars: int, n_others: int, dt: float
+) -> tuple[str, str]:
+    """MJCF of the shapes (floor, pillars, other drones) and of their contact pairs with
+    the geom "drone".
     """
     shapes = ['<geom name="floor" type="plane" size="0 0 1"/>']
     pillar = f'type="capsule" size="{arena.pillar_radius} {arena.height / 2}"'
@@ -112,8 +119,8 @@ def solids_xml(arena: Arena, n_pillars: int, n_others: int, dt: float) -> tuple[
 
 
 def _pair(name, contact, dt):
-    """MJCF of the contact with one shape. Negative numbers are MuJoCo's sign for its direct
-    form.
+    """MJCF of the contact with one shape. Negative numbers are MuJoCo's sign for its
+    direct form.
     """
     return (
         f'<pair geom1="drone" geom2="{name}" condim="1" '
@@ -124,7 +131,9 @@ def _pair(name, contact, dt):
 
 def others(n: int) -> np.ndarray:
     """(n, n - 1) indices of the other drones, for each of n."""
-    return np.array([[j for j in range(n) if j != i] for i in range(n)], int).reshape(n, n - 1)
+    return np.array([[j for j in range(n) if j != i] for i in range(n)], int).reshape(
+        n, n - 1
+    )
 
 
 def surroundings(
@@ -132,7 +141,8 @@ def surroundings(
 ) -> Surroundings:
     """What each of N drones may touch, leading axis N.
 
-    position and velocity (N, 3) of the drones, pillar_position (P, 2) m, pillar_active (P,).
+    position and velocity (N, 3) of the drones, pillar_position (P, 2) m, pillar_active
+    (P,).
     """
     n = position.shape[0]
 
@@ -154,14 +164,18 @@ def floor(position: Components) -> Thing:
     return Thing(place, place[2], _STILL, DRONE_RADIUS, _FIXED)
 
 
-def pillar(arena: Arena, position: Components, place: Sequence[jax.Array], active) -> Thing:
-    """A pillar at `place` (x, y) m to drones at `position`; where it isn't `active`, it stands far
-    below.
+def pillar(
+    arena: Arena, position: Components, place: Sequence[jax.Array], active
+) -> Thing:
+    """A pillar at `place` (x, y) m to drones at `position`; where it isn't `active`, it
+    stands far below.
     """
     half = arena.height / 2
     height = jnp.where(active, half, PARKED).astype(position[2].dtype)
     level = jnp.clip(position[2] - height, -half, half) + height
-    return Thing((*place, height), level, _STILL, arena.pillar_radius + DRONE_RADIUS, _FIXED)
+    return Thing(
+        (*place, height), level, _STILL, arena.pillar_radius + DRONE_RADIUS, _FIXED
+    )
 
 
 def other_drone(position: Components, velocity: Components) -> Thing:
@@ -194,8 +208,8 @@ def _things(arena, position, around) -> Thing:
 def encounters(
     arena: Arena, position: Vector, velocity: Vector, around: Surroundings, dt: Seconds
 ) -> Encounters:
-    """One drone at `position` (3,) m with `velocity` (3,) m/s beside its solid things, for a step
-    of dt seconds.
+    """One drone at `position` (3,) m with `velocity` (3,) m/s beside its solid things,
+    for a step of dt seconds.
     """
     things = _things(arena, position, around)
     normal, gap, gap_ahead = approach(position, velocity, things, dt)
@@ -204,9 +218,9 @@ def encounters(
 
 
 def approach(position, velocity, thing: Thing, dt: Seconds):
-    """The normal of contact (x, y, z), the gap now, and at the end of a step of dt seconds if
-    nothing intervened (m), between a drone at `position` with `velocity`, three components each,
-    and a thing.
+    """The normal of contact (x, y, z), the gap now, and at the end of a step of dt
+    seconds if nothing intervened (m), between a drone at `position` with `velocity`,
+    three components each, and a thing.
     """
     nearest = (*thing.place[:2], thing.level)
     away = tuple(own - other for own, other in zip(position, nearest, strict=True))
@@ -220,14 +234,16 @@ def approach(position, velocity, thing: Thing, dt: Seconds):
 
 
 def shown_gap(gap, gap_ahead, hit):
-    """The gap (m) that the solver of contacts is shown, by those now and at the step's end, where
-    something or nothing is `hit`.
+    """The gap (m) that the solver of contacts is shown, by those now and at the step's
+    end, where something or nothing is `hit`.
     """
     return jnp.where(hit & (gap < _NEAR) & (gap_ahead >= 0.0), _TOUCHING, gap_ahead)
 
 
 def place_solids(met: Encounters) -> Things:
-    """Where one drone's shapes are shown to it, (M, 3) m, in the order of `solids_xml`."""
+    """Where one drone's shapes are shown to it, (M, 3) m, in the order of
+    `solids_xml`.
+    """
     shift = met.shown - met.gap
     places = zip(met.things.place, met.normal, strict=True)
     return jnp.stack([place - n * shift for place, n in places], axis=-1)

@@ -12,8 +12,8 @@ from openjax.vehicle.shapes import Quaternion, Rotors, Vector
 
 @flax.struct.dataclass
 class DroneState:
-    """One drone; more drones or environments are leading axes. World frame: z up, z = 0 is the
-    floor.
+    """One drone; more drones or environments are leading axes. World frame: z up, z = 0
+    is the floor.
     """
 
     position: Vector  # m, world, of the centre of mass
@@ -33,11 +33,11 @@ def hover_state(
     velocity: ArrayLike | None = None,
     effect_memory: Any = (),
 ) -> DroneState:
-    """A drone with its rotors at hover speed, at rest unless `velocity` says otherwise, controller
-    reset.
+    """A drone with its rotors at hover speed, at rest unless `velocity` says otherwise,
+    controller reset.
 
-    position (..., 3) m, quaternion (..., 4) (default: level), velocity (..., 3) m/s (default:
-    zero); leading axes are broadcast. `effect_memory` comes from
+    position (..., 3) m, quaternion (..., 4) (default: level), velocity (..., 3) m/s
+    (default: zero); leading axes are broadcast. `effect_memory` comes from
     `openjax.vehicle.effects.initial_memory` where effects need it.
     """
     dtype = vehicle.mass.dtype
@@ -45,7 +45,9 @@ def hover_state(
     level = (1, 0, 0, 0)
     quaternion = jnp.asarray(level if quaternion is None else quaternion, dtype)
     velocity = jnp.asarray((0, 0, 0) if velocity is None else velocity, dtype)
-    lead = jnp.broadcast_shapes(position.shape[:-1], quaternion.shape[:-1], velocity.shape[:-1])
+    lead = jnp.broadcast_shapes(
+        position.shape[:-1], quaternion.shape[:-1], velocity.shape[:-1]
+    )
     zeros = jnp.zeros((*lead, 3), dtype)
     return DroneState(
         position=jnp.broadcast_to(position, (*lead, 3)),

@@ -1,8 +1,8 @@
-"""Solid things, cheaply: once per step, drones are put back out of what they have sunk into and
-lose their approach.
+"""Solid things, cheaply: once per step, drones are put back out of what they have sunk
+into and lose their approach.
 
-For learning, where a touch ends what the episode is worth anyhow; `mjx` stops a drone at the
-surface itself.
+For learning, where a touch ends what the episode is worth anyhow; `mjx` stops a drone
+at the surface itself.
 """
 
 import jax.numpy as jnp
@@ -16,22 +16,30 @@ from openjax.vehicle.state import DroneState
 def stop(
     arena: Arena, drones: DroneState, pillar_position: Pillars, pillar_active: Active
 ) -> DroneState:
-    """`drones` (leading axis N) out of the floor, pillars (P, 2) m in use (P,) and one another; no
-    friction, no bounce.
+    """`drones` (leading axis N) out of the floor, pillars (P, 2) m in use (P,) and one
+    another; no friction, no bounce.
     """
     position = drones.position
     velocity = drones.velocity
-    # a pillar gives way to nobody, so the drone goes the whole depth; of two drones each goes half
+    # a pillar gives way to nobody, so the drone goes the whole depth; of two drones
+    # each goes half
     if pillar_position.shape[0]:
         away = position[:, None, :2] - pillar_position[None]
         position, velocity = _push(
-            position, velocity, away, arena.pillar_radius + DRONE_RADIUS, pillar_active[None], 1.0
+            position,
+            velocity,
+            away,
+            arena.pillar_radius + DRONE_RADIUS,
+            pillar_active[None],
+            1.0,
         )
     if position.shape[0] > 1:
         apart = position[:, None] - position[None]
         others = ~jnp.eye(position.shape[0], dtype=bool)
         moving = velocity[:, None] - velocity[None]
-        position, velocity = _push(position, velocity, apart, 2 * DRONE_RADIUS, others, 0.5, moving)
+        position, velocity = _push(
+            position, velocity, apart, 2 * DRONE_RADIUS, others, 0.5, moving
+        )
     # the floor comes last: whatever pushed a drone before, it ends above it
     low = position[:, 2] < DRONE_RADIUS
     height = jnp.maximum(position[:, 2], DRONE_RADIUS)
@@ -42,8 +50,8 @@ def stop(
 
 
 def _push(position, velocity, away, reach, solid, share, moving=None):
-    """Move drones out of things at `away` (N, M, 2 or 3) from them, by their `share` of the depth
-    and of the approach.
+    """Move drones out of things at `away` (N, M, 2 or 3) from them, by their `share` of
+    the depth and of the approach.
     """
     size = away.shape[-1]
     moving = velocity[:, None, :size] if moving is None else moving
@@ -53,7 +61,9 @@ def _push(position, velocity, away, reach, solid, share, moving=None):
     hit = solid & (distance < reach)
     depth = jnp.where(hit, share * (reach - distance), 0.0)
     # only what goes inwards is taken off: who leaves already keeps its velocity
-    approach = jnp.where(hit, share * jnp.minimum(jnp.sum(normal * moving, axis=-1), 0.0), 0.0)
+    approach = jnp.where(
+        hit, share * jnp.minimum(jnp.sum(normal * moving, axis=-1), 0.0), 0.0
+    )
     shift = jnp.sum(depth[..., None] * normal, axis=1)
     change = jnp.sum(approach[..., None] * normal, axis=1)
     return position.at[:, :size].add(shift), velocity.at[:, :size].add(-change)

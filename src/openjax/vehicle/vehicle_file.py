@@ -1,7 +1,8 @@
-"""`vehicle.toml`: which vehicle flew, how its motors are commanded, and what a calibration found.
+"""`vehicle.toml`: which vehicle flew, how its motors are commanded, and what a
+calibration found.
 
-All tables but `[log]` are strict, so that a misspelt key can't be ignored silently. What the file
-leaves out is the nominal vehicle.
+All tables but `[log]` are strict, so that a misspelt key can't be ignored silently.
+What the file leaves out is the nominal vehicle.
 """
 
 import tomllib
@@ -44,8 +45,8 @@ HEAVY = 1.0
 """kg, above which the Crazyflie's moments of inertia say nothing of a vehicle."""
 
 SAME_ROTORS = 2.0
-"""A vehicle up to so many times as heavy still flies with the airframe's rotors: they lift twice
-its weight.
+"""A vehicle up to so many times as heavy still flies with the airframe's rotors: they
+lift twice its weight.
 """
 
 Place = Literal[*NOMINAL_ORDER]
@@ -59,7 +60,9 @@ class Overrides:
 
     name: str | None = None
     mass: Annotated[float | None, Interval("[0.005, 10]", "kg")] = None
-    """The lightest frame weighs twice the least; the most is what one person still carries."""
+    """The lightest frame weighs twice the least; the most is what one person still
+    carries.
+    """
     mass_weighed: bool | None = None
 
 
@@ -68,7 +71,9 @@ class _Vehicle(Overrides):
     """`[vehicle]`."""
 
     airframe: str = NOMINAL
-    inertia: Annotated[tuple[float, float, float] | None, Interval("(0, 10]", "kg m^2")] = None
+    inertia: Annotated[
+        tuple[float, float, float] | None, Interval("(0, 10]", "kg m^2")
+    ] = None
     """About the body's x, y and z."""
 
 
@@ -117,8 +122,8 @@ class _Tables:
 
 @dataclass(frozen=True)
 class CalibratedValue:
-    """A fitted quantity of the vehicle: `value` and its 90 % interval, tuples of length 1 (3 for
-    inertia).
+    """A fitted quantity of the vehicle: `value` and its 90 % interval, tuples of length
+    1 (3 for inertia).
     """
 
     value: tuple[float, ...]
@@ -128,14 +133,16 @@ class CalibratedValue:
 
 @dataclass(frozen=True, eq=False)
 class VehicleFile:
-    """What a vehicle file says. `vehicle` is the nominal one with everything of the file applied,
-    its motors in the nominal order; `motor` is of the logged columns.
+    """What a vehicle file says. `vehicle` is the nominal one with everything of the
+    file applied, its motors in the nominal order; `motor` is of the logged columns.
     """
 
     vehicle: Vehicle
     name: str = NOMINAL_NAME
     airframe: str = NOMINAL
-    """One of `AIRFRAMES`, or the name of an MJCF file beside the vehicle file: `mjcf`."""
+    """One of `AIRFRAMES`, or the name of an MJCF file beside the vehicle file:
+    `mjcf`.
+    """
     mass_weighed: bool = False
     motor: Motor = field(default_factory=Motor)
     calibrated: Mapping[str, CalibratedValue] = field(default_factory=dict)
@@ -157,23 +164,25 @@ class VehicleFile:
         return self.vehicle if mass is None else _changed(self.vehicle, mass=mass)
 
     def mass_weighed_of(self, vehicle_id: str) -> bool:
-        """Whether the mass of `vehicle_id` was weighed, so that a thrust error can't be explained
-        by it.
+        """Whether the mass of `vehicle_id` was weighed, so that a thrust error can't be
+        explained by it.
         """
         weighed = self.vehicles.get(vehicle_id, Overrides()).mass_weighed
         return self.mass_weighed if weighed is None else weighed
 
 
 def load_vehicle_file(path: str | Path | None = None, dtype=jnp.float32) -> VehicleFile:
-    """Read a `vehicle.toml` (or a folder that holds one); None or an airframe's name give that
-    nominal vehicle.
+    """Read a `vehicle.toml` (or a folder that holds one); None or an airframe's name
+    give that nominal vehicle.
 
-    Raises UserError for a missing or unreadable file, an unknown key in a strict table, or an
-    impossible value.
+    Raises UserError for a missing or unreadable file, an unknown key in a strict table,
+    or an impossible value.
     """
     path = Path(NOMINAL if path is None else path)
     if str(path) in AIRFRAMES and not path.exists():
-        return VehicleFile(load_vehicle(str(path), dtype), _usual_name(str(path)), str(path))
+        return VehicleFile(
+            load_vehicle(str(path), dtype), _usual_name(str(path)), str(path)
+        )
     # a name without a suffix was meant for an airframe, or for a folder
     if not path.exists() and not path.suffix:
         raise UserError(
@@ -187,8 +196,8 @@ def load_vehicle_file(path: str | Path | None = None, dtype=jnp.float32) -> Vehi
 def save_vehicle_file(path: str | Path, vehicle_file: VehicleFile) -> None:
     """Write a vehicle file that `load_vehicle_file` reads back to the same vehicle.
 
-    The source file's text, comments included, is kept where there is one; `[calibrated]` is written
-    anew.
+    The source file's text, comments included, is kept where there is one;
+    `[calibrated]` is written anew.
     """
     if vehicle_file.path:
         document = tomlkit.parse(vehicle_file.path.read_text(encoding="utf-8"))
@@ -210,8 +219,8 @@ def save_vehicle_file(path: str | Path, vehicle_file: VehicleFile) -> None:
 
 
 def copy_vehicle_file(source: str | Path, target: Path) -> None:
-    """Copy a vehicle file as it is, with the MJCF that it names. Raises UserError where it can't be
-    used.
+    """Copy a vehicle file as it is, with the MJCF that it names. Raises UserError where
+    it can't be used.
     """
     vehicle_file = load_vehicle_file(source)
     _copy_mjcf(vehicle_file, target)
@@ -231,8 +240,8 @@ def _usual_name(airframe):
 
 
 def _own_mjcf(name, path):
-    """The MJCF file that `[vehicle] airframe` of the file at `path` names; None for one of
-    `AIRFRAMES`.
+    """The MJCF file that `[vehicle] airframe` of the file at `path` names; None for one
+    of `AIRFRAMES`.
     """
     if name in AIRFRAMES:
         return None
@@ -251,7 +260,9 @@ def _from_tables(plain: dict, path: Path, dtype) -> VehicleFile:
     motor = tables.motor
     # [log] may hold anything: only what openjax reads of it is checked
     read = {f.name for f in fields(_Log)}
-    log = from_plain(_Log, {k: v for k, v in tables.log.items() if k in read}, f"{root}log")
+    log = from_plain(
+        _Log, {k: v for k, v in tables.log.items() if k in read}, f"{root}log"
+    )
     if log.ceiling_z is not None and log.ceiling_z <= log.floor_z:
         raise UserError(
             f"{root}log.ceiling_z is {log.ceiling_z:g}; it must be above floor_z, {log.floor_z:g} m"
@@ -284,11 +295,15 @@ def _from_tables(plain: dict, path: Path, dtype) -> VehicleFile:
 
 
 def _spins(motor: Motor, nominal: Vehicle, root: str) -> tuple[Spin, ...]:
-    """How the motors m1 to m4 of the log spin. Raises UserError unless two spin either way."""
-    # an array of NumPy's: going through one of JAX's compiles, which a flight can't that writes its
-    # log in a fork
+    """How the motors m1 to m4 of the log spin. Raises UserError unless two spin either
+    way.
+    """
+    # an array of NumPy's: going through one of JAX's compiles, which a flight can't
+    # that writes its log in a fork
     usual = ["cw" if spin > 0 else "ccw" for spin in np.asarray(nominal.rotor_spin)]
-    spins = motor.spin or tuple(usual[NOMINAL_ORDER.index(place)] for place in motor.order)
+    spins = motor.spin or tuple(
+        usual[NOMINAL_ORDER.index(place)] for place in motor.order
+    )
     if sorted(spins) != ["ccw", "ccw", "cw", "cw"]:
         raise UserError(
             f'{root}motor.spin is {list(spins)}; it must hold two "cw" and two "ccw", in the order '
@@ -298,10 +313,10 @@ def _spins(motor: Motor, nominal: Vehicle, root: str) -> tuple[Spin, ...]:
 
 
 def _sized(nominal: Vehicle, table: _Vehicle, mjcf: Path | None, root: str) -> Vehicle:
-    """The nominal vehicle with the moments of inertia that the file gives. One that is far heavier
-    or lighter and has no MJCF is taken to be of the same shape: its rotors lift the same multiple
-    of its weight, and its arms are longer as its radius of gyration is. Raises UserError for a
-    heavy one of which the mass alone is known.
+    """The nominal vehicle with the moments of inertia that the file gives. One that is
+    far heavier or lighter and has no MJCF is taken to be of the same shape: its rotors
+    lift the same multiple of its weight, and its arms are longer as its radius of
+    gyration is. Raises UserError for a heavy one of which the mass alone is known.
     """
     mass = table.mass
     if mjcf is None and table.inertia is None and mass is not None and mass > HEAVY:
@@ -319,20 +334,27 @@ def _sized(nominal: Vehicle, table: _Vehicle, mjcf: Path | None, root: str) -> V
     changes: dict[str, Any] = {"inertia": table.inertia}
     heavier = 1.0 if mass is None else mass / float(np.asarray(nominal.mass))
     if mjcf is None and not 1.0 / SAME_ROTORS <= heavier <= SAME_ROTORS:
-        # moments over mass are the squared radius of gyration, along which the arms grow
-        wider = np.mean(np.asarray(table.inertia) / np.asarray(nominal.inertia)) / heavier
+        # moments over mass are the squared radius of gyration, along which the arms
+        # grow
+        wider = (
+            np.mean(np.asarray(table.inertia) / np.asarray(nominal.inertia)) / heavier
+        )
         longer = float(np.sqrt(wider))
         changes |= {
             "rotor_position": longer * np.asarray(nominal.rotor_position),
             "thrust_constant": heavier * float(np.asarray(nominal.thrust_constant)),
-            "torque_constant": heavier * longer * float(np.asarray(nominal.torque_constant)),
+            "torque_constant": heavier
+            * longer
+            * float(np.asarray(nominal.torque_constant)),
         }
     return _changed(nominal, **changes)
 
 
-def _with_numbers(nominal: Vehicle, mass: float | None, motor: Motor, calibrated: dict) -> Vehicle:
-    """The nominal vehicle with everything that the file says of it; what a calibration found
-    counts most.
+def _with_numbers(
+    nominal: Vehicle, mass: float | None, motor: Motor, calibrated: dict
+) -> Vehicle:
+    """The nominal vehicle with everything that the file says of it; what a calibration
+    found counts most.
     """
     spin = dict(zip(motor.order, motor.spin, strict=True))
     # in the nominal order; +1 where the reaction on the body is along +z (a cw rotor)
@@ -343,7 +365,8 @@ def _with_numbers(nominal: Vehicle, mass: float | None, motor: Motor, calibrated
         changes["mass"] = mass
     for name, entry in calibrated.items():
         changes[name] = entry.value if len(entry.value) > 1 else entry.value[0]
-    # last, since it multiplies the thrust constant, which a calibration may have changed
+    # last, since it multiplies the thrust constant, which a calibration may have
+    # changed
     if motor.torque_per_thrust is not None and "torque_constant" not in calibrated:
         thrust = changes.get("thrust_constant", float(nominal.thrust_constant))
         changes["torque_constant"] = motor.torque_per_thrust * thrust
@@ -352,35 +375,50 @@ def _with_numbers(nominal: Vehicle, mass: float | None, motor: Motor, calibrated
 
 def _changed(vehicle: Vehicle, **values) -> Vehicle:
     dtype = vehicle.mass.dtype
-    return vehicle.replace(**{name: jnp.asarray(value, dtype) for name, value in values.items()})
+    return vehicle.replace(
+        **{name: jnp.asarray(value, dtype) for name, value in values.items()}
+    )
 
 
-def _calibrated(name: str, entry: _Calibrated, nominal: Vehicle, where: str) -> CalibratedValue:
+def _calibrated(
+    name: str, entry: _Calibrated, nominal: Vehicle, where: str
+) -> CalibratedValue:
     """A calibrated quantity of the file. Raises UserError for one that can't be."""
     if (entry.unit or CALIBRATED_UNITS[name]) != CALIBRATED_UNITS[name]:
-        raise UserError(f"{where} is in {entry.unit!r}; it must be in {CALIBRATED_UNITS[name]!r}")
+        raise UserError(
+            f"{where} is in {entry.unit!r}; it must be in {CALIBRATED_UNITS[name]!r}"
+        )
     usual = np.atleast_1d(np.asarray(getattr(nominal, name)))
     value = np.atleast_1d(entry.value)
     interval = np.atleast_2d(entry.interval90)
     if value.shape != usual.shape or interval.shape != (usual.size, 2):
         number = f"{usual.size} number{'s' * (usual.size > 1)}"
-        raise UserError(f"{where} needs value ({number}) and interval90 ([low, high] each)")
+        raise UserError(
+            f"{where} needs value ({number}) and interval90 ([low, high] each)"
+        )
     if not ((usual / FAR <= value) & (value <= usual * FAR)).all():
-        raise UserError(f"{where}: {value.tolist()} is far from the nominal {usual.tolist()}")
+        raise UserError(
+            f"{where}: {value.tolist()} is far from the nominal {usual.tolist()}"
+        )
     if not (interval[:, 0] <= interval[:, 1]).all():
-        raise UserError(f"{where}: interval90 is {interval.tolist()}; low must not exceed high")
-    return CalibratedValue(tuple(value.tolist()), tuple(map(tuple, interval.tolist())), entry.notes)
+        raise UserError(
+            f"{where}: interval90 is {interval.tolist()}; low must not exceed high"
+        )
+    return CalibratedValue(
+        tuple(value.tolist()), tuple(map(tuple, interval.tolist())), entry.notes
+    )
 
 
 def _tables_of(vehicle_file: VehicleFile) -> dict[str, Any]:
-    """The tables of a vehicle file that wasn't read from one, without its calibration and what is
-    usual.
+    """The tables of a vehicle file that wasn't read from one, without its calibration
+    and what is usual.
     """
     tables = {
         "vehicle": {
             "name": vehicle_file.name,
             "airframe": vehicle_file.airframe,
-            # as a person writes it: single precision has seven digits, and prints seventeen
+            # as a person writes it: single precision has seven digits, and prints
+            # seventeen
             "mass": float(f"{float(vehicle_file.vehicle.mass):.6g}"),
             "mass_weighed": vehicle_file.mass_weighed,
         },

@@ -1,3 +1,3 @@
-"""Crazyflies that answer as real ones do: firmware, CRTP, radio link, vehicles; `cflib` flies
-them.
+"""Crazyflies that answer as real ones do: firmware, CRTP, radio link, vehicles; `cflib`
+flies them.
 """

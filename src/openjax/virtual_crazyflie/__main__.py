@@ -1,4 +1,6 @@
-"""`python -m openjax.virtual_crazyflie`: the command is `openjax.commands.virtual_crazyflie`."""
+"""`python -m openjax.virtual_crazyflie`: the command is
+`openjax.commands.virtual_crazyflie`.
+"""
 
 from openjax.__main__ import entry
 

@@ -1,8 +1,9 @@
-"""What a Crazyflie's firmware answers over CRTP: parameters, log blocks, set-points, arming,
-external pose.
+"""What a Crazyflie's firmware answers over CRTP: parameters, log blocks, set-points,
+arming, external pose.
 
-One vehicle, without sockets or clock: packets in, packets out. Set-points of body rates or angles
-with thrust are flown; position set-points, trajectories and memories are not there.
+One vehicle, without sockets or clock: packets in, packets out. Set-points of body rates
+or angles with thrust are flown; position set-points, trajectories and memories are not
+there.
 """
 
 import errno
@@ -35,25 +36,27 @@ from openjax.virtual_crazyflie.tables import (
 )
 
 LEVEL_AFTER = 0.5
-"""Set-points older than this (s) are replaced by a level attitude at the same thrust (firmware:
-supervisor.c, a constant).
+"""Set-points older than this (s) are replaced by a level attitude at the same thrust
+(firmware: supervisor.c, a constant).
 """
 STOP_AFTER = 2.0
 """Set-points older than this (s) stop the motors and disarm."""
 WATCHDOG = 1.0
-"""Once an emergency-stop watchdog was started, it stops the motors unless it is repeated within
-this time (s).
+"""Once an emergency-stop watchdog was started, it stops the motors unless it is
+repeated within this time (s).
 """
 THRUST_CUT = 60000
 """The legacy commander cuts thrust here and takes less than 1000 as none (16 bit)."""
 
 
 class VirtualFirmware:
-    """One virtual Crazyflie's firmware. Times are seconds of one clock that the caller owns."""
+    """One virtual Crazyflie's firmware. Times are seconds of one clock that the caller
+    owns.
+    """
 
     def __init__(self, needs_arming: bool = True):
-        """`needs_arming`: motors stay off until armed; otherwise armed from the start, as on
-        brushed Crazyflies.
+        """`needs_arming`: motors stay off until armed; otherwise armed from the start,
+        as on brushed Crazyflies.
         """
         self.auto_arm = not needs_arming
         self.level_after = LEVEL_AFTER
@@ -66,7 +69,8 @@ class VirtualFirmware:
         self.crashed = False
         self.emergency = False
         self.flying = False
-        self.external_pose = np.array([0, 0, 0, 1, 0, 0, 0], float)  # position, quaternion wxyz
+        # position, quaternion wxyz
+        self.external_pose = np.array([0, 0, 0, 1, 0, 0, 0], float)
         self.external_poses = 0
         self.parameters = {name: value for name, (_, value) in PARAMETERS.items()}
         self.logs = LogBlocks()
@@ -79,8 +83,8 @@ class VirtualFirmware:
 
     @property
     def supervisor_info(self) -> int:
-        """The supervisor's bits: can be armed, is armed, auto arming, can fly, is flying, tumbled,
-        locked, crashed.
+        """The supervisor's bits: can be armed, is armed, auto arming, can fly, is
+        flying, tumbled, locked, crashed.
         """
         ready = not (self.crashed or self.emergency)
         holds = {
@@ -96,10 +100,17 @@ class VirtualFirmware:
         return sum(int(bit) for bit, is_so in holds.items() if is_so)
 
     def set_point(self, time: float) -> SetPoint:
-        """What the stabiliser is asked for at `time`, watchdogs and supervision included."""
+        """What the stabiliser is asked for at `time`, watchdogs and supervision
+        included.
+        """
         if self._watchdog_time is not None and time - self._watchdog_time > WATCHDOG:
             self.emergency = True
-        if self._set_point_time is None or not self.armed or self.crashed or self.emergency:
+        if (
+            self._set_point_time is None
+            or not self.armed
+            or self.crashed
+            or self.emergency
+        ):
             return SetPoint()
         age = time - self._set_point_time
         # nothing to time out: an armed vehicle waits for its first set-point
@@ -129,12 +140,15 @@ class VirtualFirmware:
     # -- packets in
 
     def receive(self, raw: bytes, time: float) -> list[bytes]:
-        """Answers to one packet. What can't be understood is left without one, as on board."""
+        """Answers to one packet. What can't be understood is left without one, as on
+        board.
+        """
         if not raw:
             return []
         if raw == b"\xff":  # the null packet of a scan
             return [raw]
-        if raw[:2] == b"\xff\xfe":  # to the radio's processor, which switches this one off and on
+        # to the radio's processor, which switches this one off and on
+        if raw[:2] == b"\xff\xfe":
             if raw[2:3] == b"\x03":
                 self.restart()
             return [raw]
@@ -161,7 +175,11 @@ class VirtualFirmware:
     def _link(self, packet, time):
         if packet.channel == 0:  # echo
             return [packet]
-        return [packet._replace(data=b"Bitcraze Crazyflie\0")] if packet.channel == 1 else []
+        return (
+            [packet._replace(data=b"Bitcraze Crazyflie\0")]
+            if packet.channel == 1
+            else []
+        )
 
     def _platform(self, packet, time):
         command = packet.data[0]
@@ -170,7 +188,9 @@ class VirtualFirmware:
             answer = answers.get(command, b"")
             return [packet._replace(data=bytes([command]) + answer)]
         if packet.channel == 0 and command == 1:
-            return [packet._replace(data=bytes([command, *self._arm(bool(packet.data[1]))]))]
+            return [
+                packet._replace(data=bytes([command, *self._arm(bool(packet.data[1]))]))
+            ]
         return []
 
     def _arm(self, do_arm):
@@ -199,7 +219,11 @@ class VirtualFirmware:
         elif packet.channel == 1 and command == SupervisorCommand.FEED_WATCHDOG:
             self.feed_watchdog(time)
             answer = b""
-        return [] if answer is None else [packet._replace(data=bytes([command | 0x80]) + answer)]
+        return (
+            []
+            if answer is None
+            else [packet._replace(data=bytes([command | 0x80]) + answer)]
+        )
 
     def _memory(self, packet, time):
         """How many memories there are: none."""
@@ -208,8 +232,8 @@ class VirtualFirmware:
         return []
 
     def _localization(self, packet, time):
-        """On channel 0 an external position; on the other, by the first byte: 8 an external pose, 3
-        an emergency stop, 4 a word to its watchdog.
+        """On channel 0 an external position; on the other, by the first byte: 8 an
+        external pose, 3 an emergency stop, 4 a word to its watchdog.
         """
         if packet.channel == 0:
             self.external_pose[:3] = struct.unpack("<3f", packet.data[:12])
@@ -248,10 +272,14 @@ class VirtualFirmware:
         return []
 
     def _accept(self, mode, degrees, thrust, time):
-        """Roll, pitch, yaw rate in the firmware's frame, where pitch points the other way."""
+        """Roll, pitch, yaw rate in the firmware's frame, where pitch points the other
+        way.
+        """
         if np.isfinite(degrees).all():
             roll, pitch, yaw_rate = np.radians(degrees).tolist()
-            self.accept(SetPoint(mode, roll, -pitch, yaw_rate, thrust / (FULL_SCALE + 1)), time)
+            self.accept(
+                SetPoint(mode, roll, -pitch, yaw_rate, thrust / (FULL_SCALE + 1)), time
+            )
 
     def accept(self, set_point: SetPoint, time: float) -> None:
         """Take a set-point as it comes out of a packet: no thrust means motors off."""
@@ -262,16 +290,24 @@ class VirtualFirmware:
     # -- tables of contents
 
     def _contents(self, packet, names, crc, limits, type_of):
-        """A table of contents: its size and checksum (command 3), or one of its entries (2)."""
+        """A table of contents: its size and checksum (command 3), or one of its entries
+        (2).
+        """
         command = packet.data[0]
         if command == 3:
-            return [packet._replace(data=struct.pack("<BHI", 3, len(names), crc) + limits)]
+            return [
+                packet._replace(data=struct.pack("<BHI", 3, len(names), crc) + limits)
+            ]
         if command == 2:
             (ident,) = struct.unpack("<H", packet.data[1:3])
             if ident >= len(names):
                 return [packet._replace(data=b"\x02")]
             name = names[ident].replace(".", "\0").encode() + b"\0"
-            return [packet._replace(data=packet.data[:3] + bytes([type_of(names[ident])]) + name)]
+            return [
+                packet._replace(
+                    data=packet.data[:3] + bytes([type_of(names[ident])]) + name
+                )
+            ]
         return []
 
     def _log(self, packet, time):
@@ -295,7 +331,9 @@ class VirtualFirmware:
 
             def type_of(name):
                 read_only = name.split(".")[0] == READ_ONLY_GROUP
-                return PARAMETER_TYPES[PARAMETERS[name][0]][0] | (READ_ONLY if read_only else 0)
+                return PARAMETER_TYPES[PARAMETERS[name][0]][0] | (
+                    READ_ONLY if read_only else 0
+                )
 
             return self._contents(packet, PARAMETER_NAMES, PARAMETER_CRC, b"", type_of)
         if packet.channel in (1, 2):

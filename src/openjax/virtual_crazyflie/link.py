@@ -1,5 +1,5 @@
-"""The link of a virtual Crazyflie: UDP, one packet a datagram, with latency, jitter and loss to
-order.
+"""The link of a virtual Crazyflie: UDP, one packet a datagram, with latency, jitter and
+loss to order.
 """
 
 import contextlib
@@ -16,8 +16,8 @@ from openjax.ranges import Interval, Seed, check_intervals
 
 @dataclass(frozen=True)
 class LinkFaults:
-    """What the link does to the two streams of a flight. Requests and their answers pass: a radio
-    sends them again.
+    """What the link does to the two streams of a flight. Requests and their answers
+    pass: a radio sends them again.
     """
 
     latency_ms: Annotated[float, Interval("[0, 1000]")] = 0.0
@@ -85,7 +85,8 @@ class VirtualLink:
                     continue
                 jitter = self._random.random() * self.faults.jitter_ms
                 delay = 1e-3 * (self.faults.latency_ms + jitter)
-            # the count keeps packets of one moment in order, and heaps from comparing peers
+            # the count keeps packets of one moment in order, and heaps from comparing
+            # peers
             self._count += 1
             heapq.heappush(self._incoming, (time + delay, self._count, raw, peer))
 
@@ -95,21 +96,25 @@ class VirtualLink:
         return min(waiting, default=float("inf"))
 
     def received(self, time: float):
-        """The packets that have come through by `time`, in order: time, bytes, who sent them."""
+        """The packets that have come through by `time`, in order: time, bytes, who sent
+        them.
+        """
         while self._incoming and self._incoming[0][0] <= time:
             due, _, raw, peer = heapq.heappop(self._incoming)
             yield due, raw, peer
 
     def send(self, raw: bytes, time: float, peer=None) -> None:
-        """Send an answer to who asked, log data to who set up log blocks or commanded last: a
-        stranger gets none.
+        """Send an answer to who asked, log data to who set up log blocks or commanded
+        last: a stranger gets none.
         """
         log_data = raw[0] >> 4 == Port.LOG and raw[0] & 3 == 2
         if log_data and self._random.random() < self.faults.pose_loss:
             return
         self._count += 1
         delay = 1e-3 * self.faults.pose_latency_ms if log_data else 0.0
-        heapq.heappush(self._outgoing, (time + delay, self._count, raw, peer or self._listener))
+        heapq.heappush(
+            self._outgoing, (time + delay, self._count, raw, peer or self._listener)
+        )
 
     def flush(self, time: float) -> None:
         """Put on the wire what is due."""

@@ -1,4 +1,6 @@
-"""The log blocks of a virtual Crazyflie's firmware: set up by packets, sent when they are due."""
+"""The log blocks of a virtual Crazyflie's firmware: set up by packets, sent when they
+are due.
+"""
 
 import errno
 import struct
@@ -26,7 +28,8 @@ MAX_VARIABLES = 128
 class _Block:
     """One block, stopped when it is made."""
 
-    variables: list[tuple[str, str]] = field(default_factory=list)  # name, struct format
+    # name, struct format
+    variables: list[tuple[str, str]] = field(default_factory=list)
     period: float = 0.0  # s; 0 while stopped
     due: float = 0.0  # s
 
@@ -35,7 +38,9 @@ class _Block:
 
 
 class LogBlocks:
-    """The blocks of one vehicle. Times are seconds of one clock that the caller owns."""
+    """The blocks of one vehicle. Times are seconds of one clock that the caller
+    owns.
+    """
 
     def __init__(self):
         self._blocks: dict[int, _Block] = {}
@@ -73,8 +78,8 @@ class LogBlocks:
     def _append(self, ident, data) -> int:
         block = self._blocks[ident]
         for kind, variable in struct.iter_unpack("<BH", data[: len(data) // 3 * 3]):
-            # the upper four bits say in which type the memory holds it, the lower ones as which
-            # it is sent
+            # the upper four bits say in which type the memory holds it, the lower ones
+            # as which it is sent
             sent_as = kind & 0x0F
             if variable >= len(LOG_NAMES) or sent_as not in LOG_FORMATS:
                 return errno.ENOENT
@@ -88,7 +93,9 @@ class LogBlocks:
 
     def next(self) -> float:
         """When the next log packet is due (s); infinite if no block runs."""
-        return min((b.due for b in self._blocks.values() if b.period > 0), default=np.inf)
+        return min(
+            (b.due for b in self._blocks.values() if b.period > 0), default=np.inf
+        )
 
     def packets(self, firmware, time: float, sensors: Sensors) -> list[bytes]:
         """The log packets due at `time`, stamped with it in milliseconds."""
@@ -103,5 +110,7 @@ class LogBlocks:
                 pack_number(fmt, LOG_VARIABLES[name][1](firmware, sensors))
                 for name, fmt in block.variables
             )
-            packets.append(Packet(Port.LOG, 2, bytes([ident]) + stamp + values).encode())
+            packets.append(
+                Packet(Port.LOG, 2, bytes([ident]) + stamp + values).encode()
+            )
         return packets

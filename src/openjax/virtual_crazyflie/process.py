@@ -56,7 +56,9 @@ class VirtualCrazyflies:
         return self._steps * STEP
 
     def run(self, stop: Callable[[], bool] = lambda: False) -> None:
-        """Fly in real time until `stop()`, which is asked some hundred times a second."""
+        """Fly in real time until `stop()`, which is asked some hundred times a
+        second.
+        """
         start = time.perf_counter() - self.time
         sockets = [link.socket for link in self.links]
         while not stop():
@@ -71,20 +73,27 @@ class VirtualCrazyflies:
             self.catch_up(time.perf_counter() - start)
 
     def catch_up(self, until: float) -> None:
-        """Take in what has arrived, advance everything to `until` (s), send what is due."""
+        """Take in what has arrived, advance everything to `until` (s), send what is
+        due.
+        """
         packets = []
         for i, link in enumerate(self.links):
             link.poll(until)
             packets += [(due, i, raw, peer) for due, raw, peer in link.received(until)]
-        # in the order of all links: vehicles are in one air, and advance together up to each packet
+        # in the order of all links: vehicles are in one air, and advance together up to
+        # each packet
         for due, i, raw, peer in sorted(packets, key=lambda packet: packet[0]):
             self._advance(due)
             for answer in self.firmware[i].receive(raw, max(due, self.time)):
                 self.links[i].send(answer, until, peer)
         self._advance(until)
-        for i, (firmware, link) in enumerate(zip(self.firmware, self.links, strict=True)):
+        for i, (firmware, link) in enumerate(
+            zip(self.firmware, self.links, strict=True)
+        ):
             if firmware.logs.next() <= self.time:
-                for packet in firmware.logs.packets(firmware, self.time, self.vehicles.sensors(i)):
+                for packet in firmware.logs.packets(
+                    firmware, self.time, self.vehicles.sensors(i)
+                ):
                     link.send(packet, until)
             link.flush(until)
 

@@ -1,7 +1,8 @@
 """Vehicles in simulated time: virtual firmware and vehicles without sockets or clock.
 
-What `Swarm` is to the loop, for flights that must not wait for a clock. What the vehicles and a
-camera would send passes through two functions, in which an experiment can damage it at its source.
+What `Swarm` is to the loop, for flights that must not wait for a clock. What the
+vehicles and a camera would send passes through two functions, in which an experiment
+can damage it at its source.
 """
 
 import math
@@ -21,21 +22,23 @@ from openjax.virtual_crazyflie.vehicles import STEP, VirtualVehicles
 TICK = 0.01
 """s"""
 FOLLOWING = (0.1, 0.5)
-"""How the estimator on board follows motion capture: share of the innovation taken into the
-position at each pose, and into the velocity (1/s). Steady state of a Kalman filter for .01 m and .5
-m/s^2 at 100 Hz (Kalata 1984: tracking index .005).
+"""How the estimator on board follows motion capture: share of the innovation taken into
+the position at each pose, and into the velocity (1/s). Steady state of a Kalman filter
+for .01 m and .5 m/s^2 at 100 Hz (Kalata 1984: tracking index .005).
 """
 CAMERA_NOISE = 5e-4
 """Of positions of motion capture, and of components of its quaternions."""
 
 Damage = Callable[[int, float, Pose], Pose | None]
-"""What is received of vehicle i at a time (s) in place of the true pose; None: nothing."""
+"""What is received of vehicle i at a time (s) in place of the true pose; None:
+nothing.
+"""
 
 
 @dataclass
 class Uplink:
-    """What goes wrong with one vehicle's set-points, and what its battery is said to have; changed
-    while it flies.
+    """What goes wrong with one vehicle's set-points, and what its battery is said to
+    have; changed while it flies.
     """
 
     loss: float = 0.0
@@ -49,13 +52,17 @@ class SimulatedSwarm:
 
     Args:
       vehicles: what flies.
-      following: whether the estimator on board of each vehicle follows motion capture, as far as it
-      is believed, instead of knowing its place by itself.
+      following: whether the estimator on board of each vehicle follows motion capture,
+      as far as it is believed, instead of knowing its place by itself.
       radio, camera: what is received of own estimates and of motion capture.
     """
 
     def __init__(
-        self, vehicles: VirtualVehicles, following: Sequence[bool], radio: Damage, camera: Damage
+        self,
+        vehicles: VirtualVehicles,
+        following: Sequence[bool],
+        radio: Damage,
+        camera: Damage,
     ):
         self.vehicles = vehicles
         self.now = 0.0
@@ -79,8 +86,8 @@ class SimulatedSwarm:
         return tuple(self._samples)
 
     def send(self, set_points: Sequence[SetPoint | None]) -> None:
-        """Send each vehicle its set-point, and a word to its watchdog, or nothing where it is
-        None.
+        """Send each vehicle its set-point, and a word to its watchdog, or nothing where
+        it is None.
         """
         for i, set_point in enumerate(set_points):
             if set_point is not None and self._random.random() >= self.uplinks[i].loss:
@@ -115,20 +122,26 @@ class SimulatedSwarm:
         report = self.vehicles.report
         noise = self._random.gauss
         # in the packets' units: millimetres
-        own = np.round(np.stack([report.position, report.velocity], 1) + self._offsets, 3).tolist()
+        own = np.round(
+            np.stack([report.position, report.velocity], 1) + self._offsets, 3
+        ).tolist()
         position = report.position.tolist()
         quaternion = report.quaternion.tolist()
         rates = report.body_rates.tolist()
         voltage = self.vehicles.voltage().tolist()
         # in g, as half-precision numbers
-        force = (9.81 * (report.specific_force / 9.81).astype(np.float16).astype(float)).tolist()
+        force = (
+            9.81 * (report.specific_force / 9.81).astype(np.float16).astype(float)
+        ).tolist()
         for i, old in enumerate(self._samples):
             if i in self.asleep:
                 continue
             shaken = [q + noise(0.0, CAMERA_NOISE) for q in quaternion[i]]
             size = math.sqrt(sum(q * q for q in shaken))
             place = tuple(p + noise(0.0, CAMERA_NOISE) for p in position[i])
-            seen = Pose(self.now, place, (0.0, 0.0, 0.0), tuple(q / size for q in shaken))
+            seen = Pose(
+                self.now, place, (0.0, 0.0, 0.0), tuple(q / size for q in shaken)
+            )
             # as exact as a packet's 32 bits
             on_board = expand_quaternion(compress_quaternion(quaternion[i]))
             own_place, own_velocity = map(tuple, own[i])
@@ -139,7 +152,9 @@ class SimulatedSwarm:
                 own=received or old.own,
                 last_contact=self.now if received else old.last_contact,
                 voltage=voltage[i] if claimed is None else claimed,
-                supervisor=self.firmware[i].supervisor_info if received else old.supervisor,
+                supervisor=self.firmware[i].supervisor_info
+                if received
+                else old.supervisor,
                 captured=self._camera(i, self.now, seen) or old.captured,
                 force=tuple(force[i]) if received else old.force,
             )

@@ -1,5 +1,5 @@
-"""The vehicles inside virtual Crazyflies: openjax's own, with any of its effects, advanced between
-packets.
+"""The vehicles inside virtual Crazyflies: openjax's own, with any of its effects,
+advanced between packets.
 """
 
 from collections.abc import Mapping
@@ -14,7 +14,13 @@ from openjax.errors import UserError
 from openjax.flying.controller import airframe_of
 from openjax.flying.real_time import compile_in_line
 from openjax.flying.set_point import ANGLES, OFF
-from openjax.vehicle import Vehicle, hover_state, make_drones_step, rotate, rotate_inverse
+from openjax.vehicle import (
+    Vehicle,
+    hover_state,
+    make_drones_step,
+    rotate,
+    rotate_inverse,
+)
 from openjax.vehicle.effects import composition
 from openjax.vehicle.rate_controller import rate_controller
 from openjax.virtual_crazyflie.tables import Sensors
@@ -22,8 +28,8 @@ from openjax.virtual_crazyflie.tables import Sensors
 STEP = 0.002
 """Seconds of a step: the firmware's rate loop runs at 500 Hz."""
 ANGLE_GAIN = 6.0
-"""Body rate asked for per angle error (1/s): proportional part of the firmware's attitude
-controller.
+"""Body rate asked for per angle error (1/s): proportional part of the firmware's
+attitude controller.
 """
 CRASH_SPEED = 1.5
 """Touching the floor faster than this (m/s) is a crash."""
@@ -57,9 +63,10 @@ class VirtualVehicles:
 
     Args:
       vehicle: their parameters.
-      position: (N, 2) m, where they stand on the floor, level; or (N, 3), where they hover.
-      effects: {effect: {parameter: value}}; those that delay or lose commands belong to the link
-      instead.
+      position: (N, 2) m, where they stand on the floor, level; or (N, 3), where they
+      hover.
+      effects: {effect: {parameter: value}}; those that delay or lose commands belong to
+      the link instead.
       battery: charge at the start, 0..1.
       endurance: s of hover that empty a full battery.
 
@@ -93,7 +100,9 @@ class VirtualVehicles:
         drones = self._step.reset(vehicle, drones, jax.random.key(0))
         flat, self._unflatten = ravel_pytree(drones)
         nothing = np.zeros((self.number, 5), np.float32)
-        self._advance = compile_in_line(jax.jit(self._advanced).lower(flat, nothing, np.int32(1)))
+        self._advance = compile_in_line(
+            jax.jit(self._advanced).lower(flat, nothing, np.int32(1))
+        )
         self._charge = float(battery)
         self._endurance = float(endurance)
         self._begin = np.asarray(flat)
@@ -107,13 +116,15 @@ class VirtualVehicles:
         self.report = self.advance(np.zeros((self.number, 5), np.float32), 0)
 
     def advance(self, set_points: np.ndarray, steps: int) -> Report:
-        """What is sensed after `steps` steps under constant set-points (N, 5) float32, see
-        `SetPoint`.
+        """What is sensed after `steps` steps under constant set-points (N, 5) float32,
+        see `SetPoint`.
         """
         self._state, report = self._advance(self._state, set_points, np.int32(steps))
         self.report = Report._make(np.asarray(leaf, np.float64) for leaf in report)
         share = self.report.motor_command.mean(1) / self._hover
-        self.battery = np.maximum(self.battery - steps * STEP * share / self._endurance, 0.0)
+        self.battery = np.maximum(
+            self.battery - steps * STEP * share / self._endurance, 0.0
+        )
         return self.report
 
     def _advanced(self, flat, set_points, steps):
@@ -122,14 +133,20 @@ class VirtualVehicles:
         effects = self._step.effects
         no_pillar = jnp.zeros((1, 2))
         inactive = jnp.zeros(1, bool)
-        complete = composition.complete_parameters(effects, self._parameters, jnp.float32)
+        complete = composition.complete_parameters(
+            effects, self._parameters, jnp.float32
+        )
         flown = composition.change_body(effects, complete, vehicle)
 
         def step(_, carry):
             drones, _, crashed = carry
             command = commands(drones.quaternion, set_points)
-            motor, _ = jax.vmap(lambda d, c: rate_controller(flown, d, c, STEP))(drones, command)
-            moved = self._step(vehicle, drones, command, no_pillar, inactive, self._parameters)
+            motor, _ = jax.vmap(lambda d, c: rate_controller(flown, d, c, STEP))(
+                drones, command
+            )
+            moved = self._step(
+                vehicle, drones, command, no_pillar, inactive, self._parameters
+            )
             # from what the step did, so that the accelerometer feels every effect
             acceleration = (moved.velocity - drones.velocity) / STEP
             moved, on_floor, hit = _stand(moved)
@@ -159,7 +176,11 @@ class VirtualVehicles:
 
     def voltage(self) -> np.ndarray:
         """(N,) V, of the batteries under their loads."""
-        return FULL_VOLTAGE - SPENT * (1.0 - self.battery) - SAG * self.report.motor_command.mean(1)
+        return (
+            FULL_VOLTAGE
+            - SPENT * (1.0 - self.battery)
+            - SAG * self.report.motor_command.mean(1)
+        )
 
     def sensors(self, i: int) -> Sensors:
         """What vehicle i senses."""
@@ -176,10 +197,11 @@ class VirtualVehicles:
 
 
 def commands(quaternion, set_points):
-    """(N, 4) thrust and body rates (rad/s) for the rate controller from set-points (N, 5) at
-    attitudes (N, 4).
+    """(N, 4) thrust and body rates (rad/s) for the rate controller from set-points (N,
+    5) at attitudes (N, 4).
 
-    Angles are tracked by the proportional attitude loop of the firmware, whose yaw is a rate.
+    Angles are tracked by the proportional attitude loop of the firmware, whose yaw is a
+    rate.
     """
     mode, roll, pitch, yaw_rate, thrust = set_points.T
     w, x, y, z = quaternion.T
@@ -198,10 +220,14 @@ def commands(quaternion, set_points):
 
 
 def _stand(drones):
-    """The floor: a vehicle on it stands still and level, and leaves it as soon as it is lifted."""
+    """The floor: a vehicle on it stands still and level, and leaves it as soon as it is
+    lifted.
+    """
     # one that rises already isn't held, however low it is
     below = (drones.position[:, 2] <= 0.0) & (drones.velocity[:, 2] <= 0.0)
-    up = jax.vmap(lambda q: rotate(q, jnp.array([0.0, 0.0, 1.0])))(drones.quaternion)[:, 2]
+    up = jax.vmap(lambda q: rotate(q, jnp.array([0.0, 0.0, 1.0])))(drones.quaternion)[
+        :, 2
+    ]
     hit = below & ((drones.velocity[:, 2] < -CRASH_SPEED) | (up < CRASH_TILT))
     w = drones.quaternion[:, 0]
     z = drones.quaternion[:, 3]
@@ -213,7 +239,9 @@ def _stand(drones):
 
     still = jnp.zeros_like(drones.velocity)
     drones = drones.replace(
-        position=drones.position.at[:, 2].set(jnp.where(below, 0.0, drones.position[:, 2])),
+        position=drones.position.at[:, 2].set(
+            jnp.where(below, 0.0, drones.position[:, 2])
+        ),
         velocity=keep(still, drones.velocity),
         quaternion=keep(level, drones.quaternion),
         body_rates=keep(still, drones.body_rates),

@@ -1,11 +1,13 @@
 """Evaders that learn a best response to a fixed policy, by PPO, several side by side.
 
-An evader decides every `hold` control steps and flies its decision until the next one: noise that
-is new in every step of 10 ms averages out before a point has moved two centimetres. Its reward is
-the time that it is free, and its foresight is seconds. It starts from nothing, as no evader of the
-library does: an evader that starts as a greedy one stays one.
+An evader decides every `hold` control steps and flies its decision until the next one:
+noise that is new in every step of 10 ms averages out before a point has moved two
+centimetres. Its reward is the time that it is free, and its foresight is seconds. It
+starts from nothing, as no evader of the library does: an evader that starts as a greedy
+one stays one.
 
-PPO: Schulman et al., 2017, arXiv 1707.06347; advantages: Schulman et al., 2016, arXiv 1506.02438.
+PPO: Schulman et al., 2017, arXiv 1707.06347; advantages: Schulman et al., 2016, arXiv
+1506.02438.
 """
 
 import functools
@@ -20,7 +22,13 @@ import optax
 from flax import struct
 
 from openjax.evaluation.judges.duel import Duel, World, copies
-from openjax.evaluation.judges.networks import apply_network, init_network, likeliest, of_way, ways
+from openjax.evaluation.judges.networks import (
+    apply_network,
+    init_network,
+    likeliest,
+    of_way,
+    ways,
+)
 from openjax.evaluation.judges.senses import sense, to_world
 from openjax.evaluation.judges.settings import BestResponseSettings
 from openjax.policy import PolicyParameters
@@ -41,16 +49,16 @@ class Evaders:
     discount: jax.Array  # (L,), of a decision
 
     def one(self, place: int) -> tuple[dict[str, jax.Array], jax.Array]:
-        """The actor of one learner, without an axis of learners, and () whether it sees in the
-        world's axes.
+        """The actor of one learner, without an axis of learners, and () whether it sees
+        in the world's axes.
         """
         return jax.tree.map(lambda leaf: leaf[place], (self.actor, self.world_axes))
 
     def steps_free(
         self, place: int, game: PursuitSettings, hold: int, state: PursuitState
     ) -> jax.Array:
-        """() steps that one learner expects to be free from a state of one world, those to come
-        counting less.
+        """() steps that one learner expects to be free from a state of one world, those
+        to come counting less.
         """
         critic = jax.tree.map(lambda leaf: leaf[place][None], self.critic)
         sensed = sense(game, state, self.world_axes[place])
@@ -81,7 +89,8 @@ class Decisions:
     way: jax.Array  # (T, L * E) int, which of the ways was chosen
     sample: jax.Array  # (T, L * E, 3)
     log_prob: jax.Array  # (T, L * E)
-    free: jax.Array  # (T, L * E), share of the decision's steps in which the evader was free
+    # (T, L * E), share of the decision's steps in which the evader was free
+    free: jax.Array
     over: jax.Array  # (T, L * E) bool, caught or out of time at its end
     caught: jax.Array  # (T, L * E) bool
 
@@ -99,9 +108,13 @@ class BestResponse:
 
     @functools.cached_property
     def optimiser(self) -> optax.GradientTransformation:
-        """Of all learners at once: Adam treats each number by itself, the norm is each one's."""
+        """Of all learners at once: Adam treats each number by itself, the norm is each
+        one's.
+        """
         settings = self.settings
-        rate = optax.linear_schedule(settings.learning_rate, 0.0, settings.gradient_steps)
+        rate = optax.linear_schedule(
+            settings.learning_rate, 0.0, settings.gradient_steps
+        )
         return optax.chain(optax.clip_by_global_norm(1.0), optax.adam(rate, eps=1e-5))
 
     @property
@@ -127,19 +140,25 @@ class BestResponse:
             critic=init_network(critic_key, learners, (inputs, width, 1)),
             log_std=log_std,
             world_axes=jnp.arange(learners) % 2 == 1,
-            discount=jnp.asarray(self.settings.discounts(self.game.time_step), jnp.float32),
+            discount=jnp.asarray(
+                self.settings.discounts(self.game.time_step), jnp.float32
+            ),
         )
-        return ResponseCarry(evaders, jax.vmap(self.optimiser.init)(evaders.networks), world, key)
+        return ResponseCarry(
+            evaders, jax.vmap(self.optimiser.init)(evaders.networks), world, key
+        )
 
     def step(
         self, parameters: PolicyParameters, carry: ResponseCarry
     ) -> tuple[ResponseCarry, dict[str, jax.Array]]:
-        """One rollout and one update; metrics (L,): share of the time free, episodes that ended,
-        share of them that ended with a capture.
+        """One rollout and one update; metrics (L,): share of the time free, episodes
+        that ended, share of them that ended with a capture.
         """
         key, noise_key, world_key, order_key = jax.random.split(carry.key, 4)
         keys = jax.random.split(noise_key, self.settings.rollout_length)
-        decide = functools.partial(self._decide, parameters, carry.evaders, self._fresh(world_key))
+        decide = functools.partial(
+            self._decide, parameters, carry.evaders, self._fresh(world_key)
+        )
         world, decisions = jax.lax.scan(decide, carry.world, keys)
         evaders, optimiser = self._learn(carry, decisions, world[1], order_key)
         episodes = jnp.sum(self._by_learner(decisions.over), (0, 2))
@@ -159,7 +178,9 @@ class BestResponse:
     def _fresh(self, key):
         """All worlds at the start of an episode."""
         task_key, reset_key = jax.random.split(key)
-        learners = jnp.repeat(jnp.arange(self.settings.learners), self.settings.num_envs)
+        learners = jnp.repeat(
+            jnp.arange(self.settings.learners), self.settings.num_envs
+        )
         keys = jax.random.split(task_key, learners.size)
         if self.draw_own_task is None:
             tasks = jax.vmap(self.draw_task)(keys)
@@ -170,8 +191,8 @@ class BestResponse:
     def _decide(self, parameters, evaders, fresh, world, key):
         """Worlds after a decision, and the decision.
 
-        A world whose evader is caught goes on at once, at the start that `fresh` has for it: where
-        it is caught twice in a rollout, at the same one again.
+        A world whose evader is caught goes on at once, at the start that `fresh` has
+        for it: where it is caught twice in a rollout, at the same one again.
         """
         hold = self.settings.hold
         sensed = _sense(self.game, evaders, world[1])
@@ -221,7 +242,9 @@ class BestResponse:
                     return jax.lax.dynamic_slice_in_dim(leaf, i * size, size, axis=1)
 
                 gradient = jax.grad(self._loss)(networks, jax.tree.map(part, shuffled))
-                change, state = jax.vmap(self.optimiser.update)(gradient, state, networks)
+                change, state = jax.vmap(self.optimiser.update)(
+                    gradient, state, networks
+                )
                 return (optax.apply_updates(networks, change), state), None
 
             indices = jnp.arange(settings.minibatches)
@@ -237,7 +260,9 @@ class BestResponse:
     def _batch(self, evaders, decisions, state):
         """(L, T * E, ...) by name: what the loss needs."""
         sensed = self._by_learner(decisions.sensed)  # (T, L, E, F)
-        of_steps = jax.vmap(lambda sensed: apply_network(evaders.critic, sensed)[..., 0])
+        of_steps = jax.vmap(
+            lambda sensed: apply_network(evaders.critic, sensed)[..., 0]
+        )
         value = of_steps(sensed)  # (T, L, E)
         last = apply_network(evaders.critic, _sense(self.game, evaders, state))[..., 0]
         discount = evaders.discount[:, None]
@@ -248,8 +273,12 @@ class BestResponse:
             advantage, following = carry
             free, over, value = step
             # values are shares of the time to come: at most one
-            target = (1.0 - discount) * free + discount * jnp.where(over, 0.0, following)
-            trace = discount * self.settings.gae_lambda * jnp.where(over, 0.0, advantage)
+            target = (1.0 - discount) * free + discount * jnp.where(
+                over, 0.0, following
+            )
+            trace = (
+                discount * self.settings.gae_lambda * jnp.where(over, 0.0, advantage)
+            )
             advantage = target - value + trace
             return (advantage, value), advantage
 
@@ -280,12 +309,16 @@ class BestResponse:
         means, odds = ways(apply_network(actor, part["sensed"]))
         log_prob = _log_prob(part["way"], part["sample"], means, odds, log_std[:, None])
         ratio = jnp.exp(log_prob - part["log_prob"])
-        clipped = jnp.clip(ratio, 1.0 - settings.clip_epsilon, 1.0 + settings.clip_epsilon)
+        clipped = jnp.clip(
+            ratio, 1.0 - settings.clip_epsilon, 1.0 + settings.clip_epsilon
+        )
         surrogate = jnp.minimum(ratio * part["advantage"], clipped * part["advantage"])
         value = apply_network(critic, part["sensed"])[..., 0]
         # a value is at most one, an advantage of one standard deviation some hundredths
         error = settings.value_coefficient * (value - part["target"]) ** 2
-        spread_out = jnp.sum(log_std, -1) - jnp.mean(jnp.sum(jnp.exp(odds) * odds, -1), axis=1)
+        spread_out = jnp.sum(log_std, -1) - jnp.mean(
+            jnp.sum(jnp.exp(odds) * odds, -1), axis=1
+        )
         entropy = settings.entropy_coefficient * spread_out
         return jnp.sum(jnp.mean(error - surrogate, axis=1) - entropy)
 
@@ -293,22 +326,30 @@ class BestResponse:
 def fly_learners(
     duel: Duel, hold: int, evaders: Evaders, parameters: PolicyParameters, start: World
 ) -> EpisodeStatistics:
-    """Statistics (L, B): an episode of each learner, without noise, from each of B starts."""
+    """Statistics (L, B): an episode of each learner, without noise, from each of B
+    starts.
+    """
     game = duel.environment.settings
     learners = evaders.world_axes.size
 
     def one(world, _):
-        decided = likeliest(apply_network(evaders.actor, _sense(game, evaders, world[1])))
+        decided = likeliest(
+            apply_network(evaders.actor, _sense(game, evaders, world[1]))
+        )
         velocity = _in_world(evaders, decided, world[1])
         return duel.fly(parameters, world, velocity, hold), None
 
     world = copies(start, learners)
-    statistics = jax.lax.scan(one, world, length=game.episode_length // hold)[0][1].statistics
+    statistics = jax.lax.scan(one, world, length=game.episode_length // hold)[0][
+        1
+    ].statistics
     return jax.tree.map(lambda leaf: leaf.reshape(learners, -1), statistics)
 
 
 def _axes(evaders, state):
-    """(L * B,) whether the evader of each world (L * B, ...) sees in the world's axes."""
+    """(L * B,) whether the evader of each world (L * B, ...) sees in the world's
+    axes.
+    """
     learners = evaders.world_axes.size
     return jnp.repeat(evaders.world_axes, state.step.size // learners)
 
@@ -325,8 +366,8 @@ def _in_world(evaders, decided, state):
 
 
 def spread(number: int) -> np.ndarray:
-    """(number, 3) ahead, back, to both sides, up, down, and so on, shares of the speed; a single
-    one stands still.
+    """(number, 3) ahead, back, to both sides, up, down, and so on, shares of the speed;
+    a single one stands still.
     """
     if number == 1:
         return np.zeros((1, 3))

@@ -26,10 +26,14 @@ class Duel:
         return jax.vmap(self.environment.reset_to)(keys, tasks)
 
     def fly(
-        self, parameters: PolicyParameters, world: World, velocity: jax.Array, steps: int
+        self,
+        parameters: PolicyParameters,
+        world: World,
+        velocity: jax.Array,
+        steps: int,
     ) -> World:
-        """Worlds (B, ...) after control steps in which the evader flies `velocity` (B, 3), as
-        shares of its speed in the world's axes.
+        """Worlds (B, ...) after control steps in which the evader flies `velocity` (B,
+        3), as shares of its speed in the world's axes.
         """
 
         def act(observation, state):
@@ -44,7 +48,9 @@ class Duel:
         velocity: jax.Array,
         steps: int,
     ) -> World:
-        """The same with pursuers that do what `act` says: (B, N, 4) of worlds (B, ...)."""
+        """The same with pursuers that do what `act` says: (B, N, 4) of worlds (B,
+        ...).
+        """
         # a game of the library draws nothing after its reset
         key = jax.random.key(0)
         step = jax.vmap(self.environment.step, in_axes=(None, 0, 0, 0))

@@ -1,16 +1,18 @@
-"""Both sides plan in the true simulation: what any pursuers could hold, and what none could.
+"""Both sides plan in the true simulation: what any pursuers could hold, and what none
+could.
 
-Every few steps each side thinks of some plans, and all pairs of them are flown in copies of the
-world: a matrix game (von Neumann, 1928). Who chooses last knows what the other has chosen. So with
-the pursuers last the captures bound from above what a team of these plans can hold, and with the
-evader last from below. Both sides see everything, pillars or not; or the pursuers what the game
-lets them see.
+Every few steps each side thinks of some plans, and all pairs of them are flown in
+copies of the world: a matrix game (von Neumann, 1928). Who chooses last knows what the
+other has chosen. So with the pursuers last the captures bound from above what a team of
+these plans can hold, and with the evader last from below. Both sides see everything,
+pillars or not; or the pursuers what the game lets them see.
 
-An evader's plan is a sequence of held velocities (`openjax.evaluation.judges.planner`). A plan of
-the pursuers says of each of them, piece by piece, that it flies as the policy does, or to a place
-beside the evader, wherever that will be, round the pillars that stand between. What a pair of plans
-is worth at its end is how long the ways to the evader are: by the straight line, pursuers would
-hover before a pillar behind which it is, and nobody would go round.
+An evader's plan is a sequence of held velocities (`openjax.evaluation.judges.planner`).
+A plan of the pursuers says of each of them, piece by piece, that it flies as the policy
+does, or to a place beside the evader, wherever that will be, round the pillars that
+stand between. What a pair of plans is worth at its end is how long the ways to the
+evader are: by the straight line, pursuers would hover before a pillar behind which it
+is, and nobody would go round.
 """
 
 from collections.abc import Callable
@@ -28,18 +30,25 @@ from openjax.policy import PolicyParameters
 from openjax.pursuit import EpisodeStatistics, Observation, PursuitState, Task
 
 BESIDE = 0.4
-"""Places beside the evader to which a pursuer is sent are at most so far from it (m)."""
+"""Places beside the evader to which a pursuer is sent are at most so far from it
+(m).
+"""
 LEAD = 0.15
-"""Seconds that a vehicle takes to fly what it is told: it is sent to where the evader will be."""
+"""Seconds that a vehicle takes to fly what it is told: it is sent to where the evader
+will be.
+"""
 REACTION = 0.1
 """Seconds in which a pursuer would reach its place, were it fast enough."""
 SPEED = 0.98
-"""Share of the pursuers' speed at which they fly to it: short of what a controller overshoots."""
+"""Share of the pursuers' speed at which they fly to it: short of what a controller
+overshoots.
+"""
 CRASH = 2.0
 """What a crash costs the pursuers, in horizons that the evader is free."""
 OTHERS = 0.5
-"""What the mean of all ways to the evader counts beside the shortest one: who is nearest may be
-before a pillar or above the ceiling's edge, and then it's for the others to come round.
+"""What the mean of all ways to the evader counts beside the shortest one: who is
+nearest may be before a pillar or above the ceiling's edge, and then it's for the others
+to come round.
 """
 
 
@@ -63,7 +72,9 @@ class BothPlanned:
 
 
 VelocityFlight = Callable[[Observation, PursuitState, jax.Array], jax.Array]
-"""observation, state of one world and desired velocities (N, 3) m/s -> actions (N, 4)."""
+"""observation, state of one world and desired velocities (N, 3) m/s -> actions (N,
+4).
+"""
 
 
 @dataclass(frozen=True)
@@ -73,8 +84,8 @@ class Ways:
     prepare: Callable[[Task], Any]
     """A task -> what is worked out once for it."""
     length: Callable[[Task, Any, jax.Array, jax.Array], jax.Array]
-    """task, what was prepared, (3,) position, (3,) target -> () m; its gradient by the position
-    points away from the target, along the way.
+    """task, what was prepared, (3,) position, (3,) target -> () m; its gradient by the
+    position points away from the target, along the way.
     """
 
 
@@ -87,8 +98,8 @@ STRAIGHT = Ways(lambda task: (), _straight_length)
 
 
 def choose(payoff: jax.Array, pursuers_last: bool) -> tuple[jax.Array, jax.Array]:
-    """Places () of the evader's plan and of the pursuers' in a payoff (E, P) that the evader wants
-    large.
+    """Places () of the evader's plan and of the pursuers' in a payoff (E, P) that the
+    evader wants large.
     """
     if pursuers_last:
         evader = jnp.argmax(jnp.min(payoff, axis=1))
@@ -112,7 +123,9 @@ class MatrixGame:
         how = PlannerSettings(own.evader_plans, own.pieces, own.piece_steps, own.replan)
         return Planner(how, self.duel)
 
-    def fly(self, parameters: PolicyParameters, start: World, key: jax.Array) -> EpisodeStatistics:
+    def fly(
+        self, parameters: PolicyParameters, start: World, key: jax.Array
+    ) -> EpisodeStatistics:
         """Statistics (B,) of one episode from each of B starts."""
 
         def one(carry, key):
@@ -140,15 +153,18 @@ class MatrixGame:
         plan, team = self._decide(parameters, carry.world, carry.prepared, plans, teams)
         now = jax.tree.map(lambda leaf: leaf[:, 0], team)
         act = self._act(parameters, carry.prepared, now)
-        world = self.duel.fly_actions(act, carry.world, plan[:, 0], self.settings.replan)
+        world = self.duel.fly_actions(
+            act, carry.world, plan[:, 0], self.settings.replan
+        )
         return carry.replace(world=world, plan=plan, team=team)
 
     def _decide(self, parameters, world, prepared, plans, teams):
-        """(B, P, 3) and TeamPlans (B, P, ...): what both sides choose in worlds (B, ...) of plans
-        (B, E, P, 3) and (B, T, P, ...).
+        """(B, P, 3) and TeamPlans (B, P, ...): what both sides choose in worlds (B,
+        ...) of plans (B, E, P, 3) and (B, T, P, ...).
         """
         settings = self.settings
-        # plans in which no pursuer asks the policy are flown without it, which is most of the work
+        # plans in which no pursuer asks the policy are flown without it, which is most
+        # of the work
         with_policy = jax.tree.map(lambda leaf: leaf[:, : settings.team_plans], teams)
         payoff = self._payoffs(parameters, world, prepared, (plans, with_policy))
         if settings.direct_plans:
@@ -163,11 +179,13 @@ class MatrixGame:
         def chosen(leaf, place):
             return jax.vmap(lambda own, place: own[place])(leaf, place)
 
-        return chosen(plans, mine), jax.tree.map(lambda leaf: chosen(leaf, theirs), teams)
+        return chosen(plans, mine), jax.tree.map(
+            lambda leaf: chosen(leaf, theirs), teams
+        )
 
     def _payoffs(self, parameters, world, prepared, both):
-        """(B, E, T) what all pairs of plans are worth in worlds (B, ...); `parameters` None: none
-        of the team's asks the policy.
+        """(B, E, T) what all pairs of plans are worth in worlds (B, ...); `parameters`
+        None: none of the team's asks the policy.
         """
         plans, teams = both
         number, evader_plans = plans.shape[:2]
@@ -189,14 +207,18 @@ class MatrixGame:
         def piece(world, both):
             velocity, team = both
             act = self._act(parameters, prepared, team)
-            return self.duel.fly_actions(act, world, velocity, self.settings.piece_steps), None
+            return self.duel.fly_actions(
+                act, world, velocity, self.settings.piece_steps
+            ), None
 
         end = jax.lax.scan(piece, copied, pieces)[0][1]
         payoff = jax.vmap(self._payoff)(copied[1], end, prepared)
         return payoff.reshape(number, evader_plans, team_plans)
 
     def _act(self, parameters, prepared, team):
-        """What the pursuers of worlds (B, ...) do in one piece of their plans (B, ...)."""
+        """What the pursuers of worlds (B, ...) do in one piece of their plans (B,
+        ...).
+        """
         speed = SPEED * self.duel.environment.settings.max_speed
         from_all = jax.vmap(self.ways.length, in_axes=(None, None, 0, 0))
 
@@ -223,13 +245,15 @@ class MatrixGame:
         return act
 
     def _team_candidates(self, key, team):
-        """(B, T, P, ...) the policy, straight at the evader, the last plan, the same shifted by a
-        piece, the shifted one with another task for one pursuer, and random ones; and as many
-        random ones as are `direct_plans`, without the policy.
+        """(B, T, P, ...) the policy, straight at the evader, the last plan, the same
+        shifted by a piece, the shifted one with another task for one pursuer, and
+        random ones; and as many random ones as are `direct_plans`, without the policy.
         """
         settings = self.settings
         random_key, direct_key, near_key, who_key = jax.random.split(key, 4)
-        shifted = jax.tree.map(lambda leaf: jnp.concatenate([leaf[:, 1:], leaf[:, -1:]], 1), team)
+        shifted = jax.tree.map(
+            lambda leaf: jnp.concatenate([leaf[:, 1:], leaf[:, -1:]], 1), team
+        )
         none = jnp.zeros_like(team.beside)
         policy = TeamPlans(none, jnp.ones_like(team.by_policy))
         at_it = TeamPlans(none, jnp.zeros_like(team.by_policy))
@@ -253,9 +277,11 @@ class MatrixGame:
             parts.append(_random_teams(direct_key, shape, settings.direct_plans, 0.0))
         return jax.tree.map(lambda *leaves: jnp.concatenate(leaves, axis=1), *parts)
 
-    def _payoff(self, start: PursuitState, end: PursuitState, prepared: Any) -> jax.Array:
-        """() what the end of a pair of plans is worth to the evader, in steps: those that it is
-        free first, then how far it is from the pursuers.
+    def _payoff(
+        self, start: PursuitState, end: PursuitState, prepared: Any
+    ) -> jax.Array:
+        """() what the end of a pair of plans is worth to the evader, in steps: those
+        that it is free first, then how far it is from the pursuers.
         """
         horizon = self.settings.pieces * self.settings.piece_steps
         crashed = end.statistics.crashed & ~start.statistics.crashed
@@ -270,8 +296,8 @@ class MatrixGame:
 
 
 def _random_teams(key, shape, number, by_policy):
-    """(B, number, P, N) plans, in which pieces are the policy's with these odds; `shape` is B, P,
-    N.
+    """(B, number, P, N) plans, in which pieces are the policy's with these odds;
+    `shape` is B, P, N.
     """
     worlds, pieces, pursuers = shape
     shape = (worlds, number, pieces, pursuers)

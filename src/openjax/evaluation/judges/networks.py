@@ -1,4 +1,6 @@
-"""The learners' networks, plain matrices: every leaf has the axis of the L learners first."""
+"""The learners' networks, plain matrices: every leaf has the axis of the L learners
+first.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -7,8 +9,8 @@ Network = dict[str, jax.Array]
 
 
 def init_network(key: jax.Array, learners: int, sizes: tuple[int, int, int]) -> Network:
-    """Parameters of L networks whose output is nearly zero at first; of as many inputs, units in
-    both hidden layers, and outputs as `sizes` say.
+    """Parameters of L networks whose output is nearly zero at first; of as many inputs,
+    units in both hidden layers, and outputs as `sizes` say.
     """
     inputs, width, outputs = sizes
     sizes = (inputs, width, width, outputs)
@@ -17,7 +19,9 @@ def init_network(key: jax.Array, learners: int, sizes: tuple[int, int, int]) -> 
     for i, scale in enumerate(scales):
         key, own = jax.random.split(key)
         shape = (learners, sizes[i], sizes[i + 1])
-        network[f"kernel_{i}"] = scale * jax.random.normal(own, shape) / jnp.sqrt(sizes[i])
+        network[f"kernel_{i}"] = (
+            scale * jax.random.normal(own, shape) / jnp.sqrt(sizes[i])
+        )
         network[f"bias_{i}"] = jnp.zeros((learners, 1, sizes[i + 1]))
     return network
 
@@ -33,8 +37,8 @@ def apply_network(network: Network, sensed: jax.Array) -> jax.Array:
 
 
 def ways(outputs: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """(..., W, 3) means and (..., W) log odds of the ways that outputs (..., 4 W) say; three
-    outputs are one way.
+    """(..., W, 3) means and (..., W) log odds of the ways that outputs (..., 4 W) say;
+    three outputs are one way.
     """
     number = outputs.shape[-1]
     if number == 3:

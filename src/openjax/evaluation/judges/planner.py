@@ -1,9 +1,10 @@
-"""An evader that plans in the true simulation against the true policy, with a receding horizon.
+"""An evader that plans in the true simulation against the true policy, with a receding
+horizon.
 
-Every few steps it tries plans, sequences of held velocities, in copies of its world, in which the
-policy answers as it will; it flies the beginning of the best one. It needs no learning, so it
-doesn't share the learner's blind spots: a learner that is caught sooner than the planner on the
-same tasks has not converged.
+Every few steps it tries plans, sequences of held velocities, in copies of its world, in
+which the policy answers as it will; it flies the beginning of the best one. It needs no
+learning, so it doesn't share the learner's blind spots: a learner that is caught sooner
+than the planner on the same tasks has not converged.
 """
 
 from collections.abc import Callable
@@ -21,7 +22,9 @@ from openjax.policy import PolicyParameters
 from openjax.pursuit import EpisodeStatistics, PursuitState
 
 SPREAD = 0.6
-"""How far the pieces of a refined plan lead aside, a share of their length: some 40 degrees."""
+"""How far the pieces of a refined plan lead aside, a share of their length: some 40
+degrees.
+"""
 
 
 @struct.dataclass
@@ -39,13 +42,17 @@ class Planner:
     settings: PlannerSettings
     duel: Duel
     value: Callable[[PursuitState], jax.Array] | None = None
-    """State of one world -> () steps that an evader will be free from there; None: the farther from
-    the pursuers the better.
+    """State of one world -> () steps that an evader will be free from there; None: the
+    farther from the pursuers the better.
     """
 
-    def fly(self, parameters: PolicyParameters, start: World, key: jax.Array) -> EpisodeStatistics:
+    def fly(
+        self, parameters: PolicyParameters, start: World, key: jax.Array
+    ) -> EpisodeStatistics:
         """Statistics (B,) of one episode from each of B starts."""
-        return self.fly_and_keep(parameters, start, key, lambda state: None)[0].statistics
+        return self.fly_and_keep(parameters, start, key, lambda state: None)[
+            0
+        ].statistics
 
     def fly_and_keep(
         self,
@@ -54,8 +61,8 @@ class Planner:
         key: jax.Array,
         keep: Callable[[PursuitState], Any],
     ) -> tuple[PursuitState, Any]:
-        """The states (B, ...) at the end of one episode from each of B starts, and what `keep` says
-        of those after each time it plans (T, ...).
+        """The states (B, ...) at the end of one episode from each of B starts, and what
+        `keep` says of those after each time it plans (T, ...).
         """
 
         def one(carry, key):
@@ -71,21 +78,29 @@ class Planner:
         """Worlds (B, ...) at the start of an episode, and plans that are none."""
         return Planned(start, jnp.zeros((start[1].step.size, self.settings.pieces, 3)))
 
-    def replan(self, parameters: PolicyParameters, carry: Planned, key: jax.Array) -> Planned:
+    def replan(
+        self, parameters: PolicyParameters, carry: Planned, key: jax.Array
+    ) -> Planned:
         """The same after it has planned once and flown until the next time."""
         plan = self._best(parameters, carry.world, carry.plan, key)
         world = self.duel.fly(parameters, carry.world, plan[:, 0], self.settings.replan)
         return Planned(world, plan)
 
     def _best(self, parameters, world, plan, key):
-        """(B, pieces, 3) the plan of those tried that promises most in each world (B, ...)."""
+        """(B, pieces, 3) the plan of those tried that promises most in each world (B,
+        ...).
+        """
         settings = self.settings
         tried = self.candidates(key, plan)  # (B, M, pieces, 3)
-        copied = jax.tree.map(lambda leaf: jnp.repeat(leaf, settings.plans, axis=0), world)
+        copied = jax.tree.map(
+            lambda leaf: jnp.repeat(leaf, settings.plans, axis=0), world
+        )
         pieces = jnp.moveaxis(tried.reshape(-1, *tried.shape[2:]), 1, 0)
 
         def piece(world, velocity):
-            return self.duel.fly(parameters, world, velocity, settings.piece_steps), None
+            return self.duel.fly(
+                parameters, world, velocity, settings.piece_steps
+            ), None
 
         (_, end), _ = jax.lax.scan(piece, copied, pieces)
         score = jax.vmap(self.promise)(copied[1], end).reshape(plan.shape[0], -1)
@@ -93,8 +108,9 @@ class Planner:
         return jnp.take_along_axis(tried, best[:, None, None, None], axis=1)[:, 0]
 
     def candidates(self, key: jax.Array, plan: jax.Array) -> jax.Array:
-        """(B, plans, pieces, 3) the last best plan (B, pieces, 3), the same shifted by a piece,
-        straight ways, random ones, and the shifted one refined. NaN is the evader's own rule.
+        """(B, plans, pieces, 3) the last best plan (B, pieces, 3), the same shifted by
+        a piece, straight ways, random ones, and the shifted one refined. NaN is the
+        evader's own rule.
         """
         settings = self.settings
         near_key, straight_key, bent_key = jax.random.split(key, 3)
@@ -106,14 +122,19 @@ class Planner:
         number = plan.shape[0]
         ways = unit(jax.random.normal(straight_key, (number, straight, 1, 3)))
         ways = jnp.broadcast_to(ways, (number, straight, settings.pieces, 3))
-        parts = [plan[:, None], shifted[:, None], ways, self._bent(bent_key, number, bent)]
+        parts = [
+            plan[:, None],
+            shifted[:, None],
+            ways,
+            self._bent(bent_key, number, bent),
+        ]
         if near:
             parts.append(self._refined(near_key, shifted, near))
         return jnp.concatenate(parts, axis=1)
 
     def _bent(self, key, number, plans):
-        """(B, plans, pieces, 3) random ones that turn now and then; some of them end by the
-        evader's own rule.
+        """(B, plans, pieces, 3) random ones that turn now and then; some of them end by
+        the evader's own rule.
         """
         settings = self.settings
         way_key, turn_key, end_key = jax.random.split(key, 3)
@@ -131,12 +152,20 @@ class Planner:
         if not left:
             return bent
         # the first flies by it from the beginning
-        end = jax.random.randint(end_key, (number, left), 0, settings.pieces).at[:, 0].set(0)
+        end = (
+            jax.random.randint(end_key, (number, left), 0, settings.pieces)
+            .at[:, 0]
+            .set(0)
+        )
         is_own = jnp.arange(settings.pieces) >= end[..., None]
-        return bent.at[:, :left].set(jnp.where(is_own[..., None], jnp.nan, bent[:, :left]))
+        return bent.at[:, :left].set(
+            jnp.where(is_own[..., None], jnp.nan, bent[:, :left])
+        )
 
     def _refined(self, key, plan, plans):
-        """(B, plans, pieces, 3) a plan (B, pieces, 3), some pieces of which lead elsewhere."""
+        """(B, plans, pieces, 3) a plan (B, pieces, 3), some pieces of which lead
+        elsewhere.
+        """
         pieces = self.settings.pieces
         shape = (plan.shape[0], plans)
         first_key, last_key, way_key = jax.random.split(key, 3)
@@ -146,10 +175,14 @@ class Planner:
         changed = ((place >= first) & (place <= last))[..., None]
         aside = SPREAD * jax.random.normal(way_key, (*shape, 1, 3))
         plan = plan[:, None]
-        return jnp.where(changed, unit(plan + aside), jnp.broadcast_to(plan, (*shape, pieces, 3)))
+        return jnp.where(
+            changed, unit(plan + aside), jnp.broadcast_to(plan, (*shape, pieces, 3))
+        )
 
     def promise(self, start: PursuitState, end: PursuitState) -> jax.Array:
-        """() how good the end of a plan is: steps free first, then the room that is left."""
+        """() how good the end of a plan is: steps free first, then the room that is
+        left.
+        """
         ahead = end.drones.position + self.settings.ahead * end.drones.velocity
         room = jnp.min(jnp.linalg.norm(ahead - end.evader_position, axis=-1))
         free = self.free_steps(start, end)
@@ -166,4 +199,6 @@ class Planner:
 
 def unit(vector: jax.Array) -> jax.Array:
     """(..., 3) of length one."""
-    return vector / jnp.sqrt(jnp.sum(vector**2, axis=-1, keepdims=True) + np.float32(1e-12))
+    return vector / jnp.sqrt(
+        jnp.sum(vector**2, axis=-1, keepdims=True) + np.float32(1e-12)
+    )

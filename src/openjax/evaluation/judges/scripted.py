@@ -15,7 +15,9 @@ def with_scripted(environment: Pursuit) -> Pursuit:
     `openjax.pursuit.evaders.SCRIPTED`; not to be called while something is traced.
     """
     settings = dataclasses.replace(environment.settings, evaders=SCRIPTED)
-    return dataclasses.replace(environment, settings=settings, evaders=None, dynamics=None)
+    return dataclasses.replace(
+        environment, settings=settings, evaders=None, dynamics=None
+    )
 
 
 def fly_scripted(
@@ -39,7 +41,9 @@ def fly_scripted(
     def begin(key, task):
         observation, state = game.reset_to(key, task)
         pursuers = task.pursuer_position
-        evader = draw_evader(game.settings, jax.random.fold_in(key, 3), pursuers, kind=place)
+        evader = draw_evader(
+            game.settings, jax.random.fold_in(key, 3), pursuers, kind=place
+        )
         return observation, state.replace(evader=evader)
 
     def step(state, action):
@@ -55,4 +59,6 @@ def fly_scripted(
 
     keys = jax.random.split(key, tasks.evader_position.shape[0])
     world = jax.vmap(begin)(keys, tasks)
-    return jax.lax.scan(one, world, length=game.settings.episode_length)[0][1].statistics
+    return jax.lax.scan(one, world, length=game.settings.episode_length)[0][
+        1
+    ].statistics

@@ -1,9 +1,9 @@
 """What a judge's evader knows: all of the world's state, as numbers in axes of its own.
 
-The x axis points away from the arena's axis, so that a game that is turned looks the same; with
-`world_axes` it is the world's. Pursuers and pillars are sorted by their distance. Where tasks have
-an evader's speed and a capture radius of their own, it knows these, too: one network plays them
-all.
+The x axis points away from the arena's axis, so that a game that is turned looks the
+same; with `world_axes` it is the world's. Pursuers and pillars are sorted by their
+distance. Where tasks have an evader's speed and a capture radius of their own, it knows
+these, too: one network plays them all.
 """
 
 import jax
@@ -15,7 +15,9 @@ from openjax.pursuit.task import capture_radius, evader_speed
 
 TINY = 1e-9
 NEAR = 3.0
-"""Capture radii by which offsets are measured: what matters is near, however wide the arena is."""
+"""Capture radii by which offsets are measured: what matters is near, however wide the
+arena is.
+"""
 _EVADER = 14
 _PURSUER = 13
 _NO_PILLAR = (4.0, 0.0, 0.0, 0.0)
@@ -57,13 +59,15 @@ def sense(
 
 
 def number_of_senses(pursuers: int, slots: int) -> int:
-    """F for as many pursuers and pillar slots, in a game whose tasks have no numbers of their
-    own.
+    """F for as many pursuers and pillar slots, in a game whose tasks have no numbers of
+    their own.
     """
     return _EVADER + _PURSUER * pursuers + len(_NO_PILLAR) * slots
 
 
-def to_world(velocity: jax.Array, state: PursuitState, world_axes: jax.Array) -> jax.Array:
+def to_world(
+    velocity: jax.Array, state: PursuitState, world_axes: jax.Array
+) -> jax.Array:
     """(3,) in the world of a velocity (3,) in the evader's axes."""
     turned = _axes(state.evader_position, world_axes)
     return velocity @ turned
@@ -73,7 +77,9 @@ def _axes(position, world_axes):
     """(3, 3) rows: the evader's axes in the world."""
     radius = jnp.sqrt(jnp.sum(position[:2] ** 2) + TINY)
     # on the axis there is no outward direction
-    outward = jnp.where(world_axes | (radius < 1e-3), jnp.array([1.0, 0.0]), position[:2] / radius)
+    outward = jnp.where(
+        world_axes | (radius < 1e-3), jnp.array([1.0, 0.0]), position[:2] / radius
+    )
     cos, sin = outward
     return jnp.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
 
@@ -101,8 +107,8 @@ def _evader(settings, state, turned):
 
 
 def _pursuers(settings, state, turned):
-    """(N, 13), the nearest first: where each is, how it flies, where its rotors pull, if it sees
-    the evader; empty slots are far away.
+    """(N, 13), the nearest first: where each is, how it flies, where its rotors pull,
+    if it sees the evader; empty slots are far away.
     """
     radius = capture_radius(settings, state.task)
     near = NEAR * radius

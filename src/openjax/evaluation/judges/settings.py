@@ -18,20 +18,22 @@ class BestResponseSettings:
     num_envs: Annotated[int, Interval("[1, 16777216]")] = 1024
     """Worlds of each learner."""
     hold: Annotated[int, Interval("[1, 1000]")] = 4
-    """Control steps for which a decision is flown: 40 ms, in which an evader moves 5 cm."""
+    """Control steps for which a decision is flown: 40 ms, in which an evader moves 5
+    cm.
+    """
     ways: Annotated[int, Interval("[1, 64]")] = 6
-    """Velocities of which a decision chooses one: where left and right are equally good, the mean
-    of a single one leads into the middle.
+    """Velocities of which a decision chooses one: where left and right are equally
+    good, the mean of a single one leads into the middle.
     """
     width: Annotated[int, Interval("[1, 4096]")] = 256
-    """Width of both hidden layers: 100 numbers are sensed, and two layers of 64 gave evaders that
-    ran into corners.
+    """Width of both hidden layers: 100 numbers are sensed, and two layers of 64 gave
+    evaders that ran into corners.
     """
     rollout_length: Annotated[int, Interval("[1, 100000]")] = 25
     """Decisions per iteration: a second of the game."""
     foresight: tuple[float, ...] = (4.0, 4.0, 2.0, 2.0)
-    """Seconds after which what comes counts 1/e, of learner after learner: traps take one to
-    three.
+    """Seconds after which what comes counts 1/e, of learner after learner: traps take
+    one to three.
     """
     gae_lambda: Annotated[float, Interval("[0, 1]")] = 0.95
     """Lambda of the generalised advantage estimate."""
@@ -40,8 +42,9 @@ class BestResponseSettings:
     epochs: Annotated[int, Interval("[1, 1000]")] = 4
     """Passes over each iteration's rollouts."""
     minibatches: Annotated[int, Interval("[1, 100000]")] = 16
-    """Gradient steps of one pass: with four, learners come to .972 to .978 of the longest time in a
-    game whose answer is known, with sixteen and six ways to .991 (`tests.learning.known_games`).
+    """Gradient steps of one pass: with four, learners come to .972 to .978 of the
+    longest time in a game whose answer is known, with sixteen and six ways to .991
+    (`tests.learning.known_games`).
     """
     clip_epsilon: Annotated[float, Interval("(0, 10]")] = 0.2
     """Clip range of the probability ratio."""
@@ -54,13 +57,13 @@ class BestResponseSettings:
     least_log_std: Annotated[float, Interval("[-10, 2]")] = -2.5
     """Least log standard deviation, so that exploring doesn't end."""
     layouts: Annotated[float, Interval("[0, 1]")] = 0.5
-    """Share of the episodes that begin among a layout's pillars, turned and with starts moved; the
-    others are uniform tasks, turned.
+    """Share of the episodes that begin among a layout's pillars, turned and with starts
+    moved; the others are uniform tasks, turned.
     """
 
     specialists: Annotated[int, Interval("[0, 64]")] = 0
-    """Of the learners, how many learn on one layout each, in turn, and now and then on uniform
-    tasks: a learner of all six sees little of each.
+    """Of the learners, how many learn on one layout each, in turn, and now and then on
+    uniform tasks: a learner of all six sees little of each.
     """
 
     def __post_init__(self):
@@ -70,7 +73,9 @@ class BestResponseSettings:
                 f"specialists {self.specialists}: at most the {self.learners} learners can be some"
             )
         if not self.foresight or min(self.foresight) <= 0.0:
-            raise UserError(f"foresight {self.foresight}: seconds above zero are needed")
+            raise UserError(
+                f"foresight {self.foresight}: seconds above zero are needed"
+            )
         if self.num_envs * self.rollout_length % self.minibatches:
             raise UserError(
                 f"num_envs {self.num_envs} times rollout_length {self.rollout_length} must be a "
@@ -95,7 +100,9 @@ class BestResponseSettings:
     def discounts(self, time_step: float) -> list[float]:
         """Of a decision, of each learner; `time_step` of the game in seconds."""
         decision = self.hold * time_step
-        seconds = (self.foresight[i % len(self.foresight)] for i in range(self.learners))
+        seconds = (
+            self.foresight[i % len(self.foresight)] for i in range(self.learners)
+        )
         return [1.0 - decision / (decision + second) for second in seconds]
 
 
@@ -112,21 +119,24 @@ class PlannerSettings:
     replan: Annotated[int, Interval("[1, 1000]")] = 10
     """Control steps after which it plans anew."""
     ahead: Annotated[float, Interval("[0, 10]")] = 0.15
-    """Seconds after which pursuers are thought to be where their velocity leads, at a plan's end:
-    about the time in which a vehicle turns its velocity round.
+    """Seconds after which pursuers are thought to be where their velocity leads, at a
+    plan's end: about the time in which a vehicle turns its velocity round.
     """
     turn: Annotated[float, Interval("[0, 1]")] = 0.5
     """Odds that a piece of a random plan leads elsewhere than the piece before."""
     refined: Annotated[float, Interval("[0, 1]")] = 0.0
-    """Share of the plans that are the last best one with some pieces flown a little otherwise."""
+    """Share of the plans that are the last best one with some pieces flown a little
+    otherwise.
+    """
     own_rule: Annotated[float, Interval("[0, 1]")] = 0.0
-    """Share of the random plans that turn after whose first pieces, or none, the evader flies as
-    the strongest of those that learned: it knows what comes after the horizon.
+    """Share of the random plans that turn after whose first pieces, or none, the evader
+    flies as the strongest of those that learned: it knows what comes after the horizon.
     """
 
     learned_value: bool = False
-    """Whether a second planner flies, to which the end of a plan is worth as many steps as the
-    strongest of those that learned would be free from there, by its own estimate.
+    """Whether a second planner flies, to which the end of a plan is worth as many steps
+    as the strongest of those that learned would be free from there, by its own
+    estimate.
     """
 
     def __post_init__(self):
@@ -135,19 +145,25 @@ class PlannerSettings:
 
 @dataclass(frozen=True)
 class MatrixGameSettings:
-    """How both sides plan. All pairs of plans are flown: of 16 each and .8 s, every .1 s, 2,048
-    steps for one of the game.
+    """How both sides plan. All pairs of plans are flown: of 16 each and .8 s, every .1
+    s, 2,048 steps for one of the game.
     """
 
     pursuers_last: bool = True
-    """Whether the pursuers choose knowing the evader's plan, or the evader knowing theirs."""
+    """Whether the pursuers choose knowing the evader's plan, or the evader knowing
+    theirs.
+    """
     evader_plans: Annotated[int, Interval("[3, 1000]")] = 16
     team_plans: Annotated[int, Interval("[5, 1000]")] = 16
     """In which pursuers may fly as the policy does."""
     direct_plans: Annotated[int, Interval("[0, 1000]")] = 0
-    """Of the team beside those, in which none does: flown without the policy, for less."""
+    """Of the team beside those, in which none does: flown without the policy, for
+    less.
+    """
     refined: Annotated[float, Interval("[0, 1]")] = 0.5
-    """Share of the team's new plans that are the last one with another task for one pursuer."""
+    """Share of the team's new plans that are the last one with another task for one
+    pursuer.
+    """
     pieces: Annotated[int, Interval("[1, 100]")] = 4
     """Pieces of a plan, one after the other."""
     piece_steps: Annotated[int, Interval("[1, 1000]")] = 20
@@ -155,8 +171,8 @@ class MatrixGameSettings:
     replan: Annotated[int, Interval("[1, 1000]")] = 10
     """Control steps after which both sides plan anew."""
     full_sight: bool = True
-    """Whether pursuers that plan see through pillars. Without it, a team that doesn't see the
-    evader flies as its policy does, and to where the evader was last seen.
+    """Whether pursuers that plan see through pillars. Without it, a team that doesn't
+    see the evader flies as its policy does, and to where the evader was last seen.
     """
 
     def __post_init__(self):

@@ -1,13 +1,15 @@
-"""Evaders by splitting: many copies of an episode, in which those that are caught become copies of
-those that aren't.
+"""Evaders by splitting: many copies of an episode, in which those that are caught
+become copies of those that aren't.
 
-Each copy's evader flies straight on, turns a little, or turns anywhere, at random; after every
-piece the caught take over the whole world of a free one. What is left at the end is an escape that
-a determined evader could have flown, since a policy's mean answers the same each time. There is no
-network, no gradient, no horizon and no model of what is good but to be free: it shares neither code
-nor ideas with the learners and the planner. It is kept for the last word on weights that are done.
+Each copy's evader flies straight on, turns a little, or turns anywhere, at random;
+after every piece the caught take over the whole world of a free one. What is left at
+the end is an escape that a determined evader could have flown, since a policy's mean
+answers the same each time. There is no network, no gradient, no horizon and no model of
+what is good but to be free: it shares neither code nor ideas with the learners and the
+planner. It is kept for the last word on weights that are done.
 
-Splitting of rare events: Kahn and Harris, 1951; Aldous and Vazirani, "Go with the winners", 1994.
+Splitting of rare events: Kahn and Harris, 1951; Aldous and Vazirani, "Go with the
+winners", 1994.
 """
 
 from dataclasses import dataclass
@@ -31,12 +33,19 @@ class Splitting:
     environment: Pursuit
     policy: Policy
 
-    def fly(self, parameters: PolicyParameters, tasks: Task, key: jax.Array) -> EpisodeStatistics:
-        """Statistics (B,) of the copy that was free the longest, for each of tasks (B, ...)."""
+    def fly(
+        self, parameters: PolicyParameters, tasks: Task, key: jax.Array
+    ) -> EpisodeStatistics:
+        """Statistics (B,) of the copy that was free the longest, for each of tasks (B,
+        ...).
+        """
         keys = jax.random.split(key, tasks.evader_position.shape[0])
-        # one task at a time would leave an accelerator idle, all at once need too much memory
+        # one task at a time would leave an accelerator idle, all at once need too much
+        # memory
         return jax.lax.map(
-            lambda own: self._fly_one(parameters, *own), (tasks, keys), batch_size=TOGETHER
+            lambda own: self._fly_one(parameters, *own),
+            (tasks, keys),
+            batch_size=TOGETHER,
         )
 
     def _fly_one(self, parameters, task, key):
@@ -44,7 +53,9 @@ class Splitting:
         copies = self.settings.copies
         start_key, heading_key, pieces_key = jax.random.split(key, 3)
         world = self.environment.reset_to(start_key, task)
-        worlds = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (copies, *leaf.shape)), world)
+        worlds = jax.tree.map(
+            lambda leaf: jnp.broadcast_to(leaf, (copies, *leaf.shape)), world
+        )
         heading = _directions(heading_key, copies)
 
         def piece(carry, key):
@@ -78,7 +89,9 @@ class Splitting:
         return jnp.where(odds < settings.straight_on, heading, turned)
 
     def _flown(self, parameters, worlds, heading):
-        """Worlds (C, ...) after a piece in which each evader flies along its heading (C, 3)."""
+        """Worlds (C, ...) after a piece in which each evader flies along its heading
+        (C, 3).
+        """
         step = jax.vmap(self.environment.step, in_axes=(None, 0, 0, 0))
         # a game of the library draws nothing after its reset
         nothing = jax.random.key(0)
@@ -99,8 +112,8 @@ def _directions(key, number):
 
 
 def sources(key: jax.Array, state: PursuitState) -> jax.Array:
-    """(C,) which of the copies (C, ...) each goes on as: a free one as itself, a caught one as the
-    better of two free ones; all as they are where none is free.
+    """(C,) which of the copies (C, ...) each goes on as: a free one as itself, a caught
+    one as the better of two free ones; all as they are where none is free.
     """
     free = ~state.statistics.captured
     copies = free.size

@@ -10,8 +10,8 @@ from openjax.evaluation.validation import uniform_tasks
 from openjax.pursuit import PursuitSettings, Task, expand_task, turn_task, uniform_task
 
 JUDGE_KEY = 70_000_009
-"""The tasks by which a policy is judged are drawn from this key: neither those by which runs choose
-their checkpoints nor any that was trained on.
+"""The tasks by which a policy is judged are drawn from this key: neither those by which
+runs choose their checkpoints nor any that was trained on.
 """
 OWN = 0.75
 """Share of a specialist's episodes that begin in its layout."""
@@ -22,8 +22,8 @@ MOVES = 4
 def draw_task(
     settings: PursuitSettings, layouts: Task | None, share: float, key: jax.Array
 ) -> Task:
-    """A task to learn on: uniform and turned, or, with these odds, a layout (L, ...) whose starts
-    are moved. None: the game's number of pursuers has no layouts.
+    """A task to learn on: uniform and turned, or, with these odds, a layout (L, ...)
+    whose starts are moved. None: the game's number of pursuers has no layouts.
     """
     keys = jax.random.split(key, 5)
     uniform = turn_task(keys[0], uniform_task(settings, keys[1]))
@@ -47,8 +47,8 @@ def draw_own_task(
     key: jax.Array,
     learner: jax.Array,
 ) -> Task:
-    """A task for one of the learners, () int: of the last ones, specialists, mostly a layout of its
-    own out of `layouts` (L, ...).
+    """A task for one of the learners, () int: of the last ones, specialists, mostly a
+    layout of its own out of `layouts` (L, ...).
     """
     number = layouts.evader_position.shape[0]
     place = learner - (learning.learners - learning.specialists)
@@ -60,7 +60,9 @@ def draw_own_task(
 
 
 def judging_tasks(settings: PursuitSettings, number: int) -> Task:
-    """(number, ...) uniform tasks of the paper's four or five pillars, in the game's slots."""
+    """(number, ...) uniform tasks of the paper's four or five pillars, in the game's
+    slots.
+    """
     paper = PursuitSettings()
     drawn = dataclasses.replace(
         settings, min_pillars=paper.min_pillars, max_pillars=paper.max_pillars

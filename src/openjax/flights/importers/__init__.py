@@ -1,8 +1,8 @@
 """Importers: logs of other formats become the same table as a CSV of the log format.
 
-A case folder may hold logs of several formats side by side. A `columns.toml` in the folder says
-which of their columns is what, where the names aren't the usual ones. A format of your own is an
-`Importer` that you `register`.
+A case folder may hold logs of several formats side by side. A `columns.toml` in the
+folder says which of their columns is what, where the names aren't the usual ones. A
+format of your own is an `Importer` that you `register`.
 """
 
 from pathlib import Path
@@ -17,7 +17,12 @@ from openjax.flights.importers import (
     topic_times,
 )
 from openjax.flights.importers.columns import MAPPING_FILE, ColumnMapping, load_mapping
-from openjax.flights.importers.importer import Importer, importer_of, importers, register
+from openjax.flights.importers.importer import (
+    Importer,
+    importer_of,
+    importers,
+    register,
+)
 from openjax.flights.reading import LogError, LogTable
 
 __all__ = [
@@ -31,8 +36,9 @@ __all__ = [
     "register",
 ]
 
-# The last that is registered is the first that is asked: a CSV that no other one knows is taken
-# for one of the log format, and a layout with several time stamps may hold a firmware's names.
+# The last that is registered is the first that is asked: a CSV that no other one knows
+# is taken for one of the log format, and a layout with several time stamps may hold a
+# firmware's names.
 for _importer in (
     log_format.IMPORTER,
     crazyflie.IMPORTER,

@@ -1,15 +1,16 @@
-"""Betaflight's blackbox: CSV files as `blackbox_decode` and the Blackbox Explorer write them.
+"""Betaflight's blackbox: CSV files as `blackbox_decode` and the Blackbox Explorer write
+them.
 
-`blackbox_decode` (blackbox-tools, blackbox_decode.c) puts a field's unit in brackets behind its
-name unless the field is raw. Raw are degrees per second for `gyroADC` and `setpoint`, counts of the
-sensor for `accSmooth`, thousandths for the throttle, and for `motor` either pulses of 1000 to 2000
-us or DShot's 48 to 2047. The Explorer writes raw values only, and above the columns a line for each
-of the log's headers, which say their scale (blackbox-log-viewer, csv-export-worker.js and
-flightlog_fields_presenter.js). `blackbox_decode --save-headers` puts the same lines into a file of
-their own.
+`blackbox_decode` (blackbox-tools, blackbox_decode.c) puts a field's unit in brackets
+behind its name unless the field is raw. Raw are degrees per second for `gyroADC` and
+`setpoint`, counts of the sensor for `accSmooth`, thousandths for the throttle, and for
+`motor` either pulses of 1000 to 2000 us or DShot's 48 to 2047. The Explorer writes raw
+values only, and above the columns a line for each of the log's headers, which say their
+scale (blackbox-log-viewer, csv-export-worker.js and flightlog_fields_presenter.js).
+`blackbox_decode --save-headers` puts the same lines into a file of their own.
 
-Axes are forward, left, up, as here: the mixer's signs say so, in which a positive pitch raises the
-rear motors. Motors are rear right, front right, rear left, front left.
+Axes are forward, left, up, as here: the mixer's signs say so, in which a positive pitch
+raises the rear motors. Motors are rear right, front right, rear left, front left.
 """
 
 import re
@@ -32,11 +33,13 @@ from openjax.flights.reading import CHANNEL_COLUMNS, LogError, LogTable
 MAGIC = b"H Product:Blackbox"
 DSHOT = (48.0, 2047.0)  # the least and the largest throttle value of the protocol
 PULSE = (1000.0, 2000.0)  # us
-# {nominal place's column: index of Betaflight's motor}, mixerQuadX in flight/mixer_init.c
+# {nominal place's column: index of Betaflight's motor}, mixerQuadX in
+# flight/mixer_init.c
 MOTOR_OF = {"m1": 1, "m2": 0, "m3": 2, "m4": 3}
 FIRST = "loopIteration"  # the name of the first column
 HEADERS_FILE = ".headers.csv"
-BESIDE = (HEADERS_FILE, ".gps.csv", ".event.csv")  # how else files are called that a decoder writes
+# how else files are called that a decoder writes
+BESIDE = (HEADERS_FILE, ".gps.csv", ".event.csv")
 FINE = 10.0  # by which blackbox_high_resolution multiplies rates
 _UNIT_NAMES = {"m/s2": "m/s^2"}
 _FIELD = re.compile(r"(.*?)(?: \((.*)\))?")
@@ -54,11 +57,16 @@ def is_blackbox_csv(path: Path) -> bool:
 def is_beside(path: Path) -> bool:
     """Whether a file is no log of its own, but what a decoder wrote beside one."""
     ending = next((end for end in BESIDE if path.name.endswith(end)), None)
-    return ending is not None and path.with_name(path.name.removesuffix(ending) + ".csv").exists()
+    return (
+        ending is not None
+        and path.with_name(path.name.removesuffix(ending) + ".csv").exists()
+    )
 
 
 def _lines_above(lines: list[str]) -> int | None:
-    """How many lines stand above the columns' names; None where there are no such names."""
+    """How many lines stand above the columns' names; None where there are no such
+    names.
+    """
     first = (line.lstrip(' "').startswith(FIRST) for line in lines)
     return next((number for number, is_first in enumerate(first) if is_first), None)
 
@@ -94,7 +102,9 @@ def read_blackbox_csv(path: Path, mapping: ColumnMapping | None = None) -> LogTa
     above = _lines_above(lines) or 0
     names = find_header(lines[above:], delimiter).names
     said = _headers(lines[:above])
-    decoded = path.with_name(path.name.removesuffix(".gz").removesuffix(".csv") + HEADERS_FILE)
+    decoded = path.with_name(
+        path.name.removesuffix(".gz").removesuffix(".csv") + HEADERS_FILE
+    )
     if decoded.is_file():
         said |= _headers(head_of(decoded))
     fields = {_FIELD.fullmatch(name)[1]: name for name in names}
@@ -114,32 +124,40 @@ def read_blackbox_csv(path: Path, mapping: ColumnMapping | None = None) -> LogTa
     merged = merge_streams([Stream(seconds, raw)], columns)
     merged["t"] = merged["t"] - merged["t"][0]
     for motor in set(CHANNEL_COLUMNS["motor_command"]) & set(merged) - set(asked):
-        merged[motor] = np.maximum(merged[motor], 0.0)  # a motor at rest is below DShot's least
+        # a motor at rest is below DShot's least
+        merged[motor] = np.maximum(merged[motor], 0.0)
     return LogTable(path.name, merged, np.full(len(merged["t"]), "0"), tuple(remarks))
 
 
 def _without_filter(fields: dict[str, str]) -> list[str]:
-    """Takes `gyroUnfilt` for a `gyroADC` that wasn't logged, and says so. Raises LogError where
-    neither was.
+    """Takes `gyroUnfilt` for a `gyroADC` that wasn't logged, and says so. Raises
+    LogError where neither was.
     """
     if "gyroADC[0]" in fields:
         return []
     if "gyroUnfilt[0]" not in fields:
-        raise LogError("no gyroscope was logged (gyroADC[0..2]): switch it on in the blackbox")
+        raise LogError(
+            "no gyroscope was logged (gyroADC[0..2]): switch it on in the blackbox"
+        )
     fields |= {f"gyroADC[{i}]": fields[f"gyroUnfilt[{i}]"] for i in range(3)}
-    return ["gyroADC wasn't logged: gyroUnfilt, before Betaflight's filters, stands for it"]
+    return [
+        "gyroADC wasn't logged: gyroUnfilt, before Betaflight's filters, stands for it"
+    ]
 
 
 def _usual(fields: dict[str, str], said: dict[str, str]) -> dict[str, Source]:
-    """{column: source} of fields that are there, whose scale the log's headers have `said`. The
-    force and the motors are raw as yet.
+    """{column: source} of fields that are there, whose scale the log's headers have
+    `said`. The force and the motors are raw as yet.
     """
     fine = FINE if _number(said, "blackbox_high_resolution") else 1.0
     # The Explorer's gyroScale is in rad/us a count.
     count = 1e6 * (_number(said, "gyroScale") or UNITS["us"] * UNITS["deg/s"])
     old = said.get("firmwareVersion", "4").startswith(("2.", "3."))
     wanted = {f"w{a}": (f"gyroADC[{i}]", count / fine) for i, a in enumerate("xyz")}
-    wanted |= {f"cmd_w{a}": (f"setpoint[{i}]", UNITS["deg/s"] / fine) for i, a in enumerate("xyz")}
+    wanted |= {
+        f"cmd_w{a}": (f"setpoint[{i}]", UNITS["deg/s"] / fine)
+        for i, a in enumerate("xyz")
+    }
     wanted |= {f"a{a}": (f"accSmooth[{i}]", 1.0) for i, a in enumerate("xyz")}
     wanted |= {column: (f"motor[{i}]", 1.0) for column, i in MOTOR_OF.items()}
     wanted |= {"cmd_thrust": ("setpoint[3]", 1e-3)}
@@ -160,7 +178,9 @@ def _number(said: dict[str, str], name: str) -> float:
 
 
 def _scale(name: str, usual: float) -> float:
-    """The factor of a field to the log format's unit: that in its brackets, or the usual one."""
+    """The factor of a field to the log format's unit: that in its brackets, or the
+    usual one.
+    """
     unit = _FIELD.fullmatch(name)[2]
     return usual if unit is None else UNITS.get(_UNIT_NAMES.get(unit, unit), usual)
 
@@ -168,9 +188,9 @@ def _scale(name: str, usual: float) -> float:
 def _force(
     raw, fields: dict[str, str], said: dict[str, str], remarks: list[str]
 ) -> dict[str, Source]:
-    """The accelerometer's columns. Raw counts are as many a g as the header acc_1G says; without
-    it, sensors have a power of two for 1 g, and it is the one nearest to what was felt in the
-    median.
+    """The accelerometer's columns. Raw counts are as many a g as the header acc_1G
+    says; without it, sensors have a power of two for 1 g, and it is the one nearest to
+    what was felt in the median.
     """
     names = [fields.get(f"accSmooth[{i}]") for i in range(3)]
     if any(name is None or name not in raw for name in names) or "(" in names[0]:
@@ -179,17 +199,22 @@ def _force(
     if not counts:
         felt = np.nanmedian(np.linalg.norm([raw[name] for name in names], axis=0))
         counts = 2.0 ** np.rint(np.log2(max(felt, 1.0)))
-        remarks.append(f"accSmooth is in the sensor's counts: {counts:g} are taken for 1 g")
+        remarks.append(
+            f"accSmooth is in the sensor's counts: {counts:g} are taken for 1 g"
+        )
     return {
-        f"a{a}": Source(name, UNITS["g"] / counts) for a, name in zip("xyz", names, strict=True)
+        f"a{a}": Source(name, UNITS["g"] / counts)
+        for a, name in zip("xyz", names, strict=True)
     }
 
 
 def _motors(raw, fields: dict[str, str], remarks: list[str]) -> dict[str, Source]:
-    """The motors' columns, as shares of the range of the protocol that they show: pulses are never
-    below their least, and DShot's largest is beyond that of pulses.
+    """The motors' columns, as shares of the range of the protocol that they show:
+    pulses are never below their least, and DShot's largest is beyond that of pulses.
     """
-    names = {c: fields[f"motor[{i}]"] for c, i in MOTOR_OF.items() if f"motor[{i}]" in fields}
+    names = {
+        c: fields[f"motor[{i}]"] for c, i in MOTOR_OF.items() if f"motor[{i}]" in fields
+    }
     values = [raw[name] for name in names.values() if name in raw]
     if not values:
         return {}
@@ -206,4 +231,6 @@ def _motors(raw, fields: dict[str, str], remarks: list[str]) -> dict[str, Source
 
 
 CSV_IMPORTER = Importer("Betaflight blackbox CSV", is_blackbox_csv, read_blackbox_csv)
-BINARY_IMPORTER = Importer("Betaflight blackbox", is_blackbox_binary, read_blackbox_binary)
+BINARY_IMPORTER = Importer(
+    "Betaflight blackbox", is_blackbox_binary, read_blackbox_binary
+)

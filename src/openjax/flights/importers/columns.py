@@ -1,7 +1,8 @@
-"""Column mapping: which column, log variable or message field holds what, in which unit.
+"""Column mapping: which column, log variable or message field holds what, in which
+unit.
 
-A `columns.toml` in a case folder applies to all its logs. A CSV column that it doesn't name and
-that has a name of the log format is taken as it is:
+A `columns.toml` in a case folder applies to all its logs. A CSV column that it doesn't
+name and that has a name of the log format is taken as it is:
 
     delimiter = ";"                                        # CSV only; by its header if left out
     [columns]
@@ -11,16 +12,16 @@ that has a name of the log format is taken as it is:
     ax     = { from = "/cf1/imu:linear_acceleration.x" }   # a field of a ROS 2 topic
     cmd_wy = { from = "pitch_rate", unit = "deg/s", scale = -1 }
 
-A CSV whose topics have time stamps of their own names each, and what is `of` it; where names begin
-as the stamp's does ("imu.time", "imu.wx"), that may be left out:
+A CSV whose topics have time stamps of their own names each, and what is `of` it; where
+names begin as the stamp's does ("imu.time", "imu.wx"), that may be left out:
 
     t = [
         { from = "pose.time", unit = "ns" },
         { from = "stamp_2", unit = "ns", of = ["wx", "wy", "wz"] },
     ]
 
-Besides the columns of the log format, `roll`, `pitch`, `yaw` (z-y-x, body to world) may stand for
-the quaternion.
+Besides the columns of the log format, `roll`, `pitch`, `yaw` (z-y-x, body to world) may
+stand for the quaternion.
 """
 
 import math
@@ -56,15 +57,16 @@ _MOTION = {
 }
 _CONTINUOUS = _MOTION | set(CHANNEL_COLUMNS["velocity"]) | set(EULER)
 OVERTAKEN = 1.0  # s by which a message may come before an older one
-# s: stamps since 1970 are known to .24 us, so that what is sent with a row may seem later
+# s: stamps since 1970 are known to .24 us, so that what is sent with a row may seem
+# later
 TIE = 1e-6
 _STALE = 5.0  # periods after which a stream's last value counts as not sampled
 
 
 @dataclass(frozen=True)
 class Source:
-    """Where a column comes from: raw name, and value = scale * raw + offset in the log format's
-    unit.
+    """Where a column comes from: raw name, and value = scale * raw + offset in the log
+    format's unit.
     """
 
     name: str
@@ -74,7 +76,9 @@ class Source:
 
 @dataclass(frozen=True)
 class Clock:
-    """A time stamp of some columns: its source, and the columns that are said to be of it."""
+    """A time stamp of some columns: its source, and the columns that are said to be of
+    it.
+    """
 
     source: Source
     columns: tuple[str, ...] = ()
@@ -105,41 +109,56 @@ class ColumnMapping:
         return self.columns["t"].name if "t" in self.columns else "t"
 
     def names(self) -> tuple[str, ...]:
-        """The raw names of a CSV that are read: those it names, and those of the log format that
-        it puts nothing in the place of.
+        """The raw names of a CSV that are read: those it names, and those of the log
+        format that it puts nothing in the place of.
         """
         usual = dict.fromkeys(c for c in LOG_COLUMNS if c not in self.columns)
-        usual = usual if not set(EULER) & set(self.columns) else _without_attitude(usual)
+        usual = (
+            usual if not set(EULER) & set(self.columns) else _without_attitude(usual)
+        )
         return (*usual, *(source.name for source in self.columns.values()))
 
     def over(self, usual: dict[str, Source]) -> dict[str, Source]:
-        """The `usual` sources of columns, and in their place those that the mapping names; time is
-        no source.
+        """The `usual` sources of columns, and in their place those that the mapping
+        names; time is no source.
         """
         kept = _without_attitude(usual) if set(EULER) & set(self.columns) else usual
-        return kept | {c: s for c, s in self.columns.items() if c not in ("t", "vehicle")}
+        return kept | {
+            c: s for c, s in self.columns.items() if c not in ("t", "vehicle")
+        }
 
     def table(self, name: str, raw: LogTable) -> LogTable:
         """A raw CSV table with its columns renamed and converted; time starts at zero.
 
-        Columns under the log format's own names are inherited. Raises LogError without time.
+        Columns under the log format's own names are inherited. Raises LogError without
+        time.
         """
         taken = {source.name for source in self.columns.values()}
-        inherited = {c: v for c, v in raw.columns.items() if c in LOG_COLUMNS and c not in taken}
-        columns = inherited if not set(EULER) & set(self.columns) else _without_attitude(inherited)
+        inherited = {
+            c: v for c, v in raw.columns.items() if c in LOG_COLUMNS and c not in taken
+        }
+        columns = (
+            inherited
+            if not set(EULER) & set(self.columns)
+            else _without_attitude(inherited)
+        )
         remarks = list(raw.remarks)
         for column, source in self.columns.items():
             if column == "vehicle":
                 continue
             if source.name in raw.columns:
-                columns[column] = source.scale * raw.columns[source.name] + source.offset
+                columns[column] = (
+                    source.scale * raw.columns[source.name] + source.offset
+                )
             else:
                 columns.pop(column, None)
                 remarks.append(f"no column {source.name!r} for {column}")
         if "t" not in columns:
             missing = "t"
             if "t" in self.columns:
-                missing = f"{self.columns['t'].name!r}, which {MAPPING_FILE} names for t"
+                missing = (
+                    f"{self.columns['t'].name!r}, which {MAPPING_FILE} names for t"
+                )
             raise LogError(f"no column {missing}; the log has {', '.join(raw.columns)}")
         columns["t"] = columns["t"] - np.nanmin(columns["t"])
         return LogTable(name, with_quaternion(columns), raw.vehicle, tuple(remarks))
@@ -152,7 +171,9 @@ def load_mapping(path: str | Path) -> ColumnMapping:
     unknown = sorted(set(tables) - {"delimiter", "columns"})
     if unknown or not isinstance(tables.get("columns"), dict):
         problem = f"unknown key {unknown[0]!r}" if unknown else "no table [columns]"
-        raise UserError(f"{path}: {problem}; it may hold delimiter and must hold [columns]")
+        raise UserError(
+            f"{path}: {problem}; it may hold delimiter and must hold [columns]"
+        )
     delimiter = tables.get("delimiter", "")
     if not isinstance(delimiter, str) or len(delimiter) != ("delimiter" in tables):
         raise UserError(f"{path}: delimiter must be one character")
@@ -173,28 +194,39 @@ def load_mapping(path: str | Path) -> ColumnMapping:
 
 
 def _clock(entry, path: Path) -> Clock:
-    """One of several time stamps. Raises UserError for an unknown column, key or unit."""
+    """One of several time stamps. Raises UserError for an unknown column, key or
+    unit.
+    """
     named = entry.get("of", []) if isinstance(entry, dict) else []
     known = (*LOG_COLUMNS[2:], *EULER)
-    unknown = [name for name in named if name not in known] if isinstance(named, list) else [named]
+    unknown = (
+        [name for name in named if name not in known]
+        if isinstance(named, list)
+        else [named]
+    )
     if unknown:
         raise UserError(
             f"{path}: a time stamp is `of` {unknown[0]!r}; it must be a list of columns out of "
             f"{', '.join(known)}"
         )
-    rest = {k: v for k, v in entry.items() if k != "of"} if isinstance(entry, dict) else entry
+    rest = (
+        {k: v for k, v in entry.items() if k != "of"}
+        if isinstance(entry, dict)
+        else entry
+    )
     return Clock(source_of("t", rest, path), tuple(named))
 
 
 def merge_streams(
     streams: list[Stream], columns: dict[str, Source]
 ) -> dict[str, Shaped[np.ndarray, " rows"]]:
-    """Columns of the log format on one clock: that of the fastest stream with motion in it (`t` as
-    in the stream).
+    """Columns of the log format on one clock: that of the fastest stream with motion in
+    it (`t` as in the stream).
 
-    Other motion streams are interpolated linearly, commands are held, the battery keeps its own
-    samples. What is older than five periods of its stream counts as not sampled. Raises LogError if
-    no motion is there, if a stream holds several recordings, or if it ends before the others begin.
+    Other motion streams are interpolated linearly, commands are held, the battery keeps
+    its own samples. What is older than five periods of its stream counts as not
+    sampled. Raises LogError if no motion is there, if a stream holds several
+    recordings, or if it ends before the others begin.
     """
     used = []
     for stream in streams:
@@ -207,7 +239,8 @@ def merge_streams(
             "holds neither position and orientation nor a gyroscope under known names: name what "
             "it has in columns.toml"
         )
-    # to a microsecond: of streams at one rate the first is the clock, however stamps are rounded
+    # to a microsecond: of streams at one rate the first is the clock, however stamps
+    # are rounded
     clock = min(with_motion, key=lambda u: round(float(np.median(np.diff(u[0]))), 6))[0]
     clock = clock[np.r_[True, np.diff(clock) > 0]]
     used = _at_one_time(used, clock)
@@ -222,8 +255,8 @@ def merge_streams(
 def _converted(
     stream: Stream, sources: dict[str, Source]
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Times of a stream, sorted, and its columns in the log format's units. Raises LogError for
-    several recordings.
+    """Times of a stream, sorted, and its columns in the log format's units. Raises
+    LogError for several recordings.
     """
     finite = np.isfinite(stream.time)
     time = stream.time[finite]
@@ -238,9 +271,11 @@ def _converted(
     return time[order], converted | _without_flips(converted)
 
 
-def _at_one_time(used, clock: np.ndarray) -> list[tuple[np.ndarray, dict[str, np.ndarray]]]:
-    """The streams that were logged while the clock ran. Raises LogError for one that wasn't, where
-    no other one has its columns; the battery may be missing.
+def _at_one_time(
+    used, clock: np.ndarray
+) -> list[tuple[np.ndarray, dict[str, np.ndarray]]]:
+    """The streams that were logged while the clock ran. Raises LogError for one that
+    wasn't, where no other one has its columns; the battery may be missing.
     """
     beside = [u for u in used if u[0][0] <= clock[-1] and u[0][-1] >= clock[0]]
     there = {column for _, converted in beside for column in converted}
@@ -256,8 +291,8 @@ def _at_one_time(used, clock: np.ndarray) -> list[tuple[np.ndarray, dict[str, np
 
 
 def _without_flips(converted: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The quaternion of a stream without jumps between q and -q, which no line between two samples
-    may cross; nothing where it has none.
+    """The quaternion of a stream without jumps between q and -q, which no line between
+    two samples may cross; nothing where it has none.
     """
     names = CHANNEL_COLUMNS["quaternion"]
     if not all(name in converted for name in names):
@@ -279,9 +314,13 @@ def with_quaternion(
     """Roll, pitch, yaw replaced by the quaternion, unless that is there."""
     angles = [columns.get(name) for name in EULER]
     rest = {c: v for c, v in columns.items() if c not in EULER}
-    if any(a is None for a in angles) or all(c in rest for c in CHANNEL_COLUMNS["quaternion"]):
+    if any(a is None for a in angles) or all(
+        c in rest for c in CHANNEL_COLUMNS["quaternion"]
+    ):
         return rest
-    attitude = Rotation.from_euler("ZYX", np.stack(angles[::-1], 1)).as_quat(scalar_first=True)
+    attitude = Rotation.from_euler("ZYX", np.stack(angles[::-1], 1)).as_quat(
+        scalar_first=True
+    )
     return rest | dict(zip(CHANNEL_COLUMNS["quaternion"], attitude.T, strict=True))
 
 
@@ -312,7 +351,9 @@ def _onto(clock, time, values, column: str, period: float) -> np.ndarray:
 
 
 def source_of(column: str, entry, path: Path) -> Source:
-    """An entry of a `columns.toml`. Raises UserError for an unknown key, column or unit."""
+    """An entry of a `columns.toml`. Raises UserError for an unknown key, column or
+    unit.
+    """
     known = (*LOG_COLUMNS, *EULER)
     if column not in known:
         raise UserError(
@@ -331,7 +372,9 @@ def source_of(column: str, entry, path: Path) -> Source:
         )
     unit = entry.get("unit", "1")
     if unit not in UNITS:
-        raise UserError(f"{path}: unknown unit {unit!r} for {column}; known are {', '.join(UNITS)}")
+        raise UserError(
+            f"{path}: unknown unit {unit!r} for {column}; known are {', '.join(UNITS)}"
+        )
     numbers = (entry.get("scale", 1.0), entry.get("offset", 0.0))
     if not all(type(n) in (int, float) and math.isfinite(n) for n in numbers):
         raise UserError(f"{path}: scale and offset of {column} must be numbers")

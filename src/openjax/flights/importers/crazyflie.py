@@ -1,9 +1,10 @@
-"""CSV files with the firmware's names: what the Crazyflie's client writes of a log block, and what
-scripts with cflib write.
+"""CSV files with the firmware's names: what the Crazyflie's client writes of a log
+block, and what scripts with cflib write.
 
-The client's `LogWriter` puts the firmware's tick in ms into a column `Timestamp` and one file per
-log block; scripts call it `timestamp` or `tick`. Files of several blocks of one flight, which have
-the same ticks, may lie in one folder of the case: they are one log.
+The client's `LogWriter` puts the firmware's tick in ms into a column `Timestamp` and
+one file per log block; scripts call it `timestamp` or `tick`. Files of several blocks
+of one flight, which have the same ticks, may lie in one folder of the case: they are
+one log.
 """
 
 from pathlib import Path
@@ -24,8 +25,18 @@ from openjax.flights.importers.importer import Importer
 from openjax.flights.reading import LogError, LogTable
 
 TIME_NAMES = ("timestamp", "tick", "ticks", "time", "time_ms", "timestamp_ms", "t")
-GROUPS = ("stateEstimate", "stateEstimateZ", "stabilizer", "kalman", "gyro", "acc", "controller")
-"""Of log variables whose names no other program has; other programs have a `motor.m1`, too."""
+GROUPS = (
+    "stateEstimate",
+    "stateEstimateZ",
+    "stabilizer",
+    "kalman",
+    "gyro",
+    "acc",
+    "controller",
+)
+"""Of log variables whose names no other program has; other programs have a `motor.m1`,
+too.
+"""
 SELDOM = 2000.0  # ms between rows: the slowest log block of the firmware has 2550
 
 
@@ -40,8 +51,8 @@ def is_block(path: Path) -> bool:
 
 
 def is_client_log(path: Path) -> bool:
-    """Whether a path is such a CSV, or a folder of one flight's log blocks; a note may lie
-    beside.
+    """Whether a path is such a CSV, or a folder of one flight's log blocks; a note may
+    lie beside.
     """
     if path.is_dir():
         inside = _blocks(path)
@@ -61,7 +72,9 @@ def time_name(names: list[str]) -> str | None:
 
 
 def read_client_log(path: Path, mapping: ColumnMapping | None = None) -> LogTable:
-    """A flight's log blocks. Raises LogError where they hold nothing that can be used."""
+    """A flight's log blocks. Raises LogError where they hold nothing that can be
+    used.
+    """
     files = _blocks(path) if path.is_dir() else [path]
     streams = []
     remarks = []
@@ -78,7 +91,9 @@ def read_client_log(path: Path, mapping: ColumnMapping | None = None) -> LogTabl
     columns, found = firmware_columns(streams, mapping)
     merged = merge_streams(streams, columns)
     merged["t"] = merged["t"] - merged["t"][0]
-    return LogTable(path.name, merged, np.full(len(merged["t"]), "0"), (*remarks, *found))
+    return LogTable(
+        path.name, merged, np.full(len(merged["t"]), "0"), (*remarks, *found)
+    )
 
 
 def _block(path: Path, mapping: ColumnMapping | None) -> tuple[Stream, list[str]]:
@@ -88,7 +103,9 @@ def _block(path: Path, mapping: ColumnMapping | None) -> tuple[Stream, list[str]
     asked = {} if mapping is None else mapping.columns
     time = asked["t"].name if "t" in asked else time_name(names)
     if time is None:
-        raise LogError(f"no column {' or '.join(TIME_NAMES[:2])}: which holds the ticks in ms?")
+        raise LogError(
+            f"no column {' or '.join(TIME_NAMES[:2])}: which holds the ticks in ms?"
+        )
     wanted = (time, *VARIABLES, *(source.name for source in asked.values()))
     values, remarks = raw_columns(path, wanted, time, delimiter)
     ticks = values.pop(time)
@@ -97,12 +114,15 @@ def _block(path: Path, mapping: ColumnMapping | None) -> tuple[Stream, list[str]
 
 
 def _tick(ticks: np.ndarray) -> float:
-    """Seconds of a tick: a ms in the firmware, so that a block that is logged once a second has
-    steps of 1000; where rows are further apart, or not whole numbers, what the steps look like.
+    """Seconds of a tick: a ms in the firmware, so that a block that is logged once a
+    second has steps of 1000; where rows are further apart, or not whole numbers, what
+    the steps look like.
     """
     steps = np.diff(np.unique(ticks[np.isfinite(ticks)]))
     whole = len(steps) and not (steps % 1.0).any()
     return 1e-3 if whole and np.median(steps) <= SELDOM else seconds_per_unit(ticks)
 
 
-IMPORTER = Importer("CSV of the Crazyflie's client or cflib", is_client_log, read_client_log)
+IMPORTER = Importer(
+    "CSV of the Crazyflie's client or cflib", is_client_log, read_client_log
+)

@@ -1,9 +1,9 @@
-"""Topics of Crazyswarm2: log blocks of the firmware as `LogDataGeneric`, an array of values, and the
-poses of all bodies that motion capture sees as one `NamedPoseArray`.
+"""Topics of Crazyswarm2: log blocks of the firmware as `LogDataGeneric`, an array of
+values, and the poses of all bodies that motion capture sees as one `NamedPoseArray`.
 
-A log block's message doesn't say what its values are. The `crazyflies.yaml` with which the server
-was started does, under `firmware_logging.custom_topics` of `all`, of a robot's type, or of the
-robot; it is looked for beside the bag and in it.
+A log block's message doesn't say what its values are. The `crazyflies.yaml` with which
+the server was started does, under `firmware_logging.custom_topics` of `all`, of a
+robot's type, or of the robot; it is looked for beside the bag and in it.
 """
 
 from pathlib import Path
@@ -40,15 +40,18 @@ LARGEST_YAML = 1 << 20  # bytes
 
 
 def custom_topics(bag: Path) -> list[dict]:
-    """What the yaml files beside a bag and in it say, those that name custom topics. One that can't
-    be read says nothing: a case's folder may hold any.
+    """What the yaml files beside a bag and in it say, those that name custom topics.
+    One that can't be read says nothing: a case's folder may hold any.
     """
     from ruamel.yaml import YAML
     from ruamel.yaml.error import YAMLError
 
     found = []
     for path in sorted(
-        p for folder in (bag, bag.parent) if folder.is_dir() for p in folder.glob("*.y*ml")
+        p
+        for folder in (bag, bag.parent)
+        if folder.is_dir()
+        for p in folder.glob("*.y*ml")
     ):
         if not path.is_file() or path.stat().st_size > LARGEST_YAML:
             continue
@@ -56,19 +59,29 @@ def custom_topics(bag: Path) -> list[dict]:
             tables = YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))
         except (YAMLError, UnicodeDecodeError, OSError):
             continue
-        if isinstance(tables, dict) and any(k in tables for k in ("all", "robots", "robot_types")):
+        if isinstance(tables, dict) and any(
+            k in tables for k in ("all", "robots", "robot_types")
+        ):
             found.append(tables)
     return found
 
 
 def variables_of(topic: str, files: list[dict]) -> tuple[str, ...] | None:
-    """The log variables of a topic ("/cf1/state"), in their order; None where no file names it."""
+    """The log variables of a topic ("/cf1/state"), in their order; None where no file
+    names it.
+    """
     vehicle, _, name = topic.strip("/").rpartition("/")
     for tables in files:
         robot = _table(tables, "robots", vehicle)
         kind = robot.get("type")
-        for owner in (robot, _table(tables, "robot_types", kind), _table(tables, "all")):
-            variables = _table(owner, "firmware_logging", "custom_topics", name).get("vars")
+        for owner in (
+            robot,
+            _table(tables, "robot_types", kind),
+            _table(tables, "all"),
+        ):
+            variables = _table(owner, "firmware_logging", "custom_topics", name).get(
+                "vars"
+            )
             if isinstance(variables, list):
                 return tuple(str(variable) for variable in variables)
     return None
@@ -81,10 +94,12 @@ def _table(tables, *keys) -> dict:
     return tables if isinstance(tables, dict) else {}
 
 
-def log_stream(topic: str, variables: tuple[str, ...], messages) -> tuple[Stream, float]:
-    """A topic's messages [(stamp in ns, message)] as a stream of log variables at the firmware's
-    ticks, which don't wait for the radio, and by how much stamps are ahead of ticks at least (s).
-    Raises LogError where messages hold another number of values.
+def log_stream(
+    topic: str, variables: tuple[str, ...], messages
+) -> tuple[Stream, float]:
+    """A topic's messages [(stamp in ns, message)] as a stream of log variables at the
+    firmware's ticks, which don't wait for the radio, and by how much stamps are ahead
+    of ticks at least (s). Raises LogError where messages hold another number of values.
     """
     counts = {len(message.values) for _, message in messages}
     if counts - {len(variables)}:
@@ -94,15 +109,17 @@ def log_stream(topic: str, variables: tuple[str, ...], messages) -> tuple[Stream
         )
     values = np.array([message.values for _, message in messages], float)
     ticks = np.array([message.timestamp for _, message in messages], float) * 1e-3
-    ahead = float(np.min(np.array([stamp for stamp, _ in messages], float) * 1e-9 - ticks))
+    ahead = float(
+        np.min(np.array([stamp for stamp, _ in messages], float) * 1e-9 - ticks)
+    )
     named = dict(zip(variables, values.T, strict=True))
     return with_mixer(Stream(ticks, named)), ahead
 
 
 def pose_streams(topic: str, messages) -> dict[str, Stream]:
-    """{body's name: stream of its poses}, named "TOPIC:NAME:x" and so on, of a topic's messages
-    [(stamp in ns, message)]. A body that isn't seen is missing in a message, and one without an
-    attitude has NaN there.
+    """{body's name: stream of its poses}, named "TOPIC:NAME:x" and so on, of a topic's
+    messages [(stamp in ns, message)]. A body that isn't seen is missing in a message,
+    and one without an attitude has NaN there.
     """
     seen: dict[str, list] = {}
     for stamp, message in messages:
@@ -115,7 +132,10 @@ def pose_streams(topic: str, messages) -> dict[str, Stream]:
     streams = {}
     for name, rows in seen.items():
         time, *values = np.array(rows, float).T
-        named = {pose_source(topic, name, c): v for c, v in zip(POSE_FIELDS, values, strict=True)}
+        named = {
+            pose_source(topic, name, c): v
+            for c, v in zip(POSE_FIELDS, values, strict=True)
+        }
         streams[name] = Stream(time, named)
     return streams
 

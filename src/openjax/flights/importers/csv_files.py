@@ -20,8 +20,8 @@ def is_csv(path: Path) -> bool:
 
 
 def header_of(path: Path, delimiter: str = "") -> list[str]:
-    """The names in a CSV file's header; none where there is no such file, or it isn't text.
-    Without a `delimiter`, what the header shows.
+    """The names in a CSV file's header; none where there is no such file, or it isn't
+    text. Without a `delimiter`, what the header shows.
     """
     if not is_csv(path):
         return []
@@ -32,7 +32,9 @@ def header_of(path: Path, delimiter: str = "") -> list[str]:
 
 
 def is_log_format(names: list[str]) -> bool:
-    """Whether a header's names are the log format's own: its time, and something of a flight."""
+    """Whether a header's names are the log format's own: its time, and something of a
+    flight.
+    """
     return "t" in names and bool(set(names) & set(LOG_COLUMNS) - {"t", "vehicle"})
 
 
@@ -44,18 +46,20 @@ def delimiter_of(mapping: ColumnMapping | None) -> str:
 def raw_columns(
     path: Path, names: tuple[str, ...], time: str, delimiter: str = "", above: int = 0
 ) -> tuple[dict[str, Shaped[np.ndarray, " rows"]], list[str]]:
-    """The columns `names` of a CSV, {name: (R,)}, and remarks; what else it holds is another's
-    business. Raises LogError where the column `time` or a number is missing.
+    """The columns `names` of a CSV, {name: (R,)}, and remarks; what else it holds is
+    another's business. Raises LogError where the column `time` or a number is missing.
     """
     table = read_csv(path, delimiter, names, time, above)
     if time not in table.columns:
         raise LogError(f"column {time} holds no number")
-    return table.columns, [r for r in table.remarks if not r.startswith("unknown column")]
+    return table.columns, [
+        r for r in table.remarks if not r.startswith("unknown column")
+    ]
 
 
 def seconds_per_unit(time: Shaped[np.ndarray, " rows"]) -> float:
-    """By what a clock's readings (R,) are multiplied to be seconds: the unit, of s, ms, us and ns,
-    in which rows come nearest to a usual step.
+    """By what a clock's readings (R,) are multiplied to be seconds: the unit, of s, ms,
+    us and ns, in which rows come nearest to a usual step.
     """
     steps = np.diff(np.unique(time[np.isfinite(time)]))
     if not len(steps):

@@ -1,5 +1,5 @@
-"""What the log variables of the Crazyflie's firmware hold, wherever they were written down: on the
-card, by the client or cflib, or in a topic of Crazyswarm2.
+"""What the log variables of the Crazyflie's firmware hold, wherever they were written
+down: on the card, by the client or cflib, or in a topic of Crazyswarm2.
 """
 
 from pathlib import Path
@@ -15,7 +15,9 @@ FIRMWARE_SOURCES = {
     for column, entries in read_toml(_FILE).items()
 }
 """Log variables of the firmware that hold each column, best first."""
-MIXER_INPUTS = tuple(f"controller.cmd_{name}" for name in ("thrust", "roll", "pitch", "yaw"))
+MIXER_INPUTS = tuple(
+    f"controller.cmd_{name}" for name in ("thrust", "roll", "pitch", "yaw")
+)
 VARIABLES = frozenset(
     source.name for sources in FIRMWARE_SOURCES.values() for source in sources
 ) | set(MIXER_INPUTS)
@@ -26,8 +28,8 @@ MIXED = "no motor commands were logged: they are made from the mixer's inputs"
 def firmware_columns(
     streams: list[Stream], mapping: ColumnMapping | None = None
 ) -> tuple[dict[str, Source], list[str]]:
-    """The columns that streams of log variables hold, what a `columns.toml` says before what is
-    usual, and remarks.
+    """The columns that streams of log variables hold, what a `columns.toml` says before
+    what is usual, and remarks.
     """
     names = {name for stream in streams for name in stream.values}
     found = {
@@ -38,7 +40,9 @@ def firmware_columns(
     remarks = []
     if mapping is not None:
         columns = mapping.over(columns)
-        missing = [source.name for source in columns.values() if source.name not in names]
+        missing = [
+            source.name for source in columns.values() if source.name not in names
+        ]
         remarks += [f"no log variable {name!r}" for name in missing]
     if columns.get("m1", Source("")).name == "mixer.m1":
         remarks.append(MIXED)
@@ -46,9 +50,9 @@ def firmware_columns(
 
 
 def with_mixer(stream: Stream) -> Stream:
-    """The stream with `mixer.m1` to `mixer.m4`, 0 to 65535, where it holds the mixer's four inputs:
-    what the firmware's legacy power distribution (power_distribution_quadrotor.c) makes of them,
-    before the battery compensation.
+    """The stream with `mixer.m1` to `mixer.m4`, 0 to 65535, where it holds the mixer's
+    four inputs: what the firmware's legacy power distribution
+    (power_distribution_quadrotor.c) makes of them, before the battery compensation.
     """
     inputs = [stream.values.get(name) for name in MIXER_INPUTS]
     if any(values is None for values in inputs):

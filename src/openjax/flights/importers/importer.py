@@ -1,6 +1,8 @@
-"""Which importers there are: each says which files are its own, and reads them as a `LogTable`.
+"""Which importers there are: each says which files are its own, and reads them as a
+`LogTable`.
 
-The shipped ones are in a list like any other; a program of yours adds one by `register`.
+The shipped ones are in a list like any other; a program of yours adds one by
+`register`.
 """
 
 from collections.abc import Callable
@@ -18,13 +20,14 @@ class Importer:
     name: str
     """Of the format, in words."""
     matches: Callable[[Path], bool]
-    """matches(path): whether a file or folder of a case is such a log. It is asked of everything in
-    the folder, so it looks at the name or at the first bytes, and never raises.
+    """matches(path): whether a file or folder of a case is such a log. It is asked of
+    everything in the folder, so it looks at the name or at the first bytes, and never
+    raises.
     """
     read: Callable[[Path, ColumnMapping | None], LogTable]
-    """read(path, mapping): the log in the log format's columns and units. `mapping` is what the
-    case's `columns.toml` says, None without one. Raises LogError, in one line, for a log that can't
-    be read.
+    """read(path, mapping): the log in the log format's columns and units. `mapping` is
+    what the case's `columns.toml` says, None without one. Raises LogError, in one line,
+    for a log that can't be read.
     """
 
 
@@ -32,10 +35,13 @@ _IMPORTERS: list[Importer] = []
 
 
 def register(importer: Importer) -> Importer:
-    """Add an importer, which is asked before those that are there already; one of the same name
-    takes the other's place. Returns it.
+    """Add an importer, which is asked before those that are there already; one of the
+    same name takes the other's place. Returns it.
     """
-    _IMPORTERS[:] = [importer, *(other for other in _IMPORTERS if other.name != importer.name)]
+    _IMPORTERS[:] = [
+        importer,
+        *(other for other in _IMPORTERS if other.name != importer.name),
+    ]
     return importer
 
 

@@ -11,7 +11,14 @@ from openjax.flights.reading import LOG_COLUMNS, LogTable, read_csv
 
 WITH_UNIT = re.compile(r"(\w+) *[(\[](.+)[)\]]")
 """A name with its unit: "wx [deg/s]", "x (m)"."""
-WRITTEN = {"m/s2": "m/s^2", "m/s²": "m/s^2", "°": "deg", "°/s": "deg/s", "%": "percent", "-": "1"}
+WRITTEN = {
+    "m/s2": "m/s^2",
+    "m/s²": "m/s^2",
+    "°": "deg",
+    "°/s": "deg/s",
+    "%": "percent",
+    "-": "1",
+}
 """Other spellings of units."""
 
 
@@ -28,8 +35,8 @@ def read_log_format(path: Path, mapping: ColumnMapping | None = None) -> LogTabl
 
 
 def units_of(names: list[str]) -> ColumnMapping:
-    """A mapping of the log format's columns that a header names with their units; of a unit that
-    nobody knows the column isn't known either.
+    """A mapping of the log format's columns that a header names with their units; of a
+    unit that nobody knows the column isn't known either.
     """
     columns = {}
     for name in names:

@@ -1,10 +1,10 @@
 """Bitcraze micro-SD deck logs (the binary files that a Crazyflie writes while flying).
 
-Layout, little endian (crazyflie-firmware, tools/usdlog): byte 0xBC; uint16 version (1 or 2); uint16
-number of event types; for each: uint16 id, name and NUL, uint16 number of variables, each
-"group.name(T)" and NUL with T a struct letter. Then records: uint16 event id, time stamp (version
-1: uint32 ms, version 2: uint64 us), the variables packed. The last four bytes are the CRC-32 of all
-before.
+Layout, little endian (crazyflie-firmware, tools/usdlog): byte 0xBC; uint16 version (1
+or 2); uint16 number of event types; for each: uint16 id, name and NUL, uint16 number of
+variables, each "group.name(T)" and NUL with T a struct letter. Then records: uint16
+event id, time stamp (version 1: uint32 ms, version 2: uint64 us), the variables packed.
+The last four bytes are the CRC-32 of all before.
 """
 
 import struct
@@ -30,12 +30,16 @@ def is_micro_sd(path: Path) -> bool:
         return False
     with path.open("rb") as file:
         head = file.read(5)
-    return len(head) == 5 and head[0] == MAGIC and int.from_bytes(head[1:3], "little") in _VERSIONS
+    return (
+        len(head) == 5
+        and head[0] == MAGIC
+        and int.from_bytes(head[1:3], "little") in _VERSIONS
+    )
 
 
 def read_micro_sd(path: str | Path, mapping: ColumnMapping | None = None) -> LogTable:
-    """Read a micro-SD log. The firmware's usual log variables are looked for, unless the mapping
-    names others.
+    """Read a micro-SD log. The firmware's usual log variables are looked for, unless
+    the mapping names others.
 
     Raises LogError if it isn't such a log, or holds nothing that can be used.
     """
@@ -52,8 +56,8 @@ def read_micro_sd(path: str | Path, mapping: ColumnMapping | None = None) -> Log
 
 
 def decode(data: bytes) -> tuple[list[Stream], list[str]]:
-    """The events of a micro-SD log as streams, one per event type, and remarks. Raises LogError if
-    it is none.
+    """The events of a micro-SD log as streams, one per event type, and remarks. Raises
+    LogError if it is none.
     """
     if len(data) < 9 or data[0] != MAGIC:
         raise LogError("not a micro-SD log (it doesn't start with 0xBC)")
@@ -63,7 +67,8 @@ def decode(data: bytes) -> tuple[list[Stream], list[str]]:
     remarks = []
     end = len(data) - 4
     if crc32(data[:end]) != int.from_bytes(data[end:], "little"):
-        # Power was cut before the file was closed: what was written is there, its checksum isn't.
+        # Power was cut before the file was closed: what was written is there, its
+        # checksum isn't.
         remarks.append(
             "the checksum doesn't match: the log is cut off or corrupt, read as far as it goes"
         )
@@ -80,7 +85,9 @@ def decode(data: bytes) -> tuple[list[Stream], list[str]]:
             stamps, packed = zip(*records, strict=True)
             rows = np.frombuffer(b"".join(packed), dtype)
             time = np.array(stamps, np.float64) * tick
-            streams.append(Stream(time, {name: rows[name].astype(float) for name in dtype.names}))
+            streams.append(
+                Stream(time, {name: rows[name].astype(float) for name in dtype.names})
+            )
     if not streams:
         raise LogError("micro-SD log without a record")
     return streams, remarks
@@ -89,8 +96,8 @@ def decode(data: bytes) -> tuple[list[Stream], list[str]]:
 def _records(
     data: bytes, at: int, end: int, events, head: str
 ) -> dict[int, list[tuple[int, bytes]]]:
-    """Event id -> (stamp, packed record) of every one from byte `at` on; the last of a log that was
-    cut off may be torn.
+    """Event id -> (stamp, packed record) of every one from byte `at` on; the last of a
+    log that was cut off may be torn.
     """
     records: dict[int, list[tuple[int, bytes]]] = {event: [] for event in events}
     head_size = struct.calcsize(head)
@@ -98,7 +105,9 @@ def _records(
         event, stamp = struct.unpack_from(head, data, at)
         if event not in events:
             if end != len(data):
-                raise LogError(f"micro-SD log with an unknown event {event} at byte {at}: corrupt")
+                raise LogError(
+                    f"micro-SD log with an unknown event {event} at byte {at}: corrupt"
+                )
             break
         size = events[event].itemsize
         at += head_size

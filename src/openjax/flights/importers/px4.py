@@ -1,12 +1,14 @@
 """PX4's ULog files (`.ulg`), through the `pyulog` library.
 
-PX4's world is north, east, down and its body forward, right, down; here they are east, north, up
-and forward, left, up. Motors are put into the nominal order by the places that the log's parameters
-give them (CA_ROTORi_PX, _PY, metres forward and right), or by PX4's quad X.
+PX4's world is north, east, down and its body forward, right, down; here they are east,
+north, up and forward, left, up. Motors are put into the nominal order by the places
+that the log's parameters give them (CA_ROTORi_PX, _PY, metres forward and right), or by
+PX4's quad X.
 
-`actuator_motors` holds shares of the largest thrust. Where it wasn't logged, `actuator_outputs` is
-taken between its least and largest value, and turned into thrust by PX4's own curve,
-thrust = f s^2 + (1 - f) s with f = THR_MDL_FAC (FunctionMotors.hpp).
+`actuator_motors` holds shares of the largest thrust. Where it wasn't logged,
+`actuator_outputs` is taken between its least and largest value, and turned into thrust
+by PX4's own curve, thrust = f s^2 + (1 - f) s with f = THR_MDL_FAC
+(FunctionMotors.hpp).
 """
 
 import contextlib
@@ -17,18 +19,29 @@ import numpy as np
 
 from openjax.errors import UserError
 from openjax.flights.csv_text import LARGEST, LogError
-from openjax.flights.importers.columns import ColumnMapping, Source, Stream, merge_streams
+from openjax.flights.importers.columns import (
+    ColumnMapping,
+    Source,
+    Stream,
+    merge_streams,
+)
 from openjax.flights.importers.importer import Importer
 from openjax.flights.reading import LogTable
 
 MAGIC = b"ULog\x01\x12\x35"
 QUAD_X = ("front_right", "rear_left", "front_left", "rear_right")  # PX4's motors 1 to 4
-COLUMN_OF = {"front_right": "m1", "rear_right": "m2", "rear_left": "m3", "front_left": "m4"}
+COLUMN_OF = {
+    "front_right": "m1",
+    "rear_right": "m2",
+    "rear_left": "m3",
+    "front_left": "m4",
+}
 PULSE = (1000.0, 2000.0)  # us, PX4's defaults of PWM_MIN and PWM_MAX
 SELDOM = 3  # values outside of its range that an output may have
 MOTOR_1 = 101  # the output function of motor 1 in PWM_MAIN_FUNCi
 
-# Topics and, in the frames of the log format, the columns that they hold: (field, scale).
+# Topics and, in the frames of the log format, the columns that they hold: (field,
+# scale).
 TOPICS: dict[str, dict[str, tuple[str, float]]] = {
     "vehicle_local_position": {
         "x": ("y", 1.0),
@@ -80,15 +93,18 @@ def is_ulog(path: Path) -> bool:
 
 
 def read_ulog(path: Path, mapping: ColumnMapping | None = None) -> LogTable:
-    """Read a ULog. With a mapping, sources are "TOPIC:FIELD" in PX4's frames and units; what it
-    doesn't name is recognised.
+    """Read a ULog. With a mapping, sources are "TOPIC:FIELD" in PX4's frames and units;
+    what it doesn't name is recognised.
 
-    Raises LogError if it is damaged or holds nothing known, UserError without the library.
+    Raises LogError if it is damaged or holds nothing known, UserError without the
+    library.
     """
     asked = {} if mapping is None else mapping.over({})
     log = _parsed(path, {source.name.partition(":")[0] for source in asked.values()})
     topics = {data.name: data for data in log.data_list if data.multi_id == 0}
-    streams = {name: _stream(data, log.start_timestamp) for name, data in topics.items()}
+    streams = {
+        name: _stream(data, log.start_timestamp) for name, data in topics.items()
+    }
     if f"{ATTITUDE}:q[0]" in streams.get(ATTITUDE, Stream(np.empty(0), {})).values:
         streams[ATTITUDE] = _turned(streams[ATTITUDE])
     motors, remarks = _motors(streams, log.initial_parameters)
@@ -100,7 +116,9 @@ def read_ulog(path: Path, mapping: ColumnMapping | None = None) -> LogTable:
         columns = mapping.over(columns)
     if log.dropouts:
         lost = sum(dropout.duration for dropout in log.dropouts)
-        remarks.append(f"{len(log.dropouts)} dropouts of {lost} ms in all while it was logged")
+        remarks.append(
+            f"{len(log.dropouts)} dropouts of {lost} ms in all while it was logged"
+        )
     if log.file_corruption:
         remarks.append("the log is corrupt in places: what can be read of it is")
     merged = merge_streams(fastest_first, columns)
@@ -109,7 +127,9 @@ def read_ulog(path: Path, mapping: ColumnMapping | None = None) -> LogTable:
 
 
 def _parsed(path: Path, more: set[str]):
-    """The library's log of the topics that are known and `more`. Raises as `read_ulog` does."""
+    """The library's log of the topics that are known and `more`. Raises as `read_ulog`
+    does.
+    """
     try:
         from pyulog import ULog
     except ImportError as error:
@@ -134,8 +154,8 @@ def _parsed(path: Path, more: set[str]):
 
 
 def _stream(data, start: int) -> Stream:
-    """A topic as a stream of "TOPIC:FIELD", in seconds since the log's start: when it was measured
-    where that is logged, else when it was published.
+    """A topic as a stream of "TOPIC:FIELD", in seconds since the log's start: when it
+    was measured where that is logged, else when it was published.
     """
     fields = data.data
     stamp = np.asarray(fields["timestamp"], np.int64)
@@ -153,8 +173,9 @@ def _period(stream: Stream) -> float:
 
 
 def _turned(stream: Stream) -> Stream:
-    """The attitude's stream with the quaternion of the log format, body (forward, left, up) to
-    world (east, north, up): q' = (i + j)/sqrt(2) q i*, of q from body to world in PX4's frames.
+    """The attitude's stream with the quaternion of the log format, body (forward, left,
+    up) to world (east, north, up): q' = (i + j)/sqrt(2) q i*, of q from body to world
+    in PX4's frames.
     """
     w, x, y, z = (stream.values[f"{ATTITUDE}:q[{i}]"] for i in range(4))
     half = np.sqrt(0.5)
@@ -185,8 +206,8 @@ def _columns(streams: list[Stream]) -> dict[str, Source]:
 
 
 def _motors(streams, parameters) -> tuple[Stream | None, list[str]]:
-    """The motors' thrusts as a stream of m1 to m4, and remarks; None where neither motors nor
-    outputs were logged. Raises LogError for another number of rotors.
+    """The motors' thrusts as a stream of m1 to m4, and remarks; None where neither
+    motors nor outputs were logged. Raises LogError for another number of rotors.
     """
     places = _places(parameters)
     if MOTORS in streams:
@@ -196,18 +217,27 @@ def _motors(streams, parameters) -> tuple[Stream | None, list[str]]:
         stream = streams[OUTPUTS]
         outputs = [_output_of(motor, parameters) for motor in range(4)]
         values = _fields(stream, [f"{OUTPUTS}:output[{o}]" for o in outputs])
-        signals = [_signal(v, o, parameters) for v, o in zip(values, outputs, strict=True)]
+        signals = [
+            _signal(v, o, parameters) for v, o in zip(values, outputs, strict=True)
+        ]
         curve = float(parameters.get("THR_MDL_FAC", 0.0))
         thrust = [curve * s**2 + (1.0 - curve) * s for s in signals]
     else:
         return None, []
     remarks = [] if MOTORS in streams else ["motors are taken from actuator_outputs"]
-    columns = {COLUMN_OF[place]: values for place, values in zip(places, thrust, strict=True)}
+    columns = {
+        COLUMN_OF[place]: values for place, values in zip(places, thrust, strict=True)
+    }
     spins = [parameters.get(f"CA_ROTOR{i}_KM") for i in range(4)]
     if None not in spins:
-        turns = {p: "ccw" if spin > 0 else "cw" for p, spin in zip(places, spins, strict=True)}
+        turns = {
+            p: "ccw" if spin > 0 else "cw"
+            for p, spin in zip(places, spins, strict=True)
+        }
         said = ", ".join(f'"{turns[place]}"' for place in COLUMN_OF)
-        remarks.append(f"by the log's parameters, motor.spin in vehicle.toml is [{said}]")
+        remarks.append(
+            f"by the log's parameters, motor.spin in vehicle.toml is [{said}]"
+        )
     return Stream(stream.time, columns), remarks
 
 
@@ -223,23 +253,30 @@ def _places(parameters) -> tuple[str, ...]:
     """Where PX4's motors 1 to 4 sit. Raises LogError where that isn't four corners."""
     count = int(parameters.get("CA_ROTOR_COUNT", 4))
     if count != 4:
-        raise LogError(f"the airframe has {count} rotors (CA_ROTOR_COUNT); four are needed")
+        raise LogError(
+            f"the airframe has {count} rotors (CA_ROTOR_COUNT); four are needed"
+        )
     corners = [[parameters.get(f"CA_ROTOR{i}_P{a}") for a in "XY"] for i in range(4)]
     if any(None in corner for corner in corners):
         return QUAD_X
     places = tuple(
-        f"{'front' if x > 0 else 'rear'}_{'right' if y > 0 else 'left'}" for x, y in corners
+        f"{'front' if x > 0 else 'rear'}_{'right' if y > 0 else 'left'}"
+        for x, y in corners
     )
     if set(places) != set(COLUMN_OF):
-        raise LogError(f"rotors sit at {', '.join(places)} (CA_ROTORi_PX, _PY): no quad X")
+        raise LogError(
+            f"rotors sit at {', '.join(places)} (CA_ROTORi_PX, _PY): no quad X"
+        )
     return places
 
 
 def _output_of(motor: int, parameters) -> int:
-    """Index of the output that a motor, from 0 on, is on: by PWM_MAIN_FUNCi, or its own number.
-    Raises LogError where it is on outputs of another kind.
+    """Index of the output that a motor, from 0 on, is on: by PWM_MAIN_FUNCi, or its own
+    number. Raises LogError where it is on outputs of another kind.
     """
-    elsewhere = [n for n, f in parameters.items() if "_FUNC" in n and f == MOTOR_1 + motor]
+    elsewhere = [
+        n for n, f in parameters.items() if "_FUNC" in n and f == MOTOR_1 + motor
+    ]
     if elsewhere and not elsewhere[0].startswith("PWM_MAIN"):
         raise LogError(
             f"motor {motor + 1} is on {elsewhere[0]}, and the first actuator_outputs are the main "
@@ -252,7 +289,11 @@ def _output_of(motor: int, parameters) -> int:
 def _signal(output: np.ndarray, index: int, parameters) -> np.ndarray:
     """An output as a share of its range. Raises LogError where that isn't its range."""
     least, most = (
-        float(parameters.get(f"PWM_MAIN_{end}{index + 1}", parameters.get(f"PWM_{end}", usual)))
+        float(
+            parameters.get(
+                f"PWM_MAIN_{end}{index + 1}", parameters.get(f"PWM_{end}", usual)
+            )
+        )
         for end, usual in (("MIN", PULSE[0]), ("MAX", PULSE[1]))
     )
     # a motor that is disarmed has one value or two below the least

@@ -1,9 +1,9 @@
-"""Bags of ROS 2 (SQLite or MCAP) and ROS 1, through the `rosbags` library; no ROS installation is
-needed.
+"""Bags of ROS 2 (SQLite or MCAP) and ROS 1, through the `rosbags` library; no ROS
+installation is needed.
 
-Without a column mapping, topics are recognised by their message types, and a topic's namespace
-("/cf1" of "/cf1/imu") is the vehicle. Times are the messages' header stamps where they have one,
-else the bag's receive times.
+Without a column mapping, topics are recognised by their message types, and a topic's
+namespace ("/cf1" of "/cf1/imu") is the vehicle. Times are the messages' header stamps
+where they have one, else the bag's receive times.
 """
 
 import re
@@ -51,16 +51,19 @@ _FORCE = {f"a{a}": f"linear_acceleration.{a}" for a in "xyz"}
 # By suffix how a bag's file begins.
 STORAGE = {".mcap": b"\x89MCAP0", ".db3": b"SQLite format 3", ".bag": b"#ROSBAG V2.0"}
 ODOMETRY = "nav_msgs/msg/Odometry"
-# Fields of the message types that say what they hold: column -> field. An odometry's twist is left
-# out: it is in the body frame, and velocity can be derived from position. Its pose goes behind
-# others: Crazyswarm2's with cflib has the firmware's legacy sign of pitch.
+# Fields of the message types that say what they hold: column -> field. An odometry's
+# twist is left out: it is in the body frame, and velocity can be derived from position.
+# Its pose goes behind others: Crazyswarm2's with cflib has the firmware's legacy sign
+# of pitch.
 KNOWN_TYPES = {
     "sensor_msgs/msg/Imu": _RATES | _FORCE,
     "geometry_msgs/msg/PoseStamped": _pose("pose.position", "pose.orientation"),
     "geometry_msgs/msg/PoseWithCovarianceStamped": _pose(
         "pose.pose.position", "pose.pose.orientation"
     ),
-    "geometry_msgs/msg/TransformStamped": _pose("transform.translation", "transform.rotation"),
+    "geometry_msgs/msg/TransformStamped": _pose(
+        "transform.translation", "transform.rotation"
+    ),
     ODOMETRY: _pose("pose.pose.position", "pose.pose.orientation"),
     "sensor_msgs/msg/BatteryState": {"vbat": "voltage"},
     "crazyflie_interfaces/msg/Status": {"vbat": "battery_voltage"},
@@ -78,7 +81,9 @@ _ARRAY_NAMES = {
 
 
 def is_bag(path: Path) -> bool:
-    """Whether a path is a bag: a folder, with its `metadata.yaml` or without, or a single file."""
+    """Whether a path is a bag: a folder, with its `metadata.yaml` or without, or a
+    single file.
+    """
     return bool(_files_of(path))
 
 
@@ -93,8 +98,8 @@ def _files_of(path: Path) -> list[Path]:
 
 
 def _is_storage(path: Path) -> bool:
-    """Whether a file holds messages of ROS, by its first bytes; an MCAP file of others may lie
-    beside flights, too.
+    """Whether a file holds messages of ROS, by its first bytes; an MCAP file of others
+    may lie beside flights, too.
     """
     start = STORAGE.get(path.suffix)
     if start is None or not path.is_file():
@@ -106,11 +111,11 @@ def _is_storage(path: Path) -> bool:
 
 
 def read_bag(path: str | Path, mapping: ColumnMapping | None = None) -> LogTable:
-    """Read a bag. With a mapping, sources are "TOPIC:FIELD" ("/cf1/imu:angular_velocity.x",
-    "/m:data[0]").
+    """Read a bag. With a mapping, sources are "TOPIC:FIELD"
+    ("/cf1/imu:angular_velocity.x", "/m:data[0]").
 
-    Raises LogError if the bag can't be read or holds nothing known, UserError without the rosbags
-    library.
+    Raises LogError if the bag can't be read or holds nothing known, UserError without
+    the rosbags library.
     """
     try:
         from rosbags.highlevel import AnyReader
@@ -128,7 +133,9 @@ def read_bag(path: str | Path, mapping: ColumnMapping | None = None) -> LogTable
             vehicles, remarks = _vehicles(reader, mapping, path)
     except LogError:
         raise
-    except Exception as error:  # the library raises many kinds for a damaged bag; all mean the same
+    except (
+        Exception
+    ) as error:  # the library raises many kinds for a damaged bag; all mean the same
         raise LogError(
             f"ROS bag can't be read: {str(error).splitlines()[0] if str(error) else type(error)}"
         ) from error
@@ -137,9 +144,9 @@ def read_bag(path: str | Path, mapping: ColumnMapping | None = None) -> LogTable
 
 @dataclass(eq=False)
 class _Recording:
-    """What a bag holds of one vehicle: streams of topics, for each of them its rank and the sources
-    of columns that its type names, and streams of log variables on the firmware's clock, which is
-    `ahead` s behind the bag's.
+    """What a bag holds of one vehicle: streams of topics, for each of them its rank and
+    the sources of columns that its type names, and streams of log variables on the
+    firmware's clock, which is `ahead` s behind the bag's.
     """
 
     streams: list[Stream] = field(default_factory=list)
@@ -148,13 +155,16 @@ class _Recording:
     ahead: list[float] = field(default_factory=list)
 
     def add(self, stream: Stream, columns: dict[str, Source], rank: int = 0) -> None:
-        """One more topic. What a topic of a lower `rank`, or a faster one, holds goes before."""
+        """One more topic. What a topic of a lower `rank`, or a faster one, holds goes
+        before.
+        """
         self.streams.append(stream)
         self.sources.append((rank, columns))
 
     def columns(self) -> tuple[dict[str, Source], list[str]]:
-        """Where each column comes from, and remarks. Log variables are on the vehicle's own clock
-        and go before topics, but for a pose that a topic has more than twice as often.
+        """Where each column comes from, and remarks. Log variables are on the vehicle's
+        own clock and go before topics, but for a pose that a topic has more than twice
+        as often.
         """
         by_name, remarks = firmware_columns(self.log_streams)
         both = zip(self.sources, self.streams, strict=True)
@@ -167,22 +177,28 @@ class _Recording:
             if 2 * poses[-1][1] < _period(logged):
                 by_name = {c: source for c, source in by_name.items() if c not in _POSE}
         if set(EULER) <= set(by_name):
-            columns = {c: source for c, source in columns.items() if c not in _QUATERNION}
+            columns = {
+                c: source for c, source in columns.items() if c not in _QUATERNION
+            }
         return columns | by_name, remarks
 
     def all_streams(self) -> list[Stream]:
-        """On one clock. The radio delays a message, never hastens it, so that the least that a
-        stamp is ahead of its tick is what the clocks are apart.
+        """On one clock. The radio delays a message, never hastens it, so that the least
+        that a stamp is ahead of its tick is what the clocks are apart.
         """
         ahead = min(self.ahead, default=0.0)
-        moved = [Stream(stream.time + ahead, stream.values) for stream in self.log_streams]
+        moved = [
+            Stream(stream.time + ahead, stream.values) for stream in self.log_streams
+        ]
         return [*moved, *self.streams]
 
 
 def _vehicles(
     reader, mapping: ColumnMapping | None, path: Path
 ) -> tuple[dict[str, _Recording], list[str]]:
-    """{vehicle: what the bag holds of it}, and remarks. With a mapping all is one vehicle's."""
+    """{vehicle: what the bag holds of it}, and remarks. With a mapping all is one
+    vehicle's.
+    """
     wanted = _wanted(reader.connections, mapping)
     files = custom_topics(path) if mapping is None else []
     vehicles: dict[str, _Recording] = {}
@@ -215,8 +231,8 @@ def _vehicles(
 
 
 def _add_captured(reader, vehicles: dict[str, _Recording]) -> list[str]:
-    """Give each vehicle its poses of motion capture; remarks on bodies of which nothing else was
-    logged.
+    """Give each vehicle its poses of motion capture; remarks on bodies of which nothing
+    else was logged.
     """
     others = []
     for connection in reader.connections:
@@ -237,23 +253,28 @@ def _add_captured(reader, vehicles: dict[str, _Recording]) -> list[str]:
 def _merged(
     vehicles: dict[str, _Recording], remarks: list[str], mapping: ColumnMapping | None
 ) -> tuple[dict[str, dict], list[str]]:
-    """The columns of each vehicle, and remarks on those that hold none. Raises LogError if none
-    does.
+    """The columns of each vehicle, and remarks on those that hold none. Raises LogError
+    if none does.
     """
     tables = {}
     for vehicle, recording in vehicles.items():
         if mapping is not None:
-            columns = {c: s for c, s in mapping.columns.items() if c not in ("t", "vehicle")}
+            columns = {
+                c: s for c, s in mapping.columns.items() if c not in ("t", "vehicle")
+            }
         else:
             columns, found = recording.columns()
             remarks += found
         try:
-            tables[vehicle.strip("/") or "0"] = merge_streams(recording.all_streams(), columns)
+            tables[vehicle.strip("/") or "0"] = merge_streams(
+                recording.all_streams(), columns
+            )
         except LogError as error:
             remarks.append(f"topics of {vehicle or '/'}: {error}")
     if not tables:
         raise LogError(
-            "; ".join(remarks) or "holds no topic of a known type; name its topics in columns.toml"
+            "; ".join(remarks)
+            or "holds no topic of a known type; name its topics in columns.toml"
         )
     return tables, remarks
 
@@ -283,7 +304,9 @@ def _stream(reader, connection, fields: dict[str, str]) -> Stream:
     rows = []
     for stamp, message in _messages(reader, connection):
         times.append(stamp)
-        rows.append([_field(message, field, connection.topic) for field in fields.values()])
+        rows.append(
+            [_field(message, field, connection.topic) for field in fields.values()]
+        )
     values = np.asarray(rows, float).reshape(len(rows), len(fields))
     named = {
         f"{connection.topic}:{field}": column
@@ -294,12 +317,17 @@ def _stream(reader, connection, fields: dict[str, str]) -> Stream:
 
 def _period(stream: Stream) -> float:
     """s between a stream's samples."""
-    return float(np.median(np.diff(np.sort(stream.time)))) if len(stream.time) > 1 else np.inf
+    return (
+        float(np.median(np.diff(np.sort(stream.time))))
+        if len(stream.time) > 1
+        else np.inf
+    )
 
 
 def _messages(reader, connection):
-    """(stamp, message) of a topic: integer nanoseconds since the bag's start, which keep their
-    resolution as floats of seconds; the header's where there is one, else when it was received.
+    """(stamp, message) of a topic: integer nanoseconds since the bag's start, which
+    keep their resolution as floats of seconds; the header's where there is one, else
+    when it was received.
     """
     for _, received, data in reader.messages(connections=[connection]):
         message = reader.deserialize(data, connection.msgtype)
@@ -317,12 +345,16 @@ def _field(message, path: str, topic: str) -> float:
         raise LogError(f"messages of {topic} have no number {path!r}") from error
 
 
-def _joined(name: str, tables: dict[str, dict[str, np.ndarray]], remarks: list[str]) -> LogTable:
+def _joined(
+    name: str, tables: dict[str, dict[str, np.ndarray]], remarks: list[str]
+) -> LogTable:
     """The vehicles' columns in the long format, time from the first row of any."""
     start = min(t["t"][0] for t in tables.values())
     names = sorted({c for t in tables.values() for c in t})
     columns = {
-        c: np.concatenate([t.get(c, np.full(len(t["t"]), np.nan)) for t in tables.values()])
+        c: np.concatenate(
+            [t.get(c, np.full(len(t["t"]), np.nan)) for t in tables.values()]
+        )
         for c in names
     }
     columns["t"] = columns["t"] - start

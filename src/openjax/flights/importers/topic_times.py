@@ -1,9 +1,11 @@
-"""CSV files with a time stamp for each topic, as exports from bags have them: `pose.time, pose.x,
-..., imu.time, imu.wx, ...`. What stands in a row together needn't have been measured together, so
-that each topic is a stream with its own clock, merged as a bag's topics are.
+"""CSV files with a time stamp for each topic, as exports from bags have them:
+`pose.time, pose.x, ..., imu.time, imu.wx, ...`. What stands in a row together needn't
+have been measured together, so that each topic is a stream with its own clock, merged
+as a bag's topics are.
 
-The layout is evident where two or more columns are called like a topic and a time. Without a
-`columns.toml` the last part of a name says what it holds: `imu.wx` is `wx`, `quat.w` is `qw`.
+The layout is evident where two or more columns are called like a topic and a time.
+Without a `columns.toml` the last part of a name says what it holds: `imu.wx` is `wx`,
+`quat.w` is `qw`.
 """
 
 import re
@@ -31,7 +33,9 @@ from openjax.flights.reading import LOG_COLUMNS, LONGEST_NAME, LogError, LogTabl
 
 SEPARATORS = "./:"
 MOST_NAMES = 100  # of a header among which a name that isn't there is looked for
-_STAMP = re.compile(rf"(.+?)(?:[{SEPARATORS}]header)?[{SEPARATORS}_](time|timestamp|stamp|t)", re.I)
+_STAMP = re.compile(
+    rf"(.+?)(?:[{SEPARATORS}]header)?[{SEPARATORS}_](time|timestamp|stamp|t)", re.I
+)
 # What the last part of a name holds by the topic that it stands in: "vel.x" is vx.
 GROUPS = {
     "pos": {a: a for a in "xyz"},
@@ -57,7 +61,11 @@ def stamps_of(names: list[str]) -> dict[str, str]:
 
 def topic_of(name: str, topics) -> str | None:
     """The topic of a column: the longest that its name begins with."""
-    mine = [t for t in topics if name == t or re.match(rf"{re.escape(t)}[{SEPARATORS}_]", name)]
+    mine = [
+        t
+        for t in topics
+        if name == t or re.match(rf"{re.escape(t)}[{SEPARATORS}_]", name)
+    ]
     return max(mine, key=len, default=None)
 
 
@@ -97,19 +105,23 @@ def read_topic_times(path: Path, mapping: ColumnMapping | None = None) -> LogTab
 
 
 def _mapped(names: list[str], mapping: ColumnMapping) -> dict[str, Source]:
-    """{column: source} of what a `columns.toml` names, and of columns that have names of the log
-    format already. Raises LogError for nothing.
+    """{column: source} of what a `columns.toml` names, and of columns that have names
+    of the log format already. Raises LogError for nothing.
     """
     usual = {name: Source(name) for name in names if name in LOG_COLUMNS[2:]}
     sources = mapping.over(usual)
     if not {source.name for source in sources.values()} & set(names):
-        raise LogError("columns.toml names times, and no column that the log has beside them")
+        raise LogError(
+            "columns.toml names times, and no column that the log has beside them"
+        )
     return sources
 
 
-def recognised(names: list[str], stamps: dict[str, str]) -> tuple[dict[str, Source], list[str]]:
-    """{column: source} of what a header's names say by themselves, and the names of columns that
-    are there already. Raises LogError for nothing.
+def recognised(
+    names: list[str], stamps: dict[str, str]
+) -> tuple[dict[str, Source], list[str]]:
+    """{column: source} of what a header's names say by themselves, and the names of
+    columns that are there already. Raises LogError for nothing.
     """
     found = {}
     again = []
@@ -120,7 +132,9 @@ def recognised(names: list[str], stamps: dict[str, str]) -> tuple[dict[str, Sour
         short = name[len(topic) + 1 :]  # "wx" of "imu_wx"
         *groups, last = re.split(rf"[{SEPARATORS}]", name)
         last = short if short in LOG_COLUMNS[2:] else last
-        column = next((GROUPS[g][last] for g in groups[::-1] if last in GROUPS.get(g, ())), last)
+        column = next(
+            (GROUPS[g][last] for g in groups[::-1] if last in GROUPS.get(g, ())), last
+        )
         if column in LOG_COLUMNS[2:] or column in EULER:
             if column in found:
                 again.append(name)
@@ -134,8 +148,8 @@ def recognised(names: list[str], stamps: dict[str, str]) -> tuple[dict[str, Sour
 
 
 def _named_stamps(names: list[str], mapping: ColumnMapping | None) -> dict[str, str]:
-    """{topic: column} of the time stamps that the header shows and those that `columns.toml`
-    names. Raises LogError for one that isn't there.
+    """{topic: column} of the time stamps that the header shows and those that
+    `columns.toml` names. Raises LogError for one that isn't there.
     """
     stamps = stamps_of(names)
     for clock in () if mapping is None else mapping.clocks:
@@ -149,9 +163,12 @@ def _named_stamps(names: list[str], mapping: ColumnMapping | None) -> dict[str, 
     return stamps
 
 
-def _clocks(sources, stamps: dict[str, str], mapping: ColumnMapping | None) -> dict[str, str]:
-    """{column: the time stamp's column} of what is read: what `columns.toml` says, its topic's, or
-    else the first that it names. Raises LogError for a column that has none.
+def _clocks(
+    sources, stamps: dict[str, str], mapping: ColumnMapping | None
+) -> dict[str, str]:
+    """{column: the time stamp's column} of what is read: what `columns.toml` says, its
+    topic's, or else the first that it names. Raises LogError for a column that has
+    none.
     """
     said = {}
     usual = None
@@ -168,16 +185,26 @@ def _clocks(sources, stamps: dict[str, str], mapping: ColumnMapping | None) -> d
 
 
 def _streams(raw, sources, clock_of: dict[str, str], mapping) -> list[Stream]:
-    """A stream for each time stamp in use, in seconds since the first of any; rows that repeat a
-    stamp hold nothing new.
+    """A stream for each time stamp in use, in seconds since the first of any; rows that
+    repeat a stamp hold nothing new.
     """
     clocks = [clock for clock in dict.fromkeys(clock_of.values()) if clock in raw]
-    units = {} if mapping is None else {c.source.name: c.source.scale for c in mapping.clocks}
-    usual = None if mapping is None or "t" not in mapping.columns else mapping.columns["t"].scale
+    units = (
+        {}
+        if mapping is None
+        else {c.source.name: c.source.scale for c in mapping.clocks}
+    )
+    usual = (
+        None
+        if mapping is None or "t" not in mapping.columns
+        else mapping.columns["t"].scale
+    )
     scale = {c: units.get(c, usual or seconds_per_unit(raw[c])) for c in clocks}
-    # Stamps since 1970 in ns are known to 256 ns as floats; their differences lose no more.
+    # Stamps since 1970 in ns are known to 256 ns as floats; their differences lose no
+    # more.
     begin = {
-        unit: min(np.nanmin(raw[c]) for c in clocks if scale[c] == unit) for unit in scale.values()
+        unit: min(np.nanmin(raw[c]) for c in clocks if scale[c] == unit)
+        for unit in scale.values()
     }
     start = min(unit * first for unit, first in begin.items())
     streams = []
@@ -197,4 +224,6 @@ def _streams(raw, sources, clock_of: dict[str, str], mapping) -> list[Stream]:
     return streams
 
 
-IMPORTER = Importer("CSV with a time stamp for each topic", has_topic_times, read_topic_times)
+IMPORTER = Importer(
+    "CSV with a time stamp for each topic", has_topic_times, read_topic_times
+)

@@ -1,5 +1,5 @@
-"""What a log says by ways of its own: pose, radio, rate loop and motion, each a channel with the
-same few methods.
+"""What a log says by ways of its own: pose, radio, rate loop and motion, each a channel
+with the same few methods.
 """
 
 from dataclasses import dataclass
@@ -24,7 +24,9 @@ class Estimated:
 
 @runtime_checkable
 class Channel(Protocol):
-    """One way by which a log tells effects. `path` is the `Card.path` of those that it reads."""
+    """One way by which a log tells effects. `path` is the `Card.path` of those that it
+    reads.
+    """
 
     path: str = ""
 
@@ -32,38 +34,48 @@ class Channel(Protocol):
         """{effect: probability} of the channel's effects that the log shows."""
 
     def undetectable(self) -> list[str]:
-        """The channel's effects that these flights would not show at their usual size."""
+        """The channel's effects that these flights would not show at their usual
+        size.
+        """
         return []
 
     def estimate(self, effect: str, parameter: str) -> Estimated:
         """A parameter of an acting effect."""
 
     def residuals(self, named) -> dict[str, list[np.ndarray]]:
-        """{name: [(T,) per track]} of normalised prediction errors with the effects `named`."""
+        """{name: [(T,) per track]} of normalised prediction errors with the effects
+        `named`.
+        """
 
     def named(self) -> dict[str, float]:
-        """Those of the acting effects without which the channel's errors grow by more than an
-        effect's form may be wrong by.
+        """Those of the acting effects without which the channel's errors grow by more
+        than an effect's form may be wrong by.
         """
         acting = self.acting()
-        return {e: p for e, p in acting.items() if self.growth(e, acting) > DECISION.form_error}
+        return {
+            e: p
+            for e, p in acting.items()
+            if self.growth(e, acting) > DECISION.form_error
+        }
 
     def growth(self, effect: str, acting) -> float:
-        """By what share the channel's errors are larger without an effect than with all that
-        act.
+        """By what share the channel's errors are larger without an effect than with all
+        that act.
         """
 
         def squares(named):
             residuals = self.residuals(named).values()
-            return np.array([np.mean(np.concatenate(series) ** 2) for series in residuals])
+            return np.array(
+                [np.mean(np.concatenate(series) ** 2) for series in residuals]
+            )
 
         ratio = squares(set(acting) - {effect}) / squares(acting)
         return float(np.sqrt(ratio.mean())) - 1.0
 
 
 def few(count: int) -> float:
-    """By what an error from so many flights is widened: Student's quantile of a 90 % interval over
-    the normal one.
+    """By what an error from so many flights is widened: Student's quantile of a 90 %
+    interval over the normal one.
     """
     return float(student.ppf(0.95, max(count - 1, 1)) / norm.ppf(0.95))
 
@@ -72,9 +84,9 @@ def robust_deviation(
     covariance: Float[np.ndarray, "parameters parameters"],
     pushes: Float[np.ndarray, "flights parameters"],
 ) -> Float[np.ndarray, " parameters"]:
-    """Standard deviations (p,) of parameters: those of `covariance` (p, p), or what flights differ
-    by where that is more: the sandwich of their gradients `pushes` (F, p), widened where they are
-    few (Liang, Zeger 1986).
+    """Standard deviations (p,) of parameters: those of `covariance` (p, p), or what
+    flights differ by where that is more: the sandwich of their gradients `pushes` (F,
+    p), widened where they are few (Liang, Zeger 1986).
     """
     model = np.sqrt(np.diag(covariance))
     count = len(pushes)

@@ -1,5 +1,5 @@
-"""The motion: motors to body rates, velocity and specific force. What each physics effect alone
-explains of it.
+"""The motion: motors to body rates, velocity and specific force. What each physics
+effect alone explains of it.
 """
 
 import dataclasses
@@ -29,10 +29,11 @@ from openjax.gap.model.replay import Replay, make_replay
 from openjax.gap.model.wakes import Gusts, as_loud_as, fit_wake, read_gusts
 from openjax.vehicle.effects import EFFECTS
 
-# rows of a log in one of the grid's: if fewer are samples, their mean isn't what five ticks of the
-# loop did
+# rows of a log in one of the grid's: if fewer are samples, their mean isn't what five
+# ticks of the loop did
 FEW_ROWS = 2.4
-# grid periods: rows as slow hide every other command of a loop that sends one each 10 ms
+# grid periods: rows as slow hide every other command of a loop that sends one each 10
+# ms
 SLOW_ROWS = 1.2
 
 
@@ -49,13 +50,15 @@ class Reading:
     pwm: bool
     """Whether motors are duty cycles."""
     at_once: bool
-    """Whether a row's motors are one sample, as the vehicle file's [log] says by motor_rows =
-    "sample".
+    """Whether a row's motors are one sample, as the vehicle file's [log] says by
+    motor_rows = "sample".
     """
     blind: bool
     """Whether it isn't known what motors do within a row."""
     late: float | None
-    """By how much motors may be off against the gyroscope (s); None where that isn't known."""
+    """By how much motors may be off against the gyroscope (s); None where that isn't
+    known.
+    """
     baseline: Baseline | None = None
     """What the vehicle is like while nothing acts; None where that isn't known."""
     reference: bool = False
@@ -63,8 +66,9 @@ class Reading:
 
     @property
     def numbers(self):
-        """The vehicle's numbers that are free in every hypothesis, as `library.numbers_of` has
-        them: how far they are usually off depends on how motors were logged.
+        """The vehicle's numbers that are free in every hypothesis, as
+        `library.numbers_of` has them: how far they are usually off depends on how
+        motors were logged.
         """
         situation = "nuisance"
         if self.pwm:
@@ -82,30 +86,36 @@ class Reading:
 
     @property
     def unmapped(self) -> bool:
-        """Whether it isn't known what thrust a motor command makes: of duty cycles without a
-        reference, or without the voltage that changes it.
+        """Whether it isn't known what thrust a motor command makes: of duty cycles
+        without a reference, or without the voltage that changes it.
         """
         volts = all(t.voltage is not None for t in self.tracks)
         return self.pwm and (self.baseline is None or not volts) and not self.reference
 
     @property
     def heard(self) -> list[Track]:
-        """The tracks as the firmware hears them: its gyroscope as it is, whatever was found to be
-        its gain.
+        """The tracks as the firmware hears them: its gyroscope as it is, whatever was
+        found to be its gain.
         """
         gain = self.sensors.gain
-        return [dataclasses.replace(t, body_rates=t.body_rates * gain) for t in self.tracks]
+        return [
+            dataclasses.replace(t, body_rates=t.body_rates * gain) for t in self.tracks
+        ]
 
     @cached_property
     def by_commands(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """`caused_by_commands` of each track."""
         links = self.arrived if self.arrived is not None else [None] * len(self.tracks)
         each = zip(self.tracks, self.vehicles, links, strict=True)
-        return [caused_by_commands(track, vehicle, link) for track, vehicle, link in each]
+        return [
+            caused_by_commands(track, vehicle, link) for track, vehicle, link in each
+        ]
 
 
 def motor_rows(case: Case) -> str:
-    """What a row's motor commands are, of `clocks.ROWS`. Raises UserError for anything else."""
+    """What a row's motor commands are, of `clocks.ROWS`. Raises UserError for anything
+    else.
+    """
     rows = case.vehicle_file.log.get("motor_rows", ROWS[0])
     if rows not in ROWS:
         raise UserError(
@@ -122,8 +132,11 @@ def make_reading(
     shortest = min(f.row_period for f in case.flights)
     slow = shortest > 0.8 * GRID_PERIOD  # faster logs are averaged
     seldom = max(t.dt for t in tracks) > SLOW_ROWS * GRID_PERIOD
-    at_once = motor_rows(case) == "sample" and slow and all(t.motors_logged for t in tracks)
-    means = case.vehicle_file.log.get("motor_rows", "").startswith("mean")  # said, not assumed
+    at_once = (
+        motor_rows(case) == "sample" and slow and all(t.motors_logged for t in tracks)
+    )
+    # said, not assumed
+    means = case.vehicle_file.log.get("motor_rows", "").startswith("mean")
     few = not means and not slow and GRID_PERIOD / shortest < FEW_ROWS
     hidden = few or any(f.body_rates_derived for f in case.flights)
     blind = hidden or (at_once and (arrived is None or seldom))
@@ -149,7 +162,9 @@ class Motion:
     replay: Replay
     library: Library
     exposure: dict[str, float]
-    """{effect: nats that it would leave at its usual size}; 0 where it can't be told."""
+    """{effect: nats that it would leave at its usual size}; 0 where it can't be
+    told.
+    """
     gusts: Gusts | None = None
     """Under other vehicles, if these gust beyond doubt."""
 
@@ -169,15 +184,27 @@ def read_motion(reading: Reading, loop: RateLoop | None) -> Motion:
     tracks = reading.tracks
     sensors = reading.sensors
     library = reading.library
-    ticks = [np.repeat(t.motor[:, None], TICKS, 1) for t in tracks] if loop is None else loop.ticks
+    ticks = (
+        [np.repeat(t.motor[:, None], TICKS, 1) for t in tracks]
+        if loop is None
+        else loop.ticks
+    )
     if loop is not None and reading.at_once:
         # single samples: what the ticks did on the mean is nearer to what drove the row
         both = zip(tracks, ticks, strict=True)
-        tracks = [dataclasses.replace(track, motor=motor.mean(1)) for track, motor in both]
+        tracks = [
+            dataclasses.replace(track, motor=motor.mean(1)) for track, motor in both
+        ]
     feedback = read_feedback(tracks, reading.vehicles, reading.by_commands)
     clocks = sensors.one_clock, reading.at_once
     replay = make_replay(
-        tracks, reading.vehicles, ticks, feedback, reading.numbers, clocks, reading.baseline
+        tracks,
+        reading.vehicles,
+        ticks,
+        feedback,
+        reading.numbers,
+        clocks,
+        reading.baseline,
     )
     replay, exposure = model_noise(replay, library)
     exposure |= {e: 0.0 for e in library.physics if _hidden(CARDS[e], reading)}
@@ -191,7 +218,9 @@ def _beside_others(motion: Motion) -> Motion:
     if not any(len(track.neighbours) for track in motion.replay.tracks):
         return motion
     shown = [
-        e for e in motion.library.physics if CARDS[e].of_others and motion.exposure[e] >= UNEXPOSED
+        e
+        for e in motion.library.physics
+        if CARDS[e].of_others and motion.exposure[e] >= UNEXPOSED
     ]
     fit = fit_wake(motion.replay, shown[0]) if shown else motion.nothing
     gusts = read_gusts(fit)
@@ -205,17 +234,23 @@ def _beside_others(motion: Motion) -> Motion:
 
 def _is_lag(effect: str) -> bool:
     """Whether an effect is a time by which something comes later."""
-    return any(EFFECTS[effect].parameters[p.name].unit == "s" for p in CARDS[effect].fitted)
+    return any(
+        EFFECTS[effect].parameters[p.name].unit == "s" for p in CARDS[effect].fitted
+    )
 
 
 def _hidden(card, reading: Reading) -> bool:
-    """Whether an effect can't be told from these logs, however large it is: its channel is missing,
-    or it looks like a nuisance, what motors do unseen or the map from duty cycles to thrust.
+    """Whether an effect can't be told from these logs, however large it is: its channel
+    is missing, or it looks like a nuisance, what motors do unseen or the map from duty
+    cycles to thrust.
     """
     if card.needs and any(getattr(t, card.needs) is None for t in reading.tracks):
         return True
-    # Torques alone tell a weaker push from nothing: heavier moments of inertia look the same.
-    weightless = any(t.velocity is None and t.specific_force is None for t in reading.tracks)
+    # Torques alone tell a weaker push from nothing: heavier moments of inertia look the
+    # same.
+    weightless = any(
+        t.velocity is None and t.specific_force is None for t in reading.tracks
+    )
     if card.needs_force and weightless:
         return True
     if (reading.blind and card.torque_axes) or (reading.unmapped and card.thrust_map):

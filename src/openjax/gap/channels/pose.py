@@ -1,5 +1,5 @@
-"""The pose: the attitude against the integrated gyroscope. No dynamics are needed to see a late
-pose.
+"""The pose: the attitude against the integrated gyroscope. No dynamics are needed to
+see a late pose.
 """
 
 from dataclasses import dataclass
@@ -20,16 +20,17 @@ STEPS = 6
 SMALL_STEP = 2e-4  # s
 GYRO_BIAS = 0.1  # rad/s
 POSE_HORIZON = 0.1  # s
-GYROSCOPE_LATE = 0.0017  # s, standard deviation of how late a low-pass at 80 Hz makes a gyroscope
+# s, standard deviation of how late a low-pass at 80 Hz makes a gyroscope
+GYROSCOPE_LATE = 0.0017
 PASSES = 3  # of fitting the noise model and the delay in turn
 START = 20  # rows at the start of a track that the noise model needs
 
 
 @dataclass(frozen=True, eq=False)
 class Delay:
-    """`value`, `error`: how late the pose is, s, and the standard error; `nats`: log Bayes factor
-    against no delay; `before` and `residual` [(T, 3)]: attitude less integrated gyroscope, rad,
-    without the delay, all else as fitted, and after the fit.
+    """`value`, `error`: how late the pose is, s, and the standard error; `nats`: log
+    Bayes factor against no delay; `before` and `residual` [(T, 3)]: attitude less
+    integrated gyroscope, rad, without the delay, all else as fitted, and after the fit.
     """
 
     value: float
@@ -41,8 +42,8 @@ class Delay:
 
 @dataclass(frozen=True, eq=False)
 class Pose(Channel):
-    """`clock` s by which pose and gyroscope may be apart in these logs; `names`: the effects that
-    it tells; `steps`: rows of POSE_HORIZON on each track.
+    """`clock` s by which pose and gyroscope may be apart in these logs; `names`: the
+    effects that it tells; `steps`: rows of POSE_HORIZON on each track.
     """
 
     fit: Delay
@@ -54,17 +55,28 @@ class Pose(Channel):
     @property
     def late(self) -> bool:
         """Whether the pose clearly is late, be it by little."""
-        return self.fit.value > DECISION.standard_errors * self.fit.error and self.fit.nats > 0.0
+        return (
+            self.fit.value > DECISION.standard_errors * self.fit.error
+            and self.fit.nats > 0.0
+        )
 
     def acting(self) -> dict[str, float]:
         odds = {
-            e: self.fit.nats + CARDS[e].log_odds for e in self.names if self.fit.value > self.clock
+            e: self.fit.nats + CARDS[e].log_odds
+            for e in self.names
+            if self.fit.value > self.clock
         }
-        return {e: 1.0 - DECISION.unknown for e, nats in odds.items() if self.late and nats > 0.0}
+        return {
+            e: 1.0 - DECISION.unknown
+            for e, nats in odds.items()
+            if self.late and nats > 0.0
+        }
 
     def estimate(self, effect: str, parameter: str) -> Estimated:
         # The delay is against the gyroscope, and a gyroscope may be late itself.
-        return Estimated(self.fit.value, self.fit.error, self.fit.error + GYROSCOPE_LATE)
+        return Estimated(
+            self.fit.value, self.fit.error, self.fit.error + GYROSCOPE_LATE
+        )
 
     def residuals(self, named) -> dict[str, list[np.ndarray]]:
         used = self.fit.residual if set(named) & set(self.names) else self.fit.before
@@ -72,7 +84,9 @@ class Pose(Channel):
             np.concatenate([np.zeros((n, 3)), r[n:] - r[:-n]])
             for r, n in zip(used, self.steps, strict=True)
         ]
-        return {f"pose {axis}": [m[:, k] for m in moved] for k, axis in enumerate("xyz")}
+        return {
+            f"pose {axis}": [m[:, k] for m in moved] for k, axis in enumerate("xyz")
+        }
 
 
 def read_pose(tracks: list[Track], library) -> Pose | None:
@@ -85,8 +99,8 @@ def read_pose(tracks: list[Track], library) -> Pose | None:
 
 
 def read_delay(tracks: list[Track]) -> Delay:
-    """How late the attitude is against the gyroscope; a clock offset of a few ms is a nuisance. The
-    delay is found by Gauss-Newton steps: the body turns on meanwhile.
+    """How late the attitude is against the gyroscope; a clock offset of a few ms is a
+    nuisance. The delay is found by Gauss-Newton steps: the body turns on meanwhile.
     """
     delay = 0.0
     for _ in range(STEPS):
@@ -99,8 +113,8 @@ def read_delay(tracks: list[Track]) -> Delay:
 
 
 def _read_around(tracks: list[Track], delay: float) -> Delay:
-    """The model linearised at a delay: the attitude, what a second of delay does, and the nuisances
-    as columns.
+    """The model linearised at a delay: the attitude, what a second of delay does, and
+    the nuisances as columns.
     """
     data = []
     for track in tracks:
@@ -116,18 +130,21 @@ def _read_around(tracks: list[Track], delay: float) -> Delay:
         time = (track.time - track.time[0])[:, None]
         drift = [GYRO_BIAS * axis * time for axis in np.eye(3)]
         tilted = [
-            SIZE["imu_tilt"] * np.concatenate([start, np.cumsum(np.cross(axis, between), 0)])
+            SIZE["imu_tilt"]
+            * np.concatenate([start, np.cumsum(np.cross(axis, between), 0)])
             for axis in np.eye(3)
         ]
         turned_so_far = np.concatenate([start, np.cumsum(between, 0)])
         gained = [SIZE["gyroscope_gain"] * axis * turned_so_far for axis in np.eye(3)]
-        data.append(np.stack([y, late, *drift, *tilted, *gained, SIZE["pose_clock"] * late]))
+        data.append(
+            np.stack([y, late, *drift, *tilted, *gained, SIZE["pose_clock"] * late])
+        )
     return _fit(data)
 
 
 def _fit(data: list[np.ndarray]) -> Delay:
-    """Fit y = delay x column + nuisances of unit prior variance + coloured noise to tracks (2 + N,
-    T, 3) of all these.
+    """Fit y = delay x column + nuisances of unit prior variance + coloured noise to
+    tracks (2 + N, T, 3) of all these.
     """
     residual = [d[0] - d[0].mean(0) for d in data]
     for _ in range(PASSES):
@@ -138,7 +155,10 @@ def _fit(data: list[np.ndarray]) -> Delay:
             np.linalg.solve(np.eye(len(c)) + w[2:] @ w[2:].T, c)
             for w, c in zip(white, cross, strict=True)
         ]
-        gram = sum(w[:2] @ w[:2].T - c.T @ t for w, c, t in zip(white, cross, taken, strict=True))
+        gram = sum(
+            w[:2] @ w[:2].T - c.T @ t
+            for w, c, t in zip(white, cross, taken, strict=True)
+        )
         precision = gram[1, 1] + 1.0 / DELAY_SPREAD**2
         value = gram[1, 0] / precision
         left = np.array([1.0, -value])
@@ -146,7 +166,8 @@ def _fit(data: list[np.ndarray]) -> Delay:
             np.tensordot(np.concatenate([left, -t @ left]), d, 1)
             for d, t in zip(data, taken, strict=True)
         ]
-    # Nuisances stay as they are beside the delay: set free, a clock of a few ms would take any.
+    # Nuisances stay as they are beside the delay: set free, a clock of a few ms would
+    # take any.
     before = [r + value * d[1] for r, d in zip(residual, data, strict=True)]
     nats = 0.5 * (gram[1, 0] * value - np.log(precision * DELAY_SPREAD**2))
     return Delay(float(value), float(precision**-0.5), float(nats), before, residual)

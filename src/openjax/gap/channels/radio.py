@@ -1,7 +1,7 @@
 """The radio: delay and lost packets of the commands, read without any dynamics.
 
-The mean of the motor commands is the commanded thrust, so its delay and its lost packets show row
-by row.
+The mean of the motor commands is the commanded thrust, so its delay and its lost
+packets show row by row.
 """
 
 from dataclasses import dataclass
@@ -16,16 +16,20 @@ from openjax.gap.model.library import CARDS
 LONGEST_DELAY = 0.1  # s
 DELAY_STEP = 0.0005  # s
 TOLERANCE = 3e-4  # of thrust: rounding of the logs and of the firmware's integers
-READABLE = 3e-3  # of thrust: mean misfit above which motors and commands aren't one stream
-INFORMATIVE = 1.5e-3  # smallest change of commanded thrust that shows what the link does at all
-# of the way from the command held to the one due: up to HELD it is held, up to BETWEEN neither
+# of thrust: mean misfit above which motors and commands aren't one stream
+READABLE = 3e-3
+# smallest change of commanded thrust that shows what the link does at all
+INFORMATIVE = 1.5e-3
+# of the way from the command held to the one due: up to HELD it is held, up to BETWEEN
+# neither
 HELD = 0.2
 BETWEEN = 0.6
 DEPENDENT = 3.0  # rows that count as one independent error
 FEWEST = 30  # changes of the command that tell what a link does
-CLEAR = 20.0  # nats that a delay or losses must gain: errors of a link aren't independent
-# of a row, by which a delay is known where rows are means, and where they are single samples: the
-# deviation of a uniform distribution over one row is 1 / sqrt(12) of it
+# nats that a delay or losses must gain: errors of a link aren't independent
+CLEAR = 20.0
+# of a row, by which a delay is known where rows are means, and where they are single
+# samples: the deviation of a uniform distribution over one row is 1 / sqrt(12) of it
 ROW_ERROR = (0.1, 0.29)
 
 # the parameters of the effects that a radio tells
@@ -38,8 +42,8 @@ class Link:
     """The link under one hypothesis. The last four are (tracks,) numbers of rows."""
 
     arrived: list
-    """[(fraction, (T, 2) rows)]: of each track the command in force at the end and at the start of
-    each row, and the share of the row that the older one rules.
+    """[(fraction, (T, 2) rows)]: of each track the command in force at the end and at
+    the start of each row, and the share of the row that the older one rules.
     """
     error: np.ndarray
     """(M,) of the collective thrust."""
@@ -59,7 +63,9 @@ class Link:
 
     @property
     def nats(self) -> float:
-        """Log-likelihood of the errors under a Laplace distribution of unknown scale."""
+        """Log-likelihood of the errors under a Laplace distribution of unknown
+        scale.
+        """
         return -len(self.error) / DEPENDENT * float(np.log(self.misfit + TOLERANCE))
 
 
@@ -89,14 +95,16 @@ class Radio(Channel):
 
     @property
     def readable(self) -> bool:
-        """Whether the motors' stream follows the commands closely enough to tell single packets."""
+        """Whether the motors' stream follows the commands closely enough to tell single
+        packets.
+        """
         return self.links[frozenset({DELAY, LOSS})].misfit < READABLE
 
     @property
     def found(self) -> frozenset:
-        """The parameters that aren't nominal: each must gain beside the other, exceed what clocks
-        may differ by, or a share of lost packets. Packets aren't lost where as many rows lie
-        between two commands: a delay that jitters leaves those.
+        """The parameters that aren't nominal: each must gain beside the other, exceed
+        what clocks may differ by, or a share of lost packets. Packets aren't lost where
+        as many rows lie between two commands: a delay that jitters leaves those.
         """
         if not self.readable:
             return frozenset()
@@ -108,7 +116,9 @@ class Radio(Channel):
             and gain[LOSS] > CLEAR
             and self.losing.between.sum() < 0.5 * self.losing.lost.sum()
         )
-        return frozenset(p for p, on in ((DELAY, late), (LOSS, lost)) if on and p in self.names)
+        return frozenset(
+            p for p, on in ((DELAY, late), (LOSS, lost)) if on and p in self.names
+        )
 
     @property
     def arrived(self) -> list:
@@ -129,18 +139,33 @@ class Radio(Channel):
         used = self.links[frozenset({DELAY, LOSS})]
         told = max(used.told.sum(), 1)
         each = used.lost / np.maximum(used.told, 1)
-        # Packets are lost in bursts: how much flights differ tells more than how many there were.
-        apart = few(len(each)) * each.std(ddof=1) / np.sqrt(len(each)) if len(each) > 1 else 0.0
-        error = float(np.hypot(np.sqrt(self.loss * (1 - self.loss) / told), apart) + 0.5 / told)
+        # Packets are lost in bursts: how much flights differ tells more than how many
+        # there were.
+        apart = (
+            few(len(each)) * each.std(ddof=1) / np.sqrt(len(each))
+            if len(each) > 1
+            else 0.0
+        )
+        error = float(
+            np.hypot(np.sqrt(self.loss * (1 - self.loss) / told), apart) + 0.5 / told
+        )
         return Estimated(self.loss, error, error)
 
     def residuals(self, named) -> dict[str, list[np.ndarray]]:
-        used = self.links[frozenset(p for p, effect in self.names.items() if effect in named)]
-        return {"motors all": [np.array([np.hypot(used.misfit, TOLERANCE)]) for _ in used.arrived]}
+        used = self.links[
+            frozenset(p for p, effect in self.names.items() if effect in named)
+        ]
+        return {
+            "motors all": [
+                np.array([np.hypot(used.misfit, TOLERANCE)]) for _ in used.arrived
+            ]
+        }
 
 
 def read_radio(tracks: list[Track], library, sampled: bool = False) -> Radio:
-    """Delay and lost packets from the commanded thrust against the mean of the motor commands."""
+    """Delay and lost packets from the commanded thrust against the mean of the motor
+    commands.
+    """
     delays = np.arange(0.0, LONGEST_DELAY, DELAY_STEP)
     misfit = sum(_delay_misfit(track, delays) for track in tracks)
     delay = float(delays[int(np.argmin(misfit))])
@@ -155,8 +180,8 @@ def read_radio(tracks: list[Track], library, sampled: bool = False) -> Radio:
 
 
 def _clean_rows(track: Track) -> np.ndarray:
-    """(T,) rows in which no motor is at its limits, where their mean isn't the commanded thrust;
-    without the first, before which commands aren't known.
+    """(T,) rows in which no motor is at its limits, where their mean isn't the
+    commanded thrust; without the first, before which commands aren't known.
     """
     clean = ((track.motor < 0.997) & (track.motor > 0.003)).all(1)
     clean[: int(LONGEST_DELAY / track.dt) + 2] = False
@@ -167,7 +192,8 @@ def _delay_misfit(track: Track, delays: np.ndarray) -> np.ndarray:
     """(D,) sums of a track's errors of the thrust under each of the delays (D,)."""
     thrust = track.command[:, 0]
     clean = _clean_rows(track)
-    cap = 0.3 * np.std(np.diff(thrust)) + 1e-9  # a lost packet must not pull at the delay
+    # a lost packet must not pull at the delay
+    cap = 0.3 * np.std(np.diff(thrust)) + 1e-9
 
     def misfit(delay):
         error = np.abs(_late_error(track, delay)[clean])
@@ -185,7 +211,9 @@ def _late_error(track: Track, delay: float) -> np.ndarray:
 
 def _late(values: np.ndarray, rows: int) -> np.ndarray:
     """Values so many rows later, the first one before."""
-    return np.concatenate([np.repeat(values[:1], rows, 0), values[: len(values) - rows]])
+    return np.concatenate(
+        [np.repeat(values[:1], rows, 0), values[: len(values) - rows]]
+    )
 
 
 def _rows_late(track: Track, delay: float) -> tuple[int, float]:
@@ -195,9 +223,10 @@ def _rows_late(track: Track, delay: float) -> tuple[int, float]:
 
 
 def _link_rows(track: Track, delay: float) -> tuple[int, float, np.ndarray, np.ndarray]:
-    """Rows in which commands of `delay` s ago are in force: whole rows late, the share of a row
-    that the one before still rules, the motors' mean (T,), whether it can be read (T,). Logs faster
-    than the rows are cut anew where the commands arrive, so that a row holds one command.
+    """Rows in which commands of `delay` s ago are in force: whole rows late, the share
+    of a row that the one before still rules, the motors' mean (T,), whether it can be
+    read (T,). Logs faster than the rows are cut anew where the commands arrive, so that
+    a row holds one command.
     """
     clean = _clean_rows(track)
     if track.fast_thrust is None:
@@ -207,12 +236,16 @@ def _link_rows(track: Track, delay: float) -> tuple[int, float, np.ndarray, np.n
     given = held_means(times, thrust, track.time + delay, track.dt)
     rows = int(np.ceil(delay / track.dt - 1e-9))
     for later in range(1, rows + 1):  # what a row holds then is in these
-        clean = clean & np.concatenate([clean[later:], np.zeros(min(later, len(clean)), bool)])
+        clean = clean & np.concatenate(
+            [clean[later:], np.zeros(min(later, len(clean)), bool)]
+        )
     return 0, 0.0, given, clean
 
 
 def _decode(tracks, delay: float, may_lose: bool) -> Link:
-    """Row by row: did the command due in this row arrive, or is the one before still held?"""
+    """Row by row: did the command due in this row arrive, or is the one before still
+    held?
+    """
     errors = []
     arrived = []
     counts = []
@@ -228,8 +261,8 @@ def _decode(tracks, delay: float, may_lose: bool) -> Link:
 
 
 def _follow(track: Track, delay: float, may_lose: bool):
-    """Row of the command in force (T,), errors of the thrust in clean rows, and how many rows are
-    informative, told, lost, between.
+    """Row of the command in force (T,), errors of the thrust in clean rows, and how
+    many rows are informative, told, lost, between.
     """
     whole, part, given, clean = _link_rows(track, delay)
     error = np.abs(_late_error(track, delay)[clean])

@@ -1,9 +1,10 @@
 """The rate loop: its gains, read from what commands excite.
 
-What the motors differ by is the rate controller's output. In closed loop it answers noise and
-gusts, so the gains are read by the generalised method of moments (Hansen 1982), with what the
-nominal loop would have done under the same commands as instruments: neither colour nor clocks need
-a model. An observer runs the same loop for the motor command of every tick.
+What the motors differ by is the rate controller's output. In closed loop it answers
+noise and gusts, so the gains are read by the generalised method of moments (Hansen
+1982), with what the nominal loop would have done under the same commands as
+instruments: neither colour nor clocks need a model. An observer runs the same loop for
+the motor command of every tick.
 """
 
 import dataclasses
@@ -24,17 +25,21 @@ from openjax.gap.model.observer import GYRO_GAIN, TICKS, observe
 from openjax.gap.model.prediction import bucket, padded
 
 GAIN_STEP = 0.05
-# Spreads of the gains, of P's delay and of the share of the derivative that is filtered.
+# Spreads of the gains, of P's delay and of the share of the derivative that is
+# filtered.
 PRIOR = np.array([0.4, 0.4, 0.4, 1.0, 1.0])
-FILTER = 30.0  # Hz of the low-pass of the derivative that the firmware of the Crazyflie may have
-# s by which motors may be off, where rows are the log's own and where they are means of its rows.
+# Hz of the low-pass of the derivative that the firmware of the Crazyflie may have
+FILTER = 30.0
+# s by which motors may be off, where rows are the log's own and where they are means of
+# its rows.
 ROW_DELAY = (0.0005, 0.0025)
 MARGIN = 0.05  # of a motor command: nearer to its limits some tick of the row was cut
 SEGMENT = 0.5  # s, unit of the errors
-# By how much what commands make of P's input must exceed the gyroscope's noise in it. The loop
-# answers the noise of ticks that no row shows, and what is commanded in a hover answers that, so
-# healthy gains look smaller: by a third at a fifth of the noise and in slow passes (2.5 times it),
-# by less than forms are wrong by from 5 times on, and not in quick turns (9 times).
+# By how much what commands make of P's input must exceed the gyroscope's noise in it.
+# The loop answers the noise of ticks that no row shows, and what is commanded in a
+# hover answers that, so healthy gains look smaller: by a third at a fifth of the noise
+# and in slow passes (2.5 times it), by less than forms are wrong by from 5 times on,
+# and not in quick turns (9 times).
 ABOVE_NOISE = 5.0
 LEAST_SECONDS = 6  # without a motor at its limit
 SMOOTH = 0.05  # s over which the outputs are compared
@@ -50,8 +55,8 @@ class RateLoop(Channel):
     error: np.ndarray
     """(6,) standard deviations of it."""
     outputs: list[np.ndarray]
-    """[(4, T, 3)]: logged less nominal outputs of each track, and what one more of p, i, d would
-    give.
+    """[(4, T, 3)]: logged less nominal outputs of each track, and what one more of p,
+    i, d would give.
     """
     ticks: list[np.ndarray]
     """[(T, TICKS, 4)]: the motor commands of the rate loop's ticks."""
@@ -62,8 +67,9 @@ class RateLoop(Channel):
 
     @cached_property
     def gain(self) -> tuple[np.ndarray, np.ndarray]:
-        """Changes (3,) of p, i, d and their errors, of roll, pitch and yaw together: by their
-        precision, with an error that covers what the two disagree by (Birge 1932).
+        """Changes (3,) of p, i, d and their errors, of roll, pitch and yaw together: by
+        their precision, with an error that covers what the two disagree by (Birge
+        1932).
         """
         value = self.change.reshape(2, 3)
         error = self.error.reshape(2, 3)
@@ -74,14 +80,20 @@ class RateLoop(Channel):
         return mean, np.maximum(apart, 1.0) / np.sqrt(total)
 
     def acting(self) -> dict[str, float]:
-        """Either group of axes may be retuned alone: the surer one tells, if P changes by more than
-        forms are wrong by.
+        """Either group of axes may be retuned alone: the surer one tells, if P changes
+        by more than forms are wrong by.
         """
         change = np.abs(self.change[[0, 3]])
         error = np.minimum(self.error[[0, 3]], PRIOR[0])
-        nats = 0.5 * (change / error) ** 2 - np.log(PRIOR[0] / error)  # Savage and Dickey's
-        chance = norm.cdf((change - DECISION.form_error) / error) * (1.0 - DECISION.unknown)
-        odds = {e: chance[nats + CARDS[e].log_odds > 0.0].max(initial=0.0) for e in self.names}
+        # Savage and Dickey's
+        nats = 0.5 * (change / error) ** 2 - np.log(PRIOR[0] / error)
+        chance = norm.cdf((change - DECISION.form_error) / error) * (
+            1.0 - DECISION.unknown
+        )
+        odds = {
+            e: chance[nats + CARDS[e].log_odds > 0.0].max(initial=0.0)
+            for e in self.names
+        }
         return {e: float(p) for e, p in odds.items() if p > 0.5}
 
     def undetectable(self) -> list[str]:
@@ -113,22 +125,32 @@ def read_rate_loop(reading) -> RateLoop:
     ticks = []
     series = []
     outputs = []
-    tracks = zip(reading.heard, reading.vehicles, reading.arrived, reading.by_commands, strict=True)
+    tracks = zip(
+        reading.heard,
+        reading.vehicles,
+        reading.arrived,
+        reading.by_commands,
+        strict=True,
+    )
     for track, vehicle, link, (_, drawn) in tracks:
         wanted, sent = observed(track, vehicle, link, reading.at_once)
         ticks.append(sent)
-        logged, nominal, *larger = np.concatenate([track.motor[None], wanted]) @ outputs_of(vehicle)
+        logged, nominal, *larger = np.concatenate(
+            [track.motor[None], wanted]
+        ) @ outputs_of(vehicle)
         slopes = [(made - nominal) / GAIN_STEP for made in larger]
         outputs.append(np.stack([logged - nominal, *slopes]))
         series.append(_series(track, vehicle, in_force(track, link), drawn, reading))
     change, error = read_gains(reading, series, ticks)
     names = reading.library.of("rate_loop")
-    return RateLoop(change, error, outputs, ticks, names, max(t.dt for t in reading.heard))
+    return RateLoop(
+        change, error, outputs, ticks, names, max(t.dt for t in reading.heard)
+    )
 
 
 def with_motors(track: Track, vehicle) -> Track:
-    """The track with motor commands: where they weren't logged, those that the nominal rate
-    controller would send.
+    """The track with motor commands: where they weren't logged, those that the nominal
+    rate controller would send.
     """
     if track.motor is not None:
         return track
@@ -142,11 +164,12 @@ def with_motors(track: Track, vehicle) -> Track:
 
 
 def observed(track: Track, vehicle, link, at_once=False):
-    """The observer's output: mean motor commands (1 + 3, T, 4) that the nominal loop wants, and
-    with one gain each larger by GAIN_STEP; and the commands sent in the ticks (T, TICKS, 4).
+    """The observer's output: mean motor commands (1 + 3, T, 4) that the nominal loop
+    wants, and with one gain each larger by GAIN_STEP; and the commands sent in the
+    ticks (T, TICKS, 4).
 
-    What pushed the body beyond the nominal physics in a first run is given to a second, so that the
-    rates inside a row are right whatever the physics.
+    What pushed the body beyond the nominal physics in a first run is given to a second,
+    so that the rates inside a row are right whatever the physics.
     """
     rows = len(track)
     size = bucket(rows)
@@ -159,9 +182,13 @@ def observed(track: Track, vehicle, link, at_once=False):
     miss = track.body_rates[1:] - np.asarray(rates, float)[: rows - 1]
     step = miss.copy()  # undo the observer's own correction of what it missed before
     step[1:] -= (1.0 - GYRO_GAIN) * miss[:-1]
-    push = padded(smooth(np.concatenate([step, step[-1:]]), 0.06, track.dt) / track.dt, size)
+    push = padded(
+        smooth(np.concatenate([step, step[-1:]]), 0.06, track.dt) / track.dt, size
+    )
     gains = ("rate_kp", "rate_ki", "rate_kd")
-    larger = [vehicle.replace(**{n: (1.0 + GAIN_STEP) * getattr(vehicle, n)}) for n in gains]
+    larger = [
+        vehicle.replace(**{n: (1.0 + GAIN_STEP) * getattr(vehicle, n)}) for n in gains
+    ]
     runs = [
         observe(controller, vehicle, command, motor, gyro, push, dt, at_once)
         for controller in (vehicle, *larger)
@@ -171,8 +198,9 @@ def observed(track: Track, vehicle, link, at_once=False):
 
 
 def read_gains(reading, series, ticks) -> tuple[np.ndarray, np.ndarray]:
-    """Changes (6,) of p, i, d as shares - roll and pitch, then yaw - and their errors, infinite
-    where flights say too little. `series`: `_series` of each track; `ticks`: as in `RateLoop`.
+    """Changes (6,) of p, i, d as shares - roll and pitch, then yaw - and their errors,
+    infinite where flights say too little. `series`: `_series` of each track; `ticks`:
+    as in `RateLoop`.
     """
     change = np.zeros(6)
     error = np.full(6, np.inf)
@@ -202,8 +230,9 @@ def read_gains(reading, series, ticks) -> tuple[np.ndarray, np.ndarray]:
 
 
 def excitation(track: Track, vehicle, series: np.ndarray) -> np.ndarray:
-    """(2, 3) squares, summed over rows of a track and its `_series`, of P's input within BAND in
-    rad/s: what commands make of it, and the gyroscope's noise as rows show it beside smooth rates.
+    """(2, 3) squares, summed over rows of a track and its `_series`, of P's input
+    within BAND in rad/s: what commands make of it, and the gyroscope's noise as rows
+    show it beside smooth rates.
     """
     gain = np.asarray(vehicle.rate_kp, float) * COUNT
     commanded = sosfiltfilt(_band(track.dt), series[6] / gain, axis=0)
@@ -214,16 +243,20 @@ def excitation(track: Track, vehicle, series: np.ndarray) -> np.ndarray:
 
 
 def _band(dt: float) -> np.ndarray:
-    return butter(2, (BAND[0], min(BAND[1], 0.4 / dt)), "bandpass", fs=1.0 / dt, output="sos")
+    return butter(
+        2, (BAND[0], min(BAND[1], 0.4 / dt)), "bandpass", fs=1.0 / dt, output="sos"
+    )
 
 
-def _series(track: Track, vehicle, ruling: np.ndarray, drawn: np.ndarray, reading) -> np.ndarray:
-    """(11, T, 3): outputs beyond the nominal ones, what P, I and D make of the rates, what a delay
-    does to P and a low-pass to D, and the last five again of the rates `drawn` (T, 3) that commands
-    alone cause: the instruments.
+def _series(
+    track: Track, vehicle, ruling: np.ndarray, drawn: np.ndarray, reading
+) -> np.ndarray:
+    """(11, T, 3): outputs beyond the nominal ones, what P, I and D make of the rates,
+    what a delay does to P and a low-pass to D, and the last five again of the rates
+    `drawn` (T, 3) that commands alone cause: the instruments.
 
-    The rates at the ticks of a row lie on a smooth curve through those of the rows; the derivative
-    is of the tick before.
+    The rates at the ticks of a row lie on a smooth curve through those of the rows; the
+    derivative is of the tick before.
     """
 
     def of_row(ticks):
@@ -255,7 +288,9 @@ def _series(track: Track, vehicle, ruling: np.ndarray, drawn: np.ndarray, readin
 
 
 def _terms(track: Track, vehicle, error: np.ndarray, slope: np.ndarray) -> np.ndarray:
-    """(3, T, 3): outputs of P, I and D for an error of the body rates and their slope (T, 3)."""
+    """(3, T, 3): outputs of P, I and D for an error of the body rates and their slope
+    (T, 3).
+    """
     p = np.asarray(vehicle.rate_kp, float) * COUNT
     i = np.asarray(vehicle.rate_ki, float) * COUNT
     d = np.asarray(vehicle.rate_kd, float) * COUNT
@@ -263,8 +298,8 @@ def _terms(track: Track, vehicle, error: np.ndarray, slope: np.ndarray) -> np.nd
 
 
 def _segments(series: np.ndarray, ticks: np.ndarray, dt: float):
-    """(axis, moments (5, 1 + 5)) of each segment of a series (11, T, 3) without a motor near its
-    limits, which obeys no gains.
+    """(axis, moments (5, 1 + 5)) of each segment of a series (11, T, 3) without a motor
+    near its limits, which obeys no gains.
     """
     edge = int(EDGE / dt)
     size = max(int(SEGMENT / dt), 1)
@@ -281,8 +316,9 @@ def _segments(series: np.ndarray, ticks: np.ndarray, dt: float):
 
 
 def _moments(found: np.ndarray, units: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Coefficients (5,) and errors (5,) that bring the moments (B, 5, 1 + 5) to zero, with weak
-    priors. Errors are what segments or, where that is more, `units` (B,) differ by.
+    """Coefficients (5,) and errors (5,) that bring the moments (B, 5, 1 + 5) to zero,
+    with weak priors. Errors are what segments or, where that is more, `units` (B,)
+    differ by.
     """
     precision = np.diag(1.0 / PRIOR**2)
     total = found.sum(0)
@@ -293,5 +329,9 @@ def _moments(found: np.ndarray, units: np.ndarray) -> tuple[np.ndarray, np.ndarr
         weight = np.linalg.inv(spread + 1e-9 * np.trace(spread) * np.eye(5))
         covariance = np.linalg.inv(total[:, 1:].T @ weight @ total[:, 1:] + precision)
         theta = covariance @ total[:, 1:].T @ weight @ total[:, 0]
-    pushes = np.array([each[units == u].sum(0) for u in np.unique(units)]) @ weight @ total[:, 1:]
+    pushes = (
+        np.array([each[units == u].sum(0) for u in np.unique(units)])
+        @ weight
+        @ total[:, 1:]
+    )
     return theta, robust_deviation(covariance, pushes)

@@ -11,9 +11,10 @@ MATTERS = {"motor_lag": 0.006, "inertia": 0.15, "yaw_torque": 0.2}
 
 
 def corrections(found: Identification, named) -> tuple[dict, dict]:
-    """Values and 90 % intervals {effect: {parameter: ...}} of motor lag, inertia and yaw torque
-    as identified: of those effects that are `named`, and of others that differ clearly and by as
-    much as matters. Of duty cycles only the lag: gains hold their map's slope.
+    """Values and 90 % intervals {effect: {parameter: ...}} of motor lag, inertia and
+    yaw torque as identified: of those effects that are `named`, and of others that
+    differ clearly and by as much as matters. Of duty cycles only the lag: gains hold
+    their map's slope.
     """
     if not found.trusted:
         return {}, {}
@@ -34,8 +35,16 @@ def corrections(found: Identification, named) -> tuple[dict, dict]:
             parameter = estimates.names[i][1]
             value = float(estimates.value[i])
             reach = REACH * float(deviation[i])
-            low = value - reach if effect == "motor_lag" else value * np.exp(-reach / value)
-            high = value + reach if effect == "motor_lag" else value * np.exp(reach / value)
+            low = (
+                value - reach
+                if effect == "motor_lag"
+                else value * np.exp(-reach / value)
+            )
+            high = (
+                value + reach
+                if effect == "motor_lag"
+                else value * np.exp(reach / value)
+            )
             least, most = EFFECTS[effect].parameters[parameter].limits()
             ends = (float(np.clip(end, least, most)) for end in (value, low, high))
             values.setdefault(effect, {})[parameter] = next(ends)

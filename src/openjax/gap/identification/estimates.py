@@ -1,4 +1,6 @@
-"""What an identification says in the diagnosis' words: values of effects with their covariance."""
+"""What an identification says in the diagnosis' words: values of effects with their
+covariance.
+"""
 
 from dataclasses import dataclass
 
@@ -12,9 +14,9 @@ from openjax.gap.identification.torques import identify_torques
 
 @dataclass(frozen=True, eq=False)
 class EffectEstimates:
-    """`value` (n,) and `covariance` (n, n) of effects' parameters `names`: (effect, parameter).
-    `clock`: s by which motors answer later than logged, and its standard deviation; a delay in
-    the vehicle and clocks that are off look alike.
+    """`value` (n,) and `covariance` (n, n) of effects' parameters `names`: (effect,
+    parameter). `clock`: s by which motors answer later than logged, and its standard
+    deviation; a delay in the vehicle and clocks that are off look alike.
     """
 
     names: tuple[tuple[str, str], ...]
@@ -36,15 +38,18 @@ ESTIMATED = (
     ("inertia", "yy"),
     ("yaw_torque", "ratio"),
 )
-"""Yaw tells the ratio of torque to the inertia about z, so that inertia is taken as it stands."""
+"""Yaw tells the ratio of torque to the inertia about z, so that inertia is taken as it
+stands.
+"""
 
 
 def effect_estimates(case: Case) -> EffectEstimates | None:
-    """What the torques of a case's flights say of motor lag, inertia and yaw torque, with nothing
-    taken for granted of the loop around them; None where no flight has motors and body rates.
+    """What the torques of a case's flights say of motor lag, inertia and yaw torque,
+    with nothing taken for granted of the loop around them; None where no flight has
+    motors and body rates.
 
-    A slow motor and a large inertia both weaken the response, and only the lag turns its phase:
-    the covariance says how well these flights tell them apart.
+    A slow motor and a large inertia both weaken the response, and only the lag turns
+    its phase: the covariance says how well these flights tell them apart.
     """
     records = records_of(case)
     return of_fit(identify_torques(records), records) if records else None

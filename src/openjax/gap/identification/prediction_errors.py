@@ -1,15 +1,17 @@
 """Numbers of the vehicle's torques by prediction errors, in closed loop.
 
-Body rates follow R = rates - model(parameters, motors) = noise of a high-order autoregression,
-whose coefficients are concentrated out: the direct method of Ljung, System Identification, chapter
-13, with a model of the ARARX kind. All of the motors' signal counts, as the loop has a delay.
+Body rates follow R = rates - model(parameters, motors) = noise of a high-order
+autoregression, whose coefficients are concentrated out: the direct method of Ljung,
+System Identification, chapter 13, with a model of the ARARX kind. All of the motors'
+signal counts, as the loop has a delay.
 
-Rows that are means over several cycles of the rate loop hide that delay: within a row motors
-answer the gust that the row's end shows. So what is new in a row of motors, given everything
-before, is free to act on the row's end (a control function: Wooldridge, Econometric Analysis of
-Cross Section and Panel Data, chapter 6); the parameters are told by what could be foreseen. In
-strong gusts that halves what a direct fit gets wrong of slow motors. Rows of quick ones stay off
-by up to a sixth, which the intervals hold.
+Rows that are means over several cycles of the rate loop hide that delay: within a row
+motors answer the gust that the row's end shows. So what is new in a row of motors,
+given everything before, is free to act on the row's end (a control function:
+Wooldridge, Econometric Analysis of Cross Section and Panel Data, chapter 6); the
+parameters are told by what could be foreseen. In strong gusts that halves what a direct
+fit gets wrong of slow motors. Rows of quick ones stay off by up to a sixth, which the
+intervals hold.
 """
 
 from dataclasses import replace
@@ -26,23 +28,26 @@ NAMES = (
     *("roll_gain", "pitch_gain", "yaw_gain"),
     *("damping", "yaw_damping", "propellers"),
 )
-"""s, s, s; torque per angular acceleration over the nominal one; 1/s; share of the inertia about
-z."""
+"""s, s, s; torque per angular acceleration over the nominal one; 1/s; share of the
+inertia about z.
+"""
 LOGARITHMS = [0, 1, 3, 4, 5]
 """Of these the search runs in the logarithm, so that none leaves what is possible."""
 SPREAD = np.array([1.0, 1.0, 0.1, 0.7, 0.7, 0.7, 2.5, 2.5, 0.003])
-"""Weak priors, several times the spread of such vehicles; logarithms where they are searched. Of
-the damping twice what the rotors' inflow makes (.015 N s/m of thrust per climbing speed, on arms of
-.03 m): a lag and a damping are two poles of one response, and nothing but their usual sizes says
-which is which.
+"""Weak priors, several times the spread of such vehicles; logarithms where they are
+searched. Of the damping twice what the rotors' inflow makes (.015 N s/m of thrust per
+climbing speed, on arms of .03 m): a lag and a damping are two poles of one response,
+and nothing but their usual sizes says which is which.
 """
 UNEQUAL = 0.4  # spread of the logarithm of slowing down over speeding up
 STEP = np.array([2e-4, 2e-4, 1e-4])  # s, of the difference quotients of lags
-GYROSCOPE_FILTER = 80.0  # Hz, of second order: the Crazyflie's firmware, sensors_bmi088_bmp3xx.c
+# Hz, of second order: the Crazyflie's firmware, sensors_bmi088_bmp3xx.c
+GYROSCOPE_FILTER = 80.0
 MEMORY = 0.25  # s of the noise's autoregression, within so many rows:
 ROWS = (15, 50)
 TINY = 1e-12  # rad^2/s^2: rates that never change
-FREE = 0.01  # s of rows whose surprise in the motors is free to act: the loop answers within them
+# s of rows whose surprise in the motors is free to act: the loop answers within them
+FREE = 0.01
 
 
 def earlier(record: Record, rows: int) -> Record:
@@ -52,8 +57,8 @@ def earlier(record: Record, rows: int) -> Record:
 
 
 class Problem:
-    """Records with all that doesn't depend on the parameters. `filtered`: rates went through the
-    firmware's filter of the gyroscope.
+    """Records with all that doesn't depend on the parameters. `filtered`: rates went
+    through the firmware's filter of the gyroscope.
     """
 
     def __init__(self, records: list[Record], filtered: bool = False):
@@ -71,7 +76,9 @@ class Problem:
         self.top_speed = float(vehicle.max_rotor_speed)
         up = float(vehicle.motor_time_constant)
         down = up * float(vehicle.motor_slowdown_ratio)
-        self.start = np.array([np.log(up), np.log(down), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+        self.start = np.array(
+            [np.log(up), np.log(down), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+        )
         self.precision = np.diag(SPREAD**-2.0)
         self.precision[:2, :2] += np.array([[1.0, -1.0], [-1.0, 1.0]]) / UNEQUAL**2
         self.new = [self._new(r) if r.hidden else None for r in records]
@@ -82,8 +89,8 @@ class Problem:
             self.surprise = 0.5 * len(every) * float(np.log(every.var(0) + TINY).sum())
 
     def _new(self, record: Record) -> np.ndarray:
-        """(T - order - 1, 3) what is new in the motors' shares of each axis in the rows from
-        `order` on, given rates until then and motors before.
+        """(T - order - 1, 3) what is new in the motors' shares of each axis in the rows
+        from `order` on, given rates until then and motors before.
         """
         shares = record.motor @ np.sign(self.base).T / 4.0
         out = []
@@ -96,8 +103,8 @@ class Problem:
         return np.stack(out, 1)
 
     def modelled(self, place: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Of each record its rates less the model's (T, 3) at a place (9,) of the search, and their
-        derivatives (9, T, 3).
+        """Of each record its rates less the model's (T, 3) at a place (9,) of the
+        search, and their derivatives (9, T, 3).
         """
         value = value_at(place)
         lags = np.repeat(value[None, :3], 4, 0)
@@ -106,7 +113,13 @@ class Problem:
         both = zip(self.records, rotors, strict=True)
         return [self._left(value, record.rates, *rotor) for record, rotor in both]
 
-    def _left(self, value: np.ndarray, rates: np.ndarray, square: np.ndarray, speed: np.ndarray):
+    def _left(
+        self,
+        value: np.ndarray,
+        rates: np.ndarray,
+        square: np.ndarray,
+        speed: np.ndarray,
+    ):
         """`modelled` of one record, whose rotors turned so."""
         unit = square @ self.base.T
         sped = self.top_speed * np.diff(speed, axis=1, prepend=speed[:, :1]) @ self.spin
@@ -135,8 +148,8 @@ class Problem:
         return rates - model, slope
 
     def at_once(self, value: np.ndarray, axis: int) -> float:
-        """rad/s at a row's end per unit of an axis' motors in the row itself: what a delay and a
-        lag leave of it, for parameters (9,).
+        """rad/s at a row's end per unit of an axis' motors in the row itself: what a
+        delay and a lag leave of it, for parameters (9,).
         """
         lag = value[:2].mean()
         acts = max(self.dt - value[2], 0.0)
@@ -144,8 +157,8 @@ class Problem:
         return float(value[3 + axis] * np.abs(self.base[axis]).sum() * effect)
 
     def solve(self, value: np.ndarray) -> tuple[float, list]:
-        """Loss at a place (9,) of the search, and of each axis: innovations (N,), their derivatives
-        (N, 9) less what the noise model takes, and its coefficients.
+        """Loss at a place (9,) of the search, and of each axis: innovations (N,), their
+        derivatives (N, 9) less what the noise model takes, and its coefficients.
         """
         modelled = self.modelled(value)
         axes = [self._axis(axis, modelled) for axis in range(3)]
@@ -176,15 +189,20 @@ class Problem:
         taken = regression.solve(following)
         errors = following - past @ taken
         whitening = polynomial(taken[:order])
-        slopes = [-lfilter(whitening, [1.0], s[:, :, axis], axis=1) for _, s in modelled]
+        slopes = [
+            -lfilter(whitening, [1.0], s[:, :, axis], axis=1) for _, s in modelled
+        ]
         slopes = np.concatenate([s[:, order + 1 :] for s in slopes], 1).T
         return errors, slopes - past @ regression.solve(slopes), taken[:order]
 
     def _answers(self, new: np.ndarray) -> list[np.ndarray]:
-        """Columns (N, 1) of what was new in the last rows of motors; before the first nothing."""
+        """Columns (N, 1) of what was new in the last rows of motors; before the first
+        nothing.
+        """
         free = max(round(FREE / self.dt), 1)
         return [
-            np.concatenate([np.zeros(row), new[: len(new) - row]])[:, None] for row in range(free)
+            np.concatenate([np.zeros(row), new[: len(new) - row]])[:, None]
+            for row in range(free)
         ]
 
 

@@ -45,8 +45,9 @@ EFFECTS_OF = {
 
 @dataclass(frozen=True)
 class Quantity:
-    """A number with its 90 % interval, beside the nominal simulator's. `effect`: whose share of the
-    gap it has a part in; `at_bound`: the search ended where nothing is looked for beyond.
+    """A number with its 90 % interval, beside the nominal simulator's. `effect`: whose
+    share of the gap it has a part in; `at_bound`: the search ended where nothing is
+    looked for beyond.
     """
 
     value: float
@@ -64,9 +65,10 @@ class Quantity:
 
 @dataclass(frozen=True, eq=False)
 class Identification:
-    """`quantities` {name: quantity}, `responses` {axis: measured and simulated}, `remarks`: what to
-    think of when reading them; `estimates` are for the diagnosis; `duty_cycles`: what thrust a
-    motor command makes isn't known, so that gains tell its map and the inertia together.
+    """`quantities` {name: quantity}, `responses` {axis: measured and simulated},
+    `remarks`: what to think of when reading them; `estimates` are for the diagnosis;
+    `duty_cycles`: what thrust a motor command makes isn't known, so that gains tell its
+    map and the inertia together.
     """
 
     quantities: dict[str, Quantity]
@@ -80,7 +82,8 @@ class Identification:
         """As it stands in `report.json`; `shares` of the gap {effect: share}."""
         shares = shares or {}
         quantities = {
-            name: asdict(q) | {"differs": q.differs, "share_of_gap": shares.get(q.effect)}
+            name: asdict(q)
+            | {"differs": q.differs, "share_of_gap": shares.get(q.effect)}
             for name, q in self.quantities.items()
         }
         return {
@@ -94,7 +97,9 @@ class Identification:
     def sentence(self) -> str:
         """What the vehicle does, in one sentence."""
         if not self.trusted:
-            return f"How torques answer can't be told from these logs: {self.remarks[0]}."
+            return (
+                f"How torques answer can't be told from these logs: {self.remarks[0]}."
+            )
         ratio, later = self.at(TALKED_OF)
         lag = self.quantities["spin_up"]
         if ALIKE[0] < ratio < ALIKE[1] and abs(later) < ALIKE_PHASE:
@@ -115,8 +120,8 @@ class Identification:
         return text + "."
 
     def at(self, frequency: float) -> tuple[float, float]:
-        """Gain as a share of the simulator's, and phase beyond it in degrees: means of roll and
-        pitch.
+        """Gain as a share of the simulator's, and phase beyond it in degrees: means of
+        roll and pitch.
         """
         pairs = [self.responses[axis] for axis in ("roll", "pitch")]
         points = [(p.measured.at(frequency), p.simulated.at(frequency)) for p in pairs]
@@ -126,9 +131,9 @@ class Identification:
 
 
 def identify(case: Case, one_clock: bool = True) -> Identification | None:
-    """What the flights of a case say of the vehicle; None where none has motors and body rates.
-    Without `one_clock` streams were found to be apart by times that wander: what is said of torques
-    then isn't trusted.
+    """What the flights of a case say of the vehicle; None where none has motors and
+    body rates. Without `one_clock` streams were found to be apart by times that wander:
+    what is said of torques then isn't trusted.
     """
     records = records_of(case)
     if not records:
@@ -162,9 +167,12 @@ def quantities_of(records: list[Record], fit: TorqueFit) -> dict[str, Quantity]:
         "yaw_ratio": numbers.pop("yaw_gain"),
     }
     numbers.pop("propellers")
-    numbers |= found | identify_forces(records, np.maximum(fit.value[:3], [1e-3, 1e-3, 0.0]))
+    numbers |= found | identify_forces(
+        records, np.maximum(fit.value[:3], [1e-3, 1e-3, 0.0])
+    )
     usual |= dict.fromkeys((*found, "thrust_level", "thrust_slope"), 1.0)
-    # Trims hold against what else acts too: they belong to no simulator's number but zero.
+    # Trims hold against what else acts too: they belong to no simulator's number but
+    # zero.
     numbers |= trims(records)
     return {
         name: _quantity(name, float(v), float(e), usual.get(name, 0.0))

@@ -1,7 +1,7 @@
 """Stretches of flights at the log's own rate, as an identification needs them.
 
-The replay of the diagnosis runs on a grid of 10 ms. What motors do is seen best at the rate of the
-loop that commands them, so here faster logs keep their rows, down to 2 ms.
+The replay of the diagnosis runs on a grid of 10 ms. What motors do is seen best at the
+rate of the loop that commands them, so here faster logs keep their rows, down to 2 ms.
 """
 
 from dataclasses import dataclass, fields, replace
@@ -19,18 +19,20 @@ from openjax.flights.track import (
 )
 from openjax.vehicle.parameters import hover_share
 
-SHORTEST = 0.002  # s, the period of the firmware's rate loop: faster rows hold nothing new
+# s, the period of the firmware's rate loop: faster rows hold nothing new
+SHORTEST = 0.002
 CARRIED = 0.5  # of the hovering thrust: below, the floor carries
 TAKE_OFF = 1.0  # s
 TORQUES = ("motor_command", "body_rates")
-SHORTEST_PART = 1.0  # s between holes; its first quarter only tells what was before the rest
+# s between holes; its first quarter only tells what was before the rest
+SHORTEST_PART = 1.0
 LOOP_ROWS = 0.003  # s: rows as short show every cycle of the rate loop
 
 
 @dataclass(frozen=True, eq=False)
 class Record:
-    """T rows of `dt` s. `motor` (T, 4): thrust commanded, as shares of the largest, held from a
-    row's time to the next; channels that weren't logged are None.
+    """T rows of `dt` s. `motor` (T, 4): thrust commanded, as shares of the largest,
+    held from a row's time to the next; channels that weren't logged are None.
     """
 
     flight: str
@@ -42,7 +44,8 @@ class Record:
     quaternion: np.ndarray | None  # (T, 4)
     voltage: np.ndarray | None  # (T,) V
     vehicle: object
-    samples: bool  # a row's motors are one sample of a faster loop, not the mean over the row
+    # a row's motors are one sample of a faster loop, not the mean over the row
+    samples: bool
     drawn: bool = False  # lines stand for motors or body rates that weren't logged
 
     def rows(self, rows: slice) -> "Record":
@@ -64,12 +67,19 @@ def records_of(case: Case) -> list[Record]:
     """All stretches of a case's flights with body rates and motor commands."""
     found = []
     for flight in case.flights:
-        if not flight.has_motors or flight.body_rates is None or flight.body_rates_derived:
+        if (
+            not flight.has_motors
+            or flight.body_rates is None
+            or flight.body_rates_derived
+        ):
             continue
         missed = flight.in_holes(TORQUES, MAX_GAP, MISSED_SAMPLES)
         parts = _records(flight.rows(~missed), flight, case, SHORTEST_PART)
         if not parts:
-            parts = [replace(r, drawn=bool(missed.any())) for r in _records(flight, flight, case)]
+            parts = [
+                replace(r, drawn=bool(missed.any()))
+                for r in _records(flight, flight, case)
+            ]
         found += parts
     # One estimator reads rows of one period: the one that holds most of the flights.
     periods = [r.dt for r in found for _ in range(len(r.rates))]
@@ -78,22 +88,27 @@ def records_of(case: Case) -> list[Record]:
 
 
 def _records(rows: Flight, flight: Flight, case: Case, least: float = MIN_DURATION):
-    """Records of the stretches, at least so many s long, of some `rows` of a flight. Lines over
-    longer gaps than these would make motors look quicker or slower, by a tenth to a fifth.
+    """Records of the stretches, at least so many s long, of some `rows` of a flight.
+    Lines over longer gaps than these would make motors look quicker or slower, by a
+    tenth to a fifth.
     """
     found = []
-    for stretch in rows.stretches(max(MAX_GAP, MISSED_SAMPLES * flight.row_period), least):
+    for stretch in rows.stretches(
+        max(MAX_GAP, MISSED_SAMPLES * flight.row_period), least
+    ):
         found += _in_the_air(_record(rows.rows(stretch), flight, case), least)
     return found
 
 
 def _in_the_air(record: Record, least: float) -> list[Record]:
-    """The parts of a record in which the motors carry the vehicle, without its take-off and
-    landing.
+    """The parts of a record in which the motors carry the vehicle, without its take-off
+    and landing.
     """
     hover = float(hover_share(record.vehicle))
     carried = smooth(record.motor.mean(1), 0.5, record.dt) > CARRIED * hover
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], carried, [False]]).astype(int)))
+    edges = np.flatnonzero(
+        np.diff(np.concatenate([[False], carried, [False]]).astype(int))
+    )
     away = round(TAKE_OFF / record.dt)
     parts = []
     for begin, end in edges.reshape(-1, 2):

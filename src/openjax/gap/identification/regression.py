@@ -1,4 +1,6 @@
-"""Least squares of long records, and the windows and polynomials of an autoregression."""
+"""Least squares of long records, and the windows and polynomials of an
+autoregression.
+"""
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -26,15 +28,17 @@ def solve(columns: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def lagged(x: np.ndarray, order: int) -> np.ndarray:
-    """x(k), then differences x(k) - x(k - 1) and before, (T - order, order): rows k = order - 1 up
-    to T - 2, which foretell the next.
+    """x(k), then differences x(k) - x(k - 1) and before, (T - order, order): rows k =
+    order - 1 up to T - 2, which foretell the next.
     """
     windows = sliding_window_view(x, order)[:-1, ::-1]
     return np.concatenate([windows[:, :1], windows[:, :-1] - windows[:, 1:]], 1)
 
 
 def polynomial(taken: np.ndarray) -> np.ndarray:
-    """1 - a_1 q^-1 - ... of coefficients on the last value and on differences before it."""
+    """1 - a_1 q^-1 - ... of coefficients on the last value and on differences before
+    it.
+    """
     out = np.zeros(len(taken) + 1)
     out[0] = 1.0
     out[1] -= taken[0]

@@ -1,9 +1,10 @@
 """What motors do to a vehicle, frequency by frequency, without a model of it.
 
-A high-order ARX fit of body rates (or of the force along body z) on the whole motor signal in
-closed loop: Ljung, System Identification, chapters 4 and 13. Torques are given as angular
-acceleration per unit of the motors' differential command, thrust as specific force per unit of
-their mean. The nominal simulator is driven by the same rows and read by the same estimator.
+A high-order ARX fit of body rates (or of the force along body z) on the whole motor
+signal in closed loop: Ljung, System Identification, chapters 4 and 13. Torques are
+given as angular acceleration per unit of the motors' differential command, thrust as
+specific force per unit of their mean. The nominal simulator is driven by the same rows
+and read by the same estimator.
 """
 
 from dataclasses import dataclass
@@ -27,8 +28,8 @@ ACCELEROMETER = 0.15  # m/s^2, the same
 
 @dataclass(frozen=True)
 class Response:
-    """One axis at `frequency` (F,) Hz: `gain` (F, 3), low, middle and high of 90 %, in rad/s^2 (or
-    m/s^2 for thrust) per unit, `phase` (F, 3) degrees.
+    """One axis at `frequency` (F,) Hz: `gain` (F, 3), low, middle and high of 90 %, in
+    rad/s^2 (or m/s^2 for thrust) per unit, `phase` (F, 3) degrees.
     """
 
     axis: str
@@ -51,8 +52,8 @@ class Pair:
 
 
 def responses(records: list[Record], fit: TorqueFit) -> dict[str, Pair]:
-    """{axis: pair} of all axes that the records hold. `fit` gives the clock, and what a row of
-    means does to its own end, which such rows can't tell from the loop's answer.
+    """{axis: pair} of all axes that the records hold. `fit` gives the clock, and what a
+    row of means does to its own end, which such rows can't tell from the loop's answer.
     """
     ahead = max(int(np.ceil((EARLIEST - fit.clock) / records[0].dt)), 0)
     problem = Problem([earlier(r, ahead) for r in records])
@@ -63,7 +64,8 @@ def responses(records: list[Record], fit: TorqueFit) -> dict[str, Pair]:
     rng = np.random.default_rng(0)
     modelled = problem.modelled(nominal)
     simulated = [
-        _simulated(r, left, rng) for r, (left, _) in zip(problem.records, modelled, strict=True)
+        _simulated(r, left, rng)
+        for r, (left, _) in zip(problem.records, modelled, strict=True)
     ]
     for axis in range(3):
         measured = [r.rates[:, axis] for r in problem.records]
@@ -78,8 +80,8 @@ def responses(records: list[Record], fit: TorqueFit) -> dict[str, Pair]:
 
 
 def _simulated(record: Record, left: np.ndarray, rng) -> np.ndarray:
-    """Rates (T, 3) of the nominal vehicle, from what they leave of the record's, as a gyroscope
-    shows them.
+    """Rates (T, 3) of the nominal vehicle, from what they leave of the record's, as a
+    gyroscope shows them.
     """
     return record.rates - left + GYROSCOPE * rng.standard_normal(left.shape)
 
@@ -95,7 +97,9 @@ def _of_thrust(problem: Problem, rng) -> Pair:
     shares = [r.motor.mean(1) for r in problem.records]
     measured = [r.force[:, 2] for r in problem.records]
     vehicle = problem.records[0].vehicle
-    full = 4.0 * float(vehicle.thrust_constant * vehicle.max_rotor_speed**2 / vehicle.mass)
+    full = 4.0 * float(
+        vehicle.thrust_constant * vehicle.max_rotor_speed**2 / vehicle.mass
+    )
     lags = value_at(problem.start)[None, :3]
     simulated = []
     for _, speed in rotor_rows([r.motor for r in problem.records], problem.dt, lags):
@@ -103,7 +107,9 @@ def _of_thrust(problem: Problem, rng) -> Pair:
         simulated.append(force + ACCELEROMETER * rng.standard_normal(len(force)))
 
     def of(outputs):
-        return _response("thrust", *_arx(problem, outputs, shares, None), problem.dt, False)
+        return _response(
+            "thrust", *_arx(problem, outputs, shares, None), problem.dt, False
+        )
 
     return Pair(of(measured), of(simulated))
 
@@ -115,8 +121,9 @@ def _windows(x: np.ndarray, order: int, first: int) -> np.ndarray:
 
 
 def _arx(problem: Problem, outputs: list, inputs: list, at_once: float | None):
-    """Coefficients (2 `order`,) on outputs and inputs before, and their covariance. With `at_once`,
-    the effect of a row's input on its own end, what is new in the input is free beside it.
+    """Coefficients (2 `order`,) on outputs and inputs before, and their covariance.
+    With `at_once`, the effect of a row's input on its own end, what is new in the input
+    is free beside it.
     """
     order = problem.order
     pasts = []
@@ -143,15 +150,22 @@ def _arx(problem: Problem, outputs: list, inputs: list, at_once: float | None):
     coefficients = taken[:count].copy()
     covariance = covariance[:count, :count]
     if at_once is not None:
-        # The last column is what was new, not a past input: the input's own comes first.
-        coefficients = np.concatenate([taken[:order], [at_once], taken[order : count - 1]])
-        places = np.concatenate([np.arange(order), [count - 1], np.arange(order, count - 1)])
+        # The last column is what was new, not a past input: the input's own comes
+        # first.
+        coefficients = np.concatenate(
+            [taken[:order], [at_once], taken[order : count - 1]]
+        )
+        places = np.concatenate(
+            [np.arange(order), [count - 1], np.arange(order, count - 1)]
+        )
         covariance = covariance[np.ix_(places, places)]
         covariance[order] = covariance[:, order] = 0.0
     return coefficients, covariance
 
 
-def _response(axis: str, coefficients, covariance, dt: float, derivative: bool) -> Response:
+def _response(
+    axis: str, coefficients, covariance, dt: float, derivative: bool
+) -> Response:
     frequency = FREQUENCIES[HIGHEST / dt >= FREQUENCIES]
     rng = np.random.default_rng(1)
     values, vectors = np.linalg.eigh(covariance)

@@ -1,12 +1,12 @@
 """Rotors along rows of motor commands: delay and lag solved exactly within every row.
 
-The rotor model is the simulator's (`openjax.vehicle.rotors`): T dw/dt = w_commanded - w, thrust in
-proportion to w^2, T different for speeding up and slowing down. A row's command holds until the
-next row.
+The rotor model is the simulator's (`openjax.vehicle.rotors`): T dw/dt = w_commanded -
+w, thrust in proportion to w^2, T different for speeding up and slowing down. A row's
+command holds until the next row.
 
-Rotors forget where they came from within some time constants. So flights are cut into lanes, each
-begun a while earlier, that run side by side: the loop is over the rows of one lane, and nothing has
-to be compiled for a flight's length.
+Rotors forget where they came from within some time constants. So flights are cut into
+lanes, each begun a while earlier, that run side by side: the loop is over the rows of
+one lane, and nothing has to be compiled for a flight's length.
 """
 
 from collections.abc import Sequence
@@ -21,11 +21,13 @@ FORGOTTEN = 10.0  # time constants
 def rotor_rows(
     commands: Sequence[np.ndarray], dt: float, lags: np.ndarray
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Mean thrust of each row (B, T, 4) and speed at its end (B, T, 4), as shares of the largest,
-    for each of some flights' commands (T, 4) in rows of dt s, with B `lags` (B, 3): time constants
-    of speeding up and of slowing down, and delay, s.
+    """Mean thrust of each row (B, T, 4) and speed at its end (B, T, 4), as shares of
+    the largest, for each of some flights' commands (T, 4) in rows of dt s, with B
+    `lags` (B, 3): time constants of speeding up and of slowing down, and delay, s.
     """
-    lanes = _Lanes([len(c) for c in commands], int(np.ceil(FORGOTTEN * lags[:, :2].max() / dt)))
+    lanes = _Lanes(
+        [len(c) for c in commands], int(np.ceil(FORGOTTEN * lags[:, :2].max() / dt))
+    )
     wanted = [np.sqrt(np.clip(c, SMALLEST, None)) for c in commands]
     whole = np.floor(lags[:, 2] / dt).astype(int)
     late = lags[:, 2] - whole * dt
@@ -49,7 +51,9 @@ def _delayed(wanted: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
 
 class _Part:
-    """A part of a row, `span` (B,) s long, in which commands hold; `up` and `down` (B,) s."""
+    """A part of a row, `span` (B,) s long, in which commands hold; `up` and `down` (B,)
+    s.
+    """
 
     def __init__(self, up: np.ndarray, down: np.ndarray, span: np.ndarray):
         self.up, self.down, self.span = (v[:, None, None] for v in (up, down, span))
@@ -67,11 +71,16 @@ class _Part:
         falls = off > 0.0
         kept = np.where(falls, self.kept_down, self.kept_up)
         moving = 2.0 * target * (1.0 - kept) + 0.5 * off * (1.0 - kept * kept)
-        return target * target * self.span + off * np.where(falls, self.down, self.up) * moving
+        return (
+            target * target * self.span
+            + off * np.where(falls, self.down, self.up) * moving
+        )
 
 
 class _Lanes:
-    """Flights of `counts` rows cut into lanes that begin `early` rows before what they are for."""
+    """Flights of `counts` rows cut into lanes that begin `early` rows before what they
+    are for.
+    """
 
     def __init__(self, counts: list[int], early: int):
         self.counts = counts
@@ -80,12 +89,15 @@ class _Lanes:
         rows = []
         for first, count in zip(firsts, counts, strict=True):
             begins = np.arange(0, count, LANE)[:, None] - early
-            # Before a flight its first command held; what a lane has beyond the end is left out.
+            # Before a flight its first command held; what a lane has beyond the end is
+            # left out.
             rows.append(first + np.clip(begins + np.arange(early + LANE), 0, count - 1))
         self.rows = np.concatenate(rows).T  # (early + LANE, lanes)
 
     def run(self, parts: list[_Part], *targets: list[np.ndarray]) -> list[np.ndarray]:
-        """Speeds (B, T, 4) at the rows' begin, for targets (B, T, 4) in the two parts of a row."""
+        """Speeds (B, T, 4) at the rows' begin, for targets (B, T, 4) in the two parts
+        of a row.
+        """
         taken = [np.moveaxis(np.concatenate(t, 1)[:, self.rows], 1, 0) for t in targets]
         speed = taken[0][0]  # (B, lanes, 4)
         begin = np.empty_like(taken[0])

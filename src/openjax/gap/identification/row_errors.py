@@ -1,35 +1,39 @@
-"""What rows hide of a rate loop that runs several times within them, as errors of the parameters."""
+"""What rows hide of a rate loop that runs several times within them, as errors of the
+parameters.
+"""
 
 import numpy as np
 
 from openjax.gap.identification.prediction_errors import NAMES, TINY, Problem
 
-HALF_CYCLE = 0.001  # s of the rate loop: when within one motors get their command is convention
+# s of the rate loop: when within one motors get their command is convention
+HALF_CYCLE = 0.001
 NOISE_IN_GAIN = 35.0
 NOISE_IN_LAG = 2.2
 QUICK = 0.03  # s
-"""What rows of means hide of a rate loop that answers noise weakens the response that they show.
-Errors of gains, as logarithms, are so much over the square of what an axis turns in standard
-deviations of its noise; errors of lags over that of what it turns within QUICK, beyond noise.
+"""What rows of means hide of a rate loop that answers noise weakens the response that
+they show. Errors of gains, as logarithms, are so much over the square of what an axis
+turns in standard deviations of its noise; errors of lags over that of what it turns
+within QUICK, beyond noise.
 """
 LARGEST_ERROR = 2.0  # as a logarithm: nothing is known
 LEAST_LAG = 0.03
 LEAST_GAIN = 0.01
 LEAST_DAMPING = 0.2
-"""Errors of lags and gains, as logarithms, and of damping, 1/s, that such rows leave in still
-air.
+"""Errors of lags and gains, as logarithms, and of damping, 1/s, that such rows leave in
+still air.
 """
 SAMPLED_LAG = 0.3
 SAMPLED_GAIN = 0.45
 SAMPLED_DAMPING = 0.5  # 1/s
-"""The same of single samples, which miss most of what the loop does. Root mean squares of simulated
-flights in calm and gusty air, `experiments/results/identification.json`.
+"""The same of single samples, which miss most of what the loop does. Root mean squares
+of simulated flights in calm and gusty air, `experiments/results/identification.json`.
 """
 
 
 def turning(problem: Problem, axes: list) -> tuple[np.ndarray, np.ndarray]:
-    """What each axis (3,) turns, and what it turns within QUICK, in standard deviations of its
-    noise.
+    """What each axis (3,) turns, and what it turns within QUICK, in standard deviations
+    of its noise.
     """
     noise = np.array([e.var() for e, _, _ in axes]) + TINY
     rows = max(round(QUICK / problem.dt), 1)

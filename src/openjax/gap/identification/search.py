@@ -1,4 +1,6 @@
-"""The search for the parameters of torques: Gauss and Newton's steps from several lags."""
+"""The search for the parameters of torques: Gauss and Newton's steps from several
+lags.
+"""
 
 from dataclasses import dataclass
 
@@ -14,7 +16,8 @@ from openjax.gap.identification.row_errors import hidden_errors, turning
 
 SEARCHED = np.array([[0.002, 0.15], [0.02, 5.0]])
 """Time constants, s, and gains beyond which nothing is looked for."""
-EARLIEST = -0.002  # s, a cycle of the rate loop: when within it motors answer is convention
+# s, a cycle of the rate loop: when within it motors answer is convention
+EARLIEST = -0.002
 ITERATIONS = 25
 LARGEST_STEP = np.array([0.8, 0.8, 0.01, 1.2, 1.2, 1.2, 8.0, 8.0, 0.003])
 """Of the search, in one step: logarithms, s, 1/s, share."""
@@ -27,9 +30,9 @@ SWEEPS = 2
 
 @dataclass(frozen=True, eq=False)
 class TorqueFit:
-    """`value` (9,) and `covariance` (9, 9) of `NAMES`; `loss` nats; `noise` {axis: coefficients
-    (p,)}; `whole` innovations' variances (3,); `turning` (3,): what each axis turns, in standard
-    deviations of its noise.
+    """`value` (9,) and `covariance` (9, 9) of `NAMES`; `loss` nats; `noise` {axis:
+    coefficients (p,)}; `whole` innovations' variances (3,); `turning` (3,): what each
+    axis turns, in standard deviations of its noise.
     """
 
     value: np.ndarray
@@ -46,8 +49,8 @@ class TorqueFit:
 
 
 def begin(problem: Problem, late: float) -> np.ndarray:
-    """A place (9,) to search from, with motors `late` s: of some lags that of the least loss,
-    once gains, in which the model is linear, are fitted to it.
+    """A place (9,) to search from, with motors `late` s: of some lags that of the least
+    loss, once gains, in which the model is linear, are fitted to it.
     """
     begun = []
     for lag in LAGS:
@@ -76,7 +79,9 @@ def _swept(problem: Problem, place: np.ndarray) -> np.ndarray:
 
 
 def search(problem: Problem, place: np.ndarray) -> TorqueFit:
-    """Gauss-Newton from a place (9,), in steps no larger than its linearisation is good for."""
+    """Gauss-Newton from a place (9,), in steps no larger than its linearisation is good
+    for.
+    """
     value = place
     loss, axes = problem.solve(value)
     for _ in range(ITERATIONS):
@@ -107,8 +112,8 @@ def search(problem: Problem, place: np.ndarray) -> TorqueFit:
 
 
 def _step(problem: Problem, value: np.ndarray, axes: list) -> np.ndarray:
-    """Gauss-Newton's step (9,), of at most LARGEST_STEP; what stands at a bound and is pushed
-    beyond stays.
+    """Gauss-Newton's step (9,), of at most LARGEST_STEP; what stands at a bound and is
+    pushed beyond stays.
     """
     hessian, push = _normal(problem, value, axes)
     tried = _bounded(problem, value - 1e-6 * np.sign(push))
@@ -136,13 +141,17 @@ def _normal(problem: Problem, value, axes):
 
 
 def _covariance(problem: Problem, value, axes) -> np.ndarray:
-    """Of the parameters, widened where errors hang together over seconds (a sandwich's)."""
+    """Of the parameters, widened where errors hang together over seconds (a
+    sandwich's).
+    """
     hessian, _ = _normal(problem, value, axes)
     inverse = np.linalg.inv(hessian)
     scores = np.zeros_like(hessian)
     for errors, slopes, _ in axes:
         pieces = np.arange(0, len(errors), max(int(BLOCK / problem.dt), 1))
-        sums = np.add.reduceat(slopes * errors[:, None], pieces, 0) / (errors.var() + TINY)
+        sums = np.add.reduceat(slopes * errors[:, None], pieces, 0) / (
+            errors.var() + TINY
+        )
         scores += sums.T @ sums
     wider = np.trace(scores @ inverse) / len(hessian)
     return inverse * max(1.0, wider)

@@ -1,8 +1,9 @@
 """How well a set of effects agrees with the identified response of the torques.
 
-The replay of the motion gives up what feedback does within a block, and with it most of what a lag
-shows. The identification keeps it. So its estimates count as a measurement of lag, inertia and yaw
-torque beside the replay's, as exact as their intervals and what such vehicles usually differ by.
+The replay of the motion gives up what feedback does within a block, and with it most of
+what a lag shows. The identification keeps it. So its estimates count as a measurement
+of lag, inertia and yaw torque beside the replay's, as exact as their intervals and what
+such vehicles usually differ by.
 """
 
 import numpy as np
@@ -11,19 +12,21 @@ from openjax.gap.identification.estimates import EffectEstimates
 from openjax.gap.model.library import PLACE
 
 USUAL = {"motor_lag": 0.007, "inertia": 0.25, "yaw_torque": 0.3}
-"""s, and as logarithms: what other effects (a used battery, limits of the motors, the floor) do to
-lags and gains, and what vehicles that nobody would call faulty differ by.
+"""s, and as logarithms: what other effects (a used battery, limits of the motors, the
+floor) do to lags and gains, and what vehicles that nobody would call faulty differ by.
 """
 UNKNOWN_MAP = 0.5
-"""The same of gains where motor commands are duty cycles: the map's slope isn't known."""
+"""The same of gains where motor commands are duty cycles: the map's slope isn't
+known.
+"""
 LEAST = 0.05  # of a gain
 HOVER = 0.62  # of the largest thrust, where the slope of a thrust curve is taken
 FARTHEST = 40.0  # nats: no response says more, as forms are never quite the model's
 
 
 def support(estimates: EffectEstimates, theta: np.ndarray, pwm: bool) -> float:
-    """Log density, up to a constant and at most FARTHEST below the best, of the estimates for
-    parameters theta (P,) of the replay.
+    """Log density, up to a constant and at most FARTHEST below the best, of the
+    estimates for parameters theta (P,) of the replay.
     """
     expected = _expected(estimates, theta)
     usual = np.array([USUAL[e] for e, _ in estimates.names])
@@ -38,7 +41,9 @@ def support(estimates: EffectEstimates, theta: np.ndarray, pwm: bool) -> float:
 
 
 def _expected(estimates: EffectEstimates, theta: np.ndarray) -> np.ndarray:
-    """What the estimates would be: a weaker thrust turns the vehicle as a larger inertia does."""
+    """What the estimates would be: a weaker thrust turns the vehicle as a larger
+    inertia does.
+    """
 
     def of(effect, parameter):
         return float(theta[PLACE[effect, parameter]])

@@ -9,14 +9,15 @@ from openjax.gap.identification.search import TorqueFit, begin, search
 FAST_ROWS = 0.005  # s: slower rows show 2 ms of delay in its place
 AHEAD = (0.01, 0.02, 0.04, 0.08)  # s by which motors are tried earlier than logged
 LATE = (0.002, 0.03)  # s, starts of the delay
-STRONG = 0.45  # of the nominal gain; the heaviest decks and duty cycles leave about as much
+# of the nominal gain; the heaviest decks and duty cycles leave about as much
+STRONG = 0.45
 SOON = 0.12  # s; the slowest motors that fly
 CLEARLY = 10.0  # nats by which motors logged too late must be better
 
 
 def identify_torques(records: list[Record], one_clock: bool = True) -> TorqueFit:
-    """The most likely fit of records with body rates, over the motors' clock as well; where streams
-    share no `one_clock`, none is looked for.
+    """The most likely fit of records with body rates, over the motors' clock as well;
+    where streams share no `one_clock`, none is looked for.
     """
     base = Problem(records)
     first = search(base, begin(base, LATE[0]))
@@ -46,7 +47,8 @@ def _comparable(loss: float, problem: Problem, base: Problem) -> float:
 
 
 def _clear(fit: TorqueFit) -> bool:
-    """Whether roll and pitch answer as strongly and as soon as those of any such vehicle: then the
-    rows' clock is right to a few milliseconds, and no other need be tried.
+    """Whether roll and pitch answer as strongly and as soon as those of any such
+    vehicle: then the rows' clock is right to a few milliseconds, and no other need be
+    tried.
     """
     return bool(fit.value[3:5].min() > STRONG and fit.value[:2].max() < SOON)

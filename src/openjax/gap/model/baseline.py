@@ -1,9 +1,10 @@
-"""What a vehicle is like while nothing is wrong with it, as its reference flights tell: the effects
-that it always has, with one joint normal distribution of their numbers.
+"""What a vehicle is like while nothing is wrong with it, as its reference flights tell:
+the effects that it always has, with one joint normal distribution of their numbers.
 
-In a diagnosis it takes the place of the nominal vehicle: effects start from there, and what is
-known together (drag and flapping) stays known together. Nuisances aren't taken over: what they take
-depends on what is flown, as in closed loop they also take what feedback makes of gusts.
+In a diagnosis it takes the place of the nominal vehicle: effects start from there, and
+what is known together (drag and flapping) stays known together. Nuisances aren't taken
+over: what they take depends on what is flown, as in closed loop they also take what
+feedback makes of gusts.
 """
 
 from dataclasses import dataclass
@@ -15,24 +16,26 @@ from openjax.gap.model.library import CARDS, PHYSICS_EFFECTS
 from openjax.vehicle.effects import EFFECTS
 from openjax.vehicle.effects.effect import growth
 
-# Effects that every vehicle has to some degree: what a simulator gets wrong of it on any day. Trims
-# of 1 to 2.5 % of hover were measured over days on published flights of two Crazyflies.
+# Effects that every vehicle has to some degree: what a simulator gets wrong of it on
+# any day. Trims of 1 to 2.5 % of hover were measured over days on published flights of
+# two Crazyflies.
 FORM = tuple(e for e in PHYSICS_EFFECTS if CARDS[e].days is not None)
-# Of what a number is usually off by, by which two sets of flights of one vehicle tell it differently.
-# With .5 thirty numbers of five development cases in which nothing acts lay 1.4 standard deviations
-# from their reference, rms.
+# Of what a number is usually off by, by which two sets of flights of one vehicle tell
+# it differently. With .5 thirty numbers of five development cases in which nothing acts
+# lay 1.4 standard deviations from their reference, rms.
 FORM_DAYS = 0.75
-# Data that a nat is worth less than by white residuals: the median share of their variance that is
-# white was .38 over 650 pairs of sets.
+# Data that a nat is worth less than by white residuals: the median share of their
+# variance that is white was .38 over 650 pairs of sets.
 COLOURED = 2.6
 
 
 @dataclass(frozen=True, eq=False)
 class Baseline:
-    """`theta` (P,) of the physics; `effects` that act in the reference, of the vehicle's form;
-    `names` of their numbers ("effect parameter") whose joint `covariance` is known; `measures` of
-    what is left of the reference flights, as `residual` has them; `channels` of the reference by
-    path; `trim` (4,) of its rotors on that day, as `reference.trim_of`.
+    """`theta` (P,) of the physics; `effects` that act in the reference, of the
+    vehicle's form; `names` of their numbers ("effect parameter") whose joint
+    `covariance` is known; `measures` of what is left of the reference flights, as
+    `residual` has them; `channels` of the reference by path; `trim` (4,) of its rotors
+    on that day, as `reference.trim_of`.
     """
 
     theta: np.ndarray
@@ -45,12 +48,14 @@ class Baseline:
 
     @property
     def numbers(self) -> tuple[tuple[str, str, float], ...]:
-        """What is known of the vehicle, as `library.numbers_of` has it, in units of the parameter."""
+        """What is known of the vehicle, as `library.numbers_of` has it, in units of the
+        parameter.
+        """
         return tuple((*name.split(" "), 1.0) for name in self.names)
 
     def mixing(self, names) -> np.ndarray:
-        """(N, N): columns of `names`, each of its usual size or unit -> columns of unit prior
-        variance.
+        """(N, N): columns of `names`, each of its usual size or unit -> columns of unit
+        prior variance.
         """
         out = np.eye(len(names))
         rows = [k for k, n in enumerate(names) if n in self.names]
@@ -61,16 +66,22 @@ class Baseline:
 
 
 def day_of(effect: str, parameter: str, vehicle, silent: bool) -> float:
-    """Standard deviation over days of a number; `silent`: motors are duty cycles whose battery
-    nobody logged.
+    """Standard deviation over days of a number; `silent`: motors are duty cycles whose
+    battery nobody logged.
     """
     card = CARDS[effect]
     usual = card.nuisance.get(parameter, 0.0)
     usual = float(usual(vehicle) if callable(usual) else usual)
-    spread = np.hypot(next(p.spread for p in card.fitted if p.name == parameter), card.common)
+    spread = np.hypot(
+        next(p.spread for p in card.fitted if p.name == parameter), card.common
+    )
     spread *= growth(EFFECTS[effect].parameters[parameter].unit, vehicle)
-    charge = card.nuisance_duty.get(parameter, 0.0) if silent and card.thrust_map else 0.0
-    return max(charge, card.days or 0.0, FORM_DAYS * usual, DECISION.form_error * float(spread))
+    charge = (
+        card.nuisance_duty.get(parameter, 0.0) if silent and card.thrust_map else 0.0
+    )
+    return max(
+        charge, card.days or 0.0, FORM_DAYS * usual, DECISION.form_error * float(spread)
+    )
 
 
 def transferred(
@@ -82,25 +93,29 @@ def transferred(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Mean and covariance, on another day, of the numbers that are not `of_a_day` (N,).
 
-    The reference's flights are a measurement of information `hessian` (N, N) and right side `push`
-    (N,), beside what such vehicles usually are: precision `prior` (N, N) around 0. What is of a day
-    is marginalised. Of the rest each number moves between two days by `days` (N,), so a measurement
-    of one day tells less of another. What the flights don't show stays as it usually is.
+    The reference's flights are a measurement of information `hessian` (N, N) and right
+    side `push` (N,), beside what such vehicles usually are: precision `prior` (N, N)
+    around 0. What is of a day is marginalised. Of the rest each number moves between
+    two days by `days` (N,), so a measurement of one day tells less of another. What the
+    flights don't show stays as it usually is.
     """
     own, rest = np.flatnonzero(of_a_day), np.flatnonzero(~of_a_day)
     inside = hessian[np.ix_(own, own)] + prior[np.ix_(own, own)]
-    taken = np.linalg.solve(inside, np.column_stack([hessian[np.ix_(own, rest)], push[own]]))
+    taken = np.linalg.solve(
+        inside, np.column_stack([hessian[np.ix_(own, rest)], push[own]])
+    )
     data = hessian[np.ix_(rest, rest)] - hessian[np.ix_(rest, own)] @ taken[:, :-1]
     right = push[rest] - hessian[np.ix_(rest, own)] @ taken[:, -1]
-    damped = np.eye(len(rest)) + data * np.square(days[rest])  # (I + D S) of information D
+    # (I + D S) of information D
+    damped = np.eye(len(rest)) + data * np.square(days[rest])
     data, right = np.linalg.solve(damped, data), np.linalg.solve(damped, right)
     covariance = np.linalg.inv(0.5 * (data + data.T) + prior[np.ix_(rest, rest)])
     return covariance @ right, covariance
 
 
 def with_days(usual, vehicle) -> tuple[tuple[str, str, float], ...]:
-    """The numbers of `library.numbers_of`, with what a day moves of each: how a vehicle is on the
-    day of its reference.
+    """The numbers of `library.numbers_of`, with what a day moves of each: how a vehicle
+    is on the day of its reference.
     """
     sizes = {(e, p): size for e, p, size in usual}
     for effect in (e for e in FORM if CARDS[e].days):

@@ -1,5 +1,5 @@
-"""Least squares with bounds: a nuisance may take twice its usual size, and one that wants more is a
-finding.
+"""Least squares with bounds: a nuisance may take twice its usual size, and one that
+wants more is a finding.
 """
 
 import numpy as np
@@ -14,12 +14,12 @@ def bounded(
     push: Float[np.ndarray, " entries"],
     free: int = 0,
 ) -> Float[np.ndarray, " entries"]:
-    """Minimum of x'Hx/2 - push'x with |x| <= BOUND beyond the first `free` entries, H positive
-    definite.
+    """Minimum of x'Hx/2 - push'x with |x| <= BOUND beyond the first `free` entries, H
+    positive definite.
 
-    Block principal pivoting (Judice, Pires 1994): entries that leave the box are fixed at its edge
-    and those that would come back are let go, all at once as long as fewer are wrong each time,
-    else the last of them alone, so that it ends.
+    Block principal pivoting (Judice, Pires 1994): entries that leave the box are fixed
+    at its edge and those that would come back are let go, all at once as long as fewer
+    are wrong each time, else the last of them alone, so that it ends.
     """
     limit = np.full(len(push), BOUND)
     limit[:free] = np.inf
@@ -32,7 +32,8 @@ def bounded(
         fixed = np.flatnonzero(side)
         right = push[inside] - hessian[np.ix_(inside, fixed)] @ found[fixed]
         found[inside] = np.linalg.solve(hessian[np.ix_(inside, inside)], right)
-        pull = side * (hessian @ found - push)  # positive: back into the box is downhill
+        # positive: back into the box is downhill
+        pull = side * (hessian @ found - push)
         beyond = np.abs(found) > limit * (1.0 + 1e-9)
         back = pull > 1e-9 * np.abs(push)
         wrong = np.flatnonzero(beyond | back)

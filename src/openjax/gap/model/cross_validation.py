@@ -1,4 +1,6 @@
-"""What a model of a table's columns is worth: fitted to all blocks but one, judged on that one."""
+"""What a model of a table's columns is worth: fitted to all blocks but one, judged on
+that one.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,9 @@ class Judged:
     """A model on B blocks, each left out of the fit by which it is judged."""
 
     nats: np.ndarray
-    """(B,) minus half the whitened sum of squares, a block's own nuisances marginalised."""
+    """(B,) minus half the whitened sum of squares, a block's own nuisances
+    marginalised.
+    """
     squares: np.ndarray
     """(B, K) of the errors of logged channels."""
     taken: np.ndarray
@@ -28,15 +32,17 @@ class Judged:
     starts: np.ndarray
     """(B,) where each block begins in it."""
     error: np.ndarray
-    """(B, K, C, C) quadratic forms of the coefficients, which the squared errors are."""
+    """(B, K, C, C) quadratic forms of the coefficients, which the squared errors
+    are.
+    """
     found: np.ndarray
     """(B, C) coefficients."""
     nuisances: np.ndarray
     """(N,) places in them of the nuisances: the last."""
 
     def squares_beside(self, other: Judged) -> np.ndarray:
-        """`squares` with the nuisances as another model has them: what nuisances take on themselves
-        in its place is an error as well, if that model is right.
+        """`squares` with the nuisances as another model has them: what nuisances take
+        on themselves in its place is an error as well, if that model is right.
         """
         found = self.found.copy()
         found[:, self.nuisances] = other.found[:, other.nuisances]
@@ -45,8 +51,8 @@ class Judged:
 
 @dataclass(frozen=True, eq=False)
 class Equations:
-    """Normal equations of a model on a table: of its free columns and the nuisances that all
-    flights share. What belongs to a block alone is marginalised already.
+    """Normal equations of a model on a table: of its free columns and the nuisances
+    that all flights share. What belongs to a block alone is marginalised already.
     """
 
     table: Table
@@ -55,11 +61,13 @@ class Equations:
     @cached_property
     def columns(self) -> np.ndarray:
         """The table's columns whose coefficients are solved for."""
-        return np.concatenate([self.model.free, self.table.nuisances[self.table.shared]])
+        return np.concatenate(
+            [self.model.free, self.table.nuisances[self.table.shared]]
+        )
 
     def solve(self, sums: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Hessian, right side and solution from `table.marginal` summed (C, C) over the blocks to
-        fit.
+        """Hessian, right side and solution from `table.marginal` summed (C, C) over the
+        blocks to fit.
         """
         hessian = sums[np.ix_(self.columns, self.columns)]
         free = len(self.model.free)
@@ -69,8 +77,8 @@ class Equations:
         return hessian, push, bounded(hessian, push, free)
 
     def coefficients(self, solution: np.ndarray, block: int) -> np.ndarray:
-        """Coefficients (C,) of every column on a block, whose own nuisances are the most likely
-        ones.
+        """Coefficients (C,) of every column on a block, whose own nuisances are the
+        most likely ones.
         """
         out = np.zeros(self.table.size)
         out[[0, *self.model.parts]] = 1.0
@@ -89,8 +97,8 @@ def screened(table: Table, model: Model) -> float:
 
 
 def promise(table: Table, model: Model) -> float:
-    """Log posterior of a model at its best, fitted to all blocks, up to what all of a table share:
-    what screening needs.
+    """Log posterior of a model at its best, fitted to all blocks, up to what all of a
+    table share: what screening needs.
     """
     sums = table.total
     own = [0, *model.parts]
@@ -104,13 +112,16 @@ def left_out(table: Table, model: Model) -> np.ndarray:
     equations = Equations(table, model)
     sums = table.total
     others = (equations.solve(sums - block)[2] for block in table.marginal)
-    return np.array([equations.coefficients(found, k) for k, found in enumerate(others)])
+    return np.array(
+        [equations.coefficients(found, k) for k, found in enumerate(others)]
+    )
 
 
 def judge(table: Table, model: Model) -> Judged:
     """The model on each block, fitted to all others."""
     found = left_out(table, model)
-    # |y - Nv|^2 + |v|^2 at its least is y'(I + NN')^-1 y: what a block's nuisances take costs.
+    # |y - Nv|^2 + |v|^2 at its least is y'(I + NN')^-1 y: what a block's nuisances take
+    # costs.
     each = zip(found, table.columns, strict=True)
     left = [np.concatenate([u @ columns, u[table.own]]) for u, columns in each]
     return Judged(
@@ -119,29 +130,37 @@ def judge(table: Table, model: Model) -> Judged:
         taken=-found[:, table.nuisances[table.shared]],
         left=np.concatenate(left),
         starts=np.cumsum([0, *map(len, left)])[:-1],
-        error=table.error.astype(np.float32),  # half the memory: one of each set that is visited
+        # half the memory: one of each set that is visited
+        error=table.error.astype(np.float32),
         found=found,
         nuisances=table.nuisances,
     )
 
 
 def _squares(error: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
-    """Squared errors (B, K) by their quadratic forms (B, K, C, C), with coefficients (B, C)."""
-    return np.einsum("bkc,bc->bk", np.einsum("bkcd,bd->bkc", error, coefficients), coefficients)
+    """Squared errors (B, K) by their quadratic forms (B, K, C, C), with coefficients
+    (B, C).
+    """
+    return np.einsum(
+        "bkc,bc->bk", np.einsum("bkcd,bd->bkc", error, coefficients), coefficients
+    )
 
 
 def ablated(
     table: Table, coefficients: np.ndarray, drop=(), off: np.ndarray | None = None
 ) -> np.ndarray:
-    """Squared errors (B, K) of a table's set with `coefficients` (B, C) of `left_out`, without the
-    effects `drop` and the nuisances `off` (N,); everything else stays as fitted.
+    """Squared errors (B, K) of a table's set with `coefficients` (B, C) of `left_out`,
+    without the effects `drop` and the nuisances `off` (N,); everything else stays as
+    fitted.
     """
     coefficients = coefficients.copy()
     remaining = [e for e in table.fit.effects if e not in drop]
     kept = {int(i) for e in remaining for i in places((e,))}
     for effect in drop:
         # parameters that another effect shares stay as they were fitted
-        gone = [table.derivative[int(i)] for i in places((effect,)) if int(i) not in kept]
+        gone = [
+            table.derivative[int(i)] for i in places((effect,)) if int(i) not in kept
+        ]
         coefficients[:, gone] = 0.0
         coefficients[:, table.part[effect]] = 1.0
     if off is not None:

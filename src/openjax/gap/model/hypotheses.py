@@ -1,8 +1,8 @@
-"""Sets of physics effects as hypotheses: Gauss-Newton fits through the simulator, and how well each
-explains a case.
+"""Sets of physics effects as hypotheses: Gauss-Newton fits through the simulator, and
+how well each explains a case.
 
-Every set is fitted with the same nuisances and weighed by its marginal likelihood (Laplace's
-approximation), so that parameters cost what they are worth.
+Every set is fitted with the same nuisances and weighed by its marginal likelihood
+(Laplace's approximation), so that parameters cost what they are worth.
 """
 
 from dataclasses import dataclass, replace
@@ -18,9 +18,11 @@ from openjax.gap.shapes import Parameters, Rows
 
 ITERATIONS = 6
 SMALL_STEP = 0.05  # nats: an improvement below this ends the search
-# degrees of freedom of the prior on a block's variance, whose scale is that of all blocks
+# degrees of freedom of the prior on a block's variance, whose scale is that of all
+# blocks
 STEADY = 20.0
-UNEXPOSED = 0.5  # nats that a typical effect would leave: below, the effect isn't fitted at all
+# nats that a typical effect would leave: below, the effect isn't fitted at all
+UNEXPOSED = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +56,9 @@ class SetFit:
 
     @cached_property
     def cost(self) -> float:
-        """Nats that the parameters cost: how much narrower their posterior is than their prior."""
+        """Nats that the parameters cost: how much narrower their posterior is than
+        their prior.
+        """
         _, posterior = np.linalg.slogdet(self.hessian)
         _, before = np.linalg.slogdet(self.precision)
         return 0.5 * float(posterior - before)
@@ -65,13 +69,20 @@ class SetFit:
         return -self.objective - self.cost
 
     def parameters(self) -> dict[str, dict[str, tuple[float, float]]]:
-        """{effect: {parameter: (value, standard deviation)}} of the set's own effects."""
-        deviation = dict(zip(self.index.tolist(), np.sqrt(np.diag(self.covariance)), strict=True))
+        """{effect: {parameter: (value, standard deviation)}} of the set's own
+        effects.
+        """
+        deviation = dict(
+            zip(self.index.tolist(), np.sqrt(np.diag(self.covariance)), strict=True)
+        )
 
         def told(key):
             return float(self.theta[PLACE[key]]), float(deviation[PLACE[key]])
 
-        return {e: {p.name: told((e, p.name)) for p in CARDS[e].fitted} for e in self.effects}
+        return {
+            e: {p.name: told((e, p.name)) for p in CARDS[e].fitted}
+            for e in self.effects
+        }
 
 
 def fit_set(
@@ -81,8 +92,9 @@ def fit_set(
     iterations: int = ITERATIONS,
     rounds: int = 1,
 ) -> SetFit:
-    """Gauss-Newton from `start` (P,), by default the effects' first starts. After each of so many
-    `rounds` nuisances of the vehicle's numbers, which depend on what acts, are worked out anew.
+    """Gauss-Newton from `start` (P,), by default the effects' first starts. After each
+    of so many `rounds` nuisances of the vehicle's numbers, which depend on what acts,
+    are worked out anew.
     """
     effects = tuple(effects)
     theta = replay.absent.copy()  # what isn't in the set is absent
@@ -110,9 +122,12 @@ def _at(replay: Replay, effects, theta: np.ndarray, columns=None) -> SetFit:
 
 
 def _descend(fit: SetFit, iterations: int) -> SetFit:
-    """Steps of Gauss and Newton, half of one that overshoots, while they gain anything."""
+    """Steps of Gauss and Newton, half of one that overshoots, while they gain
+    anything.
+    """
     index, mean, precision = prior(fit.effects, fit.replay.absent, fit.replay.grown)
-    # no step longer than three prior deviations: farther away the derivatives say little
+    # no step longer than three prior deviations: farther away the derivatives say
+    # little
     reach = 3.0 * np.sqrt(np.diag(np.linalg.inv(precision)))
     share = 1.0
     for _ in range(iterations):
@@ -135,22 +150,30 @@ def _descend(fit: SetFit, iterations: int) -> SetFit:
 
 
 def model_noise(replay: Replay, library: Library) -> tuple[Replay, dict[str, float]]:
-    """The replay with noise models that fit what is left when all effects of the library may act at
-    once, and what each effect would show if it acted as at its start (nats, nuisances
-    marginalised): its exposure.
+    """The replay with noise models that fit what is left when all effects of the
+    library may act at once, and what each effect would show if it acted as at its start
+    (nats, nuisances marginalised): its exposure.
     """
-    starts = [(effect, theta) for effect in library.physics for theta in _starts(effect, replay)]
+    starts = [
+        (effect, theta)
+        for effect in library.physics
+        for theta in _starts(effect, replay)
+    ]
     index, _, precision = prior(library.physics, grown=replay.grown)
     columns = replay.linearised(replay.absent, index)
     ahead = np.array([theta for _, theta in starts])
-    moved = replay.predict(ahead) if starts else [np.zeros((0, *n.shape)) for n in replay.nominal]
+    moved = (
+        replay.predict(ahead)
+        if starts
+        else [np.zeros((0, *n.shape)) for n in replay.nominal]
+    )
     each = zip(columns, moved, replay.nominal, strict=True)
     columns = [np.concatenate([c, m - n[None]]) for c, m, n in each]
     size = len(index)
     penalty = np.eye(size + len(starts))
     penalty[:size, :size] = precision
-    # what effects take depends on the noise, and the noise on that: first without any effect,
-    # until the noise models are near, and then with all
+    # what effects take depends on the noise, and the noise on that: first without any
+    # effect, until the noise models are near, and then with all
     for weighed in (False, False, True, True):
         taken = np.zeros(len(penalty))
         if weighed:
@@ -166,23 +189,29 @@ def model_noise(replay: Replay, library: Library) -> tuple[Replay, dict[str, flo
     return replay, exposure
 
 
-def with_noise_of(replay: Replay, residuals: list[Float[np.ndarray, "_ channels"]]) -> Replay:
-    """The replay with noise models of residuals; channels that weren't logged keep the present
-    ones.
+def with_noise_of(
+    replay: Replay, residuals: list[Float[np.ndarray, "_ channels"]]
+) -> Replay:
+    """The replay with noise models of residuals; channels that weren't logged keep the
+    present ones.
     """
     skip = int(SKIP / replay.tracks[0].dt)
     noises = tuple(
-        fit_noise(axes, residuals, integrated, skip=skip) if replay.usable[axes[0]] else old
+        fit_noise(axes, residuals, integrated, skip=skip)
+        if replay.usable[axes[0]]
+        else old
         for (axes, integrated), old in zip(GROUPS, replay.noises, strict=True)
     )
     replay = replace(replay, noises=noises, loudness=None)
-    return replace(replay, loudness=tuple(_loudness(replay, r, k) for k, r in enumerate(residuals)))
+    return replace(
+        replay, loudness=tuple(_loudness(replay, r, k) for k, r in enumerate(residuals))
+    )
 
 
 def _loudness(replay: Replay, residual: np.ndarray, track: int) -> np.ndarray:
-    """(T', 9) how loud the noise is in each block: rotors, air and what motors do between rows are
-    quieter in hover than in a turn. The variance of a group of axes has a scaled inverse
-    chi-squared prior (Gelman et al. 2013).
+    """(T', 9) how loud the noise is in each block: rotors, air and what motors do
+    between rows are quieter in hover than in a turn. The variance of a group of axes
+    has a scaled inverse chi-squared prior (Gelman et al. 2013).
     """
     squares = replay.whiten(residual, track) ** 2
     out = np.ones_like(squares)
@@ -190,13 +219,17 @@ def _loudness(replay: Replay, residual: np.ndarray, track: int) -> np.ndarray:
     for rows in np.array_split(np.arange(len(squares)), blocks):
         for axes, _ in GROUPS:
             block = np.ix_(rows, axes)
-            out[block] = (squares[block].sum() + STEADY) / (squares[block].size + STEADY)
+            out[block] = (squares[block].sum() + STEADY) / (
+                squares[block].size + STEADY
+            )
     return np.sqrt(out)
 
 
 def without_nuisances(replay: Replay, residual: Rows, track: int) -> Rows:
     """A residual (T, 9) less the nuisances' most likely part."""
-    return residual - np.tensordot(replay.taken(residual, track), replay.nuisances[track], 1)
+    return residual - np.tensordot(
+        replay.taken(residual, track), replay.nuisances[track], 1
+    )
 
 
 def fit_singles(replay: Replay, library: Library, exposure) -> dict[str, SetFit]:
@@ -211,8 +244,8 @@ def fit_single(replay: Replay, effect: str) -> SetFit:
 
 
 def _starts(effect: str, replay: Replay) -> np.ndarray:
-    """The starts (S, P) of an effect's search, as far from what the vehicle has while nothing acts
-    as its card says, for a vehicle of this size.
+    """The starts (S, P) of an effect's search, as far from what the vehicle has while
+    nothing acts as its card says, for a vehicle of this size.
     """
     absent = replay.absent
     starts = np.repeat(absent[None], 1 + len(CARDS[effect].others), 0)
@@ -227,5 +260,8 @@ def _best_start(replay: Replay, effect: str) -> np.ndarray:
     starts = _starts(effect, replay)
     if len(starts) == 1:
         return starts[0]
-    left = [y[None] - p for y, p in zip(replay.measured, replay.predict(starts), strict=True)]
+    left = [
+        y[None] - p
+        for y, p in zip(replay.measured, replay.predict(starts), strict=True)
+    ]
     return starts[int(np.argmin(np.diag(replay.grams(left).sum(0))))]

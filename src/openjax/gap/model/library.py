@@ -1,7 +1,8 @@
-"""How each effect of `openjax.vehicle.effects` is fitted: which parameters, where to start, what is
-plausible.
+"""How each effect of `openjax.vehicle.effects` is fitted: which parameters, where to
+start, what is plausible.
 
-Priors are weak: their spread is of the order of the effect's usual range."""
+Priors are weak: their spread is of the order of the effect's usual range.
+"""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -22,8 +23,8 @@ CARDS: dict[str, Card] = {
 
 
 def numbers_of(situation: str, vehicle) -> tuple[tuple[str, str, float], ...]:
-    """(effect, parameter, usual size) of small errors of a vehicle's numbers, which are free in
-    every hypothesis; `situation` is the field of `Card` that holds them.
+    """(effect, parameter, usual size) of small errors of a vehicle's numbers, which are
+    free in every hypothesis; `situation` is the field of `Card` that holds them.
     """
     return tuple(
         (e, p, float(size(vehicle) if callable(size) else size))
@@ -37,7 +38,9 @@ BALANCE = 0.9999  # share of the common variance that `balanced` parameters go w
 
 @dataclass(frozen=True)
 class Library:
-    """The effects that may be named, in one order, and the vector of all physics parameters."""
+    """The effects that may be named, in one order, and the vector of all physics
+    parameters.
+    """
 
     effects: tuple[str, ...] = tuple(EFFECTS)
 
@@ -51,14 +54,16 @@ class Library:
         return tuple(e for e in self.effects if path_of(e) == path)
 
 
-# Every physics parameter has a fixed place in theta, whatever is left out of a library: one
-# compiled function. The last two are no effect's: the propellers' inertia and the motors' shift in
-# time, see `physics`.
+# Every physics parameter has a fixed place in theta, whatever is left out of a library:
+# one compiled function. The last two are no effect's: the propellers' inertia and the
+# motors' shift in time, see `physics`.
 PHYSICS_EFFECTS = tuple(e for e in CARDS if CARDS[e].path == "physics")
 THETA = tuple((e, p.name) for e in PHYSICS_EFFECTS for p in CARDS[e].fitted)
 PLACE = {key: number for number, key in enumerate(THETA)}
 ABSENT = np.array([EFFECTS[e].parameters[p].none for e, p in THETA] + [0.0, 0.0])
-STEP = np.array([p.step for e in PHYSICS_EFFECTS for p in CARDS[e].fitted] + [1e-3, 2e-4])
+STEP = np.array(
+    [p.step for e in PHYSICS_EFFECTS for p in CARDS[e].fitted] + [1e-3, 2e-4]
+)
 
 
 def path_of(effect: str) -> str:
@@ -70,7 +75,9 @@ def library(without=()) -> Library:
     """All effects but those in `without`. Raises UserError for unknown names."""
     for name in without:
         if name not in EFFECTS:
-            raise UserError(f"--without {name}: no such effect; {suggestion(name, EFFECTS)}")
+            raise UserError(
+                f"--without {name}: no such effect; {suggestion(name, EFFECTS)}"
+            )
     return Library(tuple(e for e in EFFECTS if e in CARDS and e not in without))
 
 
@@ -80,16 +87,21 @@ def places(effects) -> Int[np.ndarray, " own"]:
 
 
 def growths(vehicle) -> Parameters:
-    """(P,) by what usual sizes of the parameters are multiplied for a vehicle of another size."""
+    """(P,) by what usual sizes of the parameters are multiplied for a vehicle of
+    another size.
+    """
     own = [growth(EFFECTS[e].parameters[p].unit, vehicle) for e, p in THETA]
     return np.array([*own, 1.0, 1.0])
 
 
 def prior(
     effects, absent: Parameters = ABSENT, grown: Parameters | None = None
-) -> tuple[Int[np.ndarray, " own"], Float[np.ndarray, " own"], Float[np.ndarray, "own own"]]:
-    """Indices (p,), mean (p,) and precision (p, p) of the parameters of a set of physics effects,
-    for a vehicle that has `absent` (P,) while nothing acts and sizes that are `grown` (P,).
+) -> tuple[
+    Int[np.ndarray, " own"], Float[np.ndarray, " own"], Float[np.ndarray, "own own"]
+]:
+    """Indices (p,), mean (p,) and precision (p, p) of the parameters of a set of
+    physics effects, for a vehicle that has `absent` (P,) while nothing acts and sizes
+    that are `grown` (P,).
     """
     index = []
     mean = []

@@ -1,5 +1,5 @@
-"""Nuisances of the replay: small errors that every vehicle and every log has, as columns of the
-channels in units of their standard deviations.
+"""Nuisances of the replay: small errors that every vehicle and every log has, as
+columns of the channels in units of their standard deviations.
 """
 
 import pathlib
@@ -19,27 +19,34 @@ SIZE = {
         pathlib.Path(__file__).with_suffix(".toml").read_text(encoding="utf-8")
     ).items()
 }
-TRIM = 0.5  # s: what motors do more slowly is no answer to a gust, but what the vehicle needs
+# s: what motors do more slowly is no answer to a gust, but what the vehicle needs
+TRIM = 0.5
 FEEDBACK_ROWS, QUICK_ROWS = (0, 2), (0, 1, 2)  # rows of delay
-# Nuisances that belong to a block of flight, not to the vehicle: noise of the gyroscope weakens
-# feedback where little else moves.
+# Nuisances that belong to a block of flight, not to the vehicle: noise of the gyroscope
+# weakens feedback where little else moves.
 OF_A_BLOCK = ("feedback",)
 
 
-def columns_of(track: Track, path: Path, nominal, feedback, at_once: bool) -> dict[str, Rows]:
-    """{name: column (T, 9)} of one track, of what doesn't depend on what acts; the arguments as in
-    `make_replay`.
+def columns_of(
+    track: Track, path: Path, nominal, feedback, at_once: bool
+) -> dict[str, Rows]:
+    """{name: column (T, 9)} of one track, of what doesn't depend on what acts; the
+    arguments as in `make_replay`.
     """
     columns = _late_torques("feedback", track, feedback.acceleration, FEEDBACK_ROWS)
     columns |= _late_torques("trim", track, feedback.trim, (0,))
     if at_once:
-        columns |= _late_torques("motors within a row", track, feedback.quick, QUICK_ROWS)
+        columns |= _late_torques(
+            "motors within a row", track, feedback.quick, QUICK_ROWS
+        )
     return columns | _sensor_nuisances(track, path, nominal)
 
 
-def _sensor_nuisances(track: Track, path: Path, nominal: np.ndarray) -> dict[str, np.ndarray]:
-    """Mounting, biases and clocks of the sensors, and what a rigid body with small errors does:
-    columns (T, 9).
+def _sensor_nuisances(
+    track: Track, path: Path, nominal: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Mounting, biases and clocks of the sensors, and what a rigid body with small
+    errors does: columns (T, 9).
     """
     rows = len(track)
     attitude = np.asarray(path.quaternion, float)[:rows]
@@ -51,14 +58,21 @@ def _sensor_nuisances(track: Track, path: Path, nominal: np.ndarray) -> dict[str
         out[:, channel] = values
         columns[name] = columns.get(name, 0.0) + out * size
 
-    def moved(acceleration):  # what a change of the body-frame acceleration does to the velocity
+    # what a change of the body-frame acceleration does to the velocity
+    def moved(acceleration):
         return np.cumsum(to_world(attitude, acceleration), 0) * track.dt
 
     rates = smooth(track.body_rates, 0.03, track.dt)
     force = nominal[:, FORCE]
     for name, axis in zip("xy", np.eye(3), strict=False):
-        column(f"frame tilt {name}", VELOCITY, moved(np.cross(axis, body)), SIZE["frame_tilt"])
-    for number, name in enumerate("xyz"):  # another in each flight, as a chip's temperature is
+        column(
+            f"frame tilt {name}",
+            VELOCITY,
+            moved(np.cross(axis, body)),
+            SIZE["frame_tilt"],
+        )
+    # another in each flight, as a chip's temperature is
+    for number, name in enumerate("xyz"):
         column(
             f"accelerometer bias {name} of {track.flight}",
             6 + number,
@@ -66,7 +80,12 @@ def _sensor_nuisances(track: Track, path: Path, nominal: np.ndarray) -> dict[str
             SIZE["accelerometer_bias"],
         )
     for name, axis in zip("xyz", np.eye(3), strict=True):
-        column(f"IMU tilt {name}", RATES, -np.cross(axis, rates - rates[0]), SIZE["imu_tilt"])
+        column(
+            f"IMU tilt {name}",
+            RATES,
+            -np.cross(axis, rates - rates[0]),
+            SIZE["imu_tilt"],
+        )
         column(f"IMU tilt {name}", FORCE, -np.cross(axis, force), SIZE["imu_tilt"])
     for axis, name in enumerate("xyz"):
         turning = np.cumsum(rates[:, axis - 2] * rates[:, axis - 1]) * track.dt
@@ -87,7 +106,9 @@ def _sensor_nuisances(track: Track, path: Path, nominal: np.ndarray) -> dict[str
         SIZE["accelerometer_lag"],
     )
     spinning = np.gradient(nominal[:, RATES], track.dt, axis=0)
-    column("gyroscope's low-pass", RATES, -(spinning - spinning[0]), SIZE["gyroscope_lag"])
+    column(
+        "gyroscope's low-pass", RATES, -(spinning - spinning[0]), SIZE["gyroscope_lag"]
+    )
     if track.velocity is not None:
         late = -moved(np.cross(np.asarray(path.body_rates, float)[:rows], body))
         late += smooth(np.gradient(track.velocity, track.dt, axis=0), 0.05, track.dt)
@@ -98,13 +119,18 @@ def _sensor_nuisances(track: Track, path: Path, nominal: np.ndarray) -> dict[str
 def _late_torques(
     name: str, track: Track, acceleration: np.ndarray, delays
 ) -> dict[str, np.ndarray]:
-    """Columns (T, 9) of angular accelerations by roll and pitch, yaw, at some delays: a filter of
-    any shape.
+    """Columns (T, 9) of angular accelerations by roll and pitch, yaw, at some delays: a
+    filter of any shape.
     """
     columns = {}
     for rows in delays:
-        late = np.concatenate([np.zeros((rows, 3)), acceleration[: len(acceleration) - rows]])
-        for axes, mask in (("roll and pitch", [1.0, 1.0, 0.0]), ("yaw", [0.0, 0.0, 1.0])):
+        late = np.concatenate(
+            [np.zeros((rows, 3)), acceleration[: len(acceleration) - rows]]
+        )
+        for axes, mask in (
+            ("roll and pitch", [1.0, 1.0, 0.0]),
+            ("yaw", [0.0, 0.0, 1.0]),
+        ):
             columns[f"{name}, {axes}, {rows} rows late"] = (
                 torque_channels(late * mask, track.dt) * SIZE["feedback"]
             )

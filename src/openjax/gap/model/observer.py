@@ -1,11 +1,12 @@
 """The nominal vehicle flown along a log: what the firmware did inside each row.
 
-A row of a log holds the mean of the motor commands over 10 ms (or the first of them), in which the
-500 Hz rate loop ran five times: a jump of the command kicks the motors, and they are back before
-the next row. The observer runs that loop: the nominal rate controller on body rates that the logged
-motors drive and the gyroscope corrects after every row. It gives the motor command of every tick,
-which the physics needs, and the one that the controller would have sent, which shows whether the
-controller is the assumed one.
+A row of a log holds the mean of the motor commands over 10 ms (or the first of them),
+in which the 500 Hz rate loop ran five times: a jump of the command kicks the motors,
+and they are back before the next row. The observer runs that loop: the nominal rate
+controller on body rates that the logged motors drive and the gyroscope corrects after
+every row. It gives the motor command of every tick, which the physics needs, and the
+one that the controller would have sent, which shows whether the controller is the
+assumed one.
 """
 
 from functools import partial
@@ -15,19 +16,26 @@ import jax.numpy as jnp
 
 from openjax.vehicle import DroneState
 from openjax.vehicle.rate_controller import rate_controller
-from openjax.vehicle.rotors import rotor_reaction, rotor_speed_step, rotor_thrust, total_wrench
+from openjax.vehicle.rotors import (
+    rotor_reaction,
+    rotor_speed_step,
+    rotor_thrust,
+    total_wrench,
+)
 
 TICKS = 5  # of the rate loop per row
-# share of a gyro innovation that corrects the observer, near the optimum for usual noise
+# share of a gyro innovation that corrects the observer, near the optimum for usual
+# noise
 GYRO_GAIN = 0.3
-# share of what single samples of the motors miss that corrects the next ones: their noise stays out
+# share of what single samples of the motors miss that corrects the next ones: their
+# noise stays out
 FOLLOWED = 0.2
 
 
 def _ticking(controller, vehicle, h):
-    """The tick of `h` s: (rates, previous, integral, speed), command, offset of the motors and
-    angular acceleration beyond the nominal -> the same, what the controller wanted and what the
-    motors got.
+    """The tick of `h` s: (rates, previous, integral, speed), command, offset of the
+    motors and angular acceleration beyond the nominal -> the same, what the controller
+    wanted and what the motors got.
     """
     level = jnp.array([1.0, 0.0, 0.0, 0.0])
 
@@ -58,37 +66,43 @@ def _ticking(controller, vehicle, h):
 
 @partial(jax.jit, static_argnames="at_once")
 def observe(controller, vehicle, command, motor, gyro, disturbance, dt, at_once=False):
-    """One track: `controller` is the vehicle with its gains; command (T, TICKS, 4), motor (T, 4),
-    gyro (T, 3) rad/s, disturbance (T, 3) rad/s^2 of angular acceleration beyond the nominal; dt ()
-    s per row.
+    """One track: `controller` is the vehicle with its gains; command (T, TICKS, 4),
+    motor (T, 4), gyro (T, 3) rad/s, disturbance (T, 3) rad/s^2 of angular acceleration
+    beyond the nominal; dt () s per row.
 
     `at_once`: a row's motor is its first tick's, not the mean.
 
-    Returns the controller's motor command as it would be logged (T, 4), the motor commands of the
-    ticks (T, TICKS, 4) that suit the log, and the rates at the end of each row as predicted (T,
-    3).
+    Returns the controller's motor command as it would be logged (T, 4), the motor
+    commands of the ticks (T, TICKS, 4) that suit the log, and the rates at the end of
+    each row as predicted (T, 3).
     """
     tick = _ticking(controller, vehicle, dt / TICKS)
 
     def ticks(state, command, offset, push):
-        return jax.lax.scan(lambda s, c: tick(s, c, offset, push), state, command, unroll=True)
+        return jax.lax.scan(
+            lambda s, c: tick(s, c, offset, push), state, command, unroll=True
+        )
 
     def row(carry, inputs):
         command, logged, gyro_next, push = inputs
         state, missed = carry
         if at_once:
-            (rates, previous, *rest), (wanted, sent) = ticks(state, command, missed, push)
+            (rates, previous, *rest), (wanted, sent) = ticks(
+                state, command, missed, push
+            )
             missed = missed + FOLLOWED * (logged - wanted[0] - missed)
             wanted = wanted[0]
         else:
             _, (wanted, _) = ticks(state, command, jnp.zeros(4), push)
             wanted = wanted.mean(0)
-            # The second pass follows the motors as logged: the controller's pattern in the row, the
-            # log's mean.
-            (rates, previous, *rest), (again, sent) = ticks(state, command, logged - wanted, push)
+            # The second pass follows the motors as logged: the controller's pattern in
+            # the row, the log's mean.
+            (rates, previous, *rest), (again, sent) = ticks(
+                state, command, logged - wanted, push
+            )
             wanted = again.mean(0)
-            # The log's mean, within a motor's limits: what a limit cuts off one tick, the others
-            # must have had.
+            # The log's mean, within a motor's limits: what a limit cuts off one tick,
+            # the others must have had.
             for _ in range(3):
                 sent = jnp.clip(sent + (logged - sent.mean(0)), 0.0, 1.0)
         step = GYRO_GAIN * (gyro_next - rates)
@@ -102,9 +116,9 @@ def observe(controller, vehicle, command, motor, gyro, disturbance, dt, at_once=
 
 @jax.jit
 def commanded(vehicle, command, dt):
-    """Mean motor commands (T, 4) and body rates (T, 3) amid the rows that the body-rate commands
-    (T, 4) alone cause: the nominal loop around the nominal vehicle, without gyroscope noise and
-    air.
+    """Mean motor commands (T, 4) and body rates (T, 3) amid the rows that the body-rate
+    commands (T, 4) alone cause: the nominal loop around the nominal vehicle, without
+    gyroscope noise and air.
     """
     tick = _ticking(vehicle, vehicle, dt / TICKS)
 
@@ -115,6 +129,8 @@ def commanded(vehicle, command, dt):
         )
         return carry, (given.mean(0), 0.5 * (start + carry[0]))
 
-    speed = vehicle.max_rotor_speed * jnp.sqrt(jnp.clip(jnp.full(4, command[0, 0]), 1e-4, 1.0))
+    speed = vehicle.max_rotor_speed * jnp.sqrt(
+        jnp.clip(jnp.full(4, command[0, 0]), 1e-4, 1.0)
+    )
     start = (command[0, 1:], command[0, 1:], jnp.zeros(3), speed)
     return jax.lax.scan(row, start, command)[1]

@@ -1,9 +1,9 @@
-"""Forces and torques along a flight: the simulator's own functions on logged states, driven by the
-logged motors.
+"""Forces and torques along a flight: the simulator's own functions on logged states,
+driven by the logged motors.
 
-Nothing is rolled out: at every row the vehicle is where the log says, only the rotor speeds are
-simulated, from the motor commands through the motors' lag. So an error stays where it arises, and
-one call is a few milliseconds.
+Nothing is rolled out: at every row the vehicle is where the log says, only the rotor
+speeds are simulated, from the motor commands through the motors' lag. So an error stays
+where it arises, and one call is a few milliseconds.
 """
 
 from functools import lru_cache, partial
@@ -21,12 +21,19 @@ from openjax.vehicle.effects.composition import (
     change_thrust,
 )
 from openjax.vehicle.rigid_body import rotate
-from openjax.vehicle.rotors import commanded_rotor_speed, rotor_reaction, rotor_thrust, total_wrench
+from openjax.vehicle.rotors import (
+    commanded_rotor_speed,
+    rotor_reaction,
+    rotor_thrust,
+    total_wrench,
+)
 
 
 @flax.struct.dataclass
 class Path:
-    """A track as the physics sees it: T rows, each the state amid its interval. float32, padded."""
+    """A track as the physics sees it: T rows, each the state amid its interval.
+    float32, padded.
+    """
 
     position: jax.Array  # (T, 3) m
     quaternion: jax.Array  # (T, 4)
@@ -41,25 +48,27 @@ class Path:
 
 @lru_cache(maxsize=16)
 def compiled_physics(names: tuple[str, ...], parameters: tuple[tuple[str, str], ...]):
-    """The batched physics with the effects `names`: theta (B, P), and of each its vehicle and path
-    (leaves (B, ...)) -> (B, T, 9).
+    """The batched physics with the effects `names`: theta (B, P), and of each its
+    vehicle and path (leaves (B, ...)) -> (B, T, 9).
 
-    `parameters` says which (effect, parameter) each entry of theta is; parameters not named stay
-    without effect. Beyond them stand the propellers' inertia, each a share of the body's about z,
-    and a shift of the motors in time (s, later is positive).
+    `parameters` says which (effect, parameter) each entry of theta is; parameters not
+    named stay without effect. Beyond them stand the propellers' inertia, each a share
+    of the body's about z, and a shift of the motors in time (s, later is positive).
     """
     return jax.jit(jax.vmap(partial(_channels, resolve(names), parameters)))
 
 
 def _rotors(flown, targets_in_ticks, commands, dt, late):
-    """Rotor speeds (T, 4) whose square is the row's mean, and their change (T, 4), 1/s^2, under the
-    motors' lag, `late` s later. `targets_in_ticks` (T, TICKS, 4): the speeds that `commands` of the
-    same shape ask for.
+    """Rotor speeds (T, 4) whose square is the row's mean, and their change (T, 4),
+    1/s^2, under the motors' lag, `late` s later. `targets_in_ticks` (T, TICKS, 4): the
+    speeds that `commands` of the same shape ask for.
     """
     step = dt / targets_in_ticks.shape[1]
     # As `rotor_speed_step`, with what doesn't change outside the loop.
     faster = -jnp.expm1(-step / flown.motor_time_constant)
-    slower = -jnp.expm1(-step / (flown.motor_time_constant * flown.motor_slowdown_ratio))
+    slower = -jnp.expm1(
+        -step / (flown.motor_time_constant * flown.motor_slowdown_ratio)
+    )
 
     def row(speed, targets):
         total = 0.0
@@ -80,11 +89,15 @@ def _rotors(flown, targets_in_ticks, commands, dt, late):
 
 
 def _values(effects, parameters, theta) -> dict[str, dict[str, jax.Array]]:
-    """{effect: {parameter: ()}}: those of theta (P,), and of the others what does nothing."""
+    """{effect: {parameter: ()}}: those of theta (P,), and of the others what does
+    nothing.
+    """
     values = {}
     for effect in effects:
         absent = effect.none()
-        values[effect.name] = {k: jnp.asarray(v, theta.dtype) for k, v in absent.items()}
+        values[effect.name] = {
+            k: jnp.asarray(v, theta.dtype) for k, v in absent.items()
+        }
     for number, (effect, parameter) in enumerate(parameters):
         values[effect] = {**values[effect], parameter: theta[number]}
     return values
@@ -126,11 +139,15 @@ def _channels(effects, parameters, theta, vehicle, path: Path):
     still = jax.vmap(context)(*along, jnp.zeros_like(path.motor[:, 0]))
 
     def demanded(commands, around):
-        return jax.vmap(lambda m: change_motor_command(effects, values, m, around))(commands)
+        return jax.vmap(lambda m: change_motor_command(effects, values, m, around))(
+            commands
+        )
 
     given = jax.vmap(demanded)(path.motor, still)
 
-    speed, sped_up = _rotors(flown, commanded_rotor_speed(flown, given), given, path.dt, theta[-1])
+    speed, sped_up = _rotors(
+        flown, commanded_rotor_speed(flown, given), given, path.dt, theta[-1]
+    )
     spun_up = theta[-2] * (sped_up @ flown.rotor_spin)
 
     def wrench(position, quaternion, velocity, rates, voltage, others, speed, spun_up):
@@ -147,6 +164,8 @@ def _channels(effects, parameters, theta, vehicle, path: Path):
         angular = angular.at[2].add(spun_up)  # what speeds a rotor up turns the body
         specific = force / flown.mass
         gravity = jnp.array([0.0, 0.0, 1.0], force.dtype) * flown.gravity
-        return jnp.concatenate([angular, rotate(quaternion, specific) - gravity, specific])
+        return jnp.concatenate(
+            [angular, rotate(quaternion, specific) - gravity, specific]
+        )
 
     return jax.vmap(wrench)(*along, speed, spun_up)

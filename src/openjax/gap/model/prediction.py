@@ -1,8 +1,8 @@
-"""What a vehicle with given effects does along each track: the physics on logged states, in lanes
-of one size.
+"""What a vehicle with given effects does along each track: the physics on logged
+states, in lanes of one size.
 
-Channels: body rates (3), velocity (3, world) - both integrated from the first row - and specific
-force (3, body).
+Channels: body rates (3), velocity (3, world) - both integrated from the first row - and
+specific force (3, body).
 """
 
 from dataclasses import dataclass
@@ -28,7 +28,9 @@ KEPT = 32  # mixtures of tracks that stay on the device, some megabytes each
 
 
 def bucket(length: int) -> int:
-    """The padded length of a track: a few fixed sizes, so that nothing is compiled twice."""
+    """The padded length of a track: a few fixed sizes, so that nothing is compiled
+    twice.
+    """
     return next((b for b in BUCKETS if b >= length), length)
 
 
@@ -48,7 +50,9 @@ class Physics:
     vehicles: tuple
     paths: tuple[Path, ...]
 
-    def predict(self, theta: Hypotheses) -> list[Float[np.ndarray, "hypotheses _ channels"]]:
+    def predict(
+        self, theta: Hypotheses
+    ) -> list[Float[np.ndarray, "hypotheses _ channels"]]:
         """Channels (B, T, 9) of each track for parameter vectors theta (B, P)."""
         theta = np.asarray(theta, np.float32)
         run = compiled_physics(PHYSICS_EFFECTS, THETA)
@@ -64,16 +68,21 @@ class Physics:
         for numbers, rows in running:
             for number, lane in zip(numbers, np.asarray(rows), strict=False):
                 parts[number].append(lane[: len(self.tracks[number])])
-        return [_integrated(np.stack(p), t.dt) for p, t in zip(parts, self.tracks, strict=True)]
+        return [
+            _integrated(np.stack(p), t.dt)
+            for p, t in zip(parts, self.tracks, strict=True)
+        ]
 
     @cached_property
     def grown(self) -> Parameters:
-        """(P,) by what usual sizes of parameters are multiplied for a vehicle of this size."""
+        """(P,) by what usual sizes of parameters are multiplied for a vehicle of this
+        size.
+        """
         return growths(self.vehicles[0])
 
     def _in_lanes(self, numbers: tuple[int, ...]) -> tuple:
-        """Vehicles and paths of the tracks `numbers`, on the device: a search asks for the same
-        few mixtures again and again.
+        """Vehicles and paths of the tracks `numbers`, on the device: a search asks for
+        the same few mixtures again and again.
         """
         kept = self._kept
         if numbers not in kept:
@@ -96,15 +105,18 @@ class Physics:
 
 
 def make_physics(tracks, vehicles, motor_ticks) -> Physics:
-    """Physics of tracks with their nominal vehicles and motor commands (T, TICKS, 4) of the rate
-    loop's ticks.
+    """Physics of tracks with their nominal vehicles and motor commands (T, TICKS, 4) of
+    the rate loop's ticks.
     """
     size = bucket(max(map(len, tracks)))
     neighbours = max(1, *(len(t.neighbours) for t in tracks))
     return Physics(
         tuple(tracks),
         tuple(jax.tree.map(np.float32, v) for v in vehicles),
-        tuple(_path(t, m, size, neighbours) for t, m in zip(tracks, motor_ticks, strict=True)),
+        tuple(
+            _path(t, m, size, neighbours)
+            for t, m in zip(tracks, motor_ticks, strict=True)
+        ),
     )
 
 
@@ -116,18 +128,32 @@ def _path(track: Track, ticks: np.ndarray, size: int, neighbours: int) -> Path:
 
     unknown = np.zeros((rows, 3))
     quaternion = (
-        track.quaternion if track.quaternion is not None else np.tile([1.0, 0, 0, 0], (rows, 1))
+        track.quaternion
+        if track.quaternion is not None
+        else np.tile([1.0, 0, 0, 0], (rows, 1))
     )
     quaternion = middle(quaternion)
     quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
     # Without a pose the vehicle is taken to be in mid-air, far from everything.
-    position = track.position if track.position is not None else unknown + np.array([0.0, 0.0, 0.6])
-    position, *neighbours_at = (_inside(p, track.ceiling) for p in (position, *track.neighbours))
+    position = (
+        track.position
+        if track.position is not None
+        else unknown + np.array([0.0, 0.0, 0.6])
+    )
+    position, *neighbours_at = (
+        _inside(p, track.ceiling) for p in (position, *track.neighbours)
+    )
     velocity = track.velocity if track.velocity is not None else unknown
     # Who didn't fly along is far away.
     others = [middle(p) for p in neighbours_at]
-    others += [np.tile(np.float32([50.0, 50.0, -50.0]), (size, 1))] * (neighbours - len(others))
-    voltage = np.full(size, np.nan, np.float32) if track.voltage is None else middle(track.voltage)
+    others += [np.tile(np.float32([50.0, 50.0, -50.0]), (size, 1))] * (
+        neighbours - len(others)
+    )
+    voltage = (
+        np.full(size, np.nan, np.float32)
+        if track.voltage is None
+        else middle(track.voltage)
+    )
     return Path(
         middle(position),
         quaternion,
@@ -142,16 +168,16 @@ def _path(track: Track, ticks: np.ndarray, size: int, neighbours: int) -> Path:
 
 
 def _inside(position: np.ndarray, ceiling: float | None) -> np.ndarray:
-    """Positions (T, 3) in the room. Neither floor nor a known ceiling can be entered: a log that
-    says so has an offset in height.
+    """Positions (T, 3) in the room. Neither floor nor a known ceiling can be entered: a
+    log that says so has an offset in height.
     """
     highest = np.inf if ceiling is None else ceiling
     return np.concatenate([position[:, :2], np.clip(position[:, 2:], 0.0, highest)], 1)
 
 
 def _ceiling(position: np.ndarray, ceiling: float | None) -> float:
-    """Height (m) of the ceiling whose effect is tried: where none is known, the arena's, unless the
-    vehicle flew above it.
+    """Height (m) of the ceiling whose effect is tried: where none is known, the
+    arena's, unless the vehicle flew above it.
     """
     if ceiling is not None:
         return ceiling
@@ -159,7 +185,9 @@ def _ceiling(position: np.ndarray, ceiling: float | None) -> float:
 
 
 def _integrated(rows: np.ndarray, dt: float) -> np.ndarray:
-    """Channels (B, T, 9) from accelerations and specific force (B, T, 9) of the rows' intervals."""
+    """Channels (B, T, 9) from accelerations and specific force (B, T, 9) of the rows'
+    intervals.
+    """
     rows = rows.astype(float)
     integral = np.zeros_like(rows[:, :, :6])
     np.cumsum(rows[:, :-1, :6] * dt, axis=1, out=integral[:, 1:])

@@ -1,8 +1,8 @@
-"""Replay of the motion: what was measured along each track against what the nominal vehicle would
-have measured.
+"""Replay of the motion: what was measured along each track against what the nominal
+vehicle would have measured.
 
-Residuals are compared through noise models (`whitening`), with the nuisances marginalised per
-flight.
+Residuals are compared through noise models (`whitening`), with the nuisances
+marginalised per flight.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ BLOCK = 1.0  # s that are left out together: gusts and sensors forget within les
 
 @dataclass(frozen=True, eq=False)
 class Replay:
-    """All tracks of a case under one nominal vehicle each, and their noise. What noise models make
-    of the nuisances is worked out once.
+    """All tracks of a case under one nominal vehicle each, and their noise. What noise
+    models make of the nuisances is worked out once.
     """
 
     physics: Physics
@@ -57,7 +57,8 @@ class Replay:
     loudness: tuple[np.ndarray, ...] | None = (
         None  # (T', 9) of each track, in units of the noise models
     )
-    absent: np.ndarray = field(default_factory=ABSENT.copy)  # (P,) the vehicle while nothing acts
+    # (P,) the vehicle while nothing acts
+    absent: np.ndarray = field(default_factory=ABSENT.copy)
     mixing: np.ndarray | None = None  # (N, N) of `columns` to independent ones
 
     @property
@@ -73,8 +74,8 @@ class Replay:
 
     @property
     def grown(self) -> Parameters:
-        """(P,) by what usual sizes of parameters are multiplied for a vehicle of this size; every
-        replay of the same physics shares them.
+        """(P,) by what usual sizes of parameters are multiplied for a vehicle of this
+        size; every replay of the same physics shares them.
         """
         return self.physics.grown
 
@@ -89,7 +90,9 @@ class Replay:
 
     @cached_property
     def shared(self) -> np.ndarray:
-        """(N,) whether a nuisance belongs to the vehicle (all flights) or to a block."""
+        """(N,) whether a nuisance belongs to the vehicle (all flights) or to a
+        block.
+        """
         return np.array([not n.startswith(OF_A_BLOCK) for n in self.nuisance_names])
 
     @cached_property
@@ -107,16 +110,21 @@ class Replay:
     def _roots(self) -> list[np.ndarray]:
         return [np.linalg.cholesky(np.eye(len(g)) + g) for g in self.nuisance_grams]
 
-    def predict(self, theta: Hypotheses) -> list[Float[np.ndarray, "hypotheses _ channels"]]:
+    def predict(
+        self, theta: Hypotheses
+    ) -> list[Float[np.ndarray, "hypotheses _ channels"]]:
         """Channels (B, T, 9) of each track for parameter vectors theta (B, P)."""
         return self.physics.predict(theta)
 
     def around(self, theta: Parameters) -> Replay:
-        """With the derivatives of a vehicle that has the effects theta (P,): a wrong moment of
-        inertia scales the torques that are left once an effect is accounted for, not those of
-        motors that hold against it.
+        """With the derivatives of a vehicle that has the effects theta (P,): a wrong
+        moment of inertia scales the torques that are left once an effect is accounted
+        for, not those of motors that hold against it.
         """
-        places = [PLACE[key[:2]] for key in self.numbers] + [len(theta) - 2, len(theta) - 1]
+        places = [PLACE[key[:2]] for key in self.numbers] + [
+            len(theta) - 2,
+            len(theta) - 1,
+        ]
         columns = []
         moved = (column[1:] for column in self.linearised(theta, places))
         for m, old, size in zip(moved, self.columns, self.sizes, strict=True):
@@ -127,8 +135,8 @@ class Replay:
     def whiten(
         self, x: Float[np.ndarray, "*sets rows channels"], track: int
     ) -> Float[np.ndarray, "*sets later channels"]:
-        """x (..., T, 9) of a track -> (..., T', 9) in units of the noise, without the first
-        moments.
+        """x (..., T, 9) of a track -> (..., T', 9) in units of the noise, without the
+        first moments.
         """
         out = whiten(self.noises, x)
         out *= self.usable
@@ -138,15 +146,17 @@ class Replay:
     def grams(
         self, columns: list[Float[np.ndarray, "columns _ channels"]]
     ) -> Float[np.ndarray, "flights columns columns"]:
-        """Inner products (F, C, C) per flight of columns [(C, T, 9) per track], nuisances
-        marginalised.
+        """Inner products (F, C, C) per flight of columns [(C, T, 9) per track],
+        nuisances marginalised.
         """
         total = np.zeros((len(self.flights), len(columns[0]), len(columns[0])))
         for number, column in enumerate(columns):
             w = self.whiten(column, number).reshape(len(column), -1)
             n = self.whitened_nuisances[number]
             cross = n.reshape(len(n), -1) @ w.T
-            taken = solve_triangular(self._roots[number], cross, lower=True, check_finite=False)
+            taken = solve_triangular(
+                self._roots[number], cross, lower=True, check_finite=False
+            )
             total[self.flight_of[number]] += w @ w.T - taken.T @ taken
         return total
 
@@ -155,14 +165,15 @@ class Replay:
         gram = self.nuisance_grams[track]
         n = self.whitened_nuisances[track]
         return np.linalg.solve(
-            np.eye(len(gram)) + gram, n.reshape(len(n), -1) @ self.whiten(residual, track).ravel()
+            np.eye(len(gram)) + gram,
+            n.reshape(len(n), -1) @ self.whiten(residual, track).ravel(),
         )
 
     def linearised(
         self, theta: Parameters, index: Int[np.ndarray, " free"] | Sequence[int]
     ) -> list[np.ndarray]:
-        """Residual and derivatives (1 + p, T, 9) of each track at theta (P,) with respect to
-        theta[index].
+        """Residual and derivatives (1 + p, T, 9) of each track at theta (P,) with
+        respect to theta[index].
         """
         count = len(index)
         steps = (STEP * self.grown)[np.asarray(index, int)]
@@ -175,14 +186,21 @@ class Replay:
 
 
 def make_replay(
-    tracks, vehicles, motor_ticks, feedback, numbers, clocks=(True, False), baseline=None
+    tracks,
+    vehicles,
+    motor_ticks,
+    feedback,
+    numbers,
+    clocks=(True, False),
+    baseline=None,
 ) -> Replay:
-    """Replay of tracks with their nominal vehicles and motor commands (T, TICKS, 4) of the rate
-    loop's ticks. `feedback` of each track: what it made of the motors may be anything in strength
-    and lag. `clocks` are `one_clock` and `at_once`. Without the former the IMU's stream and the
-    motors' are apart by unknown times: the IMU counts nothing, and the motors may be off by tens of
-    milliseconds. With the latter motor commands are single samples, whose quick part and time
-    within a row aren't known. `baseline`: what the vehicle is like while nothing acts.
+    """Replay of tracks with their nominal vehicles and motor commands (T, TICKS, 4) of
+    the rate loop's ticks. `feedback` of each track: what it made of the motors may be
+    anything in strength and lag. `clocks` are `one_clock` and `at_once`. Without the
+    former the IMU's stream and the motors' are apart by unknown times: the IMU counts
+    nothing, and the motors may be off by tens of milliseconds. With the latter motor
+    commands are single samples, whose quick part and time within a row aren't known.
+    `baseline`: what the vehicle is like while nothing acts.
     """
     one_clock, at_once = clocks
     absent = ABSENT if baseline is None else baseline.theta
@@ -195,21 +213,34 @@ def make_replay(
         usable[RATES] = usable[FORCE] = 0.0
     if usable[3:].any() and not all(t.motors_logged for t in tracks):
         usable[RATES] = (
-            0.0  # motors made from commands tell the thrust, not how a real loop shares it out
+            # motors made from commands tell the thrust, not how a real loop shares it
+            # out
+            0.0
         )
     physics = make_physics(tracks, vehicles, motor_ticks)
     nominal = [p[0] for p in physics.predict(absent[None])]
     named = [
         columns_of(track, path, p, made, at_once)
-        for track, path, p, made in zip(tracks, physics.paths, nominal, feedback, strict=True)
+        for track, path, p, made in zip(
+            tracks, physics.paths, nominal, feedback, strict=True
+        )
     ]
     names = tuple(dict.fromkeys(name for columns in named for name in columns))
-    moving = (*(" ".join(key[:2]) for key in numbers), "propellers' inertia", *MOTORS_LATE)
+    moving = (
+        *(" ".join(key[:2]) for key in numbers),
+        "propellers' inertia",
+        *MOTORS_LATE,
+    )
     own = [key[2] for key in numbers]
     apart = SIZE["motor_clock" if one_clock else "streams_apart"]
     sizes = [
         np.array(
-            [*own, SIZE["propeller"], max(apart, t.dt / 4 if at_once else 0.0), SIZE["motor_delay"]]
+            [
+                *own,
+                SIZE["propeller"],
+                max(apart, t.dt / 4 if at_once else 0.0),
+                SIZE["motor_delay"],
+            ]
         )
         for t in tracks
     ]
@@ -225,22 +256,28 @@ def make_replay(
         sizes,
         numbers,
         usable,
-        tuple(first_noise(a, i, d) for (a, i), d in zip(GROUPS, FIRST_NOISE, strict=True)),
+        tuple(
+            first_noise(a, i, d) for (a, i), d in zip(GROUPS, FIRST_NOISE, strict=True)
+        ),
         absent=absent.copy(),
     ).around(absent)
     if not any(CARDS[key[0]].balanced for key in numbers):  # trims are told otherwise
-        replay = replace(replay, columns=[_balanced(c, len(numbers)) for c in replay.columns])
+        replay = replace(
+            replay, columns=[_balanced(c, len(numbers)) for c in replay.columns]
+        )
     mixing = None if baseline is None else baseline.mixing(replay.nuisance_names)
     return replace(replay, mixing=mixing)
 
 
 def _balanced(nuisances: np.ndarray, count: int) -> np.ndarray:
-    """Nuisances (N, T, 9), the first `count` of them without their mean torque: as long as it isn't
-    known what acts, motors that pull one way all the time hold against something, and of a sum of
-    torques that is zero no number can be wrong.
+    """Nuisances (N, T, 9), the first `count` of them without their mean torque: as long
+    as it isn't known what acts, motors that pull one way all the time hold against
+    something, and of a sum of torques that is zero no number can be wrong.
     """
     out = nuisances.copy()
-    out[:count, :, RATES] -= np.linspace(0.0, 1.0, out.shape[1])[:, None] * out[:count, -1:, RATES]
+    out[:count, :, RATES] -= (
+        np.linspace(0.0, 1.0, out.shape[1])[:, None] * out[:count, -1:, RATES]
+    )
     return out
 
 

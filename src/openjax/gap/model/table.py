@@ -1,15 +1,17 @@
-"""Everything that a set of effects could still become, as small matrices: the case linearised
-around a fitted set.
+"""Everything that a set of effects could still become, as small matrices: the case
+linearised around a fitted set.
 
-A table holds, for every second of flight, inner products of all columns that a decision may combine
-- what is left, its derivatives with respect to every parameter, what each further effect would do
-as it was fitted alone, what each effect of the set does, and the nuisances - once whitened
-(likelihood) and once as errors of short predictions (gap). So adding, dropping and swapping effects
-on stretches left out costs nothing but linear algebra.
+A table holds, for every second of flight, inner products of all columns that a decision
+may combine
+- what is left, its derivatives with respect to every parameter, what each further
+  effect would do
+as it was fitted alone, what each effect of the set does, and the nuisances - once
+whitened (likelihood) and once as errors of short predictions (gap). So adding, dropping
+and swapping effects on stretches left out costs nothing but linear algebra.
 
-Nuisances of the vehicle and its sensors are shared by all flights of the case and bounded: each
-stays within twice its usual size, and one that ends there is a finding. How strong feedback is
-depends on what the vehicle does, block by block.
+Nuisances of the vehicle and its sensors are shared by all flights of the case and
+bounded: each stays within twice its usual size, and one that ends there is a finding.
+How strong feedback is depends on what the vehicle does, block by block.
 """
 
 from dataclasses import dataclass
@@ -30,8 +32,8 @@ ERRORS = tuple(f"{kind} {axis}" for kind in HORIZONS for axis in "xyz")
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """Inner products of C columns in each of B blocks. Column 0 is what is left; then come
-    derivatives, steps and parts; the last are nuisances.
+    """Inner products of C columns in each of B blocks. Column 0 is what is left; then
+    come derivatives, steps and parts; the last are nuisances.
     """
 
     fit: SetFit
@@ -71,7 +73,9 @@ class Table:
 
     @cached_property
     def taken(self) -> np.ndarray:
-        """(B, own, C): what each column has of a block's own nuisances, of unit prior variance."""
+        """(B, own, C): what each column has of a block's own nuisances, of unit prior
+        variance.
+        """
         inside = self.white[:, self.own][:, :, self.own]
         return np.linalg.solve(inside + np.eye(len(self.own)), self.white[:, self.own])
 
@@ -85,7 +89,9 @@ class Table:
         """(C, C): `total` with the shared nuisances marginalised as well."""
         shared = self.nuisances[self.shared]
         inside = self.total[np.ix_(shared, shared)] + np.eye(len(shared))
-        return self.total - self.total[:, shared] @ np.linalg.solve(inside, self.total[shared])
+        return self.total - self.total[:, shared] @ np.linalg.solve(
+            inside, self.total[shared]
+        )
 
     @cached_property
     def marginal(self) -> np.ndarray:
@@ -95,8 +101,8 @@ class Table:
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """One combination of a table's columns: column 0 and `parts` are there, the coefficients of
-    `free` are fitted, with prior `mean` and `precision`.
+    """One combination of a table's columns: column 0 and `parts` are there, the
+    coefficients of `free` are fitted, with prior `mean` and `precision`.
     """
 
     parts: tuple[int, ...]
@@ -106,8 +112,8 @@ class Model:
 
 
 def build(fit: SetFit, singles: dict[str, SetFit] | None) -> Table:
-    """The table around a fitted set; `singles` {effect: its fit alone} are the effects that may
-    come in; None: nothing may come in or go.
+    """The table around a fitted set; `singles` {effect: its fit alone} are the effects
+    that may come in; None: nothing may come in or go.
     """
     replay = fit.replay
     own = fit.effects if singles is not None else ()
@@ -128,15 +134,21 @@ def build(fit: SetFit, singles: dict[str, SetFit] | None) -> Table:
     rows = []
     track_of = []
     whole = []
-    for number, (c, m, track) in enumerate(zip(columns, moved, replay.tracks, strict=True)):
+    for number, (c, m, track) in enumerate(
+        zip(columns, moved, replay.tracks, strict=True)
+    ):
         now = replay.measured[number] - c[0]
         nuisances = replay.nuisances[number]
-        x = np.concatenate([c, m[: len(others)] - now, now - m[len(others) :], nuisances])
+        x = np.concatenate(
+            [c, m[: len(others)] - now, now - m[len(others) :], nuisances]
+        )
         without = replay.whiten(x[: -len(nuisances)], number)
         w = np.concatenate([without, replay.whitened_nuisances[number]])
         count = block_count(w.shape[1], track.dt)
         e = _errors(x, track.dt)[:, max(int(SKIP / track.dt), 25) :, replay.usable > 0]
-        for a, b in zip(np.array_split(w, count, 1), np.array_split(e, count, 1), strict=True):
+        for a, b in zip(
+            np.array_split(w, count, 1), np.array_split(e, count, 1), strict=True
+        ):
             flat = a.reshape(len(x), -1)
             whole.append(flat)
             white.append(flat @ flat.T)
@@ -171,11 +183,13 @@ def _errors(x: np.ndarray, dt: float) -> np.ndarray:
 
 
 def with_effects(table: Table, add=(), drop=()) -> Model:
-    """The table's set with effects that come in as they were fitted alone (and may move from there)
-    or go.
+    """The table's set with effects that come in as they were fitted alone (and may move
+    from there) or go.
     """
     kept = tuple(e for e in table.fit.effects if e not in drop)
-    index, mean, precision = prior(kept, table.fit.replay.absent, table.fit.replay.grown)
+    index, mean, precision = prior(
+        kept, table.fit.replay.absent, table.fit.replay.grown
+    )
     own = np.array([table.derivative[int(i)] for i in index], int)
     # The set's parameters: coefficients count from where they were fitted.
     mean = mean - table.fit.theta[index] if len(index) else mean
@@ -197,5 +211,8 @@ def with_effects(table: Table, add=(), drop=()) -> Model:
         blocks.append(np.diag(1.0 / spread[inside] ** 2))
     free = np.concatenate(free).astype(int)
     return Model(
-        tuple(table.part[e] for e in drop), free, np.concatenate(means), block_diagonal(blocks)
+        tuple(table.part[e] for e in drop),
+        free,
+        np.concatenate(means),
+        block_diagonal(blocks),
     )

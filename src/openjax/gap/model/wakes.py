@@ -1,15 +1,16 @@
 """Wakes of other vehicles as they are felt: late, and in gusts.
 
-Air that arrives under another vehicle left it some tenths of a second ago, and passes by a vehicle
-that is no longer there: of some speeds of fall the likeliest is taken.
+Air that arrives under another vehicle left it some tenths of a second ago, and passes
+by a vehicle that is no longer there: of some speeds of fall the likeliest is taken.
 
-A real wake also wanders and arrives in puffs. Of a vehicle that passes through it little is left on
-average, and what is left looks like wind or drag. But it shakes: what the replay doesn't predict is
-louder under another vehicle than elsewhere in the same flights. How much louder is told by the
-innovations' mean squares over visits below the other one and over stretches elsewhere (Welch's test
-of their logarithms). Where it is clear, rows under the other one count by their own noise, so that
-puffs aren't evidence of anything else. The effect that acts there alone has the nats of the test
-for it, and those that its mean push has by the noise elsewhere.
+A real wake also wanders and arrives in puffs. Of a vehicle that passes through it
+little is left on average, and what is left looks like wind or drag. But it shakes: what
+the replay doesn't predict is louder under another vehicle than elsewhere in the same
+flights. How much louder is told by the innovations' mean squares over visits below the
+other one and over stretches elsewhere (Welch's test of their logarithms). Where it is
+clear, rows under the other one count by their own noise, so that puffs aren't evidence
+of anything else. The effect that acts there alone has the nats of the test for it, and
+those that its mean push has by the noise elsewhere.
 """
 
 from collections.abc import Sequence
@@ -29,13 +30,15 @@ ASIDE = 0.2  # m, to the side: a wake's width at a metre below, and its wanderin
 LINGERS = 0.3  # s: a wake falls with some 2 m/s, and sensors and motors answer
 SHORTEST = 0.1  # s of a visit, or of a stretch elsewhere, that is compared
 FEWEST = 3  # of each
-FEWEST_HERE = 2.0  # s of a track elsewhere; below, other tracks of the case are asked as well
+# s of a track elsewhere; below, other tracks of the case are asked as well
+FEWEST_HERE = 2.0
 CLEAR = 3.0  # standard errors
-SURE = 5.0  # standard errors beyond which the test, whose tails nobody knows, says no more
+# standard errors beyond which the test, whose tails nobody knows, says no more
+SURE = 5.0
 LOUDER = 1.3  # times the mean square elsewhere
 SPEEDS = (4.0, 2.5, 1.5)
-"""m/s, at which air falls: of the disc of a vehicle of 30 g 4.3, by momentum theory, and less below
-where the jet has widened.
+"""m/s, at which air falls: of the disc of a vehicle of 30 g 4.3, by momentum theory,
+and less below where the jet has widened.
 """
 LATER = 4.0  # nats by which one of these must be better than a wake at once
 
@@ -47,7 +50,9 @@ class Gusts:
     rows: tuple[Bool[np.ndarray, " _"], ...]
     """(T,) of each track: under another vehicle, or just before."""
     louder: dict[tuple[int, ...], float]
-    """{axes of the groups that are clearly louder there: by which factor in the mean square}."""
+    """{axes of the groups that are clearly louder there: by which factor in the mean
+    square}.
+    """
     nats: float
     """For a wake; 0 where nothing is clear."""
 
@@ -61,7 +66,9 @@ class Gusts:
 
 
 def fit_wake(replay: Replay, effect: str) -> SetFit:
-    """The fit of the effect that acts under others alone, with wakes at the likeliest speed."""
+    """The fit of the effect that acts under others alone, with wakes at the likeliest
+    speed.
+    """
     at_once = fit_single(replay, effect)
     late = [fit_single(with_late_wakes(replay, speed), effect) for speed in SPEEDS]
     best = max(late, key=lambda fit: fit.score)
@@ -69,8 +76,8 @@ def fit_wake(replay: Replay, effect: str) -> SetFit:
 
 
 def with_late_wakes(replay: Replay, speed: float) -> Replay:
-    """The replay with other vehicles where they were when the air left them that arrives now,
-    having fallen at a speed (m/s).
+    """The replay with other vehicles where they were when the air left them that
+    arrives now, having fallen at a speed (m/s).
     """
     paths = []
     for path in replay.physics.paths:
@@ -79,13 +86,17 @@ def with_late_wakes(replay: Replay, speed: float) -> Replay:
         for other in np.moveaxis(others, 1, 0):
             above = np.clip(other[:, 2] - path.position[:, 2], 0.0, ABOVE[1])
             then = np.maximum(now - above / speed / float(path.dt), 0.0)
-            other[:, :2] = np.stack([np.interp(then, now, x) for x in other[:, :2].T.copy()], 1)
+            other[:, :2] = np.stack(
+                [np.interp(then, now, x) for x in other[:, :2].T.copy()], 1
+            )
         paths.append(path.replace(others=others))
     return replace(replay, physics=replace(replay.physics, paths=tuple(paths)))
 
 
 def under_another(track: Track) -> Chosen:
-    """(T,) whether another vehicle flies above, or did within the time that its wake takes."""
+    """(T,) whether another vehicle flies above, or did within the time that its wake
+    takes.
+    """
     near = np.zeros(len(track), bool)
     if track.position is None:
         return near
@@ -98,7 +109,9 @@ def under_another(track: Track) -> Chosen:
 
 
 def read_gusts(fit: SetFit) -> Gusts:
-    """The gusts that a fit leaves: of nothing, or of the effect that acts under others alone."""
+    """The gusts that a fit leaves: of nothing, or of the effect that acts under others
+    alone.
+    """
     replay = replace(fit.replay, loudness=None)
     rows = tuple(under_another(track) for track in replay.tracks)
     left = [
@@ -109,7 +122,9 @@ def read_gusts(fit: SetFit) -> Gusts:
     far = 0.0
     for axes, _ in GROUPS:
         if replay.usable[axes[0]]:
-            ratio, errors = louder_in(replay.tracks, rows, [w[:, list(axes)] for w in left])
+            ratio, errors = louder_in(
+                replay.tracks, rows, [w[:, list(axes)] for w in left]
+            )
             if errors > CLEAR and ratio > LOUDER:
                 louder[axes] = ratio
                 far = max(far, min(errors, SURE))
@@ -121,8 +136,8 @@ def louder_in(
     rows: Sequence[Bool[np.ndarray, " _"]],
     left: Sequence[Float[np.ndarray, "_ axes"]],
 ) -> tuple[float, float]:
-    """By which factor mean squares of innovations (T', axes) are larger in the chosen rows than
-    elsewhere, and how many standard errors the logarithm is from none.
+    """By which factor mean squares of innovations (T', axes) are larger in the chosen
+    rows than elsewhere, and how many standard errors the logarithm is from none.
     """
     inside: list[float] = []
     outside: list[float] = []
@@ -144,12 +159,16 @@ def louder_in(
     ratio = float(parts[0].mean() - parts[1].mean())
     freedom = spread.sum() ** 2 / (spread**2 / [len(part) - 1 for part in parts]).sum()
     # as many standard errors of a normal distribution as Student's says
-    return float(np.exp(ratio)), float(-norm.ppf(t.sf(ratio / spread.sum() ** 0.5, freedom)))
+    return float(np.exp(ratio)), float(
+        -norm.ppf(t.sf(ratio / spread.sum() ** 0.5, freedom))
+    )
 
 
 def _stretches(squares: np.ndarray, chosen: Chosen, dt: float) -> list[float]:
     """Mean squares of stretches of chosen rows, none longer than a block."""
-    edges = np.flatnonzero(np.diff(chosen.astype(int), prepend=0, append=0)).reshape(-1, 2)
+    edges = np.flatnonzero(np.diff(chosen.astype(int), prepend=0, append=0)).reshape(
+        -1, 2
+    )
     found = []
     for begin, end in edges:
         pieces = max(round((end - begin) * dt / BLOCK), 1)
@@ -159,15 +178,19 @@ def _stretches(squares: np.ndarray, chosen: Chosen, dt: float) -> list[float]:
     return found
 
 
-def as_loud_as(gusts: Gusts, replay: Replay, effects: Sequence[str]) -> tuple[Replay, Gusts]:
-    """A replay whose noise is as loud under other vehicles as the gusts are, and these with the
-    nats that the effect of wakes, if there is one in `effects`, loses by that.
+def as_loud_as(
+    gusts: Gusts, replay: Replay, effects: Sequence[str]
+) -> tuple[Replay, Gusts]:
+    """A replay whose noise is as loud under other vehicles as the gusts are, and these
+    with the nats that the effect of wakes, if there is one in `effects`, loses by that.
     """
     louder = _louder(replay, gusts)
     lost = 0.0
     for effect in effects:
         quiet = fit_single(replay, effect).score - fit_set(replay, ()).score
-        lost = max(quiet - fit_single(louder, effect).score + fit_set(louder, ()).score, 0.0)
+        lost = max(
+            quiet - fit_single(louder, effect).score + fit_set(louder, ()).score, 0.0
+        )
     return louder, replace(gusts, nats=gusts.nats + lost)
 
 
@@ -175,11 +198,15 @@ def _louder(replay: Replay, gusts: Gusts) -> Replay:
     if replay.loudness is None:
         return replay
     loudness = []
-    for track, chosen, loud in zip(replay.tracks, gusts.rows, replay.loudness, strict=True):
+    for track, chosen, loud in zip(
+        replay.tracks, gusts.rows, replay.loudness, strict=True
+    ):
         here = chosen[int(SKIP / track.dt) :]
         own = loud.copy()
         for axes, ratio in gusts.louder.items():
-            quiet = np.sqrt((loud[~here][:, axes] ** 2).mean()) if (~here).any() else 1.0
+            quiet = (
+                np.sqrt((loud[~here][:, axes] ** 2).mean()) if (~here).any() else 1.0
+            )
             columns = np.ix_(here, axes)
             own[columns] = np.maximum(own[columns], quiet * ratio**0.5)
         loudness.append(own)

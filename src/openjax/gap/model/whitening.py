@@ -1,11 +1,12 @@
-"""Noise models: what turns the residual of a channel into (nearly) independent numbers of unit
-variance.
+"""Noise models: what turns the residual of a channel into (nearly) independent numbers
+of unit variance.
 
-A residual is sensor noise and gusts. Sensor noise is white; a gust is a force or torque with a
-memory of some time, which integrated channels (rates, velocity, attitude) add up, beside small
-white steps from what the replay leaves out. The innovations of the Kalman filter of this model are
-white. Everything acts on residuals and on their derivatives alike, and causally: in closed loop the
-motors answer disturbances, so only a residual given its own past says something about causes.
+A residual is sensor noise and gusts. Sensor noise is white; a gust is a force or torque
+with a memory of some time, which integrated channels (rates, velocity, attitude) add
+up, beside small white steps from what the replay leaves out. The innovations of the
+Kalman filter of this model are white. Everything acts on residuals and on their
+derivatives alike, and causally: in closed loop the motors answer disturbances, so only
+a residual given its own past says something about causes.
 """
 
 import itertools
@@ -17,8 +18,8 @@ from jaxtyping import Float
 from scipy.linalg import solve_discrete_are
 from scipy.signal import lfilter
 
-# The grid of models: memory of the gust (per row), its rms per row and that of the white steps over
-# sensor noise.
+# The grid of models: memory of the gust (per row), its rms per row and that of the
+# white steps over sensor noise.
 MEMORIES = (0.0, 0.5, 0.8, 0.9, 0.95, 0.98, 0.995)
 GUSTS = (0.003, 0.01, 0.02, 0.04, 0.08, 0.15, 0.3, 0.6, 1.5)
 STEPS = (0.0, 0.05, 0.15, 0.4, 1.0)
@@ -26,8 +27,8 @@ STEPS = (0.0, 0.05, 0.15, 0.4, 1.0)
 
 @dataclass(frozen=True, eq=False)
 class Noise:
-    """Noise of one group of axes: whitening filter (numerator, denominator), innovation's
-    deviation.
+    """Noise of one group of axes: whitening filter (numerator, denominator),
+    innovation's deviation.
     """
 
     axes: tuple[int, ...]
@@ -45,8 +46,8 @@ class Noise:
 def whiten(
     noises, x: Float[np.ndarray, "*sets rows channels"]
 ) -> Float[np.ndarray, "*sets later channels"]:
-    """x (..., T, C) channel by channel, each group of axes, which lie side by side, by its own
-    noise model.
+    """x (..., T, C) channel by channel, each group of axes, which lie side by side, by
+    its own noise model.
     """
     out = np.empty_like(x)
     for noise in noises:
@@ -58,7 +59,9 @@ def whiten(
 def first_noise(axes, integrated: bool, deviation: float) -> Noise:
     """A noise model to begin with: sensor noise and some white steps."""
     step = 0.15 if integrated else 0.0
-    numerator, denominator = _kalman(memory=0.9, gust=0.04, step=step, integrated=integrated)
+    numerator, denominator = _kalman(
+        memory=0.9, gust=0.04, step=step, integrated=integrated
+    )
     return Noise(tuple(axes), numerator, denominator, deviation)
 
 
@@ -69,15 +72,16 @@ def fit_noise(axes, residuals, integrated: bool, skip: int = 20) -> Noise:
     series = [r[:, list(axes)] for r in residuals]
     memory, gust, step = _choose([s[skip:] for s in series], integrated)
     numerator, denominator = _kalman(memory, gust, step, integrated)
-    # the filter starts at the first row, and what it makes of its start is cut off afterwards
+    # the filter starts at the first row, and what it makes of its start is cut off
+    # afterwards
     white = [lfilter(numerator, denominator, s, axis=0)[skip:].ravel() for s in series]
     deviation = float(np.sqrt(np.mean(np.concatenate(white) ** 2))) + 1e-9
     return Noise(tuple(axes), numerator, denominator, deviation)
 
 
 def _choose(parts, integrated: bool) -> tuple[float, float, float]:
-    """The grid's (memory, gust, step) with the largest Whittle likelihood, its scale profiled
-    out.
+    """The grid's (memory, gust, step) with the largest Whittle likelihood, its scale
+    profiled out.
     """
     log_part = 0.0
     ratio_part = 0.0
@@ -104,8 +108,9 @@ def _grid(integrated: bool) -> list[tuple[float, float, float]]:
 
 @lru_cache(maxsize=32)
 def _spectra(rows: int, integrated: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Model spectra (G, f) of (differenced) residuals of unit sensor noise, and the sums of their
-    logarithms (G,)."""
+    """Model spectra (G, f) of (differenced) residuals of unit sensor noise, and the
+    sums of their logarithms (G,).
+    """
     shift = np.exp(-2j * np.pi * np.fft.rfftfreq(rows)[2:])
     grid = np.array(_grid(integrated))
     memory, gust, step = (grid[:, k, None] for k in range(3))
@@ -118,8 +123,8 @@ def _spectra(rows: int, integrated: bool) -> tuple[np.ndarray, np.ndarray]:
 def _kalman(
     memory: float, gust: float, step: float, integrated: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Innovation filter (numerator, denominator) of the stationary Kalman filter with unit sensor
-    noise.
+    """Innovation filter (numerator, denominator) of the stationary Kalman filter with
+    unit sensor noise.
     """
     drive = gust**2 * (1 - memory**2)
     if integrated:

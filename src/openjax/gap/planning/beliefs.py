@@ -17,7 +17,9 @@ SCALE_ONLY = {"mass", "thrust_scale", "thrust_curve"}
 
 
 def read_report(folder: Path) -> dict:
-    """The `report.json` of a diagnosis. Raises UserError where there is none that can be read."""
+    """The `report.json` of a diagnosis. Raises UserError where there is none that can
+    be read.
+    """
     path = folder / "report.json" if folder.is_dir() else folder
     if not path.is_file():
         raise UserError(
@@ -27,14 +29,17 @@ def read_report(folder: Path) -> dict:
         report = json.loads(path.read_text(encoding="utf-8"))
     except (ValueError, UnicodeDecodeError):
         raise UserError(f"{path}: isn't JSON; diagnose the flights again") from None
-    if not isinstance(report, dict) or not {"probabilities", "parameters"} <= set(report):
+    if not isinstance(report, dict) or not {"probabilities", "parameters"} <= set(
+        report
+    ):
         raise UserError(f"{path}: not a report of openjax diagnose")
     return report
 
 
 def beliefs_of(report: dict) -> list[Belief]:
-    """The likeliest causes of a report and what these flights couldn't show, normalised. Only what
-    acts between motors and motion: other effects are read from the commands' own columns.
+    """The likeliest causes of a report and what these flights couldn't show,
+    normalised. Only what acts between motors and motion: other effects are read from
+    the commands' own columns.
     """
     chances = report["probabilities"]
     named = [e for e in report.get("effects", ()) if _flown(e)]
@@ -53,7 +58,9 @@ def beliefs_of(report: dict) -> list[Belief]:
     for effect in filter(_flown, report.get("not_testable", ())):
         found.setdefault((effect,), UNTESTED)
     whole = sum(found.values())
-    return [Belief(e, _theta(e, report["parameters"]), p / whole) for e, p in found.items()]
+    return [
+        Belief(e, _theta(e, report["parameters"]), p / whole) for e, p in found.items()
+    ]
 
 
 def _flown(effect: str) -> bool:
@@ -62,7 +69,9 @@ def _flown(effect: str) -> bool:
 
 
 def _theta(effects, parameters: dict) -> np.ndarray:
-    """(P,) with the report's values, or an effect's usual start where the report has none."""
+    """(P,) with the report's values, or an effect's usual start where the report has
+    none.
+    """
     theta = ABSENT.copy()
     for effect in effects:
         theta[places((effect,))] = [p.start for p in CARDS[effect].fitted]

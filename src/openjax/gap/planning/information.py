@@ -1,11 +1,11 @@
 """What each segment of flight is expected to tell.
 
-A segment is flown by the nominal simulator. Of two causes i and j it then shows d_ij = 1/2 |f_i -
-f_j|^2 nats, in units of the noise, less what nuisances and the parameters of j can take. Its value
-is sum_ij p_i p_j (1 - exp(-(d_ij - 8) / 2)), for the 8 nats that a diagnosis asks for: the
-probability that two causes drawn from what is believed are told apart (T-optimal design: Atkinson,
-Fedorov 1975; the bound is Bhattacharyya's). The air is as uneven as in a quiet hall: in still air
-every segment would tell everything.
+A segment is flown by the nominal simulator. Of two causes i and j it then shows d_ij =
+1/2 |f_i - f_j|^2 nats, in units of the noise, less what nuisances and the parameters of
+j can take. Its value is sum_ij p_i p_j (1 - exp(-(d_ij - 8) / 2)), for the 8 nats that
+a diagnosis asks for: the probability that two causes drawn from what is believed are
+told apart (T-optimal design: Atkinson, Fedorov 1975; the bound is Bhattacharyya's). The
+air is as uneven as in a quiet hall: in still air every segment would tell everything.
 """
 
 import itertools
@@ -79,7 +79,9 @@ def advise(beliefs: list[Belief], vehicle_file: VehicleFile) -> Advice:
         i, j = np.unravel_index(int(np.argmax(np.triu(told, 1))), told.shape)
         pair = (beliefs[i].name, beliefs[j].name)
         promises.append(
-            Promise(name.split(".")[0], float(told.sum()), pair, float(apart[number, i, j]))
+            Promise(
+                name.split(".")[0], float(told.sum()), pair, float(apart[number, i, j])
+            )
         )
     chosen = _fewest(apart, together)
     best = apart.max(0)
@@ -92,15 +94,15 @@ def advise(beliefs: list[Belief], vehicle_file: VehicleFile) -> Advice:
 
 
 def _told(nats: np.ndarray) -> np.ndarray:
-    """Probability that two causes so many nats apart are told from each other by a diagnosis that
-    asks for DETECTABLE of them.
+    """Probability that two causes so many nats apart are told from each other by a
+    diagnosis that asks for DETECTABLE of them.
     """
     return 1.0 - np.exp(-0.5 * np.maximum(nats - DETECTABLE, 0.0))
 
 
 def _fewest(apart: np.ndarray, together: np.ndarray) -> list[int]:
-    """Segments, each adding most to those before, until they tell nearly what all do (nats of
-    flights add up).
+    """Segments, each adding most to those before, until they tell nearly what all do
+    (nats of flights add up).
     """
 
     def told(nats):
@@ -123,7 +125,9 @@ def _simulated(vehicle_file: VehicleFile) -> Replay:
     flights = []
     for number, (name, segment) in enumerate(SEGMENTS.items()):
         air = Turbulence()
-        columns = fly(vehicle, vehicle, segment.reference(SECONDS), seed=number, air=air)
+        columns = fly(
+            vehicle, vehicle, segment.reference(SECONDS), seed=number, air=air
+        )
         found, _ = flights_of(log_of(columns, name), (0, 1, 2, 3))
         flights += found
     case = Case("segments", tuple(flights), described)
@@ -138,7 +142,8 @@ def _distances(replay: Replay, beliefs: list[Belief]) -> np.ndarray:
         index = places(belief.effects)
         slopes = [c[1:] for c in replay.linearised(belief.theta, index)]
         columns = [
-            np.concatenate([p - p[j][None], s]) for p, s in zip(predicted, slopes, strict=True)
+            np.concatenate([p - p[j][None], s])
+            for p, s in zip(predicted, slopes, strict=True)
         ]
         grams = replay.grams(columns)
         count = len(beliefs)
@@ -152,9 +157,10 @@ def _distances(replay: Replay, beliefs: list[Belief]) -> np.ndarray:
 
 
 def of_pairs(nats: np.ndarray, beliefs: list[Belief]) -> np.ndarray:
-    """(F, B, B) nats of pairs, from those (F, B, B) by which what one cause does speaks against
-    another. A cause is told from another only if neither can imitate the other; but one that holds
-    the other's effects and more imitates it always, so there what it does more counts.
+    """(F, B, B) nats of pairs, from those (F, B, B) by which what one cause does speaks
+    against another. A cause is told from another only if neither can imitate the other;
+    but one that holds the other's effects and more imitates it always, so there what it
+    does more counts.
     """
     out = np.minimum(nats, np.swapaxes(nats, 1, 2))
     for i, more in enumerate(beliefs):

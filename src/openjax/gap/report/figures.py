@@ -14,15 +14,23 @@ from openjax.gap.model.table import HORIZONS
 from openjax.gap.report.report import Report
 from openjax.gap.residual import disturbances
 from openjax.gap.where import CALM, before_and_after
-from openjax.show.pages import AFTER, BEFORE, GREY, STYLE, add_legend, as_svg, small_figure
+from openjax.show.pages import (
+    AFTER,
+    BEFORE,
+    GREY,
+    STYLE,
+    add_legend,
+    as_svg,
+    small_figure,
+)
 
 HORIZONS_SHOWN = (0.02, 0.05, 0.1, 0.25, 0.5, 1.0)  # s
 BINS = 15
 
 
 def figures(report: Report) -> list[tuple[str, str, str]]:
-    """(title, what it shows, SVG) of every figure that the report's arrays allow; a gap only where
-    there is one.
+    """(title, what it shows, SVG) of every figure that the report's arrays allow; a gap
+    only where there is one.
     """
     if not report.plots:
         return []
@@ -37,16 +45,16 @@ def figures(report: Report) -> list[tuple[str, str, str]]:
 
 
 def _residuals(report: Report) -> tuple[list, list]:
-    """Residuals of each track of the nominal simulator, sensors and clocks as with the named
-    effects, and with those.
+    """Residuals of each track of the nominal simulator, sensors and clocks as with the
+    named effects, and with those.
     """
     fit = report.plots["selection"].fit
     return before_and_after(fit, [e for e in report.named if e in fit.effects])
 
 
 def _places(report: Report):
-    """The parts of the flights that hold most of the gap: error before and after, in units of the
-    noise.
+    """The parts of the flights that hold most of the gap: error before and after, in
+    units of the noise.
     """
     places = [place for place in report.where if place.share > 0.01][:8][::-1]
     if not report.effects or not places:
@@ -58,10 +66,18 @@ def _places(report: Report):
     axes.hlines(rows, after, before, color=GREY, linewidth=2)
     axes.plot(before, rows, "o", color=BEFORE, markersize=7, label="nominal simulator")
     if report.parameters:
-        axes.plot(after, rows, "o", color=AFTER, markersize=7, label="with the named effects")
+        axes.plot(
+            after, rows, "o", color=AFTER, markersize=7, label="with the named effects"
+        )
     axes.axvline(1.0, color=GREY, linestyle=":", linewidth=1.2)
-    axes.set_yticks(rows, [f"{p.channel}, {p.regime}".replace("_", " ") for p in places])
-    axes.set(xlabel="error, in units of the noise", xlim=(0, None), ylim=(-0.6, len(places) - 0.4))
+    axes.set_yticks(
+        rows, [f"{p.channel}, {p.regime}".replace("_", " ") for p in places]
+    )
+    axes.set(
+        xlabel="error, in units of the noise",
+        xlim=(0, None),
+        ylim=(-0.6, len(places) - 0.4),
+    )
     add_legend(axes)
     return (
         "Where the gap lies",
@@ -85,7 +101,9 @@ class Course:
     name: str
     unit: str
     adds_up: bool
-    """Whether errors of a prediction are differences of these; else these are the errors."""
+    """Whether errors of a prediction are differences of these; else these are the
+    errors.
+    """
 
     def errors(self, seconds: float) -> tuple[np.ndarray, np.ndarray]:
         """Errors of predictions so far ahead, before and after."""
@@ -115,7 +133,9 @@ def _courses(report: Report) -> Iterator[Course]:
         floor = channel.residuals(evidence.library.of(channel.path))
         for name, series in channel.residuals(report.named).items():
             scale = max(rms(np.concatenate(floor[name])), 1e-12)
-            for track, before, after in zip(evidence.tracks, without[name], series, strict=True):
+            for track, before, after in zip(
+                evidence.tracks, without[name], series, strict=True
+            ):
                 # of some channels one number is known of a whole flight
                 skip = int(SKIP / track.dt) if len(after) > 1 else 0
                 yield Course(
@@ -152,8 +172,8 @@ def _courses_of_motion(report: Report) -> Iterator[Course]:
 
 
 def _worst(report: Report) -> Course | None:
-    """Where the nominal simulator errs most, against what is left; None where no channel of motion
-    or firmware was logged.
+    """Where the nominal simulator errs most, against what is left; None where no
+    channel of motion or firmware was logged.
     """
     return max(_courses(report), key=lambda course: course.ratio, default=None)
 
@@ -189,12 +209,22 @@ def _course(report: Report):
 
 
 def _lines(report: Report, nominal, corrected) -> Sequence[tuple]:
-    """(residual, colour, label): the nominal simulator, and the corrected one where effects were
-    named.
+    """(residual, colour, label): the nominal simulator, and the corrected one where
+    effects were named.
     """
     if not report.parameters:
-        return ((nominal, AFTER if report.verdict == "none" else BEFORE, "nominal simulator"),)
-    return (nominal, BEFORE, "nominal simulator"), (corrected, AFTER, "with the named effects")
+        return (
+            (
+                nominal,
+                AFTER if report.verdict == "none" else BEFORE,
+                "nominal simulator",
+            ),
+        )
+    return (nominal, BEFORE, "nominal simulator"), (
+        corrected,
+        AFTER,
+        "with the named effects",
+    )
 
 
 def _horizons(report: Report):
@@ -224,12 +254,16 @@ def _horizons(report: Report):
 
 
 def _coordinate(report: Report):
-    """What the nominal simulator misses, against the variable that the first named effect
-    follows.
+    """What the nominal simulator misses, against the variable that the first named
+    effect follows.
     """
     evidence = report.plots["evidence"]
     named = report.named
-    if not named or not evidence.replay.usable[3] or evidence.tracks[0].quaternion is None:
+    if (
+        not named
+        or not evidence.replay.usable[3]
+        or evidence.tracks[0].quaternion is None
+    ):
         return None
     coordinate = CARDS[named[0]].coordinate
     if not coordinate:  # its force follows none, or it makes torques or delays
@@ -254,7 +288,8 @@ def _coordinate(report: Report):
     }
     axes.axhline(0.0, color=GREY, linestyle=":", linewidth=1.2)
     axes.set(
-        xlabel=units.get(coordinate, f"{coordinate} [m]"), ylabel="missing acceleration [m/s²]"
+        xlabel=units.get(coordinate, f"{coordinate} [m]"),
+        ylabel="missing acceleration [m/s²]",
     )
     add_legend(axes)
     return (
@@ -265,8 +300,8 @@ def _coordinate(report: Report):
 
 
 def _pairs(track, residual, coordinate):
-    """(T', 2) of the coordinate and the missing acceleration along its axis; None where the track
-    hasn't it.
+    """(T', 2) of the coordinate and the missing acceleration along its axis; None where
+    the track hasn't it.
     """
     missing = smooth(disturbances(track, residual), CALM, track.dt)[:, 3:6]
     # drag acts against the motion, all else along the rotors' axes

@@ -18,8 +18,8 @@ MOST = 0.5
 
 
 def page_of(report: Report, folder: Path | None = None) -> str:
-    """The whole page as text: the answer and what to type next, figures, values, and folded what is
-    rarely asked. `folder`: where it is written.
+    """The whole page as text: the answer and what to type next, figures, values, and
+    folded what is rarely asked. `folder`: where it is written.
     """
     ranked = sorted(report.probabilities.items(), key=lambda item: -item[1])
     return filled(
@@ -55,14 +55,17 @@ def facts(report: Report) -> list[tuple[str, str]]:
 
 
 def sentence(report: Report) -> str:
-    """What was found, in one plain sentence that says what the chart of shares shows."""
+    """What was found, in one plain sentence that says what the chart of shares
+    shows.
+    """
     named = report.named
     if not named:
         return VERDICTS[report.verdict]
     values = [report.shares.effects[effect].value for effect in named]
     names = [report.class_of(effect).replace("_", " ") for effect in named]
     parts = " and ".join(
-        f"{name} ({100 * value:.0f} %)" for name, value in zip(names, values, strict=True)
+        f"{name} ({100 * value:.0f} %)"
+        for name, value in zip(names, values, strict=True)
     )
     whole = sum(values)
     if whole < MOST:
@@ -84,7 +87,9 @@ def sentence(report: Report) -> str:
 
 
 def shares(report: Report) -> list[dict]:
-    """Rows of the chart: name, value and interval in per cent, and what kind of thing it is."""
+    """Rows of the chart: name, value and interval in per cent, and what kind of thing
+    it is.
+    """
     if not report.effects and not report.sensors:
         return []
 
@@ -102,15 +107,18 @@ def shares(report: Report) -> list[dict]:
         """Within the chart: an estimate's interval may leave it."""
         return min(max(100.0 * value, 0.0), 100.0)
 
-    rows = [row(effect, share, "effect") for effect, share in report.shares.effects.items()]
+    rows = [
+        row(effect, share, "effect") for effect, share in report.shares.effects.items()
+    ]
     rows.append(row("sensors and clocks", report.shares.sensors, "nuisance"))
     rows.append(row("unexplained", report.shares.unexplained, "unexplained"))
     return rows
 
 
 def next_steps(report: Report, folder: Path | None = None) -> list[tuple[str, str]]:
-    """(why, command or empty) of what to do next: first the flight that tells confounded causes
-    apart, then adapting, then training. Commands are typed in the page's `folder`.
+    """(why, command or empty) of what to do next: first the flight that tells
+    confounded causes apart, then adapting, then training. Commands are typed in the
+    page's `folder`.
     """
     steps = []
     for name, others in report.equivalent.items():
@@ -158,4 +166,6 @@ def _fly(report: Report, others: Sequence[str] = ()) -> str:
     text = flight.strip().rstrip(".")
     if not text:
         return ""
-    return f"Next flight: {text[:1].lower()}{text[1:]}; then diagnose all of them again."
+    return (
+        f"Next flight: {text[:1].lower()}{text[1:]}; then diagnose all of them again."
+    )

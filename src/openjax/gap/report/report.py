@@ -37,8 +37,8 @@ class Estimate:
     """Whether the interval holds the value at which the effect does nothing."""
 
     def in_words(self, name: str) -> str:
-        """The value of the parameter `name` with its interval and unit, and whether it is
-        unusual.
+        """The value of the parameter `name` with its interval and unit, and whether it
+        is unusual.
         """
         low, high = self.interval90
         text = f"{name} = {self.value:.4g} [{low:.4g}, {high:.4g}]"
@@ -60,7 +60,9 @@ class Report:
     verdict: str
     """One of `VERDICTS`, or "effect"."""
     effects: tuple[str, ...]
-    """By share, largest first; "unknown" stands among them where what is left isn't noise."""
+    """By share, largest first; "unknown" stands among them where what is left isn't
+    noise.
+    """
     probabilities: dict[str, float]
     shares: Split
     equivalent: dict[str, list[str]]
@@ -97,13 +99,17 @@ class Report:
     @property
     def left_out(self) -> list[str]:
         """Logs that weren't used, each with the reason."""
-        return [f"{q['flight']}: {q['issue']}" for q in self.quality if q.get("left_out")]
+        return [
+            f"{q['flight']}: {q['issue']}" for q in self.quality if q.get("left_out")
+        ]
 
     def prediction(self) -> dict:
         """The case's entry in a predictions file."""
         return {
             "effects": list(self.effects),
-            "probabilities": {k: round(v, 5) for k, v in self.probabilities.items() if v >= 5e-6},
+            "probabilities": {
+                k: round(v, 5) for k, v in self.probabilities.items() if v >= 5e-6
+            },
             "where": in_words(self.where),
             "reduction": round(min(max(self.gap.reduction, 0.0), 1.0), 4),
             "not_testable": list(self.not_testable),
@@ -117,11 +123,15 @@ class Report:
             "unexplained": self.shares.unexplained,
         }
         estimates = {
-            effect: {name: asdict(v) | {"unusual": v.unusual} for name, v in found.items()}
+            effect: {
+                name: asdict(v) | {"unusual": v.unusual} for name, v in found.items()
+            }
             for effect, found in self.parameters.items()
         }
         apart = ("case", "plots", "seconds", "identification")
-        plain = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in apart}
+        plain = {
+            f.name: getattr(self, f.name) for f in fields(self) if f.name not in apart
+        }
         if self.identification is not None:
             of_gap = {e: share.value for e, share in self.shares.effects.items()}
             plain["identification"] = self.identification.to_dict(of_gap)
@@ -132,8 +142,8 @@ class Report:
         return " or ".join([effect, *self.equivalent.get(effect, ())])
 
     def shares_in_words(self) -> str:
-        """Every named class' share with its interval, then sensors and clocks, then what is
-        unexplained.
+        """Every named class' share with its interval, then sensors and clocks, then
+        what is unexplained.
         """
         named = []
         for effect in self.named:
@@ -175,7 +185,9 @@ class Report:
         if self.runner_up:
             lines.append(f"Runner-up: {self.runner_up}.")
         if self.not_testable:
-            lines.append(f"Not testable with these flights: {', '.join(self.not_testable)}.")
+            lines.append(
+                f"Not testable with these flights: {', '.join(self.not_testable)}."
+            )
         if self.next_flight:
             lines.append(f"Fly next: {self.next_flight}")
         return [line for line in lines if line]
@@ -193,7 +205,9 @@ class Report:
                     "vehicle, and alike?"
                 )
         for effect, others in self.equivalent.items():
-            doubts.append(f"These flights can't tell {effect} from {', '.join(others)}.")
+            doubts.append(
+                f"These flights can't tell {effect} from {', '.join(others)}."
+            )
         return lines + doubts
 
 

@@ -28,7 +28,9 @@ WORDS = {
 
 
 def response_of(identification: Identification | None) -> dict | None:
-    """Sentence, remarks, rows of numbers and the picture (SVG) for the page; None without."""
+    """Sentence, remarks, rows of numbers and the picture (SVG) for the page; None
+    without.
+    """
     if identification is None:
         return None
     rows = [
@@ -51,7 +53,9 @@ def response_of(identification: Identification | None) -> dict | None:
 
 
 def _picture(identification: Identification) -> str:
-    """Gain and phase of every axis over frequency, measured with 90 % bands beside simulated."""
+    """Gain and phase of every axis over frequency, measured with 90 % bands beside
+    simulated.
+    """
     from matplotlib.figure import Figure
 
     with rc_context(STYLE):
@@ -68,7 +72,9 @@ def _picture(identification: Identification) -> str:
                     low, middle, high = np.array(values).T
                     axes = grid[row, column]
                     axes.plot(response.frequency, middle, color=color, label=name)
-                    axes.fill_between(response.frequency, low, high, color=color, alpha=0.25)
+                    axes.fill_between(
+                        response.frequency, low, high, color=color, alpha=0.25
+                    )
             unit = "m/s² per unit" if axis == "thrust" else "rad/s² per unit"
             grid[0, column].set(title=axis, xscale="log", ylim=(0.0, None))
             grid[1, column].set(xlabel="frequency, Hz")
@@ -76,5 +82,7 @@ def _picture(identification: Identification) -> str:
                 grid[0, column].set(ylabel=unit)
                 grid[1, column].set(ylabel="phase, °")
             grid[1, column].set_xticks([1, 2, 5, 10], ["1", "2", "5", "10"])
-        figure.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside upper left", ncols=2)
+        figure.legend(
+            *grid[0, 0].get_legend_handles_labels(), loc="outside upper left", ncols=2
+        )
         return as_svg(figure, TITLE)

@@ -57,13 +57,17 @@ def _domains(report: Report) -> Iterator[str]:
 
 
 def _likelihood(report: Report) -> Iterator[str]:
-    """Nothing is likelier than what is named, and "none" isn't likely beside a sure share."""
+    """Nothing is likelier than what is named, and "none" isn't likely beside a sure
+    share.
+    """
     chance = report.probabilities
     said = report.effects or ("none",)
     named = max(chance.get(name, 0.0) for name in said)
     second = report.runner_up.partition(" (")[0]
     if second and chance.get(second, 0.0) > named + ROUNDING:
         yield f"the runner-up {second} ({chance[second]:.2f}) is likelier than {', '.join(said)}"
-    sure = max((report.shares.effects[e].interval90[0] for e in report.named), default=0.0)
+    sure = max(
+        (report.shares.effects[e].interval90[0] for e in report.named), default=0.0
+    )
     if sure > SURE_SHARE and chance.get("none", 0.0) > NOTHING + ROUNDING:
         yield f"none ({chance['none']:.2f}) beside a share of at least {sure:.2f}"

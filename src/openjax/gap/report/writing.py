@@ -1,4 +1,6 @@
-"""A report as files: `report.json`, `report.html`, and `effects.toml` for the trainer."""
+"""A report as files: `report.json`, `report.html`, and `effects.toml` for the
+trainer.
+"""
 
 import json
 from pathlib import Path
@@ -15,13 +17,18 @@ Intervals = dict[str, dict[str, tuple[float, float]]]
 
 
 def write_report(report: Report, folder: Path, pictures: bool = True) -> None:
-    """Write `report.json`, `effects.toml` and (with `pictures`) `report.html` into an existing
-    folder.
+    """Write `report.json`, `effects.toml` and (with `pictures`) `report.html` into an
+    existing folder.
     """
     text = json.dumps(report.to_dict(), indent=1)
     (folder / "report.json").write_text(text + "\n", encoding="utf-8")
     values, intervals = to_fly(report)
-    save_effects(folder / "effects.toml", values, intervals, notes=" ".join(report.in_words()[:2]))
+    save_effects(
+        folder / "effects.toml",
+        values,
+        intervals,
+        notes=" ".join(report.in_words()[:2]),
+    )
     if pictures:
         # loads Matplotlib, which takes a second
         from openjax.gap.report.page import page_of
@@ -30,14 +37,16 @@ def write_report(report: Report, folder: Path, pictures: bool = True) -> None:
 
 
 def to_fly(report: Report) -> tuple[Values, Intervals]:
-    """Values and 90 % intervals by effect and parameter for a simulator that knows no voltage: the
-    battery and what depends on it are as in the flights, at their median.
+    """Values and 90 % intervals by effect and parameter for a simulator that knows no
+    voltage: the battery and what depends on it are as in the flights, at their median.
     """
     values: Values = {}
     intervals: Intervals = {}
     for effect, estimates in report.parameters.items():
         values[effect] = {name: estimate.value for name, estimate in estimates.items()}
-        intervals[effect] = {name: estimate.interval90 for name, estimate in estimates.items()}
+        intervals[effect] = {
+            name: estimate.interval90 for name, estimate in estimates.items()
+        }
     if report.identification is not None:
         # what was measured directly is more exact than what was fitted beside all else
         better, narrower = corrections(report.identification, report.named)
@@ -51,7 +60,9 @@ def to_fly(report: Report) -> tuple[Values, Intervals]:
     for effect, found in values.items():
         at_voltage = CARDS[effect].at_voltage
         if at_voltage is not None:
-            values[effect], intervals[effect] = at_voltage(found, intervals[effect], voltage)
+            values[effect], intervals[effect] = at_voltage(
+                found, intervals[effect], voltage
+            )
     return values, intervals
 
 

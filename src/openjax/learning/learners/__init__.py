@@ -1,6 +1,7 @@
-"""Learners: what learns from a rollout in the training step. Shipped are MAPPO for the pursuers'
-policy, the supervised evader predictor, and PPO for evaders that learn beside them; anything with
-`start` and `learn` may stand in their place or beside them (`learner.py`).
+"""Learners: what learns from a rollout in the training step. Shipped are MAPPO for the
+pursuers' policy, the supervised evader predictor, and PPO for evaders that learn beside
+them; anything with `start` and `learn` may stand in their place or beside them
+(`learner.py`).
 """
 
 from openjax.lazy import lazy_names

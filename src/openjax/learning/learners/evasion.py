@@ -6,7 +6,11 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from openjax.learning.evader_learning import EvaderLearning, EvaderSamples, LearningEvaders
+from openjax.learning.evader_learning import (
+    EvaderLearning,
+    EvaderSamples,
+    LearningEvaders,
+)
 from openjax.learning.learners.learner import Flown
 from openjax.policy import PolicyParameters
 from openjax.pursuit import PursuitState
@@ -14,7 +18,9 @@ from openjax.pursuit import PursuitState
 
 @dataclass(frozen=True)
 class EvaderLearner:
-    """A learner that also flies the worlds of its evaders, by samples of their policies."""
+    """A learner that also flies the worlds of its evaders, by samples of their
+    policies.
+    """
 
     learning: EvaderLearning
 
@@ -23,15 +29,22 @@ class EvaderLearner:
         return self.learning.start(key)
 
     def act(
-        self, state: LearningEvaders, worlds: PursuitState, noise: Float[Array, "worlds 3"]
+        self,
+        state: LearningEvaders,
+        worlds: PursuitState,
+        noise: Float[Array, "worlds 3"],
     ) -> tuple[Float[Array, "worlds 3"], EvaderSamples]:
-        """Desired velocities (E, 3) in worlds (E, ...) as shares of the speed, NaN where none of
-        these evaders flies, and the samples; noise (E, 3).
+        """Desired velocities (E, 3) in worlds (E, ...) as shares of the speed, NaN
+        where none of these evaders flies, and the samples; noise (E, 3).
         """
         return self.learning.act(state, worlds, noise)
 
     def learn(
-        self, state: LearningEvaders, parameters: PolicyParameters, flown: Flown, key: PRNGKeyArray
+        self,
+        state: LearningEvaders,
+        parameters: PolicyParameters,
+        flown: Flown,
+        key: PRNGKeyArray,
     ) -> tuple[LearningEvaders, PolicyParameters, dict[str, Any]]:
         """After all epochs on the samples of a rollout."""
         samples = flown.rollout.learning

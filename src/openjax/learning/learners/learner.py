@@ -28,21 +28,23 @@ class Flown:
     """Name of the devices' axis; None on one device."""
 
     def mean(self, tree: Any) -> Any:
-        """The mean of every leaf over all devices, each of which has a share of the worlds: a
-        gradient has to go through this, so that all devices learn the same.
+        """The mean of every leaf over all devices, each of which has a share of the
+        worlds: a gradient has to go through this, so that all devices learn the same.
         """
         return mean_over_devices(tree, self.axis)
 
 
 @runtime_checkable
 class Learner(Protocol):
-    """What learns from each rollout: of the policy's parameters some, or something beside them.
+    """What learns from each rollout: of the policy's parameters some, or something
+    beside them.
 
-    Its state is any tree of arrays, the same on all devices; checkpoints hold it, and a resumed run
-    goes on with it. Learners come one after the other, in the order of their dictionary.
+    Its state is any tree of arrays, the same on all devices; checkpoints hold it, and a
+    resumed run goes on with it. Learners come one after the other, in the order of
+    their dictionary.
 
-    One that has a method `act(state, worlds, noise) -> desired velocities (E, 3), samples` also
-    flies the evaders; see `openjax.learning.learners.evasion`.
+    One that has a method `act(state, worlds, noise) -> desired velocities (E, 3),
+    samples` also flies the evaders; see `openjax.learning.learners.evasion`.
     """
 
     def start(self, parameters: PolicyParameters, key: PRNGKeyArray) -> Any:

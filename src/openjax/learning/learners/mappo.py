@@ -16,7 +16,13 @@ from openjax.learning.collectives import joint_moments, minibatches
 from openjax.learning.learners.learner import Flown
 from openjax.learning.settings import MappoSettings
 from openjax.learning.train_state import TrainState, clipped_adam, shuffled
-from openjax.policy import OwnPolicy, Policy, PolicyParameters, gaussian_entropy, gaussian_log_prob
+from openjax.policy import (
+    OwnPolicy,
+    Policy,
+    PolicyParameters,
+    gaussian_entropy,
+    gaussian_log_prob,
+)
 from openjax.pursuit import Observation
 from openjax.pursuit.shapes import Scalar
 from openjax.pursuit.teams import team_mean
@@ -32,7 +38,9 @@ class ValueScale:
 
     @property
     def moments(self) -> tuple[Scalar, Scalar]:
-        """Mean () and standard deviation () of the returns; 0 and 1 before the first update."""
+        """Mean () and standard deviation () of the returns; 0 and 1 before the first
+        update.
+        """
         weight = jnp.maximum(self.weight, 1e-6)
         mean = self.mean / weight
         # a weighted sum of what was seen, over the sum of its weights, as Adam does
@@ -73,14 +81,15 @@ class StepScale(NamedTuple):
 
 
 def follow_kl(target: float) -> optax.GradientTransformationExtraArgs:
-    """Scale steps so that the policy's divergence from the one that flew stays near `target`
-    (nats).
+    """Scale steps so that the policy's divergence from the one that flew stays near
+    `target` (nats).
 
-    Its `update` takes `kl` (), that divergence before the step: above twice the target the step is
-    divided by 1.5, below half of it multiplied, never past the schedule's (the adaptive rule of
-    Schulman et al., 2017, section 4, on the step size as in Rudin et al., 2022). From a policy
-    whose noise is small, a step of fixed size leads far outside the ratio's clip range, where the
-    clipped loss has no gradient that would lead back.
+    Its `update` takes `kl` (), that divergence before the step: above twice the target
+    the step is divided by 1.5, below half of it multiplied, never past the schedule's
+    (the adaptive rule of Schulman et al., 2017, section 4, on the step size as in Rudin
+    et al., 2022). From a policy whose noise is small, a step of fixed size leads far
+    outside the ratio's clip range, where the clipped loss has no gradient that would
+    lead back.
     """
 
     def init(parameters):
@@ -99,9 +108,11 @@ def follow_kl(target: float) -> optax.GradientTransformationExtraArgs:
 
 def make_optimiser(
     settings: MappoSettings, total_updates: int
-) -> tuple[optax.GradientTransformationExtraArgs, optax.GradientTransformationExtraArgs]:
-    """Optimisers of actor and critic; the step size falls linearly to zero over the run, the
-    actor's may start late.
+) -> tuple[
+    optax.GradientTransformationExtraArgs, optax.GradientTransformationExtraArgs
+]:
+    """Optimisers of actor and critic; the step size falls linearly to zero over the
+    run, the actor's may start late.
 
     With a `target_kl` the actor's update takes `kl`; see `follow_kl`.
     """
@@ -126,14 +137,18 @@ def loss(
     batch: Batch,
     clip: jax.Array | float,
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """Sum of actor's and critic's () loss, `parameters` (actor, critic); and what to watch.
+    """Sum of actor's and critic's () loss, `parameters` (actor, critic); and what to
+    watch.
 
-    The actor's is the surrogate, its ratio clipped to 1 +- `clip` (), minus the entropy bonus; the
-    critic's the Huber loss of normalised values. Unless they share an encoder, neither's gradient
-    knows of the other. Means are those of pursuers that are there.
+    The actor's is the surrogate, its ratio clipped to 1 +- `clip` (), minus the entropy
+    bonus; the critic's the Huber loss of normalised values. Unless they share an
+    encoder, neither's gradient knows of the other. Means are those of pursuers that are
+    there.
     """
     actor, critic = parameters
-    mean, log_std, value = policy.evaluate(actor, critic, batch.observation, batch.predicted)
+    mean, log_std, value = policy.evaluate(
+        actor, critic, batch.observation, batch.predicted
+    )
     log_ratio = gaussian_log_prob(batch.action, mean, log_std) - batch.log_prob
     ratio = jnp.exp(log_ratio)
     clipped = jnp.clip(ratio, 1.0 - clip, 1.0 + clip)
@@ -144,8 +159,8 @@ def loss(
     policy_loss = -surrogate - settings.entropy_coefficient * entropy
     value_loss = mean_of(optax.huber_loss(value, batch.target, delta=settings.huber))
     watch = {
-        # the same mean as that of -log_ratio, with less noise and never negative (Schulman 2020,
-        # Approximating KL divergence)
+        # the same mean as that of -log_ratio, with less noise and never negative
+        # (Schulman 2020, Approximating KL divergence)
         "kl": mean_of(ratio - 1.0 - log_ratio),
         "clipped": mean_of(jnp.abs(ratio - 1.0) > clip),
         "entropy": entropy,
@@ -176,7 +191,9 @@ class MappoState:
 
 @dataclass(frozen=True)
 class Mappo:
-    """Multi-agent PPO as a learner (`openjax.learning.learners.Learner`) of actor and critic."""
+    """Multi-agent PPO as a learner (`openjax.learning.learners.Learner`) of actor and
+    critic.
+    """
 
     settings: MappoSettings
     policy: Policy
@@ -193,24 +210,33 @@ class Mappo:
         """Before the first update: no steps taken, no returns seen."""
         actor, critic = self.optimisers
         return MappoState(
-            actor.init(parameters.actor), critic.init(parameters.critic), initial_value_scale()
+            actor.init(parameters.actor),
+            critic.init(parameters.critic),
+            initial_value_scale(),
         )
 
     def learn(
-        self, state: MappoState, parameters: PolicyParameters, flown: Flown, key: PRNGKeyArray
+        self,
+        state: MappoState,
+        parameters: PolicyParameters,
+        flown: Flown,
+        key: PRNGKeyArray,
     ) -> tuple[MappoState, PolicyParameters, dict[str, Scalar]]:
         """All epochs of the policy update on one rollout; `key` shuffles."""
         estimates = self._estimates(state.value_scale, parameters, flown)
         scale = self._renewed_scale(state.value_scale, estimates.returns, flown)
         mean, std = scale.moments
-        # by the moments with these returns in them: values and targets are then of one scale
+        # by the moments with these returns in them: values and targets are then of one
+        # scale
         targets = (estimates.returns - mean) / std
         batch = self._batch(estimates.advantage, targets, flown)
 
         actor = TrainState(parameters.actor, state.actor)
         critic = TrainState(parameters.critic, state.critic)
         (actor, critic), metrics = self._epochs((actor, critic), batch, flown, key)
-        parameters = parameters.replace(actor=actor.parameters, critic=critic.parameters)
+        parameters = parameters.replace(
+            actor=actor.parameters, critic=critic.parameters
+        )
         metrics["explained_variance"] = estimates.explained_variance
         metrics["value_scale"] = std
         return MappoState(actor.optimiser, critic.optimiser, scale), parameters, metrics
@@ -223,11 +249,14 @@ class Mappo:
         # the history's frames are the predictor's; the policy sees the prediction
         before = rollout.observation.replace(frames=None), rollout.predicted
         after = flown.observation.replace(frames=None), flown.predicted
-        # before and after all steps by one program: one for what comes last would be as large
+        # before and after all steps by one program: one for what comes last would be as
+        # large
         observation, predicted = jax.tree.map(
             lambda x, last: jnp.concatenate([x, last[None]]), before, after
         )
-        values = self.policy.value(parameters.actor, parameters.critic, observation, predicted)
+        values = self.policy.value(
+            parameters.actor, parameters.critic, observation, predicted
+        )
         values = mean + std * values
         value = values[:-1]
         following = values[1:]
@@ -247,7 +276,8 @@ class Mappo:
             settings.gae_lambda,
         )
         returns = advantage + value
-        # an advantage is what the value left of the return: one less the share that is unexplained
+        # an advantage is what the value left of the return: one less the share that is
+        # unexplained
         active = rollout.observation.active
         _, spread_left = joint_moments(advantage, flown.axis, active)
         _, spread = joint_moments(returns, flown.axis, active)
@@ -258,7 +288,9 @@ class Mappo:
         """The running moments after these returns."""
         decay = self.settings.value_norm_decay
         active = flown.rollout.observation.active
-        mean, square = flown.mean((team_mean(active, returns), team_mean(active, returns**2)))
+        mean, square = flown.mean(
+            (team_mean(active, returns), team_mean(active, returns**2))
+        )
         return ValueScale(
             mean=decay * scale.mean + (1 - decay) * mean,
             square=decay * scale.square + (1 - decay) * square,
@@ -266,8 +298,8 @@ class Mappo:
         )
 
     def _batch(self, advantage, targets, flown):
-        """The rollout's samples with advantages and targets (T, E, N), minibatch by minibatch, (M,
-        W, T, ...).
+        """The rollout's samples with advantages and targets (T, E, N), minibatch by
+        minibatch, (M, W, T, ...).
         """
         rollout = flown.rollout
         # over the whole rollout, not in each minibatch, whose moments are noisier
@@ -283,15 +315,15 @@ class Mappo:
         return minibatches(batch, self.settings.minibatches)
 
     def _epochs(self, networks, batch, flown, key):
-        """Actor and critic (`TrainState`s) after all gradient steps, and the means of what was
-        watched.
+        """Actor and critic (`TrainState`s) after all gradient steps, and the means of
+        what was watched.
         """
         settings = self.settings
         actor, critic = networks
         change = settings.clip_epsilon_end - settings.clip_epsilon
         clip = settings.clip_epsilon + change * flown.progress
-        # each network as one vector while it learns: leaf by leaf, a step on a GPU is forty kernels
-        # more
+        # each network as one vector while it learns: leaf by leaf, a step on a GPU is
+        # forty kernels more
         actor_vector, to_actor = ravel_pytree(actor.parameters)
         critic_vector, to_critic = ravel_pytree(critic.parameters)
 
@@ -317,7 +349,10 @@ class Mappo:
             return (actor, critic), jnp.stack([watch[name] for name in WATCHED])
 
         steps = self._order(key)
-        start = actor.replace(parameters=actor_vector), critic.replace(parameters=critic_vector)
+        start = (
+            actor.replace(parameters=actor_vector),
+            critic.replace(parameters=critic_vector),
+        )
         (actor, critic), watched = jax.lax.scan(gradient_step, start, steps)
         actor = actor.replace(parameters=to_actor(actor.parameters))
         critic = critic.replace(parameters=to_critic(critic.parameters))
@@ -325,15 +360,17 @@ class Mappo:
         return (actor, critic), metrics
 
     def _order(self, key):
-        """The minibatches of all gradient steps, and the first of the trajectory's steps that each
-        sees; None: it sees all.
+        """The minibatches of all gradient steps, and the first of the trajectory's
+        steps that each sees; None: it sees all.
         """
         settings = self.settings
         order = shuffled(key, settings.epochs, settings.minibatches)
         if settings.step_subsampling == 1:
             return order, None
         draw = jax.random.fold_in(key, 1)
-        return order, jax.random.randint(draw, order.shape, 0, settings.step_subsampling)
+        return order, jax.random.randint(
+            draw, order.shape, 0, settings.step_subsampling
+        )
 
 
 def every_nth(x, first, number):

@@ -1,4 +1,6 @@
-"""Supervised training of the evader predictor on the rollout (the paper's section IV-B1)."""
+"""Supervised training of the evader predictor on the rollout (the paper's section
+IV-B1).
+"""
 
 import functools
 from dataclasses import dataclass
@@ -24,7 +26,9 @@ def make_predictor_optimiser(
     """Adam, with gradients cut at norm 1."""
     step_size = settings.learning_rate
     if settings.decay:
-        step_size = optax.linear_schedule(step_size, 0.0, total_updates * settings.steps)
+        step_size = optax.linear_schedule(
+            step_size, 0.0, total_updates * settings.steps
+        )
     return optax.chain(optax.clip_by_global_norm(1.0), optax.adam(step_size))
 
 
@@ -39,16 +43,17 @@ def windows_and_labels(
     Float[Array, "worlds windows 3"],
     Float[Array, "worlds windows horizons 3"],
 ]:
-    """Windows of frames that end at the given steps, and the true positions to be predicted.
+    """Windows of frames that end at the given steps, and the true positions to be
+    predicted.
 
-    Episodes start and end between rollouts only and the history is cleared at a reset, so no window
-    and no label crosses the boundary of an episode.
+    Episodes start and end between rollouts only and the history is cleared at a reset,
+    so no window and no label crosses the boundary of an episode.
 
     Args:
       policy: for the predictor's horizons.
       history_spacing: steps between two frames of a window.
-      earlier: (E, H, F) frames before the rollout's second step, oldest first (H = window's span);
-        its last one is the rollout's first.
+      earlier: (E, H, F) frames before the rollout's second step, oldest first (H =
+        window's span); its last one is the rollout's first.
       rollout: T steps.
       times: (E, W) steps of the rollout, at most T - largest horizon.
 
@@ -57,11 +62,13 @@ def windows_and_labels(
     """
     span = earlier.shape[1]
     new = jnp.swapaxes(rollout.observation.frames[1:, :, 0], 0, 1)
-    sequence = jnp.concatenate([earlier, new], axis=1)  # index span - 1 + t is the frame of step t
+    # index span - 1 + t is the frame of step t
+    sequence = jnp.concatenate([earlier, new], axis=1)
     window = jnp.arange(history_spacing - 1, span, history_spacing)
     frames = _take(sequence, times[..., None] + window)
     last_seen = _take(jnp.swapaxes(rollout.observation.last_seen, 0, 1), times)
-    # evader[t] is the position after step t, that is one step ahead of the observation of step t
+    # evader[t] is the position after step t, that is one step ahead of the observation
+    # of step t
     ahead = jnp.array(policy.predictor.horizons) - 1
     positions = _take(jnp.swapaxes(rollout.evader, 0, 1), times[..., None] + ahead)
     return frames, last_seen, positions
@@ -74,18 +81,21 @@ def prediction_loss(
     last_seen: Float[Array, "*windows 3"],
     positions: Float[Array, "*windows horizons 3"],
 ) -> Scalar:
-    """() loss of predictions (..., K, 3), given last_seen (..., 3) and the true positions (..., K,
-    3).
+    """() loss of predictions (..., K, 3), given last_seen (..., 3) and the true
+    positions (..., K, 3).
 
-    Squared errors are nearly all those of the longest horizon, and of windows that end before the
-    evader was first seen: nothing can be learnt from these, but what is learnt from them is carried
-    over to where it is lost from sight.
+    Squared errors are nearly all those of the longest horizon, and of windows that end
+    before the evader was first seen: nothing can be learnt from these, but what is
+    learnt from them is carried over to where it is lost from sight.
     """
     error = predicted - positions
     if settings.loss == "squared":
         return jnp.mean(error**2)
-    # in units of the distance that the evader flies within each horizon, all horizons weigh alike
-    flown = game.evader_speed * game.time_step * jnp.array(settings.horizons, jnp.float32)
+    # in units of the distance that the evader flies within each horizon, all horizons
+    # weigh alike
+    flown = (
+        game.evader_speed * game.time_step * jnp.array(settings.horizons, jnp.float32)
+    )
     # the arena's middle stands for an evader that nobody has seen yet
     was_seen = jnp.any(last_seen != jnp.array(game.middle, jnp.float32), axis=-1)
     return jnp.mean(was_seen[..., None, None] * (error / flown[:, None]) ** 2)
@@ -93,8 +103,8 @@ def prediction_loss(
 
 @dataclass(frozen=True)
 class PredictorLearner:
-    """The evader predictor as a learner (`openjax.learning.learners.Learner`): a few gradient
-    steps on random windows of each world.
+    """The evader predictor as a learner (`openjax.learning.learners.Learner`): a few
+    gradient steps on random windows of each world.
     """
 
     policy: Policy
@@ -145,15 +155,17 @@ class PredictorLearner:
         return predictor.optimiser, parameters, metrics
 
     def _windows(self, flown, key):
-        """Windows of frames, last seen and true positions, (steps, E, windows / steps, ...): every
-        gradient step sees other windows of every world.
+        """Windows of frames, last seen and true positions, (steps, E, windows / steps,
+        ...): every gradient step sees other windows of every world.
         """
         settings = self.policy.predictor
         rollout = flown.rollout
         keys = own_keys(key, flown.frames.shape[0], flown.axis)
         # later windows would have labels beyond the rollout
         room = rollout.reward.shape[0] - settings.horizons[-1] + 1
-        times = jax.vmap(lambda key: jax.random.permutation(key, room)[: settings.windows])(keys)
+        times = jax.vmap(
+            lambda key: jax.random.permutation(key, room)[: settings.windows]
+        )(keys)
         data = windows_and_labels(
             self.policy, self.game.history_spacing, flown.frames, rollout, times
         )

@@ -1,5 +1,5 @@
-"""Evaders as data: what each does, which numbers are drawn for it in each world, and which of them
-may be trained on.
+"""Evaders as data: what each does, which numbers are drawn for it in each world, and
+which of them may be trained on.
 """
 
 from openjax.lazy import lazy_names

@@ -1,4 +1,5 @@
-"""What evaders do: pure functions of what one knows and of its memory, of static shapes.
+"""What evaders do: pure functions of what one knows and of its memory, of static
+shapes.
 
     behaviour(scene, memory) -> wish (3,), memory (MEMORY,)
 
@@ -23,18 +24,20 @@ from openjax.pursuit.shapes import Active, Memory, Pillars, Team, Vector
 from openjax.vehicle import DroneState
 
 DIRECTIONS = 64
-"""That a greedy evader tries; one that looks two steps ahead tries half as many at each."""
+"""That a greedy evader tries; one that looks two steps ahead tries half as many at
+each.
+"""
 MARGIN = 0.02
 """Distance (m) at which an evader keeps off pillars and the arena's bounds."""
 AROUND = 0.1
-"""A pillar's hugger stays this far from its surface, and way-points are left when nearer than this
-(m).
+"""A pillar's hugger stays this far from its surface, and way-points are left when
+nearer than this (m).
 """
 PLACES = 128
 """In the arena, among which one looks for the safest."""
 R_SEQUENCE = 1.2207440846057596 ** -np.arange(1.0, 4.0)
-"""Steps from point to point of a sequence of low discrepancy: by the root of x^4 = x + 1 (Roberts
-2018, The unreasonable effectiveness of quasirandom sequences).
+"""Steps from point to point of a sequence of low discrepancy: by the root of x^4 = x +
+1 (Roberts 2018, The unreasonable effectiveness of quasirandom sequences).
 """
 FAR_AWAY = 100.0
 """Distance (m) at which pursuers are put that an evader doesn't know of."""
@@ -70,8 +73,8 @@ class Scene:
 
     @property
     def thrust_direction(self) -> Team:
-        """(N, 3) unit vectors, world: where each pursuer's rotors pull, and so what it is about to
-        do.
+        """(N, 3) unit vectors, world: where each pursuer's rotors pull, and so what it
+        is about to do.
         """
         return rotation_axes(self.drones.quaternion)[1]
 
@@ -91,7 +94,9 @@ def directions(number: int) -> Float[np.ndarray, "{number} 3"]:
     z = 1.0 - 2.0 * i / number
     angle = np.pi * (1.0 + 5.0**0.5) * i
     radius = np.sqrt(1.0 - z**2)
-    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=-1).astype(np.float32)
+    return np.stack(
+        [radius * np.cos(angle), radius * np.sin(angle), z], axis=-1
+    ).astype(np.float32)
 
 
 def into_free_space(
@@ -100,17 +105,21 @@ def into_free_space(
     pillar_position: Pillars,
     pillar_active: Active,
 ) -> Float[Array, "*places 3"]:
-    """(..., 3) the points nearest to `place` (..., 3) that keep their distance from bounds and one
-    pillar.
+    """(..., 3) the points nearest to `place` (..., 3) that keep their distance from
+    bounds and one pillar.
     """
     xy = place[..., :2]
     z = place[..., 2:]
     offset = xy[..., None, :] - pillar_position
     distance = _length(offset)
     depth = jnp.maximum(settings.pillar_radius + MARGIN - distance, 0.0)
-    xy = xy + jnp.sum(jnp.where(pillar_active[:, None], offset / distance * depth, 0.0), axis=-2)
+    xy = xy + jnp.sum(
+        jnp.where(pillar_active[:, None], offset / distance * depth, 0.0), axis=-2
+    )
     xy = xy * jnp.minimum(1.0, (settings.arena_radius - MARGIN) / _length(xy))
-    return jnp.concatenate([xy, jnp.clip(z, MARGIN, settings.arena_height - MARGIN)], axis=-1)
+    return jnp.concatenate(
+        [xy, jnp.clip(z, MARGIN, settings.arena_height - MARGIN)], axis=-1
+    )
 
 
 def greedy(scene: Scene, memory: Memory) -> tuple[Vector, Memory]:
@@ -123,8 +132,8 @@ def greedy(scene: Scene, memory: Memory) -> tuple[Vector, Memory]:
 
 
 def two_step(scene: Scene, memory: Memory) -> tuple[Vector, Memory]:
-    """The same over two steps; after the first the pursuers have come closer, each straight to
-    where it went.
+    """The same over two steps; after the first the pursuers have come closer, each
+    straight to where it went.
     """
     tried = directions(DIRECTIONS // 2)
     first, open_way = _ends(scene, scene.position, tried)
@@ -132,7 +141,9 @@ def two_step(scene: Scene, memory: Memory) -> tuple[Vector, Memory]:
     def best_after(end):
         # as if they knew where it goes, at full speed: nothing is worse for it
         to_end = end - scene.pursuers
-        step = jnp.minimum(scene.settings.max_speed * scene.look_ahead / _length(to_end), 1.0)
+        step = jnp.minimum(
+            scene.settings.max_speed * scene.look_ahead / _length(to_end), 1.0
+        )
         answer = scene.pursuers + step * to_end
         second, open_then = _ends(scene, end, tried)
         later = jnp.where(open_then, _nearness(scene, second, answer), -jnp.inf)
@@ -143,32 +154,43 @@ def two_step(scene: Scene, memory: Memory) -> tuple[Vector, Memory]:
 
 
 def wall_runner(scene: Scene, memory: Memory) -> tuple[Vector, Memory]:
-    """Run along the wall, round the arena and up or down, away from the nearest pursuer."""
+    """Run along the wall, round the arena and up or down, away from the nearest
+    pursuer.
+    """
     settings = scene.settings
     threat = scene.nearest
     radius = _length(scene.position[:2])
     out = scene.position[:2] / radius
     left = jnp.stack([-out[1], out[0]])
-    # the sign of the cross product says on which side of it the pursuer is; it runs to the other
+    # the sign of the cross product says on which side of it the pursuer is; it runs to
+    # the other
     side = jnp.where(threat[0] * out[1] - threat[1] * out[0] >= 0.0, 1.0, -1.0)
     # towards its distance from the wall, from either side
     outward = jnp.clip((settings.arena_radius - AROUND - radius) / AROUND, -1.0, 1.0)
-    goal = jnp.where(threat[2] > settings.arena_height / 2, AROUND, settings.arena_height - AROUND)
+    goal = jnp.where(
+        threat[2] > settings.arena_height / 2, AROUND, settings.arena_height - AROUND
+    )
     climb = 0.5 * jnp.clip((goal - scene.position[2:]) / AROUND, -1.0, 1.0)
     return _unit(jnp.concatenate([side * left + outward * out, climb])), memory
 
 
 def pillar_hugger(scene: Scene, memory: Memory) -> tuple[Vector, Memory]:
-    """Stay behind a pillar, as seen by the nearest pursuer; where there is none, fly straight away
-    from it.
+    """Stay behind a pillar, as seen by the nearest pursuer; where there is none, fly
+    straight away from it.
     """
     threat = scene.nearest
     pillars = scene.pillar_position
     behind = pillars - threat[:2]
-    behind = pillars + behind / _length(behind) * (scene.settings.pillar_radius + AROUND)
-    distance = jnp.where(scene.pillar_active, _length(behind - scene.position[:2])[:, 0], jnp.inf)
+    behind = pillars + behind / _length(behind) * (
+        scene.settings.pillar_radius + AROUND
+    )
+    distance = jnp.where(
+        scene.pillar_active, _length(behind - scene.position[:2])[:, 0], jnp.inf
+    )
     is_chosen = jnp.arange(distance.shape[0])[:, None] == jnp.argmin(distance)
-    goal = jnp.concatenate([jnp.sum(jnp.where(is_chosen, behind, 0.0), axis=0), scene.position[2:]])
+    goal = jnp.concatenate(
+        [jnp.sum(jnp.where(is_chosen, behind, 0.0), axis=0), scene.position[2:]]
+    )
     to_goal = goal - scene.position
     away = _unit(scene.position - threat)
     hidden = to_goal / jnp.maximum(_length(to_goal), AROUND)
@@ -176,8 +198,8 @@ def pillar_hugger(scene: Scene, memory: Memory) -> tuple[Vector, Memory]:
 
 
 def safe_place(scene: Scene, memory: Memory) -> tuple[Vector, Memory]:
-    """Fly to the place, of many all over the arena, that it would reach the longest before any
-    pursuer; none behind a pillar.
+    """Fly to the place, of many all over the arena, that it would reach the longest
+    before any pursuer; none behind a pillar.
     """
     settings = scene.settings
     # the same places in every step, which fill the arena evenly
@@ -197,11 +219,11 @@ def safe_place(scene: Scene, memory: Memory) -> tuple[Vector, Memory]:
 
 
 def way_points(scene: Scene, memory: Memory) -> tuple[Vector, Memory]:
-    """Fly from point to point, whatever the pursuers do. The points are a sequence of low
-    discrepancy from a drawn one on.
+    """Fly from point to point, whatever the pursuers do. The points are a sequence of
+    low discrepancy from a drawn one on.
     """
-    # three shares say where the present point lies, the fourth number how long (s) it is flown to;
-    # more follows where another evader of the game remembers more
+    # three shares say where the present point lies, the fourth number how long (s) it
+    # is flown to; more follows where another evader of the game remembers more
     share = memory[:3]
     rest = memory[4:]
     to_goal = _free_place(scene, share) - scene.position
@@ -230,8 +252,8 @@ BEHAVIOURS: dict[str, Callable[[Scene, Any], tuple[jax.Array, Any]]] = {
 
 
 def _free_place(scene, share):
-    """(..., 3) m, a place outside pillars at shares (..., 3) from 0 to 1 of a turn, of the arena's
-    area and of its height.
+    """(..., 3) m, a place outside pillars at shares (..., 3) from 0 to 1 of a turn, of
+    the arena's area and of its height.
     """
     settings = scene.settings
     angle = 2.0 * jnp.pi * share[..., 0]
@@ -248,8 +270,8 @@ def _free_place(scene, share):
 
 
 def _ends(scene, start, tried):
-    """(K, 3) where K directions lead within the look-ahead, and (K,) whether no pillar is in the
-    way.
+    """(K, 3) where K directions lead within the look-ahead, and (K,) whether no pillar
+    is in the way.
     """
     pillars = scene.pillar_position
     active = scene.pillar_active
@@ -259,8 +281,8 @@ def _ends(scene, start, tried):
 
 
 def _nearness(scene, ends, pursuers):
-    """(K,) m, from (K, 3) places to the nearest of (N, 3) pursuers; those without a line of sight
-    count farther.
+    """(K,) m, from (K, 3) places to the nearest of (N, 3) pursuers; those without a
+    line of sight count farther.
     """
     distance = _length(ends[:, None] - pursuers)[..., 0]
     sees = jax.vmap(
@@ -274,7 +296,9 @@ def _nearness(scene, ends, pursuers):
 
 
 def _chosen(tried, score):
-    """The direction of the highest score, by a sum: cheaper on an accelerator than a gather."""
+    """The direction of the highest score, by a sum: cheaper on an accelerator than a
+    gather.
+    """
     is_best = jnp.arange(tried.shape[0])[:, None] == jnp.argmax(score)
     return jnp.sum(jnp.where(is_best, tried, 0.0), axis=0)
 

@@ -1,5 +1,5 @@
-"""The evader of one world: which it is, its numbers and its memory, drawn at the start; and its
-velocity in each step.
+"""The evader of one world: which it is, its numbers and its memory, drawn at the start;
+and its velocity in each step.
 """
 
 import jax
@@ -8,7 +8,12 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from openjax.errors import UserError
-from openjax.pursuit.evaders.behaviours import BEHAVIOURS, MEMORY, Scene, into_free_space
+from openjax.pursuit.evaders.behaviours import (
+    BEHAVIOURS,
+    MEMORY,
+    Scene,
+    into_free_space,
+)
 from openjax.pursuit.evaders.evader_state import EvaderState
 from openjax.pursuit.evaders.field import field_velocity
 from openjax.pursuit.evaders.kinds import NUMBERS, UNBOUNDED, EvaderKind, evader_rows
@@ -43,15 +48,16 @@ def draw_row(
       rows: evaders, drawn with equal odds.
       key: ().
       pursuers: (N, 3) m, their starts, for the memory of a learned evader.
-      share: () from 0 to 1, how far a curriculum has come; None is 1. At 0 all worlds have the
-        first of the evaders; from there the others' odds grow to the equal ones, and their speed
-        from half to the whole.
+      share: () from 0 to 1, how far a curriculum has come; None is 1. At 0 all worlds
+        have the first of the evaders; from there the others' odds grow to the equal
+        ones, and their speed from half to the whole.
       kind: () int32, the place in `rows` of the one it is; None draws it.
 
     Raises:
       UserError: one's own remembers more than fits beside a learned one's memory.
     """
-    # the paper's has no numbers to draw and no memory: its game carries nothing for them
+    # the paper's has no numbers to draw and no memory: its game carries nothing for
+    # them
     behaviours = [row.behaviour for row in rows]
     if set(behaviours) == {"field"}:
         return None
@@ -60,9 +66,11 @@ def draw_row(
         kind = jax.random.randint(kind_key, (), 0, len(rows))
     slow = jnp.ones(())
     if share is not None:
-        # at half the speed when they come in: who can't catch yet learns nothing from one that is
-        # always away
-        kind = jnp.where(jax.random.uniform(jax.random.fold_in(kind_key, 1)) < share, kind, 0)
+        # at half the speed when they come in: who can't catch yet learns nothing from
+        # one that is always away
+        kind = jnp.where(
+            jax.random.uniform(jax.random.fold_in(kind_key, 1)) < share, kind, 0
+        )
         slow = jnp.where(kind == 0, 1.0, 0.5 + 0.5 * share)
     draws = jax.random.uniform(number_key, (len(NUMBERS),))
     numbers = {
@@ -90,7 +98,9 @@ def _drawn(values, kind, draw):
     """One of `values[kind]`, by the uniform `draw`."""
     # a table needs rows of one length: filled up with zeros, which no draw reaches
     width = max(len(row) for row in values)
-    table = np.array([[*row, *[0.0] * (width - len(row))] for row in values], np.float32)
+    table = np.array(
+        [[*row, *[0.0] * (width - len(row))] for row in values], np.float32
+    )
     lengths = np.array([len(row) for row in values], np.float32)
     place = (draw * jnp.asarray(lengths)[kind]).astype(jnp.int32)
     return jnp.asarray(table)[kind, place]
@@ -102,17 +112,18 @@ def evader_velocity(
     world: PursuitState,
     wish: Vector | None = None,
 ) -> tuple[Vector, EvaderState | None]:
-    """(3,) velocity (m/s, world) of the evader of a world in this step, and its state after it.
+    """(3,) velocity (m/s, world) of the evader of a world in this step, and its state
+    after it.
 
-    Evaders other than the paper's neither leave the arena nor enter a pillar, and no gradient goes
-    through what they decide.
+    Evaders other than the paper's neither leave the arena nor enter a pillar, and no
+    gradient goes through what they decide.
 
     Args:
       settings: the game.
       rows: its evaders.
       world: before this step.
-      wish: (3,) a velocity, as a share of its speed, that is flown in place of its own; None or NaN
-      is its own.
+      wish: (3,) a velocity, as a share of its speed, that is flown in place of its own;
+      None or NaN is its own.
     """
     if world.evader is None and wish is None:
         return _field(settings, world), None
@@ -120,8 +131,12 @@ def evader_velocity(
     world = jax.lax.stop_gradient(world)
     state = world.evader
     if state is None:
-        velocity = _flown(settings, world, evader_speed(settings, world.task), UNBOUNDED, wish)
-        return jnp.where(jnp.any(jnp.isnan(wish)), _field(settings, world), velocity), None
+        velocity = _flown(
+            settings, world, evader_speed(settings, world.task), UNBOUNDED, wish
+        )
+        return jnp.where(
+            jnp.any(jnp.isnan(wish)), _field(settings, world), velocity
+        ), None
     own_wish, memory = _wish(settings, rows, world)
     by_itself = jnp.ones((), bool) if wish is None else jnp.any(jnp.isnan(wish))
     speed = state.numbers["speed"] * evader_speed(settings, world.task)
@@ -168,17 +183,25 @@ def _field(settings, world):
         world.task.pillar_active,
     )
     task_speed = world.task.evader_speed
-    return velocity if task_speed is None else velocity * (task_speed / settings.evader_speed)
+    return (
+        velocity
+        if task_speed is None
+        else velocity * (task_speed / settings.evader_speed)
+    )
 
 
 def _wish(settings, rows, world):
-    """Wish (3,) and memory of an evader with a behaviour; of the paper's something finite."""
+    """Wish (3,) and memory of an evader with a behaviour; of the paper's something
+    finite.
+    """
     state = world.evader
     behaviours = [row.behaviour for row in rows]
-    handed_in = {row.behaviour: _like_shipped(row) for row in rows if callable(row.behaviour)}
+    handed_in = {
+        row.behaviour: _like_shipped(row) for row in rows if callable(row.behaviour)
+    }
     functions = {**BEHAVIOURS, "learned": learning, **handed_in}
-    # mapped over worlds, a switch works all of them out and selects: each behaviour stands in it
-    # once, however many rows have it
+    # mapped over worlds, a switch works all of them out and selects: each behaviour
+    # stands in it once, however many rows have it
     in_game = [name for name in functions if name in behaviours]
     place = [in_game.index(name) if name in in_game else 0 for name in behaviours]
     return jax.lax.switch(
@@ -190,8 +213,8 @@ def _wish(settings, rows, world):
 
 
 def _like_shipped(row):
-    """A behaviour like the shipped ones, of a row whose function gives m/s and has a memory of its
-    own size.
+    """A behaviour like the shipped ones, of a row whose function gives m/s and has a
+    memory of its own size.
     """
 
     def behaviour(scene, memory):
@@ -204,8 +227,8 @@ def _like_shipped(row):
 
 
 def _flown(settings, world, speed, acceleration, wish):
-    """(3,) m/s, what is flown of a wish: bounded in speed and acceleration, and past what is
-    solid.
+    """(3,) m/s, what is flown of a wish: bounded in speed and acceleration, and past
+    what is solid.
     """
 
     def at_most(vector, limit):
@@ -214,8 +237,11 @@ def _flown(settings, world, speed, acceleration, wish):
     dt = settings.time_step
     start = world.evader_position
     before = world.evader_velocity
-    velocity = at_most(before + at_most(speed * wish - before, acceleration * dt), speed)
-    # past what is solid it slides along the surface: where it would end is moved out of there
+    velocity = at_most(
+        before + at_most(speed * wish - before, acceleration * dt), speed
+    )
+    # past what is solid it slides along the surface: where it would end is moved out of
+    # there
     pillars = world.task.pillar_position
     active = world.task.pillar_active
     moved = into_free_space(settings, start + dt * velocity, pillars, active)

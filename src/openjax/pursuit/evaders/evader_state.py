@@ -12,4 +12,6 @@ class EvaderState:
     numbers: dict[str, jax.Array]  # those of `EvaderKind`, () each, float32
     memory: jax.Array  # (M,)
     key: jax.Array | None = None
-    """() from which an evader of one's own draws; None where all are shipped ones, which don't"""
+    """() from which an evader of one's own draws; None where all are shipped ones,
+    which don't
+    """

@@ -1,5 +1,5 @@
-"""The paper's evader: a potential field that flees pursuers in sight, pillars and the arena's
-bounds.
+"""The paper's evader: a potential field that flees pursuers in sight, pillars and the
+arena's bounds.
 """
 
 import jax
@@ -11,8 +11,8 @@ from openjax.pursuit.shapes import Active, Pillars, Team, Vector, Which
 EPSILON = 1e-5
 """Added to distances (m) and their squares, so that nothing is divided by zero."""
 INWARD = 1e5
-"""Push back where the evader is outside the arena or inside a pillar: what 1/distance comes to at
-`EPSILON`.
+"""Push back where the evader is outside the arena or inside a pillar: what 1/distance
+comes to at `EPSILON`.
 """
 
 
@@ -26,8 +26,8 @@ def field_velocity(
 ) -> Vector:
     """(3,) velocity (m/s, world) of the evader at (3,), memoryless, of constant speed.
 
-    `pursuers` (N, 3) repel as 1/distance where `in_sight` (N,); bounds and pillars as 1/distance to
-    their surface.
+    `pursuers` (N, 3) repel as 1/distance where `in_sight` (N,); bounds and pillars as
+    1/distance to their surface.
     """
     away = evader - pursuers
     # a unit vector over the distance is the offset over its square
@@ -37,16 +37,24 @@ def field_velocity(
     radius = jnp.sqrt(_norm_squared(evader[:2])[0] + 1e-12)
     outward = evader[:2] / radius
     to_wall = settings.arena_radius - radius
-    wall = -outward * jnp.where(to_wall > 0.0, 1.0 / (jnp.maximum(to_wall, 0.0) + EPSILON), INWARD)
+    wall = -outward * jnp.where(
+        to_wall > 0.0, 1.0 / (jnp.maximum(to_wall, 0.0) + EPSILON), INWARD
+    )
 
     to_ceiling = settings.arena_height - evader[2]
-    ceiling = jnp.where(to_ceiling > 0.0, 1.0 / (jnp.maximum(to_ceiling, 0.0) + EPSILON), INWARD)
-    floor = jnp.where(evader[2] > 0.0, 1.0 / (jnp.maximum(evader[2], 0.0) + EPSILON), INWARD)
+    ceiling = jnp.where(
+        to_ceiling > 0.0, 1.0 / (jnp.maximum(to_ceiling, 0.0) + EPSILON), INWARD
+    )
+    floor = jnp.where(
+        evader[2] > 0.0, 1.0 / (jnp.maximum(evader[2], 0.0) + EPSILON), INWARD
+    )
 
     from_pillar = evader[None, :2] - pillar_position
     distance = jnp.sqrt(_norm_squared(from_pillar) + 1e-12)
     to_surface = distance - settings.pillar_radius
-    strength = jnp.where(to_surface > 0.0, 1.0 / (jnp.maximum(to_surface, 0.0) + EPSILON), INWARD)
+    strength = jnp.where(
+        to_surface > 0.0, 1.0 / (jnp.maximum(to_surface, 0.0) + EPSILON), INWARD
+    )
     push = from_pillar / distance * strength
     pillars = jnp.sum(jnp.where(pillar_active[:, None], push, 0.0), axis=0)
 

@@ -1,5 +1,5 @@
-"""The evaders by name: a behaviour, and the values of its numbers, one of which is drawn for each
-world.
+"""The evaders by name: a behaviour, and the values of its numbers, one of which is
+drawn for each world.
 """
 
 from collections.abc import Callable
@@ -9,8 +9,8 @@ from typing import Any, Literal
 from openjax.errors import UserError, suggestion
 
 MEMORY = 4
-"""Numbers that a scripted evader remembers; drawn uniformly from 0 to 1 at the start of an
-episode.
+"""Numbers that a scripted evader remembers; drawn uniformly from 0 to 1 at the start of
+an episode.
 """
 UNBOUNDED = 1e6
 """An acceleration (m/s^2) that bounds nothing."""
@@ -18,18 +18,19 @@ UNBOUNDED = 1e6
 
 @dataclass(frozen=True)
 class EvaderKind:
-    """One evader. Where a number has several values, each world draws one of them, with equal
-    odds.
+    """One evader. Where a number has several values, each world draws one of them, with
+    equal odds.
     """
 
     behaviour: str | Callable[[Any, Any], tuple[Any, Any]]
-    """A name in `openjax.pursuit.evaders.behaviours.BEHAVIOURS`; "field" is the paper's, which has
-    none of these numbers. Or a function of one's own, velocity(scene, memory) -> velocity (3,) in
-    m/s in the world, memory: `Scene` says what it knows, `memory` has as many numbers.
+    """A name in `openjax.pursuit.evaders.behaviours.BEHAVIOURS`; "field" is the
+    paper's, which has none of these numbers. Or a function of one's own,
+    velocity(scene, memory) -> velocity (3,) in m/s in the world, memory: `Scene` says
+    what it knows, `memory` has as many numbers.
     """
     of: Literal["train", "validation", "held out", "file"] = "train"
-    """What it may be used for: held-out ones are never trained on, nor are checkpoints chosen by
-    them. "file": it comes from one, or is handed in.
+    """What it may be used for: held-out ones are never trained on, nor are checkpoints
+    chosen by them. "file": it comes from one, or is handed in.
     """
     look_ahead: tuple[float, ...] = (0.15,)
     """Seconds after which it looks at where a direction leads."""
@@ -42,8 +43,8 @@ class EvaderKind:
     speed: tuple[float, ...] = (1.0,)
     """Its speed, as a share of the game's `evader_speed`."""
     memory: int = MEMORY
-    """Numbers that a function of one's own remembers: the first four are drawn as `MEMORY` says,
-    others begin as zeros.
+    """Numbers that a function of one's own remembers: the first four are drawn as
+    `MEMORY` says, others begin as zeros.
     """
 
 
@@ -60,11 +61,15 @@ EVADERS = {
         sees_all=(True, True, False),
     ),
     "wall_runner": EvaderKind("wall_runner", "train", speed=(0.8, 1.0)),
-    # slow enough to be caught by whoever dares to come near: without it, some teams wait a pillar's
-    # width away for good
+    # slow enough to be caught by whoever dares to come near: without it, some teams
+    # wait a pillar's width away for good
     "slow_hugger": EvaderKind("pillar_hugger", "train", speed=(0.4, 0.7)),
     "heavy": EvaderKind(
-        "greedy", "validation", look_ahead=(0.2,), acceleration=(8.0,), hiding=(0.0, 0.3)
+        "greedy",
+        "validation",
+        look_ahead=(0.2,),
+        acceleration=(8.0,),
+        hiding=(0.0, 0.3),
     ),
     "pillar_hugger": EvaderKind("pillar_hugger", "validation"),
     "greedy_far": EvaderKind("greedy", "held out", look_ahead=(0.4,)),
@@ -95,7 +100,8 @@ Evader = str | EvaderKind | Callable[[Any, Any], tuple[Any, Any]]
 def evader_rows(
     names: tuple[str, ...], handed_in: tuple[EvaderKind, ...] = ()
 ) -> tuple[EvaderKind, ...]:
-    """The row of each name; those called "own" are the ones that were `handed_in`, in their order.
+    """The row of each name; those called "own" are the ones that were `handed_in`, in
+    their order.
 
     Raises:
       UserError: settings name one that wasn't handed in.
@@ -109,7 +115,9 @@ def evader_rows(
     return tuple(next(rest) if name == "own" else EVADERS[name] for name in names)
 
 
-def handed_in(evaders: tuple[Evader, ...]) -> tuple[tuple[str, ...], tuple[EvaderKind, ...]]:
+def handed_in(
+    evaders: tuple[Evader, ...],
+) -> tuple[tuple[str, ...], tuple[EvaderKind, ...]]:
     """Names of evaders for the settings, and the rows of those that have none."""
     rows = [EvaderKind(one, "file") if callable(one) else one for one in evaders]
     names = tuple(one if isinstance(one, str) else "own" for one in rows)
@@ -124,4 +132,6 @@ def check_evaders(names: tuple[str, ...]) -> None:
         )
     for name in names:
         if name not in EVADERS:
-            raise UserError(f"evader {str(name)[:60]}: unknown; {suggestion(str(name), SCRIPTED)}")
+            raise UserError(
+                f"evader {str(name)[:60]}: unknown; {suggestion(str(name), SCRIPTED)}"
+            )

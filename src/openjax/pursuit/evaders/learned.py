@@ -1,9 +1,9 @@
-"""A learned evader: a small network with a memory; every third is added to what the greedy evader
-of some look-ahead would do.
+"""A learned evader: a small network with a memory; every third is added to what the
+greedy evader of some look-ahead would do.
 
-Its memory holds where the pursuers were in the last steps. Pursuers and pillars are pooled, so that
-their number and order don't matter. With zeros in its last layer, as it starts, it is that greedy
-evader, or stays where it is.
+Its memory holds where the pursuers were in the last steps. Pursuers and pillars are
+pooled, so that their number and order don't matter. With zeros in its last layer, as it
+starts, it is that greedy evader, or stays where it is.
 """
 
 import functools
@@ -25,20 +25,27 @@ STEPS = 10
 WIDTH = 64
 """Units of each hidden layer."""
 LOOK_AHEAD = (0.15, 0.5, 0.3)
-"""Seconds that the greedy evaders look ahead as which networks start, one after the other: a best
-response to who is caught out by a far-sighted one isn't found from a short-sighted one.
+"""Seconds that the greedy evaders look ahead as which networks start, one after the
+other: a best response to who is caught out by a far-sighted one isn't found from a
+short-sighted one.
 """
 _OWN = 9
-"""Numbers of `features` that an evader knows of itself: place, velocity, greedy wish (3 each)."""
+"""Numbers of `features` that an evader knows of itself: place, velocity, greedy wish (3
+each).
+"""
 _PURSUER = 16
-"""And of each pursuer: offset, two moves, velocity, thrust direction (3 each), distance."""
+"""And of each pursuer: offset, two moves, velocity, thrust direction (3 each),
+distance.
+"""
 _PILLAR = 4
 """And of each pillar: offset (2), distance, in use."""
 
 
-def learned_place(names: tuple[str, ...], kind: Int32[Array, "*worlds"]) -> Int32[Array, "*worlds"]:
-    """The place among the learned evaders of those at the places `kind` (...) in `names`; -1 for
-    others.
+def learned_place(
+    names: tuple[str, ...], kind: Int32[Array, "*worlds"]
+) -> Int32[Array, "*worlds"]:
+    """The place among the learned evaders of those at the places `kind` (...) in
+    `names`; -1 for others.
     """
     is_learned = np.array([EVADERS[name].behaviour == "learned" for name in names])
     return jnp.asarray(np.where(is_learned, np.cumsum(is_learned) - 1, -1))[kind]
@@ -47,15 +54,20 @@ def learned_place(names: tuple[str, ...], kind: Int32[Array, "*worlds"]) -> Int3
 def init_network(
     key: PRNGKeyArray, number: int | Count = 0, own_axes: bool = False
 ) -> dict[str, Any]:
-    """Parameters of a network (actor and critic alike) whose output, three numbers and one, is
-    zero; `number` among others.
+    """Parameters of a network (actor and critic alike) whose output, three numbers and
+    one, is zero; `number` among others.
 
-    With `own_axes` it sees in axes of its own, x away from the arena's axis, so that a game that is
-    turned looks the same.
+    With `own_axes` it sees in axes of its own, x away from the arena's axis, so that a
+    game that is turned looks the same.
     """
-    inputs = {"pursuer": _PURSUER, "pillar": _PILLAR, "own": _OWN + 3 * WIDTH, "hidden": WIDTH}
-    # no orthogonal ones: several decompositions at once may wait for each other for ever on a CPU
-    # of two cores
+    inputs = {
+        "pursuer": _PURSUER,
+        "pillar": _PILLAR,
+        "own": _OWN + 3 * WIDTH,
+        "hidden": WIDTH,
+    }
+    # no orthogonal ones: several decompositions at once may wait for each other for
+    # ever on a CPU of two cores
     initial = jax.nn.initializers.he_normal()
     keys = jax.random.split(key, len(inputs))
     layers = {
@@ -67,7 +79,8 @@ def init_network(
         "output": {"kernel": jnp.zeros((WIDTH, 4)), "bias": jnp.zeros(4)},
         # these three go with them, and have no gradient
         "look_ahead": jnp.asarray(LOOK_AHEAD)[number % len(LOOK_AHEAD)],
-        # every third starts as a greedy evader, a local optimum that others find no way out of
+        # every third starts as a greedy evader, a local optimum that others find no way
+        # out of
         "scripted": jnp.float32(number % 3 == 2),
         "own_axes": jnp.float32(own_axes),
     }
@@ -76,21 +89,27 @@ def init_network(
 def features(
     networks: dict[str, Any], which: int | Count, scene: Scene, memory: Memory
 ) -> dict[str, jax.Array]:
-    """What the one of K networks that `which` () names sees: own (9,), pursuers (N, 16), pillars
-    (P, 4), in_use (P,), greedy (3,), outward (2,), and active (N,) where slots may be empty.
+    """What the one of K networks that `which` () names sees: own (9,), pursuers (N,
+    16), pillars (P, 4), in_use (P,), greedy (3,), outward (2,), and active (N,) where
+    slots may be empty.
 
-    Of itself: place in the arena, velocity, the greedy wish. Of each pursuer: offset and distance,
-    how it moved over the last half and the whole of the memory, its velocity, where its rotors
-    pull. Of each pillar: offset, distance, and whether the slot is in use.
+    Of itself: place in the arena, velocity, the greedy wish. Of each pursuer: offset
+    and distance, how it moved over the last half and the whole of the memory, its
+    velocity, where its rotors pull. Of each pillar: offset, distance, and whether the
+    slot is in use.
     """
     settings = scene.settings
     scene = scene.replace(look_ahead=networks["look_ahead"][which])
     # so that all inputs are of the order of one
-    size = np.array([settings.arena_radius] * 2 + [settings.arena_height / 2], np.float32)
+    size = np.array(
+        [settings.arena_radius] * 2 + [settings.arena_height / 2], np.float32
+    )
     middle = np.array(settings.middle, np.float32)
     wish = networks["scripted"][which] * greedy(scene, memory)[0]
     outward = scene.position[:2] / jnp.sqrt(jnp.sum(scene.position[:2] ** 2) + 1e-6)
-    outward = jnp.where(networks["own_axes"][which] > 0, outward, np.array([1.0, 0.0], np.float32))
+    outward = jnp.where(
+        networks["own_axes"][which] > 0, outward, np.array([1.0, 0.0], np.float32)
+    )
     turned = functools.partial(turned_back, outward)
     itself = [
         turned((scene.position - middle) / size),
@@ -118,7 +137,8 @@ def _pursuer_features(scene, memory, turned):
     earlier = memory[MEMORY:].reshape(STEPS, *scene.pursuers.shape)  # oldest first
     offset = scene.pursuers - scene.position
     distance = jnp.sqrt(jnp.sum(offset**2, axis=-1, keepdims=True) + 1e-12)
-    # as far as a pursuer gets in the memory's time: what it moved is of the order of one
+    # as far as a pursuer gets in the memory's time: what it moved is of the order of
+    # one
     scale = settings.max_speed * settings.time_step * STEPS
     numbers = [
         turned(offset),
@@ -136,7 +156,9 @@ def _pillar_features(scene, turned):
     offset = scene.pillar_position - scene.position[:2]
     distance = jnp.sqrt(jnp.sum(offset**2, axis=-1, keepdims=True) + 1e-12)
     in_use = scene.pillar_active[:, None]
-    return jnp.where(in_use, jnp.concatenate([turned(offset), distance, in_use], axis=-1), 0.0)
+    return jnp.where(
+        in_use, jnp.concatenate([turned(offset), distance, in_use], axis=-1), 0.0
+    )
 
 
 def outputs(
@@ -152,13 +174,15 @@ def outputs(
     pillars = jnp.where(inputs["in_use"][..., None], pillars, 0.0)
     if "active" in inputs:
         active = inputs["active"][..., None]
-        mean = jnp.sum(active * pursuers, axis=-2) / jnp.maximum(jnp.sum(active, axis=-2), 1)
+        mean = jnp.sum(active * pursuers, axis=-2) / jnp.maximum(
+            jnp.sum(active, axis=-2), 1
+        )
         most = jnp.max(jnp.where(active, pursuers, -1.0), axis=-2)  # a tanh's least
     else:
         mean = jnp.mean(pursuers, axis=-2)
         most = jnp.max(pursuers, axis=-2)
-    # pursuers by mean and maximum, whose size doesn't grow with their number; pillars by a sum, as
-    # empty slots are zeros
+    # pursuers by mean and maximum, whose size doesn't grow with their number; pillars
+    # by a sum, as empty slots are zeros
     pooled = [mean, most, jnp.sum(pillars, axis=-2)]
     hidden = jnp.tanh(dense("own", jnp.concatenate([inputs["own"], *pooled], axis=-1)))
     out = dense("output", jnp.tanh(dense("hidden", hidden)))
@@ -170,15 +194,21 @@ def outputs(
 def remember(scene: Scene, memory: Memory) -> Memory:
     """The memory after this step."""
     return jnp.concatenate(
-        [memory[:MEMORY], memory[MEMORY + scene.pursuers.size :], scene.pursuers.ravel()]
+        [
+            memory[:MEMORY],
+            memory[MEMORY + scene.pursuers.size :],
+            scene.pursuers.ravel(),
+        ]
     )
 
 
 def outputs_of(
-    networks: dict[str, Any], which: Int32[Array, "*batch"], inputs: dict[str, jax.Array]
+    networks: dict[str, Any],
+    which: Int32[Array, "*batch"],
+    inputs: dict[str, jax.Array],
 ) -> tuple[Float[Array, "*batch 3"], Float[Array, "*batch"]]:
-    """`outputs` of the one of K networks, every leaf with their axis first, that `which` (...)
-    names for each of the features.
+    """`outputs` of the one of K networks, every leaf with their axis first, that
+    `which` (...) names for each of the features.
     """
     # all of them: cheaper than their parameters by world
     wishes, values = jax.vmap(outputs, (0, None))(networks, inputs)
@@ -187,7 +217,7 @@ def outputs_of(
 
 
 def learning(scene: Scene, memory: Memory) -> tuple[Vector, Memory]:
-    """The behaviour without a network, whose wishes come from outside: the greedy one's, and the
-    memory goes on.
+    """The behaviour without a network, whose wishes come from outside: the greedy
+    one's, and the memory goes on.
     """
     return greedy(scene, memory)[0], remember(scene, memory)

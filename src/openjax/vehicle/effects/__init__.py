@@ -1,10 +1,10 @@
-"""Physical effects that the nominal vehicle leaves out: twenty, one file each, to fly with and to
-fit.
+"""Physical effects that the nominal vehicle leaves out: twenty, one file each, to fly
+with and to fit.
 
-In a step: `make_drones_step(effects=("rotor_drag",))`, with `{"rotor_drag": {"d_xy": 0.01}}` as its
-parameters. On logged states, without simulating: the hooks of `EFFECTS[name]` are pure functions of
-one sample, to be mapped and differentiated. The force of rotor drag along a flight (states: leading
-axis T):
+In a step: `make_drones_step(effects=("rotor_drag",))`, with `{"rotor_drag": {"d_xy":
+0.01}}` as its parameters. On logged states, without simulating: the hooks of
+`EFFECTS[name]` are pure functions of one sample, to be mapped and differentiated. The
+force of rotor drag along a flight (states: leading axis T):
 
     drag = EFFECTS["rotor_drag"]
     context = jax.vmap(lambda state: make_context(vehicle, state))(states)
@@ -17,7 +17,14 @@ from openjax.vehicle.effects.composition import (
     resolve,
     seen_state,
 )
-from openjax.vehicle.effects.effect import Card, Context, Effect, Fitted, Parameter, make_context
+from openjax.vehicle.effects.effect import (
+    Card,
+    Context,
+    Effect,
+    Fitted,
+    Parameter,
+    make_context,
+)
 from openjax.vehicle.effects.effects_file import load_effects, save_effects
 from openjax.vehicle.effects.registry import EFFECTS, register_effect
 

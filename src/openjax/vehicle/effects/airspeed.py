@@ -1,4 +1,6 @@
-"""Where the hubs are and how they move: shared by the effects that act at each rotor."""
+"""Where the hubs are and how they move: shared by the effects that act at each
+rotor.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -15,9 +17,13 @@ def body_velocity(context: Context) -> jax.Array:
 
 
 def hub_velocity(context: Context) -> jax.Array:
-    """Velocity of each hub in the body frame, (4, 3) m/s: it moves with the body's rates too."""
+    """Velocity of each hub in the body frame, (4, 3) m/s: it moves with the body's
+    rates too.
+    """
     velocity = body_velocity(context)
-    return jax.vmap(lambda r: velocity + cross(context.body_rates, r))(context.rotor_position)
+    return jax.vmap(lambda r: velocity + cross(context.body_rates, r))(
+        context.rotor_position
+    )
 
 
 def hub_height(context: Context) -> jax.Array:

@@ -1,19 +1,27 @@
-"""Thrust falls with the battery's voltage: a motor command is a share of what the battery gives
-now.
+"""Thrust falls with the battery's voltage: a motor command is a share of what the
+battery gives now.
 """
 
 import jax.numpy as jnp
 
-from openjax.vehicle.effects.effect import NOT_NEGATIVE, RARE, Card, Effect, Fitted, Parameter
+from openjax.vehicle.effects.effect import (
+    NOT_NEGATIVE,
+    RARE,
+    Card,
+    Effect,
+    Fitted,
+    Parameter,
+)
 
 
 def voltage(parameters, context):
-    """Battery voltage () V: the context's where it is known, else a linear discharge from
-    `full`.
+    """Battery voltage () V: the context's where it is known, else a linear discharge
+    from `full`.
     """
     simulated = parameters["full"] - parameters["discharge"] * context.air_time
     known = ~jnp.isnan(context.battery_voltage)
-    # a linear discharge crosses zero some day, and a power of a negative ratio is no number
+    # a linear discharge crosses zero some day, and a power of a negative ratio is no
+    # number
     return jnp.maximum(jnp.where(known, context.battery_voltage, simulated), 1.0)
 
 
@@ -23,11 +31,15 @@ def motor(parameters, motor_command, context):
     return motor_command * ratio ** parameters["exponent"]
 
 
-_CELL = "one-cell LiPo: 4.2 V full, about 3.2 V empty under load, seven minutes of hover"
+_CELL = (
+    "one-cell LiPo: 4.2 V full, about 3.2 V empty under load, seven minutes of hover"
+)
 
 
 def frozen(values, intervals, voltage):
-    """Values and intervals for a battery that stays at one voltage: nothing is discharged."""
+    """Values and intervals for a battery that stays at one voltage: nothing is
+    discharged.
+    """
     return values | {"full": voltage, "discharge": 0.0}, intervals
 
 
@@ -46,13 +58,27 @@ EFFECT = Effect(
             ),
         ),
         "reference": Parameter(
-            "V", 3.9, (3.7, 4.2), _CELL, "voltage at which the nominal thrust holds", NOT_NEGATIVE
+            "V",
+            3.9,
+            (3.7, 4.2),
+            _CELL,
+            "voltage at which the nominal thrust holds",
+            NOT_NEGATIVE,
         ),
         "full": Parameter(
-            "V", 4.0, (3.8, 4.15), _CELL, "voltage at take-off, where none is logged", NOT_NEGATIVE
+            "V",
+            4.0,
+            (3.8, 4.15),
+            _CELL,
+            "voltage at take-off, where none is logged",
+            NOT_NEGATIVE,
         ),
         "discharge": Parameter(
-            "V/s", 0.0017, (0.001, 0.003), _CELL, "loss per second, where none is logged"
+            "V/s",
+            0.0017,
+            (0.001, 0.003),
+            _CELL,
+            "loss per second, where none is logged",
         ),
     },
     motor=motor,

@@ -17,17 +17,21 @@ FARTHEST = 0.06  # m, twice what is usual
 def thrust(parameters, thrust, reaction, context):
     """The ground effect mirrored at the ceiling, per rotor."""
     distance = context.ceiling_height - hub_height(context)
-    return thrust * gain(parameters["strength"], distance + parameters["offset"]), reaction
+    return thrust * gain(
+        parameters["strength"], distance + parameters["offset"]
+    ), reaction
 
 
 def above(position) -> bool:
-    """Whether a flight (T, 3) m was higher than the paper's ceiling: then there is none."""
+    """Whether a flight (T, 3) m was higher than the paper's ceiling: then there is
+    none.
+    """
     return bool((position[:, 2] > ARENA_CEILING).any())
 
 
 def within_reach(values, deviations) -> bool:
-    """Whether the rotors stand no further from the tracked point than FARTHEST: a ceiling that
-    would have to be higher than the room's is some slow change of thrust.
+    """Whether the rotors stand no further from the tracked point than FARTHEST: a
+    ceiling that would have to be higher than the room's is some slow change of thrust.
     """
     return values["offset"] < FARTHEST
 
@@ -40,7 +44,9 @@ EFFECT = Effect(
     formula=r"T_i' = T_i\left(1 + s\,\frac{R^2}{(h_c - z_i + \delta)^2}\right)",
     parameters={
         "strength": Parameter("1", 0.0, (0.2, 1.5), _SOURCE, domain=NOT_NEGATIVE),
-        "offset": Parameter("m", 0.0, (0.0, 0.03), "distance of the rotors from the tracked point"),
+        "offset": Parameter(
+            "m", 0.0, (0.0, 0.03), "distance of the rotors from the tracked point"
+        ),
     },
     thrust=thrust,
     card=Card(

@@ -7,8 +7,11 @@ from openjax.vehicle.effects.effect import Card, Effect, Fitted, Parameter
 
 
 def body(parameters, vehicle):
-    """Positions and velocities of the state are those of the centre of mass, wherever it is."""
-    # the body frame's origin is the centre of mass: seen from it the rotors move the other way
+    """Positions and velocities of the state are those of the centre of mass, wherever
+    it is.
+    """
+    # the body frame's origin is the centre of mass: seen from it the rotors move the
+    # other way
     offset = jnp.stack([parameters["x"], parameters["y"], parameters["z"]])
     return vehicle.replace(rotor_position=vehicle.rotor_position - offset)
 
@@ -17,7 +20,9 @@ def as_rotors(values, vehicle):
     """(4,) shares of the rotors' thrust that turn the body as much."""
     places = np.asarray(vehicle.rotor_position, float)[:, :2]
     # a centre of mass farther forward is as if the front rotors pushed less
-    return -places @ (np.array([values["x"], values["y"]]) / np.mean(np.square(places), 0))
+    return -places @ (
+        np.array([values["x"], values["y"]]) / np.mean(np.square(places), 0)
+    )
 
 
 _SOURCE = "battery and decks shift it by 0.05-8 mm"
@@ -30,7 +35,11 @@ EFFECT = Effect(
         "x": Parameter("m", 0.0, (-0.008, 0.008), _SOURCE, "forward"),
         "y": Parameter("m", 0.0, (-0.008, 0.008), _SOURCE, "left"),
         "z": Parameter(
-            "m", 0.0, (-0.01, 0.01), _SOURCE, "up; felt only through forces in the rotor plane"
+            "m",
+            0.0,
+            (-0.01, 0.01),
+            _SOURCE,
+            "up; felt only through forces in the rotor plane",
         ),
     },
     body=body,

@@ -1,5 +1,5 @@
-"""Several effects at once. They act in the order of their names, whatever order they are given
-in.
+"""Several effects at once. They act in the order of their names, whatever order they
+are given in.
 """
 
 from collections.abc import Mapping
@@ -19,8 +19,8 @@ AIR_TIME = "air_time"  # beside the effects' own memories
 
 
 def resolve(effects) -> tuple[Effect, ...]:
-    """Effects from names or `Effect`s, in the order in which they act. Raises UserError for unknown
-    names.
+    """Effects from names or `Effect`s, in the order in which they act. Raises UserError
+    for unknown names.
     """
     found = {}
     for effect in effects:
@@ -45,12 +45,15 @@ def complete_parameters(
             )
         for parameter in values:
             find_effect(name, parameter, effects=known)
-    complete = {name: {**effect.none(), **given.get(name, {})} for name, effect in known.items()}
+    complete = {
+        name: {**effect.none(), **given.get(name, {})} for name, effect in known.items()
+    }
     return jax.tree.map(lambda value: jnp.asarray(value, dtype), complete)
 
 
 def initial_memory(effects, vehicle: Vehicle, state: DroneState, dt: float, key=None):
-    """Memory of the effects for one drone at the start of an episode; () without effects.
+    """Memory of the effects for one drone at the start of an episode; () without
+    effects.
 
     Raises UserError if an effect draws random numbers and `key` is None.
     """
@@ -61,7 +64,8 @@ def initial_memory(effects, vehicle: Vehicle, state: DroneState, dt: float, key=
         if effect.random and key is None:
             raise UserError(f"effect {effect.name!r} is random: its memory needs a key")
         if effect.initial_memory is not None:
-            # a key of its own for each: two random effects mustn't draw the same numbers
+            # a key of its own for each: two random effects mustn't draw the same
+            # numbers
             effect_key = None if key is None else jax.random.fold_in(key, number)
             memory[effect.name] = effect.initial_memory(vehicle, state, dt, effect_key)
     return memory
@@ -87,7 +91,9 @@ def change_command(effects, parameters, memory, command, context: Context):
 
 
 def change_motor_command(effects, parameters, motor_command, context: Context):
-    """The motor command (4,) that the motors follow; negative thrust is beyond a rotor."""
+    """The motor command (4,) that the motors follow; negative thrust is beyond a
+    rotor.
+    """
     changed = motor_command
     for effect in effects:
         if effect.motor is not None:
@@ -100,7 +106,9 @@ def change_thrust(effects, parameters, thrust, reaction, context: Context):
     """Thrust (4,) N and reaction torque (4,) N m of the rotors."""
     for effect in effects:
         if effect.thrust is not None:
-            thrust, reaction = effect.thrust(parameters[effect.name], thrust, reaction, context)
+            thrust, reaction = effect.thrust(
+                parameters[effect.name], thrust, reaction, context
+            )
     return thrust, reaction
 
 
@@ -116,8 +124,8 @@ def added_wrench(effects, parameters, context: Context):
 
 
 def wrench(effects, parameters, vehicle: Vehicle, rotor_speed, context: Context | None):
-    """Force (3,) N and torque (3,) N m about the centre of mass on the body, body frame, of rotors
-    and effects.
+    """Force (3,) N and torque (3,) N m about the centre of mass on the body, body
+    frame, of rotors and effects.
 
     rotor_speed (4,) rad/s; without effects there need be no `context`.
     """
@@ -128,8 +136,11 @@ def wrench(effects, parameters, vehicle: Vehicle, rotor_speed, context: Context 
     context = context.replace(rotor_speed=rotor_speed, thrust=thrust)
     thrust, reaction = change_thrust(effects, parameters, thrust, reaction, context)
     force, torque = total_wrench(vehicle, thrust, reaction)
-    # drag and flapping grow with the thrust that the rotors really give, ground effect included
-    more_force, more_torque = added_wrench(effects, parameters, context.replace(thrust=thrust))
+    # drag and flapping grow with the thrust that the rotors really give, ground effect
+    # included
+    more_force, more_torque = added_wrench(
+        effects, parameters, context.replace(thrust=thrust)
+    )
     return force + more_force, torque + more_torque
 
 
@@ -147,11 +158,17 @@ def air_time(effects, memory):
 
 
 def record(effects, memory, state: DroneState, dt):
-    """Memory at the end of a step of dt seconds that led to `state`; without effects it stays."""
+    """Memory at the end of a step of dt seconds that led to `state`; without effects it
+    stays.
+    """
     if not effects:
         return memory
-    # a new dictionary: a state that is written to would change for whoever still holds it
-    memory = {**memory, AIR_TIME: memory[AIR_TIME] + jnp.asarray(dt, memory[AIR_TIME].dtype)}
+    # a new dictionary: a state that is written to would change for whoever still holds
+    # it
+    memory = {
+        **memory,
+        AIR_TIME: memory[AIR_TIME] + jnp.asarray(dt, memory[AIR_TIME].dtype),
+    }
     for effect in effects:
         if effect.record is not None:
             memory[effect.name] = effect.record(memory[effect.name], state)
@@ -162,5 +179,7 @@ def seen_state(effects, parameters, state: DroneState) -> DroneState:
     """What the off-board controller sees of one drone in `state`."""
     for effect in effects:
         if effect.sensor is not None:
-            state = effect.sensor(parameters[effect.name], state.effect_memory[effect.name], state)
+            state = effect.sensor(
+                parameters[effect.name], state.effect_memory[effect.name], state
+            )
     return state

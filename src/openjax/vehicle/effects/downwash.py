@@ -1,4 +1,6 @@
-"""The wake of vehicles above pushes down, at each hub: at the wake's edge it tilts the vehicle."""
+"""The wake of vehicles above pushes down, at each hub: at the wake's edge it tilts the
+vehicle.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -9,21 +11,26 @@ from openjax.vehicle.rigid_body import rotate, rotate_inverse
 
 
 def wrench(parameters, context):
-    """-A exp(-dz / h) exp(-r^2 / 2 s^2), s = width + spread dz, along world z; a quarter of it at
-    each hub.
+    """-A exp(-dz / h) exp(-r^2 / 2 s^2), s = width + spread dz, along world z; a
+    quarter of it at each hub.
     """
     in_world = jax.vmap(lambda r: rotate(context.quaternion, r))(context.rotor_position)
     hubs = in_world + context.position
     separation = context.others_position[None] - hubs[:, None]  # (4, M, 3)
     above = separation[..., 2] > 0.0
-    # cut before the exponential as well: of a vehicle far below that could overflow, and the
-    # gradient through it be no number
+    # cut before the exponential as well: of a vehicle far below that could overflow,
+    # and the gradient through it be no number
     dz = jnp.where(above, separation[..., 2], 0.0)
     square = separation[..., 0] ** 2 + separation[..., 1] ** 2
     width = parameters["width"] + parameters["spread"] * dz
     strength = jnp.exp(-dz / parameters["length"] - square / (2.0 * width**2))
-    push = -0.25 * parameters["force"] * jnp.sum(jnp.where(above, strength, 0.0), axis=1)  # (4,)
-    up = rotate_inverse(context.quaternion, jnp.array([0, 0, 1], context.position.dtype))
+    # (4,)
+    push = (
+        -0.25 * parameters["force"] * jnp.sum(jnp.where(above, strength, 0.0), axis=1)
+    )
+    up = rotate_inverse(
+        context.quaternion, jnp.array([0, 0, 1], context.position.dtype)
+    )
     return hub_wrench(context, push[:, None] * up)
 
 
@@ -40,7 +47,12 @@ EFFECT = Effect(
     formula=r"f = -A\,e^{-\Delta z/h}\,e^{-r^2/2s^2}\,e_z,\quad s = w + b\,\Delta z",
     parameters={
         "force": Parameter(
-            "N", 0.0, (0.03, 0.2), _SOURCE, "right under the other vehicle", NOT_NEGATIVE
+            "N",
+            0.0,
+            (0.03, 0.2),
+            _SOURCE,
+            "right under the other vehicle",
+            NOT_NEGATIVE,
         ),
         "length": Parameter("m", 0.5, (0.2, 1.0), _SOURCE, "decay below", NOT_NEGATIVE),
         "width": Parameter(
@@ -52,7 +64,11 @@ EFFECT = Effect(
             NOT_NEGATIVE,
         ),
         "spread": Parameter(
-            "1", 0.1, (0.0, 0.3), "turbulent jets widen by about 0.1 m per m", domain=NOT_NEGATIVE
+            "1",
+            0.1,
+            (0.0, 0.3),
+            "turbulent jets widen by about 0.1 m per m",
+            domain=NOT_NEGATIVE,
         ),
     },
     wrench=wrench,

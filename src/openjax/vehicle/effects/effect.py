@@ -1,4 +1,6 @@
-"""What an effect is: named parameters, and pure functions that hook into the step of one drone."""
+"""What an effect is: named parameters, and pure functions that hook into the step of
+one drone.
+"""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -20,7 +22,9 @@ ARENA_CEILING = Arena.height  # m
 
 @flax.struct.dataclass
 class Context:
-    """What surrounds one drone at a moment; the input of most hooks. NaN stands for "not known"."""
+    """What surrounds one drone at a moment; the input of most hooks. NaN stands for
+    "not known".
+    """
 
     position: jax.Array  # (3,) m, world
     quaternion: jax.Array  # (4,) body to world
@@ -39,11 +43,12 @@ class Context:
 
 
 def make_context(vehicle: Vehicle, state: DroneState, **known) -> Context:
-    """The context of one drone in `state`. `known`: further fields of `Context`; those left out
-    are usual, or not known.
+    """The context of one drone in `state`. `known`: further fields of `Context`; those
+    left out are usual, or not known.
 
-    For logged flights: map it over the samples, `jax.vmap(lambda state, v: make_context(vehicle,
-    state, battery_voltage=v))(states, voltages)`, and map an effect's hooks over the result.
+    For logged flights: map it over the samples, `jax.vmap(lambda state, v:
+    make_context(vehicle, state, battery_voltage=v))(states, voltages)`, and map an
+    effect's hooks over the result.
     """
     usual = Context(
         position=state.position,
@@ -70,11 +75,13 @@ Domain = tuple[float, float]
 NOT_NEGATIVE: Domain = (0.0, np.inf)
 """Of strengths, lengths and times."""
 RATIO: Domain = (0.05, np.inf)
-"""Of multiples of what is assumed: no vehicle flies with less than a twentieth of it."""
+"""Of multiples of what is assumed: no vehicle flies with less than a twentieth of
+it.
+"""
 
-# Forces are shares of the weight; drag over mass is alike, since the rotors of larger vehicles push
-# more air at the same speed; places of things on a vehicle are shares of its arm. Speeds of the
-# air, times, voltages and shares don't grow.
+# Forces are shares of the weight; drag over mass is alike, since the rotors of larger
+# vehicles push more air at the same speed; places of things on a vehicle are shares of
+# its arm. Speeds of the air, times, voltages and shares don't grow.
 GROWTH = {
     "kg": (1, 0),
     "N": (1, 0),
@@ -82,18 +89,18 @@ GROWTH = {
     "N m s/m": (1, 1),
     "m": (0, 1),
 }
-"""Unit of a parameter -> powers of the vehicle's mass and of its arm by which its usual range
-grows.
+"""Unit of a parameter -> powers of the vehicle's mass and of its arm by which its usual
+range grows.
 """
 ALIKE = 2.0
-"""Factor of mass or arm within which a vehicle counts as a Crazyflie, for which ranges are
-written.
+"""Factor of mass or arm within which a vehicle counts as a Crazyflie, for which ranges
+are written.
 """
 
 
 def growth(unit: str, vehicle: Vehicle) -> float:
-    """By what the usual range of a parameter in `unit` is multiplied for a vehicle; 1 for those of
-    about a Crazyflie's size.
+    """By what the usual range of a parameter in `unit` is multiplied for a vehicle; 1
+    for those of about a Crazyflie's size.
     """
     if unit not in GROWTH:
         return 1.0
@@ -101,7 +108,8 @@ def growth(unit: str, vehicle: Vehicle) -> float:
     factor = 1.0
     for power, size, usual in zip(GROWTH[unit], sizes, _usual_sizes(), strict=True):
         ratio = size / usual
-        # another battery or frame guard mustn't shift the ranges of what is still a Crazyflie
+        # another battery or frame guard mustn't shift the ranges of what is still a
+        # Crazyflie
         if not 1.0 / ALIKE <= ratio <= ALIKE:
             factor *= ratio**power
     return factor
@@ -121,7 +129,9 @@ def _mass(vehicle: Vehicle) -> float:
 
 def _arm(vehicle: Vehicle) -> float:
     """m, from the centre of mass to a rotor, on the mean."""
-    return float(np.linalg.norm(np.asarray(vehicle.rotor_position)[:, :2], axis=1).mean())
+    return float(
+        np.linalg.norm(np.asarray(vehicle.rotor_position)[:, :2], axis=1).mean()
+    )
 
 
 @dataclass(frozen=True)
@@ -142,7 +152,8 @@ class Parameter:
     def usual(self, vehicle: Vehicle) -> tuple[float, float]:
         """The usual range for a vehicle: what differs from `none` grows with it."""
         factor = growth(self.unit, vehicle)
-        if factor == 1.0:  # the written numbers themselves, which arithmetic would round
+        # the written numbers themselves, which arithmetic would round
+        if factor == 1.0:
             return self.prior
         low, high = (self.none + factor * (end - self.none) for end in self.prior)
         return low, high
@@ -187,36 +198,44 @@ class Card:
     fitted: tuple[Fitted, ...]
     """Its parameters."""
     path: str = "physics"
-    """By which way of the log it is read: "physics" (motors to motion), "radio", "rate_loop" or
-    "estimator".
+    """By which way of the log it is read: "physics" (motors to motion), "radio",
+    "rate_loop" or "estimator".
     """
     common: float = 0.0
     """Spread that all its parameters share."""
     balanced: bool = False
-    """Whether the mean of its parameters belongs to another effect, and is held near zero."""
+    """Whether the mean of its parameters belongs to another effect, and is held near
+    zero.
+    """
     others: tuple[tuple[float, ...], ...] = ()
     """More starts of the search."""
     needs: str = ""
-    """The channel without which it can't be told, though it leaves a trace in others."""
+    """The channel without which it can't be told, though it leaves a trace in
+    others.
+    """
     needs_force: bool = False
     """Whether it can't be told without a force, of the path or of an accelerometer."""
     coordinate: str = ""
-    """The variable that its force follows, for pictures; none where it makes torques or delays."""
+    """The variable that its force follows, for pictures; none where it makes torques or
+    delays.
+    """
     thrust_map: bool = False
     """Whether a map from duty cycles to thrust that isn't known can imitate it."""
     torque_axes: tuple[int, ...] = ()
-    """Axes of the torques by which it is told: what motors do between two rows can imitate
-    them.
+    """Axes of the torques by which it is told: what motors do between two rows can
+    imitate them.
     """
     log_odds: float = UNCOMMON
     """Log prior odds that it acts at a size that matters."""
     possible: Callable[[Mapping[str, float], Mapping[str, float]], bool] | None = None
-    """possible({parameter: value}, {parameter: deviation}): whether fitted values lie within
-    physical bounds.
+    """possible({parameter: value}, {parameter: deviation}): whether fitted values lie
+    within physical bounds.
     """
-    nuisance: Mapping[str, float | Callable[[Vehicle], float]] = field(default_factory=dict)
-    """{parameter: by how much the vehicle's number is usually off}, as a number or a function of
-    the vehicle: free in every hypothesis, never a cause.
+    nuisance: Mapping[str, float | Callable[[Vehicle], float]] = field(
+        default_factory=dict
+    )
+    """{parameter: by how much the vehicle's number is usually off}, as a number or a
+    function of the vehicle: free in every hypothesis, never a cause.
     """
     nuisance_duty: Mapping[str, float] = field(default_factory=dict)
     """The same where motor commands are duty cycles."""
@@ -227,24 +246,24 @@ class Card:
     of_others: bool = False
     """Whether it acts near other vehicles alone."""
     at_voltage: Callable[[dict, dict, float], tuple[dict, dict]] | None = None
-    """at_voltage(values, intervals, voltage): both as they are at one voltage, for simulators that
-    know none.
+    """at_voltage(values, intervals, voltage): both as they are at one voltage, for
+    simulators that know none.
     """
     impossible: Callable[[Any], bool] | None = None
     """impossible(position): whether a flight along position (T, 3) m rules it out."""
     sample: Mapping[str, float] = field(default_factory=dict)
     """A strength within its usual range to fly with, strong enough to see."""
     practical: Mapping[str, float] = field(default_factory=dict)
-    """{parameter: how far it must be from doing nothing before anybody would change a simulator for
-    it}; one of them is enough.
+    """{parameter: how far it must be from doing nothing before anybody would change a
+    simulator for it}; one of them is enough.
     """
     days: float | None = None
-    """Of an effect that every vehicle has to some degree: the standard deviation of its parameters
-    over a vehicle's days. None for others.
+    """Of an effect that every vehicle has to some degree: the standard deviation of its
+    parameters over a vehicle's days. None for others.
     """
     trim: Callable[[Mapping[str, float], Vehicle], Any] | None = None
-    """trim({parameter: value}, vehicle) -> (4,): of an effect that a day's trims look like, by
-    which share each rotor seems to push more.
+    """trim({parameter: value}, vehicle) -> (4,): of an effect that a day's trims look
+    like, by which share each rotor seems to push more.
     """
     next_flight: str = ""
     """What flight would show it, in words."""
@@ -252,7 +271,9 @@ class Card:
 
 # Hooks of one drone; `parameters` is {name: () array}, `memory` a pytree of arrays.
 BodyHook = Callable[[Mapping[str, Any], Vehicle], Vehicle]
-CommandHook = Callable[[Mapping[str, Any], Any, jax.Array, Context], tuple[jax.Array, Any]]
+CommandHook = Callable[
+    [Mapping[str, Any], Any, jax.Array, Context], tuple[jax.Array, Any]
+]
 MotorHook = Callable[[Mapping[str, Any], jax.Array, Context], jax.Array]
 ThrustHook = Callable[
     [Mapping[str, Any], jax.Array, jax.Array, Context], tuple[jax.Array, jax.Array]
@@ -263,8 +284,8 @@ SensorHook = Callable[[Mapping[str, Any], Any, DroneState], DroneState]
 
 @dataclass(frozen=True)
 class Effect:
-    """One physical effect that the nominal vehicle leaves out. Any subset of the hooks may be
-    given; they stand in the order in which a step calls them.
+    """One physical effect that the nominal vehicle leaves out. Any subset of the hooks
+    may be given; they stand in the order in which a step calls them.
     """
 
     name: str
@@ -273,33 +294,41 @@ class Effect:
     body: BodyHook | None = None
     """(parameters, vehicle) -> vehicle: another vehicle; once per step."""
     command: CommandHook | None = None
-    """(parameters, memory, command (4,), context) -> command, memory: what reaches the rate
-    controller of what the off-board controller sent; once per step.
+    """(parameters, memory, command (4,), context) -> command, memory: what reaches the
+    rate controller of what the off-board controller sent; once per step.
     """
     motor: MotorHook | None = None
-    """(parameters, motor_command (4,), context) -> motor_command: before the motors' lag."""
+    """(parameters, motor_command (4,), context) -> motor_command: before the motors'
+    lag.
+    """
     thrust: ThrustHook | None = None
-    """(parameters, thrust (4,) N, reaction (4,) N m, context) -> thrust, reaction: of each
-    rotor.
+    """(parameters, thrust (4,) N, reaction (4,) N m, context) -> thrust, reaction: of
+    each rotor.
     """
     wrench: WrenchHook | None = None
-    """(parameters, context) -> force (3,) N, torque (3,) N m: added, body frame, about the centre
-    of mass.
+    """(parameters, context) -> force (3,) N, torque (3,) N m: added, body frame, about
+    the centre of mass.
     """
     sensor: SensorHook | None = None
-    """(parameters, memory, state) -> state: what the off-board controller sees of the present
-    state; whenever it looks.
+    """(parameters, memory, state) -> state: what the off-board controller sees of the
+    present state; whenever it looks.
     """
     record: Callable[[Any, DroneState], Any] | None = None
-    """(memory, state) -> memory: remembers the state at the end of a step, for `sensor`."""
+    """(memory, state) -> memory: remembers the state at the end of a step, for
+    `sensor`.
+    """
     initial_memory: Callable[[Vehicle, DroneState, float, Any], Any] | None = None
-    """(vehicle, state, dt, key) -> memory: needed where `command`, `sensor` or `record` use one."""
+    """(vehicle, state, dt, key) -> memory: needed where `command`, `sensor` or `record`
+    use one.
+    """
     random: bool = False
     """Whether `initial_memory` needs its key."""
     formula: str = ""
     """What it changes, in LaTeX, for the documentation."""
     card: Card | None = None
-    """How the diagnosis tells it; without one it can be flown with, but not be diagnosed."""
+    """How the diagnosis tells it; without one it can be flown with, but not be
+    diagnosed.
+    """
 
     def none(self) -> dict[str, float]:
         """Parameters at which the effect is absent."""

@@ -1,5 +1,5 @@
-"""`effects.toml`: which effects act, and how strongly. Written by the diagnosis, read by the
-trainer.
+"""`effects.toml`: which effects act, and how strongly. Written by the diagnosis, read
+by the trainer.
 
     notes = "optional text"
 
@@ -7,8 +7,8 @@ trainer.
     d_xy = { value = 0.012, unit = "N s/m", interval90 = [0.0113, 0.0128] }
     d_z = 0.0            # a bare number is in the parameter's own unit
 
-A parameter that is left out has no effect. `unit` and `interval90` are optional; a unit other than
-the parameter's own is an error, so that nothing is converted silently.
+A parameter that is left out has no effect. `unit` and `interval90` are optional; a unit
+other than the parameter's own is an error, so that nothing is converted silently.
 """
 
 import dataclasses
@@ -36,11 +36,14 @@ class _Entry:
     interval90: tuple[float, float] | None = None
 
 
-def load_effects(path: str | Path) -> tuple[tuple[str, ...], dict[str, dict[str, float]]]:
-    """Names of the effects, sorted, and {effect: {parameter: value}} from an effects file.
+def load_effects(
+    path: str | Path,
+) -> tuple[tuple[str, ...], dict[str, dict[str, float]]]:
+    """Names of the effects, sorted, and {effect: {parameter: value}} from an effects
+    file.
 
-    Raises UserError for a missing or unreadable file, unknown names, wrong units and values that
-    aren't numbers.
+    Raises UserError for a missing or unreadable file, unknown names, wrong units and
+    values that aren't numbers.
     """
     effects = _read(Path(path))
     values = {
@@ -51,12 +54,14 @@ def load_effects(path: str | Path) -> tuple[tuple[str, ...], dict[str, dict[str,
 
 
 def load_intervals(path: str | Path) -> dict[str, dict[str, tuple[float, float]]]:
-    """90 % intervals {effect: {parameter: (low, high)}} of an effects file, of those that have
-    any.
+    """90 % intervals {effect: {parameter: (low, high)}} of an effects file, of those
+    that have any.
     """
     found = {}
     for name, entries in _read(Path(path)).items():
-        intervals = {key: entry.interval90 for key, entry in entries.items() if entry.interval90}
+        intervals = {
+            key: entry.interval90 for key, entry in entries.items() if entry.interval90
+        }
         if intervals:
             found[name] = intervals
     return found
@@ -71,7 +76,9 @@ def _read(path: Path) -> dict[str, dict[str, _Entry]]:
         if not isinstance(entries, dict):
             raise UserError(f"{path}: [{name}] must be a table of its parameters")
         find_effect(name, where=f"{path}: ")
-        read[name] = {key: _entry(path, name, key, entry) for key, entry in entries.items()}
+        read[name] = {
+            key: _entry(path, name, key, entry) for key, entry in entries.items()
+        }
     return read
 
 
@@ -79,9 +86,13 @@ def _entry(path: Path, name: str, key: str, text) -> _Entry:
     """One parameter's entry from what TOML reads, a number or a table."""
     where = f"{path}: {name}.{key}"
     parameter = find_effect(name, key, f"{path}: ").parameters[key]
-    entry = from_plain(_Entry, text if isinstance(text, dict) else {"value": text}, where)
+    entry = from_plain(
+        _Entry, text if isinstance(text, dict) else {"value": text}, where
+    )
     if entry.unit not in (None, parameter.unit):
-        raise UserError(f"{where} is in {entry.unit!r}; {parameter.unit!r} would be right")
+        raise UserError(
+            f"{where} is in {entry.unit!r}; {parameter.unit!r} would be right"
+        )
     if entry.interval90 is not None and not entry.interval90[0] <= entry.interval90[1]:
         raise UserError(
             f"{where}: interval90 is {list(entry.interval90)}; low must not exceed high"
@@ -114,8 +125,8 @@ def save_effects(
     intervals: Mapping[str, Mapping[str, tuple[float, float]]] | None = None,
     notes: str = "",
 ) -> None:
-    """Write an effects file: {effect: {parameter: value}}, with 90 % intervals where `intervals`
-    has them.
+    """Write an effects file: {effect: {parameter: value}}, with 90 % intervals where
+    `intervals` has them.
 
     Raises UserError for unknown effects or parameters, before anything is written.
     """

@@ -8,15 +8,20 @@ from openjax.vehicle.effects.effect import NOT_NEGATIVE, Card, Effect, Fitted, P
 
 def gain(strength, distance):
     """1 + strength (R / distance)^2 for hubs at `distance` m from a plane."""
-    # nearer than half a radius the formula holds no more, and at the plane it is infinite
+    # nearer than half a radius the formula holds no more, and at the plane it is
+    # infinite
     near = jnp.maximum(distance, 0.5 * PROPELLER_RADIUS)
     return 1.0 + strength * (PROPELLER_RADIUS / near) ** 2
 
 
 def thrust(parameters, thrust, reaction, context):
-    """Each hub has its own height, so that a tilted vehicle is righted or turned over."""
+    """Each hub has its own height, so that a tilted vehicle is righted or turned
+    over.
+    """
     height = hub_height(context) - context.floor_height
-    return thrust * gain(parameters["strength"], height + parameters["offset"]), reaction
+    return thrust * gain(
+        parameters["strength"], height + parameters["offset"]
+    ), reaction
 
 
 _SOURCE = (
@@ -31,7 +36,10 @@ EFFECT = Effect(
     parameters={
         "strength": Parameter("1", 0.0, (0.2, 1.2), _SOURCE, domain=NOT_NEGATIVE),
         "offset": Parameter(
-            "m", 0.0, (0.0, 0.03), "height of the rotors above the tracked point, mocap offset"
+            "m",
+            0.0,
+            (0.0, 0.03),
+            "height of the rotors above the tracked point, mocap offset",
         ),
     },
     thrust=thrust,

@@ -1,5 +1,5 @@
-"""Rotors differ: bent or worn propellers and motors, each with its own factor on thrust and
-torque.
+"""Rotors differ: bent or worn propellers and motors, each with its own factor on thrust
+and torque.
 """
 
 import jax.numpy as jnp
@@ -9,7 +9,9 @@ from openjax.vehicle.effects.effect import Card, Effect, Fitted, Parameter
 
 
 def thrust(parameters, thrust, reaction, context):
-    """Each rotor's own factor on both: a bent propeller changes thrust and torque alike."""
+    """Each rotor's own factor on both: a bent propeller changes thrust and torque
+    alike.
+    """
     factor = 1.0 + jnp.stack([parameters[name] for name in ("m1", "m2", "m3", "m4")])
     return thrust * factor, reaction * factor
 
@@ -36,7 +38,9 @@ EFFECT = Effect(
         sample={"m1": 0.06, "m2": -0.04, "m3": 0.02, "m4": -0.05},
         practical={"m1": 0.002, "m2": 0.002, "m3": 0.002, "m4": 0.002},
         days=0.03,
-        trim=lambda values, vehicle: np.array([values[m] for m in ("m1", "m2", "m3", "m4")]),
+        trim=lambda values, vehicle: np.array(
+            [values[m] for m in ("m1", "m2", "m3", "m4")]
+        ),
         next_flight="hover and climbs at several thrusts, with yaw free.",
     ),
 )

@@ -6,26 +6,31 @@ import numpy as np
 from openjax.vehicle.effects.effect import Card, Effect, Fitted, Parameter
 
 _SHORTEST = 1e-3  # s
-# small brushed motors were measured at up to 0.1 s in all, and no loop flies through more
+# small brushed motors were measured at up to 0.1 s in all, and no loop flies through
+# more
 _SLOWEST = 0.1  # s
 # motors that seem earlier than this are not what they seem
 EARLY = 0.0025  # s
 
 
 def body(parameters, vehicle):
-    """Both time constants, of which the vehicle holds the first and the ratio of the second to
-    it.
+    """Both time constants, of which the vehicle holds the first and the ratio of the
+    second to it.
     """
     up = jnp.maximum(vehicle.motor_time_constant + parameters["extra_up"], _SHORTEST)
-    down = vehicle.motor_time_constant * vehicle.motor_slowdown_ratio + parameters["extra_down"]
+    down = (
+        vehicle.motor_time_constant * vehicle.motor_slowdown_ratio
+        + parameters["extra_down"]
+    )
     return vehicle.replace(
         motor_time_constant=up, motor_slowdown_ratio=jnp.maximum(down, _SHORTEST) / up
     )
 
 
 def lags(value, deviation):
-    """Whether motors lag. That they are early is what gusts look like, which the rate controller
-    answers, and single samples of the motors; a motor's time constant is known better than that.
+    """Whether motors lag. That they are early is what gusts look like, which the rate
+    controller answers, and single samples of the motors; a motor's time constant is
+    known better than that.
     """
     return -EARLY < max(value["extra_up"], value["extra_down"]) < _SLOWEST
 
@@ -36,7 +41,9 @@ def spin_up_error(vehicle):
 
 
 def spin_down_error(vehicle):
-    """s: braking isn't driving; brushed motors were measured up to a third slower down than up."""
+    """s: braking isn't driving; brushed motors were measured up to a third slower down
+    than up.
+    """
     return 0.15 * vehicle.motor_time_constant * vehicle.motor_slowdown_ratio
 
 
@@ -62,17 +69,36 @@ EFFECT = Effect(
     ),
     parameters={
         "extra_up": Parameter(
-            "s", 0.0, (-0.005, 0.095), _SOURCE, "added to the time constant of speeding up", up
+            "s",
+            0.0,
+            (-0.005, 0.095),
+            _SOURCE,
+            "added to the time constant of speeding up",
+            up,
         ),
         "extra_down": Parameter(
-            "s", 0.0, (-0.005, 0.095), _SOURCE, "added to the time constant of slowing down", down
+            "s",
+            0.0,
+            (-0.005, 0.095),
+            _SOURCE,
+            "added to the time constant of slowing down",
+            down,
         ),
     },
     body=body,
     card=Card(
         fitted=(
-            Fitted("extra_up", mean=0.0, spread=0.03, start=0.01, step=0.0005, error=0.001),
-            Fitted("extra_down", mean=0.0, spread=0.03, start=0.01, step=0.0005, error=0.001),
+            Fitted(
+                "extra_up", mean=0.0, spread=0.03, start=0.01, step=0.0005, error=0.001
+            ),
+            Fitted(
+                "extra_down",
+                mean=0.0,
+                spread=0.03,
+                start=0.01,
+                step=0.0005,
+                error=0.001,
+            ),
         ),
         common=0.03,
         possible=lags,

@@ -1,8 +1,8 @@
 """Some commands never arrive: the last one is held.
 
-Which are lost is drawn from a key in the memory. In a replay that knows, `Context.packet_lost`
-decides instead (1 lost, 0 arrived). A share between gives the mean over draws of one step, which is
-differentiable in that share.
+Which are lost is drawn from a key in the memory. In a replay that knows,
+`Context.packet_lost` decides instead (1 lost, 0 arrived). A share between gives the
+mean over draws of one step, which is differentiable in that share.
 """
 
 import jax
@@ -13,7 +13,10 @@ from openjax.vehicle.parameters import hover_command
 
 
 def initial_memory(vehicle, state, dt, key):
-    return {"held": hover_command(vehicle, state.position.dtype), "key": jax.random.key_data(key)}
+    return {
+        "held": hover_command(vehicle, state.position.dtype),
+        "key": jax.random.key_data(key),
+    }
 
 
 def command(parameters, memory, command, context):

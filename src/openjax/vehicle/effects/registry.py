@@ -1,4 +1,6 @@
-"""All effects by name: adding an effect takes one file, here or outside (`register_effect`)."""
+"""All effects by name: adding an effect takes one file, here or outside
+(`register_effect`).
+"""
 
 import importlib
 import sys
@@ -15,12 +17,12 @@ EFFECTS: dict[str, Effect] = {
 
 
 def register_effect(effect: Effect) -> None:
-    """From now on an effect of one's own is flown, written to files and diagnosed as shipped ones
-    are.
+    """From now on an effect of one's own is flown, written to files and diagnosed as
+    shipped ones are.
 
     Raises:
-      UserError: there is another one of that name, or the diagnosis has been loaded already, which
-      gives each effect its place when it is.
+      UserError: there is another one of that name, or the diagnosis has been loaded
+      already, which gives each effect its place when it is.
     """
     if EFFECTS.get(effect.name, effect) is not effect:
         raise UserError(f"effect {effect.name!r}: there is one of that name already")
@@ -42,7 +44,9 @@ def find_effect(
     parameter.
     """
     if name not in effects:
-        raise UserError(f"{where}effect {name!r} is unknown; {suggestion(name, effects)}")
+        raise UserError(
+            f"{where}effect {name!r} is unknown; {suggestion(name, effects)}"
+        )
     parameters = effects[name].parameters
     if parameter is not None and parameter not in parameters:
         raise UserError(

@@ -1,4 +1,6 @@
-"""Linear drag of the spinning rotors. It acts at the hubs, so it damps body rates as well."""
+"""Linear drag of the spinning rotors. It acts at the hubs, so it damps body rates as
+well.
+"""
 
 import jax.numpy as jnp
 
@@ -19,7 +21,9 @@ _SOURCE = (
 
 
 def brakes(value, deviation):
-    """Whether a fitted drag isn't clearly a push along the motion: three standard deviations."""
+    """Whether a fitted drag isn't clearly a push along the motion: three standard
+    deviations.
+    """
     return bool(value["d_xy"] > -3.0 * deviation["d_xy"])
 
 

@@ -1,4 +1,6 @@
-"""The pose that the off-board controller sees is old; gyroscope and motors on board are not."""
+"""The pose that the off-board controller sees is old; gyroscope and motors on board are
+not.
+"""
 
 import jax.numpy as jnp
 
@@ -11,15 +13,15 @@ def _pose(state):
 
 
 def initial_memory(vehicle, state, dt, key):
-    """As if the drone had been here before. The step is remembered, since `sensor` has no other way
-    to know it.
+    """As if the drone had been here before. The step is remembered, since `sensor` has
+    no other way to know it.
     """
     return {"pose": fill(_pose(state), dt), "dt": jnp.asarray(dt, state.position.dtype)}
 
 
 def record(memory, state):
-    """Quaternions q and -q are the same attitude: the one nearer to the last is kept, so they can
-    be averaged.
+    """Quaternions q and -q are the same attitude: the one nearer to the last is kept,
+    so they can be averaged.
     """
     pose = _pose(state)
     # a pose is position (3), quaternion (4) and velocity (3) in one row
@@ -43,7 +45,11 @@ EFFECT = Effect(
     formula=r"(p, q, v)_{\mathrm{seen}}(t) = (p, q, v)(t - \Delta)",
     parameters={
         "delay": Parameter(
-            "s", 0.0, (0.004, 0.06), "motion capture, filtering and network", domain=NOT_NEGATIVE
+            "s",
+            0.0,
+            (0.004, 0.06),
+            "motion capture, filtering and network",
+            domain=NOT_NEGATIVE,
         )
     },
     sensor=sensor,

@@ -11,19 +11,18 @@ def motor(parameters, motor_command, context):
     return parameters["offset"] + parameters["slope"] * motor_command + square
 
 
-_SOURCE = (
-    "spread of quadratic thrust maps published for the Crazyflie, as shares of the largest thrust"
-)
+_SOURCE = "spread of quadratic thrust maps published for the Crazyflie, as shares of the largest thrust"
 
-# A straight line rises by 1; these are what powers of the command from 0.6 to 1.9 rise by.
+# A straight line rises by 1; these are what powers of the command from 0.6 to 1.9 rise
+# by.
 _LEAST_SLOPE = 0.4
 _LARGEST_SLOPE = 2.2
 _USUAL_COMMANDS = np.array([0.45, 0.85])
 
 
 def rises(value, deviation):
-    """Whether a fitted curve rises over the usual commands as a motor's does; if not, the motors
-    don't make this force.
+    """Whether a fitted curve rises over the usual commands as a motor's does; if not,
+    the motors don't make this force.
     """
     slope = value["slope"] + 2.0 * value["curvature"] * _USUAL_COMMANDS
     return bool(_LEAST_SLOPE < slope.min() and slope.max() < _LARGEST_SLOPE)
@@ -44,7 +43,9 @@ EFFECT = Effect(
         fitted=(
             Fitted("offset", mean=0.0, spread=0.08, start=0.02, step=0.001),
             Fitted("slope", mean=1.0, spread=0.2, start=0.95, step=0.001),
-            Fitted("curvature", mean=0.0, spread=0.25, start=0.02, step=0.001, error=0.1),
+            Fitted(
+                "curvature", mean=0.0, spread=0.25, start=0.02, step=0.001, error=0.1
+            ),
         ),
         thrust_map=True,
         log_odds=RARE,

@@ -8,8 +8,8 @@ _REFERENCE_VOLTAGE = 3.9  # V
 
 
 def motor(parameters, motor_command, context):
-    """min(m, limit), before the motors' lag: a saturated motor leaves its limit as soon as the
-    command does.
+    """min(m, limit), before the motors' lag: a saturated motor leaves its limit as soon
+    as the command does.
     """
     # where nobody knows the voltage, the limit is that at the reference
     voltage = context.battery_voltage
@@ -19,7 +19,9 @@ def motor(parameters, motor_command, context):
 
 
 def tops_out(value, deviation):
-    """Whether the limit is one that full commands reach; above 1 it is a thrust curve's form."""
+    """Whether the limit is one that full commands reach; above 1 it is a thrust curve's
+    form.
+    """
     return value["limit"] < 1.0
 
 
@@ -27,7 +29,9 @@ def frozen(values, intervals, voltage):
     """The limit as it is at one voltage."""
     factor = 1.0 + values["voltage_slope"] * (voltage - _REFERENCE_VOLTAGE)
     limit = tuple(factor * v for v in intervals["limit"])
-    return values | {"limit": values["limit"] * factor, "voltage_slope": 0.0}, {"limit": limit}
+    return values | {"limit": values["limit"] * factor, "voltage_slope": 0.0}, {
+        "limit": limit
+    }
 
 
 EFFECT = Effect(
@@ -37,8 +41,8 @@ EFFECT = Effect(
     parameters={
         "limit": Parameter(
             unit="1",
-            # out of reach: what a curve or a full battery gives beyond the nominal largest thrust
-            # stays
+            # out of reach: what a curve or a full battery gives beyond the nominal
+            # largest thrust stays
             none=1.5,
             prior=(0.6, 0.95),
             source="brushed motors on a worn battery top out 10-30 % early",
