@@ -1,5 +1,4 @@
-"""What makes flights differ from the simulator? Make flights of a vehicle with drag,
-and ask.
+"""What makes flights differ from the simulator? Make flights of a vehicle with drag, and ask.
 
 python examples/diagnose_flights.py
 """
@@ -12,15 +11,7 @@ from pathlib import Path
 from openjax.gap import diagnose_case, load_case
 
 folder = Path(tempfile.mkdtemp()) / "drag"
-sample = [
-    sys.executable,
-    "-m",
-    "openjax",
-    "sample_flights",
-    str(folder),
-    "--effect",
-    "rotor_drag",
-]
+sample = [sys.executable, "-m", "openjax", "sample_flights", str(folder), "--effect", "rotor_drag"]
 subprocess.run(sample, check=True)
 
 case = load_case(folder)  # flight logs (CSV, micro-SD, ROS 2 bags) and a vehicle.toml

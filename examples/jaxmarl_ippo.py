@@ -1,7 +1,6 @@
 """JaxMARL's own IPPO on the game, its file unchanged.
 
-python examples/jaxmarl_ippo.py JaxMARL/baselines/IPPO/ippo_ff_mabrax.py [hydra's
-options]
+python examples/jaxmarl_ippo.py JaxMARL/baselines/IPPO/ippo_ff_mabrax.py [hydra's options]
 """
 
 import runpy

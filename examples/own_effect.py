@@ -1,5 +1,4 @@
-"""A physical effect of one's own, flown and diagnosed: a cable hangs from the vehicle
-to the floor.
+"""A physical effect of one's own, flown and diagnosed: a cable hangs from the vehicle to the floor.
 
 python examples/own_effect.py
 """
@@ -24,9 +23,7 @@ def wrench(parameters, context):
 tether = Effect(
     name="tether",
     description="the weight of a cable that hangs down to the floor",
-    parameters={
-        "weight": Parameter("N/m", 0.0, (0.01, 0.05), "thin cables, 1 to 5 g a metre")
-    },
+    parameters={"weight": Parameter("N/m", 0.0, (0.01, 0.05), "thin cables, 1 to 5 g a metre")},
     wrench=wrench,
     card=Card(
         fitted=(Fitted("weight", mean=0.0, spread=0.03, start=0.01, step=0.0005),),
@@ -34,8 +31,7 @@ tether = Effect(
         next_flight="climb slowly to the ceiling and back.",
     ),
 )
-# before the diagnosis is loaded, which is when it is first asked
-register_effect(tether)
+register_effect(tether)  # before the diagnosis is loaded, which is when it is first asked
 
 folder = Path(tempfile.mkdtemp()) / "tether"
 sample_flights.make_case(sample_flights.Arguments(folder, effect=("tether",)))

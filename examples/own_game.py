@@ -15,27 +15,19 @@ game = openjax.make(num_pursuers=3, evader_speed=0.6, max_pillars=3, min_pillars
 
 
 def controller(state):
-    """(N, 4) actions that lean towards the evader, by rates in proportion to where it
-    is.
-    """
+    """(N, 4) actions that lean towards the evader, by rates in proportion to where it is."""
     drones = state.drones
     tilt = drones.quaternion[:, 1:3]  # sine of half the roll and pitch
     towards = state.evader_position - drones.position
     lean = jnp.array([-1.0, 1.0])  # roll moves towards -y, pitch towards +x
     wanted = lean * (0.2 * towards[:, [1, 0]] - 0.1 * drones.velocity[:, [1, 0]])
     rates = jnp.clip(4.0 * (wanted - tilt), -1.0, 1.0)
-    thrust = (
-        hover_action(game.vehicle)[0]
-        + 0.5 * towards[:, 2]
-        - 0.4 * drones.velocity[:, 2]
-    )
+    thrust = hover_action(game.vehicle)[0] + 0.5 * towards[:, 2] - 0.4 * drones.velocity[:, 2]
     return jnp.column_stack([thrust, rates, jnp.zeros(len(thrust))])
 
 
 def episode(key):
-    """One world from its start; whether some pursuer captured the evader in some
-    step.
-    """
+    """One world from its start; whether some pursuer captured the evader in some step."""
 
     def step(state, _):
         _, state, _, _, _, info = game.step(key, state, controller(state))

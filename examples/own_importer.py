@@ -1,5 +1,4 @@
-"""Logs in a format of one's own: two functions say which files are such logs and what
-they hold.
+"""Logs in a format of one's own: two functions say which files are such logs and what they hold.
 
 python examples/own_importer.py flights/ours
 """
@@ -23,9 +22,7 @@ def is_ours(path):
 
 
 def read(path, mapping):
-    """One JSON object a line: {"ms": 10, "p": [x, y, z], "q": [...], "gyro": [...],
-    "u": [...]}.
-    """
+    """One JSON object a line: {"ms": 10, "p": [x, y, z], "q": [...], "gyro": [...], "u": [...]}."""
     rows = [json.loads(line) for line in path.read_text().splitlines()]
     if not rows:
         raise LogError("holds no row")

@@ -1,5 +1,4 @@
-"""A learner of one's own in MAPPO's place: REINFORCE, the oldest policy gradient
-(Williams, 1992).
+"""A learner of one's own in MAPPO's place: REINFORCE, the oldest policy gradient (Williams, 1992).
 
 python examples/own_learner.py
 """
@@ -17,8 +16,7 @@ policy = build(settings).policy
 adam = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(3e-4))
 
 
-# what `openjax.learning.Learner` asks for; its state is the optimiser's
-class Reinforce:
+class Reinforce:  # what `openjax.learning.Learner` asks for; its state is the optimiser's
     def start(self, parameters, key):
         return adam.init(parameters.actor)
 
@@ -28,9 +26,7 @@ class Reinforce:
         worth = (rest - jnp.mean(rest, axis=1, keepdims=True)) / (jnp.std(rest) + 1e-6)
 
         def loss(actor):
-            mean, log_std = policy.distribution(
-                actor, rollout.observation, rollout.predicted
-            )
+            mean, log_std = policy.distribution(actor, rollout.observation, rollout.predicted)
             return -jnp.mean(worth * gaussian_log_prob(rollout.action, mean, log_std))
 
         value, gradient = flown.mean(jax.value_and_grad(loss)(parameters.actor))
@@ -40,6 +36,4 @@ class Reinforce:
 
 
 learners = {"policy": Reinforce()}
-openjax.train(
-    settings, "runs/own_learner", learners=learners, minutes=6, overwrite=True
-)
+openjax.train(settings, "runs/own_learner", learners=learners, minutes=6, overwrite=True)

@@ -26,8 +26,7 @@ class Plain:  # what `openjax.policy.Network` asks for
 
     def distribution(self, actor, seen):
         mean = Layers(4).apply(actor, seen.self_state, seen.others, seen.pillars)
-        # about hovering
-        return mean + jnp.array([0.25, 0.0, 0.0, 0.0]), jnp.full(4, -1.5)
+        return mean + jnp.array([0.25, 0.0, 0.0, 0.0]), jnp.full(4, -1.5)  # about hovering
 
     def value(self, critic, seen):
         return Layers(1).apply(critic, seen.self_state, seen.privileged)[..., 0]
@@ -36,6 +35,4 @@ class Plain:  # what `openjax.policy.Network` asks for
 settings = openjax.preset("quick", first_flights=dict(updates=0))
 options = dict(minutes=6, overwrite=True)
 policy = openjax.train(settings, "runs/own_network", policy=Plain(), **options)
-print(
-    f"captured in {openjax.evaluate(policy, 'empty', episodes=9)['capture_rate']:.0%}"
-)
+print(f"captured in {openjax.evaluate(policy, 'empty', episodes=9)['capture_rate']:.0%}")

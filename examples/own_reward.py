@@ -1,5 +1,4 @@
-"""A reward term of one's own: pursuers are paid for standing on all sides of the
-evader.
+"""A reward term of one's own: pursuers are paid for standing on all sides of the evader.
 
 python examples/own_reward.py [MINUTES]
 """
@@ -13,8 +12,8 @@ from openjax.pursuit import Term, default_reward
 
 
 def surround(step):
-    """() from 0, where all pursuers are on one side of the evader, to 1, where they are
-    all around.
+    """() from 0, where all pursuers are on one side of the evader, to 1, where they are all
+    around.
     """
     towards = step.state.drones.position - step.state.evader_position
     direction = towards / jnp.linalg.norm(towards + 1e-6, axis=-1, keepdims=True)

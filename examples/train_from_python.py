@@ -12,8 +12,7 @@ import openjax
 
 minutes = float(sys.argv[1]) if len(sys.argv) > 1 else 6.0
 settings = openjax.preset("quick")
-# any field of any part can be replaced
-settings = dataclasses.replace(settings, seed=1)
+settings = dataclasses.replace(settings, seed=1)  # any field of any part can be replaced
 
 policy = openjax.train(settings, "runs/from_python", minutes=minutes, overwrite=True)
 record = openjax.evaluate(policy, "empty", episodes=32)

@@ -397,10 +397,11 @@ def test_shipped_policies_act_in_their_game_and_refuse_another():
         )
         action = policy(observation)
         assert action.shape == (3, 4) and bool((abs(action) <= 1).all()), policy.source
+    flight = openjax.load_policy("flight")
     for changes in ({"history_length": 3}, {"observe_time": False}):
-        other = openjax.make(policy.settings.environment, **changes)
+        other = openjax.make(flight.settings.environment, **changes)
         with pytest.raises(openjax.UserError, match="make its game with"):
-            policy(jax.eval_shape(other.reset, jax.random.key(0))[0])
+            flight(jax.eval_shape(other.reset, jax.random.key(0))[0])
 
 
 def test_benchmark_writes_table_and_file(tmp_path, monkeypatch, capsys):
