@@ -3,6 +3,7 @@ signal, a time limit.
 """
 
 import gc
+import itertools
 import json
 import os
 import signal
@@ -214,8 +215,10 @@ def test_an_update_leaves_nothing_in_memory(compiled, tmp_path):
 
     tracemalloc.start()
     try:
-        run(tmp_path, compiled, 1200, evaluate=evaluate, validation_interval=400)
+        run(tmp_path, compiled, 1600, evaluate=evaluate, validation_interval=400)
     finally:
         tracemalloc.stop()
-    _, (before, arrays), (after, same) = seen
-    assert after - before < 250 * 400 and same == arrays
+    sizes, arrays = zip(*seen[1:], strict=True)
+    # a leak grows in every stretch, what others cache for good in one
+    grown = min(after - before for before, after in itertools.pairwise(sizes))
+    assert grown < 250 * 400 and len(set(arrays)) == 1
