@@ -556,8 +556,7 @@ def make(
       settings: the game; None is the paper's.
       evader: a name in `openjax.pursuit.evaders.EVADERS`, short for `evaders=(name,)`;
       a row, or a function of one's own.
-      changes: fields of `PursuitSettings`, such as `num_pursuers=4` or
-      `reward=dict(crash=20.0)`.
+      changes: fields of `PursuitSettings`, as `reward=dict(crash=20.0)`.
 
     Raises:
       UserError: no such setting, a value that it can't have, an evader that nobody
