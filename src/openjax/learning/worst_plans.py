@@ -244,13 +244,19 @@ class WorstPlans:
         hold = jnp.where(world[1].seen, self.settings.hold, planning.hold_unseen)[
             :, None
         ]
+        # what isn't weighed isn't worked out, nor told
+        room = {}
+        if planning.territory:
+            territory = seen * jnp.mean(met.territory, axis=0)
+            room["territory"] = (planning.territory, territory)
+        if planning.unseen:
+            # where nobody sees it, too: to look where it was last seen is what is to be
+            # learnt
+            room["unseen"] = (planning.unseen, met.unseen)
         parts = {
             "free": (1.0, seen * jnp.mean(met.free, axis=0)),
             "distance": (planning.distance, seen * jnp.mean(met.distance, axis=0)),
-            "territory": (planning.territory, seen * jnp.mean(met.territory, axis=0)),
-            # where nobody sees it, too: to look where it was last seen is what is to be
-            # learnt
-            "unseen": (planning.unseen, met.unseen),
+            **room,
             "crashes": (planning.crash, crash_share(jnp.min(met.least, axis=0))),
             "breaches": (planning.breach, met.breach),
             "speed": (self.settings.speed, met.excess),
