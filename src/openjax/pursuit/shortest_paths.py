@@ -103,14 +103,12 @@ def path_length(
     return jnp.sqrt(level**2 + (position[:, 2] - target[2]) ** 2)
 
 
-def arena_points(
-    settings: PursuitSettings, number: int = POINTS
-) -> Float[Array, "points 2"]:
+def arena_points(settings: PursuitSettings) -> Float[Array, "points 2"]:
     """(M, 2) m, points spread evenly over the arena: Vogel's sunflower (1979, A better
     way to construct the sunflower head).
     """
-    index = np.arange(number)
-    radius = settings.arena_radius * np.sqrt((index + 0.5) / number)
+    index = np.arange(POINTS)
+    radius = settings.arena_radius * np.sqrt((index + 0.5) / POINTS)
     angle = index * np.pi * (3.0 - np.sqrt(5.0))
     return jnp.asarray(
         radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], -1), jnp.float32
