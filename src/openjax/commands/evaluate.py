@@ -20,7 +20,7 @@ from openjax.files import check_output, write_json
 from openjax.pursuit.settings import LAYOUT_PURSUERS, PursuitSettings
 from openjax.ranges import Interval, Seed
 from openjax.show.progress import Steps
-from openjax.store import default_policy, default_policy_line
+from openjax.store import default_policy
 from openjax.store.compiled_programs import cache_programs
 
 if TYPE_CHECKING:
@@ -71,8 +71,9 @@ class FlightOptions:
         names = self.policy
         if names is None:
             number = self.pursuers_of(environment or PursuitSettings())
-            names = (default_policy(number),)
-            if line := default_policy_line(number):
+            name, line = default_policy(number)
+            names = (name,)
+            if line:
                 output_console().print(line, soft_wrap=True)
         if not names:
             raise UserError("--policy needs at least one policy")

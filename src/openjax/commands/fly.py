@@ -20,7 +20,7 @@ from openjax.files import check_new_folder, replacing
 from openjax.flying.endpoints import UDP_PORT, endpoints_of, sole_command
 from openjax.flying.state import SafetySettings
 from openjax.ranges import Interval
-from openjax.store import default_policy, default_policy_line
+from openjax.store import default_policy
 
 PROGRAM = "openjax fly"
 DRIFT = 0.1
@@ -183,9 +183,10 @@ def prepare(arguments: Arguments) -> Prepared:
     if arguments.plan is not None:
         return _planned(arguments)
     name = arguments.policy
+    line = ""
     if name is None:
         number = len(find_scenario(arguments.scenario, PursuitSettings()).pursuers)
-        name = default_policy(number)
+        name, line = default_policy(number)
     policy = load_policy(name)
     settings = policy.settings.environment
     scenario = find_scenario(arguments.scenario, settings)
@@ -205,9 +206,7 @@ def prepare(arguments: Arguments) -> Prepared:
     uris = uris_of(arguments)
     state = flight_state(game, len(uris), arguments.safety)
     remarks = _remarks(arguments, game, vehicle)
-    if arguments.policy is None and (
-        line := default_policy_line(len(scenario.pursuers))
-    ):
+    if line:
         remarks = (line, *remarks)
     about = {"policy": policy.source, "scenario": scenario.name, "uris": uris}
     return Prepared(game, state, session, vehicle, about, remarks)

@@ -8,15 +8,13 @@ TEAM_POLICY = "teams"
 """The one for any other number of them."""
 
 
-def default_policy(num_pursuers: int) -> str:
-    """The shipped policy that so many pursuers fly where none is named."""
-    return DEFAULT_POLICY if num_pursuers == LAYOUT_PURSUERS else TEAM_POLICY
-
-
-def default_policy_line(num_pursuers: int) -> str:
-    """What is said of it; nothing of the usual one."""
+def default_policy(num_pursuers: int) -> tuple[str, str]:
+    """The shipped policy that so many pursuers fly where none is named, and what is
+    said of it; nothing of the usual one.
+    """
     if num_pursuers == LAYOUT_PURSUERS:
-        return ""
-    return (
+        return DEFAULT_POLICY, ""
+    line = (
         f"policy {TEAM_POLICY}: {DEFAULT_POLICY} flies {LAYOUT_PURSUERS} pursuers only"
     )
+    return TEAM_POLICY, line
