@@ -278,6 +278,12 @@ class WorstPlansSettings:
     """
     unseen: Annotated[float, Interval("[0, 1000]")] = 0.0
     """Weight of how well the evader hides from all of them, beside the same."""
+    team_plans: Annotated[int, Interval("[0, 10000]")] = 0
+    """Plans of the whole team that are tried against evaders' plans, by points, to show
+    pursuers what they could do; 0: none.
+    """
+    follow: Annotated[float, Interval("[0, 1000]")] = 3.0
+    """Weight of how far pursuers are from where the best of these leads (m)."""
     crash: Annotated[float, Interval("[0, 1000]")] = 8.0
     """Weight of the share of pursuers that touch something, beside the same."""
     breach: Annotated[float, Interval("[0, 1000]")] = 2.0

@@ -16,10 +16,11 @@ learnt here.
 import dataclasses
 import functools
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from flax import struct
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
@@ -40,6 +41,7 @@ from openjax.learning.settings import (
     WorstPlansSettings,
 )
 from openjax.learning.smooth_measures import crash_share
+from openjax.learning.team_search import STEP, TeamPlan, TeamSearch, no_plan
 from openjax.policy import PolicyParameters
 from openjax.pursuit import Pursuit, PursuitSettings, PursuitState
 from openjax.pursuit.shapes import Scalar
@@ -61,6 +63,18 @@ WARM_UP = 15
 the gradient, and one of them undoes a policy (captures of a planner fell from .44 to
 .06).
 """
+ANSWERS = 12
+"""Plans of the evader, those that promised it most, against which a team's plan has to
+be good.
+"""
+MARGIN = 0.02
+CLEAR = 0.1
+"""From this much better, in points' steps, the team's plan is followed at all, and from
+both together in full: points turn a little sooner than quadrotors. A metre of all ways
+to the evader is .4 of a step.
+"""
+NEAR = 0.05
+"""Who is nearer than this to where they should be is taken to be there (m)."""
 
 
 @struct.dataclass
@@ -74,6 +88,34 @@ class Planned:
     """(B, pieces, 3) the rest of the last plan of each, NaN or zero where there is
     none
     """
+    team: TeamPlan | None = None
+    """(B, ...) the rest of the last plan that their pursuers should have flown; None:
+    no such plans are searched for
+    """
+
+
+class Tried(NamedTuple):
+    """Plans that evaders of B worlds tried."""
+
+    plans: jax.Array
+    """(B, plans, pieces, 3)"""
+    promised: jax.Array
+    """(B, plans), see `promise`"""
+    free: jax.Array
+    """(B, plans) control steps in which it was free"""
+    end: PursuitState
+    """(B, plans, ...)"""
+
+
+class Shown(NamedTuple):
+    """What the pursuers of B worlds are shown."""
+
+    places: jax.Array
+    """(B, pieces, N, 3) m, where they should be after each piece of the evader's
+    plan
+    """
+    gain: jax.Array
+    """(B,) from 0 to 1, how much better the team's plan is than what they do"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,10 +163,23 @@ class WorstPlans:
         falling = falling_rate(rate, self.settings.updates - warm_up)
         return clipped_descent(optax.join_schedules([rising, falling], [warm_up]))
 
+    @functools.cached_property
+    def team(self) -> TeamSearch:
+        """What a team could do."""
+        seconds = self.steps * self.game.time_step
+        return TeamSearch(self.game, self.planning.team_plans, seconds)
+
     def begin(self, parameters: PolicyParameters, key: PRNGKeyArray) -> Planned:
         """Fresh worlds, and no plan yet."""
-        plan = jnp.zeros((self.planning.worlds, self.planning.pieces, 3))
-        return Planned(self.optimiser.init(parameters.actor), self.start(key), plan)
+        worlds = self.planning.worlds
+        plan = jnp.zeros((worlds, self.planning.pieces, 3))
+        team = None
+        if self.planning.team_plans:
+            none = no_plan(self.game.num_pursuers)
+            team = jax.tree.map(lambda leaf: jnp.stack([leaf] * worlds), none)
+        return Planned(
+            self.optimiser.init(parameters.actor), self.start(key), plan, team
+        )
 
     def record(self, parameters: PolicyParameters, key: PRNGKeyArray):
         """Flights for the usual part."""
@@ -184,6 +239,17 @@ class WorstPlans:
         and what it promises the evader, see `promise`; `plan` is the rest of the last
         one.
         """
+        return worst_of(self.attempts(actor, parameters, world, plan, key))
+
+    def attempts(
+        self,
+        actor: Any,
+        parameters: PolicyParameters,
+        world,
+        plan: Plan,
+        key: PRNGKeyArray,
+    ) -> Tried:
+        """All plans tried in worlds (B, ...), and what became of them."""
         tried = self.candidates(key, plan)
         number = self.planning.plans
         copied = jax.tree.map(lambda leaf: jnp.repeat(leaf, number, axis=0), world)
@@ -198,10 +264,53 @@ class WorstPlans:
             return jax.lax.scan(one, world, length=self.piece_steps)[0], None
 
         (_, end), _ = jax.lax.scan(piece, copied, pieces)
-        promised = self.promise(copied[1], end).reshape(-1, number)
-        best = jnp.argmax(promised, axis=1)
-        chosen = jnp.take_along_axis(tried, best[:, None, None, None], axis=1)[:, 0]
-        return chosen, jnp.max(promised, axis=1)
+        free = self._free(copied[1], end)
+        promised = self.promise(copied[1], end)
+
+        def by_world(leaf):
+            return leaf.reshape(-1, number, *leaf.shape[1:])
+
+        return Tried(
+            tried, *map(by_world, (promised, free)), jax.tree.map(by_world, end)
+        )
+
+    def _free(self, start, end):
+        """(W,) control steps of a plan in which the evader was free."""
+        newly = end.statistics.captured & ~start.statistics.captured
+        return jnp.where(newly, end.statistics.capture_step - start.step, self.steps)
+
+    def show(
+        self, tried: Tried, world, last: TeamPlan, plan: Plan, key: PRNGKeyArray
+    ) -> tuple[TeamPlan, Shown]:
+        """What the teams of worlds (B, ...) should do against evaders that fly `plan`:
+        what is best against the worst of the plans that promised most.
+        """
+        team = self.team
+        room = jax.vmap(jax.vmap(team.room))(tried.end)
+        worth = tried.free * (self.game.time_step / STEP) + room
+        most = jax.lax.top_k(tried.promised, min(ANSWERS, self.planning.plans))[1]
+
+        def chosen(leaf):
+            return jax.vmap(lambda own, places: own[places])(leaf, most)
+
+        velocities = self._velocities(chosen(tried.plans))
+        keys = jax.random.split(key, plan.shape[0])
+        best, promised = jax.vmap(team.search)(world[1], velocities, last, keys)
+        gain = jnp.max(chosen(worth), axis=1) - promised
+        way = jax.vmap(team.way)(world[1], best, self._velocities(plan))
+        ends_of_pieces = (
+            np.arange(1, self.planning.pieces + 1) * team.steps // self.planning.pieces
+        )
+        places = way[:, ends_of_pieces - 1]
+        return best, Shown(places, jnp.clip((gain - MARGIN) / CLEAR, 0.0, 1.0))
+
+    def _velocities(self, plans):
+        """(..., steps, 3) m/s at the points' steps of plans (..., pieces, 3); who flies
+        by its own rule is taken to stay.
+        """
+        pieces = self.planning.pieces
+        piece = np.arange(self.team.steps) * pieces // self.team.steps
+        return self.game.evader_speed * jnp.nan_to_num(plans[..., piece, :])
 
     def promise(
         self, start: PursuitState, end: PursuitState
@@ -209,15 +318,19 @@ class WorstPlans:
         """(W,) how good the end of a plan is for the evader: steps free first, then the
         room that is left.
         """
-        newly = end.statistics.captured & ~start.statistics.captured
-        free = jnp.where(newly, end.statistics.capture_step - start.step, self.steps)
+        free = self._free(start, end)
         ahead = end.drones.position + AHEAD * end.drones.velocity
         offset = ahead - end.evader_position[:, None]
         room = jnp.sqrt(jnp.min(jnp.sum(offset**2, axis=-1), axis=-1))
         return free + room / self.game.arena_radius
 
     def loss(
-        self, actor: Any, parameters: PolicyParameters, world, plan: Plan
+        self,
+        actor: Any,
+        parameters: PolicyParameters,
+        world,
+        plan: Plan,
+        shown: Shown | None = None,
     ) -> tuple[Scalar, tuple[Any, dict[str, Scalar]]]:
         """What is learnt () while evaders fly their plans; the worlds after the plans'
         first piece, and the loss's parts.
@@ -253,6 +366,12 @@ class WorstPlans:
             # where nobody sees it, too: to look where it was last seen is what is to be
             # learnt
             room["unseen"] = (planning.unseen, met.unseen)
+        if shown is not None:
+            flown = jnp.moveaxis(worlds[1].drones.position, 0, 1)
+            square = jnp.sum((flown - shown.places) ** 2, axis=-1)
+            # of two ways round a pillar the nearer one: a mean of both leads into it
+            off = jnp.mean(jnp.sqrt(square + NEAR**2) - NEAR, axis=(1, 2))
+            room["follow"] = (planning.follow, seen * shown.gain * off)
         parts = {
             "free": (1.0, seen * jnp.mean(met.free, axis=0)),
             "distance": (planning.distance, seen * jnp.mean(met.distance, axis=0)),
@@ -275,11 +394,15 @@ class WorstPlans:
     ) -> tuple[Any, Planned, dict[str, Scalar]]:
         """Actor and state after an update, and parts of both losses."""
         plan_key, usual_key, start_key = jax.random.split(key, 3)
-        plan, promised = self.worst(
-            actor, parameters, state.world, state.plan, plan_key
-        )
+        tried = self.attempts(actor, parameters, state.world, state.plan, plan_key)
+        plan, promised = worst_of(tried)
+        team = shown = None
+        if state.team is not None:
+            team_key = jax.random.fold_in(plan_key, 1)
+            team, shown = self.show(tried, state.world, state.team, plan, team_key)
+            team = team.replace(until=team.until - self.planning.piece_seconds)
         gradient, (world, parts) = jax.grad(self.loss, has_aux=True)(
-            actor, parameters, state.world, plan
+            actor, parameters, state.world, plan, shown
         )
         usual, usual_parts = self.usual.gradient(actor, parameters, flights, usual_key)
         gradient = jax.tree.map(jnp.add, finite_or_zero(gradient), usual)
@@ -289,9 +412,11 @@ class WorstPlans:
         plan = jnp.where(over[:, None, None], 0.0, _later(plan))
         parts = {f"planned_{name}": value for name, value in parts.items()}
         survived = {"planned_survived": jnp.mean(promised >= self.steps)}
+        if shown is not None:
+            survived["planned_gain"] = jnp.mean(shown.gain)
         return (
             optax.apply_updates(actor, change),
-            Planned(optimiser, world, plan),
+            Planned(optimiser, world, plan, team),
             usual_parts | parts | survived,
         )
 
@@ -301,6 +426,13 @@ class WorstPlans:
         """
         late = state.step > self.game.episode_length - self.steps
         return is_lost(self.game, state) | state.statistics.captured | late
+
+
+def worst_of(tried: Tried) -> tuple[Plan, Float[Array, " worlds"]]:
+    """The plan that promises the evader of each world most, and how much."""
+    best = jnp.argmax(tried.promised, axis=1)
+    plans = jnp.take_along_axis(tried.plans, best[:, None, None, None], axis=1)
+    return plans[:, 0], jnp.max(tried.promised, axis=1)
 
 
 def planning_game(environment: Pursuit) -> Pursuit:

@@ -1,0 +1,280 @@
+"""What a team could do in the next second or two: many plans of the pursuers against
+many of the evader, flown by points.
+
+A policy that learns by small changes of what it does waits where it could close in:
+none of three who stand round an evader gains by going first. A search over plans of the
+whole team doesn't. Here the pursuers are points that turn and brake as quadrotors can,
+so that a thousand pairs of plans cost less than one flight of the networks; the team
+plan that is best against the evader's best answer is the one to learn from (a matrix
+game, in which the evader chooses last).
+
+It shares no code with the planners of `openjax.evaluation.judges`, which judge what is
+learnt here.
+"""
+
+import dataclasses
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from openjax.pursuit import PursuitSettings, PursuitState
+from openjax.pursuit.shapes import Scalar, Team, Vector
+from openjax.pursuit.shortest_paths import (
+    ROOM,
+    ShortestPaths,
+    path_length,
+    shortest_paths,
+)
+from openjax.pursuit.task import capture_radius
+
+STEP = 0.04
+"""Seconds of a point's step: it flies 4 cm."""
+NARROW = 0.02
+"""How much nearer to pillars than other paths the points' may lead (m): through ways
+of .4 m between two axes, which breach nothing.
+"""
+RESPONSE = 0.12
+"""Seconds in which a quadrotor takes on a velocity that it is told."""
+ACCELERATION = 6.0
+"""m/s², as a quadrotor that tilts by 31 degrees."""
+BRAKING = 0.1
+"""Seconds in which a point would reach its place, were it fast enough."""
+BESIDE = 0.45
+"""Places beside the evader to which a pursuer is sent are at most so far from it (m):
+a capture radius and a half.
+"""
+OTHERS = 0.5
+"""What the mean of all ways to the evader counts beside the shortest one: it is for
+those who aren't the nearest to come round.
+"""
+LOWEST = 0.15
+"""Pursuers are sent no nearer than this to floor and ceiling (m): from there they
+reach who is at it.
+"""
+CLOSE = 0.2
+"""Steps' worth of each step in which two pursuers are closer than they may be."""
+
+
+Velocities = Float[Array, "plans steps 3"]
+Places = Float[Array, "steps drones 3"]
+
+
+@struct.dataclass
+class TeamPlan:
+    """Where N pursuers go until they turn to the evader itself."""
+
+    place: jax.Array  # (..., N, 3) m, beside the evader or of the world
+    is_fixed: jax.Array  # (..., N) bool, the place is one of the world
+    until: jax.Array  # (..., N) s, when they turn to the evader
+
+
+def no_plan(number: int) -> TeamPlan:
+    """Of so many pursuers, who all fly at the evader."""
+    return TeamPlan(jnp.zeros((number, 3)), jnp.zeros(number, bool), jnp.zeros(number))
+
+
+@struct.dataclass
+class Points:
+    """A team and an evader on their way."""
+
+    position: jax.Array  # (N, 3) m
+    velocity: jax.Array  # (N, 3) m/s
+    evader: jax.Array  # (3,) m
+    caught: jax.Array  # () bool
+    free: jax.Array  # () steps in which it was free
+    close: jax.Array  # () steps in which two pursuers were too close
+
+
+@dataclass(frozen=True)
+class TeamSearch:
+    """How many plans a team tries, and how far they reach."""
+
+    game: PursuitSettings
+    plans: int = 48
+    seconds: float = 1.2
+
+    @property
+    def steps(self) -> int:
+        """Points' steps of a plan."""
+        return max(1, round(self.seconds / STEP))
+
+    @property
+    def narrow_game(self) -> PursuitSettings:
+        """The game in whose paths narrower ways are open."""
+        clearance = max(0.0, self.game.pillar_clearance - min(NARROW, ROOM))
+        return dataclasses.replace(self.game, pillar_clearance=clearance)
+
+    def candidates(self, key: PRNGKeyArray, last: TeamPlan) -> TeamPlan:
+        """(T, ...) plans of N pursuers: straight at the evader, the last plan, and for
+        a while or to the end to places beside the evader and to places anywhere.
+        """
+        shape = (self.plans, *last.until.shape)
+        keys = jax.random.split(key, 7)
+        way = jax.random.normal(keys[0], (*shape, 3))
+        way = way / jnp.sqrt(jnp.sum(way**2, axis=-1, keepdims=True) + 1e-12)
+        far = BESIDE * jax.random.uniform(keys[1], (*shape, 1)) ** (1 / 3)
+        angle = jax.random.uniform(keys[2], shape, maxval=2 * jnp.pi)
+        out = (
+            0.9 * self.game.arena_radius * jnp.sqrt(jax.random.uniform(keys[3], shape))
+        )
+        height = self.game.arena_height * jax.random.uniform(
+            keys[4], shape, minval=0.15, maxval=0.9
+        )
+        anywhere = jnp.stack(
+            [out * jnp.cos(angle), out * jnp.sin(angle), height], axis=-1
+        )
+        kind = jax.random.uniform(keys[5], shape)
+        is_fixed = kind > 0.75
+        until = self.seconds * jax.random.uniform(keys[6], shape, maxval=1.5)
+        until = jnp.where(kind < 0.3, 0.0, until)
+        drawn = TeamPlan(
+            jnp.where(is_fixed[..., None], anywhere, far * way), is_fixed, until
+        )
+        straight = no_plan(last.until.shape[0])
+        return jax.tree.map(
+            lambda leaf, *first: leaf.at[: len(first)].set(jnp.stack(first)),
+            drawn,
+            straight,
+            last,
+        )
+
+    def target(self, plan: TeamPlan, evader: Vector, time: Scalar) -> Team:
+        """(N, 3) m, where pursuers go at a time."""
+        beside = plan.place + jnp.where(plan.is_fixed[:, None], 0.0, evader)
+        place = jnp.where((time >= plan.until)[:, None], evader, beside)
+        low = jnp.array([-jnp.inf, -jnp.inf, LOWEST])
+        high = jnp.array([jnp.inf, jnp.inf, self.game.arena_height - LOWEST])
+        return jnp.clip(place, low, high)
+
+    def desired(self, task, paths: ShortestPaths, position: Team, target: Team) -> Team:
+        """(N, 3) m/s, along the shortest path to (N, 3) targets."""
+
+        def one(position, target):
+            def length(position):
+                return path_length(
+                    self.narrow_game, task, paths, position[None], target
+                )[0]
+
+            length, away = jax.value_and_grad(length)(position)
+            return -away * jnp.minimum(self.game.max_speed, length / BRAKING)
+
+        return jax.vmap(one)(position, target)
+
+    def fly(
+        self, task, paths: ShortestPaths, start: Points, plan: TeamPlan, velocities
+    ):
+        """Points at the end of a plan against (steps, 3) velocities of the evader in
+        m/s, and where the pursuers were after each step (steps, N, 3).
+        """
+        game = self.game
+        radius = capture_radius(game, task)
+
+        def one(now, given):
+            index, velocity = given
+            evader = self._moved(task, now.evader, velocity)
+            target = self.target(plan, evader + RESPONSE * velocity, index * STEP)
+            desired = self.desired(task, paths, now.position, target)
+            push = (desired - now.velocity) / RESPONSE
+            size = jnp.sqrt(jnp.sum(push**2, axis=-1, keepdims=True) + 1e-12)
+            push = push * jnp.minimum(1.0, ACCELERATION / size)
+            flown = now.velocity + STEP * push
+            position = now.position + STEP * flown
+            low = jnp.array([-jnp.inf, -jnp.inf, 0.1])
+            high = jnp.array([jnp.inf, jnp.inf, game.arena_height - 0.05])
+            position = jnp.clip(position, low, high)
+            distance = jnp.sqrt(jnp.sum((position - evader) ** 2, axis=-1))
+            caught = now.caught | jnp.any(distance < radius)
+            apart = position[:, None] - position[None]
+            square = jnp.sum(apart**2, axis=-1) + jnp.eye(position.shape[0])
+            close = jnp.any(square < (1.15 * game.drone_clearance) ** 2)
+            to_axis = position[:, None, :2] - task.pillar_position
+            square = jnp.sum(to_axis**2, axis=-1)
+            room = game.pillar_radius + game.pillar_clearance
+            close |= jnp.any((square < room**2) & task.pillar_active)
+            close |= jnp.any(
+                jnp.sum(position[:, :2] ** 2, axis=-1) > game.arena_radius**2
+            )
+            after = Points(
+                position, flown, evader, caught, now.free + ~caught, now.close + close
+            )
+            return after, position
+
+        return jax.lax.scan(one, start, (jnp.arange(self.steps), velocities))
+
+    def _moved(self, task, evader, velocity):
+        """Where the evader is a step later, outside the pillars and inside the arena."""
+        game = self.game
+        there = evader + STEP * velocity
+        offset = there[:2] - task.pillar_position
+        length = jnp.sqrt(jnp.sum(offset**2, axis=-1, keepdims=True) + 1e-12)
+        deep = jnp.maximum(game.pillar_radius - length, 0.0)
+        level = there[:2] + jnp.sum(
+            jnp.where(task.pillar_active[:, None], deep * offset / length, 0.0), axis=0
+        )
+        out = jnp.sqrt(jnp.sum(level**2) + 1e-12)
+        level = level * jnp.minimum(1.0, game.arena_radius / out)
+        return jnp.append(level, jnp.clip(there[2], 0.0, game.arena_height))
+
+    def payoff(self, task, paths: ShortestPaths, end: Points) -> Scalar:
+        """() what a pair of plans is worth to the evader, in steps: those that it is
+        free first.
+        """
+        room = self._room(task, paths, end.position, end.evader)
+        return end.free + room + CLOSE * end.close
+
+    def start(self, state: PursuitState) -> Points:
+        """A world's vehicles as points."""
+        drones = state.drones
+        none = jnp.zeros((), jnp.int32)
+        return Points(
+            drones.position,
+            drones.velocity,
+            state.evader_position,
+            jnp.zeros((), bool),
+            none,
+            none,
+        )
+
+    def search(
+        self, state: PursuitState, velocities: Velocities, last: TeamPlan, key
+    ) -> tuple[TeamPlan, Scalar]:
+        """Of one world: the team's plan that is best against the worst of the evader's
+        (E, steps, 3) m/s, and what that is worth to the evader.
+        """
+        task = state.task
+        paths = shortest_paths(self.narrow_game, task)
+        start = self.start(state)
+        teams = self.candidates(key, last)
+
+        def pair(team, velocity):
+            return self.payoff(
+                task, paths, self.fly(task, paths, start, team, velocity)[0]
+            )
+
+        payoff = jax.vmap(jax.vmap(pair, (None, 0)), (0, None))(teams, velocities)
+        worth = jnp.max(payoff, axis=1)
+        best = jnp.argmin(worth)
+        return jax.tree.map(lambda leaf: leaf[best], teams), worth[best]
+
+    def way(self, state: PursuitState, plan: TeamPlan, velocity) -> Places:
+        """Where the pursuers of one world are after each step of a plan against the
+        evader's (steps, 3) m/s.
+        """
+        paths = shortest_paths(self.narrow_game, state.task)
+        return self.fly(state.task, paths, self.start(state), plan, velocity)[1]
+
+    def room(self, state: PursuitState) -> Scalar:
+        """() of a step, how far a world's evader is from the pursuers."""
+        paths = shortest_paths(self.narrow_game, state.task)
+        return self._room(
+            state.task, paths, state.drones.position, state.evader_position
+        )
+
+    def _room(self, task, paths, position, evader):
+        ways = path_length(self.narrow_game, task, paths, position, evader)
+        room = jnp.min(ways) + OTHERS * jnp.mean(ways)
+        # less than a step
+        return room / (4.0 * self.game.arena_radius)
