@@ -107,11 +107,12 @@ class TeamSearch:
         clearance = max(0.0, self.game.pillar_clearance - min(NARROW, ROOM))
         return dataclasses.replace(self.game, pillar_clearance=clearance)
 
-    def candidates(self, key: PRNGKeyArray, last: TeamPlan) -> TeamPlan:
-        """(T, ...) plans of N pursuers: straight at the evader, the last plan, and for
-        a while or to the end to places beside the evader and to places anywhere.
+    def candidates(self, key: PRNGKeyArray, team_plan: TeamPlan) -> TeamPlan:
+        """(T, ...) plans of N pursuers: straight at the evader, the rest of the last
+        plan, and for a while or to the end to places beside the evader and to places
+        anywhere.
         """
-        shape = (self.plans, *last.until.shape)
+        shape = (self.plans, *team_plan.until.shape)
         keys = jax.random.split(key, 7)
         way = jax.random.normal(keys[0], (*shape, 3))
         way = way / jnp.sqrt(jnp.sum(way**2, axis=-1, keepdims=True) + 1e-12)
@@ -133,12 +134,12 @@ class TeamSearch:
         drawn = TeamPlan(
             jnp.where(is_fixed[..., None], anywhere, far * way), is_fixed, until
         )
-        straight = no_plan(last.until.shape[0])
+        straight = no_plan(team_plan.until.shape[0])
         return jax.tree.map(
             lambda leaf, *first: leaf.at[: len(first)].set(jnp.stack(first)),
             drawn,
             straight,
-            last,
+            team_plan,
         )
 
     def target(self, plan: TeamPlan, evader: Vector, time: Scalar) -> Team:
@@ -172,21 +173,21 @@ class TeamSearch:
         game = self.game
         radius = capture_radius(game, task)
 
-        def one(now, given):
-            index, velocity = given
-            evader = self._moved(task, now.evader, velocity)
+        def one(points, step):
+            index, velocity = step
+            evader = self._moved(task, points.evader, velocity)
             target = self.target(plan, evader + RESPONSE * velocity, index * STEP)
-            desired = self.desired(task, paths, now.position, target)
-            push = (desired - now.velocity) / RESPONSE
+            desired = self.desired(task, paths, points.position, target)
+            push = (desired - points.velocity) / RESPONSE
             size = jnp.sqrt(jnp.sum(push**2, axis=-1, keepdims=True) + 1e-12)
             push = push * jnp.minimum(1.0, ACCELERATION / size)
-            flown = now.velocity + STEP * push
-            position = now.position + STEP * flown
+            flown = points.velocity + STEP * push
+            position = points.position + STEP * flown
             low = jnp.array([-jnp.inf, -jnp.inf, 0.1])
             high = jnp.array([jnp.inf, jnp.inf, game.arena_height - 0.05])
             position = jnp.clip(position, low, high)
             distance = jnp.sqrt(jnp.sum((position - evader) ** 2, axis=-1))
-            caught = now.caught | jnp.any(distance < radius)
+            caught = points.caught | jnp.any(distance < radius)
             apart = position[:, None] - position[None]
             square = jnp.sum(apart**2, axis=-1) + jnp.eye(position.shape[0])
             close = jnp.any(square < (1.15 * game.drone_clearance) ** 2)
@@ -198,7 +199,12 @@ class TeamSearch:
                 jnp.sum(position[:, :2] ** 2, axis=-1) > game.arena_radius**2
             )
             after = Points(
-                position, flown, evader, caught, now.free + ~caught, now.close + close
+                position,
+                flown,
+                evader,
+                caught,
+                points.free + ~caught,
+                points.close + close,
             )
             return after, position
 
@@ -239,7 +245,7 @@ class TeamSearch:
         )
 
     def search(
-        self, state: PursuitState, velocities: Velocities, last: TeamPlan, key
+        self, state: PursuitState, velocities: Velocities, team_plan: TeamPlan, key
     ) -> tuple[TeamPlan, Scalar]:
         """Of one world: the team's plan that is best against the worst of the evader's
         (E, steps, 3) m/s, and what that is worth to the evader.
@@ -247,7 +253,7 @@ class TeamSearch:
         task = state.task
         paths = shortest_paths(self.narrow_game, task)
         start = self.start(state)
-        teams = self.candidates(key, last)
+        teams = self.candidates(key, team_plan)
 
         def pair(team, velocity):
             return self.payoff(

@@ -107,8 +107,8 @@ class Tried(NamedTuple):
     """(B, plans, ...)"""
 
 
-class Shown(NamedTuple):
-    """What the pursuers of B worlds are shown."""
+class Example(NamedTuple):
+    """What the pursuers of B worlds are shown by the search."""
 
     places: jax.Array
     """(B, pieces, N, 3) m, where they should be after each piece of the evader's
@@ -280,10 +280,11 @@ class WorstPlans:
         return jnp.where(newly, end.statistics.capture_step - start.step, self.steps)
 
     def show(
-        self, tried: Tried, world, last: TeamPlan, plan: Plan, key: PRNGKeyArray
-    ) -> tuple[TeamPlan, Shown]:
+        self, tried: Tried, world, team_plan: TeamPlan, plan: Plan, key: PRNGKeyArray
+    ) -> tuple[TeamPlan, Example]:
         """What the teams of worlds (B, ...) should do against evaders that fly `plan`:
-        what is best against the worst of the plans that promised most.
+        what is best against the worst of the plans that promised most. `team_plan` is
+        the rest of the last one.
         """
         team = self.team
         room = jax.vmap(jax.vmap(team.room))(tried.end)
@@ -295,14 +296,14 @@ class WorstPlans:
 
         velocities = self._velocities(chosen(tried.plans))
         keys = jax.random.split(key, plan.shape[0])
-        best, promised = jax.vmap(team.search)(world[1], velocities, last, keys)
+        best, promised = jax.vmap(team.search)(world[1], velocities, team_plan, keys)
         gain = jnp.max(chosen(worth), axis=1) - promised
         way = jax.vmap(team.way)(world[1], best, self._velocities(plan))
         ends_of_pieces = (
             np.arange(1, self.planning.pieces + 1) * team.steps // self.planning.pieces
         )
         places = way[:, ends_of_pieces - 1]
-        return best, Shown(places, jnp.clip((gain - MARGIN) / CLEAR, 0.0, 1.0))
+        return best, Example(places, jnp.clip((gain - MARGIN) / CLEAR, 0.0, 1.0))
 
     def _velocities(self, plans):
         """(..., steps, 3) m/s at the points' steps of plans (..., pieces, 3); who flies
@@ -330,7 +331,7 @@ class WorstPlans:
         parameters: PolicyParameters,
         world,
         plan: Plan,
-        shown: Shown | None = None,
+        example: Example | None = None,
     ) -> tuple[Scalar, tuple[Any, dict[str, Scalar]]]:
         """What is learnt () while evaders fly their plans; the worlds after the plans'
         first piece, and the loss's parts.
@@ -357,25 +358,11 @@ class WorstPlans:
         hold = jnp.where(world[1].seen, self.settings.hold, planning.hold_unseen)[
             :, None
         ]
-        # what isn't weighed isn't worked out, nor told
-        room = {}
-        if planning.territory:
-            territory = seen * jnp.mean(met.territory, axis=0)
-            room["territory"] = (planning.territory, territory)
-        if planning.unseen:
-            # where nobody sees it, too: to look where it was last seen is what is to be
-            # learnt
-            room["unseen"] = (planning.unseen, met.unseen)
-        if shown is not None:
-            flown = jnp.moveaxis(worlds[1].drones.position, 0, 1)
-            square = jnp.sum((flown - shown.places) ** 2, axis=-1)
-            # of two ways round a pillar the nearer one: a mean of both leads into it
-            off = jnp.mean(jnp.sqrt(square + NEAR**2) - NEAR, axis=(1, 2))
-            room["follow"] = (planning.follow, seen * shown.gain * off)
+        flown = jnp.moveaxis(worlds[1].drones.position, 0, 1)
         parts = {
             "free": (1.0, seen * jnp.mean(met.free, axis=0)),
             "distance": (planning.distance, seen * jnp.mean(met.distance, axis=0)),
-            **room,
+            **self._wished(met, seen, flown, example),
             "crashes": (planning.crash, crash_share(jnp.min(met.least, axis=0))),
             "breaches": (planning.breach, met.breach),
             "speed": (self.settings.speed, met.excess),
@@ -383,6 +370,26 @@ class WorstPlans:
         }
         total, means = weighted_sum(parts)
         return total, (after, means)
+
+    def _wished(self, met, weight, position, example):
+        """Parts of the loss that a stage may have, `weight` (B,) where the evader is
+        seen; what isn't weighed isn't worked out, nor told.
+        """
+        planning = self.planning
+        parts = {}
+        if planning.territory:
+            territory = weight * jnp.mean(met.territory, axis=0)
+            parts["territory"] = (planning.territory, territory)
+        if planning.unseen:
+            # where nobody sees it, too: to look where it was last seen is what is to be
+            # learnt
+            parts["unseen"] = (planning.unseen, met.unseen)
+        if example is not None:
+            square = jnp.sum((position - example.places) ** 2, axis=-1)
+            # of two ways round a pillar the nearer one: a mean of both leads into it
+            off = jnp.mean(jnp.sqrt(square + NEAR**2) - NEAR, axis=(1, 2))
+            parts["follow"] = (planning.follow, weight * example.gain * off)
+        return parts
 
     def update(
         self,
@@ -396,13 +403,13 @@ class WorstPlans:
         plan_key, usual_key, start_key = jax.random.split(key, 3)
         tried = self.attempts(actor, parameters, state.world, state.plan, plan_key)
         plan, promised = worst_of(tried)
-        team = shown = None
+        team = example = None
         if state.team is not None:
             team_key = jax.random.fold_in(plan_key, 1)
-            team, shown = self.show(tried, state.world, state.team, plan, team_key)
+            team, example = self.show(tried, state.world, state.team, plan, team_key)
             team = team.replace(until=team.until - self.planning.piece_seconds)
         gradient, (world, parts) = jax.grad(self.loss, has_aux=True)(
-            actor, parameters, state.world, plan, shown
+            actor, parameters, state.world, plan, example
         )
         usual, usual_parts = self.usual.gradient(actor, parameters, flights, usual_key)
         gradient = jax.tree.map(jnp.add, finite_or_zero(gradient), usual)
@@ -412,8 +419,8 @@ class WorstPlans:
         plan = jnp.where(over[:, None, None], 0.0, _later(plan))
         parts = {f"planned_{name}": value for name, value in parts.items()}
         survived = {"planned_survived": jnp.mean(promised >= self.steps)}
-        if shown is not None:
-            survived["planned_gain"] = jnp.mean(shown.gain)
+        if example is not None:
+            survived["planned_gain"] = jnp.mean(example.gain)
         return (
             optax.apply_updates(actor, change),
             Planned(optimiser, world, plan, team),
