@@ -39,6 +39,7 @@ AROUND = {
     "UTF-32": lambda t: t.encode("utf-32"),
     "tabs in UTF-16": lambda t: t.replace(",", "\t").encode("utf-16"),
     "a byte order mark and quotes": quoted,
+    "bars": lambda t: t.replace(",", "|"),
     "comments": lambda t: "# Monday, hall 3\n\n# 100 Hz\n" + t,
     "a header as numpy.savetxt writes it": lambda t: "# " + t,
     "Excel's line": lambda t: "sep=;\r\n" + t.replace(",", ";"),
@@ -66,8 +67,9 @@ def test_what_stands_around_a_table_changes_nothing(tmp_path, text, around, name
     assert [r for r in read.remarks if "line 2 holds words" not in r] == []
 
 
-def test_units_in_the_header_are_read(tmp_path, sample_columns):
-    """In other units than the format's, and however they are written."""
+@pytest.mark.parametrize("code", ["utf-8", "latin-1"])
+def test_units_in_the_header_are_read(tmp_path, sample_columns, code):
+    """In other units than the format's, and however they are written and saved."""
     columns = sample_columns["flight_a"]
     units = {
         "t": "ms",
@@ -87,7 +89,7 @@ def test_units_in_the_header_are_read(tmp_path, sample_columns):
     path = tmp_path / "flight.csv"
     rows = np.stack(list(named.values()), 1)
     np.savetxt(
-        path, rows, delimiter=",", header=",".join(named), comments="", encoding="utf-8"
+        path, rows, delimiter=",", header=",".join(named), comments="", encoding=code
     )
     read = read_log(path)
     for name, values in columns.items():

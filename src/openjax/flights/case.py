@@ -50,9 +50,7 @@ def load_case(path: str | Path, dtype=jnp.float32, comparison: bool = False) -> 
         )
     described = (path / "vehicle.toml").exists()
     if not described and not comparison:
-        raise UserError(
-            f"{path}: no vehicle.toml; an empty one there means the nominal Crazyflie"
-        )
+        raise UserError(f"{path}: no vehicle.toml; {_called_otherwise(path)}")
     vehicle_file = load_vehicle_file(
         path / "vehicle.toml" if described else None, dtype
     )
@@ -99,6 +97,17 @@ def _held_instead(path: Path) -> str:
         len(others) > SHOWN
     )
     return f": {known}; it holds {shown}" if others else f"; {known}"
+
+
+def _called_otherwise(path: Path) -> str:
+    """What to do where a folder has no vehicle.toml: an editor may have called it
+    Vehicle.toml or vehicle.toml.txt.
+    """
+    names = sorted(file.name for file in path.iterdir())
+    for name in names:
+        if name.lower().startswith("vehicle.t"):
+            return f"if {name} is meant, rename it"
+    return "an empty one there means the nominal Crazyflie"
 
 
 def _cases_inside(path):

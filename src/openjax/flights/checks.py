@@ -210,9 +210,11 @@ def _refuse_units(step: float) -> None:
             ("nanoseconds", 1e9),
         ):
             if 5e-4 <= step / factor <= SLOWEST:
+                counted = " or counts rows" if step == 1.0 else ""
                 raise Refused(
                     "units",
-                    f"t is in {unit} (rows {step:g} apart); the log format wants seconds",
+                    f"t is in {unit}{counted} (rows {step:g} apart); the log format "
+                    "wants seconds",
                 )
         raise Refused(
             "time", f"rows are {step:g} s apart; at least 20 rows per second are needed"

@@ -27,7 +27,10 @@ GZIP = b"\x1f\x8b"
 ZIP = b"PK\x03\x04"  # also of spreadsheets
 WIDE = (b"\xff\xfe", b"\xfe\xff")  # how a text in UTF-16 begins
 WIDEST = (b"\xff\xfe\0\0", b"\0\0\xfe\xff")  # in UTF-32
-SEPARATORS = (",", ";", "\t")
+SEPARATORS = (",", ";", "\t", "|")
+CONTROLS = bytes(set(range(32)) - set(b"\t\n\r"))
+BEYOND_ASCII = bytes(range(128, 256))
+ODD = 0.05  # share of bytes beyond ASCII that a table in another code may have
 COMMENT = "#"
 MOST_ABOVE = 1_000  # lines among which the header is
 LETTER = re.compile(r"[^\W\d_]")
@@ -82,7 +85,7 @@ def head_of(path: Path) -> list[str]:
     try:
         with ExitStack() as stack:
             data = _opened(path, stack).read(LONGEST_HEADER)
-        return _decoded(data[: len(data) // 2 * 2], "replace").split("\n")
+        return _decoded(data[: len(data) // 2 * 2], cut=True).split("\n")
     except (OSError, EOFError, zlib.error, LogError):
         return []
 
@@ -141,8 +144,19 @@ def _opened(path: Path, stack: ExitStack) -> io.BufferedIOBase:
     return stack.enter_context(gzip.open(path) if packed else path.open("rb"))
 
 
-def _decoded(data: bytes, errors: str = "strict") -> str:
-    """Bytes as text with line ends of one kind. Raises LogError for what is no text."""
+def _is_plain(data: bytes) -> bool:
+    """Whether bytes are a table with a degree sign or an umlaut beside it, as Windows
+    saves them.
+    """
+    printed = data.translate(None, CONTROLS)
+    odd = len(printed) - len(printed.translate(None, BEYOND_ASCII))
+    return len(printed) == len(data) and odd < ODD * len(data)
+
+
+def _decoded(data: bytes, cut: bool = False) -> str:
+    """Bytes as text with line ends of one kind; of those that are `cut` somewhere what
+    can be read. Raises LogError for what is no text.
+    """
     code = "utf-8-sig"
     if data.startswith(WIDEST):
         code = "utf-32"
@@ -151,7 +165,12 @@ def _decoded(data: bytes, errors: str = "strict") -> str:
     elif b"\0" in data:
         raise LogError("not a text file in UTF-8")
     try:
-        text = data.decode(code, errors)
+        text = data.decode(code)
     except UnicodeDecodeError as error:
-        raise LogError("not a text file in UTF-8: save it as one") from error
+        if code == "utf-8-sig" and error.end < len(data) and _is_plain(data):
+            text = data.decode("latin-1")
+        elif cut:
+            text = data.decode(code, "replace")
+        else:
+            raise LogError("not a text file in UTF-8: save it as one") from error
     return text.replace("\r\n", "\n").replace("\r", "\n")

@@ -205,8 +205,10 @@ def _channel(
     if len(found) < len(names):
         missing = ", ".join(n for n in names if n not in table.columns)
         if found and channel in WHOLE:
+            counted = "; motors are counted from 1" * (missing == "m4")
             raise LogError(
-                f"{', '.join(found)} without {missing}: log {missing}, or none of them"
+                f"{', '.join(found)} without {missing}: log {missing}, or none of "
+                f"them{counted}"
             )
         if found:
             remarks.append(
@@ -385,7 +387,9 @@ def _why_not(
                 continue
             if [cell.strip() for cell in cells] == names:
                 return f"line {row} is the header again: several recordings in one file"
-            return f"line {row}, column {names[i]}: {cells[i].strip()[:LONGEST_NAME]!r} is no number"
+            cell = cells[i].strip()[:LONGEST_NAME]
+            dated = ": a date or a time of day? t counts seconds" * (":" in cell)
+            return f"line {row}, column {names[i]}: {cell!r} is no number{dated}"
     return f"not a table of numbers ({error})"
 
 

@@ -36,6 +36,8 @@ __all__ = [
     "register",
 ]
 
+HIDDEN = (".", "~$")
+
 # The last that is registered is the first that is asked: a CSV that no other one knows
 # is taken for one of the log format, and a layout with several time stamps may hold a
 # firmware's names.
@@ -54,8 +56,9 @@ for _importer in (
 
 def find_logs(folder: Path) -> list[Path]:
     """The logs of a case folder, by name."""
-    # hidden files aren't logs: macOS leaves one beside each file that it copies
-    files = (path for path in folder.iterdir() if not path.name.startswith("."))
+    # hidden files aren't logs: macOS leaves one beside each file that it copies, a
+    # spreadsheet beside each that is open
+    files = (path for path in folder.iterdir() if not path.name.startswith(HIDDEN))
     logs = (path for path in files if not betaflight.is_beside(path))
     return sorted(path for path in logs if importer_of(path) is not None)
 
