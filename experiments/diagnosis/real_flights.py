@@ -4,10 +4,10 @@ full: names, sizes, and the response of the torques.
     python -m experiments.diagnosis.real_flights FOLDER ... --separate FOLDER --jobs 2
     --out experiments/results/real/real.json
 
-A folder is one case, or holds several. Of a folder after `--separate` each flight is a
-case, once with its own rows and once with rows of 100 Hz that hold the motors' means,
-as laboratories log them: both are of one vehicle, so that what rows hide shows as a
-difference.
+A folder is one case, or holds several. Of a folder after `--each` each flight is a case
+of its own. Of one after `--separate` it is so twice, once with its own rows and once
+with rows of 100 Hz that hold the motors' means, as laboratories log them: both are of
+one vehicle, so that what rows hide shows as a difference.
 """
 
 import argparse
@@ -60,19 +60,19 @@ def as_means(case):
     )
 
 
-def parts_of(folder: Path, separate: bool) -> list[tuple[Path, int | None, bool]]:
-    """(folder, number of its flight or None for all, whether as means) of each
-    diagnosis.
-    """
+Part = tuple[Path, int | None, bool]
+"""A diagnosis' folder, the number of its flight or None for all, whether as means."""
+
+
+def flights_of(folder: Path, rows: tuple[bool, ...]) -> list[Part]:
+    """Each flight of a folder by itself, with each kind of rows: as means or not."""
     from openjax.flights.case import load_case
 
-    if not separate:
-        return [(folder, None, False)]
     count = len(load_case(folder).flights)
-    return [(folder, n, means) for n in range(count) for means in (False, True)]
+    return [(folder, n, means) for n in range(count) for means in rows]
 
 
-def diagnose(part: tuple[Path, int | None, bool]) -> dict:
+def diagnose(part: Part) -> dict:
     """What is kept of one diagnosis."""
     from openjax.flights.case import load_case
     from openjax.gap.diagnosis import diagnose_case
@@ -124,22 +124,29 @@ def rounded(value, digits: int = 4):
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("folders", type=Path, nargs="*")
+    parser.add_argument("--each", type=Path, nargs="*", default=[])
     parser.add_argument("--separate", type=Path, nargs="*", default=[])
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--out", type=Path, default=Path("real.json"))
     arguments = parser.parse_args()
     use_single_thread()
-    parts = [
-        p for f in arguments.folders for c in cases_of(f) for p in parts_of(c, False)
-    ]
-    parts += [p for f in arguments.separate for p in parts_of(f, True)]
+    from openjax.runs.machine import describe_machine
+
+    parts = [(c, None, False) for f in arguments.folders for c in cases_of(f)]
+    for folders, rows in (
+        (arguments.each, (False,)),
+        (arguments.separate, (False, True)),
+    ):
+        parts += [p for f in folders for c in cases_of(f) for p in flights_of(c, rows)]
     found = sorted(
         in_processes(diagnose, parts, arguments.jobs), key=lambda c: c["case"]
     )
     command = "python -m experiments.diagnosis.real_flights"
     command += "".join(f" {f.name}" for f in arguments.folders)
+    command += "".join(f" --each {f.name}" for f in arguments.each)
     command += "".join(f" --separate {f.name}" for f in arguments.separate)
-    text = json.dumps({"command": command, "cases": rounded(found)}, indent=1)
+    out = {"command": command, "machine": describe_machine(), "cases": rounded(found)}
+    text = json.dumps(out, indent=1)
     arguments.out.write_text(text + "\n", encoding="utf-8")
 
 
