@@ -235,6 +235,13 @@ def test_rotors_are_counted_as_logged(case, folders, tmp_path):
     assert change.rotors == (1,) and change.side == "rear left"
 
 
+def test_flights_are_no_reference_of_their_own(folders, tmp_path):
+    """They would be found unchanged, whatever changed."""
+    monday = str(folders / "monday")
+    with pytest.raises(UserError, match="is the case itself"):
+        main([monday, "--reference", monday, "--out", str(tmp_path / "out")])
+
+
 def test_the_command_writes_page_and_numbers_and_spares_the_others(
     folders, tmp_path, capsys
 ):

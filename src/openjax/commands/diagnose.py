@@ -131,6 +131,12 @@ def _checked_names(options: Options) -> list[str]:
         raise UserError(
             f"two cases are called {twice!r}: their reports would overwrite each other"
         )
+    cases = {case.resolve() for case in options.cases}
+    itself = next((day for day in options.reference if day.resolve() in cases), None)
+    if itself is not None:
+        raise UserError(
+            f"--reference {itself}: is the case itself; name flights of before the change"
+        )
     check_output_folder(options.out, "--out")
     for name in names:
         if (options.out / name).exists() and not options.overwrite:

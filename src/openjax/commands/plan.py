@@ -68,6 +68,8 @@ def make_plan(arguments: Arguments) -> list[str]:
         f"  {p['segment']:6} {p['value']:.3f}  {SEGMENTS[p['segment']].shows}"
         for p in promises
     ]
+    if rows:
+        rows.insert(0, "How probably a segment tells two of the believed causes apart:")
     file = arguments.out / "plan.csv"
     seconds = len(plan) * PERIOD
     limit = SafetySettings().alone_time
