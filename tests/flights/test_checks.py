@@ -308,6 +308,10 @@ def test_a_copy_with_another_clock_and_layout_is_a_duplicate(
         (lambda f: [p.unlink() for p in f.glob("*.gz")], "holds no flight log"),
         (lambda f: (f / "vehicle.toml").unlink(), "an empty one"),
         (
+            lambda f: (f / "vehicle.toml").write_text("[vehicle]\nmass = 0.321\n"),
+            "motors lift 0.03. kg on the mean, and vehicle.mass is 0.32 kg",
+        ),
+        (
             lambda f: (f / "vehicle.toml").rename(f / "vehicle.toml.txt"),
             "if vehicle.toml.txt is meant, rename it",
         ),

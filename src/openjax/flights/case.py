@@ -21,6 +21,7 @@ from openjax.flights.importers import (
     load_mapping,
     read_log,
 )
+from openjax.flights.plausible import wrong_mass
 from openjax.flights.reading import LogError, flights_of
 from openjax.vehicle.vehicle_file import VehicleFile, load_vehicle_file
 
@@ -176,7 +177,11 @@ def _check(
     """
     vehicle = vehicle_file.vehicle_of(flight.vehicle)
     try:
-        return check_flight(flight, vehicle, vehicle_file.log, comparison)
+        kept, found = check_flight(flight, vehicle, vehicle_file.log, comparison)
+        wrong = "" if kept is None or comparison else wrong_mass(kept, vehicle)
+        if wrong:
+            found = [*found, Issue(flight.name, wrong, refused=True, kind="vehicle")]
+        return None if wrong else kept, found
     except (ArithmeticError, ValueError, IndexError, np.linalg.LinAlgError) as error:
         # Values that no check has foreseen: this flight can't be used, the others can.
         text = f"can't be checked ({type(error).__name__}: {error})".split("\n")[0]

@@ -10,6 +10,7 @@ import numpy as np
 from openjax.flights.flight import CHANNEL_COLUMNS, Finding, Flight
 from openjax.flights.pairs import Signals
 from openjax.flights.signals import RATE
+from openjax.vehicle.parameters import hover_share
 
 # share of the variance from row to row at which a continuous signal has no order
 RANDOM = 0.5
@@ -17,6 +18,7 @@ LEAST_ROWS = 100
 # Standard deviation above which the rows of a continuous channel can't be its sensor's
 # noise, in its unit.
 CONTINUOUS = {"position": 0.05, "quaternion": 0.03, "velocity": 0.25}
+LIFT = 3.0  # times its weight, which no flight's mean thrust is
 MOVES = 0.05  # m, which a path must do for a velocity to contradict it
 DRIFT = 0.03  # m/s by which an estimated velocity may be off on the mean
 PATH_ERROR = 0.03  # m by which an estimated path may be off
@@ -60,6 +62,22 @@ def gravity_findings(force: np.ndarray | None) -> list[Finding]:
         text = f"accelerometer axes: a{'xyz'[axis]} holds {sign}z (median {mean[axis]:.1f} m/s^2)"
         return [("axes", f"{text}; az must read +9.81 at hover", ())]
     return []
+
+
+def wrong_mass(flight: Flight, vehicle) -> str:
+    """In words that a vehicle can't weigh what it is told to, where its motors lift
+    many times that or a fraction: a slip in the decimals, or other rotors.
+    """
+    if flight.motor_command is None:
+        return ""
+    share = float(np.nanmean(flight.motor_command)) / float(hover_share(vehicle))
+    if 1.0 / LIFT < share < LIFT:
+        return ""
+    mass = float(vehicle.mass)
+    return (
+        f"the motors lift {share * mass:.2g} kg on the mean, and vehicle.mass is "
+        f"{mass:.2g} kg: weigh it, or give an MJCF of its rotors as the airframe"
+    )
 
 
 def path_findings(signals: Signals) -> Iterator[Finding]:
