@@ -13,6 +13,7 @@ one vehicle, so that what rows hide shows as a difference.
 import argparse
 import json
 import time
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,6 +23,8 @@ from experiments.diagnosis.generate import in_processes
 from experiments.flying.single_thread import use_single_thread
 
 PERIOD = 0.01  # s
+NOMINAL = 0.025  # s, the simulator's motors
+SURE = 0.5
 
 
 def cases_of(folder: Path) -> list[Path]:
@@ -112,6 +115,45 @@ def diagnose(part: Part) -> dict:
     return out
 
 
+def groups_of(names: list[str]) -> dict[str, list[str]]:
+    """Names of cases by what they are: folders of one set, or single flights of it."""
+    set_of = {n.split("/")[1]: n.split("/")[0] for n in names if "/flight_" not in n}
+    groups: dict[str, list[str]] = {}
+    for name in names:
+        head, _, tail = name.partition("/")
+        if "/flight_" in name:
+            head = f"{set_of.get(head, head)}, single flights"
+            head += ", 100 Hz" * tail.endswith("100 Hz")
+        groups.setdefault(head, []).append(name)
+    return groups
+
+
+def figures(found: list[dict]) -> dict:
+    """How often each name stands somewhere, first, and with a probability of .5, by
+    groups of cases; and in how many motors are clearly slower than NOMINAL.
+    """
+    by_name = {case["case"]: case for case in found}
+
+    def slow(case: dict) -> bool:
+        torques = case.get("torques", {"trusted": False})
+        return torques["trusted"] and torques["spin_up"][1] > NOMINAL
+
+    out = {}
+    for group, names in groups_of(list(by_name)).items():
+        cases = [by_name[name] for name in names]
+        likely = Counter(
+            e for c in cases for e in c["named"] if c["probabilities"].get(e, 0) >= SURE
+        )
+        out[group] = {
+            "cases": len(cases),
+            "named": dict(Counter(e for c in cases for e in c["named"])),
+            "first": dict(Counter(c["named"][0] for c in cases)),
+            "named_at_half": dict(likely),
+            "motors_shown_slow": sum(map(slow, cases)),
+        }
+    return out
+
+
 def rounded(value, digits: int = 4):
     """Numbers of a nested structure with so many significant digits."""
     if isinstance(value, dict):
@@ -145,7 +187,8 @@ def main() -> None:
     command += "".join(f" {f.name}" for f in arguments.folders)
     command += "".join(f" --each {f.name}" for f in arguments.each)
     command += "".join(f" --separate {f.name}" for f in arguments.separate)
-    out = {"command": command, "machine": describe_machine(), "cases": rounded(found)}
+    out = {"command": command, "machine": describe_machine()}
+    out |= {"figures": figures(found), "cases": rounded(found)}
     text = json.dumps(out, indent=1)
     arguments.out.write_text(text + "\n", encoding="utf-8")
 
