@@ -16,8 +16,7 @@ import numpy as np
 
 from openjax.errors import UserError
 from openjax.evaluation.evaluator import layout_slots, layout_tasks, stacked
-from openjax.evaluation.judges.matrix_game import MatrixGame
-from openjax.evaluation.judges.planner import Planner
+from openjax.evaluation.judges.receding_horizon import RecedingHorizon
 from openjax.evaluation.judges.tasks import judging_tasks
 from openjax.files import write_json
 from openjax.pursuit import SCENARIOS, Pursuit, RewardSettings, Task
@@ -25,9 +24,6 @@ from openjax.runs.exploit import record
 from openjax.store.compiled_programs import cache_programs
 from openjax.store.environments import make_environment
 from openjax.store.policies import LoadedPolicy, load_policy
-
-Replanning = Planner | MatrixGame
-"""Evaders, or both sides, that plan again and again."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +58,7 @@ class JudgedGame:
         self._keep(name, self._flown_in_parts(jax.jit(fly)), found, path)
 
     def replanned_kept(
-        self, name: str, judge: Replanning, found: dict, path: Path
+        self, name: str, judge: RecedingHorizon, found: dict, path: Path
     ) -> None:
         """The same of who plans again and again, `--slots` episodes side by side: one
         makes room for the next as soon as its evader is caught, so that no crash after
@@ -191,6 +187,11 @@ def game_parser(
         type=int,
         help="episodes side by side that end with the capture; for a CPU",
     )
+    parser.add_argument(
+        "--track_unseen",
+        action="store_true",
+        help="pursuers look for who hides where it can be, whatever they learnt",
+    )
     parser.add_argument("--steps", type=int, help="of an episode, to try it")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path, required=True)
@@ -212,6 +213,7 @@ def judged_game(options: argparse.Namespace) -> JudgedGame:
         evaders=("field",),
         reward=RewardSettings(),
         episode_length=options.steps or own.episode_length,
+        track_unseen=options.track_unseen or own.track_unseen,
     )
     environment = make_environment(game, options.vehicle, options.effects)
     kinds = layout_tasks(game, list(SCENARIOS.values()), options.episodes)

@@ -25,9 +25,10 @@ from flax import struct
 
 from openjax.evaluation.judges.duel import Duel, World
 from openjax.evaluation.judges.planner import Planner, unit
+from openjax.evaluation.judges.receding_horizon import RecedingHorizon
 from openjax.evaluation.judges.settings import MatrixGameSettings, PlannerSettings
 from openjax.policy import PolicyParameters
-from openjax.pursuit import EpisodeStatistics, Observation, PursuitState, Task
+from openjax.pursuit import Observation, PursuitState, Task
 
 BESIDE = 0.4
 """Places beside the evader to which a pursuer is sent are at most so far from it
@@ -109,7 +110,7 @@ def choose(payoff: jax.Array, pursuers_last: bool) -> tuple[jax.Array, jax.Array
 
 
 @dataclass(frozen=True, eq=False)
-class MatrixGame:
+class MatrixGame(RecedingHorizon):
     """Both sides' plans in one game; the policy is one of the pursuers' plans."""
 
     settings: MatrixGameSettings
@@ -122,18 +123,6 @@ class MatrixGame:
         own = self.settings
         how = PlannerSettings(own.evader_plans, own.pieces, own.piece_steps, own.replan)
         return Planner(how, self.duel)
-
-    def fly(
-        self, parameters: PolicyParameters, start: World, key: jax.Array
-    ) -> EpisodeStatistics:
-        """Statistics (B,) of one episode from each of B starts."""
-
-        def one(carry, key):
-            return self.replan(parameters, carry, key), None
-
-        episode = self.duel.environment.settings.episode_length
-        keys = jax.random.split(key, episode // self.settings.replan)
-        return jax.lax.scan(one, self.begin(start), keys)[0].world[1].statistics
 
     def begin(self, start: World) -> BothPlanned:
         """Worlds (B, ...) at the start of an episode, and plans that are none."""

@@ -9,7 +9,6 @@ than the planner on the same tasks has not converged.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -17,9 +16,10 @@ import numpy as np
 from flax import struct
 
 from openjax.evaluation.judges.duel import Duel, World
+from openjax.evaluation.judges.receding_horizon import RecedingHorizon
 from openjax.evaluation.judges.settings import PlannerSettings
 from openjax.policy import PolicyParameters
-from openjax.pursuit import EpisodeStatistics, PursuitState
+from openjax.pursuit import PursuitState
 
 SPREAD = 0.6
 """How far the pieces of a refined plan lead aside, a share of their length: some 40
@@ -36,7 +36,7 @@ class Planned:
 
 
 @dataclass(frozen=True, eq=False)
-class Planner:
+class Planner(RecedingHorizon):
     """The planner against a policy's mean."""
 
     settings: PlannerSettings
@@ -45,34 +45,6 @@ class Planner:
     """State of one world -> () steps that an evader will be free from there; None: the
     farther from the pursuers the better.
     """
-
-    def fly(
-        self, parameters: PolicyParameters, start: World, key: jax.Array
-    ) -> EpisodeStatistics:
-        """Statistics (B,) of one episode from each of B starts."""
-        return self.fly_and_keep(parameters, start, key, lambda state: None)[
-            0
-        ].statistics
-
-    def fly_and_keep(
-        self,
-        parameters: PolicyParameters,
-        start: World,
-        key: jax.Array,
-        keep: Callable[[PursuitState], Any],
-    ) -> tuple[PursuitState, Any]:
-        """The states (B, ...) at the end of one episode from each of B starts, and what
-        `keep` says of those after each time it plans (T, ...).
-        """
-
-        def one(carry, key):
-            carry = self.replan(parameters, carry, key)
-            return carry, keep(carry.world[1])
-
-        episode = self.duel.environment.settings.episode_length
-        keys = jax.random.split(key, episode // self.settings.replan)
-        end, kept = jax.lax.scan(one, self.begin(start), keys)
-        return end.world[1], kept
 
     def begin(self, start: World) -> Planned:
         """Worlds (B, ...) at the start of an episode, and plans that are none."""
