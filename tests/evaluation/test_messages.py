@@ -9,6 +9,7 @@ from openjax.evaluation.message_settings import MessageSettings
 from openjax.evaluation.messages import Hearsay
 
 GAME = PursuitSettings(
+    track_unseen=True,
     physics="rigid",
     contacts=False,
     observe_in="heading",

@@ -10,6 +10,7 @@ messages all views are the same, and those of a game in which what one sees is s
 all.
 """
 
+import functools
 from dataclasses import dataclass
 
 import jax
@@ -18,6 +19,7 @@ from flax import struct
 
 from openjax.evaluation.message_settings import MessageSettings
 from openjax.pursuit import Observation, Pursuit, PursuitState
+from openjax.pursuit.hiding import thought_place
 from openjax.pursuit.observation import frame, frame_pursuers
 
 COAST = 0.3
@@ -124,12 +126,16 @@ class Hearsay:
         )
         reported = jnp.where(has_report, arriving.step, beliefs.reported)
         seen = sees | has_report
-        beliefs = _with_teammates(beliefs, sent, arriving, arrives).replace(
+        beliefs = _with_teammates(beliefs, sent, arriving, arrives)
+        thought = jax.vmap(functools.partial(self._thought, state))(
+            beliefs.replace(on_the_way=None)
+        )
+        beliefs = beliefs.replace(
             evader=evader,
             evader_velocity=velocity,
             reported=jnp.where(sees, state.step, reported),
             seen=seen,
-            last_seen=jnp.where(seen[:, None], evader, beliefs.last_seen),
+            last_seen=jnp.where(seen[:, None], evader, thought),
             on_the_way=jax.tree.map(lambda leaf: leaf[1:], line),
         )
         return beliefs.replace(frames=self._frames(beliefs, state))
@@ -138,6 +144,12 @@ class Hearsay:
         """(N, 3) m, where one pursuer takes all to be at a step ()."""
         age = (step - belief.told) * self.environment.settings.time_step
         return belief.position + belief.velocity * jnp.minimum(age, COAST)[..., None]
+
+    def _thought(self, state, belief):
+        """(3,) m, where one pursuer takes an evader to be that it knows nothing of."""
+        drones = state.drones.replace(position=self._place(belief, state.step))
+        game = self.environment.settings
+        return thought_place(game, state.task, drones, state.active, belief.last_seen)
 
     def _frames(self, beliefs, state):
         settings = self.environment.settings

@@ -21,6 +21,7 @@ from openjax.pursuit.evaders import (
     evader_velocity,
     handed_in,
 )
+from openjax.pursuit.hiding import thought_place
 from openjax.pursuit.info import StepInfo
 from openjax.pursuit.observation import (
     Observation,
@@ -457,8 +458,11 @@ class Pursuit:
         step = before.step + 1
         active = self._active_after(before)
         in_sight, in_view, seen = self._sights(before.task, active, drones, evader)
-        last_seen = jnp.where(seen, evader, before.last_seen)
         seen_drones = self._seen(drones, before.vehicles)
+        thought = thought_place(
+            settings, before.task, seen_drones, active, before.last_seen
+        )
+        last_seen = jnp.where(seen, evader, thought)
         framed = frame_pursuers(settings, seen_drones.position, last_seen, active)
         newest = frame(settings, step, framed, evader, velocity, seen)
         own_history = before.own_history

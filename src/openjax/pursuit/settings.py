@@ -211,6 +211,11 @@ class PursuitSettings:
     """Axes of what a pursuer observes. "heading": its own, but upright: a game turned
     about the arena's axis looks the same, at any yaw (not in the paper).
     """
+    track_unseen: bool = False
+    """Take an evader that nobody sees to be at the hidden place nearest to where it was
+    thought to be (not in the paper, where it stays where it was last seen): who sees
+    that place, and nothing there, has to look elsewhere. See `openjax.pursuit.hiding`.
+    """
     observe_history: Annotated[int, Interval("[0, 1000]")] = 0
     """Also observe this many of the last frames of the own velocity, attitude and
     command (not in the paper): they show how this vehicle answers, and which commands
