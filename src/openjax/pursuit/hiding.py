@@ -60,7 +60,8 @@ def nearest_hidden(
     `active` (N,) says which slots of pursuers are in use, None: all are.
     """
     offset = _offsets()
-    place = thought + offset
+    # which place it is has no gradient, and that of an index is a scatter
+    place = jax.lax.stop_gradient(thought) + offset
     free = _can_be_at(settings, task, place)
     hidden = free & ~_is_seen(settings, task, drones, active, place)
     distance = jnp.where(hidden, np.linalg.norm(offset, axis=-1), jnp.inf)
