@@ -86,10 +86,12 @@ def sentence(advice: Advice, report: dict) -> str:
     best = advice.promises[0]
     hopeless = [pair for pair, nats in advice.nats.items() if nats < DETECTABLE]
     weigh = [pair for pair in hopeless if set(pair) <= SCALE_ONLY]
-    told = f"Fly {best.segment!r} next: in 10 s it tells {best.pair[0]} from {best.pair[1]} "
-    told += f"by {best.nats:.0f} nats."
+    pair = f"{best.pair[0]!r} from {best.pair[1]!r}"
+    told = (
+        f"Fly {best.segment!r} next: in 10 s it tells {pair} by {best.nats:.0f} nats."
+    )
     if best.nats < DETECTABLE:
-        told = f"No segment tells {best.pair[0]} from {best.pair[1]}."
+        told = f"No segment tells {pair}."
     if weigh:
         told += f" No flight tells {weigh[0][0]} from {weigh[0][1]}: weigh the vehicle."
     remarks = report.get("identification", {}).get("remarks", ())
