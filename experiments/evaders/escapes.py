@@ -3,10 +3,13 @@
 
 Records where everybody is in episodes against a planner, and says of the episodes
 without a capture, second by second, how fast the pursuers fly, how near they are,
-whether they see the evader, and how they stand round it. With `--clock` the time that
-the pursuers observe stands still from then on, and the planner knows it.
+whether they see the evader, and how they stand round it; and of all, what becomes of an
+evader that hasn't been seen for so long. `--only` flies some of the tasks alone, as
+those in which a planner got away. With `--clock` the time that the pursuers observe
+stands still from then on, and the planner knows it.
 """
 
+import itertools
 import time
 from dataclasses import dataclass
 
@@ -21,8 +24,11 @@ from openjax.evaluation.judges.planner import Planner
 from openjax.evaluation.judges.settings import PlannerSettings
 from openjax.files import write_json
 from openjax.policy import Policy, PolicyParameters
-from openjax.pursuit import Observation, PursuitSettings, PursuitState
+from openjax.pursuit import Observation, PursuitSettings, PursuitState, Task
+from openjax.pursuit.sensing import line_of_sight
 
+AGES = (0.0, 0.1, 0.3, 0.6, 1.1, 2.1)
+"""Seconds for which nobody has seen an evader, from each to the next; 0: it is seen."""
 TIME = slice(16, 20)
 """Where t/T stands in a pursuer's own part of the observation."""
 
@@ -34,7 +40,8 @@ class Moment:
     pursuers: jax.Array  # (T, B, N, 3) m
     velocity: jax.Array  # (T, B, N, 3) m/s, the pursuers'
     evader: jax.Array  # (T, B, 3) m
-    seen: jax.Array  # (T, B) bool
+    in_sight: jax.Array  # (T, B, N) bool, who sees the evader
+    last_seen: jax.Array  # (T, B, 3) m, where it is taken to be
     captured: jax.Array  # (T, B) bool, by now
 
 
@@ -61,9 +68,13 @@ class StoppedClock:
 def moment(state: PursuitState) -> Moment:
     """What is kept of worlds (B, ...)."""
     drones = state.drones
-    captured = state.statistics.captured
     return Moment(
-        drones.position, drones.velocity, state.evader_position, state.seen, captured
+        pursuers=drones.position,
+        velocity=drones.velocity,
+        evader=state.evader_position,
+        in_sight=state.sees,
+        last_seen=state.last_seen,
+        captured=state.statistics.captured,
     )
 
 
@@ -105,7 +116,7 @@ def summary(moments: Moment, game: PursuitSettings, replan: int) -> dict:
         "spread_in_height": np.ptp(height, axis=-1),
     }
     shares = {
-        "seen": moments.seen,
+        "seen": moments.in_sight.any(-1),
         "all_above_or_below": np.abs(side.sum(-1)) == side.shape[-1],
     }
     second = round(1.0 / (game.time_step * replan))
@@ -118,12 +129,73 @@ def summary(moments: Moment, game: PursuitSettings, replan: int) -> dict:
     return found | {name: each_second(value, np.mean) for name, value in shares.items()}
 
 
+def age_of_sight(seen: np.ndarray) -> np.ndarray:
+    """(T, B) moments since somebody saw the evader, of (T, B) whether somebody does; it
+    counts as seen before the first.
+    """
+    age = np.zeros(seen.shape, int)
+    for i in range(1, len(seen)):
+        age[i] = np.where(seen[i], 0, age[i - 1] + 1)
+    return np.where(seen, 0, np.maximum(age, 1))
+
+
+def place_in_view(moments: Moment, tasks: Task, game: PursuitSettings) -> np.ndarray:
+    """(T, B) whether somebody sees the place where the evader is taken to be."""
+
+    def one(pursuers, place, task):
+        pillars = task.pillar_position, task.pillar_active
+        return jnp.any(line_of_sight(game, pursuers, place, *pillars))
+
+    of_worlds = jax.vmap(jax.vmap(one), in_axes=(0, 0, None))
+    return np.asarray(jax.jit(of_worlds)(moments.pursuers, moments.last_seen, tasks))
+
+
+def out_of_sight(
+    moments: Moment, in_view: np.ndarray, second: int
+) -> list[dict[str, float]]:
+    """What becomes of evaders that nobody has seen for so long: a row for each of
+    `AGES`; `in_view` (T, B) whether the place is where they are taken to be, and
+    `second` moments are one.
+    """
+    free = ~moments.captured
+    age = age_of_sight(moments.in_sight.any(-1))
+    speed = np.linalg.norm(moments.velocity, axis=-1).mean(-1)
+    error = np.linalg.norm((moments.last_seen - moments.evader)[..., :2], axis=-1)
+    later_seen = moments.in_sight.any(-1)[1:]
+    caught = moments.captured[1:] & ~moments.captured[:-1]
+    rows = []
+    bounds = [*np.round(np.multiply(AGES, second)), np.inf]
+    for first, (begin, end) in zip(AGES, itertools.pairwise(bounds), strict=True):
+        # with a moment after it
+        own = (free & (age >= begin) & (age < end))[:-1]
+        if not own.any():
+            continue
+        means = {
+            "pursuers_speed": speed[:-1],
+            "place_in_view": in_view[:-1],
+            "place_off_level": error[:-1],
+            "seen_a_moment_later": later_seen,
+        }
+        rows.append(
+            {
+                "unseen_from": first,
+                "seconds": float(own.sum() / second),
+                "captures": int((own & caught).sum()),
+                **{name: float(value[own].mean()) for name, value in means.items()},
+            }
+        )
+    return rows
+
+
 def main() -> None:
     """The command."""
     parser = game_parser(__doc__, episodes=10, uniform=24)
     parser.add_argument("--plans", type=int, default=PlannerSettings().plans)
     parser.add_argument(
         "--clock", type=float, help="seconds after which the observed time stops"
+    )
+    parser.add_argument(
+        "--only", type=int, nargs="*", help="numbers of each kind's tasks; all"
     )
     options = parser.parse_args()
     game = judged_game(options)
@@ -134,13 +206,23 @@ def main() -> None:
         policy = StoppedClock(policy, options.clock / length)
     planner = Planner(PlannerSettings(options.plans), Duel(game.environment, policy))
     fly = jax.jit(lambda *arguments: record(planner, *arguments))
-    found = {**game.flown, "plans": options.plans, "clock": options.clock, "kinds": {}}
+    found = {
+        **game.flown,
+        "plans": options.plans,
+        "clock": options.clock,
+        "only": options.only,
+        "kinds": {},
+    }
     for kind, tasks in game.part(game.tasks).items():
         began = time.monotonic()
+        if options.only:
+            tasks = jax.tree.map(lambda leaf: leaf[np.array(options.only)], tasks)
         flown = fly(game.loaded.parameters, tasks, jax.random.key(options.seed))
-        own = summary(
-            jax.tree.map(np.asarray, flown), settings, planner.settings.replan
-        )
+        flown = jax.tree.map(np.asarray, flown)
+        own = summary(flown, settings, planner.settings.replan)
+        second = round(1.0 / (settings.time_step * planner.settings.replan))
+        in_view = place_in_view(flown, tasks, settings)
+        own["out_of_sight"] = out_of_sight(flown, in_view, second)
         found["kinds"][kind] = own
         seconds = time.monotonic() - began
         print(
