@@ -105,7 +105,10 @@ class TeamSearch:
     def narrow_game(self) -> PursuitSettings:
         """The game in whose paths narrower ways are open."""
         clearance = max(0.0, self.game.pillar_clearance - min(NARROW, ROOM))
-        return dataclasses.replace(self.game, pillar_clearance=clearance)
+        # whose vehicles, which points aren't, couldn't be checked inside a program
+        return dataclasses.replace(
+            self.game, pillar_clearance=clearance, vehicles=(), rare_vehicles=0.0
+        )
 
     def candidates(self, key: PRNGKeyArray, team_plan: TeamPlan) -> TeamPlan:
         """(T, ...) plans of N pursuers: straight at the evader, the rest of the last
