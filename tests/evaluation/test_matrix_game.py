@@ -25,7 +25,7 @@ def test_who_chooses_last_knows_the_other_s_plan():
 @pytest.mark.slow
 def test_pursuers_that_plan_catch_a_slower_evader_that_their_policy_lets_go():
     """The policy hovers; an evader of half their speed that plans is caught all the
-    same.
+    same. Where no pillar stands, who sees honestly sees all.
     """
     game = game_of_points(
         num_pursuers=2, evader_speed=0.5, evaders=("field",), episode_length=200
@@ -46,9 +46,16 @@ def test_pursuers_that_plan_catch_a_slower_evader_that_their_policy_lets_go():
         jnp.zeros((1, 1), bool),
     )
     start = duel.start(task, jax.random.key(0))
-    for last in (True, False):
+
+    def flown(last, full_sight):
         settings = MatrixGameSettings(
-            last, evader_plans=6, team_plans=6, direct_plans=4
+            last, evader_plans=6, team_plans=6, direct_plans=4, full_sight=full_sight
         )
         fly = jax.jit(MatrixGame(settings, duel, flight).fly)
-        assert np.asarray(fly({}, start, jax.random.key(1)).captured).all(), last
+        return fly({}, start, jax.random.key(1))
+
+    for last in (True, False):
+        statistics = flown(last, full_sight=True)
+        assert np.asarray(statistics.captured).all(), last
+        honest = flown(last, full_sight=False)
+        np.testing.assert_array_equal(statistics.capture_step, honest.capture_step)

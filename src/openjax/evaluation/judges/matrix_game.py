@@ -109,6 +109,13 @@ def choose(payoff: jax.Array, pursuers_last: bool) -> tuple[jax.Array, jax.Array
     return jnp.argmax(payoff[:, team]), team
 
 
+def as_thought(world: World) -> World:
+    """Worlds (B, ...) in which an evader that nobody sees is where it's taken to be."""
+    observation, state = world
+    place = jnp.where(state.seen[:, None], state.evader_position, state.last_seen)
+    return observation, state.replace(evader_position=place)
+
+
 @dataclass(frozen=True, eq=False)
 class MatrixGame(RecedingHorizon):
     """Both sides' plans in one game; the policy is one of the pursuers' plans."""
@@ -152,25 +159,45 @@ class MatrixGame(RecedingHorizon):
         ...) of plans (B, E, P, 3) and (B, T, P, ...).
         """
         settings = self.settings
-        # plans in which no pursuer asks the policy are flown without it, which is most
-        # of the work
-        with_policy = jax.tree.map(lambda leaf: leaf[:, : settings.team_plans], teams)
-        payoff = self._payoffs(parameters, world, prepared, (plans, with_policy))
-        if settings.direct_plans:
-            direct = jax.tree.map(lambda leaf: leaf[:, settings.team_plans :], teams)
-            more = self._payoffs(None, world, prepared, (plans, direct))
-            payoff = jnp.concatenate([payoff, more], axis=-1)
-        if not settings.full_sight:
-            # a team that doesn't see has one plan, the first: to fly as the policy does
-            payoff = jnp.where(world[1].seen[:, None, None], payoff, payoff[:, :, :1])
-        mine, theirs = jax.vmap(lambda own: choose(own, settings.pursuers_last))(payoff)
 
         def chosen(leaf, place):
             return jax.vmap(lambda own, place: own[place])(leaf, place)
 
-        return chosen(plans, mine), jax.tree.map(
-            lambda leaf: chosen(leaf, theirs), teams
+        if settings.full_sight:
+            payoff = self._all_payoffs(parameters, world, prepared, plans, teams)
+            mine, theirs = jax.vmap(lambda own: choose(own, settings.pursuers_last))(
+                payoff
+            )
+            team = jax.tree.map(lambda leaf: chosen(leaf, theirs), teams)
+            return chosen(plans, mine), team
+        # the team plans where it takes the evader to be, and the evader knows better
+        thought = self._all_payoffs(
+            parameters, as_thought(world), prepared, plans, teams
         )
+        if settings.pursuers_last:
+            true = self._all_payoffs(parameters, world, prepared, plans, teams)
+            mine = jnp.argmax(jnp.min(true, axis=2), axis=1)
+            theirs = jnp.argmin(chosen(thought, mine), axis=1)
+            team = jax.tree.map(lambda leaf: chosen(leaf, theirs), teams)
+            return chosen(plans, mine), team
+        theirs = jnp.argmin(jnp.max(thought, axis=1), axis=1)
+        team = jax.tree.map(lambda leaf: chosen(leaf, theirs), teams)
+        alone = jax.tree.map(lambda leaf: leaf[:, None], team)
+        true = self._payoffs(parameters, world, prepared, (plans, alone))
+        return chosen(plans, jnp.argmax(true[..., 0], axis=1)), team
+
+    def _all_payoffs(self, parameters, world, prepared, plans, teams):
+        """(B, E, T) what all pairs of plans are worth in worlds (B, ...)."""
+        settings = self.settings
+        # plans in which no pursuer asks the policy are flown without it, which is most
+        # of the work
+        with_policy = jax.tree.map(lambda leaf: leaf[:, : settings.team_plans], teams)
+        payoff = self._payoffs(parameters, world, prepared, (plans, with_policy))
+        if not settings.direct_plans:
+            return payoff
+        direct = jax.tree.map(lambda leaf: leaf[:, settings.team_plans :], teams)
+        more = self._payoffs(None, world, prepared, (plans, direct))
+        return jnp.concatenate([payoff, more], axis=-1)
 
     def _payoffs(self, parameters, world, prepared, both):
         """(B, E, T) what all pairs of plans are worth in worlds (B, ...); `parameters`

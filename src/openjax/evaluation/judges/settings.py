@@ -172,7 +172,7 @@ class MatrixGameSettings:
     """Control steps after which both sides plan anew."""
     full_sight: bool = True
     """Whether pursuers that plan see through pillars. Without it, a team that doesn't
-    see the evader flies as its policy does, and to where the evader was last seen.
+    see the evader plans as if it were where the game takes it to be.
     """
 
     def __post_init__(self):
