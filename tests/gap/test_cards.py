@@ -83,7 +83,16 @@ def test_what_pushes_along_the_motion_is_no_drag():
     )
     assert seems("wind", x=0.5, y=0.0, z=0.0, drag=0.004, along=1.0)
     assert not seems("wind", x=0.5, y=0.0, z=0.0, drag=-0.004, along=1.0)
-    assert not seems("wind", x=0.5, y=0.0, z=1.0, drag=0.004, along=-0.1)
+    assert not seems("wind", x=0.5, y=0.0, z=0.5, drag=0.004, along=-0.1)
+
+
+def test_what_no_air_and_no_rotor_does_is_something_else():
+    # a thrust of duty cycles that isn't known
+    assert not seems("wind", x=-0.35, y=0.0, z=2.0, drag=0.011, along=4.0)
+    rotors = dict(m1=-0.01, m2=0.06, m3=0.02, m4=-0.07)
+    assert seems("motor_imbalance", **rotors)
+    # slow turns' thrust, where torques aren't judged
+    assert not seems("motor_imbalance", **rotors | dict(m2=0.41, m3=-0.41))
 
 
 def test_above_the_ceiling_there_is_none():

@@ -16,6 +16,16 @@ def thrust(parameters, thrust, reaction, context):
     return thrust * factor, reaction * factor
 
 
+STRONGEST = 0.30  # above the rotors' mean, twice what is usual
+
+
+def flies(values, deviations) -> bool:
+    """Whether no rotor is stronger than propellers of a kind can be: where torques
+    tell nothing, a difference of rotors follows what slow turns do to the thrust.
+    """
+    return max(values.values()) < STRONGEST
+
+
 _SOURCE = "spread between motors and propellers: 0.3-15 %"
 
 EFFECT = Effect(
@@ -35,6 +45,7 @@ EFFECT = Effect(
             Fitted("m4", mean=0.0, spread=0.05, start=-0.01, step=0.001),
         ),
         balanced=True,
+        possible=flies,
         sample={"m1": 0.06, "m2": -0.04, "m3": 0.02, "m4": -0.05},
         practical={"m1": 0.002, "m2": 0.002, "m3": 0.002, "m4": 0.002},
         days=0.03,

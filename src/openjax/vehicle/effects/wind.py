@@ -26,12 +26,22 @@ def wrench(parameters, context):
     return hub_wrench(context, -0.25 * drag * (hub_velocity(context) - wind))
 
 
+STEEPEST = 2.0  # times as much drag along the rotors' axes, twice what is usual
+FASTEST_UP = 1.0  # m/s, the end of the usual range
+
 _SOURCE = "indoor draughts and fans, 0.3-3 m/s"
 
 
 def drags(value, deviation):
-    """Whether air that moves drags the vehicle along, along the rotors' axes too."""
-    return bool(value["drag"] > 0.0 and value["along"] > 0.0)
+    """Whether air that moves drags the vehicle along, along the rotors' axes too and not
+    much more there, and rises no faster than draughts do: a thrust that isn't known
+    looks like a gale from below.
+    """
+    return bool(
+        value["drag"] > 0.0
+        and 0.0 < value["along"] < STEEPEST
+        and abs(value["z"]) < FASTEST_UP
+    )
 
 
 EFFECT = Effect(
