@@ -43,12 +43,12 @@ def quiet_compiler() -> Iterator[None]:
     """Keep XLA from logging how long it takes, as an error to be filed; what does go
     wrong is raised.
     """
-    before = jax.config.jax_logging_level
+    level = jax.config.jax_logging_level
     jax.config.update("jax_logging_level", "CRITICAL")
     try:
         yield
     finally:
         # XLA's own level has no "as before": it is set by one that it knows, then JAX's
         # is put back
-        jax.config.update("jax_logging_level", before or "WARNING")
-        jax.config.update("jax_logging_level", before)
+        jax.config.update("jax_logging_level", level or "WARNING")
+        jax.config.update("jax_logging_level", level)

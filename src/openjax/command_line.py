@@ -51,8 +51,8 @@ def typed(command: str) -> str:
     script = Path(sys.executable).with_name("openjax")
     if shutil.which("openjax") or not script.exists():
         return command
-    here = Path.cwd()
-    path = script.relative_to(here) if script.is_relative_to(here) else script
+    folder = Path.cwd()
+    path = script.relative_to(folder) if script.is_relative_to(folder) else script
     return f"{path}{command.removeprefix('openjax')}"
 
 

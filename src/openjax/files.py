@@ -125,8 +125,8 @@ def replacing(path: str | Path) -> Iterator[Path]:
 
 def _put_in_place(partial: Path, path: Path) -> None:
     """Rename what was written to where it belongs, once it is on the disk."""
-    for written in (partial, *partial.rglob("*")) if partial.is_dir() else (partial,):
-        flush(written)
+    for file in (partial, *partial.rglob("*")) if partial.is_dir() else (partial,):
+        flush(file)
     folder_there = path.is_dir() and not path.is_symlink()
     if folder_there and not partial.is_dir():
         raise IsADirectoryError(21, "is a folder", str(path))
@@ -159,12 +159,12 @@ def read_checked(path: str | Path) -> bytes | None:
     whole.
     """
     try:
-        written = Path(path).read_bytes()
+        data = Path(path).read_bytes()
     except OSError:
         return None
     size = hashlib.sha256().digest_size
-    digest = written[:size]
-    content = written[size:]
+    digest = data[:size]
+    content = data[size:]
     return content if hashlib.sha256(content).digest() == digest else None
 
 
@@ -231,10 +231,10 @@ def check_output_folder(path: str | Path, option: str) -> None:
     path = Path(path).absolute()
     try:
         # the nearest folder above that is there already
-        there = next(folder for folder in (path, *path.parents) if folder.exists())
-        if not there.is_dir():
-            raise UserError(f"{option} {path}: {there} is a file; a folder is needed")
-        with tempfile.TemporaryFile(dir=there):
+        parent = next(folder for folder in (path, *path.parents) if folder.exists())
+        if not parent.is_dir():
+            raise UserError(f"{option} {path}: {parent} is a file; a folder is needed")
+        with tempfile.TemporaryFile(dir=parent):
             pass
     except OSError as error:
         raise UserError(

@@ -54,15 +54,15 @@ def install() -> None:
     """From now on SIGINT and SIGTERM end this process at once; for commands, from their
     main thread, before anything is loaded that takes its time.
     """
-    read, write = os.pipe()
-    for descriptor in (read, write):
+    reader, writer = os.pipe()
+    for descriptor in (reader, writer):
         os.set_blocking(descriptor, False)
-    signal.set_wakeup_fd(write, warn_on_full_buffer=False)
+    signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
     for number in SIGNALS:
         # what a shell starts in the background doesn't hear Ctrl-C, and neither do we
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, _left_to_the_watch)
-    _watch.descriptor = read
+    _watch.descriptor = reader
     threading.Thread(target=_listen, daemon=True, name="signals").start()
 
 
@@ -99,13 +99,13 @@ def patience(signals: int) -> Iterator[None]:
     at once at the next one. Elsewhere all are.
     """
     settle()
-    before = _watch.patience
+    previous = _watch.patience
     _watch.patience = signals
     try:
         yield
     finally:
         settle()
-        _watch.patience = before
+        _watch.patience = previous
 
 
 @contextlib.contextmanager
@@ -145,14 +145,14 @@ def as_exception() -> Iterator[None]:
     """Inside, both signals raise KeyboardInterrupt: for loops in Python that end in
     good order. To be entered in the main thread.
     """
-    before = {number: signal.getsignal(number) for number in SIGNALS}
+    handlers = {number: signal.getsignal(number) for number in SIGNALS}
     for number in SIGNALS:
         signal.signal(number, signal.default_int_handler)
     try:
         yield
     finally:
         settle()
-        for number, handler in before.items():
+        for number, handler in handlers.items():
             signal.signal(number, handler)
 
 

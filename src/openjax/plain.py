@@ -39,11 +39,11 @@ def from_plain(kind: Any, value: Any, where: str = "settings") -> Any:
     if origin is tuple:
         return _tuple_from_plain(arguments, value, where)
     if origin is dict:
-        filled = {}
+        values_of = {}
         for key, entry in _table(value, where).items():
             name = from_plain(arguments[0], key, f"{where}: a key")
-            filled[name] = from_plain(arguments[1], entry, _place(where, key))
-        return filled
+            values_of[name] = from_plain(arguments[1], entry, _place(where, key))
+        return values_of
     if origin is typing.Literal and value not in arguments:
         raise UserError(
             f"{where} is {shown(value)}; expected one of {', '.join(map(repr, arguments))}"
@@ -109,10 +109,10 @@ def _dataclass_from_plain(kind, value, where):
         key: from_plain(hints[key], entry, _place(where, key))
         for key, entry in entries.items()
     }
-    filled = kind(**values)
+    instance = kind(**values)
     # once more, though most kinds check themselves: here the error names the file
-    check_intervals(filled, _place(where, ""))
-    return filled
+    check_intervals(instance, _place(where, ""))
+    return instance
 
 
 def _union_from_plain(arguments, value, where):

@@ -121,9 +121,9 @@ def check_intervals(settings: Any, group: str = "") -> None:
             # to Python, True is a whole number
             is_number = isinstance(value, kind) and not isinstance(value, bool)
             if not is_number or value not in field.interval:
-                whole = "a whole number in" if field.kind is int else "in"
+                kind_words = "a whole number in" if field.kind is int else "in"
                 raise UserError(
-                    f"{group}{field.name} is {shown(value)}; it must be {whole} {field.interval}"
+                    f"{group}{field.name} is {shown(value)}; it must be {kind_words} {field.interval}"
                 )
 
 

@@ -46,12 +46,12 @@ def angelani(
         return jax.nn.sigmoid((middle - distance) / parameters.width)
 
     distance = jnp.sqrt(jnp.sum(around.from_others**2, axis=-1) + 1e-12)
-    apart = fermi(distance, parameters.repulsion_range)[..., None] * unit(
+    repulsion = fermi(distance, parameters.repulsion_range)[..., None] * unit(
         around.from_others
     )
 
-    near = fermi(around.obstacle_distance, parameters.obstacle_range)
-    sideways = jnp.sum(near[..., None] * around.obstacle_normal, axis=-2)
+    nearness = fermi(around.obstacle_distance, parameters.obstacle_range)
+    sideways = jnp.sum(nearness[..., None] * around.obstacle_normal, axis=-2)
     # the floor pushes up, the ceiling down
     from_floor = fermi(around.floor_distance, parameters.obstacle_range)
     from_ceiling = fermi(around.ceiling_distance, parameters.obstacle_range)
@@ -60,7 +60,7 @@ def angelani(
     force = (
         unit(around.target - around.position)
         + parameters.alignment * unit(around.team_velocity)
-        + parameters.repulsion * jnp.sum(apart, axis=-2)
+        + parameters.repulsion * jnp.sum(repulsion, axis=-2)
         + parameters.obstacle * obstacles
     )
     # particles of constant speed: forces turn them, and never slow them down

@@ -112,11 +112,13 @@ def wall_following(field: Forces, velocity: jax.Array) -> jax.Array:
     half away from the obstacle; its height is the field's.
     """
     away = unit(field.repulsion[..., :2])
-    left = jnp.stack([-away[..., 1], away[..., 0]], axis=-1)
+    tangent = jnp.stack([-away[..., 1], away[..., 0]], axis=-1)
     # 1 is the size of the attraction
     pushed = length(field.individual) > 1.0
     heading = jnp.where(pushed, field.individual, unit(velocity))[..., :2]
-    side = jnp.where(jnp.sum(left * heading, axis=-1, keepdims=True) >= 0.0, 1.0, -1.0)
+    side = jnp.where(
+        jnp.sum(tangent * heading, axis=-1, keepdims=True) >= 0.0, 1.0, -1.0
+    )
     climb = field.attraction + field.repulsion + field.individual
-    along = side * left + jnp.where(field.inside[..., None], away, 0.0)
+    along = side * tangent + jnp.where(field.inside[..., None], away, 0.0)
     return unit(level(along) + upward(unit(climb)[..., 2]))

@@ -57,16 +57,16 @@ class DacoopPolicy(CraftPolicy):
 
 def field_parameters(output: jax.Array) -> ApfParameters:
     """The field (leaves (..., N)) that outputs (..., N, 2) in -1..1 stand for."""
-    learned = {}
+    outputs = {}
     for i, name in enumerate(LEARNED):
         low, high = ranges(ApfParameters)[name]
-        learned[name] = low * (high / low) ** (0.5 * (output[..., i] + 1.0))
+        outputs[name] = low * (high / low) ** (0.5 * (output[..., i] + 1.0))
     fixed = {
         name: getattr(START, name)
         for name in ranges(ApfParameters)
         if name not in LEARNED
     }
-    return ApfParameters(**fixed, **learned)
+    return ApfParameters(**fixed, **outputs)
 
 
 def _place(name, value):

@@ -60,9 +60,9 @@ def janosov(
     predicted = around.target + ahead * around.target_velocity
     relative = around.velocity - around.target_velocity
     # a prey that isn't seen has no velocity to be damped against
-    seen = jnp.any(around.target_velocity != 0.0, axis=-1, keepdims=True)
+    is_seen = jnp.any(around.target_velocity != 0.0, axis=-1, keepdims=True)
     friction = jnp.where(
-        seen, relative / jnp.maximum(length(to_target) ** 2, 1e-4), 0.0
+        is_seen, relative / jnp.maximum(length(to_target) ** 2, 1e-4), 0.0
     )
     chase = unit(
         unit(predicted - around.position) - parameters.chase_friction * friction
@@ -89,8 +89,8 @@ def janosov(
             jnp.pi * jnp.clip(gap / parameters.wall_range, 0.0, 1.0)
         )
 
-    near = soft_wall(around.obstacle_distance)
-    sideways = jnp.sum(near[..., None] * around.obstacle_normal, axis=-2)
+    nearness = soft_wall(around.obstacle_distance)
+    sideways = jnp.sum(nearness[..., None] * around.obstacle_normal, axis=-2)
     # the floor pushes up, the ceiling down
     vertical = soft_wall(around.floor_distance) - soft_wall(around.ceiling_distance)
     walls = level(sideways) + upward(vertical)

@@ -34,7 +34,7 @@ def best(method: str, kind: type[Parameters]) -> Parameters:
     """A method's parameters as the search found them; the literature's where there is
     no result of it.
     """
-    found = json.loads(FOUND.read_text(encoding="utf-8"))
+    searches = json.loads(FOUND.read_text(encoding="utf-8"))
     values = {field.name: field.default for field in dataclasses.fields(kind)}
-    values |= found.get(method, {})
+    values |= searches.get(method, {})
     return kind(**{name: jnp.float32(value) for name, value in values.items()})

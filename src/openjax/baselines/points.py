@@ -74,7 +74,10 @@ def stack_team(environment: Pursuit) -> Team:
     craft = dataclasses.replace(
         Craft.of(environment), speed=settings.max_speed, response=0.0
     )
-    how = StackParameters(tolerance=0.05, gain=1.0 / settings.time_step)
+    parameters = StackParameters(tolerance=0.05, gain=1.0 / settings.time_step)
     return Team(
-        lambda seen: stack(craft, how, surroundings(craft, seen)) / settings.max_speed
+        lambda observation: (
+            stack(craft, parameters, surroundings(craft, observation))
+            / settings.max_speed
+        )
     )

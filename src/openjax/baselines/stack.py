@@ -117,10 +117,10 @@ def stack(craft: Craft, parameters: StackParameters, around: Surroundings) -> ja
 
     # what keeps the ray comes first, then the height; moving outwards gets what speed
     # is left
-    left = jnp.full_like(height, craft.speed)
-    aside_speed, left = cut(-parameters.gain * across, left)
-    up, left = cut(parameters.gain * height, left)
-    forwards = out * left[..., None] + aside * aside_speed[..., None]
+    speed_left = jnp.full_like(height, craft.speed)
+    aside_speed, speed_left = cut(-parameters.gain * across, speed_left)
+    up, speed_left = cut(parameters.gain * height, speed_left)
+    forwards = out * speed_left[..., None] + aside * aside_speed[..., None]
 
     # before that each flies to its place on the axis
     gather = -parameters.gain * place

@@ -107,7 +107,7 @@ def surroundings(craft: Craft, observation: Observation) -> Surroundings:
     newest = observation.frames[..., -1, :]
     # what is hidden is shown at HIDDEN exactly, far below any place; .9 allows for
     # rounding
-    seen = newest[..., 1:2] > 0.9 * HIDDEN
+    is_seen = newest[..., 1:2] > 0.9 * HIDDEN
     per_pursuer = (*own.shape[:-2], number, 3)
 
     def for_all(vector):
@@ -115,10 +115,10 @@ def surroundings(craft: Craft, observation: Observation) -> Surroundings:
 
     # a frame is time (1), evader's position and velocity (6) and the pursuers'
     # positions
-    moved = newest[..., 7:] - observation.frames[..., 0, 7:]
-    velocities = moved.reshape(per_pursuer) / max(craft.history_seconds, 1e-6)
+    displacement = newest[..., 7:] - observation.frames[..., 0, 7:]
+    velocities = displacement.reshape(per_pursuer) / max(craft.history_seconds, 1e-6)
     apart_velocity = velocities[..., :, None, :] - velocities[..., others(number), :]
-    target_velocity = for_all(jnp.where(seen, newest[..., 4:7], 0.0))
+    target_velocity = for_all(jnp.where(is_seen, newest[..., 4:7], 0.0))
 
     normal, distance = _obstacles(craft, observation)
     position = own + craft.response * velocity
@@ -139,14 +139,17 @@ def surroundings(craft: Craft, observation: Observation) -> Surroundings:
 
 def _obstacles(craft, observation):
     """`obstacle_normal` and `obstacle_distance`."""
-    own = observation.position
+    position = observation.position
     velocity = observation.self_state[..., VELOCITY]
     pillar = observation.pillars
     across = jnp.sqrt(jnp.sum(pillar[..., :2] ** 2, axis=-1) + 1e-12)
     to_pillar = jnp.where(observation.pillar_seen, across - pillar[..., 4], jnp.inf)
-    radius = jnp.sqrt(jnp.sum(own[..., :2] ** 2, axis=-1, keepdims=True) + 1e-12)
+    radius = jnp.sqrt(jnp.sum(position[..., :2] ** 2, axis=-1, keepdims=True) + 1e-12)
     normal = jnp.concatenate(
-        [pillar[..., :2] / across[..., None], (-own[..., :2] / radius)[..., None, :]],
+        [
+            pillar[..., :2] / across[..., None],
+            (-position[..., :2] / radius)[..., None, :],
+        ],
         axis=-2,
     )
     distance = jnp.concatenate([to_pillar, craft.arena_radius - radius], axis=-1)

@@ -59,10 +59,10 @@ def velocity_action(
     """(..., N, 4) action in -1..1 (thrust, body rates) that flies the desired
     velocities (..., N, 3) in m/s, world.
     """
-    own = observation.self_state
-    body_x, body_z = rotation_axes(own[..., QUATERNION])
+    self_state = observation.self_state
+    body_x, body_z = rotation_axes(self_state[..., QUATERNION])
     # in units of the weight
-    thrust = VELOCITY_GAIN / GRAVITY * (desired - own[..., VELOCITY])
+    thrust = VELOCITY_GAIN / GRAVITY * (desired - self_state[..., VELOCITY])
     rise = 1.0 + jnp.clip(thrust[..., 2:], *CLIMB_LIMITS)
     # height before the rest: what a limited tilt can't do is left of the horizontal
     # part

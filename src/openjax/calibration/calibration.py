@@ -136,20 +136,20 @@ def calibrate(case: Case) -> Calibration:
     replay = _without_numbers(evidence.replay)
     fit = fit_set(replay, effects, iterations=ITERATIONS)
     nothing = fit_set(replay, ())
-    explained = _explained(replay, nothing, fit)
+    explained_shares = _explained(replay, nothing, fit)
     # Where gyroscope and attitude share no clock, the rates tell nothing.
-    share = explained.get("body rates", (0.0, 0.0))[1]
+    share = explained_shares.get("body rates", (0.0, 0.0))[1]
     quantities = _quantities(evidence, fit, share > LEAST_EXPLAINED)
     return Calibration(
         quantities=quantities,
         cannot_tell=tuple(_cannot_tell(evidence, fit, quantities, share)),
         nuisances={
             f"{e} {p}": (value, EFFECTS[e].parameters[p].unit)
-            for e, found in fit.parameters().items()
+            for e, parameters_of in fit.parameters().items()
             if e in BESIDE
-            for p, (value, _) in found.items()
+            for p, (value, _) in parameters_of.items()
         },
-        explained=explained,
+        explained=explained_shares,
         flights=tuple(dict.fromkeys(t.flight for t in evidence.tracks)),
         seconds=float(sum(len(t) * t.dt for t in evidence.tracks)),
     )
@@ -182,13 +182,15 @@ def logarithms(theta: np.ndarray, vehicle, duty_cycles: bool) -> dict[str, np.nd
         / at["inertia", "zz"]
     )
     lag = 0.5 * (at["motor_lag", "extra_up"] + at["motor_lag", "extra_down"])
-    found = {
+    estimates = {
         "thrust_constant": [thrust],
         "torque_constant": [torque],
         "motor_time_constant": [1.0 + lag / float(vehicle.motor_time_constant)],
         "inertia": [at["inertia", "xx"], at["inertia", "yy"]],
     }
-    return {name: np.log(np.maximum(values, 1e-3)) for name, values in found.items()}
+    return {
+        name: np.log(np.maximum(values, 1e-3)) for name, values in estimates.items()
+    }
 
 
 def _quantities(
@@ -209,8 +211,8 @@ def _quantities(
     for name, value in values.items():
         slope = slopes[name]
         deviation = np.sqrt(np.diag(slope @ posterior @ slope.T))
-        before = np.sqrt(np.diag(slope @ prior_covariance @ slope.T))
-        determined = bool((deviation < DETERMINED * before).all())
+        prior_deviations = np.sqrt(np.diag(slope @ prior_covariance @ slope.T))
+        determined = bool((deviation < DETERMINED * prior_deviations).all())
         determined &= rates_fit or name not in TOLD_BY_RATES
         determined &= not (duty_cycles and name == "thrust_constant")
         total = np.hypot(deviation, MODEL_ERROR[name])
@@ -226,13 +228,13 @@ def _slopes(fit: SetFit, vehicle, duty_cycles: bool) -> dict[str, np.ndarray]:
     difference quotients.
     """
     step = 1e-5
-    here = logarithms(fit.theta, vehicle, duty_cycles)
-    slopes = {name: [] for name in here}
+    at_theta = logarithms(fit.theta, vehicle, duty_cycles)
+    slopes = {name: [] for name in at_theta}
     for place in fit.index:
         theta = fit.theta.copy()
         theta[place] += step
         for name, value in logarithms(theta, vehicle, duty_cycles).items():
-            slopes[name].append((value - here[name]) / step)
+            slopes[name].append((value - at_theta[name]) / step)
     return {name: np.array(columns).T for name, columns in slopes.items()}
 
 
@@ -245,8 +247,8 @@ def _quantity(
     # be
     value[: len(logs)] *= np.exp(logs)
     reach = np.exp(REACH * deviations)
-    fitted = zip(value[: len(logs)], reach, strict=True)
-    pairs = [(float(v / r), float(v * r)) for v, r in fitted]
+    intervals = zip(value[: len(logs)], reach, strict=True)
+    pairs = [(float(v / r), float(v * r)) for v, r in intervals]
     if len(value) > len(logs):
         low, high = YAW_INERTIA_RANGE
         pairs.append((low * nominal[2], high * nominal[2]))
@@ -310,11 +312,11 @@ def _explained(replay, nothing: SetFit, fit: SetFit) -> dict[str, tuple[float, f
         return float(sum((c**2).sum() for c in changes))
 
     residuals = (residuals_of(nothing), residuals_of(fit))
-    explained = {}
+    shares = {}
     for kind, channels in kinds.items():
         if replay.usable[channels].all():
-            whole = square(replay.measured, channels)
-            explained[kind] = tuple(
-                1.0 - square(left, channels) / whole for left in residuals
+            total = square(replay.measured, channels)
+            shares[kind] = tuple(
+                1.0 - square(residual, channels) / total for residual in residuals
             )
-    return explained
+    return shares

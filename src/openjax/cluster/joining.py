@@ -215,14 +215,14 @@ def _held_open(host, port):
     def serve():
         with contextlib.suppress(OSError):
             while True:
-                near, _ = server.accept()
+                client, _ = server.accept()
                 try:
-                    far = socket.create_connection((host, port), timeout=10.0)
+                    server_end = socket.create_connection((host, port), timeout=10.0)
                 except OSError:  # refused: JAX tries again
-                    near.close()
+                    client.close()
                     continue
-                far.settimeout(None)
-                for source, sink in ((near, far), (far, near)):
+                server_end.settimeout(None)
+                for source, sink in ((client, server_end), (server_end, client)):
                     threading.Thread(
                         target=_pump, args=(source, sink), daemon=True
                     ).start()
@@ -270,9 +270,9 @@ def _accept(server, number):
         try:
             connection, _ = server.accept()
         except TimeoutError:
-            missing = ", ".join(str(i) for i in range(1, number) if i not in others)
+            absent = ", ".join(str(i) for i in range(1, number) if i not in others)
             raise UserError(
-                f"process {missing} of {number} didn't come within {JOIN:.0f} s"
+                f"process {absent} of {number} didn't come within {JOIN:.0f} s"
             ) from None
         connection.settimeout(10.0)
         reader = connection.makefile("rb")

@@ -63,8 +63,8 @@ def main(arguments: Sequence[str]) -> int:
                 write_json(
                     command.json, {**facts, "settings": command.settings, "rows": rows}
                 )
-    if told := _programs_and_step(rows):
-        print(told)
+    if sentence := _programs_and_step(rows):
+        print(sentence)
     print(f"written to {command.json}")
     return 0
 
@@ -108,10 +108,10 @@ def _programs_and_step(rows) -> str | None:
     phases = [row["seconds"] for row in rows if row["part"].startswith("- ")]
     if not phases or None in phases:
         return None
-    whole = sum(row["seconds"] for row in rows if row["part"] == "training")
+    seconds = sum(row["seconds"] for row in rows if row["part"] == "training")
     return (
         f"the training step's programs take {1e3 * sum(phases):,.1f} ms, the step as one "
-        f"{1e3 * whole:,.1f} ms"
+        f"{1e3 * seconds:,.1f} ms"
     )
 
 
@@ -142,11 +142,11 @@ def _row(case, settings, timing) -> dict:
 def _line(row):
     speed = row["env_steps_per_second"]
     memory = row["memory"]
-    told = (
+    words = (
         "out of memory"
         if speed is None
         else f"{speed:,.0f} env steps/s, {1e3 * row['seconds']:,.1f} ms"
     )
     needs = "" if memory is None else f", {memory / 1e6:,.0f} MB"
     compiled = f"compiled in {row['compile_seconds']:.1f} s{needs}"
-    return f"{row['part']:17} {row['num_envs']:>9,} environments: {told} ({compiled})"
+    return f"{row['part']:17} {row['num_envs']:>9,} environments: {words} ({compiled})"

@@ -103,9 +103,9 @@ def _print(result, console: Console) -> None:
                 remark,
             )
     console.print(table)
-    for channel, (nominal, fitted) in result.explained.items():
+    for channel, (nominal, calibrated) in result.explained.items():
         nominal_share = f"{nominal:.1%}" if nominal > 0 else "none"
-        fitted_share = f"{max(fitted, 0.0):.1%}"
+        fitted_share = f"{max(calibrated, 0.0):.1%}"
         console.print(
             f"{channel}: the fitted vehicle explains {fitted_share} of what changed, the given "
             f"{nominal_share}"

@@ -168,13 +168,15 @@ def _diagnosis(
     with replacing(options.out / name) as partial_folder:
         partial_folder.mkdir()
         write_report(report, partial_folder, options.html)
-    written = options.out / name / ("report.html" if options.html else "report.json")
+    report_file = (
+        options.out / name / ("report.html" if options.html else "report.json")
+    )
     noted = [
         f"{issue.flight}: {issue.issue}" for issue in case.quality if not issue.refused
     ]
     more = f" (and {len(noted) - 1} more in the report)" if len(noted) > 1 else ""
     remark = [f"Noted in the logs: {noted[0]}{more}."] if noted else []
-    lines = [*remark, *report.in_words(), f"({report.seconds:.1f} s; {written})"]
+    lines = [*remark, *report.in_words(), f"({report.seconds:.1f} s; {report_file})"]
     return ", ".join(report.effects) or report.verdict, lines, report.prediction()
 
 
@@ -193,16 +195,20 @@ def _changes(
         report.write(change, partial_folder, options.html)
         if diagnosis is not None:
             write_report(diagnosis, partial_folder, options.html)
-    written = options.out / name / f"changes.{'html' if options.html else 'json'}"
+    report_file = options.out / name / f"changes.{'html' if options.html else 'json'}"
     if diagnosis is None:
         title = "changed" if change.changed else "no change"
         return (
             title,
-            [*report.in_words(change), f"({written})"],
+            [*report.in_words(change), f"({report_file})"],
             report.prediction(change),
         )
     trims = [f"Trims: {line}" for line in report.in_words(change)[:1]]
-    lines = [*diagnosis.in_words(), *trims, f"({diagnosis.seconds:.1f} s; {written})"]
+    lines = [
+        *diagnosis.in_words(),
+        *trims,
+        f"({diagnosis.seconds:.1f} s; {report_file})",
+    ]
     return ", ".join(diagnosis.effects) or "no change", lines, diagnosis.prediction()
 
 

@@ -129,9 +129,9 @@ def main(arguments: Sequence[str]) -> int:
     command = parse(EvaluateCommand, EvaluateCommand(), arguments, PROGRAM)
     evaluators = {}
     results = []
-    for own, loaded in prepare(command, arguments):
-        records, _ = fly_scenarios(own, loaded, evaluators)
-        results.append((own, loaded.source, records))
+    for options, policy in prepare(command, arguments):
+        records, _ = fly_scenarios(options, policy, evaluators)
+        results.append((options, policy.source, records))
     _show(command, results)
     return 0
 
@@ -148,18 +148,18 @@ def prepare(command: EvaluateCommand, arguments: Sequence[str]) -> list[tuple]:
     typed = command.environment
     if command.num_pursuers is not None:
         typed = dataclasses.replace(typed, num_pursuers=command.num_pursuers)
-    for loaded in command.start(typed):
+    for policy in command.start(typed):
         default = dataclasses.replace(
-            EvaluateCommand(), environment=loaded.settings.environment
+            EvaluateCommand(), environment=policy.settings.environment
         )
-        own = parse(EvaluateCommand, default, arguments, PROGRAM)
-        _game(own, loaded)
-        policies.append((own, loaded))
+        options = parse(EvaluateCommand, default, arguments, PROGRAM)
+        _game(options, policy)
+        policies.append((options, policy))
     return policies
 
 
 def fly_scenarios(
-    command: EvaluateCommand, loaded, evaluators: dict
+    command: EvaluateCommand, policy, evaluators: dict
 ) -> tuple[list[dict], list]:
     """A record (see `openjax.evaluation.evaluator.FIELDS`) and the first episode's
     `Trajectory` per scenario.
@@ -179,38 +179,38 @@ def fly_scenarios(
     from openjax.evaluation.judges.tasks import JUDGE_KEY
     from openjax.evaluation.validation import uniform_tasks
 
-    game, loaded, layouts = _game(command, loaded)
-    if words := loaded.outside_of_training(game):
-        note = f"note: {loaded.source} was never trained for this: {'; '.join(words)}"
+    game, policy, layouts = _game(command, policy)
+    if words := policy.outside_of_training(game):
+        note = f"note: {policy.source} was never trained for this: {'; '.join(words)}"
         output_console().print(note, soft_wrap=True)
     tasks = layout_tasks(game.settings, layouts, command.episodes)
     if not layouts:
-        drawn = _settings(command)
+        settings = _settings(command)
         slots = game.settings.max_pillars
         # not those by which runs choose their checkpoints
-        tasks["uniform"] = uniform_tasks(drawn, command.episodes, slots, JUDGE_KEY)
-    kind = (game.settings, loaded.policy, command.opponent, command.messages)
+        tasks["uniform"] = uniform_tasks(settings, command.episodes, slots, JUDGE_KEY)
+    kind = (game.settings, policy.policy, command.opponent, command.messages)
     compiled = kind in evaluators
     if not compiled:
         batch = min(command.episodes, LARGEST_BATCH)
-        evaluators[kind] = Evaluator(game, loaded.policy, batch, command.messages)
+        evaluators[kind] = Evaluator(game, policy.policy, batch, command.messages)
     # seconds of an episode on a laptop, about
     expected = dict.fromkeys(tasks, 0.02 * command.episodes)
     first = next(iter(tasks))
     if not compiled:
         expected[first] += COMPILING
-    with Steps(f"flying {loaded.source}", expected, output_console()) as steps:
+    with Steps(f"flying {policy.source}", expected, output_console()) as steps:
 
         def tell(layout):
             steps.begin(
                 layout, "compiled first" if not compiled and layout == first else ""
             )
 
-        flown = evaluators[kind].fly(
-            loaded.parameters, tasks, jax.random.key(command.seed), tell
+        episodes = evaluators[kind].fly(
+            policy.parameters, tasks, jax.random.key(command.seed), tell
         )
-        return [kind.record() for kind in flown], [
-            kind.trajectory(0, kind.name) for kind in flown
+        return [kind.record() for kind in episodes], [
+            kind.trajectory(0, kind.name) for kind in episodes
         ]
 
 
@@ -227,7 +227,7 @@ def _settings(command):
     )
 
 
-def _game(command, loaded):
+def _game(command, policy):
     """The game of a command, the policy in it, and the layouts; none: uniform tasks."""
     from openjax.evaluation.evaluator import layout_slots
     from openjax.pursuit.scenarios import SCENARIOS, find_scenario
@@ -238,13 +238,13 @@ def _game(command, loaded):
             "--environment.evaders learned: a name isn't enough; --opponent takes a file of "
             "openjax exploit"
         )
-    if not command.messages.perfect and loaded.is_heuristic:
+    if not command.messages.perfect and policy.is_heuristic:
         raise UserError(
-            f"--messages: {loaded.source} flies the team as one; policies that were trained fly "
+            f"--messages: {policy.source} flies the team as one; policies that were trained fly "
             "each pursuer by what it knows"
         )
     number = settings.num_pursuers
-    trained = number if loaded.any_number else loaded.settings.environment.num_pursuers
+    trained = number if policy.any_number else policy.settings.environment.num_pursuers
     layouts = []
     if command.scenario == "all":
         layouts = [
@@ -266,17 +266,17 @@ def _game(command, loaded):
         )
     slots = max([layout_slots(settings), *(len(layout.pillars) for layout in layouts)])
     game = dataclasses.replace(settings, max_pillars=slots, num_pursuers=in_layout)
-    environment = _environment(command, game, loaded)
-    return environment, loaded.in_game(environment), layouts
+    environment = _environment(command, game, policy)
+    return environment, policy.in_game(environment), layouts
 
 
-def _environment(command, game, loaded):
+def _environment(command, game, policy):
     """The game with all that the command, or a policy of a game of one's own, adds to
     it.
     """
     from openjax.store.environments import make_environment
 
-    trained_in = loaded.environment
+    trained_in = policy.environment
     if trained_in is None:
         return make_environment(
             game, command.vehicle, command.effects, command.opponent
@@ -301,9 +301,9 @@ def _show(command, results):
     from openjax.runs.words import unlike_the_papers
 
     console = output_console()
-    for own, source, rows in results:
-        settings = _settings(own)
-        evaders = (own.opponent,) if own.opponent else settings.evaders
+    for options, source, rows in results:
+        settings = _settings(options)
+        evaders = (options.opponent,) if options.opponent else settings.evaders
         game = unlike_the_papers(settings, evaders)
         console.print(
             results_table(f"{source}, mean policy, seed {command.seed}", rows, game)

@@ -87,10 +87,10 @@ def observations(policy, number: int, seed: int) -> dict:
             # some noise, or all worlds would soon look alike
             noise = 0.3 * jax.random.normal(key, state.previous_action.shape)
             action = jnp.clip(policy(observation) + noise, -1.0, 1.0)
-            following, state, *_ = jax.vmap(environment.step, in_axes=(None, 0, 0))(
-                key, state, action
-            )
-            return (following, state), observation
+            next_observation, state, *_ = jax.vmap(
+                environment.step, in_axes=(None, 0, 0)
+            )(key, state, action)
+            return (next_observation, state), observation
 
         return jax.lax.scan(step, (observation, state), jax.random.split(key, steps))[1]
 
@@ -206,12 +206,12 @@ def _onnx(act, inputs, samples, source):
     session = onnxruntime.InferenceSession(
         data, options, providers=["CPUExecutionProvider"]
     )
-    read = [value.name for value in session.get_inputs()]
+    input_names = [value.name for value in session.get_inputs()]
     actions = []
     for i in range(len(samples["frames"])):
-        actions += session.run(None, {name: samples[name][i] for name in read})
+        actions += session.run(None, {name: samples[name][i] for name in input_names})
     extra = {
-        "inputs": _described({name: inputs[name] for name in read}),
+        "inputs": _described({name: inputs[name] for name in input_names}),
         "numbers": size(model),
         "nodes": len(model.graph.node),
     }

@@ -287,18 +287,18 @@ def _time_remark(arguments: Arguments, seconds: float) -> tuple[str, ...]:
     )
 
 
-def _write(out, flown, flight, samples, scheduler):
+def _write(out, preparation, flight, samples, scheduler):
     """Write the case."""
     from openjax.flying.flight_files import write_case
 
-    policy = flown.about["policy"]
+    policy = preparation.about["policy"]
     described = dataclasses.replace(
-        flown.vehicle,
+        preparation.vehicle,
         path=None,
         log={"source": f"openjax.fly, policy {policy}", "floor_z": 0.0},
     )
     about = {
-        **flown.about,
+        **preparation.about,
         "scheduler": scheduler,
         "reasons": [drone.reason for drone in flight.state.drones],
     }
@@ -356,13 +356,13 @@ def _show(console, flight, planned):
         f"({timing['missed_share']:.2%})"
     )
     for number, game in enumerate(() if planned else record.episodes):
-        caught = (
+        outcome = (
             f"caught at step {game['capture_step']}"
             if game["capture_step"]
             else "not caught"
         )
         console.print(
-            f"game {number}: {caught}, {game['steps']} steps, {game['breaches']} with a breach"
+            f"game {number}: {outcome}, {game['steps']} steps, {game['breaches']} with a breach"
         )
     for i, drone in enumerate(flight.state.drones):
         if drone.reason not in ("", "asked to land"):

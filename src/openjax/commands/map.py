@@ -41,8 +41,8 @@ def main(arguments: Sequence[str]) -> int:
     from openjax.runs.map_page import map_page
     from openjax.store.policies import load_policy
 
-    loaded = load_policy(command.policy)
-    trained = loaded.settings.environment
+    policy = load_policy(command.policy)
+    trained = policy.settings.environment
     less = ON_CPU if jax.default_backend() == "cpu" else {}
     if not command.messages.perfect:
         less = less | {"best_response": False}  # who learns doesn't know what was heard
@@ -57,7 +57,7 @@ def main(arguments: Sequence[str]) -> int:
     map_game(command, trained)
     console = output_console()
     results = draw_map(
-        command, loaded, lambda text: console.print(text, soft_wrap=True)
+        command, policy, lambda text: console.print(text, soft_wrap=True)
     )
     if command.json is not None:
         write_json(command.json, results)

@@ -52,17 +52,17 @@ def make_plan(arguments: Arguments) -> list[str]:
 
     promises: list[dict] = []
     if arguments.diagnosis == STANDARD and not Path(STANDARD).exists():
-        chosen = list(SEGMENTS)
-        said = "The standard plan: it shows every effect that one vehicle can show."
+        segments = list(SEGMENTS)
+        sentence = "The standard plan: it shows every effect that one vehicle can show."
     else:
-        said, promises, chosen = _advised(arguments)
-    plan = plan_of(chosen)
+        sentence, promises, segments = _advised(arguments)
+    plan = plan_of(segments)
     with replacing(arguments.out) as folder:
         folder.mkdir()
         write_plan(folder / "plan.csv", plan)
         write_json(
             folder / "plan.json",
-            {"sentence": said, "segments": promises, "fly": chosen},
+            {"sentence": sentence, "segments": promises, "fly": segments},
         )
     rows = [
         f"  {p['segment']:6} {p['value']:.3f}  {SEGMENTS[p['segment']].shows}"
@@ -79,9 +79,9 @@ def make_plan(arguments: Arguments) -> list[str]:
         else f" Without --motion_capture it lands after {limit:g} s."
     )
     return [
-        said,
+        sentence,
         *rows,
-        f"{file}: {', '.join(chosen)}; {seconds:.0f} s. "
+        f"{file}: {', '.join(segments)}; {seconds:.0f} s. "
         f"Next, openjax fly --plan {file} --uri ...{lands}",
     ]
 

@@ -60,8 +60,10 @@ def make_case(arguments: Arguments) -> list[Path]:
     )
     log = {"source": source, "motor_rows": "mean", "floor_z": 0.0}
     # On a scale a vehicle that weighs more would have shown it.
-    weighed = not any(EFFECTS[name].card.weighed for name in names)
-    described = dataclasses.replace(load_vehicle_file(), mass_weighed=weighed, log=log)
+    is_weighed = not any(EFFECTS[name].card.weighed for name in names)
+    described = dataclasses.replace(
+        load_vehicle_file(), mass_weighed=is_weighed, log=log
+    )
     decimals = {c: DECIMALS.get(c, _REST) for c in LOG_COLUMNS}
     of_others = any(EFFECTS[name].card.of_others for name in names)
     flights = references(arguments.seed, arguments.duration, neighbour=of_others)

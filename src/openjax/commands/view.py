@@ -123,17 +123,17 @@ def fly_all(command: ViewCommand) -> list[tuple[str, Trajectory]]:
     """
     flights = []
     evaluators = {}
-    shared = {
+    options = {
         field.name: getattr(command, field.name)
         for field in dataclasses.fields(FlightOptions)
     }
-    for loaded in command.start():
+    for policy in command.start():
         # each policy flies the game that it was trained in
-        own = EvaluateCommand(
-            **shared, episodes=1, environment=loaded.settings.environment
+        evaluation = EvaluateCommand(
+            **options, episodes=1, environment=policy.settings.environment
         )
-        _, episodes = fly_scenarios(own, loaded, evaluators)
-        flights += [(loaded.source, episode) for episode in episodes]
+        _, episodes = fly_scenarios(evaluation, policy, evaluators)
+        flights += [(policy.source, episode) for episode in episodes]
     return flights
 
 
@@ -151,12 +151,12 @@ def page_server(page: str, port: int) -> ThreadingHTTPServer:
             host = self.headers.get("Host", "").rpartition(":")[0] or self.headers.get(
                 "Host", ""
             )
-            found = self.path == "/" and host in OWN_NAMES
-            self.send_response(200 if found else 404)
+            is_page = self.path == "/" and host in OWN_NAMES
+            self.send_response(200 if is_page else 404)
             self.send_header("Content-Type", "text/html; charset=utf-8")
-            self.send_header("Content-Length", str(len(content) if found else 0))
+            self.send_header("Content-Length", str(len(content) if is_page else 0))
             self.end_headers()
-            if found:
+            if is_page:
                 self.wfile.write(content)
 
         def log_message(self, *_):

@@ -43,13 +43,13 @@ def compare(flights: Path, references: Sequence[Path]) -> Change:
     new_case, new, quality = read(Path(flights))
     old: list[FlightFigures] = []
     for folder in references:
-        case, figures, found = read(Path(folder))
+        case, figures, issues = read(Path(folder))
         if {f.vehicle for f in case.flights} != {f.vehicle for f in new_case.flights}:
             raise UserError(
                 f"{folder}: holds flights of another vehicle than {flights}"
             )
         old += figures
-        quality += found
+        quality += issues
     return change_between(
         Path(flights).resolve().name, new, old, new_case, tuple(quality)
     )
@@ -67,11 +67,11 @@ def read(folder: Path) -> tuple[Case, list[FlightFigures], list[Issue]]:
     quality = list(case.quality)
     figures = []
     for flight in case.flights:
-        found = figures_of(flight, case, str(folder))
-        if isinstance(found, str):
-            quality.append(Issue(flight.name, found, refused=True, kind="comparison"))
+        values = figures_of(flight, case, str(folder))
+        if isinstance(values, str):
+            quality.append(Issue(flight.name, values, refused=True, kind="comparison"))
         else:
-            figures.append(found)
+            figures.append(values)
     if not figures:
         reasons = "; ".join(dict.fromkeys(i.issue for i in quality if i.refused))
         raise UserError(f"{folder}: no flight can be compared: {reasons}")
@@ -90,31 +90,33 @@ def change_between(
     """
     mixer = mixer_of(case.vehicle_of(case.flights[0]))
     battery = battery_of([*new, *old])
-    before, after = (by_day(f, battery) for f in (old, new))
-    spread, freedom = spread_of_days(before, after)
-    difference = after.mean - before.mean
-    days = 1 / np.maximum(before.count, 1) + 1 / np.maximum(after.count, 1)
+    old_days, new_days = (by_day(f, battery) for f in (old, new))
+    spread, freedom = spread_of_days(old_days, new_days)
+    difference = new_days.mean - old_days.mean
+    days = 1 / np.maximum(old_days.count, 1) + 1 / np.maximum(new_days.count, 1)
     charge = spread_of_charge([*new, *old])
-    scale = np.sqrt(spread**2 * days + before.error**2 + after.error**2 + charge**2)
-    trims = before.mean[: len(TRIMS)]
+    scale = np.sqrt(
+        spread**2 * days + old_days.error**2 + new_days.error**2 + charge**2
+    )
+    trims = old_days.mean[: len(TRIMS)]
     hypotheses = hypotheses_of(mixer, trims)
     evidence = weigh(hypotheses, difference, scale, freedom)
-    logged = [case.vehicle_file.motor_permutation[j] + 1 for j in range(4)]
+    motor_numbers = [case.vehicle_file.motor_permutation[j] + 1 for j in range(4)]
     place, within = evidence.place()
-    here = evidence.causes_at(within)
+    causes = evidence.causes_at(within)
     reach = 1.645 * scale
     return Change(
         name=name,
         changed=evidence.changed > SHOWN,
         probability=evidence.changed,
         trims_changed=evidence.changed > SHOWN
-        and not CAUSES[max(here, key=lambda c: here[c])].figures,
-        rotors=tuple(sorted(logged[j] for j in place)),
+        and not CAUSES[max(causes, key=lambda c: causes[c])].figures,
+        rotors=tuple(sorted(motor_numbers[j] for j in place)),
         side=ROTOR_PLACES[place[0]] if len(place) == 1 else SIDES.get(place, ""),
         causes=evidence.causes,
-        causes_here=here,
+        causes_here=causes,
         places={
-            tuple(sorted(logged[j] for j in p)): share
+            tuple(sorted(motor_numbers[j] for j in p)): share
             for p, share in evidence.places.items()
         },
         size=evidence.size(within),

@@ -156,13 +156,13 @@ def hypotheses_of(mixer: np.ndarray, trims: np.ndarray) -> Hypotheses:
     draws = _Draws(mixer, trims)
     _rotors(draws)
     _weights(draws)
-    for cause, told in CAUSES.items():
-        if not told.figures:
+    for cause, cause_card in CAUSES.items():
+        if not cause_card.figures:
             continue
-        size = told.usual[0] + told.usual[1] * draws.normal[:, 0]
+        size = cause_card.usual[0] + cause_card.usual[1] * draws.normal[:, 0]
         each = {
             n: size * (1 + INEXACT * draws.normal[:, k + 1])
-            for k, n in enumerate(told.figures)
+            for k, n in enumerate(cause_card.figures)
         }
         if cause == "motors":
             each["loop_gain"] = LOOP_WITH_MOTORS * size * draws.normal[:, 2]
@@ -170,14 +170,14 @@ def hypotheses_of(mixer: np.ndarray, trims: np.ndarray) -> Hypotheses:
     anything = USUAL_CHANGE / 2 * draws.normal[:, :4]
     each = dict(zip(TRIMS, anything.T, strict=True))
     draws.add("something else", 1.0, each, (), np.abs(anything).sum(1))
-    joined = zip(*draws.parts, strict=True)
-    change, weight, cause, place, sizes = (np.concatenate(part) for part in joined)
+    parts = zip(*draws.parts, strict=True)
+    change, weight, cause, place, sizes = (np.concatenate(part) for part in parts)
     return Hypotheses(change, weight, cause, place, sizes, tuple(draws.place_of))
 
 
 def _rotors(draws: _Draws) -> None:
     """One rotor weaker, or two."""
-    sizes, lost = (
+    sizes, losses = (
         draws.sizes,
         draws.sizes / (1.0 + draws.sizes),
     )  # one that needs 1 + d has lost d / (1 + d)
@@ -185,18 +185,18 @@ def _rotors(draws: _Draws) -> None:
         factors = np.ones((DRAWS, 4))
         factors[:, rotor] += sizes[:, 0]
         draws.add(
-            "one rotor weaker", 0.25, draws.trims_of(factors), (rotor,), lost[:, 0]
+            "one rotor weaker", 0.25, draws.trims_of(factors), (rotor,), losses[:, 0]
         )
     for pair, side in SIDES.items():
         factors = np.ones((DRAWS, 4))
         factors[:, pair] += sizes
         places = np.full(DRAWS, draws.place_of[pair])
         for one, other in ((0, 1), (1, 0)):
-            alone = np.abs(sizes[:, other]) < LEAST_PARTNER * np.abs(sizes[:, one])
-            places[alone] = pair[one]
+            is_single = np.abs(sizes[:, other]) < LEAST_PARTNER * np.abs(sizes[:, one])
+            places[is_single] = pair[one]
         share = 0.05 if side == "diagonal" else 0.225
         draws.add(
-            "two rotors weaker", share, draws.trims_of(factors), places, lost.sum(1)
+            "two rotors weaker", share, draws.trims_of(factors), places, losses.sum(1)
         )
 
 
@@ -205,25 +205,25 @@ def _weights(draws: _Draws) -> None:
     # In units of the rotors' distance from the axes.
     radius = np.sqrt(2.0 * draws.places[:, 0])
     angle = 2 * np.pi * draws.places[:, 1]
-    left, rear = (radius * f(angle) for f in (np.cos, np.sin))
+    lateral, rear = (radius * f(angle) for f in (np.cos, np.sin))
     signs = 4.0 * draws.mixer[1:3]
     weight = draws.sizes[:, 0]
-    beside = left[:, None] * signs[0] + rear[:, None] * signs[1]
-    near = np.clip(0.5 * beside, -1.0, 1.0)
-    places = np.array([draws.place_of[_beside(row)] for row in near])
+    beside = lateral[:, None] * signs[0] + rear[:, None] * signs[1]
+    nearness = np.clip(0.5 * beside, -1.0, 1.0)
+    places = np.array([draws.place_of[_beside(row)] for row in nearness])
     factors = 1.0 + weight[:, None] * (1.0 + beside)
     draws.add("weight", 1.0, draws.trims_of(factors), places, 4.0 * weight)
     alike = np.repeat(1.0 + draws.sizes[:, :1], 4, 1)
     draws.add("whole vehicle", 1.0, draws.trims_of(alike), EVERYWHERE, 4.0 * weight)
 
 
-def _beside(near: np.ndarray) -> tuple[int, ...]:
+def _beside(nearness: np.ndarray) -> tuple[int, ...]:
     """The rotors beside a weight, from how near (4,) -1 to 1 it is to each: one, two of
     a side, or all.
     """
-    order = np.argsort(-near)
-    if near[order[0]] < 0.3:
+    order = np.argsort(-nearness)
+    if nearness[order[0]] < 0.3:
         return EVERYWHERE
-    if near[order[0]] - near[order[1]] > 0.4:
+    if nearness[order[0]] - nearness[order[1]] > 0.4:
         return (int(order[0]),)
     return tuple(sorted(int(i) for i in order[:2]))

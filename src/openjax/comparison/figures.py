@@ -150,11 +150,13 @@ def _trims(
     flight: Flight, motor: np.ndarray, rows: np.ndarray, mixer: np.ndarray
 ) -> dict:
     mixed = motor @ mixer.T
-    felt = _specific_thrust(flight)
+    specific_thrust = _specific_thrust(flight)
     block = (flight.time // BLOCK).astype(int)[rows]
     _, block = np.unique(block, return_inverse=True)
     count = np.bincount(block)
-    means = np.stack([np.bincount(block, c[rows]) / count for c in (*mixed.T, felt)], 1)
+    means = np.stack(
+        [np.bincount(block, c[rows]) / count for c in (*mixed.T, specific_thrust)], 1
+    )
     means = means[count > 0.5 * np.median(count)]
     weight = means.sum(0)
     out = {}
@@ -256,9 +258,9 @@ def _loop(torque, rates, commands) -> dict:
     three, so the commands are the instruments (two-stage least squares).
     """
     # motors hold from a row to the next: rates count in the middle
-    after = np.concatenate([rates[1:], rates[-1:]])
-    error = commands - 0.5 * (rates + after)
-    change = (after - rates) * RATE
+    next_rates = np.concatenate([rates[1:], rates[-1:]])
+    error = commands - 0.5 * (rates + next_rates)
+    change = (next_rates - rates) * RATE
     signals = (torque, error, change, *(np.roll(commands, k, 0) for k in DELAYS))
     filtered = np.stack([in_band(values, ANSWERING) for values in signals], -1)
     gains = []
@@ -284,7 +286,11 @@ def _shaking(gyro, motor) -> dict:
         np.array_split(in_band(values, (20.0, 45.0)), 6) for values in (gyro, motor)
     ]
     each = np.mean(
-        [[0.5 * np.log((p**2).sum(1).mean() + 1e-12) for p in own] for own in parts], 0
+        [
+            [0.5 * np.log((p**2).sum(1).mean() + 1e-12) for p in power]
+            for power in parts
+        ],
+        0,
     )
     return {
         "shaking": (float(each.mean()), float(each.std(ddof=1) / np.sqrt(len(each))))

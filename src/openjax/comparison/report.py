@@ -75,7 +75,7 @@ def to_dict(change: Change) -> dict:
 
 def in_words(change: Change) -> list[str]:
     """The answer in a few plain sentences."""
-    told = list(
+    sentences = list(
         dict.fromkeys(_cause_in_words(change, cause) for cause in change.likely_causes)
     )
     chance = (
@@ -83,11 +83,11 @@ def in_words(change: Change) -> list[str]:
     )
     if not change.changed:
         lines = [f"No change that these flights can show ({chance})."]
-        lines += [f"Below the spread of days; if anything, {told[0]}."] * (
+        lines += [f"Below the spread of days; if anything, {sentences[0]}."] * (
             change.probability > 0.2
         )
     else:
-        lines = [f"The vehicle changed ({chance}): {' or '.join(told)}."]
+        lines = [f"The vehicle changed ({chance}): {' or '.join(sentences)}."]
     if change.trims_changed:
         value, low, high = (
             100 * v for v in (change.size.value, change.size.low, change.size.high)
@@ -96,18 +96,18 @@ def in_words(change: Change) -> list[str]:
         lines.append(
             f"Size: {value:.0f} % [{low:.0f}, {high:.0f}] of a rotor's thrust{end}"
         )
-        if len(told) > 1:
+        if len(sentences) > 1:
             lines.append(
                 "These flights can't split the causes named; a weighed vehicle or another "
                 "propeller would."
             )
     elif change.changed:
-        moved = dict.fromkeys(
+        names = dict.fromkeys(
             n for c in change.likely_causes for n in CAUSES[c].figures
         )
         lines += [
             f"{FIGURES[n].words.capitalize()}: {_difference(n, change.figures[n])}."
-            for n in moved
+            for n in names
             if n in change.figures
         ]
     if change.charge_unknown:
@@ -190,8 +190,12 @@ def html_of(change: Change) -> str:
         (FIGURES[name].words, _difference(name, d))
         for name, d in change.figures.items()
     ]
-    told = {"lines": in_words(change), "picture": picture, "differences": differences}
-    return filled("changes.html.jinja", Path(__file__).parent, change=change, **told)
+    content = {
+        "lines": in_words(change),
+        "picture": picture,
+        "differences": differences,
+    }
+    return filled("changes.html.jinja", Path(__file__).parent, change=change, **content)
 
 
 def draw(change: Change):
@@ -205,9 +209,11 @@ def draw(change: Change):
         for k, figures in enumerate((change.reference, change.flights)):
             days = list(dict.fromkeys(f.day for f in figures))
             for j, day in enumerate(days):
-                own = [f.values[name][0] for f in figures if f.day == day]
+                day_values = [f.values[name][0] for f in figures if f.day == day]
                 values = 100 * (
-                    np.array(own) / level - 1.0 if name == "hover" else np.array(own)
+                    np.array(day_values) / level - 1.0
+                    if name == "hover"
+                    else np.array(day_values)
                 )
                 place = k + 0.6 * ((j + 0.5) / len(days) - 0.5)
                 axis.plot(

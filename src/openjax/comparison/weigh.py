@@ -50,18 +50,18 @@ class Weighed:
 
     def causes_at(self, places: list[tuple[int, ...]]) -> dict[str, float]:
         """Probability of each cause at some places."""
-        here = self._within(places)
+        inside = self._within(places)
         each = np.bincount(
-            self.hypotheses.cause[here], self.posterior[here], len(CAUSES)
+            self.hypotheses.cause[inside], self.posterior[inside], len(CAUSES)
         )
         return dict(zip(CAUSES, (each / each.sum()).tolist(), strict=True))
 
     def size(self, places: list[tuple[int, ...]]) -> Interval:
         """Median and 90 % interval of the size at some places."""
-        here = self._within(places)
-        order = np.argsort(self.hypotheses.size[here])
-        share = np.cumsum(self.posterior[here][order])
-        values = self.hypotheses.size[here][order]
+        inside = self._within(places)
+        order = np.argsort(self.hypotheses.size[inside])
+        share = np.cumsum(self.posterior[inside][order])
+        values = self.hypotheses.size[inside][order]
         low, middle, high = (
             float(values[np.searchsorted(share, q * share[-1])])
             for q in (0.05, 0.5, 0.95)
@@ -81,25 +81,25 @@ def weigh(
     difference, scale and freedom (F,) of the figures; what the logs don't give is NaN
     and tells nothing.
     """
-    given = np.isfinite(difference)
-    scale = scale[given]
-    freedom = freedom[given]
+    is_given = np.isfinite(difference)
+    scale = scale[is_given]
+    freedom = freedom[is_given]
 
     def log_density(rest: np.ndarray) -> np.ndarray:
         return -0.5 * (
-            (freedom + 1.0) * np.log1p((rest[..., given] / scale) ** 2 / freedom)
+            (freedom + 1.0) * np.log1p((rest[..., is_given] / scale) ** 2 / freedom)
         ).sum(-1)
 
     none = log_density(difference)
     # what would show only in figures that these logs lack can't be weighed
-    shows = (hypotheses.change[:, given] != 0).any(1)
+    shows = (hypotheses.change[:, is_given] != 0).any(1)
     each = np.where(shows, np.log(hypotheses.weight), -np.inf) + log_density(
         difference - hypotheses.change
     )
     top = max(each.max(), none)
     posterior = PRIOR_CHANGED * np.exp(each - top)
     total = posterior.sum() + (1.0 - PRIOR_CHANGED) * np.exp(none - top)
-    changed = float(posterior.sum() / total)
+    probability = float(posterior.sum() / total)
     posterior /= posterior.sum()
     causes = {
         c: float(posterior[hypotheses.cause == k].sum()) for k, c in enumerate(CAUSES)
@@ -108,7 +108,7 @@ def weigh(
         p: float(posterior[hypotheses.place == k].sum())
         for k, p in enumerate(hypotheses.places)
     }
-    return Weighed(changed, causes, places, posterior, hypotheses)
+    return Weighed(probability, causes, places, posterior, hypotheses)
 
 
 def least_shown(
@@ -131,7 +131,7 @@ def least_shown(
             change[: len(trims)] = trims_with(
                 mixer, trims, 1.0 + middle * (np.arange(4) == rotor)
             )
-            shown = weigh(hypotheses, change, scale, freedom).changed > SHOWN
-            low, high = (low, middle) if shown else (middle, high)
+            is_shown = weigh(hypotheses, change, scale, freedom).changed > SHOWN
+            low, high = (low, middle) if is_shown else (middle, high)
         worst = max(worst, high / (1.0 + high))
     return worst

@@ -68,14 +68,14 @@ class Evaluator:
         """
         numbers = [tasks.evader_position.shape[0] for tasks in kinds.values()]
         if not any(number % self.batch for number in numbers):
-            flown = []
+            results = []
             for name, tasks in kinds.items():
                 tell(name)
                 evaluation, records = self._fly(parameters, tasks, key)
-                flown.append(Flown(self, name, tasks, evaluation, records))
-            return flown
-        packed, part = stacked(kinds)
-        evaluation, records = self._fly(parameters, packed, key)
+                results.append(Flown(self, name, tasks, evaluation, records))
+            return results
+        one_stack, part = stacked(kinds)
+        evaluation, records = self._fly(parameters, one_stack, key)
         parts = part(evaluation)
         first = np.cumsum([0, *numbers])
         return [
@@ -144,14 +144,14 @@ class Flown:
         record = jax.tree.map(lambda leaf: np.asarray(leaf[place]), self.records[batch])
         settings = self.evaluator.settings
         task = jax.tree.map(lambda leaf: np.asarray(leaf[episode]), self.tasks)
-        there = slice(None) if task.active is None else task.active  # no empty slots
+        members = slice(None) if task.active is None else task.active  # no empty slots
         return Trajectory(
             title=title,
-            pursuer_position=_on_the_floor(record.pursuers[:, there]),
-            pursuer_quaternion=record.quaternion[:, there],
+            pursuer_position=_on_the_floor(record.pursuers[:, members]),
+            pursuer_quaternion=record.quaternion[:, members],
             evader_position=record.evader,
-            captured=record.captured[:, there],
-            crashed=record.crashed[:, there],
+            captured=record.captured[:, members],
+            crashed=record.crashed[:, members],
             pillar_position=task.pillar_position[task.pillar_active],
             arena_radius=settings.arena_radius,
             arena_height=settings.arena_height,

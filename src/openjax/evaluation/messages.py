@@ -101,9 +101,11 @@ class Hearsay:
         lost.
         """
         number = state.drones.position.shape[0]
-        sent = _sent(state)
+        reports = _sent(state)
         line = jax.tree.map(
-            lambda old, new: jnp.concatenate([old, new[None]]), beliefs.on_the_way, sent
+            lambda old, new: jnp.concatenate([old, new[None]]),
+            beliefs.on_the_way,
+            reports,
         )
         arriving = jax.tree.map(lambda leaf: leaf[0], line)
         # (N, N): row by row what each pursuer hears of each
@@ -120,13 +122,13 @@ class Hearsay:
             believed = jnp.where(has_report[:, None], by_report, by_belief)
             return jnp.where(sees[:, None], by_itself, believed)
 
-        evader = newest(sent.evader, arriving.evader, beliefs.evader)
+        evader = newest(reports.evader, arriving.evader, beliefs.evader)
         velocity = newest(
-            sent.evader_velocity, arriving.evader_velocity, beliefs.evader_velocity
+            reports.evader_velocity, arriving.evader_velocity, beliefs.evader_velocity
         )
         reported = jnp.where(has_report, arriving.step, beliefs.reported)
-        seen = sees | has_report
-        beliefs = _with_teammates(beliefs, sent, arriving, arrives)
+        has_sight = sees | has_report
+        beliefs = _with_teammates(beliefs, reports, arriving, arrives)
         thought = jax.vmap(functools.partial(self._thought, state))(
             beliefs.replace(on_the_way=None)
         )
@@ -134,8 +136,8 @@ class Hearsay:
             evader=evader,
             evader_velocity=velocity,
             reported=jnp.where(sees, state.step, reported),
-            seen=seen,
-            last_seen=jnp.where(seen[:, None], evader, thought),
+            seen=has_sight,
+            last_seen=jnp.where(has_sight[:, None], evader, thought),
             on_the_way=jax.tree.map(lambda leaf: leaf[1:], line),
         )
         return beliefs.replace(frames=self._frames(beliefs, state))
@@ -192,19 +194,19 @@ class Hearsay:
         return jax.vmap(view)(jnp.arange(number), beliefs.replace(on_the_way=None))
 
 
-def _with_teammates(beliefs, sent, arriving, arrives):
+def _with_teammates(beliefs, reports, arriving, arrives):
     """Beliefs after messages (N, N) of who `arrives`, and what each knows of itself."""
     is_itself = jnp.eye(len(arrives), dtype=bool)
 
     def told(by_itself, by_message, by_belief):
         axes = (..., *[None] * (by_belief.ndim - 2))
-        heard = jnp.where(arrives[axes], by_message, by_belief)
-        return jnp.where(is_itself[axes], by_itself, heard)
+        told_by_all = jnp.where(arrives[axes], by_message, by_belief)
+        return jnp.where(is_itself[axes], by_itself, told_by_all)
 
     return beliefs.replace(
-        position=told(sent.position, arriving.position, beliefs.position),
-        velocity=told(sent.velocity, arriving.velocity, beliefs.velocity),
-        told=told(sent.step, arriving.step, beliefs.told),
+        position=told(reports.position, arriving.position, beliefs.position),
+        velocity=told(reports.velocity, arriving.velocity, beliefs.velocity),
+        told=told(reports.step, arriving.step, beliefs.told),
     )
 
 

@@ -49,12 +49,12 @@ def shared_out(position, evaders, free):
     share = jnp.ceil(number / jnp.maximum(jnp.sum(free), 1))
 
     def pair(carry, _):
-        target, distance, left = carry
-        flat = jnp.argmin(jnp.where(left > 0, distance, jnp.inf))
+        target, distance, free = carry
+        flat = jnp.argmin(jnp.where(free > 0, distance, jnp.inf))
         pursuer, evader = jnp.divmod(flat, evaders.shape[0])
         target = target.at[pursuer].set(evader)
         distance = distance.at[pursuer].set(jnp.inf)
-        return (target, distance, left.at[evader].add(-1.0)), None
+        return (target, distance, free.at[evader].add(-1.0)), None
 
     start = (
         jnp.zeros(number, jnp.int32),

@@ -71,21 +71,23 @@ class Strangers:
         def one(worlds, _):
             actions = jnp.stack(
                 [
-                    policy.act(own, observation)
-                    for policy, own, (observation, _) in zip(
+                    policy.act(of_policy, observation)
+                    for policy, of_policy, (observation, _) in zip(
                         self.policies, parameters, worlds, strict=True
                     )
                 ],
                 axis=1,
             )
-            action = jax.vmap(lambda own, member: own[member, which])(actions, members)
+            action = jax.vmap(lambda of_policy, member: of_policy[member, which])(
+                actions, members
+            )
             action = jnp.clip(action, -1.0, 1.0)
             drones = jax.vmap(self.environments[0].move)(worlds[0][1], action)
-            after = []
+            results = []
             for game, (_, state) in zip(self.environments, worlds, strict=True):
                 observation, state, *_ = jax.vmap(game.follow)(state, action, drones)
-                after.append((observation, state))
-            return tuple(after), None
+                results.append((observation, state))
+            return tuple(results), None
 
         length = self.environments[0].settings.episode_length
         return jax.lax.scan(one, worlds, length=length)[0][0][1].statistics
@@ -104,8 +106,8 @@ def bootstrap_mean(
     generator = np.random.default_rng(seed)
     strata, episodes = values.shape
     means = np.zeros(draws)
-    for own in values:
-        chosen = generator.integers(episodes, size=(draws, episodes))
-        means += own[chosen].mean(axis=1) / strata
+    for episode_values in values:
+        resample = generator.integers(episodes, size=(draws, episodes))
+        means += episode_values[resample].mean(axis=1) / strata
     low, high = np.quantile(means, (0.025, 0.975))
     return float(low), float(high)

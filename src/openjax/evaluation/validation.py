@@ -56,8 +56,8 @@ def far_tasks(settings: PursuitSettings, number: int, slots: int) -> Task:
         def expand(task, key):
             return expand_task(settings, key, task), None
 
-        far, _ = jax.lax.scan(expand, task, keys)
-        return far
+        expanded, _ = jax.lax.scan(expand, task, keys)
+        return expanded
 
     # of another key than the uniform ones: no task is in both
     keys = jax.random.split(
@@ -84,20 +84,22 @@ class Validation:
         number: int,
         evaders: tuple[str, ...] = (),
     ):
-        drawn = environment.settings
+        settings = environment.settings
         self.number = number
         # drawn by the run's own game, which a wider one would draw otherwise; flown
         # with more slots
-        slots = layout_slots(drawn)
+        slots = layout_slots(settings)
         game = dataclasses.replace(
-            drawn, max_pillars=slots, evaders=evaders or drawn.evaders
+            settings, max_pillars=slots, evaders=evaders or settings.evaders
         )
         changes = {"evaders": None} if evaders else {}
-        wide = dataclasses.replace(environment, settings=game, dynamics=None, **changes)
-        self.evaluator = Evaluator(wide, policy, 2 * number)
+        wide_game = dataclasses.replace(
+            environment, settings=game, dynamics=None, **changes
+        )
+        self.evaluator = Evaluator(wide_game, policy, 2 * number)
         self.tasks: dict[str, Task] = {
-            "validation": uniform_tasks(drawn, self.number, slots),
-            "validation_far": far_tasks(drawn, self.number, slots),
+            "validation": uniform_tasks(settings, self.number, slots),
+            "validation_far": far_tasks(settings, self.number, slots),
         }
 
     def __call__(self, parameters: PolicyParameters) -> list[Flown]:

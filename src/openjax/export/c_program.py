@@ -89,7 +89,7 @@ def c_program(
     """
     writer, workspace, shape = _written(function, inputs, output)
     text = "\n".join(writer.statements)
-    read = {
+    buffers_read = {
         name: kind
         for name, kind in inputs.items()
         if f"in->{name}[" in text or f"in->{name}," in text
@@ -97,7 +97,7 @@ def c_program(
     values = {
         "about": about,
         "prefix": prefix,
-        "inputs": read,
+        "inputs": buffers_read,
         "output": output,
         "shape": shape,
         "workspace": workspace,
@@ -107,7 +107,7 @@ def c_program(
     return CProgram(
         header=_TEMPLATES.get_template("program.h.jinja").render(values),
         source=_TEMPLATES.get_template("program.c.jinja").render(values),
-        inputs=read,
+        inputs=buffers_read,
         shape=shape,
         numbers=sum(value.size for value in writer.constants),
         workspace=workspace,

@@ -53,7 +53,7 @@ class Array:
         """Whether its entries follow one another row by row."""
         axes = zip(self.shape, self.strides, row_by_row(self.shape), strict=True)
         return not self.number and all(
-            size == 1 or own == whole for size, own, whole in axes
+            size == 1 or stride == dense_stride for size, stride, dense_stride in axes
         )
 
     @property
@@ -138,11 +138,11 @@ class Writer(Walk):
                 strides[axis] = 0
         if value.size == 1:
             return Array("", shape, tuple(strides), number=literal(value.item()))
-        kept = np.ascontiguousarray(value).reshape(-1)
-        key = kept.tobytes()
+        values = np.ascontiguousarray(value).reshape(-1)
+        key = values.tobytes()
         if key not in self._names:
             self._names[key] = len(self.constants)
-            self.constants.append(kept)
+            self.constants.append(values)
         return Array(f"c{self._names[key]}", shape, tuple(strides))
 
     def new(self, shape: Sequence[int]) -> Array:
@@ -166,8 +166,10 @@ class Writer(Walk):
             for array in arrays
         ):
             # entry by entry in the order of memory: one loop does for all axes
-            whole = (math.prod(out.shape),)
-            arrays = [replace(array, shape=whole, strides=(1,)) for array in arrays]
+            flat_shape = (math.prod(out.shape),)
+            arrays = [
+                replace(array, shape=flat_shape, strides=(1,)) for array in arrays
+            ]
         indices = index_names(arrays[0].shape)
         target, *operands = (array.at(indices) for array in arrays)
         body = f"{target} = {form.format(*operands)};"
@@ -253,14 +255,14 @@ class Writer(Walk):
         return parts
 
     def _join(self, values, shape, axis):
-        joined = self.new(shape)
+        output = self.new(shape)
         start = 0
         for value in map(self.array, values):
             size = value.shape[axis]
             starts, part_shape = _within(shape, axis, start, size)
-            self.write(joined.part(starts, part_shape), "{}", [value])
+            self.write(output.part(starts, part_shape), "{}", [value])
             start += size
-        return joined
+        return output
 
     def _op_pad(self, operation):
         value, filling = map(self.array, operation.inputs)
@@ -311,4 +313,4 @@ class Writer(Walk):
 def _within(shape, axis, start, size):
     """Starts and shape of `size` entries along one axis."""
     starts = [start if a == axis else 0 for a in range(len(shape))]
-    return starts, [size if a == axis else whole for a, whole in enumerate(shape)]
+    return starts, [size if a == axis else extent for a, extent in enumerate(shape)]

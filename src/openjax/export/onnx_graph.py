@@ -194,7 +194,7 @@ def onnx_model(
     graph = _Graph()
     (result,) = graph.run(traced.jaxpr, traced.consts, list(inputs))
     graph.nodes.append(helper.make_node("Identity", [graph.name(result)], [output]))
-    read = {name for node in graph.nodes for name in node.input}
+    names_read = {name for node in graph.nodes for name in node.input}
 
     def described(name, kind):
         return helper.make_tensor_value_info(
@@ -206,7 +206,11 @@ def onnx_model(
         helper.make_graph(
             graph.nodes,
             "openjax_policy",
-            [described(name, kind) for name, kind in inputs.items() if name in read],
+            [
+                described(name, kind)
+                for name, kind in inputs.items()
+                if name in names_read
+            ],
             [helper.make_tensor_value_info(output, TensorProto.FLOAT, out.shape)],
             graph.initializers,
         ),

@@ -75,9 +75,11 @@ class Walk:
     def _op_stack(self, operation: Operation):
         shape = operation.shape
         axis = operation.parameters["axis"]
-        apart = (*shape[:axis], 1, *shape[axis + 1 :])
+        part_shape = (*shape[:axis], 1, *shape[axis + 1 :])
         return self._join(
-            [self._reshape(value, apart) for value in operation.inputs], shape, axis
+            [self._reshape(value, part_shape) for value in operation.inputs],
+            shape,
+            axis,
         )
 
     def _op_integer_pow(self, operation: Operation):

@@ -45,14 +45,14 @@ def check_agreement(flight: Flight, vehicle) -> list[Issue]:
     """Findings on a flight that has passed the other checks (sorted, finite, airborne);
     every one refuses it. `vehicle` gives the rotors' places and spins.
     """
-    found = [
+    issues = [
         ("garbage", text, ())
         for text in (*copied_columns(flight), *rows_at_random(flight))
     ]
     grid = clock_of(flight)
-    if grid is not None and not found:
+    if grid is not None and not issues:
         signals = Signals.of(flight, grid)
-        found = (
+        issues = (
             _upside_down(signals)
             or gravity_findings(signals.force)
             or _inverted(signals)
@@ -62,7 +62,7 @@ def check_agreement(flight: Flight, vehicle) -> list[Issue]:
         )
     return [
         Issue(flight.name, text, True, kind, tuple(against))
-        for kind, text, against in found
+        for kind, text, against in issues
     ]
 
 
@@ -74,12 +74,12 @@ def shown_right(flight: Flight, vehicle) -> set[str]:
     if grid is None:
         return set()
     signals = Signals.of(flight, grid)
-    shown = {
+    channels = {
         pair.what
         for pair in pairs_of(signals)
         if pair.tells.sum() >= min(2, len(pair.tells))
     }
-    return shown | ({MOTORS} if torques_fit(signals, vehicle) else set())
+    return channels | ({MOTORS} if torques_fit(signals, vehicle) else set())
 
 
 def other_frames(flight: Flight) -> str:
@@ -107,23 +107,23 @@ def _unit(pair: Pair) -> list[Finding]:
     """Columns of a pair that agrees but for its size, where a wrong unit explains
     that.
     """
-    found = pair.agreement
-    follows = (found.correlation > AGREE) & (found.reference > 1e-9)
+    agreement = pair.agreement
+    follows = (agreement.correlation > AGREE) & (agreement.reference > 1e-9)
     if not follows.any():
         return []
-    gain = float(np.median(found.measured[follows] / found.reference[follows]))
+    gain = float(np.median(agreement.measured[follows] / agreement.reference[follows]))
     for unit, factor in UNITS.get(pair.unit, ()):
         for columns, times in ((", ".join(pair.names), gain), (pair.what, 1.0 / gain)):
             if factor / UNIT < times < factor * UNIT:
-                wanted = "m" if pair.unit == "m/s^2" else pair.unit
-                text = f"{columns}: in {unit} ({times:.0f} times too large); the log format wants {wanted}"
+                logged_unit = "m" if pair.unit == "m/s^2" else pair.unit
+                text = f"{columns}: in {unit} ({times:.0f} times too large); the log format wants {logged_unit}"
                 return [("units", text, [pair.what])]
     # noise and an estimator's lag cost correlation, and change a gain of rms values by
     # as much
-    clear = pair.tells & (found.correlation > CLEAR)
+    clear = pair.tells & (agreement.correlation > CLEAR)
     if pair.holds != "body_rates" or clear.sum() < 2:
         return []
-    gains = found.measured[clear] / found.reference[clear]
+    gains = agreement.measured[clear] / agreement.reference[clear]
     if (gains < SAME).any() and (gains > 1 / SAME).any():
         return []
     text = f"{', '.join(pair.names)} are {np.median(gains):.2g} times {pair.what}"

@@ -59,30 +59,32 @@ def _attitude(part: Flight) -> np.ndarray:
     ends = size * np.arange(windows + 1)
     # an accelerometer feels what holds the vehicle against gravity, as if it
     # accelerated upwards
-    wanted = np.diff(velocity[ends], axis=0) / WINDOW + [0.0, 0.0, GRAVITY]
-    turned = _integrated(rates)
-    early = slice(0, max(int(START / WINDOW), FEWEST))
-    felt = _means(turned.apply(force), ends)
-    attitude = _kabsch(felt[early], wanted[early]) * turned
+    velocity_force = np.diff(velocity[ends], axis=0) / WINDOW + [0.0, 0.0, GRAVITY]
+    rotation = _integrated(rates)
+    beginning = slice(0, max(int(START / WINDOW), FEWEST))
+    measured_force = _means(rotation.apply(force), ends)
+    attitude = _kabsch(measured_force[beginning], velocity_force[beginning]) * rotation
     middle = time[ends[:-1]] + 0.5 * WINDOW - time[0]
     knots = max(int(np.ceil((time[-1] - time[0]) / KNOTS)) + 1, 2)
     weights = _hats(middle, knots)
     bias = np.zeros(3)
     total = np.zeros((knots, 3))
     for _ in range(STEPS):
-        push, drift = _step(attitude, force - bias, (ends, wanted, weights), total)
+        push, drift = _step(
+            attitude, force - bias, (ends, velocity_force, weights), total
+        )
         bias = bias + push
         total = total + drift
         attitude = Rotation.from_rotvec(_hats(time - time[0], knots) @ drift) * attitude
         if np.abs(drift).max() < 1e-4:
             break
     # without jumps between q and -q, so that rows between may be interpolated
-    found = attitude.as_quat(scalar_first=True)
-    found[1:] *= np.cumprod(np.where((found[1:] * found[:-1]).sum(1) < 0.0, -1.0, 1.0))[
-        :, None
-    ]
+    quaternion = attitude.as_quat(scalar_first=True)
+    quaternion[1:] *= np.cumprod(
+        np.where((quaternion[1:] * quaternion[:-1]).sum(1) < 0.0, -1.0, 1.0)
+    )[:, None]
     at = np.clip(part.time, time[0], time[-1])
-    out = np.stack([np.interp(at, time, column) for column in found.T], 1)
+    out = np.stack([np.interp(at, time, column) for column in quaternion.T], 1)
     return out / np.linalg.norm(out, axis=1, keepdims=True)
 
 
@@ -91,41 +93,41 @@ def _step(attitude: Rotation, force: np.ndarray, windows, total: np.ndarray):
     rad by which the attitude turns in the world. `windows`: ends, wanted forces (W, 3)
     and weights (W, knots) of the knots; `total` (knots, 3): turned so far.
     """
-    ends, wanted, weights = windows
-    felt = _means(attitude.apply(force), ends)
-    left = (wanted - felt) / FELT
+    ends, velocity_force, weights = windows
+    measured_force = _means(attitude.apply(force), ends)
+    residual = (velocity_force - measured_force) / FELT
     turn = _means(attitude.as_matrix().reshape(-1, 9), ends).reshape(-1, 3, 3)
     knots = weights.shape[1]
     by_bias = -turn / FELT
     # (W, 3, 3)
-    by_turn = np.stack([np.cross(axis, felt) for axis in np.eye(3)], 2) / FELT
+    by_turn = np.stack([np.cross(axis, measured_force) for axis in np.eye(3)], 2) / FELT
     columns = np.einsum("wk,wij->wikj", weights, by_turn).reshape(
-        len(felt), 3, 3 * knots
+        len(measured_force), 3, 3 * knots
     )
     columns = np.concatenate([by_bias, columns], 2).reshape(-1, 3 + 3 * knots)
     # The gyroscope's error walks at random from knot to knot.
     walk = np.kron(np.diff(np.eye(knots), axis=0), np.eye(3)) / WANDER
     prior = np.concatenate([np.zeros((len(walk), 3)), walk], 1)
     rows = np.concatenate([columns, prior, np.eye(3, 3 + 3 * knots) / BIAS])
-    target = np.concatenate([left.ravel(), -walk @ total.ravel(), np.zeros(3)])
-    found = np.linalg.lstsq(rows, target, rcond=1e-9)[0]
-    return found[:3], found[3:].reshape(knots, 3)
+    target = np.concatenate([residual.ravel(), -walk @ total.ravel(), np.zeros(3)])
+    solution = np.linalg.lstsq(rows, target, rcond=1e-9)[0]
+    return solution[:3], solution[3:].reshape(knots, 3)
 
 
 def _integrated(rates: np.ndarray) -> Rotation:
     """Attitudes of a body that turns with rates (T, 3) rad/s, from no rotation on."""
     turns = Rotation.from_rotvec(0.5 * (rates[1:] + rates[:-1]) * STEP).as_quat()
-    found = np.zeros((len(rates), 4))
-    found[0, 3] = 1.0
+    quaternion = np.zeros((len(rates), 4))
+    quaternion[0, 3] = 1.0
     for row, (x, y, z, w) in enumerate(turns):
-        a, b, c, d = found[row]
-        found[row + 1] = (
+        a, b, c, d = quaternion[row]
+        quaternion[row + 1] = (
             d * x + a * w + b * z - c * y,
             d * y - a * z + b * w + c * x,
             d * z + a * y - b * x + c * w,
             d * w - a * x - b * y - c * z,
         )
-    return Rotation.from_quat(found)
+    return Rotation.from_quat(quaternion)
 
 
 def _kabsch(vectors: np.ndarray, targets: np.ndarray) -> Rotation:

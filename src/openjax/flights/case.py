@@ -58,10 +58,10 @@ def load_case(path: str | Path, dtype=jnp.float32, comparison: bool = False) -> 
     mapping = (
         load_mapping(path / MAPPING_FILE) if (path / MAPPING_FILE).exists() else None
     )
-    read = [_read(log, vehicle_file, mapping) for log in logs]
-    kept, issues = _usable(read, vehicle_file, comparison)
-    issues += _not_flown(vehicle_file, read)
-    if not kept:
+    logs_read = [_read(log, vehicle_file, mapping) for log in logs]
+    flights, issues = _usable(logs_read, vehicle_file, comparison)
+    issues += _not_flown(vehicle_file, logs_read)
+    if not flights:
         reasons = [i for i in issues if i.refused]
         first = (
             f"{reasons[0].flight}: {reasons[0].issue}"
@@ -72,32 +72,34 @@ def load_case(path: str | Path, dtype=jnp.float32, comparison: bool = False) -> 
         raise UserError(f"{path}: no flight can be used: {first}{more}")
     # A thrust error is told from the mass only where every vehicle that flew was
     # weighed.
-    weighed = all(vehicle_file.mass_weighed_of(flight.vehicle) for flight in kept)
-    vehicle_file = dataclasses.replace(vehicle_file, mass_weighed=weighed)
-    return Case(path.resolve().name, tuple(kept), vehicle_file, tuple(issues), path)
+    is_weighed = all(vehicle_file.mass_weighed_of(flight.vehicle) for flight in flights)
+    vehicle_file = dataclasses.replace(vehicle_file, mass_weighed=is_weighed)
+    return Case(path.resolve().name, tuple(flights), vehicle_file, tuple(issues), path)
 
 
-def _not_flown(vehicle_file: VehicleFile, read) -> list[Issue]:
+def _not_flown(vehicle_file: VehicleFile, logs_read) -> list[Issue]:
     """What the vehicle file says of vehicles that are in none of the logs: an id with
     another spelling, whose mass would go unnoticed.
     """
-    flown = sorted({flight.vehicle for flights, _ in read for flight in flights})
-    others = sorted(set(vehicle_file.vehicles) - set(flown))
-    if not others or not flown:
+    vehicles = sorted(
+        {flight.vehicle for flights, _ in logs_read for flight in flights}
+    )
+    others = sorted(set(vehicle_file.vehicles) - set(vehicles))
+    if not others or not vehicles:
         return []
     tables = ", ".join(f"[vehicles.{name}]" for name in others)
-    text = f"{tables}: no log is of such a vehicle; they are of {', '.join(flown)}"
+    text = f"{tables}: no log is of such a vehicle; they are of {', '.join(vehicles)}"
     return [Issue("vehicle.toml", text, kind="vehicle")]
 
 
 def _held_instead(path: Path) -> str:
     """What a folder without a log holds, in words, and what a log is."""
     others = sorted(file.name for file in path.iterdir() if file.name not in NO_LOGS)
-    known = f"known are {', '.join(importer.name for importer in importers())}"
-    shown = ", ".join(others[:SHOWN]) + f" and {len(others) - SHOWN} more" * (
+    formats = f"known are {', '.join(importer.name for importer in importers())}"
+    listing = ", ".join(others[:SHOWN]) + f" and {len(others) - SHOWN} more" * (
         len(others) > SHOWN
     )
-    return f": {known}; it holds {shown}" if others else f"; {known}"
+    return f": {formats}; it holds {listing}" if others else f"; {formats}"
 
 
 def _called_otherwise(path: Path) -> str:
@@ -120,25 +122,25 @@ def _cases_inside(path):
 
 
 def _usable(
-    read, vehicle_file: VehicleFile, comparison: bool
+    logs_read, vehicle_file: VehicleFile, comparison: bool
 ) -> tuple[list[Flight], list[Issue]]:
-    """Of what was `read` of all logs the flights that can be used, checked and mended,
-    and what was found.
+    """Of the logs that were read the flights that can be used, checked and mended, and
+    what was found.
     """
-    flights = [flight for found, _ in read for flight in found]
-    issues = [issue for _, found in read for issue in found]
+    flights = [flight for found, _ in logs_read for flight in found]
+    issues = [issue for _, found in logs_read for issue in found]
     copies = duplicates(flights)
     for name, original in copies.items():
         text = f"the same values as {original}: a copy, left out"
         issues.append(Issue(name, text, refused=True, kind="duplicate"))
-    checked = [
+    results = [
         _check(f, vehicle_file, comparison) for f in flights if f.log not in copies
     ]
-    issues += [issue for _, found in checked for issue in found]
-    kept, found = _trusted(
-        [f for f, _ in checked if f is not None], issues, vehicle_file
+    issues += [issue for _, found in results for issue in found]
+    usable, found = _trusted(
+        [f for f, _ in results if f is not None], issues, vehicle_file
     )
-    return kept, issues + found
+    return usable, issues + found
 
 
 def _trusted(
@@ -150,13 +152,13 @@ def _trusted(
     failed = Counter(what for issue in issues for what in issue.against)
     if not failed:
         return flights, []
-    shown = [shown_right(f, vehicle_file.vehicle_of(f.vehicle)) for f in flights]
-    passed = Counter(what for flight in shown for what in flight)
+    channels = [shown_right(f, vehicle_file.vehicle_of(f.vehicle)) for f in flights]
+    counts = Counter(what for flight in channels for what in flight)
     out = []
-    found = []
-    for flight, right in zip(flights, shown, strict=True):
+    refusals = []
+    for flight, right in zip(flights, channels, strict=True):
         doubts = [
-            what for what in failed if what not in right and failed[what] > passed[what]
+            what for what in failed if what not in right and failed[what] > counts[what]
         ]
         if not doubts:
             out.append(flight)
@@ -165,8 +167,8 @@ def _trusted(
                 f"too calm to show that it doesn't contradict {doubts[0]}, as other flights of the "
                 "case do"
             )
-            found.append(Issue(flight.name, text, refused=True, kind="garbage"))
-    return out, found
+            refusals.append(Issue(flight.name, text, refused=True, kind="garbage"))
+    return out, refusals
 
 
 def _check(

@@ -164,10 +164,10 @@ def _while_motors_turn(flight: Flight, note) -> Flight:
     if not len(turning):
         return flight
     part = slice(turning[0], turning[-1] + 1)
-    cut = flight.duration - (flight.time[part.stop - 1] - flight.time[part.start])
-    if cut < LONG_REST:
+    seconds = flight.duration - (flight.time[part.stop - 1] - flight.time[part.start])
+    if seconds < LONG_REST:
         return flight
-    note("ground", f"{cut:.1f} s with motors at rest are cut away")
+    note("ground", f"{seconds:.1f} s with motors at rest are cut away")
     return flight.rows(part)
 
 
@@ -189,16 +189,16 @@ def _written_once(flight: Flight, note) -> Flight:
     """Without rows that repeat the one before in every column, as where a log was
     written twice.
     """
-    logged = [
+    channels = [
         getattr(flight, c) for c in CHANNEL_COLUMNS if getattr(flight, c) is not None
     ]
-    table = np.column_stack([flight.time, *(v.reshape(len(v), -1) for v in logged)])
+    table = np.column_stack([flight.time, *(v.reshape(len(v), -1) for v in channels)])
     same = (table[1:] == table[:-1]) | (np.isnan(table[1:]) & np.isnan(table[:-1]))
-    again = np.r_[False, same.all(1)]
-    if not again.any():
+    repeated = np.r_[False, same.all(1)]
+    if not repeated.any():
         return flight
-    note("time", f"{again.sum()} rows that stand twice were left out")
-    return flight.rows(~again)
+    note("time", f"{repeated.sum()} rows that stand twice were left out")
+    return flight.rows(~repeated)
 
 
 def _refuse_units(step: float) -> None:
@@ -357,15 +357,17 @@ def _without_lost_poses(flight: Flight, note) -> Flight:
             flight = dataclasses.replace(flight, position=place)
     if flight.quaternion is None:
         return flight
-    lost = (flight.quaternion == 0.0).all(1)
-    if not lost.any():
+    is_lost = (flight.quaternion == 0.0).all(1)
+    if not is_lost.any():
         return flight
     note(
         "corrupt",
-        f"{lost.sum()} poses whose quaternion is zero are taken as not sampled",
+        f"{is_lost.sum()} poses whose quaternion is zero are taken as not sampled",
     )
     channels = [c for c in ("position", "quaternion") if getattr(flight, c) is not None]
-    changes = {c: np.where(lost[:, None], np.nan, getattr(flight, c)) for c in channels}
+    changes = {
+        c: np.where(is_lost[:, None], np.nan, getattr(flight, c)) for c in channels
+    }
     return dataclasses.replace(flight, **changes)
 
 
@@ -479,8 +481,8 @@ def _long_runs(
     """`flags` (T,) without runs of less than `shortest` s: a dip of thrust in the air
     is a manoeuvre.
     """
-    kept = flags.copy()
+    long = flags.copy()
     for start, stop in runs_of(flags):
         if time[stop - 1] - time[start] < shortest:
-            kept[start:stop] = False
-    return kept
+            long[start:stop] = False
+    return long

@@ -74,22 +74,27 @@ def read_motor_clock(
     """
     both = zip(tracks, vehicles, strict=True)
     turning = (_turning(t, v, gyroscope) for t, v in both if t.motor is not None)
-    said = row if rows == "mean_before" else 0.0
+    row_time = row if rows == "mean_before" else 0.0
     by_a_row = dict.fromkeys(map(_flight_of, tracks), row)
-    late = {flight: -d for flight, d in _offsets(turning).items()}
-    usual = float(np.median(list(late.values()))) if late else said
+    delays = {flight: -d for flight, d in _offsets(turning).items()}
+    usual = float(np.median(list(delays.values()))) if delays else row_time
     least = _least(row, rows)
-    alike = not late or max(late.values()) - min(late.values()) < APART
-    if alike and -LATE < usual - said <= least:
-        return MotorClock(by_a_row if said else {}, True, {})
-    if alike and not said and row >= SLOWEST_ROW and least < usual < 1.5 * row + EARLY:
+    alike = not delays or max(delays.values()) - min(delays.values()) < APART
+    if alike and -LATE < usual - row_time <= least:
+        return MotorClock(by_a_row if row_time else {}, True, {})
+    if (
+        alike
+        and not row_time
+        and row >= SLOWEST_ROW
+        and least < usual < 1.5 * row + EARLY
+    ):
         text = (
             f"motor commands act {1e3 * usual:.0f} ms before their row: rows hold what acted since "
             "the last one, and are read one row earlier"
         )
         return MotorClock(by_a_row, True, {"motor rows": text})
     words = _in_words(
-        {flight: time for flight, time in late.items() if abs(time) > least}
+        {flight: time for flight, time in delays.items() if abs(time) > least}
     )
     text = (
         f"motors and {'gyroscope' if gyroscope else 'attitude'} don't share a clock: motor "
@@ -97,8 +102,8 @@ def read_motor_clock(
         "told from these logs"
     )
     if alike:  # what tells no clock has that of the others
-        late = dict.fromkeys(by_a_row, usual) | late
-    return MotorClock(late, False, {"motor clock": text})
+        delays = dict.fromkeys(by_a_row, usual) | delays
+    return MotorClock(delays, False, {"motor clock": text})
 
 
 def _least(row: float, rows: str) -> float:
@@ -109,11 +114,11 @@ def _least(row: float, rows: str) -> float:
     return half + EARLY + (0.5 * row if rows == "sample" else 0.0)
 
 
-def _in_words(late: dict[str, float]) -> str:
+def _in_words(delays: dict[str, float]) -> str:
     """How late each flight is."""
     return ", ".join(
         f"{1e3 * abs(time):.0f} ms {'late' if time > 0 else 'early'} in {flight}"
-        for flight, time in late.items()
+        for flight, time in delays.items()
     )
 
 
@@ -121,27 +126,27 @@ def on_gyroscope_clock(track: Track, clock: MotorClock) -> Track:
     """The track with its motor commands when they act. Without one clock they tell the
     thrust and no torques.
     """
-    late = clock.late.get(_flight_of(track), 0.0)
-    if track.motor is None or (late == 0.0 and clock.one_clock):
+    delay = clock.late.get(_flight_of(track), 0.0)
+    if track.motor is None or (delay == 0.0 and clock.one_clock):
         return track
     fast = track.fast_thrust
     return dataclasses.replace(
         track,
-        motor=earlier(track.motor, -late, track),
-        fast_thrust=None if fast is None else (fast[0] - late, fast[1]),
+        motor=earlier(track.motor, -delay, track),
+        fast_thrust=None if fast is None else (fast[0] - delay, fast[1]),
         motors_logged=track.motors_logged and clock.one_clock,
     )
 
 
-def case_on_gyroscope_clock(case: Case, late: Mapping[str, float]) -> Case:
+def case_on_gyroscope_clock(case: Case, delays: Mapping[str, float]) -> Case:
     """A case whose flights hold their motor commands when they act, see
     `MotorClock.late`.
     """
     flights = []
     for flight in case.flights:
-        moved = late.get(flight.name, 0.0)
-        if moved and flight.motor_command is not None:
-            acting = flight.time + moved
+        delay = delays.get(flight.name, 0.0)
+        if delay and flight.motor_command is not None:
+            acting = flight.time + delay
             motor = flight.interpolated("motor_command", acting)
             for begin, end in flight.holes("motor_command", MAX_GAP, MISSED_SAMPLES):
                 motor[(acting > begin) & (acting < end)] = np.nan
@@ -156,13 +161,13 @@ def read_command_clock(tracks: Sequence[Track], row: float) -> str:
     """
     both = [t for t in tracks if t.command is not None and t.motor is not None]
     pairs = ((t, t.motor.mean(1)[:, None], t.command[:, :1]) for t in both)
-    late = {
+    delays = {
         f: -d for f, d in _offsets(pairs).items() if not -1.5 * row - EARLY < d < LINK
     }
     return (
-        f"commands and motors don't share a clock: commands are {_in_words(late)}; they aren't "
+        f"commands and motors don't share a clock: commands are {_in_words(delays)}; they aren't "
         "used, and link and rate controller can't be told from these logs"
-        if late
+        if delays
         else ""
     )
 
@@ -177,8 +182,8 @@ def _offsets(signals) -> dict[str, float]:
     `signals` (track, that one, the other) that are alike.
     """
     likeness: dict[str, list] = {}
-    for track, late, early in signals:
-        if (found := _likeness(late, early, track.dt)) is not None:
+    for track, effect, cause in signals:
+        if (found := _likeness(effect, cause, track.dt)) is not None:
             likeness.setdefault(_flight_of(track), []).append((found, track.dt / FINER))
     curves = {}
     for flight, parts in likeness.items():
@@ -204,12 +209,12 @@ def _offsets(signals) -> dict[str, float]:
     return out
 
 
-def _peak(whole: np.ndarray, step: float) -> float:
+def _peak(likeness: np.ndarray, step: float) -> float:
     """The offset, s, of the highest peak of a curve (N,) around zero; of peaks that are
     as high that of the one in the middle, as where a flight is periodic.
     """
-    best, middle = int(np.argmax(whole)), len(whole) // 2
-    high = find_peaks(whole, BETTER * whole[best], distance=int(APART / step))[0]
+    best, middle = int(np.argmax(likeness)), len(likeness) // 2
+    high = find_peaks(likeness, BETTER * likeness[best], distance=int(APART / step))[0]
     if len(high):
         best = int(high[np.argmin(np.abs(high - middle))])
     return (best - middle) * step
@@ -220,29 +225,29 @@ def _on(grid: np.ndarray, values: np.ndarray, step: float) -> np.ndarray:
     return np.interp(grid, step * (np.arange(len(values)) - len(values) // 2), values)
 
 
-def _likeness(late: np.ndarray, early: np.ndarray, dt: float) -> np.ndarray | None:
+def _likeness(effect: np.ndarray, cause: np.ndarray, dt: float) -> np.ndarray | None:
     """Squared correlation, with its sign, of two signals (T, C) at offsets up to REACH
     in steps of a row / FINER; mean of the columns.
     """
     edge = int(EDGE / dt)
-    if len(late) < 4 * edge:
+    if len(effect) < 4 * edge:
         return None
     band = butter(
         2, (BAND[0], min(BAND[1], 0.4 / dt)), "bandpass", fs=1 / dt, output="sos"
     )
-    passed = (sosfiltfilt(band, v, axis=0)[edge:-edge] for v in (late, early))
+    filtered = (sosfiltfilt(band, v, axis=0)[edge:-edge] for v in (effect, cause))
     # The one turn at a start outweighs a whole flight.
-    late, early = (
-        np.clip(v, -u, u) for v in passed for u in [LOUD * np.median(np.abs(v), 0)]
+    effect, cause = (
+        np.clip(v, -u, u) for v in filtered for u in [LOUD * np.median(np.abs(v), 0)]
     )
-    size = 1 << int(np.ceil(np.log2(2 * len(late))))
-    spectrum = np.fft.rfft(late, size, axis=0) * np.conj(
-        np.fft.rfft(early, size, axis=0)
+    size = 1 << int(np.ceil(np.log2(2 * len(effect))))
+    spectrum = np.fft.rfft(effect, size, axis=0) * np.conj(
+        np.fft.rfft(cause, size, axis=0)
     )
     steps = int(REACH / dt) * FINER
     cross = FINER * np.fft.irfft(spectrum, FINER * size, axis=0)
     cross = np.concatenate([cross[-steps:], cross[: steps + 1]])
-    power = np.sqrt((late**2).sum(0) * (early**2).sum(0))
+    power = np.sqrt((effect**2).sum(0) * (cause**2).sum(0))
     correlation = cross / np.maximum(power, 1e-12)
     return (np.abs(correlation) * correlation).mean(1)
 
@@ -255,9 +260,10 @@ def _turning(
     """
     rates = track.body_rates
     if not gyroscope or rates is None:
-        turned = turn_increments(track.quaternion) / track.dt
+        increments = turn_increments(track.quaternion) / track.dt
         rates = 0.5 * (
-            np.concatenate([turned[:1], turned]) + np.concatenate([turned, turned[-1:]])
+            np.concatenate([increments[:1], increments])
+            + np.concatenate([increments, increments[-1:]])
         )
     return track, np.diff(rates, axis=0) / track.dt, _torques(track, vehicle)[:-1]
 
@@ -269,9 +275,11 @@ def _torques(track: Track, vehicle) -> np.ndarray:
     place = np.asarray(vehicle.rotor_position, float)
     spin = np.asarray(vehicle.rotor_spin, float)
     time = float(vehicle.motor_time_constant)
-    kept = np.exp(-track.dt / time)
-    start = kept * track.motor[:1]
-    after = lfilter([1.0 - kept], [1.0, -kept], track.motor, axis=0, zi=start)[0]
-    before = np.concatenate([track.motor[:1], after[:-1]])
-    mean = track.motor + (before - track.motor) * (1.0 - kept) * time / track.dt
+    decay = np.exp(-track.dt / time)
+    start = decay * track.motor[:1]
+    response = lfilter([1.0 - decay], [1.0, -decay], track.motor, axis=0, zi=start)[0]
+    response_before = np.concatenate([track.motor[:1], response[:-1]])
+    mean = (
+        track.motor + (response_before - track.motor) * (1.0 - decay) * time / track.dt
+    )
     return mean @ np.stack([place[:, 1], -place[:, 0], spin], 1)

@@ -99,10 +99,12 @@ def find_header(lines: list[str], delimiter: str = "") -> Header:
 
     Raises LogError where there is no text.
     """
-    filled = [(i, line) for i, line in enumerate(lines[:MOST_ABOVE]) if line.strip()]
-    if not filled:
+    written_lines = [
+        (i, line) for i, line in enumerate(lines[:MOST_ABOVE]) if line.strip()
+    ]
+    if not written_lines:
         raise LogError("is empty: no column names")
-    (at, line), *below = filled
+    (at, line), *below = written_lines
     if len(line.strip()) == 5 and line.lower().startswith("sep=") and below:
         delimiter = delimiter or line[4]
         (at, line), *below = below
@@ -140,8 +142,8 @@ def _opened(path: Path, stack: ExitStack) -> io.BufferedIOBase:
         raise LogError(
             "is a zip archive or a spreadsheet: unpack it, or save it as CSV"
         )
-    packed = start.startswith(GZIP)
-    return stack.enter_context(gzip.open(path) if packed else path.open("rb"))
+    is_packed = start.startswith(GZIP)
+    return stack.enter_context(gzip.open(path) if is_packed else path.open("rb"))
 
 
 def _is_plain(data: bytes) -> bool:

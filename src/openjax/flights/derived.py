@@ -101,8 +101,8 @@ def derive_rates(flight: Flight, note) -> Flight:
         return flight
     half = min(half, _enough(attitude, step))
     slope, reach = _slopes(time, attitude, half)
-    (w, turned), (dw, changed) = ((q[:, :1], q[:, 1:]) for q in (attitude, slope))
-    rates = 2.0 * (w * changed - dw * turned - np.cross(turned, changed))
+    (w, vector), (dw, vector_slope) = ((q[:, :1], q[:, 1:]) for q in (attitude, slope))
+    rates = 2.0 * (w * vector_slope - dw * vector - np.cross(vector, vector_slope))
     rates[reach > 0.25] = np.nan
     derived = np.full((len(flight), 3), np.nan)
     derived[np.isfinite(flight.quaternion).all(1)] = rates

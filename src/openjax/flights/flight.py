@@ -152,8 +152,8 @@ class Flight:
         """
         at = np.r_[self.time[0], self.sampled(channel)[0], self.time[-1]]
         steps = np.diff(at)
-        wide = np.flatnonzero(steps > max(least, samples * np.median(steps)))
-        return np.stack([at[wide], at[wide + 1]], 1)
+        gaps = np.flatnonzero(steps > max(least, samples * np.median(steps)))
+        return np.stack([at[gaps], at[gaps + 1]], 1)
 
     def in_holes(
         self, channels: Iterable[str], least: float = HOLE, samples: float = 10.0

@@ -63,9 +63,9 @@ def read_kinematics(tracks: list[Track], limits) -> Kinematics:
     """
     streams = _streams(tracks, _turning, BAND)
     gain, error, coherence, turning = _gains(streams)
-    apart = turning & (coherence < ONE_CLOCK)
+    on_two_clocks = turning & (coherence < ONE_CLOCK)
     # An estimator's noise costs correlation as well, and is no matter of time.
-    one_clock = int(apart.sum()) < 2 or _wander(streams) < WANDER
+    one_clock = int(on_two_clocks.sum()) < 2 or _wander(streams) < WANDER
     tilt = None
     findings = {}
     if words := _unusual(gain, error, limits.gyroscope_gain):
@@ -110,14 +110,16 @@ def _of_one_chip(gain: np.ndarray, error: np.ndarray, standard_errors: float) ->
     than so many standard errors, which cover what the axes disagree by (Birge 1932);
     else 1.
     """
-    known = np.isfinite(gain)
-    if not known.any():
+    is_known = np.isfinite(gain)
+    if not is_known.any():
         return 1.0
-    gain = gain[known]
-    weight = 1.0 / np.maximum(error[known], 1e-6) ** 2
+    gain = gain[is_known]
+    weight = 1.0 / np.maximum(error[is_known], 1e-6) ** 2
     mean = float((weight * gain).sum() / weight.sum())
-    apart = (weight * (gain - mean) ** 2).sum() / max(len(gain) - 1, 1)
-    clear = abs(mean - 1.0) > standard_errors * np.sqrt(max(apart, 1.0) / weight.sum())
+    dispersion = (weight * (gain - mean) ** 2).sum() / max(len(gain) - 1, 1)
+    clear = abs(mean - 1.0) > standard_errors * np.sqrt(
+        max(dispersion, 1.0) / weight.sum()
+    )
     return mean if clear else 1.0
 
 
@@ -143,8 +145,10 @@ def corrected(track: Track, kinematics: Kinematics) -> Track:
         changes["body_rates"] = track.body_rates / kinematics.gain
     if kinematics.tilt is not None:
         turn = Rotation.from_rotvec([*-kinematics.tilt, 0.0])
-        logged = [n for n in ("position", "velocity") if getattr(track, n) is not None]
-        changes |= {name: turn.apply(getattr(track, name)) for name in logged}
+        channels = [
+            n for n in ("position", "velocity") if getattr(track, n) is not None
+        ]
+        changes |= {name: turn.apply(getattr(track, name)) for name in channels}
         attitude = turn * Rotation.from_quat(track.quaternion, scalar_first=True)
         changes["quaternion"] = attitude.as_quat(scalar_first=True)
         if len(track.neighbours):
@@ -171,9 +175,9 @@ def _accelerating(track: Track) -> tuple[np.ndarray, np.ndarray] | None:
         or track.specific_force is None
     ):
         return None
-    felt = to_world(track.quaternion, track.specific_force)
+    force = to_world(track.quaternion, track.specific_force)
     velocity = np.gradient(track.position, track.dt, axis=0)
-    return felt, np.gradient(velocity, track.dt, axis=0)
+    return force, np.gradient(velocity, track.dt, axis=0)
 
 
 def _streams(tracks, signals_of, band) -> list[tuple[float, np.ndarray, np.ndarray]]:
@@ -186,8 +190,8 @@ def _streams(tracks, signals_of, band) -> list[tuple[float, np.ndarray, np.ndarr
         edge = int(EDGE / track.dt)
         if signals is None or len(signals[0]) < 4 * edge:
             continue
-        passed = butter(2, band, "bandpass", fs=1.0 / track.dt, output="sos")
-        first, second = (sosfiltfilt(passed, v, axis=0)[edge:-edge] for v in signals)
+        bandpass = butter(2, band, "bandpass", fs=1.0 / track.dt, output="sos")
+        first, second = (sosfiltfilt(bandpass, v, axis=0)[edge:-edge] for v in signals)
         out.append((track.dt, first, second))
     return out
 
@@ -232,8 +236,8 @@ def _wander(streams) -> float:
     how fast a signal changes, noise doesn't. Least squares over granules, each axis
     with a noise of its own.
     """
-    found = []
-    left = []
+    deviations = []
+    residuals = []
     for dt, a, b in streams:
         size = max(int(BLOCK / dt), 1)
         slope = np.gradient(a, dt, axis=0)
@@ -242,10 +246,12 @@ def _wander(streams) -> float:
                 part = slice(k, k + size)
                 noise = np.zeros(3)
                 noise[axis] = len(a[part])
-                found.append([*noise, (slope[part, axis] ** 2).sum()])
-                left.append(((a - b)[part, axis] ** 2).sum())
+                deviations.append([*noise, (slope[part, axis] ** 2).sum()])
+                residuals.append(((a - b)[part, axis] ** 2).sum())
     return (
-        float(np.sqrt(nnls(np.array(found), np.array(left))[0][-1])) if found else 0.0
+        float(np.sqrt(nnls(np.array(deviations), np.array(residuals))[0][-1]))
+        if deviations
+        else 0.0
     )
 
 
@@ -286,8 +292,8 @@ def _world(tracks) -> tuple[np.ndarray, np.ndarray] | None:
         bias = np.zeros((len(track), 3, 2 + 3 * len(flights)))
         bias[:, 0, 1] = GRAVITY  # gravity, seen from a world that leans
         bias[:, 1, 0] = -GRAVITY
-        own = 2 + 3 * flights.index(track.flight)
-        bias[:, :, own : own + 3] = turn
+        first_bias = 2 + 3 * flights.index(track.flight)
+        bias[:, :, first_bias : first_bias + 3] = turn
         both = np.concatenate([bias, rest[:, :, None]], 2).reshape(len(track), -1)
         both = sosfiltfilt(low, both, axis=0)[edge:-edge].reshape(
             -1, 3, bias.shape[2] + 1

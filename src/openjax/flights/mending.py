@@ -100,8 +100,11 @@ def attitudes(signals: Signals) -> Iterator[tuple[str, np.ndarray]]:
             attitude = signals.quaternion[:, order] * sign
             if _turns_with(signals, attitude):
                 # quaternion[:, order[i]] is what should stand at i
-                held = ", ".join("wxyz"[order.index(i)] for i in range(4))
-                yield f"the quaternion is in the order {held}{way}; {WANTED}", attitude
+                order_words = ", ".join("wxyz"[order.index(i)] for i in range(4))
+                yield (
+                    f"the quaternion is in the order {order_words}{way}; {WANTED}",
+                    attitude,
+                )
 
 
 def _turns_with(signals: Signals, attitude: np.ndarray) -> bool:
@@ -110,10 +113,12 @@ def _turns_with(signals: Signals, attitude: np.ndarray) -> bool:
         return False
     if signals.body_rates is None:
         return True
-    turned = in_band(rates_of(attitude), WIDE)
-    felt = in_band(signals.body_rates, WIDE)
-    power = max(float(np.sqrt((turned**2).sum() * (felt**2).sum())), 1e-12)
-    return float((turned * felt).sum()) > FOLLOWED * power
+    attitude_rates = in_band(rates_of(attitude), WIDE)
+    gyroscope_rates = in_band(signals.body_rates, WIDE)
+    power = max(
+        float(np.sqrt((attitude_rates**2).sum() * (gyroscope_rates**2).sum())), 1e-12
+    )
+    return float((attitude_rates * gyroscope_rates).sum()) > FOLLOWED * power
 
 
 def _relabelled(signals: Signals, pair: Pair, bad: list[Pair]) -> str:
@@ -141,9 +146,13 @@ def _relabelled(signals: Signals, pair: Pair, bad: list[Pair]) -> str:
     if not agrees(dataclasses.replace(signals, **changes), bad):
         return ""
     # values[:, order[i]] is what column i should hold
-    held = {order[i]: f"{'minus ' if signs[i] < 0 else ''}{'xyz'[i]}" for i in range(3)}
+    axis_words = {
+        order[i]: f"{'minus ' if signs[i] < 0 else ''}{'xyz'[i]}" for i in range(3)
+    }
     words = ", ".join(
-        f"{names[k]} holds {held[k]}" for k in range(3) if held[k] != "xyz"[k]
+        f"{names[k]} holds {axis_words[k]}"
+        for k in range(3)
+        if axis_words[k] != "xyz"[k]
     )
     return f"{pair.holds.replace('_', ' ')} axes: {words}, by {pair.what}"
 

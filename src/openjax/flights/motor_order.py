@@ -21,7 +21,7 @@ def order_findings(signals: Signals, vehicle) -> list[Finding]:
     torques = _torques(signals, vehicle)
     if not torques:
         return []
-    logged, (rotors, best) = (
+    track_torques, (rotors, best) = (
         torques[IDENTITY],
         max(torques.items(), key=lambda item: item[1].sum()),
     )
@@ -30,14 +30,14 @@ def order_findings(signals: Signals, vehicle) -> list[Finding]:
     if (
         best.min() > 0.4
         and best.mean() > 0.65
-        and (logged < AGREE * best).any()
-        and (best - logged).sum() > 0.6
+        and (track_torques < AGREE * best).any()
+        and (best - track_torques).sum() > 0.6
     ):
         return [("motors", _order_in_words(*rotors), [MOTORS])]
-    if (in_band(signals.rates[:, :2], TURNING).std(0) > 0.3).all() and logged[
+    if (in_band(signals.rates[:, :2], TURNING).std(0) > 0.3).all() and track_torques[
         :2
     ].max() < 0.15:
-        text = f"correlation {logged[0]:.2f} in roll and {logged[1]:.2f} in pitch"
+        text = f"correlation {track_torques[0]:.2f} in roll and {track_torques[1]:.2f} in pitch"
         text += f" while the body turns at {signals.rates[:, :2].std():.1f} rad/s"
         return [
             (
@@ -76,13 +76,13 @@ def _torques(signals: Signals, vehicle) -> dict[tuple, np.ndarray]:
     shifted = np.stack([np.roll(lagged, lag, 0) for lag in OFFSETS])
     cross = np.einsum("ti,ltj->lij", measured, shifted)
     among = np.einsum("lti,ltj->lij", shifted, shifted)
-    found = {}
+    torques = {}
     for order, flip in itertools.product(itertools.permutations(range(4)), (1.0, -1.0)):
         mixed = mixing[:, order] * [[1.0], [1.0], [flip]]
         power = np.einsum("ij,ljk,ik->li", mixed, among, mixed) * (measured**2).sum(0)
         each = (mixed * cross).sum(2) / np.sqrt(np.maximum(power, 1e-24))
-        found[order, flip] = each[int(np.argmax(each.sum(1)))]
-    return found
+        torques[order, flip] = each[int(np.argmax(each.sum(1)))]
+    return torques
 
 
 def _order_in_words(order: tuple[int, ...], flip: float) -> str:

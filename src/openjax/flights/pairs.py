@@ -160,34 +160,34 @@ class Pair:
 
     def in_words(self) -> str:
         """Which columns contradict what, with the numbers."""
-        found = self.agreement
-        worst = int(np.argmin(np.where(self.bad, found.correlation, np.inf)))
+        agreement = self.agreement
+        worst = int(np.argmin(np.where(self.bad, agreement.correlation, np.inf)))
         columns = ", ".join(n for n, b in zip(self.names, self.bad, strict=True) if b)
         low, high = self.band
         return (
             f"contradictory: {columns} against {self.what}: "
-            f"correlation {found.correlation[worst]:.2f} "
-            f"where sensors allow {found.expected[worst]:.2f} "
-            f"({found.measured[worst]:.2g} against {found.reference[worst]:.2g} {self.unit} "
+            f"correlation {agreement.correlation[worst]:.2f} "
+            f"where sensors allow {agreement.expected[worst]:.2f} "
+            f"({agreement.measured[worst]:.2g} against {agreement.reference[worst]:.2g} {self.unit} "
             f"from {low:g} to {high:g} Hz)"
         )
 
 
 def pairs_of(s: Signals) -> Iterator[Pair]:
     """All pairs that were logged."""
-    turned = s.attitude_rates
+    attitude_rates = s.attitude_rates
     acceleration, order = s.acceleration
     rates = CHANNEL_COLUMNS["body_rates"]
     velocity = CHANNEL_COLUMNS["velocity"]
     commands = CHANNEL_COLUMNS["command_body_rates"]
-    if turned is not None and s.body_rates is not None:
+    if attitude_rates is not None and s.body_rates is not None:
         least = MOVED["rate"]
         what = "the attitude's rate"
         yield Pair(
             rates,
             s.body_rates,
             what,
-            turned,
+            attitude_rates,
             WIDE,
             least,
             "rad/s",
@@ -263,13 +263,22 @@ def _caused(s: Signals, along: np.ndarray | None, order: int) -> Iterator[Pair]:
     if s.motor is None:
         return
     collective = s.motor.mean(1, keepdims=True)
-    felt, order = (along, order) if s.force is None else (s.force[:, 2:], 0)
-    if felt is not None:
-        asked = collective * np.median(felt) / max(float(np.median(collective)), 1e-3)
+    force, order = (along, order) if s.force is None else (s.force[:, 2:], 0)
+    if force is not None:
+        forecast = (
+            collective * np.median(force) / max(float(np.median(collective)), 1e-3)
+        )
         what = "what the motors would make"
         least = MOVED["thrust"]
         yield Pair(
-            ("the force felt",), felt, what, asked, LOW, least, "m/s^2", (order, None)
+            ("the force felt",),
+            force,
+            what,
+            forecast,
+            LOW,
+            least,
+            "m/s^2",
+            (order, None),
         )
     if s.thrust is not None and not s.saturated:
         what = "m1 + m2 + m3 + m4"
@@ -315,28 +324,28 @@ def agreement(
     products = np.zeros(y.shape[1])
     powers = np.zeros((2, y.shape[1]))
     for part in np.array_split(np.arange(len(y)), max(len(y) // width, 1)):
-        own = y[part]
+        values = y[part]
         other = x[part]
-        scale = np.sqrt((own**2).sum(0) * (other**2).sum(0)) + 1e-12
+        scale = np.sqrt((values**2).sum(0) * (other**2).sum(0)) + 1e-12
         inner = slice(shift, len(part) - shift)
         each = [
-            (own[inner] * np.roll(other, lag, 0)[inner]).sum(0)
+            (values[inner] * np.roll(other, lag, 0)[inner]).sum(0)
             for lag in range(-shift, shift + 1)
         ]
         best = int(np.argmax((np.array(each) / scale).sum(1)))
-        moved = np.roll(other, best - shift, 0)[inner]
+        aligned = np.roll(other, best - shift, 0)[inner]
         products += each[best]
-        powers += [(own[inner] ** 2).sum(0), (moved**2).sum(0)]
+        powers += [(values[inner] ** 2).sum(0), (aligned**2).sum(0)]
     rms_y = y.std(0)
     rms_x = x.std(0)
     noise_y = _noise(measured, band, derivatives[0])
     noise_x = np.minimum(_noise(reference, band, derivatives[1]), rms_x)
-    moved = np.sqrt(rms_x**2 - noise_x**2)
-    expected = moved**2 / (
-        np.maximum(rms_x, 1e-12) * np.sqrt(moved**2 + noise_y**2 + 1e-24)
+    aligned = np.sqrt(rms_x**2 - noise_x**2)
+    expected = aligned**2 / (
+        np.maximum(rms_x, 1e-12) * np.sqrt(aligned**2 + noise_y**2 + 1e-24)
     )
     correlation = products / np.sqrt(np.maximum(powers.prod(0), 1e-24))
-    return Agreement(correlation, expected, moved, rms_y)
+    return Agreement(correlation, expected, aligned, rms_y)
 
 
 def _noise(

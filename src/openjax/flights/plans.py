@@ -46,11 +46,11 @@ def plan_of(segments: Iterable[str] = tuple(SEGMENTS)) -> SetPoints:
     extra = []
     names = []
     for name in segments:
-        flown = SEGMENTS[name].reference()
-        position.append(flown.position[:, 0])
-        yaw.append(flown.yaw[:, 0])
-        extra.append(flown.extra_command[:, 0])
-        names += [name] * len(flown.yaw)
+        reference = SEGMENTS[name].reference()
+        position.append(reference.position[:, 0])
+        yaw.append(reference.yaw[:, 0])
+        extra.append(reference.extra_command[:, 0])
+        names += [name] * len(reference.yaw)
     place = np.concatenate(position)
     velocity = np.gradient(place, PERIOD, axis=0)
     acceleration = np.gradient(velocity, PERIOD, axis=0)

@@ -106,11 +106,11 @@ def _gain(path: np.ndarray, other: np.ndarray) -> tuple[float, float]:
     # Errors of a path last: each second says one thing.
     weight = 1.0 / (PATH_ERROR**2 * RATE)
     normal = weight * columns.T @ columns + np.diag([0.0, 1.0 / DRIFT**2])
-    moved = float(normal[0, 0] - normal[0, 1] ** 2 / normal[1, 1])
-    if moved * PATH_ERROR**2 < MOVES**2 * len(path) / RATE:
+    information = float(normal[0, 0] - normal[0, 1] ** 2 / normal[1, 1])
+    if information * PATH_ERROR**2 < MOVES**2 * len(path) / RATE:
         return 1.0, np.inf
     gain = np.linalg.solve(normal, weight * columns.T @ (other - other.mean()))[0]
-    return float(gain), moved**-0.5
+    return float(gain), information**-0.5
 
 
 def _outside(gain: float, error: float, gains: tuple[float, float]) -> bool:
@@ -140,11 +140,11 @@ def rows_at_random(flight: Flight) -> Iterator[str]:
         ):
             continue
         time, values = flight.sampled(channel)
-        near = np.diff(time) < 0.03  # s: longer steps say nothing about continuity
-        if near.sum() < LEAST_ROWS:
+        is_near = np.diff(time) < 0.03  # s: longer steps say nothing about continuity
+        if is_near.sum() < LEAST_ROWS:
             continue
         spread = values.std(0)
-        steps = np.diff(values, axis=0)[near]
+        steps = np.diff(values, axis=0)[is_near]
         ratio = 0.5 * (steps**2).mean(0) / np.maximum(spread**2, 1e-18)
         bad = (ratio > RANDOM) & (spread > least)
         if bad.any():

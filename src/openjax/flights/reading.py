@@ -84,49 +84,49 @@ def read_csv(
     header = header._replace(line=above + header.line)
     _check_header(header, time)
     names = header.names
-    kept = [i for i, name in enumerate(names) if name != "vehicle" and name in known]
-    numbered, remarks = _whole_lines(lines, header)
+    places = [i for i, name in enumerate(names) if name != "vehicle" and name in known]
+    rows, remarks = _whole_lines(lines, header)
     number = _number if header.delimiter == "," else _number_with_comma
-    numbered, found = _without_units(numbered, header, kept, number)
-    remarks += found
+    rows, unit_remarks = _without_units(rows, header, places, number)
+    remarks += unit_remarks
     unknown = [n for n in names if n and n not in known]
     if unknown:
         remarks.append(
             f"unknown column{'s' * (len(unknown) > 1)} left out: {_listed(unknown)}"
         )
-    values = _numbers(numbered, header, kept, number)
-    remarks += _not_numbers(np.isinf(values), [names[i] for i in kept])
+    values = _numbers(rows, header, places, number)
+    remarks += _not_numbers(np.isinf(values), [names[i] for i in places])
     values[np.isinf(values)] = np.nan
     columns = {
         names[i]: np.ascontiguousarray(column)
-        for i, column in zip(kept, values.T, strict=True)
+        for i, column in zip(places, values.T, strict=True)
         if not np.isnan(column).all()
     }
     vehicle = np.full(len(values), "0")
     if "vehicle" in names:
-        vehicle = _vehicles(numbered, header.delimiter, names.index("vehicle"))
+        vehicle = _vehicles(rows, header.delimiter, names.index("vehicle"))
     return LogTable(path.name, columns, vehicle, tuple(remarks))
 
 
 def _numbers(
-    numbered: list[tuple[int, str]],
+    rows: list[tuple[int, str]],
     header: Header,
-    kept: list[int],
+    places: list[int],
     number: Callable[[str], float],
 ) -> np.ndarray:
-    """(R, columns) of the columns `kept`. Raises LogError where a cell is no number."""
-    lines = [line for _, line in numbered]
+    """(R, columns) of the columns `places`. Raises LogError where a cell is no number."""
+    lines = [line for _, line in rows]
     try:
         return np.loadtxt(
             lines,
             delimiter=header.delimiter,
-            usecols=kept,
+            usecols=places,
             ndmin=2,
             comments=None,
             converters=number,
         )
     except (ValueError, OverflowError) as error:
-        raise LogError(_why_not(numbered, header, kept, number, error)) from error
+        raise LogError(_why_not(rows, header, places, number, error)) from error
 
 
 def _not_numbers(bad: np.ndarray, names: list[str]) -> list[str]:
@@ -144,11 +144,9 @@ def _not_numbers(bad: np.ndarray, names: list[str]) -> list[str]:
     ]
 
 
-def _vehicles(
-    numbered: list[tuple[int, str]], delimiter: str, column: int
-) -> np.ndarray:
+def _vehicles(rows: list[tuple[int, str]], delimiter: str, column: int) -> np.ndarray:
     """(R,) ids of a column; "0" where it is empty."""
-    cells = (line.split(delimiter, column + 1)[column] for _, line in numbered)
+    cells = (line.split(delimiter, column + 1)[column] for _, line in rows)
     return np.array([cell.strip(' \t"') or "0" for cell in cells])
 
 
@@ -184,14 +182,14 @@ def flights_of(
         rows = np.flatnonzero(table.vehicle == vehicle_id)
         # in the long format a vehicle's rows hold what it logged, and nothing of the
         # others'
-        logged = {
+        arrays = {
             c: v[rows] for c, v in channels.items() if not np.isnan(v[rows]).all()
         }
         name = table.name if len(ids) == 1 else f"{table.name}:{vehicle_id}"
         time = table.columns["t"][rows]
         flights.append(
             Flight(
-                name, table.name, vehicle_id, time, fingerprint=fingerprint, **logged
+                name, table.name, vehicle_id, time, fingerprint=fingerprint, **arrays
             )
         )
     return flights, remarks
@@ -201,18 +199,18 @@ def _channel(
     table: LogTable, channel: str, names, remarks: list[str]
 ) -> np.ndarray | None:
     """(T,) or (T, columns) of one channel; None where it wasn't logged."""
-    found = [n for n in names if n in table.columns]
-    if len(found) < len(names):
-        missing = ", ".join(n for n in names if n not in table.columns)
-        if found and channel in WHOLE:
-            counted = "; motors are counted from 1" * (missing == "m4")
+    present = [n for n in names if n in table.columns]
+    if len(present) < len(names):
+        absent = ", ".join(n for n in names if n not in table.columns)
+        if present and channel in WHOLE:
+            counted = "; motors are counted from 1" * (absent == "m4")
             raise LogError(
-                f"{', '.join(found)} without {missing}: log {missing}, or none of "
+                f"{', '.join(present)} without {absent}: log {absent}, or none of "
                 f"them{counted}"
             )
-        if found:
+        if present:
             remarks.append(
-                f"{', '.join(found)} without {missing}: {channel} is left out; log {missing}"
+                f"{', '.join(present)} without {absent}: {channel} is left out; log {absent}"
             )
         return None
     values = np.stack([table.columns[n] for n in names], 1)
@@ -268,9 +266,9 @@ def _check_header(header: Header, time: str) -> None:
     if repeated:
         raise LogError(f"column {min(repeated)!r} occurs more than once")
     if time not in names:
-        asked = "t" if time == "t" else f"{time!r}, which columns.toml names for t"
+        time_name = "t" if time == "t" else f"{time!r}, which columns.toml names for t"
         raise LogError(
-            f"no column {asked}; the log has {_listed(n for n in names if n)}: say in columns.toml "
+            f"no column {time_name}; the log has {_listed(n for n in names if n)}: say in columns.toml "
             "which is which"
         )
 
@@ -317,9 +315,9 @@ def _whole_lines(
         del numbered[-1]
         remarks.append("the last line is cut off and left out")
     for number, line in numbered:
-        if (found := line.count(delimiter) + 1) != cells:
+        if (cell_count := line.count(delimiter) + 1) != cells:
             raise LogError(
-                f"line {number} has {found} cells, the header {cells} (cut off or corrupt)"
+                f"line {number} has {cell_count} cells, the header {cells} (cut off or corrupt)"
             )
     if not numbered:
         raise LogError("no rows")
@@ -327,21 +325,21 @@ def _whole_lines(
 
 
 def _without_units(
-    numbered: list[tuple[int, str]],
+    rows: list[tuple[int, str]],
     header: Header,
-    kept: list[int],
+    places: list[int],
     number: Callable[[str], float],
 ) -> tuple[list[tuple[int, str]], list[str]]:
     """The lines without a first one that holds units or other words, and a remark on
     it.
     """
-    row, first = numbered[0]
+    row, first = rows[0]
     cells = first.split(header.delimiter)
-    written = [cells[i] for i in kept if cells[i].strip()]
-    words = [cell for cell in written if not _is_number(cell, number)]
-    if len(numbered) < 2 or len(words) < 2 or 2 * len(words) <= len(written):
-        return numbered, []
-    return numbered[1:], [f"line {row} holds words, no numbers, and is left out"]
+    units = [cells[i] for i in places if cells[i].strip()]
+    words = [cell for cell in units if not _is_number(cell, number)]
+    if len(rows) < 2 or len(words) < 2 or 2 * len(words) <= len(units):
+        return rows, []
+    return rows[1:], [f"line {row} holds words, no numbers, and is left out"]
 
 
 def _number(cell: str) -> float:
@@ -372,17 +370,17 @@ def _is_number(cell: str, number: Callable[[str], float]) -> bool:
 
 
 def _why_not(
-    numbered: list[tuple[int, str]],
+    rows: list[tuple[int, str]],
     header: Header,
-    kept: list[int],
+    places: list[int],
     number: Callable[[str], float],
     error: Exception,
 ) -> str:
     """The first cell that is no number, in words."""
     names = header.names
-    for row, line in numbered:
+    for row, line in rows:
         cells = line.split(header.delimiter)
-        for i in kept:
+        for i in places:
             if _is_number(cells[i], number):
                 continue
             if [cell.strip() for cell in cells] == names:

@@ -25,12 +25,12 @@ REGIMES = (
 def regimes_of(track: Track) -> dict[str, Chosen]:
     """Masks (T,) of the regimes; a row may be in several."""
     rows = len(track)
-    never = np.zeros(rows, bool)
+    nowhere = np.zeros(rows, bool)
     collective = smooth(track.motor.mean(1), 0.05, track.dt)
     change = np.abs(
         np.gradient(smooth(track.motor, 0.03, track.dt), track.dt, axis=0)
     ).max(1)
-    masks = {r: never for r in REGIMES}
+    masks = {r: nowhere for r in REGIMES}
     masks["high_thrust"] = track.motor.max(1) > 0.8
     masks["transient"] = change > max(1.0, float(np.quantile(change, 0.8)))
     if track.velocity is not None:
@@ -44,8 +44,8 @@ def regimes_of(track: Track) -> dict[str, Chosen]:
         masks["high"] = track.position[:, 2] > ceiling - NEAR_CEILING
         for other in track.neighbours:
             gap = other - track.position
-            near = (gap[:, 2] > 0.05) & (np.hypot(gap[:, 0], gap[:, 1]) < 0.2)
-            masks["under_neighbour"] = masks["under_neighbour"] | near
+            is_below = (gap[:, 2] > 0.05) & (np.hypot(gap[:, 0], gap[:, 1]) < 0.2)
+            masks["under_neighbour"] = masks["under_neighbour"] | is_below
     if track.voltage is not None:
         masks["low_battery"] = track.voltage < 3.5
     masks["high_thrust"] = masks["high_thrust"] | (collective > 0.8)

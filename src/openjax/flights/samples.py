@@ -67,12 +67,12 @@ class Turbulence:
         """(T, N, 6) force in the world's axes and torque in the body's."""
         sizes = np.repeat([self.force, self.torque], 3)
         times = np.repeat([self.force_time, self.torque_time], 3)
-        kept = np.exp(-PERIOD / times)
+        decay = np.exp(-PERIOD / times)
         white = rng.standard_normal((rows, count, 6))
         out = np.empty_like(white)
         out[0] = white[0]
         for row in range(1, rows):
-            out[row] = kept * out[row - 1] + np.sqrt(1.0 - kept**2) * white[row]
+            out[row] = decay * out[row - 1] + np.sqrt(1.0 - decay**2) * white[row]
         return sizes * out
 
 
@@ -135,7 +135,7 @@ def references(
     along = 0.1 * np.sin(0.8 * t)
     above = 0.45 + 0.1 * np.sin(0.5 * t)
     offset = np.stack([sideways, along, above], 1)
-    found = {}
+    by_name = {}
     for name, (place, yaw, command, voltage) in flights.items():
         places = [place]
         yaws = [yaw]
@@ -144,13 +144,13 @@ def references(
             places.append(place + offset)
             yaws.append(0 * yaw)
             commands.append(zero)
-        found[name] = Reference(
+        by_name[name] = Reference(
             position=np.stack(places, 1),
             yaw=np.stack(yaws, 1),
             extra_command=np.stack(commands, 1),
             open_circuit_voltage=voltage,
         )
-    return found
+    return by_name
 
 
 def fly(
@@ -173,24 +173,26 @@ def fly(
     )
     velocity = np.gradient(reference.position, PERIOD, axis=0)
     acceleration = np.gradient(velocity, PERIOD, axis=0)
-    wanted = (
+    targets = (
         reference.position,
         velocity,
         acceleration,
         reference.yaw,
         reference.extra_command,
     )
-    wanted = tuple(jnp.asarray(w, jnp.float32) for w in wanted)
+    targets = tuple(jnp.asarray(w, jnp.float32) for w in targets)
     start = jnp.float32(reference.open_circuit_voltage)
     length, count = reference.position.shape[:2]
     # generators of their own: the same flight in other air, or with other sensors
     gusts = None
     if air is not None:
-        drawn = air.drawn(np.random.default_rng([seed, 2]), length, count)
-        gusts = jnp.asarray(drawn, jnp.float32)
+        gusts_drawn = air.drawn(np.random.default_rng([seed, 2]), length, count)
+        gusts = jnp.asarray(gusts_drawn, jnp.float32)
     key = jax.random.key(seed)
-    flown = _fly(plant, assumed, wanted, start, parameters, key, gusts, names, sensors)
-    rows = jax.device_get(flown)
+    record = _fly(
+        plant, assumed, targets, start, parameters, key, gusts, names, sensors
+    )
+    rows = jax.device_get(record)
     rng = np.random.default_rng([seed, 1])
     return [_columns([r[:, n] for r in rows], rng, sensors) for n in range(count)]
 
@@ -201,11 +203,11 @@ def log_of(columns: list[dict[str, Shaped[np.ndarray, "..."]]], name: str) -> Lo
     """
     time = np.concatenate([c["t"] for c in columns])
     order = np.argsort(time, kind="stable")
-    joined = {n: np.concatenate([c[n] for c in columns])[order] for n in columns[0]}
+    table = {n: np.concatenate([c[n] for c in columns])[order] for n in columns[0]}
     vehicle = np.concatenate(
         [np.full(len(c["t"]), str(i)) for i, c in enumerate(columns)]
     )[order]
-    return LogTable(name, joined, vehicle)
+    return LogTable(name, table, vehicle)
 
 
 @partial(jax.jit, static_argnames=("names", "sensors"))
@@ -222,7 +224,7 @@ def _fly(
 ):
     effects = composition.resolve(names)
     count = target[0].shape[1]
-    flown = composition.change_body(effects, parameters, plant)
+    vehicle = composition.change_body(effects, parameters, plant)
     key, bias_key, memory_key = jax.random.split(key, 3)
     gyro_bias = sensors.gyro_bias * jax.random.normal(bias_key, (count, 3))
     drones = hover_state(plant, target[0][0], velocity=target[1][0])
@@ -239,7 +241,7 @@ def _fly(
 
         def build(d, near, v):
             return make_context(
-                flown,
+                vehicle,
                 d,
                 others_position=near,
                 battery_voltage=v,
@@ -255,13 +257,15 @@ def _fly(
         drones, integral, force, load, key = carry
         wanted_row, air_time, gust = inputs
         key, noise_key = jax.random.split(key)
-        seen = jax.vmap(partial(composition.seen_state, effects, parameters))(drones)
-        sent, integral = jax.vmap(_position_controller, (None, 0, 0, 0))(
-            assumed, seen, integral, wanted_row
+        measured_state = jax.vmap(partial(composition.seen_state, effects, parameters))(
+            drones
+        )
+        command_sent, integral = jax.vmap(_position_controller, (None, 0, 0, 0))(
+            assumed, measured_state, integral, wanted_row
         )
         context, under_load = contexts(drones, load, air_time, PERIOD)
         change = partial(composition.change_command, effects, parameters)
-        command, memory = jax.vmap(change)(drones.effect_memory, sent, context)
+        command, memory = jax.vmap(change)(drones.effect_memory, command_sent, context)
         drones = drones.replace(effect_memory=memory)
 
         def rate_loop(inner, noise):
@@ -270,7 +274,7 @@ def _fly(
 
             def control(d, g, c):
                 return rate_controller(
-                    flown, d.replace(body_rates=g), c, PERIOD / RATE_LOOPS
+                    vehicle, d.replace(body_rates=g), c, PERIOD / RATE_LOOPS
                 )
 
             motor, rate_integral = jax.vmap(control)(drones, gyro, command)
@@ -281,32 +285,38 @@ def _fly(
                 context, _ = contexts(
                     drones, load, air_time, PERIOD / RATE_LOOPS / SUBSTEPS
                 )
-                drones, force = jax.vmap(partial(_physics, flown, effects, parameters))(
-                    drones, motor, context, gust
-                )
+                drones, force = jax.vmap(
+                    partial(_physics, vehicle, effects, parameters)
+                )(drones, motor, context, gust)
             return (drones, force), motor
 
         noise = jax.random.normal(noise_key, (RATE_LOOPS, count, 3))
-        (after, force_after), motors = jax.lax.scan(rate_loop, (drones, force), noise)
+        (state_after, force_after), motors = jax.lax.scan(
+            rate_loop, (drones, force), noise
+        )
         motors = motors.mean(0)
         memory = jax.vmap(
             lambda d: composition.record(effects, d.effect_memory, d, PERIOD)
-        )(after)
-        after = after.replace(effect_memory=memory)
+        )(state_after)
+        state_after = state_after.replace(effect_memory=memory)
         # What motion capture and estimator deliver is what the controller sees; the IMU
         # knows the moment itself.
-        pose = (seen.position, seen.quaternion, seen.velocity)
+        pose = (
+            measured_state.position,
+            measured_state.quaternion,
+            measured_state.velocity,
+        )
         log = (
             *pose,
             drones.body_rates + gyro_bias,
-            force / flown.mass,
-            sent,
+            force / vehicle.mass,
+            command_sent,
             motors,
             under_load,
         )
-        return (after, integral, force_after, motors.mean(-1), key), log
+        return (state_after, integral, force_after, motors.mean(-1), key), log
 
-    hover = jnp.zeros((count, 3)).at[:, 2].set(flown.mass * flown.gravity)
+    hover = jnp.zeros((count, 3)).at[:, 2].set(vehicle.mass * vehicle.gravity)
     load = jnp.full(count, 0.6)
     air_time = jnp.arange(target[0].shape[0], dtype=jnp.float32) * PERIOD
     start = (drones, jnp.zeros((count, 3)), hover, load, key)
@@ -402,8 +412,8 @@ def _turned(quaternion: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     u = quaternion[:, 1:]
     half = rotation / 2
     scalar = w - (u * half).sum(1, keepdims=True)
-    turned = np.concatenate([scalar, u + w * half + np.cross(u, half)], 1)
-    return turned / np.linalg.norm(turned, axis=1, keepdims=True)
+    product = np.concatenate([scalar, u + w * half + np.cross(u, half)], 1)
+    return product / np.linalg.norm(product, axis=1, keepdims=True)
 
 
 def _minimum_jerk(points: np.ndarray, t: np.ndarray, leg: float) -> np.ndarray:

@@ -81,10 +81,10 @@ def _standing_still(flight: Flight, channel: str, rows, note) -> np.ndarray:
     columns = CHANNEL_COLUMNS[channel]
     values = getattr(flight, channel)
     table = values.reshape(len(values), -1)
-    changed = np.diff(table[rows], axis=0) != 0
-    together = channel in ("position", "quaternion", "velocity")
-    dead = np.flatnonzero(~changed.any(0)).tolist()
-    if together and changed.any():
+    is_new = np.diff(table[rows], axis=0) != 0
+    as_one = channel in ("position", "quaternion", "velocity")
+    dead = np.flatnonzero(~is_new.any(0)).tolist()
+    if as_one and is_new.any():
         dead = [k for k in dead if not _may_stand_still(flight, channel, k)]
     if len(dead):
         names = ", ".join(columns[i] for i in dead)
@@ -92,12 +92,14 @@ def _standing_still(flight: Flight, channel: str, rows, note) -> np.ndarray:
             "corrupt",
             f"{names}: the same value {table[rows[0], dead[0]]:g} in every row",
         )
-    frozen = _frozen(table, rows, flight.time, together)
+    frozen = _frozen(table, rows, flight.time, as_one)
     if frozen.any():
         share = frozen.mean()
         start = flight.time[np.argmax(frozen)]
-        still = f"stand still for {share * flight.duration:.1f} s from t = {start:.2f}"
-        words = f"{', '.join(columns)} {still}"
+        sentence = (
+            f"stand still for {share * flight.duration:.1f} s from t = {start:.2f}"
+        )
+        words = f"{', '.join(columns)} {sentence}"
         if share > 0.5:
             raise Refused("corrupt", f"{words}: frozen for {share:.0%} of the flight")
         note("corrupt", f"{words}; taken as not sampled there")
@@ -134,26 +136,26 @@ def drop_held_rows(flight: Flight, note) -> Flight:
     commands as well: they repeat the one before in every column but the time's and the
     battery's. Longer stretches without a change are a stand, or frozen.
     """
-    logged = [
+    channels = [
         c
         for c in CHANNEL_COLUMNS
         if c != "battery_voltage" and getattr(flight, c) is not None
     ]
     table = np.column_stack(
-        [getattr(flight, c).reshape(len(flight), -1) for c in logged]
+        [getattr(flight, c).reshape(len(flight), -1) for c in channels]
     )
     same = (table[1:] == table[:-1]) | (np.isnan(table[1:]) & np.isnan(table[:-1]))
-    held = np.r_[False, same.all(1)]
-    for begin, end in runs_of(held):
+    is_held = np.r_[False, same.all(1)]
+    for begin, end in runs_of(is_held):
         if flight.time[end - 1] - flight.time[begin - 1] > 0.5 * FROZEN:
-            held[begin:end] = False
-    if held.mean() < HELD or np.median(np.diff(flight.time[~held])) > SLOWEST:
+            is_held[begin:end] = False
+    if is_held.mean() < HELD or np.median(np.diff(flight.time[~is_held])) > SLOWEST:
         return flight
     note(
         "held",
-        f"{held.mean():.0%} of the rows repeat the one before in every column: left out",
+        f"{is_held.mean():.0%} of the rows repeat the one before in every column: left out",
     )
-    return flight.rows(~held)
+    return flight.rows(~is_held)
 
 
 def drop_repeats(flight: Flight, note) -> Flight:
@@ -166,21 +168,21 @@ def drop_repeats(flight: Flight, note) -> Flight:
         ("position", "quaternion", "velocity"),
         ("body_rates", "specific_force"),
     ):
-        logged = [c for c in group if getattr(flight, c) is not None]
-        if not logged:
+        channels = [c for c in group if getattr(flight, c) is not None]
+        if not channels:
             continue
-        together = np.concatenate(
-            [getattr(flight, c).reshape(len(flight), -1) for c in logged], 1
+        stack = np.concatenate(
+            [getattr(flight, c).reshape(len(flight), -1) for c in channels], 1
         )
-        repeated = np.r_[False, (np.diff(together, axis=0) == 0).all(1)]
+        repeated = np.r_[False, (np.diff(stack, axis=0) == 0).all(1)]
         if repeated.mean() < HELD:
             continue
         note(
             "held",
-            f"{repeated.mean():.0%} of the rows repeat the last sample of {', '.join(logged)}: "
+            f"{repeated.mean():.0%} of the rows repeat the last sample of {', '.join(channels)}: "
             "left out",
         )
-        for channel in logged:
+        for channel in channels:
             changes[channel] = _unsampled(getattr(flight, channel), repeated)
         if group[0] == "position":
             changes["pose_age"] = flight.row_period
@@ -193,38 +195,38 @@ def put_in_step(flight: Flight, note) -> Flight:
     regular. Poses are on a line through their rows; a held one is half a row late on
     the mean.
     """
-    logged = [
+    channels = [
         c
         for c in ("position", "quaternion", "velocity")
         if getattr(flight, c) is not None
     ]
-    if not logged:
+    if not channels:
         return flight
     rows = np.flatnonzero(
         np.all(
             [
                 np.isfinite(getattr(flight, c).reshape(len(flight), -1)).all(1)
-                for c in logged
+                for c in channels
             ],
             0,
         )
     )
     if len(rows) < IN_STEP or len(rows) > (1.0 - HELD) * len(flight):
         return flight
-    seen = flight.time[rows]
-    own = _regular_clock(seen, flight.row_period)
-    if own is None:
+    stamps = flight.time[rows]
+    regular = _regular_clock(stamps, flight.row_period)
+    if regular is None:
         return flight
-    own = own - 0.5 * flight.pose_age
+    regular = regular - 0.5 * flight.pose_age
     changes = {"pose_age": 0.0}
-    for channel in logged:
+    for channel in channels:
         values = getattr(flight, channel)
-        moved = np.full_like(values, np.nan)
-        moved[rows] = np.stack(
-            [np.interp(seen, own, column) for column in values[rows].T], 1
+        resampled = np.full_like(values, np.nan)
+        resampled[rows] = np.stack(
+            [np.interp(stamps, regular, column) for column in values[rows].T], 1
         )
-        changes[channel] = moved
-    rate = (len(own) - 1) / (own[-1] - own[0])
+        changes[channel] = resampled
+    rate = (len(regular) - 1) / (regular[-1] - regular[0])
     note(
         "held",
         f"poses come at {rate:.0f} Hz of a clock of their own: moved from it to the rows' times",
@@ -240,40 +242,40 @@ def _regular_clock(times: np.ndarray, row: float) -> np.ndarray | None:
     since = times - times[0]
     usual = (len(times) - 1) / since[-1]
     rates = np.arange(0.9 * usual, 1.15 * usual, 0.2 / since[-1])
-    turned = np.exp(2j * np.pi * rates[:, None] * since).mean(1)
-    best = int(np.argmax(np.abs(turned)))
-    if np.abs(turned[best]) < IN_PHASE:
+    phasor = np.exp(2j * np.pi * rates[:, None] * since).mean(1)
+    best = int(np.argmax(np.abs(phasor)))
+    if np.abs(phasor[best]) < IN_PHASE:
         return None
-    middle = np.angle(turned[best]) / (2.0 * np.pi)
+    middle = np.angle(phasor[best]) / (2.0 * np.pi)
     # cycles since a tick could first be seen
-    late = rates[best] * since - middle + 0.5 * row * rates[best]
-    ticks = np.floor(late + EDGE)
-    usual = late - ticks < row * rates[best] + EDGE
+    phase = rates[best] * since - middle + 0.5 * row * rates[best]
+    ticks = np.floor(phase + EDGE)
+    usual = phase - ticks < row * rates[best] + EDGE
     slope, start = np.polyfit(ticks[usual], times[usual], 1)
     return start + slope * ticks
 
 
 def _unsampled(values: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """Values (T, ...) without those of some rows (T,)."""
-    left = values.copy()
-    left[rows] = np.nan
-    return left
+    sampled = values.copy()
+    sampled[rows] = np.nan
+    return sampled
 
 
 def _frozen(
-    table: np.ndarray, rows: np.ndarray, time: np.ndarray, together: bool
+    table: np.ndarray, rows: np.ndarray, time: np.ndarray, as_one: bool
 ) -> np.ndarray:
     """(T,) True in runs of at least FROZEN seconds in which a column (all columns if
-    `together`) doesn't change though it does elsewhere. Runs at the column's extremes
+    `as_one`) doesn't change though it does elsewhere. Runs at the column's extremes
     are saturation, not a frozen sensor.
     """
     values = table[rows]
-    still = np.diff(values, axis=0) == 0
+    is_still = np.diff(values, axis=0) == 0
     extreme = (values == values.min(0)) | (values == values.max(0))
-    if together:
-        per_column = [still.all(1)]
+    if as_one:
+        per_column = [is_still.all(1)]
     else:
-        per_column = [s & ~e for s, e in zip(still.T, extreme[1:].T, strict=True)]
+        per_column = [s & ~e for s, e in zip(is_still.T, extreme[1:].T, strict=True)]
     frozen = np.zeros(len(time), bool)
     for run in per_column:
         for start, stop in runs_of(run):

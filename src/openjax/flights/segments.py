@@ -115,8 +115,8 @@ def _climbing(t, ease):
 
 def _fast(t, ease):
     along = RADIUS * np.sin(2.0 * np.pi * 0.3 * t)
-    turned = np.clip((t - 0.5 * t[-1]) / 1.0 + 0.5, 0.0, 1.0)
-    yaw = 0.5 * np.pi * turned**2 * (3.0 - 2.0 * turned) * ease[:, 0]
+    progress = np.clip((t - 0.5 * t[-1]) / 1.0 + 0.5, 0.0, 1.0)
+    yaw = 0.5 * np.pi * progress**2 * (3.0 - 2.0 * progress) * ease[:, 0]
     return _middle(t) + ease * _at(along, 0.0, 0.0), yaw
 
 

@@ -27,10 +27,10 @@ def clock_of(flight: Flight) -> Times | None:
     anything.
     """
     steps = np.diff(flight.time)
-    wide = np.flatnonzero(steps > max(0.1, 5 * flight.row_period))
-    gaps = np.stack([flight.time[wide], flight.time[wide + 1]], 1)
-    logged = [c for c in COMPARED if getattr(flight, c) is not None]
-    holes = [flight.holes(channel) for channel in logged]
+    long_steps = np.flatnonzero(steps > max(0.1, 5 * flight.row_period))
+    gaps = np.stack([flight.time[long_steps], flight.time[long_steps + 1]], 1)
+    channels = [c for c in COMPARED if getattr(flight, c) is not None]
+    holes = [flight.holes(channel) for channel in channels]
     start, stop = _longest_without(np.concatenate([gaps, *holes]), flight.time)
     if stop - start < SHORTEST:  # holes everywhere: lines over them are all there is
         start, stop = _longest_without(gaps, flight.time)

@@ -70,25 +70,28 @@ def flight_tracks(flight: Flight, case: Case) -> list[Track]:
     """The stretches of one flight without gaps, on a uniform grid. A long hole in a
     channel is one, too, unless nothing is left without.
     """
-    whole = flight.rows(~flight.in_holes(CHANNELS))
-    return _stretches(whole, flight, case) or _stretches(flight, flight, case)
+    without_holes = flight.rows(~flight.in_holes(CHANNELS))
+    return _stretches(without_holes, flight, case) or _stretches(flight, flight, case)
 
 
-def _stretches(flight: Flight, logged: Flight, case: Case) -> list[Track]:
+def _stretches(flight: Flight, without_holes: Flight, case: Case) -> list[Track]:
     """Tracks of rows of a flight as it was `logged`."""
-    found = []
+    tracks = []
     for number, stretch in enumerate(
         flight.stretches(
             max_step=max(MAX_GAP, 3 * flight.row_period), min_duration=MIN_DURATION
         )
     ):
         part = flight.rows(stretch)
-        found.append(
+        tracks.append(
             _on_grid(
-                part, logged, case, f"{flight.name}#{number}" if number else flight.name
+                part,
+                without_holes,
+                case,
+                f"{flight.name}#{number}" if number else flight.name,
             )
         )
-    return found
+    return tracks
 
 
 def _on_grid(part: Flight, flight: Flight, case: Case, name: str) -> Track:
@@ -154,11 +157,14 @@ def _on_grid(part: Flight, flight: Flight, case: Case, name: str) -> Track:
     )
 
 
-def _missing(logged: Array, grid: Array, period: float) -> Array:
+def _missing(stamps: Array, grid: Array, period: float) -> Array:
     """(T,) the rows of a grid with no logged row within half a period and a bit."""
-    after = np.clip(np.searchsorted(logged, grid), 1, len(logged) - 1)
+    following_row = np.clip(np.searchsorted(stamps, grid), 1, len(stamps) - 1)
     return (
-        np.minimum(np.abs(grid - logged[after - 1]), np.abs(logged[after] - grid))
+        np.minimum(
+            np.abs(grid - stamps[following_row - 1]),
+            np.abs(stamps[following_row] - grid),
+        )
         > 0.6 * period
     )
 
@@ -175,19 +181,19 @@ def held_means(
     return _means(at, values[:, None], begin, period, True)[:, 0]
 
 
-def _means(at, values, begin, period, held):
-    """Means (G, C) of samples (S, C) over periods, of samples that are `held` until the
-    next or of lines between them.
+def _means(at, values, begin, period, is_held):
+    """Means (G, C) of samples (S, C) over periods, of samples that stay until the next
+    (`is_held`) or of lines between them.
     """
     step = np.diff(at)[:, None] * (
-        values[:-1] if held else 0.5 * (values[1:] + values[:-1])
+        values[:-1] if is_held else 0.5 * (values[1:] + values[:-1])
     )
-    whole = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(step, 0)])
+    integral = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(step, 0)])
     begin = np.clip(begin, at[0], at[-1] - 0.5 * period)
     end = np.clip(begin + period, at[0], at[-1])
     means = [
         (np.interp(end, at, column) - np.interp(begin, at, column)) / (end - begin)
-        for column in whole.T
+        for column in integral.T
     ]
     return np.stack(means, 1)
 
@@ -208,9 +214,9 @@ def _command_phase(part: Flight, period: float) -> float:
     if abs(turns.mean()) < RHYTHMIC:
         return 0.0
     # late ones belong to the row that began before them: the begin is before the middle
-    late = np.angle(turns / turns.mean()) / (2 * np.pi) * period
+    delays = np.angle(turns / turns.mean()) / (2 * np.pi) * period
     middle = np.angle(turns.mean()) / (2 * np.pi) * period
-    return float((middle + np.percentile(late, EARLY)) % period)
+    return float((middle + np.percentile(delays, EARLY)) % period)
 
 
 def pwm_thrust(duty: Motors, voltage: Times | None, vehicle) -> Motors:
@@ -286,10 +292,12 @@ def undelayed(track: Track, delay: float) -> Track:
         for n in ("position", "quaternion", "velocity")
         if getattr(track, n) is not None
     ]
-    moved = {n: earlier(getattr(track, n), -delay, track) for n in pose}
-    moved["quaternion"] /= np.linalg.norm(moved["quaternion"], axis=1, keepdims=True)
+    channels = {n: earlier(getattr(track, n), -delay, track) for n in pose}
+    channels["quaternion"] /= np.linalg.norm(
+        channels["quaternion"], axis=1, keepdims=True
+    )
     if len(track.neighbours):  # the same cameras saw them
-        moved["neighbours"] = np.stack(
+        channels["neighbours"] = np.stack(
             [earlier(p, -delay, track) for p in track.neighbours]
         )
-    return replace(track, **moved)
+    return replace(track, **channels)

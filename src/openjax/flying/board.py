@@ -122,13 +122,13 @@ class Board:
         """`role` flew a tick at `time` (s), and this is what it knows."""
         numbers = []
         for drone in state.drones:
-            known = drone.estimate is not None
+            has_estimate = drone.estimate is not None
             # a row has its place for a pose's 14 numbers, known or not
-            pose = numbers_of(drone.estimate) if known else (0.0,) * 14
+            pose = numbers_of(drone.estimate) if has_estimate else (0.0,) * 14
             numbers += [
                 float(_MODES.index(drone.mode)),
                 drone.trim,
-                float(known),
+                float(has_estimate),
                 *pose,
             ]
         self._numbers[_HEAD:] = numbers
@@ -144,8 +144,8 @@ class Board:
         drones = []
         for i, drone in enumerate(state.drones):
             start = _HEAD + _EACH * i
-            mode, trim, known, *numbers = self._numbers[start : start + _EACH]
-            pose = moved_on(pose_of(numbers), time) if known else None
+            mode, trim, has_estimate, *numbers = self._numbers[start : start + _EACH]
+            pose = moved_on(pose_of(numbers), time) if has_estimate else None
             drones.append(
                 drone._replace(mode=_MODES[int(mode)], trim=trim, estimate=pose)
             )
@@ -161,11 +161,11 @@ def start_deaf(process) -> None:
     # Python starts its resource tracker with the first process, and unblocks signals
     # for it
     resource_tracker.ensure_running()
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
     try:
         process.start()
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
 def stand_alone() -> None:

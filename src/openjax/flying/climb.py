@@ -51,22 +51,24 @@ class Climb(NamedTuple):
         """
         dt = pose.time - self.time
         speed = pose.velocity[2]
-        felt = math.nan if force is None else felt_climb(pose.quaternion, force)
-        if not 0.0 < dt <= LONGEST or math.isnan(felt + self.felt):
-            return self._replace(time=pose.time, speed=speed, felt=felt)
-        beyond = speed - self.speed - dt * (0.5 * (felt + self.felt) + self.offset)
+        force_climb = math.nan if force is None else felt_climb(pose.quaternion, force)
+        if not 0.0 < dt <= LONGEST or math.isnan(force_climb + self.felt):
+            return self._replace(time=pose.time, speed=speed, felt=force_climb)
+        beyond = (
+            speed - self.speed - dt * (0.5 * (force_climb + self.felt) + self.offset)
+        )
         age = self.age + dt
-        kept = math.exp(-dt / WINDOW)
-        summed = kept * self.summed + beyond
+        decay = math.exp(-dt / WINDOW)
+        summed = decay * self.summed + beyond
         return Climb(
             time=pose.time,
             speed=speed,
-            felt=felt,
+            felt=force_climb,
             offset=self.offset + beyond / min(age + TRUSTED, LEARNT),
             age=age,
             summed=summed,
             smooth=summed + math.exp(-dt / CALM) * (self.smooth - summed),
-            height=kept * self.height + dt * summed,
+            height=decay * self.height + dt * summed,
         )
 
     @property

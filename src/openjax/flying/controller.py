@@ -159,22 +159,22 @@ def turned_on(
     # to first order: nothing turns far in the hundredths of a second between two poses
     w, x, y, z = quaternion
     a, b, c = (0.5 * duration * rate for rate in rates)
-    turned = (
+    turn = (
         w - x * a - y * b - z * c,
         x + w * a + y * c - z * b,
         y + w * b + z * a - x * c,
         z + w * c + x * b - y * a,
     )
-    size = math.sqrt(sum(q * q for q in turned))
-    return tuple(q / size for q in turned)
+    size = math.sqrt(sum(q * q for q in turn))
+    return tuple(q / size for q in turn)
 
 
 def wanted_velocity(position: Vector, target: Vector, speed: float) -> Vector:
     """The velocity that leads from `position` to `target`, of at most `speed` (m/s)."""
-    wanted = [POSITION_GAIN * (t - p) for t, p in zip(target, position, strict=True)]
-    size = math.sqrt(sum(v * v for v in wanted))
+    velocity = [POSITION_GAIN * (t - p) for t, p in zip(target, position, strict=True)]
+    size = math.sqrt(sum(v * v for v in velocity))
     share = min(1.0, speed / size) if size > 0 else 1.0
-    return tuple(v * share for v in wanted)
+    return tuple(v * share for v in velocity)
 
 
 def wanted_acceleration(velocity: Vector, target: Vector) -> Vector:
@@ -209,11 +209,11 @@ def accelerate(
     ax, ay, az = acceleration
     roll, pitch, yaw = roll_pitch_yaw(quaternion)
     forward = ax * math.cos(yaw) + ay * math.sin(yaw)
-    left = -ax * math.sin(yaw) + ay * math.cos(yaw)
-    lift = math.sqrt((GRAVITY + az) ** 2 + forward**2 + left**2)
+    lateral = -ax * math.sin(yaw) + ay * math.cos(yaw)
+    lift = math.sqrt((GRAVITY + az) ** 2 + forward**2 + lateral**2)
     # a positive pitch leans the thrust forward, a positive roll to the right
     wanted_pitch = math.atan2(forward, GRAVITY + az)
-    wanted_roll = math.asin(min(max(-left / lift, -1.0), 1.0))
+    wanted_roll = math.asin(min(max(-lateral / lift, -1.0), 1.0))
     along = sum(
         a * b
         for a, b in zip(body_axis(quaternion), (ax, ay, GRAVITY + az), strict=True)

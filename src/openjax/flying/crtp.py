@@ -134,7 +134,7 @@ def compress_quaternion(wxyz) -> int:
     xyzw = (x, y, z, w)
     size = math.hypot(*xyzw)
     largest = max(range(4), key=lambda i: abs(xyzw[i]))
-    packed = largest
+    word = largest
     for i, value in enumerate(xyzw):
         if i != largest:
             # q and -q are one attitude: signs are those of the one whose largest is
@@ -143,20 +143,20 @@ def compress_quaternion(wxyz) -> int:
             # a component that isn't the largest is at most 1 / sqrt(2), for which 511
             # stands
             size_in_bits = min(round(511 * abs(value) / size * 2**0.5), 511)
-            packed = packed << 10 | negative << 9 | size_in_bits
-    return packed
+            word = word << 10 | negative << 9 | size_in_bits
+    return word
 
 
-def expand_quaternion(packed: int) -> tuple[float, float, float, float]:
+def expand_quaternion(word: int) -> tuple[float, float, float, float]:
     """wxyz from 32 bits, see `compress_quaternion`; precise to about 1e-3."""
     xyzw = [0.0] * 4
-    largest = packed >> 30
+    largest = word >> 30
     square = 0.0
     for i in (3, 2, 1, 0):  # the last one packed stands in the lowest bits
         if i != largest:
-            value = (packed & 0x1FF) / 511 / 2**0.5
-            xyzw[i] = -value if packed & 0x200 else value
+            value = (word & 0x1FF) / 511 / 2**0.5
+            xyzw[i] = -value if word & 0x200 else value
             square += value * value
-            packed >>= 10
+            word >>= 10
     xyzw[largest] = max(0.0, 1.0 - square) ** 0.5
     return (xyzw[3], *xyzw[:3])

@@ -54,13 +54,13 @@ class Fit(NamedTuple):
 
     def after(self, acceleration: float, velocity: float, dt: float) -> "Fit":
         """With what was unexplained for `dt` (s) at a velocity (m/s)."""
-        kept = math.exp(-dt / FORGETTING)
+        decay = math.exp(-dt / FORGETTING)
         return Fit(
-            kept * self.time + dt + (1.0 - kept) * SPREAD,
-            kept * self.way + dt * velocity,
-            kept * self.energy + dt * velocity**2 + (1.0 - kept) * SPREAD,
-            kept * self.gained + dt * acceleration,
-            kept * self.moment + dt * acceleration * velocity,
+            decay * self.time + dt + (1.0 - decay) * SPREAD,
+            decay * self.way + dt * velocity,
+            decay * self.energy + dt * velocity**2 + (1.0 - decay) * SPREAD,
+            decay * self.gained + dt * acceleration,
+            decay * self.moment + dt * acceleration * velocity,
         )
 
     def at(self, velocity: float) -> float:
@@ -86,9 +86,9 @@ class Drift(NamedTuple):
         """
         # x and y of the velocity; the third, the height, is left out
         level = list(zip(self.fits, unexplained, velocity, strict=False))
-        kept = math.exp(-dt / WINDOW)
+        decay = math.exp(-dt / WINDOW)
         summed = tuple(
-            kept * total + dt * (acceleration - fit.at(speed))
+            decay * total + dt * (acceleration - fit.at(speed))
             for total, (fit, acceleration, speed) in zip(
                 self.summed, level, strict=False
             )

@@ -69,15 +69,17 @@ def _address(host: str) -> str:
 
 def _radio(parts) -> Endpoint:
     """The dongle is no part of the name: two dongles reach the same vehicle."""
-    given = parts.path.strip("/").split("/")
-    channel, rate, address = (*given, "", "", "")[:3]  # any of them may be left out
+    path_parts = parts.path.strip("/").split("/")
+    channel, rate, address = (*path_parts, "", "", "")[
+        :3
+    ]  # any of them may be left out
     number = int(channel) if channel else CHANNEL
     rate = rate.upper() or RATE
     address = (address or ADDRESS).upper().rjust(10, "0")
-    known = (
+    is_radio = (
         rate in RATES and 0 <= number <= 125 and re.fullmatch("[0-9A-F]{10}", address)
     )
-    if not parts.netloc or not known:
+    if not parts.netloc or not is_radio:
         raise ValueError
     vehicle = f"{number}/{rate}/{address}"
     query = f"?{parts.query}" if parts.query else ""

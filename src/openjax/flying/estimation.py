@@ -60,20 +60,20 @@ def _without_drift(state, drone) -> Drone:
 
 def _estimated(state, drone, sample) -> Drone:
     """The drone with its estimate now, after what was newly told of it."""
-    now = state.time
+    time = state.time
     limits = state.limits
     moving = drone.mode in FLYING and not (
-        drone.mode is Mode.LIFT and now - drone.since < SPIN_UP
+        drone.mode is Mode.LIFT and time - drone.since < SPIN_UP
     )
     by_capture = sample.captured is not None and not drone.capture_fault
-    own = _own(state, drone, sample, by_capture, moving)
-    drone = _consistent(state, drone, own, sample.force)
+    track = _own(state, drone, sample, by_capture, moving)
+    drone = _consistent(state, drone, track, sample.force)
     if by_capture and not drone.capture_fault:
         drone = _captured(state, drone, sample, moving)
     source = drone.captured if by_capture and not drone.capture_fault else drone.own
     contradicted = source is drone.own and drone.contradiction
-    if source.fresh(now, limits) and not contradicted:
-        estimate = moved_on(source.pose, max(now, source.pose.time))
+    if source.fresh(time, limits) and not contradicted:
+        estimate = moved_on(source.pose, max(time, source.pose.time))
         level = level_acceleration(estimate.quaternion)
         return drone._replace(
             estimate=estimate, seen=source.pose.time, acceleration=level
@@ -94,7 +94,7 @@ def _reckoned(state, drone) -> Drone:
     return drone._replace(estimate=estimate)
 
 
-def _consistent(state, drone, own, force) -> Drone:
+def _consistent(state, drone, own_track, force) -> Drone:
     """The drone after its newest own estimate, with what its accelerometer feels.
 
     If its innovations contradict that, none is believed any more in this flight, nor
@@ -104,25 +104,27 @@ def _consistent(state, drone, own, force) -> Drone:
     if drone.contradiction:
         return drone._replace(own=drone.own._replace(verdict=drone.contradiction))
     if drone.mode not in CHECKED:
-        return drone._replace(own=own, innovations=Innovations())
-    if own.pose is drone.own.pose:
+        return drone._replace(own=own_track, innovations=Innovations())
+    if own_track.pose is drone.own.pose:
         # what told nothing but wrong poses until it was lost may tell believable ones,
         # of another place, once anything can have happened
-        lost = own.verdict and not any(
-            track.fresh(state.time, state.limits) for track in (own, drone.captured)
+        verdict_lost = own_track.verdict and not any(
+            track.fresh(state.time, state.limits)
+            for track in (own_track, drone.captured)
         )
         return drone._replace(
-            own=own, contradiction=own.verdict if lost else Verdict.GOOD
+            own=own_track,
+            contradiction=own_track.verdict if verdict_lost else Verdict.GOOD,
         )
     refused = bool(drone.own.verdict)
     innovations = drone.innovations.after(
-        own.pose, as_sent(drone.sent), state.airframe, refused
+        own_track.pose, as_sent(drone.sent), state.airframe, refused
     )
     innovations = innovations.feeling(force)
     verdict = innovations.verdict()
-    seen = drone.captured
+    capture = drone.captured
     if not verdict:
-        return drone._replace(own=own, innovations=innovations)
+        return drone._replace(own=own_track, innovations=innovations)
     drone = drone._replace(
         own=drone.own._replace(verdict=verdict),
         innovations=innovations,
@@ -130,7 +132,9 @@ def _consistent(state, drone, own, force) -> Drone:
     )
     # motion capture tells otherwise than the estimate, so it isn't what the estimate
     # followed
-    if seen.pose is not None and not follows(seen.pose, own.pose, state.limits):
+    if capture.pose is not None and not follows(
+        capture.pose, own_track.pose, state.limits
+    ):
         return drone
     # neither is believed any more: back to where the sums say that the vehicle is
     estimate = moved_on(innovations.corrected(), state.time)
@@ -141,58 +145,58 @@ def _own(state, drone, sample, by_capture, moving) -> Track:
     """The drone's own estimates after the newest one, which motion capture must confirm
     where they were lost or wrong.
     """
-    now = state.time
+    time = state.time
     limits = state.limits
-    before = drone.own
-    if by_capture and before.fresh(now, limits):
+    track = drone.own
+    if by_capture and track.fresh(time, limits):
         # what it is flown by is motion capture: that says nothing of where its own
         # leads
-        return before.after(sample.own, now, limits, moving, None)
-    own = before.after(sample.own, now, limits, moving, drone.estimate)
-    seen = drone.captured
+        return track.after(sample.own, time, limits, moving, None)
+    next_track = track.after(sample.own, time, limits, moving, drone.estimate)
+    capture = drone.captured
     to_confirm = (
         moving
         and by_capture
-        and own.pose is not before.pose
-        and seen.fresh(now, limits)
+        and next_track.pose is not track.pose
+        and capture.fresh(time, limits)
     )
-    if to_confirm and agree(seen.pose, own.pose, limits) is Verdict.APART:
-        return own._replace(pose=before.pose, verdict=Verdict.JUMPED)
-    return own
+    if to_confirm and agree(capture.pose, next_track.pose, limits) is Verdict.APART:
+        return next_track._replace(pose=track.pose, verdict=Verdict.JUMPED)
+    return next_track
 
 
 def _captured(state, drone, sample, moving) -> Drone:
     """The drone after the newest of motion capture: whether it is believed, and told to
     the estimator on board.
     """
-    now = state.time
+    time = state.time
     limits = state.limits
-    own = drone.own
-    seen = _with_motion(sample.captured, drone.captured.pose, sample.own)
-    captured = drone.captured.after(seen, now, limits, moving, drone.estimate)
+    estimates = drone.own
+    capture = _with_motion(sample.captured, drone.captured.pose, sample.own)
+    captured = drone.captured.after(capture, time, limits, moving, drone.estimate)
     capture_fault = ""
-    if captured.pose is seen:
+    if captured.pose is capture:
         # on the ground, or with no pose of its own, there is nothing to compare it with
-        comparable = moving and own.pose is not None
-        feeds = not comparable or follows(seen, own.pose, limits)
+        comparable = moving and estimates.pose is not None
+        feeds = not comparable or follows(capture, estimates.pose, limits)
         drone = drone._replace(feeds_estimator=feeds)
         verdict = Verdict.GOOD
-        if comparable and own.fresh(now, limits):
-            verdict = agree(seen, own.pose, limits)
+        if comparable and estimates.fresh(time, limits):
+            verdict = agree(capture, estimates.pose, limits)
         if verdict:
             captured = captured._replace(pose=drone.captured.pose, verdict=verdict)
     innovations = drone.captured_innovations
     if drone.mode not in CHECKED:
         innovations = Innovations()
-    elif captured.pose is seen and seen is not drone.captured.pose:
+    elif captured.pose is capture and capture is not drone.captured.pose:
         refused = bool(drone.captured.verdict)
         innovations = innovations.after(
-            seen, as_sent(drone.sent), state.airframe, refused
+            capture, as_sent(drone.sent), state.airframe, refused
         )
         capture_fault = innovations.verdict()
     if capture_fault:
         captured = captured._replace(pose=drone.captured.pose, verdict=capture_fault)
-    elif moving and not captured.fresh(now, limits):
+    elif moving and not captured.fresh(time, limits):
         capture_fault = captured.verdict or "pose lost"
     return drone._replace(
         captured=captured, captured_innovations=innovations, capture_fault=capture_fault

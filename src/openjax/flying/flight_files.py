@@ -48,19 +48,19 @@ def write_case(
       about: what flight.json is to say beside timing and games.
     """
     table, vehicles = record.table()
-    _, sent, episode = table.T
+    _, sent_at, episode = table.T
     commands = vehicles[..., 2:]
     games = []
     for number in range(len(record.episodes)):
         ticks = np.flatnonzero(episode == number)
-        if not len(ticks) or sent[ticks[-1]] - sent[ticks[0]] < SHORTEST:
+        if not len(ticks) or sent_at[ticks[-1]] - sent_at[ticks[0]] < SHORTEST:
             continue
         games.append((folder / f"game_{number:02d}.csv.gz", ticks))
 
     def write(game):
         path, ticks = game
         write_csv(
-            path, _table(path.name, samples, sent[ticks], commands[ticks]), DECIMALS
+            path, _table(path.name, samples, sent_at[ticks], commands[ticks]), DECIMALS
         )
         return path
 
@@ -75,7 +75,7 @@ def write_case(
     return [*files, folder / "vehicle.toml", folder / "flight.json"]
 
 
-def _table(name: str, samples, sent: np.ndarray, commands: np.ndarray) -> LogTable:
+def _table(name: str, samples, sent_at: np.ndarray, commands: np.ndarray) -> LogTable:
     """One game's log.
 
     Args:
@@ -84,13 +84,15 @@ def _table(name: str, samples, sent: np.ndarray, commands: np.ndarray) -> LogTab
       sent: (T,) s, when the set-points of each tick had left.
       commands: (T, N, 5) of them: mode, thrust, body rates.
     """
-    rows = [_rows(vehicle, sent, commands[:, i]) for i, vehicle in enumerate(samples)]
+    rows = [
+        _rows(vehicle, sent_at, commands[:, i]) for i, vehicle in enumerate(samples)
+    ]
     log = log_of(rows, name)
     # a column that nobody filled in would say that there was such a sensor
-    filled = {
+    columns = {
         n: column for n, column in log.columns.items() if not np.isnan(column).all()
     }
-    return LogTable(name, filled, log.vehicle)
+    return LogTable(name, columns, log.vehicle)
 
 
 class _Source(NamedTuple):
@@ -114,34 +116,34 @@ def _sources(vehicle: Samples) -> list[_Source]:
     """All that was recorded of a vehicle; what comes later replaces what came
     before.
     """
-    own = np.column_stack([vehicle.poses[:, 3:], vehicle.poses[:, 1]])
-    poses = _Source(vehicle.poses[:, 2], (*_POSE, "vbat"), own)
+    own_poses = np.column_stack([vehicle.poses[:, 3:], vehicle.poses[:, 1]])
+    poses = _Source(vehicle.poses[:, 2], (*_POSE, "vbat"), own_poses)
     bodies = _Source(vehicle.bodies[:, 0], _BODY, vehicle.bodies[:, 1:])
     if not len(vehicle.seen):
         return [poses, bodies]
     # motion capture in place of the estimate on board, of which body rates and voltage
     # stay
-    poses = _Source(poses.when, poses.names[10:], own[:, 10:])
-    seen = _Source(vehicle.seen[:, 0], _POSE[:10], vehicle.seen[:, 1:11])
-    return [poses, bodies, seen]
+    poses = _Source(poses.when, poses.names[10:], own_poses[:, 10:])
+    capture = _Source(vehicle.seen[:, 0], _POSE[:10], vehicle.seen[:, 1:11])
+    return [poses, bodies, capture]
 
 
-def _rows(vehicle: Samples, sent, commands) -> dict[str, np.ndarray]:
+def _rows(vehicle: Samples, sent_at, commands) -> dict[str, np.ndarray]:
     """The rows of one vehicle, by column: one for each moment at which something was
     measured.
     """
-    sources = [source.during(sent[0], sent[-1]) for source in _sources(vehicle)]
+    sources = [source.during(sent_at[0], sent_at[-1]) for source in _sources(vehicle)]
     times = np.unique(np.concatenate([source.when for source in sources]))
     rows = {
         n: np.full(len(times), np.nan) for n in ("t", *_POSE, *_BODY, *_COMMAND, "vbat")
     }
-    rows["t"] = times - sent[0]
+    rows["t"] = times - sent_at[0]
     for source in sources:
         at = np.searchsorted(times, source.when)
         for n, column in zip(source.names, source.values.T, strict=True):
             rows[n][at] = column
     # in force at a moment is what left last before it
-    command = commands[np.maximum(np.searchsorted(sent, times, side="right") - 1, 0)]
+    command = commands[np.maximum(np.searchsorted(sent_at, times, side="right") - 1, 0)]
     # angles and motors off are no commanded body rates: their cells stay empty
     rated = command[:, 0] == RATES
     for n, column in zip(_COMMAND, command[:, 1:].T, strict=True):

@@ -60,21 +60,21 @@ class FlightRecord:
         ticks, vehicles = self.table()
         if not len(ticks):
             return {"ticks": 0}
-        due, sent, _ = ticks.T
+        due, sent_at, _ = ticks.T
         # of each tick the vehicle with the oldest pose counts
-        age, measured = 1e3 * (sent[:, None, None] - vehicles[..., :2]).max(1).T
-        work = 1e3 * (sent - due)
-        gaps = 1e3 * np.diff(sent)
-        missed = int((work > 1e3 * PERIOD).sum()) + self.skipped
+        age, measured = 1e3 * (sent_at[:, None, None] - vehicles[..., :2]).max(1).T
+        work = 1e3 * (sent_at - due)
+        gaps = 1e3 * np.diff(sent_at)
+        misses = int((work > 1e3 * PERIOD).sum()) + self.skipped
         return {
             "ticks": len(due),
-            "seconds": round(sent[-1] - due[0], 2),
+            "seconds": round(sent_at[-1] - due[0], 2),
             "command_age_ms": _percentiles(age),
             "measured_to_sent_ms": _percentiles(measured),
             "due_to_sent_ms": _percentiles(work),
             "between_set_points_ms": _percentiles(gaps) if len(gaps) else {},
-            "missed_deadlines": missed,
-            "missed_share": missed / (len(due) + self.skipped),
+            "missed_deadlines": misses,
+            "missed_share": misses / (len(due) + self.skipped),
         }
 
 

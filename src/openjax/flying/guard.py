@@ -82,15 +82,15 @@ def watch(board: Board, parent: int, links: RawLinks, state: State) -> None:
     board.enter(Role.GUARD)
     while not board.over:
         time.sleep(CHECK)
-        now = time.perf_counter()
-        board.beat(Role.GUARD, now)
-        links_silent = board.silent(Role.LINKS, now) > board.silence
+        time_read = time.perf_counter()
+        board.beat(Role.GUARD, time_read)
+        links_silent = board.silent(Role.LINKS, time_read) > board.silence
         # three times as long as the links wait: should they live and not take over
-        loop_late = board.silent(Role.LOOP, now) > 3.0 * board.silence
+        loop_late = board.silent(Role.LOOP, time_read) > 3.0 * board.silence
         loop_silent = board.pilot is Role.LOOP and loop_late
         if board.flying and (links_silent or loop_silent):
             board.pilot = Role.GUARD
-            board.beat(Role.GUARD, now + OPENING)
+            board.beat(Role.GUARD, time_read + OPENING)
             board.end_process(Role.LINKS)
             say(
                 "openjax fly: nothing from the links' process, the guard lands all vehicles"

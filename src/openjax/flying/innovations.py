@@ -100,9 +100,9 @@ class Innovations(NamedTuple):
     climb: Climb = Climb()
 
     def after(
-        self, pose: Pose, sent: SetPoint, airframe: Airframe, refused: bool = False
+        self, pose: Pose, set_point: SetPoint, airframe: Airframe, refused: bool = False
     ) -> "Innovations":
-        """With the next pose; `sent` has acted since the last one.
+        """With the next pose; `set_point` has acted since the last one.
 
         `refused`: whether poses between them came and weren't believed. Then this one
         must follow from the last believable one, however long that is ago.
@@ -110,17 +110,19 @@ class Innovations(NamedTuple):
         last = self.pose
         longest = math.inf if refused else LONGEST
         if last is None or not 0.0 < pose.time - last.time <= longest:
-            return self._replace(pose=pose, thrust=sent.thrust, rates=pose.body_rates)
+            return self._replace(
+                pose=pose, thrust=set_point.thrust, rates=pose.body_rates
+            )
         dt = pose.time - last.time
         # what motors and rate loop have made of what was sent, as two low-passes
         reached = _share(dt, airframe.motor_time_constant)
-        thrust = self.thrust + reached * (sent.thrust - self.thrust)
-        asked = (
-            (sent.roll, sent.pitch, sent.yaw_rate)
-            if sent.mode == RATES
+        thrust = self.thrust + reached * (set_point.thrust - self.thrust)
+        request = (
+            (set_point.roll, set_point.pitch, set_point.yaw_rate)
+            if set_point.mode == RATES
             else pose.body_rates
         )
-        rates = _towards(self.rates, asked, _share(dt, RATE_LAG))
+        rates = _towards(self.rates, request, _share(dt, RATE_LAG))
         # the trapezoidal rule: exact for an acceleration that stays
         mean = _towards(last.velocity, pose.velocity, 0.5)
         way = _difference(_difference(pose.position, last.position), _times(dt, mean))

@@ -177,8 +177,8 @@ class Track(NamedTuple):
 
 def at_one_time(a: Pose, b: Pose) -> tuple[Pose, Pose]:
     """Both, moved on to the later one's time."""
-    late = max(a.time, b.time)
-    return moved_on(a, late), moved_on(b, late)
+    newer = max(a.time, b.time)
+    return moved_on(a, newer), moved_on(b, newer)
 
 
 def agree(captured: Pose, estimate: Pose, limits: PoseLimits) -> Verdict:
@@ -186,9 +186,11 @@ def agree(captured: Pose, estimate: Pose, limits: PoseLimits) -> Verdict:
     one's time.
     """
     captured, estimate = at_one_time(captured, estimate)
-    near = math.dist(captured.position, estimate.position) <= limits.apart
-    turned = angle_between(captured.quaternion, estimate.quaternion) <= limits.turned
-    return Verdict.GOOD if near and turned else Verdict.APART
+    is_near = math.dist(captured.position, estimate.position) <= limits.apart
+    is_aligned = (
+        angle_between(captured.quaternion, estimate.quaternion) <= limits.turned
+    )
+    return Verdict.GOOD if is_near and is_aligned else Verdict.APART
 
 
 def follows(captured: Pose, estimate: Pose, limits: PoseLimits) -> bool:

@@ -42,8 +42,8 @@ class Operator:
     def __enter__(self) -> Operator:
         for name in DEAF:
             handler = self._signal if name in LANDING else signal.SIG_IGN
-            before = signal.signal(getattr(signal, name), handler)
-            self._restore.callback(signal.signal, getattr(signal, name), before)
+            previous = signal.signal(getattr(signal, name), handler)
+            self._restore.callback(signal.signal, getattr(signal, name), previous)
         if self._terminal is None:
             with contextlib.suppress(ValueError, OSError, AttributeError):
                 self._terminal = sys.stdin.fileno()
@@ -51,8 +51,8 @@ class Operator:
             import termios
             import tty
 
-            before = termios.tcgetattr(self._terminal)
-            self._restore.callback(_give_back, self._terminal, before)
+            previous = termios.tcgetattr(self._terminal)
+            self._restore.callback(_give_back, self._terminal, previous)
             tty.setcbreak(self._terminal)
         else:
             self._terminal = None

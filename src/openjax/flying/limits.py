@@ -77,19 +77,19 @@ def parting_velocity(
     Two vehicles that close in at `c` and both brake at `braking` need `c * reaction +
     c**2 / (4 * braking)` to stop.
     """
-    own = poses[i]
-    wanted = None
+    pose = poses[i]
+    velocity = None
     for j, other in enumerate(poses):
         if j == i or other is None:
             continue
-        distance = math.dist(own.position, other.position)
+        distance = math.dist(pose.position, other.position)
         if distance < 1e-6:  # no way leads apart from there
             continue
         away = tuple(
             (p - q) / distance
-            for p, q in zip(own.position, other.position, strict=True)
+            for p, q in zip(pose.position, other.position, strict=True)
         )
-        approach = zip(away, own.velocity, other.velocity, strict=True)
+        approach = zip(away, pose.velocity, other.velocity, strict=True)
         # along the line between them; what moves apart needs no room
         closing = max(sum(a * (w - v) for a, v, w in approach), 0.0)
         stopping = closing * (settings.reaction + closing / (4.0 * settings.braking))
@@ -97,14 +97,15 @@ def parting_velocity(
         if lack > 0.0:
             # half of the approach: the other brakes the other half
             push = 0.5 * closing + min(lack / settings.reaction, FASTEST_PUSH)
-            wanted = tuple(
-                w + push * a for w, a in zip(wanted or own.velocity, away, strict=True)
+            velocity = tuple(
+                w + push * a
+                for w, a in zip(velocity or pose.velocity, away, strict=True)
             )
-    return wanted
+    return velocity
 
 
 def within_reach(
-    action: SetPoint, sent: SetPoint, airframe: Airframe, dt: float
+    action: SetPoint, previous: SetPoint, airframe: Airframe, dt: float
 ) -> SetPoint:
     """The action within its bounds, and no farther from what was sent `dt` (s) before
     than the vehicle can follow.
@@ -114,7 +115,9 @@ def within_reach(
     """
 
     def near(value, old, room):
-        return min(max(value, old - room), old + room) if sent.mode == RATES else value
+        return (
+            min(max(value, old - room), old + room) if previous.mode == RATES else value
+        )
 
     def rate(value, old):
         return near(min(max(value, -math.pi), math.pi), old, turn)
@@ -123,10 +126,10 @@ def within_reach(
     lift = dt / airframe.motor_time_constant
     return SetPoint(
         mode=RATES,
-        roll=rate(action.roll, sent.roll),
-        pitch=rate(action.pitch, sent.pitch),
-        yaw_rate=rate(action.yaw_rate, sent.yaw_rate),
-        thrust=near(min(max(action.thrust, 0.0), 1.0), sent.thrust, lift),
+        roll=rate(action.roll, previous.roll),
+        pitch=rate(action.pitch, previous.pitch),
+        yaw_rate=rate(action.yaw_rate, previous.yaw_rate),
+        thrust=near(min(max(action.thrust, 0.0), 1.0), previous.thrust, lift),
     )
 
 
@@ -151,7 +154,7 @@ def resting_places(
     places = [(x, y, min(max(z, low), high)) for x, y, z in stops]
     # each push may undo another, so all are repeated until nothing moves
     for _ in range(ROUNDS):
-        moved = []
+        next_places = []
         for i, place in enumerate(places):
             for x, y, radius in pillars:
                 place = _pushed(place, (x, y), radius + CLEARANCE)
@@ -162,10 +165,12 @@ def resting_places(
                     place = _pushed(place, other, APART, 0.5, 1.0 if i < j else -1.0)
             # the wall last, so that no push leads out of the arena
             inside = min(1.0, reach / max(math.hypot(*place[:2]), 1e-6))
-            moved.append((place[0] * inside, place[1] * inside, place[2]))
-        if all(math.dist(a, b) < 1e-4 for a, b in zip(moved, places, strict=True)):
+            next_places.append((place[0] * inside, place[1] * inside, place[2]))
+        if all(
+            math.dist(a, b) < 1e-4 for a, b in zip(next_places, places, strict=True)
+        ):
             break
-        places = moved
+        places = next_places
     return places
 
 

@@ -159,15 +159,15 @@ class Links:
                 return
             # a stream keeps no records apart: the last one may have come in part
             data = self._rest + data
-            whole = len(data) - len(data) % POSE_RECORD.size
-            self._rest = data[whole:]
+            complete = len(data) - len(data) % POSE_RECORD.size
+            self._rest = data[complete:]
             for (
                 vehicle,
                 supervisor,
                 arrival,
                 voltage,
                 *numbers,
-            ) in POSE_RECORD.iter_unpack(data[:whole]):
+            ) in POSE_RECORD.iter_unpack(data[:complete]):
                 force = tuple(numbers[:3])
                 self._samples[vehicle] = PoseSample(
                     own=pose_of(numbers[3:]),
@@ -181,15 +181,17 @@ class Links:
 
     def wait(self, until: float) -> None:
         """Return at `until` (s), or as soon as a pose arrives."""
-        remaining = until - time.perf_counter()
-        if remaining > 0:
-            select.select([self._stream], [], [], remaining)
+        seconds_left = until - time.perf_counter()
+        if seconds_left > 0:
+            select.select([self._stream], [], [], seconds_left)
 
     def observe(self) -> tuple[PoseSample, ...]:
         """What is known of each vehicle now."""
         self._drain()
-        known = zip(self._samples, self._contacts, strict=True)
-        return tuple(sample._replace(last_contact=contact) for sample, contact in known)
+        samples = zip(self._samples, self._contacts, strict=True)
+        return tuple(
+            sample._replace(last_contact=contact) for sample, contact in samples
+        )
 
     def arrivals(self) -> tuple[float, ...]:
         """When each vehicle's newest pose arrived (s, host)."""
@@ -205,16 +207,18 @@ class Links:
         if self.board.pilot is not Role.LOOP:
             raise LinksGone("another process flies")
         self._count += 1
-        packed = b"".join(SET_POINT_RECORD.pack(*s) for s in set_points)
+        payload = b"".join(SET_POINT_RECORD.pack(*s) for s in set_points)
         try:
-            self._commands.send(SET_POINTS_NUMBER.pack(self._count) + packed)
+            self._commands.send(SET_POINTS_NUMBER.pack(self._count) + payload)
             number = 0
             # an answer that came too late for its tick may still be there
             while number != self._count:
-                number, sent = SENT_RECORD.unpack(self._commands.recv(SENT_RECORD.size))
+                number, sent_at = SENT_RECORD.unpack(
+                    self._commands.recv(SENT_RECORD.size)
+                )
         except OSError as error:
             raise LinksGone("the links' process is gone or stuck") from error
-        return sent
+        return sent_at
 
     def send_pose(self, i: int, pose: Pose) -> None:
         """Tell vehicle i where motion capture sees it."""

@@ -147,9 +147,9 @@ def _send_on(swarm: Swarm, commands: socket.socket, board: Board) -> None:
             (number,) = SET_POINTS_NUMBER.unpack_from(data)
             if board.pilot is not Role.LOOP:
                 return
-            packed = SET_POINT_RECORD.iter_unpack(data[SET_POINTS_NUMBER.size :])
-            sent = swarm.send([SetPoint._make(numbers) for numbers in packed])
-            commands.send(SENT_RECORD.pack(number, sent))
+            records = SET_POINT_RECORD.iter_unpack(data[SET_POINTS_NUMBER.size :])
+            sent_at = swarm.send([SetPoint._make(numbers) for numbers in records])
+            commands.send(SENT_RECORD.pack(number, sent_at))
         except (OSError, struct.error):
             return
 
@@ -160,13 +160,13 @@ def _watch(swarm: Swarm, board: Board, parent: int, state: State | None) -> None
     """
     while True:
         time.sleep(CHECK)
-        now = time.perf_counter()
-        board.beat(Role.LINKS, now)
-        silent = board.silent(Role.LOOP, now)
-        left = board.pilot is Role.LINKS or (
+        time_read = time.perf_counter()
+        board.beat(Role.LINKS, time_read)
+        silent = board.silent(Role.LOOP, time_read)
+        is_over = board.pilot is Role.LINKS or (
             board.pilot is Role.LOOP and silent > board.silence
         )
-        if left and board.flying and state is not None:
+        if is_over and board.flying and state is not None:
             say(
                 f"openjax fly: the loop, heard {silent:.2f} s ago, left all vehicles to the links' "
                 "process"

@@ -131,9 +131,11 @@ class Flight:
         """One tick at `time` that was due at `due` (s)."""
         arrivals = self.vehicles.arrivals()
         samples = self.vehicles.observe()
-        before = self.state.drones
+        old_drones = self.state.drones
         self.state = see(self.state, time, samples)
-        for i, (drone, old) in enumerate(zip(self.state.drones, before, strict=True)):
+        for i, (drone, old) in enumerate(
+            zip(self.state.drones, old_drones, strict=True)
+        ):
             # only what was believed goes to the estimators on board, and each pose once
             if drone.captured.pose is not old.captured.pose:
                 self.vehicles.believed(i, drone.captured.pose, drone.feeds_estimator)
@@ -147,11 +149,11 @@ class Flight:
         self.state, set_points = decide(
             self.state, Event(time, samples, actions, request, self._alarm)
         )
-        sent = self.vehicles.send(set_points)
+        sent_at = self.vehicles.send(set_points)
         self._alarm = self._watched(time, self.state)
         # after the set-points have left: they mustn't wait for it
         self.record.keep(
-            (due, sent, self._episode), arrivals, measured_times(samples), set_points
+            (due, sent_at, self._episode), arrivals, measured_times(samples), set_points
         )
         if self._episode >= 0 and not any(m is Mode.PURSUIT for m in self.state.modes):
             self._end_episode("safety")
@@ -227,8 +229,8 @@ class Flight:
         """The set-point of an evader that is a vehicle, at `pose`: to the velocity of
         its rule.
         """
-        wanted = tuple(float(v) for v in self._play.evader_velocity)
-        acceleration = wanted_acceleration(pose.velocity, wanted)
+        velocity = tuple(float(v) for v in self._play.evader_velocity)
+        acceleration = wanted_acceleration(pose.velocity, velocity)
         trim = self.state.drones[-1].trim
         return accelerate(
             pose.quaternion, acceleration, self.state.airframe, trim, RATES

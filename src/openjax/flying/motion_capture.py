@@ -40,16 +40,16 @@ def find_feed(name: str) -> Callable:
     # called
     sys.path.insert(0, str(Path.cwd()))
     try:
-        found = pkgutil.resolve_name(name)
+        feed = pkgutil.resolve_name(name)
     except (ImportError, AttributeError, ValueError) as error:
         raise UserError(
             f"--motion_capture {name}: no such MODULE:FUNCTION ({error})"
         ) from error
     finally:
         sys.path.pop(0)
-    if not callable(found):
+    if not callable(feed):
         raise UserError(f"--motion_capture {name}: is no function")
-    return found
+    return feed
 
 
 class MotionCaptured(Links):
@@ -112,9 +112,9 @@ class MotionCaptured(Links):
 
     def observe(self) -> tuple[PoseSample, ...]:
         """What is known of each vehicle now."""
-        own = super().observe()
+        samples = super().observe()
         return tuple(
-            s._replace(captured=p) for p, s in zip(self._captured, own, strict=True)
+            s._replace(captured=p) for p, s in zip(self._captured, samples, strict=True)
         )
 
     def arrivals(self) -> tuple[float, ...]:

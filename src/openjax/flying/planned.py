@@ -86,12 +86,12 @@ class PlannedFlight:
         error = plan.position[row] - pose.position
         self._trim += LIFT_GAIN * PERIOD * float(error[2])
         self._trim = min(max(self._trim, -MOST_TRIM), MOST_TRIM)
-        wanted = plan.velocity[row] + POSITION_GAIN * error
+        velocity = plan.velocity[row] + POSITION_GAIN * error
         pull = (
-            np.array(wanted_acceleration(pose.velocity, tuple(wanted)))
+            np.array(wanted_acceleration(pose.velocity, tuple(velocity)))
             + plan.acceleration[row]
         )
-        sent = accelerate(
+        set_point = accelerate(
             pose.quaternion, tuple(pull), self.airframe, self._trim, RATES
         )
         yaw = roll_pitch_yaw(pose.quaternion)[2]
@@ -99,8 +99,10 @@ class PlannedFlight:
         # what the plan itself turns until the next row is asked for beside the error's
         # share
         ahead = plan.yaw[min(row + 1, len(plan) - 1)] - plan.yaw[row]
-        rates = np.array([sent.roll, sent.pitch, YAW_GAIN * turn + ahead / PERIOD])
-        thrust = sent.thrust + plan.extra[row, 0]
+        rates = np.array(
+            [set_point.roll, set_point.pitch, YAW_GAIN * turn + ahead / PERIOD]
+        )
+        thrust = set_point.thrust + plan.extra[row, 0]
         rates = rates + plan.extra[row, 1:]
         return np.clip(
             np.concatenate([[2.0 * thrust - 1.0], rates / math.pi]), -1.0, 1.0

@@ -33,12 +33,12 @@ def poses_arriving(links) -> list[float]:
         times = [sample.own.time for sample in links.observe()]
         return list(zip(times, links.counts, strict=True))
 
-    before = newest()
+    earlier = newest()
     time.sleep(LISTENING)
     # by the times at which poses were measured, since the sleep may have taken longer
     return [
         (count - old_count) / max(at - since, LISTENING)
-        for (at, count), (since, old_count) in zip(newest(), before, strict=True)
+        for (at, count), (since, old_count) in zip(newest(), earlier, strict=True)
     ]
 
 
@@ -62,11 +62,11 @@ def faults(
     for i, (sample, start, rate) in enumerate(
         zip(samples, state.starts, rates, strict=True)
     ):
-        found = [
+        pose_faults = [
             *_firmware_faults(state.settings, sample, rate),
             *_pose_faults(state, sample, start),
         ]
-        lines += [f"vehicle {i}: {fault}" for fault in found]
+        lines += [f"vehicle {i}: {fault}" for fault in pose_faults]
     return lines
 
 
@@ -119,8 +119,8 @@ def _pose_faults(state, sample, start: Vector) -> Iterator[str]:
     if sample.captured is None or sample.own is None:
         return
     if agree(sample.captured, sample.own, limits):
-        own = ", ".join(f"{p:.2f}" for p in sample.own.position)
+        place = ", ".join(f"{p:.2f}" for p in sample.own.position)
         yield (
-            f"motion capture sees it at {where} m, itself at ({own}): mend axes, unit or origin of "
+            f"motion capture sees it at {where} m, itself at ({place}): mend axes, unit or origin of "
             "one of them"
         )

@@ -86,11 +86,11 @@ class RawLinks:
         """Send each vehicle its set-point; returns when the last one left (s)."""
         for link, set_point in zip(self._links.values(), set_points, strict=True):
             send_set_point(link, set_point)
-        now = time.perf_counter()
-        if self._watchdog and now - self._fed > WATCHDOG_PERIOD:
-            self._fed = now
+        time_read = time.perf_counter()
+        if self._watchdog and time_read - self._fed > WATCHDOG_PERIOD:
+            self._fed = time_read
             self._supervise(SupervisorCommand.FEED_WATCHDOG)
-        return now
+        return time_read
 
     def arm(self, on: bool) -> None:
         """Arm or disarm all."""

@@ -88,44 +88,46 @@ def decide(state: State, event: Event) -> tuple[State, tuple[SetPoint, ...]]:
     """The state after a tick whose poses were seen already, and the set-point of each
     vehicle.
     """
-    now = event.time
+    time = event.time
     actions = event.actions
     finite = actions is not None and all(
         math.isfinite(x) for action in actions for x in action
     )
-    action_time = now if finite else state.action_time
+    action_time = time if finite else state.action_time
     # requests first, so that troubles have the last word
     drones = _requested(state, event)
     both = zip(drones, event.samples, strict=True)
     troubles = [_trouble(state, drone, sample) for drone, sample in both]
     pursuing = any(d.mode is Mode.PURSUIT for d in drones)
     if pursuing and event.request is not Request.PURSUE:
-        if now - action_time > state.settings.action_timeout:
+        if time - action_time > state.settings.action_timeout:
             reason = "no action in time" if actions is None else "action not finite"
             troubles = [t or (Mode.HOLD, reason) for t in troubles]
     else:
         # the clock of the actions starts with the game
-        action_time = now
+        action_time = time
     state = state._replace(
         drones=_react(state, drones, troubles), action_time=action_time
     )
-    moved = tuple(
+    next_drones = tuple(
         steer(state, i, actions[i] if finite else None, sample)
         for i, sample in enumerate(event.samples)
     )
-    return state._replace(drones=moved), tuple(drone.sent for drone in moved)
+    return state._replace(drones=next_drones), tuple(
+        drone.sent for drone in next_drones
+    )
 
 
 def _requested(state, event) -> tuple[Drone, ...]:
     """The drones after what the operator, or the plan, asks for."""
     drones = state.drones
-    now = event.time
+    time = event.time
     anchors = state.starts
     if event.request is Request.STOP:
         reason = event.reason or "stopped by hand"
-        return tuple(d.to(Mode.STOPPED, now, reason=reason) for d in drones)
+        return tuple(d.to(Mode.STOPPED, time, reason=reason) for d in drones)
     if event.request is Request.PURSUE and state.all_in(Mode.READY):
-        return tuple(d.to(Mode.PURSUIT, now) for d in drones)
+        return tuple(d.to(Mode.PURSUIT, time) for d in drones)
     answer = {Request.LAND: _land, Request.HOLD: _hold}.get(event.request)
     if answer is not None:
         anchors = resting_places_of(state)
@@ -187,8 +189,8 @@ def lift_fault(state: State, drone: Drone) -> str:
     moves = []
     for track, stand in zip((drone.own, drone.captured), drone.stand, strict=True):
         if stand is not None:
-            moved = zip(track.pose.position, stand, strict=True)
-            moves.append(tuple(p - s for p, s in moved))
+            offsets = zip(track.pose.position, stand, strict=True)
+            moves.append(tuple(p - s for p, s in offsets))
     if any(z > 2.0 * settings.lift for *_, z in moves):
         return "the test lift went too high: is it lighter, or another, than --vehicle says?"
     if any(math.hypot(x, y) > ASIDE for x, y, _ in moves):
@@ -214,9 +216,9 @@ def _trouble(state, drone, sample) -> tuple[Mode, str] | None:
         return Mode.STOPPED, "stopped by its firmware"
     if drone.mode is Mode.SETTLE:
         return None
-    lost = _lost(state, drone, sample)
+    loss = _lost(state, drone, sample)
     if drone.mode is Mode.LIFT:  # from there it may fall
-        fault = lost or lift_fault(state, drone)
+        fault = loss or lift_fault(state, drone)
         return (Mode.STOPPED, fault) if fault else None
     if (
         drone.over_since is not None
@@ -224,8 +226,8 @@ def _trouble(state, drone, sample) -> tuple[Mode, str] | None:
     ):
         return Mode.STOPPED, "tumbled"
     # who lands already goes on landing, whatever else is wrong with it
-    fault = lost
-    if not lost and drone.mode is not Mode.LAND:
+    fault = loss
+    if not loss and drone.mode is not Mode.LAND:
         fault = drone.capture_fault or _unfit(state, drone)
     return (Mode.LAND, fault) if fault else None
 
@@ -242,12 +244,15 @@ def _lost(state, drone, sample) -> str:
 def _unfit(state, drone) -> str:
     """Why a drone whose pose is known mustn't fly on; empty if it may."""
     settings = state.settings
-    now = state.time
-    if drone.low_since is not None and now - drone.low_since > settings.battery_time:
+    time = state.time
+    if drone.low_since is not None and time - drone.low_since > settings.battery_time:
         return "battery low"
-    if drone.alone_since is not None and now - drone.alone_since > settings.alone_time:
+    if drone.alone_since is not None and time - drone.alone_since > settings.alone_time:
         return f"{settings.alone_time:g} s by its own estimate alone"
-    if drone.own.pose is not None and now - drone.own.pose.time > settings.link_timeout:
+    if (
+        drone.own.pose is not None
+        and time - drone.own.pose.time > settings.link_timeout
+    ):
         return f"own estimate lost ({drone.own.verdict or 'silent'})"
     x, y, z = drone.estimate.position
     if math.hypot(x, y) > settings.arena_radius + settings.outside:
@@ -265,34 +270,34 @@ def _react(state, drones, troubles) -> tuple[Drone, ...]:
     """The drones after troubles: those in trouble as told; the others stop, wait, and
     land. A test lift ends at once.
     """
-    now = state.time
+    time = state.time
     team = any(d.reason for d in drones) or any(troubles)
     anchors = resting_places_of(state) if team else [None] * len(drones)
-    risen = all(d.mode is Mode.LIFT and _risen(d, now) for d in drones) and not team
+    risen = all(d.mode is Mode.LIFT and _risen(d, time) for d in drones) and not team
     reacted = []
     for drone, trouble, anchor, start in zip(
         drones, troubles, anchors, state.starts, strict=True
     ):
-        waited = now - drone.since > state.settings.hold_time
+        waited = time - drone.since > state.settings.hold_time
         if trouble is not None and trouble[0] is not drone.mode:
             mode, reason = trouble
-            drone = drone.to(mode, now, anchor, reason)
+            drone = drone.to(mode, time, anchor, reason)
         elif drone.mode is Mode.LIFT and team:
-            drone = drone.to(Mode.STOPPED, now, reason="another is in trouble")
+            drone = drone.to(Mode.STOPPED, time, reason="another is in trouble")
         elif team and not drone.reason and drone.mode in (*_UNTROUBLED, Mode.HOLD):
-            drone = drone.to(Mode.HOLD, now, anchor, "another is in trouble")
+            drone = drone.to(Mode.HOLD, time, anchor, "another is in trouble")
         elif drone.mode is Mode.HOLD and drone.reason and waited:
-            drone = drone.to(Mode.LAND, now)
+            drone = drone.to(Mode.LAND, time)
         elif risen:
-            drone = drone.to(Mode.TRANSFER, now, start)
+            drone = drone.to(Mode.TRANSFER, time, start)
         reacted.append(drone)
     return tuple(reacted)
 
 
 def _risen(drone, time) -> bool:
     """Whether a test lift is over; not before its rotors must have turned up."""
-    near = abs(drone.estimate.position[2] - drone.anchor[2]) < RISEN
-    return near and time - drone.since > 2.0 * SPIN_UP
+    is_near = abs(drone.estimate.position[2] - drone.anchor[2]) < RISEN
+    return is_near and time - drone.since > 2.0 * SPIN_UP
 
 
 def resting_places_of(state: State) -> list[Vector]:
@@ -311,14 +316,14 @@ def steer(state: State, i: int, action: SetPoint | None, sample: PoseSample) -> 
     there is one.
     """
     drone = _watched(state, state.drones[i], sample)._replace(sent=MOTORS_OFF)
-    now = state.time
+    time = state.time
     if drone.mode not in FLYING or drone.estimate is None:
         return drone
-    if drone.mode is Mode.SETTLE and now - drone.since > SETTLING:
-        return drone.to(Mode.LANDED, now)
+    if drone.mode is Mode.SETTLE and time - drone.since > SETTLING:
+        return drone.to(Mode.LANDED, time)
     # the last centimetres go level: nothing on board knows exactly where the floor is
     if drone.mode is Mode.LAND and _is_low(state, drone):
-        drone = drone.to(Mode.SETTLE, now)
+        drone = drone.to(Mode.SETTLE, time)
     if drone.mode is Mode.SETTLE:
         lift = SETTLING_LIFT * (state.airframe.hover_thrust + drone.trim)
         return drone._replace(sent=SetPoint(ANGLES, thrust=lift))
@@ -336,9 +341,9 @@ def _watched(state, drone, sample) -> Drone:
     low = sample.voltage < state.settings.battery_low  # an unknown voltage is not low
     over = drone.estimate is not None and up(drone.estimate.quaternion) < 0.0
     confirmed = drone.captured.pose is not None and not drone.capture_fault
-    alone = drone.mode in FLYING and not confirmed
+    is_alone = drone.mode in FLYING and not confirmed
     return drone._replace(
-        alone_since=since(drone.alone_since, alone),
+        alone_since=since(drone.alone_since, is_alone),
         low_since=since(drone.low_since, low),
         over_since=since(drone.over_since, over),
     )
@@ -346,8 +351,8 @@ def _watched(state, drone, sample) -> Drone:
 
 def _is_low(state, drone) -> bool:
     """Whether a landing is near the floor, or long enough on the way."""
-    late = state.time - drone.since > state.settings.landing_time
-    return late or drone.estimate.position[2] < LOW
+    overdue = state.time - drone.since > state.settings.landing_time
+    return overdue or drone.estimate.position[2] < LOW
 
 
 def _pursue(state, drone, i, action) -> SetPoint:
@@ -360,21 +365,21 @@ def _pursue(state, drone, i, action) -> SetPoint:
         parting = parting_velocity(settings, i, poses)
     # who makes room for another mustn't leave the arena for that
     aimed = estimate if parting is None else estimate._replace(velocity=parting)
-    sent = state.drones[i].sent
+    previous = state.drones[i].sent
     # until its motors have followed it turns on
-    turned = turned_on(
+    set_point = turned_on(
         estimate.quaternion, estimate.body_rates, state.airframe.motor_time_constant
     )
-    lift = max(sent.thrust, LEAST_THRUST) / state.airframe.hover_thrust
-    present = lift_acceleration(turned, lift)
-    wanted = (
+    lift = max(previous.thrust, LEAST_THRUST) / state.airframe.hover_thrust
+    present = lift_acceleration(set_point, lift)
+    velocity = (
         fence_velocity(settings, estimate, present)
         or fence_velocity(settings, aimed, present)
         or parting
     )
-    if wanted is None:
-        return within_reach(action, sent, state.airframe, state.dt)
-    acceleration = wanted_acceleration(estimate.velocity, wanted)
+    if velocity is None:
+        return within_reach(action, previous, state.airframe, state.dt)
+    acceleration = wanted_acceleration(estimate.velocity, velocity)
     return accelerate(
         estimate.quaternion, acceleration, state.airframe, drone.trim, RATES
     )
@@ -384,8 +389,8 @@ def _go(state, drone, i) -> Drone:
     """The drone on its way to its anchor, or waiting there, by the controller."""
     estimate = drone.estimate
     airframe = state.airframe
-    wanted = _wanted(state, drone, i)
-    acceleration = wanted_acceleration(estimate.velocity, wanted)
+    velocity = _wanted(state, drone, i)
+    acceleration = wanted_acceleration(estimate.velocity, velocity)
     attitude = estimate.quaternion
     if state.time - drone.seen > state.settings.pose_timeout:
         # by reckoning: the vehicle does what it is asked for, and is level else
@@ -398,7 +403,7 @@ def _go(state, drone, i) -> Drone:
     else:
         # not lower: on the floor a vehicle that doesn't climb isn't too heavy
         if estimate.position[2] > (0.02 if drone.mode is Mode.LIFT else 0.1):
-            error = min(max(wanted[2] - estimate.velocity[2], -0.3), 0.3)
+            error = min(max(velocity[2] - estimate.velocity[2], -0.3), 0.3)
             trim = min(
                 max(drone.trim + TRIM_GAIN * state.dt * error, -TRIM_LIMIT), TRIM_LIMIT
             )

@@ -118,13 +118,13 @@ class Session:
         # first, as it takes half a second: what is judged is what is known after it
         rates = poses_arriving(self.links)
         guarded = self._guard is None or self._guard.lives()
-        found = faults(self._state, self.links.observe(), rates, guarded)
-        if len(found) == 1:
-            raise UserError(f"no take-off: {found[0]}")
-        if found:
-            for line in found:
+        problems = faults(self._state, self.links.observe(), rates, guarded)
+        if len(problems) == 1:
+            raise UserError(f"no take-off: {problems[0]}")
+        if problems:
+            for line in problems:
                 say(line)
-            raise UserError(f"no take-off for these {len(found)} reasons")
+            raise UserError(f"no take-off for these {len(problems)} reasons")
 
     def fly(self, flight: Flight) -> tuple[list, str]:
         """Arm and fly; what was recorded of each vehicle, and why another process
@@ -175,12 +175,12 @@ class Session:
             board.pilot = Role.LINKS
         while board.flying:
             time.sleep(0.005)
-            now = time.perf_counter()
-            board.beat(Role.LOOP, now)
+            time_read = time.perf_counter()
+            board.beat(Role.LOOP, time_read)
             self._listen()
             lander = max(lander, board.pilot)
             if all(
-                board.silent(role, now) > board.silence
+                board.silent(role, time_read) > board.silence
                 for role in (Role.LINKS, Role.GUARD)
             ):
                 lander = Role.LOOP
@@ -204,18 +204,18 @@ class Session:
         """
         deadline = time.monotonic() + POSES
         while True:
-            now = time.perf_counter()
+            time_read = time.perf_counter()
             samples = self.links.observe()
             newest = zip(measured_times(samples), samples, strict=True)
-            old = [not abs(now - t) <= FRESH or s.own is None for t, s in newest]
+            old = [not abs(time_read - t) <= FRESH or s.own is None for t, s in newest]
             if not any(old):
                 return
             if time.monotonic() > deadline:
                 uris: Sequence[str] = self._settings.uris
                 silent = ", ".join(
-                    uri for uri, missing in zip(uris, old, strict=True) if missing
+                    uri for uri, is_old in zip(uris, old, strict=True) if is_old
                 )
                 raise UserError(
                     f"no pose from {silent} within {POSES:g} s; is its position known?"
                 )
-            self.links.wait(now + 0.02)
+            self.links.wait(time_read + 0.02)

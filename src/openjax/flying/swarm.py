@@ -119,23 +119,25 @@ class Member:
 
     def sample(self) -> PoseSample:
         """What is known of it."""
-        near = self.pose is not None and abs(self.pose.time - self.felt[0]) <= FORCE_AGE
+        is_recent = (
+            self.pose is not None and abs(self.pose.time - self.felt[0]) <= FORCE_AGE
+        )
         return PoseSample(
             own=self.pose,
             last_contact=self.last_contact,
             voltage=self.voltage,
             supervisor=self.supervisor,
-            force=self.felt[1] if near else None,
+            force=self.felt[1] if is_recent else None,
         )
 
     def pose_arrived(self, stamp: int, data: dict, _block=None) -> None:
         """A pose block, called by cflib's thread."""
-        now = perf_counter()
+        arrival = perf_counter()
         values = [data[name] for name, _ in POSE_BLOCK]
         # in millimetres, mm/s, degrees/s and millivolts, so that all fits into one
         # packet
         pose = Pose(
-            self._onboard.host(stamp, now),
+            self._onboard.host(stamp, arrival),
             tuple(1e-3 * v for v in values[:3]),
             tuple(1e-3 * v for v in values[3:6]),
             expand_quaternion(values[6]),
@@ -144,18 +146,18 @@ class Member:
         self.voltage = 1e-3 * values[10]
         self.supervisor = values[11]
         self.pose = pose
-        self.arrival = now
-        self.last_contact = now
+        self.arrival = arrival
+        self.last_contact = arrival
         if self.recording:
-            self.poses.extend((now, self.voltage, *numbers_of(pose)))
+            self.poses.extend((arrival, self.voltage, *numbers_of(pose)))
         self.listener(True)
 
     def body_arrived(self, stamp: int, data: dict, _block=None) -> None:
         """A block of motors and accelerometer."""
-        now = perf_counter()
-        self.last_contact = now
+        arrival = perf_counter()
+        self.last_contact = arrival
         self.phases[_block] = stamp % PERIOD_MS
-        measured = self._onboard.host(stamp, now)
+        measured = self._onboard.host(stamp, arrival)
         force = tuple(9.81 * data[name] for name, _ in BODY_BLOCK[4:])
         if measured > self.felt[0]:  # packets may overtake each other
             self.felt = measured, force
@@ -285,19 +287,19 @@ class Swarm:
 
     def _answers(self, member, make, timeout) -> bool:
         """Whether the vehicle has told all that `cflib` asks for."""
-        done = threading.Event()
+        answered_event = threading.Event()
         member.error = None
         member.crazyflie = crazyflie = make()
-        crazyflie.fully_connected.add_callback(lambda _uri: done.set())
+        crazyflie.fully_connected.add_callback(lambda _uri: answered_event.set())
 
         def failed(_uri, message):
             member.error = str(message).strip().splitlines()[0]
-            done.set()
+            answered_event.set()
 
         crazyflie.connection_failed.add_callback(failed)
         crazyflie.connection_lost.add_callback(failed)
         crazyflie.open_link(member.uri)
-        if not done.wait(timeout):
+        if not answered_event.wait(timeout):
             member.error = f"no answer in {timeout:.0f} s"
         if member.error is not None:
             crazyflie.close_link()
@@ -313,10 +315,10 @@ class Swarm:
                 block = LogConfig(f"openjax{number}", PERIOD_MS)
                 for name, fetch_as in kind:
                     block.add_variable(name, fetch_as)
-                arrived = (
+                arrival = (
                     member.pose_arrived if kind is POSE_BLOCK else member.body_arrived
                 )
-                block.data_received_cb.add_callback(arrived)
+                block.data_received_cb.add_callback(arrival)
                 try:
                     member.crazyflie.log.add_config(block)
                 except (KeyError, AttributeError) as error:
@@ -377,12 +379,12 @@ class Swarm:
         """Send each vehicle its set-point; returns when the last one left (s)."""
         for member, set_point in zip(self.members, set_points, strict=True):
             send_set_point(member.crazyflie, set_point)
-        sent = perf_counter()
-        if self._watchdog and sent - self._fed > WATCHDOG_PERIOD:
-            self._fed = sent
+        sent_at = perf_counter()
+        if self._watchdog and sent_at - self._fed > WATCHDOG_PERIOD:
+            self._fed = sent_at
             for member in self.members:
                 member.crazyflie.supervisor.send_emergency_stop_watchdog()
-        return sent
+        return sent_at
 
     def send_pose(self, i: int, position, quaternion) -> None:
         """Tell vehicle i where motion capture sees it: (3,) m, (4,) wxyz."""

@@ -57,8 +57,8 @@ def fly_down(
       off.
     """
     board.pilot = role
-    now = due = time.perf_counter()
-    state = take_over(board.read(state, now), now)
+    time_read = due = time.perf_counter()
+    state = take_over(board.read(state, time_read), time_read)
     while state.flying and board.pilot is role:
         listen()
         request = Request.STOP if board.stopped else Request.NONE

@@ -66,20 +66,20 @@ def await_poses(vehicles: Links, due: float) -> None:
     """Return around `due` (s): as soon as each vehicle's newest pose is there that was
     measured before.
     """
-    begun = perf_counter()
-    latest = max(due, begun) + PATIENCE
+    start = perf_counter()
+    latest = max(due, start) + PATIENCE
     while True:
-        now = perf_counter()
-        stood_still = latest + PATIENCE < now < begun + GONE
-        if now >= latest and not stood_still:
+        time_read = perf_counter()
+        stood_still = latest + PATIENCE < time_read < start + GONE
+        if time_read >= latest and not stood_still:
             return
         if stood_still:
             # so may the links have, which have first to pass on what came
-            due = now - PATIENCE
-            latest = now + PATIENCE
+            due = time_read - PATIENCE
+            latest = time_read + PATIENCE
         measured = measured_times(vehicles.observe())
-        complete = all(t > due - PERIOD or now - t > GONE for t in measured)
-        if complete and now >= due - EARLY:
+        complete = all(t > due - PERIOD or time_read - t > GONE for t in measured)
+        if complete and time_read >= due - EARLY:
             return
         vehicles.wait(due - EARLY if complete else latest)
 

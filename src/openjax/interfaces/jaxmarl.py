@@ -96,9 +96,13 @@ class PursuitMultiAgentEnv:
         dones = {agent: over for agent in self.agents} | {"__all__": over}
         observations = self._by_agent(flat_observation(observation))
         # of each agent, as JaxMARL's wrappers stack what is in `infos`
-        cut = jnp.broadcast_to(truncated, info.captured.shape)
+        is_cut = jnp.broadcast_to(truncated, info.captured.shape)
         # (N,) each
-        infos = {"captured": info.captured, "crashed": info.crashed, "truncated": cut}
+        infos = {
+            "captured": info.captured,
+            "crashed": info.crashed,
+            "truncated": is_cut,
+        }
         if not self.environment.settings.observe_time:
             infos["final_obs"] = observations
         return observations, state, self._by_agent(reward), dones, infos

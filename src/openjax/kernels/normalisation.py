@@ -69,9 +69,9 @@ def _forward(x, affine, activate):
     return normalise(x, affine, activate), (x, affine)
 
 
-def _backward(activate, saved, gradient):
+def _backward(activate, residuals, gradient):
     return on_platform(_reference_backward, backward_by_kernel, activate)(
-        *saved, gradient
+        *residuals, gradient
     )
 
 

@@ -226,7 +226,7 @@ class _Stage:
         """States (W, ...) SETTLE steps later, flown by vehicles of the bounds."""
         number = state.step.shape[0]
         draw = functools.partial(draw_vehicles, self.free.vehicles)
-        drawn = jax.vmap(lambda key: draw(key, self.free.num_pursuers, 0.0, bounds))(
+        vehicles = jax.vmap(lambda key: draw(key, self.free.num_pursuers, 0.0, bounds))(
             jax.random.split(key, number)
         )
         diagnosed = self.pursuit(bounds)
@@ -236,7 +236,7 @@ class _Stage:
             observation, state = carry
             return fly_on(parameters.actor, observation, state), None
 
-        state = state.replace(vehicles=drawn)
+        state = state.replace(vehicles=vehicles)
         start = (jax.vmap(diagnosed.observe)(state), state)
         (_, settled), _ = jax.lax.scan(one, start, None, length=SETTLE)
         return settled
@@ -253,12 +253,17 @@ class _Stage:
         _, starts = jax.vmap(pursuit.reset_to)(
             jax.random.split(reset_key, worlds), tasks
         )
-        chosen = jax.random.choice(
+        start_indices = jax.random.choice(
             moment_key, flights.position.shape[1], (worlds,), replace=False
         )
-        moments = jax.tree.map(lambda leaf: leaf[chosen], flights.state)
+        moments = jax.tree.map(lambda leaf: leaf[start_indices], flights.state)
         state = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), starts, moments)
-        return pursuit, state, flights.position[:, chosen], flights.velocity[:, chosen]
+        return (
+            pursuit,
+            state,
+            flights.position[:, start_indices],
+            flights.velocity[:, start_indices],
+        )
 
     def loss(self, actor, parameters, flights, key, bounds):
         """() what is learnt, and its parts."""

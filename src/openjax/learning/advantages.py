@@ -34,9 +34,9 @@ def generalised_advantages(
     error = reward + discount * goes_on * next_value - value
     decay = discount * trace * goes_on * (1.0 - truncated.astype(reward.dtype))
 
-    def backwards(following, inputs):
+    def backwards(later_advantage, inputs):
         error, decay = inputs
-        advantage = error + decay * following
+        advantage = error + decay * later_advantage
         return advantage, advantage
 
     _, advantage = jax.lax.scan(

@@ -174,13 +174,13 @@ class AnalyticGradient:
 
         def one(carry, _):
             world = moved(carry[0])
-            met = self._met(carry[1], world[1], paths, steps)
-            return (world, met), None
+            encounter = self._met(carry[1], world[1], paths, steps)
+            return (world, encounter), None
 
         nothing = no_encounter(world[1].drones.position.shape[:2])
         return jax.lax.scan(one, (world, nothing), None, length=steps)[0]
 
-    def _met(self, met, state, paths, steps):
+    def _met(self, encounter, state, paths, steps):
         """What pursuers have met so far, with what the step that ended with `state`
         adds.
         """
@@ -192,16 +192,18 @@ class AnalyticGradient:
         distance = evader_distance(self.game, state, paths)
         beyond_rest = jax.nn.relu(distance - rest)
         return Encounter(
-            least=jnp.minimum(met.least, nearest_gap(self.game, state)),
+            least=jnp.minimum(encounter.least, nearest_gap(self.game, state)),
             upright=jnp.minimum(
-                met.upright, rotation_axes(state.drones.quaternion)[1][..., 2]
+                encounter.upright, rotation_axes(state.drones.quaternion)[1][..., 2]
             ),
-            breach=met.breach + breach_share(self.game, state) / steps,
-            excess=met.excess + jax.nn.relu(speed(state.drones) - limit) / FAST / steps,
-            distance=met.distance + nearest_distance(beyond_rest) / steps,
-            free=met.free + free_share(radius, distance) / steps,
-            territory=met.territory + territory_share(self.game, state, paths) / steps,
-            unseen=met.unseen + hidden_share(self.game, state) / steps,
+            breach=encounter.breach + breach_share(self.game, state) / steps,
+            excess=encounter.excess
+            + jax.nn.relu(speed(state.drones) - limit) / FAST / steps,
+            distance=encounter.distance + nearest_distance(beyond_rest) / steps,
+            free=encounter.free + free_share(radius, distance) / steps,
+            territory=encounter.territory
+            + territory_share(self.game, state, paths) / steps,
+            unseen=encounter.unseen + hidden_share(self.game, state) / steps,
         )
 
     def starts(self, key: PRNGKeyArray, bounds: Bounds):
@@ -252,26 +254,29 @@ class AnalyticGradient:
         settings = self.settings
         number = starts[1].step.shape[0]
         observation, predicted = self.inputs(parameters, flying[0])
-        before, log_std = self.policy.distribution(
+        start_mean, log_std = self.policy.distribution(
             parameters.actor, observation, predicted
         )
         mean, _ = self.policy.distribution(actor, observation, predicted)
-        change = (mean - before) * jnp.exp(-log_std)
+        change = (mean - start_mean) * jnp.exp(-log_std)
         # starts and flights by one program, the starts first
         worlds = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), starts, flying)
-        (_, end), met = self.fly(actor, parameters, worlds, self.steps)
+        (_, end), encounter = self.fly(actor, parameters, worlds, self.steps)
         drones = jax.tree.map(lambda leaf: leaf[:number], end.drones)
         fast = speed(drones) - FASTEST
         low = LOWEST - drones.position[..., 2]
         parts = {
-            "crashes_from_starts": (1.0, crash_depth(met.least[:number])),
-            "breaches_from_starts": (BREACH_AT_START, met.breach[:number]),
+            "crashes_from_starts": (1.0, crash_depth(encounter.least[:number])),
+            "breaches_from_starts": (BREACH_AT_START, encounter.breach[:number]),
             # a dive saves some of those that start tilted towards something, so there
             # the speed is free but for its end
             "ends": (END, jax.nn.relu(fast) + jax.nn.relu(low)),
-            "crashes_in_flight": (CRASH_IN_FLIGHT, crash_share(met.least[number:])),
-            "breaches_in_flight": (settings.breach, met.breach[number:]),
-            "speed_in_flight": (settings.speed, met.excess[number:]),
+            "crashes_in_flight": (
+                CRASH_IN_FLIGHT,
+                crash_share(encounter.least[number:]),
+            ),
+            "breaches_in_flight": (settings.breach, encounter.breach[number:]),
+            "speed_in_flight": (settings.speed, encounter.excess[number:]),
             "change": (settings.hold, jnp.sum(change**2, axis=-1)),
         }
         return weighted_sum(parts)
@@ -291,8 +296,10 @@ class AnalyticGradient:
         """The actor's gradient, and the loss's parts."""
         start_key, choice_key = jax.random.split(key)
         moments = flights[1].step.shape[0]
-        chosen = jax.random.randint(choice_key, (self.settings.worlds,), 0, moments)
-        flying = jax.tree.map(lambda leaf: leaf[chosen], flights)
+        moment_indices = jax.random.randint(
+            choice_key, (self.settings.worlds,), 0, moments
+        )
+        flying = jax.tree.map(lambda leaf: leaf[moment_indices], flights)
         starts = self.hard_starts(actor, parameters, start_key)
         gradient, parts = jax.grad(self.loss, has_aux=True)(
             actor, parameters, starts, flying

@@ -70,7 +70,7 @@ def insert(
         lambda new, old: jnp.concatenate([new[::-1], old]), tasks, archive.tasks
     )
     pool_success = jnp.concatenate([success[::-1], archive.success])
-    used = jnp.concatenate([accepted[::-1], jnp.arange(capacity) < archive.size])
+    is_used = jnp.concatenate([accepted[::-1], jnp.arange(capacity) < archive.size])
 
     features = descriptor(pool)
     # |a - b|^2 = |a|^2 + |b|^2 - 2 ab, all pairs by one matrix product; in full
@@ -80,21 +80,21 @@ def insert(
     product = jnp.matmul(features, features.T, precision=jax.lax.Precision.HIGHEST)
     distance = squared[:, None] + squared[None] - 2.0 * product
     index = jnp.arange(m + capacity)
-    newer = (index[None] < index[:, None]) & used[None]
+    newer = (index[None] < index[:, None]) & is_used[None]
     novelty = jnp.min(jnp.where(newer, jnp.maximum(distance, 0.0), jnp.inf), axis=1)
     # a squared distance is never negative: unused slots come behind all used ones
-    novelty = jnp.where(used, novelty, -1.0)
+    novelty = jnp.where(is_used, novelty, -1.0)
 
     # the newest of all has nobody newer: its novelty is infinite, and it always stays
     slot = jax.lax.top_k(novelty, capacity)[1]
     # back to newest first, unused last: sorted by age, with the unused ones moved
     # behind all
     total = m + capacity
-    slot = jnp.sort(jnp.where(used[slot], slot, slot + total)) % total
+    slot = jnp.sort(jnp.where(is_used[slot], slot, slot + total)) % total
     return TaskArchive(
         tasks=jax.tree.map(lambda leaf: leaf[slot], pool),
         success=pool_success[slot],
-        size=jnp.minimum(jnp.sum(used), capacity).astype(jnp.int32),
+        size=jnp.minimum(jnp.sum(is_used), capacity).astype(jnp.int32),
     )
 
 

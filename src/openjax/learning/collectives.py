@@ -69,12 +69,12 @@ def minibatches(tree, number: int):
 
 
 def joint_moments(
-    x: Float[Array, "..."], axis: str | None, counted: jax.Array | None = None
+    x: Float[Array, "..."], axis: str | None, mask: jax.Array | None = None
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Mean () and standard deviation () over all elements on all devices, or those
-    `counted`, bool like x.
+    in `mask`, bool like x.
     """
-    # the mean of the devices' means: all of them have about as many `counted`
-    mean = mean_over_devices(team_mean(counted, x), axis)
-    variance = mean_over_devices(team_mean(counted, (x - mean) ** 2), axis)
+    # the mean of the devices' means: all of them have about as many in `mask`
+    mean = mean_over_devices(team_mean(mask, x), axis)
+    variance = mean_over_devices(team_mean(mask, (x - mean) ** 2), axis)
     return mean, jnp.sqrt(variance)

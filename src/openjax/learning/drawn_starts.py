@@ -66,8 +66,8 @@ def side_by_side(settings: PursuitSettings, key: PRNGKeyArray, task: Task) -> Ta
         position = parked(position, task.active)
     clear_of_pillars = ~jnp.any(task.pillar_active & (to_axis < room))
     # less a rounding error: two that stand exactly as close as they may are apart
-    apart = jnp.all(drone_distance(position) >= settings.drone_clearance - 1e-4)
-    clear = clear_of_pillars & apart
+    are_clear = jnp.all(drone_distance(position) >= settings.drone_clearance - 1e-4)
+    clear = clear_of_pillars & are_clear
     return task.with_starts(jnp.where(clear, position, task.pursuer_position))
 
 
@@ -75,16 +75,18 @@ def draw_start(settings: PursuitSettings, key: PRNGKeyArray) -> Task:
     """A task to learn from: close to something, side by side, or any."""
     task_key, turn_key, start_key, choice_key = jax.random.split(key, 4)
     task = turn_task(turn_key, uniform_task(settings, task_key))
-    near = close_starts(settings, start_key, task, MOST)
+    close_task = close_starts(settings, start_key, task, MOST)
     beside = (
-        side_by_side(settings, start_key, task) if settings.num_pursuers > 1 else near
+        side_by_side(settings, start_key, task)
+        if settings.num_pursuers > 1
+        else close_task
     )
     kind = jax.random.uniform(choice_key)
     return jax.tree.map(
         lambda a, b, c: jnp.where(
             kind < CLOSE, a, jnp.where(kind < CLOSE + SIDE_BY_SIDE, b, c)
         ),
-        near,
+        close_task,
         beside,
         task,
     )
@@ -107,12 +109,12 @@ def draw_anywhere(
 def is_lost(settings: PursuitSettings, state: PursuitState) -> Bool[Array, " worlds"]:
     """(W,) whether a pursuer of worlds (W, ...) has crashed or is far outside."""
     position = state.drones.position
-    lost = (
+    outside = (
         jnp.sum(position[..., :2] ** 2, axis=-1)
         > (OUTSIDE * settings.arena_radius) ** 2
     )
-    lost |= position[..., 2] > OUTSIDE * settings.arena_height
-    lost |= nearest_gap(settings, state) < 0.0
+    outside |= position[..., 2] > OUTSIDE * settings.arena_height
+    outside |= nearest_gap(settings, state) < 0.0
     if state.active is not None:
-        lost &= state.active
-    return jnp.any(lost, axis=-1)
+        outside &= state.active
+    return jnp.any(outside, axis=-1)

@@ -82,8 +82,8 @@ class EvaderLearning:
     @property
     def number(self) -> int:
         """Networks; 0: none learns, as the game names none."""
-        named = self.environment.settings.evaders.count("learned")
-        return named - self.settings.past if named else 0
+        learned_number = self.environment.settings.evaders.count("learned")
+        return learned_number - self.settings.past if learned_number else 0
 
     @functools.cached_property
     def optimiser(self) -> optax.GradientTransformation:
@@ -145,8 +145,8 @@ class EvaderLearning:
         the samples; noise (E, 3).
         """
         flying = evaders.flying
-        which, seen = self.see(flying, state)
-        mean = outputs_of(flying, which, seen)[0]
+        which, features = self.see(flying, state)
+        mean = outputs_of(flying, which, features)[0]
         # earlier selves tremble as much as the others do on average: how they once did
         # isn't kept
         usual = jnp.mean(evaders.log_std, 0)
@@ -158,7 +158,7 @@ class EvaderLearning:
         sample = mean + jnp.exp(log_std) * noise
         log_prob = jax.vmap(gaussian_log_prob)(sample, mean, log_std)
         samples = EvaderSamples(
-            seen, which, sample, log_prob, ~state.statistics.captured
+            features, which, sample, log_prob, ~state.statistics.captured
         )
         desired = jnp.where((which >= 0)[:, None], sample, jnp.nan)
         # a program of its own: the compiler doesn't fuse the evaders' rules with the
@@ -212,7 +212,7 @@ class EvaderLearning:
         network_key, place_key, past_key = jax.random.split(key, 3)
         network = jax.random.randint(network_key, (), 0, self.number)
         place = jax.random.randint(place_key, (), 0, self.settings.pool)
-        drawn = jax.random.randint(
+        slots = jax.random.randint(
             past_key, (self.settings.past,), 0, self.settings.pool
         )
 
@@ -220,7 +220,7 @@ class EvaderLearning:
             return pool.at[place].set(jnp.where(due, actor[network], pool[place]))
 
         pool = jax.tree.map(renewed, evaders.pool, evaders.actor)
-        return evaders.replace(pool=pool, past=jnp.where(due, drawn, evaders.past))
+        return evaders.replace(pool=pool, past=jnp.where(due, slots, evaders.past))
 
     def _by_network(self, which):
         """(..., K) of (...,): one for the network, zero for the others."""
@@ -261,10 +261,10 @@ class EvaderLearning:
         advantage, target, all (n, T, ...).
         """
         actor, critic, log_std = networks
-        seen, sample, log_prob, weight, advantage, target = part
+        features, sample, log_prob, weight, advantage, target = part
         weight = belongs[:, None] * weight
         log_ratio = (
-            gaussian_log_prob(sample, outputs(actor, seen)[0], log_std) - log_prob
+            gaussian_log_prob(sample, outputs(actor, features)[0], log_std) - log_prob
         )
         # samples of other networks count for nothing, and mustn't overflow: zero times
         # infinity is no number
@@ -273,7 +273,7 @@ class EvaderLearning:
             ratio, 1.0 - self.settings.clip_epsilon, 1.0 + self.settings.clip_epsilon
         )
         surrogate = jnp.minimum(ratio * advantage, clipped * advantage)
-        error = (outputs(critic, seen)[1] - target) ** 2
+        error = (outputs(critic, features)[1] - target) ** 2
         # weighted too: before the first of its worlds begins, a network's noise stays
         # as it is
         entropy = self.settings.entropy_coefficient * gaussian_entropy(log_std)
@@ -286,17 +286,17 @@ class EvaderLearning:
         settings = self.settings
         critic = evaders.critic
         value = outputs_of(critic, samples.which, samples.seen)[1]
-        which, seen = self.see(evaders.flying, last)
-        last_value = outputs_of(critic, which, seen)[1]
+        which, features = self.see(evaders.flying, last)
+        last_value = outputs_of(critic, which, features)[1]
         # a capture ends what an evader learns from, though the pursuers' episode goes
         # on
-        caught = jnp.concatenate([~samples.flying[1:], last.statistics.captured[None]])
+        is_over = jnp.concatenate([~samples.flying[1:], last.statistics.captured[None]])
         advantage = generalised_advantages(
-            REWARD * (~caught).astype(jnp.float32),
+            REWARD * (~is_over).astype(jnp.float32),
             value,
             jnp.concatenate([value[1:], last_value[None]]),
-            caught,
-            jnp.zeros_like(caught),
+            is_over,
+            jnp.zeros_like(is_over),
             settings.discount,
             settings.gae_lambda,
         )

@@ -118,24 +118,24 @@ class FirstFlights:
         """
         settings = self.settings
         is_fast_possible = self.environment.settings.speed_limit == "none"
-        end, met = self.stage.fly(actor, parameters, world, settings.steps)
+        end, encounter = self.stage.fly(actor, parameters, world, settings.steps)
         # with whole penalties from the start, pursuers stay away from the evader for
         # good
         penalty = settings.penalty_start + (1.0 - settings.penalty_start) * risen
         parts = {
-            "free": (1.0, met.free),
+            "free": (1.0, encounter.free),
             # along the shortest path: by the straight line they wait in sight of the
             # evader, on the wrong side of a row of pillars
-            "distance": (settings.distance, met.distance),
+            "distance": (settings.distance, encounter.distance),
             # felt from farther than a touch, or they never leave such a place either:
             # over 5 cm they go round rows and hardly crash, over 1 cm they do neither
             "crashes": (
                 penalty * settings.crash,
-                crash_share(met.least, settings.crash_smooth),
+                crash_share(encounter.least, settings.crash_smooth),
             ),
-            "tips": (risen * settings.crash, tip_share(met.upright)),
-            "breaches": (penalty * settings.breach, met.breach),
-            "speed": (settings.speed * is_fast_possible, met.excess),
+            "tips": (risen * settings.crash, tip_share(encounter.upright)),
+            "breaches": (penalty * settings.breach, encounter.breach),
+            "speed": (settings.speed * is_fast_possible, encounter.excess),
             "low": (1.0, jax.nn.relu(LOW - end[1].drones.position[..., 2])),
         }
         total, means = weighted_sum(parts)
@@ -164,10 +164,10 @@ class FirstFlights:
             actor=optax.apply_updates(parameters.actor, change)
         )
         start_key, choice_key = jax.random.split(key)
-        drawn = (
+        worlds_drawn = (
             jax.random.uniform(choice_key, (self.settings.worlds,)) < self.settings.anew
         )
-        over = self._over(end[1]) | own_share(drawn, self.axis)
+        over = self._over(end[1]) | own_share(worlds_drawn, self.axis)
         world = renewed(over, end, self.start(start_key))
         return FirstCarry(parameters, state, world, risen), parts
 
@@ -176,8 +176,8 @@ class FirstFlights:
         moment.
         """
         game = self.environment.settings
-        late = state.step > game.episode_length - self.settings.steps
-        return is_lost(game, state) | late
+        is_late = state.step > game.episode_length - self.settings.steps
+        return is_lost(game, state) | is_late
 
     @functools.cached_property
     def optimiser(self) -> optax.GradientTransformation:
@@ -202,9 +202,9 @@ def make_first_flights(flights: FirstFlights, together: int) -> Callable:
     parts of the loss; to be compiled.
     """
 
-    def some(carry, key, done):
+    def some(carry, key, updates_done):
         keys = jax.vmap(lambda i: jax.random.fold_in(key, i))(
-            done + jnp.arange(together)
+            updates_done + jnp.arange(together)
         )
         carry, parts = jax.lax.scan(flights.update, carry, keys)
         return carry, jax.tree.map(jnp.mean, parts)

@@ -101,8 +101,8 @@ def collect(
 
     # two scans, one in the other: the evaders decide once, and their decision is flown
     # `hold` steps
-    held = noise.pursuers.reshape(-1, players.hold, *noise.pursuers.shape[1:])
-    noise = noise.replace(pursuers=held)
+    held_noise = noise.pursuers.reshape(-1, players.hold, *noise.pursuers.shape[1:])
+    noise = noise.replace(pursuers=held_noise)
     (observation, state), (record, samples) = jax.lax.scan(decide, world, noise)
     rollout = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), record)
     return rollout.replace(learning=samples), observation, state
@@ -122,7 +122,7 @@ def _step(players, penalty_share):
         predicted, action, log_prob = _sample(players, observation, noise)
         command = policy.action(action, observation)
         # any key will do: the game draws nothing after its reset
-        following, state, reward, terminated, truncated, info = move(
+        next_observation, state, reward, terminated, truncated, info = move(
             jax.random.key(0), state, command, desired
         )
         record = Rollout(
@@ -137,7 +137,7 @@ def _step(players, penalty_share):
             truncated=truncated,
             evader=state.evader_position,
         )
-        return (following, state), record
+        return (next_observation, state), record
 
     return step
 

@@ -311,13 +311,13 @@ class _Step:
         # one group of worlds ends its episodes with each rollout: tasks are judged by
         # whole episodes, and no rollout has a reset in its middle
         group = schedule.ending(carry.update)
-        ended = schedule.members(carry.state, group)
+        members = schedule.members(carry.state, group)
         archive, metrics = _selection(
-            settings, carry.archive, ended, penalty_share_at(settings, progress), axis
+            settings, carry.archive, members, penalty_share_at(settings, progress), axis
         )
         # new worlds for those that end, and for those that are started anew within the
         # episodes of other groups
-        numbers = ended.step.shape[0], schedule.restarts(carry.state.step.shape[0])
+        numbers = members.step.shape[0], schedule.restarts(carry.state.step.shape[0])
         keys = self._key(carry, 4), self._key(carry, 5)
         fresh = self._fresh(starting, archive, keys, numbers)
         observation, state = schedule.renewed(
@@ -423,11 +423,11 @@ def _tasks(settings, environment, archive, keys, close=None):
     )
 
 
-def _selection(settings, archive, ended, penalty_share, axis):
+def _selection(settings, archive, members, penalty_share, axis):
     """Put unsolved tasks of ended episodes into the archive; and what these episodes
     were like.
     """
-    statistics = ended.statistics
+    statistics = members.statistics
     complete = statistics.steps >= settings.environment.episode_length
     share = settings.episodes_per_task
     solved = successes(settings.generator, statistics, penalty_share)
@@ -435,13 +435,13 @@ def _selection(settings, archive, ended, penalty_share, axis):
     solved = solved.astype(jnp.float32).reshape(-1, share)
     if settings.generator.enabled:
         # of neighbours that flew one task the first stands for all
-        tasks = jax.tree.map(lambda x: x[::share], ended.task)
+        tasks = jax.tree.map(lambda x: x[::share], members.task)
         # the archive is the same on all devices, and so all of them see all candidates
         tasks, success, complete = gather_over_devices(
             (tasks, jnp.mean(solved, axis=1), complete[::share]), axis
         )
         archive = select(settings.generator, archive, tasks, success, complete)
-    counted = {
+    metrics = {
         "capture_rate": statistics.captured,
         "capture_step": statistics.capture_step,
         "collision_rate": statistics.collision_rate,
@@ -451,21 +451,23 @@ def _selection(settings, archive, ended, penalty_share, axis):
         "success_rate": solved.ravel(),
     }
     if "learned" in settings.environment.evaders:
-        by_network = learned_place(settings.environment.evaders, ended.evader.kind) >= 0
-        counted |= {
+        by_network = (
+            learned_place(settings.environment.evaders, members.evader.kind) >= 0
+        )
+        metrics |= {
             "learned": by_network,
             "learned_capture_rate": by_network & statistics.captured,
         }
     # worlds that were started anew within their episode flew a shorter one, which is no
     # fair sample
     lasting = settings.schedule.lasting(statistics.steps.shape[0])
-    counted = {
+    metrics = {
         name: jnp.mean(value.astype(jnp.float32)[lasting])
-        for name, value in counted.items()
+        for name, value in metrics.items()
     }
-    counted = mean_over_devices(counted, axis)
-    if "learned" in counted:
+    metrics = mean_over_devices(metrics, axis)
+    if "learned" in metrics:
         # shares of all episodes so far: one by the other is the rate among the learned
         # ones'
-        counted["learned_capture_rate"] /= jnp.maximum(counted["learned"], 1e-6)
-    return archive, counted | {"archive_size": archive.size.astype(jnp.float32)}
+        metrics["learned_capture_rate"] /= jnp.maximum(metrics["learned"], 1e-6)
+    return archive, metrics | {"archive_size": archive.size.astype(jnp.float32)}

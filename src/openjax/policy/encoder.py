@@ -70,12 +70,15 @@ class SelfAttention(nn.Module):
             kernel("value", (f, f)).reshape(f, h, width),
             kernel("output", (f, f)).reshape(h, width, f),
         )
-        seen = jnp.where(pillar_seen, 0.0, MASKED)
-        there = jnp.zeros(others.shape[:-1])
+        pillar_bias = jnp.where(pillar_seen, 0.0, MASKED)
+        other_bias = jnp.zeros(others.shape[:-1])
         if others_there is not None:
-            there = jnp.where(others_there, 0.0, MASKED)
+            other_bias = jnp.where(others_there, 0.0, MASKED)
         entities = []
-        for name, x, bias in (("others", others, there), ("pillars", pillars, seen)):
+        for name, x, bias in (
+            ("others", others, other_bias),
+            ("pillars", pillars, pillar_bias),
+        ):
             if x.shape[-2] > 0:  # a single pursuer has no others
                 entities.append((x, *self._embedding(kernel, name, x.shape[-1]), bias))
         if can_compile_for_cuda():
@@ -209,9 +212,9 @@ class Encoder(nn.Module):
         attention = SelfAttention(
             self.features, self.heads, self.dtype, name="attention"
         )
-        there = None if others_there is None else flat(others_there)
+        others_mask = None if others_there is None else flat(others_there)
         hidden = token + attention(
-            token, flat(others), flat(pillars), flat(pillar_seen), there
+            token, flat(others), flat(pillars), flat(pillar_seen), others_mask
         )
         hidden = normalise(
             hidden, affine_parameters(self, "norm", self.features), activate=False

@@ -41,8 +41,8 @@ class EvaderPredictor(nn.Module):
             in_gate, forget_gate, candidate, out_gate = jnp.split(gates, 4, axis=-1)
             # one more, so that a fresh cell forgets little (Jozefowicz et al. 2015, An
             # empirical exploration of recurrent network architectures)
-            kept = jax.nn.sigmoid(forget_gate + 1.0) * cell
-            cell = kept + jax.nn.sigmoid(in_gate) * jnp.tanh(candidate)
+            forget = jax.nn.sigmoid(forget_gate + 1.0) * cell
+            cell = forget + jax.nn.sigmoid(in_gate) * jnp.tanh(candidate)
             hidden = jax.nn.sigmoid(out_gate) * jnp.tanh(cell)
         # small, so that a fresh predictor says what it is relative to: where the evader
         # was last seen, or the arena's middle

@@ -88,7 +88,10 @@ class PredictorSettings:
 
     def __post_init__(self):
         check_intervals(self, "predictor.")
-        rising = all(near < far for near, far in itertools.pairwise(self.horizons))
+        rising = all(
+            horizon < later_horizon
+            for horizon, later_horizon in itertools.pairwise(self.horizons)
+        )
         if not self.horizons or self.horizons[0] != 1 or not rising:
             raise UserError(
                 f"predictor.horizons {list(self.horizons)[:20]} must start with 1 and rise"

@@ -264,19 +264,19 @@ class Pursuit:
         in_sight, in_view, seen = self._sights(
             task, task.active, drones, task.evader_position
         )
-        still = jnp.zeros(3, jnp.float32)
+        rest = jnp.zeros(3, jnp.float32)
         step = jnp.zeros((), jnp.int32)
         last_seen = jnp.where(
             seen, task.evader_position, jnp.array(settings.middle, jnp.float32)
         )
         framed = frame_pursuers(settings, task.pursuer_position, last_seen, task.active)
-        first = frame(settings, step, framed, task.evader_position, still, seen)
+        first = frame(settings, step, framed, task.evader_position, rest, seen)
         state = PursuitState(
             task=task,
             drones=drones,
             vehicles=self._draw_vehicles(vehicle_key),
             evader_position=task.evader_position,
-            evader_velocity=still,
+            evader_velocity=rest,
             evader=self._draw_evader(evader_key, task),
             last_seen=last_seen,
             in_sight=in_sight,
@@ -537,8 +537,12 @@ class Pursuit:
         one only cuts the episode.
         """
         over = step >= self.settings.episode_length
-        never = jnp.zeros((), bool)
-        return (over, never) if self.settings.observe_time else (never, over)
+        no_time_limit = jnp.zeros((), bool)
+        return (
+            (over, no_time_limit)
+            if self.settings.observe_time
+            else (no_time_limit, over)
+        )
 
 
 def _repeated(first, number):

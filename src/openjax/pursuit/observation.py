@@ -134,7 +134,7 @@ def observe(
     task = state.task
     position = seen_drones.position
     heading = _heading(seen_drones) if settings.observe_in == "heading" else None
-    turned = functools.partial(turned_back, heading)
+    turn_back = functools.partial(turned_back, heading)
 
     def of_others(values):
         """(N, N - 1, ...) of (N, ...): for each pursuer the values of all but
@@ -145,7 +145,7 @@ def observe(
             [jnp.concatenate([values[:i], values[i + 1 :]]) for i in range(n)]
         )
 
-    others = turned(position[:, None] - of_others(position))
+    others = turn_back(position[:, None] - of_others(position))
     active = state.active
     others_there = None
     if active is not None:
@@ -155,10 +155,10 @@ def observe(
         settings, position, task.pillar_position, task.pillar_active
     )
     each = {
-        "self_state": _own_part(settings, state, seen_drones, turned),
+        "self_state": _own_part(settings, state, seen_drones, turn_back),
         "others": others,
-        "pillars": jnp.where(pillar_seen[..., None], turned(pillars), HIDDEN),
-        "privileged": _privileged_part(settings, state, turned),
+        "pillars": jnp.where(pillar_seen[..., None], turn_back(pillars), HIDDEN),
+        "privileged": _privileged_part(settings, state, turn_back),
         "position": position,
     }
     return Observation(
@@ -179,21 +179,23 @@ def _heading(drones):
     return ahead / jnp.sqrt(jnp.sum(ahead**2, axis=-1, keepdims=True) + 1e-6)
 
 
-def _own_part(settings, state, seen_drones, turned):
-    """`self_state`; `turned` turns vectors (N, ..., 3)."""
+def _own_part(settings, state, seen_drones, turn_back):
+    """`self_state`; `turn_back` turns vectors (N, ..., 3)."""
     position = seen_drones.position
     quaternion = seen_drones.quaternion
-    body_x, body_z = map(turned, rotation_axes(quaternion))
+    body_x, body_z = map(turn_back, rotation_axes(quaternion))
     if settings.observe_in == "heading":
         quaternion = _quaternion(body_x, body_z)
-    to_evader = jnp.where(state.seen, turned(position - state.evader_position), HIDDEN)
-    parts = [to_evader, quaternion, turned(seen_drones.velocity), body_x, body_z]
+    to_evader = jnp.where(
+        state.seen, turn_back(position - state.evader_position), HIDDEN
+    )
+    parts = [to_evader, quaternion, turn_back(seen_drones.velocity), body_x, body_z]
     if settings.observe_time:
         time = state.step.astype(jnp.float32) / settings.episode_length
         # four times, as in the released code
         parts.append(jnp.broadcast_to(time, (len(position), 4)))
     if settings.observe_position:
-        parts.append(turned(position))
+        parts.append(turn_back(position))
     if settings.observe_game:
         speed = evader_speed(settings, state.task) / settings.max_speed
         numbers = jnp.stack([speed, capture_radius(settings, state.task)]).astype(
@@ -205,26 +207,26 @@ def _own_part(settings, state, seen_drones, turned):
         history = jnp.moveaxis(state.own_history[spacing - 1 :: spacing], 0, 1)
         # the past is seen in today's axes: velocity, body x and z axes are vectors, the
         # command is none
-        vectors = [turned(history[..., i : i + 3]) for i in (0, 3, 6)]
+        vectors = [turn_back(history[..., i : i + 3]) for i in (0, 3, 6)]
         history = jnp.concatenate([*vectors, history[..., 9:]], axis=-1)
         parts.append(history.reshape(len(position), -1))
     return jnp.concatenate(parts, axis=-1)
 
 
-def _privileged_part(settings, state, turned):
-    """`privileged`, by the drones' true states; `turned` as in `_own_part`."""
+def _privileged_part(settings, state, turn_back):
+    """`privileged`, by the drones' true states; `turn_back` as in `_own_part`."""
     n = settings.num_pursuers
     drones = state.drones
     parts = [
-        turned(drones.position - state.evader_position),
-        turned(jnp.broadcast_to(state.evader_velocity, (n, 3))),
-        turned(drones.position),
+        turn_back(drones.position - state.evader_position),
+        turn_back(jnp.broadcast_to(state.evader_velocity, (n, 3))),
+        turn_back(drones.position),
         jnp.broadcast_to(state.seen.astype(jnp.float32), (n, 1)),
     ]
     if settings.vehicles:
         # which vehicle it is decides what a state is worth
         parts += [
-            turned(drones.velocity),
+            turn_back(drones.velocity),
             standard_parameters(settings.vehicles, state.vehicles),
         ]
     return jnp.concatenate(parts, axis=-1)
@@ -269,7 +271,7 @@ def _nearest_pillars(settings, position, pillar_position, pillar_active):
     rank = jnp.sum(nearer, axis=1)
     slot = (rank[:, None, :] == jnp.arange(k)[None, :, None]).astype(jnp.float32)
     axis = jnp.sum(slot[..., None] * pillar_position[None, None], axis=2)
-    seen = jnp.sum(slot * pillar_active[None, None], axis=2) > 0.5
+    is_seen = jnp.sum(slot * pillar_active[None, None], axis=2) > 0.5
     features = jnp.concatenate(
         [
             position[:, None, :2] - axis,
@@ -282,4 +284,4 @@ def _nearest_pillars(settings, position, pillar_position, pillar_active):
         ],
         axis=-1,
     )
-    return features, seen
+    return features, is_seen

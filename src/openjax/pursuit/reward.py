@@ -191,9 +191,9 @@ def recapture(transition: Transition) -> Flag:
     """() whether this is a later capture, of an evader that was free for `FREE`
     seconds.
     """
-    before = transition.before.statistics
-    was_free = before.free_steps * transition.settings.time_step >= FREE
-    return captured(transition) & before.captured & was_free
+    statistics = transition.before.statistics
+    was_free = statistics.free_steps * transition.settings.time_step >= FREE
+    return captured(transition) & statistics.captured & was_free
 
 
 def steadiness(transition: Transition) -> Each:
@@ -218,9 +218,9 @@ def breach_number(transition: Transition) -> Each:
         )
     if weights.lookahead != 0.0:
         ahead = drones.position + weights.lookahead * drones.velocity
-        soon = breaches(settings, ahead, pillars, pillar_active)
+        breach_ahead = breaches(settings, ahead, pillars, pillar_active)
         # the greater, not the sum: one that is near and comes nearer counts once
-        breach = jax.tree.map(jnp.maximum, breach, soon)
+        breach = jax.tree.map(jnp.maximum, breach, breach_ahead)
     return breach.total
 
 

@@ -106,10 +106,10 @@ def scenario_task(settings: PursuitSettings, scenario: Scenario) -> Task:
       UserError: it has more pillars than that, or not `settings.num_pursuers` pursuers.
     """
     slots = settings.max_pillars
-    used = len(scenario.pillars)
-    if used > slots:
+    pillar_number = len(scenario.pillars)
+    if pillar_number > slots:
         raise UserError(
-            f"scenario {scenario.name}: {used} pillars do not fit into {slots} slots (max_pillars)"
+            f"scenario {scenario.name}: {pillar_number} pillars do not fit into {slots} slots (max_pillars)"
         )
     if len(scenario.pursuers) != settings.num_pursuers:
         raise UserError(
@@ -117,12 +117,14 @@ def scenario_task(settings: PursuitSettings, scenario: Scenario) -> Task:
             f"{settings.num_pursuers}"
         )
     pillars = np.zeros((slots, 2), np.float32)
-    pillars[:used] = np.asarray(scenario.pillars, np.float32).reshape(used, 2)
+    pillars[:pillar_number] = np.asarray(scenario.pillars, np.float32).reshape(
+        pillar_number, 2
+    )
     return Task(
         pursuer_position=jnp.asarray(scenario.pursuers, jnp.float32),
         evader_position=jnp.asarray(scenario.evader, jnp.float32),
         pillar_position=jnp.asarray(pillars),
-        pillar_active=jnp.arange(slots) < used,
+        pillar_active=jnp.arange(slots) < pillar_number,
     )
 
 

@@ -272,11 +272,13 @@ class PursuitSettings:
             )
         for name in ("evader_speeds", "capture_radii", "fall_out_seconds"):
             # none at all is fine, but for the seconds of those that fall out
-            drawn = getattr(self, name)
+            drawn_from = getattr(self, name)
             needed = name == "fall_out_seconds" and self.fall_outs
-            if (drawn or needed) and (len(drawn) != 2 or drawn[0] > drawn[1]):
+            if (drawn_from or needed) and (
+                len(drawn_from) != 2 or drawn_from[0] > drawn_from[1]
+            ):
                 raise UserError(
-                    f"environment.{name} {list(drawn)} must be two numbers, the lower one first, "
+                    f"environment.{name} {list(drawn_from)} must be two numbers, the lower one first, "
                     "or none"
                 )
 
@@ -290,8 +292,8 @@ class PursuitSettings:
     @property
     def limited_sight(self) -> bool:
         """Whether something else than pillars can hide the evader."""
-        whole = PursuitSettings.sight_range, PursuitSettings.sight_angle
-        return (self.sight_range, self.sight_angle) != whole
+        full_sight = PursuitSettings.sight_range, PursuitSettings.sight_angle
+        return (self.sight_range, self.sight_angle) != full_sight
 
     @property
     def arena(self) -> Arena:
@@ -320,11 +322,11 @@ class PursuitSettings:
         """
         # in the order of `Observation.self_state`: evader, quaternion, velocity, two
         # axes, time, position, the game's numbers, history
-        always = 3 + 4 + 3 + 3 + 3
+        base = 3 + 4 + 3 + 3 + 3
         time = 4 if self.observe_time else 0
         position = 3 if self.observe_position else 0
         game = 2 if self.observe_game else 0
-        return always + time + position + game + OWN_FRAME * self.observe_history
+        return base + time + position + game + OWN_FRAME * self.observe_history
 
     @property
     def privileged_size(self) -> int:

@@ -56,9 +56,9 @@ def shortest_paths(settings: PursuitSettings, task: Task) -> ShortestPaths:
     around = radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     corner = (task.pillar_position[:, None] + around).reshape(-1, 2)
     to_axis = jnp.sum((corner[:, None] - task.pillar_position) ** 2, axis=-1)
-    closed = jnp.any((to_axis < reach**2) & task.pillar_active, axis=-1)
-    closed |= jnp.sum(corner**2, axis=-1) > settings.arena_radius**2
-    toll = TOLL * (closed | ~jnp.repeat(task.pillar_active, CORNERS))
+    is_closed = jnp.any((to_axis < reach**2) & task.pillar_active, axis=-1)
+    is_closed |= jnp.sum(corner**2, axis=-1) > settings.arena_radius**2
+    toll = TOLL * (is_closed | ~jnp.repeat(task.pillar_active, CORNERS))
     direct = _straight(settings, task, corner[:, None], corner[None]) + toll
 
     # Floyd and Warshall: after step k, the shortest paths that bend at the first k
@@ -91,8 +91,8 @@ def path_length(
     through_corners = jnp.min(paths.length + from_corner, axis=-1, initial=jnp.inf)
     rest = jnp.append(paths.toll + through_corners, 0.0)
     bend = jnp.concatenate([paths.corner, target[None, :2]])
-    here = jax.lax.stop_gradient(position[:, None, :2])
-    best = jnp.argmin(_straight(settings, task, here, bend) + rest, axis=-1)
+    place = jax.lax.stop_gradient(position[:, None, :2])
+    best = jnp.argmin(_straight(settings, task, place, bend) + rest, axis=-1)
 
     # which bend is best has no gradient; how far it is has one, straight towards the
     # bend
@@ -129,14 +129,14 @@ def evader_territory(
     Empty slots' pursuers are parked too far to count.
     """
     points = arena_points(settings)
-    here = position[:, None, :2]
+    place = position[:, None, :2]
     # whoever of the team is sooner at a corner is sooner wherever the path leads from
     # there
-    to_corner = jnp.min(_straight(settings, task, here, paths.corner), axis=0)
+    to_corner = jnp.min(_straight(settings, task, place, paths.corner), axis=0)
     round_pillars = jnp.min(
         (to_corner + paths.toll)[:, None] + paths.to_point, axis=0, initial=jnp.inf
     )
-    straight = jnp.min(_straight(settings, task, here, points), axis=0)
+    straight = jnp.min(_straight(settings, task, place, points), axis=0)
     length = jnp.minimum(straight, round_pillars)
     pursuers = jax.nn.relu(length - capture_radius(settings, task)) / settings.max_speed
     evader = jnp.sqrt(jnp.sum((points - target[:2]) ** 2, axis=-1) + 1e-12)

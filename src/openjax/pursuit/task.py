@@ -174,11 +174,11 @@ def uniform_task(settings: PursuitSettings, key: PRNGKeyArray) -> Task:
     # would have no fixed length
     candidates = jax.random.uniform(position_key, (draws, n, 3), jnp.float32, low, high)
     active = draw_team(settings, key)
-    apart = jax.vmap(
+    is_apart = jax.vmap(
         lambda p: jnp.all(drone_distance(parked(p, active)) >= settings.drone_clearance)
     )(candidates)
     # where none is good, `argmax` gives the first: such a task starts in a breach
-    pursuers = parked(candidates[jnp.argmax(apart)], active)
+    pursuers = parked(candidates[jnp.argmax(is_apart)], active)
     mirrored = jnp.array([-1.0, 1.0, 1.0], jnp.float32)
     evader = jax.random.uniform(evader_key, (3,), jnp.float32, low, high) * mirrored
 
@@ -191,16 +191,16 @@ def uniform_task(settings: PursuitSettings, key: PRNGKeyArray) -> Task:
     # the first ones of a random order are a draw without replacement; cells that aren't
     # free come last
     rank = jnp.where(free, jax.random.uniform(cell_key, (cells.shape[0],)), -1.0)
-    chosen = jax.lax.top_k(rank, settings.max_pillars)[1]
+    slots = jax.lax.top_k(rank, settings.max_pillars)[1]
     number = jax.random.randint(
         number_key, (), settings.min_pillars, settings.max_pillars + 1
     )
     # fewer than drawn where not enough cells are free
-    in_use = (jnp.arange(settings.max_pillars) < number) & free[chosen]
+    in_use = (jnp.arange(settings.max_pillars) < number) & free[slots]
     return Task(
         pursuer_position=pursuers,
         evader_position=evader,
-        pillar_position=jnp.where(in_use[:, None], cells[chosen], 0.0),
+        pillar_position=jnp.where(in_use[:, None], cells[slots], 0.0),
         pillar_active=in_use,
         active=active,
         evader_speed=_between(settings.evader_speeds, key, 5),
@@ -235,19 +235,21 @@ def expand_task(
         pursuer_key, evader_key = jax.random.split(key)
 
         def move(key, position):
-            moved = position + jax.random.uniform(
+            candidate = position + jax.random.uniform(
                 key, position.shape, jnp.float32, -EXPANSION, EXPANSION
             )
             # who would come too near the wall is drawn back along the radius
-            radius = jnp.linalg.norm(moved[..., :2], axis=-1, keepdims=True)
+            radius = jnp.linalg.norm(candidate[..., :2], axis=-1, keepdims=True)
             reach = settings.arena_radius - wall_distance
-            xy = moved[..., :2] * jnp.minimum(1.0, reach / jnp.maximum(radius, 1e-6))
+            xy = candidate[..., :2] * jnp.minimum(
+                1.0, reach / jnp.maximum(radius, 1e-6)
+            )
             return jnp.concatenate(
-                [xy, _start_height(settings, moved[..., 2:])], axis=-1
+                [xy, _start_height(settings, candidate[..., 2:])], axis=-1
             )
 
-        moved = task.replace(evader_position=move(evader_key, task.evader_position))
-        return moved.with_starts(move(pursuer_key, task.pursuer_position))
+        candidate = task.replace(evader_position=move(evader_key, task.evader_position))
+        return candidate.with_starts(move(pursuer_key, task.pursuer_position))
 
     return _first_clear(settings, draw, key, task)
 
@@ -295,12 +297,12 @@ def close_starts(
 
     def draw(key):
         choice_key, place_key = jax.random.split(key)
-        moved = jax.random.uniform(choice_key, (n,)) < share
+        is_moved = jax.random.uniform(choice_key, (n,)) < share
         position = start
         # one after the other, so that nobody is put beside a start that moves away
         # again
         for i, key in enumerate(jax.random.split(place_key, n)):
-            position = jnp.where(moved[i], place(position, i, key), position)
+            position = jnp.where(is_moved[i], place(position, i, key), position)
         return task.with_starts(position)
 
     return _first_clear(settings, draw, key, task)
@@ -390,20 +392,20 @@ def line_up_pillars(settings: PursuitSettings, key: PRNGKeyArray, task: Task) ->
     return _move_pillars(settings, task, middle + along[:, None] * direction)
 
 
-def _move_pillars(settings, task, moved):
+def _move_pillars(settings, task, position):
     """The task with those pillars moved that stay within reach of the axis and clear of
     all starts.
     """
     vehicles = jnp.concatenate([task.pursuer_position, task.evader_position[None]])[
         :, :2
     ]
-    inside = jnp.linalg.norm(moved, axis=-1) < PILLAR_REACH
+    inside = jnp.linalg.norm(position, axis=-1) < PILLAR_REACH
     # each pillar by itself: a row may have gaps
-    accepted = (_clear_of(settings, moved, vehicles) & inside & task.pillar_active)[
+    accepted = (_clear_of(settings, position, vehicles) & inside & task.pillar_active)[
         :, None
     ]
     return task.replace(
-        pillar_position=jnp.where(accepted, moved, task.pillar_position)
+        pillar_position=jnp.where(accepted, position, task.pillar_position)
     )
 
 
@@ -431,11 +433,11 @@ def turn_task(key: PRNGKeyArray, task: Task) -> Task:
         xy = jnp.stack([cosine * x - sine * y, sine * x + cosine * y], axis=-1)
         return jnp.concatenate([xy, position[..., 2:]], axis=-1)
 
-    turned = task.replace(
+    rotated = task.replace(
         evader_position=turn(task.evader_position),
         pillar_position=turn(task.pillar_position),
     )
-    return turned.with_starts(turn(task.pursuer_position))
+    return rotated.with_starts(turn(task.pursuer_position))
 
 
 def start_attitude(settings: PursuitSettings, key: PRNGKeyArray) -> Quaternions:

@@ -46,7 +46,7 @@ def draw_fall_out(
     number = settings.num_pursuers
     active = jnp.ones(number, bool) if active is None else active
     whether_key, which_key, when_key = jax.random.split(key, 3)
-    chosen = jnp.argmax(
+    member = jnp.argmax(
         jnp.where(active, jax.random.uniform(which_key, (number,)), -1.0)
     )
     low, high = settings.fall_out_seconds
@@ -55,7 +55,7 @@ def draw_fall_out(
     falls = jax.random.bernoulli(whether_key, settings.fall_outs) & (
         jnp.sum(active) > 1
     )
-    is_gone = falls & (jnp.arange(number) == chosen)
+    is_gone = falls & (jnp.arange(number) == member)
     return jnp.where(is_gone, last, settings.episode_length)
 
 
@@ -73,8 +73,8 @@ def still_there(
     """
     if gone_after is None:
         return active
-    there = step[..., None] <= gone_after
-    return there if active is None else there & active
+    is_there = step[..., None] <= gone_after
+    return is_there if active is None else is_there & active
 
 
 def parked(position: Team, active: Which | None) -> Team:
@@ -102,8 +102,8 @@ def of_team(active: Which | None, value: T) -> T:
         return value
 
     def without_empty(leaf):
-        there = active.reshape(-1, *[1] * (leaf.ndim - 1))
-        return jnp.where(there, leaf, jnp.zeros_like(leaf))
+        mask = active.reshape(-1, *[1] * (leaf.ndim - 1))
+        return jnp.where(mask, leaf, jnp.zeros_like(leaf))
 
     return jax.tree.map(without_empty, value)
 

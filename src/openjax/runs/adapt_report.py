@@ -63,7 +63,7 @@ def _picture(results):
 
     from openjax.show.pages import STYLE, as_svg
 
-    shown = {
+    rates = {
         "crashes_from_starts": "crashes from leaning starts (smooth)",
         "crashes_in_flight": "crashes within flights (smooth)",
         "off_the_nominal_flight": "distance from nominal flights",
@@ -71,7 +71,7 @@ def _picture(results):
     with rc_context(STYLE):
         figure = Figure(figsize=(11, 3.2), layout="constrained")
         for axes, (name, title) in zip(
-            figure.subplots(1, len(shown)), shown.items(), strict=True
+            figure.subplots(1, len(rates)), rates.items(), strict=True
         ):
             course = [row[name] for row in results["history"]]
             axes.plot(range(1, len(course) + 1), course)

@@ -66,23 +66,23 @@ def adapt(
     """Do all of it and write it down; `tell` hears the steps. Raises UserError for
     flights that can't be diagnosed or an unusable policy.
     """
-    started = time.monotonic()
+    start = time.monotonic()
     seconds = {}
     steps = iter(STEPS)
     tell(next(steps))
     with _diagnosis(command) as effects:
         programs = _Programs(command)  # compiles meanwhile
         vehicle = _diagnosed(effects(), programs.game.airframe)
-        seconds["diagnosis"] = time.monotonic() - started
+        seconds["diagnosis"] = time.monotonic() - start
     programs.ready()
-    seconds["compiled"] = time.monotonic() - started
+    seconds["compiled"] = time.monotonic() - start
     tell(next(steps))
     tuned = programs.fine_tune(vehicle)
-    seconds["fine-tuned"] = time.monotonic() - started
+    seconds["fine-tuned"] = time.monotonic() - start
     tell(next(steps))
-    flown = programs.measure(vehicle, tuned.parameters)
-    seconds["measured"] = time.monotonic() - started
-    results = {**_results(command, vehicle, flown, tuned), "seconds": seconds}
+    rates = programs.measure(vehicle, tuned.parameters)
+    seconds["measured"] = time.monotonic() - start
+    results = {**_results(command, vehicle, rates, tuned), "seconds": seconds}
     _write(command, programs, vehicle, tuned, results)
     return results
 
@@ -146,11 +146,11 @@ class _Programs:
         usual = self._fly(self._parameters, self._chosen_by, 1, self._nominal)
 
         def scores(policy):
-            flown = self._fly(policy, self._chosen_by, 1, vehicle.bounds)
-            flown["over_speed_rate"] = np.maximum(
-                flown["over_speed_rate"], usual["over_speed_rate"]
+            episodes = self._fly(policy, self._chosen_by, 1, vehicle.bounds)
+            episodes["over_speed_rate"] = np.maximum(
+                episodes["over_speed_rate"], usual["over_speed_rate"]
             )
-            return selection_score(flown, self.game.episode_length)
+            return selection_score(episodes, self.game.episode_length)
 
         return fine_tune(
             self.adaptation, self._parameters, vehicle.bounds, self._key, scores
@@ -169,7 +169,7 @@ class _Programs:
         }
 
 
-def _results(command, vehicle, flown, tuned) -> dict:
+def _results(command, vehicle, rates, tuned) -> dict:
     """What adapt.json holds, but for the time that it took."""
     parameters = []
     for name, low, high, *_ in vehicle.family:
@@ -188,9 +188,9 @@ def _results(command, vehicle, flown, tuned) -> dict:
         "episodes": command.episodes,
         **{
             which: {name: float(figures[name].mean()) for name in FIGURES}
-            for which, figures in flown.items()
+            for which, figures in rates.items()
         },
-        "won_back": won_back(flown),
+        "won_back": won_back(rates),
         "kept": f"fine-tuned, as it was after step {tuned.update}"
         if tuned.update
         else "the policy as it was",
@@ -216,7 +216,7 @@ def _write(command, programs, vehicle, tuned, results):
     write_text(command.out / "adapt.html", page(results))
 
 
-def won_back(flown: dict) -> dict[str, float | None]:
+def won_back(rates: dict) -> dict[str, float | None]:
     """Of each loss, before against nominal, the share that is none any more after; None
     where there was none beyond chance.
 
@@ -226,8 +226,8 @@ def won_back(flown: dict) -> dict[str, float | None]:
     shares = {}
     for name in LOSSES:
         # of the same episodes: by their differences chance is much smaller
-        loss = flown["before"][name] - flown["nominal"][name]
-        loss_left = flown["after"][name] - flown["nominal"][name]
+        loss = rates["before"][name] - rates["nominal"][name]
+        loss_left = rates["after"][name] - rates["nominal"][name]
         beyond_chance = loss.mean() > ERRORS * loss.std() / len(loss) ** 0.5
         shares[name] = (
             float(1.0 - loss_left.mean() / loss.mean()) if beyond_chance else None

@@ -76,10 +76,10 @@ def _training(settings, devices):
     yield "training", training_step.make_training_step(settings), (carry,)
     yield "- fly", phases.fly, (carry,)
     # zeros: learning from them takes as long as from anything
-    flown = jax.eval_shape(phases.fly, carry)[1]
-    flown = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), flown)
+    rollout = jax.eval_shape(phases.fly, carry)[1]
+    rollout = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), rollout)
     for learn in phases.learn:
-        yield f"- {learn.__name__}", learn, (carry, flown)
+        yield f"- {learn.__name__}", learn, (carry, rollout)
     yield "- renew", phases.renew, (carry,)
 
 
@@ -147,10 +147,10 @@ def _environment(settings, num_envs, steps):
                 key, state, action
             )
             # Observation and reward are used, else the compiler would leave them out.
-            used = sum(
+            total = sum(
                 jnp.sum(leaf) for leaf in jax.tree.leaves(observation)
             ) + jnp.sum(reward)
-            return state, used
+            return state, total
 
         return jax.lax.scan(one, state, None, length=steps)
 

@@ -107,7 +107,7 @@ def draw_task(
 
 
 def draw_map(
-    command: MapCommand, loaded: LoadedPolicy, tell: Callable[[str], None]
+    command: MapCommand, policy: LoadedPolicy, tell: Callable[[str], None]
 ) -> dict:
     """Fly all cells.
 
@@ -125,25 +125,25 @@ def draw_map(
       used.
     """
     began = time.monotonic()
-    game = map_game(command, loaded.settings.environment)
+    game = map_game(command, policy.settings.environment)
     environment = Pursuit(game)
-    loaded = loaded.in_game(environment)
+    policy = policy.in_game(environment)
     draw = functools.partial(draw_task, game, command)
     cells = cells_of(command)
-    evaluate = make_evaluate(environment, loaded.policy, messages=command.messages)
+    evaluate = make_evaluate(environment, policy.policy, messages=command.messages)
 
     def scripted(_, tasks, key):
-        return evaluate(loaded.parameters, tasks, key).statistics
+        return evaluate(policy.parameters, tasks, key).statistics
 
     flights = [Flight("scripted evaders", scripted, command.episodes)]
     learning = {}
     if command.best_response:
-        knowing = MapEvaders(command, game, loaded, draw)
+        knowing = MapEvaders(command, game, policy, draw)
         learners, learning["curve"] = knowing.evaders(tell)
         learning["seconds_of_learning"] = time.monotonic() - began
         flights += [knowing.learned(learners), knowing.planned]
     return {
-        "policy": loaded.source,
+        "policy": policy.source,
         "evaders": list(command.evaders),
         "scenario": command.scenario,
         "messages": dataclasses.asdict(command.messages),
@@ -154,7 +154,7 @@ def draw_map(
             "arena_height": game.arena_height,
             "seconds": game.episode_length * game.time_step,
         },
-        "trained_with": list(loaded.settings.environment.team_sizes),
+        "trained_with": list(policy.settings.environment.team_sizes),
         "cells": _records(_Flyer(command, draw, tell), game, cells, flights),
         **learning,
         "seconds": time.monotonic() - began,
@@ -169,27 +169,27 @@ def _records(flyer, game, cells, flights):
     records = [cell_record(game, *pair) for pair in zip(cells, flown, strict=True)]
     if not knowing:
         return records
-    learned, planned = knowing
-    for record, statistics in zip(records, flyer.fly(learned, cells), strict=True):
+    learners, planner = knowing
+    for record, statistics in zip(records, flyer.fly(learners, cells), strict=True):
         record["learned"] = figures(game, _of_least_caught(statistics))
     command = flyer.command
     number = round(command.planner_share * len(cells))
     if number:
         generator = np.random.default_rng(command.seed)
         places = np.sort(generator.choice(len(cells), number, replace=False)).tolist()
-        flown = flyer.fly(planned, [cells[place] for place in places])
+        flown = flyer.fly(planner, [cells[place] for place in places])
         for place, statistics in zip(places, flown, strict=True):
             records[place]["planner"] = figures(game, statistics)
     return records
 
 
-def cells_against(found: Mapping, evaders: str) -> list[dict]:
+def cells_against(file: Mapping, evaders: str) -> list[dict]:
     """The cells of a map (see `draw_map`) that evaders of one kind flew, with their
     figures: "scripted", "learned", or "planner".
     """
     if evaders == "scripted":
-        return list(found["cells"])
-    return [{**cell, **cell[evaders]} for cell in found["cells"] if evaders in cell]
+        return list(file["cells"])
+    return [{**cell, **cell[evaders]} for cell in file["cells"] if evaders in cell]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -219,18 +219,18 @@ class _Flyer:
         for start in range(0, number, batch):
             place = np.minimum(np.arange(start, start + batch), number - 1)
             which, episode = np.divmod(place, episodes)
-            own = jnp.asarray(cells, jnp.float32)[which]
+            values = jnp.asarray(cells, jnp.float32)[which]
             key = jax.random.fold_in(first, 1 + start)
-            statistics = fly(flight.networks, keys[episode], own, key)
+            statistics = fly(flight.networks, keys[episode], values, key)
             parts.append(jax.tree.map(np.asarray, statistics))
             self.tell(
                 f"{flight.name}: {min(start + batch, number)} of {number} episodes"
             )
-        flown = jax.tree.map(lambda *leaves: np.concatenate(leaves)[:number], *parts)
+        results = jax.tree.map(lambda *leaves: np.concatenate(leaves)[:number], *parts)
         starts = range(0, number, episodes)
         return [
             jax.tree.map(
-                lambda leaf, start=start: leaf[start : start + episodes], flown
+                lambda leaf, start=start: leaf[start : start + episodes], results
             )
             for start in starts
         ]
@@ -240,8 +240,8 @@ def _of_least_caught(statistics):
     """(E,) of (E, L): of each half of the episodes, those of the learner that is caught
     least in the other half.
     """
-    chosen = least_caught(statistics.captured)
-    return jax.tree.map(lambda leaf: leaf[np.arange(len(chosen)), chosen], statistics)
+    least = least_caught(statistics.captured)
+    return jax.tree.map(lambda leaf: leaf[np.arange(len(least)), least], statistics)
 
 
 def cell_record(
@@ -266,16 +266,16 @@ def figures(game: PursuitSettings, statistics: EpisodeStatistics) -> dict:
     """Captures of episodes (E,) with their 95 % interval, crashes and mean capture time
     (s, of those that capture).
     """
-    caught = statistics.captured
+    is_caught = statistics.captured
     seconds = (
-        statistics.capture_step[caught].mean() * game.time_step
-        if caught.any()
+        statistics.capture_step[is_caught].mean() * game.time_step
+        if is_caught.any()
         else None
     )
     return {
-        "episodes": len(caught),
-        "capture_rate": float(caught.mean()),
-        "interval": list(wilson(int(caught.sum()), len(caught))),
+        "episodes": len(is_caught),
+        "capture_rate": float(is_caught.mean()),
+        "interval": list(wilson(int(is_caught.sum()), len(is_caught))),
         "capture_seconds": None if seconds is None else float(seconds),
         "crash_rate": float(statistics.crashed.mean()),
     }

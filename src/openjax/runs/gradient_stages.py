@@ -102,7 +102,7 @@ def compile_first_flights(
         begin = begin_ready()
         if over():
             return None
-        started = time.monotonic()
+        start = time.monotonic()
         # a copy, as the first call takes the carry's buffers, and the parameters are
         # needed below
         parameters_there, key = place((own_copy(parameters), key), at)
@@ -111,12 +111,12 @@ def compile_first_flights(
             if first and over():
                 break
             carry, parts = some(carry, key, place(jnp.int32(first), at))
-            done = min(first + TOGETHER, updates)
+            updates_done = min(first + TOGETHER, updates)
             # waits for them
             loss = {name: float(value) for name, value in parts.items()}
-            seconds_left = (time.monotonic() - started) * (updates / done - 1.0)
+            seconds_left = (time.monotonic() - start) * (updates / updates_done - 1.0)
             say(
-                f"{done} of {updates} updates, {duration(seconds_left)} left | evader out of reach "
+                f"{updates_done} of {updates} updates, {duration(seconds_left)} left | evader out of reach "
                 f"{loss['free']:.0%} of the time, the nearest pursuer {loss['distance']:.2f} m too "
                 f"far, close to a crash {loss['crashes']:.1%}"
             )
@@ -132,16 +132,19 @@ def _compiling(flights, policy, devices, at, keep):
     begin, some, shardings = make_device_first_flights(
         flights, min(TOGETHER, flights.settings.updates), devices
     )
-    key, done = jax.eval_shape(lambda: (jax.random.key(0), jnp.int32(0)))
-    policy, key, done = abstract_like((policy, key, done), at)
+    key, updates_done = jax.eval_shape(lambda: (jax.random.key(0), jnp.int32(0)))
+    policy, key, updates_done = abstract_like((policy, key, updates_done), at)
     carry = abstract_like(jax.eval_shape(begin, policy, key), shardings)
     if keep is not None and devices == 1:
         some = keep(
-            "first_flights", jax.jit(some), lambda: (carry, key, done), carry=carry
+            "first_flights",
+            jax.jit(some),
+            lambda: (carry, key, updates_done),
+            carry=carry,
         )
     options = compiler_options(devices, brief=True)
     some = jax.jit(some, donate_argnums=0, compiler_options=options)
-    lowered_some = some.lower(carry, key, done)
+    lowered_some = some.lower(carry, key, updates_done)
     lowered_begin = jax.jit(begin, compiler_options=options).lower(policy, key)
     # the larger one first
     return [in_background(program.compile) for program in (lowered_some, lowered_begin)]

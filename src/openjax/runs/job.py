@@ -139,12 +139,12 @@ def start_parameters(job: TrainingJob, fresh: PolicyParameters) -> PolicyParamet
     """Those of the policy that the run starts from; `fresh` ones where it has no
     critic, or one of another game.
     """
-    loaded = load_policy(job.start_from)
-    if isinstance(loaded.policy, Heuristic):
+    start_policy = load_policy(job.start_from)
+    if isinstance(start_policy.policy, Heuristic):
         raise UserError(
             f"--start_from {job.start_from}: a heuristic has no networks to start from"
         )
-    settings = loaded.settings
+    settings = start_policy.settings
     axes = job.settings.environment.observe_in
     policy_axes = settings.environment.observe_in
     # of the same shapes, so that nothing else would tell
@@ -154,14 +154,16 @@ def start_parameters(job: TrainingJob, fresh: PolicyParameters) -> PolicyParamet
             "(--environment.observe_in)"
         )
     old = with_longer_history(
-        loaded.parameters,
+        start_policy.parameters,
         settings.predictor,
         settings.environment,
         job.settings.environment,
     )
     leaves = named_leaves(old.replace(critic={}))
-    filled = fill(fresh.replace(critic={}), leaves, f"--start_from {job.start_from}")
+    leaves_filled = fill(
+        fresh.replace(critic={}), leaves, f"--start_from {job.start_from}"
+    )
     # a critic may see other numbers in another game; it is learnt anew sooner than an
     # actor
     fits = jax.tree.map(jnp.shape, old.critic) == jax.tree.map(jnp.shape, fresh.critic)
-    return filled.replace(critic=old.critic if fits else fresh.critic)
+    return leaves_filled.replace(critic=old.critic if fits else fresh.critic)

@@ -49,16 +49,16 @@ def keep_best(
     """
     began = time.monotonic()
     settings = job.settings
-    before, _, notes = load_policy_file(directory.policy)
+    earlier, _, notes = load_policy_file(directory.policy)
     abstract = abstract_parameters(job.parts.environment, job.parts.policy)
     # where the validation, too, was compiled for
-    before = place(fill(abstract, before, str(directory.policy)))
+    earlier = place(fill(abstract, earlier, str(directory.policy)))
     length = settings.environment.episode_length
-    looks = [{"update": 0, **validate(before)}]
+    looks = [{"update": 0, **validate(earlier)}]
     history = []
     best = 0
     scores = [selection_score(looks[0], length)]
-    for parameters, parts in learn(before, jax.random.key(settings.seed)):
+    for parameters, parts in learn(earlier, jax.random.key(settings.seed)):
         history.append(parts)
         if over():
             break

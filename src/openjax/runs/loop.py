@@ -89,8 +89,8 @@ def guarded(step: Callable[[Any], tuple[Any, dict]]) -> Callable:
 
     def checked(carry):
         carry, metrics = step(carry)
-        broken = [jnp.any(jnp.isnan(leaf)) for leaf in float_leaves(carry).values()]
-        return carry, metrics, jnp.stack(broken) if broken else jnp.zeros((0,), bool)
+        has_nan = [jnp.any(jnp.isnan(leaf)) for leaf in float_leaves(carry).values()]
+        return carry, metrics, jnp.stack(has_nan) if has_nan else jnp.zeros((0,), bool)
 
     return checked
 
@@ -157,19 +157,19 @@ class Loop:
         if reason is None:
             self.progress.phase("compiling the training step", announce=False)
         while update < plan.total_updates and reason is None:
-            carry, values, broken = self.step(carry)
+            carry, values, has_nan = self.step(carry)
             update += 1
             # the update before is read while the device works on this one
             if pending is not None:
                 self._finish(carry, update, pending)
-            pending = _Update(update, values, broken)
+            pending = _Update(update, values, has_nan)
             due = update % plan.validation_interval == 0 or update == plan.total_updates
-            reason, late = self._decide()
+            reason, checkpoint_due = self._decide()
             # what is saved or validated must be known to hold no NaN
-            if not overlap or due or late or reason:
+            if not overlap or due or checkpoint_due or reason:
                 self._finish(carry, update, pending)
                 pending = None
-            if due or late:
+            if due or checkpoint_due:
                 self._save(update, carry, validate=due)
         self._save(update, carry)  # does nothing where it's saved already
         self.checkpoints.wait()
@@ -192,16 +192,16 @@ class Loop:
         update more where updates overlap.
         """
         update = results.number
-        broken = np.asarray(results.broken)
+        has_nan = np.asarray(results.broken)
         values = {
             name: float(value)
             for name, value in jax.device_get(results.metrics).items()
         }
         self._log("train", update, values)
-        if broken.any():
+        if has_nan.any():
             leaves = [
                 name
-                for name, bad in zip(float_leaves(carry), broken, strict=True)
+                for name, bad in zip(float_leaves(carry), has_nan, strict=True)
                 if bad
             ]
             raise self._leave_broken_state(carry, reached, update, leaves, values)
@@ -212,15 +212,17 @@ class Loop:
         """Why to stop, and whether a checkpoint is late: a signal to any process
         counts, and the first one's clock.
         """
-        late = time.monotonic() - self._saved_at > self.plan.checkpoint_seconds
-        asked = self.everyone(
-            [self.stop.name, self._elapsed() >= self.plan.time_limit, late]
+        checkpoint_due = (
+            time.monotonic() - self._saved_at > self.plan.checkpoint_seconds
         )
-        signals = [name for name, _, _ in asked if name is not None]
+        decision = self.everyone(
+            [self.stop.name, self._elapsed() >= self.plan.time_limit, checkpoint_due]
+        )
+        signals = [name for name, _, _ in decision if name is not None]
         # hosts' clocks differ, and all must decide alike
-        _, over, late = asked[0]
+        _, over, checkpoint_due = decision[0]
         limit = "the time limit" if over else None
-        return signals[0] if signals else limit, late
+        return signals[0] if signals else limit, checkpoint_due
 
     def _save(self, update, carry, validate=False):
         """Write a checkpoint, with its score on the validation tasks where it is to

@@ -58,7 +58,7 @@ def commit() -> dict:
 
 def _git(directory, *arguments):
     try:
-        found = subprocess.run(
+        answer = subprocess.run(
             ["git", "-C", str(directory), *arguments],
             capture_output=True,
             text=True,
@@ -67,7 +67,7 @@ def _git(directory, *arguments):
         )
     except (OSError, subprocess.SubprocessError):
         return None
-    return found.stdout.strip()
+    return answer.stdout.strip()
 
 
 def _processor():

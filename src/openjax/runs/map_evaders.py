@@ -94,8 +94,8 @@ class MapEvaders:
 
         def fly(evaders, tasks, key):
             start = duel.start(tasks, key)
-            flown = fly_learners(duel, hold, evaders, self.loaded.parameters, start)
-            return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), flown)
+            results = fly_learners(duel, hold, evaders, self.loaded.parameters, start)
+            return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), results)
 
         learners = len(evaders.world_axes)
         return Flight(
@@ -138,11 +138,11 @@ class MapEvaders:
             "scenario": self.command.scenario,
             "curve": curve,
         }
-        stored = {
+        content = {
             "map_evaders": {"actor": evaders.actor, "world_axes": evaders.world_axes}
         }
         save_policy_file(
-            path, stored, {"environment": self.game}, notes, storage="float32"
+            path, content, {"environment": self.game}, notes, storage="float32"
         )
 
     def load(self, path: Path) -> tuple[Evaders, list[dict]]:
@@ -170,9 +170,9 @@ class MapEvaders:
         abstract = {
             "map_evaders": {"actor": kinds.actor, "world_axes": kinds.world_axes}
         }
-        stored = fill(abstract, leaves, str(path))["map_evaders"]
+        content = fill(abstract, leaves, str(path))["map_evaders"]
         evaders = jax.tree.map(lambda kind: jnp.zeros(kind.shape, kind.dtype), kinds)
-        return evaders.replace(**stored), notes.get("curve", [])
+        return evaders.replace(**content), notes.get("curve", [])
 
 
 def least_caught(captured: np.ndarray) -> np.ndarray:

@@ -38,12 +38,12 @@ def map_page(maps: Mapping[str, dict]) -> str:
     """
     first = next(iter(maps.values()))
     plain = []
-    for name, found in maps.items():
+    for name, map_ in maps.items():
         for evaders, words in WHO.items():
-            cells = cells_against(found, evaders)
+            cells = cells_against(map_, evaders)
             if cells:
-                shown = [{key: cell.get(key) for key in SHOWN} for cell in cells]
-                plain.append({"name": f"{name}, {words}", "cells": shown})
+                cells_shown = [{key: cell.get(key) for key in SHOWN} for cell in cells]
+                plain.append({"name": f"{name}, {words}", "cells": cells_shown})
     return filled(
         "catch_map.html.jinja",
         Path(__file__).parent,
@@ -53,5 +53,5 @@ def map_page(maps: Mapping[str, dict]) -> str:
         evaders=first["evaders"],
         episodes=first["cells"][0]["episodes"],
         machine=first["machine"]["device"],
-        seconds=round(sum(found["seconds"] for found in maps.values())),
+        seconds=round(sum(map_["seconds"] for map_ in maps.values())),
     )

@@ -83,8 +83,8 @@ def compare(
     tasks |= layout_tasks(settings, scenarios, episodes)
     # all in one batch, which is flown once
     evaluator = Evaluator(game, policy.policy, validation + episodes * len(scenarios))
-    flown = evaluator.fly(policy.parameters, tasks, jax.random.key(0))
-    rows = [kind.record() for kind in flown]
+    kinds = evaluator.fly(policy.parameters, tasks, jax.random.key(0))
+    rows = [kind.record() for kind in kinds]
     for row in rows:
         row["capture_step"] *= settings.time_step / environment.settings.time_step
-    return rows, [kind.trajectory(0, f"{kind.name}, {policy.source}") for kind in flown]
+    return rows, [kind.trajectory(0, f"{kind.name}, {policy.source}") for kind in kinds]

@@ -45,8 +45,8 @@ def report(
     ):
         progress.phase(f"evaluating the policy {moment} training on the layouts")
         parameters = fill(abstract, load_policy_file(path)[0], str(path))
-        flown, pictured = _fly(validation, parameters, layouts, job.layout_episodes)
-        rows[moment] = [kind.record(_BESIDE_RECORD) for kind in flown]
+        kinds, pictured = _fly(validation, parameters, layouts, job.layout_episodes)
+        rows[moment] = [kind.record(_BESIDE_RECORD) for kind in kinds]
     # of the trained policy, which comes last
     flights = [kind.trajectory(episode, title) for kind, episode, title in pictured]
     other_rows, other_flights = _compare(job, layouts, validation.number, progress)
@@ -92,14 +92,16 @@ def _fly(validation, parameters, layouts, episodes):
     episode, title), a flight of each layout, or some validation tasks where no layout
     fits the game.
     """
-    flown = validation(parameters)
+    kinds_flown = validation(parameters)
     if not layouts:
         number = min(3, validation.number)
-        return flown, [(flown[0], i, f"validation task {i + 1}") for i in range(number)]
+        return kinds_flown, [
+            (kinds_flown[0], i, f"validation task {i + 1}") for i in range(number)
+        ]
     evaluator = validation.evaluator
     tasks = layout_tasks(evaluator.settings, layouts, episodes)
     kinds = evaluator.fly(parameters, tasks, jax.random.key(0))
-    return [*flown, *kinds], [(kind, 0, kind.name) for kind in kinds]
+    return [*kinds_flown, *kinds], [(kind, 0, kind.name) for kind in kinds]
 
 
 def _draw(directory, flights, other_flights):
@@ -112,15 +114,17 @@ def _draw(directory, flights, other_flights):
     # a chase that ends well shows what the game is about; beside it the other policy's,
     # from the same start
     captured = [flight for flight in flights if flight.capture_index is not None]
-    chosen = (captured or flights)[0]
+    best_flight = (captured or flights)[0]
     beside = [
         flight
         for flight in other_flights
-        if flight.title.startswith(f"{chosen.title}, ")
+        if flight.title.startswith(f"{best_flight.title}, ")
     ]
     if beside:
-        chosen = dataclasses.replace(chosen, title=f"{chosen.title}, this run")
-    animate(directory.path / "chase.gif", [chosen, *beside])
+        best_flight = dataclasses.replace(
+            best_flight, title=f"{best_flight.title}, this run"
+        )
+    animate(directory.path / "chase.gif", [best_flight, *beside])
 
 
 _KINDS = {"validation": "new tasks", "validation_far": "far starts"}

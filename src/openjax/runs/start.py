@@ -151,20 +151,20 @@ def prepare(
       UserError: whatever can be wrong with the files or the settings.
     """
     resumed = None if command.resume is None else open_run(command.resume)
-    stored = {} if resumed is None else resumed.read_facts()
+    stored_facts = {} if resumed is None else resumed.read_facts()
     files = _files(command, resumed)
-    _check_parts(parts, files, stored)
+    _check_parts(parts, files, stored_facts)
     environment = parts.environment or _environment(command.settings.environment, files)
     settings = dataclasses.replace(command.settings, environment=environment.settings)
     directory = resumed or RunDirectory(_free_directory(command, processes))
-    started_from = _lasting(command.start_from) or stored.get("start_from")
+    started_from = _lasting(command.start_from) or stored_facts.get("start_from")
     facts = {
         **({"own_parts": parts.names} if parts.names else {}),
         "command": " ".join([PROGRAM, *arguments]),
         "machine": describe_machine(),
-        "devices": _devices(command.devices, settings, stored.get("devices")),
+        "devices": _devices(command.devices, settings, stored_facts.get("devices")),
         "start_from": started_from,
-        "compare_with": _comparison(command, stored),
+        "compare_with": _comparison(command, stored_facts),
     }
     job = TrainingJob(
         settings=settings,
@@ -237,16 +237,16 @@ def _files(command, resumed):
     }
 
 
-def _check_parts(parts, files, stored):
+def _check_parts(parts, files, facts):
     """Raises UserError for parts of one's own that don't go with files, or with the run
-    that is resumed, whose `stored` facts these are.
+    that is resumed, whose facts these are.
     """
     if parts.environment is not None and any(files.values()):
         raise UserError(
             "an environment of one's own has its vehicle, effects and evader already"
         )
     # a new run may have any; one that is resumed and says nothing had none
-    first = stored.get("own_parts", []) if stored else parts.names
+    first = facts.get("own_parts", []) if facts else parts.names
     if first != parts.names:
         raise UserError(
             f"the run was begun with {', '.join(first) or 'no part'} of one's own, here are "
@@ -275,14 +275,14 @@ def _layout_episodes(environment):
     return 32 if jax.default_backend() == "cpu" else 100
 
 
-def _comparison(command, stored):
+def _comparison(command, facts):
     """The policy to compare with; None for none."""
     if command.compare_with is not None:
         return (
             None if command.compare_with == "none" else _lasting(command.compare_with)
         )
     if command.resume is not None:
-        return stored.get("compare_with")
+        return facts.get("compare_with")
     # beside a run of minutes, a policy of hours shows what more time is worth
     fits = (
         command.settings.environment.num_pursuers
@@ -307,9 +307,9 @@ def _check_same(settings, processes):
     """Raises UserError where processes were started with different settings: their
     results would drift apart.
     """
-    here = {"settings": to_plain(settings), "JAX": jax.__version__}
-    for other, there in enumerate(processes.everyone(here)):
-        different = [name for name in here if here[name] != there[name]]
+    facts = {"settings": to_plain(settings), "JAX": jax.__version__}
+    for other, others_facts in enumerate(processes.everyone(facts)):
+        different = [name for name in facts if facts[name] != others_facts[name]]
         if different:
             raise UserError(
                 f"processes {other} and {processes.index} differ in their {' and '.join(different)}"
@@ -331,8 +331,8 @@ def check_resumed(command: TrainCommand, stored: TrainSettings) -> None:
         and open_run(resume).optional("evader.npz") is None
     ):
         options.remove("opponent")  # a function isn't in the run's files
-    given = [name for name in options if getattr(command, name) is not None]
-    for name in (*given, *different_settings(command.settings, stored)):
+    changes = [name for name in options if getattr(command, name) is not None]
+    for name in (*changes, *different_settings(command.settings, stored)):
         if name not in MAY_CHANGE:
             raise UserError(
                 f"--{name} can't change when a run is resumed; {', '.join(MAY_CHANGE)} can, or "
@@ -340,15 +340,15 @@ def check_resumed(command: TrainCommand, stored: TrainSettings) -> None:
             )
 
 
-def _devices(text, settings, stored):
-    """How many; where nobody says, as many as the run had (`stored`, None for a new
+def _devices(text, settings, saved_settings):
+    """How many; where nobody says, as many as the run had (`saved_settings`, None for a new
     one), or as many cores as the worlds can be shared out to.
     """
     available = len(jax.devices())
     if text is None and jax.default_backend() == "cpu" and jax.process_count() == 1:
         numbers = range(1, available + 1)
-        if stored in numbers:
-            return stored
+        if saved_settings in numbers:
+            return saved_settings
         return max(number for number in numbers if can_share_out(settings, number))
     text = text or "1"
     if text == "all":

@@ -132,8 +132,8 @@ class _Run:
         settings = self.settings
         latest = self.checkpoints.latest()
         is_done = latest is not None and latest.update >= settings.total_updates
-        done = self.processes.of_first(is_done)
-        if done:
+        first_done = self.processes.of_first(is_done)
+        if first_done:
             self.progress.message(
                 "all updates are done; --total_steps N goes on to more. Its report is made anew"
             )
@@ -143,7 +143,7 @@ class _Run:
         start, step, self.abstract = _programs(job)
         # takes longest, so it comes first
         step_ready = (
-            _nothing_to_wait_for if done else compile_ahead(step, self.abstract)
+            _nothing_to_wait_for if first_done else compile_ahead(step, self.abstract)
         )
         self.first_flights = self._first_flights()
         carry, self.first_update, seconds = self._first_carry(start)
@@ -156,7 +156,7 @@ class _Run:
             return None
         with self._metrics() as metrics:
             self.progress.phase(
-                "compiling the training step", announce=not (done or over)
+                "compiling the training step", announce=not (first_done or over)
             )
             self._compile_beside(_nothing_to_wait_for if over else step_ready)
             self.began = min(self.began, time.monotonic())
@@ -183,10 +183,10 @@ class _Run:
     def last_words(self) -> str:
         """What there is of the run, and how it goes on, should it end now."""
         update = self.checkpoints.last_finished()
-        saved = (
+        checkpoint_words = (
             "nothing was learnt yet" if update is None else f"saved at update {update}"
         )
-        return f"{saved}; go on with {typed(f'openjax train --resume {self.directory.path}')}"
+        return f"{checkpoint_words}; go on with {typed(f'openjax train --resume {self.directory.path}')}"
 
     def _plan(self, seconds):
         """What the loop is to do after so many seconds of earlier processes."""
@@ -222,8 +222,8 @@ class _Run:
         if not signals and settings.analytic.updates:
             self.progress.phase("learning by the gradient through the simulation")
             self.progress.message(self._learn_last())
-        if asked := (*signals, self.stop.name)[0]:
-            self.progress.message(f"{asked}: {self.last_words()}")
+        if stop_name := (*signals, self.stop.name)[0]:
+            self.progress.message(f"{stop_name}: {self.last_words()}")
             return None
         return report(
             self.job, self.directory, self.validation(), outcome, self.progress
@@ -266,9 +266,9 @@ class _Run:
         """Whether the run is to end: a signal to any process counts, and the first
         one's clock.
         """
-        late = time.monotonic() - self.began >= self.job.time_limit
-        asked = self.processes.everyone([self.stop.name, late])
-        return any(name is not None for name, _ in asked) or asked[0][1]
+        out_of_time = time.monotonic() - self.began >= self.job.time_limit
+        answers = self.processes.everyone([self.stop.name, out_of_time])
+        return any(name is not None for name, _ in answers) or answers[0][1]
 
     def _first_carry(self, start):
         """The carry to start from, the updates done and the seconds spent."""
@@ -376,7 +376,7 @@ class _Run:
         # a copy: on several devices the carry's leaves lie elsewhere than the
         # validation's
         validation = self._await_validation()
-        uniform, far = (
+        uniform, far_tasks = (
             summarise(kind.evaluation) for kind in validation(own_copy(carry.policy))
         )
         settings = self.settings
@@ -384,7 +384,7 @@ class _Run:
         if int(carry.update) < settings.validation_start * settings.total_updates:
             score -= EARLY
         return self.processes.of_first(
-            (score, {**flat_metrics(uniform, far), "score": score})
+            (score, {**flat_metrics(uniform, far_tasks), "score": score})
         )
 
     def _save_best(self):

@@ -20,14 +20,14 @@ def opening_words(settings: TrainSettings) -> str:
     """Which preset this is, or comes nearest to, and what that is: nobody should take
     another game for the paper's.
     """
-    changed = {
+    changes = {
         name: [leaf for leaf in different_settings(settings, make()) if leaf != "seed"]
         for name, make in PRESETS.items()
     }
     # the preset from which the fewest settings differ
-    name = min(changed, key=lambda name: len(changed[name]))
-    words = changed[name][:NAMED]
-    if more := len(changed[name]) - len(words):
+    name = min(changes, key=lambda name: len(changes[name]))
+    words = changes[name][:NAMED]
+    if more := len(changes[name]) - len(words):
         words.append(f"{more} more")
     return (
         f"preset {name}{', changed in ' if words else ''}{', '.join(words)}: "

@@ -175,13 +175,13 @@ def _entity(name: str, kind: str, position, size, colour: dict) -> dict:
 
 def _pillars(flight: Trajectory) -> list[dict]:
     height = flight.arena_height
-    wide = 2 * flight.pillar_radius
+    diameter = 2 * flight.pillar_radius
     return [
         _entity(
             f"pillar_{k + 1}",
             "cylinders",
             (*at, height / 2),
-            (wide, wide, height),
+            (diameter, diameter, height),
             PILLAR,
         )
         for k, at in enumerate(np.asarray(flight.pillar_position, float))

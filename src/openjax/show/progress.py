@@ -102,16 +102,16 @@ class Progress(_Display):
           steps: environment steps so far.
           values: its metrics; those known to the display are shown.
         """
-        now = time.monotonic()
-        if self._last is not None and now > self._last[0]:
-            rate = (steps - self._last[1]) / (now - self._last[0])
+        time_read = time.monotonic()
+        if self._last is not None and time_read > self._last[0]:
+            rate = (steps - self._last[1]) / (time_read - self._last[0])
             # a running mean: single updates are uneven
             self._rate = rate if self._rate == 0.0 else 0.9 * self._rate + 0.1 * rate
-        self._last = (now, steps)
+        self._last = (time_read, steps)
         self._steps = steps
         self._values = values
-        if self._lines and now - self._last_line > _LINE_INTERVAL:
-            self._last_line = now
+        if self._lines and time_read - self._last_line > _LINE_INTERVAL:
+            self._last_line = time_read
             self.message(f"{self._speed()} | {_listed(values)}")
 
     def validation(self, values: dict[str, float], is_best: bool) -> None:
@@ -122,11 +122,11 @@ class Progress(_Display):
             self.message(f"validation tasks: {_listed(values)}{remark}")
 
     def _speed(self):
-        done = f"{100 * min(self._steps / self._total, 1):.0f} %, {_count(self._steps)} steps"
+        share = f"{100 * min(self._steps / self._total, 1):.0f} %, {_count(self._steps)} steps"
         if self._rate == 0.0:  # a speed takes two updates
-            return done
-        left = max(self._total - self._steps, 0) / self._rate
-        return f"{done}, {_count(self._rate)} steps/s, {duration(left)} left"
+            return share
+        seconds = max(self._total - self._steps, 0) / self._rate
+        return f"{share}, {_count(self._rate)} steps/s, {duration(seconds)} left"
 
     def _render(self):
         seconds = time.monotonic() - self._phase_start
@@ -231,13 +231,13 @@ class Steps(_Display):
         slower = took / self._done if self._done > 0 else 1.0
         step = self._expected.get(self._step, 0.0)
         in_step = max(slower * step - (moment - self._step_start), 0.0)
-        following = self._total - self._done - step
-        return in_step + slower * max(following, 0.0)
+        steps_left = self._total - self._done - step
+        return in_step + slower * max(steps_left, 0.0)
 
     def _render(self):
-        now = time.monotonic()
-        left = self.seconds_left(now)
-        done = (now - self._start) / max(now - self._start + left, 1e-6)
+        time_read = time.monotonic()
+        seconds = self.seconds_left(time_read)
+        share = (time_read - self._start) / max(time_read - self._start + seconds, 1e-6)
         text = f"{self._title}: {self._step or 'starting'}"
         if self._note:
             text += f" ({self._note})"
@@ -245,7 +245,7 @@ class Steps(_Display):
         row.add_row(
             self._spinner,
             Text(text),
-            ProgressBar(total=1.0, completed=done, width=24),
-            Text(f"about {duration(left)} left", style="dim"),
+            ProgressBar(total=1.0, completed=share, width=24),
+            Text(f"about {duration(seconds)} left", style="dim"),
         )
         return row

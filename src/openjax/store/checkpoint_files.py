@@ -52,11 +52,11 @@ def load_state(path: Path, abstract: Any) -> Any:
     """
     path = Path(path).absolute()
     check_state(path)
-    stored = load_orbax().metadata(path).metadata
+    metadata = load_orbax().metadata(path).metadata
     expected = {
         name: leaf for name, leaf in named_leaves(abstract).items() if leaf.size
     }
-    _check_same_shapes(path, stored, expected)
+    _check_same_shapes(path, metadata, expected)
     arrays = load_orbax().load(path, expected)
     # Orbax can't write arrays without elements; they hold nothing, so they are made
     # anew.
@@ -84,19 +84,19 @@ def load_arrays(
     path = Path(path).absolute()
     check_state(path)
     sharding = first_device()
-    stored = load_orbax().metadata(path).metadata
-    names = {name: name_of(name) for name in stored}
+    metadata = load_orbax().metadata(path).metadata
+    names = {name: name_of(name) for name in metadata}
     abstract = {}
-    for name, leaf in stored.items():
+    for name, leaf in metadata.items():
         abstract[name] = jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding)
         if names[name] is None:  # not read at all
             abstract[name] = load_orbax().PLACEHOLDER
     # else Orbax would wait for the other processes
-    alone = load_orbax().Context()
-    alone.multiprocessing.primary_host = jax.process_index()
-    alone.multiprocessing.active_processes = {jax.process_index()}
-    with alone:
-        loaded = load_orbax().load(path, abstract)
+    context = load_orbax().Context()
+    context.multiprocessing.primary_host = jax.process_index()
+    context.multiprocessing.active_processes = {jax.process_index()}
+    with context:
+        checkpoint = load_orbax().load(path, abstract)
 
     def plain(leaf):
         is_key = jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
@@ -104,7 +104,7 @@ def load_arrays(
 
     return {
         names[name]: plain(leaf)
-        for name, leaf in loaded.items()
+        for name, leaf in checkpoint.items()
         if names[name] is not None
     }
 
@@ -132,8 +132,8 @@ def commit(path: Path, started: Any) -> None:
     if jax.process_index() == 0:
         # on the disk before the checksums are, as a checkpoint counts once these are
         # there
-        for written in (*_files(path), path, path.parent):
-            flush(written)
+        for path_written in (*_files(path), path, path.parent):
+            flush(path_written)
         lines = [
             f"{_checksum(file)}  {file.relative_to(path).as_posix()}"
             for file in _files(path)
@@ -200,22 +200,22 @@ def _checksums_file(path):
     return path.with_name(path.name + _CHECKSUMS)
 
 
-def _check_same_shapes(path, stored, leaves):
+def _check_same_shapes(path, metadata, leaves):
     """Raises UserError where a checkpoint's leaves aren't these."""
     reason = "it was written by other settings or another version"
     for name, leaf in leaves.items():
-        if name not in stored:
+        if name not in metadata:
             raise UserError(f"checkpoint {path} lacks {name}; {reason}")
         # Orbax writes a random key as its numbers
         is_key = jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
         expected = jax.eval_shape(jax.random.key_data, leaf) if is_key else leaf
-        shape = tuple(stored[name].shape)
-        if shape != tuple(expected.shape) or stored[name].dtype != expected.dtype:
+        shape = tuple(metadata[name].shape)
+        if shape != tuple(expected.shape) or metadata[name].dtype != expected.dtype:
             raise UserError(
                 f"checkpoint {path} is of another shape: {name} is "
-                f"{stored[name].dtype}{list(shape)} there, the settings make it "
+                f"{metadata[name].dtype}{list(shape)} there, the settings make it "
                 f"{expected.dtype}{list(expected.shape)}"
             )
-    for name in stored:
+    for name in metadata:
         if name not in leaves:
             raise UserError(f"checkpoint {path} also holds {name}; {reason}")

@@ -155,8 +155,8 @@ class Checkpoints:
             remove_state(path)
             self._known.pop(path.name, None)
             self._damaged.pop(path.name, None)
-        started = start_save(path, carry, {**(notes or {}), "score": score})
-        self._pending = in_background(functools.partial(commit, path, started))
+        write = start_save(path, carry, {**(notes or {}), "score": score})
+        self._pending = in_background(functools.partial(commit, path, write))
 
     def _holds(self, path, score):
         """Whether a checkpoint is there, with a score if there is one to write."""

@@ -38,13 +38,15 @@ def cache_programs() -> Path | None:
 
     from openjax.store.checked_cache import use_checked_cache
 
-    chosen = jax.config.jax_compilation_cache_dir
-    if chosen is not None and "://" in chosen:  # a bucket; JAX reads it by itself
-        return Path(chosen)
-    folder = _own_folder() if chosen is None else Path(chosen)
+    configured = jax.config.jax_compilation_cache_dir
+    if (
+        configured is not None and "://" in configured
+    ):  # a bucket; JAX reads it by itself
+        return Path(configured)
+    folder = _own_folder() if configured is None else Path(configured)
     if folder is None:
         return None
-    if chosen is not None and folder.exists() and not _is_private(folder):
+    if configured is not None and folder.exists() and not _is_private(folder):
         _LOGGER.warning(
             "others can write to %s, and so run what they like here: chmod go-w it",
             folder,
@@ -53,7 +55,7 @@ def cache_programs() -> Path | None:
     jax.config.update("jax_compilation_cache_dir", str(folder))
     # XLA's own caches have no checksums
     jax.config.update("jax_persistent_cache_enable_xla_caches", "none")
-    if chosen is None:
+    if configured is None:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", _WORTH_KEEPING)
     return folder
 

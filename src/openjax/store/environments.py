@@ -84,8 +84,8 @@ def is_evader_file(opponent: Any) -> bool:
     """Whether it is a file that `openjax exploit` wrote, neither a scripted evader's
     name nor code.
     """
-    named = isinstance(opponent, str | Path) and str(opponent) not in SCRIPTED
-    return named and not is_own_code(opponent)
+    is_name = isinstance(opponent, str | Path) and str(opponent) not in SCRIPTED
+    return is_name and not is_own_code(opponent)
 
 
 def save_evader(
@@ -99,10 +99,10 @@ def save_evader(
     many control steps it holds a decision, and the game that it learned.
     """
     actor, world_axes = evader
-    stored = {
+    content = {
         "evader": {"actor": actor, "world_axes": world_axes, "hold": jnp.int32(hold)}
     }
-    save_policy_file(path, stored, {"environment": game}, notes, storage="float32")
+    save_policy_file(path, content, {"environment": game}, notes, storage="float32")
 
 
 def find_opponent(evader: str | Path | Evader, game: PursuitSettings) -> Evader:
@@ -157,7 +157,7 @@ def find_opponent(evader: str | Path | Evader, game: PursuitSettings) -> Evader:
     )
     scalar = {"world_axes": jnp.bool_, "hold": jnp.int32}
     abstract = {name: jax.ShapeDtypeStruct((), kind) for name, kind in scalar.items()}
-    stored = fill({"evader": {"actor": one, **abstract}}, leaves, str(path))["evader"]
+    content = fill({"evader": {"actor": one, **abstract}}, leaves, str(path))["evader"]
     return learned_opponent(
-        stored["actor"], stored["world_axes"], int(stored["hold"]), slots
+        content["actor"], content["world_axes"], int(content["hold"]), slots
     )

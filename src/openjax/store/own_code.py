@@ -34,7 +34,7 @@ def own_code(option: str, name: str, kinds: tuple[type, ...], what: str) -> Any:
         spec.loader.exec_module(module)
     except Exception as error:  # whatever the file does
         raise UserError(f"{option} {name}: {path} doesn't run: {error}") from error
-    found = getattr(module, attribute, None)
-    if not callable(found) and not isinstance(found, kinds):
+    value = getattr(module, attribute, None)
+    if not callable(value) and not isinstance(value, kinds):
         raise UserError(f"{option} {name}: {path} has no {what.format(attribute)}")
-    return found
+    return value

@@ -254,9 +254,9 @@ def own_controller(
     """
     nothing = PolicyParameters(actor={}, critic={}, predictor={})
     # which fits all games
-    whole = dict.fromkeys(("rollout_length", "restart_steps"), game.episode_length)
+    lengths = dict.fromkeys(("rollout_length", "restart_steps"), game.episode_length)
     settings = TrainSettings(
-        environment=game, predictor=OwnController.predictor, **whole
+        environment=game, predictor=OwnController.predictor, **lengths
     )
     return LoadedPolicy(OwnController(function), nothing, settings, source)
 

@@ -75,13 +75,13 @@ def load_policy_file(
       UserError: no policy file, or one of another format.
     """
     try:
-        stored = _read_arrays(Path(path))
-        header = json.loads(stored.pop(_HEADER).tobytes())
+        arrays = _read_arrays(Path(path))
+        header = json.loads(arrays.pop(_HEADER).tobytes())
         if not isinstance(header, dict) or header.get("format") != _FORMAT:
             raise UserError(f"{path} isn't of the format {_FORMAT!r}")
         leaves = {
             name: array.astype(_dtype(header["dtypes"][name]))
-            for name, array in stored.items()
+            for name, array in arrays.items()
         }
         settings = header["settings"]
         notes = header["notes"]
@@ -97,13 +97,13 @@ def load_policy_file(
         ) from error
     # float16 turns what is larger than 65,504 into infinity, and a flipped bit may do
     # it, too
-    broken = [
+    unequal = [
         name
         for name, leaf in leaves.items()
         if not np.isfinite(leaf.astype(np.float32)).all()
     ]
-    if broken:
-        raise UserError(f"{path} holds numbers that aren't finite, in {broken[0]}")
+    if unequal:
+        raise UserError(f"{path} holds numbers that aren't finite, in {unequal[0]}")
     return leaves, settings, notes
 
 
@@ -115,8 +115,8 @@ def _read_arrays(path):
             raise UserError(
                 f"{path} holds more than {LARGEST >> 20} MiB; no policy of openjax is so large"
             )
-    with np.load(path, allow_pickle=False) as stored:
-        return {name: stored[name] for name in stored.files}
+    with np.load(path, allow_pickle=False) as npz:
+        return {name: npz[name] for name in npz.files}
 
 
 def _dtype(name):
@@ -133,7 +133,7 @@ def fill(abstract: Any, leaves: dict[str, np.ndarray], where: str) -> Any:
     Raises:
       UserError: a leaf is missing or has another shape; `where` names the source.
     """
-    filled = []
+    values = []
     for name, leaf in named_leaves(abstract).items():
         if name not in leaves:
             raise UserError(
@@ -144,8 +144,8 @@ def fill(abstract: Any, leaves: dict[str, np.ndarray], where: str) -> Any:
                 f"{where} is of another shape: {name} is {list(leaves[name].shape)} there, "
                 f"its settings make it {list(leaf.shape)}"
             )
-        filled.append(jnp.asarray(leaves[name], leaf.dtype))
-    return jax.tree.unflatten(jax.tree.structure(abstract), filled)
+        values.append(jnp.asarray(leaves[name], leaf.dtype))
+    return jax.tree.unflatten(jax.tree.structure(abstract), values)
 
 
 def shipped_policies() -> list[str]:

@@ -99,11 +99,11 @@ class RunDirectory:
           UserError: not written by openjax, or with settings that this version doesn't
           know.
         """
-        stored = read_json(self.settings_file)
-        if not isinstance(stored, dict) or stored.get("format") != _FORMAT:
+        content = read_json(self.settings_file)
+        if not isinstance(content, dict) or content.get("format") != _FORMAT:
             raise UserError(f"{self.settings_file} isn't of the format {_FORMAT!r}")
         return from_plain(
-            TrainSettings, stored.get("settings"), f"{self.settings_file}: "
+            TrainSettings, content.get("settings"), f"{self.settings_file}: "
         )
 
 

@@ -97,10 +97,10 @@ class Bodies:
     def _mjx(self, world, vehicle, drone, force, torque, around):
         shapes = None
         if around is not None:
-            met = encounters(
+            gaps = encounters(
                 self.arena, drone.position, drone.velocity, around, self.dt
             )
-            shapes = place_solids(met)
+            shapes = place_solids(gaps)
         return mjx_step(world, vehicle, shapes, drone, force, torque, self.dt)
 
 

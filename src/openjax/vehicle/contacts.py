@@ -36,10 +36,10 @@ def contact_acceleration(
     -(b n_i v + k gap_i) / d. As the MJCF's solver does, this takes one Newton step from
     a_free: exact unless the step brings in another contact.
     """
-    met = encounters(arena, position, velocity, around, dt)
-    reference = _reference(met.things, met.normal, met.shown, velocity, dt)
-    lacking = _along(met.normal, acceleration) - reference
-    terms = _terms(met.things, met.normal, met.shown, lacking)
+    gaps = encounters(arena, position, velocity, around, dt)
+    reference = _reference(gaps.things, gaps.normal, gaps.shown, velocity, dt)
+    lacking = _along(gaps.normal, acceleration) - reference
+    terms = _terms(gaps.things, gaps.normal, gaps.shown, lacking)
     return jnp.stack(_newton_step(_sums(terms)))
 
 
@@ -61,9 +61,11 @@ def looped_contact_acceleration(
         least, sums = totals
         normal, gap, gap_ahead = approach(position, velocity, thing, dt)
         # where nothing is hit, the sums aren't used
-        shown = shown_gap(gap, gap_ahead, True)
-        reference = _reference(thing, normal, shown, velocity, dt)
-        terms = _terms(thing, normal, shown, _along(normal, acceleration) - reference)
+        solver_gap = shown_gap(gap, gap_ahead, True)
+        reference = _reference(thing, normal, solver_gap, velocity, dt)
+        terms = _terms(
+            thing, normal, solver_gap, _along(normal, acceleration) - reference
+        )
         sums = tuple(a + b for a, b in zip(sums, terms, strict=True))
         return jnp.minimum(least, gap_ahead), sums
 

@@ -38,8 +38,8 @@ def _jitter_command(parameters, memory, command, context):
     over that step.
     """
     draw, key = _draw(memory)
-    late = parameters["longest"] * jax.random.uniform(draw, (), command.dtype)
-    part = jnp.clip(late / context.dt, 0.0, 1.0)
+    delay = parameters["longest"] * jax.random.uniform(draw, (), command.dtype)
+    part = jnp.clip(delay / context.dt, 0.0, 1.0)
     return command + part * (memory["previous"] - command), {
         "previous": command,
         "key": key,
@@ -119,15 +119,15 @@ def _noise_sensor(parameters, memory, state):
     """
     position, velocity, angle = jnp.split(memory["noise"], 3)
     # what was measured `late` ago is shown as if it were measured now
-    late = parameters["jitter"] * memory["late"]
+    delay = parameters["jitter"] * memory["late"]
     # half of a small rotation vector is the vector part of its quaternion
-    turn = 0.5 * (parameters["attitude"] * angle - late * state.body_rates)
+    turn = 0.5 * (parameters["attitude"] * angle - delay * state.body_rates)
     quaternion = quaternion_multiply(
         state.quaternion, jnp.concatenate([jnp.ones_like(turn[:1]), turn])
     )
     return state.replace(
         position=state.position
-        - late * state.velocity
+        - delay * state.velocity
         + parameters["position"] * position,
         velocity=state.velocity + parameters["velocity"] * velocity,
         quaternion=quaternion * jax.lax.rsqrt(jnp.sum(quaternion * quaternion)),

@@ -145,18 +145,18 @@ def draw_vehicles(
     value_key, chosen_key, rare_key = jax.random.split(key, 3)
     # one draw serves both widths: which of them holds is chosen afterwards
     share = jax.random.uniform(value_key, (number, len(ranges)))
-    chosen = jax.random.randint(chosen_key, (number,), 0, len(names))
+    quantity = jax.random.randint(chosen_key, (number,), 0, len(names))
     # -1 is no effect's place: nothing of such a vehicle is out of the ordinary
-    chosen = jnp.where(jax.random.uniform(rare_key, (number,)) < rare, chosen, -1)
-    rarely = chosen[:, None] == owner
+    quantity = jnp.where(jax.random.uniform(rare_key, (number,)) < rare, quantity, -1)
+    rarely = quantity[:, None] == owner
     low = jnp.where(rarely, bounds[:, 2], bounds[:, 0])
     high = jnp.where(rarely, bounds[:, 3], bounds[:, 1])
     values = low + share * (high - low)
-    drawn: dict[str, dict[str, jax.Array]] = {name: {} for name in names}
+    draws: dict[str, dict[str, jax.Array]] = {name: {} for name in names}
     for i, entry in enumerate(ranges):
         effect, _, parameter = entry.parameter.partition(".")
-        drawn[effect][parameter] = values[:, i]
-    return drawn
+        draws[effect][parameter] = values[:, i]
+    return draws
 
 
 def standard_parameters(ranges: Sequence[VehicleRange], parameters: dict) -> jax.Array:
@@ -223,18 +223,20 @@ def adapted_family(
     usual = {entry.parameter: entry for entry in vehicle_family(airframe)}
     family = []
     for effect in known_effects().values():
-        found = values.get(effect.name)
+        estimate = values.get(effect.name)
         for key, parameter in effect.parameters.items():
             name = f"{effect.name}.{key}"
             none = parameter.none
-            if found is None:
+            if estimate is None:
                 # an effect that the airframe's family lacks stays as the nominal
                 # vehicle has it
-                whole = usual.get(name, VehicleRange(name, none, none, none, none))
-                low = none + rest * (whole.low - none)
-                high = none + rest * (whole.high - none)
+                usual_range = usual.get(
+                    name, VehicleRange(name, none, none, none, none)
+                )
+                low = none + rest * (usual_range.low - none)
+                high = none + rest * (usual_range.high - none)
             else:
-                value = found.get(key, none)
+                value = estimate.get(key, none)
                 margin = 0.1 * abs(value - none)
                 about = (value - margin, value + margin)
                 low, high = intervals.get(effect.name, {}).get(key, about)

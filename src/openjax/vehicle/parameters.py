@@ -66,12 +66,12 @@ def assets_directory() -> Path:
     """Where the MJCF files lie: inside the installed package, or at the top of the
     source tree. UserError: nowhere.
     """
-    here = Path(__file__).resolve()
-    for candidate in (here.parents[1] / "assets", here.parents[3] / "assets"):
+    file = Path(__file__).resolve()
+    for candidate in (file.parents[1] / "assets", file.parents[3] / "assets"):
         if (candidate / "crazyflie.xml").is_file():
             return candidate
     raise UserError(
-        f"crazyflie.xml is neither in {here.parents[1]}/assets nor in {here.parents[3]}/assets"
+        f"crazyflie.xml is neither in {file.parents[1]}/assets nor in {file.parents[3]}/assets"
     )
 
 
@@ -90,8 +90,8 @@ def read_mjcf(path: str) -> dict[str, np.ndarray]:
         ) from None
     body = _find(model, path, "body", BODY)
     # all equations here are about the centre of mass and the principal axes
-    turned = not np.allclose(model.body_iquat[body], [1, 0, 0, 0])
-    if turned or not np.allclose(model.body_ipos[body], 0):
+    is_turned = not np.allclose(model.body_iquat[body], [1, 0, 0, 0])
+    if is_turned or not np.allclose(model.body_ipos[body], 0):
         raise UserError(
             f"{path}: the inertial frame of {BODY!r} must lie in the body frame (pos 0, "
             "diaginertia only)"
@@ -172,8 +172,8 @@ def find_mjcf(name_or_path: str | Path) -> Path:
     """The MJCF file of an airframe: one of `AIRFRAMES`, or a file. UserError: there is
     none.
     """
-    known = AIRFRAMES.get(str(name_or_path))
-    path = Path(name_or_path) if known is None else assets_directory() / known
+    shipped = AIRFRAMES.get(str(name_or_path))
+    path = Path(name_or_path) if shipped is None else assets_directory() / shipped
     if not path.is_file():
         raise UserError(
             f"{path}: no such MJCF file, nor an airframe ({', '.join(AIRFRAMES)})"

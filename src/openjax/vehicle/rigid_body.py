@@ -65,11 +65,11 @@ def quaternion_integrate(
     angle = jnp.sqrt(jnp.where(tiny, 1.0, square))
     cosine = jnp.where(tiny, 1.0 - square / 2, jnp.cos(angle))
     sinc = jnp.where(tiny, 1.0 - square / 6, jnp.sin(angle) / angle)
-    turned = quaternion_multiply(
+    product = quaternion_multiply(
         quaternion, jnp.concatenate([cosine[None], sinc * half])
     )
     # rounding would let the length drift over an episode
-    return turned * jax.lax.rsqrt(jnp.sum(turned * turned))
+    return product * jax.lax.rsqrt(jnp.sum(product * product))
 
 
 def euler_step(

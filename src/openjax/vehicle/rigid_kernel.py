@@ -59,7 +59,7 @@ class FusedStep(NamedTuple):
         self, vehicle: Vehicle, drone: DroneState, command, around: Surroundings | None
     ) -> DroneState:
         """One drone after a substep, in free flight if nothing is `around`."""
-        moved, acceleration, angular = self.accelerate(vehicle, drone, command)
+        next_drone, acceleration, angular = self.accelerate(vehicle, drone, command)
         if around is not None:
             extra = contact_acceleration(
                 self.arena,
@@ -72,7 +72,7 @@ class FusedStep(NamedTuple):
             # as by MJX, gradients are those of free flight: what contacts add is a
             # constant to them
             acceleration = acceleration + jax.lax.stop_gradient(extra)
-        return euler_step(moved, acceleration, angular, self.dt)
+        return euler_step(next_drone, acceleration, angular, self.dt)
 
 
 def step_many(
@@ -153,7 +153,7 @@ def _many_worlds(step):
             axes = jax.tree.map(
                 lambda batched: 0 if batched else None, tuple(in_batched)
             )
-            stepped = jax.vmap(mapped, axes)(vehicle, drones, command, pillars)
+            drones_after = jax.vmap(mapped, axes)(vehicle, drones, command, pillars)
         else:
 
             def flat(leaf, batched):
@@ -167,11 +167,11 @@ def _many_worlds(step):
             # two axes of worlds become one, and two again afterwards
             worlds = (drones, command, pillars)
             drones, command, pillars = jax.tree.map(flat, worlds, tuple(in_batched[1:]))
-            stepped = run(vehicle, drones, command, pillars)
-            stepped = jax.tree.map(
-                lambda leaf: leaf.reshape(axis_size, -1, *leaf.shape[1:]), stepped
+            drones_after = run(vehicle, drones, command, pillars)
+            drones_after = jax.tree.map(
+                lambda leaf: leaf.reshape(axis_size, -1, *leaf.shape[1:]), drones_after
             )
-        return stepped, jax.tree.map(lambda _: True, stepped)
+        return drones_after, jax.tree.map(lambda _: True, drones_after)
 
     derived = jax.custom_jvp(run)
     looped = jax.vmap(functools.partial(looped_step, step), (None, 0, 0, 0))
@@ -256,26 +256,26 @@ def _one_call(step, vehicle, worlds, interpret):
     # a block's size is a power of two
     size = 1 << (constants.shape[0] - 1).bit_length()
     constants = jnp.pad(constants, (0, size - constants.shape[0]))
-    moved = rows[:-1]
+    outputs = rows[:-1]
     blocks = [pl.BlockSpec((DRONES, leaf.shape[1]), lambda i: (i, 0)) for leaf in rows]
-    whole = [pl.BlockSpec(leaf.shape, lambda i: (0, 0)) for leaf in around]
+    specs = [pl.BlockSpec(leaf.shape, lambda i: (0, 0)) for leaf in around]
     # position and velocity, the first leaf and the third, aren't written over where
     # others look
     looked_up = {0, 2} if around else set()
-    moved = pl.pallas_call(
+    outputs = pl.pallas_call(
         _kernel(step, vehicle, worlds),
-        out_shape=[jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in moved],
+        out_shape=[jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in outputs],
         grid=(rows[0].shape[0] // DRONES,),
-        in_specs=[pl.BlockSpec(constants.shape, lambda i: (0,)), *blocks, *whole],
+        in_specs=[pl.BlockSpec(constants.shape, lambda i: (0,)), *blocks, *specs],
         out_specs=blocks[:-1],
         input_output_aliases={
-            i + 1: i for i in range(len(moved)) if i not in looked_up
+            i + 1: i for i in range(len(outputs)) if i not in looked_up
         },
         interpret=interpret,
         compiler_params=pallas_triton.CompilerParams(num_warps=WARPS, num_stages=1),
         name="rigid_step",
     )(constants, *rows, *around)
-    return worlds.unpacked(moved)
+    return worlds.unpacked(outputs)
 
 
 def _kernel(step, vehicle, worlds):
@@ -303,16 +303,18 @@ def _kernel(step, vehicle, worlds):
                 split(row).reshape(leaf.shape)
                 for row, leaf in zip(state, leaves, strict=True)
             ]
-            *turned, free, angular = evaluate(accelerate, [*constants, *parts, command])
+            *rotated, free, angular = evaluate(
+                accelerate, [*constants, *parts, command]
+            )
             if around:
-                before = jax.tree.structure(drone).unflatten(parts)
+                drone_before = jax.tree.structure(drone).unflatten(parts)
                 free = free + _contacts(
-                    step, before, free, worlds.command.shape[:2], around
+                    step, drone_before, free, worlds.command.shape[:2], around
                 )
-            moved = evaluate(move, [*turned, free, angular])
+            next_parts = evaluate(move, [*rotated, free, angular])
             return [
                 [jnp.broadcast_to(part, (DRONES,)) for part in leaf.ravel()]
-                for leaf in moved
+                for leaf in next_parts
             ]
 
         if step.substeps == 1:  # not worth a loop

@@ -185,10 +185,10 @@ def other_drone(position: Components, velocity: Components) -> Thing:
 
 def _things(arena, position, around) -> Thing:
     """All things around one drone at `position` (3,), in the order of `solids_xml`."""
-    here = tuple(position)
+    place = tuple(position)
     kinds = (
-        floor(tuple(part[None] for part in here)),
-        pillar(arena, here, tuple(around.pillar_position.T), around.pillar_active),
+        floor(tuple(part[None] for part in place)),
+        pillar(arena, place, tuple(around.pillar_position.T), around.pillar_active),
         other_drone(tuple(around.other_position.T), tuple(around.other_velocity.T)),
     )
     sizes = [kind.level.shape[0] for kind in kinds]
@@ -213,8 +213,8 @@ def encounters(
     """
     things = _things(arena, position, around)
     normal, gap, gap_ahead = approach(position, velocity, things, dt)
-    shown = shown_gap(gap, gap_ahead, jnp.any(gap_ahead < 0.0))
-    return Encounters(things, normal, gap, shown)
+    solver_gap = shown_gap(gap, gap_ahead, jnp.any(gap_ahead < 0.0))
+    return Encounters(things, normal, gap, solver_gap)
 
 
 def approach(position, velocity, thing: Thing, dt: Seconds):
@@ -223,13 +223,15 @@ def approach(position, velocity, thing: Thing, dt: Seconds):
     three components each, and a thing.
     """
     nearest = (*thing.place[:2], thing.level)
-    away = tuple(own - other for own, other in zip(position, nearest, strict=True))
+    away = tuple(
+        component - other for component, other in zip(position, nearest, strict=True)
+    )
     # the root keeps a slope where a drone is in the middle of a thing
     distance = jnp.sqrt(sum(part * part for part in away) + 1e-12)
     normal = tuple(part / distance for part in away)
     gap = distance - thing.reach
     moving = zip(normal, velocity, thing.velocity, strict=True)
-    speed = sum(n * (own - other) for n, own, other in moving)
+    speed = sum(n * (component - other) for n, component, other in moving)
     return normal, gap, gap + dt * speed
 
 
@@ -240,10 +242,10 @@ def shown_gap(gap, gap_ahead, hit):
     return jnp.where(hit & (gap < _NEAR) & (gap_ahead >= 0.0), _TOUCHING, gap_ahead)
 
 
-def place_solids(met: Encounters) -> Things:
+def place_solids(gaps: Encounters) -> Things:
     """Where one drone's shapes are shown to it, (M, 3) m, in the order of
     `solids_xml`.
     """
-    shift = met.shown - met.gap
-    places = zip(met.things.place, met.normal, strict=True)
+    shift = gaps.shown - gaps.gap
+    places = zip(gaps.things.place, gaps.normal, strict=True)
     return jnp.stack([place - n * shift for place, n in places], axis=-1)

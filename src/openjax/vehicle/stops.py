@@ -34,11 +34,11 @@ def stop(
             1.0,
         )
     if position.shape[0] > 1:
-        apart = position[:, None] - position[None]
+        offset = position[:, None] - position[None]
         others = ~jnp.eye(position.shape[0], dtype=bool)
         moving = velocity[:, None] - velocity[None]
         position, velocity = _push(
-            position, velocity, apart, 2 * DRONE_RADIUS, others, 0.5, moving
+            position, velocity, offset, 2 * DRONE_RADIUS, others, 0.5, moving
         )
     # the floor comes last: whatever pushed a drone before, it ends above it
     low = position[:, 2] < DRONE_RADIUS

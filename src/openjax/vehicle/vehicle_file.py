@@ -167,8 +167,8 @@ class VehicleFile:
         """Whether the mass of `vehicle_id` was weighed, so that a thrust error can't be
         explained by it.
         """
-        weighed = self.vehicles.get(vehicle_id, Overrides()).mass_weighed
-        return self.mass_weighed if weighed is None else weighed
+        of_vehicle = self.vehicles.get(vehicle_id, Overrides()).mass_weighed
+        return self.mass_weighed if of_vehicle is None else of_vehicle
 
 
 def load_vehicle_file(path: str | Path | None = None, dtype=jnp.float32) -> VehicleFile:
@@ -259,9 +259,9 @@ def _from_tables(plain: dict, path: Path, dtype) -> VehicleFile:
     airframe = tables.vehicle
     motor = tables.motor
     # [log] may hold anything: only what openjax reads of it is checked
-    read = {f.name for f in fields(_Log)}
+    log_keys = {f.name for f in fields(_Log)}
     log = from_plain(
-        _Log, {k: v for k, v in tables.log.items() if k in read}, f"{root}log"
+        _Log, {k: v for k, v in tables.log.items() if k in log_keys}, f"{root}log"
     )
     if log.ceiling_z is not None and log.ceiling_z <= log.floor_z:
         raise UserError(
@@ -431,13 +431,13 @@ def _tables_of(vehicle_file: VehicleFile) -> dict[str, Any]:
 
 def _given(plain: dict) -> dict:
     """A tree of tables without empty ones and without None, which TOML hasn't."""
-    kept = {}
+    values = {}
     for name, value in plain.items():
         if isinstance(value, dict):
             value = _given(value)  # which may be empty afterwards
         if value is not None and value != {}:
-            kept[name] = value
-    return kept
+            values[name] = value
+    return values
 
 
 def _calibrated_table(name: str, entry: CalibratedValue) -> tomlkit.items.Table:

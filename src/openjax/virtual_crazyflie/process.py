@@ -102,8 +102,8 @@ class VirtualCrazyflies:
         if steps < 1:
             return
         self.late += steps * STEP > LATE + LONGEST_WAIT
-        asked = [firmware.set_point(self.time) for firmware in self.firmware]
-        set_points = np.array(asked, np.float32)
+        latest = [firmware.set_point(self.time) for firmware in self.firmware]
+        set_points = np.array(latest, np.float32)
         report = self.vehicles.advance(set_points, steps)
         self._steps += steps
         for i, firmware in enumerate(self.firmware):

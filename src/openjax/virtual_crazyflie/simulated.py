@@ -91,8 +91,8 @@ class SimulatedSwarm:
         """
         for i, set_point in enumerate(set_points):
             if set_point is not None and self._random.random() >= self.uplinks[i].loss:
-                sent = set_point if set_point.mode == OFF else as_sent(set_point)
-                self.firmware[i].accept(sent, self.now)
+                command = set_point if set_point.mode == OFF else as_sent(set_point)
+                self.firmware[i].accept(command, self.now)
                 self.firmware[i].feed_watchdog(self.now)
 
     def believed(self, i: int, pose: Pose) -> None:
@@ -107,9 +107,11 @@ class SimulatedSwarm:
 
     def advance(self) -> None:
         """One tick of 10 ms."""
-        wanted = np.array([f.set_point(self.now) for f in self.firmware], np.float32)
+        set_points = np.array(
+            [f.set_point(self.now) for f in self.firmware], np.float32
+        )
         steps = round(TICK / STEP)
-        report = self.vehicles.advance(wanted, steps)
+        report = self.vehicles.advance(set_points, steps)
         self._steps += steps
         self.now = self._steps * STEP
         for firmware, crashed in zip(self.firmware, report.crashed, strict=True):
@@ -122,7 +124,7 @@ class SimulatedSwarm:
         report = self.vehicles.report
         noise = self._random.gauss
         # in the packets' units: millimetres
-        own = np.round(
+        estimate = np.round(
             np.stack([report.position, report.velocity], 1) + self._offsets, 3
         ).tolist()
         position = report.position.tolist()
@@ -139,14 +141,14 @@ class SimulatedSwarm:
             shaken = [q + noise(0.0, CAMERA_NOISE) for q in quaternion[i]]
             size = math.sqrt(sum(q * q for q in shaken))
             place = tuple(p + noise(0.0, CAMERA_NOISE) for p in position[i])
-            seen = Pose(
+            capture = Pose(
                 self.now, place, (0.0, 0.0, 0.0), tuple(q / size for q in shaken)
             )
             # as exact as a packet's 32 bits
             on_board = expand_quaternion(compress_quaternion(quaternion[i]))
-            own_place, own_velocity = map(tuple, own[i])
-            sent = Pose(self.now, own_place, own_velocity, on_board, tuple(rates[i]))
-            received = self._radio(i, self.now, sent)
+            own_place, own_velocity = map(tuple, estimate[i])
+            on_air = Pose(self.now, own_place, own_velocity, on_board, tuple(rates[i]))
+            received = self._radio(i, self.now, on_air)
             claimed = self.uplinks[i].voltage
             self._samples[i] = PoseSample(
                 own=received or old.own,
@@ -155,6 +157,6 @@ class SimulatedSwarm:
                 supervisor=self.firmware[i].supervisor_info
                 if received
                 else old.supervisor,
-                captured=self._camera(i, self.now, seen) or old.captured,
+                captured=self._camera(i, self.now, capture) or old.captured,
                 force=tuple(force[i]) if received else old.force,
             )

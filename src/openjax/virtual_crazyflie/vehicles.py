@@ -136,24 +136,26 @@ class VirtualVehicles:
         complete = composition.complete_parameters(
             effects, self._parameters, jnp.float32
         )
-        flown = composition.change_body(effects, complete, vehicle)
+        plant = composition.change_body(effects, complete, vehicle)
 
         def step(_, carry):
             drones, _, crashed = carry
             command = commands(drones.quaternion, set_points)
-            motor, _ = jax.vmap(lambda d, c: rate_controller(flown, d, c, STEP))(
+            motor, _ = jax.vmap(lambda d, c: rate_controller(plant, d, c, STEP))(
                 drones, command
             )
-            moved = self._step(
+            drones_moved = self._step(
                 vehicle, drones, command, no_pillar, inactive, self._parameters
             )
             # from what the step did, so that the accelerometer feels every effect
-            acceleration = (moved.velocity - drones.velocity) / STEP
-            moved, on_floor, hit = _stand(moved)
+            acceleration = (drones_moved.velocity - drones.velocity) / STEP
+            drones_moved, on_floor, hit = _stand(drones_moved)
             gravity = vehicle.gravity * jnp.array([0.0, 0.0, 1.0])
             acceleration = jnp.where(on_floor[:, None], 0.0, acceleration)
-            force = jax.vmap(rotate_inverse)(moved.quaternion, acceleration + gravity)
-            return moved, (motor, force, on_floor), crashed | hit
+            force = jax.vmap(rotate_inverse)(
+                drones_moved.quaternion, acceleration + gravity
+            )
+            return drones_moved, (motor, force, on_floor), crashed | hit
 
         drones = self._unflatten(flat)
         gravity = jnp.zeros((self.number, 3)).at[:, 2].set(vehicle.gravity)
@@ -237,15 +239,15 @@ def _stand(drones):
     def keep(fixed, free):
         return jnp.where(below[:, None], fixed, free)
 
-    still = jnp.zeros_like(drones.velocity)
+    rest = jnp.zeros_like(drones.velocity)
     drones = drones.replace(
         position=drones.position.at[:, 2].set(
             jnp.where(below, 0.0, drones.position[:, 2])
         ),
-        velocity=keep(still, drones.velocity),
+        velocity=keep(rest, drones.velocity),
         quaternion=keep(level, drones.quaternion),
-        body_rates=keep(still, drones.body_rates),
-        rate_integral=keep(still, drones.rate_integral),
-        previous_body_rates=keep(still, drones.previous_body_rates),
+        body_rates=keep(rest, drones.body_rates),
+        rate_integral=keep(rest, drones.rate_integral),
+        previous_body_rates=keep(rest, drones.previous_body_rates),
     )
     return drones, below, hit

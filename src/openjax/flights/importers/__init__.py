@@ -67,6 +67,6 @@ def read_log(path: Path, mapping: ColumnMapping | None = None) -> LogTable:
     """One log of any known format as a table. Raises LogError if it can't be read."""
     importer = importer_of(path)
     if importer is None:
-        known = ", ".join(importer.name for importer in importers())
-        raise LogError(f"no known format; known are {known}")
+        formats = ", ".join(importer.name for importer in importers())
+        raise LogError(f"no known format; known are {formats}")
     return importer.read(path, mapping)

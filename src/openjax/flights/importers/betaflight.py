@@ -101,32 +101,34 @@ def read_blackbox_csv(path: Path, mapping: ColumnMapping | None = None) -> LogTa
     lines = head_of(path)
     above = _lines_above(lines) or 0
     names = find_header(lines[above:], delimiter).names
-    said = _headers(lines[:above])
+    headers = _headers(lines[:above])
     decoded = path.with_name(
         path.name.removesuffix(".gz").removesuffix(".csv") + HEADERS_FILE
     )
     if decoded.is_file():
-        said |= _headers(head_of(decoded))
+        headers |= _headers(head_of(decoded))
     fields = {_FIELD.fullmatch(name)[1]: name for name in names}
     if "motor[4]" in fields:
         raise LogError("more than four motors were logged; four are needed")
     remarks = _without_filter(fields)
-    usual = _usual(fields, said)
+    usual = _usual(fields, headers)
     time = fields.get("time", "time")
-    asked = {} if mapping is None else mapping.columns
-    wanted = (time, *(source.name for source in (*usual.values(), *asked.values())))
-    raw, found = raw_columns(path, wanted, time, delimiter, above)
-    remarks += found
-    columns = usual | _force(raw, fields, said, remarks) | _motors(raw, fields, remarks)
+    mapped = {} if mapping is None else mapping.columns
+    wanted = (time, *(source.name for source in (*usual.values(), *mapped.values())))
+    raw, more_remarks = raw_columns(path, wanted, time, delimiter, above)
+    remarks += more_remarks
+    columns = (
+        usual | _force(raw, fields, headers, remarks) | _motors(raw, fields, remarks)
+    )
     if mapping is not None:
         columns = mapping.over(columns)
     seconds = raw[time] * UNITS.get(_FIELD.fullmatch(time)[2] or "us", UNITS["us"])
-    merged = merge_streams([Stream(seconds, raw)], columns)
-    merged["t"] = merged["t"] - merged["t"][0]
-    for motor in set(CHANNEL_COLUMNS["motor_command"]) & set(merged) - set(asked):
+    table = merge_streams([Stream(seconds, raw)], columns)
+    table["t"] = table["t"] - table["t"][0]
+    for motor in set(CHANNEL_COLUMNS["motor_command"]) & set(table) - set(mapped):
         # a motor at rest is below DShot's least
-        merged[motor] = np.maximum(merged[motor], 0.0)
-    return LogTable(path.name, merged, np.full(len(merged["t"]), "0"), tuple(remarks))
+        table[motor] = np.maximum(table[motor], 0.0)
+    return LogTable(path.name, table, np.full(len(table["t"]), "0"), tuple(remarks))
 
 
 def _without_filter(fields: dict[str, str]) -> list[str]:
@@ -145,34 +147,34 @@ def _without_filter(fields: dict[str, str]) -> list[str]:
     ]
 
 
-def _usual(fields: dict[str, str], said: dict[str, str]) -> dict[str, Source]:
+def _usual(fields: dict[str, str], headers: dict[str, str]) -> dict[str, Source]:
     """{column: source} of fields that are there, whose scale the log's headers have
     `said`. The force and the motors are raw as yet.
     """
-    fine = FINE if _number(said, "blackbox_high_resolution") else 1.0
+    fine = FINE if _number(headers, "blackbox_high_resolution") else 1.0
     # The Explorer's gyroScale is in rad/us a count.
-    count = 1e6 * (_number(said, "gyroScale") or UNITS["us"] * UNITS["deg/s"])
-    old = said.get("firmwareVersion", "4").startswith(("2.", "3."))
-    wanted = {f"w{a}": (f"gyroADC[{i}]", count / fine) for i, a in enumerate("xyz")}
-    wanted |= {
+    count = 1e6 * (_number(headers, "gyroScale") or UNITS["us"] * UNITS["deg/s"])
+    old = headers.get("firmwareVersion", "4").startswith(("2.", "3."))
+    channels = {f"w{a}": (f"gyroADC[{i}]", count / fine) for i, a in enumerate("xyz")}
+    channels |= {
         f"cmd_w{a}": (f"setpoint[{i}]", UNITS["deg/s"] / fine)
         for i, a in enumerate("xyz")
     }
-    wanted |= {f"a{a}": (f"accSmooth[{i}]", 1.0) for i, a in enumerate("xyz")}
-    wanted |= {column: (f"motor[{i}]", 1.0) for column, i in MOTOR_OF.items()}
-    wanted |= {"cmd_thrust": ("setpoint[3]", 1e-3)}
-    wanted |= {"vbat": ("vbatLatest", 0.1 if old else 0.01)}
+    channels |= {f"a{a}": (f"accSmooth[{i}]", 1.0) for i, a in enumerate("xyz")}
+    channels |= {column: (f"motor[{i}]", 1.0) for column, i in MOTOR_OF.items()}
+    channels |= {"cmd_thrust": ("setpoint[3]", 1e-3)}
+    channels |= {"vbat": ("vbatLatest", 0.1 if old else 0.01)}
     return {
         column: Source(fields[field], _scale(fields[field], usual))
-        for column, (field, usual) in wanted.items()
+        for column, (field, usual) in channels.items()
         if field in fields
     }
 
 
-def _number(said: dict[str, str], name: str) -> float:
+def _number(headers: dict[str, str], name: str) -> float:
     """A header's number; 0 where there is none."""
     try:
-        return float(said.get(name, 0.0))
+        return float(headers.get(name, 0.0))
     except ValueError:
         return 0.0
 
@@ -186,7 +188,7 @@ def _scale(name: str, usual: float) -> float:
 
 
 def _force(
-    raw, fields: dict[str, str], said: dict[str, str], remarks: list[str]
+    raw, fields: dict[str, str], headers: dict[str, str], remarks: list[str]
 ) -> dict[str, Source]:
     """The accelerometer's columns. Raw counts are as many a g as the header acc_1G
     says; without it, sensors have a power of two for 1 g, and it is the one nearest to
@@ -195,10 +197,10 @@ def _force(
     names = [fields.get(f"accSmooth[{i}]") for i in range(3)]
     if any(name is None or name not in raw for name in names) or "(" in names[0]:
         return {}
-    counts = _number(said, "acc_1G")
+    counts = _number(headers, "acc_1G")
     if not counts:
-        felt = np.nanmedian(np.linalg.norm([raw[name] for name in names], axis=0))
-        counts = 2.0 ** np.rint(np.log2(max(felt, 1.0)))
+        magnitude = np.nanmedian(np.linalg.norm([raw[name] for name in names], axis=0))
+        counts = 2.0 ** np.rint(np.log2(max(magnitude, 1.0)))
         remarks.append(
             f"accSmooth is in the sensor's counts: {counts:g} are taken for 1 g"
         )

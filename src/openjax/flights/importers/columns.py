@@ -122,8 +122,8 @@ class ColumnMapping:
         """The `usual` sources of columns, and in their place those that the mapping
         names; time is no source.
         """
-        kept = _without_attitude(usual) if set(EULER) & set(self.columns) else usual
-        return kept | {
+        base = _without_attitude(usual) if set(EULER) & set(self.columns) else usual
+        return base | {
             c: s for c, s in self.columns.items() if c not in ("t", "vehicle")
         }
 
@@ -133,9 +133,11 @@ class ColumnMapping:
         Columns under the log format's own names are inherited. Raises LogError without
         time.
         """
-        taken = {source.name for source in self.columns.values()}
+        sources = {source.name for source in self.columns.values()}
         inherited = {
-            c: v for c, v in raw.columns.items() if c in LOG_COLUMNS and c not in taken
+            c: v
+            for c, v in raw.columns.items()
+            if c in LOG_COLUMNS and c not in sources
         }
         columns = (
             inherited
@@ -154,12 +156,10 @@ class ColumnMapping:
                 columns.pop(column, None)
                 remarks.append(f"no column {source.name!r} for {column}")
         if "t" not in columns:
-            missing = "t"
+            absent = "t"
             if "t" in self.columns:
-                missing = (
-                    f"{self.columns['t'].name!r}, which {MAPPING_FILE} names for t"
-                )
-            raise LogError(f"no column {missing}; the log has {', '.join(raw.columns)}")
+                absent = f"{self.columns['t'].name!r}, which {MAPPING_FILE} names for t"
+            raise LogError(f"no column {absent}; the log has {', '.join(raw.columns)}")
         columns["t"] = columns["t"] - np.nanmin(columns["t"])
         return LogTable(name, with_quaternion(columns), raw.vehicle, tuple(remarks))
 
@@ -197,24 +197,24 @@ def _clock(entry, path: Path) -> Clock:
     """One of several time stamps. Raises UserError for an unknown column, key or
     unit.
     """
-    named = entry.get("of", []) if isinstance(entry, dict) else []
-    known = (*LOG_COLUMNS[2:], *EULER)
+    columns = entry.get("of", []) if isinstance(entry, dict) else []
+    possible = (*LOG_COLUMNS[2:], *EULER)
     unknown = (
-        [name for name in named if name not in known]
-        if isinstance(named, list)
-        else [named]
+        [name for name in columns if name not in possible]
+        if isinstance(columns, list)
+        else [columns]
     )
     if unknown:
         raise UserError(
             f"{path}: a time stamp is `of` {unknown[0]!r}; it must be a list of columns out of "
-            f"{', '.join(known)}"
+            f"{', '.join(possible)}"
         )
     rest = (
         {k: v for k, v in entry.items() if k != "of"}
         if isinstance(entry, dict)
         else entry
     )
-    return Clock(source_of("t", rest, path), tuple(named))
+    return Clock(source_of("t", rest, path), tuple(columns))
 
 
 def merge_streams(
@@ -228,12 +228,12 @@ def merge_streams(
     sampled. Raises LogError if no motion is there, if a stream holds several
     recordings, or if it ends before the others begin.
     """
-    used = []
+    timed = []
     for stream in streams:
         sources = {c: s for c, s in columns.items() if s.name in stream.values}
         if sources and np.isfinite(stream.time).sum() > 1:
-            used.append(_converted(stream, sources))
-    with_motion = [u for u in used if _MOTION & set(u[1])]
+            timed.append(_converted(stream, sources))
+    with_motion = [u for u in timed if _MOTION & set(u[1])]
     if not with_motion:
         raise LogError(
             "holds neither position and orientation nor a gyroscope under known names: name what "
@@ -243,13 +243,13 @@ def merge_streams(
     # are rounded
     clock = min(with_motion, key=lambda u: round(float(np.median(np.diff(u[0]))), 6))[0]
     clock = clock[np.r_[True, np.diff(clock) > 0]]
-    used = _at_one_time(used, clock)
-    merged = {"t": clock}
-    for time, converted in used:
+    timed = _at_one_time(timed, clock)
+    table = {"t": clock}
+    for time, converted in timed:
         period = max(float(np.median(np.diff(time))), 1e-4)
         for column, values in converted.items():
-            merged.setdefault(column, _onto(clock, time, values, column, period))
-    return with_quaternion(merged)
+            table.setdefault(column, _onto(clock, time, values, column, period))
+    return with_quaternion(table)
 
 
 def _converted(
@@ -272,18 +272,18 @@ def _converted(
 
 
 def _at_one_time(
-    used, clock: np.ndarray
+    streams, clock: np.ndarray
 ) -> list[tuple[np.ndarray, dict[str, np.ndarray]]]:
     """The streams that were logged while the clock ran. Raises LogError for one that
     wasn't, where no other one has its columns; the battery may be missing.
     """
-    beside = [u for u in used if u[0][0] <= clock[-1] and u[0][-1] >= clock[0]]
-    there = {column for _, converted in beside for column in converted}
-    for time, converted in used:
-        missing = [column for column in converted if column not in there | {"vbat"}]
-        if missing:
+    beside = [u for u in streams if u[0][0] <= clock[-1] and u[0][-1] >= clock[0]]
+    elsewhere = {column for _, converted in beside for column in converted}
+    for time, converted in streams:
+        absent = [column for column in converted if column not in elsewhere | {"vbat"}]
+        if absent:
             raise LogError(
-                f"{', '.join(missing)} were logged from {time[0]:.2f} to {time[-1]:.2f} s, and "
+                f"{', '.join(absent)} were logged from {time[0]:.2f} to {time[-1]:.2f} s, and "
                 f"the rest from {clock[0]:.2f} to {clock[-1]:.2f} s: of another flight, or by "
                 "another clock?"
             )
@@ -298,8 +298,8 @@ def _without_flips(converted: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     if not all(name in converted for name in names):
         return {}
     quaternion = np.stack([converted[name] for name in names], 1)
-    turned = (quaternion[1:] * quaternion[:-1]).sum(1) < 0.0
-    sign = np.where(np.cumsum(np.r_[False, turned]) % 2, -1.0, 1.0)
+    flips = (quaternion[1:] * quaternion[:-1]).sum(1) < 0.0
+    sign = np.where(np.cumsum(np.r_[False, flips]) % 2, -1.0, 1.0)
     return dict(zip(names, (quaternion * sign[:, None]).T, strict=True))
 
 
@@ -333,7 +333,7 @@ def _onto(clock, time, values, column: str, period: float) -> np.ndarray:
     values = values[finite]
     if not len(time):
         return np.full(len(clock), np.nan)
-    before = np.searchsorted(time, clock + TIE, side="right") - 1
+    previous = np.searchsorted(time, clock + TIE, side="right") - 1
     if column == "vbat":
         out = np.full(len(clock), np.nan)
         nearest = np.clip(np.searchsorted(clock, time), 0, len(clock) - 1)
@@ -341,12 +341,14 @@ def _onto(clock, time, values, column: str, period: float) -> np.ndarray:
         return out
     if column in _CONTINUOUS:
         out = np.interp(clock, time, values, left=np.nan, right=np.nan)
-        after = np.clip(before + 1, 0, len(time) - 1)
-        wide = time[after] - time[np.clip(before, 0, None)] > max(_STALE * period, 0.05)
-        return np.where(wide, np.nan, out)
+        following_row = np.clip(previous + 1, 0, len(time) - 1)
+        is_wide = time[following_row] - time[np.clip(previous, 0, None)] > max(
+            _STALE * period, 0.05
+        )
+        return np.where(is_wide, np.nan, out)
     # a command holds until the next one comes
-    last = np.clip(before, 0, None)
-    out = np.where(before >= 0, values[last], np.nan)
+    last = np.clip(previous, 0, None)
+    out = np.where(previous >= 0, values[last], np.nan)
     return np.where(clock - time[last] > max(_STALE * period, 0.1), np.nan, out)
 
 
@@ -354,10 +356,10 @@ def source_of(column: str, entry, path: Path) -> Source:
     """An entry of a `columns.toml`. Raises UserError for an unknown key, column or
     unit.
     """
-    known = (*LOG_COLUMNS, *EULER)
-    if column not in known:
+    possible = (*LOG_COLUMNS, *EULER)
+    if column not in possible:
         raise UserError(
-            f"{path}: unknown column {column!r} in [columns]; known are {', '.join(known)}"
+            f"{path}: unknown column {column!r} in [columns]; known are {', '.join(possible)}"
         )
     if isinstance(entry, str):
         return Source(entry)

@@ -43,11 +43,11 @@ SELDOM = 2000.0  # ms between rows: the slowest log block of the firmware has 25
 def is_block(path: Path) -> bool:
     """Whether a CSV holds a time and log variables of the firmware."""
     names = header_of(path)
-    known = VARIABLES.intersection(names)
-    evident = {name.partition(".")[0] for name in known} & set(GROUPS)
+    variables = VARIABLES.intersection(names)
+    evident = {name.partition(".")[0] for name in variables} & set(GROUPS)
     # A log block of motors or of the battery alone has nothing else to be known by.
-    alone = known and len(known) == len(names) - 1
-    return bool((evident or alone) and time_name(names) and not is_log_format(names))
+    has_time = variables and len(variables) == len(names) - 1
+    return bool((evident or has_time) and time_name(names) and not is_log_format(names))
 
 
 def is_client_log(path: Path) -> bool:
@@ -67,8 +67,10 @@ def _blocks(folder: Path) -> list[Path]:
 
 def time_name(names: list[str]) -> str | None:
     """The column that holds the time: the firmware's own rather than the computer's."""
-    found = [name for name in names if name.lower() in TIME_NAMES]
-    return min(found, key=lambda name: TIME_NAMES.index(name.lower()), default=None)
+    candidates = [name for name in names if name.lower() in TIME_NAMES]
+    return min(
+        candidates, key=lambda name: TIME_NAMES.index(name.lower()), default=None
+    )
 
 
 def read_client_log(path: Path, mapping: ColumnMapping | None = None) -> LogTable:
@@ -80,19 +82,19 @@ def read_client_log(path: Path, mapping: ColumnMapping | None = None) -> LogTabl
     remarks = []
     for file in files:
         try:
-            stream, found = _block(file, mapping)
+            stream, more_remarks = _block(file, mapping)
         except LogError as error:
             if len(files) == 1:
                 raise
             remarks.append(f"{file.name}: {error}: left out")
             continue
         streams.append(with_mixer(stream))
-        remarks += found
-    columns, found = firmware_columns(streams, mapping)
-    merged = merge_streams(streams, columns)
-    merged["t"] = merged["t"] - merged["t"][0]
+        remarks += more_remarks
+    columns, more_remarks = firmware_columns(streams, mapping)
+    table = merge_streams(streams, columns)
+    table["t"] = table["t"] - table["t"][0]
     return LogTable(
-        path.name, merged, np.full(len(merged["t"]), "0"), (*remarks, *found)
+        path.name, table, np.full(len(table["t"]), "0"), (*remarks, *more_remarks)
     )
 
 
@@ -100,16 +102,16 @@ def _block(path: Path, mapping: ColumnMapping | None) -> tuple[Stream, list[str]
     """One file as a stream, time in seconds since the firmware started, and remarks."""
     delimiter = delimiter_of(mapping)
     names = header_of(path, delimiter)
-    asked = {} if mapping is None else mapping.columns
-    time = asked["t"].name if "t" in asked else time_name(names)
+    mapped = {} if mapping is None else mapping.columns
+    time = mapped["t"].name if "t" in mapped else time_name(names)
     if time is None:
         raise LogError(
             f"no column {' or '.join(TIME_NAMES[:2])}: which holds the ticks in ms?"
         )
-    wanted = (time, *VARIABLES, *(source.name for source in asked.values()))
+    wanted = (time, *VARIABLES, *(source.name for source in mapped.values()))
     values, remarks = raw_columns(path, wanted, time, delimiter)
     ticks = values.pop(time)
-    scale = asked["t"].scale if "t" in asked else _tick(ticks)
+    scale = mapped["t"].scale if "t" in mapped else _tick(ticks)
     return Stream(scale * ticks, values), remarks
 
 
@@ -119,8 +121,8 @@ def _tick(ticks: np.ndarray) -> float:
     the steps look like.
     """
     steps = np.diff(np.unique(ticks[np.isfinite(ticks)]))
-    whole = len(steps) and not (steps % 1.0).any()
-    return 1e-3 if whole and np.median(steps) <= SELDOM else seconds_per_unit(ticks)
+    is_whole = len(steps) and not (steps % 1.0).any()
+    return 1e-3 if is_whole and np.median(steps) <= SELDOM else seconds_per_unit(ticks)
 
 
 IMPORTER = Importer(

@@ -46,7 +46,7 @@ def custom_topics(bag: Path) -> list[dict]:
     from ruamel.yaml import YAML
     from ruamel.yaml.error import YAMLError
 
-    found = []
+    topics = []
     for path in sorted(
         p
         for folder in (bag, bag.parent)
@@ -62,8 +62,8 @@ def custom_topics(bag: Path) -> list[dict]:
         if isinstance(tables, dict) and any(
             k in tables for k in ("all", "robots", "robot_types")
         ):
-            found.append(tables)
-    return found
+            topics.append(tables)
+    return topics
 
 
 def variables_of(topic: str, files: list[dict]) -> tuple[str, ...] | None:
@@ -112,8 +112,8 @@ def log_stream(
     ahead = float(
         np.min(np.array([stamp for stamp, _ in messages], float) * 1e-9 - ticks)
     )
-    named = dict(zip(variables, values.T, strict=True))
-    return with_mixer(Stream(ticks, named)), ahead
+    by_variable = dict(zip(variables, values.T, strict=True))
+    return with_mixer(Stream(ticks, by_variable)), ahead
 
 
 def pose_streams(topic: str, messages) -> dict[str, Stream]:
@@ -121,22 +121,22 @@ def pose_streams(topic: str, messages) -> dict[str, Stream]:
     messages [(stamp in ns, message)]. A body that isn't seen is missing in a message,
     and one without an attitude has NaN there.
     """
-    seen: dict[str, list] = {}
+    by_body: dict[str, list] = {}
     for stamp, message in messages:
         for body in message.poses:
             row = [stamp * 1e-9]
             for path in POSE_FIELDS.values():
                 part, _, axis = path.partition(".")
                 row.append(getattr(getattr(body.pose, part), axis))
-            seen.setdefault(body.name, []).append(row)
+            by_body.setdefault(body.name, []).append(row)
     streams = {}
-    for name, rows in seen.items():
+    for name, rows in by_body.items():
         time, *values = np.array(rows, float).T
-        named = {
+        columns = {
             pose_source(topic, name, c): v
             for c, v in zip(POSE_FIELDS, values, strict=True)
         }
-        streams[name] = Stream(time, named)
+        streams[name] = Stream(time, columns)
     return streams
 
 

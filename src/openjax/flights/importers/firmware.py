@@ -32,18 +32,20 @@ def firmware_columns(
     what is usual, and remarks.
     """
     names = {name for stream in streams for name in stream.values}
-    found = {
+    present = {
         column: next((source for source in sources if source.name in names), None)
         for column, sources in FIRMWARE_SOURCES.items()
     }
-    columns = {column: source for column, source in found.items() if source is not None}
+    columns = {
+        column: source for column, source in present.items() if source is not None
+    }
     remarks = []
     if mapping is not None:
         columns = mapping.over(columns)
-        missing = [
+        absent = [
             source.name for source in columns.values() if source.name not in names
         ]
-        remarks += [f"no log variable {name!r}" for name in missing]
+        remarks += [f"no log variable {name!r}" for name in absent]
     if columns.get("m1", Source("")).name == "mixer.m1":
         remarks.append(MIXED)
     return columns, remarks

@@ -40,12 +40,12 @@ def units_of(names: list[str]) -> ColumnMapping:
     """
     columns = {}
     for name in names:
-        found = WITH_UNIT.fullmatch(name)
-        if found and found[1] in LOG_COLUMNS and found[1] not in names:
-            unit = found[2].strip()
+        match = WITH_UNIT.fullmatch(name)
+        if match and match[1] in LOG_COLUMNS and match[1] not in names:
+            unit = match[2].strip()
             unit = WRITTEN.get(unit, unit)
             if unit in UNITS:
-                columns[found[1]] = Source(name, UNITS[unit])
+                columns[match[1]] = Source(name, UNITS[unit])
     return ColumnMapping(columns)
 
 

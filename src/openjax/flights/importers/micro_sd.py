@@ -50,9 +50,9 @@ def read_micro_sd(path: str | Path, mapping: ColumnMapping | None = None) -> Log
     streams = [with_mixer(stream) for stream in streams]
     columns, found = firmware_columns(streams, mapping)
     remarks += found
-    merged = merge_streams(streams, columns)
-    merged["t"] = merged["t"] - merged["t"][0]
-    return LogTable(path.name, merged, np.full(len(merged["t"]), "0"), tuple(remarks))
+    table = merge_streams(streams, columns)
+    table["t"] = table["t"] - table["t"][0]
+    return LogTable(path.name, table, np.full(len(table["t"]), "0"), tuple(remarks))
 
 
 def decode(data: bytes) -> tuple[list[Stream], list[str]]:
@@ -82,8 +82,8 @@ def decode(data: bytes) -> tuple[list[Stream], list[str]]:
     for event, records in _records(data, start, end, events, head).items():
         dtype = events[event]
         if records and dtype.names:
-            stamps, packed = zip(*records, strict=True)
-            rows = np.frombuffer(b"".join(packed), dtype)
+            stamps, payloads = zip(*records, strict=True)
+            rows = np.frombuffer(b"".join(payloads), dtype)
             time = np.array(stamps, np.float64) * tick
             streams.append(
                 Stream(time, {name: rows[name].astype(float) for name in dtype.names})

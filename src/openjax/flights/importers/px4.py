@@ -99,8 +99,8 @@ def read_ulog(path: Path, mapping: ColumnMapping | None = None) -> LogTable:
     Raises LogError if it is damaged or holds nothing known, UserError without the
     library.
     """
-    asked = {} if mapping is None else mapping.over({})
-    log = _parsed(path, {source.name.partition(":")[0] for source in asked.values()})
+    mapped = {} if mapping is None else mapping.over({})
+    log = _parsed(path, {source.name.partition(":")[0] for source in mapped.values()})
     topics = {data.name: data for data in log.data_list if data.multi_id == 0}
     streams = {
         name: _stream(data, log.start_timestamp) for name, data in topics.items()
@@ -115,15 +115,15 @@ def read_ulog(path: Path, mapping: ColumnMapping | None = None) -> LogTable:
     if mapping is not None:
         columns = mapping.over(columns)
     if log.dropouts:
-        lost = sum(dropout.duration for dropout in log.dropouts)
+        seconds_lost = sum(dropout.duration for dropout in log.dropouts)
         remarks.append(
-            f"{len(log.dropouts)} dropouts of {lost} ms in all while it was logged"
+            f"{len(log.dropouts)} dropouts of {seconds_lost} ms in all while it was logged"
         )
     if log.file_corruption:
         remarks.append("the log is corrupt in places: what can be read of it is")
-    merged = merge_streams(fastest_first, columns)
-    merged["t"] = merged["t"] - merged["t"][0]
-    return LogTable(path.name, merged, np.full(len(merged["t"]), "0"), tuple(remarks))
+    table = merge_streams(fastest_first, columns)
+    table["t"] = table["t"] - table["t"][0]
+    return LogTable(path.name, table, np.full(len(table["t"]), "0"), tuple(remarks))
 
 
 def _parsed(path: Path, more: set[str]):
@@ -138,10 +138,10 @@ def _parsed(path: Path, more: set[str]):
         ) from error
     if path.stat().st_size > LARGEST:
         raise LogError(f"holds more than {LARGEST >> 20} MB: cut it into flights")
-    wanted = {*TOPICS, ATTITUDE, MOTORS, OUTPUTS, *more}
+    topics = {*TOPICS, ATTITUDE, MOTORS, OUTPUTS, *more}
     try:
         with contextlib.redirect_stdout(io.StringIO()):  # it warns of damages there
-            log = ULog(str(path), sorted(wanted))
+            log = ULog(str(path), sorted(topics))
     except Exception as error:  # damaged logs raise many kinds; all mean the same here
         words = (str(error).splitlines() or [type(error).__name__])[0]
         raise LogError(f"PX4 log can't be read: {words}") from error
@@ -179,30 +179,30 @@ def _turned(stream: Stream) -> Stream:
     """
     w, x, y, z = (stream.values[f"{ATTITUDE}:q[{i}]"] for i in range(4))
     half = np.sqrt(0.5)
-    turned = {
+    values_of = {
         "qw": half * (w + z),
         "qx": half * (x + y),
         "qy": half * (x - y),
         "qz": half * (w - z),
     }
-    return Stream(stream.time, stream.values | turned)
+    return Stream(stream.time, stream.values | values_of)
 
 
 def _columns(streams: list[Stream]) -> dict[str, Source]:
     """{column: source} of what was logged, by the first stream that has it."""
-    found: dict[str, Source] = {}
-    known = {
+    sources: dict[str, Source] = {}
+    fields_of = {
         f"{topic}:{field}": (column, scale)
         for topic, columns in TOPICS.items()
         for column, (field, scale) in columns.items()
     }
-    own = {c: (c, 1.0) for c in ("qw", "qx", "qy", "qz", *COLUMN_OF.values())}
+    identity = {c: (c, 1.0) for c in ("qw", "qx", "qy", "qz", *COLUMN_OF.values())}
     for stream in streams:
         for name in stream.values:
-            if name in known or name in own:
-                column, scale = (known | own)[name]
-                found.setdefault(column, Source(name, scale))
-    return found
+            if name in fields_of or name in identity:
+                column, scale = (fields_of | identity)[name]
+                sources.setdefault(column, Source(name, scale))
+    return sources
 
 
 def _motors(streams, parameters) -> tuple[Stream | None, list[str]]:
@@ -234,18 +234,18 @@ def _motors(streams, parameters) -> tuple[Stream | None, list[str]]:
             p: "ccw" if spin > 0 else "cw"
             for p, spin in zip(places, spins, strict=True)
         }
-        said = ", ".join(f'"{turns[place]}"' for place in COLUMN_OF)
+        order = ", ".join(f'"{turns[place]}"' for place in COLUMN_OF)
         remarks.append(
-            f"by the log's parameters, motor.spin in vehicle.toml is [{said}]"
+            f"by the log's parameters, motor.spin in vehicle.toml is [{order}]"
         )
     return Stream(stream.time, columns), remarks
 
 
 def _fields(stream: Stream, names: list[str]) -> list[np.ndarray]:
     """The values of a topic's fields. Raises LogError for one that it hasn't."""
-    missing = next((name for name in names if name not in stream.values), None)
-    if missing is not None:
-        raise LogError(f"no {missing} in the log; four motors are needed")
+    absent = next((name for name in names if name not in stream.values), None)
+    if absent is not None:
+        raise LogError(f"no {absent} in the log; four motors are needed")
     return [stream.values[name] for name in names]
 
 

@@ -187,10 +187,10 @@ class _Recording:
         that a stamp is ahead of its tick is what the clocks are apart.
         """
         ahead = min(self.ahead, default=0.0)
-        moved = [
+        streams = [
             Stream(stream.time + ahead, stream.values) for stream in self.log_streams
         ]
-        return [*moved, *self.streams]
+        return [*streams, *self.streams]
 
 
 def _vehicles(
@@ -199,18 +199,18 @@ def _vehicles(
     """{vehicle: what the bag holds of it}, and remarks. With a mapping all is one
     vehicle's.
     """
-    wanted = _wanted(reader.connections, mapping)
+    topics = _wanted(reader.connections, mapping)
     files = custom_topics(path) if mapping is None else []
     vehicles: dict[str, _Recording] = {}
     remarks = []
     for connection in reader.connections:
         topic = connection.topic
         vehicle = "" if mapping is not None else topic.rpartition("/")[0]
-        if topic in wanted:
+        if topic in topics:
             recording = vehicles.setdefault(vehicle, _Recording())
-            columns = {c: Source(f"{topic}:{f}") for c, f in wanted[topic].items()}
+            columns = {c: Source(f"{topic}:{f}") for c, f in topics[topic].items()}
             rank = int(connection.msgtype == ODOMETRY)
-            recording.add(_stream(reader, connection, wanted[topic]), columns, rank)
+            recording.add(_stream(reader, connection, topics[topic]), columns, rank)
         elif mapping is None and connection.msgtype == LOG_TYPE:
             variables = variables_of(topic, files)
             if variables is None:
@@ -281,21 +281,21 @@ def _merged(
 
 def _wanted(connections, mapping: ColumnMapping | None) -> dict[str, dict[str, str]]:
     """Topic -> {column: field} of what is to be read."""
-    wanted: dict[str, dict[str, str]] = {}
+    topics: dict[str, dict[str, str]] = {}
     if mapping is not None:
         for column, source in mapping.columns.items():
             topic, separator, field = source.name.partition(":")
             if separator and column not in ("t", "vehicle"):
-                wanted.setdefault(topic, {})[column] = field
-        return wanted
+                topics.setdefault(topic, {})[column] = field
+        return topics
     for connection in connections:
         fields = KNOWN_TYPES.get(connection.msgtype)
         if connection.msgtype in _ARRAY_TYPES:
             last = connection.topic.rpartition("/")[2].lower()
             fields = next((f for word, f in _ARRAY_NAMES.items() if word in last), None)
         if fields is not None:
-            wanted[connection.topic] = fields
-    return wanted
+            topics[connection.topic] = fields
+    return topics
 
 
 def _stream(reader, connection, fields: dict[str, str]) -> Stream:
@@ -308,11 +308,11 @@ def _stream(reader, connection, fields: dict[str, str]) -> Stream:
             [_field(message, field, connection.topic) for field in fields.values()]
         )
     values = np.asarray(rows, float).reshape(len(rows), len(fields))
-    named = {
+    by_field = {
         f"{connection.topic}:{field}": column
         for field, column in zip(fields.values(), values.T, strict=True)
     }
-    return Stream(np.asarray(times, float) * 1e-9, named)
+    return Stream(np.asarray(times, float) * 1e-9, by_field)
 
 
 def _period(stream: Stream) -> float:

@@ -55,8 +55,8 @@ GROUPS = {
 
 def stamps_of(names: list[str]) -> dict[str, str]:
     """{topic: the column of its time stamp} of a header's names."""
-    found = {name: _STAMP.fullmatch(name) for name in names}
-    return {match[1]: name for name, match in found.items() if match}
+    matches = {name: _STAMP.fullmatch(name) for name in names}
+    return {match[1]: name for name, match in matches.items() if match}
 
 
 def topic_of(name: str, topics) -> str | None:
@@ -80,28 +80,30 @@ def read_topic_times(path: Path, mapping: ColumnMapping | None = None) -> LogTab
     delimiter = delimiter_of(mapping)
     names = header_of(path, delimiter)
     stamps = _named_stamps(names, mapping)
-    again = []
+    repeated = []
     if mapping is None:
-        sources, again = recognised(names, stamps)
+        sources, repeated = recognised(names, stamps)
     else:
         sources = _mapped(names, mapping)
     clock_of = _clocks(sources, stamps, mapping)
     wanted = (*stamps.values(), *(source.name for source in sources.values()))
     raw, remarks = raw_columns(path, wanted, next(iter(stamps.values())), delimiter)
     streams = _streams(raw, sources, clock_of, mapping)
-    if again:
+    if repeated:
         remarks.append(
-            f"columns that others hold already are left out, {again[0]} to {again[-1]}: a vehicle "
+            f"columns that others hold already are left out, {repeated[0]} to {repeated[-1]}: a vehicle "
             "each, a file each"
         )
-    missing = [source.name for source in sources.values() if source.name not in raw]
-    remarks += [f"no column {name!r}" for name in missing]
-    used = sorted(set(clock_of.values()))
-    if mapping is not None and not mapping.clocks and len(used) > 1:
-        remarks.append(f"each topic's columns are at its own times: {', '.join(used)}")
-    merged = merge_streams(streams, sources)
-    merged["t"] = merged["t"] - merged["t"][0]
-    return LogTable(path.name, merged, np.full(len(merged["t"]), "0"), tuple(remarks))
+    absent = [source.name for source in sources.values() if source.name not in raw]
+    remarks += [f"no column {name!r}" for name in absent]
+    clocks = sorted(set(clock_of.values()))
+    if mapping is not None and not mapping.clocks and len(clocks) > 1:
+        remarks.append(
+            f"each topic's columns are at its own times: {', '.join(clocks)}"
+        )
+    table = merge_streams(streams, sources)
+    table["t"] = table["t"] - table["t"][0]
+    return LogTable(path.name, table, np.full(len(table["t"]), "0"), tuple(remarks))
 
 
 def _mapped(names: list[str], mapping: ColumnMapping) -> dict[str, Source]:
@@ -123,8 +125,8 @@ def recognised(
     """{column: source} of what a header's names say by themselves, and the names of
     columns that are there already. Raises LogError for nothing.
     """
-    found = {}
-    again = []
+    sources = {}
+    repeated = []
     for name in names:
         topic = topic_of(name, stamps)
         if topic is None or name in stamps.values():
@@ -136,15 +138,15 @@ def recognised(
             (GROUPS[g][last] for g in groups[::-1] if last in GROUPS.get(g, ())), last
         )
         if column in LOG_COLUMNS[2:] or column in EULER:
-            if column in found:
-                again.append(name)
-            found.setdefault(column, Source(name))
-    if not found:
+            if column in sources:
+                repeated.append(name)
+            sources.setdefault(column, Source(name))
+    if not sources:
         raise LogError(
             f"each topic has a time stamp ({', '.join(stamps.values())}), but no column is called "
             f"like x, qw, wx, m1: say in columns.toml which is which"
         )
-    return found, again
+    return sources, repeated
 
 
 def _named_stamps(names: list[str], mapping: ColumnMapping | None) -> dict[str, str]:
@@ -170,15 +172,19 @@ def _clocks(
     topic's, or else the first that it names. Raises LogError for a column that has
     none.
     """
-    said = {}
+    named_sources = {}
     usual = None
     if mapping is not None:
-        said = {column: c.source.name for c in mapping.clocks for column in c.columns}
+        named_sources = {
+            column: c.source.name for c in mapping.clocks for column in c.columns
+        }
         usual = mapping.columns["t"].name if "t" in mapping.columns else None
     found = {}
     for column, source in sources.items():
         topic = topic_of(source.name, stamps)
-        found[column] = said.get(column, usual if topic is None else stamps[topic])
+        found[column] = named_sources.get(
+            column, usual if topic is None else stamps[topic]
+        )
         if found[column] is None:
             raise LogError(f"column {source.name!r} has no time stamp: name it for t")
     return found

@@ -247,19 +247,19 @@ class Mappo:
         rollout = flown.rollout
         mean, std = scale.moments
         # the history's frames are the predictor's; the policy sees the prediction
-        before = rollout.observation.replace(frames=None), rollout.predicted
-        after = flown.observation.replace(frames=None), flown.predicted
+        inputs = rollout.observation.replace(frames=None), rollout.predicted
+        last_inputs = flown.observation.replace(frames=None), flown.predicted
         # before and after all steps by one program: one for what comes last would be as
         # large
         observation, predicted = jax.tree.map(
-            lambda x, last: jnp.concatenate([x, last[None]]), before, after
+            lambda x, last: jnp.concatenate([x, last[None]]), inputs, last_inputs
         )
         values = self.policy.value(
             parameters.actor, parameters.critic, observation, predicted
         )
         values = mean + std * values
         value = values[:-1]
-        following = values[1:]
+        next_values = values[1:]
         per_pursuer = value.shape
         terminated = jnp.broadcast_to(rollout.terminated[..., None], per_pursuer)
         active = observation.active
@@ -269,7 +269,7 @@ class Mappo:
         advantage = generalised_advantages(
             settings.reward_scale * rollout.reward,
             value,
-            following,
+            next_values,
             terminated,
             jnp.broadcast_to(rollout.truncated[..., None], per_pursuer),
             settings.discount,
@@ -281,8 +281,8 @@ class Mappo:
         active = rollout.observation.active
         _, spread_left = joint_moments(advantage, flown.axis, active)
         _, spread = joint_moments(returns, flown.axis, active)
-        explained = 1.0 - spread_left**2 / (spread**2 + 1e-8)
-        return Estimates(advantage, returns, explained)
+        explained_share = 1.0 - spread_left**2 / (spread**2 + 1e-8)
+        return Estimates(advantage, returns, explained_share)
 
     def _renewed_scale(self, scale, returns, flown):
         """The running moments after these returns."""

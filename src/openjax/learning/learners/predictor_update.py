@@ -93,12 +93,12 @@ def prediction_loss(
         return jnp.mean(error**2)
     # in units of the distance that the evader flies within each horizon, all horizons
     # weigh alike
-    flown = (
+    is_flown = (
         game.evader_speed * game.time_step * jnp.array(settings.horizons, jnp.float32)
     )
     # the arena's middle stands for an evader that nobody has seen yet
     was_seen = jnp.any(last_seen != jnp.array(game.middle, jnp.float32), axis=-1)
-    return jnp.mean(was_seen[..., None, None] * (error / flown[:, None]) ** 2)
+    return jnp.mean(was_seen[..., None, None] * (error / is_flown[:, None]) ** 2)
 
 
 @dataclass(frozen=True)

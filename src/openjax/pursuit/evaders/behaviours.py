@@ -124,19 +124,19 @@ def into_free_space(
 
 def greedy(scene: Scene, memory: Memory) -> tuple[Vector, Memory]:
     """Fly to where, after the look-ahead, the nearest pursuer is farthest away."""
-    tried = directions(DIRECTIONS)
-    ends, open_way = _ends(scene, scene.position, tried)
+    candidates = directions(DIRECTIONS)
+    ends, open_way = _ends(scene, scene.position, candidates)
     score = jnp.where(open_way, _nearness(scene, ends, scene.pursuers), -jnp.inf)
     # who knows of nobody stays where it is
-    return _chosen(tried, score) * jnp.any(scene.known), memory
+    return _chosen(candidates, score) * jnp.any(scene.known), memory
 
 
 def two_step(scene: Scene, memory: Memory) -> tuple[Vector, Memory]:
     """The same over two steps; after the first the pursuers have come closer, each
     straight to where it went.
     """
-    tried = directions(DIRECTIONS // 2)
-    first, open_way = _ends(scene, scene.position, tried)
+    candidates = directions(DIRECTIONS // 2)
+    first, open_way = _ends(scene, scene.position, candidates)
 
     def best_after(end):
         # as if they knew where it goes, at full speed: nothing is worse for it
@@ -145,12 +145,12 @@ def two_step(scene: Scene, memory: Memory) -> tuple[Vector, Memory]:
             scene.settings.max_speed * scene.look_ahead / _length(to_end), 1.0
         )
         answer = scene.pursuers + step * to_end
-        second, open_then = _ends(scene, end, tried)
-        later = jnp.where(open_then, _nearness(scene, second, answer), -jnp.inf)
-        return jnp.minimum(_nearness(scene, end[None], answer)[0], jnp.max(later))
+        second, open_then = _ends(scene, end, candidates)
+        nearness = jnp.where(open_then, _nearness(scene, second, answer), -jnp.inf)
+        return jnp.minimum(_nearness(scene, end[None], answer)[0], jnp.max(nearness))
 
     score = jnp.where(open_way, jax.vmap(best_after)(first), -jnp.inf)
-    return _chosen(tried, score) * jnp.any(scene.known), memory
+    return _chosen(candidates, score) * jnp.any(scene.known), memory
 
 
 def wall_runner(scene: Scene, memory: Memory) -> tuple[Vector, Memory]:
@@ -161,7 +161,7 @@ def wall_runner(scene: Scene, memory: Memory) -> tuple[Vector, Memory]:
     threat = scene.nearest
     radius = _length(scene.position[:2])
     out = scene.position[:2] / radius
-    left = jnp.stack([-out[1], out[0]])
+    tangent = jnp.stack([-out[1], out[0]])
     # the sign of the cross product says on which side of it the pursuer is; it runs to
     # the other
     side = jnp.where(threat[0] * out[1] - threat[1] * out[0] >= 0.0, 1.0, -1.0)
@@ -171,7 +171,7 @@ def wall_runner(scene: Scene, memory: Memory) -> tuple[Vector, Memory]:
         threat[2] > settings.arena_height / 2, AROUND, settings.arena_height - AROUND
     )
     climb = 0.5 * jnp.clip((goal - scene.position[2:]) / AROUND, -1.0, 1.0)
-    return _unit(jnp.concatenate([side * left + outward * out, climb])), memory
+    return _unit(jnp.concatenate([side * tangent + outward * out, climb])), memory
 
 
 def pillar_hugger(scene: Scene, memory: Memory) -> tuple[Vector, Memory]:
@@ -214,8 +214,8 @@ def safe_place(scene: Scene, memory: Memory) -> tuple[Vector, Memory]:
         settings, places, scene.position, scene.pillar_position, scene.pillar_active
     )
     lead = jnp.where(in_the_open, lead, -jnp.inf)
-    chosen = _chosen(to_place, lead)
-    return chosen / jnp.maximum(_length(chosen), MARGIN), memory
+    direction = _chosen(to_place, lead)
+    return direction / jnp.maximum(_length(direction), MARGIN), memory
 
 
 def way_points(scene: Scene, memory: Memory) -> tuple[Vector, Memory]:
@@ -269,13 +269,13 @@ def _free_place(scene, share):
     )
 
 
-def _ends(scene, start, tried):
+def _ends(scene, start, candidates):
     """(K, 3) where K directions lead within the look-ahead, and (K,) whether no pillar
     is in the way.
     """
     pillars = scene.pillar_position
     active = scene.pillar_active
-    ends = start + scene.reach * scene.look_ahead * tried
+    ends = start + scene.reach * scene.look_ahead * candidates
     ends = into_free_space(scene.settings, ends, pillars, active)
     return ends, line_of_sight(scene.settings, ends, start, pillars, active)
 
@@ -295,12 +295,12 @@ def _nearness(scene, ends, pursuers):
     return jnp.min(jnp.where(scene.known, distance, FAR_AWAY), axis=-1)
 
 
-def _chosen(tried, score):
+def _chosen(candidates, score):
     """The direction of the highest score, by a sum: cheaper on an accelerator than a
     gather.
     """
-    is_best = jnp.arange(tried.shape[0])[:, None] == jnp.argmax(score)
-    return jnp.sum(jnp.where(is_best, tried, 0.0), axis=0)
+    is_best = jnp.arange(candidates.shape[0])[:, None] == jnp.argmax(score)
+    return jnp.sum(jnp.where(is_best, candidates, 0.0), axis=0)
 
 
 def _length(vector):

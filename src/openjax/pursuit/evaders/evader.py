@@ -154,13 +154,13 @@ def scene_of(settings: PursuitSettings, world: PursuitState) -> Scene:
     """What the evader of a world knows of it."""
     numbers = world.evader.numbers
     key = world.evader.key
-    known = world.in_sight | (numbers["sees_all"] > 0.5)
+    is_known = world.in_sight | (numbers["sees_all"] > 0.5)
     return Scene(
         settings=settings,
         position=world.evader_position,
         velocity=world.evader_velocity,
         pursuers=world.drones.position,
-        known=known if world.active is None else known & world.active,
+        known=is_known if world.active is None else is_known & world.active,
         pillar_position=world.task.pillar_position,
         pillar_active=world.task.pillar_active,
         look_ahead=numbers["look_ahead"],
@@ -236,16 +236,16 @@ def _flown(settings, world, speed, acceleration, wish):
 
     dt = settings.time_step
     start = world.evader_position
-    before = world.evader_velocity
+    previous = world.evader_velocity
     velocity = at_most(
-        before + at_most(speed * wish - before, acceleration * dt), speed
+        previous + at_most(speed * wish - previous, acceleration * dt), speed
     )
     # past what is solid it slides along the surface: where it would end is moved out of
     # there
     pillars = world.task.pillar_position
     active = world.task.pillar_active
-    moved = into_free_space(settings, start + dt * velocity, pillars, active)
-    velocity = at_most((moved - start) / dt, speed)
+    place = into_free_space(settings, start + dt * velocity, pillars, active)
+    velocity = at_most((place - start) / dt, speed)
     # between pillars that touch, what leads out of one may lead into another
     free = _is_free(settings, start + dt * velocity, pillars, active)
     return jnp.where(free, velocity, 0.0)

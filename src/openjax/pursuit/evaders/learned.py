@@ -110,29 +110,29 @@ def features(
     outward = jnp.where(
         networks["own_axes"][which] > 0, outward, np.array([1.0, 0.0], np.float32)
     )
-    turned = functools.partial(turned_back, outward)
+    turn_back = functools.partial(turned_back, outward)
     itself = [
-        turned((scene.position - middle) / size),
-        turned(scene.velocity / settings.evader_speed),
-        turned(wish),
+        turn_back((scene.position - middle) / size),
+        turn_back(scene.velocity / settings.evader_speed),
+        turn_back(wish),
     ]
-    seen = {
+    parts = {
         "own": jnp.concatenate(itself),
-        "pursuers": _pursuer_features(scene, memory, turned),
-        "pillars": _pillar_features(scene, turned),
+        "pursuers": _pursuer_features(scene, memory, turn_back),
+        "pillars": _pillar_features(scene, turn_back),
         "in_use": scene.pillar_active,
         "greedy": wish,
         "outward": outward,
     }
     if scene.active is not None:
-        seen["pursuers"] = of_team(scene.active, seen["pursuers"])
-        seen["active"] = scene.active
+        parts["pursuers"] = of_team(scene.active, parts["pursuers"])
+        parts["active"] = scene.active
     # fused with what follows, the greedy evader in it takes a GPU's compiler minutes
-    return jax.lax.optimization_barrier(seen)
+    return jax.lax.optimization_barrier(parts)
 
 
-def _pursuer_features(scene, memory, turned):
-    """(N, 16) of the pursuers; `turned` turns vectors into the network's axes."""
+def _pursuer_features(scene, memory, turn_back):
+    """(N, 16) of the pursuers; `turn_back` turns vectors into the network's axes."""
     settings = scene.settings
     earlier = memory[MEMORY:].reshape(STEPS, *scene.pursuers.shape)  # oldest first
     offset = scene.pursuers - scene.position
@@ -141,23 +141,23 @@ def _pursuer_features(scene, memory, turned):
     # one
     scale = settings.max_speed * settings.time_step * STEPS
     numbers = [
-        turned(offset),
+        turn_back(offset),
         distance,
-        turned(2.0 * (scene.pursuers - earlier[STEPS // 2]) / scale),
-        turned((scene.pursuers - earlier[0]) / scale),
-        turned(scene.pursuer_velocity / settings.max_speed),
-        turned(scene.thrust_direction),
+        turn_back(2.0 * (scene.pursuers - earlier[STEPS // 2]) / scale),
+        turn_back((scene.pursuers - earlier[0]) / scale),
+        turn_back(scene.pursuer_velocity / settings.max_speed),
+        turn_back(scene.thrust_direction),
     ]
     return jnp.concatenate(numbers, axis=-1)
 
 
-def _pillar_features(scene, turned):
+def _pillar_features(scene, turn_back):
     """(P, 4) of the pillars, zeros in slots that aren't in use."""
     offset = scene.pillar_position - scene.position[:2]
     distance = jnp.sqrt(jnp.sum(offset**2, axis=-1, keepdims=True) + 1e-12)
     in_use = scene.pillar_active[:, None]
     return jnp.where(
-        in_use, jnp.concatenate([turned(offset), distance, in_use], axis=-1), 0.0
+        in_use, jnp.concatenate([turn_back(offset), distance, in_use], axis=-1), 0.0
     )
 
 
@@ -212,8 +212,10 @@ def outputs_of(
     """
     # all of them: cheaper than their parameters by world
     wishes, values = jax.vmap(outputs, (0, None))(networks, inputs)
-    chosen = jax.nn.one_hot(which, values.shape[0], axis=0)
-    return jnp.sum(chosen[..., None] * wishes, axis=0), jnp.sum(chosen * values, axis=0)
+    one_hot = jax.nn.one_hot(which, values.shape[0], axis=0)
+    return jnp.sum(one_hot[..., None] * wishes, axis=0), jnp.sum(
+        one_hot * values, axis=0
+    )
 
 
 def learning(scene: Scene, memory: Memory) -> tuple[Vector, Memory]:

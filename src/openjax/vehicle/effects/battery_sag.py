@@ -19,10 +19,10 @@ def voltage(parameters, context):
     from `full`.
     """
     simulated = parameters["full"] - parameters["discharge"] * context.air_time
-    known = ~jnp.isnan(context.battery_voltage)
+    is_logged = ~jnp.isnan(context.battery_voltage)
     # a linear discharge crosses zero some day, and a power of a negative ratio is no
     # number
-    return jnp.maximum(jnp.where(known, context.battery_voltage, simulated), 1.0)
+    return jnp.maximum(jnp.where(is_logged, context.battery_voltage, simulated), 1.0)
 
 
 def motor(parameters, motor_command, context):

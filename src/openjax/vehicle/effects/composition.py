@@ -22,11 +22,11 @@ def resolve(effects) -> tuple[Effect, ...]:
     """Effects from names or `Effect`s, in the order in which they act. Raises UserError
     for unknown names.
     """
-    found = {}
+    by_name = {}
     for effect in effects:
         effect = effect if isinstance(effect, Effect) else find_effect(effect)
-        found[effect.name] = effect
-    return tuple(found[name] for name in sorted(found))
+        by_name[effect.name] = effect
+    return tuple(by_name[name] for name in sorted(by_name))
 
 
 def complete_parameters(
@@ -37,16 +37,17 @@ def complete_parameters(
     Raises UserError for effects or parameters that aren't known.
     """
     given = given or {}
-    known = {effect.name: effect for effect in effects}
+    by_name = {effect.name: effect for effect in effects}
     for name, values in given.items():
-        if name not in known:
+        if name not in by_name:
             raise UserError(
-                f"parameters for {name!r}, which is not among the effects {sorted(known)}"
+                f"parameters for {name!r}, which is not among the effects {sorted(by_name)}"
             )
         for parameter in values:
-            find_effect(name, parameter, effects=known)
+            find_effect(name, parameter, effects=by_name)
     complete = {
-        name: {**effect.none(), **given.get(name, {})} for name, effect in known.items()
+        name: {**effect.none(), **given.get(name, {})}
+        for name, effect in by_name.items()
     }
     return jax.tree.map(lambda value: jnp.asarray(value, dtype), complete)
 
@@ -94,12 +95,12 @@ def change_motor_command(effects, parameters, motor_command, context: Context):
     """The motor command (4,) that the motors follow; negative thrust is beyond a
     rotor.
     """
-    changed = motor_command
+    command = motor_command
     for effect in effects:
         if effect.motor is not None:
-            changed = effect.motor(parameters[effect.name], changed, context)
+            command = effect.motor(parameters[effect.name], command, context)
     # what no effect changed is in 0..1 already, and is left as it is, bit for bit
-    return changed if changed is motor_command else jnp.maximum(changed, 0.0)
+    return command if command is motor_command else jnp.maximum(command, 0.0)
 
 
 def change_thrust(effects, parameters, thrust, reaction, context: Context):

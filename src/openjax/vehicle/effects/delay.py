@@ -38,11 +38,11 @@ def look_back(buffer, delay, dt) -> jax.Array:
     # delay needs the whole
     too_long = delay > LONGEST_DELAY
     steps = jnp.where(delay < 0.0, 0.0, jnp.where(too_long, LONGEST_DELAY, delay)) / dt
-    whole = jax.lax.stop_gradient(jnp.floor(steps))
-    part = steps - whole
+    steps_floor = jax.lax.stop_gradient(jnp.floor(steps))
+    part = steps - steps_floor
     # weights of all samples: in a mapped program each drone looks back by a delay of
     # its own
     index = jnp.arange(buffer.shape[0], dtype=buffer.dtype)
-    newer = jnp.where(index == whole, 1.0 - part, 0.0)
-    older = jnp.where(index == whole + 1.0, part, 0.0)
+    newer = jnp.where(index == steps_floor, 1.0 - part, 0.0)
+    older = jnp.where(index == steps_floor + 1.0, part, 0.0)
     return jnp.tensordot(newer + older, buffer, axes=1)

@@ -57,29 +57,29 @@ def load_intervals(path: str | Path) -> dict[str, dict[str, tuple[float, float]]
     """90 % intervals {effect: {parameter: (low, high)}} of an effects file, of those
     that have any.
     """
-    found = {}
+    by_name = {}
     for name, entries in _read(Path(path)).items():
         intervals = {
             key: entry.interval90 for key, entry in entries.items() if entry.interval90
         }
         if intervals:
-            found[name] = intervals
-    return found
+            by_name[name] = intervals
+    return by_name
 
 
 def _read(path: Path) -> dict[str, dict[str, _Entry]]:
     """The entries of an effects file."""
     table = read_toml(path, "effects file")
-    read = {}
+    values = {}
     table.pop("notes", None)
     for name, entries in table.items():
         if not isinstance(entries, dict):
             raise UserError(f"{path}: [{name}] must be a table of its parameters")
         find_effect(name, where=f"{path}: ")
-        read[name] = {
+        values[name] = {
             key: _entry(path, name, key, entry) for key, entry in entries.items()
         }
-    return read
+    return values
 
 
 def _entry(path: Path, name: str, key: str, text) -> _Entry:

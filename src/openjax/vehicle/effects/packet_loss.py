@@ -23,11 +23,11 @@ def command(parameters, memory, command, context):
     """The command, or the one that is held where this one is lost."""
     # drawn in any case: whether a replay knows is told by a value, at run time
     draw, carry = jax.random.split(jax.random.wrap_key_data(memory["key"]))
-    drawn = jax.random.uniform(draw, (), command.dtype) < parameters["probability"]
-    known = ~jnp.isnan(context.packet_lost)
-    lost = jnp.where(known, context.packet_lost, drawn.astype(command.dtype))
+    is_drawn = jax.random.uniform(draw, (), command.dtype) < parameters["probability"]
+    is_logged = ~jnp.isnan(context.packet_lost)
+    is_lost = jnp.where(is_logged, context.packet_lost, is_drawn.astype(command.dtype))
     # a sum of shares, so that a replay's `lost` may lie between and has a slope
-    command = (1.0 - lost) * command + lost * memory["held"]
+    command = (1.0 - is_lost) * command + is_lost * memory["held"]
     return command, {"held": command, "key": jax.random.key_data(carry)}
 
 
