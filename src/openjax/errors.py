@@ -2,6 +2,7 @@
 
 import difflib
 from collections.abc import Iterable
+from typing import Any
 
 
 class UserError(Exception):
@@ -19,3 +20,10 @@ def suggestion(name: str, names: Iterable[str]) -> str:
     names = list(names)
     close = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
     return f"did you mean {close[0]}?" if close else f"there are {', '.join(names)}"
+
+
+def part_name(part: Any) -> str:
+    """What an error calls a part that somebody handed in: the name of a function or a
+    class, or the class of an object.
+    """
+    return getattr(part, "__name__", type(part).__name__)

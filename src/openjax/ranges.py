@@ -123,7 +123,8 @@ def check_intervals(settings: Any, group: str = "") -> None:
             if not is_number or value not in field.interval:
                 kind_words = "a whole number in" if field.kind is int else "in"
                 raise UserError(
-                    f"{group}{field.name} is {shown(value)}; it must be {kind_words} {field.interval}"
+                    f"{group}{field.name} is {shown(value)}; it must be {kind_words} "
+                    f"{field.interval}"
                 )
 
 

@@ -125,3 +125,37 @@ def test_an_observation_of_ones_own():
         observation.self_state[:, -1], states[-1].drones.position[:, 2]
     )
     assert observation.self_state.shape[-1] == GAME.self_size + 1
+
+
+@pytest.mark.parametrize(
+    ("part", "words"),
+    [
+        ({"reward": Term(len, 1.0)}, "reward: Term is no tuple"),
+        ({"reward": (len,)}, "reward: len is no Term"),
+        ({"evaders": len}, "evaders: len is no tuple"),
+        ({"evaders": (3,)}, "evaders: int is no evader"),
+    ],
+)
+def test_what_is_no_part_is_a_line(part, words):
+    with pytest.raises(UserError, match=words):
+        Pursuit(GAME, **part)
+
+
+def test_a_part_that_gives_another_shape_is_a_line_with_its_name():
+    def of_seven(step):
+        return jnp.zeros(7)
+
+    def place_alone(scene, memory):
+        return scene.position
+
+    for part, words in (
+        (
+            {"reward": (Term(of_seven, 1.0),)},
+            r"reward term of_seven gives shape \(7,\)",
+        ),
+        ({"evaders": (place_alone,)}, r"evader place_alone gives arrays of shapes"),
+    ):
+        game = Pursuit(GAME, **part)
+        _, state = jax.eval_shape(game.reset, jax.random.key(0))
+        with pytest.raises(UserError, match=words):
+            jax.eval_shape(game.step, jax.random.key(0), state, jnp.zeros((2, 4)))

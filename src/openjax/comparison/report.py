@@ -145,7 +145,10 @@ def _cause_in_words(change: Change, cause: str) -> str:
     if cause == "one rotor weaker" and several:
         return f"one of rotors {rotors} ({change.side}) is {weaker}"
     if cause.endswith("weaker"):
-        return f"rotor{'s' * several} {rotors} ({change.side}) {'are' if several else 'is'} {weaker}"
+        return (
+            f"rotor{'s' * several} {rotors} ({change.side}) "
+            f"{'are' if several else 'is'} {weaker}"
+        )
     if cause == "weight":
         beside = (
             f" at the {change.side}"
@@ -198,6 +201,14 @@ def html_of(change: Change) -> str:
     return filled("changes.html.jinja", Path(__file__).parent, change=change, **content)
 
 
+def _in_percent(flights, name, level):
+    """(F,) a trim of each flight in percent of a hover; of the hover itself what it
+    differs from the usual one, `level`.
+    """
+    values = np.array([flight.values[name][0] for flight in flights])
+    return 100 * (values / level - 1.0 if name == "hover" else values)
+
+
 def draw(change: Change):
     """Trims of every flight, day by day, beside what days differ by; and where the
     change would sit.
@@ -209,12 +220,8 @@ def draw(change: Change):
         for k, figures in enumerate((change.reference, change.flights)):
             days = list(dict.fromkeys(f.day for f in figures))
             for j, day in enumerate(days):
-                day_values = [f.values[name][0] for f in figures if f.day == day]
-                values = 100 * (
-                    np.array(day_values) / level - 1.0
-                    if name == "hover"
-                    else np.array(day_values)
-                )
+                of_day = [f for f in figures if f.day == day]
+                values = _in_percent(of_day, name, level)
                 place = k + 0.6 * ((j + 0.5) / len(days) - 0.5)
                 axis.plot(
                     np.full(len(values), place),
@@ -224,8 +231,7 @@ def draw(change: Change):
                     color=(GREY, BEFORE)[k],
                     alpha=0.8,
                 )
-        middle = 100 * np.mean([f.values[name][0] / level - 1 if name == "hover" else f.values[name][0]
-                                for f in change.reference])  # fmt: skip
+        middle = _in_percent(change.reference, name, level).mean()
         spread = 100 * change.spread[name]
         axis.axhspan(
             middle - 1.645 * spread,

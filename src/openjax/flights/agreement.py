@@ -116,7 +116,10 @@ def _unit(pair: Pair) -> list[Finding]:
         for columns, times in ((", ".join(pair.names), gain), (pair.what, 1.0 / gain)):
             if factor / UNIT < times < factor * UNIT:
                 logged_unit = "m" if pair.unit == "m/s^2" else pair.unit
-                text = f"{columns}: in {unit} ({times:.0f} times too large); the log format wants {logged_unit}"
+                text = (
+                    f"{columns}: in {unit} ({times:.0f} times too large); the log "
+                    f"format wants {logged_unit}"
+                )
                 return [("units", text, [pair.what])]
     # noise and an estimator's lag cost correlation, and change a gain of rms values by
     # as much

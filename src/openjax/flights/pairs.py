@@ -168,7 +168,8 @@ class Pair:
             f"contradictory: {columns} against {self.what}: "
             f"correlation {agreement.correlation[worst]:.2f} "
             f"where sensors allow {agreement.expected[worst]:.2f} "
-            f"({agreement.measured[worst]:.2g} against {agreement.reference[worst]:.2g} {self.unit} "
+            f"({agreement.measured[worst]:.2g} against "
+            f"{agreement.reference[worst]:.2g} {self.unit} "
             f"from {low:g} to {high:g} Hz)"
         )
 

@@ -268,7 +268,8 @@ def _check_header(header: Header, time: str) -> None:
     if time not in names:
         time_name = "t" if time == "t" else f"{time!r}, which columns.toml names for t"
         raise LogError(
-            f"no column {time_name}; the log has {_listed(n for n in names if n)}: say in columns.toml "
+            f"no column {time_name}; the log has {_listed(n for n in names if n)}: "
+            "say in columns.toml "
             "which is which"
         )
 

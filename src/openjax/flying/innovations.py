@@ -100,9 +100,9 @@ class Innovations(NamedTuple):
     climb: Climb = Climb()
 
     def after(
-        self, pose: Pose, set_point: SetPoint, airframe: Airframe, refused: bool = False
+        self, pose: Pose, command: SetPoint, airframe: Airframe, refused: bool = False
     ) -> "Innovations":
-        """With the next pose; `set_point` has acted since the last one.
+        """With the next pose; `command` has acted since the last one.
 
         `refused`: whether poses between them came and weren't believed. Then this one
         must follow from the last believable one, however long that is ago.
@@ -111,18 +111,10 @@ class Innovations(NamedTuple):
         longest = math.inf if refused else LONGEST
         if last is None or not 0.0 < pose.time - last.time <= longest:
             return self._replace(
-                pose=pose, thrust=set_point.thrust, rates=pose.body_rates
+                pose=pose, thrust=command.thrust, rates=pose.body_rates
             )
         dt = pose.time - last.time
-        # what motors and rate loop have made of what was sent, as two low-passes
-        reached = _share(dt, airframe.motor_time_constant)
-        thrust = self.thrust + reached * (set_point.thrust - self.thrust)
-        request = (
-            (set_point.roll, set_point.pitch, set_point.yaw_rate)
-            if set_point.mode == RATES
-            else pose.body_rates
-        )
-        rates = _towards(self.rates, request, _share(dt, RATE_LAG))
+        thrust, rates = self._reached(pose, command, airframe, dt)
         # the trapezoidal rule: exact for an acceleration that stays
         mean = _towards(last.velocity, pose.velocity, 0.5)
         way = _difference(_difference(pose.position, last.position), _times(dt, mean))
@@ -151,6 +143,19 @@ class Innovations(NamedTuple):
             drift=self.drift.after(beyond_thrust, mean, dt),
             climb=self.climb,
         )
+
+    def _reached(self, pose, command, airframe, dt):
+        """Thrust and body rates that motors and rate loop have made of a command after
+        `dt` s, as two low-passes.
+        """
+        share = _share(dt, airframe.motor_time_constant)
+        thrust = self.thrust + share * (command.thrust - self.thrust)
+        request = (
+            (command.roll, command.pitch, command.yaw_rate)
+            if command.mode == RATES
+            else pose.body_rates
+        )
+        return thrust, _towards(self.rates, request, _share(dt, RATE_LAG))
 
     def feeling(self, force: Vector | None) -> "Innovations":
         """With the specific force (m/s^2, body) that the accelerometer feels at the

@@ -121,6 +121,7 @@ def _pose_faults(state, sample, start: Vector) -> Iterator[str]:
     if agree(sample.captured, sample.own, limits):
         place = ", ".join(f"{p:.2f}" for p in sample.own.position)
         yield (
-            f"motion capture sees it at {where} m, itself at ({place}): mend axes, unit or origin of "
+            f"motion capture sees it at {where} m, itself at ({place}): mend axes, "
+            "unit or origin of "
             "one of them"
         )

@@ -12,6 +12,7 @@ from gymnasium.vector.utils import batch_space
 from openjax.errors import UserError
 from openjax.interfaces.flat import ACTION_SIZE, flat_observation, flat_size, to_numpy
 from openjax.pursuit import Pursuit, make
+from openjax.pursuit.rows import where_rows
 
 
 class _Team:
@@ -162,12 +163,10 @@ class PursuitVectorEnv(VectorEnv):
             fresh_observation, fresh = self._reset(self._keys())
             infos["final_obs"] = to_numpy(observation)
             infos["_final_obs"] = over
-
-            def new_where_over(new, old):
-                return jnp.where(over.reshape(-1, *[1] * (new.ndim - 1)), new, old)
-
-            observation, self._state = jax.tree.map(
-                new_where_over, (fresh_observation, fresh), (observation, self._state)
+            observation, self._state = where_rows(
+                jnp.asarray(over),
+                (fresh_observation, fresh),
+                (observation, self._state),
             )
         return *to_numpy((observation, reward, terminated, truncated)), infos
 

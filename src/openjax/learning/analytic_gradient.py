@@ -232,7 +232,7 @@ class AnalyticGradient:
         worlds = jax.lax.scan(
             segment, self.starts(key, bounds), None, length=self.moments
         )[1]
-        return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), worlds)
+        return jax.tree.map(lambda leaf: jax.lax.collapse(leaf, 0, 2), worlds)
 
     def hard_starts(self, actor: Any, parameters: PolicyParameters, key: PRNGKeyArray):
         """Of `settings.draws` times as many starts those with the least gaps on the

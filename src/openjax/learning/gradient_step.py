@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float
 
 from openjax.policy import Policy, PolicyParameters
 from openjax.pursuit import Observation, Pursuit, PursuitState
+from openjax.pursuit.rows import where_rows
 from openjax.pursuit.shapes import Scalar
 
 LOWEST = 0.35
@@ -50,11 +51,7 @@ def finite_or_zero(gradient: Any) -> Any:
 
 def renewed(over: Bool[Array, " worlds"], world: Any, fresh: Any) -> Any:
     """Worlds (W, ...), those that are `over` (W,) replaced by fresh ones."""
-
-    def chosen(old, new):
-        return jnp.where(over.reshape(-1, *[1] * (old.ndim - 1)), new, old)
-
-    return jax.tree.map(chosen, world, fresh)
+    return where_rows(over, fresh, world)
 
 
 def weighted_sum(

@@ -104,7 +104,7 @@ def collect(
     held_noise = noise.pursuers.reshape(-1, players.hold, *noise.pursuers.shape[1:])
     noise = noise.replace(pursuers=held_noise)
     (observation, state), (record, samples) = jax.lax.scan(decide, world, noise)
-    rollout = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), record)
+    rollout = jax.tree.map(lambda leaf: jax.lax.collapse(leaf, 0, 2), record)
     return rollout.replace(learning=samples), observation, state
 
 

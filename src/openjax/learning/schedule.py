@@ -38,7 +38,7 @@ class Schedule:
         # `groups`
         def spread(x):
             x = jnp.moveaxis(x.reshape(self.groups, -1, *x.shape[1:]), 0, 1)
-            return x.reshape(number, *x.shape[2:])
+            return jax.lax.collapse(x, 0, 2)
 
         return jax.tree.map(spread, tasks)
 

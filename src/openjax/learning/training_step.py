@@ -24,12 +24,24 @@ from openjax.learning.collectives import (
 from openjax.learning.evader_learning import EvaderLearning
 from openjax.learning.generator import generate_task, select, successes, task_like
 from openjax.learning.learners.evasion import EvaderLearner
-from openjax.learning.learners.learner import Flown, Learner
+from openjax.learning.learners.learner import (
+    Flown,
+    Learner,
+    check_learners,
+    check_learning,
+)
 from openjax.learning.learners.mappo import Mappo
 from openjax.learning.learners.predictor_update import PredictorLearner
 from openjax.learning.rollout import Noise, Players, collect
 from openjax.learning.settings import TrainSettings
-from openjax.policy import Network, OwnPolicy, Policy, PolicyParameters, make_policy
+from openjax.policy import (
+    Network,
+    OwnPolicy,
+    Policy,
+    PolicyParameters,
+    check_network,
+    make_policy,
+)
 from openjax.pursuit import Observation, Pursuit, PursuitState
 from openjax.pursuit.evaders import learned_place
 from openjax.pursuit.shapes import Scalar
@@ -76,11 +88,16 @@ def build(
     A `policy` may be a network alone (`openjax.policy.Network`). Own `learners` stand
     beside the shipped ones, or in the place of the one whose name they have:
     `predictor`, `evaders`, `policy` (which is MAPPO).
+
+    Raises:
+      UserError: a network or learner that isn't one.
     """
     environment = environment or Pursuit(settings.environment)
     policy = policy or make_policy(environment, settings.network, settings.predictor)
-    if not hasattr(policy, "evaluate"):
+    if isinstance(policy, type) or not hasattr(policy, "evaluate"):
+        check_network(policy, jax.eval_shape(environment.reset, jax.random.key(0))[0])
         policy = OwnPolicy(policy)
+    check_learners(learners or {})
     shipped = shipped_learners(settings, environment, policy)
     return Parts(environment, policy, {**shipped, **(learners or {})})
 
@@ -290,9 +307,10 @@ class _Step:
 
         def learn(carry, flown):
             key = self._learner_key(carry, name)
-            state, policy, metrics = learner.learn(
-                carry.learners[name], carry.policy, flown, key
-            )
+            old_state = carry.learners[name]
+            result = learner.learn(old_state, carry.policy, flown, key)
+            check_learning(name, result, old_state)
+            state, policy, metrics = result
             return carry.replace(
                 policy=policy, learners={**carry.learners, name: state}
             ), metrics

@@ -6,7 +6,7 @@ __getattr__, __dir__, __all__ = lazy_names(
     __name__,
     {
         "outputs": "make_policy register_output",
-        "own_network": "Network OwnPolicy",
+        "own_network": "Network OwnPolicy check_network",
         "policy": "Policy PolicyParameters gaussian_entropy gaussian_log_prob",
         "settings": "NetworkSettings PredictorSettings",
     },

@@ -6,6 +6,7 @@ from typing import Any, Protocol, runtime_checkable
 import jax
 import jax.numpy as jnp
 
+from openjax.errors import UserError, part_name
 from openjax.policy.policy import PolicyParameters
 from openjax.policy.settings import NetworkSettings, PredictorSettings
 from openjax.pursuit import Observation
@@ -31,6 +32,41 @@ class Network(Protocol):
 
     def value(self, critic: Any, observation: Observation) -> jax.Array:
         """(..., N), normalised."""
+
+
+def check_network(network: Any, observation: Observation) -> None:
+    """Try a network on shapes alone; `observation` is one world's, of N pursuers.
+
+    Raises:
+      UserError: it lacks a function of `Network`, or gives other shapes.
+    """
+    name = part_name(network)
+    if isinstance(network, type):
+        raise UserError(f"policy {name}: a class; an object of it would be right")
+    if not isinstance(network, Network):
+        raise UserError(
+            f"policy {name}: init, distribution and value are needed; see "
+            "openjax.policy.Network"
+        )
+    actor, critic = jax.eval_shape(network.init, jax.random.key(0), observation)
+    # with another leading axis than a world's, as a rollout has
+    worlds = jax.tree.map(
+        lambda leaf: jax.ShapeDtypeStruct((2, *leaf.shape), leaf.dtype), observation
+    )
+    per_pursuer = worlds.self_state.shape[:-1]
+    mean, log_std = jax.eval_shape(network.distribution, actor, worlds)
+    value = jax.eval_shape(network.value, critic, worlds)
+    needed = {
+        "distribution's mean": (mean, (*per_pursuer, 4)),
+        "distribution's log standard deviation": (log_std, (4,)),
+        "value": (value, per_pursuer),
+    }
+    for what, (given, shape) in needed.items():
+        if given.shape != shape:
+            raise UserError(
+                f"policy {name}: {what} has shape {given.shape} for two worlds of "
+                f"{per_pursuer[1]} pursuers; {shape} would be right"
+            )
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ __getattr__, __dir__, __all__ = lazy_names(
     __name__,
     {
         "environment": "Dynamics Observer Pursuit action_to_command hover_action make",
+        "evaders.kinds": "EvaderKind",
         "info": "StepInfo",
         "observation": "Observation observe",
         "reward": "Term Transition default_reward",

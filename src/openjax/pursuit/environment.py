@@ -34,6 +34,7 @@ from openjax.pursuit.reward import (
     Term,
     Transition,
     captures,
+    check_terms,
     default_reward,
     over_speed,
     total_reward,
@@ -172,6 +173,7 @@ class Pursuit:
             if self.vehicle is None
             else self.vehicle,
             "effects": tuple(self.effects),
+            "reward": None if self.reward is None else check_terms(self.reward),
             "effect_parameters": self.effect_parameters or {},
             "dynamics": self.dynamics
             or make_drones_step(

@@ -9,11 +9,13 @@ import functools
 import operator
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 
+from openjax.errors import UserError, part_name
 from openjax.pursuit.axes import rotation_axes
 from openjax.pursuit.collisions import breaches, crashed
 from openjax.pursuit.info import StepInfo
@@ -92,6 +94,36 @@ class Term:
     """A training may let penalties grow (`mappo.penalty_start`); never positive."""
 
 
+def check_terms(terms: Any) -> tuple[Term, ...]:
+    """Terms that somebody hands in, as a tuple. Raises UserError for anything else."""
+    if not isinstance(terms, tuple | list):
+        raise UserError(
+            f"reward: {part_name(terms)} is no tuple; (Term(function, weight), ...) would "
+            "be right"
+        )
+    for term in terms:
+        if not isinstance(term, Term):
+            raise UserError(
+                f"reward: {part_name(term)} is no Term; Term(function, weight) would be "
+                "right"
+            )
+    return tuple(terms)
+
+
+def _weighted(term, transition):
+    """A term's part of the reward. Raises UserError where its function gives another
+    shape than () or (N,).
+    """
+    value = term.function(transition)
+    number = transition.settings.num_pursuers
+    if getattr(value, "shape", ()) not in ((), (number,)):
+        raise UserError(
+            f"reward term {part_name(term.function)} gives shape {value.shape}; () of all "
+            f"pursuers or ({number},) of each would be right"
+        )
+    return term.weight * value
+
+
 def total_reward(terms: tuple[Term, ...], transition: Transition) -> tuple[Each, Each]:
     """(N,) reward of each pursuer, the sum of the terms in their order, penalties last;
     and (N,) the sum of its penalties. Empty slots have none.
@@ -102,9 +134,7 @@ def total_reward(terms: tuple[Term, ...], transition: Transition) -> tuple[Each,
 
     def total(is_penalty):
         values = [
-            term.weight * term.function(transition)
-            for term in terms
-            if term.penalty == is_penalty
+            _weighted(term, transition) for term in terms if term.penalty == is_penalty
         ]
         return functools.reduce(operator.add, values) if values else nothing
 

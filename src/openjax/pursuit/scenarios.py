@@ -109,7 +109,8 @@ def scenario_task(settings: PursuitSettings, scenario: Scenario) -> Task:
     pillar_number = len(scenario.pillars)
     if pillar_number > slots:
         raise UserError(
-            f"scenario {scenario.name}: {pillar_number} pillars do not fit into {slots} slots (max_pillars)"
+            f"scenario {scenario.name}: {pillar_number} pillars do not fit into "
+            f"{slots} slots (max_pillars)"
         )
     if len(scenario.pursuers) != settings.num_pursuers:
         raise UserError(

@@ -278,7 +278,8 @@ class PursuitSettings:
                 len(drawn_from) != 2 or drawn_from[0] > drawn_from[1]
             ):
                 raise UserError(
-                    f"environment.{name} {list(drawn_from)} must be two numbers, the lower one first, "
+                    f"environment.{name} {list(drawn_from)} must be two numbers, the "
+                    "lower one first, "
                     "or none"
                 )
 

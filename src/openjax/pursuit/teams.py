@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int32, PRNGKeyArray, Shaped
 
+from openjax.pursuit.rows import where_rows
 from openjax.pursuit.settings import PursuitSettings
 from openjax.pursuit.shapes import Scalar, Team, Which
 from openjax.vehicle import DroneState
@@ -100,12 +101,7 @@ def of_team(active: Which | None, value: T) -> T:
     """A tree of (N, ...) arrays whose rows of empty slots are zeros."""
     if active is None:
         return value
-
-    def without_empty(leaf):
-        mask = active.reshape(-1, *[1] * (leaf.ndim - 1))
-        return jnp.where(mask, leaf, jnp.zeros_like(leaf))
-
-    return jax.tree.map(without_empty, value)
+    return where_rows(active, value, jax.tree.map(jnp.zeros_like, value))
 
 
 def team_mean(

@@ -116,7 +116,8 @@ def compile_first_flights(
             loss = {name: float(value) for name, value in parts.items()}
             seconds_left = (time.monotonic() - start) * (updates / updates_done - 1.0)
             say(
-                f"{updates_done} of {updates} updates, {duration(seconds_left)} left | evader out of reach "
+                f"{updates_done} of {updates} updates, {duration(seconds_left)} left "
+                "| evader out of reach "
                 f"{loss['free']:.0%} of the time, the nearest pursuer {loss['distance']:.2f} m too "
                 f"far, close to a crash {loss['crashes']:.1%}"
             )

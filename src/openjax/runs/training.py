@@ -186,7 +186,10 @@ class _Run:
         checkpoint_words = (
             "nothing was learnt yet" if update is None else f"saved at update {update}"
         )
-        return f"{checkpoint_words}; go on with {typed(f'openjax train --resume {self.directory.path}')}"
+        return (
+            f"{checkpoint_words}; go on with "
+            f"{typed(f'openjax train --resume {self.directory.path}')}"
+        )
 
     def _plan(self, seconds):
         """What the loop is to do after so many seconds of earlier processes."""

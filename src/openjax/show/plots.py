@@ -80,29 +80,27 @@ def draw_from_above(axes: Axes, trajectory: Trajectory) -> None:
     capture = trajectory.capture_index
     end = trajectory.end()
     for i in range(trajectory.pursuer_position.shape[1]):
-        position = trajectory.pursuer_position[:end, i]
+        x, y = trajectory.pursuer_position[:end, i, :2].T
         color = PURSUER_COLORS[i % len(PURSUER_COLORS)]
-        axes.plot(
-            *position[:, :2].T, color=color, linewidth=1.2, label=f"pursuer {i + 1}"
-        )
-        axes.plot(*position[0, :2], "o", color=color, fillstyle="none")
-        axes.plot(*position[-1, :2], "o", color=color, markersize=4)
+        axes.plot(x, y, color=color, linewidth=1.2, label=f"pursuer {i + 1}")
+        axes.plot(x[0], y[0], "o", color=color, fillstyle="none")
+        axes.plot(x[-1], y[-1], "o", color=color, markersize=4)
         crash = trajectory.crash_of(i)
         if crash is not None and crash < end:
             axes.plot(
-                *position[crash, :2], "X", color="black", markersize=9, label="crash"
+                x[crash], y[crash], "X", color="black", markersize=9, label="crash"
             )
-    evader = trajectory.evader_position[:end]
-    axes.plot(*evader[:, :2].T, color=EVADER_COLOR, linewidth=1.2, label="evader")
-    axes.plot(*evader[0, :2], "o", color=EVADER_COLOR, fillstyle="none")
+    x, y = trajectory.evader_position[:end, :2].T
+    axes.plot(x, y, color=EVADER_COLOR, linewidth=1.2, label="evader")
+    axes.plot(x[0], y[0], "o", color=EVADER_COLOR, fillstyle="none")
     if capture is None:
-        axes.plot(*evader[-1, :2], "o", color=EVADER_COLOR, markersize=4)
+        axes.plot(x[-1], y[-1], "o", color=EVADER_COLOR, markersize=4)
         outcome = "not captured"
     else:
-        captured_at = trajectory.evader_position[capture, :2]
+        x, y = trajectory.evader_position[capture, :2]
         axes.add_patch(
             Circle(
-                captured_at,
+                (x, y),
                 trajectory.capture_radius,
                 fill=False,
                 color="0.5",
@@ -110,7 +108,8 @@ def draw_from_above(axes: Axes, trajectory: Trajectory) -> None:
             )
         )
         axes.plot(
-            *captured_at,
+            x,
+            y,
             "*",
             color="gold",
             markeredgecolor="black",

@@ -162,7 +162,7 @@ def _many_worlds(step):
                     if batched
                     else jnp.broadcast_to(leaf, (axis_size, *leaf.shape))
                 )
-                return leaf.reshape(-1, *leaf.shape[2:])
+                return jax.lax.collapse(leaf, 0, 2)
 
             # two axes of worlds become one, and two again afterwards
             worlds = (drones, command, pillars)

@@ -328,7 +328,8 @@ def _sized(nominal: Vehicle, table: _Vehicle, mjcf: Path | None, root: str) -> V
         return nominal
     if max(table.inertia) > ROUNDED * 0.5 * sum(table.inertia):
         raise UserError(
-            f"{root}vehicle.inertia is {list(table.inertia)}; of a body none of the three is larger "
+            f"{root}vehicle.inertia is {list(table.inertia)}; of a body none of the "
+            "three is larger "
             "than the sum of the other two"
         )
     changes: dict[str, Any] = {"inertia": table.inertia}

@@ -91,7 +91,8 @@ def read_topic_times(path: Path, mapping: ColumnMapping | None = None) -> LogTab
     streams = _streams(raw, sources, clock_of, mapping)
     if repeated:
         remarks.append(
-            f"columns that others hold already are left out, {repeated[0]} to {repeated[-1]}: a vehicle "
+            f"columns that others hold already are left out, {repeated[0]} to "
+            f"{repeated[-1]}: a vehicle "
             "each, a file each"
         )
     absent = [source.name for source in sources.values() if source.name not in raw]

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
-from openjax.errors import UserError
+from openjax.errors import UserError, part_name
 from openjax.pursuit.evaders.behaviours import (
     BEHAVIOURS,
     MEMORY,
@@ -218,12 +218,26 @@ def _like_shipped(row):
     """
 
     def behaviour(scene, memory):
-        velocity, remembered = row.behaviour(scene, memory[: row.memory])
+        result = row.behaviour(scene, memory[: row.memory])
+        velocity, remembered = _checked(row, result)
         # all evaders of a game have memories of one size, the largest
         memory = jnp.concatenate([remembered, memory[row.memory :]])
         return velocity / jnp.maximum(scene.reach, 1e-6), memory
 
     return behaviour
+
+
+def _checked(row, result):
+    """The velocity and memory that a function of one's own gives. Raises UserError
+    where they have other shapes.
+    """
+    shapes = [jnp.shape(part) for part in jax.tree.leaves(result)]
+    if shapes != [(3,), (row.memory,)]:
+        raise UserError(
+            f"evader {part_name(row.behaviour)} gives arrays of shapes {shapes}; velocity "
+            f"(3,), memory ({row.memory},) would be right"
+        )
+    return result
 
 
 def _flown(settings, world, speed, acceleration, wish):

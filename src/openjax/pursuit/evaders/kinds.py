@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from openjax.errors import UserError, suggestion
+from openjax.errors import UserError, part_name, suggestion
 
 MEMORY = 4
 """Numbers that a scripted evader remembers; drawn uniformly from 0 to 1 at the start of
@@ -116,9 +116,23 @@ def evader_rows(
 
 
 def handed_in(
-    evaders: tuple[Evader, ...],
+    evaders: Any,
 ) -> tuple[tuple[str, ...], tuple[EvaderKind, ...]]:
-    """Names of evaders for the settings, and the rows of those that have none."""
+    """Names of evaders for the settings, and the rows of those that have none.
+
+    Raises:
+      UserError: something that is no evader, or no tuple of them.
+    """
+    if not isinstance(evaders, tuple | list):
+        raise UserError(
+            f"evaders: {part_name(evaders)} is no tuple; (evader, ...) would be right"
+        )
+    for one in evaders:
+        if not (isinstance(one, str | EvaderKind) or callable(one)):
+            raise UserError(
+                f"evaders: {part_name(one)} is no evader; a name, an EvaderKind or a "
+                "function (scene, memory) -> velocity, memory would be right"
+            )
     rows = [EvaderKind(one, "file") if callable(one) else one for one in evaders]
     names = tuple(one if isinstance(one, str) else "own" for one in rows)
     return names, tuple(one for one in rows if isinstance(one, EvaderKind))

@@ -11,7 +11,10 @@ def motor(parameters, motor_command, context):
     return parameters["offset"] + parameters["slope"] * motor_command + square
 
 
-_SOURCE = "spread of quadratic thrust maps published for the Crazyflie, as shares of the largest thrust"
+_SOURCE = (
+    "spread of quadratic thrust maps published for the Crazyflie, as shares of the "
+    "largest thrust"
+)
 
 # A straight line rises by 1; these are what powers of the command from 0.6 to 1.9 rise
 # by.
