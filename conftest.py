@@ -131,7 +131,7 @@ def sample_columns():
 @pytest.fixture
 def case_folder(tmp_path, sample_columns):
     """A case folder with the three sample flights."""
-    from openjax.flights.reading import write_csv
+    from openjax.flights.csv_table import write_csv
     from openjax.flights.samples import log_of
 
     folder = tmp_path / "case"

@@ -23,7 +23,7 @@ from openjax.commands.sample_flights import Arguments, make_case
 from openjax.comparison import Change
 from openjax.comparison.report import draw, prediction
 from openjax.files import read_json
-from openjax.flights.reading import write_csv
+from openjax.flights.csv_table import write_csv
 from openjax.flights.samples import fly, log_of, references
 from openjax.vehicle import load_vehicle
 

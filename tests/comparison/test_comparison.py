@@ -15,7 +15,8 @@ from openjax.comparison.figures import PLACES, FlightFigures, mixer_of
 from openjax.comparison.report import in_words, prediction
 from openjax.errors import UserError
 from openjax.flights.case import load_case
-from openjax.flights.reading import LogTable, write_csv
+from openjax.flights.csv_table import write_csv
+from openjax.flights.reading import LogTable
 from openjax.flights.samples import fly, log_of, references
 from openjax.vehicle import load_vehicle
 from openjax.vehicle.effects import EFFECTS

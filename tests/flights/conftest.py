@@ -2,7 +2,7 @@
 
 import pytest
 
-from openjax.flights.reading import write_csv
+from openjax.flights.csv_table import write_csv
 from openjax.flights.samples import log_of
 
 

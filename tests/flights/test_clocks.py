@@ -26,7 +26,7 @@ VEHICLE = load_vehicle()
 @pytest.fixture(scope="module")
 def tracks(sample_columns, tmp_path_factory):
     """Of three sample flights; a row's motors are the mean until the next row."""
-    from openjax.flights.reading import write_csv
+    from openjax.flights.csv_table import write_csv
     from openjax.flights.samples import log_of
 
     folder = tmp_path_factory.mktemp("case")

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from openjax.errors import UserError
 from openjax.flights.case import load_case
 from openjax.flights.checks import check_flight
-from openjax.flights.reading import LOG_COLUMNS, LogTable, flights_of, write_csv
+from openjax.flights.csv_table import write_csv
+from openjax.flights.reading import LOG_COLUMNS, LogTable, flights_of
 from openjax.flights.samples import log_of
 from openjax.vehicle import load_vehicle
 

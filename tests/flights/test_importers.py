@@ -10,8 +10,9 @@ import pytest
 
 from openjax.errors import UserError
 from openjax.flights.case import load_case
+from openjax.flights.csv_table import write_csv
 from openjax.flights.importers import find_logs, load_mapping, read_log
-from openjax.flights.reading import LogError, flights_of, write_csv
+from openjax.flights.reading import LogError, flights_of
 from openjax.flights.samples import log_of
 
 DEGREES = 180 / np.pi

@@ -9,10 +9,11 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from openjax.flights import csv_text, reading
+from openjax.flights import csv_table, csv_text
+from openjax.flights.csv_table import read_csv, write_csv
 from openjax.flights.importers import read_log
 from openjax.flights.importers.columns import ColumnMapping, Source
-from openjax.flights.reading import LogError, LogTable, flights_of, read_csv, write_csv
+from openjax.flights.reading import LogError, LogTable, flights_of
 
 HEADER = "t,wx,wy,wz,ax,ay,az,m1,m2,m3,m4,vbat\n"
 
@@ -158,9 +159,9 @@ def test_many_columns_and_rows_take_as_many_times_the_work(tmp_path, monkeypatch
     once each.
     """
     calls = Counter()
-    number = reading._number
+    number = csv_table._number
     monkeypatch.setattr(
-        reading, "_number", lambda cell: calls.update([1]) or number(cell)
+        csv_table, "_number", lambda cell: calls.update([1]) or number(cell)
     )
     rows = 2_000
     columns = {c: np.ones(rows) for c in HEADER.strip().split(",")}

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from openjax.errors import UserError
 from openjax.flights.case import load_case
+from openjax.flights.csv_table import read_csv, write_csv
 from openjax.flights.importers import find_logs, read_log
-from openjax.flights.reading import read_csv, write_csv
 from openjax.flights.samples import log_of
 from openjax.flights.track import tracks_of
 

@@ -15,7 +15,7 @@ from openjax.command_line import one_line
 from openjax.commands import diagnose
 from openjax.errors import UserError
 from openjax.flights.case import load_case
-from openjax.flights.reading import write_csv
+from openjax.flights.csv_table import write_csv
 from openjax.flights.regimes import REGIMES
 from openjax.flights.samples import fly, log_of, references
 from openjax.gap.decision import DECISION

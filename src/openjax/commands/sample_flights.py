@@ -46,7 +46,8 @@ def make_case(arguments: Arguments) -> list[Path]:
     """Write the case; returns its files. Raises UserError for an unknown effect or a
     folder that isn't empty.
     """
-    from openjax.flights.reading import LOG_COLUMNS, write_csv
+    from openjax.flights.csv_table import write_csv
+    from openjax.flights.reading import LOG_COLUMNS
     from openjax.flights.samples import fly, log_of, references
     from openjax.vehicle.effects import EFFECTS
     from openjax.vehicle.vehicle_file import load_vehicle_file, save_vehicle_file

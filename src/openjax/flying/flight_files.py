@@ -13,11 +13,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from openjax.flights.reading import CHANNEL_COLUMNS, LogTable, write_csv
+from openjax.flights.csv_table import write_csv
+from openjax.flights.reading import CHANNEL_COLUMNS, LogTable
 from openjax.flights.samples import log_of
 from openjax.flying.flight_record import FlightRecord
+from openjax.flying.member import Samples
 from openjax.flying.set_point import RATES
-from openjax.flying.swarm import Samples
 from openjax.vehicle.vehicle_file import VehicleFile, save_vehicle_file
 
 SHORTEST = 2.0
@@ -42,7 +43,7 @@ def write_case(
 
     Args:
       folder: to write to; it must exist.
-      samples: what was recorded of each vehicle, see `openjax.flying.swarm.Samples`.
+      samples: what was recorded of each vehicle, see `openjax.flying.member.Samples`.
       record: of the loop.
       vehicle: what flew, for all I know.
       about: what flight.json is to say beside timing and games.

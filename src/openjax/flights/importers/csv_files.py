@@ -5,9 +5,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Shaped
 
+from openjax.flights.csv_table import read_csv
 from openjax.flights.csv_text import find_header, head_of
 from openjax.flights.importers.columns import ColumnMapping
-from openjax.flights.reading import LOG_COLUMNS, LogError, read_csv
+from openjax.flights.reading import LOG_COLUMNS, LogError
 
 TIME_UNITS = {1.0: "s", 1e-3: "ms", 1e-6: "us", 1e-9: "ns"}
 # s between rows; units are a factor of a thousand apart, so this need not be near

@@ -3,11 +3,12 @@
 import re
 from pathlib import Path
 
+from openjax.flights.csv_table import read_csv
 from openjax.flights.importers.columns import UNITS, ColumnMapping, Source
 from openjax.flights.importers.csv_files import header_of, is_csv
 from openjax.flights.importers.importer import Importer
 from openjax.flights.importers.topic_times import read_topic_times
-from openjax.flights.reading import LOG_COLUMNS, LogTable, read_csv
+from openjax.flights.reading import LOG_COLUMNS, LogTable
 
 WITH_UNIT = re.compile(r"(\w+) *[(\[](.+)[)\]]")
 """A name with its unit: "wx [deg/s]", "x (m)"."""
