@@ -32,9 +32,9 @@ from openjax.flying.links_process import (
     Ends,
     serve,
 )
+from openjax.flying.member import Samples
 from openjax.flying.set_point import SetPoint
 from openjax.flying.state import PoseSample, State
-from openjax.flying.swarm import Samples
 
 STARTING = 20.0
 """s until its interpreter has loaded `cflib`, on a busy machine."""

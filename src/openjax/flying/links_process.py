@@ -20,9 +20,10 @@ from openjax.flying import real_time
 from openjax.flying.board import Board, Role, say, stand_alone
 from openjax.flying.controller import numbers_of
 from openjax.flying.guard import CHECK
+from openjax.flying.member import Member
 from openjax.flying.set_point import SetPoint
 from openjax.flying.state import State
-from openjax.flying.swarm import Member, Swarm
+from openjax.flying.swarm import Swarm
 from openjax.flying.takeover import disarm, fly_down
 
 POSE_RECORD = struct.Struct("<iI19d")

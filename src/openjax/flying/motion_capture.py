@@ -28,8 +28,8 @@ import numpy as np
 from openjax.errors import UserError
 from openjax.flying.controller import Pose, numbers_of
 from openjax.flying.links import Links
+from openjax.flying.member import Samples
 from openjax.flying.state import PoseSample
-from openjax.flying.swarm import Samples
 
 
 def find_feed(name: str) -> Callable:

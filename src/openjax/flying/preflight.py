@@ -7,8 +7,8 @@ from collections.abc import Iterator, Sequence
 from openjax.flying.controller import Vector, roll_pitch_yaw, up
 from openjax.flying.crtp import Supervisor
 from openjax.flying.judge import agree, judge
+from openjax.flying.member import PERIOD_MS
 from openjax.flying.state import PoseSample, State
-from openjax.flying.swarm import PERIOD_MS
 
 LISTENING = 0.5
 """How long (s) links are listened to, to count poses."""

@@ -7,16 +7,12 @@ import struct
 import time
 from collections.abc import Sequence
 
+from openjax.flying.crazyflie_links import never_wait, send_set_point
 from openjax.flying.crtp import LOG_TYPES, Port, SupervisorCommand
+from openjax.flying.member import POSE_BLOCK, Member
 from openjax.flying.set_point import SetPoint
 from openjax.flying.state import PoseSample
-from openjax.flying.swarm import (
-    POSE_BLOCK,
-    WATCHDOG_PERIOD,
-    Member,
-    never_wait,
-    send_set_point,
-)
+from openjax.flying.swarm import WATCHDOG_PERIOD
 
 
 class RawLinks:

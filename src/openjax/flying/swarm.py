@@ -8,212 +8,23 @@ import math
 import struct
 import threading
 import warnings
-from array import array
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from time import perf_counter, sleep
 
-import numpy as np
-
 from openjax.errors import UserError
-from openjax.flying.controller import Pose, numbers_of
-from openjax.flying.crtp import expand_quaternion
-from openjax.flying.set_point import OFF, SetPoint, manual_arguments
-from openjax.flying.state import FORCE_AGE, PoseSample
+from openjax.flying.crazyflie_links import never_wait, restart, send_set_point
+from openjax.flying.member import BODY_BLOCK, PERIOD_MS, POSE_BLOCK, Member
+from openjax.flying.set_point import SetPoint
+from openjax.flying.state import PoseSample
 
-PERIOD_MS = 10
-"""Of the log blocks: the shortest that the protocol knows."""
-POSE_BLOCK = (
-    *((f"stateEstimateZ.{v}", "int16_t") for v in ("x", "y", "z", "vx", "vy", "vz")),
-    ("stateEstimateZ.quat", "uint32_t"),
-    *((f"gyro.{v}", "FP16") for v in "xyz"),
-    ("pm.vbatMV", "uint16_t"),
-    ("supervisor.info", "uint16_t"),
-)
-BODY_BLOCK = (
-    *((f"motor.m{i}", "uint16_t") for i in range(1, 5)),
-    *((f"acc.{v}", "FP16") for v in "xyz"),
-)
 WATCHDOG_PERIOD = 0.1
 """s between two words to the firmware's watchdog."""
 CONNECTING = 3
 """Attempts to connect: over UDP nothing is sent again, and one lost answer leaves
 `cflib` waiting.
 """
-BOOT = {"udp": 0.2, "radio": 5.0}
-"""How long a restarted vehicle takes until it answers (s)."""
 TRIES = 5
 """To have the log blocks sampled at different moments."""
-DRIFT = 5e-5
-"""How fast two clocks may part (s/s): quartzes are good to some tens of ppm."""
-_WRAP = 1 << 24
-"""Milliseconds after which a time stamp of three bytes begins again."""
-
-
-class _Clock:
-    """On-board milliseconds (24 bit) to host seconds: the packet that came through
-    fastest sets the difference.
-    """
-
-    def __init__(self):
-        self.offset = math.inf
-        self._last = 0.0
-        self._stamp = None
-        self._base = 0
-
-    def host(self, stamp: int, arrival: float) -> float:
-        """Host seconds of a time stamp that came at `arrival` (s)."""
-        # only a step back by half of the range is a new turn: packets may overtake each
-        # other
-        if self._stamp is not None and stamp < self._stamp - _WRAP // 2:
-            self._base += _WRAP
-        self._stamp = stamp
-        on_board = 1e-3 * (stamp + self._base)
-        # the smallest difference so far, let up by as much as clocks may have parted
-        # since
-        if math.isfinite(self.offset):
-            self.offset += DRIFT * (arrival - self._last)
-        self.offset = min(self.offset, arrival - on_board)
-        self._last = arrival
-        return on_board + self.offset
-
-
-@dataclass(frozen=True)
-class Samples:
-    """What was recorded of one vehicle; times are host seconds. NumPy."""
-
-    poses: np.ndarray
-    """(K, 16) own estimates: arrival, voltage (V), when measured, position, velocity,
-    quaternion, body rates.
-    """
-    bodies: np.ndarray
-    """(K, 8): when measured, m1..m4 0..1, the specific force (m/s^2)."""
-    seen: np.ndarray
-    """(K, 14) by motion capture, where there is one: when measured, position, velocity,
-    quaternion, body rates.
-    """
-
-
-class Member:
-    """One vehicle of the swarm."""
-
-    def __init__(self, uri: str):
-        self.uri = uri
-        self._onboard = _Clock()
-        self.pose: Pose | None = None
-        self.arrival = -math.inf  # host s, of the newest pose
-        self.last_contact = perf_counter()
-        self.voltage = math.nan
-        self.supervisor = 0
-        # host s, the newest specific force (m/s^2, body)
-        self.felt: tuple = (-math.inf, None)
-        self.error: str | None = None
-        self.poses = array("d")  # rows as in `Samples`
-        self.bodies = array("d")
-        self.recording = False
-        self.listener: Callable[[bool], None] = lambda new_pose: None
-        self.crazyflie = None
-        self.blocks: list = []
-        # when in the period each block of motors was sampled last (ms)
-        self.phases: dict = {}
-
-    def sample(self) -> PoseSample:
-        """What is known of it."""
-        is_recent = (
-            self.pose is not None and abs(self.pose.time - self.felt[0]) <= FORCE_AGE
-        )
-        return PoseSample(
-            own=self.pose,
-            last_contact=self.last_contact,
-            voltage=self.voltage,
-            supervisor=self.supervisor,
-            force=self.felt[1] if is_recent else None,
-        )
-
-    def pose_arrived(self, stamp: int, data: dict, _block=None) -> None:
-        """A pose block, called by cflib's thread."""
-        arrival = perf_counter()
-        values = [data[name] for name, _ in POSE_BLOCK]
-        # in millimetres, mm/s, degrees/s and millivolts, so that all fits into one
-        # packet
-        pose = Pose(
-            self._onboard.host(stamp, arrival),
-            tuple(1e-3 * v for v in values[:3]),
-            tuple(1e-3 * v for v in values[3:6]),
-            expand_quaternion(values[6]),
-            tuple(math.radians(v) for v in values[7:10]),
-        )
-        self.voltage = 1e-3 * values[10]
-        self.supervisor = values[11]
-        self.pose = pose
-        self.arrival = arrival
-        self.last_contact = arrival
-        if self.recording:
-            self.poses.extend((arrival, self.voltage, *numbers_of(pose)))
-        self.listener(True)
-
-    def body_arrived(self, stamp: int, data: dict, _block=None) -> None:
-        """A block of motors and accelerometer."""
-        arrival = perf_counter()
-        self.last_contact = arrival
-        self.phases[_block] = stamp % PERIOD_MS
-        measured = self._onboard.host(stamp, arrival)
-        force = tuple(9.81 * data[name] for name, _ in BODY_BLOCK[4:])
-        if measured > self.felt[0]:  # packets may overtake each other
-            self.felt = measured, force
-        if self.recording:
-            # motors are 16 bits, the accelerometer counts in g
-            motors = tuple(data[name] / 65536 for name, _ in BODY_BLOCK[:4])
-            self.bodies.extend((measured, *motors, *force))
-        self.listener(False)
-
-
-def send_set_point(crazyflie, set_point: SetPoint) -> None:
-    """Send one vehicle its set-point. `crazyflie`: its own, or its link: it needs no
-    more than `send_packet`.
-    """
-    from cflib.crazyflie.commander import Commander
-
-    commander = Commander(crazyflie)
-    if set_point.mode == OFF:
-        commander.send_stop_setpoint()
-    else:
-        commander.send_setpoint_manual(*manual_arguments(set_point))
-
-
-def never_wait(link) -> None:
-    """Have packets wait for a link, and never who sends them: the newest of each kind,
-    in the place of an older one.
-
-    A radio's link has room for one until its vehicle acknowledges; `cflib` waits two
-    seconds for a vehicle that doesn't, and meanwhile sends the others nothing. Over UDP
-    nothing waits.
-    """
-    room = getattr(link, "out_queue", None)
-
-    def send_packet(packet) -> bool:
-        with room.mutex:
-            waiting = [old.header for old in room.queue]
-            if packet.header in waiting:
-                room.queue[waiting.index(packet.header)] = packet
-            else:
-                room.queue.append(packet)
-                room.not_empty.notify()
-        return True
-
-    if room is not None:
-        link.send_packet = send_packet
-
-
-def _restart(uri: str, crazyflie) -> None:
-    """Restart a vehicle whose firmware is locked: its motors are off."""
-    from cflib.utils.power_switch import PowerSwitch
-
-    crazyflie.close_link()
-    switch = PowerSwitch(uri)
-    switch.stm_power_cycle()
-    switch.close()
-    sleep(BOOT[uri.split(":")[0]])
 
 
 class Swarm:
@@ -276,7 +87,7 @@ class Swarm:
             if self._answers(member, make, timeout / CONNECTING):
                 if attempt or not member.crazyflie.supervisor.is_locked:
                     return
-                _restart(member.uri, member.crazyflie)
+                restart(member.uri, member.crazyflie)
         question = "is the vehicle on"
         if member.uri.startswith("udp:"):
             question = "does openjax virtual_crazyflie run"

@@ -1,0 +1,118 @@
+"""One vehicle of the swarm: what its log blocks tell, and what is recorded of it."""
+
+import math
+from array import array
+from collections.abc import Callable
+from dataclasses import dataclass
+from time import perf_counter
+
+import numpy as np
+
+from openjax.flying.controller import Pose, numbers_of
+from openjax.flying.crtp import expand_quaternion
+from openjax.flying.onboard_clock import OnboardClock
+from openjax.flying.state import FORCE_AGE, PoseSample
+
+PERIOD_MS = 10
+"""Of the log blocks: the shortest that the protocol knows."""
+POSE_BLOCK = (
+    *((f"stateEstimateZ.{v}", "int16_t") for v in ("x", "y", "z", "vx", "vy", "vz")),
+    ("stateEstimateZ.quat", "uint32_t"),
+    *((f"gyro.{v}", "FP16") for v in "xyz"),
+    ("pm.vbatMV", "uint16_t"),
+    ("supervisor.info", "uint16_t"),
+)
+BODY_BLOCK = (
+    *((f"motor.m{i}", "uint16_t") for i in range(1, 5)),
+    *((f"acc.{v}", "FP16") for v in "xyz"),
+)
+
+
+@dataclass(frozen=True)
+class Samples:
+    """What was recorded of one vehicle; times are host seconds. NumPy."""
+
+    poses: np.ndarray
+    """(K, 16) own estimates: arrival, voltage (V), when measured, position, velocity,
+    quaternion, body rates.
+    """
+    bodies: np.ndarray
+    """(K, 8): when measured, m1..m4 0..1, the specific force (m/s^2)."""
+    seen: np.ndarray
+    """(K, 14) by motion capture, where there is one: when measured, position, velocity,
+    quaternion, body rates.
+    """
+
+
+class Member:
+    """One vehicle of the swarm."""
+
+    def __init__(self, uri: str):
+        self.uri = uri
+        self._onboard = OnboardClock()
+        self.pose: Pose | None = None
+        self.arrival = -math.inf  # host s, of the newest pose
+        self.last_contact = perf_counter()
+        self.voltage = math.nan
+        self.supervisor = 0
+        # host s, the newest specific force (m/s^2, body)
+        self.felt: tuple = (-math.inf, None)
+        self.error: str | None = None
+        self.poses = array("d")  # rows as in `Samples`
+        self.bodies = array("d")
+        self.recording = False
+        self.listener: Callable[[bool], None] = lambda new_pose: None
+        self.crazyflie = None
+        self.blocks: list = []
+        # when in the period each block of motors was sampled last (ms)
+        self.phases: dict = {}
+
+    def sample(self) -> PoseSample:
+        """What is known of it."""
+        is_recent = (
+            self.pose is not None and abs(self.pose.time - self.felt[0]) <= FORCE_AGE
+        )
+        return PoseSample(
+            own=self.pose,
+            last_contact=self.last_contact,
+            voltage=self.voltage,
+            supervisor=self.supervisor,
+            force=self.felt[1] if is_recent else None,
+        )
+
+    def pose_arrived(self, stamp: int, data: dict, _block=None) -> None:
+        """A pose block, called by cflib's thread."""
+        arrival = perf_counter()
+        values = [data[name] for name, _ in POSE_BLOCK]
+        # in millimetres, mm/s, degrees/s and millivolts, so that all fits into one
+        # packet
+        pose = Pose(
+            self._onboard.host(stamp, arrival),
+            tuple(1e-3 * v for v in values[:3]),
+            tuple(1e-3 * v for v in values[3:6]),
+            expand_quaternion(values[6]),
+            tuple(math.radians(v) for v in values[7:10]),
+        )
+        self.voltage = 1e-3 * values[10]
+        self.supervisor = values[11]
+        self.pose = pose
+        self.arrival = arrival
+        self.last_contact = arrival
+        if self.recording:
+            self.poses.extend((arrival, self.voltage, *numbers_of(pose)))
+        self.listener(True)
+
+    def body_arrived(self, stamp: int, data: dict, _block=None) -> None:
+        """A block of motors and accelerometer."""
+        arrival = perf_counter()
+        self.last_contact = arrival
+        self.phases[_block] = stamp % PERIOD_MS
+        measured = self._onboard.host(stamp, arrival)
+        force = tuple(9.81 * data[name] for name, _ in BODY_BLOCK[4:])
+        if measured > self.felt[0]:  # packets may overtake each other
+            self.felt = measured, force
+        if self.recording:
+            # motors are 16 bits, the accelerometer counts in g
+            motors = tuple(data[name] / 65536 for name, _ in BODY_BLOCK[:4])
+            self.bodies.extend((measured, *motors, *force))
+        self.listener(False)
