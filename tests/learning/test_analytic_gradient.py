@@ -11,12 +11,9 @@ import optax
 import pytest
 
 from openjax.learning import AnalyticSettings
-from openjax.learning.analytic_gradient import (
-    AnalyticGradient,
-    compile_analytic,
-    free_flight,
-)
+from openjax.learning.analytic_gradient import AnalyticGradient, free_flight
 from openjax.learning.drawn_starts import APART, side_by_side
+from openjax.learning.gradient_stage import compile_stage
 from openjax.learning.smooth_measures import (
     SMOOTH,
     breach_share,
@@ -148,9 +145,7 @@ def test_gradient_is_that_of_the_loss_and_learning_follows_it(stage):
         )
 
     assert moved(step) - moved(-step) == pytest.approx(2 * step * steepness, rel=0.1)
-    updates = list(
-        compile_analytic(gradient, parameters)(parameters, jax.random.key(4))
-    )
+    updates = list(compile_stage(gradient, parameters)(parameters, jax.random.key(4)))
     assert len(updates) == 6
     assert all(np.isfinite(list(parts.values())).all() for _, parts in updates)
     assert loss(updates[-1][0].actor) < value

@@ -12,17 +12,16 @@ the critic). All else is held to what it did.
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from openjax.background import in_background
 from openjax.learning.drawn_starts import draw_start
+from openjax.learning.encounter import Encounter, no_encounter
 from openjax.learning.gradient_step import (
     END,
     FASTEST,
@@ -69,47 +68,6 @@ REST = 0.9
 """Share of the capture radius within which a pursuer needn't come nearer to the
 evader.
 """
-
-
-class Encounter(NamedTuple):
-    """What the pursuers of B worlds met in some steps, all smooth and (B, N) unless
-    said otherwise.
-    """
-
-    least: jax.Array
-    """m, least gap to anything solid"""
-    upright: jax.Array
-    """least cosine of the tilt"""
-    breach: jax.Array
-    """mean number of breaches"""
-    excess: jax.Array
-    """mean excess of speed, in units of `FAST`"""
-    distance: jax.Array
-    """(B,) m, mean length of the nearest pursuers' paths to the evader, beyond where
-    they may rest
-    """
-    free: jax.Array
-    """(B,) share of the steps in which nobody has caught the evader"""
-    territory: jax.Array
-    """(B,) mean share of the arena that the evader can be at before any pursuer"""
-    unseen: jax.Array
-    """(B,) mean of how well the evader hides from all pursuers"""
-
-
-def no_encounter(shape: tuple[int, int]) -> Encounter:
-    """What pursuers (B, N) have met before the first step."""
-    zeros = jnp.zeros(shape)
-    of_worlds = jnp.zeros(shape[0])
-    return Encounter(
-        least=zeros + jnp.inf,
-        upright=zeros + 1.0,
-        breach=zeros,
-        excess=zeros,
-        distance=of_worlds,
-        free=of_worlds,
-        territory=of_worlds,
-        unseen=of_worlds,
-    )
 
 
 @dataclass(frozen=True)
@@ -344,69 +302,3 @@ def free_flight(environment: Pursuit) -> Pursuit:
     )
     by_default = {"vehicle_bounds": None, "evader_share": None, "dynamics": None}
     return dataclasses.replace(environment, settings=free, **by_default)
-
-
-@runtime_checkable
-class GradientStage(Protocol):
-    """A last stage of a run: `AnalyticGradient`, or
-    `openjax.learning.worst_plans.WorstPlans`.
-    """
-
-    settings: AnalyticSettings
-
-    def record(self, parameters: PolicyParameters, key: PRNGKeyArray) -> Any:
-        """Flights of the policy as it was before the stage."""
-
-    def begin(self, parameters: PolicyParameters, key: PRNGKeyArray) -> Any:
-        """What is carried from update to update beside the actor."""
-
-    def update(
-        self,
-        actor: Any,
-        state: Any,
-        parameters: PolicyParameters,
-        flights,
-        key: PRNGKeyArray,
-    ) -> tuple[Any, Any, dict[str, Scalar]]:
-        """Actor and state after an update, and parts of the loss."""
-
-
-def compile_analytic(
-    stage: GradientStage, parameters: PolicyParameters
-) -> Callable[
-    [PolicyParameters, jax.Array], Iterator[tuple[PolicyParameters, dict[str, float]]]
-]:
-    """Start to compile the stage for parameters of these shapes (or abstract ones), in
-    the background.
-
-    Returns:
-      the stage, which waits for the compiler: (parameters, key) -> after every update
-      the parameters and its metrics.
-    """
-    key = jax.eval_shape(lambda: jax.random.key(0))
-    record = jax.jit(stage.record)
-    begin = jax.jit(stage.begin)
-    flights = jax.eval_shape(record, parameters, key)
-    state = jax.eval_shape(begin, parameters, key)
-    update = jax.jit(stage.update)
-    lowered = (
-        record.lower(parameters, key),
-        begin.lower(parameters, key),
-        update.lower(parameters.actor, state, parameters, flights, key),
-    )
-    ready = [in_background(program.compile) for program in lowered]
-
-    def learn(parameters, key):
-        record, begin, update = (wait() for wait in ready)
-        flight_key, update_key = jax.random.split(key)
-        actor = parameters.actor
-        state = begin(parameters, jax.random.fold_in(flight_key, 1))
-        flights = record(parameters, flight_key)
-        for number in range(stage.settings.updates):
-            step_key = jax.random.fold_in(update_key, number)
-            # `parameters` stay those from before: what flew the moments, and what is
-            # held to
-            actor, state, parts = update(actor, state, parameters, flights, step_key)
-            yield parameters.replace(actor=actor), jax.device_get(parts)
-
-    return learn

@@ -18,12 +18,9 @@ from openjax.cluster.devices import (
     own_copy,
 )
 from openjax.learning import build
-from openjax.learning.analytic_gradient import (
-    AnalyticGradient,
-    compile_analytic,
-    free_flight,
-)
+from openjax.learning.analytic_gradient import AnalyticGradient, free_flight
 from openjax.learning.first_flights import FirstFlights, first_game
+from openjax.learning.gradient_stage import compile_stage
 from openjax.learning.settings import TrainSettings
 from openjax.learning.worst_plans import WorstPlans, planning_game
 from openjax.policy import Policy, PolicyParameters
@@ -39,7 +36,7 @@ def compile_last_stage(
     settings: TrainSettings, environment: Pursuit, policy: Any
 ) -> Callable:
     """The stage after MAPPO, compiled for parameters of these shapes; see
-    `compile_analytic`.
+    `compile_stage`.
     """
     exact = _exact(settings, environment)
     if not settings.worst_plans.worlds:
@@ -57,7 +54,7 @@ def compile_last_stage(
         stage = WorstPlans(
             settings.worst_plans, planning_game(game), usual, settings.generator
         )
-    return compile_analytic(stage, abstract_like(policy))
+    return compile_stage(stage, abstract_like(policy))
 
 
 def first_flights(settings: TrainSettings, environment: Pursuit) -> FirstFlights:
