@@ -17,7 +17,8 @@ from openjax.flights.flight import Case
 from openjax.flights.reading import flights_of
 from openjax.flights.samples import fly, log_of, references
 from openjax.vehicle import load_vehicle
-from openjax.vehicle.vehicle_file import Motor, VehicleFile, load_vehicle_file
+from openjax.vehicle.vehicle_file import VehicleFile, load_vehicle_file
+from openjax.vehicle.vehicle_tables import Motor
 
 NOMINAL = load_vehicle()
 # Relative to nominal: thrust, inertia xx, yy, torque per thrust's share, motor time

@@ -11,13 +11,13 @@ from openjax.errors import UserError
 from openjax.vehicle import load_vehicle
 from openjax.vehicle.parameters import assets_directory
 from openjax.vehicle.vehicle_file import (
-    CalibratedValue,
-    Motor,
     VehicleFile,
     copy_vehicle_file,
     load_vehicle_file,
     save_vehicle_file,
 )
+from openjax.vehicle.vehicle_numbers import CalibratedValue
+from openjax.vehicle.vehicle_tables import Motor
 
 FULL = """
 [vehicle]

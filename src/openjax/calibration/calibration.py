@@ -21,7 +21,8 @@ from openjax.gap.model.hypotheses import UNEXPOSED, SetFit, fit_set
 from openjax.gap.model.library import CARDS, PLACE, library, prior
 from openjax.gap.residual import residuals_of
 from openjax.vehicle.effects import EFFECTS
-from openjax.vehicle.vehicle_file import CALIBRATED_UNITS, CalibratedValue
+from openjax.vehicle.vehicle_numbers import CalibratedValue
+from openjax.vehicle.vehicle_tables import CALIBRATED_UNITS
 
 # effects whose parameters are the constants
 FITTED = ("thrust_scale", "yaw_torque", "motor_lag", "inertia")
