@@ -20,151 +20,24 @@ import threading
 import time
 import traceback
 from dataclasses import replace
-from itertools import combinations
 from pathlib import Path
 
-import numpy as np
-
-from experiments.flying.faults import (
-    BEYOND,
-    CAMERA,
-    ENDING,
-    GONE,
-    MARGIN,
-    RADIO,
-    WILD,
-    Fault,
-    PoseDamage,
-    draw_fault,
-    outcome,
+from experiments.flying.faults import ENDING, MARGIN, outcome
+from experiments.flying.process_faults import (
+    KEYS,
+    ROLES,
+    SIGNALS,
+    START,
+    STOPPED,
+    ends_flight,
+    fault_of,
 )
+from experiments.flying.remote_game import RemoteGame, feed_of, play
 
-ROLES = ("loop", "links", "guard")
-SIGNALS = ("KILL", "STOP", "TERM", "HUP", "INT", "TSTP", "QUIT")
-UNSENT = {k for k in (*CAMERA, *RADIO) if "clock" in k or "order" in k}
-UNSENT |= {*BEYOND, "poses: a number that is none", "poses: no attitude"}
-"""No packet, or adapter, can say so; or nothing mends it."""
-KEYS = {
-    "key l": "l", "key h, l a second later": "h…l", "h and l": "hl", "Ctrl-C": "\x03", "Ctrl-Z": "\x1a", "Ctrl-\\": "\x1c",
-    "space": " ", "q": "q", "space and l": " l", "l and space": "l ", "x x space": "xx ", "an arrow and space": "\x1b[A ",
-    "Ctrl-C and space": "\x03 ", "Ctrl-C three times": "\x03\x03\x03",
-}  # fmt: skip
-STOPPED = ("space", "q")
-"""In these keys' names: motors off at once."""
-START = {
-    "start: y up": ("camera: y up", 1.0), "start: millimetres": ("camera scaled", 1e3), "start: scaled": ("camera scaled", 1.3),
-    "start: yaw turned": ("camera: yaw turned", 1.0), "start: beside the mark": ("camera moved", 0.3),
-}  # fmt: skip
-"""What is wrong with motion capture before anything flies, and by how much."""
-GROUPS = {
-    "a signal to one process": [f"{name} {role}" for name in SIGNALS for role in ROLES],
-    "to several processes": (
-        "TERM group", "HUP group", *(f"{name} {a}+{b}" for name in ("KILL", "STOP") for a, b in combinations(ROLES, 2)),
-        "KILL links then guard", "KILL loop then links", "KILL links then space", "KILL links+guard then space",
-        *(f"STOP {role} then CONT" for role in (*ROLES, "loop+links+guard")),
-    ),
-    "keys, terminal closed": (*KEYS, "terminal closed"),
-    "motion capture": [kind for kind in CAMERA if kind not in UNSENT],
-    "own estimates, links": [kind for kind in (*RADIO, *GONE) if kind not in UNSENT],
-    "the policy": ("policy: a number that is none", *WILD, "policy fails"),
-    "wrong from the start": tuple(START),
-    "strangers, a second fly, nothing": ("strangers' packets", "none", "second fly", "none with camera"),
-}  # fmt: skip
-KINDS = [kind for kinds in GROUPS.values() for kind in kinds]
-DRAWN = (
-    *GROUPS["motion capture"],
-    *GROUPS["own estimates, links"],
-    *GROUPS["the policy"][:-1],
-)
-"""Faults as in simulated time."""
-ENDLESS = (*DRAWN, *GROUPS["strangers, a second fly, nothing"])
-"""These needn't end a flight."""
-LATEST = 6.0
 LONGEST = 25.0
 """A flight is given up this long (s) after its fault."""
 SETTLE = 1.0
 """What lands over is looked at for so long (s): processes must have ended by then."""
-
-
-def ends_flight(kind: str) -> bool:
-    """Whether a fault of this kind must end its flight; links and guard are deaf to a
-    terminal's signals.
-    """
-    name, _, target = kind.partition(" ")
-    deaf = name in SIGNALS[2:] and target in ("links", "guard")
-    return not (deaf or kind in ENDLESS or kind in START)
-
-
-def fault_of(number: int, kind: str) -> Fault:
-    """The fault with this number and kind."""
-    rng = random.Random(number)
-    time = rng.uniform(0.3, LATEST)
-    vehicle = rng.randrange(3)
-    if kind in DRAWN:
-        drawn = (
-            draw_fault(seed, LATEST)
-            for seed in range(1000 * number, 1000 * number + 1000)
-        )
-        return replace(next(like for like in drawn if like.kind == kind), time=time)
-    if kind in START:
-        kind, amount = START[kind]
-        return Fault(kind, -2.0, vehicle, math.inf, amount)
-    return Fault(kind, time, vehicle, direction=0.0 if "camera" in kind else 4.0)
-
-
-def feed_of(fault: Fault, truth):
-    """What a laboratory's adapter would be: poses of a camera at 100 Hz, damaged."""
-    damage = PoseDamage(fault)
-    noise = np.random.default_rng(7)
-
-    def feed(update):
-        due = time.perf_counter()
-        while True:
-            # before the take-off, too
-            now = max(time.perf_counter() - truth.take_off, -1.0)
-            poses = truth.poses()
-            for i, pose in enumerate(poses):
-                shaken = tuple(
-                    (np.array(pose.position) + noise.normal(0, 5e-4, 3)).tolist()
-                )
-                seen = damage("camera", i, now, pose._replace(position=shaken), poses)
-                if seen is not None:
-                    update(i, seen.position, seen.quaternion)
-            due += 0.01
-            time.sleep(max(due - time.perf_counter(), 0.0))
-
-    return feed
-
-
-class RemoteGame:
-    """The game of a flight, played by the worker; `spoil` makes of each play what the
-    policy is said to have answered.
-    """
-
-    def __init__(self, game, pipe, spoil):
-        self.task = game.task
-        self.settings = game.settings
-        self.airframe = game.airframe
-        self._pipe = pipe
-        self._spoil = spoil
-
-    def start(self, poses):
-        """See `openjax.flying.game.Game.start`."""
-        self._pipe.send(("start", (poses,)))
-        return self._pipe.recv()
-
-    def step(self, poses, evader=None):
-        """See `openjax.flying.game.Game.step`."""
-        self._pipe.send(("step", (poses, evader)))
-        return self._spoil(self._pipe.recv())
-
-
-def play(game, pipe) -> None:
-    """Answer a `RemoteGame` until its process ends."""
-    with contextlib.suppress(EOFError, OSError):
-        while True:
-            name, arguments = pipe.recv()
-            pipe.send(getattr(game, name)(*arguments))
 
 
 class Flown:

@@ -16,7 +16,8 @@ from pathlib import Path
 import tyro
 
 from experiments.flying.faults import ENDING, MARGIN, finite
-from experiments.flying.processes import GROUPS, KINDS, STOPPED, Flown, ends_flight
+from experiments.flying.process_faults import GROUPS, KINDS, STOPPED, ends_flight
+from experiments.flying.processes import Flown
 from experiments.flying.single_thread import share_out
 from experiments.table import RESULTS, Page, Table, facts, write_page
 from openjax.files import read_json, write_json
