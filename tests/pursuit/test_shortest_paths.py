@@ -155,9 +155,12 @@ def test_who_stands_on_both_sides_of_a_wall_leaves_less_territory_than_who_waits
     paths = shortest_paths(game, task)
     evader = jnp.array([-0.15, 0.0, 1.1])
 
+    @jax.jit
+    def territory(position):
+        return evader_territory(game, task, paths, position, evader)
+
     def left(*places):
-        position = jnp.array([[x, y, 0.6] for x, y in places])
-        return float(evader_territory(game, task, paths, position, evader))
+        return float(territory(jnp.array([[x, y, 0.6] for x, y in places])))
 
     before_it = left((0.25, 0.0), (0.25, 0.15), (0.25, -0.15))
     both_sides = left((0.25, 0.0), (-0.1, 0.5), (-0.1, -0.5))
@@ -168,8 +171,9 @@ def test_worlds_know_their_paths_only_where_the_reward_asks_for_them():
     key = jax.random.key(3)
     assert jax.eval_shape(Pursuit().reset, key)[1].paths is None
     weights = dict(distance=0.0, capture=0.0, collision=0.0, over_speed=0.0, path=0.5)
-    game = make(reward=weights)
-    _, state = game.reset(key)
+    # points that stop: which physics it is, paths don't ask
+    game = make(reward=weights, physics="stops")
+    _, state = jax.jit(game.reset)(key)
     action = jnp.broadcast_to(hover_action(game.vehicle), (3, 4))
     _, state, reward, *_ = jax.jit(game.step)(None, state, action)
     way = length(state.task, state.drones.position, state.evader_position)
