@@ -78,7 +78,7 @@ def parse(
     complaint = io.StringIO()
     try:
         with contextlib.redirect_stderr(complaint):
-            parsed, unknown = tyro.cli(
+            values, unknown = tyro.cli(
                 command,
                 args=arguments,
                 default=default,
@@ -93,8 +93,8 @@ def parse(
         raise UserError(_one_line(complaint.getvalue())) from None
     if unknown:
         raise UserError(_unknown(unknown[0], default, program))
-    check_intervals(parsed, "--")
-    return parsed
+    check_intervals(values, "--")
+    return values
 
 
 def _rules_of_help():

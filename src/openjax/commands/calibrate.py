@@ -117,5 +117,5 @@ def _print(result, console: Console) -> None:
 
 def main(arguments: Sequence[str]) -> None:
     """The command. Raises UserError for a case that can't be read or calibrated."""
-    parsed = parse(Arguments, Arguments(case=tyro.MISSING), arguments, PROGRAM)
-    run(parsed, output_console())
+    options = parse(Arguments, Arguments(case=tyro.MISSING), arguments, PROGRAM)
+    run(options, output_console())

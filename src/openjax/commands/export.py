@@ -261,15 +261,15 @@ def _c(act, inputs, samples, source):
 
 def main(arguments: Sequence[str]) -> None:
     """The command. Raises UserError for an unusable policy or folder."""
-    parsed = parse(Arguments, Arguments(), arguments, PROGRAM)
+    options = parse(Arguments, Arguments(), arguments, PROGRAM)
     console = output_console()
-    with Steps(f"exporting {parsed.policy}", STEPS, console) as steps:
-        report = export(parsed, steps.begin)
+    with Steps(f"exporting {options.policy}", STEPS, console) as steps:
+        report = export(options, steps.begin)
     difference = report["largest_difference"]
     compared = "compared with nothing, as there is no C compiler here"
     if difference is not None:
         compared = f"differs by at most {difference:.1e} on {report['observations']} observations"
     console.print(
-        f"{parsed.out / report['file']}: {report['bytes'] / 1e6:.2f} MB, {compared}",
+        f"{options.out / report['file']}: {report['bytes'] / 1e6:.2f} MB, {compared}",
         soft_wrap=True,
     )

@@ -36,10 +36,10 @@ class Arguments:
 def main(arguments: Sequence[str]) -> None:
     """The command. Raises UserError for a folder that holds no report."""
     one_thread_for_matrices()
-    parsed = parse(Arguments, Arguments(diagnosis=tyro.MISSING), arguments, PROGRAM)
-    check_new_folder(parsed.out, "--out")
+    options = parse(Arguments, Arguments(diagnosis=tyro.MISSING), arguments, PROGRAM)
+    check_new_folder(options.out, "--out")
     console = output_console()
-    for line in make_plan(parsed):
+    for line in make_plan(options):
         console.print(line, soft_wrap=True)
 
 

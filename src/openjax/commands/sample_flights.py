@@ -103,12 +103,12 @@ def _checked_effects(
 
 def main(arguments: Sequence[str]) -> None:
     """The command. Raises UserError for an unknown effect or an unusable folder."""
-    parsed = parse(Arguments, Arguments(out=tyro.MISSING), arguments, PROGRAM)
-    files = make_case(parsed)
+    options = parse(Arguments, Arguments(out=tyro.MISSING), arguments, PROGRAM)
+    files = make_case(options)
     console = output_console()
     console.print(
-        f"[bold]{parsed.out}[/]: three flights of {parsed.duration:g} s, "
-        f"effect{'s' * (len(parsed.effect) > 1)}: {', '.join(parsed.effect)}"
+        f"[bold]{options.out}[/]: three flights of {options.duration:g} s, "
+        f"effect{'s' * (len(options.effect) > 1)}: {', '.join(options.effect)}"
     )
     for file in files:
         console.print(f"  {file.name}  {file.stat().st_size / 1024:.1f} KiB")

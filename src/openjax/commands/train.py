@@ -14,7 +14,7 @@ from openjax.command_line import parse, peek
 
 def main(arguments: Sequence[str]) -> int:
     """The command; returns its exit status."""
-    started = time.monotonic()
+    start_time = time.monotonic()
     if {"-h", "--help"} & set(arguments):
         return _help(arguments)
     if peek(arguments, "process_id") in (None, "0"):
@@ -33,7 +33,7 @@ def main(arguments: Sequence[str]) -> int:
     if place is None and peek(arguments, "devices") != "all":
         make_cores_devices()
     with joined(place) as processes:
-        return start(read_command(arguments), arguments, started, processes)
+        return start(read_command(arguments), arguments, start_time, processes)
 
 
 def _help(arguments):

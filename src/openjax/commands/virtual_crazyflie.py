@@ -87,17 +87,17 @@ def make(arguments: Arguments):
 
 def main(arguments: Sequence[str]) -> None:
     """The command; it runs until it is stopped."""
-    parsed = parse(Arguments, Arguments(), arguments, PROGRAM)
+    options = parse(Arguments, Arguments(), arguments, PROGRAM)
     from openjax.flying import real_time
 
     real_time.prepare()
-    virtual = make(parsed)
+    virtual = make(options)
     console = output_console()
     try:
         real_time.hurry()
         console.print(f"listening: --uri {' '.join(virtual.uris)}")
         with as_exception():
-            virtual.run(lambda: virtual.time >= (parsed.seconds or math.inf))
+            virtual.run(lambda: virtual.time >= (options.seconds or math.inf))
     except KeyboardInterrupt:
         pass
     finally:

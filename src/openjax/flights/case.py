@@ -127,8 +127,8 @@ def _usable(
     """Of the logs that were read the flights that can be used, checked and mended, and
     what was found.
     """
-    flights = [flight for found, _ in logs_read for flight in found]
-    issues = [issue for _, found in logs_read for issue in found]
+    flights = [flight for of_log, _ in logs_read for flight in of_log]
+    issues = [issue for _, of_log in logs_read for issue in of_log]
     copies = duplicates(flights)
     for name, original in copies.items():
         text = f"the same values as {original}: a copy, left out"
@@ -136,11 +136,11 @@ def _usable(
     results = [
         _check(f, vehicle_file, comparison) for f in flights if f.log not in copies
     ]
-    issues += [issue for _, found in results for issue in found]
-    usable, found = _trusted(
+    issues += [issue for _, of_flight in results for issue in of_flight]
+    usable, refusals = _trusted(
         [f for f, _ in results if f is not None], issues, vehicle_file
     )
-    return usable, issues + found
+    return usable, issues + refusals
 
 
 def _trusted(
@@ -179,11 +179,11 @@ def _check(
     """
     vehicle = vehicle_file.vehicle_of(flight.vehicle)
     try:
-        kept, found = check_flight(flight, vehicle, vehicle_file.log, comparison)
-        wrong = "" if kept is None or comparison else wrong_mass(kept, vehicle)
+        usable, issues = check_flight(flight, vehicle, vehicle_file.log, comparison)
+        wrong = "" if usable is None or comparison else wrong_mass(usable, vehicle)
         if wrong:
-            found = [*found, Issue(flight.name, wrong, refused=True, kind="vehicle")]
-        return None if wrong else kept, found
+            issues = [*issues, Issue(flight.name, wrong, refused=True, kind="vehicle")]
+        return None if wrong else usable, issues
     except (ArithmeticError, ValueError, IndexError, np.linalg.LinAlgError) as error:
         # Values that no check has foreseen: this flight can't be used, the others can.
         text = f"can't be checked ({type(error).__name__}: {error})".split("\n")[0]

@@ -50,8 +50,8 @@ def check_flight(
             *issues,
             Issue(flight.name, str(refused), refused=True, kind=refused.kind),
         ]
-    found = check_agreement(checked, vehicle)
-    return (None if found else checked), issues + found
+    disagreements = check_agreement(checked, vehicle)
+    return (None if disagreements else checked), issues + disagreements
 
 
 def duplicates(flights: list[Flight]) -> dict[str, str]:

@@ -183,8 +183,10 @@ def _offsets(signals) -> dict[str, float]:
     """
     likeness: dict[str, list] = {}
     for track, effect, cause in signals:
-        if (found := _likeness(effect, cause, track.dt)) is not None:
-            likeness.setdefault(_flight_of(track), []).append((found, track.dt / FINER))
+        if (correlation := _likeness(effect, cause, track.dt)) is not None:
+            likeness.setdefault(_flight_of(track), []).append(
+                (correlation, track.dt / FINER)
+            )
     curves = {}
     for flight, parts in likeness.items():
         # Stretches of one flight may have rows of another length: all on the grid of
@@ -192,19 +194,19 @@ def _offsets(signals) -> dict[str, float]:
         reach = min(len(part) // 2 * step for part, step in parts)
         step = parts[0][1]
         grid = step * np.arange(-int(reach / step), int(reach / step) + 1)
-        whole = sum(_on(grid, *part) for part in parts) / len(parts)
-        if whole.max() >= FOLLOWS:
-            curves[flight] = whole, step
+        summed = sum(_on(grid, *part) for part in parts) / len(parts)
+        if summed.max() >= FOLLOWS:
+            curves[flight] = summed, step
     out = {flight: _peak(*curve) for flight, curve in curves.items()}
     # one logger has one clock, unless a flight tells another one clearly
     if len(curves) > 1:
-        reach = min(len(whole) // 2 * step for whole, step in curves.values())
+        reach = min(len(summed) // 2 * step for summed, step in curves.values())
         step = min(step for _, step in curves.values())
         grid = step * np.arange(-int(reach / step), int(reach / step) + 1)
         alike = {flight: _on(grid, *curve) for flight, curve in curves.items()}
         common = _peak(sum(alike.values()), step)
-        for flight, whole in alike.items():
-            if np.interp(common, grid, whole) >= TELLS * whole.max():
+        for flight, summed in alike.items():
+            if np.interp(common, grid, summed) >= TELLS * summed.max():
                 out[flight] = common
     return out
 

@@ -190,26 +190,29 @@ def _whole_lines(
     delimiter = header.delimiter
     cells = len(header.names)
     rows = enumerate(lines[header.line + 1 :], header.line + 2)
-    numbered = [
+    whole_lines = [
         (number, unquoted(line, delimiter)) for number, line in rows if line.strip()
     ]
     # a delimiter at the end of each line but the header's, as a loop in C writes it
-    if numbered and all(line.count(delimiter) == cells for _, line in numbered[:2]):
-        numbered = [
-            (number, line.rstrip().removesuffix(delimiter)) for number, line in numbered
+    if whole_lines and all(
+        line.count(delimiter) == cells for _, line in whole_lines[:2]
+    ):
+        whole_lines = [
+            (number, line.rstrip().removesuffix(delimiter))
+            for number, line in whole_lines
         ]
     remarks = []
-    if len(numbered) > 1 and numbered[-1][1].count(delimiter) + 1 < cells:
-        del numbered[-1]
+    if len(whole_lines) > 1 and whole_lines[-1][1].count(delimiter) + 1 < cells:
+        del whole_lines[-1]
         remarks.append("the last line is cut off and left out")
-    for number, line in numbered:
+    for number, line in whole_lines:
         if (cell_count := line.count(delimiter) + 1) != cells:
             raise LogError(
                 f"line {number} has {cell_count} cells, the header {cells} (cut off or corrupt)"
             )
-    if not numbered:
+    if not whole_lines:
         raise LogError("no rows")
-    return numbered, remarks
+    return whole_lines, remarks
 
 
 def _without_units(

@@ -203,12 +203,12 @@ class Flight:
 
     def rows(self, rows: slice | Array) -> Flight:
         """The flight with a subset of its rows."""
-        cut = {
+        channels = {
             c: getattr(self, c)[rows]
             for c in CHANNEL_COLUMNS
             if getattr(self, c) is not None
         }
-        return dataclasses.replace(self, time=self.time[rows], **cut)
+        return dataclasses.replace(self, time=self.time[rows], **channels)
 
 
 @dataclass(frozen=True, eq=False)

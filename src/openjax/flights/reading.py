@@ -52,10 +52,10 @@ def flights_of(
             f"no column t; the log has {listed(table.columns)}: name it in columns.toml"
         )
     remarks = list(table.remarks)
-    read = {
+    all_channels = {
         c: _channel(table, c, names, remarks) for c, names in CHANNEL_COLUMNS.items()
     }
-    channels = {c: v for c, v in read.items() if v is not None}
+    channels = {c: v for c, v in all_channels.items() if v is not None}
     if "motor_command" in channels:
         channels["motor_command"] = channels["motor_command"][
             :, list(motor_permutation)
@@ -93,10 +93,10 @@ def _channel(
     if len(present) < len(names):
         absent = ", ".join(n for n in names if n not in table.columns)
         if present and channel in WHOLE:
-            counted = "; motors are counted from 1" * (absent == "m4")
+            hint = "; motors are counted from 1" * (absent == "m4")
             raise LogError(
                 f"{', '.join(present)} without {absent}: log {absent}, or none of "
-                f"them{counted}"
+                f"them{hint}"
             )
         if present:
             remarks.append(

@@ -239,11 +239,11 @@ def _fly(
         """
         under_load = voltage - 0.004 * air_time - 0.5 * load
 
-        def build(d, near, v):
+        def build(d, neighbours, v):
             return make_context(
                 vehicle,
                 d,
-                others_position=near,
+                others_position=neighbours,
                 battery_voltage=v,
                 air_time=air_time,
                 dt=dt,

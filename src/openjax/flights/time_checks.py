@@ -110,10 +110,10 @@ def _refuse_units(step: float) -> None:
             ("nanoseconds", 1e9),
         ):
             if 5e-4 <= step / factor <= SLOWEST:
-                counted = " or counts rows" if step == 1.0 else ""
+                hint = " or counts rows" if step == 1.0 else ""
                 raise Refused(
                     "units",
-                    f"t is in {unit}{counted} (rows {step:g} apart); the log format "
+                    f"t is in {unit}{hint} (rows {step:g} apart); the log format "
                     "wants seconds",
                 )
         raise Refused(

@@ -34,12 +34,12 @@ class FlightRecord:
           set_points: each vehicle's.
         """
         self._rows.extend(tick)
-        for arrival, seen, s in zip(arrivals, measured, set_points, strict=True):
+        for arrival, measured_at, s in zip(arrivals, measured, set_points, strict=True):
             # what a packet holds, not what was asked for: a diagnosis must know what
             # was sent
             s = s if s.mode == OFF else as_sent(s)
             self._rows.extend(
-                (arrival, seen, s.mode, s.thrust, s.roll, s.pitch, s.yaw_rate)
+                (arrival, measured_at, s.mode, s.thrust, s.roll, s.pitch, s.yaw_rate)
             )
 
     def table(self) -> tuple[np.ndarray, np.ndarray]:

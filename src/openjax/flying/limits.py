@@ -181,9 +181,13 @@ def _pushed(place, other, distance, share=1.0, direction=1.0) -> Vector:
     """
     dx = place[0] - other[0]
     dy = place[1] - other[1]
-    apart = math.hypot(dx, dy)
-    if apart >= distance:
+    distance_now = math.hypot(dx, dy)
+    if distance_now >= distance:
         return place
-    dx, dy = (dx / apart, dy / apart) if apart > 1e-6 else (direction, 0.0)
-    lack = share * (distance - apart)
+    dx, dy = (
+        (dx / distance_now, dy / distance_now)
+        if distance_now > 1e-6
+        else (direction, 0.0)
+    )
+    lack = share * (distance - distance_now)
     return place[0] + lack * dx, place[1] + lack * dy, place[2]

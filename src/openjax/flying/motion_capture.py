@@ -101,8 +101,8 @@ class MotionCaptured(Links):
         """What was recorded of each vehicle, here and on board."""
         both = zip(super().samples(), self._seen, strict=True)
         return [
-            dataclasses.replace(s, seen=np.frombuffer(seen).reshape(-1, 14))
-            for s, seen in both
+            dataclasses.replace(s, seen=np.frombuffer(capture).reshape(-1, 14))
+            for s, capture in both
         ]
 
     def wait(self, until: float) -> None:

@@ -457,16 +457,17 @@ class TrainSettings:
         """
         rollout = self.rollout_length
         hold = self.evader_learning.hold
-        learned = self.environment.evaders.count("learned")
+        learned_number = self.environment.evaders.count("learned")
         yield (
-            not learned or rollout % hold == 0,
+            not learned_number or rollout % hold == 0,
             f"evader_learning.hold {hold} must divide rollout_length {rollout}",
         )
         past = self.evader_learning.past
         yield (
-            not learned or past < learned,
-            f"evader_learning.past {past} leaves none of {learned} learned evaders that learns; at "
-            f"most {learned - 1} would be right",
+            not learned_number or past < learned_number,
+            f"evader_learning.past {past} leaves none of {learned_number} learned "
+            "evaders that learns; at "
+            f"most {learned_number - 1} would be right",
         )
 
     def _demands_of_learners(self):

@@ -61,10 +61,10 @@ def check_network(network: Any, observation: Observation) -> None:
         "distribution's log standard deviation": (log_std, (4,)),
         "value": (value, per_pursuer),
     }
-    for what, (given, shape) in needed.items():
-        if given.shape != shape:
+    for what, (output, shape) in needed.items():
+        if output.shape != shape:
             raise UserError(
-                f"policy {name}: {what} has shape {given.shape} for two worlds of "
+                f"policy {name}: {what} has shape {output.shape} for two worlds of "
                 f"{per_pursuer[1]} pursuers; {shape} would be right"
             )
 

@@ -450,28 +450,24 @@ class Pursuit:
         vehicles say, this alone. Returns what `step` does.
         """
         settings = self.settings
-        before = state
+        old = state
         # the evader answers to the pursuers as they were at the step's start, while
         # they moved
-        velocity, evader_state = evader_velocity(
-            settings, self.evader_rows, before, wish
-        )
-        evader = before.evader_position + settings.time_step * velocity
-        step = before.step + 1
-        active = self._active_after(before)
-        in_sight, in_view, seen = self._sights(before.task, active, drones, evader)
-        seen_drones = self._seen(drones, before.vehicles)
-        thought = thought_place(
-            settings, before.task, seen_drones, active, before.last_seen
-        )
+        velocity, evader_state = evader_velocity(settings, self.evader_rows, old, wish)
+        evader = old.evader_position + settings.time_step * velocity
+        step = old.step + 1
+        active = self._active_after(old)
+        in_sight, in_view, seen = self._sights(old.task, active, drones, evader)
+        seen_drones = self._seen(drones, old.vehicles)
+        thought = thought_place(settings, old.task, seen_drones, active, old.last_seen)
         last_seen = jnp.where(seen, evader, thought)
         framed = frame_pursuers(settings, seen_drones.position, last_seen, active)
         newest = frame(settings, step, framed, evader, velocity, seen)
-        own_history = before.own_history
+        own_history = old.own_history
         if settings.observe_history:
             newest_own = own_frame(seen_drones.quaternion, seen_drones.velocity, action)
             own_history = _with_newest(own_history, newest_own)
-        state = before.replace(
+        state = old.replace(
             drones=drones,
             evader_position=evader,
             evader_velocity=velocity,
@@ -479,14 +475,14 @@ class Pursuit:
             last_seen=last_seen,
             in_sight=in_sight,
             in_view=in_view,
-            frames=_with_newest(before.frames, newest),
+            frames=_with_newest(old.frames, newest),
             own_history=own_history,
             previous_action=action,
             step=step,
         )
-        info, rewards = self._outcome(before, state, active)
+        info, rewards = self._outcome(old, state, active)
         state = state.replace(
-            statistics=count(before.statistics, step, info, rewards, active)
+            statistics=count(old.statistics, step, info, rewards, active)
         )
         terminated, truncated = self._end(step)
         return (

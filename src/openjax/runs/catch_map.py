@@ -165,8 +165,10 @@ def draw_map(
 def _records(flyer, game, cells, flights):
     """A record of each cell."""
     scripted, *knowing = flights
-    flown = flyer.fly(scripted, cells)
-    records = [cell_record(game, *pair) for pair in zip(cells, flown, strict=True)]
+    statistics_of = flyer.fly(scripted, cells)
+    records = [
+        cell_record(game, *pair) for pair in zip(cells, statistics_of, strict=True)
+    ]
     if not knowing:
         return records
     learners, planner = knowing
@@ -177,8 +179,8 @@ def _records(flyer, game, cells, flights):
     if number:
         generator = np.random.default_rng(command.seed)
         places = np.sort(generator.choice(len(cells), number, replace=False)).tolist()
-        flown = flyer.fly(planner, [cells[place] for place in places])
-        for place, statistics in zip(places, flown, strict=True):
+        statistics_of = flyer.fly(planner, [cells[place] for place in places])
+        for place, statistics in zip(places, statistics_of, strict=True):
             records[place]["planner"] = figures(game, statistics)
     return records
 

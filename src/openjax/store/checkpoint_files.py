@@ -126,9 +126,9 @@ def start_save(path: Path, carry: Any, notes: dict) -> Any:
     return load_orbax().save_async(path.absolute(), arrays, custom_metadata=notes)
 
 
-def commit(path: Path, started: Any) -> None:
+def commit(path: Path, write: Any) -> None:
     """Wait until orbax has written a checkpoint, and seal it by its checksums."""
-    started.result()
+    write.result()
     if jax.process_index() == 0:
         # on the disk before the checksums are, as a checkpoint counts once these are
         # there

@@ -90,12 +90,12 @@ def step_many(
         return mapped_step(step, vehicle, drones, command, pillars or ())
     if pillars is None:  # every drone is a world of its own
         drones, command = jax.tree.map(lambda leaf: leaf[:, None], (drones, command))
-        stepped = _many_worlds(step)(vehicle, drones, command, ())
-        return jax.tree.map(lambda leaf: leaf[:, 0], stepped)
+        drones_after = _many_worlds(step)(vehicle, drones, command, ())
+        return jax.tree.map(lambda leaf: leaf[:, 0], drones_after)
     world = (drones, command, tuple(pillars))
     drones, command, pillars = jax.tree.map(lambda leaf: leaf[None], world)
-    stepped = _many_worlds(step)(vehicle, drones, command, pillars)
-    return jax.tree.map(lambda leaf: leaf[0], stepped)
+    drones_after = _many_worlds(step)(vehicle, drones, command, pillars)
+    return jax.tree.map(lambda leaf: leaf[0], drones_after)
 
 
 def mapped_step(
@@ -241,11 +241,11 @@ class _Worlds(NamedTuple):
         """The drones again from their leaves' rows."""
         leaves, structure = jax.tree.flatten(self.drones)
         number = self.command.shape[0] * self.command.shape[1]
-        whole = [
+        full = [
             row[:number].reshape(leaf.shape)
             for row, leaf in zip(rows, leaves, strict=True)
         ]
-        return structure.unflatten(whole)
+        return structure.unflatten(full)
 
 
 def _one_call(step, vehicle, worlds, interpret):

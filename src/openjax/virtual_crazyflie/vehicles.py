@@ -144,16 +144,16 @@ class VirtualVehicles:
             motor, _ = jax.vmap(lambda d, c: rate_controller(plant, d, c, STEP))(
                 drones, command
             )
-            later = self._step(
+            new = self._step(
                 vehicle, drones, command, no_pillar, inactive, self._parameters
             )
             # from what the step did, so that the accelerometer feels every effect
-            acceleration = (later.velocity - drones.velocity) / STEP
-            later, on_floor, hit = _stand(later)
+            acceleration = (new.velocity - drones.velocity) / STEP
+            new, on_floor, hit = _stand(new)
             gravity = vehicle.gravity * jnp.array([0.0, 0.0, 1.0])
             acceleration = jnp.where(on_floor[:, None], 0.0, acceleration)
-            force = jax.vmap(rotate_inverse)(later.quaternion, acceleration + gravity)
-            return later, (motor, force, on_floor), crashed | hit
+            force = jax.vmap(rotate_inverse)(new.quaternion, acceleration + gravity)
+            return new, (motor, force, on_floor), crashed | hit
 
         drones = self._unflatten(flat)
         gravity = jnp.zeros((self.number, 3)).at[:, 2].set(vehicle.gravity)

@@ -114,8 +114,11 @@ def read_blackbox_csv(path: Path, mapping: ColumnMapping | None = None) -> LogTa
     usual = _usual(fields, headers)
     time = fields.get("time", "time")
     mapped = {} if mapping is None else mapping.columns
-    wanted = (time, *(source.name for source in (*usual.values(), *mapped.values())))
-    raw, more_remarks = raw_columns(path, wanted, time, delimiter, above)
+    columns_read = (
+        time,
+        *(source.name for source in (*usual.values(), *mapped.values())),
+    )
+    raw, more_remarks = raw_columns(path, columns_read, time, delimiter, above)
     remarks += more_remarks
     columns = (
         usual | _force(raw, fields, headers, remarks) | _motors(raw, fields, remarks)

@@ -108,8 +108,8 @@ def _block(path: Path, mapping: ColumnMapping | None) -> tuple[Stream, list[str]
         raise LogError(
             f"no column {' or '.join(TIME_NAMES[:2])}: which holds the ticks in ms?"
         )
-    wanted = (time, *VARIABLES, *(source.name for source in mapped.values()))
-    values, remarks = raw_columns(path, wanted, time, delimiter)
+    variables = (time, *VARIABLES, *(source.name for source in mapped.values()))
+    values, remarks = raw_columns(path, variables, time, delimiter)
     ticks = values.pop(time)
     scale = mapped["t"].scale if "t" in mapped else _tick(ticks)
     return Stream(scale * ticks, values), remarks

@@ -48,8 +48,8 @@ def read_micro_sd(path: str | Path, mapping: ColumnMapping | None = None) -> Log
         raise LogError(f"holds more than {LARGEST >> 20} MB: no log of a flight")
     streams, remarks = decode(path.read_bytes())
     streams = [with_mixer(stream) for stream in streams]
-    columns, found = firmware_columns(streams, mapping)
-    remarks += found
+    columns, more_remarks = firmware_columns(streams, mapping)
+    remarks += more_remarks
     table = merge_streams(streams, columns)
     table["t"] = table["t"] - table["t"][0]
     return LogTable(path.name, table, np.full(len(table["t"]), "0"), tuple(remarks))

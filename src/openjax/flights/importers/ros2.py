@@ -170,11 +170,15 @@ class _Recording:
         both = zip(self.sources, self.streams, strict=True)
         ranked = [(rank, _period(stream), columns) for (rank, columns), stream in both]
         ranked.sort(key=lambda topic: topic[:2], reverse=True)
-        columns = {c: source for *_, own in ranked for c, source in own.items()}
+        columns = {
+            c: source for *_, of_stream in ranked for c, source in of_stream.items()
+        }
         poses = [topic for topic in ranked if "x" in topic[2]]
         if "x" in by_name and poses:
-            logged = next(s for s in self.log_streams if by_name["x"].name in s.values)
-            if 2 * poses[-1][1] < _period(logged):
+            with_position = next(
+                s for s in self.log_streams if by_name["x"].name in s.values
+            )
+            if 2 * poses[-1][1] < _period(with_position):
                 by_name = {c: source for c, source in by_name.items() if c not in _POSE}
         if set(EULER) <= set(by_name):
             columns = {
@@ -263,8 +267,8 @@ def _merged(
                 c: s for c, s in mapping.columns.items() if c not in ("t", "vehicle")
             }
         else:
-            columns, found = recording.columns()
-            remarks += found
+            columns, more_remarks = recording.columns()
+            remarks += more_remarks
         try:
             tables[vehicle.strip("/") or "0"] = merge_streams(
                 recording.all_streams(), columns

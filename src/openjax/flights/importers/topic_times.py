@@ -86,8 +86,10 @@ def read_topic_times(path: Path, mapping: ColumnMapping | None = None) -> LogTab
     else:
         sources = _mapped(names, mapping)
     clock_of = _clocks(sources, stamps, mapping)
-    wanted = (*stamps.values(), *(source.name for source in sources.values()))
-    raw, remarks = raw_columns(path, wanted, next(iter(stamps.values())), delimiter)
+    columns_read = (*stamps.values(), *(source.name for source in sources.values()))
+    raw, remarks = raw_columns(
+        path, columns_read, next(iter(stamps.values())), delimiter
+    )
     streams = _streams(raw, sources, clock_of, mapping)
     if repeated:
         remarks.append(
@@ -180,15 +182,15 @@ def _clocks(
             column: c.source.name for c in mapping.clocks for column in c.columns
         }
         usual = mapping.columns["t"].name if "t" in mapping.columns else None
-    found = {}
+    clock_of = {}
     for column, source in sources.items():
         topic = topic_of(source.name, stamps)
-        found[column] = named_sources.get(
+        clock_of[column] = named_sources.get(
             column, usual if topic is None else stamps[topic]
         )
-        if found[column] is None:
+        if clock_of[column] is None:
             raise LogError(f"column {source.name!r} has no time stamp: name it for t")
-    return found
+    return clock_of
 
 
 def _streams(raw, sources, clock_of: dict[str, str], mapping) -> list[Stream]:

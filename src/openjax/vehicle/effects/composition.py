@@ -30,15 +30,15 @@ def resolve(effects) -> tuple[Effect, ...]:
 
 
 def complete_parameters(
-    effects, given: Mapping[str, Mapping[str, Any]] | None, dtype
+    effects, partial: Mapping[str, Mapping[str, Any]] | None, dtype
 ) -> dict[str, dict]:
     """Parameters of every effect as arrays; what `given` leaves out has no effect.
 
     Raises UserError for effects or parameters that aren't known.
     """
-    given = given or {}
+    partial = partial or {}
     by_name = {effect.name: effect for effect in effects}
-    for name, values in given.items():
+    for name, values in partial.items():
         if name not in by_name:
             raise UserError(
                 f"parameters for {name!r}, which is not among the effects {sorted(by_name)}"
@@ -46,7 +46,7 @@ def complete_parameters(
         for parameter in values:
             find_effect(name, parameter, effects=by_name)
     complete = {
-        name: {**effect.none(), **given.get(name, {})}
+        name: {**effect.none(), **partial.get(name, {})}
         for name, effect in by_name.items()
     }
     return jax.tree.map(lambda value: jnp.asarray(value, dtype), complete)
