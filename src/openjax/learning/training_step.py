@@ -48,6 +48,10 @@ from openjax.pursuit.shapes import Scalar
 from openjax.pursuit.teams import team_mean
 from openjax.vehicle.family import narrowed_bounds
 
+# the order stays: it says which key is which, and a seed's first updates are compared to
+# the bit
+KEYS = ("next step", "noise", "windows", "shuffling", "tasks", "resets")
+
 
 @struct.dataclass
 class TrainCarry:
@@ -260,7 +264,7 @@ class _Step:
         steps = settings.rollout_length
         pursuers = self.parts.environment.settings.num_pursuers
         shape = (steps, pursuers, policy.sample_size)
-        keys = own_keys(self._key(carry, 1), carry.state.step.shape[0], axis)
+        keys = own_keys(self._key(carry, "noise"), carry.state.step.shape[0], axis)
         # a key for each world: the same noise on however many devices the worlds lie
         noise = jax.vmap(lambda k: jax.random.normal(k, shape))(keys)
         noise = Noise(jnp.moveaxis(noise, 1, 0))
@@ -336,7 +340,7 @@ class _Step:
         # new worlds for those that end, and for those that are started anew within the
         # episodes of other groups
         numbers = members.step.shape[0], schedule.restarts(carry.state.step.shape[0])
-        keys = self._key(carry, 4), self._key(carry, 5)
+        keys = self._key(carry, "tasks"), self._key(carry, "resets")
         fresh = self._fresh(starting, archive, keys, numbers)
         observation, state = schedule.renewed(
             (carry.observation, carry.state), fresh, group
@@ -345,7 +349,7 @@ class _Step:
             observation=observation,
             state=state,
             archive=archive,
-            key=self._key(carry, 0),
+            key=self._key(carry, "next step"),
             update=carry.update + 1,
         )
         return carry, metrics
@@ -378,19 +382,17 @@ class _Step:
         )
         return jax.vmap(environment.reset_to)(of_worlds(reset_key, numbers), tasks)
 
-    def _key(self, carry, number):
-        """One of the keys of this step: of the next step, noise, windows, shuffling,
-        tasks, resets.
-        """
-        return jax.random.split(carry.key, 6)[number]
+    def _key(self, carry, name):
+        """One of the keys of this step, by its name in `KEYS`."""
+        return jax.random.split(carry.key, len(KEYS))[KEYS.index(name)]
 
     def _learner_key(self, carry, name):
         """The key of a learner in this step; shipped ones have the windows' and the
         shuffling's.
         """
         if name == "predictor":
-            return self._key(carry, 2)
-        key = self._key(carry, 3)
+            return self._key(carry, "windows")
+        key = self._key(carry, "shuffling")
         if name == "policy":
             return key
         return jax.random.fold_in(key, 1 if name == "evaders" else _number_of(name))
