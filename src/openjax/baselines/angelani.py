@@ -13,6 +13,7 @@ from flax import struct
 
 from openjax.baselines.parameters import parameter
 from openjax.baselines.surroundings import Craft, Surroundings, level, unit, upward
+from openjax.vehicle import vectors
 
 
 @struct.dataclass
@@ -45,7 +46,7 @@ def angelani(
     def fermi(distance, middle):
         return jax.nn.sigmoid((middle - distance) / parameters.width)
 
-    distance = jnp.sqrt(jnp.sum(around.from_others**2, axis=-1) + 1e-12)
+    distance = vectors.length(around.from_others)
     repulsion = fermi(distance, parameters.repulsion_range)[..., None] * unit(
         around.from_others
     )

@@ -11,7 +11,7 @@ from flax import struct
 from openjax.errors import UserError
 from openjax.pursuit import Observation, Pursuit
 from openjax.pursuit.settings import HIDDEN
-from openjax.vehicle import hover_share
+from openjax.vehicle import hover_share, vectors
 from openjax.vehicle.solids import others
 
 QUATERNION = slice(3, 7)
@@ -142,9 +142,9 @@ def _obstacles(craft, observation):
     position = observation.position
     velocity = observation.self_state[..., VELOCITY]
     pillar = observation.pillars
-    across = jnp.sqrt(jnp.sum(pillar[..., :2] ** 2, axis=-1) + 1e-12)
+    across = vectors.length(pillar[..., :2])
     to_pillar = jnp.where(observation.pillar_seen, across - pillar[..., 4], jnp.inf)
-    radius = jnp.sqrt(jnp.sum(position[..., :2] ** 2, axis=-1, keepdims=True) + 1e-12)
+    radius = vectors.length(position[..., :2], keepdims=True)
     normal = jnp.concatenate(
         [
             pillar[..., :2] / across[..., None],
@@ -160,7 +160,7 @@ def _obstacles(craft, observation):
 
 def length(vector: jax.Array) -> jax.Array:
     """(..., 1) Euclidean length of (..., d), with a gradient at zero."""
-    return jnp.sqrt(jnp.sum(vector**2, axis=-1, keepdims=True) + 1e-12)
+    return vectors.length(vector, keepdims=True)
 
 
 def unit(vector: jax.Array) -> jax.Array:

@@ -17,6 +17,7 @@ from openjax.pursuit.sensing import sight_room
 from openjax.pursuit.shortest_paths import ShortestPaths, evader_territory, path_length
 from openjax.vehicle import DroneState
 from openjax.vehicle.solids import DRONE_RADIUS
+from openjax.vehicle.vectors import length
 
 Worlds = Float[Array, "worlds"]
 """A number of each world."""
@@ -97,9 +98,7 @@ def breach_share(game: PursuitSettings, state: PursuitState) -> Pursuers:
         - game.pillar_clearance
     )
     to_drone = jax.vmap(drone_distance)(position) - game.drone_clearance
-    to_wall = game.arena_radius - jnp.sqrt(
-        jnp.sum(position[..., :2] ** 2, axis=-1) + 1e-12
-    )
+    to_wall = game.arena_radius - length(position[..., :2])
     to_ceiling = game.arena_height - position[..., 2]
 
     def near(distance):

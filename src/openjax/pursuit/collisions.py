@@ -8,6 +8,7 @@ from jaxtyping import Array, Float
 from openjax.pursuit.settings import PursuitSettings
 from openjax.pursuit.shapes import Active, Each, Pillars, Team, Which
 from openjax.vehicle.solids import DRONE_RADIUS
+from openjax.vehicle.vectors import length
 
 TOUCH = 1e-3
 """A gap between solids below this (m) counts as touching: contacts are soft by a
@@ -35,14 +36,14 @@ def pillar_distance(
     """(N, P) distance (m) between (N, 3) centres and the surfaces of (P, 2) pillars."""
     offset = position[:, None, :2] - pillar_position[None]
     # the small number keeps the root's gradient finite on the axis
-    return jnp.sqrt(jnp.sum(offset**2, axis=-1) + 1e-12) - settings.pillar_radius
+    return length(offset) - settings.pillar_radius
 
 
 def drone_distance(position: Team) -> Float[Array, "drones drones"]:
     """(N, N) distance (m) between (N, 3) centres; infinite on the diagonal."""
     n = position.shape[0]
     offset = position[:, None] - position[None]
-    distance = jnp.sqrt(jnp.sum(offset**2, axis=-1) + 1e-12)
+    distance = length(offset)
     return jnp.where(jnp.eye(n, dtype=bool), jnp.inf, distance)
 
 

@@ -67,6 +67,7 @@ from openjax.vehicle import (
     make_drones_step,
 )
 from openjax.vehicle.family import draw_vehicles, family_effects
+from openjax.vehicle.vectors import length
 
 THRUST_LIMIT = 0.9
 """The commanded thrust is cut here, as a fraction of the maximum (the paper's simulator
@@ -428,9 +429,7 @@ class Pursuit:
         if settings.speed_limit == "clamp":
             # as the paper's simulator does; the small number keeps the root's gradient
             # finite
-            speed = jnp.sqrt(
-                jnp.sum(drones.velocity**2, axis=-1, keepdims=True) + 1e-12
-            )
+            speed = length(drones.velocity, keepdims=True)
             drones = drones.replace(
                 velocity=drones.velocity * jnp.minimum(1.0, settings.max_speed / speed)
             )

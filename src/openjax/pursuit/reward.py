@@ -33,6 +33,7 @@ from openjax.pursuit.shapes import (
 from openjax.pursuit.shortest_paths import evader_territory, path_length
 from openjax.pursuit.state import PursuitState
 from openjax.pursuit.teams import of_team
+from openjax.vehicle.vectors import length
 
 OVER_SPEED = 1.01
 """Share of the maximal speed above which a step counts as over speed."""
@@ -189,7 +190,7 @@ def first_capture(transition: Transition) -> Flag:
 def evader_distance(transition: Transition) -> Each:
     """(N,) m to the evader."""
     offset = transition.state.drones.position - transition.state.evader_position
-    return jnp.sqrt(jnp.sum(offset**2, axis=-1) + 1e-12)
+    return length(offset)
 
 
 def evader_path(transition: Transition) -> Each:
@@ -229,8 +230,8 @@ def recapture(transition: Transition) -> Flag:
 def steadiness(transition: Transition) -> Each:
     """(N,) from one, where the squashed command stays, to zero."""
     change = transition.state.previous_action - transition.before.previous_action
-    # the small number keeps the root's gradient finite where nothing changes
-    return jnp.exp(-jnp.sqrt(jnp.sum(change**2, axis=-1) + 1e-12))
+    # a length that has a gradient where nothing changes, too
+    return jnp.exp(-length(change))
 
 
 def breach_number(transition: Transition) -> Each:

@@ -8,6 +8,7 @@ from jaxtyping import Array, Bool, Float
 
 from openjax.pursuit.settings import PursuitSettings
 from openjax.pursuit.shapes import Active, Pillars, Vector
+from openjax.vehicle.vectors import length
 
 
 def line_of_sight(
@@ -69,7 +70,7 @@ def within_view(
     within the cone of `sight_angle` about each axis (N, 3), of length one.
     """
     offset = target - position
-    distance = jnp.sqrt(jnp.sum(offset**2, axis=-1) + 1e-12)
+    distance = length(offset)
     # a whole turn is everywhere, what lies exactly behind included
     least = (
         np.cos(np.deg2rad(settings.sight_angle) / 2)

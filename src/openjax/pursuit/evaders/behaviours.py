@@ -22,6 +22,7 @@ from openjax.pursuit.sensing import line_of_sight
 from openjax.pursuit.settings import PursuitSettings
 from openjax.pursuit.shapes import Active, Memory, Pillars, Team, Vector
 from openjax.vehicle import DroneState
+from openjax.vehicle.vectors import length
 
 DIRECTIONS = 64
 """That a greedy evader tries; one that looks two steps ahead tries half as many at
@@ -304,7 +305,7 @@ def _chosen(candidates, score):
 
 
 def _length(vector):
-    return jnp.sqrt(jnp.sum(vector**2, axis=-1, keepdims=True) + 1e-12)
+    return length(vector, keepdims=True)
 
 
 def _unit(vector):

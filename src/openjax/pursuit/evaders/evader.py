@@ -22,6 +22,7 @@ from openjax.pursuit.settings import PursuitSettings
 from openjax.pursuit.shapes import Count, Scalar, Team, Vector
 from openjax.pursuit.state import PursuitState
 from openjax.pursuit.task import evader_speed
+from openjax.vehicle.vectors import length
 
 
 def draw_evader(
@@ -246,7 +247,7 @@ def _flown(settings, world, speed, acceleration, wish):
     """
 
     def at_most(vector, limit):
-        return vector * jnp.minimum(1.0, limit / jnp.sqrt(jnp.sum(vector**2) + 1e-12))
+        return vector * jnp.minimum(1.0, limit / length(vector))
 
     dt = settings.time_step
     start = world.evader_position

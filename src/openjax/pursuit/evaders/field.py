@@ -7,6 +7,7 @@ import jax.numpy as jnp
 
 from openjax.pursuit.settings import PursuitSettings
 from openjax.pursuit.shapes import Active, Pillars, Team, Vector, Which
+from openjax.vehicle.vectors import length
 
 EPSILON = 1e-5
 """Added to distances (m) and their squares, so that nothing is divided by zero."""
@@ -64,7 +65,7 @@ def field_velocity(
     if settings.evader_norm == "axis":
         size = jnp.max(jnp.abs(force))
     else:
-        size = jnp.sqrt(jnp.sum(force**2) + 1e-12)
+        size = length(force)
     return settings.evader_speed * force / (size + EPSILON)
 
 

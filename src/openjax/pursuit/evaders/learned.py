@@ -19,6 +19,7 @@ from openjax.pursuit.evaders.behaviours import MEMORY, Scene, greedy
 from openjax.pursuit.evaders.kinds import EVADERS
 from openjax.pursuit.shapes import Count, Memory, Vector
 from openjax.pursuit.teams import of_team
+from openjax.vehicle.vectors import length
 
 STEPS = 10
 """Steps that it remembers."""
@@ -136,7 +137,7 @@ def _pursuer_features(scene, memory, turn_back):
     settings = scene.settings
     earlier = memory[MEMORY:].reshape(STEPS, *scene.pursuers.shape)  # oldest first
     offset = scene.pursuers - scene.position
-    distance = jnp.sqrt(jnp.sum(offset**2, axis=-1, keepdims=True) + 1e-12)
+    distance = length(offset, keepdims=True)
     # as far as a pursuer gets in the memory's time: what it moved is of the order of
     # one
     scale = settings.max_speed * settings.time_step * STEPS
@@ -154,7 +155,7 @@ def _pursuer_features(scene, memory, turn_back):
 def _pillar_features(scene, turn_back):
     """(P, 4) of the pillars, zeros in slots that aren't in use."""
     offset = scene.pillar_position - scene.position[:2]
-    distance = jnp.sqrt(jnp.sum(offset**2, axis=-1, keepdims=True) + 1e-12)
+    distance = length(offset, keepdims=True)
     in_use = scene.pillar_active[:, None]
     return jnp.where(
         in_use, jnp.concatenate([turn_back(offset), distance, in_use], axis=-1), 0.0
