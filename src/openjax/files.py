@@ -208,7 +208,7 @@ def check_output(path: str | Path | None, option: str) -> None:
     if path is None:
         return
     path = Path(path).absolute()
-    try:
+    with _write_errors(option, path):
         if path.is_dir():
             raise UserError(f"{option} {path}: is a folder; a file is needed")
         if not path.parent.is_dir():
@@ -218,6 +218,13 @@ def check_output(path: str | Path | None, option: str) -> None:
             pass
         if path.exists() and not os.access(path, os.W_OK):
             raise UserError(f"{option} {path}: may not be written to")
+
+
+@contextlib.contextmanager
+def _write_errors(option, path):
+    """What the system says of a place that can't be written to, as a line."""
+    try:
+        yield
     except OSError as error:
         raise UserError(
             f"{option} {path}: can't be written there ({error.strerror or error})"
@@ -229,17 +236,13 @@ def check_output_folder(path: str | Path, option: str) -> None:
     Raises UserError.
     """
     path = Path(path).absolute()
-    try:
+    with _write_errors(option, path):
         # the nearest folder above that is there already
         parent = next(folder for folder in (path, *path.parents) if folder.exists())
         if not parent.is_dir():
             raise UserError(f"{option} {path}: {parent} is a file; a folder is needed")
         with tempfile.TemporaryFile(dir=parent):
             pass
-    except OSError as error:
-        raise UserError(
-            f"{option} {path}: can't be written there ({error.strerror or error})"
-        ) from None
 
 
 def check_new_folder(path: str | Path, option: str) -> None:
@@ -257,6 +260,7 @@ def check_new_folder(path: str | Path, option: str) -> None:
 def remove_unfinished(folder: Path) -> None:
     """Delete what killed processes left of files they were writing."""
     for path in folder.glob(f"{WRITING}*"):
-        shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(
-            missing_ok=True
-        )
+        if path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
