@@ -12,7 +12,8 @@ from openjax.errors import UserError
 from openjax.flights.case import load_case
 from openjax.flights.csv_table import write_csv
 from openjax.flights.importers import find_logs, load_mapping, read_log
-from openjax.flights.reading import LogError, flights_of
+from openjax.flights.importers.importer import check_table
+from openjax.flights.reading import LogError, LogTable, flights_of
 from openjax.flights.samples import log_of
 
 DEGREES = 180 / np.pi
@@ -439,3 +440,22 @@ def test_a_px4_log_with_flipped_bits_is_read_quietly(tmp_path, capsys):
     with pytest.raises(LogError):
         read_log(tmp_path / "log.ulg")
     assert capsys.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(
+    ("read", "words"),
+    [
+        (lambda columns, ids: columns, "importer of ours gives dict"),
+        (lambda columns, ids: LogTable("a", columns, ids[:3]), "column t as ndarray"),
+        (
+            lambda columns, ids: LogTable("a", {**columns, "wx": [0.0]}, ids),
+            r"column wx as list of shape \(1,\); an array of shape \(5,\)",
+        ),
+    ],
+)
+def test_what_an_importer_of_ones_own_may_not_give_is_a_line(read, words):
+    columns = {"t": np.arange(5.0), "wx": np.zeros(5)}
+    ids = np.full(5, "0")
+    check_table("ours", LogTable("a", columns, ids))
+    with pytest.raises(LogError, match=words):
+        check_table("ours", read(columns, ids))

@@ -19,6 +19,7 @@ from openjax.flights.importers import (
 from openjax.flights.importers.columns import MAPPING_FILE, ColumnMapping, load_mapping
 from openjax.flights.importers.importer import (
     Importer,
+    check_table,
     importer_of,
     importers,
     register,
@@ -69,4 +70,4 @@ def read_log(path: Path, mapping: ColumnMapping | None = None) -> LogTable:
     if importer is None:
         formats = ", ".join(importer.name for importer in importers())
         raise LogError(f"no known format; known are {formats}")
-    return importer.read(path, mapping)
+    return check_table(importer.name, importer.read(path, mapping))

@@ -8,9 +8,13 @@ The shipped ones are in a list like any other; a program of yours adds one by
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+
+from openjax.errors import part_name
 from openjax.flights.importers.columns import ColumnMapping
-from openjax.flights.reading import LogTable
+from openjax.flights.reading import LogError, LogTable
 
 
 @dataclass(frozen=True)
@@ -53,3 +57,22 @@ def importers() -> tuple[Importer, ...]:
 def importer_of(path: Path) -> Importer | None:
     """The first importer that knows a file or folder; None where none does."""
     return next((importer for importer in _IMPORTERS if importer.matches(path)), None)
+
+
+def check_table(name: str, table: Any) -> LogTable:
+    """What the importer of that name has read. Raises LogError where it is no table
+    whose columns all have a row for each vehicle's id.
+    """
+    if not isinstance(table, LogTable):
+        raise LogError(
+            f"the importer of {name} gives {part_name(table)}; a LogTable would be right"
+        )
+    rows = np.shape(table.vehicle)
+    for column, values in table.columns.items():
+        if not isinstance(values, np.ndarray) or values.shape != rows:
+            raise LogError(
+                f"the importer of {name} gives column {column} as {part_name(values)} of "
+                f"shape {np.shape(values)}; an array of shape {rows}, a row for each id in "
+                "vehicle, would be right"
+            )
+    return table
