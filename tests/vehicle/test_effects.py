@@ -25,6 +25,7 @@ from openjax.vehicle.effects import (
     EFFECTS,
     Effect,
     Parameter,
+    composition,
     make_context,
     register_effect,
 )
@@ -576,3 +577,25 @@ def test_usual_ranges_grow_with_the_vehicle_and_stay_for_a_crazyflie():
     drag = EFFECTS["rotor_drag"].parameters["d_xy"]
     assert drag.usual(small) == drag.prior
     assert drag.usual(heavy) == pytest.approx((40 * drag.prior[0], 40 * drag.prior[1]))
+
+
+@pytest.mark.parametrize(
+    ("parts", "words"),
+    [
+        ({"name": "two words"}, "letters, digits and _ would be right"),
+        ({}, "changes nothing: one of body, command"),
+        ({"command": lambda p, m, u, c: (u, m)}, "initial_memory says what"),
+    ],
+)
+def test_what_is_no_effect_is_a_line(parts, words):
+    with pytest.raises(UserError, match=words):
+        Effect(**{"name": "mine", "description": "", "parameters": {}, **parts})
+
+
+def test_a_hook_that_gives_another_shape_is_a_line_with_its_effect():
+    def of_three(parameters, motor_command, context):
+        return motor_command[:3]
+
+    effect = Effect(name="mine", description="", parameters={}, motor=of_three)
+    with pytest.raises(UserError, match=r"'mine': motor gives arrays of shapes"):
+        composition.change_motor_command([effect], {"mine": {}}, jnp.ones(4), None)

@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from openjax.errors import UserError
+from openjax.errors import UserError, part_name
 from openjax.vehicle.effects.effect import Context, Effect
 from openjax.vehicle.effects.registry import find_effect
 from openjax.vehicle.parameters import Vehicle
@@ -84,9 +84,12 @@ def change_command(effects, parameters, memory, command, context: Context):
     """The command (4,) that reaches the rate controller, and the memory after it."""
     for effect in effects:
         if effect.command is not None:
-            command, remembered = effect.command(
+            result = effect.command(
                 parameters[effect.name], memory[effect.name], command, context
             )
+            _check_pair(effect, "command", result)
+            _check_shapes(effect, "command", result[0], command)
+            command, remembered = result
             memory = {**memory, effect.name: remembered}
     return command, memory
 
@@ -99,6 +102,7 @@ def change_motor_command(effects, parameters, motor_command, context: Context):
     for effect in effects:
         if effect.motor is not None:
             command = effect.motor(parameters[effect.name], command, context)
+            _check_shapes(effect, "motor", command, motor_command)
     # what no effect changed is in 0..1 already, and is left as it is, bit for bit
     return command if command is motor_command else jnp.maximum(command, 0.0)
 
@@ -107,9 +111,9 @@ def change_thrust(effects, parameters, thrust, reaction, context: Context):
     """Thrust (4,) N and reaction torque (4,) N m of the rotors."""
     for effect in effects:
         if effect.thrust is not None:
-            thrust, reaction = effect.thrust(
-                parameters[effect.name], thrust, reaction, context
-            )
+            result = effect.thrust(parameters[effect.name], thrust, reaction, context)
+            _check_shapes(effect, "thrust", result, (thrust, reaction))
+            thrust, reaction = result
     return thrust, reaction
 
 
@@ -118,7 +122,9 @@ def added_wrench(effects, parameters, context: Context):
     force = torque = jnp.zeros_like(context.velocity)
     for effect in effects:
         if effect.wrench is not None:
-            more_force, more_torque = effect.wrench(parameters[effect.name], context)
+            result = effect.wrench(parameters[effect.name], context)
+            _check_shapes(effect, "wrench", result, (force, torque))
+            more_force, more_torque = result
             force = force + more_force
             torque = torque + more_torque
     return force, torque
@@ -180,7 +186,30 @@ def seen_state(effects, parameters, state: DroneState) -> DroneState:
     """What the off-board controller sees of one drone in `state`."""
     for effect in effects:
         if effect.sensor is not None:
-            state = effect.sensor(
+            result = effect.sensor(
                 parameters[effect.name], state.effect_memory[effect.name], state
             )
+            _check_shapes(effect, "sensor", result, state)
+            state = result
     return state
+
+
+def _check_pair(effect, hook, result):
+    if not isinstance(result, tuple) or len(result) != 2:
+        raise UserError(
+            f"effect {effect.name!r}: {hook} gives {part_name(result)}; command, memory "
+            "would be right"
+        )
+
+
+def _check_shapes(effect, hook, result, right):
+    """Raises UserError where a hook gives other arrays than it should: what somebody
+    hands in is traced far from where it was written.
+    """
+    shapes = [jnp.shape(leaf) for leaf in jax.tree.leaves(result)]
+    right_shapes = [jnp.shape(leaf) for leaf in jax.tree.leaves(right)]
+    if shapes != right_shapes:
+        raise UserError(
+            f"effect {effect.name!r}: {hook} gives arrays of shapes {shapes}; "
+            f"{right_shapes} would be right"
+        )

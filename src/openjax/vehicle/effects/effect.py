@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from openjax.errors import UserError
 from openjax.vehicle.arena import Arena
 from openjax.vehicle.parameters import Vehicle, load_vehicle
 from openjax.vehicle.rotors import rotor_thrust
@@ -329,6 +330,31 @@ class Effect:
     """How the diagnosis tells it; without one it can be flown with, but not be
     diagnosed.
     """
+
+    def __post_init__(self):
+        hooks = {
+            "body": self.body,
+            "command": self.command,
+            "motor": self.motor,
+            "thrust": self.thrust,
+            "wrench": self.wrench,
+            "sensor": self.sensor,
+        }
+        if not self.name.isidentifier():
+            # it is a key of effects.toml and an option of commands
+            raise UserError(
+                f"effect {self.name!r}: letters, digits and _ would be right in its name"
+            )
+        if not any(hooks.values()):
+            raise UserError(
+                f"effect {self.name!r} changes nothing: one of {', '.join(hooks)} is needed"
+            )
+        remembers = self.command or self.sensor or self.record
+        if remembers and self.initial_memory is None:
+            raise UserError(
+                f"effect {self.name!r}: command, sensor and record remember something; "
+                "initial_memory says what at the start"
+            )
 
     def none(self) -> dict[str, float]:
         """Parameters at which the effect is absent."""
