@@ -111,7 +111,7 @@ class Swarm:
         crazyflie.connection_lost.add_callback(failed)
         crazyflie.open_link(member.uri)
         if not answered_event.wait(timeout):
-            member.error = f"no answer in {timeout:.0f} s"
+            member.error = f"no answer in {timeout:.1f} s"
         if member.error is not None:
             crazyflie.close_link()
         return member.error is None
