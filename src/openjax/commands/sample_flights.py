@@ -20,7 +20,7 @@ PROGRAM = "openjax sample_flights"
 DECIMALS = {"t": 2, "vbat": 3} | dict.fromkeys(
     "x y z qw qx qy qz m1 m2 m3 m4".split(), 5
 )
-_REST = 4
+_REST = 4  # decimals of all other columns
 _EFFECT_HELP = (
     "What the vehicle suffers from that the simulator doesn't know, one effect or several at once: "
     f"none, {', '.join(effect_names())}."

@@ -9,6 +9,7 @@ import numpy as np
 from openjax.comparison.causes import CAUSES, SIDES, Hypotheses, trims_with
 from openjax.comparison.result import SHOWN, Interval
 
+# before any flight speaks, a change is as probable as none
 PRIOR_CHANGED = 0.5
 
 

@@ -65,6 +65,7 @@ def read_csv(
         )
     values = _numbers(rows, header, places, number)
     remarks += _not_numbers(np.isinf(values), [names[i] for i in places])
+    # the two could be told apart so far: empty cells, and such as hold no number
     values[np.isinf(values)] = np.nan
     columns = {
         names[i]: np.ascontiguousarray(column)

@@ -14,7 +14,7 @@ from openjax.vehicle.parameters import hover_share
 
 # share of the variance from row to row at which a continuous signal has no order
 RANDOM = 0.5
-LEAST_ROWS = 100
+LEAST_ROWS = 100  # of which a share tells order from disorder
 # Standard deviation above which the rows of a continuous channel can't be its sensor's
 # noise, in its unit.
 CONTINUOUS = {"position": 0.05, "quaternion": 0.03, "velocity": 0.25}

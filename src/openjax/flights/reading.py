@@ -60,6 +60,7 @@ def flights_of(
         channels["motor_command"] = channels["motor_command"][
             :, list(motor_permutation)
         ]
+    # of all vehicles at once: a copy of a log is one of all of its flights
     fingerprint = _fingerprint(channels)
     ids = list(dict.fromkeys(table.vehicle.tolist()))
     if len(ids) > MOST_VEHICLES:

@@ -22,7 +22,7 @@ HELD = (0.04, 0.16)  # s, shortest and longest that it holds: 3 to 12 Hz
 # of thrust (share of the largest) and body rates, rad/s
 DOUBLETS = (0.08, 1.5, 1.5, 1.0)
 FULL = 4.0  # V, open circuit
-EMPTY = 3.6
+EMPTY = 3.6  # V, of a battery that is nearly spent
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from openjax.vehicle.vehicle_file import VehicleFile, save_vehicle_file
 
 SHORTEST = 2.0
 """Shorter games (s) tell a diagnosis nothing and get no log."""
-DECIMALS = {"t": 4, "vbat": 3}
+DECIMALS = {"t": 4, "vbat": 3}  # others have six
 _POSE = (
     *CHANNEL_COLUMNS["position"],
     *CHANNEL_COLUMNS["velocity"],

@@ -15,7 +15,7 @@ from openjax.files import replacing
 from openjax.show.plots import EVADER_COLOR, PURSUER_COLORS
 from openjax.show.trajectory import Trajectory
 
-FRAMES_PER_SECOND = 12.5
+FRAMES_PER_SECOND = 12.5  # one of eight steps of 10 ms
 WIDTH = 560
 HEIGHT = 400
 FINER = 2

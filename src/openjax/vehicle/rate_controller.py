@@ -9,9 +9,9 @@ from openjax.vehicle.shapes import Command, Hubs, Rotors, Seconds, Vector
 from openjax.vehicle.state import DroneState
 
 COUNTS = 65536.0  # motor commands are 16-bit in the firmware
-_LARGEST_COUNT = 65535.0
+_LARGEST_COUNT = 65535.0  # of them
 _AXIS_LIMIT = 32767.0  # outputs of the rate controllers are int16
-_DEGREES = 57.29577951308232
+_DEGREES = 57.29577951308232  # in a radian: the firmware counts in degrees
 
 
 def mixer(vehicle: Vehicle) -> Hubs:

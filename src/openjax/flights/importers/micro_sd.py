@@ -20,6 +20,7 @@ from openjax.flights.importers.importer import Importer
 from openjax.flights.reading import LogTable
 
 MAGIC = 0xBC
+# by version, how a record begins (its kind and its ticks), and seconds in a tick
 _VERSIONS = {1: ("<HI", 1e-3), 2: ("<HQ", 1e-6)}
 _TYPES = set("bBhHiIqQefd")
 
