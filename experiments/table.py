@@ -94,10 +94,10 @@ class Page:
         """The Markdown of the one table that stands between the marks of the page of
         results.
         """
-        chosen = self.table or next(
+        columns = self.table or next(
             part for part in self.all_parts() if isinstance(part, Table)
         )
-        return Table(chosen.columns, chosen.records).lines()
+        return Table(columns.columns, columns.records).lines()
 
     def lines(self, facts: Mapping) -> list[str]:
         """The report's Markdown, at its end command, commit and machine of `facts`."""
@@ -203,11 +203,11 @@ def publish(
     """
     data = options.out.with_suffix(".json")
     if not options.report:
-        started = time.monotonic()
-        found = study(options)
+        start = time.monotonic()
+        results = study(options)
         write_json(
             data,
-            {**facts(options.commit), "seconds": time.monotonic() - started, **found},
+            {**facts(options.commit), "seconds": time.monotonic() - start, **results},
         )
     write_page(options.out, page, read_json(data), draw)
 
@@ -224,11 +224,11 @@ def write_page(
     A page whose table stands between the marks keeps its words; any other becomes the
     report.
     """
-    made = page(results)
-    report = "\n".join(made.lines(results)) + "\n"
+    content = page(results)
+    report = "\n".join(content.lines(results)) + "\n"
     path = out.with_suffix(".md")
-    written = path.read_text(encoding="utf-8") if path.exists() else ""
-    write_text(path, with_table(written, made) if MARKS[0] in written else report)
+    old_text = path.read_text(encoding="utf-8") if path.exists() else ""
+    write_text(path, with_table(old_text, content) if MARKS[0] in old_text else report)
     if draw is not None:
         draw(results, out.with_suffix(".png"))
     print(report, end="")
@@ -237,6 +237,6 @@ def write_page(
 def with_table(text: str, page: Page) -> str:
     """A page's text, with the table between the marks as `page` has it."""
     begin, end = MARKS
-    before, _, rest = text.partition(begin)
-    after = rest.partition(end)[2]
-    return "\n".join([before + begin, *page.rows(), end + after])
+    head, _, rest = text.partition(begin)
+    tail = rest.partition(end)[2]
+    return "\n".join([head + begin, *page.rows(), end + tail])

@@ -31,7 +31,7 @@ DRIFTS = [(speed, within) for speed in (0.1, 0.2, 0.3, 0.5) for within in (2.0, 
 
 def airborne(flight) -> list[tuple[Pose, tuple]]:
     """Poses and specific forces of a flight, from take-off to landing."""
-    known = np.isfinite(
+    is_known = np.isfinite(
         np.c_[flight.velocity, flight.quaternion, flight.specific_force]
     ).all(1)
     height = flight.position[:, 2]
@@ -47,7 +47,7 @@ def airborne(flight) -> list[tuple[Pose, tuple]]:
             tuple(flight.specific_force[k].tolist()),
         )
         for k in range(up[0], up[-1] + 1)
-        if known[k]
+        if is_known[k]
     ]
 
 
@@ -55,7 +55,7 @@ def judged(rows, speed: float = 0.0, within: float = 1.0, begin: float = 0.0):
     """(the largest smoothed sum (m/s), when it was told (s in the air) or None)."""
     climb = Climb()
     largest = 0.0
-    told = None
+    end_time = None
     first = rows[0][0].time
     for true, force in rows:
         t = true.time - first
@@ -63,9 +63,9 @@ def judged(rows, speed: float = 0.0, within: float = 1.0, begin: float = 0.0):
         pose = true._replace(velocity=(*true.velocity[:2], true.velocity[2] + drift))
         climb = climb.after(pose, force)
         largest = max(largest, abs(climb.smooth))
-        if told is None and climb.contradicts:
-            told = t
-    return largest, told
+        if end_time is None and climb.contradicts:
+            end_time = t
+    return largest, end_time
 
 
 def study(options) -> dict:
@@ -83,18 +83,18 @@ def study(options) -> dict:
     for speed, within in DRIFTS:
         row = {"speed": speed, "within": within}
         for name, begins in BEGINS.items():
-            late = []
+            delays = []
             for begin in begins:
-                told = [
+                end_times = [
                     judged(f, sign * speed, within, begin)[1]
                     for f in flights
                     for sign in (1, -1)
                 ]
-                late += [np.inf if t is None else t - begin for t in told]
-            late = np.array(late)
-            row[name] = float((late < SOON).mean())
+                delays += [np.inf if t is None else t - begin for t in end_times]
+            delays = np.array(delays)
+            row[name] = float((delays < SOON).mean())
             row[f"{name}_seconds"] = (
-                float(np.median(late[late < SOON])) if row[name] else None
+                float(np.median(delays[delays < SOON])) if row[name] else None
             )
         rows.append(row)
     return {

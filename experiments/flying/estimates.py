@@ -76,13 +76,15 @@ class EstimateDamage:
         """The pose as it was, with 2 mm of noise; the gyroscope may live, the velocity
         be zero.
         """
-        held = self._held
-        rates = pose.body_rates if gyroscope else self.noisy(held.body_rates, 0.02)
-        return held._replace(
+        memory = self._held
+        rates = pose.body_rates if gyroscope else self.noisy(memory.body_rates, 0.02)
+        return memory._replace(
             time=pose.time,
-            position=self.noisy(held.position, 0.002),
-            velocity=self.noisy(held.velocity if velocity else (0.0, 0.0, 0.0), 0.005),
-            quaternion=_unit(self.noisy(held.quaternion, 0.001)),
+            position=self.noisy(memory.position, 0.002),
+            velocity=self.noisy(
+                memory.velocity if velocity else (0.0, 0.0, 0.0), 0.005
+            ),
+            quaternion=_unit(self.noisy(memory.quaternion, 0.001)),
             body_rates=rates,
         )
 
@@ -292,8 +294,8 @@ def page(results) -> Page:
 
 def _together(name, rows) -> dict:
     """One row of several."""
-    counted = ("flights", "well", "landed", "fell", "armed")
-    numbers = {column: sum(row[column] for row in rows) for column in counted}
+    names = ("flights", "well", "landed", "fell", "armed")
+    numbers = {column: sum(row[column] for row in rows) for column in names}
     return {"kind": name, "farthest": max(row["farthest"] for row in rows), **numbers}
 
 

@@ -131,12 +131,12 @@ class Worlds:
         self._damage = [damage(fault) for fault in faults]
         vehicles = VirtualVehicles(load_vehicle(), np.tile(starts, (len(faults), 1)))
         self._vehicles = vehicles
-        following = [
+        heard = [
             fault.kind != "camera drifts" for fault in faults for _ in range(self.n)
         ]
         radio = functools.partial(self._received, "radio")
         camera = functools.partial(self._received, "camera")
-        self.swarm = SimulatedSwarm(vehicles, following, radio, camera)
+        self.swarm = SimulatedSwarm(vehicles, heard, radio, camera)
         pillars = [
             (x, y, self._game.settings.pillar_radius) for x, y in scenario.pillars
         ]
@@ -179,25 +179,25 @@ class Worlds:
         """10 ms of all flights; whether any goes on."""
         now = self.swarm.now
         samples = list(self.swarm.observe())
-        flown = np.flatnonzero(self._down < LAIN).tolist()
+        worlds = np.flatnonzero(self._down < LAIN).tolist()
         awake = [
             w
-            for w in flown
+            for w in worlds
             if not (self.faults[w].kind == ASLEEP and self.faults[w].on(now))
         ]
-        over = set(range(len(self.faults))) - set(flown)
+        over = set(range(len(self.faults))) - set(worlds)
         self.swarm.asleep = {w * self.n + i for w in over for i in range(self.n)}
         for w in awake:
             first = w * self.n
-            before = self.states[w].drones
+            drones = self.states[w].drones
             if self._landing[w]:  # who takes over knows no motion capture
-                seen = samples[first : first + self.n]
+                of_world = samples[first : first + self.n]
                 samples[first : first + self.n] = [
-                    s._replace(captured=None) for s in seen
+                    s._replace(captured=None) for s in of_world
                 ]
             self.states[w] = see(self.states[w], now, samples[first : first + self.n])
             for i, (drone, old) in enumerate(
-                zip(self.states[w].drones, before, strict=True)
+                zip(self.states[w].drones, drones, strict=True)
             ):
                 if (
                     drone.captured.pose is not old.captured.pose
@@ -229,8 +229,8 @@ class Worlds:
         else:
             unseen = np.zeros(3, np.float32), np.zeros((), bool)
             self._measured = self._game.tick(*self._measured[:2], poses, *unseen)
-            for w, caught in enumerate(np.asarray(self._measured[4])):
-                if caught and self.captured[w] is None:
+            for w, is_caught in enumerate(np.asarray(self._measured[4])):
+                if is_caught and self.captured[w] is None:
                     self.captured[w] = len(self._tracks)
         self._actions = np.asarray(self._measured[1])
 
@@ -264,8 +264,8 @@ class Worlds:
         over = not landing and now >= SECONDS
         request = Request.LAND if landing or over else Request.NONE
         event = Event(now, samples, actions, request, OVER if over else "")
-        self.states[w], wanted = decide(self.states[w], event)
-        return list(wanted)
+        self.states[w], set_points = decide(self.states[w], event)
+        return list(set_points)
 
     def records(self, seeds) -> list[dict]:
         """What became of each flight."""
@@ -286,9 +286,9 @@ class Worlds:
         position = track[..., :3]
         off = track[..., 3] > 0.0
         begin = min(fault.time, 0.01 * (len(track) - 1))
-        seen = outcome(fault, 0.01 * np.arange(len(track)), position, off, begin)
-        held = seen.pop("held")
-        ended = any(d.reason not in ("", OVER) for d in drones)
+        result = outcome(fault, 0.01 * np.arange(len(track)), position, off, begin)
+        is_held = result.pop("held")
+        is_over = any(d.reason not in ("", OVER) for d in drones)
         crashed = np.array(
             [f.crashed for f in self.swarm.firmware[w * self.n : (w + 1) * self.n]]
         )
@@ -301,12 +301,12 @@ class Worlds:
                 name: getattr(fault, name)
                 for name in ("time", "vehicle", "duration", "amount")
             },
-            "ended": ended,
+            "ended": is_over,
             "reasons": [d.reason for d in drones],
-            **seen,
-            "seconds": seen["seconds"] if ended else None,
-            "hard": bool(crashed[held].any()),
-            "armed": bool((~off[-1])[held].any()),
+            **result,
+            "seconds": result["seconds"] if is_over else None,
+            "hard": bool(crashed[is_held].any()),
+            "armed": bool((~off[-1])[is_held].any()),
             "nearest": float(np.linalg.norm(pairs, axis=-1).min()),
             "caught": self.captured[w],
         }

@@ -97,12 +97,12 @@ class Fault:
         """Shares of a vehicle's set-points, and of what it sends, that are lost at
         `now` (s).
         """
-        gone = float(self.kind in GONE)
+        loss = float(self.kind in GONE)
         up, down = {
             "packets lost": (self.amount,) * 2,
             "poses lost": (0.0, 1.0),
             "poses lost for a while": (0.0, 1.0),
-        }.get(self.kind, (gone, gone))
+        }.get(self.kind, (loss, loss))
         return up * self.on(now), down * self.on(now)
 
     def answered(self, action: np.ndarray, now: float) -> np.ndarray | None:
@@ -257,11 +257,11 @@ def outcome(fault: Fault, times, position, off, begin: float) -> dict:
     `seconds` until all stayed on the floor with their motors off, None if they didn't;
     `held`: (N,) whom one can hold.
     """
-    held = (np.arange(off.shape[1]) != fault.vehicle) | (fault.kind not in GONE)
-    late = times >= begin
-    times = times[late]
-    position = position[late][:, held]
-    off = off[late][:, held]
+    is_held = (np.arange(off.shape[1]) != fault.vehicle) | (fault.kind not in GONE)
+    is_after = times >= begin
+    times = times[is_after]
+    position = position[is_after][:, is_held]
+    off = off[is_after][:, is_held]
     height = position[..., 2]
     limits = SafetySettings()
     sideways = np.linalg.norm(position[..., :2], axis=-1) - limits.arena_radius
@@ -272,7 +272,7 @@ def outcome(fault: Fault, times, position, off, begin: float) -> dict:
         "out": round(math.inf if np.isnan(position).any() else float(out), 3),
         "fell": bool((off & (height > FALL)).any()),
         "seconds": float(times[first] - begin) if first < len(times) else None,
-        "held": held,
+        "held": is_held,
     }
 
 

@@ -90,15 +90,15 @@ def summed(rest: np.ndarray, velocity: np.ndarray) -> np.ndarray:
     moment = np.zeros((*velocity.shape[1:], 2))
     total = np.zeros(velocity.shape[1:])
     learnt = np.zeros_like(moment)
-    kept = np.exp(-PERIOD / FORGETTING)
+    decay = np.exp(-PERIOD / FORGETTING)
     out = np.zeros(velocity.shape[:-1])
     for k, (value, speed) in enumerate(zip(rest, velocity, strict=True)):
-        given = np.stack([np.ones_like(speed), speed], -1)
-        left = value - (learnt * given).sum(-1)
-        total = np.exp(-PERIOD / WINDOW) * total + PERIOD * left
-        normal = kept * normal + PERIOD * given[..., :, None] * given[..., None, :]
-        normal = normal + (1 - kept) * SPREAD * np.eye(2)
-        moment = kept * moment + PERIOD * given * value[..., None]
+        inputs = np.stack([np.ones_like(speed), speed], -1)
+        residual = value - (learnt * inputs).sum(-1)
+        total = np.exp(-PERIOD / WINDOW) * total + PERIOD * residual
+        normal = decay * normal + PERIOD * inputs[..., :, None] * inputs[..., None, :]
+        normal = normal + (1 - decay) * SPREAD * np.eye(2)
+        moment = decay * moment + PERIOD * inputs * value[..., None]
         if k % 10 == 0:
             learnt = np.linalg.solve(normal, moment[..., None])[..., 0]
         out[k] = np.linalg.norm(total, axis=-1)
@@ -123,13 +123,13 @@ def study(options) -> dict:
     rows = []
     for name, vehicle in VEHICLES.items():
         rng = np.random.default_rng(options.seed)
-        how = (options.hover, tuple(options.begin))
-        without = told(summed(*unexplained(rng, vehicle, (0.0, 1.0), *how)[:2]))
+        times = (options.hover, tuple(options.begin))
+        without = told(summed(*unexplained(rng, vehicle, (0.0, 1.0), *times)[:2]))
         row = {"vehicle": name, "ended": float(np.isfinite(without).any(1).mean())}
         for drift, size in DRIFTS.items():
-            rest, velocity, begin = unexplained(rng, vehicle, size, *how)
-            after = told(summed(rest, velocity))[:, 0] - begin
-            row[drift] = float(((after > 0.0) & (after < SOON)).mean())
+            rest, velocity, begin = unexplained(rng, vehicle, size, *times)
+            delays = told(summed(rest, velocity))[:, 0] - begin
+            row[drift] = float(((delays > 0.0) & (delays < SOON)).mean())
         rows.append(row)
     return {"flights": FLIGHTS, "rows": rows}
 

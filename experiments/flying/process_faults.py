@@ -74,11 +74,11 @@ def fault_of(number: int, kind: str) -> Fault:
     time = rng.uniform(0.3, LATEST)
     vehicle = rng.randrange(3)
     if kind in DRAWN:
-        drawn = (
+        faults = (
             draw_fault(seed, LATEST)
             for seed in range(1000 * number, 1000 * number + 1000)
         )
-        return replace(next(like for like in drawn if like.kind == kind), time=time)
+        return replace(next(like for like in faults if like.kind == kind), time=time)
     if kind in START:
         kind, amount = START[kind]
         return Fault(kind, -2.0, vehicle, math.inf, amount)

@@ -134,8 +134,8 @@ class Flown:
             time.sleep(0.005)
 
     def _ended(self, pid):
-        done, status = os.waitpid(pid, os.WNOHANG)
-        return os.waitstatus_to_exitcode(status) if done else None
+        ended_pid, status = os.waitpid(pid, os.WNOHANG)
+        return os.waitstatus_to_exitcode(status) if ended_pid else None
 
     def _find(self, pid):
         """Process ids by role: links and guard are the loop's children, in this
@@ -225,24 +225,24 @@ class Flown:
     def _record(self, status, injected, begin) -> dict:
         track = self._virtual.track()
         fault = self.fault
-        seen = outcome(
+        result = outcome(
             fault,
             track["time"],
             track["position"],
             track["off"].astype(bool),
             injected or begin,
         )
-        held = seen.pop("held")
-        said = [
+        is_held = result.pop("held")
+        lines = [
             line
             for line in self._said.decode(errors="replace").splitlines()
             if line.strip()
         ]
         row = {
             "number": self._number, "kind": self._kind, "time": round(min(max(fault.time, 0.0), 99.0), 2), "status": status,
-            "took_off": not math.isinf(self._virtual.truth.take_off), **seen, "hard": bool(track["crashed"][held].any()),
-            "armed": bool(track["armed"][-1][held].any()), "left": self._left,
-            "second": self._second, "said": " | ".join(said[1:])[-600:],
+            "took_off": not math.isinf(self._virtual.truth.take_off), **result, "hard": bool(track["crashed"][is_held].any()),
+            "armed": bool(track["armed"][-1][is_held].any()), "left": self._left,
+            "second": self._second, "said": " | ".join(lines[1:])[-600:],
         }  # fmt: skip
         return row | {"well": self._well(row)}
 

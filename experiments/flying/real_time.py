@@ -45,10 +45,10 @@ def main() -> None:
     arguments = tyro.cli(Arguments)
     names = [kind for kind in KINDS if any(part in kind for part in arguments.only)]
     records = read_json(arguments.out)["records"] if arguments.go_on else []
-    left = set(range(arguments.seed, arguments.seed + arguments.flights)) - {
+    numbers = set(range(arguments.seed, arguments.seed + arguments.flights)) - {
         r["number"] for r in records
     }
-    work = [(n, names[n % len(names)]) for n in sorted(left)]
+    work = [(n, names[n % len(names)]) for n in sorted(numbers)]
     random.Random(arguments.seed).shuffle(
         work
     )  # whenever it stops, kinds were flown without favour
@@ -75,11 +75,11 @@ def page(results) -> Page:
             for r in mine
             if r["seconds"] is not None and ends_flight(r["kind"])
         ]
-        asked = [any(name in r["kind"] for name in STOPPED) for r in mine]
+        is_stop = [any(name in r["kind"] for name in STOPPED) for r in mine]
         rows.append({
             "group": group, "flights": len(mine), "well": sum(r["well"] for r in mine),
             "farthest": 0.9 + max((r["out"] for r in mine), default=math.nan), "armed": sum(r["armed"] for r in mine),
-            "fell": sum(r["fell"] and not a for r, a in zip(mine, asked, strict=True)),
+            "fell": sum(r["fell"] and not a for r, a in zip(mine, is_stop, strict=True)),
             "left": sum(bool(r["left"]) for r in mine), "longest": max(ends, default=None),
         })  # fmt: skip
     columns = {

@@ -25,9 +25,9 @@ def feed_of(fault: Fault, truth):
                 shaken = tuple(
                     (np.array(pose.position) + noise.normal(0, 5e-4, 3)).tolist()
                 )
-                seen = damage("camera", i, now, pose._replace(position=shaken), poses)
-                if seen is not None:
-                    update(i, seen.position, seen.quaternion)
+                shown = damage("camera", i, now, pose._replace(position=shaken), poses)
+                if shown is not None:
+                    update(i, shown.position, shown.quaternion)
             due += 0.01
             time.sleep(max(due - time.perf_counter(), 0.0))
 

@@ -138,8 +138,8 @@ def main() -> None:
     records = []
     stands = facts(arguments.commit)
     try:
-        for flown in share_out(fly, jobs, arguments.processes, arguments.seconds_left):
-            records += flown
+        for more in share_out(fly, jobs, arguments.processes, arguments.seconds_left):
+            records += more
             write_json(
                 arguments.out,
                 {
@@ -206,7 +206,7 @@ SHOWN = {
 
 def by_group(rows: list[dict]) -> Table:
     """The page's table: kinds of one source together."""
-    starts = {start: group for group, own in SHOWN.items() for start in own}
+    starts = {start: group for group, kinds in SHOWN.items() for start in kinds}
     grouped: dict[str, list[dict]] = {group: [] for group in SHOWN}
     for row in rows:
         if row["kind"] in KINDS:
@@ -214,10 +214,10 @@ def by_group(rows: list[dict]) -> Table:
             grouped[starts[start]].append(row)
     added = ("faults", "well", "out", "fell", "hard", "armed")
     records = [
-        {"group": group, "farthest": max(r["farthest"] for r in own)}
-        | {name: sum(r[name] for r in own) for name in added}
-        for group, own in grouped.items()
-        if own
+        {"group": group, "farthest": max(r["farthest"] for r in rows)}
+        | {name: sum(r[name] for r in rows) for name in added}
+        for group, rows in grouped.items()
+        if rows
     ]
     columns = {
         "what fails": "group",

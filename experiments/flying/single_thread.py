@@ -41,18 +41,20 @@ def share_out(
     failed = 0
     with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
         try:
-            given = {pool.submit(_in_time, do, job, latest): job for job in jobs}
-            for done in as_completed(given):
-                if error := done.exception():
+            job_of = {pool.submit(_in_time, do, job, latest): job for job in jobs}
+            for future in as_completed(job_of):
+                if error := future.exception():
                     failed += 1
-                    said = f"{str(given[done])[:200]}: {type(error).__name__}: {error}"
-                    print(said, file=sys.stderr, flush=True)
-                elif done.result() is not None:
-                    yield done.result()
+                    reason = (
+                        f"{str(job_of[future])[:200]}: {type(error).__name__}: {error}"
+                    )
+                    print(reason, file=sys.stderr, flush=True)
+                elif future.result() is not None:
+                    yield future.result()
         finally:  # also where who asks has failed: nobody waits for what isn't begun
             pool.shutdown(cancel_futures=True)
     if failed:
-        raise RuntimeError(f"{failed} of {len(given)} jobs failed")
+        raise RuntimeError(f"{failed} of {len(job_of)} jobs failed")
 
 
 def _in_time(do, job, latest):

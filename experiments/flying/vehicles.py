@@ -92,25 +92,27 @@ def fly(name: str, options) -> dict[str, dict[str, dict]]:
     """Summaries of a policy by kind of vehicle and kind of task. `options`: of the
     command.
     """
-    loaded = load_policy(name)
-    own = loaded.settings.environment
-    game = game_of(own, options.airframe or own.airframe, options.physics)
+    policy = load_policy(name)
+    game_settings = policy.settings.environment
+    game = game_of(
+        game_settings, options.airframe or game_settings.airframe, options.physics
+    )
     drawn_from = dataclasses.replace(game, max_pillars=PursuitSettings().max_pillars)
     kinds = {"uniform": uniform_tasks(drawn_from, options.number, game.max_pillars)}
     if options.layouts:
         kinds |= layout_tasks(game, SCENARIOS.values(), options.layouts)
-    (tasks, part), (run, found) = stacked(kinds), (program(game, loaded.policy), {})
+    (tasks, part), (run, records) = stacked(kinds), (program(game, policy.policy), {})
     for kind, bounds in vehicles(game.airframe).items():
         if kind in options.vehicles:
             flown = jax.tree.map(
-                np.asarray, run(loaded.parameters, tasks, jax.random.key(0), bounds)
+                np.asarray, run(policy.parameters, tasks, jax.random.key(0), bounds)
             )
-            for tasks_of, own in part(flown).items():
-                summary = summarise(own)
-                found.setdefault(kind, {})[tasks_of] = finite(summary)
+            for tasks_of, statistics in part(flown).items():
+                summary = summarise(statistics)
+                records.setdefault(kind, {})[tasks_of] = finite(summary)
                 figures = (cell(summary, column) for column in FIGURES.values())
                 print(name, kind, tasks_of, *figures, flush=True)
-    return found
+    return records
 
 
 def finite(summary: dict) -> dict:
@@ -138,8 +140,8 @@ def page(results: dict) -> Page:
     rows = [
         {"policy": name, "vehicle": kind, "tasks": tasks, **summary}
         for name, kinds in results["policies"].items()
-        for kind, found in kinds.items()
-        for tasks, summary in found.items()
+        for kind, records in kinds.items()
+        for tasks, summary in records.items()
     ]
     return Page(
         "Policies on other vehicles",
@@ -165,9 +167,9 @@ def over_layouts(results: dict) -> Table:
     rows = []
     for name, kinds in results["policies"].items():
         row: dict = {"policy": name}
-        for kind, found in kinds.items():
+        for kind, records in kinds.items():
             layouts = [
-                summary for tasks, summary in found.items() if tasks in SCENARIOS
+                summary for tasks, summary in records.items() if tasks in SCENARIOS
             ]
             for word, figure in (
                 ("captures", "capture_rate"),

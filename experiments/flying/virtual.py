@@ -128,19 +128,24 @@ class _Flown:
         """What vehicle i senses, as its log blocks tell it."""
         sensors = self._sensors(i)
         now = time.perf_counter() - self._truth.take_off
-        sensed = (
+        shown = (
             sensors.position,
             sensors.velocity,
             sensors.quaternion,
             sensors.body_rates,
         )
-        pose = Pose(now, *(tuple(x.tolist()) for x in sensed))
-        sent = self._damage("radio", i, now, pose, ())
-        if sent is pose or sent is None:
+        pose = Pose(now, *(tuple(x.tolist()) for x in shown))
+        radioed = self._damage("radio", i, now, pose, ())
+        if radioed is pose or radioed is None:
             return sensors
         parts = [
             np.array(p)
-            for p in (sent.position, sent.velocity, sent.quaternion, sent.body_rates)
+            for p in (
+                radioed.position,
+                radioed.velocity,
+                radioed.quaternion,
+                radioed.body_rates,
+            )
         ]
         return sensors.__class__(
             *parts, sensors.specific_force, sensors.motor_command, sensors.voltage
@@ -161,8 +166,8 @@ class _Flown:
                 self._truth.begin(now)
             self._spoil(now - self._truth.take_off)
         if self._pipe.poll():
-            asked = self._pipe.recv()
-            if asked is None:
+            request = self._pipe.recv()
+            if request is None:
                 times, positions, off, armed = zip(*self._rows, strict=True)
                 crashed = [f.crashed for f in virtual.firmware]
                 kinds = {
@@ -176,7 +181,7 @@ class _Flown:
                     {name: np.array(values) for name, values in kinds.items()}
                 )
             else:
-                self._reset(asked)
+                self._reset(request)
                 self._pipe.send("ready")
         return False
 

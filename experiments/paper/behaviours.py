@@ -55,53 +55,61 @@ def measure(layout: str, paths: Any, statistics: Any) -> dict[str, float | None]
     """
     pursuers = np.asarray(paths.pursuers)
     evader = np.asarray(paths.evader)
-    caught = np.asarray(statistics.captured)
+    is_caught = np.asarray(statistics.captured)
     end = np.asarray(statistics.capture_step)
-    before = np.arange(pursuers.shape[1])[None] < end[:, None]
+    is_before = np.arange(pursuers.shape[1])[None] < end[:, None]
     x = pursuers[..., 0]
     y = pursuers[..., 1]
     if layout == "wall":
         # beyond the middle plane or in line with the wall: not merely on the way there
-        there = x < 0.15
-        sides = [np.any(there & (sign * y > END), axis=-1) for sign in (1.0, -1.0)]
+        is_near = x < 0.15
+        sides = [np.any(is_near & (sign * y > END), axis=-1) for sign in (1.0, -1.0)]
         return {
-            "both sides": float(np.mean(np.any(sides[0] & sides[1] & before, axis=1)))
+            "both sides": float(
+                np.mean(np.any(sides[0] & sides[1] & is_before, axis=1))
+            )
         }
     if layout == "passage":
         low, high = CORRIDORS
         ways = (y < low, (y > low) & (y < high), y > high)
         blocked = np.all([np.any(way, axis=-1) for way in ways], axis=0)
-        return {"three ways": float(np.mean(np.any(blocked & before, axis=1)))}
+        return {"three ways": float(np.mean(np.any(blocked & is_before, axis=1)))}
     if layout == "narrow_gap":
-        met = []
+        meetings = []
         ways = []
-        for b in np.flatnonzero(caught):
+        for b in np.flatnonzero(is_caught):
             last = end[b] - 1
             who = int(np.argmax(paths.captured[b, last]))
             velocity = evader[b, last] - evader[b, max(last - 5, 0)]
-            met.append(np.dot(velocity, pursuers[b, last, who] - evader[b, last]) > 0.0)
+            meetings.append(
+                np.dot(velocity, pursuers[b, last, who] - evader[b, last]) > 0.0
+            )
             ways.append(
                 _way(pursuers[b, : last + 1, who])
                 / max(_way(evader[b, : last + 1]), 1e-6)
             )
-        return {"met": _mean(met), "shorter way": _mean(ways)}
-    seen = np.asarray(paths.seen)
-    first = np.where(seen.any(axis=1), seen.argmax(axis=1) + 1, seen.shape[1])
-    lost = np.sum(~seen & before, axis=1) / np.maximum(np.sum(before, axis=1), 1)
-    return {"seen": float(np.mean(first)), "lost": float(np.mean(lost))}
+        return {"met": _mean(meetings), "shorter way": _mean(ways)}
+    is_seen = np.asarray(paths.seen)
+    first = np.where(is_seen.any(axis=1), is_seen.argmax(axis=1) + 1, is_seen.shape[1])
+    unseen_share = np.sum(~is_seen & is_before, axis=1) / np.maximum(
+        np.sum(is_before, axis=1), 1
+    )
+    return {"seen": float(np.mean(first)), "lost": float(np.mean(unseen_share))}
 
 
 def one_episode(paths: Any) -> dict[str, list]:
     """The first episode's paths up to a second after its capture, thinned out."""
-    caught = np.asarray(paths.captured[0]).any(axis=-1)
+    is_caught = np.asarray(paths.captured[0]).any(axis=-1)
     end = (
-        min(int(np.argmax(caught)) + 100, len(caught)) if caught.any() else len(caught)
+        min(int(np.argmax(is_caught)) + 100, len(is_caught))
+        if is_caught.any()
+        else len(is_caught)
     )
 
     def thin(values):
         return np.round(np.asarray(values)[0, :end:EVERY], 3).tolist()
 
-    capture = int(np.argmax(caught)) // EVERY if caught.any() else None
+    capture = int(np.argmax(is_caught)) // EVERY if is_caught.any() else None
     return {
         "pursuers": thin(paths.pursuers),
         "evader": thin(paths.evader),
@@ -124,8 +132,8 @@ def page(results: dict) -> Page:
         for name in measures:
             row = {"layout": layout, "name": name}
             for method in METHODS:
-                flown = flights_of(results, method)
-                row[method] = [f["layouts"][layout]["behaviour"][name] for f in flown]
+                records = flights_of(results, method)
+                row[method] = [f["layouts"][layout]["behaviour"][name] for f in records]
             rows.append(row)
     meanings = [
         f"* {layout}, {n}: {text}"
@@ -149,18 +157,18 @@ def page(results: dict) -> Page:
 def draw(results: dict, path: Path) -> None:
     """One episode of every method's first seed on the paper's four layouts."""
     layouts = [layout for layout in MEASURES if layout != "hidden"]
-    shown = [method for method in METHODS if flights_of(results, method)]
+    methods = [method for method in METHODS if flights_of(results, method)]
     figure = Figure(
-        figsize=(3.1 * len(shown), 3.3 * len(layouts)), layout="constrained"
+        figsize=(3.1 * len(methods), 3.3 * len(layouts)), layout="constrained"
     )
-    axes = figure.subplots(len(layouts), len(shown), squeeze=False)
+    axes = figure.subplots(len(layouts), len(methods), squeeze=False)
     for i, layout in enumerate(layouts):
-        for j, method in enumerate(shown):
+        for j, method in enumerate(methods):
             flown = flights_of(results, method)[0]["layouts"][layout]
-            told = ", ".join(
+            title = ", ".join(
                 f"{n} {x:.2g}" for n, x in flown["behaviour"].items() if x is not None
             )
-            draw_from_above(axes[i, j], trajectory_of(flown["paths"], layout, told))
+            draw_from_above(axes[i, j], trajectory_of(flown["paths"], layout, title))
             axes[i, j].title.set_fontsize("x-small")
             axes[i, j].set(
                 xlabel=method if i == len(layouts) - 1 else "",

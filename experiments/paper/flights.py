@@ -67,7 +67,7 @@ def fly(
         field.name: getattr(settings, field.name)
         for field in dataclasses.fields(settings)
     }
-    never = settings.episode_length + 1
+    no_capture = settings.episode_length + 1
     number = speeds.shape[0]
 
     def step(state, action, speed):
@@ -93,7 +93,9 @@ def fly(
         observation, state, info = jax.vmap(step)(
             state, policy.action(mean, observation), speeds
         )
-        now = jnp.where(jax.vmap(caught)(state), state.step[:, None], never)
+        capture_step = jnp.where(
+            jax.vmap(caught)(state), state.step[:, None], no_capture
+        )
         guesses = jnp.stack(
             [last_seen if predicted is None else predicted[:, 0], last_seen]
         )
@@ -101,12 +103,12 @@ def fly(
         paths = Paths(
             state.drones.position, state.evader_position, info.seen, info.captured
         )
-        return (observation, state, jnp.minimum(first, now), errors), paths
+        return (observation, state, jnp.minimum(first, capture_step), errors), paths
 
     observation, state = jax.vmap(environment.reset_to)(
         jax.random.split(key, number), tasks
     )
-    first = jnp.full((number, len(radii)), never, jnp.int32)
+    first = jnp.full((number, len(radii)), no_capture, jnp.int32)
     start = (observation, state, first, jnp.zeros((2, number), jnp.float32))
     (_, state, first, errors), paths = jax.lax.scan(
         one, start, length=settings.episode_length

@@ -93,7 +93,7 @@ def cells(
     results: dict, methods: Iterable[str], condition: str, layouts: Iterable[str]
 ) -> list[dict]:
     """By layout and method: each figure's values, one per seed, and the paper's."""
-    found = []
+    row = []
     for layout in layouts:
         for method in methods:
             records = [
@@ -106,10 +106,10 @@ def cells(
                     for name in records[0]
                 }
                 paper = (MAIN.get(layout, {}) | PARTS.get(layout, {})).get(method)
-                found.append(
+                row.append(
                     {**seeds, "layout": layout, "method": method, "paper": paper}
                 )
-    return found
+    return row
 
 
 def beside_paper(figure: str, form: str):

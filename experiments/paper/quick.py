@@ -70,13 +70,13 @@ def train(options: argparse.Namespace, seed: int, cores: list[int]) -> dict:
         "TF_CPP_MIN_LOG_LEVEL",
     ):  # JAX sets the latter here, a user doesn't
         environment.pop(name, None)
-    started = time.monotonic()
+    start = time.monotonic()
     with open(f"{run}.txt", "w") as log:
         pinned = ["taskset", "-c", ",".join(map(str, cores)), *command]
         subprocess.run(
             pinned, env=environment, stdout=log, stderr=subprocess.STDOUT, check=True
         )
-    seconds = round(time.monotonic() - started)
+    seconds = round(time.monotonic() - start)
     print(f"seed {seed}: {seconds} s", flush=True)
     return {
         "seed": seed,
@@ -91,14 +91,14 @@ def record(run: Path) -> dict:
     more.
     """
     layouts = read_json(run / "layouts.json")
-    loaded = load_policy(run)
-    kept = {
+    policy = load_policy(run)
+    figures = {
         name: layouts[name]
         for name in ("after", "open", "seconds", "steps")
         if name in layouts
     }
-    step = loaded.settings.environment.time_step
-    return {"time_step": step, **kept, "every_physics_step": fly_finely(loaded)}
+    step = policy.settings.environment.time_step
+    return {"time_step": step, **figures, "every_physics_step": fly_finely(policy)}
 
 
 def fly_finely(loaded: LoadedPolicy) -> dict[str, float]:
@@ -106,15 +106,15 @@ def fly_finely(loaded: LoadedPolicy) -> dict[str, float]:
     the policy's action held between.
     """
     own = loaded.settings.environment
-    held = loaded.settings.environment.substeps
+    substeps = loaded.settings.environment.substeps
     game = Pursuit(
         dataclasses.replace(
             own,
-            time_step=own.time_step / held,
+            time_step=own.time_step / substeps,
             substeps=1,
-            episode_length=own.episode_length * held,
-            history_spacing=own.history_spacing * held,
-            observe_history_spacing=own.observe_history_spacing * held,
+            episode_length=own.episode_length * substeps,
+            history_spacing=own.history_spacing * substeps,
+            observe_history_spacing=own.observe_history_spacing * substeps,
         )
     )
     tasks = uniform_tasks(own, loaded.settings.validation_episodes, own.max_pillars)
@@ -125,7 +125,7 @@ def fly_finely(loaded: LoadedPolicy) -> dict[str, float]:
         def one(carry, _):
             observation, state = carry
             action = loaded(observation)
-            for _ in range(held):
+            for _ in range(substeps):
                 observation, state, *_ = jax.vmap(game.step, (None, 0, 0))(
                     jax.random.key(0), state, action
                 )
@@ -142,7 +142,7 @@ def fly_finely(loaded: LoadedPolicy) -> dict[str, float]:
         "crash_rate": float(jnp.mean(statistics.crashed)),
         "capture_seconds": float(jnp.mean(statistics.capture_step))
         * own.time_step
-        / held,
+        / substeps,
     }
 
 
@@ -174,16 +174,16 @@ def page(results: dict) -> Page:
     }
     parts: list[Table | str] = [Table(columns, results["runs"])]
     if "trials" in results:
-        tried = {
+        runs = {
             name: (lambda row, name=name: spread(row[name], ".2f")) for name in TRIED_ON
         }
         parts.append(
             Table(
-                {"variant": "variant", "updates": "updates", **tried},
+                {"variant": "variant", "updates": "updates", **runs},
                 *results["trials"],
             )
         )
-    parts.append("\n".join(f"* {found}" for found in results.get("findings", ())))
+    parts.append("\n".join(f"* {finding}" for finding in results.get("findings", ())))
     prose = f"{results['preset']} Each cell: capture rate, seconds to the capture, crash rate. {results.get('note', '')}"
     todays = [run for run in results["runs"] if "recipe" not in run]
     return Page(

@@ -30,18 +30,18 @@ def figures(flown: list[Any], length: int) -> dict:
     of `CELLS`.
     """
     first = np.stack([part.first for part in flown])
-    missed = first > length
-    rate = np.round(1 - missed.mean(axis=1), 5)
-    step = np.round(np.where(missed, length, first).mean(axis=1), 2)
-    own = RADII.index(RADIUS)
+    is_missed = first > length
+    rate = np.round(1 - is_missed.mean(axis=1), 5)
+    step = np.round(np.where(is_missed, length, first).mean(axis=1), 2)
+    place = RADII.index(RADIUS)
     collisions = [
         float(np.mean(part.evaluation.statistics.collision_rate)) for part in flown[1:]
     ]
     return {
         "radius": {"capture_rate": rate[0].tolist(), "capture_step": step[0].tolist()},
         "speed": {
-            "capture_rate": rate[1:, own].tolist(),
-            "capture_step": step[1:, own].tolist(),
+            "capture_rate": rate[1:, place].tolist(),
+            "capture_step": step[1:, place].tolist(),
             "collision_rate": np.round(collisions, 6).tolist(),
         },
     }
@@ -117,7 +117,7 @@ def not_above(methods: dict, axis: str, values: tuple[float, ...], unit: str) ->
     def mean(label, name, i):
         return np.mean([seed[axis][name][i] for seed in methods[label]])
 
-    found = []
+    axes_found = []
     for label in methods.keys() - {"OPEN"} if "OPEN" in methods else ():
         for i, value in enumerate(values):
             rate, step = (
@@ -128,10 +128,10 @@ def not_above(methods: dict, axis: str, values: tuple[float, ...], unit: str) ->
             )
             if rate > best + 1e-9 or (abs(rate - best) < 1e-9 and step < early):
                 both = f"{rate:.2f} / {step:.0f} against {best:.2f} / {early:.0f}"
-                found.append(f"{label} at {value} {unit} ({both})")
+                axes_found.append(f"{label} at {value} {unit} ({both})")
     return (
-        f"OPEN isn't above: {'; '.join(sorted(found))}."
-        if found
+        f"OPEN isn't above: {'; '.join(sorted(axes_found))}."
+        if axes_found
         else "No method is above OPEN anywhere."
     )
 

@@ -51,8 +51,8 @@ LIMITS = {"clamp": "clamp", "no clamp": "none"}
 @functools.cache
 def game_of(name: str, limit: str, physics: str) -> tuple[LoadedPolicy, Pursuit]:
     """A policy, and the game that it flies."""
-    loaded = load_policy(name)
-    game = loaded.settings.environment
+    policy = load_policy(name)
+    game = policy.settings.environment
     # the reward changes nothing that is counted here; one for all saves compilations
     game = dataclasses.replace(
         game,
@@ -62,7 +62,7 @@ def game_of(name: str, limit: str, physics: str) -> tuple[LoadedPolicy, Pursuit]
         physics=physics,
     )
     environment = environment_of(game)
-    return loaded.in_game(environment), environment
+    return policy.in_game(environment), environment
 
 
 def cells_of(evader_speed: float, episodes: int) -> list[tuple[str, float, int]]:
@@ -85,14 +85,14 @@ def tasks_of(
 
 def call_of(name: str, seed: int, limit: str, physics: str, episodes: int) -> tuple:
     """The arguments of `fly`."""
-    loaded, environment = game_of(name, limit, physics)
+    policy, environment = game_of(name, limit, physics)
     game = environment.settings
     cells = cells_of(game.evader_speed, episodes)
     return (
         environment,
-        loaded.policy,
+        policy.policy,
         sweeps.RADII,
-        loaded.parameters,
+        policy.parameters,
         stacked(tasks_of(game, cells))[0],
         jnp.concatenate(
             [jnp.full(number, speed, jnp.float32) for _, speed, number in cells]
@@ -132,14 +132,14 @@ def flights_to_keep(options: argparse.Namespace, alike: dict) -> list[dict]:
     """What stands in the file already of methods that aren't flown anew, if it was
     flown alike.
     """
-    stored = options.out / "tables.json"
-    if not stored.exists() or len(options.methods) == len(LABELS):
+    path = options.out / "tables.json"
+    if not path.exists() or len(options.methods) == len(LABELS):
         return []
-    kept = read_json(stored)
-    same = {name: kept.get(name) for name in alike} == alike
+    records = read_json(path)
+    same = {name: records.get(name) for name in alike} == alike
     return [
         flight
-        for flight in kept["flights"]
+        for flight in records["flights"]
         if same and flight["method"] not in options.methods
     ]
 
@@ -160,27 +160,27 @@ def calls_of(
 
 def study(options: argparse.Namespace) -> None:
     """Fly and store all methods and the ablations."""
-    started = time.monotonic()
+    start = time.monotonic()
     alike = {"episodes": options.episodes, "physics": options.physics}
     rest = (options.physics, options.episodes)
-    wanted = calls_of(options)
+    calls = calls_of(options)
     flights = flights_to_keep(options, alike)
     compiled = {}
     # compiled side by side, and while others fly
-    for (label, condition), seeds in wanted.items():
+    for (label, condition), seeds in calls.items():
         for name, seed in seeds[:1]:
             compiled[label, condition] = compile_ahead(
                 fly, *call_of(name, seed, LIMITS[condition], *rest)
             )
-    for (label, condition), seeds in wanted.items():
+    for (label, condition), seeds in calls.items():
         if (label, condition) in compiled:
             compiled[label, condition]()
         for name, seed in seeds:
-            begun = time.monotonic()
-            flown = of_policy(name, seed, LIMITS[condition], *rest)
+            begin = time.monotonic()
+            record = of_policy(name, seed, LIMITS[condition], *rest)
             if condition != "clamp" or (name, seed) != seeds[0]:
                 # one episode of each method is drawn
-                for layout in flown["layouts"].values():
+                for layout in record["layouts"].values():
                     del layout["paths"]
             about = {
                 "method": label,
@@ -188,13 +188,13 @@ def study(options: argparse.Namespace) -> None:
                 "seed": seed,
                 "condition": condition,
             }
-            flights.append({**about, "seconds": time.monotonic() - begun, **flown})
+            flights.append({**about, "seconds": time.monotonic() - begin, **record})
             print(
-                f"{time.monotonic() - started:5.0f} s  {label}: {name}, {condition}",
+                f"{time.monotonic() - start:5.0f} s  {label}: {name}, {condition}",
                 flush=True,
             )
         # after each, so that an interrupted study leaves what it has
-        seconds = time.monotonic() - started
+        seconds = time.monotonic() - start
         results = {
             **facts(options.commit),
             "seconds": seconds,

@@ -14,8 +14,8 @@ def means(layout: str, method: str) -> tuple[float, int, float] | None:
     """Capture rate, capture step and collision rate; None of what the paper doesn't
     have.
     """
-    found = (MAIN.get(layout, {}) | PARTS.get(layout, {})).get(method)
-    if found is None:
+    value = (MAIN.get(layout, {}) | PARTS.get(layout, {})).get(method)
+    if value is None:
         return None
-    (rate, _), (step, _), (collisions, _) = found
+    (rate, _), (step, _), (collisions, _) = value
     return rate, round(step), collisions

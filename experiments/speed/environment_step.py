@@ -89,8 +89,8 @@ def main(arguments: list[str]) -> None:
         for source in options.source:
             environment = os.environ | {"PYTHONPATH": str(Path(source).resolve())}
             print(source, flush=True)
-            for own in ways:
-                command = [sys.executable, __file__, "--here", *own]
+            for way in ways:
+                command = [sys.executable, __file__, "--here", *way]
                 subprocess.run(command, env=environment, check=True)
 
 

@@ -73,13 +73,13 @@ RUNS = {
 
 def checksums(tree) -> list[str]:
     """One for each leaf, sorted."""
-    found = []
+    sums = []
     for leaf in jax.tree.leaves(tree):
         is_key = jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
         array = np.asarray(jax.random.key_data(leaf) if is_key else leaf)
-        whole = f"{array.dtype}{array.shape}".encode() + array.tobytes()
-        found.append(hashlib.sha256(whole).hexdigest()[:16])
-    return sorted(found)
+        data = f"{array.dtype}{array.shape}".encode() + array.tobytes()
+        sums.append(hashlib.sha256(data).hexdigest()[:16])
+    return sorted(sums)
 
 
 def equations(jaxpr) -> int:

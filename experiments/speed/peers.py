@@ -55,8 +55,8 @@ def openjax_drones(options, contacts: bool = True) -> dict:
     def step(state):
         task = state.task
         fly = jax.vmap(lambda d, p, a: game.dynamics(VEHICLE, d, command, p, a, {}))
-        moved = fly(state.drones, task.pillar_position, task.pillar_active)
-        return state.replace(drones=moved), None
+        drones = fly(state.drones, task.pillar_position, task.pillar_active)
+        return state.replace(drones=drones), None
 
     number = 3 * options.worlds * options.steps
     return {

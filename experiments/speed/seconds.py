@@ -63,7 +63,7 @@ class Runner:
         if time.monotonic() >= self.ends:
             return
         cache = self.cache / re.sub(r"\W+", "_", f"{start} {seed if self.cold else ''}")
-        kept = "all" if cache.exists() else "nothing"
+        cached = "all" if cache.exists() else "nothing"
         with tempfile.TemporaryDirectory() as folder:
             out = Path(folder) / "run"
             process = begin(start, seed, out, cache)
@@ -81,7 +81,7 @@ class Runner:
             yield {
                 "start": start,
                 "seed": seed,
-                "kept": kept,
+                "kept": cached,
                 **curve(file),
                 "whole": whole(out),
             }
@@ -163,14 +163,14 @@ def whole(out: Path) -> dict | None:
 
 def study(options: argparse.Namespace) -> dict:
     """All runs; they are stored after each, for `--report`."""
-    stored = options.out.with_suffix(".json")
-    runs = read_json(stored)["runs"] if options.go_on else []
+    path = options.out.with_suffix(".json")
+    runs = read_json(path)["runs"] if options.go_on else []
     results = {"note": options.note, "runs": runs}
     with tempfile.TemporaryDirectory() as folder:
         options.cache = options.cache or Path(folder)
         for run in Runner(options).all(options.starts, options.seeds):
             runs.append(run)
-            write_json(stored, to_plain({**facts(options.commit), **results}))
+            write_json(path, to_plain({**facts(options.commit), **results}))
     return results
 
 
@@ -228,20 +228,20 @@ def medians(rows: list[dict]) -> str:
     """
     prose = ""
     for start in dict.fromkeys(run["start"] for run in rows):
-        for kept in ("all", "nothing"):
-            own = [
+        for cached in ("all", "nothing"):
+            runs = [
                 run
                 for run in rows
-                if (run["start"], run["kept"]) == (start, kept)
+                if (run["start"], run["kept"]) == (start, cached)
                 and run["validations"][1:]
             ]
             seconds = [
-                run["reached"]["seconds"] if run["reached"] else np.inf for run in own
+                run["reached"]["seconds"] if run["reached"] else np.inf for run in runs
             ]
-            if len(own) > 2 and np.isfinite(np.median(seconds)):
+            if len(runs) > 2 and np.isfinite(np.median(seconds)):
                 prose += (
-                    f" `{start}` with {kept} kept: {np.median(seconds):.1f} s in the median of "
-                    f"{len(own)} runs."
+                    f" `{start}` with {cached} kept: {np.median(seconds):.1f} s in the median of "
+                    f"{len(runs)} runs."
                 )
     return prose
 

@@ -102,12 +102,12 @@ class CrazyflowWorld(RotorPyWorld):
         ).T
         super().fly(command)
         thrust, rates = np.split(command.reshape(-1, 4), (1,), axis=1)
-        told = {
+        sensors_told = {
             "command_thrust": thrust,
             "command_body_rates": rates,
             "motor_command": self.motors.T,
         }
-        self.rows.append(row | told)
+        self.rows.append(row | sensors_told)
 
 
 def main() -> None:
@@ -119,7 +119,7 @@ def main() -> None:
     parser.add_argument("--layouts", nargs="+", default=["random", "passage", "hidden"])
     options = parser.parse_args()
     worlds = []
-    loaded, game = loaded_policy(options.policy)
+    policy, game = loaded_policy(options.policy)
     tasks = [scenario_task(game, SCENARIOS[name]) for name in options.layouts]
     keys = jax.random.split(jax.random.key(SEED), len(tasks))
     tasks = jax.tree.map(lambda *leaves: np.stack(leaves), *tasks)
@@ -128,7 +128,7 @@ def main() -> None:
         worlds.append(CrazyflowWorld(*of, game.episode_length, SEED))
         return worlds[0]
 
-    statistics = play(loaded, game, tasks, keys, make_world)
+    statistics = play(policy, game, tasks, keys, make_world)
     rows = {
         n: np.stack([row[n] for row in worlds[0].rows], 1) for n in worlds[0].rows[0]
     }
@@ -136,12 +136,12 @@ def main() -> None:
     for i, layout in enumerate(options.layouts):
         vehicles = []
         for j in range(worlds[0].team * i, worlds[0].team * (i + 1)):
-            own = {
+            columns = {
                 c: x[j, :, k]
                 for n, x in rows.items()
                 for k, c in enumerate(CHANNEL_COLUMNS[n])
             }
-            vehicles.append({"t": PERIOD * np.arange(game.episode_length)} | own)
+            vehicles.append({"t": PERIOD * np.arange(game.episode_length)} | columns)
         write_csv(options.out / f"{layout}.csv.gz", log_of(vehicles, layout), {"t": 4})
         print(
             layout,

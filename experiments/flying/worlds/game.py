@@ -57,11 +57,11 @@ class SeenElsewhere:
 
     def reset(self, vehicle, drones: DroneState, key=None) -> DroneState:
         """Drones that are seen where they are."""
-        seen = {
+        shown = {
             name: getattr(drones, name)
             for name in ("position", "quaternion", "velocity")
         }
-        return drones.replace(effect_memory=seen)
+        return drones.replace(effect_memory=shown)
 
     def seen(self, drones: DroneState, effect_parameters=None) -> DroneState:
         """The drones as they were measured."""

@@ -31,8 +31,8 @@ def sensors_of(seed: int, number: int) -> dict:
     """Sensors and air of a vehicle: light turbulence, white noise, every channel logged
     at 100 Hz.
     """
-    drawn = sensors.draw(rng_of(seed, number, 1), "white", "psgacmv", "light")
-    return drawn | {"rate": 100, "pose_rate": 100, "dropped": 0.0}
+    sensors_drawn = sensors.draw(rng_of(seed, number, 1), "white", "psgacmv", "light")
+    return sensors_drawn | {"rate": 100, "pose_rate": 100, "dropped": 0.0}
 
 
 def air_of(
@@ -123,11 +123,11 @@ class PlantWorld:
     ):
         worlds, self.team = drones.position.shape[:2]
         count = worlds * self.team
-        told = [vehicle.Told()] * count
-        drawn = sensors_of(seed, number)
+        vehicles_told = [vehicle.Told()] * count
+        sensors_drawn = sensors_of(seed, number)
         everyone = np.arange(count)
-        parameters = vehicle.nominal_parameters(told)
-        sensors.apply_nuisances(parameters, everyone, drawn)
+        parameters = vehicle.nominal_parameters(vehicles_told)
+        sensors.apply_nuisances(parameters, everyone, sensors_drawn)
         ticks += 1  # a pose is measured after the last step, too
         arrival = np.repeat(10 * np.arange(ticks)[:, None], count, axis=1)
         if cause is not None:
@@ -136,9 +136,16 @@ class PlantWorld:
             )
         index = everyone.reshape(worlds, self.team)
         self.flight = plant.Flight(
-            told,
+            vehicles_told,
             parameters,
-            air_of(drawn, seed, number, ticks, range(first, first + worlds), self.team),
+            air_of(
+                sensors_drawn,
+                seed,
+                number,
+                ticks,
+                range(first, first + worlds),
+                self.team,
+            ),
             arrival,
             np.asarray(drones.position, float).reshape(count, 3).T,
             np.asarray(drones.quaternion, float).reshape(count, 4).T,

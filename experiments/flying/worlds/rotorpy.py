@@ -150,9 +150,9 @@ class RotorPyWorld:
         }
         firmware = v.nominal_parameters([v.Told()] * count)
         self.bodies = self.make_bodies(start, firmware)
-        drawn = sensors_of(seed, 0)
+        sensors_drawn = sensors_of(seed, 0)
         self.air = air_of(
-            drawn, seed, 0, ticks + 1, range(first, first + worlds), self.team
+            sensors_drawn, seed, 0, ticks + 1, range(first, first + worlds), self.team
         )
         self.firmware = Firmware(firmware, self.air["gyro_bias"].astype(float))
         self.solids = solids_of(tasks, self.team)
@@ -190,12 +190,12 @@ class RotorPyWorld:
         air = self.air
         k = self.tick
         bodies = self.bodies
-        late = 1e-3 * air["pose_delay"]
+        delay = 1e-3 * air["pose_delay"]
         quaternion = v.multiply(
-            v.turn(bodies.quaternion, -bodies.rates, late), air["seen_attitude"][k]
+            v.turn(bodies.quaternion, -bodies.rates, delay), air["seen_attitude"][k]
         )
         quaternion /= np.sqrt((quaternion * quaternion).sum(axis=0))
-        position = bodies.position - late * bodies.velocity + air["seen_position"][k]
+        position = bodies.position - delay * bodies.velocity + air["seen_position"][k]
         return per_world(
             self.team, position, quaternion, bodies.velocity + air["seen_velocity"][k]
         )

@@ -94,18 +94,18 @@ def loaded_policy(name: str, held_out: bool):
     """A policy, and its game without clamp and family, with the paper's evader or
     held-out ones.
     """
-    loaded = load_policy(name)
+    policy = load_policy(name)
     settings = dataclasses.replace(
-        loaded.settings.environment,
+        policy.settings.environment,
         speed_limit="none",
         start_attitude="drawn",
         physics="rigid",
         evaders=HELD_OUT if held_out else ("field",),
         vehicles=(),
         rare_vehicles=0.0,
-        max_pillars=layout_slots(loaded.settings.environment),
+        max_pillars=layout_slots(policy.settings.environment),
     )
-    return loaded, settings
+    return policy, settings
 
 
 def do(job: Job) -> tuple[Job, dict[str, list[float]], float]:
@@ -148,10 +148,10 @@ def study(options: argparse.Namespace) -> dict:
     ]
     found = defaultdict(lambda: defaultdict(list))
     records = {}
-    flown = share_out(
+    results = share_out(
         do, [(job,) for job in jobs], min(options.jobs, len(jobs)), options.seconds
     )
-    for done, (job, figures, seconds) in enumerate(flown, 1):
+    for number, (job, figures, seconds) in enumerate(results, 1):
         policy = f"{job.policy}, held-out evaders" if job.held_out else job.policy
         place = found[policy, job.world, job.layout]
         places = records.setdefault(policy, {}).setdefault(job.world, {})
@@ -160,7 +160,7 @@ def study(options: argparse.Namespace) -> dict:
         means = " ".join(
             f"{name} {np.mean(values):.3f}" for name, values in figures.items()
         )
-        of = f"{done}/{len(jobs)} {job.policy} {job.world} {job.layout} {job.start}"
+        of = f"{number}/{len(jobs)} {job.policy} {job.world} {job.layout} {job.start}"
         print(
             f"{of} {means} ({seconds:.0f} s, {time.monotonic() - started:.0f} s in all)",
             flush=True,
