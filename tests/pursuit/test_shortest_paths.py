@@ -133,7 +133,9 @@ def test_territory_is_where_the_evader_is_sooner_than_anybody_by_the_shortest_pa
     task = jax.jit(lambda key: line_up_pillars(GAME, key, uniform_task(GAME, key)))(key)
     position = task.pursuer_position.at[:, 2].set(task.evader_position[2])
     paths = jax.jit(functools.partial(shortest_paths, GAME))(task)
-    share = evader_territory(GAME, task, paths, position, task.evader_position)
+    share = jax.jit(functools.partial(evader_territory, GAME))(
+        task, paths, position, task.evader_position
+    )
     expected = []
     for x, y in np.asarray(arena_points(GAME)):
         if any(
@@ -152,7 +154,7 @@ def test_territory_is_where_the_evader_is_sooner_than_anybody_by_the_shortest_pa
 def test_who_stands_on_both_sides_of_a_wall_leaves_less_territory_than_who_waits_before_it():
     game = PursuitSettings(max_pillars=6)
     task = scenario_task(game, SCENARIOS["hidden"])
-    paths = shortest_paths(game, task)
+    paths = jax.jit(functools.partial(shortest_paths, game))(task)
     evader = jnp.array([-0.15, 0.0, 1.1])
 
     @jax.jit

@@ -30,6 +30,7 @@ ALONE = PursuitSettings(
     reward=REWARD,
 )
 TEAMS = dataclasses.replace(ALONE, num_pursuers=5, team_sizes=(1, 3, 5))
+drawn_task = jax.jit(uniform_task, static_argnums=0)
 
 
 def flown(settings, task, actions):
@@ -58,7 +59,7 @@ def test_three_of_five_fly_as_three(physics):
     those of three.
     """
     alone = dataclasses.replace(ALONE, physics=physics)
-    task = uniform_task(alone, jax.random.key(3)).replace(
+    task = drawn_task(alone, jax.random.key(3)).replace(
         evader=jnp.int32(0),
         evader_speed=jnp.float32(1.1),
         capture_radius=jnp.float32(0.55),
@@ -110,7 +111,7 @@ def test_tasks_draw_teams_speeds_and_radii():
 
 
 def test_what_moves_starts_leaves_empty_slots_far_away():
-    task = uniform_task(dataclasses.replace(TEAMS, team_sizes=()), jax.random.key(0))
+    task = drawn_task(dataclasses.replace(TEAMS, team_sizes=()), jax.random.key(0))
     task = task.replace(active=jnp.arange(5) < 3).with_starts(task.pursuer_position)
 
     @jax.jit
@@ -132,7 +133,7 @@ def test_a_term_of_ones_own_counts_nothing_for_empty_slots():
     game = Pursuit(
         TEAMS, reward=(*default_reward(REWARD), Term(lambda t: jnp.ones(()), 3.0))
     )
-    task = uniform_task(TEAMS, jax.random.key(0)).replace(active=jnp.arange(5) < 1)
+    task = drawn_task(TEAMS, jax.random.key(0)).replace(active=jnp.arange(5) < 1)
     _, state = jax.jit(game.reset_to)(jax.random.key(0), task)
     reward = jax.jit(game.step)(jax.random.key(0), state, jnp.zeros((5, 4)))[2]
     assert reward[0] != 0.0 and not np.any(reward[1:])
@@ -152,7 +153,7 @@ def test_one_falls_out_and_the_others_fly_on_as_a_smaller_team():
     would.
     """
     settings = dataclasses.replace(ALONE, fall_outs=1.0, fall_out_seconds=(0.03, 0.03))
-    task = uniform_task(settings, jax.random.key(3)).replace(evader=jnp.int32(0))
+    task = drawn_task(settings, jax.random.key(3)).replace(evader=jnp.int32(0))
     game = Pursuit(settings)
 
     @jax.jit
