@@ -25,6 +25,7 @@ from experiments.flying.single_thread import use_single_thread
 PERIOD = 0.01  # s
 NOMINAL = 0.025  # s, the simulator's motors
 SURE = 0.5
+BY_HAND = (0.38, 0.41)  # 1/s, of NanoBench's vehicle
 
 
 def cases_of(folder: Path) -> list[Path]:
@@ -94,7 +95,9 @@ def diagnose(part: Part) -> dict:
     seconds = time.process_time() - begin
     told = report.to_dict()
     torques = report.identification
-    out = {"case": name, "named": list(report.effects) or [report.verdict]}
+    mass = float(case.vehicle_file.vehicle_of(case.flights[0].vehicle).mass)
+    out = {"case": name, "mass": mass}
+    out["named"] = list(report.effects) or [report.verdict]
     out["probabilities"] = {
         e: round(p, 3) for e, p in report.probabilities.items() if p > 0.03
     }
@@ -154,6 +157,33 @@ def figures(found: list[dict]) -> dict:
     return out
 
 
+def draw(cases: list[dict], path: Path) -> None:
+    """Drag over mass of each case that names it, with its 90 % interval; hollow where
+    another name stands first.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    named = [c for c in cases if "rotor_drag" in c["parameters"]]
+    figure, axes = plt.subplots(figsize=(7.0, 4.6), layout="constrained")
+    axes.axvspan(*BY_HAND, color="0.88", label="NanoBench by hand")
+    for place, case in enumerate(reversed(named)):
+        value, low, high = (
+            v / case["mass"] for v in case["parameters"]["rotor_drag"]["d_xy"]
+        )
+        first = case["named"][0] == "rotor_drag"
+        axes.plot([low, high], [place, place], color="C0", lw=1.5)
+        axes.plot(value, place, "o", color="C0", mfc="C0" if first else "white")
+    names = [c["case"] for c in reversed(named)]
+    axes.set_yticks(range(len(named)), names, fontsize=7)
+    axes.set_xlabel("drag in the rotor plane over mass, 1/s")
+    axes.set_xlim(0.0, None)
+    axes.legend(loc="lower left", fontsize=8)
+    figure.savefig(path, dpi=110)
+
+
 def rounded(value, digits: int = 4):
     """Numbers of a nested structure with so many significant digits."""
     if isinstance(value, dict):
@@ -170,7 +200,12 @@ def main() -> None:
     parser.add_argument("--separate", type=Path, nargs="*", default=[])
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--out", type=Path, default=Path("real.json"))
+    parser.add_argument("--figure", type=Path, help="drawn from --out, if it's there")
     arguments = parser.parse_args()
+    if arguments.figure:
+        found = json.loads(arguments.out.read_text(encoding="utf-8"))
+        draw(found["cases"], arguments.figure)
+        return
     use_single_thread()
     from openjax.runs.machine import describe_machine
 
