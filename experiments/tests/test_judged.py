@@ -109,7 +109,8 @@ def test_a_team_that_stands_round_the_evader_leaves_a_third_of_the_circle_open()
         pursuers=np.repeat(team, 2, axis=1),
         velocity=np.full((20, 2, 3, 3), [0.0, 0.6, 0.8]),
         evader=np.zeros((20, 2, 3)),
-        seen=~captured,
+        in_sight=np.repeat(~captured[..., None], 3, axis=2),
+        last_seen=np.zeros((20, 2, 3)),
         captured=captured,
     )
     found = summary(moments, PursuitSettings(), replan=10)
