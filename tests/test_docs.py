@@ -2,6 +2,8 @@
 stored, and pages of results have one form that reads at a glance.
 """
 
+import ast
+import importlib
 import importlib.util
 import json
 import pkgutil
@@ -163,3 +165,33 @@ def test_names_of_the_api_page_are_there():
     places = [re.sub(r"^(openjax)\.(\w+)$", r"\1:\2", name) for name in names]
     missing = [place for place in places if not callable(pkgutil.resolve_name(place))]
     assert len(names) > 50 and not missing
+
+
+def test_what_pages_and_their_programs_import_is_there():
+    """A function that moves is looked for in tutorials, too, which run only where the
+    site is built.
+    """
+    # below a cell's first line stand its options, which begin with a colon
+    code = re.compile(
+        r"^```(?:python|\{code-cell\}[^\n]*)\n(?::.*\n)*(.*?)^```", re.M | re.S
+    )
+    texts = [
+        (page.name, text)
+        for page in PAGES
+        for text in code.findall(page.read_text(encoding="utf-8"))
+    ]
+    texts += [(path.name, path.read_text("utf-8")) for path in DOCS.glob("*.py")]
+    imports = [
+        (name, node.module, alias.name)
+        for name, text in texts
+        for node in ast.walk(ast.parse(text))
+        if isinstance(node, ast.ImportFrom) and node.module.startswith("openjax")
+        for alias in node.names
+    ]
+    missing = [
+        (page, f"{module}.{name}")
+        for page, module, name in imports
+        if not hasattr(importlib.import_module(module), name)
+        and find_spec(f"{module}.{name}") is None
+    ]
+    assert len(imports) > 20 and not missing
