@@ -3,14 +3,17 @@ that the pursuers learn from that.
 """
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from openjax.learning import AnalyticSettings, GeneratorSettings
+from openjax.learning import AnalyticSettings, GeneratorSettings, build
 from openjax.learning.analytic_gradient import AnalyticGradient, free_flight
+from openjax.learning.gradient_stage import Turn, update
+from openjax.learning.presets import preset
 from openjax.learning.settings import WorstPlansSettings
 from openjax.learning.worst_plans import WARM_UP, WorstPlans, planning_game
 from openjax.policy import NetworkSettings, Policy, PredictorSettings
@@ -103,20 +106,43 @@ def test_the_worst_plan_is_the_worst_of_those_tried(flown):
 @pytest.mark.slow
 def test_pursuers_learn_from_the_worst_plan(flown):
     stage, parameters, carried = flown
-    update = jax.jit(stage.update)
+    one = jax.jit(functools.partial(update, stage))
     flights = jax.jit(stage.record)(parameters, jax.random.key(5))
-    actor, after, parts = update(
-        parameters.actor, carried, parameters, flights, jax.random.key(6)
-    )
+    turn = Turn(parameters.actor, carried, parameters, flights, jax.random.key(6))
+    actor, after, parts = one(turn)
     assert jax.tree.structure(after) == jax.tree.structure(carried)
     assert all(np.isfinite(value) for value in parts.values())
     # worlds are a piece of the plan later, the plan is what is left of it
     steps = np.asarray(after.world[1].step)
     assert set(steps) <= {0, stage.piece_steps}
     # Adam's first step has a rate of zero, the second doesn't
-    actor, *_ = update(actor, after, parameters, flights, jax.random.key(7))
+    actor, *_ = one(turn._replace(actor=actor, state=after, key=jax.random.key(7)))
     moved = jax.tree.map(lambda a, b: jnp.any(a != b), actor, parameters.actor)
     assert any(jax.tree.leaves(moved))
+
+
+@pytest.mark.slow
+def test_the_game_that_is_shipped_can_be_learnt_with_team_plans():
+    settings = preset("evaders", worst_plans=dict(worlds=2, team_plans=3))
+    game = dataclasses.replace(settings.environment, evaders=("field",))
+    environment = free_flight(Pursuit(game))
+    policy = build(settings, environment).policy
+    usual = AnalyticGradient(settings.analytic, environment, policy)
+    stage = WorstPlans(
+        settings.worst_plans, planning_game(environment), usual, settings.generator
+    )
+
+    def whole(key):
+        parameters = policy.init(key, environment.reset(key)[0])
+        state = stage.begin(parameters, key)
+        flights = stage.record(parameters, key)
+        turn = Turn(parameters.actor, state, parameters, flights, key)
+        return state, update(stage, turn)
+
+    # its shapes alone: vehicles' ranges, say, can't be checked inside a program
+    before, (_, after, parts) = jax.eval_shape(whole, jax.random.key(0))
+    assert jax.tree.structure(before) == jax.tree.structure(after)
+    assert {"planned_follow", "planned_gain"} <= set(parts)
 
 
 @pytest.mark.slow

@@ -22,6 +22,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from openjax.learning.drawn_starts import draw_start
 from openjax.learning.encounter import Encounter, no_encounter
+from openjax.learning.gradient_stage import Turn, Updated
 from openjax.learning.gradient_step import (
     END,
     FASTEST,
@@ -264,17 +265,15 @@ class AnalyticGradient:
         )
         return finite_or_zero(gradient), parts
 
-    def update(
-        self,
-        actor: Any,
-        state: Any,
-        parameters: PolicyParameters,
-        flights,
-        key: PRNGKeyArray,
-    ):
-        """The actor and its optimiser's state after an update, and the loss's parts."""
-        gradient, parts = self.gradient(actor, parameters, flights, key)
-        change, state = self.optimiser.update(gradient, state)
+    @property
+    def programs(self):
+        """An update is one program; see `GradientStage`."""
+        return (self._updated,)
+
+    def _updated(self, turn: Turn, _results: tuple) -> Updated:
+        actor = turn.actor
+        gradient, parts = self.gradient(actor, turn.parameters, turn.flights, turn.key)
+        change, state = self.optimiser.update(gradient, turn.state)
         return optax.apply_updates(actor, change), state, parts
 
     def bounds(self) -> Bounds:

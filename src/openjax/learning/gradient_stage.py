@@ -3,7 +3,7 @@ compiled while the run learns.
 """
 
 from collections.abc import Callable, Iterator
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 from jaxtyping import PRNGKeyArray
@@ -12,6 +12,23 @@ from openjax.background import in_background
 from openjax.learning.settings import AnalyticSettings
 from openjax.policy import PolicyParameters
 from openjax.pursuit.shapes import Scalar
+
+
+class Turn(NamedTuple):
+    """What an update begins with."""
+
+    actor: Any
+    state: Any
+    """See `GradientStage.begin`."""
+    parameters: PolicyParameters
+    """The policy's before the stage: what flew the flights, and what is held to"""
+    flights: Any
+    """See `GradientStage.record`."""
+    key: PRNGKeyArray
+
+
+Updated = tuple[Any, Any, dict[str, Scalar]]
+"""Actor and state after an update, and parts of the loss."""
 
 
 @runtime_checkable
@@ -28,15 +45,20 @@ class GradientStage(Protocol):
     def begin(self, parameters: PolicyParameters, key: PRNGKeyArray) -> Any:
         """What is carried from update to update beside the actor."""
 
-    def update(
-        self,
-        actor: Any,
-        state: Any,
-        parameters: PolicyParameters,
-        flights,
-        key: PRNGKeyArray,
-    ) -> tuple[Any, Any, dict[str, Scalar]]:
-        """Actor and state after an update, and parts of the loss."""
+    @property
+    def programs(self) -> tuple[Callable[[Turn, tuple], Any], ...]:
+        """What an update does, one after the other: each is handed the turn and what
+        those before it returned, and the last one returns what is `Updated`. They are
+        compiled side by side, as a whole update would take a GPU's compiler minutes.
+        """
+
+
+def update(stage: GradientStage, turn: Turn) -> Updated:
+    """A whole update."""
+    results = ()
+    for program in stage.programs:
+        results = (*results, program(turn, results))
+    return results[-1]
 
 
 def compile_stage(
@@ -56,25 +78,27 @@ def compile_stage(
     begin = jax.jit(stage.begin)
     flights = jax.eval_shape(record, parameters, key)
     state = jax.eval_shape(begin, parameters, key)
-    update = jax.jit(stage.update)
-    lowered = (
-        record.lower(parameters, key),
-        begin.lower(parameters, key),
-        update.lower(parameters.actor, state, parameters, flights, key),
-    )
+    turn = Turn(parameters.actor, state, parameters, flights, key)
+    lowered = [record.lower(parameters, key), begin.lower(parameters, key)]
+    results = ()
+    for program in stage.programs:
+        lowered.append(jax.jit(program).lower(turn, results))
+        results = (*results, lowered[-1].out_info)
     ready = [in_background(program.compile) for program in lowered]
 
     def learn(parameters, key):
-        record, begin, update = (wait() for wait in ready)
+        record, begin, *programs = (wait() for wait in ready)
         flight_key, update_key = jax.random.split(key)
         actor = parameters.actor
         state = begin(parameters, jax.random.fold_in(flight_key, 1))
         flights = record(parameters, flight_key)
         for number in range(stage.settings.updates):
             step_key = jax.random.fold_in(update_key, number)
-            # `parameters` stay those from before: what flew the moments, and what is
-            # held to
-            actor, state, parts = update(actor, state, parameters, flights, step_key)
+            turn = Turn(actor, state, parameters, flights, step_key)
+            results = ()
+            for program in programs:
+                results = (*results, program(turn, results))
+            actor, state, parts = results[-1]
             yield parameters.replace(actor=actor), jax.device_get(parts)
 
     return learn

@@ -27,6 +27,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from openjax.learning.analytic_gradient import AnalyticGradient
 from openjax.learning.drawn_starts import draw_anywhere, is_lost
+from openjax.learning.gradient_stage import Turn, Updated
 from openjax.learning.gradient_step import (
     clipped_descent,
     falling_rate,
@@ -391,40 +392,60 @@ class WorstPlans:
             parts["follow"] = (planning.follow, weight * example.gain * off)
         return parts
 
-    def update(
-        self,
-        actor: Any,
-        state: Planned,
-        parameters: PolicyParameters,
-        flights,
-        key: PRNGKeyArray,
-    ) -> tuple[Any, Planned, dict[str, Scalar]]:
-        """Actor and state after an update, and parts of both losses."""
-        plan_key, usual_key, start_key = jax.random.split(key, 3)
-        tried = self.attempts(actor, parameters, state.world, state.plan, plan_key)
+    @property
+    def programs(self):
+        """Plans; what is learnt from them; what is always learnt; and what comes of
+        both. See `GradientStage`.
+        """
+        return self._planned, self._learnt, self._always_learnt, self._updated
+
+    def _planned(self, turn: Turn, _results: tuple):
+        """Plans (B, ...) of the evaders and what these promise, plans of their
+        pursuers' teams, and what these show.
+        """
+        key = _keys(turn)[0]
+        state = turn.state
+        tried = self.attempts(turn.actor, turn.parameters, state.world, state.plan, key)
         plan, promised = worst_of(tried)
-        team = example = None
-        if state.team is not None:
-            team_key = jax.random.fold_in(plan_key, 1)
-            team, example = self.show(tried, state.world, state.team, plan, team_key)
-            team = team.replace(until=team.until - self.planning.piece_seconds)
-        gradient, (world, parts) = jax.grad(self.loss, has_aux=True)(
-            actor, parameters, state.world, plan, example
+        if state.team is None:
+            return plan, promised, None, None
+        team, example = self.show(
+            tried, state.world, state.team, plan, jax.random.fold_in(key, 1)
         )
-        usual, usual_parts = self.usual.gradient(actor, parameters, flights, usual_key)
-        gradient = jax.tree.map(jnp.add, finite_or_zero(gradient), usual)
-        change, optimiser = self.optimiser.update(gradient, state.optimiser)
+        team = team.replace(until=team.until - self.planning.piece_seconds)
+        return plan, promised, team, example
+
+    def _learnt(self, turn: Turn, results: tuple):
+        """The gradient, the worlds after the plans' first piece, and the loss's
+        parts.
+        """
+        plan, _, _, example = results[0]
+        gradient, (world, parts) = jax.grad(self.loss, has_aux=True)(
+            turn.actor, turn.parameters, turn.state.world, plan, example
+        )
+        return finite_or_zero(gradient), world, parts
+
+    def _always_learnt(self, turn: Turn, _results: tuple):
+        """The gradient of the usual part, and its loss's parts."""
+        key = _keys(turn)[1]
+        return self.usual.gradient(turn.actor, turn.parameters, turn.flights, key)
+
+    def _updated(self, turn: Turn, results: tuple) -> Updated:
+        (plan, promised, team, example), (gradient, world, parts), usual = results
+        usual_gradient, usual_parts = usual
+        gradient = jax.tree.map(jnp.add, gradient, usual_gradient)
+        change, optimiser = self.optimiser.update(gradient, turn.state.optimiser)
         over = self._over(world[1])
-        world = renewed(over, world, self.start(start_key))
+        world = renewed(over, world, self.start(_keys(turn)[2]))
         plan = jnp.where(over[:, None, None], 0.0, _later(plan))
         parts = {f"planned_{name}": value for name, value in parts.items()}
-        survived = {"planned_survived": jnp.mean(promised >= self.steps)}
+        parts["planned_survived"] = jnp.mean(promised >= self.steps)
         if example is not None:
-            survived["planned_gain"] = jnp.mean(example.gain)
+            parts["planned_gain"] = jnp.mean(example.gain)
         return (
-            optax.apply_updates(actor, change),
+            optax.apply_updates(turn.actor, change),
             Planned(optimiser, world, plan, team),
-            usual_parts | parts | survived,
+            usual_parts | parts,
         )
 
     def _over(self, state: PursuitState) -> Bool[Array, " worlds"]:
@@ -448,6 +469,11 @@ def planning_game(environment: Pursuit) -> Pursuit:
     """
     settings = dataclasses.replace(environment.settings, evaders=("field",))
     return dataclasses.replace(environment, settings=settings, evaders=None)
+
+
+def _keys(turn):
+    """Of the plans, of the usual part and of fresh worlds."""
+    return jax.random.split(turn.key, 3)
 
 
 def _unit(vector):
