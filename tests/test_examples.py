@@ -82,6 +82,12 @@ def test_a_part_of_ones_own_is_trained(part, tiny_preset, tmp_path, capsys):
     assert ("reinforce_loss" in metrics[0]) == (part == "learner")
     with pytest.raises(openjax.UserError, match="was begun with"):
         openjax.train(resume=run)
+    if part == "network":
+        assert f'openjax.load_policy("runs/own_{part}", ' in printed
+        with pytest.raises(
+            openjax.UserError, match="a network of one's own: in Python"
+        ):
+            openjax.load_policy(run)
     if part == "learner":
         longer = dataclasses.replace(example["settings"], total_steps=960)
         openjax.train(longer, resume=run, learners=example["learners"])

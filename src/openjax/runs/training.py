@@ -76,7 +76,10 @@ def run_job(job: TrainingJob, directory: RunDirectory, console: Console) -> int:
     if table is not None:
         console.print(table)
         for line in closing_words(
-            job.settings, directory.path, jax.default_backend() == "cpu"
+            job.settings,
+            directory.path,
+            jax.default_backend() == "cpu",
+            job.own.policy is not None,
         ):
             console.print(line, soft_wrap=True)
         console.print(

@@ -55,8 +55,12 @@ def layouts_like(game: PursuitSettings) -> list[Scenario]:
     ]
 
 
-def closing_words(settings: TrainSettings, run: Path, on_cpu: bool) -> list[str]:
-    """Three lines below the table of the run in that directory."""
+def closing_words(
+    settings: TrainSettings, run: Path, on_cpu: bool, own_network: bool = False
+) -> list[str]:
+    """Three lines below the table of the run in that directory. Commands don't know a
+    network of one's own.
+    """
     game = settings.environment
     seconds = game.episode_length * game.time_step
     lines = [
@@ -70,6 +74,8 @@ def closing_words(settings: TrainSettings, run: Path, on_cpu: bool) -> list[str]
     if layouts := layouts_like(game):
         view += f" --scenario {layouts[-1].name}"
     steps = [f"{typed(view)} (in a browser)"]
+    if own_network:
+        steps = [f'openjax.load_policy("{run}", environment, network) in Python']
     if on_cpu:
         steps.append(
             typed("openjax train --preset paper (the real game, two minutes on a GPU)")

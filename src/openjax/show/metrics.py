@@ -85,7 +85,9 @@ class MetricsWriter:
         self._file.write((json.dumps(record) + "\n").encode())
         if self._events is not None:
             for name, value in numbers.items():
-                self._events.add_scalar(f"{event}/{name}", value, int(steps))
+                # what isn't measured, as a prediction where nothing predicts, is no point
+                if math.isfinite(value):
+                    self._events.add_scalar(f"{event}/{name}", value, int(steps))
             self._events.flush()
 
     def close(self) -> None:

@@ -289,6 +289,11 @@ def _own(run, source, environment, policy):
 
 
 def _from_run(run, source):
+    if "policy" in run.read_facts().get("own_parts", ()):
+        raise UserError(
+            f"{source} was trained with a network of one's own: in Python "
+            "openjax.load_policy(run, environment, network) takes it again"
+        )
     if run.policy.exists():
         return _from_file(run.policy, source)
     checkpoints = Checkpoints(run.checkpoints)
