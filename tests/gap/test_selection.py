@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from openjax.gap.model.cross_validation import Judged
-from openjax.gap.selection import difference, growth, worse
+from openjax.gap.selection import clearly_larger, difference, growth, worse
 
 
 def judged(left: np.ndarray, blocks: int) -> Judged:
@@ -74,3 +74,14 @@ def test_an_effect_that_nuisances_take_on_matters_as_what_it_does():
     gaps, own = ((s, floor, s) for s in (inside, beside))
     assert worse(10.0, 5.0, gaps, own) and not worse(10.0, 5.0, gaps, gaps)
     assert not worse(10.0, 7.0, gaps, own)  # and it isn't clear
+
+
+def test_what_only_a_sum_is_known_of_is_clear_by_the_sum():
+    least = np.full(2, 0.5)
+    apart = np.eye(2)
+    # the sum is known to .1, the difference to 3
+    together = 0.5 * (0.005 * np.ones((2, 2)) + 4.5 * np.array([[1, -1], [-1, 1]]))
+    assert not clearly_larger(np.array([1.0, 1.0]), apart, least)
+    assert clearly_larger(np.array([1.0, 1.0]), together, least)
+    assert not clearly_larger(np.array([1.0, -1.0]), together, least)
+    assert clearly_larger(np.array([2.5, 0.0]), apart, least)

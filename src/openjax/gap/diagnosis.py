@@ -9,6 +9,7 @@ import numpy as np
 
 from openjax.flights.clocks import case_on_gyroscope_clock
 from openjax.flights.flight import Case
+from openjax.gap.decision import DECISION
 from openjax.gap.evidence import Evidence, gather
 from openjax.gap.identification.quantities import identify
 from openjax.gap.intervals import estimates
@@ -106,11 +107,12 @@ def conclude(evidence: Evidence) -> Report:
 
 def worth_naming(shares_of: Callable[[list[str]], Split], named: list[str]) -> Split:
     """The shares of those of the effects `named` that have one, and that make held-out
-    predictions no worse; `shares_of` splits the gap.
+    predictions no worse; `shares_of` splits the gap. Of the motion's effects it must be
+    larger than errors of the others' forms.
     """
     parts = shares_of(named)
     while named:
-        gone = [e for e in named if parts.effects[e].interval90[1] < LEAST_SHARE]
+        gone = [e for e in named if parts.effects[e].interval90[1] < least_share(e)]
         if not gone and parts.gap.reduction < 0.0:
             gone = [min(named, key=lambda e: parts.effects[e].value)]
         if not gone:
@@ -118,6 +120,11 @@ def worth_naming(shares_of: Callable[[list[str]], Split], named: list[str]) -> S
         named = [e for e in named if e not in gone]
         parts = shares_of(named)
     return parts
+
+
+def least_share(effect: str) -> float:
+    """Of the gap's square that an effect must take."""
+    return DECISION.form_error if path_of(effect) == "physics" else LEAST_SHARE
 
 
 def words(check: Check, parts: Split) -> tuple[str, ...]:

@@ -20,7 +20,9 @@ from itertools import combinations
 
 import numpy as np
 from jaxtyping import Float
+from scipy.stats import chi2
 
+from openjax.gap.channels import between_flights
 from openjax.gap.decision import DECISION
 from openjax.gap.evidence import Evidence
 from openjax.gap.model.cross_validation import Judged, judge, promise, screened
@@ -197,33 +199,52 @@ def log_odds(effects) -> float:
 
 
 def practical(fit: SetFit, measured: Measured) -> bool:
-    """Whether every effect of a set is clearly of a size that matters in practice: of
-    some parameter the 90 % interval is further from doing nothing than its card says (a
-    region of practical equivalence on the parameter, Kruschke 2018). Intervals are the
-    replay's and, of what the torques' response tells, those that are `measured`:
-    {(effect, parameter): (value, deviation)}.
+    """Whether every effect of a set is clearly of a size that matters in practice (a
+    region of practical equivalence on the parameters, Kruschke 2018), by the replay or,
+    of what the torques' response tells, by what is `measured`: {(effect, parameter):
+    (value, deviation)}.
     """
-    found = fit.parameters()
+    covariance = fit.covariance + between_flights(fit.covariance, fit.grams[:, 1:, 0])
+    place = {i: k for k, i in enumerate(fit.index.tolist())}
 
-    def matters_of(effect: str, parameter: str, size: float) -> bool:
-        place = PLACE[effect, parameter]
-        least = size * fit.replay.grown[place]
-        estimates = [found[effect][parameter]]
-        estimates += (
-            [measured[effect, parameter]] if (effect, parameter) in measured else []
-        )
+    def of_replay(effect: str) -> bool:
+        sizes = CARDS[effect].practical
+        own = [PLACE[effect, parameter] for parameter in sizes]
+        rows = [place[i] for i in own]
+        away = fit.theta[own] - fit.replay.absent[own]
+        least = np.array(list(sizes.values())) * fit.replay.grown[own]
+        return clearly_larger(away, covariance[np.ix_(rows, rows)], least)
+
+    def of_response(effect: str) -> bool:
         return any(
-            abs(v - fit.replay.absent[place]) - REACH * d > least for v, d in estimates
+            abs(measured[key][0] - fit.replay.absent[PLACE[key]])
+            - REACH * measured[key][1]
+            > size * fit.replay.grown[PLACE[key]]
+            for parameter, size in CARDS[effect].practical.items()
+            if (key := (effect, parameter)) in measured
         )
 
     return all(
-        not CARDS[e].practical
-        or any(
-            matters_of(e, parameter, size)
-            for parameter, size in CARDS[e].practical.items()
-        )
-        for e in fit.effects
+        not CARDS[e].practical or of_replay(e) or of_response(e) for e in fit.effects
     )
+
+
+def clearly_larger(
+    away: Float[np.ndarray, " own"],
+    covariance: Float[np.ndarray, "own own"],
+    least: Float[np.ndarray, " own"],
+) -> bool:
+    """Whether parameters that are `away` (p,) from doing nothing are further than
+    `least` (p,), either one of them by its 90 % interval, or all together by as much of
+    their size as their common 90 % region leaves: of two that only their sum is known
+    of, neither need be clear by itself.
+    """
+    deviation = np.sqrt(np.diag(covariance))
+    if (np.abs(away) - REACH * deviation > least).any():
+        return True
+    square = float(away @ np.linalg.solve(covariance, away))
+    left = 1.0 - np.sqrt(chi2.ppf(0.9, len(away)) / max(square, 1e-12))
+    return bool(left * np.max(np.abs(away) / least) > 1.0)
 
 
 def possible(fit: SetFit) -> bool:
@@ -340,9 +361,12 @@ class Search:
         return with_effects(table, come, gone)
 
     def sets(self) -> list[frozenset]:
-        """All sets of up to LARGEST effects that may act."""
+        """All sets of up to LARGEST effects that may act, with one at most that scales
+        all motion.
+        """
         sizes = range(LARGEST + 1)
-        return [frozenset(s) for n in sizes for s in combinations(self.singles, n)]
+        every = (frozenset(s) for n in sizes for s in combinations(self.singles, n))
+        return [s for s in every if sum(CARDS[e].scales_motion for e in s) <= 1]
 
     @property
     def best(self) -> Hypothesis:

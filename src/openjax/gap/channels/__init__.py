@@ -85,13 +85,24 @@ def robust_deviation(
     pushes: Float[np.ndarray, "flights parameters"],
 ) -> Float[np.ndarray, " parameters"]:
     """Standard deviations (p,) of parameters: those of `covariance` (p, p), or what
-    flights differ by where that is more: the sandwich of their gradients `pushes` (F,
-    p), widened where they are few (Liang, Zeger 1986).
+    flights differ by where that is more, as `between_flights` has it.
     """
-    model = np.sqrt(np.diag(covariance))
+    model = np.diag(covariance)
+    between = np.diag(between_flights(covariance, pushes))
+    return np.sqrt(np.maximum(between, model))
+
+
+def between_flights(
+    covariance: Float[np.ndarray, "parameters parameters"],
+    pushes: Float[np.ndarray, "flights parameters"],
+) -> Float[np.ndarray, "parameters parameters"]:
+    """Covariance (p, p) of parameters by what flights differ by: the sandwich of their
+    gradients `pushes` (F, p), widened where they are few (Liang, Zeger 1986); zero for
+    a single flight.
+    """
     count = len(pushes)
-    if count < 2 or not len(model):
-        return model
+    if count < 2 or not len(covariance):
+        return np.zeros_like(covariance)
     apart = pushes - pushes.mean(0)
     between = covariance @ apart.T @ apart @ covariance * count / (count - 1)
-    return np.maximum(few(count) * np.sqrt(np.maximum(np.diag(between), 0.0)), model)
+    return few(count) ** 2 * between

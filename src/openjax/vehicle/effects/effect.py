@@ -222,6 +222,10 @@ class Card:
     """
     thrust_map: bool = False
     """Whether a map from duty cycles to thrust that isn't known can imitate it."""
+    scales_motion: bool = False
+    """Whether it can change all accelerations in proportion: of two such effects
+    flights show the product alone, so that no set has both.
+    """
     torque_axes: tuple[int, ...] = ()
     """Axes of the torques by which it is told: what motors do between two rows can
     imitate them.

@@ -37,6 +37,7 @@ EFFECT = Effect(
         coordinate="thrust",
         fitted=(Fitted("extra", mean=0.0, spread=0.005, start=0.001, step=2e-05),),
         thrust_map=True,
+        scales_motion=True,
         weighed=True,
         sample={"extra": 0.003},
         practical={"extra": 0.0003},

@@ -51,6 +51,7 @@ EFFECT = Effect(
             ),
         ),
         thrust_map=True,
+        scales_motion=True,
         log_odds=RARE,
         possible=rises,
         nuisance_duty={"offset": 0.15, "curvature": 0.3},
