@@ -200,9 +200,9 @@ def log_odds(effects) -> float:
 
 def practical(fit: SetFit, measured: Measured) -> bool:
     """Whether every effect of a set is clearly of a size that matters in practice (a
-    region of practical equivalence on the parameters, Kruschke 2018), by the replay or,
-    of what the torques' response tells, by what is `measured`: {(effect, parameter):
-    (value, deviation)}.
+    region of practical equivalence on the parameters, Kruschke 2018), by the replay or
+    by what is `measured` of the torques' response: {(effect, parameter): (value,
+    deviation)}. What a card wants confirmed by the latter must be.
     """
     covariance = fit.covariance + between_flights(fit.covariance, fit.grams[:, 1:, 0])
     place = {i: k for k, i in enumerate(fit.index.tolist())}
@@ -215,18 +215,23 @@ def practical(fit: SetFit, measured: Measured) -> bool:
         least = np.array(list(sizes.values())) * fit.replay.grown[own]
         return clearly_larger(away, covariance[np.ix_(rows, rows)], least)
 
-    def of_response(effect: str) -> bool:
+    def of_response(keys) -> bool:
         return any(
-            abs(measured[key][0] - fit.replay.absent[PLACE[key]])
-            - REACH * measured[key][1]
-            > size * fit.replay.grown[PLACE[key]]
-            for parameter, size in CARDS[effect].practical.items()
-            if (key := (effect, parameter)) in measured
+            abs(measured[e, p][0] - fit.replay.absent[PLACE[e, p]])
+            - REACH * measured[e, p][1]
+            > CARDS[e].practical[p] * fit.replay.grown[PLACE[e, p]]
+            for e, p in keys
+            if (e, p) in measured
         )
 
-    return all(
-        not CARDS[e].practical or of_replay(e) or of_response(e) for e in fit.effects
-    )
+    def of_a_size(effect: str) -> bool:
+        card = CARDS[effect]
+        if any(key in measured for key in card.confirmed_by):
+            return of_response(card.confirmed_by)
+        own = [(effect, parameter) for parameter in card.practical]
+        return not own or of_replay(effect) or of_response(own)
+
+    return all(of_a_size(e) for e in fit.effects)
 
 
 def clearly_larger(
@@ -389,8 +394,9 @@ class Search:
 
     def equivalents(self, chosen: Hypothesis, named) -> dict[str, list[str]]:
         """For each named effect those in whose place, of the sets visited, flights
-        don't tell the difference.
+        don't tell the difference: not a wind that doesn't blow, which is a drag.
         """
+        measured = self.evidence.measured
         out = {}
         for effect in named:
             rest = frozenset(chosen.effects) - {effect}
@@ -398,7 +404,7 @@ class Search:
                 next(iter(key - rest))
                 for key, h in self.visited.items()
                 if len(key - rest) == 1 and rest < key and effect not in key and possible(h.fit)
-                and not self.clearly_worse(h, chosen)
+                and practical(h.fit, measured) and not self.clearly_worse(h, chosen)
             ]  # fmt: skip
             if alike:
                 out[effect] = sorted(alike)

@@ -262,6 +262,11 @@ class Card:
     """{parameter: how far it must be from doing nothing before anybody would change a
     simulator for it}; one of them is enough.
     """
+    confirmed_by: tuple[tuple[str, str], ...] = ()
+    """(effect, parameter) of what the torques' response tells without a model of the
+    loop: where it is trusted, one of them must be of a size that matters as well. The
+    replay's torques are biased in closed loop, where motors answer gusts.
+    """
     days: float | None = None
     """Of an effect that every vehicle has to some degree: the standard deviation of its
     parameters over a vehicle's days. None for others.
