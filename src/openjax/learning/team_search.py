@@ -4,9 +4,9 @@ many of the evader, flown by points.
 A policy that learns by small changes of what it does waits where it could close in:
 none of three who stand round an evader gains by going first. A search over plans of the
 whole team doesn't. Here the pursuers are points that turn and brake as quadrotors can,
-so that a thousand pairs of plans cost less than one flight of the networks; the team
-plan that is best against the evader's best answer is the one to learn from (a matrix
-game, in which the evader chooses last).
+so that 600 pairs of plans cost less than flying the networks against 32; the team plan
+that is best against the evader's best answer is the one to learn from (a matrix game,
+in which the evader chooses last).
 
 It shares no code with the planners of `openjax.evaluation.judges`, which judge what is
 learnt here.
@@ -32,6 +32,8 @@ from openjax.pursuit.task import capture_radius
 
 STEP = 0.04
 """Seconds of a point's step: it flies 4 cm."""
+STRIDE = 2
+"""Steps after which a point asks for its way: finding it is most of the work."""
 NARROW = 0.02
 """How much nearer to pillars than other paths the points' may lead (m): through ways
 of .4 m between two axes, which breach nothing.
@@ -54,8 +56,23 @@ LOWEST = 0.15
 """Pursuers are sent no nearer than this to floor and ceiling (m): from there they
 reach who is at it.
 """
-CLOSE = 0.2
-"""Steps' worth of each step in which two pursuers are closer than they may be."""
+LEAST_HEIGHT = 0.1
+"""Nor are they ever nearer to the floor (m), where the rotors' flow comes back."""
+BREACH = 0.2
+"""Steps' worth of each step in which somebody breaches a safety distance: a plan that
+catches the evader may, one that waits may not.
+"""
+APART = 1.15
+"""Share of the safety distance that points keep from one another: quadrotors swing."""
+STRAIGHT = 0.3
+ANYWHERE = 0.25
+"""Share of the pursuers that fly straight at the evader, and of those that go to a
+place anywhere; all others go to places beside it.
+"""
+LONGEST = 1.5
+"""Plans' lengths after which a pursuer turns to the evader at the latest: one of three
+doesn't within the plan.
+"""
 
 
 Velocities = Float[Array, "plans steps 3"]
@@ -85,7 +102,7 @@ class Points:
     evader: jax.Array  # (3,) m
     caught: jax.Array  # () bool
     free: jax.Array  # () steps in which it was free
-    close: jax.Array  # () steps in which two pursuers were too close
+    breaches: jax.Array  # () steps in which somebody breached a safety distance
 
 
 @dataclass(frozen=True)
@@ -99,7 +116,7 @@ class TeamSearch:
     @property
     def steps(self) -> int:
         """Points' steps of a plan."""
-        return max(1, round(self.seconds / STEP))
+        return STRIDE * max(1, round(self.seconds / (STRIDE * STEP)))
 
     @property
     def narrow_game(self) -> PursuitSettings:
@@ -131,9 +148,9 @@ class TeamSearch:
             [out * jnp.cos(angle), out * jnp.sin(angle), height], axis=-1
         )
         kind = jax.random.uniform(keys[5], shape)
-        is_fixed = kind > 0.75
-        until = self.seconds * jax.random.uniform(keys[6], shape, maxval=1.5)
-        until = jnp.where(kind < 0.3, 0.0, until)
+        is_fixed = kind > 1.0 - ANYWHERE
+        until = self.seconds * jax.random.uniform(keys[6], shape, maxval=LONGEST)
+        until = jnp.where(kind < STRAIGHT, 0.0, until)
         drawn = TeamPlan(
             jnp.where(is_fixed[..., None], anywhere, far * way), is_fixed, until
         )
@@ -173,45 +190,60 @@ class TeamSearch:
         """Points at the end of a plan against (steps, 3) velocities of the evader in
         m/s, and where the pursuers were after each step (steps, N, 3).
         """
-        game = self.game
-        radius = capture_radius(game, task)
 
-        def one(points, step):
-            index, velocity = step
-            evader = self._moved(task, points.evader, velocity)
-            target = self.target(plan, evader + RESPONSE * velocity, index * STEP)
+        def stride(points, step):
+            first, velocities = step
+            lead = points.evader + RESPONSE * velocities[0]
+            target = self.target(plan, lead, first * STEP)
             desired = self.desired(task, paths, points.position, target)
-            push = (desired - points.velocity) / RESPONSE
-            size = jnp.sqrt(jnp.sum(push**2, axis=-1, keepdims=True) + 1e-12)
-            push = push * jnp.minimum(1.0, ACCELERATION / size)
-            flown = points.velocity + STEP * push
-            position = points.position + STEP * flown
-            low = jnp.array([-jnp.inf, -jnp.inf, 0.1])
-            high = jnp.array([jnp.inf, jnp.inf, game.arena_height - 0.05])
-            position = jnp.clip(position, low, high)
-            distance = jnp.sqrt(jnp.sum((position - evader) ** 2, axis=-1))
-            caught = points.caught | jnp.any(distance < radius)
-            apart = position[:, None] - position[None]
-            square = jnp.sum(apart**2, axis=-1) + jnp.eye(position.shape[0])
-            close = jnp.any(square < (1.15 * game.drone_clearance) ** 2)
-            to_axis = position[:, None, :2] - task.pillar_position
-            square = jnp.sum(to_axis**2, axis=-1)
-            room = game.pillar_radius + game.pillar_clearance
-            close |= jnp.any((square < room**2) & task.pillar_active)
-            close |= jnp.any(
-                jnp.sum(position[:, :2] ** 2, axis=-1) > game.arena_radius**2
-            )
-            after = Points(
-                position,
-                flown,
-                evader,
-                caught,
-                points.free + ~caught,
-                points.close + close,
-            )
-            return after, position
+            places = []
+            for velocity in velocities:
+                points = self._after_step(task, points, desired, velocity)
+                places.append(points.position)
+            return points, jnp.stack(places)
 
-        return jax.lax.scan(one, start, (jnp.arange(self.steps), velocities))
+        firsts = jnp.arange(0, self.steps, STRIDE)
+        end, places = jax.lax.scan(
+            stride, start, (firsts, velocities.reshape(-1, STRIDE, 3))
+        )
+        return end, places.reshape(-1, *places.shape[2:])
+
+    def _after_step(self, task, points, desired, velocity):
+        """Points a step later, whose pursuers wish to fly (N, 3) m/s."""
+        game = self.game
+        evader = self._moved(task, points.evader, velocity)
+        push = (desired - points.velocity) / RESPONSE
+        size = jnp.sqrt(jnp.sum(push**2, axis=-1, keepdims=True) + 1e-12)
+        flown = points.velocity + STEP * push * jnp.minimum(1.0, ACCELERATION / size)
+        low = jnp.array([-jnp.inf, -jnp.inf, LEAST_HEIGHT])
+        high = jnp.array([jnp.inf, jnp.inf, game.arena_height])
+        position = jnp.clip(points.position + STEP * flown, low, high)
+        square = jnp.sum((position - evader) ** 2, axis=-1)
+        caught = points.caught | jnp.any(square < capture_radius(game, task) ** 2)
+        return Points(
+            position,
+            flown,
+            evader,
+            caught,
+            free=points.free + ~caught,
+            breaches=points.breaches + self._is_breach(task, position),
+        )
+
+    def _is_breach(self, task, position):
+        """() bool, whether somebody of (N, 3) is too close to another or a pillar, or
+        outside.
+        """
+        game = self.game
+        offset = position[:, None] - position[None]
+        to_others = jnp.sum(offset**2, axis=-1) + jnp.eye(position.shape[0])
+        to_axis = jnp.sum((position[:, None, :2] - task.pillar_position) ** 2, axis=-1)
+        room = game.pillar_radius + game.pillar_clearance
+        level = jnp.sum(position[:, :2] ** 2, axis=-1)
+        return (
+            jnp.any(to_others < (APART * game.drone_clearance) ** 2)
+            | jnp.any((to_axis < room**2) & task.pillar_active)
+            | jnp.any(level > game.arena_radius**2)
+        )
 
     def _moved(self, task, evader, velocity):
         """Where the evader is a step later, outside the pillars and inside the arena."""
@@ -232,7 +264,7 @@ class TeamSearch:
         free first.
         """
         room = self._room(task, paths, end.position, end.evader)
-        return end.free + room + CLOSE * end.close
+        return end.free + room + BREACH * end.breaches
 
     def start(self, state: PursuitState) -> Points:
         """A world's vehicles as points."""
