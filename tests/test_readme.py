@@ -174,7 +174,7 @@ def test_from_sample_flights_to_a_corrected_simulator(tmp_path):
         abs(report["parameters"]["rotor_drag"]["d_xy"]["value"] / float(value) - 1)
         < 0.02
     )
-    (share,) = re.findall(r"Shares of the gap: rotor_drag or wind ([\d.]+) \[", README)
+    (share,) = re.findall(r"Shares of the gap: rotor_drag ([\d.]+) \[", README)
     assert abs(report["shares"]["effects"]["rotor_drag"]["value"] - float(share)) < 0.03
 
     settings = openjax.PursuitSettings(physics="rigid", speed_limit="none")
