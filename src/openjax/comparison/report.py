@@ -73,8 +73,8 @@ def to_dict(change: Change) -> dict:
     }
 
 
-def in_words(change: Change) -> list[str]:
-    """The answer in a few plain sentences."""
+def _what_changed(change):
+    """Whether something did, by which cause, and how large it is."""
     sentences = list(
         dict.fromkeys(_cause_in_words(change, cause) for cause in change.likely_causes)
     )
@@ -110,6 +110,12 @@ def in_words(change: Change) -> list[str]:
             for n in names
             if n in change.figures
         ]
+    return lines
+
+
+def in_words(change: Change) -> list[str]:
+    """The answer in a few plain sentences."""
+    lines = _what_changed(change)
     if change.charge_unknown:
         lines.append(
             "What may differ is the battery: an emptier one makes less thrust of a duty cycle. Log "
@@ -209,6 +215,39 @@ def _in_percent(flights, name, level):
     return 100 * (values / level - 1.0 if name == "hover" else values)
 
 
+def _draw_trim(axis, change, name, level):
+    """A trim of every flight, day by day, on the band of normal days."""
+    for k, figures in enumerate((change.reference, change.flights)):
+        days = list(dict.fromkeys(f.day for f in figures))
+        for j, day in enumerate(days):
+            of_day = [f for f in figures if f.day == day]
+            values = _in_percent(of_day, name, level)
+            place = k + 0.6 * ((j + 0.5) / len(days) - 0.5)
+            axis.plot(
+                np.full(len(values), place),
+                values,
+                "o",
+                ms=5,
+                color=(GREY, BEFORE)[k],
+                alpha=0.8,
+            )
+    middle = _in_percent(change.reference, name, level).mean()
+    spread = 100 * change.spread[name]
+    axis.axhspan(
+        middle - 1.645 * spread,
+        middle + 1.645 * spread,
+        color=AFTER,
+        alpha=0.12,
+        lw=0,
+    )
+    axis.set(
+        title=name,
+        xticks=(0, 1),
+        xticklabels=("reference", "new"),
+        xlim=(-0.6, 1.6),
+    )
+
+
 def draw(change: Change):
     """Trims of every flight, day by day, beside what days differ by; and where the
     change would sit.
@@ -217,35 +256,7 @@ def draw(change: Change):
     axes = figure.subplots(1, 5, width_ratios=(1, 1, 1, 1, 1.3))
     level = np.mean([f.values["hover"][0] for f in change.reference])
     for axis, name in zip(axes, TRIMS, strict=False):
-        for k, figures in enumerate((change.reference, change.flights)):
-            days = list(dict.fromkeys(f.day for f in figures))
-            for j, day in enumerate(days):
-                of_day = [f for f in figures if f.day == day]
-                values = _in_percent(of_day, name, level)
-                place = k + 0.6 * ((j + 0.5) / len(days) - 0.5)
-                axis.plot(
-                    np.full(len(values), place),
-                    values,
-                    "o",
-                    ms=5,
-                    color=(GREY, BEFORE)[k],
-                    alpha=0.8,
-                )
-        middle = _in_percent(change.reference, name, level).mean()
-        spread = 100 * change.spread[name]
-        axis.axhspan(
-            middle - 1.645 * spread,
-            middle + 1.645 * spread,
-            color=AFTER,
-            alpha=0.12,
-            lw=0,
-        )
-        axis.set(
-            title=name,
-            xticks=(0, 1),
-            xticklabels=("reference", "new"),
-            xlim=(-0.6, 1.6),
-        )
+        _draw_trim(axis, change, name, level)
     axes[0].set_ylabel("% of hover (band: 90 % of normal days)")
     places = sorted(change.places.items(), key=lambda item: -item[1])[:6]
     names = [

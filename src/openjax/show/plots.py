@@ -77,7 +77,13 @@ def draw_from_above(axes: Axes, trajectory: Trajectory) -> None:
         xlabel="x [m]",
         ylabel="y [m]",
     )
-    capture = trajectory.capture_index
+    _draw_pursuers(axes, trajectory)
+    outcome = _draw_evader(axes, trajectory)
+    axes.set_title(f"{trajectory.title}: {outcome}", fontsize="medium")
+
+
+def _draw_pursuers(axes, trajectory):
+    """Paths from an open to a full circle, and where one crashed."""
     end = trajectory.end()
     for i in range(trajectory.pursuer_position.shape[1]):
         x, y = trajectory.pursuer_position[:end, i, :2].T
@@ -90,34 +96,30 @@ def draw_from_above(axes: Axes, trajectory: Trajectory) -> None:
             axes.plot(
                 x[crash], y[crash], "X", color="black", markersize=9, label="crash"
             )
-    x, y = trajectory.evader_position[:end, :2].T
+
+
+def _draw_evader(axes, trajectory):
+    """Its path, and where it was first captured; what became of it in words."""
+    x, y = trajectory.evader_position[: trajectory.end(), :2].T
     axes.plot(x, y, color=EVADER_COLOR, linewidth=1.2, label="evader")
     axes.plot(x[0], y[0], "o", color=EVADER_COLOR, fillstyle="none")
+    capture = trajectory.capture_index
     if capture is None:
         axes.plot(x[-1], y[-1], "o", color=EVADER_COLOR, markersize=4)
-        outcome = "not captured"
-    else:
-        x, y = trajectory.evader_position[capture, :2]
-        axes.add_patch(
-            Circle(
-                (x, y),
-                trajectory.capture_radius,
-                fill=False,
-                color="0.5",
-                linestyle=":",
-            )
-        )
-        axes.plot(
-            x,
-            y,
-            "*",
-            color="gold",
-            markeredgecolor="black",
-            markersize=14,
-            label="first capture",
-        )
-        outcome = f"captured after {(capture + 1) * trajectory.time_step:.2f} s"
-    axes.set_title(f"{trajectory.title}: {outcome}", fontsize="medium")
+        return "not captured"
+    x, y = trajectory.evader_position[capture, :2]
+    radius = trajectory.capture_radius
+    axes.add_patch(Circle((x, y), radius, fill=False, color="0.5", linestyle=":"))
+    axes.plot(
+        x,
+        y,
+        "*",
+        color="gold",
+        markeredgecolor="black",
+        markersize=14,
+        label="first capture",
+    )
+    return f"captured after {(capture + 1) * trajectory.time_step:.2f} s"
 
 
 def plot_map(path: Path, cells: Sequence[dict], title: str) -> None:
