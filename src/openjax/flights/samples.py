@@ -98,38 +98,12 @@ def references(
     rng = np.random.default_rng(seed)
     t = np.arange(0.0, duration, PERIOD)
     zero = np.zeros((len(t), 4))
-
-    leg = 1.6  # s
-    corners = rng.uniform(
-        [-0.6, -0.6, 0.3], [0.6, 0.6, 1.0], (int(duration / leg) + 2, 3)
-    )
-    corners[3::3, 2] = rng.uniform(0.06, 0.1, len(corners[3::3]))
-    corners[2::3, 2] = rng.uniform(1.05, 1.12, len(corners[2::3]))
-    waypoints = _minimum_jerk(corners, t, leg)
-
-    phase = rng.uniform(0, 2 * np.pi, 3)
-    frequency = np.array([0.42, 0.35, 0.25]) * 2 * np.pi * rng.uniform(0.9, 1.1, 3)
-    start = np.clip(t / 3.0, 0, 1)[:, None]
-    # a smooth step, so that the figure begins at rest in the middle
-    swell = start**2 * (3 - 2 * start)
-    figure = swell * [0.55, 0.55, 0.22] * np.sin(frequency * t[:, None] + phase)
-    figure += [0.0, 0.0, 0.6]
-
-    doublets = zero.copy()
-    size = np.array([0.12, 4.0, 4.0, 3.0])
-    for k, begin in enumerate(np.arange(0.8, duration - 0.6, 0.45)):
-        axis = k % 4
-        sign = 1 if (k // 4) % 2 == 0 else -1
-        at = (t >= begin) & (t < begin + 0.16)
-        doublets[at, axis] += (
-            sign * size[axis] * np.where(t[at] < begin + 0.08, 1.0, -1.0)
-        )
     hover = np.tile([0.0, 0.0, 0.7], (len(t), 1))
-
+    # in this order: a seed's draws are those of the way points, then of the figure
     flights = {
-        "flight_a": (waypoints, 0.6 * np.sin(0.9 * t), zero, 4.1),
-        "flight_b": (figure, 0.8 * np.sin(0.7 * t), zero, 3.9),
-        "flight_c": (hover, 0.0 * t, doublets, 3.7),
+        "flight_a": (_way_points(rng, t, duration), 0.6 * np.sin(0.9 * t), zero, 4.1),
+        "flight_b": (_figure(rng, t), 0.8 * np.sin(0.7 * t), zero, 3.9),
+        "flight_c": (hover, 0.0 * t, _doublets(t, duration), 3.7),
     }
     sideways = 0.25 * np.sin(1.3 * t)
     along = 0.1 * np.sin(0.8 * t)
@@ -151,6 +125,46 @@ def references(
             open_circuit_voltage=voltage,
         )
     return by_name
+
+
+def _way_points(rng, t, duration):
+    """(T, 3) m, from corner to corner."""
+    leg = 1.6  # s
+    corners = rng.uniform(
+        [-0.6, -0.6, 0.3], [0.6, 0.6, 1.0], (int(duration / leg) + 2, 3)
+    )
+    # one of three is near the floor and one near the ceiling, whose effects it shows
+    corners[3::3, 2] = rng.uniform(0.06, 0.1, len(corners[3::3]))
+    corners[2::3, 2] = rng.uniform(1.05, 1.12, len(corners[2::3]))
+    return _minimum_jerk(corners, t, leg)
+
+
+def _figure(rng, t):
+    """(T, 3) m, a Lissajous figure about the middle."""
+    phase = rng.uniform(0, 2 * np.pi, 3)
+    frequency = np.array([0.42, 0.35, 0.25]) * 2 * np.pi * rng.uniform(0.9, 1.1, 3)
+    start = np.clip(t / 3.0, 0, 1)[:, None]
+    # a smooth step, so that the figure begins at rest in the middle
+    swell = start**2 * (3 - 2 * start)
+    figure = swell * [0.55, 0.55, 0.22] * np.sin(frequency * t[:, None] + phase)
+    figure += [0.0, 0.0, 0.6]
+    return figure
+
+
+def _doublets(t, duration):
+    """(T, 4) of thrust and rates, one axis after the other, up and down and then the
+    other way round.
+    """
+    doublets = np.zeros((len(t), 4))
+    size = np.array([0.12, 4.0, 4.0, 3.0])
+    for k, begin in enumerate(np.arange(0.8, duration - 0.6, 0.45)):
+        axis = k % 4
+        sign = 1 if (k // 4) % 2 == 0 else -1
+        at = (t >= begin) & (t < begin + 0.16)
+        doublets[at, axis] += (
+            sign * size[axis] * np.where(t[at] < begin + 0.08, 1.0, -1.0)
+        )
+    return doublets
 
 
 def fly(
