@@ -176,83 +176,90 @@ class Pair:
 
 def pairs_of(s: Signals) -> Iterator[Pair]:
     """All pairs that were logged."""
-    attitude_rates = s.attitude_rates
+    yield from _derived(s)
     acceleration, order = s.acceleration
-    rates = CHANNEL_COLUMNS["body_rates"]
-    velocity = CHANNEL_COLUMNS["velocity"]
-    commands = CHANNEL_COLUMNS["command_body_rates"]
-    if attitude_rates is not None and s.body_rates is not None:
-        least = MOVED["rate"]
-        what = "the attitude's rate"
-        yield Pair(
-            rates,
-            s.body_rates,
-            what,
-            attitude_rates,
-            WIDE,
-            least,
-            "rad/s",
-            (0, 1),
-            "body_rates",
-        )
-    if s.position is not None and s.velocity is not None:
-        path = np.gradient(s.position, 1 / RATE, axis=0)
-        what = "the position's rate"
-        yield Pair(
-            velocity,
-            s.velocity,
-            what,
-            path,
-            LOW,
-            MOVED["velocity"],
-            "m/s",
-            (0, 1),
-            "velocity",
-        )
     along = None
     if acceleration is not None and s.quaternion is not None:
-        size = np.full(len(acceleration), GRAVITY) if s.force is None else s.force[:, 2]
-        lift = rotation(s.quaternion)[:, :, 2] * np.median(size)
-        names = ("the path's acceleration in x", "in y")
-        what = "the attitude's thrust"
-        yield Pair(
-            names,
-            acceleration[:, :2],
-            what,
-            lift[:, :2],
-            LOW,
-            MOVED["tilt"],
-            "m/s^2",
-            (order, 0),
-            "position",
-        )
-        # Sideways a late or tilted attitude feels accelerations that aren't there: the
-        # vertical alone tells.
-        along = to_body(s.quaternion, acceleration + np.array([0.0, 0.0, GRAVITY]))[
-            :, 2:
-        ]
-        if s.force is not None:
-            # Sideways the attitude tells how wrong the path's acceleration is.
-            off = in_band(acceleration[:, :2] - lift[:, :2], LOW).std(0).mean()
-            least = max(MOVED["force"], 2.0 * float(off))
-            what = "the path's acceleration"
-            yield Pair(
-                ("az",), s.force[:, 2:], what, along, LOW, least, "m/s^2", (0, order)
-            )
+        # sideways a late or tilted attitude feels accelerations that aren't there: the
+        # vertical alone tells
+        upright = acceleration + np.array([0.0, 0.0, GRAVITY])
+        along = to_body(s.quaternion, upright)[:, 2:]
+        yield from _felt(s, acceleration, along, order)
     yield from _caused(s, along, order)
     if s.commands is not None and s.rates is not None and not s.saturated:
-        least = MOVED["command"]
-        what = "the body rates"
         yield Pair(
-            commands,
-            s.commands,
-            what,
-            s.rates,
-            LOW,
-            least,
-            "rad/s",
-            (None, 0),
-            "commands",
+            names=CHANNEL_COLUMNS["command_body_rates"],
+            measured=s.commands,
+            what="the body rates",
+            reference=s.rates,
+            band=LOW,
+            least=MOVED["command"],
+            unit="rad/s",
+            derivatives=(None, 0),
+            holds="commands",
+        )
+
+
+def _derived(s: Signals) -> Iterator[Pair]:
+    """Body rates with the attitude, and the velocity with the position."""
+    attitude_rates = s.attitude_rates
+    if attitude_rates is not None and s.body_rates is not None:
+        yield Pair(
+            names=CHANNEL_COLUMNS["body_rates"],
+            measured=s.body_rates,
+            what="the attitude's rate",
+            reference=attitude_rates,
+            band=WIDE,
+            least=MOVED["rate"],
+            unit="rad/s",
+            derivatives=(0, 1),
+            holds="body_rates",
+        )
+    if s.position is not None and s.velocity is not None:
+        yield Pair(
+            names=CHANNEL_COLUMNS["velocity"],
+            measured=s.velocity,
+            what="the position's rate",
+            reference=np.gradient(s.position, 1 / RATE, axis=0),
+            band=LOW,
+            least=MOVED["velocity"],
+            unit="m/s",
+            derivatives=(0, 1),
+            holds="velocity",
+        )
+
+
+def _felt(
+    s: Signals, acceleration: np.ndarray, along: np.ndarray, order: int
+) -> Iterator[Pair]:
+    """The path's acceleration with what an attitude and an accelerometer make of it;
+    `along` (T, 1) is that along the body's z axis.
+    """
+    size = np.full(len(acceleration), GRAVITY) if s.force is None else s.force[:, 2]
+    lift = rotation(s.quaternion)[:, :, 2] * np.median(size)
+    yield Pair(
+        names=("the path's acceleration in x", "in y"),
+        measured=acceleration[:, :2],
+        what="the attitude's thrust",
+        reference=lift[:, :2],
+        band=LOW,
+        least=MOVED["tilt"],
+        unit="m/s^2",
+        derivatives=(order, 0),
+        holds="position",
+    )
+    if s.force is not None:
+        # sideways the attitude tells how wrong the path's acceleration is
+        off = in_band(acceleration[:, :2] - lift[:, :2], LOW).std(0).mean()
+        yield Pair(
+            names=("az",),
+            measured=s.force[:, 2:],
+            what="the path's acceleration",
+            reference=along,
+            band=LOW,
+            least=max(MOVED["force"], 2.0 * float(off)),
+            unit="m/s^2",
+            derivatives=(0, order),
         )
 
 
@@ -266,32 +273,27 @@ def _caused(s: Signals, along: np.ndarray | None, order: int) -> Iterator[Pair]:
     collective = s.motor.mean(1, keepdims=True)
     force, order = (along, order) if s.force is None else (s.force[:, 2:], 0)
     if force is not None:
-        forecast = (
-            collective * np.median(force) / max(float(np.median(collective)), 1e-3)
-        )
-        what = "what the motors would make"
-        least = MOVED["thrust"]
+        usual = max(float(np.median(collective)), 1e-3)
         yield Pair(
-            ("the force felt",),
-            force,
-            what,
-            forecast,
-            LOW,
-            least,
-            "m/s^2",
-            (order, None),
+            names=("the force felt",),
+            measured=force,
+            what="what the motors would make",
+            reference=collective * np.median(force) / usual,
+            band=LOW,
+            least=MOVED["thrust"],
+            unit="m/s^2",
+            derivatives=(order, None),
         )
     if s.thrust is not None and not s.saturated:
-        what = "m1 + m2 + m3 + m4"
         yield Pair(
-            ("cmd_thrust",),
-            100 * s.thrust,
-            what,
-            100 * collective,
-            WIDE,
-            MOVED["share"],
-            "%",
-            (None, None),
+            names=("cmd_thrust",),
+            measured=100 * s.thrust,
+            what="m1 + m2 + m3 + m4",
+            reference=100 * collective,
+            band=WIDE,
+            least=MOVED["share"],
+            unit="%",
+            derivatives=(None, None),
         )
 
 

@@ -105,6 +105,23 @@ def save_evader(
     save_policy_file(path, content, {"environment": game}, notes, storage="float32")
 
 
+def _check_game(path, learned_in, game):
+    """Raises UserError where a file's evader learned in a game unlike this one."""
+    plain = to_plain(game)
+    for name in SAME:
+        if learned_in.get(name) != plain[name]:
+            raise UserError(
+                f"--opponent {path}: learned in a game with {name} {learned_in.get(name)}, here "
+                f"it's {plain[name]}"
+            )
+    slots = learned_in["max_pillars"]
+    if game.max_pillars > slots:
+        raise UserError(
+            f"--opponent {path}: senses {slots} pillars at most, the game has up to "
+            f"{game.max_pillars}; environment.max_pillars {slots} would be right"
+        )
+
+
 def find_opponent(evader: str | Path | Evader, game: PursuitSettings) -> Evader:
     """An evader that isn't one of the library's.
 
@@ -133,19 +150,8 @@ def find_opponent(evader: str | Path | Evader, game: PursuitSettings) -> Evader:
             f"--opponent {path}: holds no evader of this version; openjax exploit writes one"
         )
     learned_in = settings["environment"]
-    plain = to_plain(game)
-    for name in SAME:
-        if learned_in.get(name) != plain[name]:
-            raise UserError(
-                f"--opponent {path}: learned in a game with {name} {learned_in.get(name)}, here "
-                f"it's {plain[name]}"
-            )
+    _check_game(path, learned_in, game)
     slots = learned_in["max_pillars"]
-    if game.max_pillars > slots:
-        raise UserError(
-            f"--opponent {path}: senses {slots} pillars at most, the game has up to "
-            f"{game.max_pillars}; environment.max_pillars {slots} would be right"
-        )
     # the network's sizes are those of its biases
     width, outputs = (
         leaves[f"evader/actor/bias_{layer}"].shape[-1] for layer in (0, 2)
