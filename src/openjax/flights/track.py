@@ -94,14 +94,39 @@ def _stretches(flight: Flight, without_holes: Flight, case: Case) -> list[Track]
     return tracks
 
 
-def _on_grid(part: Flight, flight: Flight, case: Case, name: str) -> Track:
+def _grid_of(part):
+    """Period (s) of the clock that a stretch is read on, whether its rows come faster,
+    and the clock's times (G,).
+    """
     period = max(part.row_period, GRID_PERIOD)
     if abs(period - GRID_PERIOD) < 0.15 * GRID_PERIOD:
         period = GRID_PERIOD
     faster = period / part.row_period > 1.2
     begin = part.time[0] + (_command_phase(part, period) if faster else 0.0)
+    # the last row counts, whatever a quotient of floats makes of it
     count = int((part.time[-1] - begin) / period + 1e-6) + 1
-    grid = begin + period * np.arange(count)
+    return period, faster, begin + period * np.arange(count)
+
+
+def _neighbours(case, flight, grid):
+    """(M, G, 3) m, where the other vehicles are that were tracked."""
+    places = [
+        other.interpolated("position", grid)
+        for other in case.others(flight)
+        if other.position is not None
+    ]
+    return np.array(places) if places else np.zeros((0, len(grid), 3))
+
+
+def _commanded(take):
+    """(G, 4) thrust and body rates; `take` gives a channel's values on the clock."""
+    thrust = take("command_thrust", ahead=True)
+    return np.concatenate([thrust[:, None], take("command_body_rates", ahead=True)], 1)
+
+
+def _on_grid(part: Flight, flight: Flight, case: Case, name: str) -> Track:
+    """A stretch of a flight on an even clock."""
+    period, faster, grid = _grid_of(part)
 
     def take(channel: str, ahead: bool = False) -> Array | None:
         if getattr(part, channel) is None:
@@ -113,7 +138,7 @@ def _on_grid(part: Flight, flight: Flight, case: Case, name: str) -> Track:
         at, values = part.sampled(channel)
         flat = values.reshape(len(values), -1)
         means = _means(at, flat, grid if ahead else grid - 0.5 * period, period, ahead)
-        return means.reshape((count, *values.shape[1:]))
+        return means.reshape((len(grid), *values.shape[1:]))
 
     motor = take("motor_command", ahead=True)
     voltage = take("battery_voltage")
@@ -123,19 +148,9 @@ def _on_grid(part: Flight, flight: Flight, case: Case, name: str) -> Track:
     elif motor is not None and faster:
         at, values = part.sampled("motor_command")
         fast_thrust = at, values.mean(1)
-    command = None
-    if part.has_commands:
-        command = np.concatenate(
-            [take("command_thrust", True)[:, None], take("command_body_rates", True)], 1
-        )
     log = case.vehicle_file.log
     floor = np.array([0.0, 0.0, log.get("floor_z", 0.0)])
     ceiling = log.get("ceiling_z")
-    neighbours = [
-        other.interpolated("position", grid) - floor
-        for other in case.others(flight)
-        if other.position is not None
-    ]
     sensors = {sensor: take(sensor) for sensor in SENSORS}
     if sensors["position"] is not None:
         sensors["position"] = sensors["position"] - floor
@@ -145,10 +160,10 @@ def _on_grid(part: Flight, flight: Flight, case: Case, name: str) -> Track:
         dt=period,
         time=grid,
         **sensors,
-        command=command,
+        command=_commanded(take) if part.has_commands else None,
         motor=motor,
         voltage=None if voltage is None else smooth(voltage, 0.3, period),
-        neighbours=np.array(neighbours) if neighbours else np.zeros((0, count, 3)),
+        neighbours=_neighbours(case, flight, grid) - floor,
         pose_age=part.pose_age,
         attitude_derived=part.attitude_derived,
         ceiling=None if ceiling is None else ceiling - floor[2],
