@@ -65,7 +65,7 @@ def test_modules_that_the_pages_run_are_there():
 
 
 def test_readme_and_pages_stay_short():
-    """README 1,300 words, all pages of the documentation 19,000; a word has a letter,
+    """README 1,300 words, all pages of the documentation 19,300; a word has a letter,
     and what the API page lists of the code is no prose.
     """
 
@@ -76,7 +76,7 @@ def test_readme_and_pages_stay_short():
         return len(re.findall(r"\S*[^\W\d_]\S*", text))
 
     assert words(README) <= 1300
-    assert sum(words(page.read_text(encoding="utf-8")) for page in PAGES) <= 19_100
+    assert sum(words(page.read_text(encoding="utf-8")) for page in PAGES) <= 19_300
 
 
 def test_links_lead_somewhere():
