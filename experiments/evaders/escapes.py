@@ -4,11 +4,13 @@
 Records where everybody is in episodes against a planner, and says of the episodes
 without a capture, second by second, how fast the pursuers fly, how near they are,
 whether they see the evader, and how they stand round it; and of all, what becomes of an
-evader that hasn't been seen for so long. `--only` flies some of the tasks alone, as
-those in which a planner got away. With `--clock` the time that the pursuers observe
+evader that hasn't been seen for so long. With `--opponent`, a file of `openjax
+exploit`, that evader flies, not a planner. `--only` flies some of the tasks alone, as
+those in which one got away. With `--clock` the time that the pursuers observe
 stands still from then on, and the planner knows it.
 """
 
+import argparse
 import itertools
 import time
 from dataclasses import dataclass
@@ -18,14 +20,16 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from experiments.evaders.judged_game import game_parser, judged_game
-from openjax.evaluation.judges.duel import Duel
+from experiments.evaders.judged_game import JudgedGame, game_parser, judged_game
+from openjax.evaluation.judges.duel import Duel, World
 from openjax.evaluation.judges.planner import Planner
+from openjax.evaluation.judges.receding_horizon import RecedingHorizon
 from openjax.evaluation.judges.settings import PlannerSettings
 from openjax.files import write_json
 from openjax.policy import Policy, PolicyParameters
 from openjax.pursuit import Observation, PursuitSettings, PursuitState, Task
 from openjax.pursuit.sensing import line_of_sight
+from openjax.store.environments import make_environment
 
 AGES = (0.0, 0.1, 0.3, 0.6, 1.1, 2.1)
 """Seconds for which nobody has seen an evader, from each to the next; 0: it is seen."""
@@ -78,14 +82,40 @@ def moment(state: PursuitState) -> Moment:
     )
 
 
-def record(planner: Planner, parameters, tasks, key) -> Moment:
-    """An episode of the planner on each of tasks (B, ...), a moment each time it
-    plans.
+@struct.dataclass
+class Flying:
+    """B worlds on their way."""
+
+    world: World
+
+
+@dataclass(frozen=True, eq=False)
+class OwnRule(RecedingHorizon):
+    """An evader that flies by its own rule, looked at as often as one that plans."""
+
+    settings: PlannerSettings
+    duel: Duel
+
+    def begin(self, start: World) -> Flying:
+        """Worlds (B, ...) at the start of an episode."""
+        return Flying(start)
+
+    def replan(
+        self, parameters: PolicyParameters, carry: Flying, key: jax.Array
+    ) -> Flying:
+        """The same a tenth of a second later."""
+        del key
+        wish = jnp.full_like(carry.world[1].evader_position, jnp.nan)
+        steps = self.settings.replan
+        return Flying(self.duel.fly(parameters, carry.world, wish, steps))
+
+
+def record(evaders: RecedingHorizon, parameters, tasks, key) -> Moment:
+    """An episode of the evaders on each of tasks (B, ...), a moment each time they
+    plan.
     """
-    flown = planner.fly_and_keep(
-        parameters, planner.duel.start(tasks, key), key, moment
-    )
-    return flown[1]
+    start = evaders.duel.start(tasks, key)
+    return evaders.fly_and_keep(parameters, start, key, moment)[1]
 
 
 def open_angle(moments: Moment) -> np.ndarray:
@@ -109,7 +139,11 @@ def summary(moments: Moment, game: PursuitSettings, replan: int) -> dict:
     height = moments.pursuers[..., 2]
     side = np.sign(height - moments.evader[..., None, 2])
     offset = moments.pursuers - moments.evader[:, :, None]
+    second = round(1.0 / (game.time_step * replan))
+    way = np.linalg.norm(np.diff(moments.evader, axis=0), axis=-1)
     values = {
+        "evader_speed": second * np.concatenate([way[:1], way]),
+        "second_nearest": np.sort(np.linalg.norm(offset, axis=-1), axis=-1)[..., 1],
         "speed": np.linalg.norm(moments.velocity, axis=-1).mean(-1),
         "nearest": np.linalg.norm(offset, axis=-1).min(-1),
         "open_angle": open_angle(moments),
@@ -119,7 +153,6 @@ def summary(moments: Moment, game: PursuitSettings, replan: int) -> dict:
         "seen": moments.in_sight.any(-1),
         "all_above_or_below": np.abs(side.sum(-1)) == side.shape[-1],
     }
-    second = round(1.0 / (game.time_step * replan))
 
     def each_second(value, over):
         parts = value[:, free].reshape(-1, second, free.sum())
@@ -187,8 +220,8 @@ def out_of_sight(
     return rows
 
 
-def main() -> None:
-    """The command."""
+def escapes_parser() -> argparse.ArgumentParser:
+    """The options."""
     parser = game_parser(__doc__, episodes=10, uniform=24)
     parser.add_argument("--plans", type=int, default=PlannerSettings().plans)
     parser.add_argument(
@@ -197,30 +230,52 @@ def main() -> None:
     parser.add_argument(
         "--only", type=int, nargs="*", help="numbers of each kind's tasks; all"
     )
-    options = parser.parse_args()
-    game = judged_game(options)
-    settings = game.environment.settings
+    parser.add_argument("--opponent", help="file of a learned evader")
+    return parser
+
+
+def evaders_of(game: JudgedGame) -> RecedingHorizon:
+    """Who flies away from the game's policy, as the options say."""
+    options = game.options
+    environment = game.environment
+    settings = environment.settings
     policy = game.loaded.policy
     if options.clock is not None:
         length = settings.episode_length * settings.time_step
         policy = StoppedClock(policy, options.clock / length)
-    planner = Planner(PlannerSettings(options.plans), Duel(game.environment, policy))
-    fly = jax.jit(lambda *arguments: record(planner, *arguments))
+    planning = PlannerSettings(options.plans)
+    if not options.opponent:
+        return Planner(planning, Duel(environment, policy))
+    environment = make_environment(
+        settings, options.vehicle, options.effects, options.opponent
+    )
+    return OwnRule(planning, Duel(environment, policy))
+
+
+def main() -> None:
+    """The command."""
+    options = escapes_parser().parse_args()
+    game = judged_game(options)
+    settings = game.environment.settings
+    evaders = evaders_of(game)
+    fly = jax.jit(lambda *arguments: record(evaders, *arguments))
     found = {
         **game.flown,
-        "plans": options.plans,
+        "plans": None if options.opponent else options.plans,
+        "opponent": options.opponent,
         "clock": options.clock,
         "only": options.only,
         "kinds": {},
     }
+    replan = evaders.settings.replan
+    second = round(1.0 / (settings.time_step * replan))
     for kind, tasks in game.part(game.tasks).items():
         began = time.monotonic()
         if options.only:
             tasks = jax.tree.map(lambda leaf: leaf[np.array(options.only)], tasks)
         flown = fly(game.loaded.parameters, tasks, jax.random.key(options.seed))
         flown = jax.tree.map(np.asarray, flown)
-        own = summary(flown, settings, planner.settings.replan)
-        second = round(1.0 / (settings.time_step * planner.settings.replan))
+        own = summary(flown, settings, replan)
         in_view = place_in_view(flown, tasks, settings)
         own["out_of_sight"] = out_of_sight(flown, in_view, second)
         found["kinds"][kind] = own
