@@ -8,7 +8,16 @@ import numpy as np
 import pytest
 
 from openjax.gap.model.cross_validation import Judged
-from openjax.gap.selection import clearly_larger, difference, growth, worse
+from openjax.gap.model.hypotheses import SetFit
+from openjax.gap.selection import (
+    Hypothesis,
+    clearly_larger,
+    difference,
+    growth,
+    possible,
+    settled,
+    worse,
+)
 
 
 def judged(left: np.ndarray, blocks: int) -> Judged:
@@ -85,3 +94,39 @@ def test_what_only_a_sum_is_known_of_is_clear_by_the_sum():
     assert clearly_larger(np.array([1.0, 1.0]), together, least)
     assert not clearly_larger(np.array([1.0, -1.0]), together, least)
     assert clearly_larger(np.array([2.5, 0.0]), apart, least)
+
+
+class Found(SetFit):
+    """A fit of which nothing but values is known."""
+
+    def __init__(self, effects, **values):
+        object.__setattr__(self, "effects", effects)
+        object.__setattr__(self, "found", values)
+
+    def parameters(self):
+        return {e: {p: (v, 1e-3) for p, v in self.found.items()} for e in self.effects}
+
+
+def test_a_set_that_only_settles_beyond_its_bounds_is_not_chosen():
+    def rotors(strongest):
+        found = {"m1": -strongest, "m2": strongest, "m3": 0.0, "m4": 0.0}
+        return Found(("motor_imbalance",), **found)
+
+    calm = judged(np.zeros(20), 5)
+    drag = Found(("rotor_drag",), d_xy=0.01, d_z=0.001)
+    visited = {
+        frozenset(fit.effects): Hypothesis(fit, calm, 0.0)
+        for fit in (Found(()), rotors(0.12), drag)
+    }
+
+    def weights():  # as the search has them: of sets that are possible
+        kept = [k for k, h in visited.items() if possible(h.fit)]
+        return {k: (0.6 if "motor_imbalance" in k else 0.2) for k in kept[::-1]}
+
+    def settle(hypothesis):
+        runs_away = "motor_imbalance" in hypothesis.effects
+        return rotors(0.37) if runs_away else hypothesis.fit
+
+    chances, chosen, fit = settled(visited, weights, settle, possible)
+    assert chosen.effects == ("rotor_drag",) and fit is drag
+    assert frozenset({"motor_imbalance"}) not in chances

@@ -13,7 +13,7 @@ probability; named is the most probable one.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import combinations
@@ -100,8 +100,12 @@ class Selection:
 def select(evidence: Evidence) -> Selection:
     """Choose among the physics effects that the flights can show."""
     search = searched(evidence)
-    weights = search.weights()
-    chosen = search.visited[max(weights, key=weights.get)]
+    weights, chosen, fit = settled(
+        search.visited,
+        search.weights,
+        lambda h: fit_set(h.fit.replay, h.effects, h.fit.theta, rounds=ROUNDS),
+        lambda fit: possible(fit) and practical(fit, evidence.measured),
+    )
     without = {
         e: search.of_set(set(chosen.effects) - {e}, chosen.fit) for e in chosen.effects
     }
@@ -110,14 +114,31 @@ def select(evidence: Evidence) -> Selection:
         for e, h in without.items()
     }
     ordered = tuple(sorted(gains, key=lambda e: -gains[e]))
-    chosen = replace(
-        chosen,
-        fit=fit_set(chosen.fit.replay, chosen.effects, chosen.fit.theta, rounds=ROUNDS),
-    )
+    chosen = replace(chosen, fit=fit)
     table = build(chosen.fit, {})
     return Selection(
         chosen, table, ordered, weights, search.equivalents(chosen, ordered), search
     )
+
+
+def settled(
+    visited: dict[frozenset, Hypothesis],
+    weights: Callable[[], dict[frozenset, float]],
+    settle: Callable[[Hypothesis], SetFit],
+    allowed: Callable[[SetFit], bool],
+) -> tuple[dict[frozenset, float], Hypothesis, SetFit]:
+    """The weights of the sets, the hypothesis that they choose, and its fit once
+    nuisances and parameters have settled. A set that only then isn't `allowed`, as it
+    leaves its physical bounds or becomes too small to matter, isn't chosen: `visited`
+    holds it as settled, and `weights` are asked again.
+    """
+    while True:
+        chances = weights()
+        key = max(chances, key=chances.get)
+        fit = settle(visited[key])
+        if not key or allowed(fit):
+            return chances, visited[key], fit
+        visited[key] = replace(visited[key], fit=fit)
 
 
 def searched(evidence: Evidence) -> Search:
