@@ -9,10 +9,11 @@ import pytest
 
 from openjax.gap.model.whitening import Noise
 from openjax.gap.residual import (
-    HORIZONS,
+    MEASURES,
     beyond,
     calibration,
     conformal_p,
+    lopsided,
     measure,
     standing_out,
 )
@@ -62,10 +63,10 @@ def test_a_push_is_left_in_its_channel_and_in_no_other():
     assert small.max() < 0.1 and large[3] > 0.5 and large[[0, 1, 2, 4, 5]].max() < 0.1
 
 
-@pytest.mark.parametrize("name", HORIZONS)
+@pytest.mark.parametrize("name", MEASURES)
 def test_p_values_fall_with_each_measure_and_none_is_zero(name):
     usual = {
-        n: float(np.median([c[n] for c in calibration() if n in c])) for n in HORIZONS
+        n: float(np.median([c[n] for c in calibration() if n in c])) for n in MEASURES
     }
     values = [conformal_p(usual | {name: usual[name] * k}) for k in (1.0, 10.0, 1e3)]
     p_values = [p for p, _ in values]
@@ -85,3 +86,10 @@ def test_a_case_of_the_calibration_stands_out_as_often_as_it_should():
 
 def test_a_log_with_nothing_to_hold_against_each_other_stands_out_nowhere():
     assert conformal_p({}) == (1.0, "")
+
+
+def test_what_is_left_along_one_direction_is_told_whichever_that_is():
+    noise = np.random.default_rng(1).standard_normal((2000, 3))
+    turned = np.linalg.qr(np.random.default_rng(2).standard_normal((3, 3)))[0]
+    assert lopsided(noise) == pytest.approx(1.0, abs=0.1)
+    assert lopsided(noise * [1.0, 1.0, 3.0] @ turned) == pytest.approx(3.0, rel=0.1)

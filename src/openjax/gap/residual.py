@@ -39,6 +39,10 @@ FORM_LEFT = 0.3
 # Share of what grew that effects leave where they aren't what acts: those named beside
 # an unknown cause left .71 to 1, those that act .54 at most (seeds 890 to 893).
 MOSTLY = 0.65
+# Name of how much more is left along one direction than along the next one. Sensors' noise and
+# air have none; what acts on a body or reads one axis has.
+ALONG = "{} along one direction"
+MEASURES = (*HORIZONS, *map(ALONG.format, HORIZONS))
 # Of HORIZONS what another vehicle's gusts shake; where there are any, rows under it
 # don't count.
 HELD_FROM_GUSTS = ("velocity", "rates")
@@ -100,8 +104,14 @@ def check_residual(evidence: Evidence, fit: SetFit, nothing: SetFit) -> Check:
         )
     rejects = p_value <= DECISION.unknown
     predicted = beyond(axes, before) if rejects else np.zeros(9)
-    where = HORIZONS.get(name, (0.0, ""))[1]
-    return Check(measured, where, p_value, predicted, rejects and mostly)
+    return Check(measured, _in_words(name), p_value, predicted, rejects and mostly)
+
+
+def _in_words(name: str) -> str:
+    """What it means that a measure is large."""
+    told = {n: words for n, (_, words) in HORIZONS.items()}
+    told |= {ALONG.format(n): f"{words}, along one direction" for n, words in told.items()}
+    return told.get(name, "")
 
 
 def residuals_of(fit: SetFit) -> list[Float[np.ndarray, "_ channels"]]:
@@ -134,14 +144,27 @@ def measure(
     dt = evidence.tracks[0].dt
     skip = int(SKIP / dt)
     axes = {}
+    along = {}
     for name, parts in _series(evidence, residuals).items():
         step = max(round(HORIZONS[name][0] / dt), 1)
         moved = [(p[step:] - p[:-step])[skip:] for p in parts]
         if name in HELD_FROM_GUSTS and evidence.motion.gusts is not None:
             calm = [_calm(rows, step)[skip:] for rows in evidence.motion.gusts.rows]
             moved = [m[c] for m, c in zip(moved, calm, strict=True)]
-        axes[name] = np.concatenate(moved).std(0)
-    return {name: float(size.max()) for name, size in axes.items()}, axes
+        moved = np.concatenate(moved)
+        axes[name] = moved.std(0)
+        along[ALONG.format(name)] = lopsided(moved)
+    return {name: float(size.max()) for name, size in axes.items()} | along, axes
+
+
+def lopsided(moved: Float[np.ndarray, "rows 3"]) -> float:
+    """By what factor the deviation along the direction of the largest exceeds that of
+    the next one.
+    """
+    middle, largest = np.sqrt(
+        np.maximum(np.linalg.eigvalsh(np.cov(moved, rowvar=False))[1:], 1e-24)
+    )
+    return float(largest / middle)
 
 
 def _calm(rows: Chosen, step: int) -> Chosen:
@@ -228,7 +251,7 @@ def changed_p(
     measures `unnamed` of no effect.
     """
     grown = {}
-    for name in (n for n in measured if n in before):
+    for name in (n for n in HORIZONS if n in measured and n in before):
         explained = max(unnamed[name] ** 2 - measured[name] ** 2, 0.0)
         left = max(measured[name] ** 2 - FORM_LEFT**2 * explained, 1e-24)
         grown[name] = float(0.5 * np.log(left / max(before[name], 1e-12) ** 2))
@@ -267,8 +290,8 @@ def standing_out(measured: dict[str, float]) -> tuple[float, str]:
     it has a part in; so each logarithm is told given the others, as of a normal
     distribution.
     """
-    names, (mean, covariance) = list(HORIZONS), usual()
-    rows = [k for k, n in enumerate(names) if n in measured]
+    mean, covariance = usual()
+    rows = [k for k, n in enumerate(MEASURES) if n in measured]
     precision = np.linalg.inv(covariance[np.ix_(rows, rows)])
     far = (
         precision
@@ -276,14 +299,15 @@ def standing_out(measured: dict[str, float]) -> tuple[float, str]:
         / np.sqrt(np.diag(precision))
     )
     return max(
-        zip(far.tolist(), (names[k] for k in rows), strict=True), default=(-np.inf, "")
+        zip(far.tolist(), (MEASURES[k] for k in rows), strict=True),
+        default=(-np.inf, ""),
     )
 
 
 def logarithms(measured: dict[str, float]) -> np.ndarray:
-    """(measures,) in the order of HORIZONS, NaN where there is none."""
+    """(measures,) in the order of MEASURES, NaN where there is none."""
     return np.log(
-        [max(measured[n], 1e-12) if n in measured else np.nan for n in HORIZONS]
+        [max(measured[n], 1e-12) if n in measured else np.nan for n in MEASURES]
     )
 
 
