@@ -130,7 +130,7 @@ def test_diagnosis():
     """The last exam's engine, without a reference, on the cases that it answered
     once.
     """
-    first = read("exam_reference")["figures"]["now"]["first"]
+    first = read("exam_reference")["sealed_2303"]["figures"]["alone"]["first"]
     label = (
         "diagnosis of 62 simulated cases with one cause: the first cause named is right"
     )
