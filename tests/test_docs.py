@@ -164,6 +164,14 @@ def test_names_of_the_api_page_are_there():
     places = [re.sub(r"^(openjax)\.(\w+)$", r"\1:\2", name) for name in names]
     missing = [place for place in places if not callable(pkgutil.resolve_name(place))]
     assert len(names) > 50 and not missing
+    members = re.findall(r"autoclass:: (\S+)\n +:members: (\S.*)", text)
+    gone = [
+        f"{name}.{member}"
+        for name, listed in members
+        for member in listed.split(", ")
+        if not hasattr(pkgutil.resolve_name(name), member)
+    ]
+    assert members and not gone
 
 
 def test_what_pages_and_their_programs_import_is_there():
