@@ -15,7 +15,6 @@ from openjax.learning.team_search import (
     no_plan,
 )
 from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings, scenario_task
-from openjax.pursuit.shortest_paths import shortest_paths
 
 GAME = PursuitSettings(max_pillars=6)
 SEARCH = TeamSearch(GAME, plans=7, seconds=0.6)
@@ -34,9 +33,11 @@ def wall():
 def test_the_best_plan_is_best_against_the_worst_answer(wall):
     state, velocities = wall
     key = jax.random.key(2)
-    best, worth = jax.jit(SEARCH.search)(state, velocities, no_plan(3), key)
+    best, worth = jax.jit(SEARCH.search)(
+        state, SEARCH.paths(state.task), velocities, no_plan(3), key
+    )
     teams = SEARCH.candidates(key, no_plan(3))
-    paths = shortest_paths(SEARCH.narrow_game, state.task)
+    paths = SEARCH.paths(state.task)
     fly = jax.jit(SEARCH.fly)
     payoff = np.zeros((7, 3))
     for i, j in itertools.product(range(7), range(3)):
@@ -50,7 +51,9 @@ def test_the_best_plan_is_best_against_the_worst_answer(wall):
 
 def test_points_are_no_faster_than_quadrotors(wall):
     state, velocities = wall
-    places = np.asarray(jax.jit(SEARCH.way)(state, no_plan(3), velocities[0]))
+    places = np.asarray(
+        jax.jit(SEARCH.way)(state, SEARCH.paths(state.task), no_plan(3), velocities[0])
+    )
     velocity = np.diff(places, axis=0) / STEP
     assert np.linalg.norm(velocity, axis=-1).max() <= GAME.max_speed + 1e-4
     change = np.diff(velocity, axis=0) / STEP
@@ -61,5 +64,7 @@ def test_a_team_catches_who_stays_behind_a_wall(wall):
     state, _ = wall
     search = dataclasses.replace(SEARCH, seconds=1.6)
     stays = jnp.zeros((1, search.steps, 3))
-    _, worth = jax.jit(search.search)(state, stays, no_plan(3), jax.random.key(3))
+    _, worth = jax.jit(search.search)(
+        state, search.paths(state.task), stays, no_plan(3), jax.random.key(3)
+    )
     assert float(worth) < search.steps

@@ -15,7 +15,7 @@ from openjax.learning.analytic_gradient import AnalyticGradient, free_flight
 from openjax.learning.gradient_stage import Turn, update
 from openjax.learning.presets import preset
 from openjax.learning.settings import WorstPlansSettings
-from openjax.learning.worst_plans import WARM_UP, WorstPlans, planning_game
+from openjax.learning.worst_plans import WARM_UP, WorstPlans, planning_game, worst_of
 from openjax.policy import NetworkSettings, Policy, PredictorSettings
 from openjax.pursuit import Pursuit, PursuitSettings
 
@@ -79,8 +79,8 @@ def test_the_worst_plan_is_the_worst_of_those_tried(flown):
     stage, parameters, carried = flown
     plan = 0.7 * jax.random.normal(jax.random.key(3), carried.plan.shape)
     key = jax.random.key(4)
-    worst, promised = jax.jit(stage.worst)(
-        parameters.actor, parameters, carried.world, plan, key
+    worst, promised = worst_of(
+        jax.jit(stage.attempts)(parameters.actor, parameters, carried.world, plan, key)
     )
     step = jax.jit(stage.environment.step)
     act = jax.jit(stage.usual.policy.act)
@@ -106,7 +106,7 @@ def test_the_worst_plan_is_the_worst_of_those_tried(flown):
 @pytest.mark.slow
 def test_pursuers_learn_from_the_worst_plan(flown):
     stage, parameters, carried = flown
-    one = jax.jit(functools.partial(update, stage))
+    one = jax.jit(functools.partial(update, stage.programs))
     flights = jax.jit(stage.record)(parameters, jax.random.key(5))
     turn = Turn(parameters.actor, carried, parameters, flights, jax.random.key(6))
     actor, after, parts = one(turn)
@@ -137,7 +137,7 @@ def test_the_game_that_is_shipped_can_be_learnt_with_team_plans():
         state = stage.begin(parameters, key)
         flights = stage.record(parameters, key)
         turn = Turn(parameters.actor, state, parameters, flights, key)
-        return state, update(stage, turn)
+        return state, update(stage.programs, turn)
 
     # its shapes alone: vehicles' ranges, say, can't be checked inside a program
     before, (_, after, parts) = jax.eval_shape(whole, jax.random.key(0))

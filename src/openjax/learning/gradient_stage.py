@@ -2,7 +2,7 @@
 compiled while the run learns.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
@@ -53,10 +53,10 @@ class GradientStage(Protocol):
         """
 
 
-def update(stage: GradientStage, turn: Turn) -> Updated:
-    """A whole update."""
+def update(programs: Sequence[Callable[[Turn, tuple], Any]], turn: Turn) -> Updated:
+    """A whole update by a stage's programs, compiled or not."""
     results = ()
-    for program in stage.programs:
+    for program in programs:
         results = (*results, program(turn, results))
     return results[-1]
 
@@ -95,10 +95,7 @@ def compile_stage(
         for number in range(stage.settings.updates):
             step_key = jax.random.fold_in(update_key, number)
             turn = Turn(actor, state, parameters, flights, step_key)
-            results = ()
-            for program in programs:
-                results = (*results, program(turn, results))
-            actor, state, parts = results[-1]
+            actor, state, parts = update(programs, turn)
             yield parameters.replace(actor=actor), jax.device_get(parts)
 
     return learn

@@ -13,6 +13,7 @@ learnt here.
 """
 
 import dataclasses
+import functools
 from dataclasses import dataclass
 
 import jax
@@ -21,6 +22,8 @@ from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from openjax.pursuit import PursuitSettings, PursuitState
+from openjax.pursuit.collisions import breaches
+from openjax.pursuit.evaders.behaviours import into_free_space
 from openjax.pursuit.shapes import Scalar, Team, Vector
 from openjax.pursuit.shortest_paths import (
     ROOM,
@@ -28,7 +31,8 @@ from openjax.pursuit.shortest_paths import (
     path_length,
     shortest_paths,
 )
-from openjax.pursuit.task import capture_radius
+from openjax.pursuit.task import Task, capture_radius
+from openjax.vehicle.vectors import length
 
 STEP = 0.04
 """Seconds of a point's step: it flies 4 cm."""
@@ -118,7 +122,7 @@ class TeamSearch:
         """Points' steps of a plan."""
         return STRIDE * max(1, round(self.seconds / (STRIDE * STEP)))
 
-    @property
+    @functools.cached_property
     def narrow_game(self) -> PursuitSettings:
         """The game in whose paths narrower ways are open."""
         clearance = max(0.0, self.game.pillar_clearance - min(NARROW, ROOM))
@@ -126,6 +130,19 @@ class TeamSearch:
         return dataclasses.replace(
             self.game, pillar_clearance=clearance, vehicles=(), rare_vehicles=0.0
         )
+
+    @functools.cached_property
+    def strict_game(self) -> PursuitSettings:
+        """The game in which pursuers keep further apart."""
+        return dataclasses.replace(
+            self.narrow_game,
+            pillar_clearance=self.game.pillar_clearance,
+            drone_clearance=APART * self.game.drone_clearance,
+        )
+
+    def paths(self, task: Task) -> ShortestPaths:
+        """Round the task's pillars, narrow ways included."""
+        return shortest_paths(self.narrow_game, task)
 
     def candidates(self, key: PRNGKeyArray, team_plan: TeamPlan) -> TeamPlan:
         """(T, ...) plans of N pursuers: straight at the evader, the rest of the last
@@ -135,7 +152,7 @@ class TeamSearch:
         shape = (self.plans, *team_plan.until.shape)
         keys = jax.random.split(key, 7)
         way = jax.random.normal(keys[0], (*shape, 3))
-        way = way / jnp.sqrt(jnp.sum(way**2, axis=-1, keepdims=True) + 1e-12)
+        way = way / length(way, keepdims=True)
         far = BESIDE * jax.random.uniform(keys[1], (*shape, 1)) ** (1 / 3)
         angle = jax.random.uniform(keys[2], shape, maxval=2 * jnp.pi)
         out = (
@@ -174,13 +191,13 @@ class TeamSearch:
         """(N, 3) m/s, along the shortest path to (N, 3) targets."""
 
         def one(position, target):
-            def length(position):
+            def way(position):
                 return path_length(
                     self.narrow_game, task, paths, position[None], target
                 )[0]
 
-            length, away = jax.value_and_grad(length)(position)
-            return -away * jnp.minimum(self.game.max_speed, length / BRAKING)
+            far, away = jax.value_and_grad(way)(position)
+            return -away * jnp.minimum(self.game.max_speed, far / BRAKING)
 
         return jax.vmap(one)(position, target)
 
@@ -211,14 +228,22 @@ class TeamSearch:
     def _after_step(self, task, points, desired, velocity):
         """Points a step later, whose pursuers wish to fly (N, 3) m/s."""
         game = self.game
-        evader = self._moved(task, points.evader, velocity)
+        evader = into_free_space(
+            game,
+            points.evader + STEP * velocity,
+            task.pillar_position,
+            task.pillar_active,
+        )
         push = (desired - points.velocity) / RESPONSE
-        size = jnp.sqrt(jnp.sum(push**2, axis=-1, keepdims=True) + 1e-12)
+        size = length(push, keepdims=True)
         flown = points.velocity + STEP * push * jnp.minimum(1.0, ACCELERATION / size)
         low = jnp.array([-jnp.inf, -jnp.inf, LEAST_HEIGHT])
         high = jnp.array([jnp.inf, jnp.inf, game.arena_height])
         position = jnp.clip(points.position + STEP * flown, low, high)
         square = jnp.sum((position - evader) ** 2, axis=-1)
+        breach = breaches(
+            self.strict_game, position, task.pillar_position, task.pillar_active
+        )
         caught = points.caught | jnp.any(square < capture_radius(game, task) ** 2)
         return Points(
             position,
@@ -226,38 +251,8 @@ class TeamSearch:
             evader,
             caught,
             free=points.free + ~caught,
-            breaches=points.breaches + self._is_breach(task, position),
+            breaches=points.breaches + jnp.any(breach.total > 0),
         )
-
-    def _is_breach(self, task, position):
-        """() bool, whether somebody of (N, 3) is too close to another or a pillar, or
-        outside.
-        """
-        game = self.game
-        offset = position[:, None] - position[None]
-        to_others = jnp.sum(offset**2, axis=-1) + jnp.eye(position.shape[0])
-        to_axis = jnp.sum((position[:, None, :2] - task.pillar_position) ** 2, axis=-1)
-        room = game.pillar_radius + game.pillar_clearance
-        level = jnp.sum(position[:, :2] ** 2, axis=-1)
-        return (
-            jnp.any(to_others < (APART * game.drone_clearance) ** 2)
-            | jnp.any((to_axis < room**2) & task.pillar_active)
-            | jnp.any(level > game.arena_radius**2)
-        )
-
-    def _moved(self, task, evader, velocity):
-        """Where the evader is a step later, outside the pillars and inside the arena."""
-        game = self.game
-        there = evader + STEP * velocity
-        offset = there[:2] - task.pillar_position
-        length = jnp.sqrt(jnp.sum(offset**2, axis=-1, keepdims=True) + 1e-12)
-        deep = jnp.maximum(game.pillar_radius - length, 0.0)
-        level = there[:2] + jnp.sum(
-            jnp.where(task.pillar_active[:, None], deep * offset / length, 0.0), axis=0
-        )
-        out = jnp.sqrt(jnp.sum(level**2) + 1e-12)
-        level = level * jnp.minimum(1.0, game.arena_radius / out)
-        return jnp.append(level, jnp.clip(there[2], 0.0, game.arena_height))
 
     def payoff(self, task, paths: ShortestPaths, end: Points) -> Scalar:
         """() what a pair of plans is worth to the evader, in steps: those that it is
@@ -280,13 +275,17 @@ class TeamSearch:
         )
 
     def search(
-        self, state: PursuitState, velocities: Velocities, team_plan: TeamPlan, key
+        self,
+        state: PursuitState,
+        paths: ShortestPaths,
+        velocities: Velocities,
+        team_plan: TeamPlan,
+        key: PRNGKeyArray,
     ) -> tuple[TeamPlan, Scalar]:
         """Of one world: the team's plan that is best against the worst of the evader's
         (E, steps, 3) m/s, and what that is worth to the evader.
         """
         task = state.task
-        paths = shortest_paths(self.narrow_game, task)
         start = self.start(state)
         teams = self.candidates(key, team_plan)
 
@@ -300,16 +299,16 @@ class TeamSearch:
         best = jnp.argmin(worth)
         return jax.tree.map(lambda leaf: leaf[best], teams), worth[best]
 
-    def way(self, state: PursuitState, plan: TeamPlan, velocity) -> Places:
+    def way(
+        self, state: PursuitState, paths: ShortestPaths, plan: TeamPlan, velocity
+    ) -> Places:
         """Where the pursuers of one world are after each step of a plan against the
         evader's (steps, 3) m/s.
         """
-        paths = shortest_paths(self.narrow_game, state.task)
         return self.fly(state.task, paths, self.start(state), plan, velocity)[1]
 
-    def room(self, state: PursuitState) -> Scalar:
+    def room(self, state: PursuitState, paths: ShortestPaths) -> Scalar:
         """() of a step, how far a world's evader is from the pursuers."""
-        paths = shortest_paths(self.narrow_game, state.task)
         return self._room(
             state.task, paths, state.drones.position, state.evader_position
         )

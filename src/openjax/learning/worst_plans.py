@@ -228,20 +228,6 @@ class WorstPlans:
         ]
         return jnp.concatenate(parts, axis=1)
 
-    def worst(
-        self,
-        actor: Any,
-        parameters: PolicyParameters,
-        world,
-        plan: Plan,
-        key: PRNGKeyArray,
-    ) -> tuple[Plan, Float[Array, " worlds"]]:
-        """The plan of those tried that is worst for the pursuers of worlds (B, ...),
-        and what it promises the evader, see `promise`; `plan` is the rest of the last
-        one.
-        """
-        return worst_of(self.attempts(actor, parameters, world, plan, key))
-
     def attempts(
         self,
         actor: Any,
@@ -250,7 +236,9 @@ class WorstPlans:
         plan: Plan,
         key: PRNGKeyArray,
     ) -> Tried:
-        """All plans tried in worlds (B, ...), and what became of them."""
+        """All plans tried in worlds (B, ...), and what became of them; `plan` is the
+        rest of the last one.
+        """
         tried = self.candidates(key, plan)
         number = self.planning.plans
         copied = jax.tree.map(lambda leaf: jnp.repeat(leaf, number, axis=0), world)
@@ -288,7 +276,9 @@ class WorstPlans:
         the rest of the last one.
         """
         team = self.team
-        room = jax.vmap(jax.vmap(team.room))(tried.end)
+        # found once: pillars stand still, whatever is tried
+        paths = jax.vmap(team.paths)(world[1].task)
+        room = jax.vmap(jax.vmap(team.room, (0, None)))(tried.end, paths)
         worth = tried.free * (self.game.time_step / STEP) + room
         most = jax.lax.top_k(tried.promised, min(ANSWERS, self.planning.plans))[1]
 
@@ -297,9 +287,11 @@ class WorstPlans:
 
         velocities = self._velocities(chosen(tried.plans))
         keys = jax.random.split(key, plan.shape[0])
-        best, promised = jax.vmap(team.search)(world[1], velocities, team_plan, keys)
+        best, promised = jax.vmap(team.search)(
+            world[1], paths, velocities, team_plan, keys
+        )
         gain = jnp.max(chosen(worth), axis=1) - promised
-        way = jax.vmap(team.way)(world[1], best, self._velocities(plan))
+        way = jax.vmap(team.way)(world[1], paths, best, self._velocities(plan))
         ends_of_pieces = (
             np.arange(1, self.planning.pieces + 1) * team.steps // self.planning.pieces
         )
