@@ -265,6 +265,8 @@ def shares(vehicles: list[dict], name: str) -> dict:
     mean = np.sum([r["mean"] for r in rows], 0)
     cov = np.sum([r["cov"] for r in rows], 0)
     out = {"vehicles": len(rows), "true_wins": float(mean[0]) / len(rows)}
+    if mean[0] <= 0.0:  # there is nothing that could be won back
+        return out
     for place, which in ((1, "found"), (2, "wrong")):
         share = mean[place] / mean[0]
         slope = np.zeros(3)

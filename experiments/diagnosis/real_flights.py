@@ -19,8 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.diagnosis.generate import in_processes
-from experiments.flying.single_thread import use_single_thread
+from experiments.flying.single_thread import share_out, use_single_thread
 
 PERIOD = 0.01  # s
 NOMINAL = 0.025  # s, the simulator's motors
@@ -207,6 +206,7 @@ def main() -> None:
         draw(found["cases"], arguments.figure)
         return
     use_single_thread()
+    from openjax.files import write_text
     from openjax.runs.machine import describe_machine
 
     parts = [(c, None, False) for f in arguments.folders for c in cases_of(f)]
@@ -215,17 +215,17 @@ def main() -> None:
         (arguments.separate, (False, True)),
     ):
         parts += [p for f in folders for c in cases_of(f) for p in flights_of(c, rows)]
-    found = sorted(
-        in_processes(diagnose, parts, arguments.jobs), key=lambda c: c["case"]
-    )
     command = "python -m experiments.diagnosis.real_flights"
     command += "".join(f" {f.name}" for f in arguments.folders)
     command += "".join(f" --each {f.name}" for f in arguments.each)
     command += "".join(f" --separate {f.name}" for f in arguments.separate)
-    out = {"command": command, "machine": describe_machine()}
-    out |= {"figures": figures(found), "cases": rounded(found)}
-    text = json.dumps(out, indent=1)
-    arguments.out.write_text(text + "\n", encoding="utf-8")
+    head = {"command": command, "machine": describe_machine()}
+    found: list[dict] = []
+    # after each case, so that what was found is there if the rest is cut short
+    for case in share_out(diagnose, [(part,) for part in parts], arguments.jobs):
+        found = sorted([*found, case], key=lambda c: c["case"])
+        figured = {"of": len(parts), "figures": figures(found), "cases": rounded(found)}
+        write_text(arguments.out, json.dumps(head | figured, indent=1) + "\n")
 
 
 if __name__ == "__main__":
