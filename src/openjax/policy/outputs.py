@@ -1,6 +1,7 @@
 """The policies by what their actors put out (`NetworkSettings.output`)."""
 
 from openjax.errors import UserError
+from openjax.policy.mixed_policy import MixedPolicy
 from openjax.policy.policy import Policy
 from openjax.policy.settings import NetworkSettings, PredictorSettings
 from openjax.pursuit import Pursuit
@@ -20,8 +21,9 @@ def register_output(name: str, kind: type[Policy]) -> None:
 
 def make_policy(
     environment: Pursuit, network: NetworkSettings, predictor: PredictorSettings
-) -> Policy:
-    """The policy for an environment, of the kind that `network.output` says.
+) -> Policy | MixedPolicy:
+    """The policy for an environment, of the kind that `network.output` says, with a
+    member for each of the team's strategies.
 
     Raises:
       UserError: nobody has registered that output.
@@ -31,4 +33,6 @@ def make_policy(
             f"network.output {network.output}: unknown here; known are {', '.join(OUTPUTS)}, more "
             "after import openjax.baselines"
         )
-    return OUTPUTS[network.output].for_environment(environment, network, predictor)
+    policy = OUTPUTS[network.output].for_environment(environment, network, predictor)
+    members = environment.settings.strategies
+    return policy if members == 1 else MixedPolicy(policy, members)

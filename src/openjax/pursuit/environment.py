@@ -56,7 +56,12 @@ from openjax.pursuit.spaces import Box
 from openjax.pursuit.state import PursuitState
 from openjax.pursuit.statistics import count, empty_statistics
 from openjax.pursuit.task import Task, start_attitude, uniform_task
-from openjax.pursuit.teams import draw_fall_out, held, still_there
+from openjax.pursuit.teams import (
+    draw_fall_out,
+    draw_strategies,
+    held,
+    still_there,
+)
 from openjax.ranges import changed
 from openjax.vehicle import (
     DroneState,
@@ -254,8 +259,8 @@ class Pursuit:
         chex.assert_shape(task.pillar_position, (*task.pillar_active.shape, 2))
         # each draw has a key of its own, so that one that is added changes no other
         attitude_key, effect_key = jax.random.split(key)
-        vehicle_key, evader_key, fall_out_key = (
-            jax.random.fold_in(key, i) for i in (2, 3, 4)
+        vehicle_key, evader_key, fall_out_key, strategy_key = (
+            jax.random.fold_in(key, i) for i in (2, 3, 4, 5)
         )
         quaternion = start_attitude(settings, attitude_key)
         hovering = functools.partial(hover_state, self.vehicle)
@@ -294,6 +299,7 @@ class Pursuit:
             paths=shortest_paths(settings, task)
             if settings.reward.needs_paths
             else None,
+            strategies=draw_strategies(settings, strategy_key),
         )
         return self.observe(state), state
 

@@ -69,6 +69,8 @@ class Observation:
     """(N,) bool, slots of pursuers in use, the others observe zeros; None: all are"""
     others_there: jax.Array | None = None
     """(N, N - 1) bool, the same of `others`"""
+    strategy: jax.Array | None = None
+    """() int32, which of its strategies the team has drawn; None: it has only one"""
 
 
 def frame(
@@ -169,7 +171,17 @@ def observe(
         heading=heading,
         active=active,
         others_there=others_there,
+        strategy=_strategy(settings, state),
     )
+
+
+def _strategy(settings, state):
+    """() which of its strategies the team flies now."""
+    if state.strategies is None:
+        return None
+    drawn = state.step // settings.strategy_steps
+    # the episode's last observation is that of a step which isn't flown any more
+    return state.strategies[jnp.minimum(drawn, len(state.strategies) - 1)]
 
 
 def _heading(drones):

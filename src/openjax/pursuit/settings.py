@@ -216,6 +216,13 @@ class PursuitSettings:
     thought to be (not in the paper, where it stays where it was last seen): who sees
     that place, and nothing there, has to look elsewhere. See `openjax.pursuit.hiding`.
     """
+    strategies: Annotated[int, Interval("[1, 16]")] = 1
+    """Strategies, one of which the team draws at an episode's start without telling the
+    evader (a mixed strategy; not in the paper). More than one is for policies of so
+    many members: `openjax.policy.MixedPolicy`.
+    """
+    strategy_seconds: Annotated[float, Interval("[0, 1000]")] = 0.0
+    """Time after which the team draws again (s); 0: never."""
     observe_history: Annotated[int, Interval("[0, 1000]")] = 0
     """Also observe this many of the last frames of the own velocity, attitude and
     command (not in the paper): they show how this vehicle answers, and which commands
@@ -289,6 +296,13 @@ class PursuitSettings:
         """
         alike = {"team_sizes": (), "evader_speeds": (), "capture_radii": ()}
         return dataclasses.replace(self, num_pursuers=number, **alike)
+
+    @property
+    def strategy_steps(self) -> int:
+        """Control steps between two draws of a strategy."""
+        if not self.strategy_seconds:
+            return self.episode_length
+        return max(1, round(self.strategy_seconds / self.time_step))
 
     @property
     def limited_sight(self) -> bool:

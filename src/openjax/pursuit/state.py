@@ -53,6 +53,11 @@ class PursuitState:
     them
     """
 
+    strategies: jax.Array | None = None
+    """(D,) int32, the strategies that the team draws one after another in this episode;
+    None: it has only one
+    """
+
     @property
     def active(self) -> Bool[Array, "*worlds drones"] | None:
         """(N,) bool, the slots of pursuers in use; None: all are."""

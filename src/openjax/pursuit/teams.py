@@ -113,3 +113,15 @@ def team_mean(
     if active is None:
         return jnp.mean(value)
     return jnp.sum(jnp.where(active, value, 0.0)) / jnp.maximum(jnp.sum(active), 1)
+
+
+def draw_strategies(
+    settings: PursuitSettings, key: PRNGKeyArray
+) -> Int32[Array, " draws"] | None:
+    """(D,) int32, the strategies that a team flies one after another in an episode,
+    each drawn with equal odds; None where the settings know only one.
+    """
+    if settings.strategies == 1:
+        return None
+    draws = -(-settings.episode_length // settings.strategy_steps)
+    return jax.random.randint(key, (draws,), 0, settings.strategies, jnp.int32)

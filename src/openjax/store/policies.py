@@ -18,6 +18,7 @@ from openjax.learning import TrainSettings, build
 from openjax.learning.train_state import policy_leaf
 from openjax.plain import from_plain
 from openjax.policy import (
+    MixedPolicy,
     Network,
     NetworkSettings,
     OwnPolicy,
@@ -111,6 +112,7 @@ class LoadedPolicy:
             "observed_pillars",
             "history_length",
             "frame_size",
+            "strategies",
         ]
         if not self.any_number:
             fixed.insert(0, "num_pursuers")  # first, as the sizes follow from it
@@ -140,7 +142,7 @@ class LoadedPolicy:
         radii, speeds, steps and vehicle. A heuristic, and a controller of one's own,
         learned in none.
         """
-        if not isinstance(self.policy, Policy | OwnPolicy):
+        if not isinstance(self.policy, Policy | MixedPolicy | OwnPolicy):
             return []
         game = environment.settings
         trained = self.settings.environment

@@ -65,7 +65,8 @@ class Planner(RecedingHorizon):
         settings = self.settings
         tried = self.candidates(key, plan)  # (B, M, pieces, 3)
         copied = jax.tree.map(
-            lambda leaf: jnp.repeat(leaf, settings.plans, axis=0), world
+            lambda leaf: jnp.repeat(leaf, settings.plans, axis=0),
+            self._without_foresight(world, key),
         )
         pieces = jnp.moveaxis(tried.reshape(-1, *tried.shape[2:]), 1, 0)
 
@@ -78,6 +79,25 @@ class Planner(RecedingHorizon):
         score = jax.vmap(self.promise)(copied[1], end).reshape(plan.shape[0], -1)
         best = jnp.argmax(score, axis=1)
         return jnp.take_along_axis(tried, best[:, None, None, None], axis=1)[:, 0]
+
+    def _without_foresight(self, world, key):
+        """Worlds (B, ...) whose teams may draw other strategies than they will: an
+        evader can tell from what it sees which one they fly, and not which come next.
+        """
+        observation, state = world
+        game = self.duel.environment.settings
+        if state.strategies is None:
+            return world
+        # beside the keys that `candidates` splits this one into
+        redraw_key = jax.random.fold_in(key, 1)
+        other = jax.random.randint(
+            redraw_key, state.strategies.shape, 0, game.strategies, jnp.int32
+        )
+        flown = state.step // game.strategy_steps
+        known = jnp.arange(state.strategies.shape[1]) <= flown[:, None]
+        return observation, state.replace(
+            strategies=jnp.where(known, state.strategies, other)
+        )
 
     def candidates(self, key: jax.Array, plan: jax.Array) -> jax.Array:
         """(B, plans, pieces, 3) the last best plan (B, pieces, 3), the same shifted by
