@@ -29,7 +29,7 @@ FLOORS = (
     "vehicle show",
     "pursuit flights",
     "policy gap flying interfaces export",
-    "baselines virtual_crazyflie comparison calibration evaluation",
+    "baselines virtual_crazyflie calibration evaluation",
     "learning",
     "cluster",
     "store",

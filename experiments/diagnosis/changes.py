@@ -4,11 +4,11 @@ flights of two Crazyflies.
     python -m experiments.diagnosis.changes --work DIR --seeds 11 12 13 --vehicles E8=FOLDER
     E9=FOLDER=ANSWERS.json
 
-Sample flights of each effect, and of none, are compared with those of none flown with
-another seed. A vehicle is a folder of conditions with `labels.json` (or a file of
+Sample flights of each effect, and of none, are diagnosed with those of none flown with
+another seed as the reference. A vehicle is a folder of conditions with `labels.json` (or a file of
 answers) and its normal flights in `normal_flight` or `reference`. These two are of
 CrazyPAD (github.com/AerialRoboticsUUST/CrazyPAD, commit 5448265, MIT; Masalimov et al.,
-Data 2024, 9(6), 79): no orientation. Every condition is compared with all normal
+Data 2024, 9(6), 79): no orientation, so trims alone are compared. Every condition is compared with all normal
 flights, and each day of normal flights with the others. `--figure` draws the figure of
 docs/what_changed.md into `--work` instead.
 """
@@ -18,32 +18,45 @@ from pathlib import Path
 import numpy as np
 
 from experiments.table import Page, Table, page_parser, publish
-from openjax import comparison
 from openjax.commands.sample_flights import Arguments, make_case
-from openjax.comparison import Change
-from openjax.comparison.report import draw, prediction
 from openjax.files import read_json
 from openjax.flights.csv_table import write_csv
 from openjax.flights.samples import fly, log_of, references
+from openjax.gap.folders import diagnose_folder
+from openjax.gap.report import Report
+from openjax.gap.report.trims_page import draw
+from openjax.gap.trims import Change, change_between, compare, read
 from openjax.vehicle import load_vehicle
 
 EFFECTS = ("motor_lag", "mass", "rotor_drag", "rate_gains", "none")
 NORMAL = ("normal_flight", "reference")
 
 
-def record_of(vehicle: str, condition: str, truth: dict, change: Change) -> dict:
-    """One comparison: what was done, and what was said."""
-    answer = prediction(change)
-    size = change.size
-    return {
-        "vehicle": vehicle,
-        "condition": condition,
-        "truth": truth,
-        "probability": change.probability,
+def record_of(
+    vehicle: str, condition: str, truth: dict, answer: Report | Change
+) -> dict:
+    """One comparison: what was done, and what was said by the diagnosis or by trims
+    alone.
+    """
+    out = {"vehicle": vehicle, "condition": condition, "truth": truth}
+    if isinstance(answer, Report):
+        return out | {
+            "probability": 1.0 - answer.probabilities.get("none", 0.0),
+            "said": list(answer.effects),
+            "changed": bool(answer.effects),
+            "effects": list(answer.effects),
+            "rotors": [],
+        }
+    size = answer.size
+    return out | {
+        "probability": answer.probability,
         "size90": [size.value, size.low, size.high],
-        "least": change.least,
-        "said": list(change.likely_causes) if change.changed else [],
-    } | {key: answer[key] for key in ("changed", "effects", "rotors")}
+        "least": answer.least,
+        "said": list(answer.likely_causes) if answer.changed else [],
+        "changed": answer.changed,
+        "effects": list(answer.effects),
+        "rotors": list(answer.rotors) if answer.changed else [],
+    }
 
 
 def sample_records(work: Path, seeds: list[int]) -> list[dict]:
@@ -56,11 +69,11 @@ def sample_records(work: Path, seeds: list[int]) -> list[dict]:
     out = []
     for effect in EFFECTS:
         for seed, other in zip(seeds, [*seeds[1:], seeds[0]], strict=True):
-            change = comparison.compare(
+            answer = diagnose_folder(
                 work / f"{effect}_{seed}", [work / f"none_{other}"]
             )
             out.append(
-                record_of("sample", f"{effect}, seed {seed}", {"cause": effect}, change)
+                record_of("sample", f"{effect}, seed {seed}", {"cause": effect}, answer)
             )
     return out
 
@@ -70,14 +83,14 @@ def vehicle_records(name: str, folder: Path, labels: dict) -> list[dict]:
     others.
     """
     (normal,) = [n for n in NORMAL if (folder / n).is_dir()]
-    case, old, _ = comparison.read(folder / normal)
+    case, old, _ = read(folder / normal)
     out = []
     for number, day in enumerate(dict.fromkeys(f.day for f in old), 1):
         new, others = (
             [f for f in old if (f.day == day) == own] for own in (True, False)
         )
         if others:
-            change = comparison.change_between(day, new, others, case)
+            change = change_between(day, new, others, case)
             out.append(
                 record_of(
                     name, f"normal flights, day {number}", {"cause": "none"}, change
@@ -85,9 +98,7 @@ def vehicle_records(name: str, folder: Path, labels: dict) -> list[dict]:
             )
     for condition, truth in labels.items():
         if condition != normal:
-            change = comparison.change_between(
-                condition, comparison.read(folder / condition)[1], old, case
-            )
+            change = change_between(condition, read(folder / condition)[1], old, case)
             out.append(record_of(name, condition, truth, change))
     return out
 
@@ -155,10 +166,14 @@ def page(results: dict) -> Page:
         "changed": "changed",
         "said": lambda r: ", ".join(r["said"]) or None,
         "rotors": lambda r: "+".join(f"m{i}" for i in r["rotors"]) or None,
-        "size, % [90 %]": lambda r: "{:.0f} [{:.0f}, {:.0f}]".format(
-            *(100 * v for v in r["size90"])
+        "size, % [90 %]": lambda r: (
+            "{:.0f} [{:.0f}, {:.0f}]".format(*(100 * v for v in r["size90"]))
+            if "size90" in r
+            else None
         ),
-        "least that shows, %": lambda r: f"{100 * r['least']:.0f}",
+        "least that shows, %": lambda r: (
+            f"{100 * r['least']:.0f}" if "least" in r else None
+        ),
     }
     prose = (
         "Two sets of flights of one vehicle are compared; what was changed is known. The real "
@@ -194,9 +209,7 @@ def figure(folder: Path) -> None:
         ):
             columns = fly(vehicle, vehicle, reference, 10 * seed + k, effects)
             write_csv(folder / name / f"{flight}.csv.gz", log_of(columns, flight))
-    change = comparison.compare(
-        folder / "tuesday", [folder / "friday", folder / "monday"]
-    )
+    change = compare(folder / "tuesday", [folder / "friday", folder / "monday"])
     draw(change).savefig(folder / "what_changed.png", dpi=90)
 
 

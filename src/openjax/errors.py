@@ -13,6 +13,10 @@ class UserError(Exception):
     """
 
 
+class TooLittle(UserError):
+    """Logs hold too little for what was asked; something less may still be possible."""
+
+
 def suggestion(name: str, names: Iterable[str]) -> str:
     """What an error can say of a name that isn't among the `names` that there are: the
     one that is nearest, or all.

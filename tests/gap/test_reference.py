@@ -3,19 +3,23 @@
 from dataclasses import replace
 from types import SimpleNamespace
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from openjax.commands.sample_flights import Arguments, make_case
-from openjax.flights.case import load_case
+from openjax.errors import UserError
+from openjax.flights.flight import Case, Issue
 from openjax.gap.channels import Estimated
 from openjax.gap.decision import DECISION
-from openjax.gap.diagnosis import diagnose_case
+from openjax.gap.folders import diagnose_folder
 from openjax.gap.model.baseline import Baseline, day_of, transferred
 from openjax.gap.model.library import ABSENT, PLACE
-from openjax.gap.reference import differs, trim_of, trimmed_before, with_some
+from openjax.gap.reference import differs, joined, trim_of, trimmed_before, with_some
+from openjax.gap.report.page import page_of
 from openjax.gap.residual import changed_p
 from openjax.vehicle import load_vehicle
+from openjax.vehicle.vehicle_file import load_vehicle_file
 
 
 def baseline(channels=None):
@@ -143,18 +147,34 @@ def test_what_is_left_beyond_the_reference_is_judged_by_the_measure_that_grew_mo
     assert changed_p(grown, before, unnamed)[0] > 2.0 * DECISION.unknown
 
 
+def test_days_of_a_reference_are_joined_and_another_vehicle_is_refused():
+    def day(name, mass):
+        told = load_vehicle_file()
+        vehicle = told.vehicle.replace(mass=jnp.asarray(mass))
+        remark = Issue("flight_a.csv", f"of {name}")
+        return Case(name, (), replace(told, vehicle=vehicle), (remark,))
+
+    monday = day("monday", 0.03)
+    assert len(joined([monday, day("friday", 0.03)]).quality) == 2
+    with pytest.raises(UserError, match=r"friday.*another mass"):
+        joined([monday, day("friday", 0.04)])
+
+
 @pytest.mark.slow
 def test_a_slower_motor_is_named_and_one_that_was_as_slow_before_is_no_change(tmp_path):
     def flown(name, seed, effects):
         arguments = Arguments(tmp_path / name, effect=effects or ("none",), seed=seed)
         make_case(arguments)
-        return load_case(tmp_path / name)
+        return tmp_path / name
 
     slow = flown("slow", 2, ("motor_lag",))
     for name, seed, effects, expected in (
         ("healthy", 1, (), ("motor_lag",)),
         ("as slow", 3, ("motor_lag",), ()),
     ):
-        report = diagnose_case(slow, reference=[flown(name, seed, effects)])
+        days = [flown(f"{name} {day}", seed + 10 * day, effects) for day in (0, 1)]
+        report = diagnose_folder(slow, days)
         assert report.effects == expected
-    assert "reference" in report.reference
+        assert "reference" in report.reference
+        assert not report.trims.changed
+    assert "Trims since the reference" in page_of(report)

@@ -3,6 +3,7 @@
 """
 
 import sys
+import time
 import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -47,8 +48,8 @@ class Options:
     """Folders of flight logs, each with a vehicle.toml."""
     reference: tuple[Path, ...] = ()
     """Folders of earlier flights of the same vehicle, one for each day: the vehicle is
-    learnt from them first, and report.html says what changed since; changes.html holds
-    trims and rotors, for which motor commands alone are enough.
+    learnt from them first, and the report says what changed since; for trims and rotors
+    motor commands alone are enough.
     """
     out: Path = Path("diagnosis")
     """Where the reports go, one folder per case."""
@@ -79,12 +80,10 @@ def run(options: Options) -> int:
     cache_programs()
     console = output_console()
     names = _checked_names(options)
-    answer = _changes if options.reference else _diagnosis
-    if not options.reference:
-        from openjax.gap.model.library import library
+    from openjax.gap.model.library import library
 
-        # a misspelt effect is an error of all cases, and said before the first
-        library(options.without)
+    # a misspelt effect is an error of all cases, and said before the first
+    library(options.without)
     predictions = {}
     failed = 0
     for i, (folder, name) in enumerate(zip(options.cases, names, strict=True)):
@@ -94,7 +93,7 @@ def run(options: Options) -> int:
                 "diagnosing", {case: SECONDS for case in names[i:]}, console
             ) as steps:
                 steps.begin(name)
-                title, lines, prediction = answer(
+                title, lines, prediction = _diagnosis(
                     options, folder, name, partial(steps.begin, name)
                 )
         except UserError as error:
@@ -150,80 +149,31 @@ def _checked_names(options: Options) -> list[str]:
 def _diagnosis(
     options: Options, folder: Path, name: str, tell: Callable[[str], None]
 ) -> tuple[str, list[str], dict]:
-    """Title, lines and prediction of what causes a case's gap, after its report was
-    written whole.
+    """Title, lines and prediction of what causes a case's gap, or of what changed since
+    the reference, after its report was written whole.
     """
-    from openjax.flights.case import load_case
-    from openjax.gap.diagnosis import diagnose_case
+    from openjax.gap.folders import diagnose_folder
     from openjax.gap.report import write_report
 
-    case = load_case(folder)
-    for issue in case.left_out():
-        print(
-            f"warning: {name}/{issue.flight} is left out: {issue.issue}",
-            file=sys.stderr,
-        )
-    report = diagnose_case(case, options.without, tell)
+    begin = time.perf_counter()
+    answer = diagnose_folder(folder, options.reference, options.without, tell)
+    seconds = time.perf_counter() - begin
+    for text in answer.left_out:
+        print(f"warning: {name}: left out: {text}", file=sys.stderr)
     tell("writing the report")
     with replacing(options.out / name) as partial_folder:
         partial_folder.mkdir()
-        write_report(report, partial_folder, options.html)
+        write_report(answer, partial_folder, options.html)
     report_file = (
         options.out / name / ("report.html" if options.html else "report.json")
     )
-    noted = [
-        f"{issue.flight}: {issue.issue}" for issue in case.quality if not issue.refused
+    more = f" (and {len(answer.noted) - 1} more in the report)"
+    remark = [
+        f"Noted in the logs: {text}{more * (len(answer.noted) > 1)}."
+        for text in answer.noted[:1]
     ]
-    more = f" (and {len(noted) - 1} more in the report)" if len(noted) > 1 else ""
-    remark = [f"Noted in the logs: {noted[0]}{more}."] if noted else []
-    lines = [*remark, *report.in_words(), f"({report.seconds:.1f} s; {report_file})"]
-    return ", ".join(report.effects) or report.verdict, lines, report.prediction()
-
-
-def _changes(
-    options: Options, folder: Path, name: str, tell: Callable[[str], None]
-) -> tuple[str, list[str], dict]:
-    """As `_diagnosis`, of what changed since the reference."""
-    from openjax import comparison
-    from openjax.comparison import report
-    from openjax.gap.report import write_report
-
-    change = comparison.compare(folder, options.reference)
-    diagnosis = _since(options, folder, tell)
-    with replacing(options.out / name) as partial_folder:
-        partial_folder.mkdir()
-        report.write(change, partial_folder, options.html)
-        if diagnosis is not None:
-            write_report(diagnosis, partial_folder, options.html)
-    report_file = options.out / name / f"changes.{'html' if options.html else 'json'}"
-    if diagnosis is None:
-        title = "changed" if change.changed else "no change"
-        return (
-            title,
-            [*report.in_words(change), f"({report_file})"],
-            report.prediction(change),
-        )
-    trims = [f"Trims: {line}" for line in report.in_words(change)[:1]]
-    lines = [
-        *diagnosis.in_words(),
-        *trims,
-        f"({diagnosis.seconds:.1f} s; {report_file})",
-    ]
-    return ", ".join(diagnosis.effects) or "no change", lines, diagnosis.prediction()
-
-
-def _since(options: Options, folder: Path, tell: Callable[[str], None]):
-    """The report of what changed since the reference; None where the logs hold too
-    little for a diagnosis, so that trims alone are compared.
-    """
-    from openjax.flights.case import load_case
-    from openjax.gap.diagnosis import diagnose_case
-
-    try:
-        reference = [load_case(day) for day in options.reference]
-        return diagnose_case(load_case(folder), options.without, tell, reference)
-    except UserError:
-        return None
+    lines = [*remark, *answer.in_words(), f"({seconds:.1f} s; {report_file})"]
+    return answer.title, lines, answer.prediction()
 
 
 def _unforeseen(name: str, error: Exception) -> str:

@@ -9,7 +9,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
-from openjax.errors import UserError
+from openjax.errors import TooLittle, UserError
 from openjax.flights.agreement import shown_right
 from openjax.flights.checks import check_flight, duplicates
 from openjax.flights.flight import Case, Flight, Issue
@@ -35,8 +35,8 @@ def load_case(path: str | Path, dtype=jnp.float32, comparison: bool = False) -> 
     without a vehicle file the nominal vehicle is taken.
 
     Logs that can't be used are left out and named in `quality` (`refused`). Raises
-    UserError for a folder that isn't a case, an unusable vehicle file, or if no log is
-    left.
+    UserError for a folder without logs or an unusable vehicle file, and of that
+    TooLittle if there is no vehicle file or no log is left.
     """
     path = Path(path)
     if not path.is_dir():
@@ -51,7 +51,7 @@ def load_case(path: str | Path, dtype=jnp.float32, comparison: bool = False) -> 
         )
     described = (path / "vehicle.toml").exists()
     if not described and not comparison:
-        raise UserError(f"{path}: no vehicle.toml; {_called_otherwise(path)}")
+        raise TooLittle(f"{path}: no vehicle.toml; {_called_otherwise(path)}")
     vehicle_file = load_vehicle_file(
         path / "vehicle.toml" if described else None, dtype
     )
@@ -69,7 +69,7 @@ def load_case(path: str | Path, dtype=jnp.float32, comparison: bool = False) -> 
             else "no vehicle in any log"
         )
         more = f" (and {len(reasons) - 1} more)" if len(reasons) > 1 else ""
-        raise UserError(f"{path}: no flight can be used: {first}{more}")
+        raise TooLittle(f"{path}: no flight can be used: {first}{more}")
     # A thrust error is told from the mass only where every vehicle that flew was
     # weighed.
     is_weighed = all(vehicle_file.mass_weighed_of(flight.vehicle) for flight in flights)

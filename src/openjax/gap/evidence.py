@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from openjax.errors import UserError
+from openjax.errors import TooLittle
 from openjax.flights.clocks import (
     on_gyroscope_clock,
     read_command_clock,
@@ -101,7 +101,7 @@ def gather(
     reference=False,
 ) -> Evidence:
     """Read a case by all its channels. `baseline`: what the vehicle is like while
-    nothing acts; `reference`: these flights are to tell that. Raises UserError where no
+    nothing acts; `reference`: these flights are to tell that. Raises TooLittle where no
     stretch of flight is long enough.
     """
     tell = progress or (lambda text: None)
@@ -160,7 +160,7 @@ def _tracks(case: Case) -> tuple[list[Track], list]:
         t for t in tracks_of(case) if t.motor is not None or t.command is not None
     ]
     if not tracks:
-        raise UserError(
+        raise TooLittle(
             f"{case.name}: no flight has 2 s without a gap, with body rates and commands or motors"
         )
     flights = {f.name: f for f in case.flights}

@@ -203,7 +203,7 @@ def joined(cases: Sequence[Case]) -> Case:
     """
     first = cases[0]
     for case in cases[1:]:
-        if case.vehicle_file.mass != first.vehicle_file.mass:
+        if case.vehicle_file.vehicle.mass != first.vehicle_file.vehicle.mass:
             raise UserError(
                 f"{case.name}: its vehicle.toml has another mass than that of {first.name}; a "
                 "reference is of one vehicle"

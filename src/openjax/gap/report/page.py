@@ -10,6 +10,7 @@ from openjax.gap.model.library import CARDS
 from openjax.gap.report.figures import figures
 from openjax.gap.report.report import VERDICTS, Report
 from openjax.gap.report.response import response_of
+from openjax.gap.report.trims_page import content_of
 from openjax.show.pages import filled
 from openjax.vehicle.effects import EFFECTS
 
@@ -32,6 +33,7 @@ def page_of(report: Report, folder: Path | None = None) -> str:
         shares=shares(report),
         steps=next_steps(report, folder),
         figures=figures(report),
+        trims=None if report.trims is None else content_of(report.trims),
         meanings={e: EFFECTS[e].description for e in report.parameters if e in EFFECTS},
         ranked=[(name, p) for name, p in ranked[:8] if p > 5e-4],
     )

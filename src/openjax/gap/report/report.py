@@ -4,6 +4,7 @@ from dataclasses import asdict, dataclass, field, fields, is_dataclass
 
 from openjax.gap.identification.quantities import Identification
 from openjax.gap.shares import Gap, Split
+from openjax.gap.trims.change import Change
 from openjax.gap.where import Place, in_words
 
 VERDICTS = {
@@ -85,6 +86,10 @@ class Report:
     residual: dict[str, float] = field(default_factory=dict)
     reference: str = ""
     """What the reference flights say of the vehicle; empty: none were given."""
+    trims: Change | None = None
+    """What trims say of a change since the reference; None: there is none, or its logs
+    show none.
+    """
     identification: Identification | None = None
     """What the vehicle does; None: no motors were logged."""
     seconds: float = 0.0
@@ -97,10 +102,28 @@ class Report:
         return [e for e in self.effects if e != "unknown"]
 
     @property
+    def title(self) -> str:
+        """The answer in a word."""
+        if self.effects or not self.reference:
+            return ", ".join(self.effects) or self.verdict
+        return "no change"
+
+    @property
     def left_out(self) -> list[str]:
-        """Logs that weren't used, each with the reason."""
+        """Logs that weren't used, those of one reason together."""
+        logs: dict[str, list[str]] = {}
+        for q in self.quality:
+            if q.get("left_out"):
+                logs.setdefault(q["issue"], []).append(q["flight"])
+        return [f"{', '.join(names)}: {issue}" for issue, names in logs.items()]
+
+    @property
+    def noted(self) -> list[str]:
+        """What was found in the logs that were used."""
         return [
-            f"{q['flight']}: {q['issue']}" for q in self.quality if q.get("left_out")
+            f"{q['flight']}: {q['issue']}"
+            for q in self.quality
+            if not q.get("left_out")
         ]
 
     def prediction(self) -> dict:
@@ -128,13 +151,15 @@ class Report:
             }
             for effect, found in self.parameters.items()
         }
-        apart = ("case", "plots", "seconds", "identification")
+        apart = ("case", "plots", "seconds", "identification", "trims")
         plain = {
             f.name: getattr(self, f.name) for f in fields(self) if f.name not in apart
         }
         if self.identification is not None:
             of_gap = {e: share.value for e, share in self.shares.effects.items()}
             plain["identification"] = self.identification.to_dict(of_gap)
+        if self.trims is not None:
+            plain["trims"] = self.trims.to_dict()
         return _plain(plain | {"shares": shares, "parameters": estimates})
 
     def class_of(self, effect: str) -> str:
@@ -177,6 +202,8 @@ class Report:
             lines.append(self.verdict_in_words())
         lines += [f"Sensors: {text}." for text in self.sensors]
         lines += [self.rest, self.reference]
+        if self.trims is not None:
+            lines.append(f"Trims: {self.trims.sentence()}")
         if self.effects:
             lines.append(f"Where: {in_words(self.where)}.")
         lines += self._parameters_in_words()

@@ -10,30 +10,34 @@ import numpy as np
 from openjax.gap.identification.corrections import corrections
 from openjax.gap.model.library import CARDS
 from openjax.gap.report.report import Report
+from openjax.gap.trims.change import Change
 from openjax.vehicle.effects import EFFECTS, save_effects
 
 Values = dict[str, dict[str, float]]
 Intervals = dict[str, dict[str, tuple[float, float]]]
 
 
-def write_report(report: Report, folder: Path, pictures: bool = True) -> None:
-    """Write `report.json`, `effects.toml` and (with `pictures`) `report.html` into an
-    existing folder.
+def write_report(answer: Report | Change, folder: Path, pictures: bool = True) -> None:
+    """Write `report.json`, of a diagnosis `effects.toml`, and with `pictures`
+    `report.html` into an existing folder.
     """
-    text = json.dumps(report.to_dict(), indent=1)
+    text = json.dumps(answer.to_dict(), indent=1)
     (folder / "report.json").write_text(text + "\n", encoding="utf-8")
-    values, intervals = to_fly(report)
-    save_effects(
-        folder / "effects.toml",
-        values,
-        intervals,
-        notes=" ".join(report.in_words()[:2]),
-    )
+    if isinstance(answer, Report):
+        notes = " ".join(answer.in_words()[:2])
+        save_effects(folder / "effects.toml", *to_fly(answer), notes=notes)
     if pictures:
-        # loads Matplotlib, which takes a second
-        from openjax.gap.report.page import page_of
+        (folder / "report.html").write_text(_page(answer, folder), encoding="utf-8")
 
-        (folder / "report.html").write_text(page_of(report, folder), encoding="utf-8")
+
+def _page(answer: Report | Change, folder: Path) -> str:
+    # loads Matplotlib, which takes a second
+    from openjax.gap.report.page import page_of
+    from openjax.gap.report.trims_page import page_of_trims
+
+    return (
+        page_of(answer, folder) if isinstance(answer, Report) else page_of_trims(answer)
+    )
 
 
 def to_fly(report: Report) -> tuple[Values, Intervals]:

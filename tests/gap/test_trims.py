@@ -1,23 +1,23 @@
-"""What changed between two sets of flights: on flown vehicles with a known change, and
-on trims made by hand for what only many flights show (days, sizes, classes).
+"""What trims say of two sets of flights: on flown vehicles with a known change, and on
+trims made by hand for what only many flights show (days, sizes, classes).
 """
 
 import functools
 import json
+import shutil
 
 import numpy as np
 import pytest
 
-from openjax import comparison
 from openjax.commands.diagnose import main
-from openjax.comparison.days import spread_of_charge
-from openjax.comparison.figures import PLACES, FlightFigures, mixer_of
-from openjax.comparison.report import in_words, prediction
 from openjax.errors import UserError
 from openjax.flights.case import load_case
 from openjax.flights.csv_table import write_csv
 from openjax.flights.reading import LogTable
 from openjax.flights.samples import fly, log_of, references
+from openjax.gap.trims import change_between, compare
+from openjax.gap.trims.days import spread_of_charge
+from openjax.gap.trims.figures import PLACES, FlightFigures, mixer_of
 from openjax.vehicle import load_vehicle
 from openjax.vehicle.effects import EFFECTS
 
@@ -27,10 +27,7 @@ CHANGES = {
     "rotor": {"motor_imbalance": {"m1": 0.0, "m2": 0.0, "m3": -0.15, "m4": 0.0}},
     "heavier": {"mass": {"extra": 0.004}},
     "weight": {"mass": {"extra": 0.003}, "com_offset": {"x": 0.0, "y": 0.004}},
-    **{
-        name: {name: EFFECTS[name].card.sample}
-        for name in ("rotor_drag", "motor_lag", "rate_gains")
-    },
+    "motor_lag": {"motor_lag": EFFECTS["motor_lag"].card.sample},
 }
 
 
@@ -55,13 +52,13 @@ def folders(tmp_path_factory):
 
 @functools.cache
 def compared(folders, name):
-    return comparison.compare(folders / name, [folders / "monday", folders / "tuesday"])
+    return compare(folders / name, [folders / "monday", folders / "tuesday"])
 
 
 def test_the_same_vehicle_has_not_changed(folders):
     change = compared(folders, "same")
     assert not change.changed and change.effects == () and change.days == 2
-    assert "No change" in in_words(change)[0]
+    assert "No change" in change.in_words()[0]
 
 
 def test_a_weak_rotor_is_found_with_its_size(folders):
@@ -90,47 +87,41 @@ def test_a_weight_at_a_side_names_the_side_and_what_it_cannot_be_told_from(folde
     assert {"motor_imbalance", "mass"} <= set(change.effects)
 
 
-@pytest.mark.parametrize("effect", ["rotor_drag", "motor_lag", "rate_gains"])
-def test_what_moves_no_trim_is_named_alone(folders, effect):
-    change = compared(folders, effect)
-    assert change.changed and change.effects == (effect,) and not change.trims_changed
+def test_slower_motors_are_no_change_of_trims(folders):
+    """The diagnosis with a reference names them."""
+    assert not compared(folders, "motor_lag").changed
 
 
-def test_the_drag_is_that_of_the_effect(folders):
-    drag = compared(folders, "rotor_drag").figures["drag_x"]
-    assert (
-        drag.low
-        < EFFECTS["rotor_drag"].card.sample["d_xy"] / float(VEHICLE.mass)
-        < drag.high
-    )
+def with_columns(folder, into, kept):
+    """The flights of a folder with motors and, if they are to be `kept`, position (x),
+    gyroscope and accelerometer (w).
+    """
+    into.mkdir()
+    for flight in load_case(folder, comparison=True).flights:
+        columns = {"t": flight.time} | {
+            f"m{i + 1}": flight.motor_command[:, i] for i in range(4)
+        }
+        if "x" in kept:
+            columns |= dict(zip("xyz", flight.position.T, strict=True))
+        if "w" in kept:
+            columns |= {
+                f"w{a}": v for a, v in zip("xyz", flight.body_rates.T, strict=True)
+            }
+            columns |= {
+                f"a{a}": v for a, v in zip("xyz", flight.specific_force.T, strict=True)
+            }
+        log = LogTable(flight.log, columns, np.full(len(flight), "0"))
+        write_csv(into / flight.log, log)
 
 
-@pytest.mark.parametrize("kept", [("m",), ("m", "x", "y", "z"), ("m", "a", "w")])
+@pytest.mark.parametrize("kept", ["m", "mx", "mw"])
 def test_poor_logs_tell_as_much_about_trims(folders, tmp_path, kept):
     """Motors alone, position without attitude, sensors without a pose: no gyroscope or
     orientation is needed.
     """
     for name in ("monday", "rotor"):
-        (tmp_path / name).mkdir()
-        for flight in load_case(folders / name, comparison=True).flights:
-            columns = {"t": flight.time} | {
-                f"m{i + 1}": flight.motor_command[:, i] for i in range(4)
-            }
-            if "x" in kept:
-                columns |= dict(zip("xyz", flight.position.T, strict=True))
-            if "w" in kept:
-                columns |= {
-                    f"w{a}": v for a, v in zip("xyz", flight.body_rates.T, strict=True)
-                }
-                columns |= {
-                    f"a{a}": v
-                    for a, v in zip("xyz", flight.specific_force.T, strict=True)
-                }
-            write_csv(
-                tmp_path / name / flight.log,
-                LogTable(flight.log, columns, np.full(len(flight), "0")),
-            )
-    change = comparison.compare(tmp_path / "rotor", [tmp_path / "monday"])
+        with_columns(folders / name, tmp_path / name, kept)
+    change = compare(tmp_path / "rotor", [tmp_path / "monday"])
     assert change.changed and change.rotors == (3,)
 
 
@@ -151,7 +142,7 @@ def test_a_folder_of_several_vehicles_is_refused(case, tmp_path):
         vehicle = np.full(len(flight), str(number % 2))
         write_csv(tmp_path / flight.log, LogTable(flight.log, columns, vehicle))
     with pytest.raises(UserError, match="several vehicles"):
-        comparison.compare(tmp_path, [tmp_path])
+        compare(tmp_path, [tmp_path])
 
 
 def trims(day, factors=(1, 1, 1, 1), offset=(0, 0, 0, 0), seed=0, flights=3):
@@ -184,8 +175,8 @@ def test_the_spread_of_days_is_learnt_and_hides_what_is_smaller(case):
     ]
     calm = [f for k in range(8) for f in trims(f"d{k}", seed=k)]
     new = trims("new", factors=(1, 1, 1.095, 1), seed=9)
-    in_wild = comparison.change_between("new", new, wild, case)
-    in_calm = comparison.change_between("new", new, calm, case)
+    in_wild = change_between("new", new, wild, case)
+    in_calm = change_between("new", new, calm, case)
     assert in_wild.spread["roll"] > 2 * in_calm.spread["roll"]
     assert in_calm.changed and in_calm.rotors == (3,)
     assert not in_wild.changed and in_wild.least > in_calm.least
@@ -197,7 +188,7 @@ def test_sizes_grow_with_the_change_and_intervals_hold_it(case):
     ]
     sizes = []
     for rise in (0.05, 0.1, 0.2, 0.3):
-        change = comparison.change_between(
+        change = change_between(
             "new", trims("new", factors=(1, 1 + rise, 1, 1), seed=5), old, case
         )
         sizes.append(change.size.value)
@@ -207,12 +198,12 @@ def test_sizes_grow_with_the_change_and_intervals_hold_it(case):
 
 def test_two_rotors_of_a_side_are_a_class_with_a_weight_there(case):
     old = [f for k in range(3) for f in trims(f"d{k}", seed=k)]
-    change = comparison.change_between(
+    change = change_between(
         "new", trims("new", factors=(1.15, 1.15, 1, 1), seed=5), old, case
     )
     assert change.changed and change.rotors == (1, 2) and change.side == "right"
     assert {"motor_imbalance", "com_offset"} <= set(change.effects)
-    chances = prediction(change)["probabilities"]
+    chances = change.prediction()["probabilities"]
     assert sum(chances.values()) == pytest.approx(1.0, abs=1e-3)
 
 
@@ -232,7 +223,7 @@ def test_rotors_are_counted_as_logged(case, folders, tmp_path):
                 tmp_path / name / flight.log,
                 LogTable(flight.log, columns, np.full(len(flight), "0")),
             )
-    change = comparison.compare(tmp_path / "rotor", [tmp_path / "monday"])
+    change = compare(tmp_path / "rotor", [tmp_path / "monday"])
     assert change.rotors == (1,) and change.side == "rear left"
 
 
@@ -243,29 +234,39 @@ def test_flights_are_no_reference_of_their_own(folders, tmp_path):
         main([monday, "--reference", monday, "--out", str(tmp_path / "out")])
 
 
-def test_the_command_writes_page_and_numbers_and_spares_the_others(
+def test_motors_alone_get_the_same_report_and_are_told_why_it_is_no_diagnosis(
     folders, tmp_path, capsys
 ):
+    for name in ("monday", "rotor"):
+        with_columns(folders / name, tmp_path / name, "m")
+    # one of three flights could be diagnosed: it isn't asked alone
+    (tmp_path / "rotor" / "vehicle.toml").touch()
+    shutil.copy(next((folders / "rotor").glob("*.csv.gz")), tmp_path / "rotor")
     (tmp_path / "empty").mkdir()
     out = tmp_path / "out"
     answers = tmp_path / "answers.json"
     status = main([
-        str(folders / "rotor"), str(tmp_path / "empty"), "--reference", str(folders / "monday"),
+        str(tmp_path / "rotor"), str(tmp_path / "empty"), "--reference", str(tmp_path / "monday"),
         "--out", str(out), "--predictions", str(answers),
     ])  # fmt: skip
     assert status == 0
-    written = json.loads((out / "rotor" / "changes.json").read_text())
-    assert (
-        written["changed"]
-        and written["rotors"] == [3]
-        and json.loads(answers.read_text())["rotor"]["rotors"] == [3]
-    )
-    page = (out / "rotor" / "changes.html").read_text()
-    assert "<svg" in page and "src=" not in page
+    written = json.loads((out / "rotor" / "report.json").read_text())
+    assert written["changed"] and written["rotors"] == [3]
+    assert json.loads(answers.read_text())["rotor"]["rotors"] == [3]
+    page = (out / "rotor" / "report.html").read_text()
+    assert "<svg" in page and "src=" not in page and "1 of 3 flights holds more" in page
     assert (
         "holds no flight log" in capsys.readouterr().err
         and not (out / "empty").exists()
     )
+
+
+def test_a_misspelt_effect_is_no_reason_to_compare_trims_alone(folders, tmp_path):
+    with pytest.raises(UserError, match="did you mean rotor_drag"):
+        main([
+            str(folders / "rotor"), "--reference", str(folders / "monday"),
+            "--out", str(tmp_path / "out"), "--without", "rotordrag",
+        ])  # fmt: skip
 
 
 def test_a_battery_that_nobody_logged_hides_a_tenth_of_hover():

@@ -1,9 +1,11 @@
-"""What changed since last week: two sets of flights of one vehicle, compared with each
-other instead of with the simulator, so that what model and sensors share cancels.
+"""Trims of two sets of flights of one vehicle, compared with each other instead of with
+the simulator, so that what model and sensors share cancels. Motor commands alone are
+enough, and every further day sharpens what days differ by. So this stays beside the
+diagnosis, which can't be made of motors alone and takes a day's trims for its own.
 
 `figures` reads what each flight says about its vehicle; `days` takes a day as a random
 effect; `causes` says what each cause would do, `weigh` how well each explains what
-differs; `result` is what comes out, `report` tells it.
+differs; `change` is what comes out.
 """
 
 from collections.abc import Sequence
@@ -11,34 +13,35 @@ from pathlib import Path
 
 import numpy as np
 
-from openjax.comparison.causes import CAUSES, ROTOR_PLACES, SIDES, hypotheses_of
-from openjax.comparison.days import (
+from openjax.errors import TooLittle, UserError
+from openjax.flights.case import load_case
+from openjax.flights.flight import Case, Issue
+from openjax.gap.trims.causes import ROTOR_PLACES, SIDES, hypotheses_of
+from openjax.gap.trims.change import SHOWN, Change, Interval
+from openjax.gap.trims.days import (
     battery_of,
     by_day,
     days_told_apart,
+    error_of,
     spread_of_charge,
     spread_of_days,
 )
-from openjax.comparison.figures import (
+from openjax.gap.trims.figures import (
     FIGURES,
     TRIMS,
     FlightFigures,
     figures_of,
     mixer_of,
 )
-from openjax.comparison.result import SHOWN, Change, Interval
-from openjax.comparison.weigh import least_shown, weigh
-from openjax.errors import UserError
-from openjax.flights.case import load_case
-from openjax.flights.flight import Case, Issue
+from openjax.gap.trims.weigh import least_shown, weigh
 
 
 def compare(flights: Path, references: Sequence[Path]) -> Change:
     """What changed in the flights of a folder against those of one or more reference
     folders (days).
 
-    Raises UserError for a folder without a usable flight and for flights of several
-    vehicles.
+    Raises UserError for flights of several vehicles, and of that TooLittle for a folder
+    without a usable flight.
     """
     new_case, new, quality = read(Path(flights))
     old: list[FlightFigures] = []
@@ -74,7 +77,7 @@ def read(folder: Path) -> tuple[Case, list[FlightFigures], list[Issue]]:
             figures.append(values)
     if not figures:
         reasons = "; ".join(dict.fromkeys(i.issue for i in quality if i.refused))
-        raise UserError(f"{folder}: no flight can be compared: {reasons}")
+        raise TooLittle(f"{folder}: no flight can be compared: {reasons}")
     return case, days_told_apart(figures), quality
 
 
@@ -90,47 +93,47 @@ def change_between(
     """
     mixer = mixer_of(case.vehicle_of(case.flights[0]))
     battery = battery_of([*new, *old])
-    old_days, new_days = (by_day(f, battery) for f in (old, new))
-    spread, freedom = spread_of_days(old_days, new_days)
+    old_days = by_day(old, battery)
+    new_days = by_day(new, battery)
     difference = new_days.mean - old_days.mean
-    days = 1 / np.maximum(old_days.count, 1) + 1 / np.maximum(new_days.count, 1)
+    spread, freedom = spread_of_days(old_days, new_days)
     charge = spread_of_charge([*new, *old])
-    scale = np.sqrt(
-        spread**2 * days + old_days.error**2 + new_days.error**2 + charge**2
-    )
+    scale = error_of(old_days, new_days, spread, charge)
     trims = old_days.mean[: len(TRIMS)]
     hypotheses = hypotheses_of(mixer, trims)
     evidence = weigh(hypotheses, difference, scale, freedom)
-    motor_numbers = [case.vehicle_file.motor_permutation[j] + 1 for j in range(4)]
     place, within = evidence.place()
-    causes = evidence.causes_at(within)
-    reach = 1.645 * scale
+    order = case.vehicle_file.motor_permutation
+
+    def as_logged(rotors) -> tuple[int, ...]:
+        return tuple(sorted(order[j] + 1 for j in rotors))
+
     return Change(
         name=name,
         changed=evidence.changed > SHOWN,
         probability=evidence.changed,
-        trims_changed=evidence.changed > SHOWN
-        and not CAUSES[max(causes, key=lambda c: causes[c])].figures,
-        rotors=tuple(sorted(motor_numbers[j] for j in place)),
+        rotors=as_logged(place),
         side=ROTOR_PLACES[place[0]] if len(place) == 1 else SIDES.get(place, ""),
         causes=evidence.causes,
-        causes_here=causes,
-        places={
-            tuple(sorted(motor_numbers[j] for j in p)): share
-            for p, share in evidence.places.items()
-        },
+        causes_here=evidence.causes_at(within),
+        places={as_logged(p): share for p, share in evidence.places.items()},
         size=evidence.size(within),
-        figures={
-            n: Interval(float(d), float(d - r), float(d + r))
-            for n, d, r in zip(FIGURES, difference, reach, strict=True)
-            if np.isfinite(d)
-        },
+        figures=_intervals(difference, 1.645 * scale),
         least=least_shown(hypotheses, mixer, trims, scale, freedom),
         reference=tuple(old),
         flights=tuple(new),
         quality=quality,
         spread=dict(zip(FIGURES, spread.tolist(), strict=True)),
     )
+
+
+def _intervals(difference: np.ndarray, reach: np.ndarray) -> dict[str, Interval]:
+    """The differences (F,) that the logs give, each so far up and down."""
+    return {
+        n: Interval(float(d), float(d - r), float(d + r))
+        for n, d, r in zip(FIGURES, difference, reach, strict=True)
+        if np.isfinite(d)
+    }
 
 
 __all__ = ["SHOWN", "Change", "Interval", "change_between", "compare", "read"]

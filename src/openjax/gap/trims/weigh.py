@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from openjax.comparison.causes import CAUSES, SIDES, Hypotheses, trims_with
-from openjax.comparison.result import SHOWN, Interval
+from openjax.gap.trims.causes import CAUSES, SIDES, Hypotheses, trims_with
+from openjax.gap.trims.change import SHOWN, Interval
 
 # before any flight speaks, a change is as probable as none
 PRIOR_CHANGED = 0.5
@@ -87,9 +87,8 @@ def weigh(
     freedom = freedom[is_given]
 
     def log_density(rest: np.ndarray) -> np.ndarray:
-        return -0.5 * (
-            (freedom + 1.0) * np.log1p((rest[..., is_given] / scale) ** 2 / freedom)
-        ).sum(-1)
+        far = np.log1p((rest[..., is_given] / scale) ** 2 / freedom)
+        return np.asarray(-0.5 * ((freedom + 1.0) * far).sum(-1))
 
     none = log_density(difference)
     # what would show only in figures that these logs lack can't be weighed

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.cluster.hierarchy import fcluster, linkage
 
-from openjax.comparison.figures import FIGURES, PLACES, FlightFigures
+from openjax.gap.trims.figures import FIGURES, PLACES, FlightFigures
 
 DAY_SPREAD, WITHIN_DAY = np.array(
     [(figure.day, figure.within) for figure in FIGURES.values()]
@@ -32,7 +32,6 @@ VOLTAGE_SLOPE = (0.0, 0.05)
 # isn't known: the map's 1.4 times that of the voltage at hover, of batteries of 3.4 to
 # 4.1 V under load.
 CHARGE = 1.4 * 0.2 / 3.7
-CHARGED = ("hover", "torque_gain")
 VOLTAGE_SPREAD = 0.1  # V, by which flights without a logged voltage may differ
 
 
@@ -151,7 +150,7 @@ def spread_of_charge(figures: Sequence[FlightFigures]) -> np.ndarray:
     """
     silent = any(f.duty and f.voltage is None for f in figures)
     out = np.zeros(len(FIGURES))
-    out[[PLACES[name] for name in CHARGED]] = 2**0.5 * CHARGE * silent
+    out[HOVER] = 2**0.5 * CHARGE * silent
     return out
 
 
@@ -165,3 +164,13 @@ def spread_of_days(*sets: Days) -> tuple[np.ndarray, np.ndarray]:
         freedom = freedom + np.maximum(one.count - 1, 0)
         total = total + np.nansum((one.days - one.mean) ** 2, 0)
     return np.sqrt(total / freedom), freedom
+
+
+def error_of(
+    old: Days, new: Days, spread: np.ndarray, charge: np.ndarray
+) -> np.ndarray:
+    """Standard deviation (F,) of the difference of two sets' means: of their days, of
+    their flights, and of the battery's `charge`.
+    """
+    days = 1 / np.maximum(old.count, 1) + 1 / np.maximum(new.count, 1)
+    return np.sqrt(spread**2 * days + old.error**2 + new.error**2 + charge**2)

@@ -1,0 +1,190 @@
+"""What the motor commands of one flight say about its vehicle without a model of it: how
+hard each rotor works, and how much it all shakes. Poor in absolute terms (scales, biases
+and the simulator's misfit are in them), good for comparing flights with flights, where
+what is shared cancels.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from openjax.flights.flight import Case, Flight
+from openjax.flights.pairs import FULL
+from openjax.flights.signals import RATE, clock_of, in_band, on_clock
+from openjax.flights.track import GRAVITY, pwm_thrust, to_body
+
+CLEAR_OF_FLOOR = 0.25  # m, where the ground's cushion is gone
+SETTLED = 0.5  # s after take-off and before landing that are left out
+BLOCK = 2.0  # s, over which rows of a flight count as one
+SHAKING = (20.0, 45.0)  # Hz
+SLOW = 0.015  # s, rows from which on these don't show
+
+
+@dataclass(frozen=True)
+class Figure:
+    """What a figure is in words, its unit and the factor to it (0: a logarithm, told as
+    a change in per cent), and its standard deviations over a vehicle's normal days and
+    over flights within a day.
+    """
+
+    words: str
+    unit: str
+    factor: float
+    day: float
+    within: float
+
+
+# Trims, as shares of hover: 1 to 2.5 % over days, measured on published flights of two
+# Crazyflies; yaw more, because its torque is a hundredth of thrust times arm and a
+# tilted motor shows in it.
+FIGURES = {
+    "hover": Figure("thrust command at hover", "%", 0.0, 0.012, 0.003),
+    "roll": Figure("roll trim", "% of hover", 100.0, 0.02, 0.0025),
+    "pitch": Figure("pitch trim", "% of hover", 100.0, 0.02, 0.0025),
+    "yaw": Figure("yaw trim", "% of hover", 100.0, 0.03, 0.005),
+    "shaking": Figure("gyroscope and motors above 20 Hz", "%", 0.0, 0.35, 0.1),
+}
+PLACES = {name: place for place, name in enumerate(FIGURES)}
+TRIMS = ("hover", "roll", "pitch", "yaw")
+
+
+@dataclass(frozen=True)
+class FlightFigures:
+    """One flight's figures: {name: (value, standard error)}.
+
+    hover: mean thrust command per specific thrust, as a fraction of a rotor's maximum
+    at 1 g; roll, pitch, yaw: the mixer's share of it that keeps the vehicle level
+    (left, rear and clockwise rotors harder: positive), also fractions of hover; shaking:
+    the logarithm of the rms of gyroscope and motors above 20 Hz. What the log can't give
+    is missing.
+    """
+
+    name: str
+    day: str
+    values: dict[str, tuple[float, float]]
+    voltage: float | None  # V, mean
+    duty: bool = False  # motors are duty cycles
+
+    def all(self) -> tuple[np.ndarray, np.ndarray]:
+        """Values and standard errors (F,) in the order of FIGURES, NaN where the log
+        gives none.
+        """
+        both = [self.values.get(n, (np.nan, np.nan)) for n in FIGURES]
+        return tuple(np.array(part, float) for part in zip(*both, strict=True))
+
+
+def mixer_of(vehicle) -> np.ndarray:
+    """(4, 4) rows hover, roll, pitch, yaw: signs of each rotor's torque about x, y and
+    z, and a quarter each.
+    """
+    place = np.asarray(vehicle.rotor_position, float)
+    spin = np.asarray(vehicle.rotor_spin, float)
+    return (
+        np.stack(
+            [np.ones(4), np.sign(place[:, 1]), -np.sign(place[:, 0]), np.sign(spin)]
+        )
+        / 4.0
+    )
+
+
+def figures_of(flight: Flight, case: Case, day: str) -> FlightFigures | str:
+    """The figures of a flight checked for a comparison, or why it has none."""
+    vehicle = case.vehicle_of(flight)
+    motor = flight.interpolated("motor_command")
+    voltage = (
+        None
+        if flight.battery_voltage is None
+        else flight.interpolated("battery_voltage")
+    )
+    rows = _in_the_air(flight, case)
+    if rows.sum() < 100 or flight.row_period * rows.sum() < 2.0:
+        return "less than 2 s clear of the floor"
+    full = float((motor[rows] > FULL).any(1).mean())
+    if full > 0.3:
+        return f"a motor is at its limit in {full:.0%} of the rows: no trim can be told"
+    if case.vehicle_file.motor.command == "pwm":
+        motor = pwm_thrust(motor, voltage, vehicle)
+    values = _trims(flight, motor, rows, mixer_of(vehicle)) | _shaking(flight)
+    mean = None if voltage is None else float(voltage[rows].mean())
+    duty = case.vehicle_file.motor.command == "pwm"
+    return FlightFigures(flight.name, day, values, mean, duty)
+
+
+def _in_the_air(flight: Flight, case: Case) -> np.ndarray:
+    rows = np.zeros(len(flight), bool)
+    for stretch in flight.stretches(max(0.2, 5 * flight.row_period)):
+        time = flight.time[stretch]
+        rows[stretch] = (time > time[0] + SETTLED) & (time < time[-1] - SETTLED)
+    if flight.position is not None:
+        height = flight.interpolated("position")[:, 2] - float(
+            case.vehicle_file.log.get("floor_z", 0.0)
+        )
+        clear = height > CLEAR_OF_FLOOR
+        # Who flies low all the time is compared as he flies.
+        rows &= clear if clear[rows].mean() > 0.5 else True
+    return rows
+
+
+def _trims(
+    flight: Flight, motor: np.ndarray, rows: np.ndarray, mixer: np.ndarray
+) -> dict:
+    mixed = motor @ mixer.T
+    specific_thrust = _specific_thrust(flight)
+    block = (flight.time // BLOCK).astype(int)[rows]
+    _, block = np.unique(block, return_inverse=True)
+    count = np.bincount(block)
+    means = np.stack(
+        [np.bincount(block, c[rows]) / count for c in (*mixed.T, specific_thrust)], 1
+    )
+    means = means[count > 0.5 * np.median(count)]
+    weight = means.sum(0)
+    out = {}
+    for k, name in enumerate(TRIMS):
+        below = weight[4] / GRAVITY if k == 0 else weight[0]
+        value = weight[k] / below
+        rest = means[:, k] - value * (means[:, 4] / GRAVITY if k == 0 else means[:, 0])
+        error = np.sqrt((rest**2).sum()) / below
+        out[name] = (float(value), float(error))
+    return out
+
+
+def _specific_thrust(flight: Flight) -> np.ndarray:
+    """m/s^2 (T,), by the path and the attitude where they are known: an accelerometer's
+    bias would be taken for a change of thrust. Without a path g: over a flight that
+    starts and ends at rest it is the mean.
+    """
+    if flight.velocity is None:
+        return np.full(len(flight), GRAVITY)
+    velocity = flight.interpolated("velocity")
+    acceleration = np.gradient(velocity, flight.time, axis=0)
+    acceleration[np.abs(acceleration) > 30.0] = 0.0  # a jump of the estimate, no motion
+    total = acceleration + np.array([0.0, 0.0, GRAVITY])
+    if flight.quaternion is None:
+        return total[:, 2]
+    return to_body(flight.interpolated("quaternion"), total)[:, 2]
+
+
+def _shaking(flight: Flight) -> dict:
+    """Mean logarithm of the rms of gyroscope and motors above 20 Hz, sixths of the
+    flight as units; nothing of a log that is too short or too slow to hold it.
+    """
+    grid = clock_of(flight)
+    measured = flight.body_rates is not None and not flight.body_rates_derived
+    if grid is None or len(grid) < 4 * RATE or not measured:
+        return {}
+    if flight.row_period >= SLOW:
+        return {}
+    parts = [
+        np.array_split(in_band(on_clock(flight, channel, grid), SHAKING), 6)
+        for channel in ("body_rates", "motor_command")
+    ]
+    each = np.mean(
+        [
+            [0.5 * np.log((p**2).sum(1).mean() + 1e-12) for p in power]
+            for power in parts
+        ],
+        0,
+    )
+    return {
+        "shaking": (float(each.mean()), float(each.std(ddof=1) / np.sqrt(len(each))))
+    }
