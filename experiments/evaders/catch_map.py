@@ -3,11 +3,12 @@
 
 Each FILE is what `openjax map --json FILE` wrote, by the names of `KINDS`: the whole
 map in an empty arena, and maps in which one thing is taken away; or, as `inertia`, what
-`experiments.evaders.forced` wrote. Losses are means over the cells that both maps have,
-which are flown from the same starts. Draws the eight small maps, and the page to move
-about in.
+`experiments.evaders.forced` wrote. A map may come in several files of that name, with
+cells of its own in each. Losses are means over the cells that both maps have, which are
+flown from the same starts. Draws the eight small maps, and the page to move about in.
 """
 
+from collections import defaultdict
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -43,12 +44,21 @@ def study(options) -> dict:
     """The maps of all files, after those stored before."""
     data = options.out.with_suffix(".json")
     stored = read_json(data) if data.exists() else {}
-    files = {
-        name: read_json(Path(file))
-        for name, file in (item.split("=", 1) for item in options.maps)
-    }
-    inertia = files.pop("inertia", stored.get("inertia", {"teams": []}))
-    return {"maps": stored.get("maps", {}) | files, "inertia": inertia}
+    files = defaultdict(list)
+    for item in options.maps:
+        name, file = item.split("=", 1)
+        files[name].append(read_json(Path(file)))
+    inertia = files.pop("inertia", [stored.get("inertia", {"teams": []})])[-1]
+    maps = {name: whole_map(parts) for name, parts in files.items()}
+    return {"maps": stored.get("maps", {}) | maps, "inertia": inertia}
+
+
+def whole_map(parts: list[dict]) -> dict:
+    """One map of those that `openjax map` wrote of some cells each; of all else, as the
+    machine and how evaders learned, it holds the first one's.
+    """
+    cells = [cell for part in parts for cell in part["cells"]]
+    return {**parts[0], "cells": list(by_cell(cells).values())}
 
 
 def by_cell(cells: list[dict]) -> dict[tuple, dict]:

@@ -1,5 +1,5 @@
 """What inertia takes away: `python -m experiments.evaders.forced --json FILE [--map
-FILE]`.
+FILE ...]`.
 
 In the cells of the map in which a theorem forces a capture for points
 (`openjax.baselines.stack`), it flies stack by points, who should catch in all of them,
@@ -103,17 +103,21 @@ def flown(size: int, command: MapCommand) -> dict:
     }
 
 
-def of_policy(path: Path, teams: list[dict]) -> list[dict]:
-    """A policy's captures in the same cells, means by size of team."""
+def of_policy(paths: list[Path], teams: list[dict]) -> list[dict]:
+    """A policy's captures in the same cells, means by size of team that its maps
+    have.
+    """
     cells = {
         tuple(cell[name] for name in Cell._fields): cell
+        for path in paths
         for cell in read_json(path)["cells"]
     }
     rows = []
     for team in teams:
-        same = [
-            cells[tuple(own[name] for name in Cell._fields)] for own in team["cells"]
-        ]
+        places = [tuple(own[name] for name in Cell._fields) for own in team["cells"]]
+        same = [cells[place] for place in places if place in cells]
+        if not same:
+            continue
         row = {
             "pursuers": team["pursuers"],
             "scripted": float(np.mean([cell["capture_rate"] for cell in same])),
@@ -131,7 +135,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--sizes", nargs="+", type=int, default=[3, 4, 6, 8])
     parser.add_argument("--episodes", type=int, default=50)
-    parser.add_argument("--map", type=Path, help="of a policy")
+    parser.add_argument("--map", type=Path, nargs="*", default=[], help="of a policy")
     parser.add_argument("--json", type=Path, required=True)
     options = parser.parse_args()
     command = dataclasses.replace(
@@ -147,7 +151,7 @@ def main() -> None:
         }
         print(row, f"{time.monotonic() - began:.0f} s", flush=True)
         write_json(options.json, found)
-    if options.map is not None:
+    if options.map:
         found["policy"] = of_policy(options.map, found["teams"])
         write_json(options.json, found)
         print(found["policy"])

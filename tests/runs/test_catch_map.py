@@ -39,7 +39,9 @@ def test_cells_are_games_of_their_own():
 
     policy = own_controller(still, GAME, "still")
     lines = []
-    found = draw_map(COMMAND, policy, lines.append)
+    kept = []
+    found = draw_map(COMMAND, policy, lines.append, kept.append)
+    assert kept == [found]
     assert len(lines) == 3 and lines[-1].endswith("24 of 24 episodes")
     cells = {
         (cell["num_pursuers"], cell["speed_ratio"], cell["capture_radius"]): cell
@@ -84,7 +86,15 @@ def test_evaders_learn_and_plan_in_the_cells_and_fly_again_from_their_file(tmp_p
         planner_episodes=1,
         planning=PlannerSettings(plans=3, pieces=1, piece_steps=1, replan=5),
     )
-    found = draw_map(command, policy, lambda text: None)
+    kept = []
+
+    def keep(known):
+        kept.append({name for cell in known["cells"] for name in cell})
+
+    found = draw_map(command, policy, lambda text: None, keep)
+    # cut off while it flies, a map holds what has flown
+    new = [sorted(own - kept[0]) for own in kept]
+    assert new == [[], [], ["learned"], ["learned", "planner"]]
     again = dataclasses.replace(command, learned=command.evaders_out, evaders_out=None)
     flown_again = draw_map(again, policy, lambda text: None)
     assert found["curve"] and flown_again["curve"] == found["curve"]

@@ -56,11 +56,14 @@ def main(arguments: Sequence[str]) -> int:
     check_evaders(command.evaders)
     map_game(command, trained)
     console = output_console()
+
+    def keep(found):
+        if command.json is not None:
+            write_json(command.json, found)
+
     results = draw_map(
-        command, policy, lambda text: console.print(text, soft_wrap=True)
+        command, policy, lambda text: console.print(text, soft_wrap=True), keep
     )
-    if command.json is not None:
-        write_json(command.json, results)
     if command.page is not None:
         write_text(command.page, map_page({command.scenario: results}))
     _show(command, results, console)

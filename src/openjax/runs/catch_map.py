@@ -107,14 +107,19 @@ def draw_task(
 
 
 def draw_map(
-    command: MapCommand, policy: LoadedPolicy, tell: Callable[[str], None]
+    command: MapCommand,
+    policy: LoadedPolicy,
+    tell: Callable[[str], None],
+    keep: Callable[[dict], None] | None = None,
 ) -> dict:
     """Fly all cells.
 
     Args:
       command: which cells, how often, and against whom.
-      loaded: the policy.
+      policy: who flies.
       tell: shows a line of progress.
+      keep: is handed what is known as soon as evaders of a kind have flown, as the
+        whole takes minutes and may be cut off.
 
     Returns:
       policy, evaders, scenario, what is taken away, cells (see `cell_record`), how
@@ -135,14 +140,7 @@ def draw_map(
     def scripted(_, tasks, key):
         return evaluate(policy.parameters, tasks, key).statistics
 
-    flights = [Flight("scripted evaders", scripted, command.episodes)]
-    learning = {}
-    if command.best_response:
-        knowing = MapEvaders(command, game, policy, draw)
-        learners, learning["curve"] = knowing.evaders(tell)
-        learning["seconds_of_learning"] = time.monotonic() - began
-        flights += [knowing.learned(learners), knowing.planned]
-    return {
+    found = {
         "policy": policy.source,
         "evaders": list(command.evaders),
         "scenario": command.scenario,
@@ -155,34 +153,41 @@ def draw_map(
             "seconds": game.episode_length * game.time_step,
         },
         "trained_with": list(policy.settings.environment.team_sizes),
-        "cells": _records(_Flyer(command, draw, tell), game, cells, flights),
-        **learning,
-        "seconds": time.monotonic() - began,
+        "cells": [],
         "machine": describe_machine(),
     }
 
+    def kept(**known):
+        found.update(known, seconds=time.monotonic() - began)
+        if keep is not None:
+            keep(found)
 
-def _records(flyer, game, cells, flights):
-    """A record of each cell."""
-    scripted, *knowing = flights
-    statistics_of = flyer.fly(scripted, cells)
-    records = [
-        cell_record(game, *pair) for pair in zip(cells, statistics_of, strict=True)
-    ]
-    if not knowing:
-        return records
-    learners, planner = knowing
-    for record, statistics in zip(records, flyer.fly(learners, cells), strict=True):
-        record["learned"] = figures(game, _of_least_caught(statistics))
-    command = flyer.command
-    number = round(command.planner_share * len(cells))
-    if number:
-        generator = np.random.default_rng(command.seed)
-        places = np.sort(generator.choice(len(cells), number, replace=False)).tolist()
-        statistics_of = flyer.fly(planner, [cells[place] for place in places])
-        for place, statistics in zip(places, statistics_of, strict=True):
-            records[place]["planner"] = figures(game, statistics)
-    return records
+    flyer = _Flyer(command, draw, tell)
+    flown = flyer.fly(Flight("scripted evaders", scripted, command.episodes), cells)
+    records = [cell_record(game, *pair) for pair in zip(cells, flown, strict=True)]
+    kept(cells=records)
+    if command.best_response:
+        knowing = MapEvaders(command, game, policy, draw)
+        learners, curve = knowing.evaders(tell)
+        kept(curve=curve, seconds_of_learning=time.monotonic() - began)
+        flown = flyer.fly(knowing.learned(learners), cells)
+        for record, statistics in zip(records, flown, strict=True):
+            record["learned"] = figures(game, _of_least_caught(statistics))
+        kept()
+        places = _planned_cells(command, len(cells))
+        if places:
+            flown = flyer.fly(knowing.planned, [cells[place] for place in places])
+            for place, statistics in zip(places, flown, strict=True):
+                records[place]["planner"] = figures(game, statistics)
+            kept()
+    return found
+
+
+def _planned_cells(command, number):
+    """Places of the cells, of so many, in which the planner flies."""
+    generator = np.random.default_rng(command.seed)
+    planned = round(command.planner_share * number)
+    return np.sort(generator.choice(number, planned, replace=False)).tolist()
 
 
 def cells_against(file: Mapping, evaders: str) -> list[dict]:
