@@ -55,11 +55,9 @@ def fly(size: int, options: argparse.Namespace, folder: Path) -> dict:
     python = [sys.executable, "-m", "openjax"]
     link = ["--loss", str(options.loss), "--pose_loss", str(options.loss)]
     place = ["--scenario", str(starts)]
+    command = ["virtual_crazyflie", "--number", str(size), "--port", str(PORT)]
     virtual = subprocess.Popen(
-        [*python, "virtual_crazyflie", "--number", str(size), *place, *link]
-        + ["--port", str(PORT)],
-        stdout=subprocess.PIPE,
-        text=True,
+        [*python, *command, *place, *link], stdout=subprocess.PIPE, text=True
     )
     try:
         # its first line says that it listens; before that there is nobody to fly

@@ -57,9 +57,9 @@ def main(arguments: Sequence[str]) -> int:
     map_game(command, trained)
     console = output_console()
 
-    def keep(found):
+    def keep(results):
         if command.json is not None:
-            write_json(command.json, found)
+            write_json(command.json, results)
 
     results = draw_map(
         command, policy, lambda text: console.print(text, soft_wrap=True), keep

@@ -16,7 +16,7 @@ import numpy as np
 
 from openjax.baselines.stack import planar_bound, stack_bound
 from openjax.errors import UserError
-from openjax.evaluation.episodes import make_evaluate, wilson
+from openjax.evaluation.episodes import wilson
 from openjax.pursuit import (
     EpisodeStatistics,
     Pursuit,
@@ -131,16 +131,20 @@ def draw_map(
     """
     began = time.monotonic()
     game = map_game(command, policy.settings.environment)
-    environment = Pursuit(game)
-    policy = policy.in_game(environment)
+    policy = policy.in_game(Pursuit(game))
     draw = functools.partial(draw_task, game, command)
-    cells = cells_of(command)
-    evaluate = make_evaluate(environment, policy.policy, messages=command.messages)
+    flyer = _Flyer(command, draw, tell)
+    found = _about(command, game, policy)
+    for known in _flown(flyer, MapEvaders(command, game, policy, draw)):
+        found |= {**known, "seconds": time.monotonic() - began}
+        if keep is not None:
+            keep(found)
+    return found
 
-    def scripted(_, tasks, key):
-        return evaluate(policy.parameters, tasks, key).statistics
 
-    found = {
+def _about(command, game, policy):
+    """What a map is of, and no cells yet."""
+    return {
         "policy": policy.source,
         "evaders": list(command.evaders),
         "scenario": command.scenario,
@@ -157,30 +161,33 @@ def draw_map(
         "machine": describe_machine(),
     }
 
-    def kept(**known):
-        found.update(known, seconds=time.monotonic() - began)
-        if keep is not None:
-            keep(found)
 
-    flyer = _Flyer(command, draw, tell)
-    flown = flyer.fly(Flight("scripted evaders", scripted, command.episodes), cells)
+def _flown(flyer, knowing):
+    """What is known when scripted evaders have flown, when others have learned, and
+    when these have flown, and planned ones.
+    """
+    command = flyer.command
+    game = knowing.game
+    cells = cells_of(command)
+    flown = flyer.fly(knowing.scripted, cells)
     records = [cell_record(game, *pair) for pair in zip(cells, flown, strict=True)]
-    kept(cells=records)
-    if command.best_response:
-        knowing = MapEvaders(command, game, policy, draw)
-        learners, curve = knowing.evaders(tell)
-        kept(curve=curve, seconds_of_learning=time.monotonic() - began)
-        flown = flyer.fly(knowing.learned(learners), cells)
-        for record, statistics in zip(records, flown, strict=True):
-            record["learned"] = figures(game, _of_least_caught(statistics))
-        kept()
-        places = _planned_cells(command, len(cells))
-        if places:
-            flown = flyer.fly(knowing.planned, [cells[place] for place in places])
-            for place, statistics in zip(places, flown, strict=True):
-                records[place]["planner"] = figures(game, statistics)
-            kept()
-    return found
+    yield {"cells": records}
+    if not command.best_response:
+        return
+    began = time.monotonic()
+    learners, curve = knowing.evaders(flyer.tell)
+    yield {"curve": curve, "seconds_of_learning": time.monotonic() - began}
+    flown = flyer.fly(knowing.learned(learners), cells)
+    for record, statistics in zip(records, flown, strict=True):
+        record["learned"] = figures(game, _of_least_caught(statistics))
+    yield {"cells": records}
+    places = _planned_cells(command, len(cells))
+    if not places:
+        return
+    flown = flyer.fly(knowing.planned, [cells[place] for place in places])
+    for place, statistics in zip(places, flown, strict=True):
+        records[place]["planner"] = figures(game, statistics)
+    yield {"cells": records}
 
 
 def _planned_cells(command, number):

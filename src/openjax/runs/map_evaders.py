@@ -1,5 +1,5 @@
-"""Evaders of a map that know the team: some learn against the policy, each by one
-network for all cells, and one plans.
+"""Evaders of a map: scripted ones, and who knows the team. Of these some learn against
+the policy, each by one network for all cells, and one plans.
 """
 
 import dataclasses
@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from openjax.errors import UserError
+from openjax.evaluation.episodes import make_evaluate
 from openjax.evaluation.judges.best_response import BestResponse, Evaders, fly_learners
 from openjax.evaluation.judges.duel import Duel
 from openjax.evaluation.judges.planner import Planner
@@ -38,7 +39,7 @@ class Flight:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class MapEvaders:
-    """Those that learn in a map's cells, and the one that plans, against one policy."""
+    """Those of a map's cells, against one policy."""
 
     command: MapCommand
     game: PursuitSettings
@@ -76,6 +77,19 @@ class MapEvaders:
             return self.draw(keys[3], jnp.stack(cell))
 
         return BestResponse(command.learning, self.duel, draw_task)
+
+    @property
+    def scripted(self) -> Flight:
+        """Scripted ones, which know nothing of the team."""
+        command = self.command
+        evaluate = make_evaluate(
+            Pursuit(self.game), self.loaded.policy, messages=command.messages
+        )
+
+        def fly(_, tasks, key):
+            return evaluate(self.loaded.parameters, tasks, key).statistics
+
+        return Flight("scripted evaders", fly, command.episodes)
 
     def learn(self, tell: Callable[[str], None]) -> tuple[Evaders, list[dict]]:
         """Learners after their training, and what was told on the way."""
