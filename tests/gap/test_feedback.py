@@ -163,7 +163,7 @@ def test_gains_of_all_axes_are_one_reading_that_covers_what_they_disagree_by():
     assert not loop([0.04, 0, 0, 0.04, 0, 0], [0.01] * 6).acting()
     assert not loop(
         [0.4, 0, 0, 0.4, 0, 0], [0.05] * 6, shown=0.01
-    ).named()  # the motors don't follow
+    ).named_effects()  # the motors don't follow
 
 
 def test_without_enough_flight_gains_cannot_be_told():

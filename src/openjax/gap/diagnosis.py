@@ -78,7 +78,7 @@ def conclude(evidence: Evidence) -> Report:
     acting |= {
         e: p
         for channel in evidence.channels
-        for e, p in channel.named().items()
+        for e, p in channel.named_effects().items()
         if differs(channel, e, evidence.baseline)
     }
     check = check_residual(evidence, selection.fit, selection.search.nothing.fit)

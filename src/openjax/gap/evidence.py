@@ -115,16 +115,16 @@ def gather(
     radio = None
     if all(t.command is not None and t.motors_logged for t in tracks):
         radio = read_radio(tracks, library, motor_rows(case) == "sample")
-    arrived = None if radio is None else radio.arrived
-    reading = make_reading(case, library, tracks, vehicles, arrived, sensors)
+    arrivals = None if radio is None else radio.arrivals
+    reading = make_reading(case, library, tracks, vehicles, arrivals, sensors)
     reading = replace(reading, baseline=baseline, reference=reference)
     loop = None if radio is None else read_rate_loop(reading)
     tell("replaying the flights")
     channels = tuple(c for c in (pose, radio, loop) if c is not None)
     motion = read_motion(reading, loop)
     if motion.gusts is not None:
-        told = {"gusts under others": motion.gusts.in_words()}
-        sensors = replace(sensors, findings=sensors.findings | told)
+        finding = {"gusts under others": motion.gusts.in_words()}
+        sensors = replace(sensors, findings=sensors.findings | finding)
     return Evidence(
         case, library, tracks, vehicles, sensors, channels, motion, baseline
     )

@@ -42,12 +42,12 @@ class Channel(Protocol):
     def estimate(self, effect: str, parameter: str) -> Estimated:
         """A parameter of an acting effect."""
 
-    def residuals(self, named) -> dict[str, list[np.ndarray]]:
+    def residuals(self, effects) -> dict[str, list[np.ndarray]]:
         """{name: [(T,) per track]} of normalised prediction errors with the effects
-        `named`.
+        `effects`.
         """
 
-    def named(self) -> dict[str, float]:
+    def named_effects(self) -> dict[str, float]:
         """Those of the acting effects without which the channel's errors grow by more
         than an effect's form may be wrong by.
         """
@@ -63,8 +63,8 @@ class Channel(Protocol):
         that act.
         """
 
-        def squares(named):
-            residuals = self.residuals(named).values()
+        def squares(effects):
+            residuals = self.residuals(effects).values()
             return np.array(
                 [np.mean(np.concatenate(series) ** 2) for series in residuals]
             )

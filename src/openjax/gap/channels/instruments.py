@@ -51,9 +51,9 @@ def outputs_of(vehicle) -> Float[np.ndarray, "4 3"]:
     return np.linalg.pinv(np.asarray(mixer(vehicle), float)).T
 
 
-def in_force(track: Track, arrived) -> Float[np.ndarray, "rows ticks 4"]:
+def in_force(track: Track, arrivals) -> Float[np.ndarray, "rows ticks 4"]:
     """Command (T, TICKS, 4) that rules at each tick of the rate loop."""
-    part, rows = arrived
+    part, rows = arrivals
     out = np.repeat(track.command[rows[:, 0]][:, None], TICKS, 1)
     older = round(part * TICKS)
     out[:, :older] = track.command[rows[:, 1]][:, None]
@@ -64,20 +64,24 @@ def read_feedback(tracks, vehicles, by_commands) -> list[Feedback]:
     """The feedback part of every track's motors. `by_commands`: `caused_by_commands` of
     each.
     """
-    caused = []
-    made = []
+    commanded_outputs = []
+    motor_outputs = []
     for track, vehicle, (motors, _) in zip(tracks, vehicles, by_commands, strict=True):
         outputs = outputs_of(vehicle)
-        caused.append((motors - motors.mean(0)) @ outputs)
-        made.append(track.motor @ outputs)
+        commanded_outputs.append((motors - motors.mean(0)) @ outputs)
+        motor_outputs.append(track.motor @ outputs)
     # First stage: as much of the outputs as is proportional to what commands would have
     # caused, axis by axis. More freedom (a filter) would let the outer loop's answers
     # to gusts in.
-    made = [m - m.mean(0) for m in made]
-    power = sum((c * c).sum(0) for c in caused)
-    common = sum((c * m).sum(0) for c, m in zip(caused, made, strict=True))
+    motor_outputs = [m - m.mean(0) for m in motor_outputs]
+    power = sum((c * c).sum(0) for c in commanded_outputs)
+    common = sum(
+        (c * m).sum(0) for c, m in zip(commanded_outputs, motor_outputs, strict=True)
+    )
     share = common / np.maximum(power, 1e-12)
-    rest = [m - share * c for c, m in zip(caused, made, strict=True)]
+    rest = [
+        m - share * c for c, m in zip(commanded_outputs, motor_outputs, strict=True)
+    ]
     return [_feedback(r, t, v) for r, t, v in zip(rest, tracks, vehicles, strict=True)]
 
 
@@ -105,15 +109,15 @@ def caused_by_commands(
     the nominal controller's law says which ones the motors and rates imply, slowly.
     """
     if track.command is not None:
-        sent = track.command if link is None else in_force(track, link).mean(1)
+        commands = track.command if link is None else in_force(track, link).mean(1)
     else:
         gain = np.asarray(vehicle.rate_kp, float) * COUNT
         # of the law outputs = gain (commanded - measured rates)
-        implied = track.motor @ outputs_of(vehicle) / gain + track.body_rates
-        slowly = smooth(implied - implied.mean(0), SLOW, track.dt)
-        sent = np.concatenate([track.motor.mean(1)[:, None], slowly], 1)
+        implied_rates = track.motor @ outputs_of(vehicle) / gain + track.body_rates
+        slow_rates = smooth(implied_rates - implied_rates.mean(0), SLOW, track.dt)
+        commands = np.concatenate([track.motor.mean(1)[:, None], slow_rates], 1)
     motors, rates = commanded(
-        vehicle, padded(sent, bucket(len(track))), np.float32(track.dt)
+        vehicle, padded(commands, bucket(len(track))), np.float32(track.dt)
     )
     return np.asarray(motors, float)[: len(track)], np.asarray(rates, float)[
         : len(track)

@@ -44,7 +44,7 @@ class Reading:
     library: Library
     tracks: list[Track]
     vehicles: list
-    arrived: list | None
+    arrivals: list | None
     """The commands that the link let through; None without commands."""
     sensors: Kinematics
     pwm: bool
@@ -80,12 +80,15 @@ class Reading:
             return with_days(usual, self.vehicles[0])
         if self.baseline is None:
             return usual
-        known = self.baseline.numbers
-        keys = {number[:2] for number in known}
-        return (*known, *(number for number in usual if number[:2] not in keys))
+        reference_numbers = self.baseline.numbers
+        keys = {number[:2] for number in reference_numbers}
+        return (
+            *reference_numbers,
+            *(number for number in usual if number[:2] not in keys),
+        )
 
     @property
-    def unmapped(self) -> bool:
+    def lacks_thrust_map(self) -> bool:
         """Whether it isn't known what thrust a motor command makes: of duty cycles
         without a reference, or without the voltage that changes it.
         """
@@ -93,7 +96,7 @@ class Reading:
         return self.pwm and (self.baseline is None or not volts) and not self.reference
 
     @property
-    def heard(self) -> list[Track]:
+    def firmware_tracks(self) -> list[Track]:
         """The tracks as the firmware hears them: its gyroscope as it is, whatever was
         found to be its gain.
         """
@@ -105,7 +108,9 @@ class Reading:
     @cached_property
     def by_commands(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """`caused_by_commands` of each track."""
-        links = self.arrived if self.arrived is not None else [None] * len(self.tracks)
+        links = (
+            self.arrivals if self.arrivals is not None else [None] * len(self.tracks)
+        )
         each = zip(self.tracks, self.vehicles, links, strict=True)
         return [
             caused_by_commands(track, vehicle, link) for track, vehicle, link in each
@@ -126,7 +131,7 @@ def motor_rows(case: Case) -> str:
 
 
 def make_reading(
-    case: Case, library: Library, tracks, vehicles, arrived, sensors: Kinematics
+    case: Case, library: Library, tracks, vehicles, arrivals, sensors: Kinematics
 ) -> Reading:
     """How the rows of a case are to be read."""
     shortest = min(f.row_period for f in case.flights)
@@ -138,15 +143,15 @@ def make_reading(
     # said, not assumed
     means = case.vehicle_file.log.get("motor_rows", "").startswith("mean")
     few = not means and not slow and GRID_PERIOD / shortest < FEW_ROWS
-    hidden = few or any(f.body_rates_derived for f in case.flights)
-    blind = hidden or (at_once and (arrived is None or seldom))
+    ticks_are_hidden = few or any(f.body_rates_derived for f in case.flights)
+    blind = ticks_are_hidden or (at_once and (arrivals is None or seldom))
     late = None if blind or seldom else ROW_DELAY[0 if slow else 1]
     pwm = case.vehicle_file.motor.command == "pwm"
     return Reading(
         library=library,
         tracks=tracks,
         vehicles=vehicles,
-        arrived=arrived,
+        arrivals=arrivals,
         sensors=sensors,
         pwm=pwm,
         at_once=at_once,
@@ -207,7 +212,7 @@ def read_motion(reading: Reading, loop: RateLoop | None) -> Motion:
         reading.baseline,
     )
     replay, exposure = model_noise(replay, library)
-    exposure |= {e: 0.0 for e in library.physics if _hidden(CARDS[e], reading)}
+    exposure |= {e: 0.0 for e in library.physics if _is_hidden(CARDS[e], reading)}
     if not sensors.motor_clock:
         exposure |= {e: 0.0 for e in library.physics if _is_lag(e)}
     return _beside_others(Motion(replay, library, exposure))
@@ -217,18 +222,22 @@ def _beside_others(motion: Motion) -> Motion:
     """The motion with what other vehicles' wakes do beside a push at once."""
     if not any(len(track.neighbours) for track in motion.replay.tracks):
         return motion
-    shown = [
+    visible_effects = [
         e
         for e in motion.library.physics
         if CARDS[e].of_others and motion.exposure[e] >= UNEXPOSED
     ]
-    fit = fit_wake(motion.replay, shown[0]) if shown else motion.nothing
+    fit = (
+        fit_wake(motion.replay, visible_effects[0])
+        if visible_effects
+        else motion.nothing
+    )
     gusts = read_gusts(fit)
     # nuisances are as around nothing again
     replay = dataclasses.replace(motion.replay, physics=fit.replay.physics)
     if not gusts.louder:
         return dataclasses.replace(motion, replay=replay)
-    replay, gusts = as_loud_as(gusts, replay, shown)
+    replay, gusts = as_loud_as(gusts, replay, visible_effects)
     return dataclasses.replace(motion, replay=replay, gusts=gusts)
 
 
@@ -239,7 +248,7 @@ def _is_lag(effect: str) -> bool:
     )
 
 
-def _hidden(card, reading: Reading) -> bool:
+def _is_hidden(card, reading: Reading) -> bool:
     """Whether an effect can't be told from these logs, however large it is: its channel
     is missing, or it looks like a nuisance, what motors do unseen or the map from duty
     cycles to thrust.
@@ -253,7 +262,9 @@ def _hidden(card, reading: Reading) -> bool:
     )
     if card.needs_force and weightless:
         return True
-    if (reading.blind and card.torque_axes) or (reading.unmapped and card.thrust_map):
+    if (reading.blind and card.torque_axes) or (
+        reading.lacks_thrust_map and card.thrust_map
+    ):
         return True
     return card.impossible is not None and any(
         t.ceiling is None and card.impossible(t.position) for t in reading.tracks

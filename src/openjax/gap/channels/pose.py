@@ -29,14 +29,14 @@ START = 20  # rows at the start of a track that the noise model needs
 @dataclass(frozen=True, eq=False)
 class Delay:
     """`value`, `error`: how late the pose is, s, and the standard error; `nats`: log
-    Bayes factor against no delay; `before` and `residual` [(T, 3)]: attitude less
+    Bayes factor against no delay; `nominal_residual` and `residual` [(T, 3)]: attitude less
     integrated gyroscope, rad, without the delay, all else as fitted, and after the fit.
     """
 
     value: float
     error: float
     nats: float
-    before: list[np.ndarray]
+    nominal_residual: list[np.ndarray]
     residual: list[np.ndarray]
 
 
@@ -78,14 +78,18 @@ class Pose(Channel):
             self.fit.value, self.fit.error, self.fit.error + GYROSCOPE_LATE
         )
 
-    def residuals(self, named) -> dict[str, list[np.ndarray]]:
-        used = self.fit.residual if set(named) & set(self.names) else self.fit.before
-        moved = [
+    def residuals(self, effects) -> dict[str, list[np.ndarray]]:
+        angles = (
+            self.fit.residual
+            if set(effects) & set(self.names)
+            else self.fit.nominal_residual
+        )
+        changes = [
             np.concatenate([np.zeros((n, 3)), r[n:] - r[:-n]])
-            for r, n in zip(used, self.steps, strict=True)
+            for r, n in zip(angles, self.steps, strict=True)
         ]
         return {
-            f"pose {axis}": [m[:, k] for m in moved] for k, axis in enumerate("xyz")
+            f"pose {axis}": [m[:, k] for m in changes] for k, axis in enumerate("xyz")
         }
 
 
@@ -105,10 +109,10 @@ def read_delay(tracks: list[Track]) -> Delay:
     delay = 0.0
     for _ in range(STEPS):
         fit = _read_around(tracks, delay)
-        found = float(np.clip(fit.value, 0.0 if delay else -LONGEST, LONGEST))
-        if abs(found - delay) < SMALL_STEP or found <= delay == 0.0:
+        estimate = float(np.clip(fit.value, 0.0 if delay else -LONGEST, LONGEST))
+        if abs(estimate - delay) < SMALL_STEP or estimate <= delay == 0.0:
             break
-        delay = max(found, 0.0)
+        delay = max(estimate, 0.0)
     return fit
 
 
@@ -118,7 +122,7 @@ def _read_around(tracks: list[Track], delay: float) -> Delay:
     """
     data = []
     for track in tracks:
-        turned = turn_increments(track.quaternion)
+        increments = turn_increments(track.quaternion)
         gyro, calm = (
             earlier(v, delay, track)
             for v in (track.body_rates, smooth(track.body_rates, 0.03, track.dt))
@@ -126,18 +130,29 @@ def _read_around(tracks: list[Track], delay: float) -> Delay:
         between = 0.5 * (gyro[1:] + gyro[:-1]) * track.dt
         start = np.zeros((1, 3))
         late = -(calm - calm[:1])
-        y = np.concatenate([start, np.cumsum(turned - between, 0)]) + delay * late
+        y = np.concatenate([start, np.cumsum(increments - between, 0)]) + delay * late
         time = (track.time - track.time[0])[:, None]
         drift = [GYRO_BIAS * axis * time for axis in np.eye(3)]
-        tilted = [
+        tilt_columns = [
             SIZE["imu_tilt"]
             * np.concatenate([start, np.cumsum(np.cross(axis, between), 0)])
             for axis in np.eye(3)
         ]
         turned_so_far = np.concatenate([start, np.cumsum(between, 0)])
-        gained = [SIZE["gyroscope_gain"] * axis * turned_so_far for axis in np.eye(3)]
+        gain_columns = [
+            SIZE["gyroscope_gain"] * axis * turned_so_far for axis in np.eye(3)
+        ]
         data.append(
-            np.stack([y, late, *drift, *tilted, *gained, SIZE["pose_clock"] * late])
+            np.stack(
+                [
+                    y,
+                    late,
+                    *drift,
+                    *tilt_columns,
+                    *gain_columns,
+                    SIZE["pose_clock"] * late,
+                ]
+            )
         )
     return _fit(data)
 
@@ -151,23 +166,23 @@ def _fit(data: list[np.ndarray]) -> Delay:
         noise = fit_noise((0, 1, 2), residual, True, START)
         white = [whiten((noise,), d)[:, START:].reshape(len(d), -1) for d in data]
         cross = [w[2:] @ w[:2].T for w in white]
-        taken = [
+        nuisances = [
             np.linalg.solve(np.eye(len(c)) + w[2:] @ w[2:].T, c)
             for w, c in zip(white, cross, strict=True)
         ]
         gram = sum(
             w[:2] @ w[:2].T - c.T @ t
-            for w, c, t in zip(white, cross, taken, strict=True)
+            for w, c, t in zip(white, cross, nuisances, strict=True)
         )
         precision = gram[1, 1] + 1.0 / DELAY_SPREAD**2
         value = gram[1, 0] / precision
-        left = np.array([1.0, -value])
+        weights = np.array([1.0, -value])
         residual = [
-            np.tensordot(np.concatenate([left, -t @ left]), d, 1)
-            for d, t in zip(data, taken, strict=True)
+            np.tensordot(np.concatenate([weights, -t @ weights]), d, 1)
+            for d, t in zip(data, nuisances, strict=True)
         ]
     # Nuisances stay as they are beside the delay: set free, a clock of a few ms would
     # take any.
-    before = [r + value * d[1] for r, d in zip(residual, data, strict=True)]
+    nominal = [r + value * d[1] for r, d in zip(residual, data, strict=True)]
     nats = 0.5 * (gram[1, 0] * value - np.log(precision * DELAY_SPREAD**2))
-    return Delay(float(value), float(precision**-0.5), float(nats), before, residual)
+    return Delay(float(value), float(precision**-0.5), float(nats), nominal, residual)

@@ -41,7 +41,7 @@ LOSS = "probability"
 class Link:
     """The link under one hypothesis. The last four are (tracks,) numbers of rows."""
 
-    arrived: list
+    arrivals: list
     """[(fraction, (T, 2) rows)]: of each track the command in force at the end and at
     the start of each row, and the share of the row that the older one rules.
     """
@@ -49,11 +49,11 @@ class Link:
     """(M,) of the collective thrust."""
     informative: np.ndarray
     """With a new command."""
-    told: np.ndarray
+    telling_rows: np.ndarray
     """So clear that they tell whether it arrived."""
-    lost: np.ndarray
+    lost_rows: np.ndarray
     """In which it didn't."""
-    between: np.ndarray
+    ambiguous_rows: np.ndarray
     """That neither hold the old command nor follow the new one."""
 
     @property
@@ -79,7 +79,7 @@ class Radio(Channel):
     names: dict[str, str]
     """{parameter: effect} of the library."""
     row: float = 0.01  # s
-    sampled: bool = False
+    single_samples: bool = False
     """Whether a row's motors are one sample."""
     path = "radio"
 
@@ -91,7 +91,9 @@ class Radio(Channel):
     @property
     def loss(self) -> float:
         """Share of the packets that were lost."""
-        return float(self.losing.lost.sum() / max(self.losing.told.sum(), 1))
+        return float(
+            self.losing.lost_rows.sum() / max(self.losing.telling_rows.sum(), 1)
+        )
 
     @property
     def readable(self) -> bool:
@@ -101,7 +103,7 @@ class Radio(Channel):
         return self.links[frozenset({DELAY, LOSS})].misfit < READABLE
 
     @property
-    def found(self) -> frozenset:
+    def off_nominal(self) -> frozenset:
         """The parameters that aren't nominal: each must gain beside the other, exceed
         what clocks may differ by, or a share of lost packets. Packets aren't lost where
         as many rows lie between two commands: a delay that jitters leaves those.
@@ -111,34 +113,38 @@ class Radio(Channel):
         both = frozenset({DELAY, LOSS})
         gain = {p: self.links[both].nats - self.links[both - {p}].nats for p in both}
         late = self.delay > DECISION.clock and gain[DELAY] > CLEAR
-        lost = (
+        loses = (
             self.loss > DECISION.packet_loss
             and gain[LOSS] > CLEAR
-            and self.losing.between.sum() < 0.5 * self.losing.lost.sum()
+            and self.losing.ambiguous_rows.sum() < 0.5 * self.losing.lost_rows.sum()
         )
         return frozenset(
-            p for p, on in ((DELAY, late), (LOSS, lost)) if on and p in self.names
+            p for p, on in ((DELAY, late), (LOSS, loses)) if on and p in self.names
         )
 
     @property
-    def arrived(self) -> list:
+    def arrivals(self) -> list:
         """The commands that the link let through."""
-        return self.links[self.found].arrived
+        return self.links[self.off_nominal].arrivals
 
     def acting(self) -> dict[str, float]:
-        return {self.names[p]: 1.0 - DECISION.unknown for p in sorted(self.found)}
+        return {self.names[p]: 1.0 - DECISION.unknown for p in sorted(self.off_nominal)}
 
     def undetectable(self) -> list[str]:
-        told = self.links[frozenset({DELAY, LOSS})].informative.sum() >= FEWEST
-        return [] if self.readable and told else list(self.names.values())
+        changes_enough = (
+            self.links[frozenset({DELAY, LOSS})].informative.sum() >= FEWEST
+        )
+        return [] if self.readable and changes_enough else list(self.names.values())
 
     def estimate(self, effect: str, parameter: str) -> Estimated:
         if parameter == DELAY:
-            error = float(np.hypot(DELAY_STEP, ROW_ERROR[self.sampled] * self.row))
+            error = float(
+                np.hypot(DELAY_STEP, ROW_ERROR[self.single_samples] * self.row)
+            )
             return Estimated(self.delay, error, error)
-        used = self.links[frozenset({DELAY, LOSS})]
-        told = max(used.told.sum(), 1)
-        each = used.lost / np.maximum(used.told, 1)
+        link = self.links[frozenset({DELAY, LOSS})]
+        packets = max(link.telling_rows.sum(), 1)
+        each = link.lost_rows / np.maximum(link.telling_rows, 1)
         # Packets are lost in bursts: how much flights differ tells more than how many
         # there were.
         apart = (
@@ -147,22 +153,23 @@ class Radio(Channel):
             else 0.0
         )
         error = float(
-            np.hypot(np.sqrt(self.loss * (1 - self.loss) / told), apart) + 0.5 / told
+            np.hypot(np.sqrt(self.loss * (1 - self.loss) / packets), apart)
+            + 0.5 / packets
         )
         return Estimated(self.loss, error, error)
 
-    def residuals(self, named) -> dict[str, list[np.ndarray]]:
-        used = self.links[
-            frozenset(p for p, effect in self.names.items() if effect in named)
+    def residuals(self, effects) -> dict[str, list[np.ndarray]]:
+        link = self.links[
+            frozenset(p for p, effect in self.names.items() if effect in effects)
         ]
         return {
             "motors all": [
-                np.array([np.hypot(used.misfit, TOLERANCE)]) for _ in used.arrived
+                np.array([np.hypot(link.misfit, TOLERANCE)]) for _ in link.arrivals
             ]
         }
 
 
-def read_radio(tracks: list[Track], library, sampled: bool = False) -> Radio:
+def read_radio(tracks: list[Track], library, single_samples: bool = False) -> Radio:
     """Delay and lost packets from the commanded thrust against the mean of the motor
     commands.
     """
@@ -176,7 +183,7 @@ def read_radio(tracks: list[Track], library, sampled: bool = False) -> Radio:
         frozenset({DELAY, LOSS}): _decode(tracks, delay, may_lose=True),
     }
     names = {CARDS[e].fitted[0].name: e for e in library.of("radio")}
-    return Radio(delay, links, names, max(t.dt for t in tracks), sampled)
+    return Radio(delay, links, names, max(t.dt for t in tracks), single_samples)
 
 
 def _clean_rows(track: Track) -> np.ndarray:
@@ -204,9 +211,9 @@ def _delay_misfit(track: Track, delays: np.ndarray) -> np.ndarray:
 
 def _late_error(track: Track, delay: float) -> np.ndarray:
     """(T,) mean of the motors less the commanded thrust of `delay` s ago."""
-    whole, part, given, _ = _link_rows(track, delay)
+    whole, part, motors, _ = _link_rows(track, delay)
     thrust = track.command[:, 0]
-    return given - (1 - part) * _late(thrust, whole) - part * _late(thrust, whole + 1)
+    return motors - (1 - part) * _late(thrust, whole) - part * _late(thrust, whole + 1)
 
 
 def _late(values: np.ndarray, rows: int) -> np.ndarray:
@@ -233,13 +240,13 @@ def _link_rows(track: Track, delay: float) -> tuple[int, float, np.ndarray, np.n
         whole, part = _rows_late(track, delay)
         return whole, part, track.motor.mean(1), clean
     times, thrust = track.fast_thrust
-    given = held_means(times, thrust, track.time + delay, track.dt)
+    motors = held_means(times, thrust, track.time + delay, track.dt)
     rows = int(np.ceil(delay / track.dt - 1e-9))
-    for later in range(1, rows + 1):  # what a row holds then is in these
+    for shift in range(1, rows + 1):  # what a row holds then is in these
         clean = clean & np.concatenate(
-            [clean[later:], np.zeros(min(later, len(clean)), bool)]
+            [clean[shift:], np.zeros(min(shift, len(clean)), bool)]
         )
-    return 0, 0.0, given, clean
+    return 0, 0.0, motors, clean
 
 
 def _decode(tracks, delay: float, may_lose: bool) -> Link:
@@ -247,46 +254,46 @@ def _decode(tracks, delay: float, may_lose: bool) -> Link:
     held?
     """
     errors = []
-    arrived = []
+    arrivals = []
     counts = []
     for track in tracks:
-        in_force, error, counted = _follow(track, delay, may_lose)
+        in_force, error, row_counts = _follow(track, delay, may_lose)
         errors.append(error)
-        counts.append(counted)
+        counts.append(row_counts)
         whole, part = _rows_late(track, delay)
         in_force = in_force if track.fast_thrust is None else _late(in_force, whole)
-        arrived.append((part, np.stack([in_force, _late(in_force, 1)], 1)))
-    informative, told, lost, between = np.array(counts).T
-    return Link(arrived, np.concatenate(errors), informative, told, lost, between)
+        arrivals.append((part, np.stack([in_force, _late(in_force, 1)], 1)))
+    informative, telling, losses, between = np.array(counts).T
+    return Link(arrivals, np.concatenate(errors), informative, telling, losses, between)
 
 
 def _follow(track: Track, delay: float, may_lose: bool):
     """Row of the command in force (T,), errors of the thrust in clean rows, and how
-    many rows are informative, told, lost, between.
+    many rows are informative, telling, lost, ambiguous.
     """
-    whole, part, given, clean = _link_rows(track, delay)
+    whole, part, motors, clean = _link_rows(track, delay)
     error = np.abs(_late_error(track, delay)[clean])
     noise = float(np.median(error)) if len(error) else 0.0
     # least change of thrust that shows whether a packet arrived
     telling = (TOLERANCE + 2.0 * noise) / HELD
     thrust = track.command[:, 0].tolist()
-    given = given.tolist()
+    motors = motors.tolist()
     flags = clean.tolist()
-    held = 0
+    last = 0
     in_force = np.zeros(len(track), int)
     error = np.zeros(len(track))
     counts = np.zeros(4, int)
     for row in range(len(track)):
         due = max(row - whole, 0)
-        expected = (1 - part) * thrust[due] + part * thrust[held]
-        change = abs(thrust[held] - expected)
-        missed = False
+        due_thrust = (1 - part) * thrust[due] + part * thrust[last]
+        change = abs(thrust[last] - due_thrust)
+        is_lost = False
         if flags[row] and change > INFORMATIVE:
-            way = abs(given[row] - thrust[held]) / change
-            missed = may_lose and way < abs(given[row] - expected) / change
-            told = change > telling
-            counts += [1, told, told and way < HELD, told and HELD <= way < BETWEEN]
-        error[row] = given[row] - (thrust[held] if missed else expected)
-        held = held if missed else due
-        in_force[row] = held
+            way = abs(motors[row] - thrust[last]) / change
+            is_lost = may_lose and way < abs(motors[row] - due_thrust) / change
+            tells = change > telling
+            counts += [1, tells, tells and way < HELD, tells and HELD <= way < BETWEEN]
+        error[row] = motors[row] - (thrust[last] if is_lost else due_thrust)
+        last = last if is_lost else due
+        in_force[row] = last
     return in_force, error[clean], counts

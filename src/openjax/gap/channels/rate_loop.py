@@ -97,25 +97,27 @@ class RateLoop(Channel):
         return {e: float(p) for e, p in odds.items() if p > 0.5}
 
     def undetectable(self) -> list[str]:
-        shown = PRIOR[0] > 2.0 * DECISION.standard_errors * self.error[[0, 3]].min()
-        return [] if shown else list(self.names)
+        detectable = (
+            PRIOR[0] > 2.0 * DECISION.standard_errors * self.error[[0, 3]].min()
+        )
+        return [] if detectable else list(self.names)
 
     def estimate(self, effect: str, parameter: str) -> Estimated:
         place = GAINS.index(parameter)
         change, error = (float(v[place]) for v in self.gain)
         return Estimated(1.0 + change, error, error)
 
-    def residuals(self, named) -> dict[str, list[np.ndarray]]:
-        changes = -self.gain[0] if set(named) & set(self.names) else np.zeros(3)
-        changed = np.append(1.0, changes)
+    def residuals(self, effects) -> dict[str, list[np.ndarray]]:
+        changes = -self.gain[0] if set(effects) & set(self.names) else np.zeros(3)
+        weights = np.append(1.0, changes)
         out: dict[str, list[np.ndarray]] = {
             "motors roll": [],
             "motors pitch": [],
             "motors yaw": [],
         }
         for outputs in self.outputs:
-            left = detrend(np.tensordot(changed, outputs, 1), axis=0)
-            for column, series in zip(left.T, out.values(), strict=True):
+            errors = detrend(np.tensordot(weights, outputs, 1), axis=0)
+            for column, series in zip(errors.T, out.values(), strict=True):
                 series.append(smooth(column, SMOOTH, self.dt))
         return out
 
@@ -126,25 +128,27 @@ def read_rate_loop(reading) -> RateLoop:
     series = []
     outputs = []
     tracks = zip(
-        reading.heard,
+        reading.firmware_tracks,
         reading.vehicles,
-        reading.arrived,
+        reading.arrivals,
         reading.by_commands,
         strict=True,
     )
-    for track, vehicle, link, (_, drawn) in tracks:
-        wanted, sent = observed(track, vehicle, link, reading.at_once)
-        ticks.append(sent)
-        logged, nominal, *larger = np.concatenate(
-            [track.motor[None], wanted]
+    for track, vehicle, link, (_, commanded_rates) in tracks:
+        requests, motor_ticks = observed(track, vehicle, link, reading.at_once)
+        ticks.append(motor_ticks)
+        logged_outputs, nominal, *larger = np.concatenate(
+            [track.motor[None], requests]
         ) @ outputs_of(vehicle)
-        slopes = [(made - nominal) / GAIN_STEP for made in larger]
-        outputs.append(np.stack([logged - nominal, *slopes]))
-        series.append(_series(track, vehicle, in_force(track, link), drawn, reading))
+        slopes = [(variant - nominal) / GAIN_STEP for variant in larger]
+        outputs.append(np.stack([logged_outputs - nominal, *slopes]))
+        series.append(
+            _series(track, vehicle, in_force(track, link), commanded_rates, reading)
+        )
     change, error = read_gains(reading, series, ticks)
     names = reading.library.of("rate_loop")
     return RateLoop(
-        change, error, outputs, ticks, names, max(t.dt for t in reading.heard)
+        change, error, outputs, ticks, names, max(t.dt for t in reading.firmware_tracks)
     )
 
 
@@ -158,8 +162,8 @@ def with_motors(track: Track, vehicle) -> Track:
     link = (0.0, np.stack([rows, np.maximum(rows - 1, 0)], 1))
     track = dataclasses.replace(track, motor=np.repeat(track.command[:, :1], 4, 1))
     for _ in range(2):
-        wanted, _ = observed(track, vehicle, link)
-        track = dataclasses.replace(track, motor=wanted[0], motors_logged=False)
+        requests, _ = observed(track, vehicle, link)
+        track = dataclasses.replace(track, motor=requests[0], motors_logged=False)
     return track
 
 
@@ -193,8 +197,8 @@ def observed(track: Track, vehicle, link, at_once=False):
         observe(controller, vehicle, command, motor, gyro, push, dt, at_once)
         for controller in (vehicle, *larger)
     ]
-    wanted = np.array([run[0] for run in runs], float)[:, :rows]
-    return wanted, np.asarray(runs[0][1])[:rows]
+    requests = np.array([run[0] for run in runs], float)[:, :rows]
+    return requests, np.asarray(runs[0][1])[:rows]
 
 
 def read_gains(reading, series, ticks) -> tuple[np.ndarray, np.ndarray]:
@@ -212,20 +216,20 @@ def read_gains(reading, series, ticks) -> tuple[np.ndarray, np.ndarray]:
         2: [],
     }  # axis: [(moments (5, 1 + 5), track)] of every segment
     power = np.zeros((2, 3))
-    flown = zip(reading.heard, reading.vehicles, series, ticks, strict=True)
-    for unit, (track, vehicle, of, sent) in enumerate(flown):
+    flights = zip(reading.firmware_tracks, reading.vehicles, series, ticks, strict=True)
+    for unit, (track, vehicle, of, motor_ticks) in enumerate(flights):
         power += excitation(track, vehicle, of)
-        for axis, part in _segments(of, sent, track.dt):
+        for axis, part in _segments(of, motor_ticks, track.dt):
             moments[axis].append((part, unit))
     for group, axes in enumerate(((0, 1), (2,))):
-        found = np.array([m for a in axes for m, _ in moments[a]])
+        segment_moments = np.array([m for a in axes for m, _ in moments[a]])
         units = np.array([3 * u + a for a in axes for _, u in moments[a]])
-        commanded, noise = power[:, axes].sum(1)
-        excited = commanded > ABOVE_NOISE**2 * noise
-        if excited and len(found) * SEGMENT >= LEAST_SECONDS * len(axes):
-            own = slice(3 * group, 3 * group + 3)
-            theta, deviation = _moments(found, units)
-            change[own], error[own] = theta[:3], deviation[:3]
+        signal, noise = power[:, axes].sum(1)
+        excites = signal > ABOVE_NOISE**2 * noise
+        if excites and len(segment_moments) * SEGMENT >= LEAST_SECONDS * len(axes):
+            columns = slice(3 * group, 3 * group + 3)
+            theta, deviation = _moments(segment_moments, units)
+            change[columns], error[columns] = theta[:3], deviation[:3]
     return change, error
 
 
@@ -235,11 +239,11 @@ def excitation(track: Track, vehicle, series: np.ndarray) -> np.ndarray:
     show it beside smooth rates.
     """
     gain = np.asarray(vehicle.rate_kp, float) * COUNT
-    commanded = sosfiltfilt(_band(track.dt), series[6] / gain, axis=0)
+    response = sosfiltfilt(_band(track.dt), series[6] / gain, axis=0)
     bends = np.diff(track.body_rates, 2, axis=0)
     share = 2.0 * track.dt * (min(BAND[1], 0.4 / track.dt) - BAND[0])
     noise = share * bends.var(0) / 6.0
-    return np.stack([(commanded**2).sum(0), len(track) * noise])
+    return np.stack([(response**2).sum(0), len(track) * noise])
 
 
 def _band(dt: float) -> np.ndarray:
@@ -249,11 +253,11 @@ def _band(dt: float) -> np.ndarray:
 
 
 def _series(
-    track: Track, vehicle, ruling: np.ndarray, drawn: np.ndarray, reading
+    track: Track, vehicle, ruling: np.ndarray, commanded_rates: np.ndarray, reading
 ) -> np.ndarray:
     """(11, T, 3): outputs beyond the nominal ones, what P, I and D make of the rates,
     what a delay does to P and a low-pass to D, and the last five again of the rates
-    `drawn` (T, 3) that commands alone cause: the instruments.
+    `commanded_rates` (T, 3) that commands alone cause: the instruments.
 
     The rates at the ticks of a row lie on a smooth curve through those of the rows; the
     derivative is of the tick before.
@@ -272,15 +276,20 @@ def _series(
     rates = curve(at)
     slopes = (curve(at) - curve(at - 1.0 / TICKS)) * TICKS / track.dt
     low = butter(2, FILTER, fs=TICKS / track.dt)
-    filtered = lfilter(*low, slopes.reshape(-1, 3), axis=0).reshape(slopes.shape)
-    sent = of_row(ruling[..., 1:])
+    low_passed = lfilter(*low, slopes.reshape(-1, 3), axis=0).reshape(slopes.shape)
+    rate_commands = of_row(ruling[..., 1:])
     slope = of_row(slopes)
-    x = _terms(track, vehicle, sent - of_row(rates), slope)
-    z = _terms(track, vehicle, sent - drawn, np.gradient(drawn, track.dt, axis=0))
+    x = _terms(track, vehicle, rate_commands - of_row(rates), slope)
+    z = _terms(
+        track,
+        vehicle,
+        rate_commands - commanded_rates,
+        np.gradient(commanded_rates, track.dt, axis=0),
+    )
     apart = reading.late or 0.0
     off = [
         apart * np.gradient(x[0], track.dt, axis=0),
-        _terms(track, vehicle, sent, of_row(filtered) - slope)[2],
+        _terms(track, vehicle, rate_commands, of_row(low_passed) - slope)[2],
     ]
     late = [apart * np.gradient(v, track.dt, axis=0) for v in z[[0, 2]]]
     y = track.motor @ outputs_of(vehicle) - x.sum(0)
@@ -305,27 +314,27 @@ def _segments(series: np.ndarray, ticks: np.ndarray, dt: float):
     size = max(int(SEGMENT / dt), 1)
     if series.shape[1] < 4 * edge + size:
         return
-    passed = sosfiltfilt(_band(dt), series, axis=1)[:, edge:-edge]
-    limited = (np.abs(ticks - 0.5) > 0.5 - MARGIN).any((1, 2))
-    limited = np.convolve(limited, np.ones(2 * edge // 3 + 1), "same")[edge:-edge] > 0
-    for k in range(0, passed.shape[1] - size // 2, size):
-        if not limited[k : k + size].any():
+    band_passed = sosfiltfilt(_band(dt), series, axis=1)[:, edge:-edge]
+    at_limit = (np.abs(ticks - 0.5) > 0.5 - MARGIN).any((1, 2))
+    at_limit = np.convolve(at_limit, np.ones(2 * edge // 3 + 1), "same")[edge:-edge] > 0
+    for k in range(0, band_passed.shape[1] - size // 2, size):
+        if not at_limit[k : k + size].any():
             for axis in range(3):
-                part = passed[:, k : k + size, axis]
+                part = band_passed[:, k : k + size, axis]
                 yield axis, part[6:] @ part[:6].T
 
 
-def _moments(found: np.ndarray, units: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _moments(moments: np.ndarray, units: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Coefficients (5,) and errors (5,) that bring the moments (B, 5, 1 + 5) to zero,
     with weak priors. Errors are what segments or, where that is more, `units` (B,)
     differ by.
     """
     precision = np.diag(1.0 / PRIOR**2)
-    total = found.sum(0)
+    total = moments.sum(0)
     theta = np.zeros(5)
     for _ in range(4):
-        each = found[:, :, 0] - found[:, :, 1:] @ theta
-        spread = each.T @ each * len(found) / max(len(found) - 5, 1)
+        each = moments[:, :, 0] - moments[:, :, 1:] @ theta
+        spread = each.T @ each * len(moments) / max(len(moments) - 5, 1)
         weight = np.linalg.inv(spread + 1e-9 * np.trace(spread) * np.eye(5))
         covariance = np.linalg.inv(total[:, 1:].T @ weight @ total[:, 1:] + precision)
         theta = covariance @ total[:, 1:].T @ weight @ total[:, 0]

@@ -34,14 +34,14 @@ def figures(report: Report) -> list[tuple[str, str, str]]:
     """
     if not report.plots:
         return []
-    found = []
+    entries = []
     with rc_context(STYLE):
         for draw in (_places, _course, _horizons, _coordinate):
-            drawn = draw(report)
-            if drawn is not None:
-                title, text, figure = drawn
-                found.append((title, text, as_svg(figure, title)))
-    return found
+            parts = draw(report)
+            if parts is not None:
+                title, text, figure = parts
+                entries.append((title, text, as_svg(figure, title)))
+    return entries
 
 
 def _residuals(report: Report) -> tuple[list, list]:
@@ -61,13 +61,18 @@ def _places(report: Report):
         return None
     figure, axes = small_figure(0.6 + 0.42 * len(places))
     rows = np.arange(len(places))
-    before = np.array([place.before for place in places])
-    after = np.array([place.after for place in places])
-    axes.hlines(rows, after, before, color=GREY, linewidth=2)
-    axes.plot(before, rows, "o", color=BEFORE, markersize=7, label="nominal simulator")
+    nominal = np.array([place.before for place in places])
+    corrected = np.array([place.after for place in places])
+    axes.hlines(rows, corrected, nominal, color=GREY, linewidth=2)
+    axes.plot(nominal, rows, "o", color=BEFORE, markersize=7, label="nominal simulator")
     if report.parameters:
         axes.plot(
-            after, rows, "o", color=AFTER, markersize=7, label="with the named effects"
+            corrected,
+            rows,
+            "o",
+            color=AFTER,
+            markersize=7,
+            label="with the named effects",
         )
     axes.axvline(1.0, color=GREY, linestyle=":", linewidth=1.2)
     axes.set_yticks(
@@ -115,8 +120,8 @@ class Course:
     @property
     def ratio(self) -> float:
         """By how much the error is larger before."""
-        before, after = (rms(e) for e in self.errors(HORIZONS["velocity"]))
-        return before / max(after, 1e-12)
+        nominal, remaining = (rms(e) for e in self.errors(HORIZONS["velocity"]))
+        return nominal / max(remaining, 1e-12)
 
 
 def rms(values: Float[np.ndarray, "..."]) -> float:
@@ -133,17 +138,17 @@ def _courses(report: Report) -> Iterator[Course]:
         floor = channel.residuals(evidence.library.of(channel.path))
         for name, series in channel.residuals(report.named).items():
             scale = max(rms(np.concatenate(floor[name])), 1e-12)
-            for track, before, after in zip(
+            for track, nominal, corrected in zip(
                 evidence.tracks, without[name], series, strict=True
             ):
                 # of some channels one number is known of a whole flight
-                skip = int(SKIP / track.dt) if len(after) > 1 else 0
+                skip = int(SKIP / track.dt) if len(corrected) > 1 else 0
                 yield Course(
                     flight=track.name,
                     dt=track.dt,
                     time=track.time[skip:],
-                    before=np.resize(before, len(track))[skip:] / scale,
-                    after=np.resize(after, len(track))[skip:] / scale,
+                    before=np.resize(nominal, len(track))[skip:] / scale,
+                    after=np.resize(corrected, len(track))[skip:] / scale,
                     name="mean motor command" if name == "motors all" else name,
                     unit="times the noise",
                     adds_up=False,
@@ -154,8 +159,10 @@ def _courses_of_motion(report: Report) -> Iterator[Course]:
     """Body rates and velocity of every flight, as far as they were logged."""
     evidence = report.plots["evidence"]
     axes = [axis for axis in range(6) if evidence.replay.usable[axis]]
-    nominal, corrected = _residuals(report)
-    for track, before, after in zip(evidence.tracks, nominal, corrected, strict=True):
+    nominal, with_effects = _residuals(report)
+    for track, nominal_errors, corrected_errors in zip(
+        evidence.tracks, nominal, with_effects, strict=True
+    ):
         skip = int(SKIP / track.dt)
         for axis in axes:
             name, unit = _axis_name(axis)
@@ -163,8 +170,8 @@ def _courses_of_motion(report: Report) -> Iterator[Course]:
                 flight=track.name,
                 dt=track.dt,
                 time=track.time[skip:],
-                before=before[skip:, axis],
-                after=after[skip:, axis],
+                before=nominal_errors[skip:, axis],
+                after=corrected_errors[skip:, axis],
                 name=name,
                 unit=unit,
                 adds_up=True,
@@ -190,13 +197,13 @@ def _course(report: Report):
     course = _worst(report)
     if course is None:
         return None
-    before, after = course.errors(HORIZONS["velocity"])
+    nominal, remaining = course.errors(HORIZONS["velocity"])
     figure, axes = small_figure(2.6)
-    time = course.time[-len(after) :] - course.time[0]
-    band = 1.645 * rms(after)
+    time = course.time[-len(remaining) :] - course.time[0]
+    band = 1.645 * rms(remaining)
     label = "90 % of what is left" if report.parameters else "90 % of all errors"
     axes.axhspan(-band, band, color=GREY, alpha=0.25, linewidth=0, label=label)
-    for error, colour, label in _lines(report, before, after):
+    for error, colour, label in _lines(report, nominal, remaining):
         axes.plot(time, error, color=colour, linewidth=1.1, label=label)
     axes.set(
         xlabel="time in the flight [s]",
@@ -208,7 +215,7 @@ def _course(report: Report):
     return ("One flight", f"{course.flight}: error of {course.name}{ahead}.", figure)
 
 
-def _lines(report: Report, nominal, corrected) -> Sequence[tuple]:
+def _lines(report: Report, nominal, with_effects) -> Sequence[tuple]:
     """(residual, colour, label): the nominal simulator, and the corrected one where
     effects were named.
     """
@@ -221,7 +228,7 @@ def _lines(report: Report, nominal, corrected) -> Sequence[tuple]:
             ),
         )
     return (nominal, BEFORE, "nominal simulator"), (
-        corrected,
+        with_effects,
         AFTER,
         "with the named effects",
     )
@@ -235,8 +242,8 @@ def _horizons(report: Report):
     ahead = sorted({max(round(h / course.dt), 1) * course.dt for h in HORIZONS_SHOWN})
     figure, axes = small_figure(2.6)
     sizes = np.array([[rms(error) for error in course.errors(h)] for h in ahead])
-    before, after = sizes.T
-    for size, colour, label in _lines(report, before, after):
+    nominal, remaining = sizes.T
+    for size, colour, label in _lines(report, nominal, remaining):
         axes.semilogx(ahead, size, "o-", color=colour, markersize=5, label=label)
     axes.set(
         xlabel="time ahead [s]",
@@ -258,14 +265,14 @@ def _coordinate(report: Report):
     effect follows.
     """
     evidence = report.plots["evidence"]
-    named = report.named
+    effects = report.named
     if (
-        not named
+        not effects
         or not evidence.replay.usable[3]
         or evidence.tracks[0].quaternion is None
     ):
         return None
-    coordinate = CARDS[named[0]].coordinate
+    coordinate = CARDS[effects[0]].coordinate
     if not coordinate:  # its force follows none, or it makes torques or delays
         return None
     figure, axes = small_figure(2.6)
@@ -279,7 +286,7 @@ def _coordinate(report: Report):
                 pairs.append(pair)
         if not pairs:
             return None
-        along, missing = _binned(np.concatenate(pairs)).T
+        along, missing = _bin_means(np.concatenate(pairs)).T
         axes.plot(along, missing, "o-", color=colour, markersize=5, label=label)
     units = {
         "body velocity": "forward speed [m/s]",
@@ -294,7 +301,7 @@ def _coordinate(report: Report):
     add_legend(axes)
     return (
         "The strongest effect",
-        f"{named[0]}: what the simulator misses, against what drives it.",
+        f"{effects[0]}: what the simulator misses, against what drives it.",
         figure,
     )
 
@@ -328,7 +335,7 @@ def _along(track, coordinate: str) -> np.ndarray | None:
     return None
 
 
-def _binned(data: np.ndarray) -> np.ndarray:
+def _bin_means(data: np.ndarray) -> np.ndarray:
     """(B, 2) means over bins of as many samples each."""
     edges = np.quantile(data[:, 0], np.linspace(0, 1, BINS + 1))
     bins = np.clip(np.searchsorted(edges, data[:, 0]) - 1, 0, BINS - 1)

@@ -22,7 +22,7 @@ def page_of(report: Report, folder: Path | None = None) -> str:
     """The whole page as text: the answer and what to type next, figures, values, and
     folded what is rarely asked. `folder`: where it is written.
     """
-    ranked = sorted(report.probabilities.items(), key=lambda item: -item[1])
+    ranking = sorted(report.probabilities.items(), key=lambda item: -item[1])
     return filled(
         "page.html.jinja",
         Path(__file__).parent,
@@ -35,23 +35,23 @@ def page_of(report: Report, folder: Path | None = None) -> str:
         figures=figures(report),
         trims=None if report.trims is None else content_of(report.trims),
         meanings={e: EFFECTS[e].description for e in report.parameters if e in EFFECTS},
-        ranked=[(name, p) for name, p in ranked[:8] if p > 5e-4],
+        ranked=[(name, p) for name, p in ranking[:8] if p > 5e-4],
     )
 
 
 def facts(report: Report) -> list[tuple[str, str]]:
     """Date, vehicle and flights."""
-    found = [("Diagnosed", datetime.datetime.now().strftime("%d %B %Y, %H:%M"))]
+    entries = [("Diagnosed", datetime.datetime.now().strftime("%d %B %Y, %H:%M"))]
     evidence = report.plots.get("evidence")
     if evidence is None:
-        return found
+        return entries
     case = evidence.case
     mass = f"{1000 * float(case.vehicle_file.vehicle.mass):.1f} g"
-    weighed = ", weighed" if case.vehicle_file.mass_weighed else ""
+    remark = ", weighed" if case.vehicle_file.mass_weighed else ""
     seconds = sum(float(flight.time[-1] - flight.time[0]) for flight in case.flights)
     return [
-        *found,
-        ("Vehicle", f"{case.vehicle_file.name}, {mass}{weighed}"),
+        *entries,
+        ("Vehicle", f"{case.vehicle_file.name}, {mass}{remark}"),
         ("Flights", f"{len(case.flights)}, {seconds:.0f} s in all"),
     ]
 
@@ -60,11 +60,11 @@ def sentence(report: Report) -> str:
     """What was found, in one plain sentence that says what the chart of shares
     shows.
     """
-    named = report.named
-    if not named:
+    effects = report.named
+    if not effects:
         return VERDICTS[report.verdict]
-    values = [report.shares.effects[effect].value for effect in named]
-    names = [report.class_of(effect).replace("_", " ") for effect in named]
+    values = [report.shares.effects[effect].value for effect in effects]
+    names = [report.class_of(effect).replace("_", " ") for effect in effects]
     parts = " and ".join(
         f"{name} ({100 * value:.0f} %)"
         for name, value in zip(names, values, strict=True)
@@ -78,10 +78,10 @@ def sentence(report: Report) -> str:
         other = max(rest, key=rest.get)
         text = f"What the simulator misses is {100 * rest[other]:.0f} % {other}; named is {parts}"
     else:
-        mostly = "" if whole > 0.995 else "mostly "  # .995 is 100 % as it is printed
-        text = f"What the simulator misses is {mostly}{parts}"
+        qualifier = "" if whole > 0.995 else "mostly "  # .995 is 100 % as it is printed
+        text = f"What the simulator misses is {qualifier}{parts}"
     if report.parameters:
-        those = "it" if len(named) == 1 else "them"
+        those = "it" if len(effects) == 1 else "them"
         smaller = f"{100 * report.gap.reduction:.0f} %"
         text += f"; with {those}, errors on held-out flights shrink by {smaller}"
     unknown = " Something unknown acts as well." if "unknown" in report.effects else ""
@@ -124,8 +124,11 @@ def next_steps(report: Report, folder: Path | None = None) -> list[tuple[str, st
     """
     steps = []
     for name, others in report.equivalent.items():
-        why = f"These flights can't tell {name} from {', '.join(others)}. {_fly(report, others)}"
-        steps.append((why, "openjax plan . --out next_flight"))
+        reason = (
+            f"These flights can't tell {name} from {', '.join(others)}. "
+            f"{_next_flight(report, others)}"
+        )
+        steps.append((reason, "openjax plan . --out next_flight"))
     if report.parameters:
         names = ", ".join(effect.replace("_", " ") for effect in report.parameters)
         tune = "openjax adapt effects.toml --policy flight"
@@ -133,22 +136,27 @@ def next_steps(report: Report, folder: Path | None = None) -> list[tuple[str, st
         steps.append((f"Fine-tune shipped weights to a vehicle with {names}:", tune))
         steps.append(("Or train from scratch in the corrected simulator:", train))
     if report.left_out:
-        why = "Mend the logs that were left out, and diagnose again: each says above what is wrong."
-        steps.append((why, ""))
+        reason = (
+            "Mend the logs that were left out, and diagnose again: each says above what is "
+            "wrong."
+        )
+        steps.append((reason, ""))
     case = _case_from(report, folder)
     if report.verdict == "none":
-        why = "Nothing needs correcting. Keep these flights as the reference for later ones:"
-        steps.append((why, f"openjax diagnose NEW_FLIGHTS --reference {case}"))
+        reason = "Nothing needs correcting. Keep these flights as the reference for later ones:"
+        steps.append((reason, f"openjax diagnose NEW_FLIGHTS --reference {case}"))
     if "unknown" in report.effects:
         follows = f" {report.rest}" if report.rest else ""
-        why = (
+        reason = (
             f"Look for what is not on the list of effects.{follows} Did anything change since it "
             "flew well?"
         )
-        steps.append((why, f"openjax diagnose {case} --reference EARLIER_FLIGHTS"))
+        steps.append((reason, f"openjax diagnose {case} --reference EARLIER_FLIGHTS"))
     if report.not_testable and not report.equivalent and report.next_flight:
         missing = ", ".join(effect.replace("_", " ") for effect in report.not_testable)
-        steps.append((f"These flights wouldn't show {missing}. {_fly(report)}", ""))
+        steps.append(
+            (f"These flights wouldn't show {missing}. {_next_flight(report)}", "")
+        )
     return steps
 
 
@@ -161,7 +169,7 @@ def _case_from(report: Report, folder: Path | None) -> str:
     return shlex.quote(os.path.relpath(path.resolve(), folder.resolve()))
 
 
-def _fly(report: Report, others: Sequence[str] = ()) -> str:
+def _next_flight(report: Report, others: Sequence[str] = ()) -> str:
     """The next flight, of the first of `others` that has one."""
     flights = [CARDS[other].next_flight for other in others if other in CARDS]
     flight = flights[0] if flights else report.next_flight

@@ -147,9 +147,9 @@ class Report:
         }
         estimates = {
             effect: {
-                name: asdict(v) | {"unusual": v.unusual} for name, v in found.items()
+                name: asdict(v) | {"unusual": v.unusual} for name, v in values.items()
             }
-            for effect, found in self.parameters.items()
+            for effect, values in self.parameters.items()
         }
         apart = ("case", "plots", "seconds", "identification", "trims")
         plain = {
@@ -170,14 +170,16 @@ class Report:
         """Every named class' share with its interval, then sensors and clocks, then
         what is unexplained.
         """
-        named = []
+        class_shares = []
         for effect in self.named:
             share = self.shares.effects[effect]
             low, high = share.interval90
             interval = f"[{_short(low)}, {_short(high)}]"
-            named.append(f"{self.class_of(effect)} {_short(share.value)} {interval}")
+            class_shares.append(
+                f"{self.class_of(effect)} {_short(share.value)} {interval}"
+            )
         parts = [
-            *([", ".join(named)] if named else []),
+            *([", ".join(class_shares)] if class_shares else []),
             f"sensors and clocks {_short(self.shares.sensors.value)}",
             f"unexplained {_short(self.shares.unexplained.value)}",
         ]

@@ -63,11 +63,11 @@ def _picture(identification: Identification) -> str:
         figure = Figure(figsize=(2.6 * count, 4.2), layout="constrained")
         grid = figure.subplots(2, count, sharex=True, squeeze=False)
         for column, (axis, pair) in enumerate(identification.responses.items()):
-            drawn = (
+            lines = (
                 (pair.simulated, BEFORE, "nominal simulator"),
                 (pair.measured, AFTER, "measured"),
             )
-            for response, color, name in drawn:
+            for response, color, name in lines:
                 for row, values in enumerate((response.gain, response.phase)):
                     low, middle, high = np.array(values).T
                     axes = grid[row, column]

@@ -45,8 +45,8 @@ def _domains(report: Report) -> Iterator[str]:
     """Values and intervals lie where their parameters mean anything."""
     evidence = report.plots.get("evidence")
     vehicle = None if evidence is None else evidence.vehicles[0]
-    for effect, found in report.parameters.items():
-        for name, estimate in found.items() if effect in EFFECTS else ():
+    for effect, estimates in report.parameters.items():
+        for name, estimate in estimates.items() if effect in EFFECTS else ():
             low, high = EFFECTS[effect].parameters[name].limits(vehicle)
             start, end = estimate.interval90
             if not low <= start <= estimate.value <= end <= high:
@@ -61,11 +61,11 @@ def _likelihood(report: Report) -> Iterator[str]:
     share.
     """
     chance = report.probabilities
-    said = report.effects or ("none",)
-    named = max(chance.get(name, 0.0) for name in said)
+    answers = report.effects or ("none",)
+    likelihood = max(chance.get(name, 0.0) for name in answers)
     second = report.runner_up.partition(" (")[0]
-    if second and chance.get(second, 0.0) > named + ROUNDING:
-        yield f"the runner-up {second} ({chance[second]:.2f}) is likelier than {', '.join(said)}"
+    if second and chance.get(second, 0.0) > likelihood + ROUNDING:
+        yield f"the runner-up {second} ({chance[second]:.2f}) is likelier than {', '.join(answers)}"
     sure = max(
         (report.shares.effects[e].interval90[0] for e in report.named), default=0.0
     )

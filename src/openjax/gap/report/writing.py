@@ -54,18 +54,22 @@ def to_fly(report: Report) -> tuple[Values, Intervals]:
     if report.identification is not None:
         # what was measured directly is more exact than what was fitted beside all else
         better, narrower = corrections(report.identification, report.named)
-        values |= {e: values.get(e, {}) | found for e, found in better.items()}
-        intervals |= {e: intervals.get(e, {}) | found for e, found in narrower.items()}
+        values |= {
+            e: values.get(e, {}) | parameters for e, parameters in better.items()
+        }
+        intervals |= {
+            e: intervals.get(e, {}) | parameters for e, parameters in narrower.items()
+        }
     # what wasn't fitted keeps the value at which it does nothing
-    values = {e: EFFECTS[e].none() | found for e, found in values.items()}
+    values = {e: EFFECTS[e].none() | parameters for e, parameters in values.items()}
     voltage = _median_voltage(report)
     if voltage is None:
         return values, intervals
-    for effect, found in values.items():
+    for effect, parameters in values.items():
         at_voltage = CARDS[effect].at_voltage
         if at_voltage is not None:
             values[effect], intervals[effect] = at_voltage(
-                found, intervals[effect], voltage
+                parameters, intervals[effect], voltage
             )
     return values, intervals
 
@@ -75,5 +79,5 @@ def _median_voltage(report: Report) -> float | None:
     evidence = report.plots.get("evidence")
     if evidence is None:
         return None
-    logged = [t.voltage for t in evidence.tracks if t.voltage is not None]
-    return float(np.median(np.concatenate(logged))) if logged else None
+    voltages = [t.voltage for t in evidence.tracks if t.voltage is not None]
+    return float(np.median(np.concatenate(voltages))) if voltages else None
