@@ -110,7 +110,7 @@ def diagnose(part: Part) -> dict:
     if torques is not None:
         out["torques"] = {
             "sentence": torques.sentence(),
-            "trusted": torques.trusted,
+            "trusted": torques.trustworthy,
         } | {n: [q.value, *q.interval90] for n, q in torques.quantities.items()}
     out["cpu_seconds"] = round(seconds, 1)
     print(json.dumps(out), flush=True)

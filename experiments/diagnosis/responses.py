@@ -41,7 +41,7 @@ def identified(folder: Path) -> dict | None:
         return None
     value = found.estimates.value
     lags = (1e3 * value[:2]).tolist()
-    return {"trusted": found.trusted, "value": lags + np.log(value[2:]).tolist()}
+    return {"trusted": found.trustworthy, "value": lags + np.log(value[2:]).tolist()}
 
 
 def both(folder: Path) -> tuple[str, dict | None, dict | None]:

@@ -128,13 +128,13 @@ def test_the_first_sentence_and_the_training_know_slow_motors(records):
         (),
         of_fit(fit, [record]),
     )
-    values, intervals = corrections(found, named=())
+    values, intervals = corrections(found, effects=())
     assert set(values) == {"motor_lag"}
     low, high = intervals["motor_lag"]["extra_up"]
     assert low < 0.05 < high
     assert "later: its motors take" in found.sentence()
     unmapped = replace(found, duty_cycles=True)
-    assert set(corrections(unmapped, named=("inertia", "motor_lag"))[0]) == {
+    assert set(corrections(unmapped, effects=("inertia", "motor_lag"))[0]) == {
         "motor_lag"
     }
     # A lag of 75 instead of 25 ms and 4 ms of delay, at 5 Hz.
@@ -200,8 +200,8 @@ def test_no_line_stands_for_motors_that_were_not_logged():
     for moved in (case, case_on_gyroscope_clock(case, {"a": 0.02})):
         parts = records_of(moved)
         assert [len(r.rates) for r in parts] == pytest.approx([270] * 3, abs=3)
-        assert not any(r.drawn for r in parts)
-    assert all(r.drawn for r in records_of(case_without(time % 0.5 > 0.3)))
+        assert not any(r.bridges_holes for r in parts)
+    assert all(r.bridges_holes for r in records_of(case_without(time % 0.5 > 0.3)))
 
 
 def test_a_hover_that_hardly_turns_says_nothing_of_torques(monkeypatch, records):

@@ -62,16 +62,16 @@ class Evidence:
         return silent and self.case.vehicle_file.motor.command == "pwm"
 
     @property
-    def measured(self) -> dict[tuple[str, str], tuple[float, float]]:
+    def torque_response(self) -> dict[tuple[str, str], tuple[float, float]]:
         """{(effect, parameter): (value, standard deviation)} of what the torques'
         response tells without a model of the loop, of effects that these logs can show.
         """
-        found = self.identification
-        if found is None or not found.trusted:
+        identification = self.identification
+        if identification is None or not identification.trustworthy:
             return {}
-        hidden = {e for e in self.library.physics if self.motion.exposure[e] == 0.0}
-        names = [key for key in found.estimates.names if key[0] not in hidden]
-        return {key: found.estimates.of(*key) for key in names}
+        unseen = {e for e in self.library.physics if self.motion.exposure[e] == 0.0}
+        names = [key for key in identification.estimates.names if key[0] not in unseen]
+        return {key: identification.estimates.of(*key) for key in names}
 
     def support(self, theta: np.ndarray) -> float:
         """Nats by which what the replay doesn't weigh speaks for parameters theta (P,):
@@ -82,15 +82,15 @@ class Evidence:
     def _of_gusts(self, theta: np.ndarray) -> float:
         gusts = self.motion.gusts
         wakes = [places((e,)) for e in self.library.physics if CARDS[e].of_others]
-        acts = any((theta[own] != self.replay.absent[own]).any() for own in wakes)
+        acts = any((theta[place] != self.replay.absent[place]).any() for place in wakes)
         return gusts.nats if gusts is not None and acts else 0.0
 
     def _of_torques(self, theta: np.ndarray) -> float:
-        found = self.identification
-        if found is None or not found.trusted:
+        identification = self.identification
+        if identification is None or not identification.trustworthy:
             return 0.0
         pwm = self.case.vehicle_file.motor.command == "pwm"
-        return support(found.estimates, theta, pwm)
+        return support(identification.estimates, theta, pwm)
 
 
 def gather(
@@ -174,15 +174,15 @@ def _sensors(
     the sensors say of each other.
     """
     pose = read_pose(tracks, library)
-    moved = pose is not None and pose.names and pose.late
-    logged = tracks
-    if moved:
-        tracks = [undelayed(t, pose.fit.value) for t in logged]
+    moves = pose is not None and pose.names and pose.late
+    original = tracks
+    if moves:
+        tracks = [undelayed(t, pose.fit.value) for t in original]
     sensors = read_kinematics(tracks, DECISION)
-    if moved and not sensors.one_clock:  # then it isn't the pose's delay that was found
-        tracks = logged
+    if moves and not sensors.one_clock:  # then it isn't the pose's delay that was found
+        tracks = original
         sensors = read_kinematics(tracks, DECISION)
     tracks = [corrected(t, sensors) for t in tracks]
-    if pose is not None and not moved:
+    if pose is not None and not moves:
         pose = read_pose(tracks, library)
     return tracks, pose if sensors.one_clock else None, sensors

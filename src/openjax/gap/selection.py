@@ -396,7 +396,7 @@ class Search:
         """For each named effect those in whose place, of the sets visited, flights
         don't tell the difference: not a wind that doesn't blow, which is a drag.
         """
-        measured = self.evidence.measured
+        measured = self.evidence.torque_response
         out = {}
         for effect in named:
             rest = frozenset(chosen.effects) - {effect}
@@ -416,7 +416,7 @@ class Search:
         the most evidence: its density, worth as many nats as blocks bear out (Pauli,
         Racugno, Ventura 2011), less what its parameters cost (Occam's factor).
         """
-        measured = self.evidence.measured
+        measured = self.evidence.torque_response
         sets = [
             h
             for h in self.visited.values()

@@ -29,38 +29,40 @@ def identify_forces(records: list[Record], lags: np.ndarray) -> Numbers:
     nominal, `sag` (share of thrust per V), `drag_xy` and `drag_z` (N s/m); only what
     the records hold. `lags` (3,): spin-up, spin-down and delay, s.
     """
-    known = [r for r in records if _force(r) is not None]
-    if not known:
+    with_force = [r for r in records if _force(r) is not None]
+    if not with_force:
         return {}
-    vehicle = known[0].vehicle
+    vehicle = with_force[0].vehicle
     mass = float(vehicle.mass)
     full = 4.0 * float(vehicle.thrust_constant * vehicle.max_rotor_speed**2) / mass
-    thrusts = [full * t for t in _thrusts(known, lags)]
-    forces = [_force(r) for r in known]
+    thrusts = [full * t for t in _thrusts(with_force, lags)]
+    forces = [_force(r) for r in with_force]
     level = np.array(
         [f[:, 2].mean() / t.mean() for f, t in zip(forces, thrusts, strict=True)]
     )
     spread = level.std() / np.sqrt(len(level))
-    found = {"thrust_level": (float(level.mean()), float(spread))}
+    numbers = {"thrust_level": (float(level.mean()), float(spread))}
     columns = {"thrust_slope": thrusts}
-    if all(r.voltage is not None for r in known):
-        middle = np.median(np.concatenate([r.voltage for r in known]))
+    if all(r.voltage is not None for r in with_force):
+        middle = np.median(np.concatenate([r.voltage for r in with_force]))
         columns["sag"] = [
-            (r.voltage - middle) * t for r, t in zip(known, thrusts, strict=True)
+            (r.voltage - middle) * t for r, t in zip(with_force, thrusts, strict=True)
         ]
-    moving = all(r.velocity is not None and r.quaternion is not None for r in known)
+    moving = all(
+        r.velocity is not None and r.quaternion is not None for r in with_force
+    )
     if moving:
-        speeds = [to_body(r.quaternion, r.velocity) for r in known]
+        speeds = [to_body(r.quaternion, r.velocity) for r in with_force]
         columns["drag_z"] = [-s[:, 2] / mass for s in speeds]
-    dt = known[0].dt
-    found |= _regression([f[:, 2] for f in forces], columns, dt)
+    dt = with_force[0].dt
+    numbers |= _regression([f[:, 2] for f in forces], columns, dt)
     if moving:
         sides = [f[:, axis] for f in forces for axis in (0, 1)]
         drag = {"drag_xy": [-s[:, axis] / mass for s in speeds for axis in (0, 1)]}
-        found |= _regression(sides, drag, dt)
+        numbers |= _regression(sides, drag, dt)
     return {
         name: (value, float(np.hypot(error, FORM.get(name, 0.0) * abs(value))))
-        for name, (value, error) in found.items()
+        for name, (value, error) in numbers.items()
     }
 
 
@@ -71,14 +73,14 @@ def trims(records: list[Record]) -> Numbers:
     x, y = np.asarray(records[0].vehicle.rotor_position, float)[:, :2].T
     spin = np.asarray(records[0].vehicle.rotor_spin, float)
     signs = np.sign(np.stack([y, -x, spin]))
-    held = np.array(
+    shares = np.array(
         [(r.motor @ signs.T).mean(0) / r.motor.sum(1).mean() for r in records]
     )
-    error = held.std(0) / np.sqrt(len(held))
+    error = shares.std(0) / np.sqrt(len(shares))
     return {
         f"{axis}_trim": (float(v), float(e))
         for axis, v, e in zip(
-            ("roll", "pitch", "yaw"), held.mean(0), error, strict=True
+            ("roll", "pitch", "yaw"), shares.mean(0), error, strict=True
         )
     }
 
@@ -114,29 +116,31 @@ def _regression(outputs: list, columns: dict[str, list], dt: float) -> Numbers:
             nexts.append(lfilter(noise, [1.0], y)[ORDER:])
         past = np.concatenate(pasts)
         following = np.concatenate(nexts)
-        taken = solve(past, following)
-        errors = following - past @ taken
-        noise = _autoregression(outputs, [columns[n] for n in names], taken)
+        coefficients = solve(past, following)
+        errors = following - past @ coefficients
+        noise = _autoregression(outputs, [columns[n] for n in names], coefficients)
     inverse = np.linalg.pinv(past.T @ past)
     pieces = np.arange(0, len(errors), max(int(BLOCK / dt), 1))
     sums = np.add.reduceat(past * errors[:, None], pieces, 0)
     covariance = inverse @ (sums.T @ sums) @ inverse
     return {
-        n: (float(taken[i]), float(np.sqrt(max(covariance[i, i], 0.0))))
+        n: (float(coefficients[i]), float(np.sqrt(max(covariance[i, i], 0.0))))
         for i, n in enumerate(names)
     }
 
 
-def _autoregression(outputs: list, columns: list, taken: np.ndarray) -> np.ndarray:
+def _autoregression(
+    outputs: list, columns: list, coefficients: np.ndarray
+) -> np.ndarray:
     """1 - a_1 q^-1 - ... of what coefficients leave of the outputs."""
     pasts = []
     nexts = []
     for number, y in enumerate(outputs):
-        left = y - sum(
-            c * column[number] for c, column in zip(taken, columns, strict=False)
+        rest = y - sum(
+            c * column[number] for c, column in zip(coefficients, columns, strict=False)
         )
-        left = left - left.mean()
-        rows = np.arange(ORDER, len(left))
-        pasts.append(left[rows[:, None] - 1 - np.arange(ORDER)])
-        nexts.append(left[ORDER:])
+        rest = rest - rest.mean()
+        rows = np.arange(ORDER, len(rest))
+        pasts.append(rest[rows[:, None] - 1 - np.arange(ORDER)])
+        nexts.append(rest[ORDER:])
     return np.concatenate([[1.0], -solve(np.concatenate(pasts), np.concatenate(nexts))])

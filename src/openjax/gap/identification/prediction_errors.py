@@ -20,7 +20,12 @@ import numpy as np
 from scipy.signal import butter, lfilter
 
 from openjax.gap.identification.records import Record
-from openjax.gap.identification.regression import Regression, lagged, polynomial, solve
+from openjax.gap.identification.regression import (
+    Regression,
+    lag_columns,
+    polynomial,
+    solve,
+)
 from openjax.gap.identification.rotor_rows import rotor_rows
 
 NAMES = (
@@ -57,14 +62,14 @@ def earlier(record: Record, rows: int) -> Record:
 
 
 class Problem:
-    """Records with all that doesn't depend on the parameters. `filtered`: rates went
+    """Records with all that doesn't depend on the parameters. `low_pass`: rates went
     through the firmware's filter of the gyroscope.
     """
 
-    def __init__(self, records: list[Record], filtered: bool = False):
+    def __init__(self, records: list[Record], low_pass: bool = False):
         self.records = records
         self.dt = records[0].dt
-        self.filtered = filtered
+        self.low_pass = low_pass
         self.order = int(np.clip(round(MEMORY / self.dt), *ROWS))
         vehicle = records[0].vehicle
         self.inertia = np.asarray(vehicle.inertia, float)
@@ -95,14 +100,14 @@ class Problem:
         shares = record.motor @ np.sign(self.base).T / 4.0
         out = []
         for axis in range(3):
-            rates = lagged(record.rates[1:, axis], self.order)
-            before = lagged(shares[:-1, axis], self.order)
-            past = np.concatenate([rates, before, np.ones((len(rates), 1))], 1)
+            rates = lag_columns(record.rates[1:, axis], self.order)
+            motors = lag_columns(shares[:-1, axis], self.order)
+            past = np.concatenate([rates, motors, np.ones((len(rates), 1))], 1)
             present = shares[self.order : -1, axis]
             out.append(present - past @ solve(past, present))
         return np.stack(out, 1)
 
-    def modelled(self, place: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    def errors(self, place: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
         """Of each record its rates less the model's (T, 3) at a place (9,) of the
         search, and their derivatives (9, T, 3).
         """
@@ -111,37 +116,39 @@ class Problem:
         lags[[1, 2, 3], [0, 1, 2]] += STEP
         rotors = rotor_rows([r.motor for r in self.records], self.dt, lags)
         both = zip(self.records, rotors, strict=True)
-        return [self._left(value, record.rates, *rotor) for record, rotor in both]
+        return [self._errors_of(value, record.rates, *rotor) for record, rotor in both]
 
-    def _left(
+    def _errors_of(
         self,
         value: np.ndarray,
         rates: np.ndarray,
         square: np.ndarray,
         speed: np.ndarray,
     ):
-        """`modelled` of one record, whose rotors turned so."""
+        """`errors` of one record, whose rotors turned so."""
         unit = square @ self.base.T
-        sped = self.top_speed * np.diff(speed, axis=1, prepend=speed[:, :1]) @ self.spin
+        acceleration = (
+            self.top_speed * np.diff(speed, axis=1, prepend=speed[:, :1]) @ self.spin
+        )
         gyroscopic = np.cross(rates, self.inertia * rates) / self.inertia
         gains = value[3:6]
         damping = value[[6, 6, 7]]
-        grown = self.dt * (gains * unit - damping * rates - gyroscopic)
-        grown[..., 2] += value[8] * sped
+        increments = self.dt * (gains * unit - damping * rates - gyroscopic)
+        increments[..., 2] += value[8] * acceleration
         slope = np.zeros((len(NAMES), *rates.shape))
-        slope[:3] = (grown[1:] - grown[0]) / STEP[:, None, None]
+        slope[:3] = (increments[1:] - increments[0]) / STEP[:, None, None]
         slope[[3, 4, 5], :, [0, 1, 2]] = self.dt * unit[0].T
         slope[6, :, :2] = -self.dt * rates[:, :2]
         slope[7, :, 2] = -self.dt * rates[:, 2]
-        slope[8, :, 2] = sped[0]
+        slope[8, :, 2] = acceleration[0]
 
         def whole(rows):
             return np.cumsum(rows, -2) - rows
 
         slope[LOGARITHMS] *= value[LOGARITHMS, None, None]
-        model = whole(grown[0])
+        model = whole(increments[0])
         slope = whole(slope)
-        if self.filtered:
+        if self.low_pass:
             low = butter(2, GYROSCOPE_FILTER, fs=1.0 / self.dt)
             model = lfilter(*low, model, axis=0)
             slope = lfilter(*low, slope, axis=1)
@@ -160,25 +167,25 @@ class Problem:
         """Loss at a place (9,) of the search, and of each axis: innovations (N,), their
         derivatives (N, 9) less what the noise model takes, and its coefficients.
         """
-        modelled = self.modelled(value)
-        axes = [self._axis(axis, modelled) for axis in range(3)]
+        errors = self.errors(value)
+        axes = [self._axis(axis, errors) for axis in range(3)]
         off = value - self.start
         loss = 0.5 * off @ self.precision @ off
         loss += sum(0.5 * len(e) * np.log(e.var() + TINY) for e, _, _ in axes)
         return float(loss), axes
 
-    def _axis(self, axis: int, modelled: list):
+    def _axis(self, axis: int, errors_of_records: list):
         order = self.order
-        steady = 2 * len(modelled)
+        steady = 2 * len(errors_of_records)
         pasts = []
         nexts = []
-        for number, (left, _) in enumerate(modelled):
-            x = left[:, axis]
+        for number, (errors_of_record, _) in enumerate(errors_of_records):
+            x = errors_of_record[:, axis]
             line = np.stack([np.ones(len(x)), np.linspace(-1.0, 1.0, len(x))], 1)
             x = x - line @ solve(line, x)
             flat = np.zeros((len(x) - order - 1, steady))
             flat[:, 2 * number : 2 * number + 2] = line[order + 1 :]
-            parts = [lagged(x, order)[1:], flat]
+            parts = [lag_columns(x, order)[1:], flat]
             if self.new[number] is not None:
                 parts += self._answers(self.new[number][:, axis])
             pasts.append(np.concatenate(parts, 1))
@@ -186,14 +193,15 @@ class Problem:
         past = np.concatenate(pasts)
         following = np.concatenate(nexts)
         regression = Regression(past)
-        taken = regression.solve(following)
-        errors = following - past @ taken
-        whitening = polynomial(taken[:order])
+        coefficients = regression.solve(following)
+        errors = following - past @ coefficients
+        whitening = polynomial(coefficients[:order])
         slopes = [
-            -lfilter(whitening, [1.0], s[:, :, axis], axis=1) for _, s in modelled
+            -lfilter(whitening, [1.0], s[:, :, axis], axis=1)
+            for _, s in errors_of_records
         ]
         slopes = np.concatenate([s[:, order + 1 :] for s in slopes], 1).T
-        return errors, slopes - past @ regression.solve(slopes), taken[:order]
+        return errors, slopes - past @ regression.solve(slopes), coefficients[:order]
 
     def _answers(self, new: np.ndarray) -> list[np.ndarray]:
         """Columns (N, 1) of what was new in the last rows of motors; before the first

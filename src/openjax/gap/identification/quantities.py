@@ -75,7 +75,7 @@ class Identification:
     responses: dict[str, Pair]
     remarks: tuple[str, ...]
     estimates: EffectEstimates
-    trusted: bool = True
+    trustworthy: bool = True
     duty_cycles: bool = False
 
     def to_dict(self, shares: dict[str, float] | None = None) -> dict:
@@ -88,7 +88,7 @@ class Identification:
         }
         return {
             "sentence": self.sentence(),
-            "trusted": self.trusted,
+            "trusted": self.trustworthy,
             "remarks": list(self.remarks),
             "quantities": quantities,
             "responses": {axis: asdict(pair) for axis, pair in self.responses.items()},
@@ -96,20 +96,20 @@ class Identification:
 
     def sentence(self) -> str:
         """What the vehicle does, in one sentence."""
-        if not self.trusted:
+        if not self.trustworthy:
             return (
                 f"How torques answer can't be told from these logs: {self.remarks[0]}."
             )
-        ratio, later = self.at(TALKED_OF)
+        ratio, lead = self.at(TALKED_OF)
         lag = self.quantities["spin_up"]
-        if ALIKE[0] < ratio < ALIKE[1] and abs(later) < ALIKE_PHASE:
+        if ALIKE[0] < ratio < ALIKE[1] and abs(lead) < ALIKE_PHASE:
             return (
                 f"At {TALKED_OF:g} Hz this vehicle turns as the simulator does: gain × {ratio:.2f},"
-                f" phase {later:+.0f}°."
+                f" phase {lead:+.0f}°."
             )
         text = (
             f"At {TALKED_OF:g} Hz this vehicle turns with {ratio:.2f} of the simulator's "
-            f"acceleration, {abs(later):.0f}° {'later' if later < 0.0 else 'earlier'}"
+            f"acceleration, {abs(lead):.0f}° {'later' if lead < 0.0 else 'earlier'}"
         )
         if lag.differs:
             low, high = (1e3 * v for v in lag.interval90)
@@ -126,8 +126,8 @@ class Identification:
         pairs = [self.responses[axis] for axis in ("roll", "pitch")]
         points = [(p.measured.at(frequency), p.simulated.at(frequency)) for p in pairs]
         ratio = np.mean([m[0] / s[0] for m, s in points])
-        later = np.mean([(m[1] - s[1] + 180.0) % 360.0 - 180.0 for m, s in points])
-        return float(ratio), float(later)
+        lead = np.mean([(m[1] - s[1] + 180.0) % 360.0 - 180.0 for m, s in points])
+        return float(ratio), float(lead)
 
 
 def identify(case: Case, one_clock: bool = True) -> Identification | None:
@@ -139,15 +139,15 @@ def identify(case: Case, one_clock: bool = True) -> Identification | None:
     if not records:
         return None
     fit = identify_torques(records, one_clock)
-    untrusted = doubts(records, fit, one_clock)
+    reasons = doubts(records, fit, one_clock)
     duty_cycles = case.vehicle_file.motor.command == "pwm"
     remarks = (*_remarks(fit), *([MAP] if duty_cycles else []))
     return Identification(
         quantities_of(records, fit),
         responses(records, fit),
-        (*untrusted, *remarks),
+        (*reasons, *remarks),
         of_fit(fit, records),
-        trusted=not untrusted,
+        trustworthy=not reasons,
         duty_cycles=duty_cycles,
     )
 
@@ -161,16 +161,16 @@ def quantities_of(records: list[Record], fit: TorqueFit) -> dict[str, Quantity]:
     }
     deviation = np.sqrt(np.diag(fit.covariance))
     numbers = dict(zip(NAMES, zip(fit.value, deviation, strict=True), strict=True))
-    found = {
+    gains = {
         "inertia_roll": _inverse(*numbers.pop("roll_gain")),
         "inertia_pitch": _inverse(*numbers.pop("pitch_gain")),
         "yaw_ratio": numbers.pop("yaw_gain"),
     }
     numbers.pop("propellers")
-    numbers |= found | identify_forces(
+    numbers |= gains | identify_forces(
         records, np.maximum(fit.value[:3], [1e-3, 1e-3, 0.0])
     )
-    usual |= dict.fromkeys((*found, "thrust_level", "thrust_slope"), 1.0)
+    usual |= dict.fromkeys((*gains, "thrust_level", "thrust_slope"), 1.0)
     # Trims hold against what else acts too: they belong to no simulator's number but
     # zero.
     numbers |= trims(records)
@@ -193,40 +193,44 @@ def _quantity(name: str, value: float, deviation: float, simulator: float) -> Qu
     if name == "delay":
         value = max(value, -1.0)
     bounds = SEARCHED[0] if name.startswith("spin") else SEARCHED[1]
-    searched = name.startswith(("spin", "inertia")) or name == "yaw_ratio"
-    tried = 1.0 / value if name.startswith("inertia") else value
-    ends = searched and bool(np.isclose(bounds, tried, rtol=0.02).any())
+    has_bounds = name.startswith(("spin", "inertia")) or name == "yaw_ratio"
+    gain = 1.0 / value if name.startswith("inertia") else value
+    ends = has_bounds and bool(np.isclose(bounds, gain, rtol=0.02).any())
     effect = EFFECTS_OF.get(name, "")
     return Quantity(value, interval, simulator, UNITS.get(name, "1"), effect, ends)
 
 
 def doubts(records: list[Record], fit: TorqueFit, one_clock: bool) -> tuple[str, ...]:
     """Why what is said of torques isn't to be trusted."""
-    found = []
+    reasons = []
     if not one_clock:
-        found.append("the streams of motors and sensors are apart by times that wander")
+        reasons.append(
+            "the streams of motors and sensors are apart by times that wander"
+        )
     if any(r.drawn for r in records):
-        found.append(
+        reasons.append(
             "motors or body rates are missing so often that no second is whole; log them without "
             "holes"
         )
     if any(r.hidden and r.samples for r in records):
-        found.append(
+        reasons.append(
             "a row's motors are one sample of a loop that runs several times within it; log their "
             "means at 100 Hz, or every sample at 500 Hz"
         )
     if any(r.hidden for r in records) and fit.turning[:2].max() < TURNS:
-        found.append("the vehicle hardly turns; fly the segments yaw, agile or step")
-    if np.isclose(fit.value[3:6], SEARCHED[1][0], rtol=0.02).any() and not found:
-        found.append("the body hardly answers the motors as they are logged")
-    return tuple(found)
+        reasons.append("the vehicle hardly turns; fly the segments yaw, agile or step")
+    if np.isclose(fit.value[3:6], SEARCHED[1][0], rtol=0.02).any() and not reasons:
+        reasons.append("the body hardly answers the motors as they are logged")
+    return tuple(reasons)
 
 
 def _remarks(fit: TorqueFit) -> tuple[str, ...]:
-    found = []
+    remarks = []
     clock = fit.clock
     error = float(np.sqrt(fit.covariance[2, 2]))
     if abs(clock) > CLOCK + 2.0 * error:
-        when = "later" if clock > 0.0 else "earlier"
-        found.append(f"motors answer {1e3 * abs(clock):.0f} ms {when} than logged")
-    return tuple(found)
+        direction = "later" if clock > 0.0 else "earlier"
+        remarks.append(
+            f"motors answer {1e3 * abs(clock):.0f} ms {direction} than logged"
+        )
+    return tuple(remarks)

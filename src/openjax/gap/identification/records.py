@@ -46,7 +46,8 @@ class Record:
     vehicle: object
     # a row's motors are one sample of a faster loop, not the mean over the row
     samples: bool
-    drawn: bool = False  # lines stand for motors or body rates that weren't logged
+    # lines stand for motors or body rates that weren't logged
+    bridges_holes: bool = False
 
     def rows(self, rows: slice) -> "Record":
         """The record with some of its rows."""
@@ -58,14 +59,14 @@ class Record:
         return replace(self, **cut)
 
     @property
-    def hidden(self) -> bool:
+    def hides_ticks(self) -> bool:
         """Whether the rate loop ran several times within a row."""
         return self.dt > LOOP_ROWS
 
 
 def records_of(case: Case) -> list[Record]:
     """All stretches of a case's flights with body rates and motor commands."""
-    found = []
+    records = []
     for flight in case.flights:
         if (
             not flight.has_motors
@@ -73,18 +74,18 @@ def records_of(case: Case) -> list[Record]:
             or flight.body_rates_derived
         ):
             continue
-        missed = flight.in_holes(TORQUES, MAX_GAP, MISSED_SAMPLES)
-        parts = _records(flight.rows(~missed), flight, case, SHORTEST_PART)
+        holes = flight.in_holes(TORQUES, MAX_GAP, MISSED_SAMPLES)
+        parts = _records(flight.rows(~holes), flight, case, SHORTEST_PART)
         if not parts:
             parts = [
-                replace(r, drawn=bool(missed.any()))
+                replace(r, bridges_holes=bool(holes.any()))
                 for r in _records(flight, flight, case)
             ]
-        found += parts
+        records += parts
     # One estimator reads rows of one period: the one that holds most of the flights.
-    periods = [r.dt for r in found for _ in range(len(r.rates))]
+    periods = [r.dt for r in records for _ in range(len(r.rates))]
     usual = max(set(periods), key=periods.count) if periods else 0.0
-    return [r for r in found if r.dt == usual]
+    return [r for r in records if r.dt == usual]
 
 
 def _records(rows: Flight, flight: Flight, case: Case, least: float = MIN_DURATION):
@@ -92,12 +93,12 @@ def _records(rows: Flight, flight: Flight, case: Case, least: float = MIN_DURATI
     Lines over longer gaps than these would make motors look quicker or slower, by a
     tenth to a fifth.
     """
-    found = []
+    records = []
     for stretch in rows.stretches(
         max(MAX_GAP, MISSED_SAMPLES * flight.row_period), least
     ):
-        found += _in_the_air(_record(rows.rows(stretch), flight, case), least)
-    return found
+        records += _in_the_air(_record(rows.rows(stretch), flight, case), least)
+    return records
 
 
 def _in_the_air(record: Record, least: float) -> list[Record]:
@@ -105,15 +106,15 @@ def _in_the_air(record: Record, least: float) -> list[Record]:
     and landing.
     """
     hover = float(hover_share(record.vehicle))
-    carried = smooth(record.motor.mean(1), 0.5, record.dt) > CARRIED * hover
+    airborne = smooth(record.motor.mean(1), 0.5, record.dt) > CARRIED * hover
     edges = np.flatnonzero(
-        np.diff(np.concatenate([[False], carried, [False]]).astype(int))
+        np.diff(np.concatenate([[False], airborne, [False]]).astype(int))
     )
     away = round(TAKE_OFF / record.dt)
     parts = []
     for begin, end in edges.reshape(-1, 2):
         begin += away * (begin > 0)
-        end -= away * (end < len(carried))
+        end -= away * (end < len(airborne))
         if (end - begin) * record.dt >= least:
             parts.append(record.rows(slice(begin, end)))
     return parts

@@ -27,7 +27,7 @@ def solve(columns: np.ndarray, target: np.ndarray) -> np.ndarray:
     return Regression(columns).solve(target)
 
 
-def lagged(x: np.ndarray, order: int) -> np.ndarray:
+def lag_columns(x: np.ndarray, order: int) -> np.ndarray:
     """x(k), then differences x(k) - x(k - 1) and before, (T - order, order): rows k =
     order - 1 up to T - 2, which foretell the next.
     """
@@ -35,13 +35,13 @@ def lagged(x: np.ndarray, order: int) -> np.ndarray:
     return np.concatenate([windows[:, :1], windows[:, :-1] - windows[:, 1:]], 1)
 
 
-def polynomial(taken: np.ndarray) -> np.ndarray:
+def polynomial(coefficients: np.ndarray) -> np.ndarray:
     """1 - a_1 q^-1 - ... of coefficients on the last value and on differences before
     it.
     """
-    out = np.zeros(len(taken) + 1)
+    out = np.zeros(len(coefficients) + 1)
     out[0] = 1.0
-    out[1] -= taken[0]
-    out[1:-1] -= taken[1:]
-    out[2:] += taken[1:]
+    out[1] -= coefficients[0]
+    out[1:-1] -= coefficients[1:]
+    out[2:] += coefficients[1:]
     return out

@@ -60,58 +60,60 @@ def responses(records: list[Record], fit: TorqueFit) -> dict[str, Pair]:
     nominal = problem.start
     real = fit.value.copy()
     real[2] += ahead * problem.dt
-    found = {}
+    pairs = {}
     rng = np.random.default_rng(0)
-    modelled = problem.modelled(nominal)
-    simulated = [
-        _simulated(r, left, rng)
-        for r, (left, _) in zip(problem.records, modelled, strict=True)
+    errors = problem.errors(nominal)
+    rates_of_nominal = [
+        _nominal_rates(r, error, rng)
+        for r, (error, _) in zip(problem.records, errors, strict=True)
     ]
     for axis in range(3):
-        measured = [r.rates[:, axis] for r in problem.records]
-        replay = [s[:, axis] for s in simulated]
-        found[AXES[axis]] = Pair(
-            _of_axis(problem, axis, measured, problem.at_once(real, axis)),
+        rates = [r.rates[:, axis] for r in problem.records]
+        replay = [s[:, axis] for s in rates_of_nominal]
+        pairs[AXES[axis]] = Pair(
+            _of_axis(problem, axis, rates, problem.at_once(real, axis)),
             _of_axis(problem, axis, replay, problem.at_once(value_at(nominal), axis)),
         )
     if all(r.force is not None for r in records):
-        found["thrust"] = _of_thrust(problem, rng)
-    return found
+        pairs["thrust"] = _of_thrust(problem, rng)
+    return pairs
 
 
-def _simulated(record: Record, left: np.ndarray, rng) -> np.ndarray:
+def _nominal_rates(record: Record, error: np.ndarray, rng) -> np.ndarray:
     """Rates (T, 3) of the nominal vehicle, from what they leave of the record's, as a
     gyroscope shows them.
     """
-    return record.rates - left + GYROSCOPE * rng.standard_normal(left.shape)
+    return record.rates - error + GYROSCOPE * rng.standard_normal(error.shape)
 
 
 def _of_axis(problem: Problem, axis: int, outputs: list, at_once: float) -> Response:
     shares = [r.motor @ np.sign(problem.base[axis]) / 4.0 for r in problem.records]
-    fit = _arx(problem, outputs, shares, at_once if problem.records[0].hidden else None)
+    fit = _arx(
+        problem, outputs, shares, at_once if problem.records[0].hides_ticks else None
+    )
     return _response(AXES[axis], *fit, problem.dt, derivative=True)
 
 
 def _of_thrust(problem: Problem, rng) -> Pair:
     """Of the specific force along body z."""
     shares = [r.motor.mean(1) for r in problem.records]
-    measured = [r.force[:, 2] for r in problem.records]
+    forces = [r.force[:, 2] for r in problem.records]
     vehicle = problem.records[0].vehicle
     full = 4.0 * float(
         vehicle.thrust_constant * vehicle.max_rotor_speed**2 / vehicle.mass
     )
     lags = value_at(problem.start)[None, :3]
-    simulated = []
+    nominal_forces = []
     for _, speed in rotor_rows([r.motor for r in problem.records], problem.dt, lags):
         force = full * (np.concatenate([speed[0, :1], speed[0, :-1]]) ** 2).mean(1)
-        simulated.append(force + ACCELEROMETER * rng.standard_normal(len(force)))
+        nominal_forces.append(force + ACCELEROMETER * rng.standard_normal(len(force)))
 
     def of(outputs):
         return _response(
             "thrust", *_arx(problem, outputs, shares, None), problem.dt, False
         )
 
-    return Pair(of(measured), of(simulated))
+    return Pair(of(forces), of(nominal_forces))
 
 
 def _windows(x: np.ndarray, order: int, first: int) -> np.ndarray:
@@ -129,31 +131,33 @@ def _arx(problem: Problem, outputs: list, inputs: list, at_once: float | None):
     pasts = []
     nexts = []
     for number, (y, u) in enumerate(zip(outputs, inputs, strict=True)):
-        before = _windows(y, order, order)
-        given = _windows(u, order, order)
-        ones = np.zeros((len(before), len(outputs)))
+        output_columns = _windows(y, order, order)
+        input_columns = _windows(u, order, order)
+        ones = np.zeros((len(output_columns), len(outputs)))
         ones[:, number] = 1.0
         following = y[order + 1 :]
         if at_once is not None:
-            past = np.concatenate([before, _windows(u[:-1], order, order - 1), ones], 1)
-            new = given[:, 0] - past @ solve(past, given[:, 0])
-            following = following - at_once * given[:, 0]
-            given = np.concatenate([given[:, 1:], new[:, None]], 1)
-        pasts.append(np.concatenate([before, given, ones], 1))
+            past = np.concatenate(
+                [output_columns, _windows(u[:-1], order, order - 1), ones], 1
+            )
+            new = input_columns[:, 0] - past @ solve(past, input_columns[:, 0])
+            following = following - at_once * input_columns[:, 0]
+            input_columns = np.concatenate([input_columns[:, 1:], new[:, None]], 1)
+        pasts.append(np.concatenate([output_columns, input_columns, ones], 1))
         nexts.append(following)
     past = np.concatenate(pasts)
     following = np.concatenate(nexts)
-    taken = solve(past, following)
-    errors = following - past @ taken
+    solution = solve(past, following)
+    errors = following - past @ solution
     covariance = np.linalg.pinv(past.T @ past) * errors.var()
     count = 2 * order
-    coefficients = taken[:count].copy()
+    coefficients = solution[:count].copy()
     covariance = covariance[:count, :count]
     if at_once is not None:
         # The last column is what was new, not a past input: the input's own comes
         # first.
         coefficients = np.concatenate(
-            [taken[:order], [at_once], taken[order : count - 1]]
+            [solution[:order], [at_once], solution[order : count - 1]]
         )
         places = np.concatenate(
             [np.arange(order), [count - 1], np.arange(order, count - 1)]
@@ -175,8 +179,8 @@ def _response(
     turn = 2j * np.pi * frequency
     late = np.exp(-turn[:, None] * dt * np.arange(1, order + 1))
     transfer = (draws[:, order:] @ late.T) / (1.0 - draws[:, :order] @ late.T)
-    held = (1.0 - np.exp(-turn * dt)) / (turn * dt)
-    transfer = transfer / held * (turn if derivative else 1.0)
+    hold = (1.0 - np.exp(-turn * dt)) / (turn * dt)
+    transfer = transfer / hold * (turn if derivative else 1.0)
     middle = np.angle(np.median(transfer.real, 0) + 1j * np.median(transfer.imag, 0))
     phase = np.rad2deg(middle + np.angle(transfer * np.exp(-1j * middle)))
     gain = np.percentile(np.abs(transfer), LEVEL, axis=0).T

@@ -28,26 +28,26 @@ def rotor_rows(
     lanes = _Lanes(
         [len(c) for c in commands], int(np.ceil(FORGOTTEN * lags[:, :2].max() / dt))
     )
-    wanted = [np.sqrt(np.clip(c, SMALLEST, None)) for c in commands]
+    targets_of_flights = [np.sqrt(np.clip(c, SMALLEST, None)) for c in commands]
     whole = np.floor(lags[:, 2] / dt).astype(int)
     late = lags[:, 2] - whole * dt
     # A row begins with the command before, as long as it is late.
     parts = [_Part(*lags[:, :2].T, late), _Part(*lags[:, :2].T, dt - late)]
-    targets = [[_delayed(w, whole + more) for w in wanted] for more in (1, 0)]
+    targets = [[_delay(w, whole + more) for w in targets_of_flights] for more in (1, 0)]
     begins = lanes.run(parts, *targets)
 
     out = []
     for begin, first, second in zip(begins, *targets, strict=True):
-        middle = parts[0].after(begin, first)
+        middle = parts[0].end_speed(begin, first)
         square = parts[0].square(begin, first) + parts[1].square(middle, second)
-        out.append((square / dt, parts[1].after(middle, second)))
+        out.append((square / dt, parts[1].end_speed(middle, second)))
     return out
 
 
-def _delayed(wanted: np.ndarray, rows: np.ndarray) -> np.ndarray:
+def _delay(targets: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """Wanted speeds (T, 4) so many `rows` (B,) later: (B, T, 4)."""
-    count = len(wanted)
-    return wanted[np.clip(np.arange(count) - rows[:, None], 0, count - 1)]
+    count = len(targets)
+    return targets[np.clip(np.arange(count) - rows[:, None], 0, count - 1)]
 
 
 class _Part:
@@ -57,20 +57,20 @@ class _Part:
 
     def __init__(self, up: np.ndarray, down: np.ndarray, span: np.ndarray):
         self.up, self.down, self.span = (v[:, None, None] for v in (up, down, span))
-        self.kept_up = np.exp(-self.span / self.up)
-        self.kept_down = np.exp(-self.span / self.down)
+        self.decay_up = np.exp(-self.span / self.up)
+        self.decay_down = np.exp(-self.span / self.down)
 
-    def after(self, speed: np.ndarray, target: np.ndarray) -> np.ndarray:
+    def end_speed(self, speed: np.ndarray, target: np.ndarray) -> np.ndarray:
         """Speed at the part's end (B, ..., 4)."""
         off = speed - target
-        return target + off * np.where(off > 0.0, self.kept_down, self.kept_up)
+        return target + off * np.where(off > 0.0, self.decay_down, self.decay_up)
 
     def square(self, speed: np.ndarray, target: np.ndarray) -> np.ndarray:
         """Integral of the square of the speed over the part, s (B, ..., 4)."""
         off = speed - target
         falls = off > 0.0
-        kept = np.where(falls, self.kept_down, self.kept_up)
-        moving = 2.0 * target * (1.0 - kept) + 0.5 * off * (1.0 - kept * kept)
+        decay = np.where(falls, self.decay_down, self.decay_up)
+        moving = 2.0 * target * (1.0 - decay) + 0.5 * off * (1.0 - decay * decay)
         return (
             target * target * self.span
             + off * np.where(falls, self.down, self.up) * moving
@@ -78,39 +78,41 @@ class _Part:
 
 
 class _Lanes:
-    """Flights of `counts` rows cut into lanes that begin `early` rows before what they
+    """Flights of `counts` rows cut into lanes that begin `lead` rows before what they
     are for.
     """
 
-    def __init__(self, counts: list[int], early: int):
+    def __init__(self, counts: list[int], lead: int):
         self.counts = counts
-        self.early = early
+        self.lead = lead
         firsts = np.cumsum([0, *counts[:-1]])
         rows = []
         for first, count in zip(firsts, counts, strict=True):
-            begins = np.arange(0, count, LANE)[:, None] - early
+            begins = np.arange(0, count, LANE)[:, None] - lead
             # Before a flight its first command held; what a lane has beyond the end is
             # left out.
-            rows.append(first + np.clip(begins + np.arange(early + LANE), 0, count - 1))
+            rows.append(first + np.clip(begins + np.arange(lead + LANE), 0, count - 1))
         self.rows = np.concatenate(rows).T  # (early + LANE, lanes)
 
     def run(self, parts: list[_Part], *targets: list[np.ndarray]) -> list[np.ndarray]:
         """Speeds (B, T, 4) at the rows' begin, for targets (B, T, 4) in the two parts
         of a row.
         """
-        taken = [np.moveaxis(np.concatenate(t, 1)[:, self.rows], 1, 0) for t in targets]
-        speed = taken[0][0]  # (B, lanes, 4)
-        begin = np.empty_like(taken[0])
-        for row, (first, second) in enumerate(zip(*taken, strict=True)):
+        target_lanes = [
+            np.moveaxis(np.concatenate(t, 1)[:, self.rows], 1, 0) for t in targets
+        ]
+        speed = target_lanes[0][0]  # (B, lanes, 4)
+        begin = np.empty_like(target_lanes[0])
+        for row, (first, second) in enumerate(zip(*target_lanes, strict=True)):
             begin[row] = speed
-            speed = parts[1].after(parts[0].after(speed, first), second)
+            speed = parts[1].end_speed(parts[0].end_speed(speed, first), second)
 
-        found = np.moveaxis(begin[self.early :], 0, 2)  # (B, lanes, LANE, 4)
+        speeds = np.moveaxis(begin[self.lead :], 0, 2)  # (B, lanes, LANE, 4)
         out = []
         lane = 0
         for count in self.counts:
             lanes = -(-count // LANE)
-            flight = found[:, lane : lane + lanes].reshape(len(found), -1, 4)
+            flight = speeds[:, lane : lane + lanes].reshape(len(speeds), -1, 4)
             out.append(flight[:, :count])
             lane += lanes
         return out

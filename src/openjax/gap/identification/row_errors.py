@@ -46,17 +46,17 @@ def hidden_errors(problem: Problem, axes: list) -> np.ndarray:
     """Standard deviations (9,) at a place of the search, of what rows hide."""
     out = np.zeros(len(NAMES))
     out[2] = HALF_CYCLE
-    if not problem.records[0].hidden:
+    if not problem.records[0].hides_ticks:
         return out
     if any(r.samples for r in problem.records):
         out[[0, 1]] = SAMPLED_LAG
         out[[3, 4, 5]] = SAMPLED_GAIN
         out[[6, 7]] = SAMPLED_DAMPING
         return out
-    turned, quick = turning(problem, axes)
+    turns, quick = turning(problem, axes)
     beyond = max(quick[:2].max() ** 2 - 1.0, NOISE_IN_LAG / LARGEST_ERROR)
     out[[0, 1]] = np.hypot(LEAST_LAG, NOISE_IN_LAG / beyond)
-    gain = np.minimum(NOISE_IN_GAIN / turned**2, LARGEST_ERROR)
+    gain = np.minimum(NOISE_IN_GAIN / turns**2, LARGEST_ERROR)
     out[[3, 4, 5]] = np.hypot(LEAST_GAIN, gain)
     out[[6, 7]] = LEAST_DAMPING
     return out

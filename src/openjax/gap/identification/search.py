@@ -52,17 +52,17 @@ def begin(problem: Problem, late: float) -> np.ndarray:
     """A place (9,) to search from, with motors `late` s: of some lags that of the least
     loss, once gains, in which the model is linear, are fitted to it.
     """
-    begun = []
+    candidates = []
     for lag in LAGS:
         place = problem.start.copy()
         place[:3] = np.log(lag), np.log(lag), late
         for _ in range(SWEEPS):
-            place = _swept(problem, place)
-        begun.append((problem.solve(place)[0], place))
-    return min(begun, key=lambda b: b[0])[1]
+            place = _fit_gains(problem, place)
+        candidates.append((problem.solve(place)[0], place))
+    return min(candidates, key=lambda b: b[0])[1]
 
 
-def _swept(problem: Problem, place: np.ndarray) -> np.ndarray:
+def _fit_gains(problem: Problem, place: np.ndarray) -> np.ndarray:
     """The place with gains as of least squares, for the noise as it is."""
     gains = np.exp(place[3:6])
     _, axes = problem.solve(place)
@@ -72,10 +72,10 @@ def _swept(problem: Problem, place: np.ndarray) -> np.ndarray:
         linear = slopes[:, 3:6] / gains
         hessian += linear.T @ linear / (errors.var() + TINY)
         push += linear.T @ errors / (errors.var() + TINY)
-    found = gains - np.linalg.solve(hessian, push)
+    solution = gains - np.linalg.solve(hessian, push)
     out = place.copy()
-    out[3:6] = np.log(np.maximum(found, SEARCHED[1][0]))
-    return _bounded(problem, out)
+    out[3:6] = np.log(np.maximum(solution, SEARCHED[1][0]))
+    return _clip(problem, out)
 
 
 def search(problem: Problem, place: np.ndarray) -> TorqueFit:
@@ -87,16 +87,16 @@ def search(problem: Problem, place: np.ndarray) -> TorqueFit:
     for _ in range(ITERATIONS):
         step = _step(problem, value, axes)
         while True:
-            ahead = _bounded(problem, value + step)
-            reached, there = problem.solve(ahead)
-            if reached < loss or np.abs(step / LARGEST_STEP).max() < LEAST_STEP:
+            ahead = _clip(problem, value + step)
+            loss_ahead, axes_ahead = problem.solve(ahead)
+            if loss_ahead < loss or np.abs(step / LARGEST_STEP).max() < LEAST_STEP:
                 break
             step = 0.3 * step
-        gained = loss - reached
-        if gained <= 0.0:
+        gain = loss - loss_ahead
+        if gain <= 0.0:
             break
-        value, loss, axes = ahead, reached, there
-        if gained < SMALL:
+        value, loss, axes = ahead, loss_ahead, axes_ahead
+        if gain < SMALL:
             break
     scale = np.ones(len(value))
     scale[LOGARITHMS] = value_at(value)[LOGARITHMS]
@@ -116,17 +116,17 @@ def _step(problem: Problem, value: np.ndarray, axes: list) -> np.ndarray:
     pushed beyond stays.
     """
     hessian, push = _normal(problem, value, axes)
-    tried = _bounded(problem, value - 1e-6 * np.sign(push))
-    free = np.flatnonzero(tried != value)
+    probe = _clip(problem, value - 1e-6 * np.sign(push))
+    free = np.flatnonzero(probe != value)
     step = np.zeros(len(value))
     step[free] = np.linalg.solve(hessian[np.ix_(free, free)], -push[free])
     return step / max(np.abs(step / LARGEST_STEP).max(), 1.0)
 
 
-def _bounded(problem: Problem, value: np.ndarray) -> np.ndarray:
+def _clip(problem: Problem, value: np.ndarray) -> np.ndarray:
     out = value.copy()
     out[:2] = np.clip(out[:2], *np.log(SEARCHED[0]))
-    out[2] = max(out[2], EARLIEST if problem.records[0].hidden else 0.0)
+    out[2] = max(out[2], EARLIEST if problem.records[0].hides_ticks else 0.0)
     out[3:6] = np.clip(out[3:6], *np.log(SEARCHED[1]))
     return out
 

@@ -28,19 +28,19 @@ def support(estimates: EffectEstimates, theta: np.ndarray, pwm: bool) -> float:
     """Log density, up to a constant and at most FARTHEST below the best, of the
     estimates for parameters theta (P,) of the replay.
     """
-    expected = _expected(estimates, theta)
+    prediction = _predict(estimates, theta)
     usual = np.array([USUAL[e] for e, _ in estimates.names])
     gains = np.array([e != "motor_lag" for e, _ in estimates.names])
     if pwm:
         usual = np.where(gains, np.hypot(usual, UNKNOWN_MAP), usual)
-    off = estimates.value - expected
-    off[gains] = np.log(estimates.value[gains] / np.maximum(expected[gains], LEAST))
+    off = estimates.value - prediction
+    off[gains] = np.log(estimates.value[gains] / np.maximum(prediction[gains], LEAST))
     scale = np.where(gains, estimates.value, 1.0)
     covariance = estimates.covariance / np.outer(scale, scale) + np.diag(usual**2)
     return -min(0.5 * float(off @ np.linalg.solve(covariance, off)), FARTHEST)
 
 
-def _expected(estimates: EffectEstimates, theta: np.ndarray) -> np.ndarray:
+def _predict(estimates: EffectEstimates, theta: np.ndarray) -> np.ndarray:
     """What the estimates would be: a weaker thrust turns the vehicle as a larger
     inertia does.
     """

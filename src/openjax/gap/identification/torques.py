@@ -23,16 +23,16 @@ def identify_torques(records: list[Record], one_clock: bool = True) -> TorqueFit
     first = search(base, begin(base, LATE[0]))
     if base.dt < FAST_ROWS:
         # Whether such rows are of the filtered gyroscope nobody says, but they show it.
-        filtered = Problem(records, filtered=True)
-        other = search(filtered, begin(filtered, LATE[0]))
+        low_pass_problem = Problem(records, low_pass=True)
+        other = search(low_pass_problem, begin(low_pass_problem, LATE[0]))
         if other.loss < first.loss - CLEARLY:
-            base, first = filtered, other
+            base, first = low_pass_problem, other
     if _clear(first) or not one_clock:
         return first
     fits = [first, search(base, begin(base, LATE[1]))]
     for rows in {round(ahead / base.dt): None for ahead in AHEAD}:
         if rows:
-            problem = Problem([earlier(r, rows) for r in records], base.filtered)
+            problem = Problem([earlier(r, rows) for r in records], base.low_pass)
             fit = search(problem, begin(problem, LATE[0]))
             value = fit.value.copy()
             value[2] -= rows * base.dt

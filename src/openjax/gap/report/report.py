@@ -196,7 +196,7 @@ class Report:
         """The shares, then what they mean, in a few plain sentences."""
         lines = [f"Left out: {text}." for text in self.left_out]
         does = self.identification
-        if does is not None and does.trusted:
+        if does is not None and does.trustworthy:
             lines.append(does.sentence())
         if self.effects or self.sensors:
             lines.append(self.shares_in_words())
