@@ -111,7 +111,7 @@ def advised(report: dict) -> tuple[list[str], list[dict]]:
     from openjax.gap.planning.information import advise
 
     advice = advise(beliefs_of(report), described())
-    chosen = list(advice.chosen)
+    chosen = list(advice.segments)
     chosen += [p.segment for p in advice.promises if p.segment not in chosen]
     return chosen[:FLOWN], [asdict(p) for p in advice.promises]
 

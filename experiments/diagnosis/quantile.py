@@ -18,7 +18,7 @@ from scipy.optimize import minimize_scalar
 from experiments.diagnosis.development import read_lines
 from openjax.files import write_json
 from openjax.gap.decision import DECISION
-from openjax.gap.probabilities import tempered
+from openjax.gap.probabilities import temper
 
 WITHOUT = ("unknown", "garbage")
 # probability of a class that was ruled out: one case must not decide alone
@@ -47,7 +47,7 @@ def best_temperature(lines: list[dict]) -> float:
 
     def loss(logarithm: float) -> float:
         cases = [
-            (tempered(p, np.exp(logarithm) / DECISION.temperature), right)
+            (temper(p, np.exp(logarithm) / DECISION.temperature), right)
             for p, right in told
         ]
         return -sum(

@@ -8,7 +8,7 @@ from scipy.optimize import lsq_linear
 
 from openjax.gap.channels import Estimated
 from openjax.gap.intervals import _estimate
-from openjax.gap.model.bounds import BOUND, bounded
+from openjax.gap.model.bounds import BOUND, solve_bounded
 from openjax.gap.model.library import ABSENT, CARDS, STEP, THETA, places, prior
 from openjax.vehicle import load_vehicle
 from openjax.vehicle.effects import EFFECTS
@@ -64,7 +64,7 @@ def test_bounded_least_squares_agree_with_scipy():
         target = root @ (5.0 * rng.standard_normal(size))
         limits = np.full(size, BOUND)
         limits[:free] = np.inf
-        found = bounded(root.T @ root, root.T @ target, free)
+        found = solve_bounded(root.T @ root, root.T @ target, free)
         best = lsq_linear(root, target, (-limits, limits), method="bvls", tol=1e-14)
         np.testing.assert_allclose(
             ((root @ found - target) ** 2).sum(), 2.0 * best.cost, rtol=1e-9, atol=1e-9

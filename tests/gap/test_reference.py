@@ -13,9 +13,9 @@ from openjax.flights.flight import Case, Issue
 from openjax.gap.channels import Estimated
 from openjax.gap.decision import DECISION
 from openjax.gap.folders import diagnose_folder
-from openjax.gap.model.baseline import Baseline, day_of, transferred
+from openjax.gap.model.baseline import Baseline, day_of, transfer
 from openjax.gap.model.library import ABSENT, PLACE
-from openjax.gap.reference import differs, joined, trim_of, trimmed_before, with_some
+from openjax.gap.reference import differs, join, trim_of, trimmed_before, with_some
 from openjax.gap.report.page import page_of
 from openjax.gap.residual import changed_p
 from openjax.vehicle import load_vehicle
@@ -47,7 +47,7 @@ def test_another_day_knows_what_was_shown_less_what_days_move():
     columns, measured = rng.normal(size=(20, 4)), rng.normal(size=20)
     columns[:, 3] = 0.0  # that flights don't show
     usual, days = np.array([1.0, 2.0, 0.5, 0.3]), np.array([0.5, 9.0, 0.1, 0.2])
-    mean, covariance = transferred(
+    mean, covariance = transfer(
         columns.T @ columns,
         columns.T @ measured,
         np.diag(usual**-2.0),
@@ -155,9 +155,9 @@ def test_days_of_a_reference_are_joined_and_another_vehicle_is_refused():
         return Case(name, (), replace(told, vehicle=vehicle), (remark,))
 
     monday = day("monday", 0.03)
-    assert len(joined([monday, day("friday", 0.03)]).quality) == 2
+    assert len(join([monday, day("friday", 0.03)]).quality) == 2
     with pytest.raises(UserError, match=r"friday.*another mass"):
-        joined([monday, day("friday", 0.04)])
+        join([monday, day("friday", 0.04)])
 
 
 @pytest.mark.slow

@@ -7,16 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from openjax.gap.model.cross_validation import Judged
+from openjax.gap.model.cross_validation import Validation
 from openjax.gap.selection import clearly_larger, difference, growth, worse
 
 
-def judged(left: np.ndarray, blocks: int) -> Judged:
+def judged(left: np.ndarray, blocks: int) -> Validation:
     """A hypothesis that leaves whitened residuals `left` in equal blocks."""
     starts = np.arange(0, len(left), len(left) // blocks)
     nats = -0.5 * np.add.reduceat(left**2, starts)
     none = np.zeros((2, 1))
-    return Judged(
+    return Validation(
         nats, np.ones((blocks, 6)), none, left, starts, none, none, np.arange(0)
     )
 

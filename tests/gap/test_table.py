@@ -7,7 +7,12 @@ import pytest
 from scipy.optimize import minimize
 
 from openjax.gap.model.bounds import BOUND
-from openjax.gap.model.cross_validation import Equations, judge, promise, screened
+from openjax.gap.model.cross_validation import (
+    Equations,
+    cross_validate,
+    promise,
+    promise_unbounded,
+)
 from openjax.gap.model.hypotheses import _loudness
 from openjax.gap.model.library import ABSENT
 from openjax.gap.model.table import Model, Table, _errors
@@ -103,7 +108,7 @@ def test_a_block_left_out_is_judged_by_its_marginal_density(columns):
     error = np.zeros((2, 1, 2, 2))
     table = Table(fit, white, error, None, np.arange(2), {}, {}, {}, shared, rows)
     model = Model((), np.array([], int), np.zeros(0), np.zeros((0, 0)))
-    for (y, n), nats in zip(rows, judge(table, model).nats, strict=True):
+    for (y, n), nats in zip(rows, cross_validate(table, model).nats, strict=True):
         expected = -0.5 * y @ np.linalg.solve(np.eye(len(y)) + np.outer(n, n), y)
         assert nats == pytest.approx(expected, rel=1e-9)
 
@@ -115,6 +120,6 @@ def test_screening_promises_what_a_fit_does_where_no_nuisance_is_at_its_bound(co
     table = Table(None, white, None, None, np.arange(2), {}, {}, {}, shared, rows)
     model = Model((), np.array([1, 2]), np.array([0.1, -0.2]), np.diag([4.0, 9.0]))
     nothing = Model((), np.array([], int), np.zeros(0), np.zeros((0, 0)))
-    gains = [f(table, model) - f(table, nothing) for f in (screened, promise)]
+    gains = [f(table, model) - f(table, nothing) for f in (promise_unbounded, promise)]
     assert np.abs(Equations(table, model).solve(table.total)[2][2:]).max() < BOUND
     assert gains[0] == pytest.approx(gains[1], rel=1e-6)

@@ -316,7 +316,7 @@ def _explained(replay, nothing: SetFit, fit: SetFit) -> dict[str, tuple[float, f
     shares = {}
     for kind, channels in kinds.items():
         if replay.usable[channels].all():
-            total = square(replay.measured, channels)
+            total = square(replay.measurements, channels)
             shares[kind] = tuple(
                 1.0 - square(residual, channels) / total for residual in residuals
             )

@@ -103,5 +103,5 @@ def _advised(arguments: Arguments) -> tuple[str, list[dict], list[str]]:
     return (
         sentence(advice, report),
         [asdict(p) for p in advice.promises],
-        list(advice.chosen),
+        list(advice.segments),
     )

@@ -20,7 +20,7 @@ from openjax.gap.reference import (
     OF_DAYS,
     borne_out,
     differs,
-    joined,
+    join,
     read_reference,
     trimmed_before,
 )
@@ -51,7 +51,7 @@ def diagnose_case(
       UserError: the flights are too short or hold no commands.
     """
     begin = time.perf_counter()
-    baseline = read_reference(joined(reference), progress) if reference else None
+    baseline = read_reference(join(reference), progress) if reference else None
     evidence = gather(case, library(without), progress, baseline)
     if (
         baseline is not None
@@ -62,13 +62,13 @@ def diagnose_case(
         progress("identifying what the vehicle does")
     sensors = evidence.sensors
     in_time = case_on_gyroscope_clock(case, sensors.motors_late)
-    found = identify(in_time, sensors.one_clock and sensors.motor_clock)
-    evidence = replace(evidence, identification=found)
+    identification = identify(in_time, sensors.one_clock and sensors.motor_clock)
+    evidence = replace(evidence, identification=identification)
     if progress:
         progress("trying every effect that the flights can show")
     report = conclude(evidence)
     seconds = time.perf_counter() - begin
-    return replace(report, identification=found, seconds=seconds)
+    return replace(report, identification=identification, seconds=seconds)
 
 
 def conclude(evidence: Evidence) -> Report:
@@ -85,17 +85,17 @@ def conclude(evidence: Evidence) -> Report:
     old = trimmed_before(
         selection.fit.theta, selection.effects, evidence.baseline, evidence.vehicles[0]
     )
-    if check.mostly:  # what acts is something else
+    if check.mostly_unknown:  # what acts is something else
         old |= set(selection.effects)
-    likely = [e for e, p in acting.items() if p >= 0.5 and e not in old]
+    candidates = [e for e, p in acting.items() if p >= 0.5 and e not in old]
     parts = worth_naming(
-        lambda named: split(evidence, selection, check.predicted, named), likely
+        lambda names: split(evidence, selection, check.excess, names), candidates
     )
     present = {e: acting[e] for e in parts.effects}
-    unnamed = (set(likely) | old) - set(present)
+    rejects = (set(candidates) | old) - set(present)
     weights = Counter()
     for effects, weight in selection.weights.items():
-        weights[effects - unnamed] += weight
+        weights[effects - rejects] += weight
     possible = evidence.library.effects
     chances = probabilities(
         present, parts.largest, check.probability, weights, possible
@@ -105,20 +105,22 @@ def conclude(evidence: Evidence) -> Report:
     return _report(evidence, selection, check, parts, chances)
 
 
-def worth_naming(shares_of: Callable[[list[str]], Split], named: list[str]) -> Split:
-    """The shares of those of the effects `named` that have one, and that make held-out
+def worth_naming(shares_of: Callable[[list[str]], Split], effects: list[str]) -> Split:
+    """The shares of those of the effects `effects` that have one, and that make held-out
     predictions no worse; `shares_of` splits the gap. Of the motion's effects it must be
     larger than errors of the others' forms.
     """
-    parts = shares_of(named)
-    while named:
-        gone = [e for e in named if parts.effects[e].interval90[1] < least_share(e)]
-        if not gone and parts.gap.reduction < 0.0:
-            gone = [min(named, key=lambda e: parts.effects[e].value)]
-        if not gone:
+    parts = shares_of(effects)
+    while effects:
+        dropouts = [
+            e for e in effects if parts.effects[e].interval90[1] < least_share(e)
+        ]
+        if not dropouts and parts.gap.reduction < 0.0:
+            dropouts = [min(effects, key=lambda e: parts.effects[e].value)]
+        if not dropouts:
             break
-        named = [e for e in named if e not in gone]
-        parts = shares_of(named)
+        effects = [e for e in effects if e not in dropouts]
+        parts = shares_of(effects)
     return parts
 
 
@@ -147,8 +149,8 @@ def not_testable(evidence: Evidence) -> list[str]:
             for e in evidence.library.physics
             if CARDS[e].of_others and e not in missing
         ]
-    logged = {c.path for c in evidence.channels} | {"physics"}
-    missing += [e for e in evidence.library.effects if path_of(e) not in logged]
+    readable_paths = {c.path for c in evidence.channels} | {"physics"}
+    missing += [e for e in evidence.library.effects if path_of(e) not in readable_paths]
     return missing + [e for c in evidence.channels for e in c.undetectable()]
 
 
@@ -161,12 +163,12 @@ def _report(
     nothing = (
         "not_testable" if len(missing) >= len(evidence.library.effects) // 2 else "none"
     )
-    named = [e for e in effects if e != "unknown"]
+    causes = [e for e in effects if e != "unknown"]
     equivalent = {
-        e: selection.equivalent[e] for e in named if e in selection.equivalent
+        e: selection.equivalent[e] for e in causes if e in selection.equivalent
     }
     second = _runner_up(chances, effects, equivalent)
-    others = [o for e in named for o in equivalent.get(e, ())]
+    others = [o for e in causes for o in equivalent.get(e, ())]
     return Report(
         case=evidence.case.name,
         verdict=nothing
@@ -178,8 +180,8 @@ def _report(
         probabilities=chances,
         shares=parts,
         equivalent=equivalent,
-        parameters=estimates(evidence, selection.fit, named),
-        where=locate(evidence, selection.fit, named),
+        parameters=estimates(evidence, selection.fit, causes),
+        where=locate(evidence, selection.fit, causes),
         gap=parts.gap,
         not_testable=missing,
         next_flight=_next_flight(evidence, (*others, *missing, second)),
@@ -196,45 +198,45 @@ def _report(
             if i.kind == "garbage"
         ),
         nuisances=_nuisances(evidence, selection),
-        reference=_reference_in_words(evidence, named),
+        reference=_reference_in_words(evidence, causes),
         residual={"p_value": check.p_value} | check.measures,
         plots={"evidence": evidence, "selection": selection},
     )
 
 
-def _reference_in_words(evidence: Evidence, named) -> str:
+def _reference_in_words(evidence: Evidence, effects) -> str:
     """What the named effects' parameters were in the reference flights, and what may
     differ between days that nothing tells.
     """
     if evidence.baseline is None:
         return ""
-    before = [
+    values = [
         f"{e} {p} {evidence.baseline.theta[PLACE[e, p]]:.4g}"
-        for e in named
+        for e in effects
         for p in (f.name for f in CARDS[e].fitted)
         if (e, p) in PLACE and e not in OF_DAYS
     ]
-    told = "Held against the reference flights of the same vehicle"
-    told += f": {', '.join(before)} there." if before else "."
+    text = "Held against the reference flights of the same vehicle"
+    text += f": {', '.join(values)} there." if values else "."
     battery = (
         "The battery's charge may differ between the days, which changes what thrust a duty cycle "
         "makes: log vbat, and thrust can be compared."
     )
     trims = "Days alone move trims by 1 to 2.5 % of hover: a change that small may be the day's."
-    if set(named) & set(OF_DAYS):
-        told = f"{told} {trims}"
-    return f"{told} {battery}" if evidence.charge_unknown else told
+    if set(effects) & set(OF_DAYS):
+        text = f"{text} {trims}"
+    return f"{text} {battery}" if evidence.charge_unknown else text
 
 
 def _runner_up(chances, effects, equivalent) -> str:
     """The likeliest cause that is neither named nor would do as well; empty if hardly
     likely.
     """
-    said = {
+    answers = {
         *(effects or ("none",)),
         *(o for others in equivalent.values() for o in others),
     }
-    second = max((e for e in chances if e not in said), key=chances.get, default="")
+    second = max((e for e in chances if e not in answers), key=chances.get, default="")
     return second if second and chances[second] > 0.01 else ""
 
 
@@ -253,22 +255,23 @@ def _nuisances(evidence: Evidence, selection: Selection) -> dict[str, str]:
     """What the vehicle's numbers and the sensors' mounting took, in usual sizes; a
     number at its bound says so.
     """
-    names = np.array(evidence.replay.nuisance_names)[evidence.replay.shared]
-    known = () if evidence.baseline is None else evidence.baseline.names
-    taken = selection.chosen.judged.taken.mean(0)
+    names = np.array(evidence.replay.nuisance_names)[evidence.replay.is_shared]
+    reference_names = () if evidence.baseline is None else evidence.baseline.names
+    sizes = selection.hypothesis.validation.nuisance_sizes.mean(0)
 
     def at(v):
         return ", at its bound" if abs(v) > 0.99 * BOUND else ""
 
-    found = {
+    entries = {
         n: f"{v:+.2f} of its usual size{at(v)}"
-        for n, v in zip(names, taken, strict=True)
-        if n not in known  # what the reference knows together has sizes of its own
+        for n, v in zip(names, sizes, strict=True)
+        if n
+        not in reference_names  # what the reference knows together has sizes of its own
     }
     if evidence.sensors.gain != 1.0:
-        found["gyroscope gain"] = f"{evidence.sensors.gain:.3f}"
+        entries["gyroscope gain"] = f"{evidence.sensors.gain:.3f}"
     if "motor_rows" not in evidence.case.vehicle_file.log:
-        found["rows of motor commands"] = (
+        entries["rows of motor commands"] = (
             "taken for means over the row: [log] motor_rows doesn't say"
         )
-    return found
+    return entries

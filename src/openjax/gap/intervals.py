@@ -18,32 +18,36 @@ from openjax.vehicle.effects import EFFECTS
 from openjax.vehicle.effects.effect import Parameter
 
 
-def estimates(evidence: Evidence, fit: SetFit, named) -> dict[str, dict[str, Estimate]]:
+def estimates(
+    evidence: Evidence, fit: SetFit, effects
+) -> dict[str, dict[str, Estimate]]:
     """{effect: {parameter: its estimate}} of the named effects."""
     channels = {c.path: c for c in evidence.channels}
     out = {}
-    for effect in named:
+    for effect in effects:
         channel = channels.get(path_of(effect))
         out[effect] = {}
-        for fitted in CARDS[effect].fitted:
-            found = (
-                channel.estimate(effect, fitted.name)
+        for entry in CARDS[effect].fitted:
+            estimate = (
+                channel.estimate(effect, entry.name)
                 if channel
-                else _of_physics(fit, effect, fitted)
+                else _of_physics(fit, effect, entry)
             )
-            parameter = EFFECTS[effect].parameters[fitted.name]
-            out[effect][fitted.name] = _estimate(found, parameter, evidence.vehicles[0])
+            parameter = EFFECTS[effect].parameters[entry.name]
+            out[effect][entry.name] = _estimate(
+                estimate, parameter, evidence.vehicles[0]
+            )
     return out
 
 
-def _estimate(estimated: Estimated, parameter: Parameter, vehicle) -> Estimate:
+def _estimate(estimate: Estimated, parameter: Parameter, vehicle) -> Estimate:
     """A value with its 90 % interval, both as far as they lie where the parameter means
     anything.
     """
-    start = estimated.value - REACH * estimated.below
-    end = estimated.value + REACH * estimated.above
+    start = estimate.value - REACH * estimate.below
+    end = estimate.value + REACH * estimate.above
     least, most = parameter.limits(vehicle)
-    value, low, high = np.clip((estimated.value, start, end), least, most).tolist()
+    value, low, high = np.clip((estimate.value, start, end), least, most).tolist()
     return Estimate(
         value=value,
         unit=parameter.unit,
@@ -55,13 +59,13 @@ def _estimate(estimated: Estimated, parameter: Parameter, vehicle) -> Estimate:
     )
 
 
-def interval(estimated: Estimated, parameter) -> tuple[float, float]:
+def interval(estimate: Estimated, parameter) -> tuple[float, float]:
     """The 90 % interval. A number that multiplies something (it does nothing at 1)
     stays positive: its logarithm is normal.
     """
-    value = estimated.value
-    below = REACH * estimated.below
-    above = REACH * estimated.above
+    value = estimate.value
+    below = REACH * estimate.below
+    above = REACH * estimate.above
     if parameter.none == 1.0 and value > 0.0:
         return value * float(np.exp(-below / value)), value * float(
             np.exp(above / value)
@@ -73,15 +77,15 @@ def _of_physics(fit: SetFit, effect: str, parameter) -> Estimated:
     """A parameter of the fit. Forms may be wrong by a share of the effect's largest
     parameter of that unit.
     """
-    known = EFFECTS[effect].parameters
+    parameters = EFFECTS[effect].parameters
     deviation = robust_deviation(fit.covariance, fit.grams[:, 1:, 0])
     deviation = float(
         deviation[fit.index.tolist().index(PLACE[effect, parameter.name])]
     )
     away = [
-        abs(float(fit.theta[PLACE[effect, p.name]]) - known[p.name].none)
+        abs(float(fit.theta[PLACE[effect, p.name]]) - parameters[p.name].none)
         for p in CARDS[effect].fitted
-        if known[p.name].unit == known[parameter.name].unit
+        if parameters[p.name].unit == parameters[parameter.name].unit
     ]
     error = float(
         np.linalg.norm((deviation, DECISION.form_error * max(away), parameter.error))

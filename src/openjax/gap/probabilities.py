@@ -31,19 +31,17 @@ def probabilities(
     for effect, p in present.items():
         chance[effect] = p * sure * largest.get(effect, 0.0)
     chance["unknown"] = unknown * (largest.get("unexplained", 0.0) if present else 1.0)
-    left = 1.0 - sum(chance.values())
-    shared = {"none": 1e-3, **dict.fromkeys(present, 1e-3)}
+    rest = 1.0 - sum(chance.values())
+    share_of = {"none": 1e-3, **dict.fromkeys(present, 1e-3)}
     for effects, w in weights.items():
         if not effects & set(present):
             others = effects or {"none"}
-            shared |= {e: shared.get(e, 0.0) + w / len(others) for e in others}
-    total = sum(shared.values())
-    for name, weight in shared.items():
-        chance[name] += left * weight / total
+            share_of |= {e: share_of.get(e, 0.0) + w / len(others) for e in others}
+    total = sum(share_of.values())
+    for name, weight in share_of.items():
+        chance[name] += rest * weight / total
     causes = {*possible, "none", "unknown"}
-    return reliable(
-        tempered(chance, DECISION.temperature), DECISION.reliability, causes
-    )
+    return reliable(temper(chance, DECISION.temperature), DECISION.reliability, causes)
 
 
 def reliable(
@@ -56,25 +54,25 @@ def reliable(
     return {name: share * p + alike * (name in causes) for name, p in chance.items()}
 
 
-def agreeing(chance: dict[str, float], said, sure: float) -> dict[str, float]:
-    """Probabilities that agree with the words `said`. Where draws of blocks choose
+def agreeing(chance: dict[str, float], answers, sure: float) -> dict[str, float]:
+    """Probabilities that agree with the words `answers`. Where draws of blocks choose
     nothing, though a share's interval begins at `sure`, they say that an effect is weak
     in some flights, not that none acts. What isn't named is at most as likely as what
     is.
     """
     chance = dict(chance)
-    named = max(said, key=lambda name: chance[name])
+    answer = max(answers, key=lambda name: chance[name])
     if sure > SURE_SHARE and chance["none"] > NOTHING:
-        chance[named] += chance["none"] - NOTHING
+        chance[answer] += chance["none"] - NOTHING
         chance["none"] = NOTHING
-    for rival in sorted(set(chance) - set(said), key=lambda name: -chance[name]):
-        if chance[rival] <= chance[named]:
+    for rival in sorted(set(chance) - set(answers), key=lambda name: -chance[name]):
+        if chance[rival] <= chance[answer]:
             break
-        chance[rival] = chance[named] = 0.5 * (chance[rival] + chance[named])
+        chance[rival] = chance[answer] = 0.5 * (chance[rival] + chance[answer])
     return chance
 
 
-def tempered(chance: dict[str, float], temperature: float) -> dict[str, float]:
+def temper(chance: dict[str, float], temperature: float) -> dict[str, float]:
     """Probabilities as sure as they are right in known cases: their logarithms over one
     temperature (Guo et al. 2017).
     """

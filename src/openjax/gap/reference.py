@@ -14,7 +14,7 @@ from openjax.flights.flight import Case
 from openjax.gap.channels import Channel
 from openjax.gap.decision import DECISION
 from openjax.gap.evidence import Evidence, gather
-from openjax.gap.model.baseline import COLOURED, FORM, Baseline, day_of, transferred
+from openjax.gap.model.baseline import COLOURED, FORM, Baseline, day_of, transfer
 from openjax.gap.model.cross_validation import Equations
 from openjax.gap.model.hypotheses import SetFit, fit_set
 from openjax.gap.model.library import (
@@ -28,7 +28,7 @@ from openjax.gap.model.library import (
 )
 from openjax.gap.model.table import build, with_effects
 from openjax.gap.residual import measure, residuals_of
-from openjax.gap.selection import searched
+from openjax.gap.selection import search_sets
 from openjax.vehicle.effects import EFFECTS
 from openjax.vehicle.effects.effect import VERY_RARE
 
@@ -55,20 +55,20 @@ def read_reference(case: Case, progress=None) -> Baseline:
         tuple(e for e in library().effects if e not in (*OF_DAYS, *OTHER_NAMES))
     )
     evidence = gather(case, effects, progress, reference=True)
-    search = searched(evidence)
+    search = search_sets(evidence)
     best = search.choose(np.ones((1, len(search.nothing.judged.nats))))[0].fit
     fit = fit_set(best.replay, best.effects, best.theta, rounds=ROUNDS)
     measures, _ = measure(evidence, residuals_of(fit))
-    kept = tuple(e for e in fit.effects if e in FORM)
-    names, mean, covariance = _another_day(evidence, fit, kept)
+    lasting = tuple(e for e in fit.effects if e in FORM)
+    names, mean, covariance = _another_day(evidence, fit, lasting)
     theta = ABSENT.copy()
-    for name, moved in zip(names, mean, strict=True):
+    for name, shift in zip(names, mean, strict=True):
         key = PLACE[tuple(name.split(" "))]
         # of an effect that the fit hasn't that is "absent"
-        theta[key] = fit.theta[key] + moved
+        theta[key] = fit.theta[key] + shift
     channels = {c.path: c for c in evidence.channels}
     trim = _trim_of_a_day(fit, evidence.vehicles[0])
-    return Baseline(theta, kept, names, covariance, measures, channels, trim)
+    return Baseline(theta, lasting, names, covariance, measures, channels, trim)
 
 
 def borne_out(evidence: Evidence) -> Baseline:
@@ -83,14 +83,14 @@ def borne_out(evidence: Evidence) -> Baseline:
         for s in combinations(baseline.effects, n)
     ]
     thetas = np.array([with_some(baseline, s).theta for s in subsets])
-    left = [
+    residuals = [
         y[None] - p
-        for y, p in zip(replay.measured, replay.predict(thetas), strict=True)
+        for y, p in zip(replay.measurements, replay.predict(thetas), strict=True)
     ]
-    squares = np.diag(replay.grams(left).sum(0))
-    kept = np.flatnonzero(squares <= (1.0 + SPOKEN_AGAINST) * squares.min())
+    squares = np.diag(replay.grams(residuals).sum(0))
+    candidates = np.flatnonzero(squares <= (1.0 + SPOKEN_AGAINST) * squares.min())
     return with_some(
-        baseline, subsets[max(kept, key=lambda k: (len(subsets[k]), -squares[k]))]
+        baseline, subsets[max(candidates, key=lambda k: (len(subsets[k]), -squares[k]))]
     )
 
 
@@ -98,10 +98,14 @@ def with_some(baseline: Baseline, effects) -> Baseline:
     """A baseline with only these of its effects; the numbers that are no effect's
     stay.
     """
-    gone = set(baseline.effects) - set(effects)
+    removed_effects = set(baseline.effects) - set(effects)
     theta = baseline.theta.copy()
-    theta[places(gone)] = ABSENT[places(gone)]
-    rows = [k for k, n in enumerate(baseline.names) if n.split(" ")[0] not in gone]
+    theta[places(removed_effects)] = ABSENT[places(removed_effects)]
+    rows = [
+        k
+        for k, n in enumerate(baseline.names)
+        if n.split(" ")[0] not in removed_effects
+    ]
     names = tuple(baseline.names[k] for k in rows)
     covariance = baseline.covariance[np.ix_(rows, rows)]
     return replace(
@@ -123,16 +127,16 @@ def trim_of(theta: np.ndarray, effects, vehicle) -> np.ndarray:
 
 
 def trimmed_before(
-    theta: np.ndarray, named, baseline: Baseline | None, vehicle
+    theta: np.ndarray, effects, baseline: Baseline | None, vehicle
 ) -> set[str]:
-    """Those of the `named` effects that are no change: trims that are more the
+    """Those of the `effects` that are no change: trims that are more the
     reference's than not, though no day need have the trims of another one.
     """
-    trims = set(named) & set(OF_DAYS)
+    trims = set(effects) & set(OF_DAYS)
     if baseline is None or not trims:
         return set()
-    now = trim_of(theta, trims, vehicle)
-    same = np.linalg.norm(now - baseline.trim) < 0.5 * np.linalg.norm(now)
+    trim = trim_of(theta, trims, vehicle)
+    same = np.linalg.norm(trim - baseline.trim) < 0.5 * np.linalg.norm(trim)
     return trims if same else set()
 
 
@@ -140,17 +144,17 @@ def _trim_of_a_day(fit: SetFit, vehicle) -> np.ndarray:
     """(4,) the trim, as `trim_of`, that the nuisances of a reference's fit say."""
     table = build(fit, None)
     equations = Equations(table, with_effects(table))
-    taken = equations.solve(table.total)[2][len(fit.index) :]
-    shared = [
+    sizes = equations.solve(table.total)[2][len(fit.index) :]
+    names = [
         n
-        for n, s in zip(fit.replay.nuisance_names, fit.replay.shared, strict=True)
+        for n, s in zip(fit.replay.nuisance_names, fit.replay.is_shared, strict=True)
         if s
     ]
-    found = dict(zip(shared, taken.tolist(), strict=True))
+    size_of = dict(zip(names, sizes.tolist(), strict=True))
     theta = ABSENT.copy()
     for e, p, size in fit.replay.numbers:
         if e in OF_DAYS:
-            theta[PLACE[e, p]] += size * found[f"{e} {p}"]
+            theta[PLACE[e, p]] += size * size_of[f"{e} {p}"]
     return trim_of(theta, OF_DAYS, vehicle)
 
 
@@ -167,37 +171,38 @@ def _another_day(
     columns, model = equations.columns, equations.model
     inside = len(fit.index)
     sizes = {f"{e} {p}": size for e, p, size in fit.replay.numbers}
-    shared = [
+    shared_names = [
         n
-        for n, s in zip(fit.replay.nuisance_names, fit.replay.shared, strict=True)
+        for n, s in zip(fit.replay.nuisance_names, fit.replay.is_shared, strict=True)
         if s
     ]
     names = [" ".join(THETA[i]) for i in fit.index]
-    kept = [n.split(" ")[0] in effects for n in names]
-    kept += [
-        n in sizes and n not in names and n.split(" ")[0] in LASTING for n in shared
+    transfers = [n.split(" ")[0] in effects for n in names]
+    transfers += [
+        n in sizes and n not in names and n.split(" ")[0] in LASTING
+        for n in shared_names
     ]
-    names += shared
-    unit = np.array([1.0] * inside + [sizes.get(n, 1.0) for n in shared])
+    names += shared_names
+    unit = np.array([1.0] * inside + [sizes.get(n, 1.0) for n in shared_names])
     # Of the parameters themselves, whatever the columns' units.
     hessian = table.total[np.ix_(columns, columns)] / COLOURED
     precision = block_diag(model.precision, np.eye(len(columns) - inside))
     around = np.concatenate([model.mean, np.zeros(len(columns) - inside)])
     push = table.total[columns, 0] / COLOURED - hessian @ around
     days = np.ones(len(columns))
-    for k in np.flatnonzero(kept):
+    for k in np.flatnonzero(transfers):
         day = day_of(
             *names[k].split(" "), evidence.vehicles[0], evidence.charge_unknown
         )
         days[k] = day / unit[k]
-    found, covariance = transferred(hessian, push, precision, ~np.array(kept), days)
-    unit = unit[kept]
-    moved = (found + around[kept]) * unit
-    told = tuple(n for n, k in zip(names, kept, strict=True) if k)
-    return told, moved, covariance * np.outer(unit, unit)
+    mean, covariance = transfer(hessian, push, precision, ~np.array(transfers), days)
+    unit = unit[transfers]
+    shifts = (mean + around[transfers]) * unit
+    transferred_names = tuple(n for n, k in zip(names, transfers, strict=True) if k)
+    return transferred_names, shifts, covariance * np.outer(unit, unit)
 
 
-def joined(cases: Sequence[Case]) -> Case:
+def join(cases: Sequence[Case]) -> Case:
     """The flights of several folders of one vehicle as one case. Raises UserError where
     the vehicles differ.
     """
@@ -225,18 +230,27 @@ def differs(channel: Channel, effect: str, baseline: Baseline | None) -> bool:
     reference in which it doesn't act says the same only where it is nearer to the case
     than to nothing.
     """
-    before = baseline.channels.get(channel.path) if baseline is not None else None
-    if before is None:
+    channel_before = (
+        baseline.channels.get(channel.path) if baseline is not None else None
+    )
+    if channel_before is None:
         return True
-    acted = effect in before.acting()
+    acts_there = effect in channel_before.acting()
     for parameter in CARDS[effect].fitted:
-        here, there = (c.estimate(effect, parameter.name) for c in (channel, before))
-        none = EFFECTS[effect].parameters[parameter.name].none
-        apart = abs(here.value - there.value)
-        error = np.hypot(max(here.below, here.above), max(there.below, there.above))
-        least = max(
-            DECISION.standard_errors * error, DECISION.form_error * abs(here.value)
+        estimate, estimate_before = (
+            c.estimate(effect, parameter.name) for c in (channel, channel_before)
         )
-        if apart > least or (not acted and apart > abs(there.value - none)):
+        none = EFFECTS[effect].parameters[parameter.name].none
+        apart = abs(estimate.value - estimate_before.value)
+        error = np.hypot(
+            max(estimate.below, estimate.above),
+            max(estimate_before.below, estimate_before.above),
+        )
+        least = max(
+            DECISION.standard_errors * error, DECISION.form_error * abs(estimate.value)
+        )
+        if apart > least or (
+            not acts_there and apart > abs(estimate_before.value - none)
+        ):
             return True
     return False

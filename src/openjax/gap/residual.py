@@ -47,18 +47,18 @@ CALIBRATION = Path(__file__).with_name("residual.json")
 
 @dataclass(frozen=True)
 class Check:
-    """`measures` {name: value} and the one that stands out most, `where`; its `p_value`
-    among cases without an unknown cause; `predicted` (9,): share of each motion
+    """`measures` {name: value} and the one that stands out most, `finding`; its `p_value`
+    among cases without an unknown cause; `excess` (9,): share of each motion
     channel's squared error beyond what such cases leave, where the check rejects;
-    `mostly`: whether it does, and effects of the motion explain little of what it
+    `mostly_unknown`: whether it does, and effects of the motion explain little of what it
     finds.
     """
 
     measures: dict[str, float]
-    where: str
+    finding: str
     p_value: float
-    predicted: np.ndarray
-    mostly: bool = False
+    excess: np.ndarray
+    mostly_unknown: bool = False
 
     @property
     def rejects(self) -> bool:
@@ -75,7 +75,7 @@ class Check:
     def in_words(self) -> str:
         """What is left, in one sentence."""
         return (
-            f"What is left isn't noise (p = {self.p_value:.2g}): {self.where}."
+            f"What is left isn't noise (p = {self.p_value:.2g}): {self.finding}."
             if self.rejects
             else ""
         )
@@ -85,23 +85,26 @@ def check_residual(evidence: Evidence, fit: SetFit, nothing: SetFit) -> Check:
     """Whether a fit leaves no more than what cases without an unknown cause leave;
     `nothing`: the fit of no effect.
     """
-    measured, axes = measure(evidence, residuals_of(fit))
-    before = {}
+    measures, axes = measure(evidence, residuals_of(fit))
+    reference = {}
     if evidence.baseline is None:
-        p_value, name = conformal_p(measured)
-        mostly = False
+        p_value, name = conformal_p(measures)
+        mostly_unknown = False
     else:
-        before = _comparable(evidence)
-        unnamed, _ = measure(evidence, residuals_of(nothing))
-        p_value, name = changed_p(measured, before, unnamed)
-        mostly = (
+        reference = _comparable(evidence)
+        measures_of_nothing, _ = measure(evidence, residuals_of(nothing))
+        p_value, name = changed_p(measures, reference, measures_of_nothing)
+        mostly_unknown = (
             bool(name)
-            and unexplained(measured[name], before[name], unnamed[name]) > MOSTLY
+            and unexplained_share(
+                measures[name], reference[name], measures_of_nothing[name]
+            )
+            > MOSTLY
         )
     rejects = p_value <= DECISION.unknown
-    predicted = beyond(axes, before) if rejects else np.zeros(9)
-    where = HORIZONS.get(name, (0.0, ""))[1]
-    return Check(measured, where, p_value, predicted, rejects and mostly)
+    excess = beyond(axes, reference) if rejects else np.zeros(9)
+    finding = HORIZONS.get(name, (0.0, ""))[1]
+    return Check(measures, finding, p_value, excess, rejects and mostly_unknown)
 
 
 def residuals_of(fit: SetFit) -> list[Float[np.ndarray, "_ channels"]]:
@@ -136,11 +139,11 @@ def measure(
     axes = {}
     for name, parts in _series(evidence, residuals).items():
         step = max(round(HORIZONS[name][0] / dt), 1)
-        moved = [(p[step:] - p[:-step])[skip:] for p in parts]
+        changes = [(p[step:] - p[:-step])[skip:] for p in parts]
         if name in HELD_FROM_GUSTS and evidence.motion.gusts is not None:
             calm = [_calm(rows, step)[skip:] for rows in evidence.motion.gusts.rows]
-            moved = [m[c] for m, c in zip(moved, calm, strict=True)]
-        axes[name] = np.concatenate(moved).std(0)
+            changes = [m[c] for m, c in zip(changes, calm, strict=True)]
+        axes[name] = np.concatenate(changes).std(0)
     return {name: float(size.max()) for name, size in axes.items()}, axes
 
 
@@ -148,8 +151,8 @@ def _calm(rows: Chosen, step: int) -> Chosen:
     """(T - step,) whether none of the rows from each one to the one a step later is
     chosen.
     """
-    before = np.concatenate([[0], np.cumsum(rows)])
-    return before[step + 1 :] == before[: -step - 1]
+    count = np.concatenate([[0], np.cumsum(rows)])
+    return count[step + 1 :] == count[: -step - 1]
 
 
 def beyond(axes: dict[str, np.ndarray], reference: dict[str, float]) -> np.ndarray:
@@ -208,59 +211,71 @@ def _comparable(evidence: Evidence) -> dict[str, float]:
     a battery that nobody logged makes another thrust of every duty cycle, and those of
     the pose nothing where it was moved in time in one of both alone.
     """
-    before = evidence.baseline
+    baseline = evidence.baseline
     silent = ("velocity", "rates") if evidence.charge_unknown else ()
-    here = {c.path: c for c in evidence.channels}
-    moved = [
+    channels = {c.path: c for c in evidence.channels}
+    shifts = [
         p["estimator"].acting() if "estimator" in p else {}
-        for p in (here, before.channels)
+        for p in (channels, baseline.channels)
     ]
-    silent += ("estimator", "position") if bool(moved[0]) != bool(moved[1]) else ()
-    return {n: v for n, v in before.measures.items() if n not in silent}
+    silent += ("estimator", "position") if bool(shifts[0]) != bool(shifts[1]) else ()
+    return {n: v for n, v in baseline.measures.items() if n not in silent}
 
 
 def changed_p(
-    measured: dict[str, float], before: dict[str, float], unnamed: dict[str, float]
+    measures: dict[str, float],
+    reference: dict[str, float],
+    measures_of_nothing: dict[str, float],
 ) -> tuple[float, str]:
     """As `conformal_p`, against the same vehicle's reference: by the measure that grew
     most. What other flights make it grow by has an exponential tail. Effects that
     aren't quite of the library's form leave a share of what they explain of the
-    measures `unnamed` of no effect.
+    measures `measures_of_nothing` of no effect.
     """
-    grown = {}
-    for name in (n for n in measured if n in before):
-        explained = max(unnamed[name] ** 2 - measured[name] ** 2, 0.0)
-        left = max(measured[name] ** 2 - FORM_LEFT**2 * explained, 1e-24)
-        grown[name] = float(0.5 * np.log(left / max(before[name], 1e-12) ** 2))
-    if not grown:
+    growths = {}
+    for name in (n for n in measures if n in reference):
+        explanation = max(measures_of_nothing[name] ** 2 - measures[name] ** 2, 0.0)
+        remaining = max(measures[name] ** 2 - FORM_LEFT**2 * explanation, 1e-24)
+        growths[name] = float(
+            0.5 * np.log(remaining / max(reference[name], 1e-12) ** 2)
+        )
+    if not growths:
         return 1.0, ""
-    name = max(grown, key=lambda n: grown[n])
+    name = max(growths, key=lambda n: growths[n])
     rate = np.log(1.0 / DECISION.unknown) / DECISION.left_over
-    return float(np.exp(-rate * max(grown[name], 0.0))), name
+    return float(np.exp(-rate * max(growths[name], 0.0))), name
 
 
-def unexplained(measure: float, reference: float, unnamed: float) -> float:
+def unexplained_share(
+    measure: float, reference: float, measure_of_nothing: float
+) -> float:
     """Share of what a measure's square has grown by since the reference that the fit
     leaves.
     """
-    left = measure**2 - reference**2
-    return left / max(unnamed**2 - reference**2, left, 1e-24)
+    remaining = measure**2 - reference**2
+    return remaining / max(measure_of_nothing**2 - reference**2, remaining, 1e-24)
 
 
-def conformal_p(measured: dict[str, float]) -> tuple[float, str]:
+def conformal_p(measures: dict[str, float]) -> tuple[float, str]:
     """Share of cases without an unknown cause, this one among them, that stand out as
     much, and by which measure this one does. Beyond the largest the tail is
     exponential, as long as that of the upper quarter (Pickands 1975).
     """
-    value, name = standing_out(measured)
-    known = np.array([standing_out(case)[0] for case in calibration()])
-    share = float((1 + (known >= value).sum()) / (1 + len(known)))
-    start = np.quantile(known, 0.75)
-    scale = max(float((known[known >= start] - start).mean()), 1e-9)
-    return share * float(np.exp(-max(value - known.max(), 0.0) / scale)), name
+    value, name = standing_out(measures)
+    calibration_values = np.array([standing_out(case)[0] for case in calibration()])
+    share = float(
+        (1 + (calibration_values >= value).sum()) / (1 + len(calibration_values))
+    )
+    start = np.quantile(calibration_values, 0.75)
+    scale = max(
+        float((calibration_values[calibration_values >= start] - start).mean()), 1e-9
+    )
+    return share * float(
+        np.exp(-max(value - calibration_values.max(), 0.0) / scale)
+    ), name
 
 
-def standing_out(measured: dict[str, float]) -> tuple[float, str]:
+def standing_out(measures: dict[str, float]) -> tuple[float, str]:
     """How far one of a case's measures stands out at most of what the others of its
     logs lead to expect, in standard deviations, and which; logs without anything to
     hold against each other stand out nowhere. What makes a sensor noisy raises all that
@@ -268,11 +283,11 @@ def standing_out(measured: dict[str, float]) -> tuple[float, str]:
     distribution.
     """
     names, (mean, covariance) = list(HORIZONS), usual()
-    rows = [k for k, n in enumerate(names) if n in measured]
+    rows = [k for k, n in enumerate(names) if n in measures]
     precision = np.linalg.inv(covariance[np.ix_(rows, rows)])
     far = (
         precision
-        @ (logarithms(measured)[rows] - mean[rows])
+        @ (logarithms(measures)[rows] - mean[rows])
         / np.sqrt(np.diag(precision))
     )
     return max(
@@ -280,10 +295,10 @@ def standing_out(measured: dict[str, float]) -> tuple[float, str]:
     )
 
 
-def logarithms(measured: dict[str, float]) -> np.ndarray:
+def logarithms(measures: dict[str, float]) -> np.ndarray:
     """(measures,) in the order of HORIZONS, NaN where there is none."""
     return np.log(
-        [max(measured[n], 1e-12) if n in measured else np.nan for n in HORIZONS]
+        [max(measures[n], 1e-12) if n in measures else np.nan for n in HORIZONS]
     )
 
 

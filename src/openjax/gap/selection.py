@@ -25,7 +25,12 @@ from scipy.stats import chi2
 from openjax.gap.channels import between_flights
 from openjax.gap.decision import DECISION
 from openjax.gap.evidence import Evidence
-from openjax.gap.model.cross_validation import Judged, judge, promise, screened
+from openjax.gap.model.cross_validation import (
+    Validation,
+    cross_validate,
+    promise,
+    promise_unbounded,
+)
 from openjax.gap.model.hypotheses import SetFit, fit_set
 from openjax.gap.model.library import CARDS, PLACE, places
 from openjax.gap.model.table import Model, Table, build, with_effects
@@ -60,7 +65,7 @@ class Hypothesis:
     """
 
     fit: SetFit
-    judged: Judged
+    validation: Validation
     log_odds: float
     support: float = 0.0
 
@@ -70,17 +75,17 @@ class Hypothesis:
 
     @property
     def score(self) -> float:
-        return float(self.judged.nats.sum()) + self.log_odds + self.support
+        return float(self.validation.nats.sum()) + self.log_odds + self.support
 
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """The hypothesis `chosen` and `table` around it; `effects` that it names, strongest
-    first; `weights` {effects: share of the draws in which that set is chosen};
+    """A `hypothesis` and the `table` around it; `effects` that it names, strongest first;
+    `weights` {effects: share of the draws in which that set is chosen};
     `equivalent` {effect: others that would do as well in its place}.
     """
 
-    chosen: Hypothesis
+    hypothesis: Hypothesis
     table: Table
     effects: tuple[str, ...]
     weights: dict[frozenset, float]
@@ -89,7 +94,7 @@ class Selection:
 
     @property
     def fit(self) -> SetFit:
-        return self.chosen.fit
+        return self.hypothesis.fit
 
     def probability(self, effect: str) -> float:
         """That the effect, or one that would do as well in its place, acts."""
@@ -99,28 +104,28 @@ class Selection:
 
 def select(evidence: Evidence) -> Selection:
     """Choose among the physics effects that the flights can show."""
-    search = searched(evidence)
+    search = search_sets(evidence)
     weights = search.weights()
-    chosen = search.visited[max(weights, key=weights.get)]
+    best = search.hypotheses[max(weights, key=weights.get)]
     without = {
-        e: search.of_set(set(chosen.effects) - {e}, chosen.fit) for e in chosen.effects
+        e: search.of_set(set(best.effects) - {e}, best.fit) for e in best.effects
     }
     gains = {
-        e: growth(h.judged.squares.sum(0), chosen.judged.squares.sum(0))
+        e: growth(h.validation.squares.sum(0), best.validation.squares.sum(0))
         for e, h in without.items()
     }
-    ordered = tuple(sorted(gains, key=lambda e: -gains[e]))
-    chosen = replace(
-        chosen,
-        fit=fit_set(chosen.fit.replay, chosen.effects, chosen.fit.theta, rounds=ROUNDS),
+    ranking = tuple(sorted(gains, key=lambda e: -gains[e]))
+    best = replace(
+        best,
+        fit=fit_set(best.fit.replay, best.effects, best.fit.theta, rounds=ROUNDS),
     )
-    table = build(chosen.fit, {})
+    table = build(best.fit, {})
     return Selection(
-        chosen, table, ordered, weights, search.equivalents(chosen, ordered), search
+        best, table, ranking, weights, search.equivalents(best, ranking), search
     )
 
 
-def searched(evidence: Evidence) -> Search:
+def search_sets(evidence: Evidence) -> Search:
     """The sets that were worth fitting."""
     search = Search(evidence, testable(evidence))
     search.alone()
@@ -141,7 +146,7 @@ def testable(evidence: Evidence) -> dict[str, SetFit]:
     }
 
 
-def difference(better: Judged, other: Judged) -> tuple[float, float, float]:
+def difference(better: Validation, other: Validation) -> tuple[float, float, float]:
     """By how much the log density of one hypothesis exceeds another's on stretches left
     out, the standard error, and which share of its square white residuals would leave.
 
@@ -150,8 +155,8 @@ def difference(better: Judged, other: Judged) -> tuple[float, float, float]:
     block (cluster-robust, Liang and Zeger 1986). So an effect that acts in one block in
     ten is judged by that block.
     """
-    change = other.left - better.left
-    cross = np.add.reduceat(change * better.left, better.starts)
+    change = other.residuals - better.residuals
+    cross = np.add.reduceat(change * better.residuals, better.starts)
     energy = np.add.reduceat(change * change, better.starts)
     square = max(float((cross**2).sum()), float(energy.sum()), 1e-12)
     return (
@@ -198,38 +203,37 @@ def log_odds(effects) -> float:
     return sum(CARDS[e].log_odds for e in effects)
 
 
-def practical(fit: SetFit, measured: Measured) -> bool:
+def practical(fit: SetFit, torque_response: Measured) -> bool:
     """Whether every effect of a set is clearly of a size that matters in practice (a
     region of practical equivalence on the parameters, Kruschke 2018), by the replay or
-    by what is `measured` of the torques' response: {(effect, parameter): (value,
-    deviation)}. What a card wants confirmed by the latter must be.
+    by the `torque_response` that was measured: {(effect, parameter): (value, deviation)}. What a card wants confirmed by the latter must be.
     """
     covariance = fit.covariance + between_flights(fit.covariance, fit.grams[:, 1:, 0])
     place = {i: k for k, i in enumerate(fit.index.tolist())}
 
     def of_replay(effect: str) -> bool:
         sizes = CARDS[effect].practical
-        own = [PLACE[effect, parameter] for parameter in sizes]
-        rows = [place[i] for i in own]
-        away = fit.theta[own] - fit.replay.absent[own]
-        least = np.array(list(sizes.values())) * fit.replay.grown[own]
+        indices = [PLACE[effect, parameter] for parameter in sizes]
+        rows = [place[i] for i in indices]
+        away = fit.theta[indices] - fit.replay.absent[indices]
+        least = np.array(list(sizes.values())) * fit.replay.size_factors[indices]
         return clearly_larger(away, covariance[np.ix_(rows, rows)], least)
 
     def of_response(keys) -> bool:
         return any(
-            abs(measured[e, p][0] - fit.replay.absent[PLACE[e, p]])
-            - REACH * measured[e, p][1]
-            > CARDS[e].practical[p] * fit.replay.grown[PLACE[e, p]]
+            abs(torque_response[e, p][0] - fit.replay.absent[PLACE[e, p]])
+            - REACH * torque_response[e, p][1]
+            > CARDS[e].practical[p] * fit.replay.size_factors[PLACE[e, p]]
             for e, p in keys
-            if (e, p) in measured
+            if (e, p) in torque_response
         )
 
     def of_a_size(effect: str) -> bool:
         card = CARDS[effect]
-        if any(key in measured for key in card.confirmed_by):
+        if any(key in torque_response for key in card.confirmed_by):
             return of_response(card.confirmed_by)
-        own = [(effect, parameter) for parameter in card.practical]
-        return not own or of_replay(effect) or of_response(own)
+        parameters = [(effect, parameter) for parameter in card.practical]
+        return not parameters or of_replay(effect) or of_response(parameters)
 
     return all(of_a_size(e) for e in fit.effects)
 
@@ -248,8 +252,8 @@ def clearly_larger(
     if (np.abs(away) - REACH * deviation > least).any():
         return True
     square = float(away @ np.linalg.solve(covariance, away))
-    left = 1.0 - np.sqrt(chi2.ppf(0.9, len(away)) / max(square, 1e-12))
-    return bool(left * np.max(np.abs(away) / least) > 1.0)
+    remaining = 1.0 - np.sqrt(chi2.ppf(0.9, len(away)) / max(square, 1e-12))
+    return bool(remaining * np.max(np.abs(away) / least) > 1.0)
 
 
 def possible(fit: SetFit) -> bool:
@@ -259,20 +263,20 @@ def possible(fit: SetFit) -> bool:
 
 def within_bounds(fit: SetFit, effect: str) -> bool:
     """Whether the parameters of one effect do."""
-    found = fit.parameters()[effect]
-    both = ({p: v[k] for p, v in found.items()} for k in (0, 1))
+    estimates = fit.parameters()[effect]
+    both = ({p: v[k] for p, v in estimates.items()} for k in (0, 1))
     return CARDS[effect].possible is None or bool(CARDS[effect].possible(*both))
 
 
 @dataclass(eq=False)
 class Search:
-    """`singles` {effect: its fit alone} are those that may act; `visited` {effects:
+    """`singles` {effect: its fit alone} are those that may act; `hypotheses` {effects:
     hypothesis}.
     """
 
     evidence: Evidence
     singles: dict[str, SetFit]
-    visited: dict[frozenset, Hypothesis] = field(default_factory=dict)
+    hypotheses: dict[frozenset, Hypothesis] = field(default_factory=dict)
 
     @cached_property
     def nothing(self) -> Hypothesis:
@@ -281,18 +285,18 @@ class Search:
     def of_fit(self, fit: SetFit) -> Hypothesis:
         """The hypothesis of a fit."""
         key = frozenset(fit.effects)
-        if key not in self.visited:
+        if key not in self.hypotheses:
             table = build(fit, None)
-            judged = judge(table, with_effects(table))
+            validation = cross_validate(table, with_effects(table))
             support = self.evidence.support(fit.theta)
-            self.visited[key] = Hypothesis(fit, judged, log_odds(key), support)
-        return self.visited[key]
+            self.hypotheses[key] = Hypothesis(fit, validation, log_odds(key), support)
+        return self.hypotheses[key]
 
     def of_set(self, effects, near: SetFit) -> Hypothesis:
         """The hypothesis of a set, fitted from a neighbouring set's fit."""
         key = frozenset(effects)
-        if key in self.visited:
-            return self.visited[key]
+        if key in self.hypotheses:
+            return self.hypotheses[key]
         if len(key) == 1:
             return self.of_fit(self.singles[next(iter(key))])
         start = near.theta.copy()
@@ -310,7 +314,7 @@ class Search:
         """Effects that leave their physical bounds in the visited set of the largest
         score.
         """
-        best = max(self.visited.values(), key=lambda h: h.score).fit
+        best = max(self.hypotheses.values(), key=lambda h: h.score).fit
         return frozenset(e for e in best.effects if not within_bounds(best, e))
 
     def enumerate(
@@ -326,12 +330,12 @@ class Search:
             key: self._model(table, key) for key in self.sets() if not key & without
         }
 
-        def ranked(keys, promise_of):
+        def rank(keys, promise_of):
             score = {
                 k: promise_of(table, models[k])
                 - len(models[k].free)
                 + log_odds(k)
-                + self.heard(k)
+                + self.torque_support(k)
                 for k in keys
             }
             return [
@@ -340,30 +344,31 @@ class Search:
                 if score[k] > score[NOTHING]
             ]
 
-        likely = ranked(models, screened)[: SCREENED * most]
-        best = ranked([NOTHING, *(k for k in likely if k != NOTHING)], promise)
-        chosen = [key for key in best if key not in self.visited][:most]
-        chosen += [key - {effect} for key in best[:SIMPLER] for effect in key]
-        for key in dict.fromkeys(chosen):
+        candidates = rank(models, promise_unbounded)[: SCREENED * most]
+        best = rank([NOTHING, *(k for k in candidates if k != NOTHING)], promise)
+        next_sets = [key for key in best if key not in self.hypotheses][:most]
+        next_sets += [key - {effect} for key in best[:SIMPLER] for effect in key]
+        for key in dict.fromkeys(next_sets):
             self.of_set(key, near.fit)
 
-    def heard(self, key: frozenset) -> float:
+    def torque_support(self, key: frozenset) -> float:
         """Nats by which the torques' response speaks for a set with each effect as it
         was alone.
         """
         theta = self.nothing.fit.theta.copy()
         for effect in key:
-            own = places((effect,))
-            theta[own] = self.singles[effect].theta[own]
+            place = places((effect,))
+            theta[place] = self.singles[effect].theta[place]
         return self.evidence.support(theta)
 
     def _model(self, table: Table, key: frozenset) -> Model:
         """A set in the table of another one."""
-        before = set(table.fit.effects)
-        come, gone = (
-            [e for e in CARDS if e in change] for change in (key - before, before - key)
+        present = set(table.fit.effects)
+        come, leaving = (
+            [e for e in CARDS if e in change]
+            for change in (key - present, present - key)
         )
-        return with_effects(table, come, gone)
+        return with_effects(table, come, leaving)
 
     def sets(self) -> list[frozenset]:
         """All sets of up to LARGEST effects that may act, with one at most that scales
@@ -377,34 +382,35 @@ class Search:
     def best(self) -> Hypothesis:
         """Of the visited sets that are possible the one of the largest score."""
         return max(
-            (h for h in self.visited.values() if possible(h.fit)), key=lambda h: h.score
+            (h for h in self.hypotheses.values() if possible(h.fit)),
+            key=lambda h: h.score,
         )
 
     def clearly_worse(self, other: Hypothesis, best: Hypothesis) -> bool:
         """Whether flights tell a hypothesis from the best one, and it leaves a gap so
         much larger that it matters.
         """
-        gain, error, _ = difference(best.judged, other.judged)
+        gain, error, _ = difference(best.validation, other.validation)
         if best.support - other.support > DETECTABLE:
             return True
         sets = (other, best, self.nothing)
-        gaps = [h.judged.squares.sum(0) for h in sets]
-        beside = [h.judged.squares_beside(best.judged).sum(0) for h in sets]
+        gaps = [h.validation.squares.sum(0) for h in sets]
+        beside = [h.validation.squares_beside(best.validation).sum(0) for h in sets]
         return bool(worse(gain, error, gaps, beside))
 
-    def equivalents(self, chosen: Hypothesis, named) -> dict[str, list[str]]:
+    def equivalents(self, hypothesis: Hypothesis, effects) -> dict[str, list[str]]:
         """For each named effect those in whose place, of the sets visited, flights
         don't tell the difference: not a wind that doesn't blow, which is a drag.
         """
-        measured = self.evidence.torque_response
+        torque_response = self.evidence.torque_response
         out = {}
-        for effect in named:
-            rest = frozenset(chosen.effects) - {effect}
+        for effect in effects:
+            rest = frozenset(hypothesis.effects) - {effect}
             alike = [
                 next(iter(key - rest))
-                for key, h in self.visited.items()
+                for key, h in self.hypotheses.items()
                 if len(key - rest) == 1 and rest < key and effect not in key and possible(h.fit)
-                and practical(h.fit, measured) and not self.clearly_worse(h, chosen)
+                and practical(h.fit, torque_response) and not self.clearly_worse(h, hypothesis)
             ]  # fmt: skip
             if alike:
                 out[effect] = sorted(alike)
@@ -416,47 +422,49 @@ class Search:
         the most evidence: its density, worth as many nats as blocks bear out (Pauli,
         Racugno, Ventura 2011), less what its parameters cost (Occam's factor).
         """
-        measured = self.evidence.torque_response
+        torque_response = self.evidence.torque_response
         sets = [
             h
-            for h in self.visited.values()
-            if possible(h.fit) and practical(h.fit, measured)
+            for h in self.hypotheses.values()
+            if possible(h.fit) and practical(h.fit, torque_response)
         ]
         odds, costs = np.array([(h.log_odds, h.fit.cost) for h in sets]).T
-        pairs = [[difference(a.judged, b.judged) for b in sets] for a in sets]
+        pairs = [[difference(a.validation, b.validation) for b in sets] for a in sets]
         _, errors, trust = np.moveaxis(np.array(pairs), 2, 0)
         response = np.array([h.support for h in sets])
         # (D, sets)
-        density = weights @ np.array([h.judged.nats for h in sets]).T + response
+        density = weights @ np.array([h.validation.nats for h in sets]).T + response
         nothing = sets.index(self.nothing)
-        chosen = []
-        squares = np.array([h.judged.squares for h in sets])
+        choices = []
+        squares = np.array([h.validation.squares for h in sets])
         beside = {}  # of a best set: the squares of all sets, nuisances as it has them
         for weight, nats in zip(weights, density, strict=True):
             best = int(np.argmax(nats + odds))
             if best not in beside:
                 beside[best] = np.array(
-                    [h.judged.squares_beside(sets[best].judged) for h in sets]
+                    [h.validation.squares_beside(sets[best].validation) for h in sets]
                 )
-            gaps, own = (
+            gaps, gaps_beside = (
                 np.einsum("b,sbc->sc", weight, s) for s in (squares, beside[best])
             )
-            told = (nats[best] - nats, errors[best])
-            out = worse(*told, *((g, g[best], g[nothing]) for g in (gaps, own)))
+            advantage = (nats[best] - nats, errors[best])
+            out = worse(
+                *advantage, *((g, g[best], g[nothing]) for g in (gaps, gaps_beside))
+            )
             # The response judges by itself: it counts no blocks, and its intervals hold
             # the forms'.
             out |= response[best] - response > DETECTABLE
             usual = ~out & (odds == odds[~out].max())
             first = int(np.argmax(np.where(usual, nats, -np.inf)))
             evidence = trust[first] * (nats - nats[first]) - costs
-            chosen.append(sets[int(np.argmax(np.where(usual, evidence, -np.inf)))])
-        return chosen
+            choices.append(sets[int(np.argmax(np.where(usual, evidence, -np.inf)))])
+        return choices
 
     def weights(self) -> dict[frozenset, float]:
         """{effects: share of the draws in which that set is chosen}, of a Bayesian
         bootstrap over blocks (Rubin 1981).
         """
-        blocks = len(self.nothing.judged.nats)
-        drawn = np.random.default_rng(0).dirichlet(np.ones(blocks), DRAWS) * blocks
-        count = Counter(frozenset(h.effects) for h in self.choose(drawn))
+        blocks = len(self.nothing.validation.nats)
+        draws = np.random.default_rng(0).dirichlet(np.ones(blocks), DRAWS) * blocks
+        count = Counter(frozenset(h.effects) for h in self.choose(draws))
         return {effects: n / DRAWS for effects, n in count.items()}

@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from openjax.gap.decision import DECISION
 from openjax.gap.evidence import Evidence
-from openjax.gap.model.cross_validation import ablated, left_out
+from openjax.gap.model.cross_validation import ablate, fit_to_others
 from openjax.gap.model.replay import SKIP
 from openjax.gap.model.table import ERRORS, with_effects
 from openjax.gap.selection import DRAWS, Selection
@@ -92,22 +92,22 @@ class Split:
 
 
 def split(
-    evidence: Evidence, selection: Selection, predicted: Float[np.ndarray, "9"], named
+    evidence: Evidence, selection: Selection, excess: Float[np.ndarray, "9"], effects
 ) -> Split:
-    """Shares of the `named` effects, of all paths. `predicted` (9,): share of each
+    """Shares of the `effects` effects, of all paths. `excess` (9,): share of each
     motion channel's squared error that the residual check finds in excess of noise.
     """
     # (sets, blocks, channels)
-    channels, squares = _squares_of_sets(evidence, selection, named)
-    known = dict(zip(ERRORS, predicted, strict=True))
-    left = 1.0 - np.array([known.get(n, 0.0) for n in channels])
+    channels, squares = _squares_of_sets(evidence, selection, effects)
+    excess_of = dict(zip(ERRORS, excess, strict=True))
+    floor_shares = 1.0 - np.array([excess_of.get(n, 0.0) for n in channels])
     blocks = squares.shape[1]
     # the first row are the flights as they are, the others draws of a Bayesian
     # bootstrap
-    drawn = np.random.default_rng(0).dirichlet(np.ones(blocks), DRAWS)
-    weights = np.concatenate([np.full((1, blocks), 1.0 / blocks), drawn])
-    values, before = shares_of_squares(squares, weights, left)
-    names = (*named, "sensors", "unexplained")
+    draws = np.random.default_rng(0).dirichlet(np.ones(blocks), DRAWS)
+    weights = np.concatenate([np.full((1, blocks), 1.0 / blocks), draws])
+    values, squares_of_gap = shares_of_squares(squares, weights, floor_shares)
+    names = (*effects, "sensors", "unexplained")
     low, high = np.quantile(values[1:], [0.05, 0.95], axis=0)
     shares = {}
     for name, value, start, end in zip(names, values[0], low, high, strict=True):
@@ -118,8 +118,8 @@ def split(
     first = np.argmax(values[1:][:, rows], 1)
     largest = {names[k]: float(np.mean(first == place)) for place, k in enumerate(rows)}
     return Split(
-        gap=_gap(before),
-        effects={e: shares[e] for e in named},
+        gap=_gap(squares_of_gap),
+        effects={e: shares[e] for e in effects},
         sensors=shares["sensors"],
         unexplained=shares["unexplained"],
         largest=largest,
@@ -141,31 +141,29 @@ def shares_of_squares(
     level = np.einsum("db,sbc->dsc", weights, squares)
     floor = level[:, :1] * floor_share + 1e-30
     level = (level / floor).mean(2)  # (draws, sets)
-    after, raw, before = level[:, :3].T
-    whole = np.maximum(raw, before) - 1.0
+    full, raw, bare = level[:, :3].T
+    whole = np.maximum(raw, bare) - 1.0
     # without a gap, all there is are the sensors
     sure = whole > 2.0 * DECISION.least_gap
-    unexplained = np.where(
-        sure, np.clip((after - 1.0) / np.where(sure, whole, 1.0), 0.0, 1.0), 0.0
+    remainder = np.where(
+        sure, np.clip((full - 1.0) / np.where(sure, whole, 1.0), 0.0, 1.0), 0.0
     )
-    useful = np.maximum(level[:, 3:] - after[:, None], 0.0) * sure[:, None]
+    useful = np.maximum(level[:, 3:] - full[:, None], 0.0) * sure[:, None]
     useful[:, -1] += 1e-12  # the sensors take all where nothing else is of use
-    shares = useful / useful.sum(1, keepdims=True) * (1.0 - unexplained)[:, None]
-    return np.concatenate([shares, unexplained[:, None]], 1), np.stack(
-        [before, after], 1
-    )
+    shares = useful / useful.sum(1, keepdims=True) * (1.0 - remainder)[:, None]
+    return np.concatenate([shares, remainder[:, None]], 1), np.stack([bare, full], 1)
 
 
 def _gap(square: np.ndarray) -> Gap:
     """The gap from its square before and after (1 + draws, 2)."""
     reduction = 1.0 - np.sqrt(square[:, 1] / square[:, 0])
     low, high = np.quantile(reduction[1:], [0.05, 0.95])
-    before, after = np.sqrt(square[0])
+    start, end = np.sqrt(square[0])
     value = float(reduction[0])
     return Gap(
         metric=METRIC,
-        before=float(before),
-        after=float(after),
+        before=float(start),
+        after=float(end),
         floor=1.0,
         reduction=value,
         interval90=(min(float(low), value), max(float(high), value)),
@@ -173,48 +171,53 @@ def _gap(square: np.ndarray) -> Gap:
 
 
 def _squares_of_sets(
-    evidence: Evidence, selection: Selection, named
+    evidence: Evidence, selection: Selection, effects
 ) -> tuple[list[str], np.ndarray]:
     """Channels, and their squared errors (sets, blocks, channels) by set of parts, as
     `shares_of_squares` takes them.
     """
     table = selection.table
-    found = left_out(table, with_effects(table))
+    coefficients = fit_to_others(table, with_effects(table))
     # Numbers of the vehicle and what feedback makes of gusts are no sensor's fault and
     # no effect: they stay.
     sensors = np.array([n.startswith(SENSORS) for n in evidence.replay.nuisance_names])
-    never = [e for e in selection.fit.effects if e not in named]
+    never = [e for e in selection.fit.effects if e not in effects]
 
-    def squares(there, off=None) -> dict[str, np.ndarray]:
-        gone = [e for e in named if e not in there and e in selection.fit.effects]
-        motion = ablated(table, found, (*never, *gone), off) / table.rows[:, None]
+    def squares(present, off=None) -> dict[str, np.ndarray]:
+        absent = [e for e in effects if e not in present and e in selection.fit.effects]
+        motion = (
+            ablate(table, coefficients, (*never, *absent), off) / table.rows[:, None]
+        )
         channels = np.array(ERRORS)[evidence.replay.usable > 0]
         of_motion = dict(zip(channels, motion.T, strict=True))
-        of_channels = [e for e in there if e not in selection.fit.effects]
+        of_channels = [e for e in present if e not in selection.fit.effects]
         return of_motion | _other_squares(evidence, of_channels, table)
 
-    sets = [squares(named), squares((), sensors), squares(())]
-    sets += [squares([e for e in named if e != gone]) for gone in named]
-    sets.append(squares(named, sensors))
+    sets = [squares(effects), squares((), sensors), squares(())]
+    sets += [squares([e for e in effects if e != absent]) for absent in effects]
+    sets.append(squares(effects, sensors))
     return list(sets[0]), np.stack([np.stack(list(s.values()), 1) for s in sets])
 
 
-def _other_squares(evidence: Evidence, named, table) -> dict[str, np.ndarray]:
+def _other_squares(evidence: Evidence, effects, table) -> dict[str, np.ndarray]:
     """{channel: (blocks,) mean squared errors} of pose, rate loop and radio with the
-    effects `named`.
+    effects `effects`.
     """
     counts = [int((table.track_of == k).sum()) for k in range(len(evidence.tracks))]
     out: dict[str, np.ndarray] = {}
     for channel in evidence.channels:
-        for name, series in channel.residuals(named).items():
+        for name, series in channel.residuals(effects).items():
             blocks = []
             for track, errors, count in zip(
                 evidence.tracks, series, counts, strict=True
             ):
                 # of some channels one number is known of a whole flight
-                used = errors[int(SKIP / track.dt) :]
+                errors_in_blocks = errors[int(SKIP / track.dt) :]
                 if len(errors) == 1:
-                    used = np.repeat(errors, count)
-                blocks += [float((b**2).mean()) for b in np.array_split(used, count)]
+                    errors_in_blocks = np.repeat(errors, count)
+                blocks += [
+                    float((b**2).mean())
+                    for b in np.array_split(errors_in_blocks, count)
+                ]
             out[name] = np.array(blocks)
     return out

@@ -45,11 +45,11 @@ class Place:
     """Spent in the regime."""
 
 
-def locate(evidence: Evidence, fit: SetFit, named=()) -> list[Place]:
-    """The table, largest share first. `fit` is the physics part of the verdict, `named`
+def locate(evidence: Evidence, fit: SetFit, effects=()) -> list[Place]:
+    """The table, largest share first. `fit` is the physics part of the verdict, `effects`
     all named effects.
     """
-    names = [e for e in named if e in fit.effects]
+    names = [e for e in effects if e in fit.effects]
     masks = [
         {r: m[int(SKIP / t.dt) :] for r, m in regimes_of(t).items()}
         for t in evidence.tracks
@@ -57,7 +57,7 @@ def locate(evidence: Evidence, fit: SetFit, named=()) -> list[Place]:
     inside = {r: np.concatenate([m[r] for m in masks]) for r in REGIMES}
     seconds = {r: int(m.sum()) * evidence.tracks[0].dt for r, m in inside.items()}
     places = []
-    powers_of = _motion_powers(evidence, fit, names) | _other_powers(evidence, named)
+    powers_of = _motion_powers(evidence, fit, names) | _other_powers(evidence, effects)
     for channel, powers in powers_of.items():
         floor = powers[2].mean() + 1e-18
         for regime in (r for r in REGIMES if seconds[r] >= LEAST_TIME):
@@ -73,29 +73,31 @@ def locate(evidence: Evidence, fit: SetFit, named=()) -> list[Place]:
 
 
 def before_and_after(
-    fit: SetFit, named
+    fit: SetFit, effects
 ) -> tuple[
     list[Float[np.ndarray, "_ channels"]], list[Float[np.ndarray, "_ channels"]]
 ]:
-    """Residuals (T, 9) of each track without the `named` effects of a fit, all else as
+    """Residuals (T, 9) of each track without the `effects` effects of a fit, all else as
     with them, and with them: the same before as the gap's.
     """
-    after = residuals_of(fit)
+    residuals = residuals_of(fit)
     without = fit.theta.copy()
-    own = places(named)
-    without[own] = ABSENT[own]
-    moved = fit.replay.predict(np.stack([fit.theta, without]))
-    return [a + m[0] - m[1] for a, m in zip(after, moved, strict=True)], after
+    place = places(effects)
+    without[place] = ABSENT[place]
+    predictions = fit.replay.predict(np.stack([fit.theta, without]))
+    return [
+        a + m[0] - m[1] for a, m in zip(residuals, predictions, strict=True)
+    ], residuals
 
 
 def _motion_powers(
-    evidence: Evidence, fit: SetFit, named
+    evidence: Evidence, fit: SetFit, effects
 ) -> dict[str, list[np.ndarray]]:
     """{channel: squared smoothed disturbances (rows,) before, after and at the
     floor}.
     """
     both = []
-    for residuals in before_and_after(fit, named):
+    for residuals in before_and_after(fit, effects):
         rows = []
         for track, residual in zip(evidence.tracks, residuals, strict=True):
             rest = disturbances(track, residual)
@@ -109,9 +111,9 @@ def _motion_powers(
     }
 
 
-def _other_powers(evidence: Evidence, named) -> dict[str, list[np.ndarray]]:
+def _other_powers(evidence: Evidence, effects) -> dict[str, list[np.ndarray]]:
     """The same of pose, radio and rate loop: their squared residuals."""
-    found: dict[str, list[np.ndarray]] = {}
+    powers_of: dict[str, list[np.ndarray]] = {}
     for channel in evidence.channels:
         floor = channel.residuals(evidence.library.of(channel.path))
         scale = {}
@@ -119,13 +121,13 @@ def _other_powers(evidence: Evidence, named) -> dict[str, list[np.ndarray]]:
             scale[name] = float(np.sqrt(np.mean(np.concatenate(series) ** 2))) + 1e-12
         powers = [
             _mean_squares(evidence, errors, scale)
-            for errors in (channel.residuals(()), channel.residuals(named), floor)
+            for errors in (channel.residuals(()), channel.residuals(effects), floor)
         ]
         name = "estimator" if channel.path == "estimator" else "firmware"
-        if name in found:  # radio and rate loop are both the firmware's
-            powers = [a + b for a, b in zip(found[name], powers, strict=True)]
-        found[name] = powers
-    return found
+        if name in powers_of:  # radio and rate loop are both the firmware's
+            powers = [a + b for a, b in zip(powers_of[name], powers, strict=True)]
+        powers_of[name] = powers
+    return powers_of
 
 
 def _mean_squares(
@@ -136,8 +138,8 @@ def _mean_squares(
     """
     rows = []
     for number, track in enumerate(evidence.tracks):
-        scaled = [series[number] / scale[name] for name, series in errors.items()]
-        mean = np.mean(np.square(scaled), 0)  # (T,), or (1,) of a whole flight
+        ratios = [series[number] / scale[name] for name, series in errors.items()]
+        mean = np.mean(np.square(ratios), 0)  # (T,), or (1,) of a whole flight
         rows.append(np.broadcast_to(mean, len(track))[int(SKIP / track.dt) :])
     return np.concatenate(rows)
 

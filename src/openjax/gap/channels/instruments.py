@@ -16,8 +16,8 @@ from scipy.signal import lfilter
 
 from openjax.flights.track import Track, smooth
 from openjax.gap.model.nuisances import TRIM
-from openjax.gap.model.observer import TICKS, commanded
-from openjax.gap.model.prediction import bucket, padded
+from openjax.gap.model.observer import TICKS, respond_to_commands
+from openjax.gap.model.prediction import bucket, pad
 from openjax.vehicle.rate_controller import mixer
 
 SLOW = 0.06  # s over which commands implied by motors and rates are smoothed
@@ -116,8 +116,8 @@ def caused_by_commands(
         implied_rates = track.motor @ outputs_of(vehicle) / gain + track.body_rates
         slow_rates = smooth(implied_rates - implied_rates.mean(0), SLOW, track.dt)
         commands = np.concatenate([track.motor.mean(1)[:, None], slow_rates], 1)
-    motors, rates = commanded(
-        vehicle, padded(commands, bucket(len(track))), np.float32(track.dt)
+    motors, rates = respond_to_commands(
+        vehicle, pad(commands, bucket(len(track))), np.float32(track.dt)
     )
     return np.asarray(motors, float)[: len(track)], np.asarray(rates, float)[
         : len(track)

@@ -22,7 +22,7 @@ from openjax.gap.channels.instruments import BAND, COUNT, EDGE, in_force, output
 from openjax.gap.decision import DECISION
 from openjax.gap.model.library import CARDS
 from openjax.gap.model.observer import GYRO_GAIN, TICKS, observe
-from openjax.gap.model.prediction import bucket, padded
+from openjax.gap.model.prediction import bucket, pad
 
 GAIN_STEP = 0.05
 # Spreads of the gains, of P's delay and of the share of the derivative that is
@@ -177,16 +177,16 @@ def observed(track: Track, vehicle, link, at_once=False):
     """
     rows = len(track)
     size = bucket(rows)
-    command = padded(in_force(track, link), size)
-    motor = padded(track.motor, size)
-    gyro = padded(track.body_rates, size)
+    command = pad(in_force(track, link), size)
+    motor = pad(track.motor, size)
+    gyro = pad(track.body_rates, size)
     dt = np.float32(track.dt)
-    push = padded(np.zeros((rows, 3)), size)
+    push = pad(np.zeros((rows, 3)), size)
     *_, rates = observe(vehicle, vehicle, command, motor, gyro, push, dt, at_once)
     miss = track.body_rates[1:] - np.asarray(rates, float)[: rows - 1]
     step = miss.copy()  # undo the observer's own correction of what it missed before
     step[1:] -= (1.0 - GYRO_GAIN) * miss[:-1]
-    push = padded(
+    push = pad(
         smooth(np.concatenate([step, step[-1:]]), 0.06, track.dt) / track.dt, size
     )
     gains = ("rate_kp", "rate_ki", "rate_kd")

@@ -59,8 +59,8 @@ class Baseline:
         """
         out = np.eye(len(names))
         rows = [k for k, n in enumerate(names) if n in self.names]
-        known = [self.names.index(names[k]) for k in rows]
-        block = self.covariance[np.ix_(known, known)]
+        columns = [self.names.index(names[k]) for k in rows]
+        block = self.covariance[np.ix_(columns, columns)]
         out[np.ix_(rows, rows)] = np.linalg.cholesky(block).T
         return out
 
@@ -84,7 +84,7 @@ def day_of(effect: str, parameter: str, vehicle, silent: bool) -> float:
     )
 
 
-def transferred(
+def transfer(
     hessian: np.ndarray,
     push: np.ndarray,
     prior: np.ndarray,
@@ -99,16 +99,16 @@ def transferred(
     two days by `days` (N,), so a measurement of one day tells less of another. What the
     flights don't show stays as it usually is.
     """
-    own, rest = np.flatnonzero(of_a_day), np.flatnonzero(~of_a_day)
-    inside = hessian[np.ix_(own, own)] + prior[np.ix_(own, own)]
-    taken = np.linalg.solve(
-        inside, np.column_stack([hessian[np.ix_(own, rest)], push[own]])
+    daily, rest = np.flatnonzero(of_a_day), np.flatnonzero(~of_a_day)
+    inside = hessian[np.ix_(daily, daily)] + prior[np.ix_(daily, daily)]
+    solution = np.linalg.solve(
+        inside, np.column_stack([hessian[np.ix_(daily, rest)], push[daily]])
     )
-    data = hessian[np.ix_(rest, rest)] - hessian[np.ix_(rest, own)] @ taken[:, :-1]
-    right = push[rest] - hessian[np.ix_(rest, own)] @ taken[:, -1]
+    data = hessian[np.ix_(rest, rest)] - hessian[np.ix_(rest, daily)] @ solution[:, :-1]
+    right = push[rest] - hessian[np.ix_(rest, daily)] @ solution[:, -1]
     # (I + D S) of information D
-    damped = np.eye(len(rest)) + data * np.square(days[rest])
-    data, right = np.linalg.solve(damped, data), np.linalg.solve(damped, right)
+    gain = np.eye(len(rest)) + data * np.square(days[rest])
+    data, right = np.linalg.solve(gain, data), np.linalg.solve(gain, right)
     covariance = np.linalg.inv(0.5 * (data + data.T) + prior[np.ix_(rest, rest)])
     return covariance @ right, covariance
 

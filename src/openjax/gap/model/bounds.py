@@ -9,7 +9,7 @@ BOUND = 2.0  # usual sizes that a nuisance may take
 PATIENCE = 4
 
 
-def bounded(
+def solve_bounded(
     hessian: Float[np.ndarray, "entries entries"],
     push: Float[np.ndarray, " entries"],
     free: int = 0,
@@ -27,19 +27,19 @@ def bounded(
     fewest = len(push) + 1
     patience = PATIENCE
     while True:
-        found = np.where(side == 0.0, 0.0, side * BOUND)
+        solution = np.where(side == 0.0, 0.0, side * BOUND)
         inside = np.flatnonzero(side == 0.0)
-        fixed = np.flatnonzero(side)
-        right = push[inside] - hessian[np.ix_(inside, fixed)] @ found[fixed]
-        found[inside] = np.linalg.solve(hessian[np.ix_(inside, inside)], right)
+        at_bound = np.flatnonzero(side)
+        right = push[inside] - hessian[np.ix_(inside, at_bound)] @ solution[at_bound]
+        solution[inside] = np.linalg.solve(hessian[np.ix_(inside, inside)], right)
         # positive: back into the box is downhill
-        pull = side * (hessian @ found - push)
-        beyond = np.abs(found) > limit * (1.0 + 1e-9)
+        pull = side * (hessian @ solution - push)
+        beyond = np.abs(solution) > limit * (1.0 + 1e-9)
         back = pull > 1e-9 * np.abs(push)
         wrong = np.flatnonzero(beyond | back)
         if not len(wrong):
-            return found
+            return solution
         patience = PATIENCE if len(wrong) < fewest else patience - 1
         fewest = min(fewest, len(wrong))
-        changed = wrong if patience > 0 else wrong[-1:]
-        side[changed] = np.where(beyond[changed], np.sign(found[changed]), 0.0)
+        flips = wrong if patience > 0 else wrong[-1:]
+        side[flips] = np.where(beyond[flips], np.sign(solution[flips]), 0.0)

@@ -10,13 +10,13 @@ from functools import cached_property
 import numpy as np
 
 from openjax.gap.model.blocks import block_diagonal
-from openjax.gap.model.bounds import bounded
+from openjax.gap.model.bounds import solve_bounded
 from openjax.gap.model.library import places
 from openjax.gap.model.table import Model, Table
 
 
 @dataclass(frozen=True, eq=False)
-class Judged:
+class Validation:
     """A model on B blocks, each left out of the fit by which it is judged."""
 
     nats: np.ndarray
@@ -25,9 +25,9 @@ class Judged:
     """
     squares: np.ndarray
     """(B, K) of the errors of logged channels."""
-    taken: np.ndarray
+    nuisance_sizes: np.ndarray
     """(B, N) what the shared nuisances took."""
-    left: np.ndarray
+    residuals: np.ndarray
     """(M,) whitened residuals and own nuisances, block after block."""
     starts: np.ndarray
     """(B,) where each block begins in it."""
@@ -35,18 +35,18 @@ class Judged:
     """(B, K, C, C) quadratic forms of the coefficients, which the squared errors
     are.
     """
-    found: np.ndarray
+    coefficients: np.ndarray
     """(B, C) coefficients."""
     nuisances: np.ndarray
     """(N,) places in them of the nuisances: the last."""
 
-    def squares_beside(self, other: Judged) -> np.ndarray:
+    def squares_beside(self, other: Validation) -> np.ndarray:
         """`squares` with the nuisances as another model has them: what nuisances take
         on themselves in its place is an error as well, if that model is right.
         """
-        found = self.found.copy()
-        found[:, self.nuisances] = other.found[:, other.nuisances]
-        return _squares(self.error, found)
+        coefficients = self.coefficients.copy()
+        coefficients[:, self.nuisances] = other.coefficients[:, other.nuisances]
+        return _squares(self.error, coefficients)
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +62,7 @@ class Equations:
     def columns(self) -> np.ndarray:
         """The table's columns whose coefficients are solved for."""
         return np.concatenate(
-            [self.model.free, self.table.nuisances[self.table.shared]]
+            [self.model.free, self.table.nuisances[self.table.is_shared]]
         )
 
     def solve(self, sums: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -74,7 +74,7 @@ class Equations:
         push = sums[self.columns][:, [0, *self.model.parts]].sum(1)
         hessian += block_diagonal([self.model.precision, np.eye(len(push) - free)])
         push[:free] += self.model.precision @ self.model.mean
-        return hessian, push, bounded(hessian, push, free)
+        return hessian, push, solve_bounded(hessian, push, free)
 
     def coefficients(self, solution: np.ndarray, block: int) -> np.ndarray:
         """Coefficients (C,) of every column on a block, whose own nuisances are the
@@ -83,16 +83,19 @@ class Equations:
         out = np.zeros(self.table.size)
         out[[0, *self.model.parts]] = 1.0
         out[self.columns] -= solution
-        out[self.table.own] = -self.table.taken[block] @ out
+        out[self.table.block_nuisances] = -self.table.projection[block] @ out
         return out
 
 
-def screened(table: Table, model: Model) -> float:
+def promise_unbounded(table: Table, model: Model) -> float:
     """`promise` with nuisances of any size, which costs next to nothing."""
-    own = [0, *model.parts]
-    hessian = table.reduced[np.ix_(model.free, model.free)] + model.precision
-    push = table.reduced[model.free][:, own].sum(1) + model.precision @ model.mean
-    square = table.reduced[np.ix_(own, own)].sum()
+    columns = [0, *model.parts]
+    hessian = table.fully_marginal[np.ix_(model.free, model.free)] + model.precision
+    push = (
+        table.fully_marginal[model.free][:, columns].sum(1)
+        + model.precision @ model.mean
+    )
+    square = table.fully_marginal[np.ix_(columns, columns)].sum()
     return float(0.5 * push @ np.linalg.solve(hessian, push) - 0.5 * square)
 
 
@@ -101,38 +104,40 @@ def promise(table: Table, model: Model) -> float:
     table share: what screening needs.
     """
     sums = table.total
-    own = [0, *model.parts]
-    hessian, push, found = Equations(table, model).solve(sums)
-    square = sums[np.ix_(own, own)].sum()
-    return float(push @ found - 0.5 * found @ hessian @ found - 0.5 * square)
+    columns = [0, *model.parts]
+    hessian, push, solution = Equations(table, model).solve(sums)
+    square = sums[np.ix_(columns, columns)].sum()
+    return float(push @ solution - 0.5 * solution @ hessian @ solution - 0.5 * square)
 
 
-def left_out(table: Table, model: Model) -> np.ndarray:
+def fit_to_others(table: Table, model: Model) -> np.ndarray:
     """Coefficients (B, C) of a model on each block, fitted to all others."""
     equations = Equations(table, model)
     sums = table.total
     others = (equations.solve(sums - block)[2] for block in table.marginal)
     return np.array(
-        [equations.coefficients(found, k) for k, found in enumerate(others)]
+        [equations.coefficients(solution, k) for k, solution in enumerate(others)]
     )
 
 
-def judge(table: Table, model: Model) -> Judged:
+def cross_validate(table: Table, model: Model) -> Validation:
     """The model on each block, fitted to all others."""
-    found = left_out(table, model)
+    coefficients = fit_to_others(table, model)
     # |y - Nv|^2 + |v|^2 at its least is y'(I + NN')^-1 y: what a block's nuisances take
     # costs.
-    each = zip(found, table.columns, strict=True)
-    left = [np.concatenate([u @ columns, u[table.own]]) for u, columns in each]
-    return Judged(
-        nats=np.array([-0.5 * (r @ r) for r in left]),
-        squares=_squares(table.error, found),
-        taken=-found[:, table.nuisances[table.shared]],
-        left=np.concatenate(left),
-        starts=np.cumsum([0, *map(len, left)])[:-1],
+    each = zip(coefficients, table.columns, strict=True)
+    residuals = [
+        np.concatenate([u @ columns, u[table.block_nuisances]]) for u, columns in each
+    ]
+    return Validation(
+        nats=np.array([-0.5 * (r @ r) for r in residuals]),
+        squares=_squares(table.error, coefficients),
+        nuisance_sizes=-coefficients[:, table.nuisances[table.is_shared]],
+        residuals=np.concatenate(residuals),
+        starts=np.cumsum([0, *map(len, residuals)])[:-1],
         # half the memory: one of each set that is visited
         error=table.error.astype(np.float32),
-        found=found,
+        coefficients=coefficients,
         nuisances=table.nuisances,
     )
 
@@ -146,22 +151,24 @@ def _squares(error: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
     )
 
 
-def ablated(
+def ablate(
     table: Table, coefficients: np.ndarray, drop=(), off: np.ndarray | None = None
 ) -> np.ndarray:
-    """Squared errors (B, K) of a table's set with `coefficients` (B, C) of `left_out`,
-    without the effects `drop` and the nuisances `off` (N,); everything else stays as
+    """Squared errors (B, K) of a table's set with `coefficients` (B, C) of
+    `fit_to_others`, without the effects `drop` and the nuisances `off` (N,); everything else stays as
     fitted.
     """
     coefficients = coefficients.copy()
     remaining = [e for e in table.fit.effects if e not in drop]
-    kept = {int(i) for e in remaining for i in places((e,))}
+    shared_places = {int(i) for e in remaining for i in places((e,))}
     for effect in drop:
         # parameters that another effect shares stay as they were fitted
-        gone = [
-            table.derivative[int(i)] for i in places((effect,)) if int(i) not in kept
+        columns = [
+            table.derivative[int(i)]
+            for i in places((effect,))
+            if int(i) not in shared_places
         ]
-        coefficients[:, gone] = 0.0
+        coefficients[:, columns] = 0.0
         coefficients[:, table.part[effect]] = 1.0
     if off is not None:
         coefficients[:, table.nuisances[off]] = 0.0

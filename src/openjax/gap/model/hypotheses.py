@@ -60,8 +60,8 @@ class SetFit:
         their prior.
         """
         _, posterior = np.linalg.slogdet(self.hessian)
-        _, before = np.linalg.slogdet(self.precision)
-        return 0.5 * float(posterior - before)
+        _, prior_logdet = np.linalg.slogdet(self.precision)
+        return 0.5 * float(posterior - prior_logdet)
 
     @property
     def score(self) -> float:
@@ -76,11 +76,11 @@ class SetFit:
             zip(self.index.tolist(), np.sqrt(np.diag(self.covariance)), strict=True)
         )
 
-        def told(key):
+        def estimate(key):
             return float(self.theta[PLACE[key]]), float(deviation[PLACE[key]])
 
         return {
-            e: {p.name: told((e, p.name)) for p in CARDS[e].fitted}
+            e: {p.name: estimate((e, p.name)) for p in CARDS[e].fitted}
             for e in self.effects
         }
 
@@ -99,22 +99,22 @@ def fit_set(
     effects = tuple(effects)
     theta = replay.absent.copy()  # what isn't in the set is absent
     for effect in effects:
-        own = places((effect,))
-        theta[own] = (_starts(effect, replay)[0] if start is None else start)[own]
+        place = places((effect,))
+        theta[place] = (_starts(effect, replay)[0] if start is None else start)[place]
     fit = _at(replay, effects, theta)
     for _ in range(rounds if effects else 0):
-        before = fit
+        previous = fit
         fit = _descend(fit, iterations)
         fit = _at(fit.replay.around(fit.theta), effects, fit.theta, fit.columns)
-        if np.allclose(before.theta, fit.theta, rtol=1e-3, atol=0.0):
+        if np.allclose(previous.theta, fit.theta, rtol=1e-3, atol=0.0):
             break
     return fit
 
 
 def _at(replay: Replay, effects, theta: np.ndarray, columns=None) -> SetFit:
     """The set with these parameters (P,), linearised there."""
-    index, mean, precision = prior(effects, replay.absent, replay.grown)
-    columns = replay.linearised(theta, index) if columns is None else columns
+    index, mean, precision = prior(effects, replay.absent, replay.size_factors)
+    columns = replay.linearise(theta, index) if columns is None else columns
     grams = replay.grams(columns)
     off = theta[index] - mean
     objective = 0.5 * float(grams[:, 0, 0].sum() + off @ precision @ off)
@@ -125,7 +125,9 @@ def _descend(fit: SetFit, iterations: int) -> SetFit:
     """Steps of Gauss and Newton, half of one that overshoots, while they gain
     anything.
     """
-    index, mean, precision = prior(fit.effects, fit.replay.absent, fit.replay.grown)
+    index, mean, precision = prior(
+        fit.effects, fit.replay.absent, fit.replay.size_factors
+    )
     # no step longer than three prior deviations: farther away the derivatives say
     # little
     reach = 3.0 * np.sqrt(np.diag(np.linalg.inv(precision)))
@@ -159,32 +161,36 @@ def model_noise(replay: Replay, library: Library) -> tuple[Replay, dict[str, flo
         for effect in library.physics
         for theta in _starts(effect, replay)
     ]
-    index, _, precision = prior(library.physics, grown=replay.grown)
-    columns = replay.linearised(replay.absent, index)
+    index, _, precision = prior(library.physics, size_factors=replay.size_factors)
+    columns = replay.linearise(replay.absent, index)
     ahead = np.array([theta for _, theta in starts])
-    moved = (
+    predictions = (
         replay.predict(ahead)
         if starts
         else [np.zeros((0, *n.shape)) for n in replay.nominal]
     )
-    each = zip(columns, moved, replay.nominal, strict=True)
+    each = zip(columns, predictions, replay.nominal, strict=True)
     columns = [np.concatenate([c, m - n[None]]) for c, m, n in each]
     size = len(index)
     penalty = np.eye(size + len(starts))
     penalty[:size, :size] = precision
     # what effects take depends on the noise, and the noise on that: first without any
     # effect, until the noise models are near, and then with all
-    for weighed in (False, False, True, True):
-        taken = np.zeros(len(penalty))
-        if weighed:
+    for with_effects in (False, False, True, True):
+        amplitudes = np.zeros(len(penalty))
+        if with_effects:
             gram = replay.grams(columns).sum(0)
-            taken = np.linalg.solve(gram[1:, 1:] + penalty, gram[1:, 0])
-        left = [c[0] - np.tensordot(taken, c[1:], 1) for c in columns]
-        residuals = [without_nuisances(replay, r, k) for k, r in enumerate(left)]
+            amplitudes = np.linalg.solve(gram[1:, 1:] + penalty, gram[1:, 0])
+        residuals_of_tracks = [
+            c[0] - np.tensordot(amplitudes, c[1:], 1) for c in columns
+        ]
+        residuals = [
+            without_nuisances(replay, r, k) for k, r in enumerate(residuals_of_tracks)
+        ]
         replay = with_noise_of(replay, residuals)
-    shown = np.diag(replay.grams(columns).sum(0))[1 + size :]
+    squares = np.diag(replay.grams(columns).sum(0))[1 + size :]
     exposure = {e: 0.0 for e in library.physics}
-    for (effect, _), square in zip(starts, shown, strict=True):
+    for (effect, _), square in zip(starts, squares, strict=True):
         exposure[effect] = max(exposure[effect], 0.5 * float(square))
     return replay, exposure
 
@@ -197,10 +203,10 @@ def with_noise_of(
     """
     skip = int(SKIP / replay.tracks[0].dt)
     noises = tuple(
-        fit_noise(axes, residuals, integrated, skip=skip)
+        fit_noise(axes, residuals, integrates, skip=skip)
         if replay.usable[axes[0]]
         else old
-        for (axes, integrated), old in zip(GROUPS, replay.noises, strict=True)
+        for (axes, integrates), old in zip(GROUPS, replay.noises, strict=True)
     )
     replay = replace(replay, noises=noises, loudness=None)
     return replace(
@@ -228,14 +234,16 @@ def _loudness(replay: Replay, residual: np.ndarray, track: int) -> np.ndarray:
 def without_nuisances(replay: Replay, residual: Rows, track: int) -> Rows:
     """A residual (T, 9) less the nuisances' most likely part."""
     return residual - np.tensordot(
-        replay.taken(residual, track), replay.nuisances[track], 1
+        replay.nuisance_sizes(residual, track), replay.nuisances[track], 1
     )
 
 
 def fit_singles(replay: Replay, library: Library, exposure) -> dict[str, SetFit]:
     """The fit of every effect alone that the flights could show."""
-    shown = [effect for effect in library.physics if exposure[effect] >= UNEXPOSED]
-    return {effect: fit_single(replay, effect) for effect in shown}
+    visible_effects = [
+        effect for effect in library.physics if exposure[effect] >= UNEXPOSED
+    ]
+    return {effect: fit_single(replay, effect) for effect in visible_effects}
 
 
 def fit_single(replay: Replay, effect: str) -> SetFit:
@@ -251,7 +259,7 @@ def _starts(effect: str, replay: Replay) -> np.ndarray:
     starts = np.repeat(absent[None], 1 + len(CARDS[effect].others), 0)
     at = places((effect,))
     starts[:, at] = [[p.start for p in CARDS[effect].fitted], *CARDS[effect].others]
-    starts[:, at] = starts[:, at] * replay.grown[at] + (absent - ABSENT)[at]
+    starts[:, at] = starts[:, at] * replay.size_factors[at] + (absent - ABSENT)[at]
     return starts
 
 
@@ -260,8 +268,8 @@ def _best_start(replay: Replay, effect: str) -> np.ndarray:
     starts = _starts(effect, replay)
     if len(starts) == 1:
         return starts[0]
-    left = [
+    residuals = [
         y[None] - p
-        for y, p in zip(replay.measured, replay.predict(starts), strict=True)
+        for y, p in zip(replay.measurements, replay.predict(starts), strict=True)
     ]
-    return starts[int(np.argmin(np.diag(replay.grams(left).sum(0))))]
+    return starts[int(np.argmin(np.diag(replay.grams(residuals).sum(0))))]

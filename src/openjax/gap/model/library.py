@@ -90,18 +90,18 @@ def growths(vehicle) -> Parameters:
     """(P,) by what usual sizes of the parameters are multiplied for a vehicle of
     another size.
     """
-    own = [growth(EFFECTS[e].parameters[p].unit, vehicle) for e, p in THETA]
-    return np.array([*own, 1.0, 1.0])
+    factors = [growth(EFFECTS[e].parameters[p].unit, vehicle) for e, p in THETA]
+    return np.array([*factors, 1.0, 1.0])
 
 
 def prior(
-    effects, absent: Parameters = ABSENT, grown: Parameters | None = None
+    effects, absent: Parameters = ABSENT, size_factors: Parameters | None = None
 ) -> tuple[
     Int[np.ndarray, " own"], Float[np.ndarray, " own"], Float[np.ndarray, "own own"]
 ]:
     """Indices (p,), mean (p,) and precision (p, p) of the parameters of a set of
     physics effects, for a vehicle that has `absent` (P,) while nothing acts and sizes
-    that are `grown` (P,).
+    that are `size_factors` (P,).
     """
     index = []
     mean = []
@@ -114,6 +114,6 @@ def prior(
         blocks.append(block - BALANCE * block.mean() if card.balanced else block)
     precision = np.linalg.inv(block_diagonal(blocks))
     index = np.array(index, int)
-    size = np.ones(len(index)) if grown is None else grown[index]
+    size = np.ones(len(index)) if size_factors is None else size_factors[index]
     mean = size * np.array(mean) + (absent - ABSENT)[index]
     return index, mean, precision / np.outer(size, size)

@@ -59,7 +59,7 @@ def _sensor_nuisances(
         columns[name] = columns.get(name, 0.0) + out * size
 
     # what a change of the body-frame acceleration does to the velocity
-    def moved(acceleration):
+    def velocity_change(acceleration):
         return np.cumsum(to_world(attitude, acceleration), 0) * track.dt
 
     rates = smooth(track.body_rates, 0.03, track.dt)
@@ -68,7 +68,7 @@ def _sensor_nuisances(
         column(
             f"frame tilt {name}",
             VELOCITY,
-            moved(np.cross(axis, body)),
+            velocity_change(np.cross(axis, body)),
             SIZE["frame_tilt"],
         )
     # another in each flight, as a chip's temperature is
@@ -110,7 +110,9 @@ def _sensor_nuisances(
         "gyroscope's low-pass", RATES, -(spinning - spinning[0]), SIZE["gyroscope_lag"]
     )
     if track.velocity is not None:
-        late = -moved(np.cross(np.asarray(path.body_rates, float)[:rows], body))
+        late = -velocity_change(
+            np.cross(np.asarray(path.body_rates, float)[:rows], body)
+        )
         late += smooth(np.gradient(track.velocity, track.dt, axis=0), 0.05, track.dt)
         column("clock of the pose", VELOCITY, late, SIZE["pose_clock"])
     return columns

@@ -52,14 +52,14 @@ def _ticking(controller, vehicle, h):
             previous_body_rates=previous,
             effect_memory=(),
         )
-        wanted, integral = rate_controller(controller, drone, command, h)
-        given = jnp.clip(wanted + offset, 0.0, 1.0)
-        speed = rotor_speed_step(vehicle, speed, given, h)
+        request, integral = rate_controller(controller, drone, command, h)
+        command_in_force = jnp.clip(request + offset, 0.0, 1.0)
+        speed = rotor_speed_step(vehicle, speed, command_in_force, h)
         thrust = rotor_thrust(vehicle, speed)
         _, torque = total_wrench(vehicle, thrust, rotor_reaction(vehicle, speed))
         gyroscopic = jnp.cross(rates, vehicle.inertia * rates)
-        after = rates + h * ((torque - gyroscopic) / vehicle.inertia + push)
-        return (after, rates, integral, speed), (wanted, given)
+        next_rates = rates + h * ((torque - gyroscopic) / vehicle.inertia + push)
+        return (next_rates, rates, integral, speed), (request, command_in_force)
 
     return tick
 
@@ -84,29 +84,35 @@ def observe(controller, vehicle, command, motor, gyro, disturbance, dt, at_once=
         )
 
     def row(carry, inputs):
-        command, logged, gyro_next, push = inputs
-        state, missed = carry
+        command, motors, gyro_next, push = inputs
+        state, shortfall = carry
         if at_once:
-            (rates, previous, *rest), (wanted, sent) = ticks(
-                state, command, missed, push
+            (rates, previous, *rest), (requests, motor_ticks) = ticks(
+                state, command, shortfall, push
             )
-            missed = missed + FOLLOWED * (logged - wanted[0] - missed)
-            wanted = wanted[0]
+            shortfall = shortfall + FOLLOWED * (motors - requests[0] - shortfall)
+            requests = requests[0]
         else:
-            _, (wanted, _) = ticks(state, command, jnp.zeros(4), push)
-            wanted = wanted.mean(0)
+            _, (requests, _) = ticks(state, command, jnp.zeros(4), push)
+            requests = requests.mean(0)
             # The second pass follows the motors as logged: the controller's pattern in
             # the row, the log's mean.
-            (rates, previous, *rest), (again, sent) = ticks(
-                state, command, logged - wanted, push
+            (rates, previous, *rest), (second_requests, motor_ticks) = ticks(
+                state, command, motors - requests, push
             )
-            wanted = again.mean(0)
+            requests = second_requests.mean(0)
             # The log's mean, within a motor's limits: what a limit cuts off one tick,
             # the others must have had.
             for _ in range(3):
-                sent = jnp.clip(sent + (logged - sent.mean(0)), 0.0, 1.0)
+                motor_ticks = jnp.clip(
+                    motor_ticks + (motors - motor_ticks.mean(0)), 0.0, 1.0
+                )
         step = GYRO_GAIN * (gyro_next - rates)
-        return ((rates + step, previous + step, *rest), missed), (wanted, sent, rates)
+        return ((rates + step, previous + step, *rest), shortfall), (
+            requests,
+            motor_ticks,
+            rates,
+        )
 
     speed = vehicle.max_rotor_speed * jnp.sqrt(jnp.clip(motor[0], 1e-4, 1.0))
     gyro_next = jnp.concatenate([gyro[1:], gyro[-1:]])
@@ -115,7 +121,7 @@ def observe(controller, vehicle, command, motor, gyro, disturbance, dt, at_once=
 
 
 @jax.jit
-def commanded(vehicle, command, dt):
+def respond_to_commands(vehicle, command, dt):
     """Mean motor commands (T, 4) and body rates (T, 3) amid the rows that the body-rate
     commands (T, 4) alone cause: the nominal loop around the nominal vehicle, without
     gyroscope noise and air.
@@ -124,10 +130,10 @@ def commanded(vehicle, command, dt):
 
     def row(carry, command):
         start = carry[0]
-        carry, (_, given) = jax.lax.scan(
+        carry, (_, motors) = jax.lax.scan(
             lambda c, _: tick(c, command, 0.0, 0.0), carry, None, length=TICKS
         )
-        return carry, (given.mean(0), 0.5 * (start + carry[0]))
+        return carry, (motors.mean(0), 0.5 * (start + carry[0]))
 
     speed = vehicle.max_rotor_speed * jnp.sqrt(
         jnp.clip(jnp.full(4, command[0, 0]), 1e-4, 1.0)

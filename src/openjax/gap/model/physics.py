@@ -58,32 +58,37 @@ def compiled_physics(names: tuple[str, ...], parameters: tuple[tuple[str, str], 
     return jax.jit(jax.vmap(partial(_channels, resolve(names), parameters)))
 
 
-def _rotors(flown, targets_in_ticks, commands, dt, late):
+def _rotors(vehicle, targets_in_ticks, commands, dt, late):
     """Rotor speeds (T, 4) whose square is the row's mean, and their change (T, 4),
     1/s^2, under the motors' lag, `late` s later. `targets_in_ticks` (T, TICKS, 4): the
     speeds that `commands` of the same shape ask for.
     """
     step = dt / targets_in_ticks.shape[1]
     # As `rotor_speed_step`, with what doesn't change outside the loop.
-    faster = -jnp.expm1(-step / flown.motor_time_constant)
+    faster = -jnp.expm1(-step / vehicle.motor_time_constant)
     slower = -jnp.expm1(
-        -step / (flown.motor_time_constant * flown.motor_slowdown_ratio)
+        -step / (vehicle.motor_time_constant * vehicle.motor_slowdown_ratio)
     )
 
     def row(speed, targets):
         total = 0.0
-        before = speed
+        start_speed = speed
         for tick in range(len(targets)):
             target = targets[tick]
-            after = speed + (target - speed) * jnp.where(target < speed, slower, faster)
+            next_speed = speed + (target - speed) * jnp.where(
+                target < speed, slower, faster
+            )
             # Mean of the square over a tick, in which the speed is nearly straight.
-            total = total + (speed * speed + speed * after + after * after) / 3.0
-            speed = after
-        return speed, (total / len(targets), (speed - before) / dt)
+            total = (
+                total
+                + (speed * speed + speed * next_speed + next_speed * next_speed) / 3.0
+            )
+            speed = next_speed
+        return speed, (total / len(targets), (speed - start_speed) / dt)
 
-    start = jnp.sqrt(jnp.clip(commands[0, 0], 1e-6, None)) * flown.max_rotor_speed
-    _, driven = jax.lax.scan(row, start, targets_in_ticks)
-    square, sped_up = (v - late * jnp.gradient(v, dt, axis=0) for v in driven)
+    start = jnp.sqrt(jnp.clip(commands[0, 0], 1e-6, None)) * vehicle.max_rotor_speed
+    _, rotors = jax.lax.scan(row, start, targets_in_ticks)
+    square, sped_up = (v - late * jnp.gradient(v, dt, axis=0) for v in rotors)
     speed = jnp.sqrt(jnp.maximum(square, 0.0))
     return speed, sped_up
 
@@ -120,13 +125,15 @@ def _state(position, quaternion, velocity, rates, speed) -> DroneState:
 def _channels(effects, parameters, theta, vehicle, path: Path):
     """(T, 9) of one track with parameters theta (P,)."""
     values = _values(effects, parameters, theta)
-    flown = change_body(effects, values, vehicle)
+    changed_vehicle = change_body(effects, values, vehicle)
     step = path.dt / path.motor.shape[1]
 
     def context(position, quaternion, velocity, rates, voltage, others, speed):
         state = _state(position, quaternion, velocity, rates, speed)
         room = {"others_position": others, "ceiling_height": path.ceiling}
-        return make_context(flown, state, battery_voltage=voltage, dt=step, **room)
+        return make_context(
+            changed_vehicle, state, battery_voltage=voltage, dt=step, **room
+        )
 
     along = (
         path.position,
@@ -136,34 +143,40 @@ def _channels(effects, parameters, theta, vehicle, path: Path):
         path.voltage,
         path.others,
     )
-    still = jax.vmap(context)(*along, jnp.zeros_like(path.motor[:, 0]))
+    at_rest = jax.vmap(context)(*along, jnp.zeros_like(path.motor[:, 0]))
 
-    def demanded(commands, around):
+    def motor_requests(commands, around):
         return jax.vmap(lambda m: change_motor_command(effects, values, m, around))(
             commands
         )
 
-    given = jax.vmap(demanded)(path.motor, still)
+    motors = jax.vmap(motor_requests)(path.motor, at_rest)
 
     speed, sped_up = _rotors(
-        flown, commanded_rotor_speed(flown, given), given, path.dt, theta[-1]
+        changed_vehicle,
+        commanded_rotor_speed(changed_vehicle, motors),
+        motors,
+        path.dt,
+        theta[-1],
     )
-    spun_up = theta[-2] * (sped_up @ flown.rotor_spin)
+    spun_up = theta[-2] * (sped_up @ changed_vehicle.rotor_spin)
 
     def wrench(position, quaternion, velocity, rates, voltage, others, speed, spun_up):
         around = context(position, quaternion, velocity, rates, voltage, others, speed)
-        thrust = rotor_thrust(flown, speed)
-        reaction = rotor_reaction(flown, speed)
+        thrust = rotor_thrust(changed_vehicle, speed)
+        reaction = rotor_reaction(changed_vehicle, speed)
         thrust, reaction = change_thrust(effects, values, thrust, reaction, around)
         around = around.replace(thrust=thrust)
-        force, torque = total_wrench(flown, thrust, reaction)
+        force, torque = total_wrench(changed_vehicle, thrust, reaction)
         more_force, more_torque = added_wrench(effects, values, around)
         force = force + more_force
         torque = torque + more_torque
-        angular = (torque - jnp.cross(rates, flown.inertia * rates)) / flown.inertia
+        angular = (
+            torque - jnp.cross(rates, changed_vehicle.inertia * rates)
+        ) / changed_vehicle.inertia
         angular = angular.at[2].add(spun_up)  # what speeds a rotor up turns the body
-        specific = force / flown.mass
-        gravity = jnp.array([0.0, 0.0, 1.0], force.dtype) * flown.gravity
+        specific = force / changed_vehicle.mass
+        gravity = jnp.array([0.0, 0.0, 1.0], force.dtype) * changed_vehicle.gravity
         return jnp.concatenate(
             [angular, rotate(quaternion, specific) - gravity, specific]
         )

@@ -34,7 +34,7 @@ def bucket(length: int) -> int:
     return next((b for b in BUCKETS if b >= length), length)
 
 
-def padded(
+def pad(
     values: Shaped[np.ndarray, " rows *rest"], length: int
 ) -> Float[np.ndarray, " {length} *rest"]:
     """float32, the last row repeated up to `length`."""
@@ -69,12 +69,12 @@ class Physics:
             for number, lane in zip(numbers, np.asarray(rows), strict=False):
                 parts[number].append(lane[: len(self.tracks[number])])
         return [
-            _integrated(np.stack(p), t.dt)
+            _integrate(np.stack(p), t.dt)
             for p, t in zip(parts, self.tracks, strict=True)
         ]
 
     @cached_property
-    def grown(self) -> Parameters:
+    def size_factors(self) -> Parameters:
         """(P,) by what usual sizes of parameters are multiplied for a vehicle of this
         size.
         """
@@ -84,16 +84,16 @@ class Physics:
         """Vehicles and paths of the tracks `numbers`, on the device: a search asks for
         the same few mixtures again and again.
         """
-        kept = self._kept
-        if numbers not in kept:
-            if len(kept) == KEPT:
-                kept.pop(next(iter(kept)))
-            chosen = jax.tree.map(lambda leaf: leaf[list(numbers)], self._nominal)
-            kept[numbers] = jax.device_put(chosen)
-        return kept[numbers]
+        cache = self._cache
+        if numbers not in cache:
+            if len(cache) == KEPT:
+                cache.pop(next(iter(cache)))
+            lanes = jax.tree.map(lambda leaf: leaf[list(numbers)], self._nominal)
+            cache[numbers] = jax.device_put(lanes)
+        return cache[numbers]
 
     @cached_property
-    def _kept(self) -> dict:
+    def _cache(self) -> dict:
         """{numbers of tracks: what `_in_lanes` gives}."""
         return {}
 
@@ -124,7 +124,7 @@ def _path(track: Track, ticks: np.ndarray, size: int, neighbours: int) -> Path:
     rows = len(track)
 
     def middle(values):
-        return padded(0.5 * (values + np.concatenate([values[1:], values[-1:]])), size)
+        return pad(0.5 * (values + np.concatenate([values[1:], values[-1:]])), size)
 
     unknown = np.zeros((rows, 3))
     quaternion = (
@@ -159,7 +159,7 @@ def _path(track: Track, ticks: np.ndarray, size: int, neighbours: int) -> Path:
         quaternion,
         middle(velocity),
         middle(smooth(track.body_rates, 0.05, track.dt)),
-        padded(ticks, size),
+        pad(ticks, size),
         voltage,
         np.stack(others, 1),
         np.float32(_ceiling(position, track.ceiling)),
@@ -184,7 +184,7 @@ def _ceiling(position: np.ndarray, ceiling: float | None) -> float:
     return ARENA_CEILING if (position[:, 2] <= ARENA_CEILING).all() else FAR
 
 
-def _integrated(rows: np.ndarray, dt: float) -> np.ndarray:
+def _integrate(rows: np.ndarray, dt: float) -> np.ndarray:
     """Channels (B, T, 9) from accelerations and specific force (B, T, 9) of the rows'
     intervals.
     """

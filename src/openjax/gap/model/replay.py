@@ -44,7 +44,7 @@ class Replay:
     """
 
     physics: Physics
-    measured: list[np.ndarray]  # (T, 9)
+    measurements: list[np.ndarray]  # (T, 9)
     nominal: list[np.ndarray]  # (T, 9)
     columns: list[np.ndarray]  # (N, T, 9) nuisances, each of its usual size
     nuisance_names: tuple[str, ...]
@@ -73,11 +73,11 @@ class Replay:
         return [np.tensordot(self.mixing, c, 1) for c in self.columns]
 
     @property
-    def grown(self) -> Parameters:
+    def size_factors(self) -> Parameters:
         """(P,) by what usual sizes of parameters are multiplied for a vehicle of this
         size; every replay of the same physics shares them.
         """
-        return self.physics.grown
+        return self.physics.size_factors
 
     @cached_property
     def flights(self) -> tuple[str, ...]:
@@ -89,7 +89,7 @@ class Replay:
         return np.array([self.flights.index(t.flight) for t in self.tracks])
 
     @cached_property
-    def shared(self) -> np.ndarray:
+    def is_shared(self) -> np.ndarray:
         """(N,) whether a nuisance belongs to the vehicle (all flights) or to a
         block.
         """
@@ -126,10 +126,10 @@ class Replay:
             len(theta) - 1,
         ]
         columns = []
-        moved = (column[1:] for column in self.linearised(theta, places))
-        for m, old, size in zip(moved, self.columns, self.sizes, strict=True):
-            own = np.concatenate([m, m[-1:]]) * size[:, None, None]
-            columns.append(np.concatenate([own, old[len(own) :]]))
+        derivatives = (column[1:] for column in self.linearise(theta, places))
+        for m, old, size in zip(derivatives, self.columns, self.sizes, strict=True):
+            fresh = np.concatenate([m, m[-1:]]) * size[:, None, None]
+            columns.append(np.concatenate([fresh, old[len(fresh) :]]))
         return replace(self, columns=columns)
 
     def whiten(
@@ -154,13 +154,13 @@ class Replay:
             w = self.whiten(column, number).reshape(len(column), -1)
             n = self.whitened_nuisances[number]
             cross = n.reshape(len(n), -1) @ w.T
-            taken = solve_triangular(
+            projection = solve_triangular(
                 self._roots[number], cross, lower=True, check_finite=False
             )
-            total[self.flight_of[number]] += w @ w.T - taken.T @ taken
+            total[self.flight_of[number]] += w @ w.T - projection.T @ projection
         return total
 
-    def taken(self, residual: Rows, track: int) -> Nuisances:
+    def nuisance_sizes(self, residual: Rows, track: int) -> Nuisances:
         """(N,) the nuisances' most likely sizes, given a residual (T, 9) of a track."""
         gram = self.nuisance_grams[track]
         n = self.whitened_nuisances[track]
@@ -169,19 +169,19 @@ class Replay:
             n.reshape(len(n), -1) @ self.whiten(residual, track).ravel(),
         )
 
-    def linearised(
+    def linearise(
         self, theta: Parameters, index: Int[np.ndarray, " free"] | Sequence[int]
     ) -> list[np.ndarray]:
         """Residual and derivatives (1 + p, T, 9) of each track at theta (P,) with
         respect to theta[index].
         """
         count = len(index)
-        steps = (STEP * self.grown)[np.asarray(index, int)]
+        steps = (STEP * self.size_factors)[np.asarray(index, int)]
         batch = np.repeat(theta[None], count + 1, 0)
         batch[np.arange(count) + 1, index] += steps
         return [
             np.concatenate([(y - p[0])[None], (p[1:] - p[:1]) / steps[:, None, None]])
-            for y, p in zip(self.measured, self.predict(batch), strict=True)
+            for y, p in zip(self.measurements, self.predict(batch), strict=True)
         ]
 
 
@@ -219,24 +219,26 @@ def make_replay(
         )
     physics = make_physics(tracks, vehicles, motor_ticks)
     nominal = [p[0] for p in physics.predict(absent[None])]
-    named = [
-        columns_of(track, path, p, made, at_once)
-        for track, path, p, made in zip(
+    columns_of_tracks = [
+        columns_of(track, path, p, feedback_of_track, at_once)
+        for track, path, p, feedback_of_track in zip(
             tracks, physics.paths, nominal, feedback, strict=True
         )
     ]
-    names = tuple(dict.fromkeys(name for columns in named for name in columns))
+    names = tuple(
+        dict.fromkeys(name for columns in columns_of_tracks for name in columns)
+    )
     moving = (
         *(" ".join(key[:2]) for key in numbers),
         "propellers' inertia",
         *MOTORS_LATE,
     )
-    own = [key[2] for key in numbers]
+    usual_sizes = [key[2] for key in numbers]
     apart = SIZE["motor_clock" if one_clock else "streams_apart"]
     sizes = [
         np.array(
             [
-                *own,
+                *usual_sizes,
                 SIZE["propeller"],
                 max(apart, t.dt / 4 if at_once else 0.0),
                 SIZE["motor_delay"],
@@ -246,11 +248,11 @@ def make_replay(
     ]
     replay = Replay(
         physics,
-        [_measured(t) for t in tracks],
+        [_measurements(t) for t in tracks],
         nominal,
         [
             np.stack([columns.get(n, np.zeros_like(base)) for n in (*moving, *names)])
-            for columns, base in zip(named, nominal, strict=True)
+            for columns, base in zip(columns_of_tracks, nominal, strict=True)
         ],
         (*moving, *names),
         sizes,
@@ -263,13 +265,14 @@ def make_replay(
     ).around(absent)
     if not any(CARDS[key[0]].balanced for key in numbers):  # trims are told otherwise
         replay = replace(
-            replay, columns=[_balanced(c, len(numbers)) for c in replay.columns]
+            replay,
+            columns=[_without_mean_torque(c, len(numbers)) for c in replay.columns],
         )
     mixing = None if baseline is None else baseline.mixing(replay.nuisance_names)
     return replace(replay, mixing=mixing)
 
 
-def _balanced(nuisances: np.ndarray, count: int) -> np.ndarray:
+def _without_mean_torque(nuisances: np.ndarray, count: int) -> np.ndarray:
     """Nuisances (N, T, 9), the first `count` of them without their mean torque: as long
     as it isn't known what acts, motors that pull one way all the time hold against
     something, and of a sum of torques that is zero no number can be wrong.
@@ -286,7 +289,7 @@ def block_count(rows: int, dt: float) -> int:
     return max(rows // max(int(BLOCK / dt), 1), 1)
 
 
-def _measured(track: Track) -> np.ndarray:
+def _measurements(track: Track) -> np.ndarray:
     out = np.zeros((len(track), 9))
     out[:, RATES] = track.body_rates - track.body_rates[0]
     if track.velocity is not None:

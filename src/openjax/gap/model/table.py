@@ -51,7 +51,7 @@ class Table:
     """{effect that may come in: column of what it does as it was fitted alone}."""
     part: dict[str, int]
     """{effect of the set: column of what it does}."""
-    shared: np.ndarray
+    is_shared: np.ndarray
     """(N,) whether a nuisance is the case's; the others are a block's."""
     columns: list
     """[(C, M)]: whitened columns of each block."""
@@ -64,20 +64,23 @@ class Table:
     @property
     def nuisances(self) -> np.ndarray:
         """(N,) columns of the nuisances."""
-        return np.arange(self.size - len(self.shared), self.size)
+        return np.arange(self.size - len(self.is_shared), self.size)
 
     @property
-    def own(self) -> np.ndarray:
+    def block_nuisances(self) -> np.ndarray:
         """Columns of the nuisances that belong to a block."""
-        return self.nuisances[~self.shared]
+        return self.nuisances[~self.is_shared]
 
     @cached_property
-    def taken(self) -> np.ndarray:
+    def projection(self) -> np.ndarray:
         """(B, own, C): what each column has of a block's own nuisances, of unit prior
         variance.
         """
-        inside = self.white[:, self.own][:, :, self.own]
-        return np.linalg.solve(inside + np.eye(len(self.own)), self.white[:, self.own])
+        inside = self.white[:, self.block_nuisances][:, :, self.block_nuisances]
+        return np.linalg.solve(
+            inside + np.eye(len(self.block_nuisances)),
+            self.white[:, self.block_nuisances],
+        )
 
     @cached_property
     def total(self) -> np.ndarray:
@@ -85,18 +88,20 @@ class Table:
         return self.marginal.sum(0)
 
     @cached_property
-    def reduced(self) -> np.ndarray:
+    def fully_marginal(self) -> np.ndarray:
         """(C, C): `total` with the shared nuisances marginalised as well."""
-        shared = self.nuisances[self.shared]
-        inside = self.total[np.ix_(shared, shared)] + np.eye(len(shared))
-        return self.total - self.total[:, shared] @ np.linalg.solve(
-            inside, self.total[shared]
+        case_nuisances = self.nuisances[self.is_shared]
+        inside = self.total[np.ix_(case_nuisances, case_nuisances)] + np.eye(
+            len(case_nuisances)
+        )
+        return self.total - self.total[:, case_nuisances] @ np.linalg.solve(
+            inside, self.total[case_nuisances]
         )
 
     @cached_property
     def marginal(self) -> np.ndarray:
         """`white` with a block's own nuisances marginalised (Frisch, Waugh, Lovell)."""
-        return self.white - self.white[:, :, self.own] @ self.taken
+        return self.white - self.white[:, :, self.block_nuisances] @ self.projection
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,31 +121,31 @@ def build(fit: SetFit, singles: dict[str, SetFit] | None) -> Table:
     that may come in; None: nothing may come in or go.
     """
     replay = fit.replay
-    own = fit.effects if singles is not None else ()
-    others = [e for e in singles or () if e not in own]
+    within = fit.effects if singles is not None else ()
+    others = [e for e in singles or () if e not in within]
     index = np.concatenate([fit.index, places(others)])
     points = []
-    for effect in (*others, *own):
+    for effect in (*others, *within):
         point = fit.theta.copy()
         at = places((effect,))
-        point[at] = replay.absent[at] if effect in own else singles[effect].theta[at]
+        point[at] = replay.absent[at] if effect in within else singles[effect].theta[at]
         points.append(point)
-    columns = fit.columns if singles is None else replay.linearised(fit.theta, index)
-    moved = [np.zeros((0, *y.shape)) for y in replay.measured]
+    columns = fit.columns if singles is None else replay.linearise(fit.theta, index)
+    predictions = [np.zeros((0, *y.shape)) for y in replay.measurements]
     if points:
-        moved = replay.predict(np.array(points))
+        predictions = replay.predict(np.array(points))
     white = []
     error = []
     rows = []
     track_of = []
     whole = []
     for number, (c, m, track) in enumerate(
-        zip(columns, moved, replay.tracks, strict=True)
+        zip(columns, predictions, replay.tracks, strict=True)
     ):
-        now = replay.measured[number] - c[0]
+        residual = replay.measurements[number] - c[0]
         nuisances = replay.nuisances[number]
         x = np.concatenate(
-            [c, m[: len(others)] - now, now - m[len(others) :], nuisances]
+            [c, m[: len(others)] - residual, residual - m[len(others) :], nuisances]
         )
         without = replay.whiten(x[: -len(nuisances)], number)
         w = np.concatenate([without, replay.whitened_nuisances[number]])
@@ -165,8 +170,8 @@ def build(fit: SetFit, singles: dict[str, SetFit] | None) -> Table:
         track_of=np.array(track_of),
         derivative={int(i): 1 + k for k, i in enumerate(index)},
         step={e: first_step + k for k, e in enumerate(others)},
-        part={e: first_part + k for k, e in enumerate(own)},
-        shared=replay.shared,
+        part={e: first_part + k for k, e in enumerate(within)},
+        is_shared=replay.is_shared,
         columns=whole,
     )
 
@@ -186,14 +191,14 @@ def with_effects(table: Table, add=(), drop=()) -> Model:
     """The table's set with effects that come in as they were fitted alone (and may move
     from there) or go.
     """
-    kept = tuple(e for e in table.fit.effects if e not in drop)
+    remaining = tuple(e for e in table.fit.effects if e not in drop)
     index, mean, precision = prior(
-        kept, table.fit.replay.absent, table.fit.replay.grown
+        remaining, table.fit.replay.absent, table.fit.replay.size_factors
     )
-    own = np.array([table.derivative[int(i)] for i in index], int)
+    derivatives_of_set = np.array([table.derivative[int(i)] for i in index], int)
     # The set's parameters: coefficients count from where they were fitted.
     mean = mean - table.fit.theta[index] if len(index) else mean
-    free = [own]
+    free = [derivatives_of_set]
     means = [mean]
     blocks = [precision]
     for effect in add:
@@ -201,11 +206,15 @@ def with_effects(table: Table, add=(), drop=()) -> Model:
             free.append(np.array([table.step[effect]]))
             means.append(np.array([0.0]))
             blocks.append(np.eye(1))
-        where = places((effect,))
+        place = places((effect,))
         spread = np.array([p.spread for p in CARDS[effect].fitted])
-        spread = spread * table.fit.replay.grown[where]
-        derivatives = [table.derivative[int(i)] for i in where]
-        inside = [k for k, column in enumerate(derivatives) if column not in own]
+        spread = spread * table.fit.replay.size_factors[place]
+        derivatives = [table.derivative[int(i)] for i in place]
+        inside = [
+            k
+            for k, column in enumerate(derivatives)
+            if column not in derivatives_of_set
+        ]
         free.append(np.array([derivatives[k] for k in inside], int))
         means.append(np.zeros(len(inside)))
         blocks.append(np.diag(1.0 / spread[inside] ** 2))

@@ -82,12 +82,12 @@ def with_late_wakes(replay: Replay, speed: float) -> Replay:
     paths = []
     for path in replay.physics.paths:
         others = path.others.copy()
-        now = np.arange(len(others), dtype=float)
+        rows = np.arange(len(others), dtype=float)
         for other in np.moveaxis(others, 1, 0):
             above = np.clip(other[:, 2] - path.position[:, 2], 0.0, ABOVE[1])
-            then = np.maximum(now - above / speed / float(path.dt), 0.0)
+            departure = np.maximum(rows - above / speed / float(path.dt), 0.0)
             other[:, :2] = np.stack(
-                [np.interp(then, now, x) for x in other[:, :2].T.copy()], 1
+                [np.interp(departure, rows, x) for x in other[:, :2].T.copy()], 1
             )
         paths.append(path.replace(others=others))
     return replace(replay, physics=replace(replay.physics, paths=tuple(paths)))
@@ -114,7 +114,7 @@ def read_gusts(fit: SetFit) -> Gusts:
     """
     replay = replace(fit.replay, loudness=None)
     rows = tuple(under_another(track) for track in replay.tracks)
-    left = [
+    innovations_of_tracks = [
         replay.whiten(without_nuisances(fit.replay, column[0], k), k)
         for k, column in enumerate(fit.columns)
     ]
@@ -123,7 +123,7 @@ def read_gusts(fit: SetFit) -> Gusts:
     for axes, _ in GROUPS:
         if replay.usable[axes[0]]:
             ratio, errors = louder_in(
-                replay.tracks, rows, [w[:, list(axes)] for w in left]
+                replay.tracks, rows, [w[:, list(axes)] for w in innovations_of_tracks]
             )
             if errors > CLEAR and ratio > LOUDER:
                 louder[axes] = ratio
@@ -134,7 +134,7 @@ def read_gusts(fit: SetFit) -> Gusts:
 def louder_in(
     tracks: Sequence[Track],
     rows: Sequence[Bool[np.ndarray, " _"]],
-    left: Sequence[Float[np.ndarray, "_ axes"]],
+    innovations_of_tracks: Sequence[Float[np.ndarray, "_ axes"]],
 ) -> tuple[float, float]:
     """By which factor mean squares of innovations (T', axes) are larger in the chosen
     rows than elsewhere, and how many standard errors the logarithm is from none.
@@ -142,13 +142,13 @@ def louder_in(
     inside: list[float] = []
     outside: list[float] = []
     aside: list[float] = []
-    for track, chosen, white in zip(tracks, rows, left, strict=True):
-        here = chosen[int(SKIP / track.dt) :]
+    for track, mask, white in zip(tracks, rows, innovations_of_tracks, strict=True):
+        inside_rows = mask[int(SKIP / track.dt) :]
         squares = (white**2).mean(1)
-        elsewhere = _stretches(squares, ~here, track.dt)
-        if here.any():
-            inside += _stretches(squares, here, track.dt)
-        near = here.any() and (~here).sum() * track.dt > FEWEST_HERE
+        elsewhere = _stretches(squares, ~inside_rows, track.dt)
+        if inside_rows.any():
+            inside += _stretches(squares, inside_rows, track.dt)
+        near = inside_rows.any() and (~inside_rows).sum() * track.dt > FEWEST_HERE
         (outside if near else aside).extend(elsewhere)
     if len(outside) < FEWEST:
         outside = outside + aside
@@ -164,18 +164,18 @@ def louder_in(
     )
 
 
-def _stretches(squares: np.ndarray, chosen: Chosen, dt: float) -> list[float]:
+def _stretches(squares: np.ndarray, mask: Chosen, dt: float) -> list[float]:
     """Mean squares of stretches of chosen rows, none longer than a block."""
-    edges = np.flatnonzero(np.diff(chosen.astype(int), prepend=0, append=0)).reshape(
+    edges = np.flatnonzero(np.diff(mask.astype(int), prepend=0, append=0)).reshape(
         -1, 2
     )
-    found = []
+    means = []
     for begin, end in edges:
         pieces = max(round((end - begin) * dt / BLOCK), 1)
         for piece in np.array_split(squares[begin:end], pieces):
             if len(piece) * dt >= SHORTEST:
-                found.append(float(piece.mean()))
-    return found
+                means.append(float(piece.mean()))
+    return means
 
 
 def as_loud_as(
@@ -185,29 +185,33 @@ def as_loud_as(
     with the nats that the effect of wakes, if there is one in `effects`, loses by that.
     """
     louder = _louder(replay, gusts)
-    lost = 0.0
+    loss = 0.0
     for effect in effects:
         quiet = fit_single(replay, effect).score - fit_set(replay, ()).score
-        lost = max(
+        loss = max(
             quiet - fit_single(louder, effect).score + fit_set(louder, ()).score, 0.0
         )
-    return louder, replace(gusts, nats=gusts.nats + lost)
+    return louder, replace(gusts, nats=gusts.nats + loss)
 
 
 def _louder(replay: Replay, gusts: Gusts) -> Replay:
     if replay.loudness is None:
         return replay
     loudness = []
-    for track, chosen, loud in zip(
+    for track, mask, loud in zip(
         replay.tracks, gusts.rows, replay.loudness, strict=True
     ):
-        here = chosen[int(SKIP / track.dt) :]
-        own = loud.copy()
+        inside_rows = mask[int(SKIP / track.dt) :]
+        loudness_here = loud.copy()
         for axes, ratio in gusts.louder.items():
             quiet = (
-                np.sqrt((loud[~here][:, axes] ** 2).mean()) if (~here).any() else 1.0
+                np.sqrt((loud[~inside_rows][:, axes] ** 2).mean())
+                if (~inside_rows).any()
+                else 1.0
             )
-            columns = np.ix_(here, axes)
-            own[columns] = np.maximum(own[columns], quiet * ratio**0.5)
-        loudness.append(own)
+            columns = np.ix_(inside_rows, axes)
+            loudness_here[columns] = np.maximum(
+                loudness_here[columns], quiet * ratio**0.5
+            )
+        loudness.append(loudness_here)
     return replace(replay, loudness=tuple(loudness))

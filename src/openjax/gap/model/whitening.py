@@ -56,22 +56,22 @@ def whiten(
     return out
 
 
-def first_noise(axes, integrated: bool, deviation: float) -> Noise:
+def first_noise(axes, integrates: bool, deviation: float) -> Noise:
     """A noise model to begin with: sensor noise and some white steps."""
-    step = 0.15 if integrated else 0.0
+    step = 0.15 if integrates else 0.0
     numerator, denominator = _kalman(
-        memory=0.9, gust=0.04, step=step, integrated=integrated
+        memory=0.9, gust=0.04, step=step, integrates=integrates
     )
     return Noise(tuple(axes), numerator, denominator, deviation)
 
 
-def fit_noise(axes, residuals, integrated: bool, skip: int = 20) -> Noise:
+def fit_noise(axes, residuals, integrates: bool, skip: int = 20) -> Noise:
     """Noise model of residuals [(T, C), ...], pooled over tracks and `axes`.
 
     The model of the grid is chosen by Whittle's likelihood."""
     series = [r[:, list(axes)] for r in residuals]
-    memory, gust, step = _choose([s[skip:] for s in series], integrated)
-    numerator, denominator = _kalman(memory, gust, step, integrated)
+    memory, gust, step = _choose([s[skip:] for s in series], integrates)
+    numerator, denominator = _kalman(memory, gust, step, integrates)
     # the filter starts at the first row, and what it makes of its start is cut off
     # afterwards
     white = [lfilter(numerator, denominator, s, axis=0)[skip:].ravel() for s in series]
@@ -79,7 +79,7 @@ def fit_noise(axes, residuals, integrated: bool, skip: int = 20) -> Noise:
     return Noise(tuple(axes), numerator, denominator, deviation)
 
 
-def _choose(parts, integrated: bool) -> tuple[float, float, float]:
+def _choose(parts, integrates: bool) -> tuple[float, float, float]:
     """The grid's (memory, gust, step) with the largest Whittle likelihood, its scale
     profiled out.
     """
@@ -88,46 +88,46 @@ def _choose(parts, integrated: bool) -> tuple[float, float, float]:
     count = 0
     for part in parts:
         # differences of what adds up are stationary, as Whittle's likelihood asks for
-        z = np.diff(part, axis=0) if integrated else part
+        z = np.diff(part, axis=0) if integrates else part
         taper = np.hanning(len(z))[:, None]
         power = np.abs(np.fft.rfft((z - z.mean(0)) * taper, axis=0)) ** 2
         # without the two lowest frequencies, into which the taper smears the mean
         periodogram = power.sum(1)[2:] / (taper**2).sum()
-        spectra, logs = _spectra(len(z), integrated)
+        spectra, logs = _spectra(len(z), integrates)
         ratio_part = ratio_part + (periodogram / spectra).sum(1)
         log_part = log_part + z.shape[1] * logs
         count += len(periodogram) * z.shape[1]
     likelihood = -log_part - count * np.log(ratio_part / count)
-    return _grid(integrated)[int(np.argmax(likelihood))]
+    return _grid(integrates)[int(np.argmax(likelihood))]
 
 
 @lru_cache(maxsize=2)
-def _grid(integrated: bool) -> list[tuple[float, float, float]]:
-    return list(itertools.product(MEMORIES, GUSTS, STEPS if integrated else (0.0,)))
+def _grid(integrates: bool) -> list[tuple[float, float, float]]:
+    return list(itertools.product(MEMORIES, GUSTS, STEPS if integrates else (0.0,)))
 
 
 @lru_cache(maxsize=32)
-def _spectra(rows: int, integrated: bool) -> tuple[np.ndarray, np.ndarray]:
+def _spectra(rows: int, integrates: bool) -> tuple[np.ndarray, np.ndarray]:
     """Model spectra (G, f) of (differenced) residuals of unit sensor noise, and the
     sums of their logarithms (G,).
     """
     shift = np.exp(-2j * np.pi * np.fft.rfftfreq(rows)[2:])
-    grid = np.array(_grid(integrated))
+    grid = np.array(_grid(integrates))
     memory, gust, step = (grid[:, k, None] for k in range(3))
     spectra = gust**2 * (1 - memory**2) / np.abs(1 - memory * shift) ** 2 + step**2
-    spectra = spectra + (np.abs(1 - shift) ** 2 if integrated else 1.0)
+    spectra = spectra + (np.abs(1 - shift) ** 2 if integrates else 1.0)
     return spectra, np.log(spectra).sum(1)
 
 
 @lru_cache(maxsize=1024)
 def _kalman(
-    memory: float, gust: float, step: float, integrated: bool
+    memory: float, gust: float, step: float, integrates: bool
 ) -> tuple[np.ndarray, np.ndarray]:
     """Innovation filter (numerator, denominator) of the stationary Kalman filter with
     unit sensor noise.
     """
     drive = gust**2 * (1 - memory**2)
-    if integrated:
+    if integrates:
         a = np.array([[1.0, 1.0], [0.0, memory]])
         q = np.diag([step**2 + 1e-9, drive])
         c = np.array([[1.0, 0.0]])

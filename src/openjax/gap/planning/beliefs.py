@@ -42,28 +42,33 @@ def beliefs_of(report: dict) -> list[Belief]:
     the commands' own columns.
     """
     chances = report["probabilities"]
-    named = [e for e in report.get("effects", ()) if _flown(e)]
-    found: dict[tuple[str, ...], float] = {(): max(chances.get("none", 0.0), UNTESTED)}
-    if named:
-        sure = max(chances.get(e, 0.0) for e in named)
-        found[tuple(named)] = max(sure, UNTESTED)
-        for effect in named:
-            for other in filter(_flown, report.get("equivalent", {}).get(effect, ())):
+    causes = [e for e in report.get("effects", ()) if _acts_in_physics(e)]
+    chances_of: dict[tuple[str, ...], float] = {
+        (): max(chances.get("none", 0.0), UNTESTED)
+    }
+    if causes:
+        sure = max(chances.get(e, 0.0) for e in causes)
+        chances_of[tuple(causes)] = max(sure, UNTESTED)
+        for effect in causes:
+            for other in filter(
+                _acts_in_physics, report.get("equivalent", {}).get(effect, ())
+            ):
                 # As likely as the one that it would do as well as.
-                rest = tuple(e for e in named if e != effect)
-                found[(*rest, other)] = max(chances.get(effect, 0.0), UNTESTED)
+                rest = tuple(e for e in causes if e != effect)
+                chances_of[(*rest, other)] = max(chances.get(effect, 0.0), UNTESTED)
     for effect, chance in chances.items():
-        if _flown(effect) and effect not in named and chance > LEAST:
-            found.setdefault((effect,), chance)
-    for effect in filter(_flown, report.get("not_testable", ())):
-        found.setdefault((effect,), UNTESTED)
-    whole = sum(found.values())
+        if _acts_in_physics(effect) and effect not in causes and chance > LEAST:
+            chances_of.setdefault((effect,), chance)
+    for effect in filter(_acts_in_physics, report.get("not_testable", ())):
+        chances_of.setdefault((effect,), UNTESTED)
+    whole = sum(chances_of.values())
     return [
-        Belief(e, _theta(e, report["parameters"]), p / whole) for e, p in found.items()
+        Belief(e, _theta(e, report["parameters"]), p / whole)
+        for e, p in chances_of.items()
     ]
 
 
-def _flown(effect: str) -> bool:
+def _acts_in_physics(effect: str) -> bool:
     """Whether an effect acts in the physics, and needs no second vehicle."""
     return effect in CARDS and CARDS[effect].path == "physics" and effect != "downwash"
 
@@ -87,14 +92,14 @@ def sentence(advice: Advice, report: dict) -> str:
     hopeless = [pair for pair, nats in advice.nats.items() if nats < DETECTABLE]
     weigh = [pair for pair in hopeless if set(pair) <= SCALE_ONLY]
     pair = f"{best.pair[0]!r} from {best.pair[1]!r}"
-    told = (
+    text = (
         f"Fly {best.segment!r} next: in 10 s it tells {pair} by {best.nats:.0f} nats."
     )
     if best.nats < DETECTABLE:
-        told = f"No segment tells {pair}."
+        text = f"No segment tells {pair}."
     if weigh:
-        told += f" No flight tells {weigh[0][0]} from {weigh[0][1]}: weigh the vehicle."
+        text += f" No flight tells {weigh[0][0]} from {weigh[0][1]}: weigh the vehicle."
     remarks = report.get("identification", {}).get("remarks", ())
     if any("sample" in remark for remark in remarks):
-        told += " Before that, log the motors' means at 100 Hz."
-    return told.replace("_", " ")
+        text += " Before that, log the motors' means at 100 Hz."
+    return text.replace("_", " ")

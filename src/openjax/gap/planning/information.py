@@ -61,7 +61,7 @@ class Advice:
 
     promises: tuple[Promise, ...]
     """Best first."""
-    chosen: tuple[str, ...]
+    segments: tuple[str, ...]
     """The fewest segments that together tell nearly what all do."""
     nats: dict[tuple[str, str], float]
     """{(cause, other): nats of the best segment}."""
@@ -69,31 +69,31 @@ class Advice:
 
 def advise(beliefs: list[Belief], vehicle_file: VehicleFile) -> Advice:
     """Rank all segments by what they are expected to tell."""
-    replay = _simulated(vehicle_file)
+    replay = _nominal_replay(vehicle_file)
     apart = _distances(replay, beliefs)
     weights = np.array([b.probability for b in beliefs])
     together = np.outer(weights, weights)
     promises = []
     for number, name in enumerate(replay.flights):
-        told = together * _told(apart[number])
-        i, j = np.unravel_index(int(np.argmax(np.triu(told, 1))), told.shape)
+        gains = together * _distinction(apart[number])
+        i, j = np.unravel_index(int(np.argmax(np.triu(gains, 1))), gains.shape)
         pair = (beliefs[i].name, beliefs[j].name)
         promises.append(
             Promise(
-                name.split(".")[0], float(told.sum()), pair, float(apart[number, i, j])
+                name.split(".")[0], float(gains.sum()), pair, float(apart[number, i, j])
             )
         )
-    chosen = _fewest(apart, together)
+    picks = _fewest(apart, together)
     best = apart.max(0)
     nats = {}
     for i, j in itertools.combinations(range(len(beliefs)), 2):
         nats[beliefs[i].name, beliefs[j].name] = float(best[i, j])
-    ranked = tuple(sorted(promises, key=lambda p: -p.value))
+    ranking = tuple(sorted(promises, key=lambda p: -p.value))
     names = [name.split(".")[0] for name in replay.flights]
-    return Advice(ranked, tuple(names[k] for k in chosen), nats)
+    return Advice(ranking, tuple(names[k] for k in picks), nats)
 
 
-def _told(nats: np.ndarray) -> np.ndarray:
+def _distinction(nats: np.ndarray) -> np.ndarray:
     """Probability that two causes so many nats apart are told from each other by a
     diagnosis that asks for DETECTABLE of them.
     """
@@ -105,54 +105,56 @@ def _fewest(apart: np.ndarray, together: np.ndarray) -> list[int]:
     (nats of flights add up).
     """
 
-    def told(nats):
-        return float((together * _told(nats)).sum())
+    def value(nats):
+        return float((together * _distinction(nats)).sum())
 
-    everything = told(apart.sum(0))
-    chosen: list[int] = []
-    known = np.zeros_like(together)
-    while told(known) < ENOUGH * everything and len(chosen) < len(apart):
-        rest = [k for k in range(len(apart)) if k not in chosen]
-        chosen.append(max(rest, key=lambda k: told(known + apart[k])))
-        known = known + apart[chosen[-1]]
-    return chosen or [int(np.argmax([told(a) for a in apart]))]
+    everything = value(apart.sum(0))
+    picks: list[int] = []
+    sums = np.zeros_like(together)
+    while value(sums) < ENOUGH * everything and len(picks) < len(apart):
+        rest = [k for k in range(len(apart)) if k not in picks]
+        picks.append(max(rest, key=lambda k: value(sums + apart[k])))
+        sums = sums + apart[picks[-1]]
+    return picks or [int(np.argmax([value(a) for a in apart]))]
 
 
-def _simulated(vehicle_file: VehicleFile) -> Replay:
+def _nominal_replay(vehicle_file: VehicleFile) -> Replay:
     """The replay of every segment, flown by the nominal vehicle."""
     vehicle = vehicle_file.vehicle
-    described = replace(vehicle_file, log={"motor_rows": "mean"})
+    file_of_means = replace(vehicle_file, log={"motor_rows": "mean"})
     flights = []
     for number, (name, segment) in enumerate(SEGMENTS.items()):
         air = Turbulence()
         columns = fly(
             vehicle, vehicle, segment.reference(SECONDS), seed=number, air=air
         )
-        found, _ = flights_of(log_of(columns, name), (0, 1, 2, 3))
-        flights += found
-    case = Case("segments", tuple(flights), described)
+        parts, _ = flights_of(log_of(columns, name), (0, 1, 2, 3))
+        flights += parts
+    case = Case("segments", tuple(flights), file_of_means)
     return gather(case, library()).motion.replay
 
 
 def _distances(replay: Replay, beliefs: list[Belief]) -> np.ndarray:
     """(F, B, B) nats by which each flight tells a cause from another."""
-    predicted = replay.predict(np.array([b.theta for b in beliefs]))
+    predictions = replay.predict(np.array([b.theta for b in beliefs]))
     out = np.zeros((len(replay.flights), len(beliefs), len(beliefs)))
     for j, belief in enumerate(beliefs):
         index = places(belief.effects)
-        slopes = [c[1:] for c in replay.linearised(belief.theta, index)]
+        slopes = [c[1:] for c in replay.linearise(belief.theta, index)]
         columns = [
             np.concatenate([p - p[j][None], s])
-            for p, s in zip(predicted, slopes, strict=True)
+            for p, s in zip(predictions, slopes, strict=True)
         ]
         grams = replay.grams(columns)
         count = len(beliefs)
-        _, _, precision = prior(belief.effects, grown=replay.grown)
+        _, _, precision = prior(belief.effects, size_factors=replay.size_factors)
         for flight, gram in enumerate(grams):
             inside = gram[count:, count:] + precision
-            taken = np.linalg.solve(inside, gram[count:, :count])
-            left = np.diag(gram[:count, :count] - gram[:count, count:] @ taken)
-            out[flight, :, j] = 0.5 * np.maximum(left, 0.0)
+            projection = np.linalg.solve(inside, gram[count:, :count])
+            distances = np.diag(
+                gram[:count, :count] - gram[:count, count:] @ projection
+            )
+            out[flight, :, j] = 0.5 * np.maximum(distances, 0.0)
     return of_pairs(out, beliefs)
 
 
