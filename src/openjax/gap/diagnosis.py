@@ -106,7 +106,7 @@ def conclude(evidence: Evidence) -> Report:
 
 
 def worth_naming(shares_of: Callable[[list[str]], Split], effects: list[str]) -> Split:
-    """The shares of those of the effects `effects` that have one, and that make held-out
+    """The shares of those of the `effects` that have one, and that make held-out
     predictions no worse; `shares_of` splits the gap. Of the motion's effects it must be
     larger than errors of the others' forms.
     """

@@ -47,11 +47,11 @@ CALIBRATION = Path(__file__).with_name("residual.json")
 
 @dataclass(frozen=True)
 class Check:
-    """`measures` {name: value} and the one that stands out most, `finding`; its `p_value`
-    among cases without an unknown cause; `excess` (9,): share of each motion
+    """`measures` {name: value} and the one that stands out most, `finding`; its
+    `p_value` among cases without an unknown cause; `excess` (9,): share of each motion
     channel's squared error beyond what such cases leave, where the check rejects;
-    `mostly_unknown`: whether it does, and effects of the motion explain little of what it
-    finds.
+    `mostly_unknown`: whether it does, and effects of the motion explain little of what
+    it finds.
     """
 
     measures: dict[str, float]

@@ -80,8 +80,8 @@ class Hypothesis:
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """A `hypothesis` and the `table` around it; `effects` that it names, strongest first;
-    `weights` {effects: share of the draws in which that set is chosen};
+    """A `hypothesis` and the `table` around it; `effects` that it names, strongest
+    first; `weights` {effects: share of the draws in which that set is chosen};
     `equivalent` {effect: others that would do as well in its place}.
     """
 
@@ -206,7 +206,8 @@ def log_odds(effects) -> float:
 def practical(fit: SetFit, torque_response: Measured) -> bool:
     """Whether every effect of a set is clearly of a size that matters in practice (a
     region of practical equivalence on the parameters, Kruschke 2018), by the replay or
-    by the `torque_response` that was measured: {(effect, parameter): (value, deviation)}. What a card wants confirmed by the latter must be.
+    by the `torque_response` that was measured: {(effect, parameter): (value,
+    deviation)}. What a card wants confirmed by the latter must be.
     """
     covariance = fit.covariance + between_flights(fit.covariance, fit.grams[:, 1:, 0])
     place = {i: k for k, i in enumerate(fit.index.tolist())}

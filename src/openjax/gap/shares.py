@@ -94,7 +94,7 @@ class Split:
 def split(
     evidence: Evidence, selection: Selection, excess: Float[np.ndarray, "9"], effects
 ) -> Split:
-    """Shares of the `effects` effects, of all paths. `excess` (9,): share of each
+    """Shares of the `effects`, of all paths. `excess` (9,): share of each
     motion channel's squared error that the residual check finds in excess of noise.
     """
     # (sets, blocks, channels)

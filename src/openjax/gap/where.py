@@ -46,8 +46,8 @@ class Place:
 
 
 def locate(evidence: Evidence, fit: SetFit, effects=()) -> list[Place]:
-    """The table, largest share first. `fit` is the physics part of the verdict, `effects`
-    all named effects.
+    """The table, largest share first. `fit` is the physics part of the verdict,
+    `effects` all named effects.
     """
     names = [e for e in effects if e in fit.effects]
     masks = [
@@ -77,7 +77,7 @@ def before_and_after(
 ) -> tuple[
     list[Float[np.ndarray, "_ channels"]], list[Float[np.ndarray, "_ channels"]]
 ]:
-    """Residuals (T, 9) of each track without the `effects` effects of a fit, all else as
+    """Residuals (T, 9) of each track without some `effects` of a fit, all else as
     with them, and with them: the same before as the gap's.
     """
     residuals = residuals_of(fit)

@@ -29,8 +29,9 @@ START = 20  # rows at the start of a track that the noise model needs
 @dataclass(frozen=True, eq=False)
 class Delay:
     """`value`, `error`: how late the pose is, s, and the standard error; `nats`: log
-    Bayes factor against no delay; `nominal_residual` and `residual` [(T, 3)]: attitude less
-    integrated gyroscope, rad, without the delay, all else as fitted, and after the fit.
+    Bayes factor against no delay; `nominal_residual` and `residual` [(T, 3)]: attitude
+    less integrated gyroscope, rad, without the delay, all else as fitted, and after the
+    fit.
     """
 
     value: float

@@ -155,8 +155,8 @@ def ablate(
     table: Table, coefficients: np.ndarray, drop=(), off: np.ndarray | None = None
 ) -> np.ndarray:
     """Squared errors (B, K) of a table's set with `coefficients` (B, C) of
-    `fit_to_others`, without the effects `drop` and the nuisances `off` (N,); everything else stays as
-    fitted.
+    `fit_to_others`, without the effects `drop` and the nuisances `off` (N,); everything
+    else stays as fitted.
     """
     coefficients = coefficients.copy()
     remaining = [e for e in table.fit.effects if e not in drop]
