@@ -22,7 +22,7 @@ from experiments.flying.vehicles import vehicles
 from experiments.table import RESULTS, Page, Table, page_parser, publish
 from openjax.command_line import run_command
 from openjax.evaluation.episodes import wilson
-from openjax.evaluation.evaluator import layout_slots, layout_tasks, stacked
+from openjax.evaluation.evaluator import layout_slots, layout_tasks, stack
 from openjax.evaluation.judges.duel import Duel
 from openjax.evaluation.judges.scripted import fly_scripted
 from openjax.evaluation.judges.tasks import judging_tasks
@@ -91,7 +91,7 @@ def fly(name: str, options) -> list[dict]:
     """A record for each vehicle, evader and kind of task."""
     loaded = load_policy(name)
     settings = game_of(loaded, options.game, options.physics)
-    tasks, part = stacked(kinds_of(settings, options.episodes, options.uniform))
+    tasks, part = stack(kinds_of(settings, options.episodes, options.uniform))
     run = program(settings, loaded.in_game(Pursuit(settings)).policy)
     records = []
     for vehicle in options.vehicles:

@@ -15,7 +15,7 @@ import jax
 import numpy as np
 
 from openjax.errors import UserError
-from openjax.evaluation.evaluator import layout_slots, layout_tasks, stacked
+from openjax.evaluation.evaluator import layout_slots, layout_tasks, stack
 from openjax.evaluation.judges.receding_horizon import RecedingHorizon
 from openjax.evaluation.judges.tasks import judging_tasks
 from openjax.files import write_json
@@ -225,6 +225,4 @@ def judged_game(options: argparse.Namespace) -> JudgedGame:
                 f"--kinds {unknown[0]}: these are known: {', '.join(kinds)}"
             )
         kinds = {kind: kinds[kind] for kind in options.kinds}
-    return JudgedGame(
-        environment, loaded.in_game(environment), *stacked(kinds), options
-    )
+    return JudgedGame(environment, loaded.in_game(environment), *stack(kinds), options)

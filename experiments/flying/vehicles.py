@@ -18,7 +18,7 @@ import numpy as np
 from experiments.table import Column, Page, Table, cell, page_parser, publish
 from openjax.command_line import run_command
 from openjax.evaluation.episodes import make_evaluate, summarise
-from openjax.evaluation.evaluator import layout_slots, layout_tasks, stacked
+from openjax.evaluation.evaluator import layout_slots, layout_tasks, stack
 from openjax.evaluation.validation import uniform_tasks
 from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings, RewardSettings
 from openjax.store.policies import load_policy
@@ -101,7 +101,7 @@ def fly(name: str, options) -> dict[str, dict[str, dict]]:
     kinds = {"uniform": uniform_tasks(drawn_from, options.number, game.max_pillars)}
     if options.layouts:
         kinds |= layout_tasks(game, SCENARIOS.values(), options.layouts)
-    (tasks, part), (run, records) = stacked(kinds), (program(game, policy.policy), {})
+    (tasks, part), (run, records) = stack(kinds), (program(game, policy.policy), {})
     for kind, bounds in vehicles(game.airframe).items():
         if kind in options.vehicles:
             flown = jax.tree.map(

@@ -24,7 +24,7 @@ from openjax.background import compile_ahead
 from openjax.baselines import METHODS as HEURISTICS
 from openjax.command_line import run_command
 from openjax.evaluation.episodes import summarise
-from openjax.evaluation.evaluator import layout_slots, repeat_task, stacked
+from openjax.evaluation.evaluator import layout_slots, repeat_task, stack
 from openjax.evaluation.result_tables import record_of
 from openjax.files import read_json, to_plain, write_text
 from openjax.pursuit import (
@@ -93,7 +93,7 @@ def call_of(name: str, seed: int, limit: str, physics: str, episodes: int) -> tu
         policy.policy,
         sweeps.RADII,
         policy.parameters,
-        stacked(tasks_of(game, cells))[0],
+        stack(tasks_of(game, cells))[0],
         jnp.concatenate(
             [jnp.full(number, speed, jnp.float32) for _, speed, number in cells]
         ),
@@ -108,7 +108,7 @@ def of_policy(name: str, seed: int, limit: str, physics: str, episodes: int) -> 
     call = call_of(name, seed, limit, physics, episodes)
     game = call[0].settings
     cells = cells_of(game.evader_speed, episodes)
-    _, part = stacked(tasks_of(game, cells))
+    _, part = stack(tasks_of(game, cells))
     parts = list(part(jax.tree.map(np.asarray, fly(*call))).values())
     layouts = {}
     for layout, part in zip(LAYOUTS, parts, strict=False):

@@ -196,8 +196,8 @@ def one_line(error: BaseException) -> str | None:
     text = " ".join(str(error).split())
     if isinstance(error, OSError):
         reason = error.strerror or text or type(error).__name__
-        where = f"{error.filename}: " if error.filename is not None else ""
-        text = f"{where}{reason[:1].lower()}{reason[1:]}"
+        place = f"{error.filename}: " if error.filename is not None else ""
+        text = f"{place}{reason[:1].lower()}{reason[1:]}"
     elif isinstance(error, MemoryError):
         text = "not enough memory"
     elif _is_out_of_device_memory(error):

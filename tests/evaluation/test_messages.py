@@ -31,7 +31,7 @@ def flights(messages):
         observation, state, *_ = game.step(
             None, state, 0.5 * jax.random.normal(key, (3, 4))
         )
-        beliefs = hearsay.after(beliefs, state, key)
+        beliefs = hearsay.update(beliefs, state, key)
         views = hearsay.observations(beliefs, state)
         return (state, beliefs), (state, observation, views)
 

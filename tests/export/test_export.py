@@ -13,7 +13,7 @@ import pytest
 
 from openjax.commands.export import EACH, Arguments, export, observations
 from openjax.errors import UserError
-from openjax.export.c_compiled import compiled
+from openjax.export.c_compiled import compile_c
 from openjax.export.c_program import c_program
 from openjax.learning import TrainSettings
 from openjax.policy import NetworkSettings, Policy, PredictorSettings
@@ -117,7 +117,7 @@ def test_the_c_program_is_one_vehicles_policy_for_any_observation(policy_file, f
         "A policy",
     )
     assert np.ptp(expected, axis=0).min() > 0.01  # a thousand times what may differ
-    np.testing.assert_allclose(compiled(program, "small")(own), expected, atol=1e-5)
+    np.testing.assert_allclose(compile_c(program, "small")(own), expected, atol=1e-5)
     assert "privileged" not in program.inputs
     assert program.workspace < 2000 and program.numbers < sum(
         leaf.size for leaf in jax.tree.leaves(policy.parameters)
@@ -163,7 +163,7 @@ def test_operations_become_their_counterparts_in_onnx():
 
 @NEEDS_CC
 def test_operations_become_their_counterparts_in_c():
-    found = compiled(
+    found = compile_c(
         c_program(everything, KINDS, "y", "everything", "A test"), "everything"
     )
     np.testing.assert_allclose(

@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from openjax.commands.fly import Arguments, checked, fly
+from openjax.commands.fly import Arguments, check, fly
 from openjax.errors import UserError
 from openjax.flying.endpoints import endpoint_of, sole_command
 
@@ -35,7 +35,7 @@ FIRST = "udp://127.0.0.1:19850"
 def test_a_vehicle_is_the_same_however_it_is_written(uri, same):
     assert endpoint_of(uri).name == endpoint_of(same).name
     with pytest.raises(UserError, match="twice"):
-        checked(Arguments(uri=(same, "udp://10.0.0.1:1"), evader_uri=uri))
+        check(Arguments(uri=(same, "udp://10.0.0.1:1"), evader_uri=uri))
 
 
 @pytest.mark.parametrize(

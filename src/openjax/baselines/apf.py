@@ -98,10 +98,10 @@ def apf(craft: Craft, parameters: ApfParameters, around: Surroundings) -> jax.Ar
     # without the force between pursuers: it alone never holds anybody in a local
     # minimum
     towards = field.attraction + field.repulsion
-    blocked = jnp.sum(towards * field.attraction, axis=-1, keepdims=True) < 0.0
+    is_blocked = jnp.sum(towards * field.attraction, axis=-1, keepdims=True) < 0.0
     along = wall_following(field, around.velocity)
     total = towards + field.individual
-    return craft.speed * jnp.where(blocked, along, unit(total))
+    return craft.speed * jnp.where(is_blocked, along, unit(total))
 
 
 def wall_following(field: Forces, velocity: jax.Array) -> jax.Array:
@@ -114,8 +114,8 @@ def wall_following(field: Forces, velocity: jax.Array) -> jax.Array:
     away = unit(field.repulsion[..., :2])
     tangent = jnp.stack([-away[..., 1], away[..., 0]], axis=-1)
     # 1 is the size of the attraction
-    pushed = length(field.individual) > 1.0
-    heading = jnp.where(pushed, field.individual, unit(velocity))[..., :2]
+    is_pushed = length(field.individual) > 1.0
+    heading = jnp.where(is_pushed, field.individual, unit(velocity))[..., :2]
     side = jnp.where(
         jnp.sum(tangent * heading, axis=-1, keepdims=True) >= 0.0, 1.0, -1.0
     )

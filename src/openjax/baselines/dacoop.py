@@ -46,10 +46,12 @@ class DacoopPolicy(CraftPolicy):
         its mean, stands for.
         """
         return velocity_action(
-            self.craft, observation, self.desired(sample, observation)
+            self.craft, observation, self.desired_velocity(sample, observation)
         )
 
-    def desired(self, sample: jax.Array, observation: Observation) -> jax.Array:
+    def desired_velocity(
+        self, sample: jax.Array, observation: Observation
+    ) -> jax.Array:
         """Velocities (..., N, 3), m/s, world, that a sample stands for."""
         parameters = field_parameters(super().action(sample, observation))
         return apf(self.craft, parameters, surroundings(self.craft, observation))
@@ -61,12 +63,12 @@ def field_parameters(output: jax.Array) -> ApfParameters:
     for i, name in enumerate(LEARNED):
         low, high = ranges(ApfParameters)[name]
         outputs[name] = low * (high / low) ** (0.5 * (output[..., i] + 1.0))
-    fixed = {
+    constants = {
         name: getattr(START, name)
         for name in ranges(ApfParameters)
         if name not in LEARNED
     }
-    return ApfParameters(**fixed, **outputs)
+    return ApfParameters(**constants, **outputs)
 
 
 def _place(name, value):

@@ -51,7 +51,7 @@ class WithoutNetwork:
         """It predicts nothing."""
 
     def distribution(
-        self, actor: Any, observation: Observation, predicted: None
+        self, actor: Any, observation: Observation, prediction: None
     ) -> tuple[jax.Array, jax.Array]:
         """Action (..., N, 4) in -1..1 and log standard deviation (4,): none, as nothing
         explores.
@@ -93,10 +93,10 @@ class Heuristic(WithoutNetwork):
 
     def mean(self, actor: Any, observation: Observation) -> jax.Array:
         """Action (..., N, 4) in -1..1."""
-        desired = METHODS[self.name].rule(
+        velocity = METHODS[self.name].rule(
             self.craft, actor, surroundings(self.craft, observation)
         )
-        return velocity_action(self.craft, observation, desired)
+        return velocity_action(self.craft, observation, velocity)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -57,7 +57,7 @@ def janosov(
     # no farther ahead than the prey could come here itself
     coming = length(to_target) / jnp.maximum(length(around.target_velocity), 1e-3)
     ahead = jnp.minimum(parameters.prediction_time, coming)
-    predicted = around.target + ahead * around.target_velocity
+    prediction = around.target + ahead * around.target_velocity
     relative = around.velocity - around.target_velocity
     # a prey that isn't seen has no velocity to be damped against
     is_seen = jnp.any(around.target_velocity != 0.0, axis=-1, keepdims=True)
@@ -65,7 +65,7 @@ def janosov(
         is_seen, relative / jnp.maximum(length(to_target) ** 2, 1e-4), 0.0
     )
     chase = unit(
-        unit(predicted - around.position) - parameters.chase_friction * friction
+        unit(prediction - around.position) - parameters.chase_friction * friction
     )
 
     distance = length(around.from_others)

@@ -44,13 +44,13 @@ class Points:
 
 def game_of_points(**changes) -> Pursuit:
     """A game of points in an arena without pillars, if its tasks have none."""
-    fixed = {
+    defaults = {
         "physics": "stops",
         "speed_limit": "none",
         "min_pillars": 0,
         "max_pillars": 1,
     }
-    settings = PursuitSettings(**(fixed | changes))
+    settings = PursuitSettings(**(defaults | changes))
     return Pursuit(settings, dynamics=Points(settings.max_speed, settings.time_step))
 
 

@@ -101,14 +101,14 @@ def surroundings(craft: Craft, observation: Observation) -> Surroundings:
     The others' velocities are those of the observed history, mean over its length (0.09
     s by default): a pursuer measures no velocity but its own.
     """
-    own = observation.position
+    own_position = observation.position
     velocity = observation.self_state[..., VELOCITY]
-    number = own.shape[-2]
+    number = own_position.shape[-2]
     newest = observation.frames[..., -1, :]
     # what is hidden is shown at HIDDEN exactly, far below any place; .9 allows for
     # rounding
     is_seen = newest[..., 1:2] > 0.9 * HIDDEN
-    per_pursuer = (*own.shape[:-2], number, 3)
+    per_pursuer = (*own_position.shape[:-2], number, 3)
 
     def for_all(vector):
         return jnp.broadcast_to(vector[..., None, :], per_pursuer)
@@ -121,7 +121,7 @@ def surroundings(craft: Craft, observation: Observation) -> Surroundings:
     target_velocity = for_all(jnp.where(is_seen, newest[..., 4:7], 0.0))
 
     normal, distance = _obstacles(craft, observation)
-    position = own + craft.response * velocity
+    position = own_position + craft.response * velocity
     return Surroundings(
         position=position,
         velocity=velocity,

@@ -54,7 +54,7 @@ def check_flyable(name: str, craft: Craft, time_step: float) -> None:
 
 
 def velocity_action(
-    craft: Craft, observation: Observation, desired: jax.Array
+    craft: Craft, observation: Observation, desired_velocity: jax.Array
 ) -> jax.Array:
     """(..., N, 4) action in -1..1 (thrust, body rates) that flies the desired
     velocities (..., N, 3) in m/s, world.
@@ -62,7 +62,7 @@ def velocity_action(
     self_state = observation.self_state
     body_x, body_z = rotation_axes(self_state[..., QUATERNION])
     # in units of the weight
-    thrust = VELOCITY_GAIN / GRAVITY * (desired - self_state[..., VELOCITY])
+    thrust = VELOCITY_GAIN / GRAVITY * (desired_velocity - self_state[..., VELOCITY])
     rise = 1.0 + jnp.clip(thrust[..., 2:], *CLIMB_LIMITS)
     # height before the rest: what a limited tilt can't do is left of the horizontal
     # part

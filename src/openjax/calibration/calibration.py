@@ -137,7 +137,7 @@ def calibrate(case: Case) -> Calibration:
     replay = _without_numbers(evidence.replay)
     fit = fit_set(replay, effects, iterations=ITERATIONS)
     nothing = fit_set(replay, ())
-    explained_shares = _explained(replay, nothing, fit)
+    explained_shares = _explained_shares(replay, nothing, fit)
     # Where gyroscope and attitude share no clock, the rates tell nothing.
     share = explained_shares.get("body rates", (0.0, 0.0))[1]
     quantities = _quantities(evidence, fit, share > LEAST_EXPLAINED)
@@ -213,11 +213,11 @@ def _quantities(
         slope = slopes[name]
         deviation = np.sqrt(np.diag(slope @ posterior @ slope.T))
         prior_deviations = np.sqrt(np.diag(slope @ prior_covariance @ slope.T))
-        determined = bool((deviation < DETERMINED * prior_deviations).all())
-        determined &= rates_fit or name not in TOLD_BY_RATES
-        determined &= not (duty_cycles and name == "thrust_constant")
+        is_determined = bool((deviation < DETERMINED * prior_deviations).all())
+        is_determined &= rates_fit or name not in TOLD_BY_RATES
+        is_determined &= not (duty_cycles and name == "thrust_constant")
         total = np.hypot(deviation, MODEL_ERROR[name])
-        out[name] = _quantity(name, vehicle, value, total, determined)
+        out[name] = _quantity(name, vehicle, value, total, is_determined)
         if name in ("thrust_constant", "inertia") and not file.mass_weighed:
             notes = "; ".join(n for n in (out[name].notes, _ASSUMED_MASS) if n)
             out[name] = dataclasses.replace(out[name], notes=notes)
@@ -240,7 +240,7 @@ def _slopes(fit: SetFit, vehicle, duty_cycles: bool) -> dict[str, np.ndarray]:
 
 
 def _quantity(
-    name: str, vehicle, logs: np.ndarray, deviations: np.ndarray, determined: bool
+    name: str, vehicle, logs: np.ndarray, deviations: np.ndarray, is_determined: bool
 ) -> Quantity:
     nominal = np.atleast_1d(np.asarray(getattr(vehicle, name), float))
     value = nominal.copy()
@@ -262,7 +262,7 @@ def _quantity(
         interval90=tuple(pairs),
         nominal=tuple(nominal.tolist()),
         unit=CALIBRATED_UNITS[name],
-        determined=determined,
+        determined=is_determined,
         notes=notes.get(name, ""),
     )
 
@@ -287,14 +287,16 @@ def _cannot_tell(
     if share <= LEAST_EXPLAINED:
         out.append(_NOT_EXPLAINED.format(share=max(share, 0.0)))
         untold += TOLD_BY_RATES
-    hardly = [n for n in _ADVICE if n not in untold and not quantities[n].determined]
+    unexcited = [n for n in _ADVICE if n not in untold and not quantities[n].determined]
     return out + [
         f"{n.replace('_', ' ')}: these flights hardly excite it; {_ADVICE[n]}"
-        for n in hardly
+        for n in unexcited
     ]
 
 
-def _explained(replay, nothing: SetFit, fit: SetFit) -> dict[str, tuple[float, float]]:
+def _explained_shares(
+    replay, nothing: SetFit, fit: SetFit
+) -> dict[str, tuple[float, float]]:
     """Per kind of channel the share of its changes over HORIZON that the nominal
     vehicle explains, and the fitted one.
     """

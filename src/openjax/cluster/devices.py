@@ -62,17 +62,19 @@ def check_memory(settings: TrainSettings, number: int) -> None:
     """
     game = settings.environment
     tasks = 3 * game.num_pursuers + 3 + 3 * game.max_pillars
-    observed = game.self_size + game.privileged_size + 5 * game.observed_pillars
+    observation_size = game.self_size + game.privileged_size + 5 * game.observed_pillars
     history = game.history_length * game.history_spacing * game.frame_size
-    per_world = tasks + history + settings.rollout_length * game.num_pursuers * observed
+    per_world = (
+        tasks + history + settings.rollout_length * game.num_pursuers * observation_size
+    )
     shared_out = settings.num_envs * per_world / number
     validation = 2 * settings.validation_episodes * (tasks + history)
     # four bytes a number; the archive and the validation are the same on each device
-    needed = 4 * (shared_out + settings.generator.capacity * tasks + validation)
-    if needed > (memory := _memory()):
+    memory_needed = 4 * (shared_out + settings.generator.capacity * tasks + validation)
+    if memory_needed > (memory := _memory()):
         raise UserError(
             f"{settings.num_envs} worlds of {settings.rollout_length} steps need at least "
-            f"{needed / 2**30:.0f} GiB on each of {number} devices, which has "
+            f"{memory_needed / 2**30:.0f} GiB on each of {number} devices, which has "
             f"{memory / 2**30:.0f}; fewer --num_envs need less"
         )
 

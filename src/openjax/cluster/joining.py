@@ -12,7 +12,7 @@ import threading
 import time
 from collections.abc import Iterator
 
-from openjax.cluster.processes import Connection, Processes, encoded
+from openjax.cluster.processes import Connection, Processes, encode
 from openjax.errors import UserError
 
 JOIN = 300.0
@@ -56,7 +56,7 @@ def find_membership(
         return None
     detection = _BY_HAND
     if None in place:
-        detection, place = _detected(place)
+        detection, place = _detect(place)
     if None in place:
         if not by_hand:
             return None
@@ -82,7 +82,7 @@ def find_membership(
     return Membership(address, number, index, detection) if number > 1 else None
 
 
-def _detected(place):
+def _detect(place):
     """Who tells what is missing of address, number and id, and all three, as
     `jax.distributed.initialize` itself would find them.
 
@@ -105,7 +105,7 @@ def _detected(place):
 
 
 @contextlib.contextmanager
-def joined(membership: Membership | None) -> Iterator[Processes]:
+def join(membership: Membership | None) -> Iterator[Processes]:
     """Join the job, before JAX touches a device; leave it together with the others, or
     tell them what went wrong.
 
@@ -115,7 +115,7 @@ def joined(membership: Membership | None) -> Iterator[Processes]:
     if membership is None:
         yield Processes()
         return
-    with _connected(membership) as (connections, address):
+    with _connect(membership) as (connections, address):
         processes = Processes(
             membership.num_processes, membership.process_id, connections
         )
@@ -167,7 +167,7 @@ def _one_line(error):
 
 
 @contextlib.contextmanager
-def _connected(membership):
+def _connect(membership):
     """Connections by process (to all others on process 0, to process 0 elsewhere), and
     where JAX is to look for its coordinator: at the port after process 0's own.
     """
@@ -246,7 +246,7 @@ def _call(host, port, membership):
         reason = "it went away, or counts another number of processes"
         try:
             connection = socket.create_connection((host, port), timeout=10.0)
-            connection.sendall(encoded({**place, "host": socket.gethostname()}))
+            connection.sendall(encode({**place, "host": socket.gethostname()}))
             connection.settimeout(max(deadline - time.monotonic(), 1.0))
             reader = connection.makefile("rb")
             if welcome := reader.readline(LINE):
@@ -286,5 +286,5 @@ def _accept(server, number):
         connection.close()
     # only now: the welcome tells each that all have come
     for other in others.values():
-        other.socket.sendall(encoded({"host": socket.gethostname()}))
+        other.socket.sendall(encode({"host": socket.gethostname()}))
     return others

@@ -173,7 +173,7 @@ class _Link:
     def send(self, message: dict) -> None:
         # what is wrong, the reader sees
         with contextlib.suppress(OSError), self._sending:
-            self._socket.sendall(encoded(message))
+            self._socket.sendall(encode(message))
 
     def close(self, seconds: float) -> None:
         """No more from here; wait until the other side closes too."""
@@ -183,7 +183,7 @@ class _Link:
 
     def _read(self):
         # a thread that reads as long as the connection lives; how it ends says why
-        why = "its connection closed"
+        reason = "its connection closed"
         leaves = False
         try:
             for line in self._reader:
@@ -191,16 +191,16 @@ class _Link:
                 leaves = leaves or "leaves" in message
                 self._job.receive(self._other, message)
         except TimeoutError:
-            why = f"no sign of life for {SILENCE:.0f} s"
+            reason = f"no sign of life for {SILENCE:.0f} s"
         except OSError as error:
-            why = f"its connection broke ({error.strerror or error})"
+            reason = f"its connection broke ({error.strerror or error})"
         except ValueError:
-            why = "it sent half a message"
+            reason = "it sent half a message"
         self._closed.set()
         if not leaves:
             job = self._job
             who = f"process {self._other} of {job.number} (on {self._host})"
-            error = f"{who} was lost: {why}; {job.advice}"
+            error = f"{who} was lost: {reason}; {job.advice}"
             job.end(self._other, {"error": error, "status": 1, "after": 0.0})
 
     def _beat(self):
@@ -216,6 +216,6 @@ def _exit(status, error):
     os._exit(status)
 
 
-def encoded(message: dict) -> bytes:
+def encode(message: dict) -> bytes:
     """A message as it goes over a connection."""
     return (json.dumps(message) + "\n").encode()

@@ -148,5 +148,5 @@ def _line(row):
         else f"{speed:,.0f} env steps/s, {1e3 * row['seconds']:,.1f} ms"
     )
     needs = "" if memory is None else f", {memory / 1e6:,.0f} MB"
-    compiled = f"compiled in {row['compile_seconds']:.1f} s{needs}"
-    return f"{row['part']:17} {row['num_envs']:>9,} environments: {words} ({compiled})"
+    note = f"compiled in {row['compile_seconds']:.1f} s{needs}"
+    return f"{row['part']:17} {row['num_envs']:>9,} environments: {words} ({note})"

@@ -70,10 +70,10 @@ def run(arguments: Arguments, console: Console):
             f"{arguments.case}: these flights determine none of the vehicle's constants; nothing "
             "is written"
         )
-    calibrated = dataclasses.replace(
+    vehicle_file = dataclasses.replace(
         load_vehicle_file(arguments.case), calibrated=result.calibrated()
     )
-    save_vehicle_file(out, calibrated)
+    save_vehicle_file(out, vehicle_file)
     console.print(f"{time.perf_counter() - start:.1f} s; written to [bold]{out}[/]")
     return result
 
@@ -90,22 +90,22 @@ def _print(result, console: Console) -> None:
                 label += f" {('xx', 'yy', 'zz')[i]}"
             # in yaw only the torque constant over the inertia shows: this is taken as
             # nominal
-            assumed = name == "inertia" and i == 2
+            is_assumption = name == "inertia" and i == 2
             low, high = quantity.interval90[i]
             remark = "" if quantity.determined else "not determined: nominal kept"
-            if assumed:
+            if is_assumption:
                 remark = "assumed"
             table.add_row(
                 f"{label} [dim]{quantity.unit}[/]",
                 f"{value:.4g}",
-                "" if assumed else f"{low:.4g} … {high:.4g}",
+                "" if is_assumption else f"{low:.4g} … {high:.4g}",
                 f"{value / quantity.nominal[i]:.3f}",
                 remark,
             )
     console.print(table)
-    for channel, (nominal, calibrated) in result.explained.items():
+    for channel, (nominal, remaining) in result.explained.items():
         nominal_share = f"{nominal:.1%}" if nominal > 0 else "none"
-        fitted_share = f"{max(calibrated, 0.0):.1%}"
+        fitted_share = f"{max(remaining, 0.0):.1%}"
         console.print(
             f"{channel}: the fitted vehicle explains {fitted_share} of what changed, the given "
             f"{nominal_share}"

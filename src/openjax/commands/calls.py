@@ -64,7 +64,7 @@ def train(
     Raises:
       UserError: settings or files that can't be used, or a run that ended by a NaN.
     """
-    resumed = None if resume is None else open_run(Path(resume)).read_settings()
+    saved_settings = None if resume is None else open_run(Path(resume)).read_settings()
     if resume is None and out is None:
         out = Path("runs") / time.strftime("%Y%m%d-%H%M%S")
     # by the command's own options, so that both are checked by the same code
@@ -80,14 +80,14 @@ def train(
         overwrite=overwrite,
         # a caller may have changed functions since they were loaded
         traced_programs=False,
-        settings=settings or resumed or preset(default_preset()),
+        settings=settings or saved_settings or preset(default_preset()),
     )
-    if resumed is not None:
-        check_resumed(command, resumed)
-    return _trained(command, OwnParts(environment, policy, learners))
+    if saved_settings is not None:
+        check_resumed(command, saved_settings)
+    return _train(command, OwnParts(environment, policy, learners))
 
 
-def _trained(command, parts):
+def _train(command, parts):
     """The policy of a run, as `train` gives it."""
     with quiet_compiler():
         status = start(

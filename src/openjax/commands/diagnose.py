@@ -85,7 +85,7 @@ def run(options: Options) -> int:
     # a misspelt effect is an error of all cases, and said before the first
     library(options.without)
     predictions = {}
-    failed = 0
+    failures = 0
     for i, (folder, name) in enumerate(zip(options.cases, names, strict=True)):
         try:
             # shows how long all that are still to come will take
@@ -97,12 +97,12 @@ def run(options: Options) -> int:
                     options, folder, name, partial(steps.begin, name)
                 )
         except UserError as error:
-            failed += 1
+            failures += 1
             print(f"error: {one_line(error)}", file=sys.stderr)
         except (
             Exception
         ) as error:  # a fault of the program in one case must not cost the others
-            failed += 1
+            failures += 1
             print(f"error: {_unforeseen(name, error)}", file=sys.stderr)
         else:
             predictions[name] = prediction
@@ -113,7 +113,7 @@ def run(options: Options) -> int:
             )
     if options.predictions is not None and predictions:
         write_json(options.predictions, predictions)
-    return 2 if failed == len(names) else 0
+    return 2 if failures == len(names) else 0
 
 
 def _checked_names(options: Options) -> list[str]:
@@ -179,9 +179,9 @@ def _diagnosis(
 def _unforeseen(name: str, error: Exception) -> str:
     """One line on a fault of the program: the case, what was raised, and where."""
     place = traceback.extract_tb(error.__traceback__)[-1]
-    where = f"{Path(place.filename).name}:{place.lineno}"
+    line = f"{Path(place.filename).name}:{place.lineno}"
     text = " ".join(str(error).split())
     return (
-        f"{name}: {type(error).__name__} in {where} ({text}): a fault of the program, please "
+        f"{name}: {type(error).__name__} in {line} ({text}): a fault of the program, please "
         "report it"
     )

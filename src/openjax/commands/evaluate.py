@@ -145,10 +145,12 @@ def prepare(command: EvaluateCommand, arguments: Sequence[str]) -> list[tuple]:
     """
     check_output(command.json, "--json")
     policies = []
-    typed = command.environment
+    environment = command.environment
     if command.num_pursuers is not None:
-        typed = dataclasses.replace(typed, num_pursuers=command.num_pursuers)
-    for policy in command.start(typed):
+        environment = dataclasses.replace(
+            environment, num_pursuers=command.num_pursuers
+        )
+    for policy in command.start(environment):
         default = dataclasses.replace(
             EvaluateCommand(), environment=policy.settings.environment
         )
@@ -190,20 +192,20 @@ def fly_scenarios(
         # not those by which runs choose their checkpoints
         tasks["uniform"] = uniform_tasks(settings, command.episodes, slots, JUDGE_KEY)
     kind = (game.settings, policy.policy, command.opponent, command.messages)
-    compiled = kind in evaluators
-    if not compiled:
+    is_compiled = kind in evaluators
+    if not is_compiled:
         batch = min(command.episodes, LARGEST_BATCH)
         evaluators[kind] = Evaluator(game, policy.policy, batch, command.messages)
     # seconds of an episode on a laptop, about
-    expected = dict.fromkeys(tasks, 0.02 * command.episodes)
+    durations = dict.fromkeys(tasks, 0.02 * command.episodes)
     first = next(iter(tasks))
-    if not compiled:
-        expected[first] += COMPILING
-    with Steps(f"flying {policy.source}", expected, output_console()) as steps:
+    if not is_compiled:
+        durations[first] += COMPILING
+    with Steps(f"flying {policy.source}", durations, output_console()) as steps:
 
         def tell(layout):
             steps.begin(
-                layout, "compiled first" if not compiled and layout == first else ""
+                layout, "compiled first" if not is_compiled and layout == first else ""
             )
 
         episodes = evaluators[kind].fly(
@@ -244,11 +246,13 @@ def _game(command, policy):
             "each pursuer by what it knows"
         )
     number = settings.num_pursuers
-    trained = number if policy.any_number else policy.settings.environment.num_pursuers
+    team_size = (
+        number if policy.any_number else policy.settings.environment.num_pursuers
+    )
     layouts = []
     if command.scenario == "all":
         layouts = [
-            layout for layout in SCENARIOS.values() if len(layout.pursuers) == trained
+            layout for layout in SCENARIOS.values() if len(layout.pursuers) == team_size
         ]
     elif command.scenario != "uniform":
         layouts = [find_scenario(command.scenario, settings)]
@@ -259,7 +263,7 @@ def _game(command, policy):
             "--scenario uniform flies any number"
         )
     # a number that nobody typed is the policy's own, which a layout goes before
-    if number not in (trained, in_layout):
+    if number not in (team_size, in_layout):
         raise UserError(
             f"--environment.num_pursuers {number}: layout {layouts[0].name} has {in_layout} "
             "pursuers"
@@ -315,5 +319,5 @@ def _show(command, results):
             source: rows if command.scenario == "all" else rows[0]
             for _, source, rows in results
         }
-        only = next(iter(by_policy.values()))
-        write_json(command.json, only if len(results) == 1 else by_policy)
+        results_of_one = next(iter(by_policy.values()))
+        write_json(command.json, results_of_one if len(results) == 1 else by_policy)

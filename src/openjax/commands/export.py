@@ -94,10 +94,10 @@ def observations(policy, number: int, seed: int) -> dict:
 
         return jax.lax.scan(step, (observation, state), jax.random.split(key, steps))[1]
 
-    played = play(observation, state, jax.random.key(seed + 1))
+    sample = play(observation, state, jax.random.key(seed + 1))
     fields = {}
-    for field in dataclasses.fields(played):
-        array = getattr(played, field.name)
+    for field in dataclasses.fields(sample):
+        array = getattr(sample, field.name)
         if array is not None:
             # steps and worlds in one axis
             fields[field.name] = np.asarray(array).reshape(-1, *array.shape[2:])
@@ -119,7 +119,7 @@ def export(
     policy = load_policy(arguments.policy)
     playing, comparing = STEPS
     tell(playing)
-    samples, expected = _samples(policy, arguments)
+    samples, reference_actions = _samples(policy, arguments)
     inputs = {
         name: jax.ShapeDtypeStruct(array.shape[1:], array.dtype)
         for name, array in samples.items()
@@ -136,9 +136,9 @@ def export(
         "format": arguments.format,
         "file": NAMES[arguments.format],
         "bytes": len(files[NAMES[arguments.format]]),
-        "observations": len(expected),
-        "largest_difference": _difference(actions, expected, policy.source),
-        "output": {"action": [int(n) for n in expected.shape[1:]]},
+        "observations": len(reference_actions),
+        "largest_difference": _difference(actions, reference_actions, policy.source),
+        "output": {"action": [int(n) for n in reference_actions.shape[1:]]},
         **extra,
     }
     files[f"{arguments.format}.json"] = (json.dumps(report, indent=1) + "\n").encode()
@@ -164,13 +164,13 @@ def _samples(policy, arguments):
     return samples, actions
 
 
-def _difference(actions, expected, source):
+def _difference(actions, reference_actions, source):
     """The largest of an action; None where nothing was compared. Raises UserError for
     one too large.
     """
     if actions is None:
         return None
-    difference = float(abs(actions - expected).max())
+    difference = float(abs(actions - reference_actions).max())
     if not difference <= TOLERANCE:  # nor where it is no number
         raise UserError(
             f"the exported policy differs by {difference:.2g} from {source}: nothing was written"
@@ -178,7 +178,7 @@ def _difference(actions, expected, source):
     return difference
 
 
-def _described(inputs) -> dict:
+def _describe(inputs) -> dict:
     return {
         name: {"shape": list(kind.shape), "type": str(kind.dtype)}
         for name, kind in inputs.items()
@@ -211,7 +211,7 @@ def _onnx(act, inputs, samples, source):
     for i in range(len(samples["frames"])):
         actions += session.run(None, {name: samples[name][i] for name in input_names})
     extra = {
-        "inputs": _described({name: inputs[name] for name in input_names}),
+        "inputs": _describe({name: inputs[name] for name in input_names}),
         "numbers": size(model),
         "nodes": len(model.graph.node),
     }
@@ -223,21 +223,21 @@ def _jax(act, inputs, samples, source):
     import jax
     import numpy as np
 
-    exported = jax.export.export(jax.jit(lambda fields: act(**fields)))(inputs)
-    data = bytes(exported.serialize())
+    program = jax.export.export(jax.jit(lambda fields: act(**fields)))(inputs)
+    data = bytes(program.serialize())
     # compared is what was read back, not what was written
     call = jax.jit(jax.export.deserialize(bytearray(data)).call)
     actions = []
     for i in range(len(samples["frames"])):
         sample = {name: array[i] for name, array in samples.items()}
         actions.append(np.asarray(call(sample)))
-    extra = {"inputs": _described(inputs), "platforms": list(exported.platforms)}
+    extra = {"inputs": _describe(inputs), "platforms": list(program.platforms)}
     return {NAMES["jax"]: data}, np.stack(actions), extra
 
 
 def _c(act, inputs, samples, source):
     """See `_onnx`; nothing is compared where there is no C compiler."""
-    from openjax.export.c_compiled import compiled
+    from openjax.export.c_compiled import compile_c
     from openjax.export.c_program import c_program
 
     name = Path(NAMES["c"]).stem
@@ -245,14 +245,14 @@ def _c(act, inputs, samples, source):
     readable = Path(source).name.encode("ascii", "backslashreplace").decode()
     program = c_program(act, inputs, "action", name, f"The policy {readable}")
     extra = {
-        "inputs": _described(program.inputs),
+        "inputs": _describe(program.inputs),
         "numbers": program.numbers,
         "workspace_floats": program.workspace,
         "multiply_adds": program.multiply_adds,
         "functions": program.functions,
     }
     files = {f"{name}.c": program.source.encode(), f"{name}.h": program.header.encode()}
-    call = compiled(program, name)
+    call = compile_c(program, name)
     if call is None:
         return files, None, extra
     extra["microseconds"] = round(1e6 * call.seconds(), 1)
@@ -266,10 +266,10 @@ def main(arguments: Sequence[str]) -> None:
     with Steps(f"exporting {options.policy}", STEPS, console) as steps:
         report = export(options, steps.begin)
     difference = report["largest_difference"]
-    compared = "compared with nothing, as there is no C compiler here"
+    comparison = "compared with nothing, as there is no C compiler here"
     if difference is not None:
-        compared = f"differs by at most {difference:.1e} on {report['observations']} observations"
+        comparison = f"differs by at most {difference:.1e} on {report['observations']} observations"
     console.print(
-        f"{options.out / report['file']}: {report['bytes'] / 1e6:.2f} MB, {compared}",
+        f"{options.out / report['file']}: {report['bytes'] / 1e6:.2f} MB, {comparison}",
         soft_wrap=True,
     )

@@ -98,39 +98,39 @@ def main(arguments: Sequence[str]) -> None:
     fly(parse(Arguments, Arguments(), arguments, PROGRAM))
 
 
-def fly(arguments: Arguments, prepared: Prepared | None = None) -> None:
+def fly(arguments: Arguments, preparation: Prepared | None = None) -> None:
     """Fly. Raises UserError for what can't be, and where another process had to land
     the vehicles.
 
     Args:
       arguments: the command's.
-      prepared: what `prepare` made of them, where that was done before.
+      preparation: what `prepare` made of them, where that was done before.
     """
-    arguments = checked(arguments)
+    arguments = check(arguments)
     with sole_command(uris_of(arguments)):  # before minutes of compiling
-        _fly(arguments, prepared)
+        _fly(arguments, preparation)
 
 
-def _fly(arguments: Arguments, prepared: Prepared | None) -> None:
+def _fly(arguments: Arguments, preparation: Prepared | None) -> None:
     """Fly vehicles that are nobody else's."""
     console = output_console()
     from openjax.flying.loop import Flight, Plan
     from openjax.flying.session import Session
 
-    if prepared is None:
+    if preparation is None:
         what = "the policy" if arguments.plan is None else "the plan"
         console.print(f"loading {what}, compiling the tick ...")
-    flown = prepared or prepare(arguments)
-    for line in flown.remarks:
+    setup = preparation or prepare(arguments)
+    for line in setup.remarks:
         console.print(line, soft_wrap=True)
-    console.print(f"connecting to {', '.join(flown.session.uris)} ...")
-    with Session(flown.session, flown.state) as session:
+    console.print(f"connecting to {', '.join(setup.session.uris)} ...")
+    with Session(setup.session, setup.state) as session:
         session.check()
         plan = Plan(arguments.episodes, arguments.episode_seconds or math.inf)
         flight = Flight(
             session.links,
-            flown.game,
-            flown.state,
+            setup.game,
+            setup.state,
             plan,
             session.requests,
             session.watched,
@@ -142,7 +142,7 @@ def _fly(arguments: Arguments, prepared: Prepared | None) -> None:
     # before a word is said: the terminal may be gone
     if arguments.out is not None and samples:
         try:
-            _write(arguments.out, flown, flight, samples, session.scheduler)
+            _write(arguments.out, setup, flight, samples, session.scheduler)
         except OSError as error:
             complaint = "; ".join(
                 filter(None, (complaint, f"no log: {one_line(error)}"))
@@ -181,7 +181,7 @@ def prepare(arguments: Arguments) -> Prepared:
 
     real_time.prepare()
     if arguments.plan is not None:
-        return _planned(arguments)
+        return _prepare_plan(arguments)
     name = arguments.policy
     line = ""
     if name is None:
@@ -212,7 +212,7 @@ def prepare(arguments: Arguments) -> Prepared:
     return Prepared(game, state, session, vehicle, about, remarks)
 
 
-def _planned(arguments: Arguments) -> Prepared:
+def _prepare_plan(arguments: Arguments) -> Prepared:
     """A plan in a policy's place."""
     from openjax.flights.plans import read_plan
     from openjax.flights.samples import PERIOD
@@ -292,7 +292,7 @@ def _write(out, preparation, flight, samples, scheduler):
     from openjax.flying.flight_files import write_case
 
     policy = preparation.about["policy"]
-    described = dataclasses.replace(
+    vehicle_file = dataclasses.replace(
         preparation.vehicle,
         path=None,
         log={"source": f"openjax.fly, policy {policy}", "floor_z": 0.0},
@@ -304,7 +304,7 @@ def _write(out, preparation, flight, samples, scheduler):
     }
     with replacing(out) as folder:
         folder.mkdir()
-        write_case(folder, samples, flight.record, described, about)
+        write_case(folder, samples, flight.record, vehicle_file, about)
 
 
 def _check_numbers(arguments, starts, pursuers):
@@ -327,7 +327,7 @@ def uris_of(arguments: Arguments) -> tuple[str, ...]:
     return (*arguments.uri, *evader)
 
 
-def checked(arguments: Arguments) -> Arguments:
+def check(arguments: Arguments) -> Arguments:
     """The arguments, their URIs as `cflib` wants them. Raises UserError."""
     if arguments.plan is not None:
         if arguments.uri == Arguments.uri:  # as many as a policy has pursuers
@@ -344,7 +344,7 @@ def checked(arguments: Arguments) -> Arguments:
     return dataclasses.replace(arguments, uri=tuple(uris[:number]), evader_uri=evader)
 
 
-def _show(console, flight, planned):
+def _show(console, flight, is_plan):
     record = flight.record
     timing = record.timing()
     if not timing["ticks"]:
@@ -355,7 +355,7 @@ def _show(console, flight, planned):
         f"median, {age['p99']:.2f} ms p99; {timing['missed_deadlines']} missed deadlines "
         f"({timing['missed_share']:.2%})"
     )
-    for number, game in enumerate(() if planned else record.episodes):
+    for number, game in enumerate(() if is_plan else record.episodes):
         outcome = (
             f"caught at step {game['capture_step']}"
             if game["capture_step"]

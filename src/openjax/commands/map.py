@@ -42,11 +42,15 @@ def main(arguments: Sequence[str]) -> int:
     from openjax.store.policies import load_policy
 
     policy = load_policy(command.policy)
-    trained = policy.settings.environment
+    game_of_training = policy.settings.environment
     less = ON_CPU if jax.default_backend() == "cpu" else {}
     if not command.messages.perfect:
         less = less | {"best_response": False}  # who learns doesn't know what was heard
-    sizes = {} if trained.team_sizes else {"sizes": (trained.num_pursuers,)}
+    sizes = (
+        {}
+        if game_of_training.team_sizes
+        else {"sizes": (game_of_training.num_pursuers,)}
+    )
     default = dataclasses.replace(MapCommand(), **less, **sizes)
     command = parse(MapCommand, default, arguments, PROGRAM)
     for option in ("out", "json", "page", "evaders_out"):
@@ -54,7 +58,7 @@ def main(arguments: Sequence[str]) -> int:
     if command.out.suffix not in (".png", ".svg", ".pdf"):
         raise UserError(f"--out {command.out}: a picture ends in .png, .svg or .pdf")
     check_evaders(command.evaders)
-    map_game(command, trained)
+    map_game(command, game_of_training)
     console = output_console()
 
     def keep(results):

@@ -55,7 +55,7 @@ def make_plan(arguments: Arguments) -> list[str]:
         segments = list(SEGMENTS)
         sentence = "The standard plan: it shows every effect that one vehicle can show."
     else:
-        sentence, promises, segments = _advised(arguments)
+        sentence, promises, segments = _advise(arguments)
     plan = plan_of(segments)
     with replacing(arguments.out) as folder:
         folder.mkdir()
@@ -86,7 +86,7 @@ def make_plan(arguments: Arguments) -> list[str]:
     ]
 
 
-def _advised(arguments: Arguments) -> tuple[str, list[dict], list[str]]:
+def _advise(arguments: Arguments) -> tuple[str, list[dict], list[str]]:
     """The sentence, the promises of all segments, and those to fly, for a diagnosis."""
     from openjax.gap.planning.beliefs import beliefs_of, read_report, sentence
     from openjax.gap.planning.information import advise

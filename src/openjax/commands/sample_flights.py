@@ -62,7 +62,7 @@ def make_case(arguments: Arguments) -> list[Path]:
     log = {"source": source, "motor_rows": "mean", "floor_z": 0.0}
     # On a scale a vehicle that weighs more would have shown it.
     is_weighed = not any(EFFECTS[name].card.weighed for name in names)
-    described = dataclasses.replace(
+    vehicle_file = dataclasses.replace(
         load_vehicle_file(), mass_weighed=is_weighed, log=log
     )
     decimals = {c: DECIMALS.get(c, _REST) for c in LOG_COLUMNS}
@@ -74,10 +74,10 @@ def make_case(arguments: Arguments) -> list[Path]:
             # the vehicle that flies is the one that is described, but for the effects
             seed = 1000 * arguments.seed + number
             columns = fly(
-                described.vehicle, described.vehicle, reference, seed, effects
+                vehicle_file.vehicle, vehicle_file.vehicle, reference, seed, effects
             )
             write_csv(folder / f"{name}.csv.gz", log_of(columns, name), decimals)
-        save_vehicle_file(folder / "vehicle.toml", described)
+        save_vehicle_file(folder / "vehicle.toml", vehicle_file)
     return sorted(arguments.out.iterdir())
 
 
@@ -94,9 +94,9 @@ def _checked_effects(
             )
     is_unclear = "none" in names and len(names) > 1
     if len(set(names)) < len(names) or not names or is_unclear:
-        typed = " ".join(names) or "nothing"
+        words = " ".join(names) or "nothing"
         raise UserError(
-            f"--effect {typed}: name none alone, or each effect that acts once"
+            f"--effect {words}: name none alone, or each effect that acts once"
         )
     return tuple(name for name in names if name != "none")
 

@@ -22,7 +22,7 @@ def main(arguments: Sequence[str]) -> int:
         print("openjax.train: loading JAX and MuJoCo ...", flush=True)
     import jax
 
-    from openjax.cluster.joining import joined
+    from openjax.cluster.joining import join
     from openjax.platform import make_cores_devices
     from openjax.runs.start import membership, read_command, start
 
@@ -32,7 +32,7 @@ def main(arguments: Sequence[str]) -> int:
     place = membership(arguments)
     if place is None and peek(arguments, "devices") != "all":
         make_cores_devices()
-    with joined(place) as processes:
+    with join(place) as processes:
         return start(read_command(arguments), arguments, start_time, processes)
 
 

@@ -58,7 +58,7 @@ def main(arguments: Sequence[str]) -> int:
     console = output_console()
     if command.flights is not None:
         write_flights(command)
-        console.print(_written(command.mcap))
+        console.print(_written_line(command.mcap))
         return 0
     flights = fly_all(command)
     if command.mcap is not None:
@@ -70,7 +70,7 @@ def main(arguments: Sequence[str]) -> int:
                 f"{Path(policy).name}/{flight.title}", flight
             )
         write_mcap(command.mcap, channels)
-        console.print(_written(command.mcap))
+        console.print(_written_line(command.mcap))
     if command.gif is not None:
         from openjax.show.videos import animate
 
@@ -91,7 +91,7 @@ def main(arguments: Sequence[str]) -> int:
     return 0
 
 
-def _written(path: Path) -> str:
+def _written_line(path: Path) -> str:
     return f"{path}: {path.stat().st_size / 1e3:,.0f} kB, opens in Foxglove"
 
 

@@ -97,7 +97,7 @@ class _Episodes:
         and of the last seen position.
         """
         observation, state, beliefs, errors = carry
-        action, predicted = self._decide(parameters, observation, state, beliefs)
+        action, prediction = self._decide(parameters, observation, state, beliefs)
         last_seen = observation.last_seen
         # what was predicted one step ahead is compared with where the evader is after
         # the step
@@ -105,8 +105,8 @@ class _Episodes:
         observation, state, _, _, _, info = step(key, state, action)
         if self.hearsay is not None:
             keys = jax.random.split(key, action.shape[0])
-            beliefs = jax.vmap(self.hearsay.after)(beliefs, state, keys)
-        guesses = [last_seen if predicted is None else predicted[:, 0], last_seen]
+            beliefs = jax.vmap(self.hearsay.update)(beliefs, state, keys)
+        guesses = [last_seen if prediction is None else prediction[:, 0], last_seen]
         errors = errors + jnp.stack(
             [
                 jnp.linalg.norm(guess - state.evader_position, axis=-1)
@@ -122,7 +122,7 @@ class _Episodes:
                 seen=info.seen,
                 captured=info.captured,
                 crashed=info.crashed,
-                predicted=predicted,
+                predicted=prediction,
             )
         return (observation, state, beliefs, errors), record
 
@@ -135,9 +135,9 @@ class _Episodes:
             views = jax.vmap(self.hearsay.observations)(beliefs, state)
             # (B, N, 1, 4): each view's policy acts for its own pursuer
             return policy.act(parameters, views)[..., 0, :], None
-        predicted = policy.predict(parameters, observation)
-        mean, _ = policy.distribution(parameters.actor, observation, predicted)
-        return policy.action(mean, observation), predicted
+        prediction = policy.predict(parameters, observation)
+        mean, _ = policy.distribution(parameters.actor, observation, prediction)
+        return policy.action(mean, observation), prediction
 
 
 def summarise(evaluation: Evaluation) -> dict[str, float]:

@@ -74,7 +74,7 @@ class Evaluator:
                 evaluation, records = self._fly(parameters, tasks, key)
                 results.append(Flown(self, name, tasks, evaluation, records))
             return results
-        one_stack, part = stacked(kinds)
+        one_stack, part = stack(kinds)
         evaluation, records = self._fly(parameters, one_stack, key)
         parts = part(evaluation)
         first = np.cumsum([0, *numbers])
@@ -205,7 +205,7 @@ def repeat_task(task: Task, number: int) -> Task:
     )
 
 
-def stacked(kinds: Mapping[str, Task]) -> tuple[Task, Callable[[Any], dict[str, Any]]]:
+def stack(kinds: Mapping[str, Task]) -> tuple[Task, Callable[[Any], dict[str, Any]]]:
     """Tasks of several kinds one after the other, and what parts a tree of results (B,
     ...) by their names again.
     """

@@ -47,10 +47,10 @@ class Beliefs:
     # (N, N, 3) m, where each pursuer (second axis) was when it told
     position: jax.Array
     velocity: jax.Array  # (N, N, 3) m/s, at that time
-    told: jax.Array  # (N, N) int32, the step of that time
+    told_step: jax.Array  # (N, N) int32, the step of that time
     evader: jax.Array  # (N, 3) m, by the newest report
     evader_velocity: jax.Array  # (N, 3) m/s
-    reported: jax.Array  # (N,) int32, the step of that report; -1: none yet
+    report_step: jax.Array  # (N,) int32, the step of that report; -1: none yet
     seen: jax.Array  # (N,) bool, whether there was one in this step
     last_seen: jax.Array  # (N, 3) m
     frames: jax.Array  # (N, H, F)
@@ -81,27 +81,28 @@ class Hearsay:
 
         # as if all had said the same since long before
         on_the_way = jax.tree.map(
-            lambda leaf: jnp.broadcast_to(leaf, (self.delay, *leaf.shape)), _sent(state)
+            lambda leaf: jnp.broadcast_to(leaf, (self.delay, *leaf.shape)),
+            _reports(state),
         )
         return Beliefs(
             position=each(state.drones.position),
             velocity=each(state.drones.velocity),
-            told=jnp.broadcast_to(state.step, (number, number)),
+            told_step=jnp.broadcast_to(state.step, (number, number)),
             evader=each(state.evader_position),
             evader_velocity=each(state.evader_velocity),
-            reported=jnp.where(each(state.seen), state.step, -1),
+            report_step=jnp.where(each(state.seen), state.step, -1),
             seen=each(state.seen),
             last_seen=each(state.last_seen),
             frames=each(state.frames),
             on_the_way=on_the_way,
         )
 
-    def after(self, beliefs: Beliefs, state: PursuitState, key: jax.Array) -> Beliefs:
+    def update(self, beliefs: Beliefs, state: PursuitState, key: jax.Array) -> Beliefs:
         """Beliefs after a step that ended with `state`; `key` draws which messages are
         lost.
         """
         number = state.drones.position.shape[0]
-        reports = _sent(state)
+        reports = _reports(state)
         line = jax.tree.map(
             lambda old, new: jnp.concatenate([old, new[None]]),
             beliefs.on_the_way,
@@ -115,18 +116,18 @@ class Hearsay:
         # a report counts that is newer than what one knows, and one's own eyes before
         # any report
         has_report = jnp.any(arrives & arriving.sees, axis=-1)
-        has_report &= arriving.step > beliefs.reported
+        has_report &= arriving.step > beliefs.report_step
         sees = state.sees
 
         def newest(by_itself, by_report, by_belief):
-            believed = jnp.where(has_report[:, None], by_report, by_belief)
-            return jnp.where(sees[:, None], by_itself, believed)
+            by_message = jnp.where(has_report[:, None], by_report, by_belief)
+            return jnp.where(sees[:, None], by_itself, by_message)
 
         evader = newest(reports.evader, arriving.evader, beliefs.evader)
         velocity = newest(
             reports.evader_velocity, arriving.evader_velocity, beliefs.evader_velocity
         )
-        reported = jnp.where(has_report, arriving.step, beliefs.reported)
+        report_step = jnp.where(has_report, arriving.step, beliefs.report_step)
         has_sight = sees | has_report
         beliefs = _with_teammates(beliefs, reports, arriving, arrives)
         thought = jax.vmap(functools.partial(self._thought, state))(
@@ -135,7 +136,7 @@ class Hearsay:
         beliefs = beliefs.replace(
             evader=evader,
             evader_velocity=velocity,
-            reported=jnp.where(sees, state.step, reported),
+            report_step=jnp.where(sees, state.step, report_step),
             seen=has_sight,
             last_seen=jnp.where(has_sight[:, None], evader, thought),
             on_the_way=jax.tree.map(lambda leaf: leaf[1:], line),
@@ -144,7 +145,7 @@ class Hearsay:
 
     def _place(self, belief, step):
         """(N, 3) m, where one pursuer takes all to be at a step ()."""
-        age = (step - belief.told) * self.environment.settings.time_step
+        age = (step - belief.told_step) * self.environment.settings.time_step
         return belief.position + belief.velocity * jnp.minimum(age, COAST)[..., None]
 
     def _thought(self, state, belief):
@@ -158,11 +159,11 @@ class Hearsay:
 
         def newest(belief):
             place = self._place(belief, state.step)
-            framed = frame_pursuers(settings, place, belief.last_seen, state.active)
+            own_frame = frame_pursuers(settings, place, belief.last_seen, state.active)
             return frame(
                 settings,
                 state.step,
-                framed,
+                own_frame,
                 belief.evader,
                 belief.evader_velocity,
                 belief.seen,
@@ -179,7 +180,7 @@ class Hearsay:
 
         def view(i, belief):
             place = self._place(belief, state.step)
-            believed = state.replace(
+            world = state.replace(
                 drones=state.drones.replace(position=place),
                 evader_position=belief.evader,
                 evader_velocity=belief.evader_velocity,
@@ -188,7 +189,7 @@ class Hearsay:
                 last_seen=belief.last_seen,
                 frames=belief.frames,
             )
-            return _of_one(self.environment.observe(believed), i)
+            return _of_one(self.environment.observe(world), i)
 
         number = beliefs.seen.shape[0]
         return jax.vmap(view)(jnp.arange(number), beliefs.replace(on_the_way=None))
@@ -198,19 +199,19 @@ def _with_teammates(beliefs, reports, arriving, arrives):
     """Beliefs after messages (N, N) of who `arrives`, and what each knows of itself."""
     is_itself = jnp.eye(len(arrives), dtype=bool)
 
-    def told(by_itself, by_message, by_belief):
+    def merge(by_itself, by_message, by_belief):
         axes = (..., *[None] * (by_belief.ndim - 2))
         told_by_all = jnp.where(arrives[axes], by_message, by_belief)
         return jnp.where(is_itself[axes], by_itself, told_by_all)
 
     return beliefs.replace(
-        position=told(reports.position, arriving.position, beliefs.position),
-        velocity=told(reports.velocity, arriving.velocity, beliefs.velocity),
-        told=told(reports.step, arriving.step, beliefs.told),
+        position=merge(reports.position, arriving.position, beliefs.position),
+        velocity=merge(reports.velocity, arriving.velocity, beliefs.velocity),
+        told_step=merge(reports.step, arriving.step, beliefs.told_step),
     )
 
 
-def _sent(state):
+def _reports(state):
     return Sent(
         position=state.drones.position,
         velocity=state.drones.velocity,

@@ -56,8 +56,8 @@ def far_tasks(settings: PursuitSettings, number: int, slots: int) -> Task:
         def expand(task, key):
             return expand_task(settings, key, task), None
 
-        expanded, _ = jax.lax.scan(expand, task, keys)
-        return expanded
+        far_task, _ = jax.lax.scan(expand, task, keys)
+        return far_task
 
     # of another key than the uniform ones: no task is in both
     keys = jax.random.split(

@@ -90,7 +90,7 @@ class Compiled:
         return min(batches) / repeats
 
 
-def compiled(program: CProgram, name: str) -> Compiled | None:
+def compile_c(program: CProgram, name: str) -> Compiled | None:
     """The program, compiled; None where there is no C compiler."""
     compiler = shutil.which("cc")
     return None if compiler is None else Compiled(program, name, compiler)

@@ -45,17 +45,17 @@ class CProgram:
     """Evaluations of exp, tanh, sqrt and their kin, per call."""
 
 
-def _placed(buffers: list[Buffer]) -> int:
+def _place(buffers: list[Buffer]) -> int:
     """Give all buffers their offsets, so that two that live at once don't overlap; the
     floats needed.
     """
     # the largest first, each into the first gap between those that live while it does
-    placed: list[Buffer] = []
+    neighbours: list[Buffer] = []
     for buffer in sorted(buffers, key=lambda buffer: -buffer.size):
         alive = [
             other
-            for other in placed
-            if other.written <= buffer.read and buffer.written <= other.read
+            for other in neighbours
+            if other.first_write <= buffer.read and buffer.first_write <= other.read
         ]
         others = sorted(alive, key=lambda other: other.offset)
         buffer.offset = 0
@@ -63,7 +63,7 @@ def _placed(buffers: list[Buffer]) -> int:
             if buffer.offset + buffer.size <= other.offset:
                 break
             buffer.offset = max(buffer.offset, other.offset + other.size)
-        placed.append(buffer)
+        neighbours.append(buffer)
     return max((buffer.offset + buffer.size for buffer in buffers), default=1)
 
 
@@ -87,7 +87,7 @@ def c_program(
     Raises:
       UserError: the function uses an operation that isn't covered.
     """
-    writer, workspace, shape = _written(function, inputs, output)
+    writer, workspace, shape = _write(function, inputs, output)
     text = "\n".join(writer.statements)
     buffers_read = {
         name: kind
@@ -116,14 +116,14 @@ def c_program(
     )
 
 
-def _written(function, inputs, output):
+def _write(function, inputs, output):
     """The statements of a function, the floats of workspace that they need, and the
     shape of its result.
     """
-    traced = trace(function, inputs)
+    program = trace(function, inputs)
     writer = Writer()
     arrays = [dense_array(f"in->{name}", kind.shape) for name, kind in inputs.items()]
-    (result,) = writer.run(traced.jaxpr, traced.consts, arrays)
-    shape = tuple(traced.out_avals[0].shape)
+    (result,) = writer.run(program.jaxpr, program.consts, arrays)
+    shape = tuple(program.out_avals[0].shape)
     writer.write(dense_array(output, shape), "{}", [writer.array(result)])
-    return writer, _placed(writer.buffers), shape
+    return writer, _place(writer.buffers), shape

@@ -28,7 +28,7 @@ class Buffer:
     """Floats of the workspace, and the statements between which they hold something."""
 
     size: int
-    written: int
+    first_write: int
     read: int
     offset: int = 0
 
@@ -80,13 +80,13 @@ class Array:
     ) -> "Array":
         """Entries from `starts` on, every `steps`-th of each axis."""
         steps = steps or [1] * len(shape)
-        skipped = sum(
+        offset_of_part = sum(
             start * stride for start, stride in zip(starts, self.strides, strict=True)
         )
         strides = tuple(
             step * stride for step, stride in zip(steps, self.strides, strict=True)
         )
-        offset = int(self.offset + skipped)
+        offset = int(self.offset + offset_of_part)
         return replace(self, shape=tuple(shape), strides=strides, offset=offset)
 
 
@@ -176,11 +176,11 @@ class Writer(Walk):
         self.emit(loops(arrays[0].shape, indices, body), arrays)
         return arrays[0]
 
-    def stored(self, value: Array) -> Array:
+    def dense_copy(self, value: Array) -> Array:
         """The same as a dense array."""
-        return value if value.dense else self._made("{}", [value], value.shape)
+        return value if value.dense else self._elementwise("{}", [value], value.shape)
 
-    def _made(self, form, values, shape):
+    def _elementwise(self, form, values, shape):
         out = self.new(shape)
         self.write(out, form, [self.array(value) for value in values])
         return out
@@ -204,14 +204,14 @@ class Writer(Walk):
 
     def _op_elementwise(self, operation):
         self.functions += math.prod(operation.shape) * (operation.name in FUNCTIONS)
-        return self._made(
+        return self._elementwise(
             ELEMENTWISE[operation.name], operation.inputs, operation.shape
         )
 
     def _power(self, value, exponent, operation):
         factors = " * ".join(["{0}"] * abs(exponent)) or "1.0f"
         form = f"({factors})" if exponent >= 0 else f"(1.0f / ({factors}))"
-        return self._made(form, [value], operation.shape)
+        return self._elementwise(form, [value], operation.shape)
 
     def _transpose(self, value, order):
         shape = tuple(value.shape[axis] for axis in order)
@@ -237,11 +237,11 @@ class Writer(Walk):
             size for size in shape if size > 1
         ]:
             # only axes of length one come or go: the others keep their strides
-            sized = zip(value.strides, value.shape, strict=True)
-            strides = iter([stride for stride, size in sized if size > 1])
+            dimensions = zip(value.strides, value.shape, strict=True)
+            strides = iter([stride for stride, size in dimensions if size > 1])
             new_strides = tuple(next(strides) if size > 1 else 0 for size in shape)
             return replace(value, shape=shape, strides=new_strides)
-        return replace(self.stored(value), shape=shape, strides=row_by_row(shape))
+        return replace(self.dense_copy(value), shape=shape, strides=row_by_row(shape))
 
     def _op_split(self, operation):
         value = operation.inputs[0]
@@ -266,32 +266,32 @@ class Writer(Walk):
 
     def _op_pad(self, operation):
         value, filling = map(self.array, operation.inputs)
-        padded = self.new(operation.shape)
-        self.write(padded, "{}", [filling])
+        result = self.new(operation.shape)
+        self.write(result, "{}", [filling])
         low, _ = outer_padding(operation)
-        self.write(padded.part(low, value.shape), "{}", [value])
-        return padded
+        self.write(result.part(low, value.shape), "{}", [value])
+        return result
 
     def _op_reduce_sum(self, operation):
         value = operation.inputs[0]
         shape = operation.shape
         axes = operation.parameters["axes"]
         start, form = _REDUCE[operation.name]
-        reduced = self.new(shape)
+        result = self.new(shape)
         every = index_names(value.shape)
         outer = [index for axis, index in enumerate(every) if axis not in axes]
         inner = [index for axis, index in enumerate(every) if axis in axes]
         add = f"sum = {form.format('sum', value.at(every))};"
         adding = loops([value.shape[axis] for axis in axes], inner, add)
-        body = f"float sum = {start};\n{adding}\n{reduced.at(outer)} = sum;"
-        self.emit(loops(shape, outer, body), [reduced, value])
-        return reduced
+        body = f"float sum = {start};\n{adding}\n{result.at(outer)} = sum;"
+        self.emit(loops(shape, outer, body), [result, value])
+        return result
 
     _op_reduce_max = _op_reduce_min = _op_reduce_sum
 
     def _product(self, first, second, shape):
-        first = self.stored(self.array(first))
-        second = self.stored(self.array(second))
+        first = self.dense_copy(self.array(first))
+        second = self.dense_copy(self.array(second))
         rows, inner = first.shape[-2:]
         columns = shape[-1]
         out = self.new(shape)

@@ -56,16 +56,16 @@ def loops(sizes, indices, body: str) -> str:
         if str(i) != "0"
     ]
     if "\n" in body:
-        body = "{\n" + indented(body) + "\n}"
+        body = "{\n" + indent(body) + "\n}"
     return "\n".join(
         [
             *(4 * " " * k + head for k, head in enumerate(heads)),
-            indented(body, len(heads)),
+            indent(body, len(heads)),
         ]
     )
 
 
-def indented(text: str, times: int = 1) -> str:
+def indent(text: str, times: int = 1) -> str:
     """Lines moved in by four spaces, `times` over."""
     return "\n".join(4 * " " * times + line for line in text.splitlines())
 

@@ -190,24 +190,24 @@ def onnx_model(
         from onnx import TensorProto, checker, helper
     except ImportError as error:
         raise UserError("onnx is missing: pip install onnx onnxruntime") from error
-    traced = trace(function, inputs)
+    program = trace(function, inputs)
     graph = _Graph()
-    (result,) = graph.run(traced.jaxpr, traced.consts, list(inputs))
+    (result,) = graph.run(program.jaxpr, program.consts, list(inputs))
     graph.nodes.append(helper.make_node("Identity", [graph.name(result)], [output]))
     names_read = {name for node in graph.nodes for name in node.input}
 
-    def described(name, kind):
+    def describe(name, kind):
         return helper.make_tensor_value_info(
             name, helper.np_dtype_to_tensor_dtype(kind.dtype), kind.shape
         )
 
-    out = traced.out_avals[0]
+    out = program.out_avals[0]
     model = helper.make_model(
         helper.make_graph(
             graph.nodes,
             "openjax_policy",
             [
-                described(name, kind)
+                describe(name, kind)
                 for name, kind in inputs.items()
                 if name in names_read
             ],

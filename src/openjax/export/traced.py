@@ -98,9 +98,11 @@ class Walk:
             zip(operation.inputs, operation.shapes, strict=True)
         ):
             batch = batches[side]
-            summed = sums[side]
-            free = [axis for axis in range(len(shape)) if axis not in (*batch, *summed)]
-            groups = (batch, summed, free) if side else (batch, free, summed)
+            sum_axes = sums[side]
+            free = [
+                axis for axis in range(len(shape)) if axis not in (*batch, *sum_axes)
+            ]
+            groups = (batch, sum_axes, free) if side else (batch, free, sum_axes)
             matrix = [math.prod(shape[axis] for axis in group) for group in groups]
             matrix = tuple(matrix if batch else matrix[1:])
             order = [axis for group in groups for axis in group]
@@ -122,13 +124,13 @@ class Walk:
         if order != sorted(order):
             value = (
                 np.transpose(value, order)
-                if _known(value)
+                if _is_known(value)
                 else self._transpose(value, order)
             )
         if matrix != tuple(shape[axis] for axis in order):
             value = (
                 np.reshape(value, matrix)
-                if _known(value)
+                if _is_known(value)
                 else self._reshape(value, matrix)
             )
         return value
@@ -151,7 +153,7 @@ class Walk:
         parameters = equation.params
         if name == "platform_index":  # what is not for a platform of its own comes last
             return [np.int32(len(parameters["platforms"]) - 1)]
-        if name == "cond" and _known(inputs[0]):
+        if name == "cond" and _is_known(inputs[0]):
             branch = parameters["branches"][int(inputs[0])]
             return self.run(branch.jaxpr, branch.consts, inputs[1:])
         if name in _INLINE:
@@ -162,7 +164,7 @@ class Walk:
             )
             consts = getattr(inner, "consts", ())
             return self.run(getattr(inner, "jaxpr", inner), consts, inputs)
-        if all(map(_known, inputs)):
+        if all(map(_is_known, inputs)):
             results = equation.primitive.bind(*inputs, **parameters)
             results = results if equation.primitive.multiple_results else [results]
             return [np.asarray(value) for value in results]
@@ -179,7 +181,7 @@ class Walk:
         return results if isinstance(results, list) else [results]
 
 
-def _known(value) -> bool:
+def _is_known(value) -> bool:
     """Whether a value is known here already."""
     return isinstance(value, np.ndarray | np.generic)
 

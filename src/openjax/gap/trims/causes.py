@@ -103,11 +103,11 @@ class _Draws:
         if CAUSES[cause].damage:
             table[:, PLACES["shaking"]] = SHAKES[0] + SHAKES[1] * self.normal[:, 4]
         weight = np.full(DRAWS, share * CAUSES[cause].prior / DRAWS)
-        where = np.broadcast_to(
+        rotor = np.broadcast_to(
             place if isinstance(place, np.ndarray) else self.place_of[place], DRAWS
         )
         self.parts.append(
-            (table, weight, np.full(DRAWS, list(CAUSES).index(cause)), where, size)
+            (table, weight, np.full(DRAWS, list(CAUSES).index(cause)), rotor, size)
         )
 
     def trims_of(self, factors: np.ndarray) -> dict:
@@ -124,9 +124,9 @@ def trims_with(mixer: np.ndarray, trims: np.ndarray, factors: np.ndarray) -> np.
     """Change (..., 4) of a reference's trims (4,) where the rotor commands of its level
     flight rise by `factors` (..., 4).
     """
-    mixed = (np.linalg.solve(mixer, np.r_[1.0, trims[1:]]) * factors) @ mixer.T
+    wrench = (np.linalg.solve(mixer, np.r_[1.0, trims[1:]]) * factors) @ mixer.T
     return np.concatenate(
-        [np.log(mixed[..., :1]), mixed[..., 1:] / mixed[..., :1] - trims[1:]], -1
+        [np.log(wrench[..., :1]), wrench[..., 1:] / wrench[..., :1] - trims[1:]], -1
     )
 
 
