@@ -118,10 +118,10 @@ print("same")
 # Both wait for each other for ever.
 WAITING = """
 import sys, threading
-from openjax.cluster.joining import Membership, joined
+from openjax.cluster.joining import Membership, join
 
 membership = Membership(sys.argv[1], 2, int(sys.argv[2]), "deactivate")
-with joined(membership) as processes:
+with join(membership) as processes:
     import jax
     assert jax.device_count() == 2 and jax.process_index() == membership.process_id
     assert processes.everyone(membership.process_id) == [0, 1] and processes.of_first(5 + membership.process_id) == 5

@@ -55,7 +55,7 @@ def check_agreement(flight: Flight, vehicle) -> list[Issue]:
         issues = (
             _upside_down(signals)
             or gravity_findings(signals.force)
-            or _inverted(signals)
+            or _inversions(signals)
             or _contradictions(signals)
             or list(path_findings(signals))
             or order_findings(signals, vehicle)
@@ -111,7 +111,7 @@ def _unit(pair: Pair) -> list[Finding]:
     follows = (agreement.correlation > AGREE) & (agreement.reference > 1e-9)
     if not follows.any():
         return []
-    gain = float(np.median(agreement.measured[follows] / agreement.reference[follows]))
+    gain = float(np.median(agreement.signal[follows] / agreement.reference[follows]))
     for unit, factor in UNITS.get(pair.unit, ()):
         for columns, times in ((", ".join(pair.names), gain), (pair.what, 1.0 / gain)):
             if factor / UNIT < times < factor * UNIT:
@@ -126,14 +126,14 @@ def _unit(pair: Pair) -> list[Finding]:
     clear = pair.tells & (agreement.correlation > CLEAR)
     if pair.holds != "body_rates" or clear.sum() < 2:
         return []
-    gains = agreement.measured[clear] / agreement.reference[clear]
+    gains = agreement.signal[clear] / agreement.reference[clear]
     if (gains < SAME).any() and (gains > 1 / SAME).any():
         return []
     text = f"{', '.join(pair.names)} are {np.median(gains):.2g} times {pair.what}"
     return [("units", f"{text}: one of them is something else", [pair.what])]
 
 
-def _inverted(signals: Signals) -> list[Finding]:
+def _inversions(signals: Signals) -> list[Finding]:
     """What flies by its thrust is upright on the mean."""
     if signals.quaternion is None:
         return []

@@ -60,7 +60,7 @@ def _attitude(part: Flight) -> np.ndarray:
     # an accelerometer feels what holds the vehicle against gravity, as if it
     # accelerated upwards
     velocity_force = np.diff(velocity[ends], axis=0) / WINDOW + [0.0, 0.0, GRAVITY]
-    rotation = _integrated(rates)
+    rotation = _integrate(rates)
     beginning = slice(0, max(int(START / WINDOW), FEWEST))
     measured_force = _means(rotation.apply(force), ends)
     attitude = _kabsch(measured_force[beginning], velocity_force[beginning]) * rotation
@@ -114,7 +114,7 @@ def _step(attitude: Rotation, force: np.ndarray, windows, total: np.ndarray):
     return solution[:3], solution[3:].reshape(knots, 3)
 
 
-def _integrated(rates: np.ndarray) -> Rotation:
+def _integrate(rates: np.ndarray) -> Rotation:
     """Attitudes of a body that turns with rates (T, 3) rad/s, from no rotation on."""
     turns = Rotation.from_rotvec(0.5 * (rates[1:] + rates[:-1]) * STEP).as_quat()
     quaternion = np.zeros((len(rates), 4))

@@ -49,11 +49,11 @@ def load_case(path: str | Path, dtype=jnp.float32, comparison: bool = False) -> 
         raise UserError(
             f"{path}: holds no flight log{_held_instead(path)}{_cases_inside(path)}"
         )
-    described = (path / "vehicle.toml").exists()
-    if not described and not comparison:
+    has_vehicle_file = (path / "vehicle.toml").exists()
+    if not has_vehicle_file and not comparison:
         raise TooLittle(f"{path}: no vehicle.toml; {_called_otherwise(path)}")
     vehicle_file = load_vehicle_file(
-        path / "vehicle.toml" if described else None, dtype
+        path / "vehicle.toml" if has_vehicle_file else None, dtype
     )
     mapping = (
         load_mapping(path / MAPPING_FILE) if (path / MAPPING_FILE).exists() else None
@@ -137,20 +137,20 @@ def _usable(
         _check(f, vehicle_file, comparison) for f in flights if f.log not in copies
     ]
     issues += [issue for _, of_flight in results for issue in of_flight]
-    usable, refusals = _trusted(
+    usable, refusals = _without_distrust(
         [f for f, _ in results if f is not None], issues, vehicle_file
     )
     return usable, issues + refusals
 
 
-def _trusted(
+def _without_distrust(
     flights: list[Flight], issues: list[Issue], vehicle_file: VehicleFile
 ) -> tuple[list[Flight], list[Issue]]:
     """The flights without those that are too calm to show what most others contradict:
     columns are mixed up for a case.
     """
-    failed = Counter(what for issue in issues for what in issue.against)
-    if not failed:
+    failures = Counter(what for issue in issues for what in issue.against)
+    if not failures:
         return flights, []
     channels = [shown_right(f, vehicle_file.vehicle_of(f.vehicle)) for f in flights]
     counts = Counter(what for flight in channels for what in flight)
@@ -158,7 +158,9 @@ def _trusted(
     refusals = []
     for flight, right in zip(flights, channels, strict=True):
         doubts = [
-            what for what in failed if what not in right and failed[what] > counts[what]
+            what
+            for what in failures
+            if what not in right and failures[what] > counts[what]
         ]
         if not doubts:
             out.append(flight)

@@ -35,23 +35,23 @@ def check_flight(
     # still with them, ranges before anything is derived from values that can't be
     try:
         _has_what_is_needed(flight, comparison)
-        checked = while_motors_turn(in_time(_with_forces(flight, note), note), note)
-        checked = drop_held_rows(checked, note)
-        checked = put_in_step(drop_repeats(drop_frozen(checked, note), note), note)
-        checked = in_range(checked, note)
-        checked = derive_velocity(mend_velocity(checked, note), note)
-        checked = derive_attitude(derive_rates(checked, note), note)
+        result = while_motors_turn(in_time(_with_forces(flight, note), note), note)
+        result = drop_held_rows(result, note)
+        result = put_in_step(drop_repeats(drop_frozen(result, note), note), note)
+        result = in_range(result, note)
+        result = derive_velocity(mend_velocity(result, note), note)
+        result = derive_attitude(derive_rates(result, note), note)
         floor = (log or {}).get("floor_z")
-        checked = airborne_part(checked, floor, note, comparison)
-        check_above_floor(checked, 0.0 if floor is None else float(floor))
-        _has_what_is_needed(checked, comparison)
+        result = airborne_part(result, floor, note, comparison)
+        check_above_floor(result, 0.0 if floor is None else float(floor))
+        _has_what_is_needed(result, comparison)
     except Refused as refused:
         return None, [
             *issues,
             Issue(flight.name, str(refused), refused=True, kind=refused.kind),
         ]
-    disagreements = check_agreement(checked, vehicle)
-    return (None if disagreements else checked), issues + disagreements
+    disagreements = check_agreement(result, vehicle)
+    return (None if disagreements else result), issues + disagreements
 
 
 def duplicates(flights: list[Flight]) -> dict[str, str]:

@@ -194,19 +194,19 @@ def _offsets(signals) -> dict[str, float]:
         reach = min(len(part) // 2 * step for part, step in parts)
         step = parts[0][1]
         grid = step * np.arange(-int(reach / step), int(reach / step) + 1)
-        summed = sum(_on(grid, *part) for part in parts) / len(parts)
-        if summed.max() >= FOLLOWS:
-            curves[flight] = summed, step
+        mean_curve = sum(_on(grid, *part) for part in parts) / len(parts)
+        if mean_curve.max() >= FOLLOWS:
+            curves[flight] = mean_curve, step
     out = {flight: _peak(*curve) for flight, curve in curves.items()}
     # one logger has one clock, unless a flight tells another one clearly
     if len(curves) > 1:
-        reach = min(len(summed) // 2 * step for summed, step in curves.values())
+        reach = min(len(mean_curve) // 2 * step for mean_curve, step in curves.values())
         step = min(step for _, step in curves.values())
         grid = step * np.arange(-int(reach / step), int(reach / step) + 1)
         alike = {flight: _on(grid, *curve) for flight, curve in curves.items()}
         common = _peak(sum(alike.values()), step)
-        for flight, summed in alike.items():
-            if np.interp(common, grid, summed) >= TELLS * summed.max():
+        for flight, mean_curve in alike.items():
+            if np.interp(common, grid, mean_curve) >= TELLS * mean_curve.max():
                 out[flight] = common
     return out
 
@@ -237,10 +237,10 @@ def _likeness(effect: np.ndarray, cause: np.ndarray, dt: float) -> np.ndarray | 
     band = butter(
         2, (BAND[0], min(BAND[1], 0.4 / dt)), "bandpass", fs=1 / dt, output="sos"
     )
-    filtered = (sosfiltfilt(band, v, axis=0)[edge:-edge] for v in (effect, cause))
+    bands = (sosfiltfilt(band, v, axis=0)[edge:-edge] for v in (effect, cause))
     # The one turn at a start outweighs a whole flight.
     effect, cause = (
-        np.clip(v, -u, u) for v in filtered for u in [LOUD * np.median(np.abs(v), 0)]
+        np.clip(v, -u, u) for v in bands for u in [LOUD * np.median(np.abs(v), 0)]
     )
     size = 1 << int(np.ceil(np.log2(2 * len(effect))))
     spectrum = np.fft.rfft(effect, size, axis=0) * np.conj(

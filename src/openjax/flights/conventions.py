@@ -54,7 +54,7 @@ def other_pitch(signals: Signals) -> Signals:
     return dataclasses.replace(signals, **changes)
 
 
-def turned(signals: Signals, world: Rotation | None, body: Rotation | None) -> Signals:
+def rotate(signals: Signals, world: Rotation | None, body: Rotation | None) -> Signals:
     """With the world's and the body's axes turned, those of every channel that is in
     them.
     """
@@ -76,18 +76,18 @@ def turned(signals: Signals, world: Rotation | None, body: Rotation | None) -> S
 
 BODY = Convention(
     f"the body's axes are forward, right, down (FRD), not forward, left, up: {RECIPE}",
-    lambda signals: turned(signals, None, DOWN),
+    lambda signals: rotate(signals, None, DOWN),
 )
 FRAMES = (
     Convention(
         "the rows are in north, east, down and forward, right, down (NED, FRD), not in east, "
         f"north, up and forward, left, up: {RECIPE}",
-        lambda signals: turned(signals, NORTH, DOWN),
+        lambda signals: rotate(signals, NORTH, DOWN),
     ),
     BODY,
     Convention(
         f"the world's axes are north, east, down (NED), not east, north, up: {RECIPE}",
-        lambda signals: turned(signals, NORTH, None),
+        lambda signals: rotate(signals, NORTH, None),
     ),
 )
 """Axes of world and body, the likeliest first."""

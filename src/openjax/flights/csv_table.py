@@ -16,10 +16,10 @@ from openjax.flights.csv_text import (
     Header,
     LogError,
     find_header,
+    remove_quotes,
     text_of,
-    unquoted,
 )
-from openjax.flights.reading import LOG_COLUMNS, LONGEST_NAME, LogTable, listed
+from openjax.flights.reading import LOG_COLUMNS, LONGEST_NAME, LogTable, name_list
 
 # the micro-SD logger of the Crazyflie writes at most some hundred variables
 MOST_COLUMNS = 2_000
@@ -30,17 +30,17 @@ NOTHING = ("na", "n/a", "#n/a", "null", "none", "-", "--")
 def read_csv(
     path: str | Path,
     delimiter: str = "",
-    known: tuple[str, ...] = LOG_COLUMNS,
+    readable_columns: tuple[str, ...] = LOG_COLUMNS,
     time: str = "t",
     above: int = 0,
 ) -> LogTable:
-    """Read a `.csv` or `.csv.gz` log. Columns outside `known` are left out with a
-    remark, whatever they hold; the column `time` must be there.
+    """Read a `.csv` or `.csv.gz` log. Columns outside `readable_columns` are left out
+    with a remark, whatever they hold; the column `time` must be there.
 
     Args:
       path: the file.
       delimiter: between cells; where it is empty, what the header shows.
-      known: columns that are read.
+      readable_columns: columns that are read.
       time: the one that must be there.
       above: lines above the header that aren't the table's.
 
@@ -53,15 +53,19 @@ def read_csv(
     header = header._replace(line=above + header.line)
     _check_header(header, time)
     names = header.names
-    places = [i for i, name in enumerate(names) if name != "vehicle" and name in known]
+    places = [
+        i
+        for i, name in enumerate(names)
+        if name != "vehicle" and name in readable_columns
+    ]
     rows, remarks = _whole_lines(lines, header)
     number = _number if header.delimiter == "," else _number_with_comma
     rows, unit_remarks = _without_units(rows, header, places, number)
     remarks += unit_remarks
-    unknown = [n for n in names if n and n not in known]
+    unknown = [n for n in names if n and n not in readable_columns]
     if unknown:
         remarks.append(
-            f"unknown column{'s' * (len(unknown) > 1)} left out: {listed(unknown)}"
+            f"unknown column{'s' * (len(unknown) > 1)} left out: {name_list(unknown)}"
         )
     values = _numbers(rows, header, places, number)
     remarks += _not_numbers(np.isinf(values), [names[i] for i in places])
@@ -84,7 +88,9 @@ def _numbers(
     places: list[int],
     number: Callable[[str], float],
 ) -> np.ndarray:
-    """(R, columns) of the columns `places`. Raises LogError where a cell is no number."""
+    """(R, columns) of the columns `places`. Raises LogError where a cell is no
+    number.
+    """
     lines = [line for _, line in rows]
     try:
         return np.loadtxt(
@@ -107,7 +113,7 @@ def _not_numbers(bad: np.ndarray, names: list[str]) -> list[str]:
     for name, count in zip(names, bad.sum(0).tolist(), strict=True):
         columns_of.setdefault(count, []).append(name)
     return [
-        f"column{'s' * (len(columns) > 1)} {listed(columns)}: {count} of {len(bad)} rows are NaN "
+        f"column{'s' * (len(columns) > 1)} {name_list(columns)}: {count} of {len(bad)} rows are NaN "
         "or infinite"
         for count, columns in columns_of.items()
         if count
@@ -157,13 +163,13 @@ def _check_header(header: Header, time: str) -> None:
     if not any(map(LETTER.search, names)):
         raise LogError("the first row holds no column names")
     counts = Counter(names)
-    repeated = [name for name in names if name and counts[name] > 1]
-    if repeated:
-        raise LogError(f"column {min(repeated)!r} occurs more than once")
+    repeats = [name for name in names if name and counts[name] > 1]
+    if repeats:
+        raise LogError(f"column {min(repeats)!r} occurs more than once")
     if time not in names:
         time_name = "t" if time == "t" else f"{time!r}, which columns.toml names for t"
         raise LogError(
-            f"no column {time_name}; the log has {listed(n for n in names if n)}: "
+            f"no column {time_name}; the log has {name_list(n for n in names if n)}: "
             "say in columns.toml "
             "which is which"
         )
@@ -192,7 +198,9 @@ def _whole_lines(
     cells = len(header.names)
     rows = enumerate(lines[header.line + 1 :], header.line + 2)
     whole_lines = [
-        (number, unquoted(line, delimiter)) for number, line in rows if line.strip()
+        (number, remove_quotes(line, delimiter))
+        for number, line in rows
+        if line.strip()
     ]
     # a delimiter at the end of each line but the header's, as a loop in C writes it
     if whole_lines and all(
@@ -278,6 +286,6 @@ def _why_not(
             if [cell.strip() for cell in cells] == names:
                 return f"line {row} is the header again: several recordings in one file"
             cell = cells[i].strip()[:LONGEST_NAME]
-            dated = ": a date or a time of day? t counts seconds" * (":" in cell)
-            return f"line {row}, column {names[i]}: {cell!r} is no number{dated}"
+            hint = ": a date or a time of day? t counts seconds" * (":" in cell)
+            return f"line {row}, column {names[i]}: {cell!r} is no number{hint}"
     return f"not a table of numbers ({error})"

@@ -60,7 +60,7 @@ def text_of(path: Path) -> str:
     lines = 0
     try:
         with ExitStack() as stack:
-            file = _opened(path, stack)
+            file = _open(path, stack)
             while chunk := file.read(CHUNK):
                 chunks.append(chunk)
                 size += len(chunk)
@@ -77,15 +77,15 @@ def text_of(path: Path) -> str:
                     )
     except (OSError, EOFError, zlib.error) as error:
         raise LogError(f"can't be read: {error}") from error
-    return _decoded(b"".join(chunks))
+    return _decode(b"".join(chunks))
 
 
 def head_of(path: Path) -> list[str]:
     """A file's first lines; none where they can't be read as text."""
     try:
         with ExitStack() as stack:
-            data = _opened(path, stack).read(LONGEST_HEADER)
-        return _decoded(data[: len(data) // 2 * 2], cut=True).split("\n")
+            data = _open(path, stack).read(LONGEST_HEADER)
+        return _decode(data[: len(data) // 2 * 2], cut=True).split("\n")
     except (OSError, EOFError, zlib.error, LogError):
         return []
 
@@ -113,7 +113,8 @@ def find_header(lines: list[str], delimiter: str = "") -> Header:
     line = line.removeprefix(COMMENT)  # where numpy.savetxt puts the names
     delimiter = delimiter or max(SEPARATORS, key=line.count)
     names = [
-        name.strip().strip('"') for name in unquoted(line, delimiter).split(delimiter)
+        name.strip().strip('"')
+        for name in remove_quotes(line, delimiter).split(delimiter)
     ]
     return Header(names, delimiter, at)
 
@@ -123,7 +124,7 @@ def _holds_names(line: str) -> bool:
     return line.startswith(COMMENT) or bool(LETTER.search(NUMBERS.sub("", line)))
 
 
-def unquoted(line: str, delimiter: str) -> str:
+def remove_quotes(line: str, delimiter: str) -> str:
     """A line without quotes around its cells, and without the delimiters that stand in
     them.
     """
@@ -134,7 +135,7 @@ def unquoted(line: str, delimiter: str) -> str:
     return "".join(parts) if len(parts) % 2 else line
 
 
-def _opened(path: Path, stack: ExitStack) -> io.BufferedIOBase:
+def _open(path: Path, stack: ExitStack) -> io.BufferedIOBase:
     """A file for reading, unpacked if it is packed, whatever its name says."""
     with path.open("rb") as file:
         start = file.read(len(ZIP))
@@ -150,12 +151,12 @@ def _is_plain(data: bytes) -> bool:
     """Whether bytes are a table with a degree sign or an umlaut beside it, as Windows
     saves them.
     """
-    printed = data.translate(None, CONTROLS)
-    odd = len(printed) - len(printed.translate(None, BEYOND_ASCII))
-    return len(printed) == len(data) and odd < ODD * len(data)
+    text = data.translate(None, CONTROLS)
+    odd = len(text) - len(text.translate(None, BEYOND_ASCII))
+    return len(text) == len(data) and odd < ODD * len(data)
 
 
-def _decoded(data: bytes, cut: bool = False) -> str:
+def _decode(data: bytes, cut: bool = False) -> str:
     """Bytes as text with line ends of one kind; of those that are `cut` somewhere what
     can be read. Raises LogError for what is no text.
     """

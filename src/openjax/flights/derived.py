@@ -84,8 +84,8 @@ def _slopes(
     normal = np.einsum("rki,rkj->rij", basis, basis)
     moment = np.einsum("rki,rkc->ric", basis, values[index])
     scale = np.array([1.0, 1e-2, 1e-4])  # keeps the normal equations well conditioned
-    solved = np.linalg.solve(normal / np.outer(scale, scale), moment / scale[:, None])
-    return solved[:, 1] / scale[1], np.abs(dt).max(1)
+    lines = np.linalg.solve(normal / np.outer(scale, scale), moment / scale[:, None])
+    return lines[:, 1] / scale[1], np.abs(dt).max(1)
 
 
 def derive_rates(flight: Flight, note) -> Flight:
@@ -104,10 +104,10 @@ def derive_rates(flight: Flight, note) -> Flight:
     (w, vector), (dw, vector_slope) = ((q[:, :1], q[:, 1:]) for q in (attitude, slope))
     rates = 2.0 * (w * vector_slope - dw * vector - np.cross(vector, vector_slope))
     rates[reach > 0.25] = np.nan
-    derived = np.full((len(flight), 3), np.nan)
-    derived[np.isfinite(flight.quaternion).all(1)] = rates
+    body_rates = np.full((len(flight), 3), np.nan)
+    body_rates[np.isfinite(flight.quaternion).all(1)] = rates
     note("columns", "no gyroscope was logged: body rates are derived from the attitude")
-    return dataclasses.replace(flight, body_rates=derived, body_rates_derived=True)
+    return dataclasses.replace(flight, body_rates=body_rates, body_rates_derived=True)
 
 
 def _enough(attitude: np.ndarray, step: float) -> int:

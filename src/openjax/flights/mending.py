@@ -65,7 +65,7 @@ def mend(signals: Signals, bad: list[Pair]) -> tuple[str, str] | None:
                 "vx, vy, vz are in the body frame; the log format wants the world frame",
             )
     for pair in bad:
-        if pair.holds and (words := _relabelled(signals, pair, bad)):
+        if pair.holds and (words := _relabel(signals, pair, bad)):
             return "axes", words
     if any(pair.holds == "body_rates" for pair in bad):
         for words, attitude in attitudes(signals):
@@ -92,9 +92,11 @@ def attitudes(signals: Signals) -> Iterator[tuple[str, np.ndarray]]:
     angles = Rotation.from_quat(signals.quaternion, scalar_first=True).as_euler("ZYX")
     for k, name in ((1, "pitch"), (2, "roll"), (0, "yaw")):
         signs = np.where(np.arange(3) == k, -1.0, 1.0)
-        mirrored = Rotation.from_euler("ZYX", angles * signs).as_quat(scalar_first=True)
+        mirror_image = Rotation.from_euler("ZYX", angles * signs).as_quat(
+            scalar_first=True
+        )
         words = f"{name} has the other sign: scale = -1 for {name} in columns.toml"
-        yield f"{words}, or the quaternion of the angle that it should be", mirrored
+        yield f"{words}, or the quaternion of the angle that it should be", mirror_image
     for order in itertools.permutations(range(4)):
         for way, sign in (("", 1.0), (" and from world to body", INVERSE)):
             attitude = signals.quaternion[:, order] * sign
@@ -121,7 +123,7 @@ def _turns_with(signals: Signals, attitude: np.ndarray) -> bool:
     return float((attitude_rates * gyroscope_rates).sum()) > FOLLOWED * power
 
 
-def _relabelled(signals: Signals, pair: Pair, bad: list[Pair]) -> str:
+def _relabel(signals: Signals, pair: Pair, bad: list[Pair]) -> str:
     """Which axes of a pair's channel hold what, if the best of all 48 labellings of it
     makes the disagreeing pairs agree.
     """

@@ -65,22 +65,24 @@ def _torques(signals: Signals, vehicle) -> dict[tuple, np.ndarray]:
     spin = np.asarray(vehicle.rotor_spin, float)
     # roll, pitch and yaw torque per thrust
     mixing = np.stack([place[:, 1], -place[:, 0], spin])
-    measured = in_band(np.gradient(signals.rates, 1 / RATE, axis=0), TURNING)
-    lagged = in_band(
+    turns = in_band(np.gradient(signals.rates, 1 / RATE, axis=0), TURNING)
+    thrusts = in_band(
         first_order(signals.motor, float(vehicle.motor_time_constant)), TURNING
     )
-    if (lagged.std(0) < 1e-6).all():
+    if (thrusts.std(0) < 1e-6).all():
         return {}
     # Motors are correlated, so whole torques are scored: by the moments of angular
     # acceleration and motors at each offset.
-    shifted = np.stack([np.roll(lagged, lag, 0) for lag in OFFSETS])
-    cross = np.einsum("ti,ltj->lij", measured, shifted)
-    among = np.einsum("lti,ltj->lij", shifted, shifted)
+    at_offsets = np.stack([np.roll(thrusts, lag, 0) for lag in OFFSETS])
+    cross = np.einsum("ti,ltj->lij", turns, at_offsets)
+    among = np.einsum("lti,ltj->lij", at_offsets, at_offsets)
     torques = {}
     for order, flip in itertools.product(itertools.permutations(range(4)), (1.0, -1.0)):
-        mixed = mixing[:, order] * [[1.0], [1.0], [flip]]
-        power = np.einsum("ij,ljk,ik->li", mixed, among, mixed) * (measured**2).sum(0)
-        each = (mixed * cross).sum(2) / np.sqrt(np.maximum(power, 1e-24))
+        mixer_rows = mixing[:, order] * [[1.0], [1.0], [flip]]
+        power = np.einsum("ij,ljk,ik->li", mixer_rows, among, mixer_rows) * (
+            turns**2
+        ).sum(0)
+        each = (mixer_rows * cross).sum(2) / np.sqrt(np.maximum(power, 1e-24))
         torques[order, flip] = each[int(np.argmax(each.sum(1)))]
     return torques
 

@@ -64,7 +64,7 @@ class Signals:
     @classmethod
     def of(cls, flight: Flight, grid: Times) -> Signals:
         """The logged channels; what the reader derived says nothing of its own."""
-        derived = {
+        is_derived = {
             "velocity": flight.velocity_derived,
             "body_rates": flight.body_rates_derived,
             "quaternion": flight.attitude_derived,
@@ -78,7 +78,10 @@ class Signals:
         )
         channels += ("motor_command", "command_thrust", "command_body_rates")
         return cls(
-            *(None if derived.get(c) else on_clock(flight, c, grid) for c in channels)
+            *(
+                None if is_derived.get(c) else on_clock(flight, c, grid)
+                for c in channels
+            )
         )
 
     @cached_property
@@ -92,7 +95,7 @@ class Signals:
         return None if self.quaternion is None else rates_of(self.quaternion)
 
     @cached_property
-    def saturated(self) -> bool:
+    def has_saturation(self) -> bool:
         """Whether motors have often nothing left to follow commands with."""
         return self.motor is not None and float((self.motor > FULL).any(1).mean()) > 0.2
 
@@ -112,7 +115,7 @@ class Signals:
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """`measured` (T, C) and what it must agree with, both in `unit`. `names` of the
+    """`signal` (T, C) and what it must agree with, both in `unit`. `names` of the
     measured columns; `holds` the channel of `Signals` that they are, where another
     labelling of it may be right; `derivatives`: how many times each was differentiated
     from what its sensor gives, None for commands; `least`: rms of the reference in the
@@ -120,7 +123,7 @@ class Pair:
     """
 
     names: tuple[str, ...]
-    measured: np.ndarray
+    signal: np.ndarray
     what: str
     reference: np.ndarray
     band: tuple[float, float]
@@ -132,20 +135,20 @@ class Pair:
     @cached_property
     def agreement(self) -> Agreement:
         """How well the two follow each other."""
-        return agreement(self.measured, self.reference, self.band, self.derivatives)
+        return agreement(self.signal, self.reference, self.band, self.derivatives)
 
     @property
     def tells(self) -> Bool[np.ndarray, " columns"]:
         """(C,) whether the reference moves enough for a column to contradict it."""
         return (self.agreement.reference > self.least) & (
-            self.agreement.expected > TELLS
+            self.agreement.expectation > TELLS
         )
 
     @property
     def bad(self) -> Bool[np.ndarray, " columns"]:
         """(C,) whether a column contradicts its reference."""
         return self.tells & (
-            self.agreement.correlation < AGREE * self.agreement.expected
+            self.agreement.correlation < AGREE * self.agreement.expectation
         )
 
     @property
@@ -153,10 +156,11 @@ class Pair:
         """Whether all columns that could contradict their reference clearly follow
         it.
         """
-        followed = (
-            self.agreement.correlation[self.tells] / self.agreement.expected[self.tells]
+        shares = (
+            self.agreement.correlation[self.tells]
+            / self.agreement.expectation[self.tells]
         )
-        return bool(len(followed) and followed.min() > FITS)
+        return bool(len(shares) and shares.min() > FITS)
 
     def in_words(self) -> str:
         """Which columns contradict what, with the numbers."""
@@ -167,8 +171,8 @@ class Pair:
         return (
             f"contradictory: {columns} against {self.what}: "
             f"correlation {agreement.correlation[worst]:.2f} "
-            f"where sensors allow {agreement.expected[worst]:.2f} "
-            f"({agreement.measured[worst]:.2g} against "
+            f"where sensors allow {agreement.expectation[worst]:.2f} "
+            f"({agreement.signal[worst]:.2g} against "
             f"{agreement.reference[worst]:.2g} {self.unit} "
             f"from {low:g} to {high:g} Hz)"
         )
@@ -176,7 +180,7 @@ class Pair:
 
 def pairs_of(s: Signals) -> Iterator[Pair]:
     """All pairs that were logged."""
-    yield from _derived(s)
+    yield from _derived_pairs(s)
     acceleration, order = s.acceleration
     along = None
     if acceleration is not None and s.quaternion is not None:
@@ -185,11 +189,11 @@ def pairs_of(s: Signals) -> Iterator[Pair]:
         upright = acceleration + np.array([0.0, 0.0, GRAVITY])
         along = to_body(s.quaternion, upright)[:, 2:]
         yield from _felt(s, acceleration, along, order)
-    yield from _caused(s, along, order)
-    if s.commands is not None and s.rates is not None and not s.saturated:
+    yield from _caused_pairs(s, along, order)
+    if s.commands is not None and s.rates is not None and not s.has_saturation:
         yield Pair(
             names=CHANNEL_COLUMNS["command_body_rates"],
-            measured=s.commands,
+            signal=s.commands,
             what="the body rates",
             reference=s.rates,
             band=LOW,
@@ -200,13 +204,13 @@ def pairs_of(s: Signals) -> Iterator[Pair]:
         )
 
 
-def _derived(s: Signals) -> Iterator[Pair]:
+def _derived_pairs(s: Signals) -> Iterator[Pair]:
     """Body rates with the attitude, and the velocity with the position."""
     attitude_rates = s.attitude_rates
     if attitude_rates is not None and s.body_rates is not None:
         yield Pair(
             names=CHANNEL_COLUMNS["body_rates"],
-            measured=s.body_rates,
+            signal=s.body_rates,
             what="the attitude's rate",
             reference=attitude_rates,
             band=WIDE,
@@ -218,7 +222,7 @@ def _derived(s: Signals) -> Iterator[Pair]:
     if s.position is not None and s.velocity is not None:
         yield Pair(
             names=CHANNEL_COLUMNS["velocity"],
-            measured=s.velocity,
+            signal=s.velocity,
             what="the position's rate",
             reference=np.gradient(s.position, 1 / RATE, axis=0),
             band=LOW,
@@ -239,7 +243,7 @@ def _felt(
     lift = rotation(s.quaternion)[:, :, 2] * np.median(size)
     yield Pair(
         names=("the path's acceleration in x", "in y"),
-        measured=acceleration[:, :2],
+        signal=acceleration[:, :2],
         what="the attitude's thrust",
         reference=lift[:, :2],
         band=LOW,
@@ -253,7 +257,7 @@ def _felt(
         off = in_band(acceleration[:, :2] - lift[:, :2], LOW).std(0).mean()
         yield Pair(
             names=("az",),
-            measured=s.force[:, 2:],
+            signal=s.force[:, 2:],
             what="the path's acceleration",
             reference=along,
             band=LOW,
@@ -263,7 +267,7 @@ def _felt(
         )
 
 
-def _caused(s: Signals, along: np.ndarray | None, order: int) -> Iterator[Pair]:
+def _caused_pairs(s: Signals, along: np.ndarray | None, order: int) -> Iterator[Pair]:
     """Motors with the force that they make and the thrust that was asked for. What the
     accelerometer or else the path feels is moved by floor, wakes and gusts, too: it
     must follow where the motors do much.
@@ -276,7 +280,7 @@ def _caused(s: Signals, along: np.ndarray | None, order: int) -> Iterator[Pair]:
         usual = max(float(np.median(collective)), 1e-3)
         yield Pair(
             names=("the force felt",),
-            measured=force,
+            signal=force,
             what="what the motors would make",
             reference=collective * np.median(force) / usual,
             band=LOW,
@@ -284,10 +288,10 @@ def _caused(s: Signals, along: np.ndarray | None, order: int) -> Iterator[Pair]:
             unit="m/s^2",
             derivatives=(order, None),
         )
-    if s.thrust is not None and not s.saturated:
+    if s.thrust is not None and not s.has_saturation:
         yield Pair(
             names=("cmd_thrust",),
-            measured=100 * s.thrust,
+            signal=100 * s.thrust,
             what="m1 + m2 + m3 + m4",
             reference=100 * collective,
             band=WIDE,
@@ -299,19 +303,19 @@ def _caused(s: Signals, along: np.ndarray | None, order: int) -> Iterator[Pair]:
 
 @dataclass(frozen=True)
 class Agreement:
-    """How well `measured` follows `reference`, axis by axis, in the band of the
+    """How well `signal` follows `reference`, axis by axis, in the band of the
     comparison.
     """
 
     correlation: np.ndarray  # (C,) at the best clock offset of each window, pooled
     # (C,) what the white part of the measured signal leaves of a perfect one
-    expected: np.ndarray
+    expectation: np.ndarray
     reference: np.ndarray  # (C,) rms of the reference in the band
-    measured: np.ndarray  # (C,) rms of the measured signal in the band
+    signal: np.ndarray  # (C,) rms of the measured signal in the band
 
 
 def agreement(
-    measured: Columns,
+    signal: Columns,
     reference: Columns,
     band: tuple[float, float],
     derivatives: tuple[int | None, int | None] = (0, 0),
@@ -320,7 +324,7 @@ def agreement(
     how many times each was differentiated from what its sensor gives; None: a command,
     which has no noise.
     """
-    y = in_band(measured, band)
+    y = in_band(signal, band)
     x = in_band(reference, band)
     width = int(WINDOW * RATE)
     shift = int(LAG * RATE)
@@ -336,19 +340,19 @@ def agreement(
             for lag in range(-shift, shift + 1)
         ]
         best = int(np.argmax((np.array(each) / scale).sum(1)))
-        aligned = np.roll(other, best - shift, 0)[inner]
+        aligned_part = np.roll(other, best - shift, 0)[inner]
         products += each[best]
-        powers += [(values[inner] ** 2).sum(0), (aligned**2).sum(0)]
+        powers += [(values[inner] ** 2).sum(0), (aligned_part**2).sum(0)]
     rms_y = y.std(0)
     rms_x = x.std(0)
-    noise_y = _noise(measured, band, derivatives[0])
+    noise_y = _noise(signal, band, derivatives[0])
     noise_x = np.minimum(_noise(reference, band, derivatives[1]), rms_x)
-    aligned = np.sqrt(rms_x**2 - noise_x**2)
-    expected = aligned**2 / (
-        np.maximum(rms_x, 1e-12) * np.sqrt(aligned**2 + noise_y**2 + 1e-24)
+    aligned_part = np.sqrt(rms_x**2 - noise_x**2)
+    expectation = aligned_part**2 / (
+        np.maximum(rms_x, 1e-12) * np.sqrt(aligned_part**2 + noise_y**2 + 1e-24)
     )
     correlation = products / np.sqrt(np.maximum(powers.prod(0), 1e-24))
-    return Agreement(correlation, expected, aligned, rms_y)
+    return Agreement(correlation, expectation, aligned_part, rms_y)
 
 
 def _noise(

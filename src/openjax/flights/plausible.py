@@ -52,8 +52,10 @@ def gravity_findings(force: np.ndarray | None) -> list[Finding]:
             )
         ]
     if not 4.0 < size < 30.0:
-        why = "gravity was taken out" if size < 0.6 else "wrong unit or corrupt"
-        text = f"the mean specific force is {size:.3g} m/s^2 and not near 9.81: {why}"
+        reason = "gravity was taken out" if size < 0.6 else "wrong unit or corrupt"
+        text = (
+            f"the mean specific force is {size:.3g} m/s^2 and not near 9.81: {reason}"
+        )
         return [
             ("units", f"{text}; the log format wants +9.81 m/s^2 on z at hover", ())
         ]

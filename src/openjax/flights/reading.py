@@ -49,7 +49,7 @@ def flights_of(
     """
     if "t" not in table.columns:
         raise LogError(
-            f"no column t; the log has {listed(table.columns)}: name it in columns.toml"
+            f"no column t; the log has {name_list(table.columns)}: name it in columns.toml"
         )
     remarks = list(table.remarks)
     all_channels = {
@@ -65,7 +65,7 @@ def flights_of(
     ids = list(dict.fromkeys(table.vehicle.tolist()))
     if len(ids) > MOST_VEHICLES:
         raise LogError(
-            f"column vehicle holds {len(ids)} ids, {listed(ids, 3)}; it names which vehicle a row "
+            f"column vehicle holds {len(ids)} ids, {name_list(ids, 3)}; it names which vehicle a row "
             "belongs to"
         )
     flights = []
@@ -116,7 +116,7 @@ def _channel(
     return values[:, 0] if len(names) == 1 else values
 
 
-def listed(names: Iterable[str], most: int = NAMES_SHOWN) -> str:
+def name_list(names: Iterable[str], most: int = NAMES_SHOWN) -> str:
     """The first names, and how many more there are."""
     names = [name[:LONGEST_NAME] for name in names]
     more = f" and {len(names) - most} more" if len(names) > most else ""

@@ -63,7 +63,7 @@ class Turbulence:
     torque: float = 1e-5  # N m
     torque_time: float = 0.08  # s
 
-    def drawn(self, rng: np.random.Generator, rows: int, count: int) -> np.ndarray:
+    def draw(self, rng: np.random.Generator, rows: int, count: int) -> np.ndarray:
         """(T, N, 6) force in the world's axes and torque in the body's."""
         sizes = np.repeat([self.force, self.torque], 3)
         times = np.repeat([self.force_time, self.torque_time], 3)
@@ -169,7 +169,7 @@ def _doublets(t, duration):
 
 def fly(
     plant: Vehicle,
-    assumed: Vehicle,
+    model: Vehicle,
     reference: Reference,
     seed: int = 0,
     effects: Mapping[str, Mapping[str, float]] | None = None,
@@ -177,7 +177,7 @@ def fly(
     air: Turbulence | None = None,
 ) -> list[dict[str, Shaped[np.ndarray, " rows"]]]:
     """Fly `plant` with `effects` ({name: {parameter: value}}) along `reference`, under
-    a controller that assumes the vehicle `assumed`, in still air or turbulent `air`.
+    a controller that assumes the vehicle `model`, in still air or turbulent `air`.
     Returns the columns of the log for each vehicle, {name: (T,)}.
     """
     sensors = SensorModel() if sensors is None else sensors
@@ -200,12 +200,10 @@ def fly(
     # generators of their own: the same flight in other air, or with other sensors
     gusts = None
     if air is not None:
-        gusts_drawn = air.drawn(np.random.default_rng([seed, 2]), length, count)
+        gusts_drawn = air.draw(np.random.default_rng([seed, 2]), length, count)
         gusts = jnp.asarray(gusts_drawn, jnp.float32)
     key = jax.random.key(seed)
-    record = _fly(
-        plant, assumed, targets, start, parameters, key, gusts, names, sensors
-    )
+    record = _fly(plant, model, targets, start, parameters, key, gusts, names, sensors)
     rows = jax.device_get(record)
     rng = np.random.default_rng([seed, 1])
     return [_columns([r[:, n] for r in rows], rng, sensors) for n in range(count)]
@@ -227,7 +225,7 @@ def log_of(columns: list[dict[str, Shaped[np.ndarray, "..."]]], name: str) -> Lo
 @partial(jax.jit, static_argnames=("names", "sensors"))
 def _fly(
     plant: Vehicle,
-    assumed: Vehicle,
+    model: Vehicle,
     target,
     voltage,
     parameters,
@@ -275,7 +273,7 @@ def _fly(
             drones
         )
         command_sent, integral = jax.vmap(_position_controller, (None, 0, 0, 0))(
-            assumed, measured_state, integral, wanted_row
+            model, measured_state, integral, wanted_row
         )
         context, under_load = contexts(drones, load, air_time, PERIOD)
         change = partial(composition.change_command, effects, parameters)
@@ -358,7 +356,7 @@ def _physics(
     return drone.replace(rotor_speed=speed), force
 
 
-def _position_controller(assumed: Vehicle, state: DroneState, integral, target):
+def _position_controller(model: Vehicle, state: DroneState, integral, target):
     """Command (4,) of a position controller and its integral (3,) m s: PID to a wanted
     acceleration, thrust along body z, attitude error to body rates. Gains are for a
     vehicle of this size.
@@ -369,9 +367,9 @@ def _position_controller(assumed: Vehicle, state: DroneState, integral, target):
     pull = (
         acceleration + 9.0 * error + 5.0 * (velocity - state.velocity) + 5.0 * integral
     )
-    pull = jnp.clip(pull, -6.0, 6.0) + jnp.array([0.0, 0.0, 1.0]) * assumed.gravity
+    pull = jnp.clip(pull, -6.0, 6.0) + jnp.array([0.0, 0.0, 1.0]) * model.gravity
     up = rotate(state.quaternion, jnp.array([0.0, 0.0, 1.0]))
-    thrust = assumed.mass * jnp.dot(pull, up) / (4 * max_rotor_thrust(assumed))
+    thrust = model.mass * jnp.dot(pull, up) / (4 * max_rotor_thrust(model))
     tilt = rotate_inverse(state.quaternion, jnp.cross(up, pull / jnp.linalg.norm(pull)))
     forward = rotate(state.quaternion, jnp.array([1.0, 0.0, 0.0]))
     across = jnp.sin(yaw) * forward[0] - jnp.cos(yaw) * forward[1]
@@ -399,7 +397,7 @@ def _columns(
     )
 
     def shaken(attitudes):
-        return _turned(attitudes, noisy(np.zeros((count, 3)), sensors.attitude_noise))
+        return _turn(attitudes, noisy(np.zeros((count, 3)), sensors.attitude_noise))
 
     groups = {
         ("x", "y", "z"): noisy(position, sensors.position_noise),
@@ -420,7 +418,7 @@ def _columns(
     }
 
 
-def _turned(quaternion: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+def _turn(quaternion: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     """Attitudes (T, 4) turned by small body-frame rotations (T, 3) rad."""
     w = quaternion[:, :1]
     u = quaternion[:, 1:]

@@ -61,7 +61,7 @@ def drop_frozen(flight: Flight, note) -> Flight:
         if channel in SENSORS or channel == "motor_command":
             frozen = _standing_still(flight, channel, rows, note)
             if frozen.any():
-                changes[channel] = _unsampled(values, frozen)
+                changes[channel] = _unsample(values, frozen)
                 rows = rows[~frozen[rows]]
         if (
             channel != "battery_voltage"
@@ -174,16 +174,16 @@ def drop_repeats(flight: Flight, note) -> Flight:
         stack = np.concatenate(
             [getattr(flight, c).reshape(len(flight), -1) for c in channels], 1
         )
-        repeated = np.r_[False, (np.diff(stack, axis=0) == 0).all(1)]
-        if repeated.mean() < HELD:
+        repeats = np.r_[False, (np.diff(stack, axis=0) == 0).all(1)]
+        if repeats.mean() < HELD:
             continue
         note(
             "held",
-            f"{repeated.mean():.0%} of the rows repeat the last sample of {', '.join(channels)}: "
+            f"{repeats.mean():.0%} of the rows repeat the last sample of {', '.join(channels)}: "
             "left out",
         )
         for channel in channels:
-            changes[channel] = _unsampled(getattr(flight, channel), repeated)
+            changes[channel] = _unsample(getattr(flight, channel), repeats)
         if group[0] == "position":
             changes["pose_age"] = flight.row_period
     return dataclasses.replace(flight, **changes) if changes else flight
@@ -221,11 +221,11 @@ def put_in_step(flight: Flight, note) -> Flight:
     changes = {"pose_age": 0.0}
     for channel in channels:
         values = getattr(flight, channel)
-        resampled = np.full_like(values, np.nan)
-        resampled[rows] = np.stack(
+        result = np.full_like(values, np.nan)
+        result[rows] = np.stack(
             [np.interp(stamps, regular, column) for column in values[rows].T], 1
         )
-        changes[channel] = resampled
+        changes[channel] = result
     rate = (len(regular) - 1) / (regular[-1] - regular[0])
     note(
         "held",
@@ -255,11 +255,11 @@ def _regular_clock(times: np.ndarray, row: float) -> np.ndarray | None:
     return start + slope * ticks
 
 
-def _unsampled(values: np.ndarray, rows: np.ndarray) -> np.ndarray:
+def _unsample(values: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """Values (T, ...) without those of some rows (T,)."""
-    sampled = values.copy()
-    sampled[rows] = np.nan
-    return sampled
+    result = values.copy()
+    result[rows] = np.nan
+    return result
 
 
 def _frozen(

@@ -102,7 +102,7 @@ def _agile(t, ease):
     return _middle(t) + path, 0.8 * np.sin(0.11 * turn) * ease[:, 0]
 
 
-def _still(t, ease):
+def _rest(t, ease):
     return _middle(t), 0.0 * t
 
 
@@ -136,12 +136,12 @@ SEGMENTS: dict[str, Segment] = {
         20.0, "a quick figure with small random body rates", _agile, _dither
     ),
     "step": Segment(
-        20.0, "doublets of thrust and of every body rate in hover", _still, _doublets
+        20.0, "doublets of thrust and of every body rate in hover", _rest, _doublets
     ),
     "climb": Segment(15.0, "quick climbs and descents", _climbing),
     "fast": Segment(20.0, "fast straight passes, nose first and side first", _fast),
     "low": Segment(10.0, "slow passes just above the floor", _level(LOWEST)),
     "high": Segment(10.0, "slow passes just below the ceiling", _level(HIGHEST)),
-    "hover": Segment(5.0, "hovering on a used battery", _still, None, EMPTY),
+    "hover": Segment(5.0, "hovering on a used battery", _rest, None, EMPTY),
 }
 """By name; all of them, in this order, are the standard plan of two minutes."""

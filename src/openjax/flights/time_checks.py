@@ -1,5 +1,5 @@
-"""What a log's times have to be: in seconds, in order, without rows that stand twice, and
-of a vehicle whose motors turn.
+"""What a log's times have to be: in seconds, in order, without rows that stand twice,
+and of a vehicle whose motors turn.
 """
 
 import numpy as np
@@ -21,20 +21,20 @@ def in_time(flight: Flight, note) -> Flight:
         time = flight.time
     if len(time) < 20:
         raise Refused("short", f"only {len(time)} row{'s' * (len(time) != 1)}")
-    flight = _sorted(_written_once(flight, note), note)
-    repeated = np.diff(flight.time) == 0
-    if repeated.mean() > 0.2:
+    flight = _sort(_written_once(flight, note), note)
+    repeats = np.diff(flight.time) == 0
+    if repeats.mean() > 0.2:
         raise Refused(
             "time",
-            f"{repeated.mean():.0%} of the rows repeat the time of the row before: the clock is "
+            f"{repeats.mean():.0%} of the rows repeat the time of the row before: the clock is "
             "frozen, or too coarse",
         )
-    if repeated.any():
+    if repeats.any():
         note(
             "time",
-            f"{repeated.sum()} rows repeat the time of the row before and are left out",
+            f"{repeats.sum()} rows repeat the time of the row before and are left out",
         )
-        flight = flight.rows(np.r_[True, ~repeated])
+        flight = flight.rows(np.r_[True, ~repeats])
     step = flight.row_period
     _refuse_units(step)
     steps = np.diff(flight.time)
@@ -42,10 +42,10 @@ def in_time(flight: Flight, note) -> Flight:
     if len(gaps):
         longest = gaps[np.argmax(steps[gaps])]
         number = f"{len(gaps)} gap{'s' * (len(gaps) > 1)}"
-        where = (
+        places = (
             f"the longest {steps[longest]:.2f} s after t = {flight.time[longest]:.2f}"
         )
-        note("gaps", f"{number} in time, {where}")
+        note("gaps", f"{number} in time, {places}")
     return flight
 
 
@@ -71,7 +71,7 @@ def while_motors_turn(flight: Flight, note) -> Flight:
     return flight.rows(part)
 
 
-def _sorted(flight: Flight, note) -> Flight:
+def _sort(flight: Flight, note) -> Flight:
     """Rows out of order are sorted: a few, or any number of one recording, whose rows
     are then evenly apart. Others are several recordings.
     """
@@ -94,11 +94,11 @@ def _written_once(flight: Flight, note) -> Flight:
     ]
     table = np.column_stack([flight.time, *(v.reshape(len(v), -1) for v in channels)])
     same = (table[1:] == table[:-1]) | (np.isnan(table[1:]) & np.isnan(table[:-1]))
-    repeated = np.r_[False, same.all(1)]
-    if not repeated.any():
+    repeats = np.r_[False, same.all(1)]
+    if not repeats.any():
         return flight
-    note("time", f"{repeated.sum()} rows that stand twice were left out")
-    return flight.rows(~repeated)
+    note("time", f"{repeats.sum()} rows that stand twice were left out")
+    return flight.rows(~repeats)
 
 
 def _refuse_units(step: float) -> None:

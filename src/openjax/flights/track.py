@@ -118,7 +118,7 @@ def _neighbours(case, flight, grid):
     return np.array(places) if places else np.zeros((0, len(grid), 3))
 
 
-def _commanded(take):
+def _command(take):
     """(G, 4) thrust and body rates; `take` gives a channel's values on the clock."""
     thrust = take("command_thrust", ahead=True)
     return np.concatenate([thrust[:, None], take("command_body_rates", ahead=True)], 1)
@@ -160,7 +160,7 @@ def _on_grid(part: Flight, flight: Flight, case: Case, name: str) -> Track:
         dt=period,
         time=grid,
         **sensors,
-        command=_commanded(take) if part.has_commands else None,
+        command=_command(take) if part.has_commands else None,
         motor=motor,
         voltage=None if voltage is None else smooth(voltage, 0.3, period),
         neighbours=_neighbours(case, flight, grid) - floor,

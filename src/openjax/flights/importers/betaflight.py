@@ -102,21 +102,21 @@ def read_blackbox_csv(path: Path, mapping: ColumnMapping | None = None) -> LogTa
     above = _lines_above(lines) or 0
     names = find_header(lines[above:], delimiter).names
     headers = _headers(lines[:above])
-    decoded = path.with_name(
+    log_file = path.with_name(
         path.name.removesuffix(".gz").removesuffix(".csv") + HEADERS_FILE
     )
-    if decoded.is_file():
-        headers |= _headers(head_of(decoded))
+    if log_file.is_file():
+        headers |= _headers(head_of(log_file))
     fields = {_FIELD.fullmatch(name)[1]: name for name in names}
     if "motor[4]" in fields:
         raise LogError("more than four motors were logged; four are needed")
     remarks = _without_filter(fields)
     usual = _usual(fields, headers)
     time = fields.get("time", "time")
-    mapped = {} if mapping is None else mapping.columns
+    mapping_columns = {} if mapping is None else mapping.columns
     columns_read = (
         time,
-        *(source.name for source in (*usual.values(), *mapped.values())),
+        *(source.name for source in (*usual.values(), *mapping_columns.values())),
     )
     raw, more_remarks = raw_columns(path, columns_read, time, delimiter, above)
     remarks += more_remarks
@@ -128,7 +128,9 @@ def read_blackbox_csv(path: Path, mapping: ColumnMapping | None = None) -> LogTa
     seconds = raw[time] * UNITS.get(_FIELD.fullmatch(time)[2] or "us", UNITS["us"])
     table = merge_streams([Stream(seconds, raw)], columns)
     table["t"] = table["t"] - table["t"][0]
-    for motor in set(CHANNEL_COLUMNS["motor_command"]) & set(table) - set(mapped):
+    for motor in set(CHANNEL_COLUMNS["motor_command"]) & set(table) - set(
+        mapping_columns
+    ):
         # a motor at rest is below DShot's least
         table[motor] = np.maximum(table[motor], 0.0)
     return LogTable(path.name, table, np.full(len(table["t"]), "0"), tuple(remarks))

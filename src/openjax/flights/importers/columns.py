@@ -4,13 +4,11 @@ unit.
 A `columns.toml` in a case folder applies to all its logs. A CSV column that it doesn't
 name and that has a name of the log format is taken as it is:
 
-    delimiter = ";"                                        # CSV only; by its header if left out
-    [columns]
-    t      = { from = "timestamp", unit = "ms" }
-    x      = "pos_x"                                       # already in the log format's unit
-    wx     = { from = "gyro.x", unit = "deg/s" }           # a micro-SD log variable
-    ax     = { from = "/cf1/imu:linear_acceleration.x" }   # a field of a ROS 2 topic
-    cmd_wy = { from = "pitch_rate", unit = "deg/s", scale = -1 }
+delimiter = ";"                                        # CSV only; by its header if left
+out [columns] t      = { from = "timestamp", unit = "ms" } x      = "pos_x"
+# already in the log format's unit wx     = { from = "gyro.x", unit = "deg/s" }
+# a micro-SD log variable ax     = { from = "/cf1/imu:linear_acceleration.x" }   # a
+field of a ROS 2 topic cmd_wy = { from = "pitch_rate", unit = "deg/s", scale = -1 }
 
 A CSV whose topics have time stamps of their own names each, and what is `of` it; where
 names begin as the stamp's does ("imu.time", "imu.wx"), that may be left out:
@@ -134,15 +132,15 @@ class ColumnMapping:
         time.
         """
         sources = {source.name for source in self.columns.values()}
-        inherited = {
+        named_columns = {
             c: v
             for c, v in raw.columns.items()
             if c in LOG_COLUMNS and c not in sources
         }
         columns = (
-            inherited
+            named_columns
             if not set(EULER) & set(self.columns)
-            else _without_attitude(inherited)
+            else _without_attitude(named_columns)
         )
         remarks = list(raw.remarks)
         for column, source in self.columns.items():
@@ -228,12 +226,12 @@ def merge_streams(
     sampled. Raises LogError if no motion is there, if a stream holds several
     recordings, or if it ends before the others begin.
     """
-    timed = []
+    series = []
     for stream in streams:
         sources = {c: s for c, s in columns.items() if s.name in stream.values}
         if sources and np.isfinite(stream.time).sum() > 1:
-            timed.append(_converted(stream, sources))
-    with_motion = [u for u in timed if _MOTION & set(u[1])]
+            series.append(_convert(stream, sources))
+    with_motion = [u for u in series if _MOTION & set(u[1])]
     if not with_motion:
         raise LogError(
             "holds neither position and orientation nor a gyroscope under known names: name what "
@@ -243,16 +241,16 @@ def merge_streams(
     # are rounded
     clock = min(with_motion, key=lambda u: round(float(np.median(np.diff(u[0]))), 6))[0]
     clock = clock[np.r_[True, np.diff(clock) > 0]]
-    timed = _at_one_time(timed, clock)
+    series = _at_one_time(series, clock)
     table = {"t": clock}
-    for time, converted in timed:
+    for time, columns_of_stream in series:
         period = max(float(np.median(np.diff(time))), 1e-4)
-        for column, values in converted.items():
+        for column, values in columns_of_stream.items():
             table.setdefault(column, _onto(clock, time, values, column, period))
     return with_quaternion(table)
 
 
-def _converted(
+def _convert(
     stream: Stream, sources: dict[str, Source]
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Times of a stream, sorted, and its columns in the log format's units. Raises
@@ -264,11 +262,11 @@ def _converted(
     if back < -OVERTAKEN and (problem := several_recordings(time)):
         raise LogError(problem)
     order = np.argsort(time, kind="stable")
-    converted = {}
+    columns = {}
     for column, source in sources.items():
         values = source.scale * stream.values[source.name] + source.offset
-        converted[column] = values[finite][order]
-    return time[order], converted | _without_flips(converted)
+        columns[column] = values[finite][order]
+    return time[order], columns | _without_flips(columns)
 
 
 def _at_one_time(
@@ -278,9 +276,13 @@ def _at_one_time(
     wasn't, where no other one has its columns; the battery may be missing.
     """
     beside = [u for u in streams if u[0][0] <= clock[-1] and u[0][-1] >= clock[0]]
-    elsewhere = {column for _, converted in beside for column in converted}
-    for time, converted in streams:
-        absent = [column for column in converted if column not in elsewhere | {"vbat"}]
+    elsewhere = {
+        column for _, columns_of_stream in beside for column in columns_of_stream
+    }
+    for time, columns_of_stream in streams:
+        absent = [
+            column for column in columns_of_stream if column not in elsewhere | {"vbat"}
+        ]
         if absent:
             raise LogError(
                 f"{', '.join(absent)} were logged from {time[0]:.2f} to {time[-1]:.2f} s, and "
@@ -290,14 +292,14 @@ def _at_one_time(
     return beside
 
 
-def _without_flips(converted: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+def _without_flips(columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """The quaternion of a stream without jumps between q and -q, which no line between
     two samples may cross; nothing where it has none.
     """
     names = CHANNEL_COLUMNS["quaternion"]
-    if not all(name in converted for name in names):
+    if not all(name in columns for name in names):
         return {}
-    quaternion = np.stack([converted[name] for name in names], 1)
+    quaternion = np.stack([columns[name] for name in names], 1)
     flips = (quaternion[1:] * quaternion[:-1]).sum(1) < 0.0
     sign = np.where(np.cumsum(np.r_[False, flips]) % 2, -1.0, 1.0)
     return dict(zip(names, (quaternion * sign[:, None]).T, strict=True))

@@ -102,16 +102,20 @@ def _block(path: Path, mapping: ColumnMapping | None) -> tuple[Stream, list[str]
     """One file as a stream, time in seconds since the firmware started, and remarks."""
     delimiter = delimiter_of(mapping)
     names = header_of(path, delimiter)
-    mapped = {} if mapping is None else mapping.columns
-    time = mapped["t"].name if "t" in mapped else time_name(names)
+    mapping_columns = {} if mapping is None else mapping.columns
+    time = mapping_columns["t"].name if "t" in mapping_columns else time_name(names)
     if time is None:
         raise LogError(
             f"no column {' or '.join(TIME_NAMES[:2])}: which holds the ticks in ms?"
         )
-    variables = (time, *VARIABLES, *(source.name for source in mapped.values()))
+    variables = (
+        time,
+        *VARIABLES,
+        *(source.name for source in mapping_columns.values()),
+    )
     values, remarks = raw_columns(path, variables, time, delimiter)
     ticks = values.pop(time)
-    scale = mapped["t"].scale if "t" in mapped else _tick(ticks)
+    scale = mapping_columns["t"].scale if "t" in mapping_columns else _tick(ticks)
     return Stream(scale * ticks, values), remarks
 
 

@@ -65,5 +65,5 @@ def with_mixer(stream: Stream) -> Stream:
     yaw = inputs[3]
     motors = (thrust - roll + pitch + yaw, thrust - roll - pitch - yaw,
               thrust + roll - pitch + yaw, thrust + roll + pitch - yaw)  # fmt: skip
-    mixed = {f"mixer.m{i}": np.clip(m, 0.0, 65535.0) for i, m in enumerate(motors, 1)}
-    return Stream(stream.time, stream.values | mixed)
+    outputs = {f"mixer.m{i}": np.clip(m, 0.0, 65535.0) for i, m in enumerate(motors, 1)}
+    return Stream(stream.time, stream.values | outputs)

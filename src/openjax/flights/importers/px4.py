@@ -99,14 +99,16 @@ def read_ulog(path: Path, mapping: ColumnMapping | None = None) -> LogTable:
     Raises LogError if it is damaged or holds nothing known, UserError without the
     library.
     """
-    mapped = {} if mapping is None else mapping.over({})
-    log = _parsed(path, {source.name.partition(":")[0] for source in mapped.values()})
+    mapping_columns = {} if mapping is None else mapping.over({})
+    log = _parse(
+        path, {source.name.partition(":")[0] for source in mapping_columns.values()}
+    )
     topics = {data.name: data for data in log.data_list if data.multi_id == 0}
     streams = {
         name: _stream(data, log.start_timestamp) for name, data in topics.items()
     }
     if f"{ATTITUDE}:q[0]" in streams.get(ATTITUDE, Stream(np.empty(0), {})).values:
-        streams[ATTITUDE] = _turned(streams[ATTITUDE])
+        streams[ATTITUDE] = _turn(streams[ATTITUDE])
     motors, remarks = _motors(streams, log.initial_parameters)
     if motors is not None:
         streams["motors"] = motors
@@ -126,7 +128,7 @@ def read_ulog(path: Path, mapping: ColumnMapping | None = None) -> LogTable:
     return LogTable(path.name, table, np.full(len(table["t"]), "0"), tuple(remarks))
 
 
-def _parsed(path: Path, more: set[str]):
+def _parse(path: Path, more: set[str]):
     """The library's log of the topics that are known and `more`. Raises as `read_ulog`
     does.
     """
@@ -159,9 +161,9 @@ def _stream(data, start: int) -> Stream:
     """
     fields = data.data
     stamp = np.asarray(fields["timestamp"], np.int64)
-    measured = fields.get("timestamp_sample")
-    if measured is not None and np.all(measured > 0):
-        stamp = np.asarray(measured, np.int64)
+    sample_times = fields.get("timestamp_sample")
+    if sample_times is not None and np.all(sample_times > 0):
+        stamp = np.asarray(sample_times, np.int64)
     values = {f"{data.name}:{name}": np.asarray(v, float) for name, v in fields.items()}
     return Stream((stamp - int(start)) * 1e-6, values)
 
@@ -172,7 +174,7 @@ def _period(stream: Stream) -> float:
     return round(float(np.median(steps)), 4) if len(steps) else np.inf
 
 
-def _turned(stream: Stream) -> Stream:
+def _turn(stream: Stream) -> Stream:
     """The attitude's stream with the quaternion of the log format, body (forward, left,
     up) to world (east, north, up): q' = (i + j)/sqrt(2) q i*, of q from body to world
     in PX4's frames.

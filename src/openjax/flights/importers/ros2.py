@@ -106,8 +106,8 @@ def _is_storage(path: Path) -> bool:
         return False
     with path.open("rb") as file:
         head = file.read(64)
-    profiled = path.suffix != ".mcap" or any(p in head for p in (b"ros1", b"ros2"))
-    return head.startswith(start) and profiled
+    has_profile = path.suffix != ".mcap" or any(p in head for p in (b"ros1", b"ros2"))
+    return head.startswith(start) and has_profile
 
 
 def read_bag(path: str | Path, mapping: ColumnMapping | None = None) -> LogTable:
@@ -139,7 +139,7 @@ def read_bag(path: str | Path, mapping: ColumnMapping | None = None) -> LogTable
         raise LogError(
             f"ROS bag can't be read: {str(error).splitlines()[0] if str(error) else type(error)}"
         ) from error
-    return _joined(path.name, *_merged(vehicles, remarks, mapping))
+    return _join(path.name, *_merge(vehicles, remarks, mapping))
 
 
 @dataclass(eq=False)
@@ -168,12 +168,12 @@ class _Recording:
         """
         by_name, remarks = firmware_columns(self.log_streams)
         both = zip(self.sources, self.streams, strict=True)
-        ranked = [(rank, _period(stream), columns) for (rank, columns), stream in both]
-        ranked.sort(key=lambda topic: topic[:2], reverse=True)
+        topics = [(rank, _period(stream), columns) for (rank, columns), stream in both]
+        topics.sort(key=lambda topic: topic[:2], reverse=True)
         columns = {
-            c: source for *_, of_stream in ranked for c, source in of_stream.items()
+            c: source for *_, of_stream in topics for c, source in of_stream.items()
         }
-        poses = [topic for topic in ranked if "x" in topic[2]]
+        poses = [topic for topic in topics if "x" in topic[2]]
         if "x" in by_name and poses:
             with_position = next(
                 s for s in self.log_streams if by_name["x"].name in s.values
@@ -203,7 +203,7 @@ def _vehicles(
     """{vehicle: what the bag holds of it}, and remarks. With a mapping all is one
     vehicle's.
     """
-    topics = _wanted(reader.connections, mapping)
+    topics = _wanted_columns(reader.connections, mapping)
     files = custom_topics(path) if mapping is None else []
     vehicles: dict[str, _Recording] = {}
     remarks = []
@@ -254,7 +254,7 @@ def _add_captured(reader, vehicles: dict[str, _Recording]) -> list[str]:
     return [f"nothing but poses was logged of {', '.join(others)}: left out"]
 
 
-def _merged(
+def _merge(
     vehicles: dict[str, _Recording], remarks: list[str], mapping: ColumnMapping | None
 ) -> tuple[dict[str, dict], list[str]]:
     """The columns of each vehicle, and remarks on those that hold none. Raises LogError
@@ -283,7 +283,9 @@ def _merged(
     return tables, remarks
 
 
-def _wanted(connections, mapping: ColumnMapping | None) -> dict[str, dict[str, str]]:
+def _wanted_columns(
+    connections, mapping: ColumnMapping | None
+) -> dict[str, dict[str, str]]:
     """Topic -> {column: field} of what is to be read."""
     topics: dict[str, dict[str, str]] = {}
     if mapping is not None:
@@ -333,11 +335,11 @@ def _messages(reader, connection):
     keep their resolution as floats of seconds; the header's where there is one, else
     when it was received.
     """
-    for _, received, data in reader.messages(connections=[connection]):
+    for _, arrival, data in reader.messages(connections=[connection]):
         message = reader.deserialize(data, connection.msgtype)
         stamp = getattr(getattr(message, "header", None), "stamp", None)
         nanoseconds = 0 if stamp is None else stamp.sec * 1_000_000_000 + stamp.nanosec
-        yield (nanoseconds or received) - reader.start_time, message
+        yield (nanoseconds or arrival) - reader.start_time, message
 
 
 def _field(message, path: str, topic: str) -> float:
@@ -349,7 +351,7 @@ def _field(message, path: str, topic: str) -> float:
         raise LogError(f"messages of {topic} have no number {path!r}") from error
 
 
-def _joined(
+def _join(
     name: str, tables: dict[str, dict[str, np.ndarray]], remarks: list[str]
 ) -> LogTable:
     """The vehicles' columns in the long format, time from the first row of any."""

@@ -80,21 +80,21 @@ def read_topic_times(path: Path, mapping: ColumnMapping | None = None) -> LogTab
     delimiter = delimiter_of(mapping)
     names = header_of(path, delimiter)
     stamps = _named_stamps(names, mapping)
-    repeated = []
+    repeats = []
     if mapping is None:
-        sources, repeated = recognised(names, stamps)
+        sources, repeats = recognise(names, stamps)
     else:
-        sources = _mapped(names, mapping)
+        sources = _map(names, mapping)
     clock_of = _clocks(sources, stamps, mapping)
     columns_read = (*stamps.values(), *(source.name for source in sources.values()))
     raw, remarks = raw_columns(
         path, columns_read, next(iter(stamps.values())), delimiter
     )
     streams = _streams(raw, sources, clock_of, mapping)
-    if repeated:
+    if repeats:
         remarks.append(
-            f"columns that others hold already are left out, {repeated[0]} to "
-            f"{repeated[-1]}: a vehicle "
+            f"columns that others hold already are left out, {repeats[0]} to "
+            f"{repeats[-1]}: a vehicle "
             "each, a file each"
         )
     absent = [source.name for source in sources.values() if source.name not in raw]
@@ -109,7 +109,7 @@ def read_topic_times(path: Path, mapping: ColumnMapping | None = None) -> LogTab
     return LogTable(path.name, table, np.full(len(table["t"]), "0"), tuple(remarks))
 
 
-def _mapped(names: list[str], mapping: ColumnMapping) -> dict[str, Source]:
+def _map(names: list[str], mapping: ColumnMapping) -> dict[str, Source]:
     """{column: source} of what a `columns.toml` names, and of columns that have names
     of the log format already. Raises LogError for nothing.
     """
@@ -122,14 +122,14 @@ def _mapped(names: list[str], mapping: ColumnMapping) -> dict[str, Source]:
     return sources
 
 
-def recognised(
+def recognise(
     names: list[str], stamps: dict[str, str]
 ) -> tuple[dict[str, Source], list[str]]:
     """{column: source} of what a header's names say by themselves, and the names of
     columns that are there already. Raises LogError for nothing.
     """
     sources = {}
-    repeated = []
+    repeats = []
     for name in names:
         topic = topic_of(name, stamps)
         if topic is None or name in stamps.values():
@@ -142,14 +142,14 @@ def recognised(
         )
         if column in LOG_COLUMNS[2:] or column in EULER:
             if column in sources:
-                repeated.append(name)
+                repeats.append(name)
             sources.setdefault(column, Source(name))
     if not sources:
         raise LogError(
             f"each topic has a time stamp ({', '.join(stamps.values())}), but no column is called "
             f"like x, qw, wx, m1: say in columns.toml which is which"
         )
-    return sources, repeated
+    return sources, repeats
 
 
 def _named_stamps(names: list[str], mapping: ColumnMapping | None) -> dict[str, str]:
