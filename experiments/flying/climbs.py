@@ -61,7 +61,7 @@ def judged(rows, speed: float = 0.0, within: float = 1.0, begin: float = 0.0):
         t = true.time - first
         drift = speed * min(max((t - begin) / within, 0.0), 1.0)
         pose = true._replace(velocity=(*true.velocity[:2], true.velocity[2] + drift))
-        climb = climb.after(pose, force)
+        climb = climb.update(pose, force)
         largest = max(largest, abs(climb.smooth))
         if end_time is None and climb.contradicts:
             end_time = t

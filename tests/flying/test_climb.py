@@ -57,7 +57,7 @@ def judged(rows, speed=0.0, axis=2, begin=0.3, logged=True):
         position[axis] += way
         velocity[axis] += drift
         told = pose._replace(position=tuple(position), velocity=tuple(velocity))
-        innovations = innovations.after(told, sent, AIRFRAME).feeling(
+        innovations = innovations.update(told, sent, AIRFRAME).feeling(
             force if logged else None
         )
         if innovations.verdict():
@@ -76,7 +76,7 @@ def test_a_gentle_drift_of_the_height_is_told_early_and_undone(flown, speed):
     innovations, pose = judged(flown, speed)
     assert innovations.verdict() is Verdict.NOT_ITS_CLIMB
     assert pose.time < 2.8
-    believed = innovations.corrected()
+    believed = innovations.corrected_pose()
     assert believed.position[2] == pytest.approx(pose.position[2], abs=0.06)
     assert believed.velocity[2] == pytest.approx(pose.velocity[2], abs=0.12)
 

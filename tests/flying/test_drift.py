@@ -32,7 +32,7 @@ def team(flights, number):
         both = zip(
             acceleration[row, number], velocity[row, number], drifts, strict=True
         )
-        drifts = [d.after((*a, 0.0), (*v, 0.0), observable.PERIOD) for a, v, d in both]
+        drifts = [d.update((*a, 0.0), (*v, 0.0), observable.PERIOD) for a, v, d in both]
         yield drifts
 
 

@@ -66,7 +66,7 @@ def judged(damage=lambda pose, t, held, noise: pose, push=(0.0, 0.0, 0.0)):
         if pose.time >= BEGIN:
             held = held or pose
             pose = damage(pose, pose.time - BEGIN, held, noise)
-        innovations = innovations.after(pose, sent, AIRFRAME)
+        innovations = innovations.update(pose, sent, AIRFRAME)
         sent = following
         if verdict := innovations.verdict():
             return verdict, pose.time - BEGIN
@@ -138,9 +138,9 @@ def test_the_pose_that_is_flown_on_by_is_without_the_drift():
     innovations = Innovations()
     for pose, sent in flight(2.0):
         moved = drifting(0.08, axis=0)(pose, pose.time, None, None)
-        innovations = innovations.after(moved, sent, AIRFRAME)
+        innovations = innovations.update(moved, sent, AIRFRAME)
     assert abs(moved.position[0] - pose.position[0]) > 0.15
-    assert abs(innovations.corrected().position[0] - moved.position[0]) > 0.06
+    assert abs(innovations.corrected_pose().position[0] - moved.position[0]) > 0.06
 
 
 def test_a_turn_between_attitudes_is_the_rotation_between_them():

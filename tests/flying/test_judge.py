@@ -120,7 +120,7 @@ def test_poses_out_of_order_late_or_from_the_future_change_nothing():
     track = Track(HERE._replace(time=1.0))
     for time in (0.99, 1.0, 0.5, 1.2, math.nan, math.inf):
         assert (
-            track.after(
+            track.update(
                 HERE._replace(time=time, position=(0.401, 0.0, 0.5)),
                 1.01,
                 LIMITS,
@@ -129,16 +129,16 @@ def test_poses_out_of_order_late_or_from_the_future_change_nothing():
             )
             is track
         )
-    assert Track().after(None, 1.0, LIMITS, True, None) == Track()
+    assert Track().update(None, 1.0, LIMITS, True, None) == Track()
 
 
 def test_a_refused_pose_leaves_the_last_good_one():
     wrong = HERE._replace(time=0.01, position=(2.0, 0.0, 0.5))
-    assert Track(HERE).after(wrong, 0.01, LIMITS, True, None) == Track(
+    assert Track(HERE).update(wrong, 0.01, LIMITS, True, None) == Track(
         HERE, Verdict.JUMPED, 0.01
     )
     assert (
-        Track(HERE).after(wrong, 0.01, LIMITS, False, None).pose is wrong
+        Track(HERE).update(wrong, 0.01, LIMITS, False, None).pose is wrong
     )  # carried to another place by hand
 
 

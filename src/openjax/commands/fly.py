@@ -133,7 +133,7 @@ def _fly(arguments: Arguments, preparation: Prepared | None) -> None:
             setup.state,
             plan,
             session.requests,
-            session.watched,
+            session.watch,
         )
         console.print(
             "flying: space or q stops all motors; l, Ctrl-C or Ctrl-Z land; h waits"

@@ -113,7 +113,8 @@ def _not_numbers(bad: np.ndarray, names: list[str]) -> list[str]:
     for name, count in zip(names, bad.sum(0).tolist(), strict=True):
         columns_of.setdefault(count, []).append(name)
     return [
-        f"column{'s' * (len(columns) > 1)} {name_list(columns)}: {count} of {len(bad)} rows are NaN "
+        f"column{'s' * (len(columns) > 1)} {name_list(columns)}: "
+        f"{count} of {len(bad)} rows are NaN "
         "or infinite"
         for count, columns in columns_of.items()
         if count

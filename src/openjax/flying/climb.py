@@ -41,11 +41,11 @@ class Climb(NamedTuple):
     felt: float = math.nan
     offset: float = 0.0  # m/s^2, as learnt
     age: float = 0.0  # s, for how long
-    summed: float = 0.0  # m/s
+    total: float = 0.0  # m/s
     smooth: float = 0.0  # m/s, the sum's low-pass
     height: float = 0.0  # m, what the sum has added to the height
 
-    def after(self, pose: Pose, force: Vector | None) -> "Climb":
+    def update(self, pose: Pose, force: Vector | None) -> "Climb":
         """With the next pose and the specific force (m/s^2, body) that is felt there.
         Where a pose or a force is missing, nothing changes.
         """
@@ -59,16 +59,16 @@ class Climb(NamedTuple):
         )
         age = self.age + dt
         decay = math.exp(-dt / WINDOW)
-        summed = decay * self.summed + beyond
+        total = decay * self.total + beyond
         return Climb(
             time=pose.time,
             speed=speed,
             felt=force_climb,
             offset=self.offset + beyond / min(age + TRUSTED, LEARNT),
             age=age,
-            summed=summed,
-            smooth=summed + math.exp(-dt / CALM) * (self.smooth - summed),
-            height=decay * self.height + dt * summed,
+            total=total,
+            smooth=total + math.exp(-dt / CALM) * (self.smooth - total),
+            height=decay * self.height + dt * total,
         )
 
     @property

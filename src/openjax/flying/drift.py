@@ -49,17 +49,17 @@ class Fit(NamedTuple):
     time: float = 0.3  # s
     way: float = 0.0  # of the velocity, m
     energy: float = 0.3  # of its square, m^2/s
-    gained: float = 0.0  # of the acceleration, m/s
+    gain: float = 0.0  # of the acceleration, m/s
     moment: float = 0.0  # of their product, m^2/s^2
 
-    def after(self, acceleration: float, velocity: float, dt: float) -> "Fit":
+    def update(self, acceleration: float, velocity: float, dt: float) -> "Fit":
         """With what was unexplained for `dt` (s) at a velocity (m/s)."""
         decay = math.exp(-dt / FORGETTING)
         return Fit(
             decay * self.time + dt + (1.0 - decay) * SPREAD,
             decay * self.way + dt * velocity,
             decay * self.energy + dt * velocity**2 + (1.0 - decay) * SPREAD,
-            decay * self.gained + dt * acceleration,
+            decay * self.gain + dt * acceleration,
             decay * self.moment + dt * acceleration * velocity,
         )
 
@@ -67,8 +67,8 @@ class Fit(NamedTuple):
         """The acceleration (m/s^2) that is usual at a velocity (m/s)."""
         # the normal equations of a straight line, whose sums fade
         determinant = self.time * self.energy - self.way**2
-        constant = self.energy * self.gained - self.way * self.moment
-        slope = self.time * self.moment - self.way * self.gained
+        constant = self.energy * self.gain - self.way * self.moment
+        slope = self.time * self.moment - self.way * self.gain
         return (constant + slope * velocity) / determinant
 
 
@@ -76,34 +76,34 @@ class Drift(NamedTuple):
     """What of a vehicle's level velocity nothing explains."""
 
     fits: tuple[Fit, Fit] = (Fit(), Fit())
-    summed: tuple[float, float] = (0.0, 0.0)  # m/s, over the window
+    totals: tuple[float, float] = (0.0, 0.0)  # m/s, over the window
     squares: float = 0.0  # m^2/s, of the sums' lengths since they are worth something
     age: float = 0.0  # s
 
-    def after(self, unexplained: Vector, velocity: Vector, dt: float) -> "Drift":
+    def update(self, residual: Vector, velocity: Vector, dt: float) -> "Drift":
         """After `dt` (s) with an acceleration (m/s^2, world) that thrust didn't
         explain.
         """
         # x and y of the velocity; the third, the height, is left out
-        level = list(zip(self.fits, unexplained, velocity, strict=False))
+        level = list(zip(self.fits, residual, velocity, strict=False))
         decay = math.exp(-dt / WINDOW)
-        summed = tuple(
+        totals = tuple(
             decay * total + dt * (acceleration - fit.at(speed))
             for total, (fit, acceleration, speed) in zip(
-                self.summed, level, strict=False
+                self.totals, level, strict=False
             )
         )
         fits = tuple(
-            fit.after(acceleration, speed, dt) for fit, acceleration, speed in level
+            fit.update(acceleration, speed, dt) for fit, acceleration, speed in level
         )
         worth = dt if self.age > LEARNT else 0.0
-        squares = self.squares + worth * sum(part**2 for part in summed)
-        return Drift(fits, summed, squares, self.age + dt)
+        squares = self.squares + worth * sum(part**2 for part in totals)
+        return Drift(fits, totals, squares, self.age + dt)
 
     @property
     def size(self) -> float:
         """Of the sum (m/s)."""
-        return math.hypot(*self.summed)
+        return math.hypot(*self.totals)
 
     @property
     def usual(self) -> float:

@@ -31,7 +31,7 @@ class Endpoint(NamedTuple):
 
 def endpoint_of(uri: str) -> Endpoint:
     """The vehicle that a URI means. Raises UserError for none."""
-    expected = UserError(
+    error = UserError(
         f"--uri {uri}: expected udp://HOST:PORT or radio://0/80/2M/E7E7E7E7E7 (dongle, channel 0 "
         "to 125, rate, address)"
     )
@@ -40,7 +40,7 @@ def endpoint_of(uri: str) -> Endpoint:
         kinds = {"udp": _udp, "radio": _radio}
         return kinds[parts.scheme](parts)
     except (KeyError, ValueError, UnicodeError):
-        raise expected from None
+        raise error from None
 
 
 def _udp(parts) -> Endpoint:

@@ -30,7 +30,7 @@ def see(state: State, time: float, samples: Sequence[PoseSample]) -> State:
     # a loop that stood still mustn't be reckoned over in one step
     state = state._replace(time=time, dt=min(max(time - state.time, 0.0), 0.1))
     both = zip(state.drones, samples, strict=True)
-    drones = tuple(_estimated(state, drone, sample) for drone, sample in both)
+    drones = tuple(_estimate(state, drone, sample) for drone, sample in both)
     drift = drifting([drone.innovations.drift for drone in drones])
     return state._replace(
         drones=tuple(
@@ -49,7 +49,7 @@ def _without_drift(state, drone) -> Drone:
     if drone.contradiction or drone.mode not in CHECKED:
         return drone
     pose = drone.innovations.pose
-    excess = (*drone.innovations.drift.summed, 0.0)
+    excess = (*drone.innovations.drift.totals, 0.0)
     velocity = tuple(v - part for v, part in zip(pose.velocity, excess, strict=True))
     return drone._replace(
         own=drone.own._replace(verdict=Verdict.DRIFTS),
@@ -58,7 +58,7 @@ def _without_drift(state, drone) -> Drone:
     )
 
 
-def _estimated(state, drone, sample) -> Drone:
+def _estimate(state, drone, sample) -> Drone:
     """The drone with its estimate now, after what was newly told of it."""
     time = state.time
     limits = state.limits
@@ -66,22 +66,22 @@ def _estimated(state, drone, sample) -> Drone:
         drone.mode is Mode.LIFT and time - drone.since < SPIN_UP
     )
     by_capture = sample.captured is not None and not drone.capture_fault
-    track = _own(state, drone, sample, by_capture, moving)
+    track = _onboard_track(state, drone, sample, by_capture, moving)
     drone = _consistent(state, drone, track, sample.force)
     if by_capture and not drone.capture_fault:
-        drone = _captured(state, drone, sample, moving)
+        drone = _with_capture(state, drone, sample, moving)
     source = drone.captured if by_capture and not drone.capture_fault else drone.own
-    contradicted = source is drone.own and drone.contradiction
-    if source.fresh(time, limits) and not contradicted:
+    is_contradiction = source is drone.own and drone.contradiction
+    if source.fresh(time, limits) and not is_contradiction:
         estimate = moved_on(source.pose, max(time, source.pose.time))
         level = level_acceleration(estimate.quaternion)
         return drone._replace(
             estimate=estimate, seen=source.pose.time, acceleration=level
         )
-    return drone if drone.estimate is None else _reckoned(state, drone)
+    return drone if drone.estimate is None else _reckon(state, drone)
 
 
-def _reckoned(state, drone) -> Drone:
+def _reckon(state, drone) -> Drone:
     """The drone a tick on by dead reckoning, its attitude as it was."""
     # without a pose nothing tells how it turns
     old = drone.estimate
@@ -116,9 +116,9 @@ def _consistent(state, drone, own_track, force) -> Drone:
             own=own_track,
             contradiction=own_track.verdict if verdict_lost else Verdict.GOOD,
         )
-    refused = bool(drone.own.verdict)
-    innovations = drone.innovations.after(
-        own_track.pose, as_sent(drone.sent), state.airframe, refused
+    is_refused = bool(drone.own.verdict)
+    innovations = drone.innovations.update(
+        own_track.pose, as_sent(drone.sent), state.airframe, is_refused
     )
     innovations = innovations.feeling(force)
     verdict = innovations.verdict()
@@ -137,11 +137,11 @@ def _consistent(state, drone, own_track, force) -> Drone:
     ):
         return drone
     # neither is believed any more: back to where the sums say that the vehicle is
-    estimate = moved_on(innovations.corrected(), state.time)
+    estimate = moved_on(innovations.corrected_pose(), state.time)
     return drone._replace(estimate=estimate, capture_fault=verdict)
 
 
-def _own(state, drone, sample, by_capture, moving) -> Track:
+def _onboard_track(state, drone, sample, by_capture, moving) -> Track:
     """The drone's own estimates after the newest one, which motion capture must confirm
     where they were lost or wrong.
     """
@@ -151,8 +151,8 @@ def _own(state, drone, sample, by_capture, moving) -> Track:
     if by_capture and track.fresh(time, limits):
         # what it is flown by is motion capture: that says nothing of where its own
         # leads
-        return track.after(sample.own, time, limits, moving, None)
-    next_track = track.after(sample.own, time, limits, moving, drone.estimate)
+        return track.update(sample.own, time, limits, moving, None)
+    next_track = track.update(sample.own, time, limits, moving, drone.estimate)
     capture = drone.captured
     to_confirm = (
         moving
@@ -165,7 +165,7 @@ def _own(state, drone, sample, by_capture, moving) -> Track:
     return next_track
 
 
-def _captured(state, drone, sample, moving) -> Drone:
+def _with_capture(state, drone, sample, moving) -> Drone:
     """The drone after the newest of motion capture: whether it is believed, and told to
     the estimator on board.
     """
@@ -173,9 +173,9 @@ def _captured(state, drone, sample, moving) -> Drone:
     limits = state.limits
     estimates = drone.own
     capture = _with_motion(sample.captured, drone.captured.pose, sample.own)
-    captured = drone.captured.after(capture, time, limits, moving, drone.estimate)
+    track = drone.captured.update(capture, time, limits, moving, drone.estimate)
     capture_fault = ""
-    if captured.pose is capture:
+    if track.pose is capture:
         # on the ground, or with no pose of its own, there is nothing to compare it with
         comparable = moving and estimates.pose is not None
         feeds = not comparable or follows(capture, estimates.pose, limits)
@@ -184,22 +184,22 @@ def _captured(state, drone, sample, moving) -> Drone:
         if comparable and estimates.fresh(time, limits):
             verdict = agree(capture, estimates.pose, limits)
         if verdict:
-            captured = captured._replace(pose=drone.captured.pose, verdict=verdict)
+            track = track._replace(pose=drone.captured.pose, verdict=verdict)
     innovations = drone.captured_innovations
     if drone.mode not in CHECKED:
         innovations = Innovations()
-    elif captured.pose is capture and capture is not drone.captured.pose:
-        refused = bool(drone.captured.verdict)
-        innovations = innovations.after(
-            capture, as_sent(drone.sent), state.airframe, refused
+    elif track.pose is capture and capture is not drone.captured.pose:
+        is_refused = bool(drone.captured.verdict)
+        innovations = innovations.update(
+            capture, as_sent(drone.sent), state.airframe, is_refused
         )
         capture_fault = innovations.verdict()
     if capture_fault:
-        captured = captured._replace(pose=drone.captured.pose, verdict=capture_fault)
-    elif moving and not captured.fresh(time, limits):
-        capture_fault = captured.verdict or "pose lost"
+        track = track._replace(pose=drone.captured.pose, verdict=capture_fault)
+    elif moving and not track.fresh(time, limits):
+        capture_fault = track.verdict or "pose lost"
     return drone._replace(
-        captured=captured, captured_innovations=innovations, capture_fault=capture_fault
+        captured=track, captured_innovations=innovations, capture_fault=capture_fault
     )
 
 

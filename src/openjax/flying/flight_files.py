@@ -99,7 +99,7 @@ def _table(name: str, samples, sent_at: np.ndarray, commands: np.ndarray) -> Log
 class _Source(NamedTuple):
     """What one sensor or log block gave."""
 
-    when: np.ndarray
+    time: np.ndarray
     """(K,) s"""
     names: tuple[str, ...]
     """Columns."""
@@ -108,9 +108,9 @@ class _Source(NamedTuple):
 
     def during(self, first: float, last: float) -> "_Source":
         """What was measured from `first` to `last` (s), times as a log writes them."""
-        when = np.round(self.when, 4)
-        inside = (when >= first) & (when <= last)
-        return _Source(when[inside], self.names, self.values[inside])
+        time = np.round(self.time, 4)
+        inside = (time >= first) & (time <= last)
+        return _Source(time[inside], self.names, self.values[inside])
 
 
 def _sources(vehicle: Samples) -> list[_Source]:
@@ -124,7 +124,7 @@ def _sources(vehicle: Samples) -> list[_Source]:
         return [poses, bodies]
     # motion capture in place of the estimate on board, of which body rates and voltage
     # stay
-    poses = _Source(poses.when, poses.names[10:], own_poses[:, 10:])
+    poses = _Source(poses.time, poses.names[10:], own_poses[:, 10:])
     capture = _Source(vehicle.seen[:, 0], _POSE[:10], vehicle.seen[:, 1:11])
     return [poses, bodies, capture]
 
@@ -134,19 +134,19 @@ def _rows(vehicle: Samples, sent_at, commands) -> dict[str, np.ndarray]:
     measured.
     """
     sources = [source.during(sent_at[0], sent_at[-1]) for source in _sources(vehicle)]
-    times = np.unique(np.concatenate([source.when for source in sources]))
+    times = np.unique(np.concatenate([source.time for source in sources]))
     rows = {
         n: np.full(len(times), np.nan) for n in ("t", *_POSE, *_BODY, *_COMMAND, "vbat")
     }
     rows["t"] = times - sent_at[0]
     for source in sources:
-        at = np.searchsorted(times, source.when)
+        at = np.searchsorted(times, source.time)
         for n, column in zip(source.names, source.values.T, strict=True):
             rows[n][at] = column
     # in force at a moment is what left last before it
     command = commands[np.maximum(np.searchsorted(sent_at, times, side="right") - 1, 0)]
     # angles and motors off are no commanded body rates: their cells stay empty
-    rated = command[:, 0] == RATES
+    is_rates = command[:, 0] == RATES
     for n, column in zip(_COMMAND, command[:, 1:].T, strict=True):
-        rows[n][rated] = column[rated]
+        rows[n][is_rates] = column[is_rates]
     return rows

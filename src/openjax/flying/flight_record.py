@@ -23,18 +23,20 @@ class FlightRecord:
         self.episodes: list[dict] = []
         self.skipped = 0
 
-    def keep(self, tick, arrivals, measured, set_points) -> None:
+    def keep(self, tick, arrivals, measured_times, set_points) -> None:
         """Add a row.
 
         Args:
           tick: when it was due, when its last set-point left (s), and the game (-1:
           none).
-          arrivals, measured: when each vehicle's newest pose arrived and was measured
+          arrivals, measured_times: when each vehicle's newest pose arrived and was measured
           (s).
           set_points: each vehicle's.
         """
         self._rows.extend(tick)
-        for arrival, measured_at, s in zip(arrivals, measured, set_points, strict=True):
+        for arrival, measured_at, s in zip(
+            arrivals, measured_times, set_points, strict=True
+        ):
             # what a packet holds, not what was asked for: a diagnosis must know what
             # was sent
             s = s if s.mode == OFF else as_sent(s)
@@ -62,7 +64,7 @@ class FlightRecord:
             return {"ticks": 0}
         due, sent_at, _ = ticks.T
         # of each tick the vehicle with the oldest pose counts
-        age, measured = 1e3 * (sent_at[:, None, None] - vehicles[..., :2]).max(1).T
+        age, latency = 1e3 * (sent_at[:, None, None] - vehicles[..., :2]).max(1).T
         work = 1e3 * (sent_at - due)
         gaps = 1e3 * np.diff(sent_at)
         misses = int((work > 1e3 * PERIOD).sum()) + self.skipped
@@ -70,7 +72,7 @@ class FlightRecord:
             "ticks": len(due),
             "seconds": round(sent_at[-1] - due[0], 2),
             "command_age_ms": _percentiles(age),
-            "measured_to_sent_ms": _percentiles(measured),
+            "measured_to_sent_ms": _percentiles(latency),
             "due_to_sent_ms": _percentiles(work),
             "between_set_points_ms": _percentiles(gaps) if len(gaps) else {},
             "missed_deadlines": misses,

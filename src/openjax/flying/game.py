@@ -123,8 +123,8 @@ class Game:
             return ravel_pytree((state, results[0]))[0], results
 
         self._first = compile_in_line(jax.jit(begin).lower(example))
-        lowered = jax.jit(move).lower(self._flat, example, nowhere, not_measured)
-        self._tick = compile_in_line(lowered)
+        program = jax.jit(move).lower(self._flat, example, nowhere, not_measured)
+        self._tick = compile_in_line(program)
         # the first calls take tens of milliseconds: not in flight
         self.start(poses)
         self.step(poses)
@@ -147,13 +147,15 @@ class Game:
         """One control step later the pursuers are at `poses`, the evader, if it is
         measured, at (3,) `evader`.
         """
-        measured = np.asarray(evader is not None)
+        is_measured = np.asarray(evader is not None)
         place = (
             np.zeros(3, np.float32)
             if evader is None
             else np.asarray(evader, np.float32)
         )
-        self._flat, results = self._tick(self._flat, pose_array(poses), place, measured)
+        self._flat, results = self._tick(
+            self._flat, pose_array(poses), place, is_measured
+        )
         action, position, velocity, captured, over, breaches, crashed = map(
             np.asarray, results
         )

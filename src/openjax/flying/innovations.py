@@ -99,22 +99,26 @@ class Innovations(NamedTuple):
     # what the accelerometer doesn't feel, of the upward velocity
     climb: Climb = Climb()
 
-    def after(
-        self, pose: Pose, command: SetPoint, airframe: Airframe, refused: bool = False
+    def update(
+        self,
+        pose: Pose,
+        command: SetPoint,
+        airframe: Airframe,
+        is_refused: bool = False,
     ) -> "Innovations":
         """With the next pose; `command` has acted since the last one.
 
-        `refused`: whether poses between them came and weren't believed. Then this one
-        must follow from the last believable one, however long that is ago.
+        `is_refused`: whether poses between them came and weren't believed. Then this
+        one must follow from the last believable one, however long that is ago.
         """
         last = self.pose
-        longest = math.inf if refused else LONGEST
+        longest = math.inf if is_refused else LONGEST
         if last is None or not 0.0 < pose.time - last.time <= longest:
             return self._replace(
                 pose=pose, thrust=command.thrust, rates=pose.body_rates
             )
         dt = pose.time - last.time
-        thrust, rates = self._reached(pose, command, airframe, dt)
+        thrust, rates = self._response(pose, command, airframe, dt)
         # the trapezoidal rule: exact for an acceleration that stays
         mean = _towards(last.velocity, pose.velocity, 0.5)
         way = _difference(_difference(pose.position, last.position), _times(dt, mean))
@@ -123,28 +127,28 @@ class Innovations(NamedTuple):
         # the bias is what thrust has not explained so far: drag, wind, an unknown
         # weight
         beyond_thrust = _difference(gain, lift)
-        unexplained = _difference(beyond_thrust, self.bias)
-        step = _times(dt, unexplained)
+        residual = _difference(beyond_thrust, self.bias)
+        step = _times(dt, residual)
         turn = _turn_beyond_gyroscope(last, pose)
         error = _difference(pose.body_rates, rates)
         age = self.age + dt
         return Innovations(
             pose=pose,
-            way=_summed(self.way, way, dt, WAY.forgetting),
+            way=_leaky_sum(self.way, way, dt, WAY.forgetting),
             step=step,
-            speed=_summed(self.speed, step, dt, SPEED.forgetting),
-            recent=_summed(self.recent, step, dt, RECENT),
-            turn=_summed(self.turn, turn, dt, TURN.forgetting),
+            speed=_leaky_sum(self.speed, step, dt, SPEED.forgetting),
+            recent=_leaky_sum(self.recent, step, dt, RECENT),
+            turn=_leaky_sum(self.turn, turn, dt, TURN.forgetting),
             rate=_towards(self.rate, error, _share(dt, RATE.forgetting)),
-            bias=_sum(self.bias, _times(dt / min(age, BIAS), unexplained)),
+            bias=_sum(self.bias, _times(dt / min(age, BIAS), residual)),
             age=age,
             thrust=thrust,
             rates=rates,
-            drift=self.drift.after(beyond_thrust, mean, dt),
+            drift=self.drift.update(beyond_thrust, mean, dt),
             climb=self.climb,
         )
 
-    def _reached(self, pose, command, airframe, dt):
+    def _response(self, pose, command, airframe, dt):
         """Thrust and body rates that motors and rate loop have made of a command after
         `dt` s, as two low-passes.
         """
@@ -161,9 +165,9 @@ class Innovations(NamedTuple):
         """With the specific force (m/s^2, body) that the accelerometer feels at the
         newest pose; None: it isn't known.
         """
-        return self._replace(climb=self.climb.after(self.pose, force))
+        return self._replace(climb=self.climb.update(self.pose, force))
 
-    def corrected(self) -> Pose:
+    def corrected_pose(self) -> Pose:
         """The newest pose without what was summed up: where the vehicle is if what it
         is compared with is right.
         """
@@ -171,7 +175,7 @@ class Innovations(NamedTuple):
         recent = self.recent
         if self.climb.contradicts:
             way = (*way[:2], self.climb.height)
-            recent = (*recent[:2], self.climb.summed)
+            recent = (*recent[:2], self.climb.total)
         return self.pose._replace(
             position=_difference(self.pose.position, way),
             velocity=_difference(self.pose.velocity, recent),
@@ -180,10 +184,10 @@ class Innovations(NamedTuple):
     def verdict(self) -> Verdict:
         """What the estimate contradicts; good if nothing."""
         *level, rise = self.speed
-        pushed = math.hypot(*level) > SPEED.bound or not -SINKING < rise < RISING
+        is_push = math.hypot(*level) > SPEED.bound or not -SINKING < rise < RISING
         if math.hypot(*self.way) > WAY.bound:
             return Verdict.NOT_ITS_WAY
-        if self.age > SETTLED and (pushed or math.hypot(*self.step) > STEP):
+        if self.age > SETTLED and (is_push or math.hypot(*self.step) > STEP):
             return Verdict.NOT_ITS_THRUST
         if self.climb.contradicts:
             return Verdict.NOT_ITS_CLIMB
@@ -223,7 +227,7 @@ def _share(dt: float, time_constant: float) -> float:
     return -math.expm1(-dt / time_constant)
 
 
-def _summed(total: Vector, part: Vector, dt: float, forgetting: float) -> Vector:
+def _leaky_sum(total: Vector, part: Vector, dt: float, forgetting: float) -> Vector:
     return _sum(_times(math.exp(-dt / forgetting), total), part)
 
 

@@ -93,7 +93,7 @@ def judge(
     last: Pose | None,
     unseen: float,
     limits: PoseLimits,
-    expected: Pose | None = None,
+    prediction: Pose | None = None,
 ) -> Verdict:
     """What is wrong with a pose.
 
@@ -103,7 +103,7 @@ def judge(
       ground.
       unseen: for how long its source told nothing before it (s).
       limits: bounds.
-      expected: where reckoning has the vehicle by now; without it, where `last` leads.
+      prediction: where reckoning has the vehicle by now; without it, where `last` leads.
     """
     # first what no comparison is true of: a NaN would pass all of the following
     if not all(map(math.isfinite, numbers_of(pose)[1:])):
@@ -117,18 +117,18 @@ def judge(
     # a measurement has noise: identical numbers are one measurement sent again
     if pose[1:] == last[1:]:
         return Verdict.FROZEN
-    expected = expected or moved_on(last, pose.time)
+    prediction = prediction or moved_on(last, pose.time)
     dt = pose.time - last.time
     sudden = min(dt, max(unseen, limits.horizon))
     push = limits.acceleration
     twist = limits.angular_acceleration
     way = limits.position + limits.drift * dt + 0.5 * push * sudden**2
-    if math.dist(pose.position, expected.position) > way:
+    if math.dist(pose.position, prediction.position) > way:
         return Verdict.JUMPED
-    if math.dist(pose.velocity, expected.velocity) > limits.velocity + push * sudden:
+    if math.dist(pose.velocity, prediction.velocity) > limits.velocity + push * sudden:
         return Verdict.TOO_FAST
     turn = limits.angle + 0.5 * twist * sudden**2
-    if angle_between(pose.quaternion, expected.quaternion) > turn:
+    if angle_between(pose.quaternion, prediction.quaternion) > turn:
         return Verdict.TURNED
     if math.dist(pose.body_rates, last.body_rates) > limits.rate + twist * sudden:
         return Verdict.SPUN
@@ -140,25 +140,25 @@ class Track(NamedTuple):
 
     pose: Pose | None = None  # the last good one
     verdict: Verdict = Verdict.GOOD  # on the newest
-    heard: float = -math.inf  # s, when that was measured
+    last_time: float = -math.inf  # s, when that was measured
 
     def fresh(self, time: float, limits: PoseLimits) -> bool:
         """Whether its last good pose is new enough to fly by at `time` (s)."""
         return self.pose is not None and time - self.pose.time <= limits.horizon
 
-    def after(
+    def update(
         self,
         pose: Pose | None,
         time: float,
         limits: PoseLimits,
         moving: bool,
-        expected: Pose | None,
+        prediction: Pose | None,
     ) -> "Track":
         """The track after its source's newest pose at `time` (s).
 
         A pose that isn't newer than the last good one, or old, or from the future,
         changes nothing. Of a vehicle that isn't `moving` any pose is believed that is
-        one. `expected`: see `judge`; at any time.
+        one. `prediction`: see `judge`; at any time.
         """
         last = self.pose
         if pose is None or not abs(time - pose.time) <= limits.horizon:
@@ -168,9 +168,13 @@ class Track(NamedTuple):
         elif pose.time <= last.time:
             return self
         else:
-            expected = None if expected is None else moved_on(expected, pose.time)
+            prediction = None if prediction is None else moved_on(prediction, pose.time)
             verdict = judge(
-                pose, last, pose.time - max(self.heard, last.time), limits, expected
+                pose,
+                last,
+                pose.time - max(self.last_time, last.time),
+                limits,
+                prediction,
             )
         return Track(last if verdict else pose, verdict, pose.time)
 
@@ -181,27 +185,25 @@ def at_one_time(a: Pose, b: Pose) -> tuple[Pose, Pose]:
     return moved_on(a, newer), moved_on(b, newer)
 
 
-def agree(captured: Pose, estimate: Pose, limits: PoseLimits) -> Verdict:
+def agree(capture: Pose, estimate: Pose, limits: PoseLimits) -> Verdict:
     """Whether motion capture and the vehicle's own estimate tell the same, at the later
     one's time.
     """
-    captured, estimate = at_one_time(captured, estimate)
-    is_near = math.dist(captured.position, estimate.position) <= limits.apart
-    is_aligned = (
-        angle_between(captured.quaternion, estimate.quaternion) <= limits.turned
-    )
+    capture, estimate = at_one_time(capture, estimate)
+    is_near = math.dist(capture.position, estimate.position) <= limits.apart
+    is_aligned = angle_between(capture.quaternion, estimate.quaternion) <= limits.turned
     return Verdict.GOOD if is_near and is_aligned else Verdict.APART
 
 
-def follows(captured: Pose, estimate: Pose, limits: PoseLimits) -> bool:
+def follows(capture: Pose, estimate: Pose, limits: PoseLimits) -> bool:
     """Whether the estimator on board may be told a pose of motion capture: errors
     explain the distance from its own, at the later one's time.
 
     An estimator that is told late or drifting poses takes their error for a velocity,
     by which it would have to land.
     """
-    captured, estimate = at_one_time(captured, estimate)
-    return math.dist(estimate.position, captured.position) <= limits.position
+    capture, estimate = at_one_time(capture, estimate)
+    return math.dist(estimate.position, capture.position) <= limits.position
 
 
 def angle_between(a, b) -> float:

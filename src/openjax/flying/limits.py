@@ -157,12 +157,12 @@ def resting_places(
         next_places = []
         for i, place in enumerate(places):
             for x, y, radius in pillars:
-                place = _pushed(place, (x, y), radius + CLEARANCE)
+                place = _push_away(place, (x, y), radius + CLEARANCE)
             for j, other in enumerate(places):
                 if j != i:
                     # each of the two goes half of the way, from one place in opposite
                     # directions
-                    place = _pushed(place, other, APART, 0.5, 1.0 if i < j else -1.0)
+                    place = _push_away(place, other, APART, 0.5, 1.0 if i < j else -1.0)
             # the wall last, so that no push leads out of the arena
             inside = min(1.0, reach / max(math.hypot(*place[:2]), 1e-6))
             next_places.append((place[0] * inside, place[1] * inside, place[2]))
@@ -174,7 +174,7 @@ def resting_places(
     return places
 
 
-def _pushed(place, other, distance, share=1.0, direction=1.0) -> Vector:
+def _push_away(place, other, distance, share=1.0, direction=1.0) -> Vector:
     """The place (x, y, z) moved on its level by a share of what it lacks of a distance
     from another; out of the very same place along x, forwards or backwards by
     `direction`.

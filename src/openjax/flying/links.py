@@ -139,11 +139,11 @@ class Links:
                 self._calls += 1
                 number = self._calls
                 self._control.send((number, name, arguments))
-            answered = 0
-            while answered != number:  # answers of interrupted calls may still be there
+            answer = 0
+            while answer != number:  # answers of interrupted calls may still be there
                 if not self._control.poll(timeout):
                     raise LinksGone("the links' process is stuck")
-                answered, result = self._control.recv()
+                answer, result = self._control.recv()
         except (EOFError, OSError) as error:
             raise LinksGone("the links' process is gone") from error
         return result

@@ -71,7 +71,7 @@ class Flight:
       state: before it, see `flight_state`.
       plan: what to fly.
       requests: asked at every tick for what the operator wants.
-      watched: called after every tick with time and state; if it returns anything, all
+      watch: called after every tick with time and state; if it returns anything, all
       land for that reason.
     """
 
@@ -82,14 +82,14 @@ class Flight:
         state: State,
         plan: Plan,
         requests: Callable[[], Request] = lambda: Request.NONE,
-        watched: Callable[[float, State], str] = lambda now, state: "",
+        watch: Callable[[float, State], str] = lambda now, state: "",
     ):
         self.vehicles = vehicles
         self.game = game
         self.state = state
         self.plan = plan
         self._requests = requests
-        self._watched = watched
+        self._watch = watch
         self._pursuers = game.settings.num_pursuers
         self._evader_flies = len(state.drones) > self._pursuers
         self.record = FlightRecord(len(state.drones))
@@ -141,7 +141,7 @@ class Flight:
                 self.vehicles.believed(i, drone.captured.pose, drone.feeds_estimator)
         # the operator before the watch, the watch before the plan
         request = self._requests() or (
-            Request.LAND if self._alarm else self._planned(time)
+            Request.LAND if self._alarm else self._plan(time)
         )
         actions = None
         if self._episode >= 0 or request is Request.PURSUE:
@@ -150,7 +150,7 @@ class Flight:
             self.state, Event(time, samples, actions, request, self._alarm)
         )
         sent_at = self.vehicles.send(set_points)
-        self._alarm = self._watched(time, self.state)
+        self._alarm = self._watch(time, self.state)
         # after the set-points have left: they mustn't wait for it
         self.record.keep(
             (due, sent_at, self._episode), arrivals, measured_times(samples), set_points
@@ -158,11 +158,11 @@ class Flight:
         if self._episode >= 0 and not any(m is Mode.PURSUIT for m in self.state.modes):
             self._end_episode("safety")
 
-    def _planned(self, time) -> Request:
+    def _plan(self, time) -> Request:
         """What the plan asks for at this tick."""
         state = self.state
         plan = self.plan
-        waited = time - self._since
+        delay = time - self._since
         # each vehicle must have said where it stands before any rises
         if state.all_in(Mode.GROUND) and all(
             d.estimate is not None for d in state.drones
@@ -175,7 +175,7 @@ class Flight:
                 return Request.LAND
             return Request.PURSUE
         underway = (Mode.GROUND, Mode.TRANSFER, Mode.READY)
-        if any(mode in underway for mode in state.modes) and waited > TRANSFER:
+        if any(mode in underway for mode in state.modes) and delay > TRANSFER:
             self._alarm = f"not all at their starts after {TRANSFER:g} s"
             return Request.LAND
         if self._episode >= 0 and (
@@ -236,6 +236,6 @@ class Flight:
             pose.quaternion, acceleration, self.state.airframe, trim, RATES
         )
 
-    def _end_episode(self, why):
-        self.record.episodes[-1]["end"] = why
+    def _end_episode(self, reason):
+        self.record.episodes[-1]["end"] = reason
         self._episode = -1

@@ -107,12 +107,12 @@ class Member:
         arrival = perf_counter()
         self.last_contact = arrival
         self.phases[_block] = stamp % PERIOD_MS
-        measured = self._onboard.host(stamp, arrival)
+        time = self._onboard.host(stamp, arrival)
         force = tuple(9.81 * data[name] for name, _ in BODY_BLOCK[4:])
-        if measured > self.felt[0]:  # packets may overtake each other
-            self.felt = measured, force
+        if time > self.felt[0]:  # packets may overtake each other
+            self.felt = time, force
         if self.recording:
             # motors are 16 bits, the accelerometer counts in g
             motors = tuple(data[name] / 65536 for name, _ in BODY_BLOCK[:4])
-            self.bodies.extend((measured, *motors, *force))
+            self.bodies.extend((time, *motors, *force))
         self.listener(False)

@@ -43,7 +43,7 @@ def poses_arriving(links) -> list[float]:
 
 
 def faults(
-    state: State, samples: Sequence[PoseSample], rates: Sequence[float], guarded: bool
+    state: State, samples: Sequence[PoseSample], rates: Sequence[float], has_guard: bool
 ) -> list[str]:
     """What speaks against taking off, a line each; vehicles are counted from 0 in the
     order of --uri.
@@ -52,10 +52,10 @@ def faults(
       state: before the flight, for starts and settings.
       samples: what is known of each vehicle.
       rates: of each vehicle's poses (Hz).
-      guarded: whether a guard watches, or none is wanted.
+      has_guard: whether a guard watches, or none is wanted.
     """
     lines = []
-    if not guarded:
+    if not has_guard:
         lines.append(
             "the guard's process isn't there; try again, with fewer programs running"
         )

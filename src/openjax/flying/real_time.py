@@ -29,7 +29,7 @@ def prepare() -> None:
     jax.config.update("jax_cpu_enable_async_dispatch", False)
 
 
-def compile_in_line(lowered):
+def compile_in_line(program):
     """Compile a lowered function so that its operations run one after the other in the
     thread that calls it.
 
@@ -38,13 +38,13 @@ def compile_in_line(lowered):
     nine 1.3 ms at the median, 9.9 at p99; in line .8 and 2.7.
     """
     try:
-        return lowered.compile(compiler_options=IN_LINE)
+        return program.compile(compiler_options=IN_LINE)
     except (
         RuntimeError,
         ValueError,
         TypeError,
     ):  # a compiler that knows no such option
-        return lowered.compile()
+        return program.compile()
 
 
 def hurry() -> str:

@@ -95,7 +95,7 @@ def decide(state: State, event: Event) -> tuple[State, tuple[SetPoint, ...]]:
     )
     action_time = time if finite else state.action_time
     # requests first, so that troubles have the last word
-    drones = _requested(state, event)
+    drones = _request(state, event)
     both = zip(drones, event.samples, strict=True)
     troubles = [_trouble(state, drone, sample) for drone, sample in both]
     pursuing = any(d.mode is Mode.PURSUIT for d in drones)
@@ -118,7 +118,7 @@ def decide(state: State, event: Event) -> tuple[State, tuple[SetPoint, ...]]:
     )
 
 
-def _requested(state, event) -> tuple[Drone, ...]:
+def _request(state, event) -> tuple[Drone, ...]:
     """The drones after what the operator, or the plan, asks for."""
     drones = state.drones
     time = event.time
@@ -216,7 +216,7 @@ def _trouble(state, drone, sample) -> tuple[Mode, str] | None:
         return Mode.STOPPED, "stopped by its firmware"
     if drone.mode is Mode.SETTLE:
         return None
-    loss = _lost(state, drone, sample)
+    loss = _loss(state, drone, sample)
     if drone.mode is Mode.LIFT:  # from there it may fall
         fault = loss or lift_fault(state, drone)
         return (Mode.STOPPED, fault) if fault else None
@@ -232,7 +232,7 @@ def _trouble(state, drone, sample) -> tuple[Mode, str] | None:
     return (Mode.LAND, fault) if fault else None
 
 
-def _lost(state, drone, sample) -> str:
+def _loss(state, drone, sample) -> str:
     """Why no pose tells where the drone is; empty if one does."""
     if state.time - sample.last_contact > state.settings.link_timeout:
         return "link gone"
@@ -273,12 +273,14 @@ def _react(state, drones, troubles) -> tuple[Drone, ...]:
     time = state.time
     team = any(d.reason for d in drones) or any(troubles)
     anchors = resting_places_of(state) if team else [None] * len(drones)
-    risen = all(d.mode is Mode.LIFT and _risen(d, time) for d in drones) and not team
-    reacted = []
+    lifted = (
+        all(d.mode is Mode.LIFT and _has_lifted(d, time) for d in drones) and not team
+    )
+    reactions = []
     for drone, trouble, anchor, start in zip(
         drones, troubles, anchors, state.starts, strict=True
     ):
-        waited = time - drone.since > state.settings.hold_time
+        waits = time - drone.since > state.settings.hold_time
         if trouble is not None and trouble[0] is not drone.mode:
             mode, reason = trouble
             drone = drone.to(mode, time, anchor, reason)
@@ -286,15 +288,15 @@ def _react(state, drones, troubles) -> tuple[Drone, ...]:
             drone = drone.to(Mode.STOPPED, time, reason="another is in trouble")
         elif team and not drone.reason and drone.mode in (*_UNTROUBLED, Mode.HOLD):
             drone = drone.to(Mode.HOLD, time, anchor, "another is in trouble")
-        elif drone.mode is Mode.HOLD and drone.reason and waited:
+        elif drone.mode is Mode.HOLD and drone.reason and waits:
             drone = drone.to(Mode.LAND, time)
-        elif risen:
+        elif lifted:
             drone = drone.to(Mode.TRANSFER, time, start)
-        reacted.append(drone)
-    return tuple(reacted)
+        reactions.append(drone)
+    return tuple(reactions)
 
 
-def _risen(drone, time) -> bool:
+def _has_lifted(drone, time) -> bool:
     """Whether a test lift is over; not before its rotors must have turned up."""
     is_near = abs(drone.estimate.position[2] - drone.anchor[2]) < RISEN
     return is_near and time - drone.since > 2.0 * SPIN_UP
@@ -315,7 +317,7 @@ def steer(state: State, i: int, action: SetPoint | None, sample: PoseSample) -> 
     """Vehicle i after this tick, with its set-point. `action`: the policy's, where
     there is one.
     """
-    drone = _watched(state, state.drones[i], sample)._replace(sent=MOTORS_OFF)
+    drone = _watch(state, state.drones[i], sample)._replace(sent=MOTORS_OFF)
     time = state.time
     if drone.mode not in FLYING or drone.estimate is None:
         return drone
@@ -332,7 +334,7 @@ def steer(state: State, i: int, action: SetPoint | None, sample: PoseSample) -> 
     return _go(state, drone, i)
 
 
-def _watched(state, drone, sample) -> Drone:
+def _watch(state, drone, sample) -> Drone:
     """The drone with since when its battery is low and since when it is upside down."""
 
     def since(begin, is_so):
@@ -340,8 +342,8 @@ def _watched(state, drone, sample) -> Drone:
 
     low = sample.voltage < state.settings.battery_low  # an unknown voltage is not low
     over = drone.estimate is not None and up(drone.estimate.quaternion) < 0.0
-    confirmed = drone.captured.pose is not None and not drone.capture_fault
-    is_alone = drone.mode in FLYING and not confirmed
+    is_confirmed = drone.captured.pose is not None and not drone.capture_fault
+    is_alone = drone.mode in FLYING and not is_confirmed
     return drone._replace(
         alone_since=since(drone.alone_since, is_alone),
         low_since=since(drone.low_since, low),
@@ -364,7 +366,7 @@ def _pursue(state, drone, i, action) -> SetPoint:
         poses = [d.estimate if d.mode in FLYING else None for d in state.drones]
         parting = parting_velocity(settings, i, poses)
     # who makes room for another mustn't leave the arena for that
-    aimed = estimate if parting is None else estimate._replace(velocity=parting)
+    aim = estimate if parting is None else estimate._replace(velocity=parting)
     previous = state.drones[i].sent
     # until its motors have followed it turns on
     set_point = turned_on(
@@ -374,7 +376,7 @@ def _pursue(state, drone, i, action) -> SetPoint:
     present = lift_acceleration(set_point, lift)
     velocity = (
         fence_velocity(settings, estimate, present)
-        or fence_velocity(settings, aimed, present)
+        or fence_velocity(settings, aim, present)
         or parting
     )
     if velocity is None:
@@ -389,7 +391,7 @@ def _go(state, drone, i) -> Drone:
     """The drone on its way to its anchor, or waiting there, by the controller."""
     estimate = drone.estimate
     airframe = state.airframe
-    velocity = _wanted(state, drone, i)
+    velocity = _target_velocity(state, drone, i)
     acceleration = wanted_acceleration(estimate.velocity, velocity)
     attitude = estimate.quaternion
     if state.time - drone.seen > state.settings.pose_timeout:
@@ -408,14 +410,14 @@ def _go(state, drone, i) -> Drone:
                 max(drone.trim + TRIM_GAIN * state.dt * error, -TRIM_LIMIT), TRIM_LIMIT
             )
             drone = drone._replace(trim=trim)
-        if drone.mode is Mode.TRANSFER and _arrived(estimate, drone.anchor):
+        if drone.mode is Mode.TRANSFER and _is_there(estimate, drone.anchor):
             drone = drone.to(Mode.READY, state.time)
     return drone._replace(
         sent=accelerate(attitude, acceleration, airframe, drone.trim, ANGLES)
     )
 
 
-def _wanted(state, drone, i) -> Vector:
+def _target_velocity(state, drone, i) -> Vector:
     """The velocity (m/s) that the drone's mode asks for."""
     position = drone.estimate.position
     settings = state.settings
@@ -443,7 +445,7 @@ def _wanted(state, drone, i) -> Vector:
     return x, y, z
 
 
-def _arrived(estimate, target) -> bool:
+def _is_there(estimate, target) -> bool:
     return (
         math.dist(estimate.position, target) < 0.06
         and math.dist(estimate.velocity, (0.0, 0.0, 0.0)) < 0.15

@@ -117,8 +117,8 @@ class Session:
         self._wait_for_poses()
         # first, as it takes half a second: what is judged is what is known after it
         rates = poses_arriving(self.links)
-        guarded = self._guard is None or self._guard.lives()
-        problems = faults(self._state, self.links.observe(), rates, guarded)
+        has_guard = self._guard is None or self._guard.lives()
+        problems = faults(self._state, self.links.observe(), rates, has_guard)
         if len(problems) == 1:
             raise UserError(f"no take-off: {problems[0]}")
         if problems:
@@ -146,7 +146,7 @@ class Session:
                 samples = self.links.samples()
         return samples, complaint
 
-    def watched(self, moment: float, state: State) -> str:
+    def watch(self, moment: float, state: State) -> str:
         """Tell the others that the loop lives and what it knows; why it must land, if
         it must.
         """

@@ -91,9 +91,9 @@ class Swarm:
         question = "is the vehicle on"
         if member.uri.startswith("udp:"):
             question = "does openjax virtual_crazyflie run"
-        why = member.error or "locked"
+        reason = member.error or "locked"
         raise UserError(
-            f"{member.uri}: no connection ({why}); {question}, is the URI right?"
+            f"{member.uri}: no connection ({reason}); {question}, is the URI right?"
         )
 
     def _answers(self, member, make, timeout) -> bool:

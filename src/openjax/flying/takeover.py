@@ -96,9 +96,9 @@ def disarm(vehicles: Swarm | RawLinks, board: Board, role: Role) -> bool:
         time.sleep(0.03)
         # a vehicle that arms by itself always says that it is armed
         either = Supervisor.ARMED | Supervisor.AUTO_ARM
-        armed = any(
+        any_armed = any(
             s.supervisor & either == Supervisor.ARMED for s in vehicles.observe()
         )
-        if not armed or time.perf_counter() > deadline:
-            board.armed = armed
-            return not armed
+        if not any_armed or time.perf_counter() > deadline:
+            board.armed = any_armed
+            return not any_armed

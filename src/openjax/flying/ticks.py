@@ -36,11 +36,11 @@ class TickSchedule:
         self.skipped = 0
         self._in_step = False
 
-    def next(self, time: float, measured: Sequence[float]) -> float:
+    def next(self, time: float, pose_times: Sequence[float]) -> float:
         """The next tick's time, after one that ended at `time` and knew poses measured
-        at `measured` (s).
+        at `pose_times` (s).
         """
-        ages = sorted((self.due - t) % PERIOD for t in measured if time - t < GONE)
+        ages = sorted((self.due - t) % PERIOD for t in pose_times if time - t < GONE)
         shift = 0.0
         if ages:
             # poses come in a bunch: the newest of a bunch is the one after the longest
@@ -77,8 +77,8 @@ def await_poses(vehicles: Links, due: float) -> None:
             # so may the links have, which have first to pass on what came
             due = time_read - PATIENCE
             latest = time_read + PATIENCE
-        measured = measured_times(vehicles.observe())
-        complete = all(t > due - PERIOD or time_read - t > GONE for t in measured)
+        times = measured_times(vehicles.observe())
+        complete = all(t > due - PERIOD or time_read - t > GONE for t in times)
         if complete and time_read >= due - EARLY:
             return
         vehicles.wait(due - EARLY if complete else latest)
