@@ -87,8 +87,8 @@ def settle() -> None:
         with contextlib.suppress(BlockingIOError):
             numbers = os.read(_watch.descriptor, 64)
         for number in numbers:
-            unhandled = signal.getsignal(number) is _left_to_the_watch
-            if number in SIGNALS and (unhandled or _watch.patience < 1):
+            is_unhandled = signal.getsignal(number) is _left_to_the_watch
+            if number in SIGNALS and (is_unhandled or _watch.patience < 1):
                 leave(number)
             _watch.patience -= 1
 

@@ -20,61 +20,61 @@ ROOT = ": "
 WORDS = {int: "a whole number", float: "a number", str: "text", bool: "true or false"}
 
 
-def from_plain(kind: Any, value: Any, where: str = "settings") -> Any:
+def from_plain(kind: Any, value: Any, place: str = "settings") -> Any:
     """The inverse of `to_plain` for the annotated type `kind`; numbers are finite and
     lie in their intervals.
 
     Raises:
       UserError: an unknown key, a missing one, or a value that doesn't fit its
-      annotation; `where` names the place.
+      annotation; `place` names the place.
     """
     if dataclasses.is_dataclass(kind):
-        return _dataclass_from_plain(kind, value, where)
+        return _dataclass_from_plain(kind, value, place)
     origin = typing.get_origin(kind)
     arguments = typing.get_args(kind)
     if origin is typing.Annotated:
-        return from_plain(arguments[0], value, where)
+        return from_plain(arguments[0], value, place)
     if origin in (typing.Union, types.UnionType):
-        return _union_from_plain(arguments, value, where)
+        return _union_from_plain(arguments, value, place)
     if origin is tuple:
-        return _tuple_from_plain(arguments, value, where)
+        return _tuple_from_plain(arguments, value, place)
     if origin is dict:
         values_of = {}
-        for key, entry in _table(value, where).items():
-            name = from_plain(arguments[0], key, f"{where}: a key")
-            values_of[name] = from_plain(arguments[1], entry, _place(where, key))
+        for key, entry in _table(value, place).items():
+            name = from_plain(arguments[0], key, f"{place}: a key")
+            values_of[name] = from_plain(arguments[1], entry, _place(place, key))
         return values_of
     if origin is typing.Literal and value not in arguments:
         raise UserError(
-            f"{where} is {shown(value)}; expected one of {', '.join(map(repr, arguments))}"
+            f"{place} is {shown(value)}; expected one of {', '.join(map(repr, arguments))}"
         )
-    return value if origin is typing.Literal else _leaf_from_plain(kind, value, where)
+    return value if origin is typing.Literal else _leaf_from_plain(kind, value, place)
 
 
-def _place(where, key):
-    return f"{where}{key}" if where.endswith(ROOT) else f"{where}.{key}"
+def _place(place, key):
+    return f"{place}{key}" if place.endswith(ROOT) else f"{place}.{key}"
 
 
-def _table(value, where):
+def _table(value, place):
     if not isinstance(value, dict):
         raise UserError(
-            f"{where.removesuffix(ROOT)} is {shown(value)}; expected a table"
+            f"{place.removesuffix(ROOT)} is {shown(value)}; expected a table"
         )
     return value
 
 
-def _tuple_from_plain(arguments, value, where):
+def _tuple_from_plain(arguments, value, place):
     if not isinstance(value, list | tuple):
-        raise UserError(f"{where} is {shown(value)}; expected a list")
+        raise UserError(f"{place} is {shown(value)}; expected a list")
     if len(arguments) == 2 and arguments[1] is Ellipsis:
         arguments = arguments[:1] * len(value)
     if len(arguments) != len(value):
-        raise UserError(f"{where} has {len(value)} entries; expected {len(arguments)}")
-    places = (f"{where}[{i}]" for i in range(len(value)))
+        raise UserError(f"{place} has {len(value)} entries; expected {len(arguments)}")
+    places = (f"{place}[{i}]" for i in range(len(value)))
     return tuple(map(from_plain, arguments, value, places))
 
 
-def _leaf_from_plain(kind, value, where):
+def _leaf_from_plain(kind, value, place):
     # TOML's 1 may stand for 1.0; to Python, True is a number, too
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
@@ -83,18 +83,18 @@ def _leaf_from_plain(kind, value, where):
     if kind in WORDS and (
         not isinstance(value, kind) or (kind is int and isinstance(value, bool))
     ):
-        raise UserError(f"{where} is {shown(value)}; expected {WORDS[kind]}")
+        raise UserError(f"{place} is {shown(value)}; expected {WORDS[kind]}")
     if kind is float and not math.isfinite(value):
-        raise UserError(f"{where} is {value}; expected a finite number")
+        raise UserError(f"{place} is {value}; expected a finite number")
     if kind is type(None) and value is not None:
-        raise UserError(f"{where} is {shown(value)}; expected nothing")
+        raise UserError(f"{place} is {shown(value)}; expected nothing")
     return value
 
 
-def _dataclass_from_plain(kind, value, where):
+def _dataclass_from_plain(kind, value, place):
     fields = {field.name: field for field in dataclasses.fields(kind) if field.init}
-    root = where.removesuffix(ROOT)
-    entries = _table(value, where)
+    root = place.removesuffix(ROOT)
+    entries = _table(value, place)
     for key in entries:
         if key not in fields:
             raise UserError(
@@ -106,22 +106,22 @@ def _dataclass_from_plain(kind, value, where):
             raise UserError(f"{root} lacks {name}")
     hints = typing.get_type_hints(kind, include_extras=True)
     values = {
-        key: from_plain(hints[key], entry, _place(where, key))
+        key: from_plain(hints[key], entry, _place(place, key))
         for key, entry in entries.items()
     }
     instance = kind(**values)
     # once more, though most kinds check themselves: here the error names the file
-    check_intervals(instance, _place(where, ""))
+    check_intervals(instance, _place(place, ""))
     return instance
 
 
-def _union_from_plain(arguments, value, where):
+def _union_from_plain(arguments, value, place):
     reasons = []
     # the exact match first: True is not 1, and 1 must not become 1.0 when int stands in
     # the union
     for argument in sorted(arguments, key=lambda kind: kind is not type(value)):
         try:
-            return from_plain(argument, value, where)
+            return from_plain(argument, value, place)
         except UserError as error:
             reasons.append(str(error))
     # the first: that of the kind which fits best

@@ -68,7 +68,7 @@ def test_pursuers_come_nearer():
         distances.append(float(parts["distance"]))
     assert distances[-1] < 0.75 * distances[0]
     # nobody is caught yet: penalties wait
-    assert carry.risen == 0.0
+    assert carry.ramp == 0.0
 
 
 def test_a_game_without_pillars_can_be_learnt():

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import pytest
 from flax import struct
 
-from openjax.store.traced_programs import recalled
+from openjax.store.traced_programs import recall
 
 
 @struct.dataclass
@@ -46,7 +46,7 @@ def test_what_was_traced_once_is_found_again_and_does_the_same(tmp_path, step, t
         return Carry(jax.random.key(3), jnp.arange(4.0))
 
     def of(made_from):
-        return recalled("step", step, lambda: (carry(),), carry(), made_from, tmp_path)
+        return recall("step", step, lambda: (carry(),), carry(), made_from, tmp_path)
 
     expected = outcome(step, carry())
     before = len(traces)
@@ -56,12 +56,12 @@ def test_what_was_traced_once_is_found_again_and_does_the_same(tmp_path, step, t
     def never(carry):
         raise AssertionError("traced again")
 
-    found = recalled(
+    found = recall(
         "step", jax.jit(never), lambda: (carry(),), carry(), "these settings", tmp_path
     )
     assert outcome(found, carry()) == expected
     with pytest.raises(AssertionError, match="traced again"):
-        recalled(
+        recall(
             "step",
             jax.jit(never),
             lambda: (carry(),),
@@ -74,7 +74,7 @@ def test_what_was_traced_once_is_found_again_and_does_the_same(tmp_path, step, t
     whole = file.read_bytes()
     file.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
     assert outcome(of("these settings"), carry()) == expected
-    again = recalled(
+    again = recall(
         "step", jax.jit(never), lambda: (carry(),), carry(), "these settings", tmp_path
     )
     assert outcome(again, carry()) == expected and list(tmp_path.iterdir()) == [file]
@@ -86,7 +86,7 @@ def test_a_program_that_cannot_be_kept_is_used_as_it_is(tmp_path):
         return jax.pure_callback(lambda x: x, x, x)
 
     assert (
-        recalled(
+        recall(
             "told",
             told,
             lambda: (jnp.zeros(2),),

@@ -41,7 +41,7 @@ def test_kernel_does_not_grow_with_drones_and_pillars(drones, pillars):
     """4,295 equations with three drones and five pillars took a GPU's compiler half a
     minute.
     """
-    step = make_drones_step("rigid").fused
+    step = make_drones_step("rigid").fused_step
     team = hover_state(VEHICLE, jnp.zeros((256, drones, 3)))
     command = jnp.zeros((256, drones, 4))
     solids = (jnp.zeros((256, pillars, 2)), jnp.zeros((256, pillars), bool))

@@ -65,7 +65,7 @@ def fly(vehicle, drones, command):
 
 def fly_plainly(vehicle, drones, command):
     """The formulas of free flight, of drones (n, ...)."""
-    return mapped_step(FREE.fused, vehicle, drones, command, ())
+    return mapped_step(FREE.fused_step, vehicle, drones, command, ())
 
 
 def by_kernel(fused, drones, command, pillars=()):
@@ -81,12 +81,12 @@ def freely(drones, command):
 
 def test_kernel_computes_the_step_of_each_drone():
     drones, command = drawn(DRONES + 5, 1)  # the last block is only partly filled
-    assert_close(by_kernel(FREE.fused, drones, command), freely(drones, command))
+    assert_close(by_kernel(FREE.fused_step, drones, command), freely(drones, command))
 
 
 def test_kernel_computes_contacts():
     drones, command, pillars = crowded(DRONES + 5)
-    among = AMONG_SOLIDS.fused
+    among = AMONG_SOLIDS.fused_step
     stepped = by_kernel(among, drones, command, pillars)
     plainly = jax.jit(jax.vmap(lambda *world: mapped_step(among, VEHICLE, *world)))
     expected = plainly(drones, command, pillars)
@@ -137,7 +137,7 @@ def test_worlds_become_more_worlds_of_one_call(monkeypatch):
     )
     got = jax.jit(jax.vmap(jax.vmap(step)))(*twice)
     expected = jax.jit(
-        jax.vmap(lambda *world: mapped_step(AMONG_SOLIDS.fused, VEHICLE, *world))
+        jax.vmap(lambda *world: mapped_step(AMONG_SOLIDS.fused_step, VEHICLE, *world))
     )(drones, command, pillars)
     assert_close(
         jax.tree.map(lambda leaf: leaf.reshape(6, *leaf.shape[2:]), got), expected

@@ -137,10 +137,10 @@ def attend_one_by_one(
         top = jax.lax.stop_gradient(functools.reduce(jnp.maximum, scores))
         parts = [jnp.exp(score - top) for score in scores]
         inverse = 1.0 / functools.reduce(jnp.add, parts)
-        weighted = [
+        products = [
             (part * inverse) * e for part, e in zip(parts, entities, strict=True)
         ]
-        means.append(functools.reduce(jnp.add, weighted))
+        means.append(functools.reduce(jnp.add, products))
     return means
 
 
@@ -216,11 +216,11 @@ class _Entities(NamedTuple):
         shift = self.w_ref[weight + size + 1, :][None, :]
         return linear, self.add(self.inverse(m)[:, None], linear, shift)
 
-    def scores(self, query, embedded):
+    def scores(self, query, entities):
         """Of one head's queries (rows, F) with all embedded entities, (rows,) each."""
-        scores = [jnp.sum(query * entity, axis=1) for entity in embedded]
+        scores = [jnp.sum(query * entity, axis=1) for entity in entities]
         # the pursuer itself, the first one, is always there and has no bias
-        biases = [self.x(self.layout.input_rows + m) for m in range(len(embedded) - 1)]
+        biases = [self.x(self.layout.input_rows + m) for m in range(len(entities) - 1)]
         return [
             scores[0],
             *(score + bias for score, bias in zip(scores[1:], biases, strict=True)),
@@ -244,15 +244,15 @@ def _forward_kernel(
     entities = _Entities(
         layout, add, lambda row: x_ref[row, :], lambda m: inverse_ref[m, :], w_ref
     )
-    embedded = [token_ref[...].astype(jnp.float32)]
+    entities_in_rows = [token_ref[...].astype(jnp.float32)]
     for m in range(len(layout.entities)):
         _, normal = entities.linear(m)
-        embedded.append(activation(normal, arithmetic))
+        entities_in_rows.append(activation(normal, arithmetic))
     for h in range(layout.heads):
         query = q_ref[:, h * f : (h + 1) * f].astype(jnp.float32) * layout.scale
-        weights = _softmax(entities.scores(query, embedded))
+        weights = _softmax(entities.scores(query, entities_in_rows))
         mean = jnp.zeros_like(query)
-        for weight, entity in zip(weights, embedded, strict=True):
+        for weight, entity in zip(weights, entities_in_rows, strict=True):
             mean = add(weight[:, None], entity, mean)
         out_ref[:, h * f : (h + 1) * f] = mean.astype(out_ref.dtype)
 
@@ -284,40 +284,42 @@ def _backward_kernel(
             w_ref,
         )
         # forward once more: to embed them again costs less than to have kept them
-        embedded = [token_ref[rows, :].astype(jnp.float32)]
+        entities_in_rows = [token_ref[rows, :].astype(jnp.float32)]
         slopes = []
         linears = []
         for m in range(len(layout.entities)):
             linear, normal = entities.linear(m)
             entity, slope = activation_and_slope(normal, arithmetic)
-            embedded.append(entity)
+            entities_in_rows.append(entity)
             slopes.append(slope)
             linears.append(linear)
-        dembedded = [jnp.zeros_like(embedded[0]) for _ in embedded]
+        dentities = [jnp.zeros_like(entities_in_rows[0]) for _ in entities_in_rows]
         for h in range(layout.heads):
             query = q_ref[rows, h * f : (h + 1) * f].astype(jnp.float32) * layout.scale
             gradient = g_ref[rows, h * f : (h + 1) * f].astype(jnp.float32)
-            weight = _softmax(entities.scores(query, embedded))
-            dweight = [jnp.sum(gradient * entity, axis=1) for entity in embedded]
+            weight = _softmax(entities.scores(query, entities_in_rows))
+            dweight = [
+                jnp.sum(gradient * entity, axis=1) for entity in entities_in_rows
+            ]
             # the softmax's own derivative: w_m (d_m - sum w d)
             mean = functools.reduce(
                 jnp.add, [w * d for w, d in zip(weight, dweight, strict=True)]
             )
             dquery = jnp.zeros_like(query)
-            for m, entity in enumerate(embedded):
+            for m, entity in enumerate(entities_in_rows):
                 dscore = (weight[m] * (dweight[m] - mean))[:, None]
                 dquery = add(dscore, entity, dquery)
-                dembedded[m] = add(
-                    weight[m][:, None], gradient, add(dscore, query, dembedded[m])
+                dentities[m] = add(
+                    weight[m][:, None], gradient, add(dscore, query, dentities[m])
                 )
             dq_ref[rows, h * f : (h + 1) * f] = (dquery * layout.scale).astype(
                 dq_ref.dtype
             )
-        dtoken_ref[rows, :] = dembedded[0].astype(dtoken_ref.dtype)
+        dtoken_ref[rows, :] = dentities[0].astype(dtoken_ref.dtype)
         # of the weights a row each, summed over samples only when all blocks are done
         sums = list(sums)
         for m, (row, size, weight) in enumerate(layout.entities):
-            dnormal = dembedded[m + 1] * slopes[m]
+            dnormal = dentities[m + 1] * slopes[m]
             dinverse_ref[m, rows] = jnp.sum(dnormal * linears[m], axis=1)
             dlinear = dnormal * entities.inverse(m)[:, None]
             for i in range(size):

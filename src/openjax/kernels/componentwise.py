@@ -43,7 +43,7 @@ def _numbers(array):
     return split(array.ravel()).reshape(array.shape)
 
 
-def evaluate(traced: ClosedJaxpr, arguments: Sequence[np.ndarray]) -> list[np.ndarray]:
+def evaluate(program: ClosedJaxpr, arguments: Sequence[np.ndarray]) -> list[np.ndarray]:
     """What a traced function gives for `arguments`, arrays of objects of its inputs'
     shapes.
 
@@ -54,7 +54,7 @@ def evaluate(traced: ClosedJaxpr, arguments: Sequence[np.ndarray]) -> list[np.nd
       NotImplementedError: the function holds an operation that mixes components in a
       way not known here.
     """
-    return _evaluate(traced.jaxpr, traced.consts, arguments)
+    return _evaluate(program.jaxpr, program.consts, arguments)
 
 
 def _evaluate(jaxpr: Jaxpr, constants, arguments):

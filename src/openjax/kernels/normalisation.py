@@ -78,22 +78,22 @@ def _backward(activate, residuals, gradient):
 normalise.defvjp(_forward, _backward)
 
 
-def _standardised(x, bias):
+def _standardise(x, bias):
     """(x + bias) with mean 0 and variance 1 over the features, and the inverse standard
     deviation.
     """
     x = x.astype(jnp.float32) + bias
     features = x.shape[-1]
-    centred = x - jnp.sum(x, axis=-1, keepdims=True) / features
+    deviation = x - jnp.sum(x, axis=-1, keepdims=True) / features
     inverse = jax.lax.rsqrt(
-        jnp.sum(centred * centred, axis=-1, keepdims=True) / features + EPSILON
+        jnp.sum(deviation * deviation, axis=-1, keepdims=True) / features + EPSILON
     )
-    return centred * inverse, inverse
+    return deviation * inverse, inverse
 
 
 def _reference(activate, x, affine):
     """The formula as it stands."""
-    standard, _ = _standardised(x, affine[0])
+    standard, _ = _standardise(x, affine[0])
     out = affine[1] * standard + affine[2]
     return (activation(out) if activate else out).astype(x.dtype)
 
@@ -104,7 +104,7 @@ def _reference_backward(activate, x, affine, gradient):
 
 
 def _forward_kernel(activate, arithmetic, x_ref, affine_ref, out_ref):
-    standard, _ = _standardised(x_ref[...], affine_ref[0, :][None, :])
+    standard, _ = _standardise(x_ref[...], affine_ref[0, :][None, :])
     out = arithmetic.multiply_add(
         standard, affine_ref[1, :][None, :], affine_ref[2, :][None, :]
     )
@@ -116,7 +116,7 @@ def _forward_kernel(activate, arithmetic, x_ref, affine_ref, out_ref):
 def _backward_kernel(
     activate, arithmetic, x_ref, affine_ref, g_ref, dx_ref, daffine_ref
 ):
-    standard, inverse = _standardised(x_ref[...], affine_ref[0, :][None, :])
+    standard, inverse = _standardise(x_ref[...], affine_ref[0, :][None, :])
     scale = affine_ref[1, :][None, :]
     dout = g_ref[...].astype(jnp.float32)
     if activate:
@@ -137,20 +137,20 @@ def _backward_kernel(
 
 def forward_by_kernel(activate, x, affine, interpret=False):
     """What the reference gives, by a kernel; `interpret` runs it without a GPU."""
-    padded = whole_blocks(x, ROWS)
+    blocks = whole_blocks(x, ROWS)
     block = pl.BlockSpec((ROWS, x.shape[1]), lambda i: (i, 0))
     out = pl.pallas_call(
         functools.partial(
             _forward_kernel, activate, kernel_arithmetic(x.dtype, interpret)
         ),
-        out_shape=jax.ShapeDtypeStruct(padded.shape, padded.dtype),
-        grid=(padded.shape[0] // ROWS,),
+        out_shape=jax.ShapeDtypeStruct(blocks.shape, blocks.dtype),
+        grid=(blocks.shape[0] // ROWS,),
         in_specs=[block, pl.BlockSpec(affine.shape, lambda i: (0, 0))],
         out_specs=block,
         interpret=interpret,
         compiler_params=pallas_triton.CompilerParams(num_warps=WARPS, num_stages=1),
         name="normalise",
-    )(padded, affine)
+    )(blocks, affine)
     return out[: x.shape[0]]
 
 
@@ -158,9 +158,9 @@ def backward_by_kernel(activate, x, affine, gradient, interpret=False):
     """The reference's gradients, by a kernel; `interpret` runs it without a GPU."""
     # samples that only fill the last block have no gradient, so they add nothing to the
     # sums
-    padded = whole_blocks(x, ROWS)
+    blocks = whole_blocks(x, ROWS)
     padded_gradient = whole_blocks(gradient, ROWS)
-    programs = padded.shape[0] // ROWS
+    programs = blocks.shape[0] // ROWS
     features = x.shape[1]
     block = pl.BlockSpec((ROWS, features), lambda i: (i, 0))
     dx, parts = pl.pallas_call(
@@ -168,7 +168,7 @@ def backward_by_kernel(activate, x, affine, gradient, interpret=False):
             _backward_kernel, activate, kernel_arithmetic(x.dtype, interpret)
         ),
         out_shape=(
-            jax.ShapeDtypeStruct(padded.shape, padded.dtype),
+            jax.ShapeDtypeStruct(blocks.shape, blocks.dtype),
             jax.ShapeDtypeStruct((programs, 3, features), jnp.float32),
         ),
         grid=(programs,),
@@ -177,5 +177,5 @@ def backward_by_kernel(activate, x, affine, gradient, interpret=False):
         interpret=interpret,
         compiler_params=pallas_triton.CompilerParams(num_warps=WARPS, num_stages=1),
         name="normalise_backward",
-    )(padded, affine, padded_gradient)
+    )(blocks, affine, padded_gradient)
     return dx[: x.shape[0]], jnp.sum(parts, axis=0)

@@ -100,16 +100,16 @@ def adapting_game(game: PursuitSettings) -> PursuitSettings:
 
 
 def starting_parameters(
-    parameters: PolicyParameters, trained: TrainSettings
+    parameters: PolicyParameters, settings: TrainSettings
 ) -> PolicyParameters:
     """A policy as it begins in `adapting_game`, without its critic; it acts as
     before.
     """
-    game = trained.environment
-    grown = with_longer_history(
-        parameters.replace(critic={}), trained.predictor, game, adapting_game(game)
+    game = settings.environment
+    start = with_longer_history(
+        parameters.replace(critic={}), settings.predictor, game, adapting_game(game)
     )
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), grown)
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), start)
 
 
 @struct.dataclass
@@ -146,17 +146,17 @@ class Adaptation:
     """(parameters, tasks, key, bounds) -> one episode per task."""
 
 
-def make_adaptation(trained: TrainSettings, settings: AdaptSettings) -> Adaptation:
-    """The programs for a policy that was trained with `trained`."""
-    game = adapting_game(trained.environment)
-    policy = make_policy(Pursuit(game), trained.network, trained.predictor)
+def make_adaptation(training: TrainSettings, settings: AdaptSettings) -> Adaptation:
+    """The programs for a policy that was trained with `training`."""
+    game = adapting_game(training.environment)
+    policy = make_policy(Pursuit(game), training.network, training.predictor)
     optimiser = clipped_descent(falling_rate(settings.learning_rate, settings.updates))
     stage = _Stage(
         settings=settings,
         game=game,
         # nothing is solid while the gradient is taken: a crash is told by the gap
         free=dataclasses.replace(game, physics="rigid", contacts=False),
-        vehicle=load_vehicle(trained.environment.airframe),
+        vehicle=load_vehicle(training.environment.airframe),
         policy=policy,
         optimiser=optimiser,
         worlds=settings.worlds or (8 if jax.default_backend() == "cpu" else 320),
@@ -207,8 +207,8 @@ class _Stage:
         # steps before it, and the tracks
         def one(carry, step):
             observation, state, at_settling, at_moment = carry
-            at_settling = _recorded(moment - SETTLE == step, state, at_settling)
-            at_moment = _recorded(moment == step, state, at_moment)
+            at_settling = _record(moment - SETTLE == step, state, at_settling)
+            at_moment = _record(moment == step, state, at_moment)
             observation, state = fly_on(parameters.actor, observation, state)
             track = (state.drones.position, state.drones.velocity)
             return (observation, state, at_settling, at_moment), track
@@ -219,8 +219,8 @@ class _Stage:
         )
         steps = moment + jnp.arange(-LAG, STEPS)[:, None]
         position, velocity = (track[steps, jnp.arange(number)] for track in tracks)
-        settled = self._settle(parameters, at_settling, vehicle_key, bounds)
-        return Flights(_in_its_place(settled, at_moment), position, velocity)
+        state_of_vehicle = self._settle(parameters, at_settling, vehicle_key, bounds)
+        return Flights(_in_its_place(state_of_vehicle, at_moment), position, velocity)
 
     def _settle(self, parameters, state, key, bounds):
         """States (W, ...) SETTLE steps later, flown by vehicles of the bounds."""
@@ -229,17 +229,17 @@ class _Stage:
         vehicles = jax.vmap(lambda key: draw(key, self.free.num_pursuers, 0.0, bounds))(
             jax.random.split(key, number)
         )
-        diagnosed = self.pursuit(bounds)
-        fly_on = mean_step(diagnosed, self.policy, parameters)
+        environment = self.pursuit(bounds)
+        fly_on = mean_step(environment, self.policy, parameters)
 
         def one(carry, _):
             observation, state = carry
             return fly_on(parameters.actor, observation, state), None
 
         state = state.replace(vehicles=vehicles)
-        start = (jax.vmap(diagnosed.observe)(state), state)
-        (_, settled), _ = jax.lax.scan(one, start, None, length=SETTLE)
-        return settled
+        start = (jax.vmap(environment.observe)(state), state)
+        (_, last_state), _ = jax.lax.scan(one, start, None, length=SETTLE)
+        return last_state
 
     def _begin(self, flights, key, bounds):
         """Half of the worlds at starts, half in flight, all with vehicles of the
@@ -310,7 +310,7 @@ class _Stage:
         gradient, watch = jax.grad(self.loss, has_aux=True)(
             actor.parameters, parameters, flights, key, bounds
         )
-        return actor.updated(self.optimiser, finite_or_zero(gradient)), watch
+        return actor.update(self.optimiser, finite_or_zero(gradient)), watch
 
     def evaluate(self, parameters, tasks, key, bounds):
         """One episode per task, with vehicles of the bounds."""
@@ -343,7 +343,7 @@ def off_the_flight(
     return functools.reduce(jnp.minimum, [at(lag) for lag in range(0, LAG + 1, 2)])
 
 
-def _recorded(is_due, state, record):
+def _record(is_due, state, record):
     """The states (W, ...) in `record`, with those of worlds that are due (W,) in place
     of older ones.
     """
@@ -354,13 +354,13 @@ def _recorded(is_due, state, record):
     return jax.vmap(newest)(is_due, state, record)
 
 
-def _in_its_place(settled: PursuitState, nominal: PursuitState) -> PursuitState:
+def _in_its_place(flight: PursuitState, nominal: PursuitState) -> PursuitState:
     """States `nominal` whose vehicles, as one would find them in flight, are those of
-    `settled`.
+    `flight`.
 
     Where they are and how they move, and what their sensors still show of that, is from
     `nominal`; rotors, controllers, commands on the way, effects, and what the policy
-    remembers of the vehicle from `settled`.
+    remembers of the vehicle from `flight`.
     """
     kinematic = (
         "position",
@@ -374,17 +374,17 @@ def _in_its_place(settled: PursuitState, nominal: PursuitState) -> PursuitState:
     }
     memory = {
         name: nominal.drones.effect_memory[name] if name in sensors else memory
-        for name, memory in settled.drones.effect_memory.items()
+        for name, memory in flight.drones.effect_memory.items()
     }
-    drones = settled.drones.replace(
+    drones = flight.drones.replace(
         **{name: getattr(nominal.drones, name) for name in kinematic},
         effect_memory=memory,
     )
     return nominal.replace(
-        vehicles=settled.vehicles,
+        vehicles=flight.vehicles,
         drones=drones,
-        own_history=settled.own_history,
-        previous_action=settled.previous_action,
+        own_history=flight.own_history,
+        previous_action=flight.previous_action,
     )
 
 

@@ -133,13 +133,13 @@ class AnalyticGradient:
 
         def one(carry, _):
             world = moved(carry[0])
-            encounter = self._met(carry[1], world[1], paths, steps)
+            encounter = self._measure(carry[1], world[1], paths, steps)
             return (world, encounter), None
 
         nothing = no_encounter(world[1].drones.position.shape[:2])
         return jax.lax.scan(one, (world, nothing), None, length=steps)[0]
 
-    def _met(self, encounter, state, paths, steps):
+    def _measure(self, encounter, state, paths, steps):
         """What pursuers have met so far, with what the step that ended with `state`
         adds.
         """
@@ -212,11 +212,11 @@ class AnalyticGradient:
         """What is learnt (), and its parts. `parameters` are the policy's before."""
         settings = self.settings
         number = starts[1].step.shape[0]
-        observation, predicted = self.inputs(parameters, flying[0])
+        observation, prediction = self.inputs(parameters, flying[0])
         start_mean, log_std = self.policy.distribution(
-            parameters.actor, observation, predicted
+            parameters.actor, observation, prediction
         )
-        mean, _ = self.policy.distribution(actor, observation, predicted)
+        mean, _ = self.policy.distribution(actor, observation, prediction)
         change = (mean - start_mean) * jnp.exp(-log_std)
         # starts and flights by one program, the starts first
         worlds = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), starts, flying)
@@ -268,9 +268,9 @@ class AnalyticGradient:
     @property
     def programs(self):
         """An update is one program; see `GradientStage`."""
-        return (self._updated,)
+        return (self._update,)
 
-    def _updated(self, turn: Turn, _results: tuple) -> Updated:
+    def _update(self, turn: Turn, _results: tuple) -> Updated:
         actor = turn.actor
         gradient, parts = self.gradient(actor, turn.parameters, turn.flights, turn.key)
         change, state = self.optimiser.update(gradient, turn.state)

@@ -43,7 +43,7 @@ def insert(
     archive: TaskArchive,
     tasks: Any,
     success: Float[Array, " new"],
-    accepted: Bool[Array, " new"],
+    is_accepted: Bool[Array, " new"],
     descriptor: Callable[[Any], Float[Array, "tasks features"]],
 ) -> TaskArchive:
     """Add the accepted ones of M tasks; where there are more than slots, keep the
@@ -58,7 +58,7 @@ def insert(
       archive: C slots.
       tasks: leading axis M, newest last.
       success: their success rates.
-      accepted: which of them enter.
+      is_accepted: which of them enter.
       descriptor: of tasks (M, ...) the (M, D) numbers by whose distance they are told
       apart.
     """
@@ -70,15 +70,15 @@ def insert(
         lambda new, old: jnp.concatenate([new[::-1], old]), tasks, archive.tasks
     )
     pool_success = jnp.concatenate([success[::-1], archive.success])
-    is_used = jnp.concatenate([accepted[::-1], jnp.arange(capacity) < archive.size])
+    is_used = jnp.concatenate([is_accepted[::-1], jnp.arange(capacity) < archive.size])
 
     features = descriptor(pool)
     # |a - b|^2 = |a|^2 + |b|^2 - 2 ab, all pairs by one matrix product; in full
     # precision, as what is left of it between close tasks is a small difference of
     # large numbers
-    squared = jnp.sum(features**2, axis=-1)
+    squares = jnp.sum(features**2, axis=-1)
     product = jnp.matmul(features, features.T, precision=jax.lax.Precision.HIGHEST)
-    distance = squared[:, None] + squared[None] - 2.0 * product
+    distance = squares[:, None] + squares[None] - 2.0 * product
     index = jnp.arange(m + capacity)
     newer = (index[None] < index[:, None]) & is_used[None]
     novelty = jnp.min(jnp.where(newer, jnp.maximum(distance, 0.0), jnp.inf), axis=1)

@@ -19,7 +19,7 @@ from openjax.pursuit import (
     uniform_task,
 )
 from openjax.pursuit.collisions import drone_distance
-from openjax.pursuit.teams import parked
+from openjax.pursuit.teams import park
 
 CLOSE = 0.45
 """Share of the starts in which most pursuers stand close to something."""
@@ -63,7 +63,7 @@ def side_by_side(settings: PursuitSettings, key: PRNGKeyArray, task: Task) -> Ta
     room = settings.pillar_radius + settings.pillar_clearance
     if task.active is not None:
         to_axis = jnp.where(task.active[:, None], to_axis, jnp.inf)
-        position = parked(position, task.active)
+        position = park(position, task.active)
     clear_of_pillars = ~jnp.any(task.pillar_active & (to_axis < room))
     # less a rounding error: two that stand exactly as close as they may are apart
     are_clear = jnp.all(drone_distance(position) >= settings.drone_clearance - 1e-4)
@@ -101,9 +101,9 @@ def draw_anywhere(
     task_key, pillar_key, turn_key, start_key, choice_key = jax.random.split(key, 5)
     task = vary_pillars(tasks, settings, pillar_key, uniform_task(settings, task_key))
     task = turn_task(turn_key, task)
-    scattered = jax.random.bernoulli(choice_key, SCATTERED)
+    is_scattered = jax.random.bernoulli(choice_key, SCATTERED)
     anywhere = scatter_starts(settings, start_key, task)
-    return jax.tree.map(lambda a, b: jnp.where(scattered, a, b), anywhere, task)
+    return jax.tree.map(lambda a, b: jnp.where(is_scattered, a, b), anywhere, task)
 
 
 def is_lost(settings: PursuitSettings, state: PursuitState) -> Bool[Array, " worlds"]:

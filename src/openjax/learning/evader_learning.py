@@ -21,7 +21,7 @@ from jaxtyping import Array, Float, Int32, PRNGKeyArray
 from openjax.learning.advantages import generalised_advantages
 from openjax.learning.collectives import mean_over_devices, minibatches
 from openjax.learning.settings import EvaderLearningSettings
-from openjax.learning.train_state import clipped_adam, shuffled
+from openjax.learning.train_state import clipped_adam, shuffle
 from openjax.policy import gaussian_entropy, gaussian_log_prob
 from openjax.pursuit import Pursuit, PursuitState
 from openjax.pursuit.evaders import init_network, learned_place, scene_of
@@ -160,10 +160,10 @@ class EvaderLearning:
         samples = EvaderSamples(
             features, which, sample, log_prob, ~state.statistics.captured
         )
-        desired = jnp.where((which >= 0)[:, None], sample, jnp.nan)
+        desired_velocity = jnp.where((which >= 0)[:, None], sample, jnp.nan)
         # a program of its own: the compiler doesn't fuse the evaders' rules with the
         # physics
-        return jax.lax.optimization_barrier(desired), samples
+        return jax.lax.optimization_barrier(desired_velocity), samples
 
     def learn(
         self,
@@ -190,7 +190,7 @@ class EvaderLearning:
             return (optax.apply_updates(networks, change), state), None
 
         start = evaders.networks, evaders.optimiser
-        order = shuffled(key, self.settings.epochs, self.settings.minibatches)
+        order = shuffle(key, self.settings.epochs, self.settings.minibatches)
         (networks, state), _ = jax.lax.scan(step, start, order)
         actor, critic, log_std = networks
         evaders = evaders.replace(
@@ -269,10 +269,10 @@ class EvaderLearning:
         # samples of other networks count for nothing, and mustn't overflow: zero times
         # infinity is no number
         ratio = jnp.exp(jnp.where(weight > 0.0, log_ratio, 0.0))
-        clipped = jnp.clip(
+        clipped_ratio = jnp.clip(
             ratio, 1.0 - self.settings.clip_epsilon, 1.0 + self.settings.clip_epsilon
         )
-        surrogate = jnp.minimum(ratio * advantage, clipped * advantage)
+        surrogate = jnp.minimum(ratio * advantage, clipped_ratio * advantage)
         error = (outputs(critic, features)[1] - target) ** 2
         # weighted too: before the first of its worlds begins, a network's noise stays
         # as it is
@@ -317,8 +317,8 @@ class EvaderLearning:
             )
             return self._by_network(samples.which[0]) @ by_network
 
-        centred = advantage - mean(advantage)
-        normal = centred / (jnp.sqrt(mean(centred**2)) + 1e-8)
+        deviation = advantage - mean(advantage)
+        normal = deviation / (jnp.sqrt(mean(deviation**2)) + 1e-8)
         batch = (
             samples.seen,
             samples.sample,

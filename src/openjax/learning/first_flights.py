@@ -26,7 +26,7 @@ from openjax.learning.gradient_step import (
     SLOWEST_RATE,
     clipped_descent,
     finite_or_zero,
-    renewed,
+    renew,
     weighted_sum,
 )
 from openjax.learning.settings import (
@@ -72,7 +72,7 @@ class FirstCarry:
     optimiser: Any
     """The state of the actor's."""
     world: Any  # (B, ...)
-    risen: jax.Array
+    ramp: jax.Array
     """() how far the penalties have risen, 0 to 1"""
 
 
@@ -112,8 +112,8 @@ class FirstFlights:
             environment = environment.with_bounds(narrowed_bounds(game.vehicles, 0.0))
         return jax.vmap(environment.reset_to)(reset_keys, tasks)
 
-    def loss(self, actor: Any, parameters: PolicyParameters, world, risen: Scalar):
-        """What is learnt (); worlds after it and its parts. `risen` () is how far the
+    def loss(self, actor: Any, parameters: PolicyParameters, world, ramp: Scalar):
+        """What is learnt (); worlds after it and its parts. `ramp` () is how far the
         penalties have risen, 0 to 1.
         """
         settings = self.settings
@@ -121,7 +121,7 @@ class FirstFlights:
         end, encounter = self.stage.fly(actor, parameters, world, settings.steps)
         # with whole penalties from the start, pursuers stay away from the evader for
         # good
-        penalty = settings.penalty_start + (1.0 - settings.penalty_start) * risen
+        penalty = settings.penalty_start + (1.0 - settings.penalty_start) * ramp
         parts = {
             "free": (1.0, encounter.free),
             # along the shortest path: by the straight line they wait in sight of the
@@ -133,7 +133,7 @@ class FirstFlights:
                 penalty * settings.crash,
                 crash_share(encounter.least, settings.crash_smooth),
             ),
-            "tips": (risen * settings.crash, tip_share(encounter.upright)),
+            "tips": (ramp * settings.crash, tip_share(encounter.upright)),
             "breaches": (penalty * settings.breach, encounter.breach),
             "speed": (settings.speed * is_fast_possible, encounter.excess),
             "low": (1.0, jax.nn.relu(LOW - end[1].drones.position[..., 2])),
@@ -147,16 +147,16 @@ class FirstFlights:
         """The carry after an update, and the parts of the loss."""
         parameters = carry.parameters
         world = carry.world
-        risen = carry.risen
+        ramp = carry.ramp
         gradient, (end, parts) = jax.grad(self.loss, has_aux=True)(
-            parameters.actor, parameters, world, risen
+            parameters.actor, parameters, world, ramp
         )
         gradient, parts = mean_over_devices((gradient, parts), self.axis)
         # penalties wait for pursuers that catch: who fears a crash before that never
         # comes near
         step = 1.0 / (self.settings.penalty_ramp * max(self.settings.updates, 1))
-        risen = jnp.minimum(
-            risen + jnp.where(parts["free"] < self.settings.penalty_free, step, 0.0),
+        ramp = jnp.minimum(
+            ramp + jnp.where(parts["free"] < self.settings.penalty_free, step, 0.0),
             1.0,
         )
         change, state = self.optimiser.update(finite_or_zero(gradient), carry.optimiser)
@@ -168,8 +168,8 @@ class FirstFlights:
             jax.random.uniform(choice_key, (self.settings.worlds,)) < self.settings.anew
         )
         over = self._over(end[1]) | own_share(worlds_drawn, self.axis)
-        world = renewed(over, end, self.start(start_key))
-        return FirstCarry(parameters, state, world, risen), parts
+        world = renew(over, end, self.start(start_key))
+        return FirstCarry(parameters, state, world, ramp), parts
 
     def _over(self, state):
         """(B,) worlds that end: crashed, far outside, or too late for another

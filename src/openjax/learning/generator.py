@@ -68,11 +68,11 @@ def _archived_or_uniform(settings, environment, archive, key):
         return uniform
     # both are drawn and one is taken: mapped over worlds, a branch would work out both,
     # too
-    expanded = expand_task(
+    neighbour = expand_task(
         environment, expand_key, draw(archive, draw_key), settings.wall_distance
     )
     local = (jax.random.uniform(choice_key) < settings.expansion) & (archive.size > 0)
-    return jax.tree.map(lambda a, b: jnp.where(local, a, b), expanded, uniform)
+    return jax.tree.map(lambda a, b: jnp.where(local, a, b), neighbour, uniform)
 
 
 def successes(
@@ -109,8 +109,8 @@ def select(
       complete: (M,) bool, its episodes ran their full length (the first ones start
       late).
     """
-    unsolved = (success >= settings.success_low) & (success <= settings.success_high)
-    return insert(archive, tasks, success, unsolved & complete, task_descriptor)
+    is_useful = (success >= settings.success_low) & (success <= settings.success_high)
+    return insert(archive, tasks, success, is_useful & complete, task_descriptor)
 
 
 def vary_pillars(settings, environment, key, task):

@@ -79,12 +79,12 @@ def compile_stage(
     flights = jax.eval_shape(record, parameters, key)
     state = jax.eval_shape(begin, parameters, key)
     turn = Turn(parameters.actor, state, parameters, flights, key)
-    lowered = [record.lower(parameters, key), begin.lower(parameters, key)]
+    traces = [record.lower(parameters, key), begin.lower(parameters, key)]
     results = ()
     for program in stage.programs:
-        lowered.append(jax.jit(program).lower(turn, results))
-        results = (*results, lowered[-1].out_info)
-    ready = [in_background(program.compile) for program in lowered]
+        traces.append(jax.jit(program).lower(turn, results))
+        results = (*results, traces[-1].out_info)
+    ready = [in_background(program.compile) for program in traces]
 
     def learn(parameters, key):
         record, begin, *programs = (wait() for wait in ready)

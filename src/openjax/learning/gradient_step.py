@@ -49,7 +49,7 @@ def finite_or_zero(gradient: Any) -> Any:
     return jax.tree.map(lambda leaf: jnp.where(finite, leaf, 0.0), gradient)
 
 
-def renewed(over: Bool[Array, " worlds"], world: Any, fresh: Any) -> Any:
+def renew(over: Bool[Array, " worlds"], world: Any, fresh: Any) -> Any:
     """Worlds (W, ...), those that are `over` (W,) replaced by fresh ones."""
     return where_rows(over, fresh, world)
 
@@ -76,8 +76,8 @@ def mean_step(
     step = jax.vmap(environment.step, in_axes=(None, 0, 0, 0))
 
     def fly_on(actor, observation, state, wish=None):
-        predicted = jax.lax.stop_gradient(policy.predict(parameters, observation))
-        mean, _ = policy.distribution(actor, observation, predicted)
+        prediction = jax.lax.stop_gradient(policy.predict(parameters, observation))
+        mean, _ = policy.distribution(actor, observation, prediction)
         # no key: the game draws nothing after its reset
         observation, state, *_ = step(
             None, state, policy.action(mean, observation), wish

@@ -91,10 +91,10 @@ def collect(
         return rollout, observation, state
 
     def decide(world, noise):
-        desired, samples = players.evaders(world[1], noise.evaders)
+        desired_velocities, samples = players.evaders(world[1], noise.evaders)
 
         def fly_on(world, noise):
-            return step(world, noise, desired)
+            return step(world, noise, desired_velocities)
 
         world, record = jax.lax.scan(fly_on, world, noise.pursuers)
         return world, (record, samples)
@@ -117,17 +117,17 @@ def _step(players, penalty_share):
         players.environment.step, in_axes=(None, 0, 0, 0 if players.evaders else None)
     )
 
-    def step(world, noise, desired=None):
+    def step(world, noise, desired_velocities=None):
         observation, state = world
-        predicted, action, log_prob = _sample(players, observation, noise)
+        prediction, action, log_prob = _sample(players, observation, noise)
         command = policy.action(action, observation)
         # any key will do: the game draws nothing after its reset
         next_observation, state, reward, terminated, truncated, info = move(
-            jax.random.key(0), state, command, desired
+            jax.random.key(0), state, command, desired_velocities
         )
         record = Rollout(
             observation=newest_frame(observation),
-            predicted=predicted,
+            predicted=prediction,
             action=action,
             log_prob=log_prob,
             # the reward holds the whole penalties: the share that doesn't count yet is
@@ -145,9 +145,9 @@ def _step(players, penalty_share):
 def _sample(players, observation, noise):
     """Predictions, samples of the policy and their log probabilities."""
     policy = players.policy
-    predicted = policy.predict(players.parameters, observation)
+    prediction = policy.predict(players.parameters, observation)
     mean, log_std = policy.distribution(
-        players.parameters.actor, observation, predicted
+        players.parameters.actor, observation, prediction
     )
     action = mean + jnp.exp(log_std) * noise
-    return predicted, action, gaussian_log_prob(action, mean, log_std)
+    return prediction, action, gaussian_log_prob(action, mean, log_std)

@@ -70,7 +70,7 @@ class Schedule:
             return 0
         return number // self.groups // self.restart_every * len(self.restart_ages)
 
-    def renewed(self, worlds: Any, fresh: Any, ending: Count) -> Any:
+    def renew(self, worlds: Any, fresh: Any, ending: Count) -> Any:
         """`worlds` (E, ...) with `fresh` ones in place of the group `ending`, and then
         of those that start anew.
         """
@@ -90,10 +90,8 @@ class Schedule:
         # one gather from [old worlds, fresh ones of the ending group, fresh ones of
         # restarts]: each world says from which place of these three it comes
         ending_size = number // self.groups
-        restarted = (task // every * ages + restart) * self.share + neighbour
-        source = jnp.where(
-            restart < 0, np.arange(number), number + ending_size + restarted
-        )
+        place = (task // every * ages + restart) * self.share + neighbour
+        source = jnp.where(restart < 0, np.arange(number), number + ending_size + place)
         # last, so that it has the word: what ends its episode is not started anew as
         # well
         source = jnp.where(behind == 0, number + member, source)

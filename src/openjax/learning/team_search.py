@@ -168,13 +168,13 @@ class TeamSearch:
         is_fixed = kind > 1.0 - ANYWHERE
         until = self.seconds * jax.random.uniform(keys[6], shape, maxval=LONGEST)
         until = jnp.where(kind < STRAIGHT, 0.0, until)
-        drawn = TeamPlan(
+        random_plan = TeamPlan(
             jnp.where(is_fixed[..., None], anywhere, far * way), is_fixed, until
         )
         straight = no_plan(team_plan.until.shape[0])
         return jax.tree.map(
             lambda leaf, *first: leaf.at[: len(first)].set(jnp.stack(first)),
-            drawn,
+            random_plan,
             straight,
             team_plan,
         )
@@ -187,7 +187,9 @@ class TeamSearch:
         high = jnp.array([jnp.inf, jnp.inf, self.game.arena_height - LOWEST])
         return jnp.clip(place, low, high)
 
-    def desired(self, task, paths: ShortestPaths, position: Team, target: Team) -> Team:
+    def desired_velocity(
+        self, task, paths: ShortestPaths, position: Team, target: Team
+    ) -> Team:
         """(N, 3) m/s, along the shortest path to (N, 3) targets."""
 
         def one(position, target):
@@ -212,10 +214,10 @@ class TeamSearch:
             first, velocities = step
             lead = points.evader + RESPONSE * velocities[0]
             target = self.target(plan, lead, first * STEP)
-            desired = self.desired(task, paths, points.position, target)
+            velocity_wish = self.desired_velocity(task, paths, points.position, target)
             places = []
             for velocity in velocities:
-                points = self._after_step(task, points, desired, velocity)
+                points = self._after_step(task, points, velocity_wish, velocity)
                 places.append(points.position)
             return points, jnp.stack(places)
 
@@ -225,7 +227,7 @@ class TeamSearch:
         )
         return end, places.reshape(-1, *places.shape[2:])
 
-    def _after_step(self, task, points, desired, velocity):
+    def _after_step(self, task, points, velocity_wish, velocity):
         """Points a step later, whose pursuers wish to fly (N, 3) m/s."""
         game = self.game
         evader = into_free_space(
@@ -234,23 +236,25 @@ class TeamSearch:
             task.pillar_position,
             task.pillar_active,
         )
-        push = (desired - points.velocity) / RESPONSE
+        push = (velocity_wish - points.velocity) / RESPONSE
         size = length(push, keepdims=True)
-        flown = points.velocity + STEP * push * jnp.minimum(1.0, ACCELERATION / size)
+        next_velocity = points.velocity + STEP * push * jnp.minimum(
+            1.0, ACCELERATION / size
+        )
         low = jnp.array([-jnp.inf, -jnp.inf, LEAST_HEIGHT])
         high = jnp.array([jnp.inf, jnp.inf, game.arena_height])
-        position = jnp.clip(points.position + STEP * flown, low, high)
+        position = jnp.clip(points.position + STEP * next_velocity, low, high)
         square = jnp.sum((position - evader) ** 2, axis=-1)
         breach = breaches(
             self.strict_game, position, task.pillar_position, task.pillar_active
         )
-        caught = points.caught | jnp.any(square < capture_radius(game, task) ** 2)
+        is_caught = points.caught | jnp.any(square < capture_radius(game, task) ** 2)
         return Points(
             position,
-            flown,
+            next_velocity,
             evader,
-            caught,
-            free=points.free + ~caught,
+            is_caught,
+            free=points.free + ~is_caught,
             breaches=points.breaches + jnp.any(breach.total > 0),
         )
 

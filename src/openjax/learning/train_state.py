@@ -19,7 +19,7 @@ class TrainState:
     optimiser: Any
     """State of the `optax` transformation."""
 
-    def updated(
+    def update(
         self, optimiser: optax.GradientTransformation, gradient: Any, **others: Any
     ) -> "TrainState":
         """One step against `gradient`, a tree like the parameters; `others` is what
@@ -49,7 +49,7 @@ def clipped_adam(
     return optax.flatten(optax.chain(*steps))
 
 
-def shuffled(
+def shuffle(
     key: PRNGKeyArray, epochs: int, minibatches: int
 ) -> Int32[Array, " {epochs*minibatches}"]:
     """(epochs * minibatches,) the minibatches in the order in which they are learnt

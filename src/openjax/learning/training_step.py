@@ -102,8 +102,8 @@ def build(
         check_network(policy, jax.eval_shape(environment.reset, jax.random.key(0))[0])
         policy = OwnPolicy(policy)
     check_learners(learners or {})
-    shipped = shipped_learners(settings, environment, policy)
-    return Parts(environment, policy, {**shipped, **(learners or {})})
+    shipped_parts = shipped_learners(settings, environment, policy)
+    return Parts(environment, policy, {**shipped_parts, **(learners or {})})
 
 
 def shipped_learners(
@@ -209,15 +209,15 @@ class Phases:
         """The whole step; its operations bear the parts' names, by which a profile
         tells them apart.
         """
-        carry, flown, metrics = _named(self.fly)(carry)
+        carry, experience, metrics = _under_its_name(self.fly)(carry)
         for learn in self.learn:
-            carry, watched = _named(learn)(carry, flown)
-            metrics |= watched
-        carry, counted = _named(self.renew)(carry)
-        return carry, metrics | counted
+            carry, measures = _under_its_name(learn)(carry, experience)
+            metrics |= measures
+        carry, counts = _under_its_name(self.renew)(carry)
+        return carry, metrics | counts
 
 
-def _named(phase):
+def _under_its_name(phase):
     return jax.named_scope(phase.__name__)(phase)
 
 
@@ -283,7 +283,7 @@ class _Step:
         rollout, observation, state = collect(players, world, noise, share)
         # a rollout keeps the newest frame of each step only: windows begin in the
         # history before it
-        flown = Flown(
+        experience = Flown(
             rollout=rollout,
             frames=carry.state.frames,
             observation=observation,
@@ -294,7 +294,7 @@ class _Step:
         )
         reward = team_mean(rollout.observation.active, rollout.reward)
         metrics = {"reward": mean_over_devices(reward, axis)}
-        return carry.replace(observation=observation, state=state), flown, metrics
+        return carry.replace(observation=observation, state=state), experience, metrics
 
     def _evaders(self, carry):
         """How evaders that learn fly, (worlds, noise) -> desired velocities, samples;
@@ -309,10 +309,10 @@ class _Step:
         """The phase in which the learner of that name learns."""
         learner = self.parts.learners[name]
 
-        def learn(carry, flown):
+        def learn(carry, experience):
             key = self._learner_key(carry, name)
             old_state = carry.learners[name]
-            result = learner.learn(old_state, carry.policy, flown, key)
+            result = learner.learn(old_state, carry.policy, experience, key)
             check_learning(name, result, old_state)
             state, policy, metrics = result
             return carry.replace(
@@ -342,7 +342,7 @@ class _Step:
         numbers = members.step.shape[0], schedule.restarts(carry.state.step.shape[0])
         keys = self._key(carry, "tasks"), self._key(carry, "resets")
         fresh = self._fresh(starting, archive, keys, numbers)
-        observation, state = schedule.renewed(
+        observation, state = schedule.renew(
             (carry.observation, carry.state), fresh, group
         )
         carry = carry.replace(
@@ -450,15 +450,15 @@ def _selection(settings, archive, members, penalty_share, axis):
     statistics = members.statistics
     complete = statistics.steps >= settings.environment.episode_length
     share = settings.episodes_per_task
-    solved = successes(settings.generator, statistics, penalty_share)
+    is_solved = successes(settings.generator, statistics, penalty_share)
     # neighbours fly the same task: a row for each task
-    solved = solved.astype(jnp.float32).reshape(-1, share)
+    is_solved = is_solved.astype(jnp.float32).reshape(-1, share)
     if settings.generator.enabled:
         # of neighbours that flew one task the first stands for all
         tasks = jax.tree.map(lambda x: x[::share], members.task)
         # the archive is the same on all devices, and so all of them see all candidates
         tasks, success, complete = gather_over_devices(
-            (tasks, jnp.mean(solved, axis=1), complete[::share]), axis
+            (tasks, jnp.mean(is_solved, axis=1), complete[::share]), axis
         )
         archive = select(settings.generator, archive, tasks, success, complete)
     metrics = {
@@ -468,7 +468,7 @@ def _selection(settings, archive, members, penalty_share, axis):
         "crash_rate": statistics.crashed,
         "over_speed_rate": statistics.over_speed_rate,
         "episode_return": statistics.episode_return,
-        "success_rate": solved.ravel(),
+        "success_rate": is_solved.ravel(),
     }
     if "learned" in settings.environment.evaders:
         by_network = (

@@ -33,7 +33,7 @@ from openjax.learning.gradient_step import (
     falling_rate,
     finite_or_zero,
     mean_step,
-    renewed,
+    renew,
     weighted_sum,
 )
 from openjax.learning.settings import (
@@ -100,7 +100,7 @@ class Tried(NamedTuple):
 
     plans: jax.Array
     """(B, plans, pieces, 3)"""
-    promised: jax.Array
+    promise_of_plans: jax.Array
     """(B, plans), see `promise`"""
     free: jax.Array
     """(B, plans) control steps in which it was free"""
@@ -210,17 +210,17 @@ class WorstPlans:
         straight = (planning.plans - 4) // 3
         turn_key, way_key, straight_key = jax.random.split(key, 3)
         shape = (number, planning.plans - 4 - straight, planning.pieces)
-        drawn = _unit(jax.random.normal(way_key, (*shape, 3)))
+        random_ways = _unit(jax.random.normal(way_key, (*shape, 3)))
         turns = jax.random.bernoulli(turn_key, 0.5, shape)
         # the last piece at which a way turned is the one that it flies
-        turned = jax.lax.cummax(
+        last_turn = jax.lax.cummax(
             jnp.where(turns, jnp.arange(planning.pieces), 0), axis=2
         )
-        bent = jnp.take_along_axis(drawn, turned[..., None], axis=2)
+        bent = jnp.take_along_axis(random_ways, last_turn[..., None], axis=2)
         ways = _unit(jax.random.normal(straight_key, (number, straight, 1, 3)))
         parts = [
             plan[:, None],
-            _later(plan)[:, None],
+            _shift(plan)[:, None],
             jnp.zeros_like(plan)[:, None],
             jnp.full_like(plan, jnp.nan)[:, None],
             jnp.broadcast_to(ways, (number, straight, planning.pieces, 3)),
@@ -239,10 +239,10 @@ class WorstPlans:
         """All plans tried in worlds (B, ...), and what became of them; `plan` is the
         rest of the last one.
         """
-        tried = self.candidates(key, plan)
+        plans = self.candidates(key, plan)
         number = self.planning.plans
-        copied = jax.tree.map(lambda leaf: jnp.repeat(leaf, number, axis=0), world)
-        pieces = jnp.moveaxis(tried.reshape(-1, *tried.shape[2:]), 1, 0)
+        copies = jax.tree.map(lambda leaf: jnp.repeat(leaf, number, axis=0), world)
+        pieces = jnp.moveaxis(plans.reshape(-1, *plans.shape[2:]), 1, 0)
         fly_on = mean_step(self.environment, self.usual.policy, parameters)
 
         def piece(world, wish):
@@ -252,24 +252,24 @@ class WorstPlans:
 
             return jax.lax.scan(one, world, length=self.piece_steps)[0], None
 
-        (_, end), _ = jax.lax.scan(piece, copied, pieces)
-        free = self._free(copied[1], end)
-        promised = self.promise(copied[1], end)
+        (_, end), _ = jax.lax.scan(piece, copies, pieces)
+        free = self._free(copies[1], end)
+        promise = self.promise(copies[1], end)
 
         def by_world(leaf):
             return leaf.reshape(-1, number, *leaf.shape[1:])
 
         return Tried(
-            tried, *map(by_world, (promised, free)), jax.tree.map(by_world, end)
+            plans, *map(by_world, (promise, free)), jax.tree.map(by_world, end)
         )
 
     def _free(self, start, end):
         """(W,) control steps of a plan in which the evader was free."""
-        newly = end.statistics.captured & ~start.statistics.captured
-        return jnp.where(newly, end.statistics.capture_step - start.step, self.steps)
+        is_new = end.statistics.captured & ~start.statistics.captured
+        return jnp.where(is_new, end.statistics.capture_step - start.step, self.steps)
 
     def show(
-        self, tried: Tried, world, team_plan: TeamPlan, plan: Plan, key: PRNGKeyArray
+        self, trials: Tried, world, team_plan: TeamPlan, plan: Plan, key: PRNGKeyArray
     ) -> tuple[TeamPlan, Example]:
         """What the teams of worlds (B, ...) should do against evaders that fly `plan`:
         what is best against the worst of the plans that promised most. `team_plan` is
@@ -278,19 +278,21 @@ class WorstPlans:
         team = self.team
         # found once: pillars stand still, whatever is tried
         paths = jax.vmap(team.paths)(world[1].task)
-        room = jax.vmap(jax.vmap(team.room, (0, None)))(tried.end, paths)
-        worth = tried.free * (self.game.time_step / STEP) + room
-        most = jax.lax.top_k(tried.promised, min(ANSWERS, self.planning.plans))[1]
+        room = jax.vmap(jax.vmap(team.room, (0, None)))(trials.end, paths)
+        worth = trials.free * (self.game.time_step / STEP) + room
+        most = jax.lax.top_k(
+            trials.promise_of_plans, min(ANSWERS, self.planning.plans)
+        )[1]
 
         def chosen(leaf):
-            return jax.vmap(lambda own, places: own[places])(leaf, most)
+            return jax.vmap(lambda values, places: values[places])(leaf, most)
 
-        velocities = self._velocities(chosen(tried.plans))
+        velocities = self._velocities(chosen(trials.plans))
         keys = jax.random.split(key, plan.shape[0])
-        best, promised = jax.vmap(team.search)(
+        best, promise = jax.vmap(team.search)(
             world[1], paths, velocities, team_plan, keys
         )
-        gain = jnp.max(chosen(worth), axis=1) - promised
+        gain = jnp.max(chosen(worth), axis=1) - promise
         way = jax.vmap(team.way)(world[1], paths, best, self._velocities(plan))
         ends_of_pieces = (
             np.arange(1, self.planning.pieces + 1) * team.steps // self.planning.pieces
@@ -333,50 +335,55 @@ class WorstPlans:
         policy = self.usual.policy
 
         def piece(world, wish):
-            world, met = self.flight.fly(
+            world, encounter = self.flight.fly(
                 actor, parameters, world, self.piece_steps, wish
             )
-            return world, (world, met)
+            return world, (world, encounter)
 
         # one body for all pieces: each would take a GPU's compiler half a minute
-        worlds, met = jax.lax.scan(piece, world, jnp.moveaxis(plan, 1, 0))[1]
-        after = jax.tree.map(lambda leaf: jax.lax.stop_gradient(leaf[0]), worlds)
-        observation, predicted = self.usual.inputs(parameters, world[0])
-        before, log_std = policy.distribution(parameters.actor, observation, predicted)
-        mean, _ = policy.distribution(actor, observation, predicted)
-        change = (mean - before) * jnp.exp(-log_std)
+        worlds, encounter = jax.lax.scan(piece, world, jnp.moveaxis(plan, 1, 0))[1]
+        next_worlds = jax.tree.map(lambda leaf: jax.lax.stop_gradient(leaf[0]), worlds)
+        observation, prediction = self.usual.inputs(parameters, world[0])
+        reference_mean, log_std = policy.distribution(
+            parameters.actor, observation, prediction
+        )
+        mean, _ = policy.distribution(actor, observation, prediction)
+        change = (mean - reference_mean) * jnp.exp(-log_std)
         # the gradient knows where the evader is, and who doesn't see it can't learn
         # from that: they would unlearn to search
-        seen = world[1].seen.astype(jnp.float32)
+        is_seen = world[1].seen.astype(jnp.float32)
         hold = jnp.where(world[1].seen, self.settings.hold, planning.hold_unseen)[
             :, None
         ]
-        flown = jnp.moveaxis(worlds[1].drones.position, 0, 1)
+        positions = jnp.moveaxis(worlds[1].drones.position, 0, 1)
         parts = {
-            "free": (1.0, seen * jnp.mean(met.free, axis=0)),
-            "distance": (planning.distance, seen * jnp.mean(met.distance, axis=0)),
-            **self._wished(met, seen, flown, example),
-            "crashes": (planning.crash, crash_share(jnp.min(met.least, axis=0))),
-            "breaches": (planning.breach, met.breach),
-            "speed": (self.settings.speed, met.excess),
+            "free": (1.0, is_seen * jnp.mean(encounter.free, axis=0)),
+            "distance": (
+                planning.distance,
+                is_seen * jnp.mean(encounter.distance, axis=0),
+            ),
+            **self._optional_parts(encounter, is_seen, positions, example),
+            "crashes": (planning.crash, crash_share(jnp.min(encounter.least, axis=0))),
+            "breaches": (planning.breach, encounter.breach),
+            "speed": (self.settings.speed, encounter.excess),
             "held": (1.0, hold * jnp.sum(change**2, axis=-1)),
         }
         total, means = weighted_sum(parts)
-        return total, (after, means)
+        return total, (next_worlds, means)
 
-    def _wished(self, met, weight, position, example):
+    def _optional_parts(self, encounter, weight, position, example):
         """Parts of the loss that a stage may have, `weight` (B,) where the evader is
         seen; what isn't weighed isn't worked out, nor told.
         """
         planning = self.planning
         parts = {}
         if planning.territory:
-            territory = weight * jnp.mean(met.territory, axis=0)
+            territory = weight * jnp.mean(encounter.territory, axis=0)
             parts["territory"] = (planning.territory, territory)
         if planning.unseen:
             # where nobody sees it, too: to look where it was last seen is what is to be
             # learnt
-            parts["unseen"] = (planning.unseen, met.unseen)
+            parts["unseen"] = (planning.unseen, encounter.unseen)
         if example is not None:
             square = jnp.sum((position - example.places) ** 2, axis=-1)
             # of two ways round a pillar the nearer one: a mean of both leads into it
@@ -389,23 +396,25 @@ class WorstPlans:
         """Plans; what is learnt from them; what is always learnt; and what comes of
         both. See `GradientStage`.
         """
-        return self._planned, self._learnt, self._always_learnt, self._updated
+        return self._plan, self._learnt, self._always_learnt, self._update
 
-    def _planned(self, turn: Turn, _results: tuple):
+    def _plan(self, turn: Turn, _results: tuple):
         """Plans (B, ...) of the evaders and what these promise, plans of their
         pursuers' teams, and what these show.
         """
         key = _keys(turn)[0]
         state = turn.state
-        tried = self.attempts(turn.actor, turn.parameters, state.world, state.plan, key)
-        plan, promised = worst_of(tried)
+        trials = self.attempts(
+            turn.actor, turn.parameters, state.world, state.plan, key
+        )
+        plan, promise = worst_of(trials)
         if state.team is None:
-            return plan, promised, None, None
+            return plan, promise, None, None
         team, example = self.show(
-            tried, state.world, state.team, plan, jax.random.fold_in(key, 1)
+            trials, state.world, state.team, plan, jax.random.fold_in(key, 1)
         )
         team = team.replace(until=team.until - self.planning.piece_seconds)
-        return plan, promised, team, example
+        return plan, promise, team, example
 
     def _learnt(self, turn: Turn, results: tuple):
         """The gradient, the worlds after the plans' first piece, and the loss's
@@ -422,16 +431,16 @@ class WorstPlans:
         key = _keys(turn)[1]
         return self.usual.gradient(turn.actor, turn.parameters, turn.flights, key)
 
-    def _updated(self, turn: Turn, results: tuple) -> Updated:
-        (plan, promised, team, example), (gradient, world, parts), usual = results
+    def _update(self, turn: Turn, results: tuple) -> Updated:
+        (plan, promise, team, example), (gradient, world, parts), usual = results
         usual_gradient, usual_parts = usual
         gradient = jax.tree.map(jnp.add, gradient, usual_gradient)
         change, optimiser = self.optimiser.update(gradient, turn.state.optimiser)
         over = self._over(world[1])
-        world = renewed(over, world, self.start(_keys(turn)[2]))
-        plan = jnp.where(over[:, None, None], 0.0, _later(plan))
+        world = renew(over, world, self.start(_keys(turn)[2]))
+        plan = jnp.where(over[:, None, None], 0.0, _shift(plan))
         parts = {f"planned_{name}": value for name, value in parts.items()}
-        parts["planned_survived"] = jnp.mean(promised >= self.steps)
+        parts["planned_survived"] = jnp.mean(promise >= self.steps)
         if example is not None:
             parts["planned_gain"] = jnp.mean(example.gain)
         return (
@@ -448,11 +457,11 @@ class WorstPlans:
         return is_lost(self.game, state) | state.statistics.captured | late
 
 
-def worst_of(tried: Tried) -> tuple[Plan, Float[Array, " worlds"]]:
+def worst_of(trials: Tried) -> tuple[Plan, Float[Array, " worlds"]]:
     """The plan that promises the evader of each world most, and how much."""
-    best = jnp.argmax(tried.promised, axis=1)
-    plans = jnp.take_along_axis(tried.plans, best[:, None, None, None], axis=1)
-    return plans[:, 0], jnp.max(tried.promised, axis=1)
+    best = jnp.argmax(trials.promise_of_plans, axis=1)
+    plans = jnp.take_along_axis(trials.plans, best[:, None, None, None], axis=1)
+    return plans[:, 0], jnp.max(trials.promise_of_plans, axis=1)
 
 
 def planning_game(environment: Pursuit) -> Pursuit:
@@ -473,6 +482,6 @@ def _unit(vector):
     return vector / jnp.sqrt(jnp.sum(vector**2, axis=-1, keepdims=True) + 1e-12)
 
 
-def _later(plan):
+def _shift(plan):
     """(..., pieces, 3) the plan after its first piece; its last one goes on."""
     return jnp.concatenate([plan[:, 1:], plan[:, -1:]], axis=1)

@@ -20,7 +20,9 @@ from openjax.pursuit.task import Task
 from openjax.vehicle import DroneState
 
 ANGLES = 12
-"""Places that are looked at round where it was thought to be, on each of the circles."""
+"""Places that are looked at round where it was thought to be, on each of the
+circles.
+"""
 STRIDES = (0.05, 0.12, 0.25)
 """How far they are from there (m). It can't jump to another pillar; with these it is
 .10 m (level) from where it's taken to be one to eight seconds after it was seen, in the
@@ -42,8 +44,8 @@ def thought_place(
         return place
     # who hasn't seen it yet knows of no place
     was_seen = jnp.any(place != jnp.array(settings.middle, jnp.float32))
-    hidden = nearest_hidden(settings, task, seen_drones, active, place)
-    return jnp.where(was_seen, hidden, place)
+    hiding_place = nearest_hidden(settings, task, seen_drones, active, place)
+    return jnp.where(was_seen, hiding_place, place)
 
 
 def nearest_hidden(
@@ -63,8 +65,8 @@ def nearest_hidden(
     # which place it is has no gradient, and that of an index is a scatter
     place = jax.lax.stop_gradient(thought) + offset
     free = _can_be_at(settings, task, place)
-    hidden = free & ~_is_seen(settings, task, drones, active, place)
-    distance = jnp.where(hidden, np.linalg.norm(offset, axis=-1), jnp.inf)
+    is_hidden = free & ~_is_seen(settings, task, drones, active, place)
+    distance = jnp.where(is_hidden, np.linalg.norm(offset, axis=-1), jnp.inf)
     # the first of equals, so the place itself where nothing is hidden
     return place[jnp.argmin(distance)]
 

@@ -111,7 +111,7 @@ def check_terms(terms: Any) -> tuple[Term, ...]:
     return tuple(terms)
 
 
-def _weighted(term, transition):
+def _weigh(term, transition):
     """A term's part of the reward. Raises UserError where its function gives another
     shape than () or (N,).
     """
@@ -135,7 +135,7 @@ def total_reward(terms: tuple[Term, ...], transition: Transition) -> tuple[Each,
 
     def total(is_penalty):
         values = [
-            _weighted(term, transition) for term in terms if term.penalty == is_penalty
+            _weigh(term, transition) for term in terms if term.penalty == is_penalty
         ]
         return functools.reduce(operator.add, values) if values else nothing
 

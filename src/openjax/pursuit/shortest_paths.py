@@ -162,8 +162,8 @@ def _straight(settings, task, start, end):
         across = jnp.sum((to_axis - share[..., None] * along) ** 2, axis=-1)
         return active & (share > 0.0) & (share < 1.0) & (across < reach**2)
 
-    crossed = map(crosses, task.pillar_position, task.pillar_active)
-    return jnp.sqrt(square + 1e-12) + TOLL * sum(crossed, jnp.zeros(square.shape))
+    crossings = map(crosses, task.pillar_position, task.pillar_active)
+    return jnp.sqrt(square + 1e-12) + TOLL * sum(crossings, jnp.zeros(square.shape))
 
 
 def _reach(settings):

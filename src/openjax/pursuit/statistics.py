@@ -68,8 +68,8 @@ def count(
 
     `active` (N,): slots in use, None: all; nothing of the others is in `info`.
     """
-    captured = jnp.any(info.captured)
-    first = captured & ~statistics.captured
+    is_captured = jnp.any(info.captured)
+    first = is_captured & ~statistics.captured
     breach = info.breaches
 
     def any_of(values):
@@ -78,8 +78,8 @@ def count(
     return EpisodeStatistics(
         steps=statistics.steps + 1,
         capture_step=jnp.where(first, step, statistics.capture_step),
-        captured=statistics.captured | captured,
-        free_steps=jnp.where(captured, 0, statistics.free_steps + 1),
+        captured=statistics.captured | is_captured,
+        free_steps=jnp.where(is_captured, 0, statistics.free_steps + 1),
         # steps, not breaches: a rate is the share of steps in which anything is
         # breached
         collision_steps=statistics.collision_steps + any_of(breach.total),

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from openjax.pursuit.collisions import breaches, drone_distance
 from openjax.pursuit.settings import PursuitSettings
 from openjax.pursuit.shapes import Flag, Quaternions, Scalar, Team
-from openjax.pursuit.teams import draw_team, of_team, parked
+from openjax.pursuit.teams import draw_team, of_team, park
 
 START_X = (0.1, 0.536)
 """Uniform tasks: pursuers start at x in this range, the evader at the mirrored one
@@ -78,7 +78,7 @@ class Task:
         """The same with pursuers that start at (N, 3) m; empty slots stay where they're
         parked.
         """
-        return self.replace(pursuer_position=parked(position, self.active))
+        return self.replace(pursuer_position=park(position, self.active))
 
 
 def evader_speed(
@@ -175,12 +175,12 @@ def uniform_task(settings: PursuitSettings, key: PRNGKeyArray) -> Task:
     candidates = jax.random.uniform(position_key, (draws, n, 3), jnp.float32, low, high)
     active = draw_team(settings, key)
     is_apart = jax.vmap(
-        lambda p: jnp.all(drone_distance(parked(p, active)) >= settings.drone_clearance)
+        lambda p: jnp.all(drone_distance(park(p, active)) >= settings.drone_clearance)
     )(candidates)
     # where none is good, `argmax` gives the first: such a task starts in a breach
-    pursuers = parked(candidates[jnp.argmax(is_apart)], active)
-    mirrored = jnp.array([-1.0, 1.0, 1.0], jnp.float32)
-    evader = jax.random.uniform(evader_key, (3,), jnp.float32, low, high) * mirrored
+    pursuers = park(candidates[jnp.argmax(is_apart)], active)
+    mirror = jnp.array([-1.0, 1.0, 1.0], jnp.float32)
+    evader = jax.random.uniform(evader_key, (3,), jnp.float32, low, high) * mirror
 
     cells = jnp.asarray(pillar_cells(), jnp.float32)
     vehicles = jnp.concatenate([pursuers, evader[None]])[:, :2]
@@ -280,8 +280,8 @@ def close_starts(
         beside = jnp.append(task.pillar_position[pillar], position[i, 2])
         by_pursuer = (jax.random.bernoulli(kind_key) | no_pillar) & (i > 0)
         # the pillar's key once more: of the two draws only one is used
-        settled = jax.random.randint(which_key, (), 0, max(i, 1))
-        anchor = jnp.where(by_pursuer, position[settled], beside)
+        partner = jax.random.randint(which_key, (), 0, max(i, 1))
+        anchor = jnp.where(by_pursuer, position[partner], beside)
         clearance = jnp.where(
             by_pursuer,
             settings.drone_clearance,
@@ -337,8 +337,8 @@ def scatter_starts(settings: PursuitSettings, key: PRNGKeyArray, task: Task) -> 
         z = jax.random.uniform(
             height_key, (n + 1, 1), minval=middle - START_Z, maxval=middle + START_Z
         )
-        scattered = task.replace(evader_position=jnp.append(xy[:, 1], z[0]))
-        return scattered.with_starts(jnp.concatenate([pursuers, z[1:]], axis=-1))
+        scatter = task.replace(evader_position=jnp.append(xy[:, 1], z[0]))
+        return scatter.with_starts(jnp.concatenate([pursuers, z[1:]], axis=-1))
 
     return _first_clear(settings, draw, key, task)
 
@@ -355,7 +355,7 @@ def _first_clear(settings, draw, key, task):
     clear = jax.vmap(lambda candidate: starts_clear(settings, candidate))(candidates)
     first = jnp.argmax(clear)
     return jax.tree.map(
-        lambda drawn, seed: jnp.where(jnp.any(clear), drawn[first], seed),
+        lambda tasks, seed: jnp.where(jnp.any(clear), tasks[first], seed),
         candidates,
         task,
     )
@@ -401,11 +401,11 @@ def _move_pillars(settings, task, position):
     ]
     inside = jnp.linalg.norm(position, axis=-1) < PILLAR_REACH
     # each pillar by itself: a row may have gaps
-    accepted = (_clear_of(settings, position, vehicles) & inside & task.pillar_active)[
+    moves = (_clear_of(settings, position, vehicles) & inside & task.pillar_active)[
         :, None
     ]
     return task.replace(
-        pillar_position=jnp.where(accepted, position, task.pillar_position)
+        pillar_position=jnp.where(moves, position, task.pillar_position)
     )
 
 
@@ -433,11 +433,11 @@ def turn_task(key: PRNGKeyArray, task: Task) -> Task:
         xy = jnp.stack([cosine * x - sine * y, sine * x + cosine * y], axis=-1)
         return jnp.concatenate([xy, position[..., 2:]], axis=-1)
 
-    rotated = task.replace(
+    turned_task = task.replace(
         evader_position=turn(task.evader_position),
         pillar_position=turn(task.pillar_position),
     )
-    return rotated.with_starts(turn(task.pursuer_position))
+    return turned_task.with_starts(turn(task.pursuer_position))
 
 
 def start_attitude(settings: PursuitSettings, key: PRNGKeyArray) -> Quaternions:

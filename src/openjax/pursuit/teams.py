@@ -78,7 +78,7 @@ def still_there(
     return is_there if active is None else is_there & active
 
 
-def parked(position: Team, active: Which | None) -> Team:
+def park(position: Team, active: Which | None) -> Team:
     """Positions (N, 3) m with those of empty slots far away."""
     if active is None:
         return position
@@ -94,7 +94,7 @@ def held(active: Which | None, drones: DroneState) -> DroneState:
     if active is None:
         return drones
     velocity = jnp.where(active[:, None], drones.velocity, 0.0)
-    return drones.replace(position=parked(drones.position, active), velocity=velocity)
+    return drones.replace(position=park(drones.position, active), velocity=velocity)
 
 
 def of_team(active: Which | None, value: T) -> T:

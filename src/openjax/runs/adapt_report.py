@@ -26,14 +26,14 @@ def in_words(results: dict) -> list[str]:
     for name in FIGURES:
         course = " → ".join(f"{results[which][name]:.3g}" for which in WHICH)
         changes.append(f"{name.replace('_', ' ')} {course}")
-    won = [
+    gains = [
         f"{name.replace('_', ' ')} {share:.0%}"
         for name, share in results["won_back"].items()
         if share is not None
     ]
     gain = "The vehicle costs nothing beyond chance."
-    if won:
-        gain = f"Won back of what the vehicle costs: {', '.join(won)}."
+    if gains:
+        gain = f"Won back of what the vehicle costs: {', '.join(gains)}."
     return [
         f"Found: {effects}.",
         f"On {results['episodes']} tasks that neither was trained on, with the nominal vehicle → "

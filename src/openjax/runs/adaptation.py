@@ -72,18 +72,18 @@ def adapt(
     tell(next(steps))
     with _diagnosis(command) as effects:
         programs = _Programs(command)  # compiles meanwhile
-        vehicle = _diagnosed(effects(), programs.game.airframe)
+        vehicle = _diagnose(effects(), programs.game.airframe)
         seconds["diagnosis"] = time.monotonic() - start
     programs.ready()
     seconds["compiled"] = time.monotonic() - start
     tell(next(steps))
-    tuned = programs.fine_tune(vehicle)
+    tuning = programs.fine_tune(vehicle)
     seconds["fine-tuned"] = time.monotonic() - start
     tell(next(steps))
-    rates = programs.measure(vehicle, tuned.parameters)
+    rates = programs.measure(vehicle, tuning.parameters)
     seconds["measured"] = time.monotonic() - start
-    results = {**_results(command, vehicle, rates, tuned), "seconds": seconds}
-    _write(command, programs, vehicle, tuned, results)
+    results = {**_results(command, vehicle, rates, tuning), "seconds": seconds}
+    _write(command, programs, vehicle, tuning, results)
     return results
 
 
@@ -95,7 +95,7 @@ class _Diagnosed(NamedTuple):
     bounds: jax.Array  # (R, 4) of it
 
 
-def _diagnosed(effects: Path, airframe: str) -> _Diagnosed:
+def _diagnose(effects: Path, airframe: str) -> _Diagnosed:
     """What an effects file says."""
     _, values = load_effects(effects)
     intervals = load_intervals(effects)
@@ -156,12 +156,12 @@ class _Programs:
             self.adaptation, self._parameters, vehicle.bounds, self._key, scores
         )
 
-    def measure(self, vehicle: _Diagnosed, tuned) -> dict[str, dict]:
+    def measure(self, vehicle: _Diagnosed, tuned_parameters) -> dict[str, dict]:
         """Figures (B,) of `WHICH` on tasks that no checkpoint was chosen by."""
         cases = (
             (self._parameters, self._nominal),
             (self._parameters, vehicle.bounds),
-            (tuned, vehicle.bounds),
+            (tuned_parameters, vehicle.bounds),
         )
         return {
             which: self._fly(parameters, self._measured_on, 2, bounds)
@@ -169,7 +169,7 @@ class _Programs:
         }
 
 
-def _results(command, vehicle, rates, tuned) -> dict:
+def _results(command, vehicle, rates, tuning) -> dict:
     """What adapt.json holds, but for the time that it took."""
     parameters = []
     for name, low, high, *_ in vehicle.family:
@@ -191,15 +191,15 @@ def _results(command, vehicle, rates, tuned) -> dict:
             for which, figures in rates.items()
         },
         "won_back": won_back(rates),
-        "kept": f"fine-tuned, as it was after step {tuned.update}"
-        if tuned.update
+        "kept": f"fine-tuned, as it was after step {tuning.update}"
+        if tuning.update
         else "the policy as it was",
-        "history": tuned.history,
-        "looks": tuned.looks,
+        "history": tuning.history,
+        "looks": tuning.looks,
     }
 
 
-def _write(command, programs, vehicle, tuned, results):
+def _write(command, programs, vehicle, tuning, results):
     """The policy, the figures and the page."""
     game = dataclasses.replace(programs.game, vehicles=vehicle.family)
     settings = dataclasses.replace(programs.loaded.settings, environment=game)
@@ -210,7 +210,11 @@ def _write(command, programs, vehicle, tuned, results):
         "machine": results["machine"],
     }
     save_policy_file(
-        command.out / "policy.npz", tuned.parameters, settings, notes, storage="float32"
+        command.out / "policy.npz",
+        tuning.parameters,
+        settings,
+        notes,
+        storage="float32",
     )
     write_json(command.out / "adapt.json", results)
     write_text(command.out / "adapt.html", page(results))

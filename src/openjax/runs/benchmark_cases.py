@@ -205,11 +205,11 @@ def time_compiled(case: Case, min_seconds: float) -> Timing:
     work.
     """
     start = time.perf_counter()
-    compiled = jax.jit(case.function).lower(*case.arguments).compile()
+    executable = jax.jit(case.function).lower(*case.arguments).compile()
     compile_seconds = time.perf_counter() - start
-    memory = _memory(compiled)
+    memory = _memory(executable)
 
-    program = functools.partial(compiled, *case.arguments)
+    program = functools.partial(executable, *case.arguments)
 
     def call():
         start = time.perf_counter()
@@ -230,13 +230,11 @@ def time_compiled(case: Case, min_seconds: float) -> Timing:
     )
 
 
-def _memory(compiled):
+def _memory(executable):
     """See `Timing.memory`; None where the compiler doesn't tell."""
-    analysis = compiled.memory_analysis()
+    analysis = executable.memory_analysis()
     if analysis is None:
         return None
-    produced = analysis.output_size_in_bytes + analysis.temp_size_in_bytes
+    outputs = analysis.output_size_in_bytes + analysis.temp_size_in_bytes
     # results that are written into an argument's place take no more
-    return int(
-        analysis.argument_size_in_bytes + produced - analysis.alias_size_in_bytes
-    )
+    return int(analysis.argument_size_in_bytes + outputs - analysis.alias_size_in_bytes)

@@ -53,7 +53,7 @@ def cells_of(command: MapCommand) -> list[Cell]:
     ]
 
 
-def map_game(command: MapCommand, trained: PursuitSettings) -> PursuitSettings:
+def map_game(command: MapCommand, game: PursuitSettings) -> PursuitSettings:
     """The game of all cells: a policy's, with slots for the largest team, and nominal
     vehicles.
 
@@ -70,13 +70,13 @@ def map_game(command: MapCommand, trained: PursuitSettings) -> PursuitSettings:
             "--best_response False scripted evaders fly alone"
         )
     largest = max(command.sizes)
-    if not trained.team_sizes and set(command.sizes) != {trained.num_pursuers}:
+    if not game.team_sizes and set(command.sizes) != {game.num_pursuers}:
         raise UserError(
             f"--sizes {' '.join(map(str, command.sizes))}: policy {command.policy} flies with "
-            f"{trained.num_pursuers} pursuers only"
+            f"{game.num_pursuers} pursuers only"
         )
     return dataclasses.replace(
-        trained.of_one_team(largest),
+        game.of_one_team(largest),
         evaders=command.evaders,
         vehicles=(),
         rare_vehicles=0.0,

@@ -46,10 +46,10 @@ def compile_last_stage(
         names = tuple(
             name for name in environment.settings.evaders if name != "learned"
         )
-        scripted = dataclasses.replace(
+        game_settings = dataclasses.replace(
             environment.settings, evaders=names or ("field",)
         )
-        game = free_flight(dataclasses.replace(environment, settings=scripted))
+        game = free_flight(dataclasses.replace(environment, settings=game_settings))
         usual = AnalyticGradient(settings.analytic, game, exact)
         stage = WorstPlans(
             settings.worst_plans, planning_game(game), usual, settings.generator

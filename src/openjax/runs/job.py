@@ -23,7 +23,7 @@ from openjax.runs.other_policy import game_for
 from openjax.store.leaves import named_leaves
 from openjax.store.policies import abstract_parameters, load_policy
 from openjax.store.policy_files import fill
-from openjax.store.traced_programs import recalled
+from openjax.store.traced_programs import recall
 
 
 @dataclasses.dataclass(frozen=True)
@@ -110,7 +110,7 @@ class TrainingJob:
             or game.observer
         ):
             return None
-        return functools.partial(recalled, made_from=self.made_from, folder=self.traced)
+        return functools.partial(recall, made_from=self.made_from, folder=self.traced)
 
     def check(self) -> None:
         """Raises UserError for what doesn't fit together, before any directory is

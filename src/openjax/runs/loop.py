@@ -175,20 +175,20 @@ class Loop:
         self.checkpoints.wait()
         # a signal during the last update came too late to stop anything
         stopped_by = reason if update < plan.total_updates else None
-        return Outcome(carry, update, self._elapsed(), stopped_by)
+        return Outcome(carry, update, self._seconds(), stopped_by)
 
-    def _elapsed(self):
+    def _seconds(self):
         return self.seconds + time.monotonic() - self._started
 
     def _log(self, event, update, values):
         if self.metrics is not None:
             steps = update * self.plan.steps_per_update
-            self.metrics.write(event, update, steps, self._elapsed(), values)
+            self.metrics.write(event, update, steps, self._seconds(), values)
 
-    def _finish(self, carry, reached, results):
+    def _finish(self, carry, update_reached, results):
         """Read, write and show the results of an update.
 
-        Raises NotFiniteError for a NaN, and leaves the carry, which `reached` one
+        Raises NotFiniteError for a NaN, and leaves the carry, which `update_reached` one
         update more where updates overlap.
         """
         update = results.number
@@ -204,7 +204,9 @@ class Loop:
                 for name, bad in zip(float_leaves(carry), has_nan, strict=True)
                 if bad
             ]
-            raise self._leave_broken_state(carry, reached, update, leaves, values)
+            raise self._leave_broken_state(
+                carry, update_reached, update, leaves, values
+            )
         self.progress.phase("training", announce=update == self.first_update + 1)
         self.progress.update(update * self.plan.steps_per_update, values)
 
@@ -216,7 +218,7 @@ class Loop:
             time.monotonic() - self._saved_at > self.plan.checkpoint_seconds
         )
         decision = self.everyone(
-            [self.stop.name, self._elapsed() >= self.plan.time_limit, checkpoint_due]
+            [self.stop.name, self._seconds() >= self.plan.time_limit, checkpoint_due]
         )
         signals = [name for name, _, _ in decision if name is not None]
         # hosts' clocks differ, and all must decide alike
@@ -235,14 +237,14 @@ class Loop:
             self._log("validation", update, validation)
             self.progress.validation(validation, is_best=score >= self._best_score)
             self._best_score = max(score, self._best_score)
-        self.checkpoints.save(update, carry, score, {"seconds": self._elapsed()})
+        self.checkpoints.save(update, carry, score, {"seconds": self._seconds()})
         self._saved_at = time.monotonic()
 
-    def _leave_broken_state(self, carry, reached, update, leaves, values):
+    def _leave_broken_state(self, carry, update_reached, update, leaves, values):
         """Save what there is to look at; the error that says where."""
         self.checkpoints.wait()
         place = Path(self.directory) / NOT_FINITE
-        save_state(place / f"{reached:09d}", carry, {"update": reached})
+        save_state(place / f"{update_reached:09d}", carry, {"update": update_reached})
         # JSON has no NaN
         metrics = {
             name: value if np.isfinite(value) else str(value)
@@ -250,7 +252,7 @@ class Loop:
         }
         report = {
             "update": update,
-            "state_after_update": reached,
+            "state_after_update": update_reached,
             "leaves": leaves,
             "metrics": metrics,
         }

@@ -189,14 +189,14 @@ class MapEvaders:
         return evaders.replace(**content), notes.get("curve", [])
 
 
-def least_caught(captured: np.ndarray) -> np.ndarray:
+def least_caught(captures: np.ndarray) -> np.ndarray:
     """(E,) the place of the learner that flies each of a cell's episodes (E, L) that
     end with a capture or not: the one that is caught least in the other half of them,
     as whoever is chosen by the episodes that count looks better than it is.
     """
-    even = np.arange(len(captured)) % 2 == 0
-    if len(captured) < 2:
-        return np.zeros(len(captured), int)
-    by_even = np.argmin(captured[even].mean(axis=0))
-    by_odd = np.argmin(captured[~even].mean(axis=0))
+    even = np.arange(len(captures)) % 2 == 0
+    if len(captures) < 2:
+        return np.zeros(len(captures), int)
+    by_even = np.argmin(captures[even].mean(axis=0))
+    by_odd = np.argmin(captures[~even].mean(axis=0))
     return np.where(even, by_odd, by_even)

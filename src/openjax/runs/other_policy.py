@@ -33,13 +33,13 @@ def game_for(environment: Pursuit, policy: LoadedPolicy) -> Pursuit:
     trained to; episodes last as long.
     """
     settings = environment.settings
-    trained = policy.settings.environment
+    game = policy.settings.environment
     settings = dataclasses.replace(
         settings,
-        **{name: getattr(trained, name) for name in _OF_THE_POLICY},
+        **{name: getattr(game, name) for name in _OF_THE_POLICY},
         # as many seconds, in steps of its own
         episode_length=round(
-            settings.episode_length * settings.time_step / trained.time_step
+            settings.episode_length * settings.time_step / game.time_step
         ),
         max_pillars=layout_slots(settings),
     )

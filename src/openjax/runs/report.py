@@ -45,10 +45,10 @@ def report(
     ):
         progress.phase(f"evaluating the policy {moment} training on the layouts")
         parameters = fill(abstract, load_policy_file(path)[0], str(path))
-        kinds, pictured = _fly(validation, parameters, layouts, job.layout_episodes)
+        kinds, pictures = _fly(validation, parameters, layouts, job.layout_episodes)
         rows[moment] = [kind.record(_BESIDE_RECORD) for kind in kinds]
     # of the trained policy, which comes last
-    flights = [kind.trajectory(episode, title) for kind, episode, title in pictured]
+    flights = [kind.trajectory(episode, title) for kind, episode, title in pictures]
     other_rows, other_flights = _compare(job, layouts, validation.number, progress)
     progress.phase("drawing")
     facts = {
@@ -113,8 +113,8 @@ def _draw(directory, flights, other_flights):
     plot_trajectories(directory.path / "trajectories.png", flights)
     # a chase that ends well shows what the game is about; beside it the other policy's,
     # from the same start
-    captured = [flight for flight in flights if flight.capture_index is not None]
-    best_flight = (captured or flights)[0]
+    captures = [flight for flight in flights if flight.capture_index is not None]
+    best_flight = (captures or flights)[0]
     beside = [
         flight
         for flight in other_flights
@@ -133,7 +133,7 @@ _KINDS = {"validation": "new tasks", "validation_far": "far starts"}
 
 def before_after_table(
     first: Sequence[dict],
-    trained: Sequence[dict],
+    records: Sequence[dict],
     time_step: float,
     other: str | None = None,
     other_rows: Sequence[dict] = (),
@@ -163,7 +163,7 @@ def before_after_table(
     def numbers(row):
         return [f"{unit * row[name]:{style}}" for _, name, unit, style in columns]
 
-    for old, new in zip(first, trained, strict=True):
+    for old, new in zip(first, records, strict=True):
         pairs = zip(numbers(old), numbers(new), strict=True)
         cells = [f"{old_number} → {new_number}" for old_number, new_number in pairs]
         if last:

@@ -96,7 +96,7 @@ def default_preset() -> str:
 def start(
     command: TrainCommand,
     arguments: Sequence[str],
-    started: float,
+    start_time: float,
     processes: Processes,
     parts: OwnParts = ALL_SHIPPED,
 ) -> int:
@@ -105,12 +105,12 @@ def start(
     Args:
       command: what to do.
       arguments: the command line, for the run's facts.
-      started: `time.monotonic()` when the command started.
+      start_time: `time.monotonic()` when the command started.
       processes: that train together.
       parts: those handed in from Python.
     """
     cache = cache_programs() if command.compilation_cache else None
-    job, directory, files = prepare(command, arguments, started, processes, parts)
+    job, directory, files = prepare(command, arguments, start_time, processes, parts)
     if command.traced_programs and cache is not None:
         job = dataclasses.replace(job, traced=cache / "traced")
     # a mistake shows before any process changes a file
@@ -140,7 +140,7 @@ def start(
 def prepare(
     command: TrainCommand,
     arguments: Sequence[str],
-    started: float,
+    start_time: float,
     processes: Processes,
     parts: OwnParts = ALL_SHIPPED,
 ) -> tuple[TrainingJob, RunDirectory, dict[str, Path]]:
@@ -150,13 +150,13 @@ def prepare(
     Raises:
       UserError: whatever can be wrong with the files or the settings.
     """
-    resumed = None if command.resume is None else open_run(command.resume)
-    stored_facts = {} if resumed is None else resumed.read_facts()
-    files = _files(command, resumed)
+    old_run = None if command.resume is None else open_run(command.resume)
+    stored_facts = {} if old_run is None else old_run.read_facts()
+    files = _files(command, old_run)
     _check_parts(parts, files, stored_facts)
     environment = parts.environment or _environment(command.settings.environment, files)
     settings = dataclasses.replace(command.settings, environment=environment.settings)
-    directory = resumed or RunDirectory(_free_directory(command, processes))
+    directory = old_run or RunDirectory(_free_directory(command, processes))
     started_from = _lasting(command.start_from) or stored_facts.get("start_from")
     facts = {
         **({"own_parts": parts.names} if parts.names else {}),
@@ -170,14 +170,14 @@ def prepare(
         settings=settings,
         environment=environment,
         # needed again only where a run was killed before its first checkpoint
-        start_from=None if _has_begun(resumed) else started_from,
+        start_from=None if _has_begun(old_run) else started_from,
         devices=facts["devices"],
         processes=processes,
         time_limit=float("inf") if command.minutes is None else 60.0 * command.minutes,
         layout_episodes=command.layout_episodes or _layout_episodes(environment),
         compare_with=facts["compare_with"],
         facts=facts,
-        started=started,
+        started=start_time,
         own=parts,
     )
     job.check()
@@ -221,7 +221,7 @@ def other_compiler(facts: dict) -> str | None:
     )
 
 
-def _files(command, resumed):
+def _files(command, old_run):
     """What the run flies with by its name in a run's directory: vehicle, effects,
     evader; None where there is none.
     """
@@ -232,7 +232,7 @@ def _files(command, resumed):
     }
     # an option goes before what a resumed run has kept
     return {
-        name: path or (resumed and resumed.optional(name))
+        name: path or (old_run and old_run.optional(name))
         for name, path in options.items()
     }
 
@@ -316,7 +316,7 @@ def _check_same(settings, processes):
             )
 
 
-def check_resumed(command: TrainCommand, stored: TrainSettings) -> None:
+def check_resumed(command: TrainCommand, stored_settings: TrainSettings) -> None:
     """Raises UserError for options that don't go with --resume, and settings that a run
     can't take up in its middle.
     """
@@ -327,12 +327,12 @@ def check_resumed(command: TrainCommand, stored: TrainSettings) -> None:
         raise UserError("--resume and --overwrite exclude each other")
     options = ["start_from", "effects", "vehicle", "opponent"]
     if (
-        "own" in stored.environment.evaders
+        "own" in stored_settings.environment.evaders
         and open_run(resume).optional("evader.npz") is None
     ):
         options.remove("opponent")  # a function isn't in the run's files
     changes = [name for name in options if getattr(command, name) is not None]
-    for name in (*changes, *different_settings(command.settings, stored)):
+    for name in (*changes, *different_settings(command.settings, stored_settings)):
         if name not in MAY_CHANGE:
             raise UserError(
                 f"--{name} can't change when a run is resumed; {', '.join(MAY_CHANGE)} can, or "
@@ -341,8 +341,8 @@ def check_resumed(command: TrainCommand, stored: TrainSettings) -> None:
 
 
 def _devices(text, settings, saved_settings):
-    """How many; where nobody says, as many as the run had (`saved_settings`, None for a new
-    one), or as many cores as the worlds can be shared out to.
+    """How many; where nobody says, as many as the run had (`saved_settings`, None for a
+    new one), or as many cores as the worlds can be shared out to.
     """
     available = len(jax.devices())
     if text is None and jax.default_backend() == "cpu" and jax.process_count() == 1:

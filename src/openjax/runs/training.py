@@ -221,9 +221,9 @@ class _Run:
             outcome.update == self.first_update
             and settings.total_updates > outcome.update
         ):
-            when = f"before its first update, {outcome.seconds:.0f} s after the start"
+            moment = f"before its first update, {outcome.seconds:.0f} s after the start"
             self.progress.message(
-                f"MAPPO did not begin: {outcome.stopped_by} came {when}"
+                f"MAPPO did not begin: {outcome.stopped_by} came {moment}"
             )
         if not signals and settings.analytic.updates:
             self.progress.phase("learning by the gradient through the simulation")
@@ -427,8 +427,8 @@ def awaits_validation(
       settings: of the run.
       started_from: the policy that it began with, which had no first flights.
     """
-    unscored = record.update == 0 and record.score is None
-    return unscored and settings.first_flights.updates > 0 and started_from is None
+    has_no_score = record.update == 0 and record.score is None
+    return has_no_score and settings.first_flights.updates > 0 and started_from is None
 
 
 def _programs(job):

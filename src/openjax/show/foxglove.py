@@ -78,13 +78,13 @@ def write_mcap(path: Path, channels: Iterable[Channel]) -> None:
             for time, message in channel.messages:
                 stamp = round(1e9 * time)
                 text = json.dumps(
-                    _stamped(channel.schema, message, stamp), allow_nan=False
+                    _stamp(channel.schema, message, stamp), allow_nan=False
                 )
                 writer.add_message(number, stamp, text.encode(), stamp)
         writer.finish()
 
 
-def _stamped(schema: str, message: dict, stamp: int) -> dict:
+def _stamp(schema: str, message: dict, stamp: int) -> dict:
     """A message with the time stamps that its schema wants."""
     time = {"sec": stamp // 10**9, "nsec": stamp % 10**9}
     if schema == "foxglove.SceneUpdate":

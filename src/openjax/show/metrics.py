@@ -116,7 +116,7 @@ def truncate_metrics(path: Path, update: int) -> None:
     path = Path(path)
     if not path.exists():
         return
-    with replacing(path) as partial, open(partial, "w", encoding="utf-8") as kept:
+    with replacing(path) as partial, open(partial, "w", encoding="utf-8") as file:
         for record in read_metrics(path):
             if record["update"] <= update:
-                kept.write(json.dumps(record) + "\n")
+                file.write(json.dumps(record) + "\n")

@@ -162,8 +162,8 @@ def _draw_map(axes, cells):
         row = ratios.index(cell["speed_ratio"])
         column = radii.index(cell["capture_radius"])
         rates[row, column] = cell["capture_rate"]
-        for name, forced in bounds.items():
-            forced[cell["capture_radius"]] = cell.get(name, 0.0)
+        for name, bound_of in bounds.items():
+            bound_of[cell["capture_radius"]] = cell.get(name, 0.0)
         text = f"{cell['capture_rate']:.2f}".replace("0.", ".")
         # the colour map is dark below its middle
         color = "white" if cell["capture_rate"] < 0.5 else "black"
@@ -177,8 +177,8 @@ def _draw_map(axes, cells):
     # middles
     ends = {"left": -0.5, "right": len(ratios) - 0.5}
     edges = np.arange(len(radii) + 1) - 0.5
-    for forced, style in zip(bounds.values(), ("-", "--"), strict=True):
-        height = np.interp(list(forced.values()), ratios, range(len(ratios)), **ends)
+    for bound_of, style in zip(bounds.values(), ("-", "--"), strict=True):
+        height = np.interp(list(bound_of.values()), ratios, range(len(ratios)), **ends)
         axes.stairs(
             height, edges, baseline=None, color="red", linewidth=1.5, linestyle=style
         )

@@ -112,14 +112,14 @@ class Progress(_Display):
         self._values = values
         if self._lines and time_read - self._last_line > _LINE_INTERVAL:
             self._last_line = time_read
-            self.message(f"{self._speed()} | {_listed(values)}")
+            self.message(f"{self._speed()} | {_list(values)}")
 
     def validation(self, values: dict[str, float], is_best: bool) -> None:
         """Result of an evaluation on the validation tasks."""
         self._validation = values
         if self._lines:
             remark = " (best so far)" if is_best else ""
-            self.message(f"validation tasks: {_listed(values)}{remark}")
+            self.message(f"validation tasks: {_list(values)}{remark}")
 
     def _speed(self):
         share = f"{100 * min(self._steps / self._total, 1):.0f} %, {_count(self._steps)} steps"
@@ -143,8 +143,8 @@ class Progress(_Display):
                 Text("training", style="bold"),
                 Text("validation tasks", style="bold"),
             )
-            training = _shown(self._values)
-            validation = _shown(self._validation)
+            training = _labels(self._values)
+            validation = _labels(self._validation)
             for label in _SHOWN.values():
                 if label in training or label in validation:
                     table.add_row(
@@ -154,7 +154,7 @@ class Progress(_Display):
         return Panel(Group(*rows), title=self._title, title_align="left")
 
 
-def _shown(values):
+def _labels(values):
     """Those that are shown, as text by their labels."""
     texts = {}
     for name, label in _SHOWN.items():
@@ -165,9 +165,9 @@ def _shown(values):
     return texts
 
 
-def _listed(values):
+def _list(values):
     """The same in a line."""
-    return ", ".join(f"{label} {value}" for label, value in _shown(values).items())
+    return ", ".join(f"{label} {value}" for label, value in _labels(values).items())
 
 
 def _count(value):
@@ -197,10 +197,10 @@ class Steps(_Display):
       console: where to draw.
     """
 
-    def __init__(self, title: str, expected: Mapping[str, float], console: Console):
+    def __init__(self, title: str, durations: Mapping[str, float], console: Console):
         self._title = title
-        self._expected = dict(expected)
-        self._total = sum(self._expected.values())
+        self._durations = dict(durations)
+        self._total = sum(self._durations.values())
         self._done = 0.0
         self._step = None
         self._note = ""
@@ -219,7 +219,7 @@ class Steps(_Display):
         takes no time of its own.
         """
         if step != self._step:
-            self._done += self._expected.get(self._step, 0.0)
+            self._done += self._durations.get(self._step, 0.0)
             self._step = step
             self._step_start = time.monotonic()
         self._note = note
@@ -229,7 +229,7 @@ class Steps(_Display):
         took = self._step_start - self._start
         # as much slower than the usual machine as the steps so far were
         slower = took / self._done if self._done > 0 else 1.0
-        step = self._expected.get(self._step, 0.0)
+        step = self._durations.get(self._step, 0.0)
         in_step = max(slower * step - (moment - self._step_start), 0.0)
         steps_left = self._total - self._done - step
         return in_step + slower * max(steps_left, 0.0)

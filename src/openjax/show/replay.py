@@ -86,6 +86,6 @@ def _spans(flags: np.ndarray) -> list[list[int]]:
     """[first, last] of each run of true flags (T,)."""
     # with a zero before and after, edges come in pairs: where a run begins, and one
     # past its end
-    padded = np.concatenate([[0], np.asarray(flags, int), [0]])
-    edges = np.flatnonzero(np.diff(padded))
+    flags_with_ends = np.concatenate([[0], np.asarray(flags, int), [0]])
+    edges = np.flatnonzero(np.diff(flags_with_ends))
     return [[int(first), int(end) - 1] for first, end in edges.reshape(-1, 2)]

@@ -50,7 +50,7 @@ def animate(path: Path, trajectories: Sequence[Trajectory]) -> None:
     for flight in trajectories:
         every = max(1, round(1.0 / (FRAMES_PER_SECOND * flight.time_step)))
         films.append([_frame(flight, step) for step in range(0, flight.end(), every)])
-    frames = _stacked(films)
+    frames = _stack(films)
     # one palette for all frames, from six of them, by the method that gives small
     # coloured things their colours, too
     sample = np.concatenate(frames[:: max(1, len(frames) // 6)])
@@ -69,7 +69,7 @@ def animate(path: Path, trajectories: Sequence[Trajectory]) -> None:
         )
 
 
-def _stacked(films):
+def _stack(films):
     """Frames of films, each below the one before; those that end sooner keep their last
     frame.
     """

@@ -53,11 +53,9 @@ def load_state(path: Path, abstract: Any) -> Any:
     path = Path(path).absolute()
     check_state(path)
     metadata = load_orbax().metadata(path).metadata
-    expected = {
-        name: leaf for name, leaf in named_leaves(abstract).items() if leaf.size
-    }
-    _check_same_shapes(path, metadata, expected)
-    arrays = load_orbax().load(path, expected)
+    shapes = {name: leaf for name, leaf in named_leaves(abstract).items() if leaf.size}
+    _check_same_shapes(path, metadata, shapes)
+    arrays = load_orbax().load(path, shapes)
     # Orbax can't write arrays without elements; they hold nothing, so they are made
     # anew.
     leaves = [
@@ -151,21 +149,21 @@ def check_state(path: Path) -> None:
         )
     try:
         lines = _checksums_file(path).read_text(encoding="utf-8").splitlines()
-        expected = {}
+        checksums = {}
         for line in lines:
             checksum, _, name = line.partition("  ")
-            expected[name] = checksum
+            checksums[name] = checksum
         actual = {
             file.relative_to(path).as_posix(): _checksum(file) for file in _files(path)
         }
         # names that only one of them has, or with another checksum
-        different = sorted(dict(expected.items() ^ actual.items()))
+        different = sorted(dict(checksums.items() ^ actual.items()))
     except (OSError, UnicodeDecodeError) as error:
         raise DamagedError(f"checkpoint {path} is damaged ({error})") from error
-    if different or not expected:
-        where = different[0] if different else _CHECKSUMS
+    if different or not checksums:
+        place = different[0] if different else _CHECKSUMS
         raise DamagedError(
-            f"checkpoint {path} is damaged: {where[:80]} isn't as it was written"
+            f"checkpoint {path} is damaged: {place[:80]} isn't as it was written"
         )
 
 
@@ -208,13 +206,16 @@ def _check_same_shapes(path, metadata, leaves):
             raise UserError(f"checkpoint {path} lacks {name}; {reason}")
         # Orbax writes a random key as its numbers
         is_key = jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
-        expected = jax.eval_shape(jax.random.key_data, leaf) if is_key else leaf
+        shape_of_leaf = jax.eval_shape(jax.random.key_data, leaf) if is_key else leaf
         shape = tuple(metadata[name].shape)
-        if shape != tuple(expected.shape) or metadata[name].dtype != expected.dtype:
+        if (
+            shape != tuple(shape_of_leaf.shape)
+            or metadata[name].dtype != shape_of_leaf.dtype
+        ):
             raise UserError(
                 f"checkpoint {path} is of another shape: {name} is "
                 f"{metadata[name].dtype}{list(shape)} there, the settings make it "
-                f"{expected.dtype}{list(expected.shape)}"
+                f"{shape_of_leaf.dtype}{list(shape_of_leaf.shape)}"
             )
     for name in metadata:
         if name not in leaves:

@@ -122,9 +122,9 @@ class Checkpoints:
         """The highest score, the later one of equals; None while nothing was
         evaluated.
         """
-        scored = [record for record in self.records() if record.score is not None]
+        records = [record for record in self.records() if record.score is not None]
         return max(
-            scored, key=lambda record: (record.score, record.update), default=None
+            records, key=lambda record: (record.score, record.update), default=None
         )
 
     def latest(self) -> CheckpointRecord | None:

@@ -38,15 +38,13 @@ def cache_programs() -> Path | None:
 
     from openjax.store.checked_cache import use_checked_cache
 
-    configured = jax.config.jax_compilation_cache_dir
-    if (
-        configured is not None and "://" in configured
-    ):  # a bucket; JAX reads it by itself
-        return Path(configured)
-    folder = _own_folder() if configured is None else Path(configured)
+    setting = jax.config.jax_compilation_cache_dir
+    if setting is not None and "://" in setting:  # a bucket; JAX reads it by itself
+        return Path(setting)
+    folder = _own_folder() if setting is None else Path(setting)
     if folder is None:
         return None
-    if configured is not None and folder.exists() and not _is_private(folder):
+    if setting is not None and folder.exists() and not _is_private(folder):
         _LOGGER.warning(
             "others can write to %s, and so run what they like here: chmod go-w it",
             folder,
@@ -55,7 +53,7 @@ def cache_programs() -> Path | None:
     jax.config.update("jax_compilation_cache_dir", str(folder))
     # XLA's own caches have no checksums
     jax.config.update("jax_persistent_cache_enable_xla_caches", "none")
-    if configured is None:
+    if setting is None:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", _WORTH_KEEPING)
     return folder
 
@@ -103,8 +101,8 @@ def _processor_key():
     text = platform.machine() + platform.processor()
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-        described = ("model name", "flags", "Features")
-        text += "".join(sorted({line for line in lines if line.startswith(described)}))
+        prefixes = ("model name", "flags", "Features")
+        text += "".join(sorted({line for line in lines if line.startswith(prefixes)}))
     except OSError:
         pass
     # enough to tell a user's machines apart, and short in a path

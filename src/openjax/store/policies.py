@@ -105,8 +105,8 @@ class LoadedPolicy:
         if isinstance(self.policy, OwnController):
             return self  # it takes what it is given
         game = environment.settings
-        trained = self.settings.environment
-        fixed = [
+        game_of_training = self.settings.environment
+        names = [
             "self_size",
             "observe_in",
             "observed_pillars",
@@ -115,9 +115,9 @@ class LoadedPolicy:
             "strategies",
         ]
         if not self.any_number:
-            fixed.insert(0, "num_pursuers")  # first, as the sizes follow from it
-        for name in fixed:
-            value = getattr(trained, name)
+            names.insert(0, "num_pursuers")  # first, as the sizes follow from it
+        for name in names:
+            value = getattr(game_of_training, name)
             if getattr(game, name) != value:
                 raise UserError(
                     f"policy {self.source} was trained with {name} {value}, here it's "
@@ -145,21 +145,23 @@ class LoadedPolicy:
         if not isinstance(self.policy, Policy | MixedPolicy | OwnPolicy):
             return []
         game = environment.settings
-        trained = self.settings.environment
+        game_of_training = self.settings.environment
         words = []
         for name in _OF_THE_WORLD:
             value = getattr(game, name)
-            ends = getattr(trained, _DRAWN.get(name, ""), ()) or (
-                getattr(trained, name),
+            ends = getattr(game_of_training, _DRAWN.get(name, ""), ()) or (
+                getattr(game_of_training, name),
             )
             if not ends[0] <= value <= ends[-1]:
                 span = " to ".join(f"{end:g}" for end in ends)
                 words.append(f"{name} {value:g} instead of {span}")
-        if self.any_number and game.num_pursuers not in trained.team_sizes:
+        if self.any_number and game.num_pursuers not in game_of_training.team_sizes:
             words.append(f"{game.num_pursuers} pursuers, which no team in training had")
-        if game.airframe != trained.airframe:
-            words.append(f"the {game.airframe} instead of the {trained.airframe}")
-        elif environment.effects and not trained.vehicles:
+        if game.airframe != game_of_training.airframe:
+            words.append(
+                f"the {game.airframe} instead of the {game_of_training.airframe}"
+            )
+        elif environment.effects and not game_of_training.vehicles:
             words.append(
                 f"{', '.join(environment.effects)}, which no vehicle in training had"
             )
@@ -177,15 +179,15 @@ class LoadedPolicy:
             return self.policy.act(self.parameters, observation)
         axes = "world" if observation.heading is None else "heading"
         sizes = (observation.self_state.shape[-1], *observation.frames.shape[-2:], axes)
-        expected = (
+        sizes_of_policy = (
             game.self_size,
             game.history_length,
             game.frame_size,
             game.observe_in,
         )
-        if sizes != expected:
+        if sizes != sizes_of_policy:
             raise UserError(
-                f"policy {self.source} observes {expected} (own state, history, axes), "
+                f"policy {self.source} observes {sizes_of_policy} (own state, history, axes), "
                 f"here are {sizes}; make its game with openjax.make(policy.settings.environment)"
             )
         return self.policy.act(self.parameters, observation)
@@ -308,19 +310,19 @@ def _from_run(run, source):
 def _build(settings, leaves, source):
     game = settings.environment
     # learned evaders' networks aren't in a policy's file
-    scripted = (
+    evaders = (
         tuple(name for name in game.evaders if name in SCRIPTED)
         or PursuitSettings().evaders
     )
     settings = dataclasses.replace(
-        settings, environment=dataclasses.replace(game, evaders=scripted)
+        settings, environment=dataclasses.replace(game, evaders=evaders)
     )
     if jax.default_backend() == "cpu":  # CPUs emulate bfloat16, slowly
         settings = dataclasses.replace(
             settings,
             network=dataclasses.replace(settings.network, compute_type="float32"),
         )
-    policy, abstract = _untrained(
+    policy, abstract = _initial(
         settings.environment, settings.network, settings.predictor
     )
     if not any(name.startswith("critic/") for name in leaves):
@@ -331,7 +333,7 @@ def _build(settings, leaves, source):
 
 
 @functools.lru_cache(maxsize=8)
-def _untrained(
+def _initial(
     game: PursuitSettings, network: NetworkSettings, predictor: PredictorSettings
 ):
     """The networks of these settings and the kinds of their parameters, which take a

@@ -127,21 +127,21 @@ def _dtype(name):
     return dtype
 
 
-def fill(abstract: Any, leaves: dict[str, np.ndarray], where: str) -> Any:
+def fill(abstract: Any, leaves: dict[str, np.ndarray], source: str) -> Any:
     """The tree of `abstract` (shapes and dtypes) with its leaves taken by path.
 
     Raises:
-      UserError: a leaf is missing or has another shape; `where` names the source.
+      UserError: a leaf is missing or has another shape; `source` names the source.
     """
     values = []
     for name, leaf in named_leaves(abstract).items():
         if name not in leaves:
             raise UserError(
-                f"{where} lacks the parameters {name}; it was made by another network or version"
+                f"{source} lacks the parameters {name}; it was made by another network or version"
             )
         if leaves[name].shape != leaf.shape:
             raise UserError(
-                f"{where} is of another shape: {name} is {list(leaves[name].shape)} there, "
+                f"{source} is of another shape: {name} is {list(leaves[name].shape)} there, "
                 f"its settings make it {list(leaf.shape)}"
             )
         values.append(jnp.asarray(leaves[name], leaf.dtype))

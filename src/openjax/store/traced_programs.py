@@ -22,7 +22,7 @@ read by the same version only.
 _LIBRARIES = ("jax", "jaxlib", "flax", "optax", "mujoco")
 
 
-def recalled(
+def recall(
     name: str,
     function: Callable,
     arguments: Callable[[], Sequence[Any]],
@@ -68,9 +68,7 @@ def recalled(
 
     def call(*arguments):
         results = program.call(*jax.tree.leaves(arguments))
-        return _replaced(
-            results, list, lambda part: jax.tree.unflatten(structure, part)
-        )
+        return _replace(results, list, lambda part: jax.tree.unflatten(structure, part))
 
     call.__name__ = name
     return call
@@ -84,7 +82,7 @@ def _export(function, arguments, kind):
 
     def of_leaves(*leaves):
         results = function(*jax.tree.unflatten(structure, leaves))
-        return _replaced(results, kind, jax.tree.leaves)
+        return _replace(results, kind, jax.tree.leaves)
 
     leaves = [
         jax.ShapeDtypeStruct(leaf.shape, leaf.dtype)
@@ -94,7 +92,7 @@ def _export(function, arguments, kind):
     return export.export(jax.jit(of_leaves), disabled_checks=checks)(*leaves)
 
 
-def _replaced(tree, kind, change):
+def _replace(tree, kind, change):
     """The tree with every part of a kind changed."""
 
     def is_one(part):

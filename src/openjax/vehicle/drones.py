@@ -104,7 +104,11 @@ class DronesStep:
             memory = drones.effect_memory  # of other effects than this step's, if any
             around = (pillar_position, pillar_active) if self.contacts else None
             drones = step_many(
-                self.fused, vehicle, drones.replace(effect_memory=()), command, around
+                self.fused_step,
+                vehicle,
+                drones.replace(effect_memory=()),
+                command,
+                around,
             )
             return drones.replace(effect_memory=memory)
 
@@ -121,13 +125,13 @@ class DronesStep:
             around = self._bodies.around(drones, pillar_position, pillar_active)
             return self._bodies(vehicle, drones, force, torque, around)
 
-        drones = _repeated(substep, drones, self.substeps)
+        drones = _repeat(substep, drones, self.substeps)
         if self.physics == "stops":
             drones = stop(self.arena, drones, pillar_position, pillar_active)
         return self._remember(drones)
 
     @property
-    def fused(self) -> FusedStep:
+    def fused_step(self) -> FusedStep:
         """`rigid` without effects, for `step_many`."""
         return FusedStep(self._accelerate, self.arena, self._bodies.dt, self.substeps)
 
@@ -238,7 +242,7 @@ class DronesStep:
         )
 
 
-def _repeated(substep, drones, number):
+def _repeat(substep, drones, number):
     """`drones` after so many substeps; a single one isn't worth a loop."""
     if number == 1:
         return substep(drones)

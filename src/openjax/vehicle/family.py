@@ -148,9 +148,9 @@ def draw_vehicles(
     quantity = jax.random.randint(chosen_key, (number,), 0, len(names))
     # -1 is no effect's place: nothing of such a vehicle is out of the ordinary
     quantity = jnp.where(jax.random.uniform(rare_key, (number,)) < rare, quantity, -1)
-    rarely = quantity[:, None] == owner
-    low = jnp.where(rarely, bounds[:, 2], bounds[:, 0])
-    high = jnp.where(rarely, bounds[:, 3], bounds[:, 1])
+    is_rare = quantity[:, None] == owner
+    low = jnp.where(is_rare, bounds[:, 2], bounds[:, 0])
+    high = jnp.where(is_rare, bounds[:, 3], bounds[:, 1])
     values = low + share * (high - low)
     draws: dict[str, dict[str, jax.Array]] = {name: {} for name in names}
     for i, entry in enumerate(ranges):

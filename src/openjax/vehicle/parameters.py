@@ -172,8 +172,12 @@ def find_mjcf(name_or_path: str | Path) -> Path:
     """The MJCF file of an airframe: one of `AIRFRAMES`, or a file. UserError: there is
     none.
     """
-    shipped = AIRFRAMES.get(str(name_or_path))
-    path = Path(name_or_path) if shipped is None else assets_directory() / shipped
+    shipped_file = AIRFRAMES.get(str(name_or_path))
+    path = (
+        Path(name_or_path)
+        if shipped_file is None
+        else assets_directory() / shipped_file
+    )
     if not path.is_file():
         raise UserError(
             f"{path}: no such MJCF file, nor an airframe ({', '.join(AIRFRAMES)})"

@@ -136,13 +136,13 @@ def looped_step(
 @functools.lru_cache(maxsize=64)
 def _many_worlds(step):
     """`step` of W worlds. A further mapped axis becomes more worlds."""
-    mapped = jax.vmap(functools.partial(mapped_step, step), (None, 0, 0, 0))
+    step_of_worlds = jax.vmap(functools.partial(mapped_step, step), (None, 0, 0, 0))
 
     @jax.custom_batching.custom_vmap
     def run(vehicle, drones, command, pillars):
         if command.shape[0] < WORTH:
-            return mapped(vehicle, drones, command, pillars)
-        fastest = on_platform(mapped, functools.partial(kernel_call, step))
+            return step_of_worlds(vehicle, drones, command, pillars)
+        fastest = on_platform(step_of_worlds, functools.partial(kernel_call, step))
         return fastest(vehicle, drones, command, pillars)
 
     @run.def_vmap
@@ -151,15 +151,17 @@ def _many_worlds(step):
         # the kernel holds one vehicle's numbers: of many vehicles it isn't taken
         if any(jax.tree.leaves(in_batched[0])):
             axes = jax.tree.map(
-                lambda batched: 0 if batched else None, tuple(in_batched)
+                lambda has_batch: 0 if has_batch else None, tuple(in_batched)
             )
-            drones_after = jax.vmap(mapped, axes)(vehicle, drones, command, pillars)
+            drones_after = jax.vmap(step_of_worlds, axes)(
+                vehicle, drones, command, pillars
+            )
         else:
 
-            def flat(leaf, batched):
+            def flat(leaf, has_batch):
                 leaf = (
                     leaf
-                    if batched
+                    if has_batch
                     else jnp.broadcast_to(leaf, (axis_size, *leaf.shape))
                 )
                 return jax.lax.collapse(leaf, 0, 2)
@@ -173,10 +175,12 @@ def _many_worlds(step):
             )
         return drones_after, jax.tree.map(lambda _: True, drones_after)
 
-    derived = jax.custom_jvp(run)
-    looped = jax.vmap(functools.partial(looped_step, step), (None, 0, 0, 0))
-    derived.defjvp(lambda primals, tangents: jax.jvp(looped, primals, tangents))
-    return derived
+    differentiable = jax.custom_jvp(run)
+    loop_step = jax.vmap(functools.partial(looped_step, step), (None, 0, 0, 0))
+    differentiable.defjvp(
+        lambda primals, tangents: jax.jvp(loop_step, primals, tangents)
+    )
+    return differentiable
 
 
 def kernel_call(
@@ -303,7 +307,7 @@ def _kernel(step, vehicle, worlds):
                 split(row).reshape(leaf.shape)
                 for row, leaf in zip(state, leaves, strict=True)
             ]
-            *rotated, free, angular = evaluate(
+            *rotation, free, angular = evaluate(
                 accelerate, [*constants, *parts, command]
             )
             if around:
@@ -311,7 +315,7 @@ def _kernel(step, vehicle, worlds):
                 free = free + _contacts(
                     step, drone_before, free, worlds.command.shape[:2], around
                 )
-            next_parts = evaluate(move, [*rotated, free, angular])
+            next_parts = evaluate(move, [*rotation, free, angular])
             return [
                 [jnp.broadcast_to(part, (DRONES,)) for part in leaf.ravel()]
                 for leaf in next_parts
@@ -358,8 +362,8 @@ def _contacts(step, drone, free, sizes, around):
 
     def drone_beside(k):
         row = world * n + k + (k >= index).astype(jnp.int32)  # all but oneself
-        where = tuple(position_ref[row, i] for i in range(3))
-        return other_drone(where, tuple(velocity_ref[row, i] for i in range(3)))
+        coordinates = tuple(position_ref[row, i] for i in range(3))
+        return other_drone(coordinates, tuple(velocity_ref[row, i] for i in range(3)))
 
     # the loops first: what comes before one makes it larger for the compiler
     groups = (

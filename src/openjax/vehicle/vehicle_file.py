@@ -183,18 +183,18 @@ def _from_tables(plain: dict, path: Path, dtype) -> VehicleFile:
     mjcf = _own_mjcf(airframe.airframe, path)
     nominal = load_vehicle(mjcf or airframe.airframe, dtype)
     motor = replace(motor, spin=spins_of(motor, nominal, root))
-    calibrated = {
+    values = {
         name: calibrated_value(name, entry, nominal, f"{root}[calibrated.{name}]")
         for name, entry in tables.calibrated.items()
     }
     with_inertia = with_size(nominal, airframe, mjcf, root)
     return VehicleFile(
-        vehicle=with_numbers(with_inertia, airframe.mass, motor, calibrated),
+        vehicle=with_numbers(with_inertia, airframe.mass, motor, values),
         name=airframe.name or _usual_name(airframe.airframe),
         airframe=airframe.airframe,
         mass_weighed=bool(airframe.mass_weighed),
         motor=motor,
-        calibrated=calibrated,
+        calibrated=values,
         vehicles=tables.vehicles,
         log=tables.log,
         path=path if path.exists() else None,
@@ -219,15 +219,15 @@ def _tables_of(vehicle_file: VehicleFile) -> dict[str, Any]:
         "motor": vehicle_file.motor,
         "log": vehicle_file.log,
     }
-    return _given(to_plain(tables))
+    return _without_empty(to_plain(tables))
 
 
-def _given(plain: dict) -> dict:
+def _without_empty(plain: dict) -> dict:
     """A tree of tables without empty ones and without None, which TOML hasn't."""
     values = {}
     for name, value in plain.items():
         if isinstance(value, dict):
-            value = _given(value)  # which may be empty afterwards
+            value = _without_empty(value)  # which may be empty afterwards
         if value is not None and value != {}:
             values[name] = value
     return values
@@ -235,10 +235,10 @@ def _given(plain: dict) -> dict:
 
 def _calibrated_table(name: str, entry: CalibratedValue) -> tomlkit.items.Table:
     table = tomlkit.table()
-    rounded = [float(f"{v:.5g}") for v in entry.value]
+    digits = [float(f"{v:.5g}") for v in entry.value]
     interval = [[float(f"{v:.4g}") for v in pair] for pair in entry.interval90]
-    single = len(rounded) == 1
-    table.add("value", rounded[0] if single else rounded)
+    single = len(digits) == 1
+    table.add("value", digits[0] if single else digits)
     table.add("interval90", interval[0] if single else interval)
     table.add("unit", CALIBRATED_UNITS[name])
     if entry.notes:

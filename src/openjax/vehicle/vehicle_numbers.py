@@ -106,7 +106,7 @@ def with_size(
 
 
 def with_numbers(
-    nominal: Vehicle, mass: float | None, motor: Motor, calibrated: dict
+    nominal: Vehicle, mass: float | None, motor: Motor, calibration: dict
 ) -> Vehicle:
     """The nominal vehicle with everything that the file says of it; what a calibration
     found counts most.
@@ -118,11 +118,11 @@ def with_numbers(
     }
     if mass is not None:
         changes["mass"] = mass
-    for name, entry in calibrated.items():
+    for name, entry in calibration.items():
         changes[name] = entry.value if len(entry.value) > 1 else entry.value[0]
     # last, since it multiplies the thrust constant, which a calibration may have
     # changed
-    if motor.torque_per_thrust is not None and "torque_constant" not in calibrated:
+    if motor.torque_per_thrust is not None and "torque_constant" not in calibration:
         thrust = changes.get("thrust_constant", float(nominal.thrust_constant))
         changes["torque_constant"] = motor.torque_per_thrust * thrust
     return with_values(nominal, **changes)
@@ -137,12 +137,12 @@ def with_values(vehicle: Vehicle, **values) -> Vehicle:
 
 
 def calibrated_value(
-    name: str, entry: CalibratedTable, nominal: Vehicle, where: str
+    name: str, entry: CalibratedTable, nominal: Vehicle, place: str
 ) -> CalibratedValue:
     """A calibrated quantity of the file. Raises UserError for one that can't be."""
     if (entry.unit or CALIBRATED_UNITS[name]) != CALIBRATED_UNITS[name]:
         raise UserError(
-            f"{where} is in {entry.unit!r}; it must be in {CALIBRATED_UNITS[name]!r}"
+            f"{place} is in {entry.unit!r}; it must be in {CALIBRATED_UNITS[name]!r}"
         )
     usual = np.atleast_1d(np.asarray(getattr(nominal, name)))
     value = np.atleast_1d(entry.value)
@@ -150,15 +150,15 @@ def calibrated_value(
     if value.shape != usual.shape or interval.shape != (usual.size, 2):
         number = f"{usual.size} number{'s' * (usual.size > 1)}"
         raise UserError(
-            f"{where} needs value ({number}) and interval90 ([low, high] each)"
+            f"{place} needs value ({number}) and interval90 ([low, high] each)"
         )
     if not ((usual / FAR <= value) & (value <= usual * FAR)).all():
         raise UserError(
-            f"{where}: {value.tolist()} is far from the nominal {usual.tolist()}"
+            f"{place}: {value.tolist()} is far from the nominal {usual.tolist()}"
         )
     if not (interval[:, 0] <= interval[:, 1]).all():
         raise UserError(
-            f"{where}: interval90 is {interval.tolist()}; low must not exceed high"
+            f"{place}: interval90 is {interval.tolist()}; low must not exceed high"
         )
     return CalibratedValue(
         tuple(value.tolist()), tuple(map(tuple, interval.tolist())), entry.notes

@@ -77,10 +77,10 @@ class VirtualLink:
             if not raw:
                 continue
             delay = 0.0
-            commanded = raw[0] >> 4 in (Port.COMMANDER, Port.COMMANDER_GENERIC)
-            if commanded or raw[0] >> 4 == Port.LOG or self._listener is None:
+            is_command = raw[0] >> 4 in (Port.COMMANDER, Port.COMMANDER_GENERIC)
+            if is_command or raw[0] >> 4 == Port.LOG or self._listener is None:
                 self._listener = peer
-            if commanded:
+            if is_command:
                 if self._random.random() < self.faults.loss:
                     continue
                 jitter = self._random.random() * self.faults.jitter_ms

@@ -148,15 +148,15 @@ class SimulatedSwarm:
             on_board = expand_quaternion(compress_quaternion(quaternion[i]))
             own_place, own_velocity = map(tuple, estimate[i])
             on_air = Pose(self.now, own_place, own_velocity, on_board, tuple(rates[i]))
-            received = self._radio(i, self.now, on_air)
-            claimed = self.uplinks[i].voltage
+            own_estimate = self._radio(i, self.now, on_air)
+            voltage_of_link = self.uplinks[i].voltage
             self._samples[i] = PoseSample(
-                own=received or old.own,
-                last_contact=self.now if received else old.last_contact,
-                voltage=voltage[i] if claimed is None else claimed,
+                own=own_estimate or old.own,
+                last_contact=self.now if own_estimate else old.last_contact,
+                voltage=voltage[i] if voltage_of_link is None else voltage_of_link,
                 supervisor=self.firmware[i].supervisor_info
-                if received
+                if own_estimate
                 else old.supervisor,
                 captured=self._camera(i, self.now, capture) or old.captured,
-                force=tuple(force[i]) if received else old.force,
+                force=tuple(force[i]) if own_estimate else old.force,
             )

@@ -101,7 +101,7 @@ class VirtualVehicles:
         flat, self._unflatten = ravel_pytree(drones)
         nothing = np.zeros((self.number, 5), np.float32)
         self._advance = compile_in_line(
-            jax.jit(self._advanced).lower(flat, nothing, np.int32(1))
+            jax.jit(self._program).lower(flat, nothing, np.int32(1))
         )
         self._charge = float(battery)
         self._endurance = float(endurance)
@@ -127,7 +127,7 @@ class VirtualVehicles:
         )
         return self.report
 
-    def _advanced(self, flat, set_points, steps):
+    def _program(self, flat, set_points, steps):
         """The flat state after `steps` steps, and what is sensed then."""
         vehicle = self._vehicle
         effects = self._step.effects
@@ -139,7 +139,7 @@ class VirtualVehicles:
         plant = composition.change_body(effects, complete, vehicle)
 
         def step(_, carry):
-            drones, _, crashed = carry
+            drones, _, has_crashed = carry
             command = commands(drones.quaternion, set_points)
             motor, _ = jax.vmap(lambda d, c: rate_controller(plant, d, c, STEP))(
                 drones, command
@@ -153,13 +153,13 @@ class VirtualVehicles:
             gravity = vehicle.gravity * jnp.array([0.0, 0.0, 1.0])
             acceleration = jnp.where(on_floor[:, None], 0.0, acceleration)
             force = jax.vmap(rotate_inverse)(new.quaternion, acceleration + gravity)
-            return new, (motor, force, on_floor), crashed | hit
+            return new, (motor, force, on_floor), has_crashed | hit
 
         drones = self._unflatten(flat)
         gravity = jnp.zeros((self.number, 3)).at[:, 2].set(vehicle.gravity)
         no_one = jnp.zeros(self.number, bool)
         nothing = (jnp.zeros((self.number, 4)), gravity, no_one)
-        drones, (motor, force, on_floor), crashed = jax.lax.fori_loop(
+        drones, (motor, force, on_floor), has_crashed = jax.lax.fori_loop(
             0, steps, step, (drones, nothing, no_one)
         )
         report = Report(
@@ -170,7 +170,7 @@ class VirtualVehicles:
             specific_force=force,
             motor_command=motor,
             on_floor=on_floor,
-            crashed=crashed,
+            crashed=has_crashed,
         )
         return ravel_pytree(drones)[0], report
 
@@ -234,8 +234,8 @@ def _stand(drones):
     size = jnp.sqrt(w * w + z * z + 1e-12)
     level = jnp.stack([w / size, 0 * w, 0 * w, z / size], axis=-1)
 
-    def keep(fixed, free):
-        return jnp.where(below[:, None], fixed, free)
+    def keep(standing, free):
+        return jnp.where(below[:, None], standing, free)
 
     rest = jnp.zeros_like(drones.velocity)
     drones = drones.replace(

@@ -43,10 +43,12 @@ class EvaderLearner:
         self,
         state: LearningEvaders,
         parameters: PolicyParameters,
-        flown: Flown,
+        experience: Flown,
         key: PRNGKeyArray,
     ) -> tuple[LearningEvaders, PolicyParameters, dict[str, Any]]:
         """After all epochs on the samples of a rollout."""
-        samples = flown.rollout.learning
-        state = self.learning.learn(state, samples, flown.state, key, flown.axis)
+        samples = experience.rollout.learning
+        state = self.learning.learn(
+            state, samples, experience.state, key, experience.axis
+        )
         return state, parameters, {"evader_noise": jnp.mean(state.log_std)}

@@ -15,7 +15,7 @@ from openjax.learning.advantages import generalised_advantages
 from openjax.learning.collectives import joint_moments, minibatches
 from openjax.learning.learners.learner import Flown
 from openjax.learning.settings import MappoSettings
-from openjax.learning.train_state import TrainState, clipped_adam, shuffled
+from openjax.learning.train_state import TrainState, clipped_adam, shuffle
 from openjax.policy import (
     OwnPolicy,
     Policy,
@@ -151,10 +151,12 @@ def loss(
     )
     log_ratio = gaussian_log_prob(batch.action, mean, log_std) - batch.log_prob
     ratio = jnp.exp(log_ratio)
-    clipped = jnp.clip(ratio, 1.0 - clip, 1.0 + clip)
+    clipped_ratio = jnp.clip(ratio, 1.0 - clip, 1.0 + clip)
     mean_of = functools.partial(team_mean, batch.observation.active)
     # the lesser of both: a pessimistic bound (Schulman et al., 2017, section 3)
-    surrogate = mean_of(jnp.minimum(ratio * batch.advantage, clipped * batch.advantage))
+    surrogate = mean_of(
+        jnp.minimum(ratio * batch.advantage, clipped_ratio * batch.advantage)
+    )
     entropy = gaussian_entropy(log_std)
     policy_loss = -surrogate - settings.entropy_coefficient * entropy
     value_loss = mean_of(optax.huber_loss(value, batch.target, delta=settings.huber))
@@ -219,21 +221,21 @@ class Mappo:
         self,
         state: MappoState,
         parameters: PolicyParameters,
-        flown: Flown,
+        experience: Flown,
         key: PRNGKeyArray,
     ) -> tuple[MappoState, PolicyParameters, dict[str, Scalar]]:
         """All epochs of the policy update on one rollout; `key` shuffles."""
-        estimates = self._estimates(state.value_scale, parameters, flown)
-        scale = self._renewed_scale(state.value_scale, estimates.returns, flown)
+        estimates = self._estimates(state.value_scale, parameters, experience)
+        scale = self._new_scale(state.value_scale, estimates.returns, experience)
         mean, std = scale.moments
         # by the moments with these returns in them: values and targets are then of one
         # scale
         targets = (estimates.returns - mean) / std
-        batch = self._batch(estimates.advantage, targets, flown)
+        batch = self._batch(estimates.advantage, targets, experience)
 
         actor = TrainState(parameters.actor, state.actor)
         critic = TrainState(parameters.critic, state.critic)
-        (actor, critic), metrics = self._epochs((actor, critic), batch, flown, key)
+        (actor, critic), metrics = self._epochs((actor, critic), batch, experience, key)
         parameters = parameters.replace(
             actor=actor.parameters, critic=critic.parameters
         )
@@ -241,36 +243,36 @@ class Mappo:
         metrics["value_scale"] = std
         return MappoState(actor.optimiser, critic.optimiser, scale), parameters, metrics
 
-    def _estimates(self, scale, parameters, flown):
+    def _estimates(self, scale, parameters, experience):
         """Advantages and returns of a rollout, by the critic as it was."""
         settings = self.settings
-        rollout = flown.rollout
+        rollout = experience.rollout
         mean, std = scale.moments
         # the history's frames are the predictor's; the policy sees the prediction
         inputs = rollout.observation.replace(frames=None), rollout.predicted
-        last_inputs = flown.observation.replace(frames=None), flown.predicted
+        last_inputs = experience.observation.replace(frames=None), experience.predicted
         # before and after all steps by one program: one for what comes last would be as
         # large
-        observation, predicted = jax.tree.map(
+        observation, prediction = jax.tree.map(
             lambda x, last: jnp.concatenate([x, last[None]]), inputs, last_inputs
         )
         values = self.policy.value(
-            parameters.actor, parameters.critic, observation, predicted
+            parameters.actor, parameters.critic, observation, prediction
         )
         values = mean + std * values
         value = values[:-1]
         next_values = values[1:]
         per_pursuer = value.shape
-        terminated = jnp.broadcast_to(rollout.terminated[..., None], per_pursuer)
+        is_terminal = jnp.broadcast_to(rollout.terminated[..., None], per_pursuer)
         active = observation.active
         if active is not None:
             # for who falls out nothing comes after
-            terminated |= active[:-1] & ~active[1:]
+            is_terminal |= active[:-1] & ~active[1:]
         advantage = generalised_advantages(
             settings.reward_scale * rollout.reward,
             value,
             next_values,
-            terminated,
+            is_terminal,
             jnp.broadcast_to(rollout.truncated[..., None], per_pursuer),
             settings.discount,
             settings.gae_lambda,
@@ -279,16 +281,16 @@ class Mappo:
         # an advantage is what the value left of the return: one less the share that is
         # unexplained
         active = rollout.observation.active
-        _, spread_left = joint_moments(advantage, flown.axis, active)
-        _, spread = joint_moments(returns, flown.axis, active)
+        _, spread_left = joint_moments(advantage, experience.axis, active)
+        _, spread = joint_moments(returns, experience.axis, active)
         explained_share = 1.0 - spread_left**2 / (spread**2 + 1e-8)
         return Estimates(advantage, returns, explained_share)
 
-    def _renewed_scale(self, scale, returns, flown):
+    def _new_scale(self, scale, returns, experience):
         """The running moments after these returns."""
         decay = self.settings.value_norm_decay
-        active = flown.rollout.observation.active
-        mean, square = flown.mean(
+        active = experience.rollout.observation.active
+        mean, square = experience.mean(
             (team_mean(active, returns), team_mean(active, returns**2))
         )
         return ValueScale(
@@ -297,13 +299,15 @@ class Mappo:
             weight=decay * scale.weight + (1 - decay),
         )
 
-    def _batch(self, advantage, targets, flown):
+    def _batch(self, advantage, targets, experience):
         """The rollout's samples with advantages and targets (T, E, N), minibatch by
         minibatch, (M, W, T, ...).
         """
-        rollout = flown.rollout
+        rollout = experience.rollout
         # over the whole rollout, not in each minibatch, whose moments are noisier
-        mean, std = joint_moments(advantage, flown.axis, rollout.observation.active)
+        mean, std = joint_moments(
+            advantage, experience.axis, rollout.observation.active
+        )
         batch = Batch(
             observation=rollout.observation.replace(frames=None),
             predicted=rollout.predicted,
@@ -314,14 +318,14 @@ class Mappo:
         )
         return minibatches(batch, self.settings.minibatches)
 
-    def _epochs(self, networks, batch, flown, key):
+    def _epochs(self, networks, batch, experience, key):
         """Actor and critic (`TrainState`s) after all gradient steps, and the means of
         what was watched.
         """
         settings = self.settings
         actor, critic = networks
         change = settings.clip_epsilon_end - settings.clip_epsilon
-        clip = settings.clip_epsilon + change * flown.progress
+        clip = settings.clip_epsilon + change * experience.progress
         # each network as one vector while it learns: leaf by leaf, a step on a GPU is
         # forty kernels more
         actor_vector, to_actor = ravel_pytree(actor.parameters)
@@ -342,10 +346,10 @@ class Mappo:
                 actor.parameters, critic.parameters
             )
             # gradients and what is watched over all devices by one collective
-            (actor_gradient, critic_gradient), watch = flown.mean(gradient)
+            (actor_gradient, critic_gradient), watch = experience.mean(gradient)
             watch |= {"actor_gradient": jnp.linalg.norm(actor_gradient)}
-            actor = actor.updated(self.optimisers[0], actor_gradient, kl=watch["kl"])
-            critic = critic.updated(self.optimisers[1], critic_gradient)
+            actor = actor.update(self.optimisers[0], actor_gradient, kl=watch["kl"])
+            critic = critic.update(self.optimisers[1], critic_gradient)
             return (actor, critic), jnp.stack([watch[name] for name in WATCHED])
 
         steps = self._order(key)
@@ -353,10 +357,10 @@ class Mappo:
             actor.replace(parameters=actor_vector),
             critic.replace(parameters=critic_vector),
         )
-        (actor, critic), watched = jax.lax.scan(gradient_step, start, steps)
+        (actor, critic), measures = jax.lax.scan(gradient_step, start, steps)
         actor = actor.replace(parameters=to_actor(actor.parameters))
         critic = critic.replace(parameters=to_critic(critic.parameters))
-        metrics = dict(zip(WATCHED, jnp.mean(watched, axis=0), strict=True))
+        metrics = dict(zip(WATCHED, jnp.mean(measures, axis=0), strict=True))
         return (actor, critic), metrics
 
     def _order(self, key):
@@ -364,7 +368,7 @@ class Mappo:
         steps that each sees; None: it sees all.
         """
         settings = self.settings
-        order = shuffled(key, settings.epochs, settings.minibatches)
+        order = shuffle(key, settings.epochs, settings.minibatches)
         if settings.step_subsampling == 1:
             return order, None
         draw = jax.random.fold_in(key, 1)

@@ -77,7 +77,7 @@ def windows_and_labels(
 def prediction_loss(
     settings: PredictorSettings,
     game: PursuitSettings,
-    predicted: Float[Array, "*windows horizons 3"],
+    predictions: Float[Array, "*windows horizons 3"],
     last_seen: Float[Array, "*windows 3"],
     positions: Float[Array, "*windows horizons 3"],
 ) -> Scalar:
@@ -88,7 +88,7 @@ def prediction_loss(
     before the evader was first seen: nothing can be learnt from these, but what is
     learnt from them is carried over to where it is lost from sight.
     """
-    error = predicted - positions
+    error = predictions - positions
     if settings.loss == "squared":
         return jnp.mean(error**2)
     # in units of the distance that the evader flies within each horizon, all horizons
@@ -123,16 +123,20 @@ class PredictorLearner:
         return self.optimiser.init(parameters.predictor)
 
     def learn(
-        self, state: Any, parameters: PolicyParameters, flown: Flown, key: PRNGKeyArray
+        self,
+        state: Any,
+        parameters: PolicyParameters,
+        experience: Flown,
+        key: PRNGKeyArray,
     ) -> tuple[Any, PolicyParameters, dict[str, Scalar]]:
         """After the gradient steps on one rollout; `key` draws the windows."""
-        rollout = flown.rollout
-        data = self._windows(flown, key)
+        rollout = experience.rollout
+        data = self._windows(experience, key)
 
         def loss(parameters, frames, last_seen, positions):
-            predicted = self.policy.predict_from(parameters, frames, last_seen)
+            predictions = self.policy.predict_from(parameters, frames, last_seen)
             return prediction_loss(
-                self.policy.predictor, self.game, predicted, last_seen, positions
+                self.policy.predictor, self.game, predictions, last_seen, positions
             )
 
         def gradient_step(predictor, batch):
@@ -140,8 +144,8 @@ class PredictorLearner:
             value, gradient = jax.value_and_grad(loss)(
                 predictor.parameters, frames, last_seen, positions
             )
-            value, gradient = flown.mean((value, gradient))
-            return predictor.updated(self.optimiser, gradient), value
+            value, gradient = experience.mean((value, gradient))
+            return predictor.update(self.optimiser, gradient), value
 
         predictor = TrainState(parameters.predictor, state)
         predictor, values = jax.lax.scan(gradient_step, predictor, data)
@@ -149,25 +153,25 @@ class PredictorLearner:
         error = jnp.linalg.norm(rollout.predicted[:, :, 0] - rollout.evader, axis=-1)
         metrics = {
             "predictor_loss": jnp.mean(values),
-            "prediction_error": flown.mean(jnp.mean(error)),
+            "prediction_error": experience.mean(jnp.mean(error)),
         }
         parameters = parameters.replace(predictor=predictor.parameters)
         return predictor.optimiser, parameters, metrics
 
-    def _windows(self, flown, key):
+    def _windows(self, experience, key):
         """Windows of frames, last seen and true positions, (steps, E, windows / steps,
         ...): every gradient step sees other windows of every world.
         """
         settings = self.policy.predictor
-        rollout = flown.rollout
-        keys = own_keys(key, flown.frames.shape[0], flown.axis)
+        rollout = experience.rollout
+        keys = own_keys(key, experience.frames.shape[0], experience.axis)
         # later windows would have labels beyond the rollout
         room = rollout.reward.shape[0] - settings.horizons[-1] + 1
         times = jax.vmap(
             lambda key: jax.random.permutation(key, room)[: settings.windows]
         )(keys)
         data = windows_and_labels(
-            self.policy, self.game.history_spacing, flown.frames, rollout, times
+            self.policy, self.game.history_spacing, experience.frames, rollout, times
         )
 
         def by_step(x):

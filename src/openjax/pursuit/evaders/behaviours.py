@@ -82,10 +82,10 @@ class Scene:
     @property
     def nearest(self) -> Vector:
         """(3,) m, the nearest pursuer that it knows of."""
-        squared = jnp.sum((self.pursuers - self.position) ** 2, axis=-1)
-        squared = jnp.where(self.known, squared, jnp.inf)
+        squares = jnp.sum((self.pursuers - self.position) ** 2, axis=-1)
+        squares = jnp.where(self.known, squares, jnp.inf)
         # a sum over all but one, cheaper on an accelerator than an index
-        is_nearest = jnp.arange(squared.shape[0])[:, None] == jnp.argmin(squared)
+        is_nearest = jnp.arange(squares.shape[0])[:, None] == jnp.argmin(squares)
         return jnp.sum(jnp.where(is_nearest, self.pursuers, 0.0), axis=0)
 
 
@@ -129,7 +129,7 @@ def greedy(scene: Scene, memory: Memory) -> tuple[Vector, Memory]:
     ends, open_way = _ends(scene, scene.position, candidates)
     score = jnp.where(open_way, _nearness(scene, ends, scene.pursuers), -jnp.inf)
     # who knows of nobody stays where it is
-    return _chosen(candidates, score) * jnp.any(scene.known), memory
+    return _choose(candidates, score) * jnp.any(scene.known), memory
 
 
 def two_step(scene: Scene, memory: Memory) -> tuple[Vector, Memory]:
@@ -151,7 +151,7 @@ def two_step(scene: Scene, memory: Memory) -> tuple[Vector, Memory]:
         return jnp.minimum(_nearness(scene, end[None], answer)[0], jnp.max(nearness))
 
     score = jnp.where(open_way, jax.vmap(best_after)(first), -jnp.inf)
-    return _chosen(candidates, score) * jnp.any(scene.known), memory
+    return _choose(candidates, score) * jnp.any(scene.known), memory
 
 
 def wall_runner(scene: Scene, memory: Memory) -> tuple[Vector, Memory]:
@@ -194,8 +194,8 @@ def pillar_hugger(scene: Scene, memory: Memory) -> tuple[Vector, Memory]:
     )
     to_goal = goal - scene.position
     away = _unit(scene.position - threat)
-    hidden = to_goal / jnp.maximum(_length(to_goal), AROUND)
-    return jnp.where(jnp.any(scene.pillar_active), hidden, away), memory
+    to_cover = to_goal / jnp.maximum(_length(to_goal), AROUND)
+    return jnp.where(jnp.any(scene.pillar_active), to_cover, away), memory
 
 
 def safe_place(scene: Scene, memory: Memory) -> tuple[Vector, Memory]:
@@ -215,7 +215,7 @@ def safe_place(scene: Scene, memory: Memory) -> tuple[Vector, Memory]:
         settings, places, scene.position, scene.pillar_position, scene.pillar_active
     )
     lead = jnp.where(in_the_open, lead, -jnp.inf)
-    direction = _chosen(to_place, lead)
+    direction = _choose(to_place, lead)
     return direction / jnp.maximum(_length(direction), MARGIN), memory
 
 
@@ -296,7 +296,7 @@ def _nearness(scene, ends, pursuers):
     return jnp.min(jnp.where(scene.known, distance, FAR_AWAY), axis=-1)
 
 
-def _chosen(candidates, score):
+def _choose(candidates, score):
     """The direction of the highest score, by a sum: cheaper on an accelerator than a
     gather.
     """

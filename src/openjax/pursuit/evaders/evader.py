@@ -75,7 +75,7 @@ def draw_row(
         slow = jnp.where(kind == 0, 1.0, 0.5 + 0.5 * share)
     draws = jax.random.uniform(number_key, (len(NUMBERS),))
     numbers = {
-        number: _drawn([getattr(row, number) for row in rows], kind, draw)
+        number: _draw([getattr(row, number) for row in rows], kind, draw)
         for number, draw in zip(NUMBERS, draws, strict=True)
     }
     numbers["speed"] = numbers["speed"] * slow
@@ -95,7 +95,7 @@ def draw_row(
     return EvaderState(kind, numbers, memory, memory_key if draws_itself else None)
 
 
-def _drawn(values, kind, draw):
+def _draw(values, kind, draw):
     """One of `values[kind]`, by the uniform `draw`."""
     # a table needs rows of one length: filled up with zeros, which no draw reaches
     width = max(len(row) for row in values)
@@ -132,7 +132,7 @@ def evader_velocity(
     world = jax.lax.stop_gradient(world)
     state = world.evader
     if state is None:
-        velocity = _flown(
+        velocity = _fly(
             settings, world, evader_speed(settings, world.task), UNBOUNDED, wish
         )
         return jnp.where(
@@ -142,7 +142,7 @@ def evader_velocity(
     by_itself = jnp.ones((), bool) if wish is None else jnp.any(jnp.isnan(wish))
     speed = state.numbers["speed"] * evader_speed(settings, world.task)
     wish = own_wish if wish is None else jnp.where(by_itself, own_wish, wish)
-    velocity = _flown(settings, world, speed, state.numbers["acceleration"], wish)
+    velocity = _fly(settings, world, speed, state.numbers["acceleration"], wish)
     is_field = np.array([row.behaviour == "field" for row in rows])
     if is_field.any():
         # the paper's flies its force as it is: nothing bounds its acceleration
@@ -220,15 +220,15 @@ def _like_shipped(row):
 
     def behaviour(scene, memory):
         result = row.behaviour(scene, memory[: row.memory])
-        velocity, remembered = _checked(row, result)
+        velocity, next_memory = _check(row, result)
         # all evaders of a game have memories of one size, the largest
-        memory = jnp.concatenate([remembered, memory[row.memory :]])
+        memory = jnp.concatenate([next_memory, memory[row.memory :]])
         return velocity / jnp.maximum(scene.reach, 1e-6), memory
 
     return behaviour
 
 
-def _checked(row, result):
+def _check(row, result):
     """The velocity and memory that a function of one's own gives. Raises UserError
     where they have other shapes.
     """
@@ -241,7 +241,7 @@ def _checked(row, result):
     return result
 
 
-def _flown(settings, world, speed, acceleration, wish):
+def _fly(settings, world, speed, acceleration, wish):
     """(3,) m/s, what is flown of a wish: bounded in speed and acceleration, and past
     what is solid.
     """
@@ -268,7 +268,7 @@ def _flown(settings, world, speed, acceleration, wish):
 
 def _is_free(settings, place, pillar_position, pillar_active):
     """() bool, whether (3,) `place` is inside the arena and outside all pillars."""
-    squared = jnp.sum((place[:2] - pillar_position) ** 2, axis=-1)
+    squares = jnp.sum((place[:2] - pillar_position) ** 2, axis=-1)
     inside = (jnp.sum(place[:2] ** 2) < settings.arena_radius**2) & (place[2] > 0.0)
     inside &= place[2] < settings.arena_height
-    return inside & ~jnp.any(pillar_active & (squared < settings.pillar_radius**2))
+    return inside & ~jnp.any(pillar_active & (squares < settings.pillar_radius**2))

@@ -184,9 +184,9 @@ def outputs(
         most = jnp.max(pursuers, axis=-2)
     # pursuers by mean and maximum, whose size doesn't grow with their number; pillars
     # by a sum, as empty slots are zeros
-    pooled = [mean, most, jnp.sum(pillars, axis=-2)]
-    hidden = jnp.tanh(dense("own", jnp.concatenate([inputs["own"], *pooled], axis=-1)))
-    out = dense("output", jnp.tanh(dense("hidden", hidden)))
+    sums = [mean, most, jnp.sum(pillars, axis=-2)]
+    features = jnp.tanh(dense("own", jnp.concatenate([inputs["own"], *sums], axis=-1)))
+    out = dense("output", jnp.tanh(dense("hidden", features)))
     # from its own axes into the world's: the same yaw with the other sign
     inverse = inputs["outward"] * np.array([1.0, -1.0], np.float32)
     return inputs["greedy"] + turned_back(inverse, out[..., :3]), out[..., 3]

@@ -18,11 +18,11 @@ def voltage(parameters, context):
     """Battery voltage () V: the context's where it is known, else a linear discharge
     from `full`.
     """
-    simulated = parameters["full"] - parameters["discharge"] * context.air_time
+    simulation = parameters["full"] - parameters["discharge"] * context.air_time
     is_logged = ~jnp.isnan(context.battery_voltage)
     # a linear discharge crosses zero some day, and a power of a negative ratio is no
     # number
-    return jnp.maximum(jnp.where(is_logged, context.battery_voltage, simulated), 1.0)
+    return jnp.maximum(jnp.where(is_logged, context.battery_voltage, simulation), 1.0)
 
 
 def motor(parameters, motor_command, context):

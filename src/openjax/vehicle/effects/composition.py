@@ -89,8 +89,8 @@ def change_command(effects, parameters, memory, command, context: Context):
             )
             _check_pair(effect, "command", result)
             _check_shapes(effect, "command", result[0], command)
-            command, remembered = result
-            memory = {**memory, effect.name: remembered}
+            command, memory_of_effect = result
+            memory = {**memory, effect.name: memory_of_effect}
     return command, memory
 
 

@@ -43,8 +43,8 @@ class Context:
     dt: jax.Array  # () s, time until the next call
 
 
-def make_context(vehicle: Vehicle, state: DroneState, **known) -> Context:
-    """The context of one drone in `state`. `known`: further fields of `Context`; those
+def make_context(vehicle: Vehicle, state: DroneState, **fields) -> Context:
+    """The context of one drone in `state`. `fields`: further fields of `Context`; those
     left out are usual, or not known.
 
     For logged flights: map it over the samples, `jax.vmap(lambda state, v:
@@ -68,7 +68,7 @@ def make_context(vehicle: Vehicle, state: DroneState, **known) -> Context:
         dt=0.01,
     )
     return jax.tree.map(
-        lambda leaf: jnp.asarray(leaf, state.position.dtype), usual.replace(**known)
+        lambda leaf: jnp.asarray(leaf, state.position.dtype), usual.replace(**fields)
     )
 
 

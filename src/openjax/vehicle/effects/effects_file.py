@@ -75,7 +75,7 @@ def _read(path: Path) -> dict[str, dict[str, _Entry]]:
     for name, entries in table.items():
         if not isinstance(entries, dict):
             raise UserError(f"{path}: [{name}] must be a table of its parameters")
-        find_effect(name, where=f"{path}: ")
+        find_effect(name, prefix=f"{path}: ")
         values[name] = {
             key: _entry(path, name, key, entry) for key, entry in entries.items()
         }
@@ -84,38 +84,38 @@ def _read(path: Path) -> dict[str, dict[str, _Entry]]:
 
 def _entry(path: Path, name: str, key: str, text) -> _Entry:
     """One parameter's entry from what TOML reads, a number or a table."""
-    where = f"{path}: {name}.{key}"
+    place = f"{path}: {name}.{key}"
     parameter = find_effect(name, key, f"{path}: ").parameters[key]
     entry = from_plain(
-        _Entry, text if isinstance(text, dict) else {"value": text}, where
+        _Entry, text if isinstance(text, dict) else {"value": text}, place
     )
     if entry.unit not in (None, parameter.unit):
         raise UserError(
-            f"{where} is in {entry.unit!r}; {parameter.unit!r} would be right"
+            f"{place} is in {entry.unit!r}; {parameter.unit!r} would be right"
         )
     if entry.interval90 is not None and not entry.interval90[0] <= entry.interval90[1]:
         raise UserError(
-            f"{where}: interval90 is {list(entry.interval90)}; low must not exceed high"
+            f"{place}: interval90 is {list(entry.interval90)}; low must not exceed high"
         )
     for number in (entry.value, *(entry.interval90 or ())):
-        _check_number(parameter, number, where)
+        _check_number(parameter, number, place)
     return entry
 
 
-def _check_number(parameter: Parameter, number: float, where: str) -> None:
+def _check_number(parameter: Parameter, number: float, place: str) -> None:
     """Refuse a value, or an end of an interval, that no vehicle has."""
     usual = parameter.prior
     reach = FAR * (usual[1] - usual[0])
     if not usual[0] - reach <= number <= usual[1] + reach:
         raise UserError(
-            f"{where} = {number:g} {parameter.unit} is far from what occurs, {usual[0]:g} to "
+            f"{place} = {number:g} {parameter.unit} is far from what occurs, {usual[0]:g} to "
             f"{usual[1]:g}"
         )
     low, high = parameter.limits()
     slack = 1e-6 * (usual[1] - usual[0])  # of numbers written with six digits
     if not low - slack <= number <= high + slack:
         raise UserError(
-            f"{where} = {number:g} {parameter.unit} can't be; it lies between {low:g} and {high:g}"
+            f"{place} = {number:g} {parameter.unit} can't be; it lies between {low:g} and {high:g}"
         )
 
 

@@ -10,8 +10,8 @@ def gain(strength, distance):
     """1 + strength (R / distance)^2 for hubs at `distance` m from a plane."""
     # nearer than half a radius the formula holds no more, and at the plane it is
     # infinite
-    limited = jnp.maximum(distance, 0.5 * PROPELLER_RADIUS)
-    return 1.0 + strength * (PROPELLER_RADIUS / limited) ** 2
+    height = jnp.maximum(distance, 0.5 * PROPELLER_RADIUS)
+    return 1.0 + strength * (PROPELLER_RADIUS / height) ** 2
 
 
 def thrust(parameters, thrust, reaction, context):

@@ -37,7 +37,7 @@ def register_effect(effect: Effect) -> None:
 def find_effect(
     name: str,
     parameter: str | None = None,
-    where: str = "",
+    prefix: str = "",
     effects: Mapping[str, Effect] = EFFECTS,
 ) -> Effect:
     """The effect of that name. Raises UserError where there is none, or it hasn't that
@@ -45,11 +45,12 @@ def find_effect(
     """
     if name not in effects:
         raise UserError(
-            f"{where}effect {name!r} is unknown; {suggestion(name, effects)}"
+            f"{prefix}effect {name!r} is unknown; {suggestion(name, effects)}"
         )
     parameters = effects[name].parameters
     if parameter is not None and parameter not in parameters:
         raise UserError(
-            f"{where}effect {name!r} has no parameter {parameter!r}; it has {', '.join(parameters)}"
+            f"{prefix}effect {name!r} has no parameter {parameter!r}; it has "
+            f"{', '.join(parameters)}"
         )
     return effects[name]
