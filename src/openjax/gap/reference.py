@@ -56,7 +56,7 @@ def read_reference(case: Case, progress=None) -> Baseline:
     )
     evidence = gather(case, effects, progress, reference=True)
     search = search_sets(evidence)
-    best = search.choose(np.ones((1, len(search.nothing.judged.nats))))[0].fit
+    best = search.choose(np.ones((1, len(search.nothing.validation.nats))))[0].fit
     fit = fit_set(best.replay, best.effects, best.theta, rounds=ROUNDS)
     measures, _ = measure(evidence, residuals_of(fit))
     lasting = tuple(e for e in fit.effects if e in FORM)

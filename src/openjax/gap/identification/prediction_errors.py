@@ -86,10 +86,10 @@ class Problem:
         )
         self.precision = np.diag(SPREAD**-2.0)
         self.precision[:2, :2] += np.array([[1.0, -1.0], [-1.0, 1.0]]) / UNEQUAL**2
-        self.new = [self._new(r) if r.hidden else None for r in records]
+        self.new = [self._new(r) if r.hides_ticks else None for r in records]
         self.count = sum(len(r.rates) - self.order - 1 for r in records)
         self.surprise = 0.0
-        if records[0].hidden:
+        if records[0].hides_ticks:
             every = np.concatenate(self.new)
             self.surprise = 0.5 * len(every) * float(np.log(every.var(0) + TINY).sum())
 

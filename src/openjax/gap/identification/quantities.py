@@ -207,17 +207,17 @@ def doubts(records: list[Record], fit: TorqueFit, one_clock: bool) -> tuple[str,
         reasons.append(
             "the streams of motors and sensors are apart by times that wander"
         )
-    if any(r.drawn for r in records):
+    if any(r.bridges_holes for r in records):
         reasons.append(
             "motors or body rates are missing so often that no second is whole; log them without "
             "holes"
         )
-    if any(r.hidden and r.samples for r in records):
+    if any(r.hides_ticks and r.samples for r in records):
         reasons.append(
             "a row's motors are one sample of a loop that runs several times within it; log their "
             "means at 100 Hz, or every sample at 500 Hz"
         )
-    if any(r.hidden for r in records) and fit.turning[:2].max() < TURNS:
+    if any(r.hides_ticks for r in records) and fit.turning[:2].max() < TURNS:
         reasons.append("the vehicle hardly turns; fly the segments yaw, agile or step")
     if np.isclose(fit.value[3:6], SEARCHED[1][0], rtol=0.02).any() and not reasons:
         reasons.append("the body hardly answers the motors as they are logged")
