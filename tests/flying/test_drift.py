@@ -71,7 +71,7 @@ def test_who_drifts_lands_with_the_team(flights):
         state = see(state, 0.01 * row, event(0.01 * row + 1e-3).samples)
     assert state.drones[0].innovations.pose is not None
     usual = Drift(squares=1e-4, age=9.0)
-    far = Drift(summed=(0.4, 0.0), squares=1e-4, age=9.0)
+    far = Drift(totals=(0.4, 0.0), squares=1e-4, age=9.0)
     drones = tuple(
         drone._replace(
             innovations=drone.innovations._replace(drift=far if i == 0 else usual)

@@ -116,9 +116,9 @@ def read(flights, sampled=False) -> RateLoop:
     tracks, vehicles, links = zip(*flights, strict=True)
     commanded = [caused_by_commands(*f) for f in flights]
     reading = SimpleNamespace(
-        heard=tracks,
+        firmware_tracks=tracks,
         vehicles=vehicles,
-        arrived=links,
+        arrivals=links,
         by_commands=commanded,
         at_once=sampled,
         late=0.0005,

@@ -63,7 +63,7 @@ def test_an_effect_that_nuisances_take_on_matters_as_what_it_does():
 
     def of(taken):
         found = np.array([[1.0, -taken]])
-        return replace(judged(y, 5), error=error, found=found, nuisances=np.array([1]))
+        return replace(judged(y, 5), error=error, coefficients=found, nuisances=np.array([1]))
 
     absorbed, best = of(1.0), of(0.0)
     floor = np.array([0.25 * 500.0])
