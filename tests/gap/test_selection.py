@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from openjax.gap.model.cross_validation import Validation
-from openjax.gap.selection import clearly_larger, difference, growth, worse
+from openjax.gap.selection import Gaps, clearly_larger, difference, growth, worse
 
 
 def judged(left: np.ndarray, blocks: int) -> Validation:
@@ -63,7 +63,9 @@ def test_an_effect_that_nuisances_take_on_matters_as_what_it_does():
 
     def of(taken):
         found = np.array([[1.0, -taken]])
-        return replace(judged(y, 5), error=error, coefficients=found, nuisances=np.array([1]))
+        return replace(
+            judged(y, 5), error=error, coefficients=found, nuisances=np.array([1])
+        )
 
     absorbed, best = of(1.0), of(0.0)
     floor = np.array([0.25 * 500.0])
@@ -71,7 +73,7 @@ def test_an_effect_that_nuisances_take_on_matters_as_what_it_does():
     assert growth(inside, floor) < 0.1  # the nuisance has taken all of it
     beside = absorbed.squares_beside(best)[0]
     assert growth(beside, floor) == pytest.approx(np.sqrt(5.0) - 1.0, abs=0.2)
-    gaps, own = ((s, floor, s) for s in (inside, beside))
+    gaps, own = (Gaps(s, floor, s) for s in (inside, beside))
     assert worse(10.0, 5.0, gaps, own) and not worse(10.0, 5.0, gaps, gaps)
     assert not worse(10.0, 7.0, gaps, own)  # and it isn't clear
 

@@ -12,8 +12,9 @@ import jax.numpy as jnp
 from flax import struct
 
 from openjax.baselines.parameters import parameter
-from openjax.baselines.surroundings import Craft, Surroundings, level, unit, upward
+from openjax.baselines.surroundings import Craft, Surroundings, level, upward
 from openjax.vehicle import vectors
+from openjax.vehicle.vectors import unit
 
 
 @struct.dataclass

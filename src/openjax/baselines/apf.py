@@ -17,9 +17,9 @@ from openjax.baselines.surroundings import (
     Surroundings,
     length,
     level,
-    unit,
     upward,
 )
+from openjax.vehicle.vectors import unit
 
 SAFE_PURSUER = 0.14
 """Distance between two pursuers at which their repulsion grows without bound (m): the

@@ -16,9 +16,9 @@ from openjax.baselines.surroundings import (
     Surroundings,
     length,
     level,
-    unit,
     upward,
 )
+from openjax.vehicle.vectors import unit
 
 
 @struct.dataclass

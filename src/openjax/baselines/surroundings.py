@@ -163,11 +163,6 @@ def length(vector: jax.Array) -> jax.Array:
     return vectors.length(vector, keepdims=True)
 
 
-def unit(vector: jax.Array) -> jax.Array:
-    """(..., d) of length one; (nearly) zero stays zero."""
-    return vector / length(vector)
-
-
 def level(vector: jax.Array) -> jax.Array:
     """(..., 2) in the plane as (..., 3)."""
     return jnp.concatenate([vector, jnp.zeros_like(vector[..., :1])], axis=-1)

@@ -10,10 +10,11 @@ controller. A function of the observation alone, without memory.
 import jax
 import jax.numpy as jnp
 
-from openjax.baselines.surroundings import QUATERNION, VELOCITY, Craft, length, unit
+from openjax.baselines.surroundings import QUATERNION, VELOCITY, Craft, length
 from openjax.errors import UserError
 from openjax.pursuit import Observation
 from openjax.pursuit.observation import rotation_axes
+from openjax.vehicle.vectors import unit
 
 VELOCITY_GAIN = 6.0
 """1/s, velocity error to acceleration: slower than the attitude, whose lag is that of

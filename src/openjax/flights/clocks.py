@@ -194,16 +194,16 @@ def _offsets(signals) -> dict[str, float]:
         reach = min(len(part) // 2 * step for part, step in parts)
         step = parts[0][1]
         grid = step * np.arange(-int(reach / step), int(reach / step) + 1)
-        mean_curve = sum(_on(grid, *part) for part in parts) / len(parts)
+        mean_curve = sum(_on(grid, values, row) for values, row in parts) / len(parts)
         if mean_curve.max() >= FOLLOWS:
             curves[flight] = mean_curve, step
-    out = {flight: _peak(*curve) for flight, curve in curves.items()}
+    out = {flight: _peak(curve, step) for flight, (curve, step) in curves.items()}
     # one logger has one clock, unless a flight tells another one clearly
     if len(curves) > 1:
         reach = min(len(mean_curve) // 2 * step for mean_curve, step in curves.values())
         step = min(step for _, step in curves.values())
         grid = step * np.arange(-int(reach / step), int(reach / step) + 1)
-        alike = {flight: _on(grid, *curve) for flight, curve in curves.items()}
+        alike = {f: _on(grid, curve, row) for f, (curve, row) in curves.items()}
         common = _peak(sum(alike.values()), step)
         for flight, mean_curve in alike.items():
             if np.interp(common, grid, mean_curve) >= TELLS * mean_curve.max():

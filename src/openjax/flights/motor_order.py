@@ -21,10 +21,8 @@ def order_findings(signals: Signals, vehicle) -> list[Finding]:
     torques = _torques(signals, vehicle)
     if not torques:
         return []
-    track_torques, (rotors, best) = (
-        torques[IDENTITY],
-        max(torques.items(), key=lambda item: item[1].sum()),
-    )
+    track_torques = torques[IDENTITY]
+    (order, flip), best = max(torques.items(), key=lambda item: item[1].sum())
     # The right order explains every axis; an offset mass or weak motor can spoil one or
     # two, and isn't an order.
     if (
@@ -33,7 +31,7 @@ def order_findings(signals: Signals, vehicle) -> list[Finding]:
         and (track_torques < AGREE * best).any()
         and (best - track_torques).sum() > 0.6
     ):
-        return [("motors", _order_in_words(*rotors), [MOTORS])]
+        return [("motors", _order_in_words(order, flip), [MOTORS])]
     if (in_band(signals.rates[:, :2], TURNING).std(0) > 0.3).all() and track_torques[
         :2
     ].max() < 0.15:

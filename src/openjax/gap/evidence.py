@@ -71,7 +71,8 @@ class Evidence:
             return {}
         unseen = {e for e in self.library.physics if self.motion.exposure[e] == 0.0}
         names = [key for key in identification.estimates.names if key[0] not in unseen]
-        return {key: identification.estimates.of(*key) for key in names}
+        estimates = identification.estimates
+        return {(effect, p): estimates.of(effect, p) for effect, p in names}
 
     def support(self, theta: np.ndarray) -> float:
         """Nats by which what the replay doesn't weigh speaks for parameters theta (P,):

@@ -191,9 +191,8 @@ def _another_day(
     push = table.total[columns, 0] / COLOURED - hessian @ around
     days = np.ones(len(columns))
     for k in np.flatnonzero(transfers):
-        day = day_of(
-            *names[k].split(" "), evidence.vehicles[0], evidence.charge_unknown
-        )
+        effect, parameter = names[k].split(" ")
+        day = day_of(effect, parameter, evidence.vehicles[0], evidence.charge_unknown)
         days[k] = day / unit[k]
     mean, covariance = transfer(hessian, push, precision, ~np.array(transfers), days)
     unit = unit[transfers]

@@ -17,6 +17,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -175,27 +176,37 @@ def growth(
     return np.sqrt((squares / floor).mean(-1)) - 1.0
 
 
-def matters(squares, floor, nothing, least: float = DECISION.least_gap):
-    """Whether a gap of squares (..., channels) is so much larger than `floor` that it
-    matters beside what `nothing` (channels,) leaves.
+class Gaps(NamedTuple):
+    """Squared errors that are left."""
+
+    squares: Squares
+    """(..., channels) by the sets in question."""
+    best: Float[np.ndarray, " channels"]
+    """By the best set."""
+    nothing: Float[np.ndarray, " channels"]
+    """By no effect."""
+
+
+def matters(gaps: Gaps, least: float = DECISION.least_gap):
+    """(...) whether the gap of a set is so much larger than that of the best one that
+    it matters beside what no effect leaves.
     """
-    return growth(squares, floor) > np.maximum(
-        least, DECISION.form_error * growth(nothing, floor)
+    return growth(gaps.squares, gaps.best) > np.maximum(
+        least, DECISION.form_error * growth(gaps.nothing, gaps.best)
     )
 
 
-def worse(gain, error, gaps, beside):
+def worse(gain, error, gaps: Gaps, beside: Gaps):
     """Whether a set is clearly worse than the best: by so many nats `gain` with their
-    standard `error`, and so that it matters. `gaps` are squares of the set, the best
-    and nothing.
+    standard `error`, and so that it matters.
 
     Nuisances take a part of what an effect does, as a wrong moment of inertia looks
     like a nuisance of some per cent. Whether an effect matters is also asked of
-    `beside`, the same squares with nuisances as the best set has them; whether it is
+    `beside`, the same gaps with nuisances as the best set has them; whether it is
     needed, of the nats alone, in which nuisances are free.
     """
-    clear = (gain > DECISION.standard_errors * error) & matters(*gaps)
-    return clear | ((gain > REACH * error) & matters(*beside, DOES))
+    clear = (gain > DECISION.standard_errors * error) & matters(gaps)
+    return clear | ((gain > REACH * error) & matters(beside, DOES))
 
 
 def log_odds(effects) -> float:
@@ -265,8 +276,10 @@ def possible(fit: SetFit) -> bool:
 def within_bounds(fit: SetFit, effect: str) -> bool:
     """Whether the parameters of one effect do."""
     estimates = fit.parameters()[effect]
-    both = ({p: v[k] for p, v in estimates.items()} for k in (0, 1))
-    return CARDS[effect].possible is None or bool(CARDS[effect].possible(*both))
+    values = {p: value for p, (value, _) in estimates.items()}
+    deviations = {p: deviation for p, (_, deviation) in estimates.items()}
+    is_possible = CARDS[effect].possible
+    return is_possible is None or bool(is_possible(values, deviations))
 
 
 @dataclass(eq=False)
@@ -394,9 +407,16 @@ class Search:
         gain, error, _ = difference(best.validation, other.validation)
         if best.support - other.support > DETECTABLE:
             return True
-        sets = (other, best, self.nothing)
-        gaps = [h.validation.squares.sum(0) for h in sets]
-        beside = [h.validation.squares_beside(best.validation).sum(0) for h in sets]
+
+        def gaps_by(squares_of) -> Gaps:
+            return Gaps(
+                squares_of(other.validation).sum(0),
+                squares_of(best.validation).sum(0),
+                squares_of(self.nothing.validation).sum(0),
+            )
+
+        gaps = gaps_by(lambda validation: validation.squares)
+        beside = gaps_by(lambda v: v.squares_beside(best.validation))
         return bool(worse(gain, error, gaps, beside))
 
     def equivalents(self, hypothesis: Hypothesis, effects) -> dict[str, list[str]]:
@@ -445,12 +465,13 @@ class Search:
                 beside[best] = np.array(
                     [h.validation.squares_beside(sets[best].validation) for h in sets]
                 )
-            gaps, gaps_beside = (
-                np.einsum("b,sbc->sc", weight, s) for s in (squares, beside[best])
-            )
-            advantage = (nats[best] - nats, errors[best])
+            sums = np.einsum("b,sbc->sc", weight, squares)
+            sums_beside = np.einsum("b,sbc->sc", weight, beside[best])
             out = worse(
-                *advantage, *((g, g[best], g[nothing]) for g in (gaps, gaps_beside))
+                nats[best] - nats,
+                errors[best],
+                Gaps(sums, sums[best], sums[nothing]),
+                Gaps(sums_beside, sums_beside[best], sums_beside[nothing]),
             )
             # The response judges by itself: it counts no blocks, and its intervals hold
             # the forms'.

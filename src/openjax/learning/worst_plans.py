@@ -47,6 +47,7 @@ from openjax.policy import PolicyParameters
 from openjax.pursuit import Pursuit, PursuitSettings, PursuitState
 from openjax.pursuit.shapes import Scalar
 from openjax.vehicle.family import partly_nominal
+from openjax.vehicle.vectors import unit
 
 Plans = Float[Array, "worlds plans pieces 3"]
 Plan = Float[Array, "worlds pieces 3"]
@@ -210,14 +211,14 @@ class WorstPlans:
         straight = (planning.plans - 4) // 3
         turn_key, way_key, straight_key = jax.random.split(key, 3)
         shape = (number, planning.plans - 4 - straight, planning.pieces)
-        random_ways = _unit(jax.random.normal(way_key, (*shape, 3)))
+        random_ways = unit(jax.random.normal(way_key, (*shape, 3)))
         turns = jax.random.bernoulli(turn_key, 0.5, shape)
         # the last piece at which a way turned is the one that it flies
         last_turn = jax.lax.cummax(
             jnp.where(turns, jnp.arange(planning.pieces), 0), axis=2
         )
         bent = jnp.take_along_axis(random_ways, last_turn[..., None], axis=2)
-        ways = _unit(jax.random.normal(straight_key, (number, straight, 1, 3)))
+        ways = unit(jax.random.normal(straight_key, (number, straight, 1, 3)))
         parts = [
             plan[:, None],
             _shift(plan)[:, None],
@@ -260,7 +261,7 @@ class WorstPlans:
             return leaf.reshape(-1, number, *leaf.shape[1:])
 
         return Tried(
-            plans, *map(by_world, (promise, free)), jax.tree.map(by_world, end)
+            plans, by_world(promise), by_world(free), jax.tree.map(by_world, end)
         )
 
     def _free(self, start, end):
@@ -475,11 +476,6 @@ def planning_game(environment: Pursuit) -> Pursuit:
 def _keys(turn):
     """Of the plans, of the usual part and of fresh worlds."""
     return jax.random.split(turn.key, 3)
-
-
-def _unit(vector):
-    """(..., 3) of length one."""
-    return vector / jnp.sqrt(jnp.sum(vector**2, axis=-1, keepdims=True) + 1e-12)
 
 
 def _shift(plan):

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from openjax.pursuit.axes import rotation_axes
-from openjax.pursuit.sensing import line_of_sight, within_view
+from openjax.pursuit.sensing import is_open, line_of_sight, within_view
 from openjax.pursuit.settings import PursuitSettings
 from openjax.pursuit.shapes import Vector, Which
 from openjax.pursuit.task import Task
@@ -64,7 +64,8 @@ def nearest_hidden(
     offset = _offsets()
     # which place it is has no gradient, and that of an index is a scatter
     place = jax.lax.stop_gradient(thought) + offset
-    free = _can_be_at(settings, task, place)
+    # all are at its height, which is one that it can have
+    free = is_open(settings, place, task.pillar_position, task.pillar_active)
     is_hidden = free & ~_is_seen(settings, task, drones, active, place)
     distance = jnp.where(is_hidden, np.linalg.norm(offset, axis=-1), jnp.inf)
     # the first of equals, so the place itself where nothing is hidden
@@ -77,14 +78,6 @@ def _offsets() -> Float[np.ndarray, "places 3"]:
     way = np.stack([np.cos(angle), np.sin(angle), np.zeros(ANGLES)], axis=-1)
     level = np.array(STRIDES)[:, None, None] * way
     return np.concatenate([np.zeros((1, 3)), level.reshape(-1, 3)]).astype(np.float32)
-
-
-def _can_be_at(settings, task, place) -> Bool[Array, " places"]:
-    """(M,) which of (M, 3) places are inside the arena and outside of all pillars."""
-    to_axis = jnp.sum((place[:, None, :2] - task.pillar_position) ** 2, axis=-1)
-    inside = (to_axis < settings.pillar_radius**2) & task.pillar_active
-    in_arena = jnp.sum(place[:, :2] ** 2, axis=-1) < settings.arena_radius**2
-    return in_arena & ~jnp.any(inside, axis=-1)
 
 
 def _is_seen(settings, task, drones, active, place) -> Bool[Array, " places"]:

@@ -28,6 +28,22 @@ def line_of_sight(
     return ~jnp.any(between & (square < settings.pillar_radius**2), axis=-1)
 
 
+def is_open(
+    settings: PursuitSettings,
+    place: Float[Array, "*places dims"],
+    pillar_position: Pillars,
+    pillar_active: Active,
+) -> Bool[Array, "*places"]:
+    """(...) whether (..., 2 or 3) places are inside the arena's circle and outside all
+    pillars, seen from above.
+    """
+    level = place[..., :2]
+    to_axis = jnp.sum((level[..., None, :] - pillar_position) ** 2, axis=-1)
+    in_pillar = pillar_active & (to_axis < settings.pillar_radius**2)
+    in_arena = jnp.sum(level**2, axis=-1) < settings.arena_radius**2
+    return in_arena & ~jnp.any(in_pillar, axis=-1)
+
+
 def sight_room(
     settings: PursuitSettings,
     position: Float[Array, "places 3"],

@@ -46,8 +46,8 @@ class Cell(NamedTuple):
 def cells_of(command: MapCommand) -> list[Cell]:
     """All cells, team by team."""
     return [
-        Cell(*values)
-        for values in itertools.product(
+        Cell(size, speed_ratio, radius)
+        for size, speed_ratio, radius in itertools.product(
             command.sizes, command.speed_ratios, command.radii
         )
     ]
@@ -170,7 +170,10 @@ def _flown(flyer, knowing):
     game = knowing.game
     cells = cells_of(command)
     flown = flyer.fly(knowing.scripted, cells)
-    records = [cell_record(game, *pair) for pair in zip(cells, flown, strict=True)]
+    records = [
+        cell_record(game, cell, statistics)
+        for cell, statistics in zip(cells, flown, strict=True)
+    ]
     yield {"cells": records}
     if not command.best_response:
         return

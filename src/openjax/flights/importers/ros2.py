@@ -139,7 +139,8 @@ def read_bag(path: str | Path, mapping: ColumnMapping | None = None) -> LogTable
         raise LogError(
             f"ROS bag can't be read: {str(error).splitlines()[0] if str(error) else type(error)}"
         ) from error
-    return _join(path.name, *_merge(vehicles, remarks, mapping))
+    tables, remarks = _merge(vehicles, remarks, mapping)
+    return _join(path.name, tables, remarks)
 
 
 @dataclass(eq=False)

@@ -116,7 +116,10 @@ class Problem:
         lags[[1, 2, 3], [0, 1, 2]] += STEP
         rotors = rotor_rows([r.motor for r in self.records], self.dt, lags)
         both = zip(self.records, rotors, strict=True)
-        return [self._errors_of(value, record.rates, *rotor) for record, rotor in both]
+        return [
+            self._errors_of(value, record.rates, square, speed)
+            for record, (square, speed) in both
+        ]
 
     def _errors_of(
         self,

@@ -162,8 +162,8 @@ def quantities_of(records: list[Record], fit: TorqueFit) -> dict[str, Quantity]:
     deviation = np.sqrt(np.diag(fit.covariance))
     numbers = dict(zip(NAMES, zip(fit.value, deviation, strict=True), strict=True))
     gains = {
-        "inertia_roll": _inverse(*numbers.pop("roll_gain")),
-        "inertia_pitch": _inverse(*numbers.pop("pitch_gain")),
+        "inertia_roll": _inverse(numbers.pop("roll_gain")),
+        "inertia_pitch": _inverse(numbers.pop("pitch_gain")),
         "yaw_ratio": numbers.pop("yaw_gain"),
     }
     numbers.pop("propellers")
@@ -180,7 +180,9 @@ def quantities_of(records: list[Record], fit: TorqueFit) -> dict[str, Quantity]:
     }
 
 
-def _inverse(value: float, deviation: float) -> tuple[float, float]:
+def _inverse(number: tuple[float, float]) -> tuple[float, float]:
+    """One over a number, each with its standard deviation."""
+    value, deviation = number
     return 1.0 / value, deviation / value**2
 
 

@@ -88,10 +88,10 @@ def _nominal_rates(record: Record, error: np.ndarray, rng) -> np.ndarray:
 
 def _of_axis(problem: Problem, axis: int, outputs: list, at_once: float) -> Response:
     shares = [r.motor @ np.sign(problem.base[axis]) / 4.0 for r in problem.records]
-    fit = _arx(
+    coefficients, covariance = _arx(
         problem, outputs, shares, at_once if problem.records[0].hides_ticks else None
     )
-    return _response(AXES[axis], *fit, problem.dt, derivative=True)
+    return _response(AXES[axis], coefficients, covariance, problem.dt, derivative=True)
 
 
 def _of_thrust(problem: Problem, rng) -> Pair:
@@ -109,9 +109,8 @@ def _of_thrust(problem: Problem, rng) -> Pair:
         nominal_forces.append(force + ACCELEROMETER * rng.standard_normal(len(force)))
 
     def of(outputs):
-        return _response(
-            "thrust", *_arx(problem, outputs, shares, None), problem.dt, False
-        )
+        coefficients, covariance = _arx(problem, outputs, shares, None)
+        return _response("thrust", coefficients, covariance, problem.dt, False)
 
     return Pair(of(forces), of(nominal_forces))
 

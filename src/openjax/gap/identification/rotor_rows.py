@@ -32,9 +32,10 @@ def rotor_rows(
     whole = np.floor(lags[:, 2] / dt).astype(int)
     late = lags[:, 2] - whole * dt
     # A row begins with the command before, as long as it is late.
-    parts = [_Part(*lags[:, :2].T, late), _Part(*lags[:, :2].T, dt - late)]
+    up, down = lags[:, :2].T
+    parts = [_Part(up, down, late), _Part(up, down, dt - late)]
     targets = [[_delay(w, whole + more) for w in targets_of_flights] for more in (1, 0)]
-    begins = lanes.run(parts, *targets)
+    begins = lanes.run(parts, targets)
 
     out = []
     for begin, first, second in zip(begins, *targets, strict=True):
@@ -94,9 +95,11 @@ class _Lanes:
             rows.append(first + np.clip(begins + np.arange(lead + LANE), 0, count - 1))
         self.rows = np.concatenate(rows).T  # (early + LANE, lanes)
 
-    def run(self, parts: list[_Part], *targets: list[np.ndarray]) -> list[np.ndarray]:
-        """Speeds (B, T, 4) at the rows' begin, for targets (B, T, 4) in the two parts
-        of a row.
+    def run(
+        self, parts: list[_Part], targets: list[list[np.ndarray]]
+    ) -> list[np.ndarray]:
+        """Speeds (B, T, 4) at the rows' begin of each flight, for its targets
+        (B, T, 4) in the two parts of a row.
         """
         target_lanes = [
             np.moveaxis(np.concatenate(t, 1)[:, self.rows], 1, 0) for t in targets

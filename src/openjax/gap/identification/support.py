@@ -50,7 +50,7 @@ def _predict(estimates: EffectEstimates, theta: np.ndarray) -> np.ndarray:
 
     slope = of("thrust_curve", "slope") + 2.0 * HOVER * of("thrust_curve", "curvature")
     thrust = max(slope * (1.0 + of("thrust_scale", "scale")), 0.1)
-    out = np.array([of(*name) for name in estimates.names])
+    out = np.array([of(effect, parameter) for effect, parameter in estimates.names])
     for number, (effect, _) in enumerate(estimates.names):
         if effect == "inertia":
             out[number] /= thrust

@@ -22,7 +22,7 @@ from openjax.pursuit.sensing import line_of_sight
 from openjax.pursuit.settings import PursuitSettings
 from openjax.pursuit.shapes import Active, Memory, Pillars, Team, Vector
 from openjax.vehicle import DroneState
-from openjax.vehicle.vectors import length
+from openjax.vehicle.vectors import length, unit
 
 DIRECTIONS = 64
 """That a greedy evader tries; one that looks two steps ahead tries half as many at
@@ -172,7 +172,7 @@ def wall_runner(scene: Scene, memory: Memory) -> tuple[Vector, Memory]:
         threat[2] > settings.arena_height / 2, AROUND, settings.arena_height - AROUND
     )
     climb = 0.5 * jnp.clip((goal - scene.position[2:]) / AROUND, -1.0, 1.0)
-    return _unit(jnp.concatenate([side * tangent + outward * out, climb])), memory
+    return unit(jnp.concatenate([side * tangent + outward * out, climb])), memory
 
 
 def pillar_hugger(scene: Scene, memory: Memory) -> tuple[Vector, Memory]:
@@ -193,7 +193,7 @@ def pillar_hugger(scene: Scene, memory: Memory) -> tuple[Vector, Memory]:
         [jnp.sum(jnp.where(is_chosen, behind, 0.0), axis=0), scene.position[2:]]
     )
     to_goal = goal - scene.position
-    away = _unit(scene.position - threat)
+    away = unit(scene.position - threat)
     to_cover = to_goal / jnp.maximum(_length(to_goal), AROUND)
     return jnp.where(jnp.any(scene.pillar_active), to_cover, away), memory
 
@@ -233,7 +233,7 @@ def way_points(scene: Scene, memory: Memory) -> tuple[Vector, Memory]:
     is_done = (_length(to_goal)[0] < AROUND) | (seconds_left < 0.0)
     next_point = jnp.append(jnp.mod(share + R_SEQUENCE, 1.0), 1.0)
     point = jnp.where(is_done, next_point, jnp.append(share, seconds_left))
-    return _unit(to_goal), jnp.concatenate([point, rest])
+    return unit(to_goal), jnp.concatenate([point, rest])
 
 
 def frozen(scene: Scene, memory: Memory) -> tuple[Vector, Memory]:
@@ -306,7 +306,3 @@ def _choose(candidates, score):
 
 def _length(vector):
     return length(vector, keepdims=True)
-
-
-def _unit(vector):
-    return vector / _length(vector)

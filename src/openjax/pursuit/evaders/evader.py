@@ -18,6 +18,7 @@ from openjax.pursuit.evaders.evader_state import EvaderState
 from openjax.pursuit.evaders.field import field_velocity
 from openjax.pursuit.evaders.kinds import NUMBERS, UNBOUNDED, EvaderKind, evader_rows
 from openjax.pursuit.evaders.learned import STEPS, learning
+from openjax.pursuit.sensing import is_open
 from openjax.pursuit.settings import PursuitSettings
 from openjax.pursuit.shapes import Count, Scalar, Team, Vector
 from openjax.pursuit.state import PursuitState
@@ -262,13 +263,7 @@ def _fly(settings, world, speed, acceleration, wish):
     place = into_free_space(settings, start + dt * velocity, pillars, active)
     velocity = at_most((place - start) / dt, speed)
     # between pillars that touch, what leads out of one may lead into another
-    free = _is_free(settings, start + dt * velocity, pillars, active)
+    end = start + dt * velocity
+    free = is_open(settings, end, pillars, active)
+    free &= (end[2] > 0.0) & (end[2] < settings.arena_height)
     return jnp.where(free, velocity, 0.0)
-
-
-def _is_free(settings, place, pillar_position, pillar_active):
-    """() bool, whether (3,) `place` is inside the arena and outside all pillars."""
-    squares = jnp.sum((place[:2] - pillar_position) ** 2, axis=-1)
-    inside = (jnp.sum(place[:2] ** 2) < settings.arena_radius**2) & (place[2] > 0.0)
-    inside &= place[2] < settings.arena_height
-    return inside & ~jnp.any(pillar_active & (squares < settings.pillar_radius**2))
