@@ -55,6 +55,7 @@ def in_range(flight: Flight, note) -> Flight:
     flight = _without_saturated(_without_lost_poses(flight, note), note)
     if flight.quaternion is not None:
         changes["quaternion"] = _of_unit_length(flight.quaternion, note)
+    # a hall's origin may be far away, but none of these flights goes so far
     if flight.position is not None and np.nanmax(np.abs(flight.position)) > 100.0:
         span = np.nanmax(
             np.ptp(flight.position[np.isfinite(flight.position).all(1)], axis=0)
@@ -165,6 +166,7 @@ def _share_of_one(values: np.ndarray, columns: str) -> None:
     """Refuse commands that aren't shares of the largest, with what they look like."""
     low = float(np.nanmin(values))
     high = float(np.nanmax(values))
+    # above 8-bit counts; pulses of servos end at 2,000 us
     if high > 256.0:
         hint = (
             "16-bit counts (divide by 65535), or rpm"

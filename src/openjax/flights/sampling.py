@@ -25,6 +25,7 @@ def several_recordings(time: np.ndarray, in_order: np.ndarray | None = None) -> 
     """
     steps = np.diff(time)
     backwards = int((steps < 0).sum())
+    # a few rows that come late, as packets do that others overtook, are put in order
     few = not backwards or (steps.min() >= -1.0 and backwards <= 0.05 * len(time))
     if few or _even(np.sort(time) if in_order is None else in_order):
         return ""
@@ -217,7 +218,9 @@ def put_in_step(flight: Flight, note) -> Flight:
     regular = _regular_clock(stamps, flight.row_period)
     if regular is None:
         return flight
+    # a pose seen first in a row is older than that by half a row on the mean
     regular = regular - 0.5 * flight.pose_age
+    # its time is known now
     changes = {"pose_age": 0.0}
     for channel in channels:
         values = getattr(flight, channel)
@@ -241,6 +244,8 @@ def _regular_clock(times: np.ndarray, row: float) -> np.ndarray | None:
     """
     since = times - times[0]
     usual = (len(times) - 1) / since[-1]
+    # ticks that no row shows make the mean rate too low, so more is looked at above it;
+    # a fifth of the periodogram's resolution misses no peak
     rates = np.arange(0.9 * usual, 1.15 * usual, 0.2 / since[-1])
     phasor = np.exp(2j * np.pi * rates[:, None] * since).mean(1)
     best = int(np.argmax(np.abs(phasor)))

@@ -21,6 +21,7 @@ def in_time(flight: Flight, note) -> Flight:
         time = flight.time
     if len(time) < 20:
         raise Refused("short", f"only {len(time)} row{'s' * (len(time) != 1)}")
+    # a log that was written twice, one after the other, would look like two recordings
     flight = _sort(_written_once(flight, note), note)
     repeats = np.diff(flight.time) == 0
     if repeats.mean() > 0.2:
@@ -109,6 +110,7 @@ def _refuse_units(step: float) -> None:
             ("microseconds", 1e6),
             ("nanoseconds", 1e9),
         ):
+            # a unit is named if in it rows would come at 20 to 2,000 Hz
             if 5e-4 <= step / factor <= SLOWEST:
                 hint = " or counts rows" if step == 1.0 else ""
                 raise Refused(

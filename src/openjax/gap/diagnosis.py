@@ -57,10 +57,13 @@ def diagnose_case(
         baseline is not None
         and (both := borne_out(evidence)).effects != baseline.effects
     ):
+        # what only the reference's flights looked like isn't this vehicle's nominal
+        # state
         evidence = gather(case, library(without), progress, both)
     if progress:
         progress("identifying what the vehicle does")
     sensors = evidence.sensors
+    # motors that a log has late are no lag of the motors
     in_time = case_on_gyroscope_clock(case, sensors.motors_late)
     identification = identify(in_time, sensors.one_clock and sensors.motor_clock)
     evidence = replace(evidence, identification=identification)
@@ -95,6 +98,7 @@ def conclude(evidence: Evidence) -> Report:
     rejects = (set(candidates) | old) - set(present)
     weights = Counter()
     for effects, weight in selection.weights.items():
+        # a set with an effect that isn't worth a name stands for the rest of it
         weights[effects - rejects] += weight
     possible = evidence.library.effects
     chances = probabilities(
@@ -160,6 +164,7 @@ def _report(
     """The report of a selection, checked and split into shares."""
     effects = words(check, parts)
     missing = [e for e in not_testable(evidence) if e not in effects]
+    # that nothing is named says little where half of the library couldn't have shown
     nothing = (
         "not_testable" if len(missing) >= len(evidence.library.effects) // 2 else "none"
     )

@@ -107,6 +107,7 @@ def gather(
     """
     tell = progress or (lambda text: None)
     if case.vehicle_file.mass_weighed:
+        # what was weighed can't be wrong
         library = Library(tuple(e for e in library.effects if not CARDS[e].weighed))
     tell("reading the channels of the log")
     tracks, vehicles = _tracks(case)
@@ -140,6 +141,8 @@ def _motors(
     row = min(f.row_period for f in case.flights)
     if apart := read_command_clock(tracks, row):
         sensors = replace(sensors, findings=sensors.findings | {"command clock": apart})
+        # commands of another clock can't say what the motors should have done; without
+        # motors they are all there is
         tracks = [t if t.motor is None else replace(t, command=None) for t in tracks]
     clock = read_motor_clock(tracks, vehicles, row, motor_rows(case))
     if not sensors.one_clock:

@@ -32,6 +32,7 @@ def probabilities(
         chance[effect] = p * sure * largest.get(effect, 0.0)
     chance["unknown"] = unknown * (largest.get("unexplained", 0.0) if present else 1.0)
     rest = 1.0 - sum(chance.values())
+    # a little for each: what is left goes somewhere, too, where no draw chose otherwise
     share_of = {"none": 1e-3, **dict.fromkeys(present, 1e-3)}
     for effects, w in weights.items():
         if not effects & set(present):

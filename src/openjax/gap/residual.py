@@ -185,6 +185,7 @@ def _series(
     out |= {c.path: c.fit.residual for c in evidence.channels if c.path in HORIZONS}
     if all(t.position is not None and t.velocity is not None for t in tracks):
         out["position"] = [
+            # the trapezoidal rule: of the last row half counts
             t.position - (np.cumsum(t.velocity, 0) - 0.5 * t.velocity) * t.dt
             for t in tracks
         ]
@@ -242,6 +243,7 @@ def changed_p(
     if not growths:
         return 1.0, ""
     name = max(growths, key=lambda n: growths[n])
+    # so that a growth of `left_over` has the p-value `unknown`
     rate = np.log(1.0 / DECISION.unknown) / DECISION.left_over
     return float(np.exp(-rate * max(growths[name], 0.0))), name
 
@@ -285,6 +287,8 @@ def standing_out(measures: dict[str, float]) -> tuple[float, str]:
     names, (mean, covariance) = list(HORIZONS), usual()
     rows = [k for k, n in enumerate(names) if n in measures]
     precision = np.linalg.inv(covariance[np.ix_(rows, rows)])
+    # with precision P of a normal distribution, (P r)_k / sqrt(P_kk) is how far r_k is
+    # from what the others lead to expect, in standard deviations
     far = (
         precision
         @ (logarithms(measures)[rows] - mean[rows])

@@ -106,6 +106,7 @@ def _motion_powers(
             rows.append(calm[int(SKIP / track.dt) :] ** 2)
         both.append(np.concatenate(rows))
     return {
+        # the motion's floor is what all effects leave of it
         name: [both[0][:, k], both[1][:, k], both[1][:, k]]
         for k, name in enumerate(CHANNELS[:6])
     }

@@ -103,6 +103,7 @@ def read_ulog(path: Path, mapping: ColumnMapping | None = None) -> LogTable:
     log = _parse(
         path, {source.name.partition(":")[0] for source in mapping_columns.values()}
     )
+    # of several sensors of a kind the first
     topics = {data.name: data for data in log.data_list if data.multi_id == 0}
     streams = {
         name: _stream(data, log.start_timestamp) for name, data in topics.items()
@@ -112,6 +113,8 @@ def read_ulog(path: Path, mapping: ColumnMapping | None = None) -> LogTable:
     motors, remarks = _motors(streams, log.initial_parameters)
     if motors is not None:
         streams["motors"] = motors
+    # the fastest stream is the table's clock, and of two that hold a column the faster
+    # one goes first
     fastest_first = sorted(streams.values(), key=_period)
     columns = _columns(fastest_first)
     if mapping is not None:
@@ -162,6 +165,7 @@ def _stream(data, start: int) -> Stream:
     fields = data.data
     stamp = np.asarray(fields["timestamp"], np.int64)
     sample_times = fields.get("timestamp_sample")
+    # a driver that doesn't know when it sampled writes zeros
     if sample_times is not None and np.all(sample_times > 0):
         stamp = np.asarray(sample_times, np.int64)
     values = {f"{data.name}:{name}": np.asarray(v, float) for name, v in fields.items()}
@@ -223,6 +227,7 @@ def _motors(streams, parameters) -> tuple[Stream | None, list[str]]:
             _signal(v, o, parameters) for v, o in zip(values, outputs, strict=True)
         ]
         curve = float(parameters.get("THR_MDL_FAC", 0.0))
+        # PX4's own model of a motor, by which it turns thrust into a signal
         thrust = [curve * s**2 + (1.0 - curve) * s for s in signals]
     else:
         return None, []

@@ -170,6 +170,8 @@ class _Recording:
         by_name, remarks = firmware_columns(self.log_streams)
         both = zip(self.sources, self.streams, strict=True)
         topics = [(rank, _period(stream), columns) for (rank, columns), stream in both]
+        # what comes later replaces what came before: the fastest of the lowest rank
+        # goes last
         topics.sort(key=lambda topic: topic[:2], reverse=True)
         columns = {
             c: source for *_, of_stream in topics for c, source in of_stream.items()
@@ -214,6 +216,7 @@ def _vehicles(
         if topic in topics:
             recording = vehicles.setdefault(vehicle, _Recording())
             columns = {c: Source(f"{topic}:{f}") for c, f in topics[topic].items()}
+            # Crazyswarm2 leaves the pitch of an odometry in the firmware's sense
             rank = int(connection.msgtype == ODOMETRY)
             recording.add(_stream(reader, connection, topics[topic]), columns, rank)
         elif mapping is None and connection.msgtype == LOG_TYPE:

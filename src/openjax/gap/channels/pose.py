@@ -130,6 +130,8 @@ def _read_around(tracks: list[Track], delay: float) -> Delay:
         )
         between = 0.5 * (gyro[1:] + gyro[:-1]) * track.dt
         start = np.zeros((1, 3))
+        # an attitude that comes a second late is behind by what the body turns in that
+        # time
         late = -(calm - calm[:1])
         y = np.concatenate([start, np.cumsum(increments - between, 0)]) + delay * late
         time = (track.time - track.time[0])[:, None]

@@ -332,6 +332,7 @@ def _moments(moments: np.ndarray, units: np.ndarray) -> tuple[np.ndarray, np.nda
     precision = np.diag(1.0 / PRIOR**2)
     total = moments.sum(0)
     theta = np.zeros(5)
+    # the best weights depend on the coefficients, and these on the weights
     for _ in range(4):
         each = moments[:, :, 0] - moments[:, :, 1:] @ theta
         spread = each.T @ each * len(moments) / max(len(moments) - 5, 1)

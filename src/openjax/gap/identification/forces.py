@@ -98,6 +98,7 @@ def _thrusts(records: list[Record], lags: np.ndarray) -> list[np.ndarray]:
     rotors = rotor_rows(
         [r.motor for r in records], records[0].dt, np.asarray(lags, float)[None]
     )
+    # a row's speed is the one at its end, where the next row begins
     return [(np.concatenate([s[0, :1], s[0, :-1]]) ** 2).mean(1) for _, s in rotors]
 
 

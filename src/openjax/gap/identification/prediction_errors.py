@@ -184,6 +184,8 @@ class Problem:
         nexts = []
         for number, (errors_of_record, _) in enumerate(errors_of_records):
             x = errors_of_record[:, axis]
+            # how the body turned at first, and what turns it steadily, add a line to
+            # the rates of a model that knows neither
             line = np.stack([np.ones(len(x)), np.linspace(-1.0, 1.0, len(x))], 1)
             x = x - line @ solve(line, x)
             flat = np.zeros((len(x) - order - 1, steady))

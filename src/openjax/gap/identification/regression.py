@@ -32,6 +32,8 @@ def lag_columns(x: np.ndarray, order: int) -> np.ndarray:
     order - 1 up to T - 2, which foretell the next.
     """
     windows = sliding_window_view(x, order)[:-1, ::-1]
+    # from row to row hardly anything changes: values would be nearly the same columns,
+    # differences aren't
     return np.concatenate([windows[:, :1], windows[:, :-1] - windows[:, 1:]], 1)
 
 

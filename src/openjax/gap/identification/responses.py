@@ -105,6 +105,7 @@ def _of_thrust(problem: Problem, rng) -> Pair:
     lags = value_at(problem.start)[None, :3]
     nominal_forces = []
     for _, speed in rotor_rows([r.motor for r in problem.records], problem.dt, lags):
+        # a row's speed is the one at its end, where the next row begins
         force = full * (np.concatenate([speed[0, :1], speed[0, :-1]]) ** 2).mean(1)
         nominal_forces.append(force + ACCELEROMETER * rng.standard_normal(len(force)))
 

@@ -150,6 +150,7 @@ def build(fit: SetFit, singles: dict[str, SetFit] | None) -> Table:
         without = replay.whiten(x[: -len(nuisances)], number)
         w = np.concatenate([without, replay.whitened_nuisances[number]])
         count = block_count(w.shape[1], track.dt)
+        # of the longest predictions, a quarter of a second, the first ends at row 25
         e = _errors(x, track.dt)[:, max(int(SKIP / track.dt), 25) :, replay.usable > 0]
         for a, b in zip(
             np.array_split(w, count, 1), np.array_split(e, count, 1), strict=True

@@ -56,6 +56,7 @@ def _places(report: Report):
     """The parts of the flights that hold most of the gap: error before and after, in
     units of the noise.
     """
+    # the largest comes last, as rows are drawn from below
     places = [place for place in report.where if place.share > 0.01][:8][::-1]
     if not report.effects or not places:
         return None
