@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from openjax.gap.criteria import Gaps, clearly_larger, difference, growth, worse
 from openjax.gap.model.cross_validation import Validation
-from openjax.gap.selection import Gaps, clearly_larger, difference, growth, worse
 
 
 def judged(left: np.ndarray, blocks: int) -> Validation:

@@ -72,6 +72,7 @@ class Links:
         self._watchdog = watchdog
         self._state = state
         n = len(self._uris)
+        # a forked process would hold locks of JAX's threads that nobody gives back
         self._context = multiprocessing.get_context("spawn")
         self.board = Board(n, self._context, silence)
         self._samples = [PoseSample(None, -math.inf, supervisor=0)] * n
@@ -96,10 +97,13 @@ class Links:
         """
         context = self._context
         self._contacts = context.RawArray("d", [time.perf_counter()] * len(self._uris))
+        # poses come one after the other; a tick's set-points are one datagram, whole or
+        # not there
         self._stream, stream = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
         self._commands, commands = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._control, control = context.Pipe()
         self._stream.setblocking(False)
+        # who is silent for longer than that isn't the pilot any more
         self._commands.settimeout(1.5 * self.board.silence)
         connection = Connection(self._uris, self._body_logs, self._watchdog, timeout)
         ends = Ends(self._contacts, stream, commands, control)
@@ -112,6 +116,7 @@ class Links:
             end.close()
         complaint = "the links' process doesn't answer"
         try:
+            # vehicles are connected one after the other
             if self._control.poll(STARTING + timeout * (1 + len(self._uris))):
                 complaint, self._blocks = self._control.recv()
         except (EOFError, OSError):

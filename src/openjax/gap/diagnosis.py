@@ -9,6 +9,7 @@ import numpy as np
 
 from openjax.flights.clocks import case_on_gyroscope_clock
 from openjax.flights.flight import Case
+from openjax.gap.criteria import DETECTABLE
 from openjax.gap.decision import DECISION
 from openjax.gap.evidence import Evidence, gather
 from openjax.gap.identification.quantities import identify
@@ -27,7 +28,7 @@ from openjax.gap.reference import (
 from openjax.gap.report import Report
 from openjax.gap.report.rules import LEAST_SHARE
 from openjax.gap.residual import Check, check_residual
-from openjax.gap.selection import DETECTABLE, Selection, select
+from openjax.gap.selection import Selection, select
 from openjax.gap.shares import Split, split
 from openjax.gap.where import locate
 

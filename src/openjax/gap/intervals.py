@@ -8,12 +8,12 @@ effect.
 import numpy as np
 
 from openjax.gap.channels import Estimated, robust_deviation
+from openjax.gap.criteria import REACH
 from openjax.gap.decision import DECISION
 from openjax.gap.evidence import Evidence
 from openjax.gap.model.hypotheses import SetFit
 from openjax.gap.model.library import CARDS, PLACE, path_of
 from openjax.gap.report import Estimate
-from openjax.gap.selection import REACH
 from openjax.vehicle.effects import EFFECTS
 from openjax.vehicle.effects.effect import Parameter
 

@@ -102,6 +102,7 @@ class DronesStep:
         # together below
         if self.physics == "rigid" and not self.effects:
             memory = drones.effect_memory  # of other effects than this step's, if any
+            # one kernel holds the motors, the body and its contacts
             around = (pillar_position, pillar_active) if self.contacts else None
             drones = step_many(
                 self.fused_step,

@@ -85,6 +85,7 @@ class VirtualVehicles:
         self._vehicle = vehicle
         self._parameters = dict(effects or {})
         names = tuple(sorted(self._parameters))
+        # without contacts: of solid things there is only the floor, see `_stand`
         self._step = make_drones_step("rigid", dt=STEP, effects=names, contacts=False)
         for effect in self._step.effects:
             if effect.command is not None:
@@ -96,6 +97,7 @@ class VirtualVehicles:
         self.number, dimensions = position.shape
         flying = dimensions == 3
         drones = hover_state(vehicle, np.pad(position, ((0, 0), (0, 3 - dimensions))))
+        # who stands on the floor has its rotors at rest
         drones = drones.replace(rotor_speed=drones.rotor_speed * flying)
         drones = self._step.reset(vehicle, drones, jax.random.key(0))
         flat, self._unflatten = ravel_pytree(drones)

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 
 from openjax.errors import UserError
+from openjax.gap.criteria import DETECTABLE
 from openjax.gap.model.library import ABSENT, CARDS, PLACE, places
 from openjax.gap.planning.information import Advice, Belief
-from openjax.gap.selection import DETECTABLE
 
 LEAST = 0.02  # probability below which a cause isn't asked for
 UNTESTED = 0.05  # of each effect that the flights couldn't show

@@ -17,10 +17,10 @@ from openjax.flights.flight import Case
 from openjax.flights.reading import flights_of
 from openjax.flights.samples import Turbulence, fly, log_of
 from openjax.flights.segments import SEGMENTS
+from openjax.gap.criteria import DETECTABLE
 from openjax.gap.evidence import gather
 from openjax.gap.model.library import library, places, prior
 from openjax.gap.model.replay import Replay
-from openjax.gap.selection import DETECTABLE
 from openjax.vehicle.vehicle_file import VehicleFile
 
 SECONDS = 10.0  # of each segment that are simulated

@@ -1,0 +1,164 @@
+"""By what sets of effects are told apart: how much better one predicts than another,
+whether the difference matters, and whether an effect can be, and is of a size that
+counts.
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy.stats import chi2
+
+from openjax.gap.channels import between_flights
+from openjax.gap.decision import DECISION
+from openjax.gap.model.cross_validation import Validation
+from openjax.gap.model.hypotheses import SetFit
+from openjax.gap.model.library import CARDS, PLACE
+from openjax.gap.shapes import Squares
+
+# Nats that an effect of usual size must promise: its gain is then expected at two
+# standard errors, as the gain of a true effect is half the square of what it does, and
+# its standard error that square's root.
+DETECTABLE = 2.0 * DECISION.standard_errors**2
+REACH = 1.645  # standard deviations of a 90 % interval
+# Growth of the gap that counts where nuisances are as the best set has them. With .05,
+# errors of the rate loop's form are named as inertia; with .15 or .2 as much is right
+# on the cases tried.
+DOES = 0.15
+Measured = Mapping[tuple[str, str], tuple[float, float]]
+
+
+def difference(better: Validation, other: Validation) -> tuple[float, float, float]:
+    """By how much the log density of one hypothesis exceeds another's on stretches left
+    out, the standard error, and which share of its square white residuals would leave.
+
+    Given what the two predict, only noise is random: its variance is that of white
+    residuals or, where that is more, what the residuals of the better one show block by
+    block (cluster-robust, Liang and Zeger 1986). So an effect that acts in one block in
+    ten is judged by that block.
+    """
+    change = other.residuals - better.residuals
+    cross = np.add.reduceat(change * better.residuals, better.starts)
+    energy = np.add.reduceat(change * change, better.starts)
+    square = max(float((cross**2).sum()), float(energy.sum()), 1e-12)
+    return (
+        float((cross + 0.5 * energy).sum()),
+        square**0.5,
+        float(energy.sum()) / square,
+    )
+
+
+def growth(
+    squares: Squares, floor: Float[np.ndarray, " channels"]
+) -> Float[np.ndarray, "*sets"] | np.floating:
+    """By how many floors a gap of squared errors (..., channels) is larger than one of
+    the squares `floor` (channels,).
+    """
+    return np.sqrt((squares / floor).mean(-1)) - 1.0
+
+
+class Gaps(NamedTuple):
+    """Squared errors that are left."""
+
+    squares: Squares
+    """(..., channels) by the sets in question."""
+    best: Float[np.ndarray, " channels"]
+    """By the best set."""
+    nothing: Float[np.ndarray, " channels"]
+    """By no effect."""
+
+
+def matters(gaps: Gaps, least: float = DECISION.least_gap):
+    """(...) whether the gap of a set is so much larger than that of the best one that
+    it matters beside what no effect leaves.
+    """
+    return growth(gaps.squares, gaps.best) > np.maximum(
+        least, DECISION.form_error * growth(gaps.nothing, gaps.best)
+    )
+
+
+def worse(gain, error, gaps: Gaps, beside: Gaps):
+    """Whether a set is clearly worse than the best: by so many nats `gain` with their
+    standard `error`, and so that it matters.
+
+    Nuisances take a part of what an effect does, as a wrong moment of inertia looks
+    like a nuisance of some per cent. Whether an effect matters is also asked of
+    `beside`, the same gaps with nuisances as the best set has them; whether it is
+    needed, of the nats alone, in which nuisances are free.
+    """
+    clear = (gain > DECISION.standard_errors * error) & matters(gaps)
+    return clear | ((gain > REACH * error) & matters(beside, DOES))
+
+
+def log_odds(effects) -> float:
+    """The log prior odds of a set of effects."""
+    return sum(CARDS[e].log_odds for e in effects)
+
+
+def practical(fit: SetFit, torque_response: Measured) -> bool:
+    """Whether every effect of a set is clearly of a size that matters in practice (a
+    region of practical equivalence on the parameters, Kruschke 2018), by the replay or
+    by the `torque_response` that was measured: {(effect, parameter): (value,
+    deviation)}. What a card wants confirmed by the latter must be.
+    """
+    covariance = fit.covariance + between_flights(fit.covariance, fit.grams[:, 1:, 0])
+    place = {i: k for k, i in enumerate(fit.index.tolist())}
+
+    def of_replay(effect: str) -> bool:
+        sizes = CARDS[effect].practical
+        indices = [PLACE[effect, parameter] for parameter in sizes]
+        rows = [place[i] for i in indices]
+        away = fit.theta[indices] - fit.replay.absent[indices]
+        least = np.array(list(sizes.values())) * fit.replay.size_factors[indices]
+        return clearly_larger(away, covariance[np.ix_(rows, rows)], least)
+
+    def of_response(keys) -> bool:
+        return any(
+            abs(torque_response[e, p][0] - fit.replay.absent[PLACE[e, p]])
+            - REACH * torque_response[e, p][1]
+            > CARDS[e].practical[p] * fit.replay.size_factors[PLACE[e, p]]
+            for e, p in keys
+            if (e, p) in torque_response
+        )
+
+    def of_a_size(effect: str) -> bool:
+        card = CARDS[effect]
+        if any(key in torque_response for key in card.confirmed_by):
+            return of_response(card.confirmed_by)
+        parameters = [(effect, parameter) for parameter in card.practical]
+        return not parameters or of_replay(effect) or of_response(parameters)
+
+    return all(of_a_size(e) for e in fit.effects)
+
+
+def clearly_larger(
+    away: Float[np.ndarray, " own"],
+    covariance: Float[np.ndarray, "own own"],
+    least: Float[np.ndarray, " own"],
+) -> bool:
+    """Whether parameters that are `away` (p,) from doing nothing are further than
+    `least` (p,), either one of them by its 90 % interval, or all together by as much of
+    their size as their common 90 % region leaves: of two that only their sum is known
+    of, neither need be clear by itself.
+    """
+    deviation = np.sqrt(np.diag(covariance))
+    if (np.abs(away) - REACH * deviation > least).any():
+        return True
+    square = float(away @ np.linalg.solve(covariance, away))
+    remaining = 1.0 - np.sqrt(chi2.ppf(0.9, len(away)) / max(square, 1e-12))
+    return bool(remaining * np.max(np.abs(away) / least) > 1.0)
+
+
+def possible(fit: SetFit) -> bool:
+    """Whether all fitted parameters lie within physical bounds."""
+    return all(within_bounds(fit, e) for e in fit.effects)
+
+
+def within_bounds(fit: SetFit, effect: str) -> bool:
+    """Whether the parameters of one effect do."""
+    estimates = fit.parameters()[effect]
+    values = {p: value for p, (value, _) in estimates.items()}
+    deviations = {p: deviation for p, (_, deviation) in estimates.items()}
+    is_possible = CARDS[effect].possible
+    return is_possible is None or bool(is_possible(values, deviations))
