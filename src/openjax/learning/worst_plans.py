@@ -353,21 +353,17 @@ class WorstPlans:
         # the gradient knows where the evader is, and who doesn't see it can't learn
         # from that: they would unlearn to search
         is_seen = world[1].seen.astype(jnp.float32)
-        hold = jnp.where(world[1].seen, self.settings.hold, planning.hold_unseen)[
-            :, None
-        ]
+        hold = jnp.where(world[1].seen, self.settings.hold, planning.hold_unseen)
+        distance = is_seen * jnp.mean(encounter.distance, axis=0)
         positions = jnp.moveaxis(worlds[1].drones.position, 0, 1)
         parts = {
             "free": (1.0, is_seen * jnp.mean(encounter.free, axis=0)),
-            "distance": (
-                planning.distance,
-                is_seen * jnp.mean(encounter.distance, axis=0),
-            ),
+            "distance": (planning.distance, distance),
             **self._optional_parts(encounter, is_seen, positions, example),
             "crashes": (planning.crash, crash_share(jnp.min(encounter.least, axis=0))),
             "breaches": (planning.breach, encounter.breach),
             "speed": (self.settings.speed, encounter.excess),
-            "held": (1.0, hold * jnp.sum(change**2, axis=-1)),
+            "held": (1.0, hold[:, None] * jnp.sum(change**2, axis=-1)),
         }
         total, means = weighted_sum(parts)
         return total, (next_worlds, means)

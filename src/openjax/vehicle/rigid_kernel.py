@@ -136,13 +136,13 @@ def looped_step(
 @functools.lru_cache(maxsize=64)
 def _many_worlds(step):
     """`step` of W worlds. A further mapped axis becomes more worlds."""
-    step_of_worlds = jax.vmap(functools.partial(mapped_step, step), (None, 0, 0, 0))
+    plain_step = jax.vmap(functools.partial(mapped_step, step), (None, 0, 0, 0))
 
     @jax.custom_batching.custom_vmap
     def run(vehicle, drones, command, pillars):
         if command.shape[0] < WORTH:
-            return step_of_worlds(vehicle, drones, command, pillars)
-        fastest = on_platform(step_of_worlds, functools.partial(kernel_call, step))
+            return plain_step(vehicle, drones, command, pillars)
+        fastest = on_platform(plain_step, functools.partial(kernel_call, step))
         return fastest(vehicle, drones, command, pillars)
 
     @run.def_vmap
@@ -151,17 +151,15 @@ def _many_worlds(step):
         # the kernel holds one vehicle's numbers: of many vehicles it isn't taken
         if any(jax.tree.leaves(in_batched[0])):
             axes = jax.tree.map(
-                lambda has_batch: 0 if has_batch else None, tuple(in_batched)
+                lambda is_many: 0 if is_many else None, tuple(in_batched)
             )
-            drones_after = jax.vmap(step_of_worlds, axes)(
-                vehicle, drones, command, pillars
-            )
+            drones_after = jax.vmap(plain_step, axes)(vehicle, drones, command, pillars)
         else:
 
-            def flat(leaf, has_batch):
+            def flat(leaf, is_many):
                 leaf = (
                     leaf
-                    if has_batch
+                    if is_many
                     else jnp.broadcast_to(leaf, (axis_size, *leaf.shape))
                 )
                 return jax.lax.collapse(leaf, 0, 2)
