@@ -21,7 +21,8 @@ from experiments.table import Page, Table, page_parser, publish
 from openjax.commands.sample_flights import Arguments, make_case
 from openjax.files import read_json
 from openjax.flights.csv_table import write_csv
-from openjax.flights.samples import fly, log_of, references
+from openjax.flights.manoeuvres import references
+from openjax.flights.samples import fly, log_of
 from openjax.gap.folders import diagnose_folder
 from openjax.gap.report import Report
 from openjax.gap.report.trims_page import draw

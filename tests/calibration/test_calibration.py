@@ -14,8 +14,9 @@ from openjax.errors import UserError
 from openjax.flights.case import load_case
 from openjax.flights.checks import check_flight
 from openjax.flights.flight import Case
+from openjax.flights.manoeuvres import references
 from openjax.flights.reading import flights_of
-from openjax.flights.samples import fly, log_of, references
+from openjax.flights.samples import fly, log_of
 from openjax.vehicle import load_vehicle
 from openjax.vehicle.vehicle_file import VehicleFile, load_vehicle_file
 from openjax.vehicle.vehicle_tables import Motor

@@ -16,8 +16,9 @@ from openjax.commands import diagnose
 from openjax.errors import UserError
 from openjax.flights.case import load_case
 from openjax.flights.csv_table import write_csv
+from openjax.flights.manoeuvres import references
 from openjax.flights.regimes import REGIMES
-from openjax.flights.samples import fly, log_of, references
+from openjax.flights.samples import fly, log_of
 from openjax.gap.decision import DECISION
 from openjax.gap.diagnosis import diagnose_case, not_testable
 from openjax.gap.evidence import gather

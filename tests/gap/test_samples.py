@@ -9,7 +9,8 @@ from openjax.commands.sample_flights import main
 from openjax.errors import UserError
 from openjax.flights import samples
 from openjax.flights.case import load_case
-from openjax.flights.samples import fly, references
+from openjax.flights.manoeuvres import references
+from openjax.flights.samples import fly
 from openjax.gap.model.library import CARDS
 from openjax.vehicle import load_vehicle
 from openjax.vehicle.effects import EFFECTS

@@ -13,8 +13,9 @@ from openjax.commands.diagnose import main
 from openjax.errors import UserError
 from openjax.flights.case import load_case
 from openjax.flights.csv_table import write_csv
+from openjax.flights.manoeuvres import references
 from openjax.flights.reading import LogTable
-from openjax.flights.samples import fly, log_of, references
+from openjax.flights.samples import fly, log_of
 from openjax.gap.trims import change_between, compare
 from openjax.gap.trims.days import spread_of_charge
 from openjax.gap.trims.figures import PLACES, FlightFigures, mixer_of

@@ -20,8 +20,9 @@ from experiments.flying.worlds.game import play
 from experiments.flying.worlds.rotorpy import Bodies, RotorPyWorld
 from experiments.flying.worlds.study import SEED, loaded_policy
 from openjax.flights.csv_table import write_csv
+from openjax.flights.manoeuvres import PERIOD
 from openjax.flights.reading import CHANNEL_COLUMNS
-from openjax.flights.samples import PERIOD, log_of
+from openjax.flights.samples import log_of
 from openjax.pursuit import SCENARIOS, scenario_task
 from openjax.vehicle import load_vehicle, max_rotor_thrust
 

@@ -214,8 +214,8 @@ def prepare(arguments: Arguments) -> Prepared:
 
 def _prepare_plan(arguments: Arguments) -> Prepared:
     """A plan in a policy's place."""
+    from openjax.flights.manoeuvres import PERIOD
     from openjax.flights.plans import read_plan
-    from openjax.flights.samples import PERIOD
     from openjax.flying.controller import airframe_of
     from openjax.flying.loop import flight_state
     from openjax.flying.planned import PlannedFlight

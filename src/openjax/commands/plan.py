@@ -45,8 +45,8 @@ def main(arguments: Sequence[str]) -> None:
 
 def make_plan(arguments: Arguments) -> list[str]:
     """Write the plan; what to say of it."""
+    from openjax.flights.manoeuvres import PERIOD
     from openjax.flights.plans import STANDARD, plan_of, write_plan
-    from openjax.flights.samples import PERIOD
     from openjax.flights.segments import SEGMENTS
     from openjax.flying.state import SafetySettings
 

@@ -47,8 +47,9 @@ def make_case(arguments: Arguments) -> list[Path]:
     folder that isn't empty.
     """
     from openjax.flights.csv_table import write_csv
+    from openjax.flights.manoeuvres import references
     from openjax.flights.reading import LOG_COLUMNS
-    from openjax.flights.samples import fly, log_of, references
+    from openjax.flights.samples import fly, log_of
     from openjax.vehicle.effects import EFFECTS
     from openjax.vehicle.vehicle_file import load_vehicle_file, save_vehicle_file
 

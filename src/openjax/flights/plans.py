@@ -15,7 +15,7 @@ import numpy as np
 
 from openjax.errors import UserError
 from openjax.files import write_text
-from openjax.flights.samples import PERIOD
+from openjax.flights.manoeuvres import PERIOD
 from openjax.flights.segments import SEGMENTS
 
 COLUMNS = tuple("t x y z vx vy vz ax ay az yaw thrust wx wy wz segment".split())

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from openjax.flights.samples import PERIOD, Reference
+from openjax.flights.manoeuvres import PERIOD, Reference
 
 RADIUS = 0.7  # m around the middle
 LOWEST = 0.14  # m, just above the floor that `openjax fly` keeps

@@ -10,8 +10,8 @@ from types import SimpleNamespace
 
 import numpy as np
 
+from openjax.flights.manoeuvres import PERIOD
 from openjax.flights.plans import SetPoints
-from openjax.flights.samples import PERIOD
 from openjax.flying.controller import (
     POSITION_GAIN,
     Airframe,
