@@ -18,6 +18,7 @@ from experiments.diagnosis import (
     unknowns,
     vehicle,
 )
+from experiments.diagnosis.rows import log_rows
 
 VOCABULARY = list(effects.EFFECTS)
 LINK = ("command_latency", "packet_loss")  # effects that the commands in force tell
@@ -173,7 +174,7 @@ class Fleet:
 
     def _log(self, rng, spec, body, ticks, sensed):
         """The rows of one body, motors as its vehicle commands them."""
-        rows = sensors.log_rows(
+        rows = log_rows(
             rng, spec["sensors"], self.flown, body, ticks, sensed, spec["told"].hover
         )
         return real.as_logged(spec.get("form_errors"), spec["told"], rows)

@@ -20,7 +20,8 @@ from experiments.diagnosis import vehicle as v
 from experiments.diagnosis.body import Body
 from experiments.diagnosis.firmware import SAMPLE, Firmware
 from experiments.diagnosis.plant import PER_TICK
-from experiments.diagnosis.sensors import GROUPS, at, smooth_derivative
+from experiments.diagnosis.rows import at, smooth_derivative
+from experiments.diagnosis.sensors import GROUPS
 
 LONG, SHORT, TURN = 125, 25, 50  # samples of 2 ms
 EVERY = 100

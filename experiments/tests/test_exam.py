@@ -14,6 +14,7 @@ from experiments.diagnosis import (
     unknowns,
     vehicle,
 )
+from experiments.diagnosis.rows import log_rows
 
 pytestmark = pytest.mark.slow
 
@@ -90,7 +91,7 @@ def log_of(flown, kind, unknown=(), **changes):
     rng = np.random.default_rng(5)
     plain = {"rate": 100, "pose_rate": 100, "dropped": 0.0}
     set_up = sensors.draw(rng, kind, "psgacmv", "none") | plain | changes
-    return sensors.log_rows(rng, set_up, flown, 1, 300, unknown)
+    return log_rows(rng, set_up, flown, 1, 300, unknown)
 
 
 def test_drawn_sensors_have_the_noise_that_they_say(hovering):

@@ -14,7 +14,7 @@ import numpy as np
 from experiments.diagnosis import vehicle as v
 from experiments.diagnosis.firmware import SAMPLE, Firmware
 from experiments.diagnosis.plant import PER_TICK
-from experiments.diagnosis.rotorpy_cases import hubs
+from experiments.diagnosis.rotorpy_flights import hubs
 from experiments.flying.worlds.game import Poses, per_world
 from experiments.flying.worlds.plant import air_of, sensors_of, solids_of
 from openjax.pursuit import Task
