@@ -116,7 +116,8 @@ def sample_columns():
     """Columns of three sample flights of the nominal vehicle: {"flight_a": {"t": ...,
     ...}, ...}.
     """
-    from openjax.flights.samples import fly, references
+    from openjax.flights.manoeuvres import references
+    from openjax.flights.samples import fly
     from openjax.vehicle import load_vehicle
 
     vehicle = load_vehicle()
