@@ -176,7 +176,7 @@ def test_rotors_in_lanes_turn_as_one_long_flight():
 
 def test_the_filter_of_the_gyroscope_is_no_delay_of_the_motors():
     truth = Truth(up=0.05, down=0.07, delay=0.004)
-    (seen,), (motors,) = fly([truth], 8.0)
+    (seen,), (motors,) = fly([truth], 4.0)
     low = butter(2, 80.0, fs=500.0)
     for rates in (seen, lfilter(*low, seen, axis=0)):
         fit = identify_torques([record_of("fast rows", rates, motors, 500)])

@@ -33,17 +33,19 @@ def wall():
 def test_the_best_plan_is_best_against_the_worst_answer(wall):
     state, velocities = wall
     key = jax.random.key(2)
-    best, worth = jax.jit(SEARCH.search)(
-        state, SEARCH.paths(state.task), velocities, no_plan(3), key
-    )
-    teams = SEARCH.candidates(key, no_plan(3))
     paths = SEARCH.paths(state.task)
-    fly = jax.jit(SEARCH.fly)
+    best, worth = jax.jit(SEARCH.search)(state, paths, velocities, no_plan(3), key)
+    teams = SEARCH.candidates(key, no_plan(3))
+
+    @jax.jit
+    def payoff_of(team, velocity):
+        end = SEARCH.fly(state.task, paths, SEARCH.start(state), team, velocity)[0]
+        return SEARCH.payoff(state.task, paths, end)
+
     payoff = np.zeros((7, 3))
     for i, j in itertools.product(range(7), range(3)):
         team = jax.tree.map(lambda leaf, i=i: leaf[i], teams)
-        end = fly(state.task, paths, SEARCH.start(state), team, velocities[j])[0]
-        payoff[i, j] = SEARCH.payoff(state.task, paths, end)
+        payoff[i, j] = payoff_of(team, velocities[j])
     chosen = payoff.max(axis=1).argmin()
     assert float(worth) == pytest.approx(payoff[chosen].max(), abs=1e-4)
     np.testing.assert_allclose(best.place, teams.place[chosen], atol=1e-6)
