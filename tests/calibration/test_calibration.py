@@ -47,7 +47,7 @@ def columns_of(plant, effects=None, names=("flight_a", "flight_b", "flight_c")):
     return {
         name: fly(plant, NOMINAL, reference, 10 + number, effects)[0]
         for number, (name, reference) in enumerate(
-            references(seed=1, duration=8.0).items()
+            references(seed=1, duration=5.0).items()
         )
         if name in names
     }
