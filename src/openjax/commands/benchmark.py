@@ -34,6 +34,7 @@ def main(arguments: Sequence[str]) -> int:
     check_output(command.json, "--json")
     import jax
 
+    # said before minutes of compiling
     if max(command.devices) > (available := len(jax.devices())):
         raise UserError(f"--devices is {max(command.devices)}; {available} are here")
     from openjax.runs.benchmark_cases import cases, time_compiled

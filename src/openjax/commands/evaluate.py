@@ -168,7 +168,7 @@ def fly_scenarios(
 
     Args:
       command: what to fly, with the game's settings.
-      loaded: the policy.
+      policy: which flies.
       evaluators: those already compiled, to be used again for policies of the same
       kind.
 
@@ -268,6 +268,7 @@ def _game(command, policy):
             f"--environment.num_pursuers {number}: layout {layouts[0].name} has {in_layout} "
             "pursuers"
         )
+    # one number of slots for all layouts: their episodes share one program
     slots = max([layout_slots(settings), *(len(layout.pillars) for layout in layouts)])
     game = dataclasses.replace(settings, max_pillars=slots, num_pursuers=in_layout)
     environment = _environment(command, game, policy)

@@ -103,6 +103,7 @@ class Hearsay:
         """
         number = state.drones.position.shape[0]
         reports = _reports(state)
+        # what is on the way as a queue: a new report joins it, the oldest one arrives
         line = jax.tree.map(
             lambda old, new: jnp.concatenate([old, new[None]]),
             beliefs.on_the_way,
@@ -111,6 +112,7 @@ class Hearsay:
         arriving = jax.tree.map(lambda leaf: leaf[0], line)
         # (N, N): row by row what each pursuer hears of each
         is_itself = jnp.eye(number, dtype=bool)
+        # each pair draws for itself: a report that one misses may reach another
         arrives = jax.random.uniform(key, (number, number)) >= self.settings.lost
         arrives &= ~is_itself
         # a report counts that is newer than what one knows, and one's own eyes before
@@ -146,6 +148,7 @@ class Hearsay:
     def _place(self, belief, step):
         """(N, 3) m, where one pursuer takes all to be at a step ()."""
         age = (step - belief.told_step) * self.environment.settings.time_step
+        # who hasn't been heard for long has turned by now, so it isn't led on for ever
         return belief.position + belief.velocity * jnp.minimum(age, COAST)[..., None]
 
     def _thought(self, state, belief):

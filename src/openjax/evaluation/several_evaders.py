@@ -46,6 +46,7 @@ def one_by_one(position, evaders, free):
 def shared_out(position, evaders, free):
     """As many go for each free evader, up to one, the nearest pairs first."""
     number = position.shape[0]
+    # of five pursuers and two evaders, three may go for the one
     share = jnp.ceil(number / jnp.maximum(jnp.sum(free), 1))
 
     def pair(carry, _):

@@ -95,6 +95,7 @@ class Board:
 
     def silent(self, role: Role, time: float) -> float:
         """For how long (s) nothing was heard of `role`; infinite if it never was."""
+        # the page begins with zeros
         return time - (self._numbers[_BEATS + role] or -float("inf"))
 
     def enter(self, role: Role) -> None:

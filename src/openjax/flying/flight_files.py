@@ -82,7 +82,7 @@ def _table(name: str, samples, sent_at: np.ndarray, commands: np.ndarray) -> Log
     Args:
       name: of the file.
       samples: as of `write_case`.
-      sent: (T,) s, when the set-points of each tick had left.
+      sent_at: (T,) s, when the set-points of each tick had left.
       commands: (T, N, 5) of them: mode, thrust, body rates.
     """
     rows = [

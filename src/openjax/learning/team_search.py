@@ -153,8 +153,10 @@ class TeamSearch:
         keys = jax.random.split(key, 7)
         way = jax.random.normal(keys[0], (*shape, 3))
         way = way / length(way, keepdims=True)
+        # evenly in a ball, whose volume grows with the third power of its radius
         far = BESIDE * jax.random.uniform(keys[1], (*shape, 1)) ** (1 / 3)
         angle = jax.random.uniform(keys[2], shape, maxval=2 * jnp.pi)
+        # evenly in a disc, whose area grows with the square
         out = (
             0.9 * self.game.arena_radius * jnp.sqrt(jax.random.uniform(keys[3], shape))
         )
@@ -212,6 +214,7 @@ class TeamSearch:
 
         def stride(points, step):
             first, velocities = step
+            # to where it is by the time that they have answered
             lead = points.evader + RESPONSE * velocities[0]
             target = self.target(plan, lead, first * STEP)
             velocity_wish = self.desired_velocity(task, paths, points.position, target)
@@ -230,6 +233,7 @@ class TeamSearch:
     def _after_step(self, task, points, velocity_wish, velocity):
         """Points a step later, whose pursuers wish to fly (N, 3) m/s."""
         game = self.game
+        # as the game's evader it keeps two centimetres from bounds and pillars
         evader = into_free_space(
             game,
             points.evader + STEP * velocity,

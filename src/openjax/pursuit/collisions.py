@@ -35,7 +35,7 @@ def pillar_distance(
 ) -> Float[Array, "drones pillars"]:
     """(N, P) distance (m) between (N, 3) centres and the surfaces of (P, 2) pillars."""
     offset = position[:, None, :2] - pillar_position[None]
-    # the small number keeps the root's gradient finite on the axis
+    # on the axis, too, with a finite gradient: see `length`
     return length(offset) - settings.pillar_radius
 
 

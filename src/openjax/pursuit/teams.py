@@ -32,6 +32,7 @@ def draw_team(settings: PursuitSettings, key: PRNGKeyArray) -> Which | None:
     if not settings.team_sizes:
         return None
     sizes = jnp.array(settings.team_sizes, jnp.int32)
+    # a draw of its own: without team sizes a key's task stays what it was
     size = jax.random.choice(jax.random.fold_in(key, 4), sizes)
     return jnp.arange(settings.num_pursuers) < size
 
@@ -47,12 +48,14 @@ def draw_fall_out(
     number = settings.num_pursuers
     active = jnp.ones(number, bool) if active is None else active
     whether_key, which_key, when_key = jax.random.split(key, 3)
+    # an empty slot's number is below all that are drawn
     member = jnp.argmax(
         jnp.where(active, jax.random.uniform(which_key, (number,)), -1.0)
     )
     low, high = settings.fall_out_seconds
     seconds = jax.random.uniform(when_key, minval=low, maxval=high)
     last = jnp.round(seconds / settings.time_step).astype(jnp.int32)
+    # the last one stays, or nobody were left to learn from
     falls = jax.random.bernoulli(whether_key, settings.fall_outs) & (
         jnp.sum(active) > 1
     )
@@ -82,6 +85,7 @@ def park(position: Team, active: Which | None) -> Team:
     """Positions (N, 3) m with those of empty slots far away."""
     if active is None:
         return position
+    # not all at one place: parked drones would breach each other's distance
     x = FAR * (1.0 + 0.01 * jnp.arange(position.shape[0]))
     away = jnp.stack([x, jnp.zeros_like(x), jnp.ones_like(x)], axis=-1)
     return jnp.where(active[:, None], position, away)

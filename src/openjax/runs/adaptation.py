@@ -225,7 +225,7 @@ def won_back(rates: dict) -> dict[str, float | None]:
     where there was none beyond chance.
 
     Args:
-      flown: {"nominal", "before", "after": figures (B,) of the same episodes}.
+      rates: {"nominal", "before", "after": figures (B,) of the same episodes}.
     """
     shares = {}
     for name in LOSSES:

@@ -115,6 +115,7 @@ def start(
         job = dataclasses.replace(job, traced=cache / "traced")
     # a mistake shows before any process changes a file
     _check_same(job.settings, processes)
+    # one process writes for all, and no second run into its directory
     with locked(directory.path) if processes.is_first else contextlib.nullcontext():
         if command.resume is None and processes.is_first:
             create_run(directory.path, command.overwrite)

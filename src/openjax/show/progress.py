@@ -192,7 +192,7 @@ class Steps(_Display):
 
     Args:
       title: what is done.
-      expected: {step: seconds on a usual machine}, in the order in which they come.
+      durations: {step: seconds on a usual machine}, in the order in which they come.
         What the steps so far took against this tells how long the rest takes here.
       console: where to draw.
     """
@@ -215,7 +215,7 @@ class Steps(_Display):
         return super().__enter__()
 
     def begin(self, step: str, note: str = "") -> None:
-        """The step before is done, and `step` begins; one that isn't in `expected`
+        """The step before is done, and `step` begins; one that isn't in `durations`
         takes no time of its own.
         """
         if step != self._step:

@@ -93,7 +93,7 @@ class _Lanes:
             # Before a flight its first command held; what a lane has beyond the end is
             # left out.
             rows.append(first + np.clip(begins + np.arange(lead + LANE), 0, count - 1))
-        self.rows = np.concatenate(rows).T  # (early + LANE, lanes)
+        self.rows = np.concatenate(rows).T  # (lead + LANE, lanes)
 
     def run(
         self, parts: list[_Part], targets: list[list[np.ndarray]]
