@@ -17,9 +17,16 @@ import numpy as np
 from openjax.errors import UserError
 from openjax.evaluation.evaluator import layout_slots, layout_tasks, stack
 from openjax.evaluation.judges.receding_horizon import RecedingHorizon
-from openjax.evaluation.judges.tasks import judging_tasks
+from openjax.evaluation.judges.tasks import JUDGE_KEY, judging_tasks
+from openjax.evaluation.validation import uniform_tasks
 from openjax.files import write_json
-from openjax.pursuit import SCENARIOS, Pursuit, RewardSettings, Task
+from openjax.pursuit import (
+    SCENARIOS,
+    Pursuit,
+    PursuitSettings,
+    RewardSettings,
+    Task,
+)
 from openjax.runs.exploit import record
 from openjax.store.compiled_programs import cache_programs
 from openjax.store.environments import make_environment
@@ -192,10 +199,28 @@ def game_parser(
         action="store_true",
         help="pursuers look for who hides where it can be, whatever they learnt",
     )
+    parser.add_argument(
+        "--fresh", type=int, help="number from 1 on: other uniform tasks of that key"
+    )
     parser.add_argument("--steps", type=int, help="of an episode, to try it")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path, required=True)
     return parser
+
+
+def uniform_of(game: PursuitSettings, options: argparse.Namespace) -> Task:
+    """Uniform tasks: those by which policies are judged, and so chosen, or with
+    `--fresh` others that are drawn alike.
+    """
+    if options.fresh is None:
+        return judging_tasks(game, options.uniform)
+    paper = PursuitSettings()
+    drawn = dataclasses.replace(
+        game, min_pillars=paper.min_pillars, max_pillars=paper.max_pillars
+    )
+    return uniform_tasks(
+        drawn, options.uniform, game.max_pillars, JUDGE_KEY + options.fresh
+    )
 
 
 def judged_game(options: argparse.Namespace) -> JudgedGame:
@@ -217,7 +242,7 @@ def judged_game(options: argparse.Namespace) -> JudgedGame:
     )
     environment = make_environment(game, options.vehicle, options.effects)
     kinds = layout_tasks(game, list(SCENARIOS.values()), options.episodes)
-    kinds["uniform"] = judging_tasks(game, options.uniform)
+    kinds["uniform"] = uniform_of(game, options)
     if options.kinds:
         unknown = [kind for kind in options.kinds if kind not in kinds]
         if unknown:
