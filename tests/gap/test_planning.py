@@ -2,14 +2,17 @@
 weighed.
 """
 
+import json
+
 import numpy as np
 import pytest
 
+from openjax.commands.plan import Arguments, make_plan
 from openjax.errors import UserError
 from openjax.flights.plans import plan_of, read_plan, write_plan
 from openjax.flights.segments import LOWEST, SEGMENTS
 from openjax.gap.model.library import ABSENT
-from openjax.gap.planning.beliefs import beliefs_of, sentence
+from openjax.gap.planning.beliefs import beliefs_of, next_flight, sentence
 from openjax.gap.planning.information import Belief, advise, of_pairs
 from openjax.vehicle.arena import Arena
 from openjax.vehicle.vehicle_file import load_vehicle_file
@@ -44,11 +47,32 @@ def test_an_effect_is_told_from_nothing_though_it_can_do_nothing():
     assert apart[1, 2] == apart[2, 1] == 1.0
 
 
+def test_no_flight_is_asked_for_where_hardly_anything_is_open():
+    assert next_flight(between("rotor_drag"), load_vehicle_file()) == ""
+
+
+@pytest.mark.slow
+def test_a_report_asks_for_the_flight_that_the_plan_puts_first(tmp_path):
+    """They followed rules of their own once."""
+    case = tmp_path / "case"
+    case.mkdir()
+    (case / "vehicle.toml").write_text(
+        '[vehicle]\nmass = 0.036\n[motor]\ncommand = "pwm"\n'
+    )
+    vehicle = load_vehicle_file(case)
+    report = between("rotor_drag", "wind") | {"vehicle": str(vehicle.path)}
+    (case / "report.json").write_text(json.dumps(report))
+    first = make_plan(Arguments(str(case), out=tmp_path / "plan"))[0]
+    assert next_flight(report, vehicle) == first
+    assert first.startswith("Fly")
+
+
 @pytest.mark.slow
 def test_passes_tell_ground_effect_and_a_scale_tells_mass():
     vehicle = load_vehicle_file()
     ground = advise(beliefs_of(between("ground_effect")), vehicle)
     assert ground.promises[0].segment == "low"
+    assert "ground_effect" in ground.promises[0].pair
     report = between("mass", "thrust_scale")
     weighed = advise(beliefs_of(report), vehicle)
     assert "weigh the vehicle" in sentence(weighed, report)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from openjax.gap.decision import DECISION
-from openjax.gap.diagnosis import _next_flight, _runner_up, worth_naming
+from openjax.gap.diagnosis import _beside_segments, _runner_up, worth_naming
 from openjax.gap.probabilities import agreeing, probabilities
 from openjax.gap.report import Estimate, Report
 from openjax.gap.report.rules import NOTHING, broken_rules
@@ -127,9 +127,10 @@ def test_nobody_who_logged_one_vehicle_is_sent_for_a_second():
     one, two = (
         SimpleNamespace(tracks=[SimpleNamespace(neighbours=[0] * n)]) for n in (0, 1)
     )
-    assert "vehicle" not in _next_flight(one, ("downwash", "rate_gains", ""))
-    assert _next_flight(one, ("downwash", "none")) == ""
-    assert "the other" in _next_flight(two, ("downwash", "rate_gains"))
+    assert "the other" not in _beside_segments(one, ("downwash", "rate_gains", ""))
+    assert "rate_gains" in _beside_segments(one, ("downwash", "rate_gains", ""))
+    assert _beside_segments(one, ("downwash", "none")) == ""
+    assert "the other" in _beside_segments(two, ("downwash", "rate_gains"))
 
 
 def test_the_runner_up_is_no_part_of_what_is_named():

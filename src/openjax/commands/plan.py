@@ -8,7 +8,6 @@ from typing import Annotated
 import tyro
 
 from openjax.command_line import one_thread_for_matrices, output_console, parse
-from openjax.errors import UserError
 from openjax.files import check_new_folder, replacing, write_json
 
 PROGRAM = "openjax plan"
@@ -30,7 +29,9 @@ class Arguments:
     out: Path = Path("plan")
     """Folder to write to; must not exist or be empty."""
     vehicle: str | None = None
-    """What flies (crazyflie, brushless, or a vehicle.toml)."""
+    """What flies (crazyflie, brushless, or a vehicle.toml); by default what was
+    diagnosed.
+    """
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -88,20 +89,10 @@ def make_plan(arguments: Arguments) -> list[str]:
 
 def _advise(arguments: Arguments) -> tuple[str, list[dict], list[str]]:
     """The sentence, the promises of all segments, and those to fly, for a diagnosis."""
-    from openjax.gap.planning.beliefs import beliefs_of, read_report, sentence
-    from openjax.gap.planning.information import advise
+    from openjax.gap.planning.beliefs import advice_for, read_report
     from openjax.vehicle.vehicle_file import load_vehicle_file
 
     report = read_report(Path(arguments.diagnosis))
-    vehicle_file = load_vehicle_file(arguments.vehicle)
-    beliefs = beliefs_of(report)
-    if len(beliefs) < 2:
-        raise UserError(
-            f"{arguments.diagnosis}: one cause is left, no flight is needed to tell it from others"
-        )
-    advice = advise(beliefs, vehicle_file)
-    return (
-        sentence(advice, report),
-        [asdict(p) for p in advice.promises],
-        list(advice.segments),
-    )
+    vehicle = arguments.vehicle or report.get("vehicle") or None
+    sentence, advice = advice_for(report, load_vehicle_file(vehicle))
+    return sentence, [asdict(p) for p in advice.promises], list(advice.segments)

@@ -16,6 +16,7 @@ from openjax.gap.identification.quantities import identify
 from openjax.gap.intervals import estimates
 from openjax.gap.model.bounds import BOUND
 from openjax.gap.model.library import CARDS, PLACE, library, path_of
+from openjax.gap.planning.beliefs import acts_in_physics
 from openjax.gap.probabilities import agreeing, probabilities
 from openjax.gap.reference import (
     OF_DAYS,
@@ -190,7 +191,7 @@ def _report(
         where=locate(evidence, selection.fit, causes),
         gap=parts.gap,
         not_testable=missing,
-        next_flight=_next_flight(evidence, (*others, *missing, second)),
+        to_show=_beside_segments(evidence, (*others, *missing, second)),
         quality=[
             {"flight": i.flight, "issue": i.issue, "left_out": i.refused}
             for i in evidence.case.quality
@@ -246,14 +247,15 @@ def _runner_up(chances, effects, equivalent) -> str:
     return second if second and chances[second] > 0.01 else ""
 
 
-def _next_flight(evidence: Evidence, effects) -> str:
-    """What to fly for the first of `effects` within reach of who logged these flights:
-    nobody is sent for a second vehicle.
+def _beside_segments(evidence: Evidence, effects) -> str:
+    """What to fly and log for the first of `effects` that no segment of `openjax plan`
+    shows, within reach of who logged these flights: nobody is sent for a second vehicle.
     """
     alone = not any(len(t.neighbours) for t in evidence.tracks)
-    for effect in (e for e in effects if e in CARDS):
-        if not (alone and CARDS[effect].coordinate == "height below a neighbour"):
-            return CARDS[effect].next_flight
+    for effect in effects:
+        if effect in CARDS and not acts_in_physics(effect):
+            if not (alone and CARDS[effect].of_others):
+                return f"{effect}: {CARDS[effect].next_flight}"
     return ""
 
 

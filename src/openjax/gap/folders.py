@@ -11,6 +11,7 @@ from openjax.errors import TooLittle
 from openjax.flights.case import load_case
 from openjax.flights.flight import Case
 from openjax.gap.diagnosis import diagnose_case
+from openjax.gap.planning.beliefs import next_flight
 from openjax.gap.report import Report
 from openjax.gap.trims import Change, compare
 
@@ -46,11 +47,20 @@ def diagnose_folder(
         if trims is not None:
             _check_that_most_show_more(case, trims)
         days = [load_case(day) for day in reference]
-        return replace(diagnose_case(case, without, progress, days), trims=trims)
+        report = diagnose_case(case, without, progress, days)
     except TooLittle as error:
         if trims is None:
             raise
         return replace(trims, alone_because=str(error))
+    told = case.vehicle_file
+    if progress:
+        progress("asking which flight would tell most")
+    return replace(
+        report,
+        trims=trims,
+        vehicle="" if told.path is None else str(told.path.resolve()),
+        next_flight=next_flight(report.to_dict(), told),
+    )
 
 
 def _check_that_most_show_more(case: Case, trims: Change) -> None:

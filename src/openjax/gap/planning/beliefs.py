@@ -6,12 +6,18 @@ from pathlib import Path
 import numpy as np
 
 from openjax.errors import UserError
+from openjax.flights.segments import SEGMENTS
 from openjax.gap.criteria import DETECTABLE
 from openjax.gap.model.library import ABSENT, CARDS, PLACE, places
-from openjax.gap.planning.information import Advice, Belief
+from openjax.gap.planning.information import SECONDS, Advice, Belief, advise
+from openjax.vehicle.vehicle_file import VehicleFile
 
 LEAST = 0.02  # probability below which a cause isn't asked for
 UNTESTED = 0.05  # of each effect that the flights couldn't show
+OPEN = 0.2
+"""Probability that two causes drawn from what is believed differ, below which no flight
+is worth its battery: none can tell more apart than that.
+"""
 SCALE_ONLY = {"mass", "thrust_scale", "thrust_curve"}
 """A scale tells these apart, no flight."""
 
@@ -32,6 +38,11 @@ def read_report(folder: Path) -> dict:
     if not isinstance(report, dict) or not {"probabilities", "parameters"} <= set(
         report
     ):
+        if isinstance(report, dict) and "rotors" in report:
+            raise UserError(
+                f"{path}: compares trims alone, of which no flight tells more; diagnose flights "
+                "with attitude or gyroscope"
+            )
         raise UserError(f"{path}: not a report of openjax diagnose")
     return report
 
@@ -42,7 +53,7 @@ def beliefs_of(report: dict) -> list[Belief]:
     the commands' own columns.
     """
     chances = report["probabilities"]
-    causes = [e for e in report.get("effects", ()) if _acts_in_physics(e)]
+    causes = [e for e in report.get("effects", ()) if acts_in_physics(e)]
     chances_of: dict[tuple[str, ...], float] = {
         (): max(chances.get("none", 0.0), UNTESTED)
     }
@@ -51,15 +62,15 @@ def beliefs_of(report: dict) -> list[Belief]:
         chances_of[tuple(causes)] = max(sure, UNTESTED)
         for effect in causes:
             for other in filter(
-                _acts_in_physics, report.get("equivalent", {}).get(effect, ())
+                acts_in_physics, report.get("equivalent", {}).get(effect, ())
             ):
                 # As likely as the one that it would do as well as.
                 rest = tuple(e for e in causes if e != effect)
                 chances_of[(*rest, other)] = max(chances.get(effect, 0.0), UNTESTED)
     for effect, chance in chances.items():
-        if _acts_in_physics(effect) and effect not in causes and chance > LEAST:
+        if acts_in_physics(effect) and effect not in causes and chance > LEAST:
             chances_of.setdefault((effect,), chance)
-    for effect in filter(_acts_in_physics, report.get("not_testable", ())):
+    for effect in filter(acts_in_physics, report.get("not_testable", ())):
         chances_of.setdefault((effect,), UNTESTED)
     whole = sum(chances_of.values())
     return [
@@ -68,9 +79,12 @@ def beliefs_of(report: dict) -> list[Belief]:
     ]
 
 
-def _acts_in_physics(effect: str) -> bool:
-    """Whether an effect acts in the physics, and needs no second vehicle."""
-    return effect in CARDS and CARDS[effect].path == "physics" and effect != "downwash"
+def acts_in_physics(effect: str) -> bool:
+    """Whether an effect acts in the physics, and needs no second vehicle, so that a
+    segment may show it.
+    """
+    card = CARDS.get(effect)
+    return card is not None and card.path == "physics" and not card.of_others
 
 
 def _theta(effects, parameters: dict) -> np.ndarray:
@@ -86,6 +100,29 @@ def _theta(effects, parameters: dict) -> np.ndarray:
     return theta
 
 
+def advice_for(report: dict, vehicle_file: VehicleFile) -> tuple[str, Advice]:
+    """What to fly after a report (as `report.json`), in words and by segments. Raises
+    UserError where nothing is left to tell apart.
+    """
+    beliefs = beliefs_of(report)
+    if len(beliefs) < 2:
+        raise UserError(
+            "one cause is left in the report, and no flight is needed to tell it from others"
+        )
+    advice = advise(beliefs, vehicle_file)
+    return sentence(advice, report), advice
+
+
+def next_flight(report: dict, vehicle_file: VehicleFile) -> str:
+    """What to fly after a report, by the same rule as `openjax plan`; empty where too
+    little is left open.
+    """
+    chances = np.array([b.probability for b in beliefs_of(report)])
+    if 1.0 - (chances**2).sum() < OPEN:
+        return ""
+    return advice_for(report, vehicle_file)[0]
+
+
 def sentence(advice: Advice, report: dict) -> str:
     """What to do next, and why."""
     best = advice.promises[0]
@@ -93,7 +130,8 @@ def sentence(advice: Advice, report: dict) -> str:
     weigh = [pair for pair in hopeless if set(pair) <= SCALE_ONLY]
     pair = f"{best.pair[0]!r} from {best.pair[1]!r}"
     text = (
-        f"Fly {best.segment!r} next: in 10 s it tells {pair} by {best.nats:.0f} nats."
+        f"Fly {best.segment!r} next, {SEGMENTS[best.segment].shows}: in {SECONDS:.0f} s it tells "
+        f"{pair} by {best.nats:.0f} nats, and {DETECTABLE:.0f} are enough."
     )
     if best.nats < DETECTABLE:
         text = f"No segment tells {pair}."

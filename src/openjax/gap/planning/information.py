@@ -50,7 +50,7 @@ class Promise:
     value: float
     """Probability that two causes drawn from what is believed are told apart."""
     pair: tuple[str, str]
-    """Of causes, which it tells best for what they are worth."""
+    """Of causes, which it tells better than other segments for what they are worth."""
     nats: float
     """By which one segment tells them."""
 
@@ -74,9 +74,11 @@ def advise(beliefs: list[Belief], vehicle_file: VehicleFile) -> Advice:
     weights = np.array([b.probability for b in beliefs])
     together = np.outer(weights, weights)
     promises = []
+    usual = together * _distinction(apart).mean(0)
     for number, name in enumerate(replay.flights):
         gains = together * _distinction(apart[number])
-        i, j = np.unravel_index(int(np.argmax(np.triu(gains, 1))), gains.shape)
+        beyond = np.triu(gains - usual, 1)  # what every segment tells is no reason
+        i, j = np.unravel_index(int(np.argmax(beyond)), gains.shape)
         pair = (beliefs[i].name, beliefs[j].name)
         promises.append(
             Promise(

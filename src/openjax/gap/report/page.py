@@ -3,7 +3,6 @@
 import datetime
 import os
 import shlex
-from collections.abc import Sequence
 from pathlib import Path
 
 from openjax.gap.model.library import CARDS
@@ -35,6 +34,7 @@ def page_of(report: Report, folder: Path | None = None) -> str:
         figures=figures(report),
         trims=None if report.trims is None else content_of(report.trims),
         meanings={e: EFFECTS[e].description for e in report.parameters if e in EFFECTS},
+        hidden=[(e, CARDS[e].next_flight) for e in report.not_testable if e in CARDS],
         ranked=[(name, p) for name, p in ranking[:8] if p > 5e-4],
     )
 
@@ -123,10 +123,13 @@ def next_steps(report: Report, folder: Path | None = None) -> list[tuple[str, st
     page's `folder`.
     """
     steps = []
-    for name, others in report.equivalent.items():
+    alike = [
+        f"These flights can't tell {name} from {', '.join(others)}. "
+        for name, others in report.equivalent.items()
+    ]
+    if alike or report.next_flight:
         reason = (
-            f"These flights can't tell {name} from {', '.join(others)}. "
-            f"{_next_flight(report, others)}"
+            f"{''.join(alike)}{report.next_flight} Then diagnose all of them again."
         )
         steps.append((reason, "openjax plan . --out next_flight"))
     if report.parameters:
@@ -152,11 +155,8 @@ def next_steps(report: Report, folder: Path | None = None) -> list[tuple[str, st
             "flew well?"
         )
         steps.append((reason, f"openjax diagnose {case} --reference EARLIER_FLIGHTS"))
-    if report.not_testable and not report.equivalent and report.next_flight:
-        missing = ", ".join(effect.replace("_", " ") for effect in report.not_testable)
-        steps.append(
-            (f"These flights wouldn't show {missing}. {_next_flight(report)}", "")
-        )
+    if report.to_show:
+        steps.append((f"To show {report.to_show}", ""))
     return steps
 
 
@@ -167,15 +167,3 @@ def _case_from(report: Report, folder: Path | None) -> str:
     if path is None or folder is None:
         return shlex.quote(report.case)
     return shlex.quote(os.path.relpath(path.resolve(), folder.resolve()))
-
-
-def _next_flight(report: Report, others: Sequence[str] = ()) -> str:
-    """The next flight, of the first of `others` that has one."""
-    flights = [CARDS[other].next_flight for other in others if other in CARDS]
-    flight = flights[0] if flights else report.next_flight
-    text = flight.strip().rstrip(".")
-    if not text:
-        return ""
-    return (
-        f"Next flight: {text[:1].lower()}{text[1:]}; then diagnose all of them again."
-    )

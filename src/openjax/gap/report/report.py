@@ -73,9 +73,14 @@ class Report:
     where: list[Place]
     gap: Gap
     not_testable: list[str]
-    next_flight: str
     quality: list[dict]
     """An entry for each flight; with `left_out` where it wasn't used."""
+    next_flight: str = ""
+    """The segment that tells most, in words; empty where little is left open."""
+    to_show: str = ""
+    """What to fly and log for an effect that no segment shows."""
+    vehicle: str = ""
+    """The vehicle file of the flights."""
     runner_up: str = ""
     rest: str = ""
     """What is left when the named effects are accounted for."""
@@ -211,15 +216,21 @@ class Report:
         lines += self._parameters_in_words()
         if self.parameters:
             lines.append(self.gap.in_words())
+        return [line for line in [*lines, *self._open_in_words()] if line]
+
+    def _open_in_words(self) -> list[str]:
+        """What is left open, and what would tell it."""
+        lines = []
         if self.runner_up:
             lines.append(f"Runner-up: {self.runner_up}.")
         if self.not_testable:
             lines.append(
                 f"Not testable with these flights: {', '.join(self.not_testable)}."
             )
-        if self.next_flight:
-            lines.append(f"Fly next: {self.next_flight}")
-        return [line for line in lines if line]
+        lines.append(self.next_flight)
+        if self.to_show:
+            lines.append(f"To show {self.to_show}")
+        return lines
 
     def _parameters_in_words(self) -> list[str]:
         """The named effects' values, then what is doubtful about them."""
