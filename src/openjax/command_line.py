@@ -44,7 +44,7 @@ KINDS = {
 """What an option wants, by what tyro says where it gets something else."""
 
 
-def typed(command: str) -> str:
+def as_typed(command: str) -> str:
     """`openjax NAME ...` as it can be typed here: where its environment isn't active,
     as after `make train`, by the path of its script.
     """

@@ -9,7 +9,7 @@ import sys
 
 import pytest
 
-from openjax.command_line import LONGEST, parse, run_command, typed
+from openjax.command_line import LONGEST, as_typed, parse, run_command
 from openjax.commands.exploit import ExploitCommand
 from openjax.errors import UserError
 
@@ -77,7 +77,7 @@ def test_a_terminal_that_lacks_characters_and_a_full_disk_for_the_output(
 
 
 @pytest.mark.parametrize(
-    ("typed", "told"),
+    ("line", "told"),
     [
         ("--num_envs abc", "--num_envs is 'abc'; expected a whole number"),
         ("--minutes soon", "--minutes is 'soon'; expected a number"),
@@ -90,17 +90,15 @@ def test_a_terminal_that_lacks_characters_and_a_full_disk_for_the_output(
         ("--learners 65", "learners is 65; it must be a whole number in"),
     ],
 )
-def test_a_mistyped_option_is_told_what_would_be_right(typed, told):
+def test_a_mistyped_option_is_told_what_would_be_right(line, told):
     with pytest.raises(UserError, match=re.escape(told)) as error:
-        parse(ExploitCommand, ExploitCommand(), typed.split(), "openjax exploit")
+        parse(ExploitCommand, ExploitCommand(), line.split(), "openjax exploit")
     assert "\n" not in str(error.value)
 
 
 def test_numbers_and_truths_may_be_written_as_people_do():
-    typed = (
-        "--total_steps 2e6 --environment.observe_position true --minutes 1e1".split()
-    )
-    command = parse(ExploitCommand, ExploitCommand(), typed, "openjax exploit")
+    line = "--total_steps 2e6 --environment.observe_position true --minutes 1e1".split()
+    command = parse(ExploitCommand, ExploitCommand(), line, "openjax exploit")
     settings = command.learning
     game = command.environment
     assert (settings.total_steps, game.observe_position, command.minutes) == (
@@ -122,8 +120,8 @@ def test_what_to_type_next_can_be_typed_where_the_environment_isnt_active(
     monkeypatch.setattr(sys, "executable", str(scripts / "python"))
     monkeypatch.setenv("PATH", str(tmp_path))
     assert (
-        typed("openjax view --policy runs/a")
+        as_typed("openjax view --policy runs/a")
         == ".venv/bin/openjax view --policy runs/a"
     )
     monkeypatch.setenv("PATH", str(scripts))
-    assert typed("openjax view --policy runs/a") == "openjax view --policy runs/a"
+    assert as_typed("openjax view --policy runs/a") == "openjax view --policy runs/a"

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from openjax.flights import kinematics
-from openjax.flights.kinematics import corrected
+from openjax.flights.kinematics import correct
 from openjax.flights.track import Track, rotation
 from openjax.gap.decision import DECISION
 
@@ -75,7 +75,7 @@ def test_a_gyroscope_with_another_gain_is_found_and_corrected(gain):
         found.gain == pytest.approx(gain, abs=0.01)
         and list(found.findings) == ["gyroscope gain"] * unusual
     )
-    assert read_kinematics([corrected(t, found) for t in tracks]).gain == pytest.approx(
+    assert read_kinematics([correct(t, found) for t in tracks]).gain == pytest.approx(
         1.0, abs=0.01
     )
 
@@ -92,7 +92,7 @@ def test_a_world_that_leans_is_found_and_put_upright():
     assert np.degrees(found.tilt) == pytest.approx([4.0, 0.0], abs=0.4) and list(
         found.findings
     ) == ["world tilt"]
-    assert read_kinematics([corrected(t, found) for t in tracks]).findings == {}
+    assert read_kinematics([correct(t, found) for t in tracks]).findings == {}
 
 
 @pytest.mark.parametrize("missing", ["position", "velocity"])
@@ -102,9 +102,9 @@ def test_an_upright_world_needs_no_position(missing):
     found = read_kinematics([track])
     beside = track.position + np.array([0.0, 0.0, 0.5])
     bare = dataclasses.replace(track, neighbours=beside[None], **{missing: None})
-    upright = corrected(bare, found)
+    upright = correct(bare, found)
     assert getattr(upright, missing) is None
-    logged = corrected(dataclasses.replace(track, neighbours=beside[None]), found)
+    logged = correct(dataclasses.replace(track, neighbours=beside[None]), found)
     apart = logged.neighbours[0] - logged.position
     assert np.allclose(np.linalg.norm(apart, axis=1), 0.5)
     assert np.allclose(apart[0], apart[-1]) and abs(apart[0, 1]) > 0.02

@@ -11,12 +11,12 @@ import pytest
 
 from openjax.errors import UserError
 from openjax.learning import preset
-from openjax.store.run_directory import check_free, create_run, locked, open_run
+from openjax.store.run_directory import check_free, create_run, lock_run, open_run
 
 HOLD = """
 import sys, time
-from openjax.store.run_directory import locked
-with locked(sys.argv[1]):
+from openjax.store.run_directory import lock_run
+with lock_run(sys.argv[1]):
     print("held", flush=True)
     time.sleep(60)
 """
@@ -28,14 +28,14 @@ def test_a_directory_is_for_one_process_until_it_ends_or_is_killed(tmp_path):
         [sys.executable, "-c", HOLD, str(run)], stdout=subprocess.PIPE, text=True
     )
     assert holder.stdout.readline() == "held\n"
-    with pytest.raises(UserError, match="another process trains"), locked(run):
+    with pytest.raises(UserError, match="another process trains"), lock_run(run):
         pass
     holder.send_signal(signal.SIGKILL)
     holder.communicate()
     assert os.listdir(run) == ["run.lock"]  # which holds nobody up
     check_free(run, overwrite=False)
-    with locked(run):
-        with pytest.raises(UserError, match="another process trains"), locked(run):
+    with lock_run(run):
+        with pytest.raises(UserError, match="another process trains"), lock_run(run):
             pass
         create_run(run, overwrite=False)
     assert os.listdir(run) == ["run.lock"]

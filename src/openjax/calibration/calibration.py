@@ -287,10 +287,10 @@ def _cannot_tell(
     if share <= LEAST_EXPLAINED:
         out.append(_NOT_EXPLAINED.format(share=max(share, 0.0)))
         untold += TOLD_BY_RATES
-    unexcited = [n for n in _ADVICE if n not in untold and not quantities[n].determined]
+    names = [n for n in _ADVICE if n not in untold and not quantities[n].determined]
     return out + [
         f"{n.replace('_', ' ')}: these flights hardly excite it; {_ADVICE[n]}"
-        for n in unexcited
+        for n in names
     ]
 
 

@@ -167,10 +167,10 @@ def _diagnosis(
     report_file = (
         options.out / name / ("report.html" if options.html else "report.json")
     )
-    more = f" (and {len(answer.noted) - 1} more in the report)"
+    more = f" (and {len(answer.notes) - 1} more in the report)"
     remark = [
-        f"Noted in the logs: {text}{more * (len(answer.noted) > 1)}."
-        for text in answer.noted[:1]
+        f"Noted in the logs: {text}{more * (len(answer.notes) > 1)}."
+        for text in answer.notes[:1]
     ]
     lines = [*remark, *answer.in_words(), f"({seconds:.1f} s; {report_file})"]
     return answer.title, lines, answer.prediction()

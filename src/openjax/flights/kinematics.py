@@ -138,7 +138,7 @@ def _unusual(gain: np.ndarray, error: np.ndarray, usual: float) -> str:
     )
 
 
-def corrected(track: Track, kinematics: Kinematics) -> Track:
+def correct(track: Track, kinematics: Kinematics) -> Track:
     """The track as it would read with sensors that agree."""
     changes = {}
     if kinematics.gain != 1.0:

@@ -82,8 +82,8 @@ def in_band(
     # faded in and out: a filter this slow would carry the last row's noise far into the
     # flight
     fade = _fade(len(values))[:, None]
-    windowed = fade * (values - values.mean(0))
-    return sosfiltfilt(_bandpass(band), windowed, axis=0)[edge:-edge]
+    signal = fade * (values - values.mean(0))
+    return sosfiltfilt(_bandpass(band), signal, axis=0)[edge:-edge]
 
 
 @lru_cache(maxsize=32)

@@ -300,7 +300,7 @@ def earlier(values: Columns, delay: float, track: Track) -> Columns:
     )
 
 
-def undelayed(track: Track, delay: float) -> Track:
+def without_delay(track: Track, delay: float) -> Track:
     """The track with its pose `delay` s younger than logged."""
     pose = [
         n

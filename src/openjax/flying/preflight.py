@@ -106,10 +106,10 @@ def _pose_faults(state, sample, start: Vector) -> Iterator[str]:
             yield f"{verdict}; look at the positioning system"
             return
     x, y, z = pose.position
-    where = f"({x:.2f}, {y:.2f}, {z:.2f})"
+    spot = f"({x:.2f}, {y:.2f}, {z:.2f})"
     if math.dist((x, y), start[:2]) > state.settings.stand or abs(z) > MOST_HEIGHT:
         yield (
-            f"stands at {where} m, its start's mark is ({start[0]:.2f}, {start[1]:.2f}, 0): put it "
+            f"stands at {spot} m, its start's mark is ({start[0]:.2f}, {start[1]:.2f}, 0): put it "
             "there, or mend the positioning system's axes, origin or unit"
         )
     if up(pose.quaternion) < math.cos(MOST_TILT):
@@ -121,7 +121,7 @@ def _pose_faults(state, sample, start: Vector) -> Iterator[str]:
     if agree(sample.captured, sample.own, limits):
         place = ", ".join(f"{p:.2f}" for p in sample.own.position)
         yield (
-            f"motion capture sees it at {where} m, itself at ({place}): mend axes, "
+            f"motion capture sees it at {spot} m, itself at ({place}): mend axes, "
             "unit or origin of "
             "one of them"
         )

@@ -273,7 +273,7 @@ def _react(state, drones, troubles) -> tuple[Drone, ...]:
     time = state.time
     team = any(d.reason for d in drones) or any(troubles)
     anchors = resting_places_of(state) if team else [None] * len(drones)
-    lifted = (
+    all_up = (
         all(d.mode is Mode.LIFT and _has_lifted(d, time) for d in drones) and not team
     )
     reactions = []
@@ -290,7 +290,7 @@ def _react(state, drones, troubles) -> tuple[Drone, ...]:
             drone = drone.to(Mode.HOLD, time, anchor, "another is in trouble")
         elif drone.mode is Mode.HOLD and drone.reason and waits:
             drone = drone.to(Mode.LAND, time)
-        elif lifted:
+        elif all_up:
             drone = drone.to(Mode.TRANSFER, time, start)
         reactions.append(drone)
     return tuple(reactions)

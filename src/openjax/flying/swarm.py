@@ -103,12 +103,12 @@ class Swarm:
         member.crazyflie = crazyflie = make()
         crazyflie.fully_connected.add_callback(lambda _uri: answered_event.set())
 
-        def failed(_uri, message):
+        def on_failure(_uri, message):
             member.error = str(message).strip().splitlines()[0]
             answered_event.set()
 
-        crazyflie.connection_failed.add_callback(failed)
-        crazyflie.connection_lost.add_callback(failed)
+        crazyflie.connection_failed.add_callback(on_failure)
+        crazyflie.connection_lost.add_callback(on_failure)
         crazyflie.open_link(member.uri)
         if not answered_event.wait(timeout):
             member.error = f"no answer in {timeout:.1f} s"

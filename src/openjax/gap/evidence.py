@@ -13,8 +13,8 @@ from openjax.flights.clocks import (
     read_motor_clock,
 )
 from openjax.flights.flight import Case
-from openjax.flights.kinematics import Kinematics, corrected, read_kinematics
-from openjax.flights.track import Track, tracks_of, undelayed
+from openjax.flights.kinematics import Kinematics, correct, read_kinematics
+from openjax.flights.track import Track, tracks_of, without_delay
 from openjax.gap.channels import Channel
 from openjax.gap.channels.motion import Motion, make_reading, motor_rows, read_motion
 from openjax.gap.channels.pose import Pose, read_pose
@@ -181,12 +181,12 @@ def _sensors(
     moves = pose is not None and pose.names and pose.late
     original = tracks
     if moves:
-        tracks = [undelayed(t, pose.fit.value) for t in original]
+        tracks = [without_delay(t, pose.fit.value) for t in original]
     sensors = read_kinematics(tracks, DECISION)
     if moves and not sensors.one_clock:  # then it isn't the pose's delay that was found
         tracks = original
         sensors = read_kinematics(tracks, DECISION)
-    tracks = [corrected(t, sensors) for t in tracks]
+    tracks = [correct(t, sensors) for t in tracks]
     if pose is not None and not moves:
         pose = read_pose(tracks, library)
     return tracks, pose if sensors.one_clock else None, sensors

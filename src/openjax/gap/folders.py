@@ -68,8 +68,8 @@ def _check_that_most_show_more(case: Case, trims: Change) -> None:
     is then known from all of them, and a diagnosis would be one of the others.
     """
     few = len(case.flights)
-    flown = len(trims.flights)
-    if 2 * few < flown:
+    number = len(trims.flights)
+    if 2 * few < number:
         raise TooLittle(
-            f"{few} of {flown} flights hold{'s' * (few == 1)} more than motors"
+            f"{few} of {number} flights hold{'s' * (few == 1)} more than motors"
         )

@@ -127,12 +127,12 @@ class AnalyticGradient:
         # only the worlds between steps are kept, the rest is worked out again on the
         # way back: it would take many times the memory
         @jax.checkpoint
-        def moved(world):
+        def move(world):
             observation, state = world
             return fly_on(actor, observation, state, wish)
 
         def one(carry, _):
-            world = moved(carry[0])
+            world = move(carry[0])
             encounter = self._measure(carry[1], world[1], paths, steps)
             return (world, encounter), None
 

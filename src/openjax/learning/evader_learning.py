@@ -48,10 +48,10 @@ class LearningEvaders:
     def flying(self) -> Any:
         """(K + S, ...) the actors, and the earlier selves."""
 
-        def joined(actor, pool):
+        def join(actor, pool):
             return jnp.concatenate([actor, pool[self.past]])
 
-        return jax.tree.map(joined, self.actor, self.pool)
+        return jax.tree.map(join, self.actor, self.pool)
 
     @property
     def networks(self) -> tuple[Any, Any, jax.Array]:
@@ -216,10 +216,10 @@ class EvaderLearning:
             past_key, (self.settings.past,), 0, self.settings.pool
         )
 
-        def renewed(pool, actor):
+        def renew(pool, actor):
             return pool.at[place].set(jnp.where(due, actor[network], pool[place]))
 
-        pool = jax.tree.map(renewed, evaders.pool, evaders.actor)
+        pool = jax.tree.map(renew, evaders.pool, evaders.actor)
         return evaders.replace(pool=pool, past=jnp.where(due, slots, evaders.past))
 
     def _by_network(self, which):

@@ -417,15 +417,15 @@ def _starting(settings, environment, progress):
     of the run.
     """
 
-    def grown(start, ramp):
+    def grow(start, ramp):
         return jnp.clip((progress - start) / max(ramp, 1e-6), 0.0, 1.0)
 
     family = environment.settings.vehicles
     if family and (settings.vehicles_start or settings.vehicles_ramp):
-        share = grown(settings.vehicles_start, settings.vehicles_ramp)
+        share = grow(settings.vehicles_start, settings.vehicles_ramp)
         environment = environment.with_bounds(narrowed_bounds(family, share))
     if settings.evaders_start or settings.evaders_ramp:
-        share = grown(settings.evaders_start, settings.evaders_ramp)
+        share = grow(settings.evaders_start, settings.evaders_ramp)
         environment = environment.with_evader_share(share)
     return environment
 

@@ -285,15 +285,15 @@ class WorstPlans:
             trials.promise_of_plans, min(ANSWERS, self.planning.plans)
         )[1]
 
-        def chosen(leaf):
+        def pick(leaf):
             return jax.vmap(lambda values, places: values[places])(leaf, most)
 
-        velocities = self._velocities(chosen(trials.plans))
+        velocities = self._velocities(pick(trials.plans))
         keys = jax.random.split(key, plan.shape[0])
         best, promise = jax.vmap(team.search)(
             world[1], paths, velocities, team_plan, keys
         )
-        gain = jnp.max(chosen(worth), axis=1) - promise
+        gain = jnp.max(pick(worth), axis=1) - promise
         way = jax.vmap(team.way)(world[1], paths, best, self._velocities(plan))
         ends_of_pieces = (
             np.arange(1, self.planning.pieces + 1) * team.steps // self.planning.pieces

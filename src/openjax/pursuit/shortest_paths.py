@@ -63,12 +63,12 @@ def shortest_paths(settings: PursuitSettings, task: Task) -> ShortestPaths:
 
     # Floyd and Warshall: after step k, the shortest paths that bend at the first k
     # corners only
-    def shortened(k, length):
+    def shorten(k, length):
         return jnp.minimum(length, length[:, k, None] + length[k])
 
     length = direct
     if corner.shape[0]:
-        length = jax.lax.fori_loop(0, corner.shape[0], shortened, direct)
+        length = jax.lax.fori_loop(0, corner.shape[0], shorten, direct)
     # a path's last bend is one of the corners, the first one perhaps
     last = _straight(settings, task, corner[:, None], arena_points(settings))
     through = jnp.min(length[:, :, None] + last, axis=1, initial=jnp.inf)

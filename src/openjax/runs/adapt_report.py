@@ -46,7 +46,7 @@ def in_words(results: dict) -> list[str]:
 def page(results: dict) -> str:
     """One self-contained HTML page."""
     # with matplotlib: not before the compiler has begun
-    from openjax.show.pages import filled
+    from openjax.show.pages import fill_template
 
     values = {
         "words": in_words(results),
@@ -54,7 +54,9 @@ def page(results: dict) -> str:
         "which": WHICH,
         "picture": _picture(results),
     }
-    return filled("adapt.html.jinja", Path(__file__).parent, results=results, **values)
+    return fill_template(
+        "adapt.html.jinja", Path(__file__).parent, results=results, **values
+    )
 
 
 def _picture(results):

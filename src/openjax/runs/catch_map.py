@@ -134,12 +134,12 @@ def draw_map(
     policy = policy.in_game(Pursuit(game))
     draw = functools.partial(draw_task, game, command)
     flyer = _Flyer(command, draw, tell)
-    found = _about(command, game, policy)
-    for known in _flown(flyer, MapEvaders(command, game, policy, draw)):
-        found |= {**known, "seconds": time.monotonic() - began}
+    record = _about(command, game, policy)
+    for part in _fly_all(flyer, MapEvaders(command, game, policy, draw)):
+        record |= {**part, "seconds": time.monotonic() - began}
         if keep is not None:
-            keep(found)
-    return found
+            keep(record)
+    return record
 
 
 def _about(command, game, policy):
@@ -162,17 +162,17 @@ def _about(command, game, policy):
     }
 
 
-def _flown(flyer, knowing):
+def _fly_all(flyer, knowing):
     """What is known when scripted evaders have flown, when others have learned, and
     when these have flown, and planned ones.
     """
     command = flyer.command
     game = knowing.game
     cells = cells_of(command)
-    flown = flyer.fly(knowing.scripted, cells)
+    statistics_of = flyer.fly(knowing.scripted, cells)
     records = [
         cell_record(game, cell, statistics)
-        for cell, statistics in zip(cells, flown, strict=True)
+        for cell, statistics in zip(cells, statistics_of, strict=True)
     ]
     yield {"cells": records}
     if not command.best_response:
@@ -180,15 +180,15 @@ def _flown(flyer, knowing):
     began = time.monotonic()
     learners, curve = knowing.evaders(flyer.tell)
     yield {"curve": curve, "seconds_of_learning": time.monotonic() - began}
-    flown = flyer.fly(knowing.learned(learners), cells)
-    for record, statistics in zip(records, flown, strict=True):
+    statistics_of = flyer.fly(knowing.learned(learners), cells)
+    for record, statistics in zip(records, statistics_of, strict=True):
         record["learned"] = figures(game, _of_least_caught(statistics))
     yield {"cells": records}
     places = _planned_cells(command, len(cells))
     if not places:
         return
-    flown = flyer.fly(knowing.planned, [cells[place] for place in places])
-    for place, statistics in zip(places, flown, strict=True):
+    statistics_of = flyer.fly(knowing.planned, [cells[place] for place in places])
+    for place, statistics in zip(places, statistics_of, strict=True):
         records[place]["planner"] = figures(game, statistics)
     yield {"cells": records}
 
@@ -196,8 +196,8 @@ def _flown(flyer, knowing):
 def _planned_cells(command, number):
     """Places of the cells, of so many, in which the planner flies."""
     generator = np.random.default_rng(command.seed)
-    planned = round(command.planner_share * number)
-    return np.sort(generator.choice(number, planned, replace=False)).tolist()
+    count = round(command.planner_share * number)
+    return np.sort(generator.choice(number, count, replace=False)).tolist()
 
 
 def cells_against(file: Mapping, evaders: str) -> list[dict]:

@@ -87,12 +87,12 @@ def guarded(step: Callable[[Any], tuple[Any, dict]]) -> Callable:
       Infinities are left alone: they're legitimate as bounds.
     """
 
-    def checked(carry):
+    def check(carry):
         carry, metrics = step(carry)
         has_nan = [jnp.any(jnp.isnan(leaf)) for leaf in float_leaves(carry).values()]
         return carry, metrics, jnp.stack(has_nan) if has_nan else jnp.zeros((0,), bool)
 
-    return checked
+    return check
 
 
 def float_leaves(carry: Any) -> dict[str, jax.Array]:

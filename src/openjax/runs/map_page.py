@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from openjax.runs.catch_map import cells_against
-from openjax.show.pages import filled
+from openjax.show.pages import fill_template
 
 SHOWN = (
     *(
@@ -44,7 +44,7 @@ def map_page(maps: Mapping[str, dict]) -> str:
             if cells:
                 cells_shown = [{key: cell.get(key) for key in SHOWN} for cell in cells]
                 plain.append({"name": f"{name}, {words}", "cells": cells_shown})
-    return filled(
+    return fill_template(
         "catch_map.html.jinja",
         Path(__file__).parent,
         maps=plain,

@@ -31,7 +31,7 @@ from openjax.store.run_directory import (
     RunDirectory,
     check_free,
     create_run,
-    locked,
+    lock_run,
     open_run,
 )
 from openjax.vehicle.vehicle_file import copy_vehicle_file, load_vehicle_file
@@ -116,7 +116,7 @@ def start(
     # a mistake shows before any process changes a file
     _check_same(job.settings, processes)
     # one process writes for all, and no second run into its directory
-    with locked(directory.path) if processes.is_first else contextlib.nullcontext():
+    with lock_run(directory.path) if processes.is_first else contextlib.nullcontext():
         if command.resume is None and processes.is_first:
             create_run(directory.path, command.overwrite)
             for name, path in files.items():

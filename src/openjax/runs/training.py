@@ -17,7 +17,7 @@ from openjax.cluster.devices import (
     make_device_step,
     own_copy,
 )
-from openjax.command_line import typed
+from openjax.command_line import as_typed
 from openjax.evaluation.episodes import summarise
 from openjax.evaluation.validation import Validation, flat_metrics, selection_score
 from openjax.interruption import StopRequest
@@ -191,7 +191,7 @@ class _Run:
         )
         return (
             f"{checkpoint_words}; go on with "
-            f"{typed(f'openjax train --resume {self.directory.path}')}"
+            f"{as_typed(f'openjax train --resume {self.directory.path}')}"
         )
 
     def _plan(self, seconds):

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from flax.traverse_util import flatten_dict
 
-from openjax.command_line import typed
+from openjax.command_line import as_typed
 from openjax.files import to_plain
 from openjax.learning import TrainSettings
 from openjax.learning.presets import PRESETS
@@ -73,15 +73,17 @@ def closing_words(
     view = f"openjax view --policy {run}"
     if layouts := layouts_like(game):
         view += f" --scenario {layouts[-1].name}"
-    steps = [f"{typed(view)} (in a browser)"]
+    steps = [f"{as_typed(view)} (in a browser)"]
     if own_network:
         steps = [f'openjax.load_policy("{run}", environment, network) in Python']
     if on_cpu:
         steps.append(
-            typed("openjax train --preset paper (the real game, two minutes on a GPU)")
+            as_typed(
+                "openjax train --preset paper (the real game, two minutes on a GPU)"
+            )
         )
-    steps.append(f"{typed('openjax sample_flights flights')}, then")
-    steps.append(typed("openjax diagnose flights (from flight logs to a cause)"))
+    steps.append(f"{as_typed('openjax sample_flights flights')}, then")
+    steps.append(as_typed("openjax diagnose flights (from flight logs to a cause)"))
     return [*lines, "\n  ".join(["Next:", *steps])]
 
 

@@ -37,7 +37,7 @@ STYLE = {
 }
 
 
-def filled(template: str, folder: Path, **values) -> str:
+def fill_template(template: str, folder: Path, **values) -> str:
     """A template of a folder with its values and the pages' looks."""
     loader = jinja2.FileSystemLoader([folder, Path(__file__).parent])
     # escaped, as names come from people's files; a name that is missing is an error,

@@ -214,7 +214,7 @@ def load_policy(
     path = Path(name_or_path)
     source = str(name_or_path)
     if environment is not None or policy is not None:
-        return _own(open_run(path), source, environment, policy)
+        return _load_own(open_run(path), source, environment, policy)
     # names before paths: a folder called "open" doesn't hide the shipped policy
     if source in METHODS:
         return _heuristic(source)
@@ -283,7 +283,7 @@ def _from_file(path, source):
     return _build(from_plain(TrainSettings, settings, f"{path}: "), leaves, source)
 
 
-def _own(run, source, environment, policy):
+def _load_own(run, source, environment, policy):
     """The best policy of a run with parts of one's own."""
     settings = run.read_settings()
     parts = build(settings, environment, policy)

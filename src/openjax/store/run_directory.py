@@ -153,7 +153,7 @@ def create_run(path: Path, overwrite: bool) -> RunDirectory:
     """An empty run directory; with `overwrite` a run that is there is removed, and only
     its own files.
 
-    Call it inside `locked`.
+    Call it inside `lock_run`.
     """
     check_free(path, overwrite)
     path = Path(path)
@@ -169,7 +169,7 @@ def create_run(path: Path, overwrite: bool) -> RunDirectory:
 
 
 @contextlib.contextmanager
-def locked(path: Path) -> Iterator[None]:
+def lock_run(path: Path) -> Iterator[None]:
     """Keep the directory, which is made where it isn't there, for this process; its end
     gives it free, also a kill.
 

@@ -239,7 +239,7 @@ class _Worlds(NamedTuple):
             active.astype(jnp.float32),
         ]
 
-    def unpacked(self, rows):
+    def unpack(self, rows):
         """The drones again from their leaves' rows."""
         leaves, structure = jax.tree.flatten(self.drones)
         number = self.command.shape[0] * self.command.shape[1]
@@ -277,7 +277,7 @@ def _one_call(step, vehicle, worlds, interpret):
         compiler_params=pallas_triton.CompilerParams(num_warps=WARPS, num_stages=1),
         name="rigid_step",
     )(constants, *rows, *around)
-    return worlds.unpacked(outputs)
+    return worlds.unpack(outputs)
 
 
 def _kernel(step, vehicle, worlds):

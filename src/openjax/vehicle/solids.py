@@ -193,7 +193,7 @@ def _things(arena, position, around) -> Thing:
     )
     sizes = [kind.level.shape[0] for kind in kinds]
 
-    def joined(*parts):
+    def join(*parts):
         # what doesn't vary is a float, and floor and pillars come before the drones
         alike = [isinstance(part, float) for part in parts].count(True)
         constant = jnp.asarray(np.repeat(parts[:alike], sizes[:alike]), position.dtype)
@@ -202,7 +202,7 @@ def _things(arena, position, around) -> Thing:
             return constant
         return jnp.concatenate([constant, *arrays] if alike else arrays)
 
-    return jax.tree.map(joined, *kinds)
+    return jax.tree.map(join, *kinds)
 
 
 def encounters(

@@ -135,7 +135,7 @@ def read_rate_loop(reading) -> RateLoop:
         strict=True,
     )
     for track, vehicle, link, (_, commanded_rates) in tracks:
-        requests, motor_ticks = observed(track, vehicle, link, reading.at_once)
+        requests, motor_ticks = observe_track(track, vehicle, link, reading.at_once)
         ticks.append(motor_ticks)
         logged_outputs, nominal, *larger = np.concatenate(
             [track.motor[None], requests]
@@ -162,12 +162,12 @@ def with_motors(track: Track, vehicle) -> Track:
     link = (0.0, np.stack([rows, np.maximum(rows - 1, 0)], 1))
     track = dataclasses.replace(track, motor=np.repeat(track.command[:, :1], 4, 1))
     for _ in range(2):
-        requests, _ = observed(track, vehicle, link)
+        requests, _ = observe_track(track, vehicle, link)
         track = dataclasses.replace(track, motor=requests[0], motors_logged=False)
     return track
 
 
-def observed(track: Track, vehicle, link, at_once=False):
+def observe_track(track: Track, vehicle, link, at_once=False):
     """The observer's output: mean motor commands (1 + 3, T, 4) that the nominal loop
     wants, and with one gain each larger by GAIN_STEP; and the commands sent in the
     ticks (T, TICKS, 4).

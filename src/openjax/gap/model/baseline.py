@@ -99,13 +99,15 @@ def transfer(
     two days by `days` (N,), so a measurement of one day tells less of another. What the
     flights don't show stays as it usually is.
     """
-    daily, rest = np.flatnonzero(of_a_day), np.flatnonzero(~of_a_day)
-    inside = hessian[np.ix_(daily, daily)] + prior[np.ix_(daily, daily)]
+    day_rows, rest = np.flatnonzero(of_a_day), np.flatnonzero(~of_a_day)
+    inside = hessian[np.ix_(day_rows, day_rows)] + prior[np.ix_(day_rows, day_rows)]
     solution = np.linalg.solve(
-        inside, np.column_stack([hessian[np.ix_(daily, rest)], push[daily]])
+        inside, np.column_stack([hessian[np.ix_(day_rows, rest)], push[day_rows]])
     )
-    data = hessian[np.ix_(rest, rest)] - hessian[np.ix_(rest, daily)] @ solution[:, :-1]
-    right = push[rest] - hessian[np.ix_(rest, daily)] @ solution[:, -1]
+    data = (
+        hessian[np.ix_(rest, rest)] - hessian[np.ix_(rest, day_rows)] @ solution[:, :-1]
+    )
+    right = push[rest] - hessian[np.ix_(rest, day_rows)] @ solution[:, -1]
     # (I + D S) of information D
     gain = np.eye(len(rest)) + data * np.square(days[rest])
     data, right = np.linalg.solve(gain, data), np.linalg.solve(gain, right)

@@ -63,12 +63,12 @@ def _places(report: Report):
     figure, axes = small_figure(0.6 + 0.42 * len(places))
     rows = np.arange(len(places))
     nominal = np.array([place.before for place in places])
-    corrected = np.array([place.after for place in places])
-    axes.hlines(rows, corrected, nominal, color=GREY, linewidth=2)
+    with_effects = np.array([place.after for place in places])
+    axes.hlines(rows, with_effects, nominal, color=GREY, linewidth=2)
     axes.plot(nominal, rows, "o", color=BEFORE, markersize=7, label="nominal simulator")
     if report.parameters:
         axes.plot(
-            corrected,
+            with_effects,
             rows,
             "o",
             color=AFTER,
@@ -139,17 +139,17 @@ def _courses(report: Report) -> Iterator[Course]:
         floor = channel.residuals(evidence.library.of(channel.path))
         for name, series in channel.residuals(report.named).items():
             scale = max(rms(np.concatenate(floor[name])), 1e-12)
-            for track, nominal, corrected in zip(
+            for track, nominal, with_effects in zip(
                 evidence.tracks, without[name], series, strict=True
             ):
                 # of some channels one number is known of a whole flight
-                skip = int(SKIP / track.dt) if len(corrected) > 1 else 0
+                skip = int(SKIP / track.dt) if len(with_effects) > 1 else 0
                 yield Course(
                     flight=track.name,
                     dt=track.dt,
                     time=track.time[skip:],
                     before=np.resize(nominal, len(track))[skip:] / scale,
-                    after=np.resize(corrected, len(track))[skip:] / scale,
+                    after=np.resize(with_effects, len(track))[skip:] / scale,
                     name="mean motor command" if name == "motors all" else name,
                     unit="times the noise",
                     adds_up=False,

@@ -10,7 +10,7 @@ from openjax.gap.report.figures import figures
 from openjax.gap.report.report import VERDICTS, Report
 from openjax.gap.report.response import response_of
 from openjax.gap.report.trims_page import content_of
-from openjax.show.pages import filled
+from openjax.show.pages import fill_template
 from openjax.vehicle.effects import EFFECTS
 
 MOST = 0.5
@@ -22,7 +22,7 @@ def page_of(report: Report, folder: Path | None = None) -> str:
     folded what is rarely asked. `folder`: where it is written.
     """
     ranking = sorted(report.probabilities.items(), key=lambda item: -item[1])
-    return filled(
+    return fill_template(
         "page.html.jinja",
         Path(__file__).parent,
         report=report,

@@ -123,7 +123,7 @@ class Report:
         return [f"{', '.join(names)}: {issue}" for issue, names in logs.items()]
 
     @property
-    def noted(self) -> list[str]:
+    def notes(self) -> list[str]:
         """What was found in the logs that were used."""
         return [
             f"{q['flight']}: {q['issue']}"

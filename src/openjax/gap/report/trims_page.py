@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from openjax.gap.trims.change import Change, difference_in_words
 from openjax.gap.trims.figures import FIGURES, TRIMS
-from openjax.show.pages import AFTER, BEFORE, GREY, STYLE, as_svg, filled
+from openjax.show.pages import AFTER, BEFORE, GREY, STYLE, as_svg, fill_template
 
 
 def content_of(change: Change) -> dict:
@@ -30,7 +30,7 @@ def page_of_trims(change: Change) -> str:
     """
     folder = Path(__file__).parent
     trims = content_of(change)
-    return filled("trims_page.html.jinja", folder, change=change, trims=trims)
+    return fill_template("trims_page.html.jinja", folder, change=change, trims=trims)
 
 
 def _in_percent(flights, name, level):

@@ -70,8 +70,8 @@ class Change:
         flights can't split from it.
         """
         top = max(self.causes_here.values())
-        likely = [c for c, p in self.causes_here.items() if p > 0.25 * top]
-        return tuple(sorted(likely, key=lambda c: -self.causes_here[c]))
+        causes = [c for c, p in self.causes_here.items() if p > 0.25 * top]
+        return tuple(sorted(causes, key=lambda c: -self.causes_here[c]))
 
     @property
     def effects(self) -> tuple[str, ...]:
@@ -92,7 +92,7 @@ class Change:
         return [f"{i.flight}: {i.issue}" for i in self.quality if i.refused]
 
     @property
-    def noted(self) -> list[str]:
+    def notes(self) -> list[str]:
         """What was found in the logs that were used."""
         return [f"{i.flight}: {i.issue}" for i in self.quality if not i.refused]
 
@@ -217,8 +217,8 @@ class Change:
 def _row(which: str, flight: FlightFigures) -> dict:
     """A flight of one of the sets, as plain data."""
     day = flight.day.rpartition("/")[2]
-    told = {"flight": flight.name, "set": which, "day": day, "voltage": flight.voltage}
-    return told | {n: round(v[0], 5) for n, v in flight.values.items()}
+    row = {"flight": flight.name, "set": which, "day": day, "voltage": flight.voltage}
+    return row | {n: round(v[0], 5) for n, v in flight.values.items()}
 
 
 def _cause_in_words(change: Change, cause: str) -> str:

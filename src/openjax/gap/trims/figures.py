@@ -128,13 +128,13 @@ def _in_the_air(flight: Flight, case: Case) -> np.ndarray:
 def _trims(
     flight: Flight, motor: np.ndarray, rows: np.ndarray, mixer: np.ndarray
 ) -> dict:
-    mixed = motor @ mixer.T
+    wrench = motor @ mixer.T
     specific_thrust = _specific_thrust(flight)
     block = (flight.time // BLOCK).astype(int)[rows]
     _, block = np.unique(block, return_inverse=True)
     count = np.bincount(block)
     means = np.stack(
-        [np.bincount(block, c[rows]) / count for c in (*mixed.T, specific_thrust)], 1
+        [np.bincount(block, c[rows]) / count for c in (*wrench.T, specific_thrust)], 1
     )
     means = means[count > 0.5 * np.median(count)]
     weight = means.sum(0)
@@ -169,8 +169,8 @@ def _shaking(flight: Flight) -> dict:
     flight as units; nothing of a log that is too short or too slow to hold it.
     """
     grid = clock_of(flight)
-    measured = flight.body_rates is not None and not flight.body_rates_derived
-    if grid is None or len(grid) < 4 * RATE or not measured:
+    has_gyroscope = flight.body_rates is not None and not flight.body_rates_derived
+    if grid is None or len(grid) < 4 * RATE or not has_gyroscope:
         return {}
     if flight.row_period >= SLOW:
         return {}
