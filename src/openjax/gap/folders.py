@@ -52,14 +52,14 @@ def diagnose_folder(
         if trims is None:
             raise
         return replace(trims, alone_because=str(error))
-    told = case.vehicle_file
+    vehicle_file = case.vehicle_file
     if progress:
         progress("asking which flight would tell most")
     return replace(
         report,
         trims=trims,
-        vehicle="" if told.path is None else str(told.path.resolve()),
-        next_flight=next_flight(report.to_dict(), told),
+        vehicle="" if vehicle_file.path is None else str(vehicle_file.path.resolve()),
+        next_flight=next_flight(report.to_dict(), vehicle_file),
     )
 
 
