@@ -118,6 +118,7 @@ def diagnose(job: tuple) -> dict:
         "rest",
         "quality",
         "residual",
+        "residual_before",
     )
     return line | {k: report[k] for k in fields if report and k in report}
 

@@ -1,12 +1,13 @@
 """What the diagnosis is calibrated with: cases with known answers, of several worlds.
 
-    python -m experiments.diagnosis.quantile CASES.jsonl … --source WORDS --out
-    src/openjax/gap/residual.json
+    python -m experiments.diagnosis.quantile CASES.jsonl … --referred CASES.jsonl …
+    --source WORDS --out src/openjax/gap/residual.json
 
-Reads what `development` wrote. Writes the residual check's measures over all cases in
-which nothing unknown acts, whatever was named: the engine takes conformal p-values
-among them (Vovk, Gammerman, Shafer 2005). Prints the temperature of the probabilities
-under which the right classes are likeliest (Guo et al. 2017), beside the one in use.
+Reads what `development` wrote, without references and with them (`--healthy`). Writes
+the residual check's measures over all cases in which nothing unknown acts, whatever was
+named: the engine takes conformal p-values among them (Vovk, Gammerman, Shafer 2005).
+Without any CASES those of the file stay. Prints the reliability of the probabilities
+under which the right classes are likeliest, beside the one in use.
 """
 
 import argparse
@@ -18,7 +19,7 @@ from scipy.optimize import minimize_scalar
 from experiments.diagnosis.development import read_lines
 from openjax.files import write_json
 from openjax.gap.decision import DECISION
-from openjax.gap.probabilities import temper
+from openjax.gap.residual import calibration
 
 WITHOUT = ("unknown", "garbage")
 # probability of a class that was ruled out: one case must not decide alone
@@ -37,24 +38,33 @@ def measures_of(lines: list[dict]) -> list[dict[str, float]]:
     ]
 
 
-def best_temperature(lines: list[dict]) -> float:
-    """The temperature that makes the right classes likeliest, from probabilities made
-    at the one in use.
+def pairs_of(lines: list[dict]) -> list[dict[str, dict[str, float]]]:
+    """The same, and what the reference leaves, of cases that had one."""
+    good = [r for r in lines if r.get("residual_before")]
+    before = [r | {"residual": r["residual_before"]} for r in good]
+    return [
+        {"case": case, "reference": reference}
+        for case, reference in zip(measures_of(good), measures_of(before), strict=True)
+    ]
+
+
+def best_reliability(lines: list[dict]) -> float:
+    """The reliability that makes the right classes likeliest, from probabilities made
+    with the one in use.
     """
     told = [
         (r["probabilities"], r["right_names"]) for r in lines if r.get("probabilities")
     ]
 
-    def loss(logarithm: float) -> float:
-        cases = [
-            (temper(p, np.exp(logarithm) / DECISION.temperature), right)
-            for p, right in told
+    def loss(share: float) -> float:
+        change = share / DECISION.reliability
+        right = [
+            sum(p.get(n, 0.0) * change + (1.0 - change) / len(p) for n in names)
+            for p, names in told
         ]
-        return -sum(
-            np.log(max(sum(p.get(n, 0.0) for n in right), FLOOR)) for p, right in cases
-        )
+        return -float(np.log(np.maximum(right, FLOOR)).sum())
 
-    return float(np.exp(minimize_scalar(loss, bounds=(-1.0, 3.0), method="bounded").x))
+    return float(minimize_scalar(loss, bounds=(0.5, 1.0), method="bounded").x)
 
 
 def main() -> None:
@@ -62,19 +72,23 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("cases", nargs="+", type=Path)
+    parser.add_argument("cases", nargs="*", type=Path)
+    parser.add_argument("--referred", nargs="*", type=Path, default=[])
     parser.add_argument(
         "--source", required=True, help="which cases these are, in words"
     )
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()
     lines = read_lines(options.cases)
-    cases = measures_of(lines)
-    write_json(options.out, {"source": options.source, "cases": cases})
-    graded = [r for r in lines if r["category"] not in ("garbage", "real")]
+    referred = read_lines(options.referred)
+    cases = measures_of(lines) if lines else calibration()
+    pairs = pairs_of(referred) if referred else calibration("with_reference")
+    found = {"source": options.source, "cases": cases, "with_reference": pairs}
+    write_json(options.out, found)
+    graded = [r for r in lines + referred if r["category"] not in ("garbage", "real")]
     print(
-        f"{len(cases)} cases; temperature {best_temperature(graded):.2f}, in use "
-        f"{DECISION.temperature}"
+        f"{len(cases)} cases, {len(pairs)} with a reference; reliability "
+        f"{best_reliability(graded):.2f}, in use {DECISION.reliability}"
     )
 
 

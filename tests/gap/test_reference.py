@@ -13,11 +13,13 @@ from openjax.flights.flight import Case, Issue
 from openjax.gap.channels import Estimated
 from openjax.gap.decision import DECISION
 from openjax.gap.folders import diagnose_folder
+from openjax.gap.identification.changes import change_of, given
+from openjax.gap.identification.estimates import ESTIMATED, EffectEstimates
 from openjax.gap.model.baseline import Baseline, day_of, transfer
 from openjax.gap.model.library import ABSENT, PLACE
 from openjax.gap.reference import differs, join, trim_of, trimmed_before, with_some
 from openjax.gap.report.page import page_of
-from openjax.gap.residual import changed_p
+from openjax.gap.residual import HORIZONS, calibration, conformal_p
 from openjax.vehicle import load_vehicle
 from openjax.vehicle.vehicle_file import load_vehicle_file
 
@@ -133,18 +135,35 @@ def test_a_delay_that_the_reference_has_as_well_is_no_change(
     assert differs(channel(0.02, 0.001, True), "state_latency", known) == changed
 
 
-def test_what_is_left_beyond_the_reference_is_judged_by_the_measure_that_grew_most():
-    before = {"rates": 0.1, "velocity": 0.02}
-    grown = {"rates": 0.1, "velocity": 0.02 * float(np.exp(DECISION.left_over))}
-    assert changed_p(grown, before, grown) == (
-        pytest.approx(DECISION.unknown),
-        "velocity",
+def test_the_same_growth_says_more_of_a_sensor_than_of_what_gusts_shake():
+    usual = [pair["reference"] for pair in calibration("with_reference")]
+    before = {n: float(np.median([c[n] for c in usual if n in c])) for n in HORIZONS}
+    p_values = {
+        name: conformal_p(before | {name: 1.6 * before[name]}, before)
+        for name in ("accelerometer", "rates")
+    }
+    assert conformal_p(before, before)[0] > 0.5
+    assert p_values["accelerometer"][1] == "accelerometer"
+    assert p_values["accelerometer"][0] < DECISION.unknown < p_values["rates"][0]
+
+
+@pytest.mark.parametrize("lag", [0.0, 0.008])
+def test_a_lag_shows_beside_the_reference_where_rows_hide_it(lag):
+    def told(extra):
+        value = np.array([0.02 + extra, 0.02 + extra, 1.4, 1.4, 0.8])
+        fit = SimpleNamespace(turning=np.full(3, 50.0))
+        rows = np.diag(np.square([0.03, 0.03, 0.6, 0.6, 0.4]))
+        return EffectEstimates(ESTIMATED, value, rows, (0.0, 0.001), fit, 1e-6 * rows)
+
+    theta = ABSENT.copy()
+    change = change_of(told(lag), told(0.0), theta)
+    alone = given(
+        change, theta, {("motor_lag", "extra_up"), ("motor_lag", "extra_down")}
     )
-    assert changed_p(before, before, before)[0] == 1.0
-    assert changed_p({"position": 1.0}, before, {"position": 1.0}) == (1.0, "")
-    # An effect that explains as much of what grew isn't quite of the library's form.
-    unnamed = grown | {"velocity": 1.0}
-    assert changed_p(grown, before, unnamed)[0] > 2.0 * DECISION.unknown
+    value, deviation = alone.of("motor_lag", "extra_up")
+    assert value == pytest.approx(lag, abs=1e-9) and deviation < 0.003
+    # with an inertia beside it a lag is told less sharply
+    assert change.of("motor_lag", "extra_up")[1] > 0.005
 
 
 def test_days_of_a_reference_are_joined_and_another_vehicle_is_refused():

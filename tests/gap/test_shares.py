@@ -55,7 +55,7 @@ def test_probabilities_add_up_and_follow_the_words():
         and max(found, key=found.get) == "mass"
     )
     nothing = probabilities({}, {}, 0.05, {frozenset(): 1.0})
-    odds = (0.95 / 0.05) ** (1.0 / DECISION.temperature)
+    odds = 0.95 / 0.05
     least = min(nothing.values())
     assert (nothing["none"] - least) / (nothing["unknown"] - least) == pytest.approx(
         odds

@@ -7,12 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from openjax.flights.clocks import case_on_gyroscope_clock
 from openjax.flights.flight import Case
 from openjax.gap.criteria import DETECTABLE
 from openjax.gap.decision import DECISION
-from openjax.gap.evidence import Evidence, gather
-from openjax.gap.identification.quantities import identify
+from openjax.gap.evidence import Evidence, gather, with_identification
 from openjax.gap.intervals import estimates
 from openjax.gap.model.bounds import BOUND
 from openjax.gap.model.library import CARDS, PLACE, library, path_of
@@ -64,16 +62,12 @@ def diagnose_case(
         evidence = gather(case, library(without), progress, both)
     if progress:
         progress("identifying what the vehicle does")
-    sensors = evidence.sensors
-    # motors that a log has late are no lag of the motors
-    in_time = case_on_gyroscope_clock(case, sensors.motors_late)
-    identification = identify(in_time, sensors.one_clock and sensors.motor_clock)
-    evidence = replace(evidence, identification=identification)
+    evidence = with_identification(evidence)
     if progress:
         progress("trying every effect that the flights can show")
     report = conclude(evidence)
     seconds = time.perf_counter() - begin
-    return replace(report, identification=identification, seconds=seconds)
+    return replace(report, identification=evidence.identification, seconds=seconds)
 
 
 def conclude(evidence: Evidence) -> Report:
@@ -207,6 +201,7 @@ def _report(
         nuisances=_nuisances(evidence, selection),
         reference=_reference_in_words(evidence, causes),
         residual={"p_value": check.p_value} | check.measures,
+        residual_before=check.reference or {},
         plots={"evidence": evidence, "selection": selection},
     )
 

@@ -2,12 +2,15 @@
 channel.
 """
 
+from collections.abc import Collection
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from openjax.errors import TooLittle
 from openjax.flights.clocks import (
+    case_on_gyroscope_clock,
     on_gyroscope_clock,
     read_command_clock,
     read_motor_clock,
@@ -21,8 +24,15 @@ from openjax.gap.channels.pose import Pose, read_pose
 from openjax.gap.channels.radio import read_radio
 from openjax.gap.channels.rate_loop import read_rate_loop, with_motors
 from openjax.gap.decision import DECISION
-from openjax.gap.identification.quantities import Identification
-from openjax.gap.identification.support import support
+from openjax.gap.identification.changes import (
+    FARTHEST,
+    change_of,
+    comparable,
+    given,
+)
+from openjax.gap.identification.estimates import EffectEstimates
+from openjax.gap.identification.quantities import Identification, identify
+from openjax.gap.identification.support import distance, support
 from openjax.gap.model.baseline import Baseline
 from openjax.gap.model.library import CARDS, Library, places
 from openjax.gap.model.replay import Replay
@@ -61,17 +71,38 @@ class Evidence:
         silent = any(t.voltage is None for t in self.tracks)
         return silent and self.case.vehicle_file.motor.command == "pwm"
 
-    @property
-    def torque_response(self) -> dict[tuple[str, str], tuple[float, float]]:
+    @cached_property
+    def change(self) -> EffectEstimates | None:
+        """What the torques' response tells beside the reference's; None where there is
+        none, or none to compare.
+        """
+        before = None if self.baseline is None else self.baseline.identification
+        if not comparable(self.identification, before):
+            return None
+        return change_of(
+            self.identification.estimates, before.estimates, self.baseline.theta
+        )
+
+    def torque_response(
+        self, effects: Collection[str]
+    ) -> dict[tuple[str, str], tuple[float, float]]:
         """{(effect, parameter): (value, standard deviation)} of what the torques'
-        response tells without a model of the loop, of effects that these logs can show.
+        response tells without a model of the loop, of effects that these logs can show;
+        beside a reference, if these `effects` alone have changed.
         """
         identification = self.identification
-        if identification is None or not identification.trustworthy:
+        if self.change is not None:
+            free = {(e, p.name) for e in effects for p in CARDS[e].fitted}
+            free = free.union(*(CARDS[e].confirmed_by for e in effects))
+            if not free & set(self.change.names):
+                return {}
+            estimates = given(self.change, self.baseline.theta, free)
+        elif identification is not None and identification.trustworthy:
+            estimates = identification.estimates
+        else:
             return {}
         unseen = {e for e in self.library.physics if self.motion.exposure[e] == 0.0}
-        names = [key for key in identification.estimates.names if key[0] not in unseen]
-        estimates = identification.estimates
+        names = [key for key in estimates.names if key[0] not in unseen]
         return {(effect, p): estimates.of(effect, p) for effect, p in names}
 
     def support(self, theta: np.ndarray) -> float:
@@ -87,11 +118,15 @@ class Evidence:
         return gusts.nats if gusts is not None and acts else 0.0
 
     def _of_torques(self, theta: np.ndarray) -> float:
+        """Two questions: is this a usual vehicle, and is it the one that it was?"""
         identification = self.identification
-        if identification is None or not identification.trustworthy:
-            return 0.0
-        pwm = self.case.vehicle_file.motor.command == "pwm"
-        return support(identification.estimates, theta, pwm)
+        nats = 0.0
+        if identification is not None and identification.trustworthy:
+            pwm = self.case.vehicle_file.motor.command == "pwm"
+            nats += support(identification.estimates, theta, pwm)
+        if self.change is not None:
+            nats -= min(distance(self.change, theta), FARTHEST)
+        return nats
 
 
 def gather(
@@ -130,6 +165,16 @@ def gather(
     return Evidence(
         case, library, tracks, vehicles, sensors, channels, motion, baseline
     )
+
+
+def with_identification(evidence: Evidence) -> Evidence:
+    """The evidence with what the vehicle does. Motors that a log has late are no lag of
+    the motors.
+    """
+    sensors = evidence.sensors
+    in_time = case_on_gyroscope_clock(evidence.case, sensors.motors_late)
+    found = identify(in_time, sensors.one_clock and sensors.motor_clock)
+    return replace(evidence, identification=found)
 
 
 def _motors(

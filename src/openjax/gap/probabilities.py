@@ -41,8 +41,7 @@ def probabilities(
     total = sum(share_of.values())
     for name, weight in share_of.items():
         chance[name] += rest * weight / total
-    causes = {*possible, "none", "unknown"}
-    return reliable(temper(chance, DECISION.temperature), DECISION.reliability, causes)
+    return reliable(chance, DECISION.reliability, {*possible, "none", "unknown"})
 
 
 def reliable(
@@ -71,12 +70,3 @@ def agreeing(chance: dict[str, float], answers, sure: float) -> dict[str, float]
             break
         chance[rival] = chance[answer] = 0.5 * (chance[rival] + chance[answer])
     return chance
-
-
-def temper(chance: dict[str, float], temperature: float) -> dict[str, float]:
-    """Probabilities as sure as they are right in known cases: their logarithms over one
-    temperature (Guo et al. 2017).
-    """
-    flat = {name: max(p, 0.0) ** (1.0 / temperature) for name, p in chance.items()}
-    total = sum(flat.values())
-    return {name: p / total for name, p in flat.items()}

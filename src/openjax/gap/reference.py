@@ -13,7 +13,7 @@ from openjax.errors import UserError
 from openjax.flights.flight import Case
 from openjax.gap.channels import Channel
 from openjax.gap.decision import DECISION
-from openjax.gap.evidence import Evidence, gather
+from openjax.gap.evidence import Evidence, gather, with_identification
 from openjax.gap.model.baseline import COLOURED, FORM, Baseline, day_of, transfer
 from openjax.gap.model.cross_validation import Equations
 from openjax.gap.model.hypotheses import SetFit, fit_set
@@ -68,7 +68,11 @@ def read_reference(case: Case, progress=None) -> Baseline:
         theta[key] = fit.theta[key] + shift
     channels = {c.path: c for c in evidence.channels}
     trim = _trim_of_a_day(fit, evidence.vehicles[0])
-    return Baseline(theta, lasting, names, covariance, measures, channels, trim)
+    # last, as what the vehicle is like is sought in the motion alone
+    response = with_identification(evidence).identification
+    return Baseline(
+        theta, lasting, names, covariance, measures, channels, trim, response
+    )
 
 
 def borne_out(evidence: Evidence) -> Baseline:

@@ -10,7 +10,7 @@ over those (Vovk et al. 2005; `residual.json`).
 
 import json
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -32,10 +32,6 @@ HORIZONS = {
     "estimator": (0.1, "attitude and gyroscope disagree"),
     "position": (0.1, "position and velocity disagree"),
 }
-# By how much of its own size an effect may be left, where it isn't quite of the
-# library's form: of 51 development cases with a cause 4 are then called unknown, and 6
-# without (seed 886).
-FORM_LEFT = 0.3
 # Share of what grew that effects leave where they aren't what acts: those named beside
 # an unknown cause left .71 to 1, those that act .54 at most (seeds 890 to 893).
 MOSTLY = 0.65
@@ -50,7 +46,8 @@ class Check:
     """`measures` {name: value} and the one that stands out most, `finding`; its
     `p_value` among cases without an unknown cause; `excess` (9,): share of each motion
     channel's squared error beyond what such cases leave, where the check rejects;
-    `mostly_unknown`: whether it does, and effects of the motion explain little of what
+    `reference`: the measures that the reference leaves and that can be compared, None
+    without one; `mostly_unknown`: whether it does, and effects of the motion explain little of what
     it finds.
     """
 
@@ -58,6 +55,7 @@ class Check:
     finding: str
     p_value: float
     excess: np.ndarray
+    reference: dict[str, float] | None = None
     mostly_unknown: bool = False
 
     @property
@@ -86,25 +84,21 @@ def check_residual(evidence: Evidence, fit: SetFit, nothing: SetFit) -> Check:
     `nothing`: the fit of no effect.
     """
     measures, axes = measure(evidence, residuals_of(fit))
-    reference = {}
-    if evidence.baseline is None:
-        p_value, name = conformal_p(measures)
-        mostly_unknown = False
-    else:
-        reference = _comparable(evidence)
+    reference = None if evidence.baseline is None else _comparable(evidence)
+    p_value, name = conformal_p(measures, reference)
+    mostly_unknown = False
+    if reference is not None and name in reference:
         measures_of_nothing, _ = measure(evidence, residuals_of(nothing))
-        p_value, name = changed_p(measures, reference, measures_of_nothing)
-        mostly_unknown = (
-            bool(name)
-            and unexplained_share(
-                measures[name], reference[name], measures_of_nothing[name]
-            )
-            > MOSTLY
+        share = unexplained_share(
+            measures[name], reference[name], measures_of_nothing[name]
         )
+        mostly_unknown = share > MOSTLY
     rejects = p_value <= DECISION.unknown
-    excess = beyond(axes, reference) if rejects else np.zeros(9)
+    excess = beyond(axes, reference or {}) if rejects else np.zeros(9)
     finding = HORIZONS.get(name, (0.0, ""))[1]
-    return Check(measures, finding, p_value, excess, rejects and mostly_unknown)
+    return Check(
+        measures, finding, p_value, excess, reference, rejects and mostly_unknown
+    )
 
 
 def residuals_of(fit: SetFit) -> list[Float[np.ndarray, "_ channels"]]:
@@ -223,31 +217,6 @@ def _comparable(evidence: Evidence) -> dict[str, float]:
     return {n: v for n, v in baseline.measures.items() if n not in silent}
 
 
-def changed_p(
-    measures: dict[str, float],
-    reference: dict[str, float],
-    measures_of_nothing: dict[str, float],
-) -> tuple[float, str]:
-    """As `conformal_p`, against the same vehicle's reference: by the measure that grew
-    most. What other flights make it grow by has an exponential tail. Effects that
-    aren't quite of the library's form leave a share of what they explain of the
-    measures `measures_of_nothing` of no effect.
-    """
-    growths = {}
-    for name in (n for n in measures if n in reference):
-        explanation = max(measures_of_nothing[name] ** 2 - measures[name] ** 2, 0.0)
-        remaining = max(measures[name] ** 2 - FORM_LEFT**2 * explanation, 1e-24)
-        growths[name] = float(
-            0.5 * np.log(remaining / max(reference[name], 1e-12) ** 2)
-        )
-    if not growths:
-        return 1.0, ""
-    name = max(growths, key=lambda n: growths[n])
-    # so that a growth of `left_over` has the p-value `unknown`
-    rate = np.log(1.0 / DECISION.unknown) / DECISION.left_over
-    return float(np.exp(-rate * max(growths[name], 0.0))), name
-
-
 def unexplained_share(
     measure: float, reference: float, measure_of_nothing: float
 ) -> float:
@@ -258,45 +227,63 @@ def unexplained_share(
     return remaining / max(measure_of_nothing**2 - reference**2, remaining, 1e-24)
 
 
-def conformal_p(measures: dict[str, float]) -> tuple[float, str]:
+def conformal_p(
+    measures: dict[str, float], reference: dict[str, float] | None = None
+) -> tuple[float, str]:
     """Share of cases without an unknown cause, this one among them, that stand out as
-    much, and by which measure this one does. Beyond the largest the tail is
-    exponential, as long as that of the upper quarter (Pickands 1975).
+    much, and by which measure this one does. `reference`: what the same vehicle's
+    reference leaves, None without one. Beyond the largest the tail is exponential, as
+    long as that of the upper quarter (Pickands 1975).
     """
-    value, name = standing_out(measures)
-    calibration_values = np.array([standing_out(case)[0] for case in calibration()])
-    share = float(
-        (1 + (calibration_values >= value).sum()) / (1 + len(calibration_values))
-    )
-    start = np.quantile(calibration_values, 0.75)
-    scale = max(
-        float((calibration_values[calibration_values >= start] - start).mean()), 1e-9
-    )
-    return share * float(
-        np.exp(-max(value - calibration_values.max(), 0.0) / scale)
-    ), name
+    value, name = standing_out(measures, reference)
+    others = calibration_values(reference is not None)
+    share = float((1 + (others >= value).sum()) / (1 + len(others)))
+    start = np.quantile(others, 0.75)
+    scale = max(float((others[others >= start] - start).mean()), 1e-9)
+    return share * float(np.exp(-max(value - others.max(), 0.0) / scale)), name
 
 
-def standing_out(measures: dict[str, float]) -> tuple[float, str]:
-    """How far one of a case's measures stands out at most of what the others of its
-    logs lead to expect, in standard deviations, and which; logs without anything to
-    hold against each other stand out nowhere. What makes a sensor noisy raises all that
-    it has a part in; so each logarithm is told given the others, as of a normal
-    distribution.
+@cache
+def calibration_values(referred: bool) -> np.ndarray:
+    """(cases,) how far each of the calibration's cases stands out, with its reference
+    or without.
+    """
+    if referred:
+        pairs = calibration("with_reference")
+        far = [standing_out(pair["case"], pair["reference"])[0] for pair in pairs]
+    else:
+        far = [standing_out(case)[0] for case in calibration()]
+    return np.array(far)
+
+
+def standing_out(
+    measures: dict[str, float], reference: dict[str, float] | None = None
+) -> tuple[float, str]:
+    """How far one of a case's measures stands out at most of what is expected, in
+    standard deviations, and which; logs without anything to hold against each other
+    stand out nowhere.
+
+    What makes a sensor noisy raises all that it has a part in; so each logarithm is
+    expected given the others, as of a normal distribution. What the `reference` leaves
+    of the same measure is a second expectation. It counts by how little two sets of
+    flights of one vehicle differ: other air and other manoeuvres shake forces and
+    torques, and hardly a sensor.
     """
     names, (mean, covariance) = list(HORIZONS), usual()
-    rows = [k for k, n in enumerate(names) if n in measures]
+    found = logarithms(measures)
+    rows = np.flatnonzero(np.isfinite(found))
+    # with precision P of a normal distribution, (P r)_k / P_kk is how far r_k is from
+    # what the others lead to expect, with a variance of 1 / P_kk
     precision = np.linalg.inv(covariance[np.ix_(rows, rows)])
-    # with precision P of a normal distribution, (P r)_k / sqrt(P_kk) is how far r_k is
-    # from what the others lead to expect, in standard deviations
-    far = (
-        precision
-        @ (logarithms(measures)[rows] - mean[rows])
-        / np.sqrt(np.diag(precision))
-    )
-    return max(
-        zip(far.tolist(), (names[k] for k in rows), strict=True), default=(-np.inf, "")
-    )
+    weight = np.diag(precision)
+    off = precision @ (found - mean)[rows] / weight
+    if reference is not None:
+        growth = (found - logarithms(reference))[rows]
+        more = np.isfinite(growth) / difference_of_days()[rows] ** 2
+        off = (weight * off + more * np.nan_to_num(growth)) / (weight + more)
+        weight = weight + more
+    far = (off * np.sqrt(weight)).tolist()
+    return max(zip(far, (names[k] for k in rows), strict=True), default=(-np.inf, ""))
 
 
 def logarithms(measures: dict[str, float]) -> np.ndarray:
@@ -306,16 +293,28 @@ def logarithms(measures: dict[str, float]) -> np.ndarray:
     )
 
 
-@lru_cache(maxsize=1)
-def calibration() -> list[dict[str, float]]:
-    """The measures of cases without an unknown cause."""
-    return json.loads(CALIBRATION.read_text(encoding="utf-8"))["cases"]
+@cache
+def calibration(kind: str = "cases") -> list[dict]:
+    """The measures of cases without an unknown cause; of the kind "with_reference" the
+    same of others, each a {"case", "reference"} with what its reference leaves.
+    """
+    return json.loads(CALIBRATION.read_text(encoding="utf-8"))[kind]
 
 
-@lru_cache(maxsize=1)
+@cache
 def usual() -> tuple[np.ndarray, np.ndarray]:
     """Mean (measures,) and covariance (measures, measures) of the logarithms over the
     calibration's cases that have them.
     """
     logs = np.ma.masked_invalid([logarithms(case) for case in calibration()])
     return logs.mean(0).filled(0.0), np.ma.cov(logs, rowvar=False).filled(0.0)
+
+
+@cache
+def difference_of_days() -> np.ndarray:
+    """(measures,) root mean squares of what the logarithms grow by from a reference to
+    a case without an unknown cause.
+    """
+    pairs = calibration("with_reference")
+    growth = [logarithms(p["case"]) - logarithms(p["reference"]) for p in pairs]
+    return np.sqrt(np.nanmean(np.square(growth), axis=0))

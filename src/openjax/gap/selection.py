@@ -291,7 +291,7 @@ class Search:
                 next(iter(key - rest))
                 for key, h in self.hypotheses.items()
                 if len(key - rest) == 1 and rest < key and effect not in key and possible(h.fit)
-                and practical(h.fit, torque_response) and not self.clearly_worse(h, hypothesis)
+                and practical(h.fit, torque_response(key)) and not self.clearly_worse(h, hypothesis)
             ]  # fmt: skip
             if alike:
                 out[effect] = sorted(alike)
@@ -307,7 +307,7 @@ class Search:
         sets = [
             h
             for h in self.hypotheses.values()
-            if possible(h.fit) and practical(h.fit, torque_response)
+            if possible(h.fit) and practical(h.fit, torque_response(h.effects))
         ]
         odds, costs = np.array([(h.log_odds, h.fit.cost) for h in sets]).T
         pairs = [[difference(a.validation, b.validation) for b in sets] for a in sets]

@@ -16,7 +16,8 @@ from openjax.gap.identification.torques import identify_torques
 class EffectEstimates:
     """`value` (n,) and `covariance` (n, n) of effects' parameters `names`: (effect,
     parameter). `clock`: s by which motors answer later than logged, and its standard
-    deviation; a delay in the vehicle and clocks that are off look alike.
+    deviation; a delay in the vehicle and clocks that are off look alike. `shown`
+    (n, n): the covariance without what rows hide.
     """
 
     names: tuple[tuple[str, str], ...]
@@ -24,6 +25,7 @@ class EffectEstimates:
     covariance: np.ndarray
     clock: tuple[float, float]
     fit: TorqueFit
+    shown: np.ndarray
 
     def of(self, effect: str, parameter: str) -> tuple[float, float]:
         """Value and standard deviation of one parameter."""
@@ -67,5 +69,6 @@ def of_fit(fit: TorqueFit, records: list[Record]) -> EffectEstimates:
     slopes[2, 3] = -1.0 / roll**2
     slopes[3, 4] = -1.0 / pitch**2
     covariance = slopes @ fit.covariance @ slopes.T
+    shown = slopes @ (fit.covariance - np.diag(fit.hidden**2)) @ slopes.T
     clock = float(fit.value[2]), float(np.sqrt(fit.covariance[2, 2]))
-    return EffectEstimates(ESTIMATED, value, covariance, clock, fit)
+    return EffectEstimates(ESTIMATED, value, covariance, clock, fit, shown)

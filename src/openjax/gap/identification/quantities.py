@@ -21,6 +21,10 @@ MAP = (
     "motor commands are duty cycles: inertia and yaw ratio hold the unknown slope of their thrust, "
     "too"
 )
+SAMPLES = (
+    "a row's motors are one sample of a loop that runs several times within it; log their "
+    "means at 100 Hz, or every sample at 500 Hz"
+)
 TURNS = 8.0  # standard deviations of noise: below, rows show a loop that answers noise
 CLOCK = 0.010  # s: rows off by more are worth a sentence
 POSITIVE = ("spin_up", "spin_down", "roll_gain", "pitch_gain", "yaw_gain")
@@ -68,7 +72,8 @@ class Identification:
     """`quantities` {name: quantity}, `responses` {axis: measured and simulated},
     `remarks`: what to think of when reading them; `estimates` are for the diagnosis;
     `duty_cycles`: what thrust a motor command makes isn't known, so that gains tell its
-    map and the inertia together.
+    map and the inertia together; `sampled`: not trusted for one reason alone, rows that
+    are single samples.
     """
 
     quantities: dict[str, Quantity]
@@ -77,6 +82,7 @@ class Identification:
     estimates: EffectEstimates
     trustworthy: bool = True
     duty_cycles: bool = False
+    sampled: bool = False
 
     def to_dict(self, shares: dict[str, float] | None = None) -> dict:
         """As it stands in `report.json`; `shares` of the gap {effect: share}."""
@@ -149,6 +155,7 @@ def identify(case: Case, one_clock: bool = True) -> Identification | None:
         of_fit(fit, records),
         trustworthy=not reasons,
         duty_cycles=duty_cycles,
+        sampled=reasons == (SAMPLES,),
     )
 
 
@@ -215,10 +222,7 @@ def doubts(records: list[Record], fit: TorqueFit, one_clock: bool) -> tuple[str,
             "holes"
         )
     if any(r.hides_ticks and r.samples for r in records):
-        reasons.append(
-            "a row's motors are one sample of a loop that runs several times within it; log their "
-            "means at 100 Hz, or every sample at 500 Hz"
-        )
+        reasons.append(SAMPLES)
     if any(r.hides_ticks for r in records) and fit.turning[:2].max() < TURNS:
         reasons.append("the vehicle hardly turns; fly the segments yaw, agile or step")
     if np.isclose(fit.value[3:6], SEARCHED[1][0], rtol=0.02).any() and not reasons:

@@ -28,19 +28,30 @@ def support(estimates: EffectEstimates, theta: np.ndarray, pwm: bool) -> float:
     """Log density, up to a constant and at most FARTHEST below the best, of the
     estimates for parameters theta (P,) of the replay.
     """
-    prediction = _predict(estimates, theta)
     usual = np.array([USUAL[e] for e, _ in estimates.names])
     gains = np.array([e != "motor_lag" for e, _ in estimates.names])
     if pwm:
         usual = np.where(gains, np.hypot(usual, UNKNOWN_MAP), usual)
+    return -min(distance(estimates, theta, usual), FARTHEST)
+
+
+def distance(
+    estimates: EffectEstimates, theta: np.ndarray, spread: np.ndarray | float = 0.0
+) -> float:
+    """Nats by which estimates are off from parameters theta (P,), where vehicles differ
+    by `spread` (n,): s of lags, logarithms of gains.
+    """
+    gains = np.array([e != "motor_lag" for e, _ in estimates.names])
+    prediction = predict(estimates, theta)
     off = estimates.value - prediction
     off[gains] = np.log(estimates.value[gains] / np.maximum(prediction[gains], LEAST))
     scale = np.where(gains, estimates.value, 1.0)
-    covariance = estimates.covariance / np.outer(scale, scale) + np.diag(usual**2)
-    return -min(0.5 * float(off @ np.linalg.solve(covariance, off)), FARTHEST)
+    covariance = estimates.covariance / np.outer(scale, scale)
+    covariance += np.square(spread) * np.eye(len(off))
+    return 0.5 * float(off @ np.linalg.solve(covariance, off))
 
 
-def _predict(estimates: EffectEstimates, theta: np.ndarray) -> np.ndarray:
+def predict(estimates: EffectEstimates, theta: np.ndarray) -> np.ndarray:
     """What the estimates would be: a weaker thrust turns the vehicle as a larger
     inertia does.
     """

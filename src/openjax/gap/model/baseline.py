@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from openjax.gap.decision import DECISION
+from openjax.gap.identification.quantities import Identification
 from openjax.gap.model.library import CARDS, PHYSICS_EFFECTS
 from openjax.vehicle.effects import EFFECTS
 from openjax.vehicle.effects.effect import growth
@@ -35,7 +36,7 @@ class Baseline:
     vehicle's form; `names` of their numbers ("effect parameter") whose joint
     `covariance` is known; `measures` of what is left of the reference flights, as
     `residual` has them; `channels` of the reference by path; `trim` (4,) of its rotors
-    on that day, as `reference.trim_of`.
+    on that day, as `reference.trim_of`; `identification`: how its torques answered.
     """
 
     theta: np.ndarray
@@ -45,6 +46,7 @@ class Baseline:
     measures: dict[str, float]
     channels: dict[str, object]
     trim: np.ndarray
+    identification: Identification | None = None
 
     @property
     def numbers(self) -> tuple[tuple[str, str, float], ...]:

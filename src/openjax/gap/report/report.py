@@ -89,6 +89,8 @@ class Report:
     nuisances: dict[str, str] = field(default_factory=dict)
     """{name: what it took}."""
     residual: dict[str, float] = field(default_factory=dict)
+    residual_before: dict[str, float] = field(default_factory=dict)
+    """What the reference leaves of the same measures."""
     reference: str = ""
     """What the reference flights say of the vehicle; empty: none were given."""
     trims: Change | None = None
