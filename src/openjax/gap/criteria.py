@@ -124,7 +124,9 @@ def practical(fit: SetFit, torque_response: Measured) -> bool:
 
     def of_a_size(effect: str) -> bool:
         card = CARDS[effect]
-        if any(key in torque_response for key in card.confirmed_by):
+        if card.needs_response or any(
+            key in torque_response for key in card.confirmed_by
+        ):
             return of_response(card.confirmed_by)
         parameters = [(effect, parameter) for parameter in card.practical]
         return not parameters or of_replay(effect) or of_response(parameters)

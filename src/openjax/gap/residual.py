@@ -9,7 +9,7 @@ over those (Vovk et al. 2005; `residual.json`).
 """
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -59,16 +59,23 @@ class Check:
     mostly_unknown: bool = False
 
     @property
+    def level(self) -> float:
+        """Share of cases without an unknown cause that may be rejected."""
+        if self.reference is None:
+            return DECISION.unknown
+        return DECISION.unknown_with_reference
+
+    @property
     def rejects(self) -> bool:
         """Whether what is left is more than noise."""
-        return self.p_value <= DECISION.unknown
+        return self.p_value <= self.level
 
     @property
     def probability(self) -> float:
-        """That something acts which no effect explains: posterior odds are the prior's
+        """That something acts which no effect explains: posterior odds are the level
         over the p-value.
         """
-        return DECISION.unknown / (DECISION.unknown + self.p_value)
+        return self.level / (self.level + self.p_value)
 
     def in_words(self) -> str:
         """What is left, in one sentence."""
@@ -93,12 +100,12 @@ def check_residual(evidence: Evidence, fit: SetFit, nothing: SetFit) -> Check:
             measures[name], reference[name], measures_of_nothing[name]
         )
         mostly_unknown = share > MOSTLY
-    rejects = p_value <= DECISION.unknown
-    excess = beyond(axes, reference or {}) if rejects else np.zeros(9)
     finding = HORIZONS.get(name, (0.0, ""))[1]
-    return Check(
-        measures, finding, p_value, excess, reference, rejects and mostly_unknown
-    )
+    check = Check(measures, finding, p_value, np.zeros(9), reference)
+    if not check.rejects:
+        return check
+    excess = beyond(axes, reference or {})
+    return replace(check, excess=excess, mostly_unknown=mostly_unknown)
 
 
 def residuals_of(fit: SetFit) -> list[Float[np.ndarray, "_ channels"]]:

@@ -267,6 +267,8 @@ class Card:
     loop: where it is trusted, one of them must be of a size that matters as well. The
     replay's torques are biased in closed loop, where motors answer gusts.
     """
+    needs_response: bool = False
+    """Whether it isn't named, and not testable, where no response is trusted."""
     days: float | None = None
     """Of an effect that every vehicle has to some degree: the standard deviation of its
     parameters over a vehicle's days. None for others.
