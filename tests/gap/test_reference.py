@@ -13,7 +13,7 @@ from openjax.flights.flight import Case, Issue
 from openjax.gap.channels import Estimated
 from openjax.gap.decision import DECISION
 from openjax.gap.folders import diagnose_folder
-from openjax.gap.identification.changes import change_of, given
+from openjax.gap.identification.changes import change_of, conditional
 from openjax.gap.identification.estimates import ESTIMATED, EffectEstimates
 from openjax.gap.model.baseline import Baseline, day_of, transfer
 from openjax.gap.model.library import ABSENT, PLACE
@@ -157,7 +157,7 @@ def test_a_lag_shows_beside_the_reference_where_rows_hide_it(lag):
 
     theta = ABSENT.copy()
     change = change_of(told(lag), told(0.0), theta)
-    alone = given(
+    alone = conditional(
         change, theta, {("motor_lag", "extra_up"), ("motor_lag", "extra_down")}
     )
     value, deviation = alone.of("motor_lag", "extra_up")

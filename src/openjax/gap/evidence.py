@@ -28,7 +28,7 @@ from openjax.gap.identification.changes import (
     FARTHEST,
     change_of,
     comparable,
-    given,
+    conditional,
 )
 from openjax.gap.identification.estimates import EffectEstimates
 from openjax.gap.identification.quantities import Identification, identify
@@ -76,12 +76,13 @@ class Evidence:
         """What the torques' response tells beside the reference's; None where there is
         none, or none to compare.
         """
-        before = None if self.baseline is None else self.baseline.identification
-        if not comparable(self.identification, before):
+        if self.baseline is None:
             return None
-        return change_of(
-            self.identification.estimates, before.estimates, self.baseline.theta
-        )
+        case = self.identification
+        reference = self.baseline.identification
+        if not comparable(case, reference):
+            return None
+        return change_of(case.estimates, reference.estimates, self.baseline.theta)
 
     def torque_response(
         self, effects: Collection[str]
@@ -96,7 +97,7 @@ class Evidence:
             free = free.union(*(CARDS[e].confirmed_by for e in effects))
             if not free & set(self.change.names):
                 return {}
-            estimates = given(self.change, self.baseline.theta, free)
+            estimates = conditional(self.change, self.baseline.theta, free)
         elif identification is not None and identification.trustworthy:
             estimates = identification.estimates
         else:
@@ -173,8 +174,8 @@ def with_identification(evidence: Evidence) -> Evidence:
     """
     sensors = evidence.sensors
     in_time = case_on_gyroscope_clock(evidence.case, sensors.motors_late)
-    found = identify(in_time, sensors.one_clock and sensors.motor_clock)
-    return replace(evidence, identification=found)
+    identification = identify(in_time, sensors.one_clock and sensors.motor_clock)
+    return replace(evidence, identification=identification)
 
 
 def _motors(

@@ -251,11 +251,11 @@ def conformal_p(
 
 
 @cache
-def calibration_values(referred: bool) -> np.ndarray:
+def calibration_values(with_reference: bool) -> np.ndarray:
     """(cases,) how far each of the calibration's cases stands out, with its reference
     or without.
     """
-    if referred:
+    if with_reference:
         pairs = calibration("with_reference")
         far = [standing_out(pair["case"], pair["reference"])[0] for pair in pairs]
     else:
@@ -277,15 +277,15 @@ def standing_out(
     torques, and hardly a sensor.
     """
     names, (mean, covariance) = list(HORIZONS), usual()
-    found = logarithms(measures)
-    rows = np.flatnonzero(np.isfinite(found))
+    logs = logarithms(measures)
+    rows = np.flatnonzero(np.isfinite(logs))
     # with precision P of a normal distribution, (P r)_k / P_kk is how far r_k is from
     # what the others lead to expect, with a variance of 1 / P_kk
     precision = np.linalg.inv(covariance[np.ix_(rows, rows)])
     weight = np.diag(precision)
-    off = precision @ (found - mean)[rows] / weight
+    off = precision @ (logs - mean)[rows] / weight
     if reference is not None:
-        growth = (found - logarithms(reference))[rows]
+        growth = (logs - logarithms(reference))[rows]
         more = np.isfinite(growth) / difference_of_days()[rows] ** 2
         off = (weight * off + more * np.nan_to_num(growth)) / (weight + more)
         weight = weight + more

@@ -22,75 +22,81 @@ and .03 to .05.
 """
 RIDGE = 0.005  # s
 GAIN_OF_LAG = -35.0  # 1/s, of an inertia as a logarithm
-"""A larger lag with a smaller inertia answers nearly the same: in six of these 52
-cases both moved so, by 12 to 26 ms.
+"""A larger lag with a smaller inertia answers nearly the same: in six of 52 cases of
+that seed both moved so, by 12 to 26 ms.
 """
+ALONG_RIDGE = {
+    **dict.fromkeys(("extra_up", "extra_down"), 1.0),
+    **dict.fromkeys(("xx", "yy"), GAIN_OF_LAG),
+}
+"""{parameter: how it moves with a lag}."""
+LAGS = ("extra_up", "extra_down")
 FARTHEST = 11.0
 """Nats: one case in ten lies several times as far off in each of five numbers, and that
 density is lower by as much (a mixture of normal distributions).
 """
 
 
-def comparable(here: Identification | None, there: Identification | None) -> bool:
+def comparable(case: Identification | None, reference: Identification | None) -> bool:
     """Whether the responses of two sets of flights have the same errors of their rows,
     or none that matter.
     """
-    if here is None or there is None or here.sampled != there.sampled:
+    if case is None or reference is None:
         return False
-    return all(found.trustworthy or found.sampled for found in (here, there))
+    if case.single_samples != reference.single_samples:
+        return False
+    return all(i.trustworthy or i.single_samples for i in (case, reference))
 
 
 def change_of(
-    here: EffectEstimates, there: EffectEstimates, theta: np.ndarray
+    case: EffectEstimates, reference: EffectEstimates, theta: np.ndarray
 ) -> EffectEstimates:
     """The estimates of a case as if those of its reference had told the parameters
     theta (P,), which are the vehicle's while nothing acts.
     """
-    gains = np.array([e != "motor_lag" for e, _ in here.names])
-    before = predict(there, theta)
-    value = before + here.value - there.value
-    value[gains] = before[gains] * here.value[gains] / there.value[gains]
-    slopes = {"motor_lag": 1.0, "inertia": GAIN_OF_LAG}
-    ridge = RIDGE * np.array([slopes.get(e, 0.0) for e, _ in here.names])
+    gains = np.array([p not in LAGS for _, p in case.names])
+    start = predict(reference, theta)
+    value = start + case.value - reference.value
+    value[gains] = start[gains] * case.value[gains] / reference.value[gains]
+    ridge = RIDGE * np.array([ALONG_RIDGE.get(p, 0.0) for _, p in case.names])
     spread = np.square(np.where(gains, GAIN, LAG))
-    covariance = np.outer(ridge, ridge) + np.diag(spread + _of_noise(here, there))
-    for found in (here, there):
-        scale = np.where(gains, found.value, 1.0)
-        covariance = covariance + found.shown / np.outer(scale, scale)
+    covariance = np.outer(ridge, ridge) + np.diag(spread + _of_noise(case, reference))
+    for estimates in (case, reference):
+        scale = np.where(gains, estimates.value, 1.0)
+        covariance = covariance + estimates.without_rows / np.outer(scale, scale)
     scale = np.where(gains, value, 1.0)
     covariance = covariance * np.outer(scale, scale)
-    return EffectEstimates(
-        here.names, value, covariance, here.clock, here.fit, covariance
-    )
+    return replace(case, value=value, covariance=covariance, without_rows=covariance)
 
 
-def given(
+def conditional(
     estimates: EffectEstimates, theta: np.ndarray, free: Collection[tuple[str, str]]
 ) -> EffectEstimates:
     """The estimates of those parameters that are `free` if all others are as in theta
     (P,): a lag alone is told more sharply than one beside an inertia.
     """
-    own = [k for k, name in enumerate(estimates.names) if name in free]
+    inside = [k for k, name in enumerate(estimates.names) if name in free]
     rest = [k for k, name in enumerate(estimates.names) if name not in free]
     covariance = estimates.covariance
     off = estimates.value - predict(estimates, theta)
-    across = covariance[np.ix_(own, rest)]
+    across = covariance[np.ix_(inside, rest)]
     gain = np.linalg.solve(covariance[np.ix_(rest, rest)], across.T).T
     return replace(
         estimates,
-        names=tuple(estimates.names[k] for k in own),
-        value=estimates.value[own] - gain @ off[rest],
-        covariance=covariance[np.ix_(own, own)] - gain @ across.T,
+        names=tuple(estimates.names[k] for k in inside),
+        value=estimates.value[inside] - gain @ off[rest],
+        covariance=covariance[np.ix_(inside, inside)] - gain @ across.T,
     )
 
 
-def _of_noise(here: EffectEstimates, there: EffectEstimates) -> np.ndarray:
+def _of_noise(case: EffectEstimates, reference: EffectEstimates) -> np.ndarray:
     """(n,) variances of what a loop that answers noise makes of gains, as logarithms,
     where one set of flights turns less than the other.
     """
     weaker = [
-        np.minimum(NOISE_IN_GAIN / found.fit.turning**2, LARGEST_ERROR)
-        for found in (here, there)
+        np.minimum(NOISE_IN_GAIN / e.fit.turning**2, LARGEST_ERROR)
+        for e in (case, reference)
     ]
-    apart = dict(zip(("xx", "yy", "ratio"), (weaker[0] - weaker[1]) ** 2, strict=True))
-    return np.array([apart.get(parameter, 0.0) for _, parameter in here.names])
+    squares = np.square(weaker[0] - weaker[1])
+    of_parameter = dict(zip(("xx", "yy", "ratio"), squares, strict=True))
+    return np.array([of_parameter.get(p, 0.0) for _, p in case.names])

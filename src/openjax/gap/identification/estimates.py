@@ -16,8 +16,8 @@ from openjax.gap.identification.torques import identify_torques
 class EffectEstimates:
     """`value` (n,) and `covariance` (n, n) of effects' parameters `names`: (effect,
     parameter). `clock`: s by which motors answer later than logged, and its standard
-    deviation; a delay in the vehicle and clocks that are off look alike. `shown`
-    (n, n): the covariance without what rows hide.
+    deviation; a delay in the vehicle and clocks that are off look alike.
+    `without_rows` (n, n): the covariance without what rows hide.
     """
 
     names: tuple[tuple[str, str], ...]
@@ -25,7 +25,7 @@ class EffectEstimates:
     covariance: np.ndarray
     clock: tuple[float, float]
     fit: TorqueFit
-    shown: np.ndarray
+    without_rows: np.ndarray
 
     def of(self, effect: str, parameter: str) -> tuple[float, float]:
         """Value and standard deviation of one parameter."""
@@ -69,6 +69,6 @@ def of_fit(fit: TorqueFit, records: list[Record]) -> EffectEstimates:
     slopes[2, 3] = -1.0 / roll**2
     slopes[3, 4] = -1.0 / pitch**2
     covariance = slopes @ fit.covariance @ slopes.T
-    shown = slopes @ (fit.covariance - np.diag(fit.hidden**2)) @ slopes.T
+    without_rows = slopes @ (fit.covariance - np.diag(fit.row_errors**2)) @ slopes.T
     clock = float(fit.value[2]), float(np.sqrt(fit.covariance[2, 2]))
-    return EffectEstimates(ESTIMATED, value, covariance, clock, fit, shown)
+    return EffectEstimates(ESTIMATED, value, covariance, clock, fit, without_rows)

@@ -72,8 +72,8 @@ class Identification:
     """`quantities` {name: quantity}, `responses` {axis: measured and simulated},
     `remarks`: what to think of when reading them; `estimates` are for the diagnosis;
     `duty_cycles`: what thrust a motor command makes isn't known, so that gains tell its
-    map and the inertia together; `sampled`: not trusted for one reason alone, rows that
-    are single samples.
+    map and the inertia together; `single_samples`: not trusted for one reason alone,
+    that rows are such.
     """
 
     quantities: dict[str, Quantity]
@@ -82,7 +82,7 @@ class Identification:
     estimates: EffectEstimates
     trustworthy: bool = True
     duty_cycles: bool = False
-    sampled: bool = False
+    single_samples: bool = False
 
     def to_dict(self, shares: dict[str, float] | None = None) -> dict:
         """As it stands in `report.json`; `shares` of the gap {effect: share}."""
@@ -155,7 +155,7 @@ def identify(case: Case, one_clock: bool = True) -> Identification | None:
         of_fit(fit, records),
         trustworthy=not reasons,
         duty_cycles=duty_cycles,
-        sampled=reasons == (SAMPLES,),
+        single_samples=reasons == (SAMPLES,),
     )
 
 

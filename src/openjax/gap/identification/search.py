@@ -32,8 +32,8 @@ SWEEPS = 2
 class TorqueFit:
     """`value` (9,) and `covariance` (9, 9) of `NAMES`; `loss` nats; `noise` {axis:
     coefficients (p,)}; `whole` innovations' variances (3,); `turning` (3,): what each
-    axis turns, in standard deviations of its noise; `hidden` (9,): standard deviations
-    of what rows hide, a part of the covariance.
+    axis turns, in standard deviations of its noise; `row_errors` (9,): standard
+    deviations of what rows hide, a part of the covariance.
     """
 
     value: np.ndarray
@@ -42,7 +42,7 @@ class TorqueFit:
     noise: list
     whole: np.ndarray
     turning: np.ndarray
-    hidden: np.ndarray
+    row_errors: np.ndarray
 
     @property
     def clock(self) -> float:
@@ -102,16 +102,16 @@ def search(problem: Problem, place: np.ndarray) -> TorqueFit:
             break
     scale = np.ones(len(value))
     scale[LOGARITHMS] = value_at(value)[LOGARITHMS]
-    hidden = hidden_errors(problem, axes)
+    row_errors = hidden_errors(problem, axes)
     return TorqueFit(
         value_at(value),
-        (_covariance(problem, value, axes) + np.diag(hidden**2))
+        (_covariance(problem, value, axes) + np.diag(row_errors**2))
         * np.outer(scale, scale),
         loss,
         [a[2] for a in axes],
         np.array([a[0].var() for a in axes]),
         turning(problem, axes)[0],
-        hidden * scale,
+        row_errors * scale,
     )
 
 
