@@ -1,10 +1,13 @@
-"""Pictures of a replay and of a diagnosis' first screen: `python docs/make_screens.py`.
+"""Pictures of a replay and of a diagnosis' first screen: `python docs/make_screens.py
+[replay] [report]`.
 
 Writes docs/pictures/replay.png, of the page docs/extra/replay/chase.html, and
 report.png, of sample flights with rotor drag that are diagnosed for it. Needs a
-headless Chromium.
+headless Chromium, or, for the report, PyQt6-WebEngine (which has no WebGL without a
+display).
 """
 
+import os
 import shutil
 import subprocess
 import sys
@@ -22,10 +25,20 @@ SIZES = {"replay": (1000, 620), "report": (1000, 940)}  # pixels
 
 def take(page: Path, name: str, folder: Path) -> None:
     """The picture `name` of an HTML page."""
+    shot = folder / f"{name}.png"
     browser = next(filter(None, map(shutil.which, BROWSERS)), None)
     if browser is None:
-        sys.exit(f"no browser: one of {', '.join(BROWSERS)} is needed")
-    shot = folder / f"{name}.png"
+        by_qt(page, name, shot)
+    else:
+        by_browser(browser, page, name, shot)
+    picture = (
+        Image.open(shot).convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE)
+    )
+    picture.save(DOCS / "pictures" / f"{name}.png", optimize=True)
+
+
+def by_browser(browser: str, page: Path, name: str, shot: Path) -> None:
+    """What a headless Chromium shows of a page."""
     width, height = SIZES[name]
     options = [
         "--headless=new",
@@ -39,10 +52,34 @@ def take(page: Path, name: str, folder: Path) -> None:
     subprocess.run(
         [browser, *options, page.resolve().as_uri()], check=True, capture_output=True
     )
-    picture = (
-        Image.open(shot).convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE)
-    )
-    picture.save(DOCS / "pictures" / f"{name}.png", optimize=True)
+
+
+def by_qt(page: Path, name: str, shot: Path) -> None:
+    """What Qt's Chromium shows of a page, without a display."""
+    os.environ.setdefault("QT_QPA_PLATFORM", "offscreen")
+    os.environ.setdefault("QTWEBENGINE_DISABLE_SANDBOX", "1")
+    os.environ.setdefault("QTWEBENGINE_CHROMIUM_FLAGS", "--disable-gpu")
+    try:
+        from PyQt6.QtCore import QTimer, QUrl
+        from PyQt6.QtWebEngineWidgets import QWebEngineView
+        from PyQt6.QtWidgets import QApplication
+    except ImportError:
+        sys.exit(f"one of {', '.join(BROWSERS)} or PyQt6-WebEngine is needed")
+    application = QApplication.instance() or QApplication(sys.argv[:1])
+    view = QWebEngineView()
+    view.resize(*SIZES[name])
+    settings = view.page().settings()
+    settings.setAttribute(settings.WebAttribute.ShowScrollBars, False)
+
+    def grab():
+        view.grab().save(str(shot))
+        application.quit()
+
+    wait = 1000 * SECONDS[name]
+    view.loadFinished.connect(lambda _: QTimer.singleShot(wait, grab))
+    view.load(QUrl.fromLocalFile(str(page.resolve())))
+    view.show()
+    application.exec()
 
 
 def diagnosed(folder: Path) -> Path:
@@ -57,13 +94,15 @@ def diagnosed(folder: Path) -> Path:
     return folder / "diagnosis" / "flights" / "report.html"
 
 
-def main() -> None:
-    """Both pictures."""
+def main(names: list[str]) -> None:
+    """The pictures of these names, by default all."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        take(DOCS / "extra" / "replay" / "chase.html", "replay", folder)
-        take(diagnosed(folder), "report", folder)
+        if "replay" in names:
+            take(DOCS / "extra" / "replay" / "chase.html", "replay", folder)
+        if "report" in names:
+            take(diagnosed(folder), "report", folder)
 
 
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1:] or list(SIZES))

@@ -13,7 +13,7 @@ from openjax.flights.plans import plan_of, read_plan, write_plan
 from openjax.flights.segments import LOWEST, SEGMENTS
 from openjax.gap.model.library import ABSENT
 from openjax.gap.planning.beliefs import beliefs_of, next_flight, sentence
-from openjax.gap.planning.information import Belief, advise, of_pairs
+from openjax.gap.planning.information import Advice, Belief, Promise, advise, of_pairs
 from openjax.vehicle.arena import Arena
 from openjax.vehicle.vehicle_file import load_vehicle_file
 
@@ -49,6 +49,15 @@ def test_an_effect_is_told_from_nothing_though_it_can_do_nothing():
 
 def test_no_flight_is_asked_for_where_hardly_anything_is_open():
     assert next_flight(between("rotor_drag"), load_vehicle_file()) == ""
+
+
+def test_logs_that_hide_a_cause_are_mended_before_any_flight():
+    promise = Promise("agile", 0.5, ("nothing", "motor_lag"), 20.0)
+    advice = Advice((promise,), ("agile",), {promise.pair: 20.0})
+    clocks = ["motors and gyroscope don't share a clock: motor commands are late"]
+    report = between("rotor_drag") | {"sensors": clocks}
+    assert "Before that, log motors and gyroscope" in sentence(advice, report)
+    assert "Before" not in sentence(advice, between("rotor_drag"))
 
 
 @pytest.mark.slow

@@ -219,13 +219,13 @@ def _reference_in_words(evidence: Evidence, effects) -> str:
     if evidence.baseline is None:
         return ""
     values = [
-        f"{e} {p} {evidence.baseline.theta[PLACE[e, p]]:.4g}"
+        f"{e} {p} was {evidence.baseline.theta[PLACE[e, p]]:.3g}"
         for e in effects
         for p in (f.name for f in CARDS[e].fitted)
         if (e, p) in PLACE and e not in OF_DAYS
     ]
     text = "Held against the reference flights of the same vehicle"
-    text += f": {', '.join(values)} there." if values else "."
+    text += f", in which {', '.join(values)}." if values else "."
     battery = (
         "The battery's charge may differ between the days, which changes what thrust a duty cycle "
         "makes: log vbat, and thrust can be compared."

@@ -115,8 +115,10 @@ class Identification:
             )
         text = (
             f"At {TALKED_OF:g} Hz this vehicle turns with {ratio:.2f} of the simulator's "
-            f"acceleration, {abs(lead):.0f}° {'later' if lead < 0.0 else 'earlier'}"
+            "acceleration, "
         )
+        shift = f"{abs(lead):.0f}° {'later' if lead < 0.0 else 'earlier'}"
+        text += "in phase with it" if abs(lead) < ALIKE_PHASE else shift
         if lag.differs:
             low, high = (1e3 * v for v in lag.interval90)
             text += (

@@ -137,7 +137,25 @@ def sentence(advice: Advice, report: dict) -> str:
         text = f"No segment tells {pair}."
     if weigh:
         text += f" No flight tells {weigh[0][0]} from {weigh[0][1]}: weigh the vehicle."
-    remarks = report.get("identification", {}).get("remarks", ())
-    if any("sample" in remark for remark in remarks):
-        text += " Before that, log the motors' means at 100 Hz."
+    if mends := _to_mend(report):
+        text += f" Before that, {' and '.join(mends)}: no flight shows more without."
     return text.replace("_", " ")
+
+
+def _to_mend(report: dict) -> list[str]:
+    """What to log otherwise, before any flight is worth it."""
+    remarks = report.get("identification", {}).get("remarks", ())
+    issues = [entry["issue"] for entry in report.get("quality", ())]
+    reasons = {
+        "log the motors' means at 100 Hz": ("sample", remarks),
+        "log motors and gyroscope on one clock": (
+            "don't share a clock",
+            report.get("sensors", ()),
+        ),
+        "log the accelerometer": ("torques alone can be told", issues),
+    }
+    return [
+        mend
+        for mend, (sign, texts) in reasons.items()
+        if any(sign in text for text in texts)
+    ]

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from openjax.gap.model.library import CARDS
 from openjax.gap.report.figures import figures
-from openjax.gap.report.report import VERDICTS, Report
+from openjax.gap.report.report import VERDICTS, VERDICTS_SINCE, Report
 from openjax.gap.report.response import response_of
 from openjax.gap.report.trims_page import content_of
 from openjax.show.pages import fill_template
@@ -62,7 +62,12 @@ def sentence(report: Report) -> str:
     """
     effects = report.named
     if not effects:
-        return VERDICTS[report.verdict]
+        return (VERDICTS_SINCE if report.reference else VERDICTS)[report.verdict]
+    what = (
+        "What changed since the reference"
+        if report.reference
+        else "What the simulator misses"
+    )
     values = [report.shares.effects[effect].value for effect in effects]
     names = [report.class_of(effect).replace("_", " ") for effect in effects]
     parts = " and ".join(
@@ -76,10 +81,10 @@ def sentence(report: Report) -> str:
             "of sensors and clocks": report.shares.sensors.value,
         }
         other = max(rest, key=rest.get)
-        text = f"What the simulator misses is {100 * rest[other]:.0f} % {other}; named is {parts}"
+        text = f"{what} is {100 * rest[other]:.0f} % {other}; named is {parts}"
     else:
         qualifier = "" if whole > 0.995 else "mostly "  # .995 is 100 % as it is printed
-        text = f"What the simulator misses is {qualifier}{parts}"
+        text = f"{what} is {qualifier}{parts}"
     if report.parameters:
         those = "it" if len(effects) == 1 else "them"
         smaller = f"{100 * report.gap.reduction:.0f} %"
