@@ -99,6 +99,8 @@ def _grid_of(part):
     and the clock's times (G,).
     """
     period = max(part.row_period, GRID_PERIOD)
+    # rows about as far apart as the grid's are taken for the grid's: one filter and one
+    # compiled program for all of them
     if abs(period - GRID_PERIOD) < 0.15 * GRID_PERIOD:
         period = GRID_PERIOD
     faster = period / part.row_period > 1.2
@@ -131,6 +133,7 @@ def _on_grid(part: Flight, flight: Flight, case: Case, name: str) -> Track:
     def take(channel: str, ahead: bool = False) -> Array | None:
         if getattr(part, channel) is None:
             return None
+        # a pose at a moment is its place on the line; a mean of attitudes is none
         if not faster or channel in ("position", "quaternion"):
             return part.interpolated(channel, grid)
         # Faster logs: the mean around a grid point; of commands, which hold until the
@@ -145,6 +148,7 @@ def _on_grid(part: Flight, flight: Flight, case: Case, name: str) -> Track:
     fast_thrust = None
     if motor is not None and case.vehicle_file.motor.command == "pwm":
         motor = pwm_thrust(motor, voltage, case.vehicle_of(flight))
+    # single commands show in rows that are faster than the grid
     elif motor is not None and faster:
         at, values = part.sampled("motor_command")
         fast_thrust = at, values.mean(1)
@@ -153,6 +157,7 @@ def _on_grid(part: Flight, flight: Flight, case: Case, name: str) -> Track:
     ceiling = log.get("ceiling_z")
     sensors = {sensor: take(sensor) for sensor in SENSORS}
     if sensors["position"] is not None:
+        # heights count from the floor, whose cushion is felt
         sensors["position"] = sensors["position"] - floor
     return Track(
         name=name,
@@ -204,6 +209,7 @@ def _means(at, values, begin, period, is_held):
         values[:-1] if is_held else 0.5 * (values[1:] + values[:-1])
     )
     integral = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(step, 0)])
+    # at the end of a log a mean is of what is left of it
     begin = np.clip(begin, at[0], at[-1] - 0.5 * period)
     end = np.clip(begin + period, at[0], at[-1])
     means = [

@@ -111,6 +111,7 @@ def pose_channel(topic: str, time, position, quaternion=None) -> Channel:
         if quaternion is None
         else quaternion
     )
+    # JSON has no NaN
     rows = np.flatnonzero(np.isfinite(position).all(1) & np.isfinite(attitude).all(1))
     messages = [
         (float(time[k]), {"frame_id": WORLD, "pose": pose(position[k], attitude[k])})
@@ -124,6 +125,7 @@ def trajectory_channels(name: str, flight: Trajectory) -> list[Channel]:
     begins the topics.
     """
     every = max(1, round(LONGEST_STEP / flight.time_step))
+    # two seconds beyond the capture, so that one sees what came of it
     steps = np.arange(0, flight.end(seconds=2.0), every)
     time = steps * flight.time_step
     drones = {

@@ -106,8 +106,10 @@ def read_blackbox_csv(path: Path, mapping: ColumnMapping | None = None) -> LogTa
         path.name.removesuffix(".gz").removesuffix(".csv") + HEADERS_FILE
     )
     if log_file.is_file():
+        # what a decoder put beside the table goes before what stands above it
         headers |= _headers(head_of(log_file))
     fields = {_FIELD.fullmatch(name)[1]: name for name in names}
+    # a hexacopter's first four motors would be read as a quad's
     if "motor[4]" in fields:
         raise LogError("more than four motors were logged; four are needed")
     remarks = _without_filter(fields)
@@ -156,6 +158,7 @@ def _usual(fields: dict[str, str], headers: dict[str, str]) -> dict[str, Source]
     """{column: source} of fields that are there, whose scale the log's headers have
     `said`. The force and the motors are raw as yet.
     """
+    # without the header nothing is said of it, and blackboxes are coarse by default
     fine = FINE if _number(headers, "blackbox_high_resolution") else 1.0
     # The Explorer's gyroScale is in rad/us a count.
     count = 1e6 * (_number(headers, "gyroScale") or UNITS["us"] * UNITS["deg/s"])
@@ -168,6 +171,7 @@ def _usual(fields: dict[str, str], headers: dict[str, str]) -> dict[str, Source]
     channels |= {f"a{a}": (f"accSmooth[{i}]", 1.0) for i, a in enumerate("xyz")}
     channels |= {column: (f"motor[{i}]", 1.0) for column, i in MOTOR_OF.items()}
     channels |= {"cmd_thrust": ("setpoint[3]", 1e-3)}
+    # up to Betaflight 3 the battery was logged in tenths of a volt
     channels |= {"vbat": ("vbatLatest", 0.1 if old else 0.01)}
     return {
         column: Source(fields[field], _scale(fields[field], usual))

@@ -240,10 +240,12 @@ def merge_streams(
     # to a microsecond: of streams at one rate the first is the clock, however stamps
     # are rounded
     clock = min(with_motion, key=lambda u: round(float(np.median(np.diff(u[0]))), 6))[0]
+    # a message that came twice is one row
     clock = clock[np.r_[True, np.diff(clock) > 0]]
     series = _at_one_time(series, clock)
     table = {"t": clock}
     for time, columns_of_stream in series:
+        # of stamps that all are the same the median is nought
         period = max(float(np.median(np.diff(time))), 1e-4)
         for column, values in columns_of_stream.items():
             table.setdefault(column, _onto(clock, time, values, column, period))
@@ -335,6 +337,7 @@ def _onto(clock, time, values, column: str, period: float) -> np.ndarray:
     values = values[finite]
     if not len(time):
         return np.full(len(clock), np.nan)
+    # what was sent with a row is there with it, however its stamp was rounded
     previous = np.searchsorted(time, clock + TIE, side="right") - 1
     if column == "vbat":
         out = np.full(len(clock), np.nan)
@@ -344,6 +347,7 @@ def _onto(clock, time, values, column: str, period: float) -> np.ndarray:
     if column in _CONTINUOUS:
         out = np.interp(clock, time, values, left=np.nan, right=np.nan)
         following_row = np.clip(previous + 1, 0, len(time) - 1)
+        # a line over a hole would look like a motion
         is_wide = time[following_row] - time[np.clip(previous, 0, None)] > max(
             _STALE * period, 0.05
         )

@@ -57,6 +57,7 @@ def beliefs_of(report: dict) -> list[Belief]:
     chances_of: dict[tuple[str, ...], float] = {
         (): max(chances.get("none", 0.0), UNTESTED)
     }
+    # what a report names is believed together, as it was found together
     if causes:
         sure = max(chances.get(e, 0.0) for e in causes)
         chances_of[tuple(causes)] = max(sure, UNTESTED)
@@ -70,6 +71,7 @@ def beliefs_of(report: dict) -> list[Belief]:
     for effect, chance in chances.items():
         if acts_in_physics(effect) and effect not in causes and chance > LEAST:
             chances_of.setdefault((effect,), chance)
+    # what those flights couldn't show they don't speak against, either
     for effect in filter(acts_in_physics, report.get("not_testable", ())):
         chances_of.setdefault((effect,), UNTESTED)
     whole = sum(chances_of.values())
