@@ -98,6 +98,7 @@ class VirtualCrazyflies:
             link.flush(until)
 
     def _advance(self, until: float) -> None:
+        # a quotient of floats may lie a hair below its whole number
         steps = int(until / STEP + 1e-6) - self._steps
         if steps < 1:
             return

@@ -159,8 +159,11 @@ def with_motors(track: Track, vehicle) -> Track:
     if track.motor is not None:
         return track
     rows = np.arange(len(track))
+    # without motors it isn't known when commands arrive: at once
     link = (0.0, np.stack([rows, np.maximum(rows - 1, 0)], 1))
     track = dataclasses.replace(track, motor=np.repeat(track.command[:, :1], 4, 1))
+    # the first pass is driven by the collective thrust alone, the second by the motors
+    # of the first
     for _ in range(2):
         requests, _ = observe_track(track, vehicle, link)
         track = dataclasses.replace(track, motor=requests[0], motors_logged=False)

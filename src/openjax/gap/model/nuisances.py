@@ -34,6 +34,7 @@ def columns_of(
     arguments as in `make_replay`.
     """
     columns = _late_torques("feedback", track, feedback.acceleration, FEEDBACK_ROWS)
+    # slow parts are the same some rows later
     columns |= _late_torques("trim", track, feedback.trim, (0,))
     if at_once:
         columns |= _late_torques(
@@ -88,6 +89,7 @@ def _sensor_nuisances(
         )
         column(f"IMU tilt {name}", FORCE, -np.cross(axis, force), SIZE["imu_tilt"])
     for axis, name in enumerate("xyz"):
+        # Euler's equations: about an axis acts the product of the other two rates
         turning = np.cumsum(rates[:, axis - 2] * rates[:, axis - 1]) * track.dt
         column(f"gyroscopic torque {name}", axis, turning, SIZE["gyroscopic"])
     for name, axes in (("roll and pitch damping", (0, 1)), ("yaw damping", (2,))):
@@ -144,5 +146,6 @@ def torque_channels(
 ) -> Float[np.ndarray, "rows 9"]:
     """Channels (T, 9) of an angular acceleration (T, 3)."""
     column = np.zeros((len(acceleration), 9))
+    # what a row's interval does shows at its end, the next row
     column[1:, RATES] = np.cumsum(acceleration[:-1], 0) * dt
     return column

@@ -209,14 +209,12 @@ def make_replay(
         usable[VELOCITY] = 0.0
     if any(t.specific_force is None for t in tracks):
         usable[FORCE] = 0.0
+    # without a path the gyroscope is all there is, whatever its clock
     if not one_clock and usable[3]:
         usable[RATES] = usable[FORCE] = 0.0
+    # motors made from commands tell the thrust, not how a real loop shares it out
     if usable[3:].any() and not all(t.motors_logged for t in tracks):
-        usable[RATES] = (
-            # motors made from commands tell the thrust, not how a real loop shares it
-            # out
-            0.0
-        )
+        usable[RATES] = 0.0
     physics = make_physics(tracks, vehicles, motor_ticks)
     nominal = [p[0] for p in physics.predict(absent[None])]
     columns_of_tracks = [
