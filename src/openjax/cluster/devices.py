@@ -61,6 +61,8 @@ def check_memory(settings: TrainSettings, number: int) -> None:
       UserError: it doesn't; said before anything is compiled.
     """
     game = settings.environment
+    # places of pursuers and evader; of each pillar two coordinates and whether it's
+    # there
     tasks = 3 * game.num_pursuers + 3 + 3 * game.max_pillars
     observation_size = game.self_size + game.privileged_size + 5 * game.observed_pillars
     history = game.history_length * game.history_spacing * game.frame_size

@@ -180,6 +180,7 @@ class MapEvaders:
         learners = len(leaves["map_evaders/world_axes"])
         settings = dataclasses.replace(self.command.learning, learners=learners)
         response = dataclasses.replace(self.response, settings=settings)
+        # how many learned the file says, whatever the command does
         kinds = jax.eval_shape(response.start, jax.random.key(0)).evaders
         abstract = {
             "map_evaders": {"actor": kinds.actor, "world_axes": kinds.world_axes}
