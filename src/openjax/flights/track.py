@@ -126,6 +126,16 @@ def _command(take):
     return np.concatenate([thrust[:, None], take("command_body_rates", ahead=True)], 1)
 
 
+def _sensors(take, floor):
+    """What each sensor says on the clock, by its name; heights count from the floor,
+    whose cushion is felt.
+    """
+    sensors = {sensor: take(sensor) for sensor in SENSORS}
+    if sensors["position"] is not None:
+        sensors["position"] = sensors["position"] - floor
+    return sensors
+
+
 def _on_grid(part: Flight, flight: Flight, case: Case, name: str) -> Track:
     """A stretch of a flight on an even clock."""
     period, faster, grid = _grid_of(part)
@@ -155,16 +165,12 @@ def _on_grid(part: Flight, flight: Flight, case: Case, name: str) -> Track:
     log = case.vehicle_file.log
     floor = np.array([0.0, 0.0, log.get("floor_z", 0.0)])
     ceiling = log.get("ceiling_z")
-    sensors = {sensor: take(sensor) for sensor in SENSORS}
-    if sensors["position"] is not None:
-        # heights count from the floor, whose cushion is felt
-        sensors["position"] = sensors["position"] - floor
     return Track(
         name=name,
         flight=flight.log,
         dt=period,
         time=grid,
-        **sensors,
+        **_sensors(take, floor),
         command=_command(take) if part.has_commands else None,
         motor=motor,
         voltage=None if voltage is None else smooth(voltage, 0.3, period),
