@@ -128,7 +128,7 @@ def test_nobody_who_logged_one_vehicle_is_sent_for_a_second():
         SimpleNamespace(tracks=[SimpleNamespace(neighbours=[0] * n)]) for n in (0, 1)
     )
     assert "the other" not in _beside_segments(one, ("downwash", "rate_gains", ""))
-    assert "rate_gains" in _beside_segments(one, ("downwash", "rate_gains", ""))
+    assert "rate gains" in _beside_segments(one, ("downwash", "rate_gains", ""))
     assert _beside_segments(one, ("downwash", "none")) == ""
     assert "the other" in _beside_segments(two, ("downwash", "rate_gains"))
 

@@ -30,6 +30,7 @@ from openjax.gap.residual import Check, check_residual
 from openjax.gap.selection import Selection, select
 from openjax.gap.shares import Split, split
 from openjax.gap.where import locate
+from openjax.vehicle.effects import EFFECTS
 
 
 def diagnose_case(
@@ -219,7 +220,7 @@ def _reference_in_words(evidence: Evidence, effects) -> str:
     if evidence.baseline is None:
         return ""
     values = [
-        f"{e} {p} was {evidence.baseline.theta[PLACE[e, p]]:.3g}"
+        f"{e} {p} was {evidence.baseline.theta[PLACE[e, p]]:.3g} {_unit(e, p)}".strip()
         for e in effects
         for p in (f.name for f in CARDS[e].fitted)
         if (e, p) in PLACE and e not in OF_DAYS
@@ -234,6 +235,12 @@ def _reference_in_words(evidence: Evidence, effects) -> str:
     if set(effects) & set(OF_DAYS):
         text = f"{text} {trims}"
     return f"{text} {battery}" if evidence.charge_unknown else text
+
+
+def _unit(effect: str, parameter: str) -> str:
+    """A parameter's unit; empty for a pure number."""
+    unit = EFFECTS[effect].parameters[parameter].unit
+    return "" if unit == "1" else unit
 
 
 def _runner_up(chances, effects, equivalent) -> str:
@@ -256,7 +263,7 @@ def _beside_segments(evidence: Evidence, effects) -> str:
     for effect in effects:
         if effect in CARDS and not acts_in_physics(effect):
             if not (alone and CARDS[effect].of_others):
-                return f"{effect}: {CARDS[effect].next_flight}"
+                return f"{effect.replace('_', ' ')}: {CARDS[effect].next_flight}"
     return ""
 
 

@@ -51,7 +51,7 @@ def diagnose_folder(
     except TooLittle as error:
         if trims is None:
             raise
-        return replace(trims, alone_because=str(error))
+        return replace(trims, alone_because=str(error).removeprefix(f"{folder}: "))
     vehicle_file = case.vehicle_file
     if progress:
         progress("asking which flight would tell most")
