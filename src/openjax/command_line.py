@@ -173,6 +173,7 @@ def run_command(main: Callable[[Sequence[str]], int | None]) -> None:
         sys.stdout.flush()
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
+        # what a shell says of a program that Ctrl-C ended
         status = 130
     except BrokenPipeError:  # the reader, head or less, has gone
         _discard_output()

@@ -177,6 +177,7 @@ def leave(number: int) -> None:
         if os.isatty(1):
             os.write(1, SHOW_CURSOR)
         os.write(2, f"{signal.Signals(number).name}: {words}\n".encode())
+    # what a shell says of a program that this signal ended
     os._exit(128 + number)
 
 

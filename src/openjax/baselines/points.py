@@ -74,6 +74,7 @@ def stack_team(environment: Pursuit) -> Team:
     craft = dataclasses.replace(
         Craft.of(environment), speed=settings.max_speed, response=0.0
     )
+    # a gain of one over the step: what is amiss is gone at the next one
     parameters = StackParameters(tolerance=0.05, gain=1.0 / settings.time_step)
     return Team(
         lambda observation: (

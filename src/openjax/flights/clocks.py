@@ -234,6 +234,7 @@ def _likeness(effect: np.ndarray, cause: np.ndarray, dt: float) -> np.ndarray | 
     edge = int(EDGE / dt)
     if len(effect) < 4 * edge:
         return None
+    # of slow rows the band ends before the highest frequency that they can hold
     band = butter(
         2, (BAND[0], min(BAND[1], 0.4 / dt)), "bandpass", fs=1 / dt, output="sos"
     )

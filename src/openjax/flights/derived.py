@@ -55,6 +55,7 @@ def mend_velocity(flight: Flight, note) -> Flight:
         return flight
     slope, reach = _slopes(time, flight.position[rows], BESIDE_GAP - 1)
     off = flight.velocity[rows] - slope
+    # by which a median becomes a standard deviation, and outliers don't count
     usual = 1.4826 * np.median(np.abs(off[~beside]), axis=0) + 1e-6
     wrong = beside & (np.abs(off) > OUTSIDE * usual).any(1) & (reach < 0.25)
     if not wrong.any():

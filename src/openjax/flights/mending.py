@@ -141,6 +141,7 @@ def _relabel(signals: Signals, pair: Pair, bad: list[Pair]) -> str:
             if p.what == pair.what
         )
         score = float(other.agreement.correlation.sum())
+        # of labellings that fit alike the first stays, whatever rounding says
         if score > most + 1e-9:
             best = (order, signs, changes)
             most = score

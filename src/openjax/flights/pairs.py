@@ -363,6 +363,7 @@ def _noise(
     """
     if derivatives is None:
         return np.zeros(values.shape[1])
+    # up to a tenth below the highest frequency of the clock
     high = (20.0, 45.0)
     power = [
         np.mean(np.sin(2 * np.pi * np.linspace(*b, 50) / RATE) ** (2 * derivatives))

@@ -38,6 +38,7 @@ def gravity_findings(force: np.ndarray | None) -> list[Finding]:
     axis = int(np.argmax(np.abs(mean)))
     unit = (
         "in g"
+        # of a flight the median lies near one in g, near a thousand in thousandths
         if 0.6 < size < 2.0
         else "in thousandths of g"
         if 600 < size < 2000

@@ -178,6 +178,7 @@ def _share_of_one(values: np.ndarray, columns: str) -> None:
         )
     if high > 1.02:
         hint = "a wrong scale or corrupt"
+        # per cent end at a hundred, 8-bit counts at 255
         if high > 101:
             hint = "8-bit counts"
         elif high > 2:

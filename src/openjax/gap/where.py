@@ -101,6 +101,7 @@ def _motion_powers(
         rows = []
         for track, residual in zip(evidence.tracks, residuals, strict=True):
             rest = disturbances(track, residual)
+            # without a path the accelerometer is all that feels a force
             force = rest[:, 3:6] if evidence.replay.usable[3] else rest[:, 6:9]
             calm = smooth(np.concatenate([force, rest[:, :3]], 1), CALM, track.dt)
             rows.append(calm[int(SKIP / track.dt) :] ** 2)

@@ -430,6 +430,7 @@ class TrainSettings:
             "started anew",
         )
         yield (
+            # they are counted in 32-bit integers
             self.total_updates < 2**31,
             f"total_steps {self.total_steps} are {self.total_updates} updates; fewer than 2^31 are "
             "possible",

@@ -146,6 +146,7 @@ class DronesStep:
         number = jnp.arange(drones.position.shape[0])
 
         def memory(drone, n):
+            # by number, so that what a drone draws doesn't depend on how many there are
             drone_key = None if key is None else jax.random.fold_in(key, n)
             return composition.initial_memory(
                 self.effects, vehicle, drone, self.dt, drone_key

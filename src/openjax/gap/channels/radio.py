@@ -225,6 +225,7 @@ def _late(values: np.ndarray, rows: int) -> np.ndarray:
 
 def _rows_late(track: Track, delay: float) -> tuple[int, float]:
     """A delay (s) in rows: whole ones and the rest."""
+    # a delay of whole rows stays so, whatever a quotient of floats makes of it
     whole = int(delay / track.dt + 1e-9)
     return whole, delay / track.dt - whole
 

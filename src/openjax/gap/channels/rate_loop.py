@@ -245,6 +245,7 @@ def excitation(track: Track, vehicle, series: np.ndarray) -> np.ndarray:
     response = sosfiltfilt(_band(track.dt), series[6] / gain, axis=0)
     bends = np.diff(track.body_rates, 2, axis=0)
     share = 2.0 * track.dt * (min(BAND[1], 0.4 / track.dt) - BAND[0])
+    # white noise of variance one has second differences of 1 + 4 + 1
     noise = share * bends.var(0) / 6.0
     return np.stack([(response**2).sum(0), len(track) * noise])
 
@@ -339,6 +340,7 @@ def _moments(moments: np.ndarray, units: np.ndarray) -> tuple[np.ndarray, np.nda
     for _ in range(4):
         each = moments[:, :, 0] - moments[:, :, 1:] @ theta
         spread = each.T @ each * len(moments) / max(len(moments) - 5, 1)
+        # fewer blocks than numbers leave a spread that has no inverse
         weight = np.linalg.inv(spread + 1e-9 * np.trace(spread) * np.eye(5))
         covariance = np.linalg.inv(total[:, 1:].T @ weight @ total[:, 1:] + precision)
         theta = covariance @ total[:, 1:].T @ weight @ total[:, 0]

@@ -12,8 +12,10 @@ class Regression:
     def __init__(self, columns: np.ndarray):
         gram = columns.T @ columns
         self.columns = columns
+        # a column of zeros counts nothing, instead of being divided by
         self.scale = np.sqrt(np.diag(gram)) + 1e-30
         self.gram = gram / np.outer(self.scale, self.scale)
+        # columns that say the same share their coefficient instead of failing
         self.gram[np.diag_indices(len(gram))] += 1e-10
 
     def solve(self, target: np.ndarray) -> np.ndarray:

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 BOUND = 2.0  # usual sizes that a nuisance may take
+# tries in which no fewer entries are wrong, after which they are let go one by one
 PATIENCE = 4
 
 

@@ -21,6 +21,7 @@ from openjax.vehicle.effects.effect import ARENA_CEILING
 RATES = slice(0, 3)
 VELOCITY = slice(3, 6)
 FORCE = slice(6, 9)
+# each twice the one before, so that less than half of a track is padding
 BUCKETS = (256, 512, 1024, 2048, 4096, 8192, 16384, 32768)
 FAR = 1e3  # m, where a ceiling does nothing
 LANES = 8  # parameter vectors along tracks that one call of the physics takes

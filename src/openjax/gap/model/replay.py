@@ -31,6 +31,8 @@ GROUPS = (
     ((6, 7), False),
     ((8,), False),
 )
+# what whitens before the first fit; its residuals then give each case a noise of its
+# own
 FIRST_NOISE = (0.03, 0.03, 0.006, 0.006, 0.25, 0.25)
 MOTORS_LATE = ("clock of the motors", "delay of the motors")
 SKIP = 0.2  # s left out at the start of a track: rotor speeds are not known there
@@ -128,6 +130,8 @@ class Replay:
         columns = []
         derivatives = (column[1:] for column in self.linearise(theta, places))
         for m, old, size in zip(derivatives, self.columns, self.sizes, strict=True):
+            # a delay of the motors does what their clock does; only its usual size is
+            # another
             fresh = np.concatenate([m, m[-1:]]) * size[:, None, None]
             columns.append(np.concatenate([fresh, old[len(fresh) :]]))
         return replace(self, columns=columns)
@@ -276,6 +280,7 @@ def _without_mean_torque(nuisances: np.ndarray, count: int) -> np.ndarray:
     something, and of a sum of torques that is zero no number can be wrong.
     """
     out = nuisances.copy()
+    # of integrals a mean torque is the straight line to their end
     out[:count, :, RATES] -= (
         np.linspace(0.0, 1.0, out.shape[1])[:, None] * out[:count, -1:, RATES]
     )

@@ -129,6 +129,7 @@ def _kalman(
     drive = gust**2 * (1 - memory**2)
     if integrates:
         a = np.array([[1.0, 1.0], [0.0, memory]])
+        # a filter that nothing drives would have no stationary gain
         q = np.diag([step**2 + 1e-9, drive])
         c = np.array([[1.0, 0.0]])
     else:

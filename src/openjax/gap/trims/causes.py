@@ -80,6 +80,7 @@ class _Draws:
     """Even draws that all causes share, and the parts that they make of them."""
 
     def __init__(self, mixer: np.ndarray, trims: np.ndarray):
+        # a normal's quantiles at the very ends are infinite
         even = np.clip(qmc.Sobol(11, seed=0).random(DRAWS), 1e-6, 1 - 1e-6)
         sign = np.where(even[:, 2] < STRONGER, -1.0, 1.0)
         self.sizes = (
