@@ -3,12 +3,21 @@ probabilities of form errors.
 """
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from openjax.gap.criteria import Gaps, clearly_larger, difference, growth, worse
+from openjax.gap.criteria import (
+    Gaps,
+    clearly_larger,
+    difference,
+    growth,
+    practical,
+    worse,
+)
 from openjax.gap.model.cross_validation import Validation
+from openjax.gap.model.library import ABSENT, places
 
 
 def judged(left: np.ndarray, blocks: int) -> Validation:
@@ -87,3 +96,26 @@ def test_what_only_a_sum_is_known_of_is_clear_by_the_sum():
     assert clearly_larger(np.array([1.0, 1.0]), together, least)
     assert not clearly_larger(np.array([1.0, -1.0]), together, least)
     assert clearly_larger(np.array([2.5, 0.0]), apart, least)
+
+
+@pytest.mark.parametrize(
+    ("response", "told"),
+    [
+        ({}, False),
+        ({("inertia", "xx"): (1.0, 0.02)}, False),
+        ({("inertia", "xx"): (1.4, 0.02)}, True),
+    ],
+)
+def test_an_inertia_needs_the_response_whatever_the_replay_says(response, told):
+    theta = ABSENT.copy()
+    index = places(("inertia",))
+    theta[index] = 1.4
+    fit = SimpleNamespace(
+        effects=("inertia",),
+        theta=theta,
+        index=index,
+        covariance=1e-6 * np.eye(len(index)),
+        grams=np.zeros((1, 1 + len(index), 1)),
+        replay=SimpleNamespace(absent=ABSENT, size_factors=np.ones(len(ABSENT))),
+    )
+    assert practical(fit, response) == told
