@@ -135,6 +135,7 @@ class _Graph(Walk):
         return self.add("Cast", operation.inputs, to=kind)
 
     def _op_broadcast_in_dim(self, operation):
+        # ONNX lines axes up from the last one, JAX says which goes where
         ones = [1] * len(operation.shape)
         axes = operation.parameters["broadcast_dimensions"]
         for axis, size in zip(axes, operation.shapes[0], strict=True):

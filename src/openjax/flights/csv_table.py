@@ -102,6 +102,7 @@ def _numbers(
             converters=number,
         )
     except (ValueError, OverflowError) as error:
+        # looked for only now: cell by cell takes many times as long as the whole table
         raise LogError(_why_not(rows, header, places, number, error)) from error
 
 

@@ -237,6 +237,7 @@ def _fly(
         )
         return (state_after, integral, force_after, motors.mean(-1), key), log
 
+    # before the first step accelerometers feel what a hover takes
     hover = jnp.zeros((count, 3)).at[:, 2].set(vehicle.mass * vehicle.gravity)
     load = jnp.full(count, 0.6)
     air_time = jnp.arange(target[0].shape[0], dtype=jnp.float32) * PERIOD

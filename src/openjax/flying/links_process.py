@@ -108,6 +108,7 @@ def _pass_on(swarm: Swarm, contacts, stream: socket.socket) -> None:
     vehicle into `contacts`.
     """
     lock = threading.Lock()
+    # who hears the vehicles must never wait for a loop that doesn't read
     stream.setblocking(False)
 
     def pass_on(vehicle: int, member: Member, new_pose: bool) -> None:

@@ -110,6 +110,7 @@ def select(evidence: Evidence) -> Selection:
         e: growth(h.validation.squares.sum(0), best.validation.squares.sum(0))
         for e, h in without.items()
     }
+    # strongest is what is missed most, not what is largest: sizes have other units
     ranking = tuple(sorted(gains, key=lambda e: -gains[e]))
     best = replace(
         best,

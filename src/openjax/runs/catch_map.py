@@ -234,6 +234,8 @@ class _Flyer:
 
         parts = []
         for start in range(0, number, batch):
+            # the program knows one size: the last batch is filled up with the last
+            # episode
             place = np.minimum(np.arange(start, start + batch), number - 1)
             which, episode = np.divmod(place, episodes)
             values = jnp.asarray(cells, jnp.float32)[which]

@@ -84,6 +84,7 @@ class RateLoop(Channel):
         by more than forms are wrong by.
         """
         change = np.abs(self.change[[0, 3]])
+        # flights that tell nothing leave what was known before
         error = np.minimum(self.error[[0, 3]], PRIOR[0])
         # Savage and Dickey's
         nats = 0.5 * (change / error) ** 2 - np.log(PRIOR[0] / error)
