@@ -129,6 +129,7 @@ def _usable(
     """
     flights = [flight for of_log, _ in logs_read for flight in of_log]
     issues = [issue for _, of_log in logs_read for issue in of_log]
+    # a copy would count as evidence twice
     copies = duplicates(flights)
     for name, original in copies.items():
         text = f"the same values as {original}: a copy, left out"

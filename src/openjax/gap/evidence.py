@@ -147,9 +147,12 @@ def gather(
         library = Library(tuple(e for e in library.effects if not CARDS[e].weighed))
     tell("reading the channels of the log")
     tracks, vehicles = _tracks(case)
+    # in this order: which clock motors are put on depends on whether pose and gyroscope
+    # share one
     tracks, pose, sensors = _sensors(tracks, library)
     tracks, sensors = _motors(case, tracks, vehicles, sensors)
     tracks = [with_motors(t, v) for t, v in zip(tracks, vehicles, strict=True)]
+    # the loop after the radio: it has to know when commands arrive
     radio = None
     if all(t.command is not None and t.motors_logged for t in tracks):
         radio = read_radio(tracks, library, motor_rows(case) == "sample")

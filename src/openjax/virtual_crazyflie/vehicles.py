@@ -143,7 +143,6 @@ class VirtualVehicles:
         def step(_, carry):
             drones, _, has_crashed = carry
             command = commands(drones.quaternion, set_points)
-            # once more beside the step, which doesn't say what it told its motors
             motor, _ = jax.vmap(lambda d, c: rate_controller(plant, d, c, STEP))(
                 drones, command
             )

@@ -66,6 +66,7 @@ def topic_of(name: str, topics) -> str | None:
         for t in topics
         if name == t or re.match(rf"{re.escape(t)}[{SEPARATORS}_]", name)
     ]
+    # a column of imu_2 begins like imu as well
     return max(mine, key=len, default=None)
 
 
