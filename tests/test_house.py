@@ -35,7 +35,7 @@ FLOORS = (
     "store",
     "runs",
     "commands",
-    "adapt benchmark calibrate diagnose evaluate exploit fly map plan sample_flights train view",
+    "adapt benchmark calibrate diagnose evaluate exploit fly map mix plan sample_flights train view",
 )
 """Rooms from the ground up: each may import those below it."""
 TWICE = {

@@ -2,6 +2,7 @@
 simulator works as written.
 """
 
+import dataclasses
 import importlib.util
 import json
 import re
@@ -65,7 +66,7 @@ def test_modules_that_the_pages_run_are_there():
 
 
 def test_readme_and_pages_stay_short():
-    """README 1,300 words, all pages of the documentation 19,300; a word has a letter,
+    """README 1,300 words, all pages of the documentation 19,700; a word has a letter,
     and what the API page lists of the code is no prose.
     """
 
@@ -76,7 +77,7 @@ def test_readme_and_pages_stay_short():
         return len(re.findall(r"\S*[^\W\d_]\S*", text))
 
     assert words(README) <= 1300
-    assert sum(words(page.read_text(encoding="utf-8")) for page in PAGES) <= 19_300
+    assert sum(words(page.read_text(encoding="utf-8")) for page in PAGES) <= 19_700
 
 
 def test_links_lead_somewhere():
@@ -199,7 +200,14 @@ def test_the_default_policy_plays_todays_game_and_its_card_names_another_recipe(
     stored = load_policy_file(WEIGHTS / f"{DEFAULT_POLICY}.npz")[1]
     shipped = from_plain(TrainSettings, stored, f"{DEFAULT_POLICY}: ")
     todays = openjax.preset(DEFAULT_POLICY, seed=shipped.seed)
-    assert shipped.environment == todays.environment
+    # a member's, of which the team draws one; evaders that learned are in no file
+    game = dataclasses.replace(
+        todays.environment,
+        evaders=shipped.environment.evaders,
+        strategies=shipped.environment.strategies,
+        strategy_seconds=shipped.environment.strategy_seconds,
+    )
+    assert shipped.environment == game
     assert shipped.network == todays.network
     cards = (ROOT / "docs/model_cards.md").read_text(encoding="utf-8")
     card = cards.partition(f"## `{DEFAULT_POLICY}`")[2].partition("\n## ")[0]

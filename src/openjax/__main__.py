@@ -12,6 +12,7 @@ COMMANDS = {
     "evaluate": "fly policies on layouts: captures, collisions, crashes",
     "view": "watch episodes in three dimensions, in a browser or as an HTML file",
     "exploit": "train an evader against a policy, and see how well the policy holds",
+    "mix": "make one policy of several: a team that draws which of them it flies",
     "map": "show what a policy catches, over team sizes, speeds and capture radii",
     "sample_flights": "write logs of a simulated vehicle with an effect, to try the diagnosis on",
     "diagnose": "say from flight logs what causes the sim-to-real gap, or what changed",

@@ -209,7 +209,9 @@ def _onnx(act, inputs, samples, source):
     input_names = [value.name for value in session.get_inputs()]
     actions = []
     for i in range(len(samples["frames"])):
-        actions += session.run(None, {name: samples[name][i] for name in input_names})
+        actions += session.run(
+            None, {name: np.asarray(samples[name][i]) for name in input_names}
+        )
     extra = {
         "inputs": _describe({name: inputs[name] for name in input_names}),
         "numbers": size(model),

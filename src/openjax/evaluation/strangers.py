@@ -25,6 +25,7 @@ OBSERVED = (
     ),
     *("observe_history", "observe_history_spacing"),
     *("history_length", "history_spacing", "history_pursuers"),
+    *("track_unseen", "strategies", "strategy_seconds"),
 )
 """The settings that say what a pursuer observes; all others are the game's."""
 

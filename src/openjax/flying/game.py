@@ -16,6 +16,7 @@ from jax.flatten_util import ravel_pytree
 from openjax.flying.controller import Pose, airframe_of
 from openjax.flying.real_time import compile_in_line
 from openjax.pursuit import Pursuit, Task
+from openjax.pursuit.teams import draw_strategies
 
 
 class Play(NamedTuple):
@@ -34,8 +35,9 @@ def game_functions(policy):
     """The game's settings and airframe, and its two steps as pure functions of arrays,
     to compile or to map.
 
-    first(task, poses (N, 13)) -> state, action (N, 4): an episode begins with the
-    pursuers at `poses`. tick(state, action, poses, evader (3,), evader_measured ()) ->
+    first(task, poses (N, 13), seed ()) -> state, action (N, 4): an episode begins with
+    the pursuers at `poses`; the seed draws which strategies a team flies that draws
+    them. tick(state, action, poses, evader (3,), evader_measured ()) ->
     state, action, *fields of `Play` but the first: one control step later they are at
     `poses`.
     """
@@ -58,12 +60,15 @@ def game_functions(policy):
             "body_rates": body_rates,
         }
 
-    def first(task: Task, poses):
+    def first(task: Task, poses, seed=0):
         drones = drones_of(poses)
         _, state = environment.reset_to(
             jax.random.key(0), task.replace(pursuer_position=drones["position"])
         )
-        state = state.replace(drones=state.drones.replace(**drones))
+        state = state.replace(
+            drones=state.drones.replace(**drones),
+            strategies=draw_strategies(settings, jax.random.key(seed)),
+        )
         return state, policy(environment.observe(state))
 
     def tick(state, action, poses, evader, evader_measured):
@@ -113,8 +118,8 @@ class Game:
 
         # the state as one array: as a tree of some thirty the call takes half as long
         # again
-        def begin(poses):
-            state, action = first(task, poses)
+        def begin(poses, seed):
+            state, action = first(task, poses, seed)
             return ravel_pytree((state, action))[0], action
 
         def move(flat, poses, evader, evader_measured):
@@ -122,7 +127,9 @@ class Game:
             state, *results = tick(state, action, poses, evader, evader_measured)
             return ravel_pytree((state, results[0]))[0], results
 
-        self._first = compile_in_line(jax.jit(begin).lower(example))
+        # whoever knew what a team draws could wait for it: other draws in each episode
+        self._draws = np.random.default_rng()
+        self._first = compile_in_line(jax.jit(begin).lower(example, np.uint32(0)))
         program = jax.jit(move).lower(self._flat, example, nowhere, not_measured)
         self._tick = compile_in_line(program)
         # the first calls take tens of milliseconds: not in flight
@@ -131,7 +138,8 @@ class Game:
 
     def start(self, poses: list[Pose]) -> Play:
         """Begin an episode with the pursuers at `poses`."""
-        self._flat, action = self._first(pose_array(poses))
+        seed = self._draws.integers(2**32, dtype=np.uint32)
+        self._flat, action = self._first(pose_array(poses), seed)
         n = self.settings.num_pursuers
         return Play(
             action=np.asarray(action),

@@ -106,9 +106,13 @@ def starting_parameters(
     before.
     """
     game = settings.environment
-    start = with_longer_history(
-        parameters.replace(critic={}), settings.predictor, game, adapting_game(game)
-    )
+
+    def longer(one):
+        return with_longer_history(one, settings.predictor, game, adapting_game(game))
+
+    start = parameters.replace(critic={})
+    # the members of a team that draws stand side by side
+    start = longer(start) if game.strategies == 1 else jax.vmap(longer)(start)
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), start)
 
 

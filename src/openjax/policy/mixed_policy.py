@@ -5,6 +5,7 @@ Whoever knows a deterministic team can find the one way past it. Against a team 
 draws, an evader needs a way that is past all of its members at once.
 """
 
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -55,25 +56,31 @@ class MixedPolicy:
     def init(self, key: PRNGKeyArray, observation: Observation) -> PolicyParameters:
         """Initial parameters, of each member from a key of its own."""
         keys = jax.random.split(key, self.number)
-        return mixed_parameters([self.member.init(one, observation) for one in keys])
+        return jax.vmap(self.member.init, in_axes=(0, None))(keys, observation)
 
     def _drawn(
         self, function: Callable[[Any], Any], parameters: Any, observation: Observation
     ) -> Any:
         """What `function` makes of the parameters of the member that each world has
-        drawn.
+        drawn; leaves with the worlds' axes first.
         """
-        # one after the other: the members' kernels are those of a policy by itself
-        of_members = jax.lax.map(function, parameters)
-        drawn = observation.strategy
+        strategy = observation.strategy
 
-        def take(values):
-            place = drawn.reshape(
-                1, *drawn.shape, *[1] * (values.ndim - 1 - drawn.ndim)
+        def choose(place, new, old):
+            is_drawn = (strategy == place).reshape(
+                *strategy.shape, *[1] * (new.ndim - strategy.ndim)
             )
-            return jnp.take_along_axis(values, place, axis=0)[0]
+            return jnp.where(is_drawn, new, old)
 
-        return jax.tree.map(take, of_members)
+        # written out and not mapped: exported policies have neither loops nor indices
+        result = function(_member(parameters, 0))
+        for place in range(1, self.number):
+            result = jax.tree.map(
+                functools.partial(choose, place),
+                function(_member(parameters, place)),
+                result,
+            )
+        return result
 
     def predict(
         self, parameters: PolicyParameters, observation: Observation
@@ -102,17 +109,13 @@ class MixedPolicy:
         """Mean and log standard deviation of the drawn member's Gaussian; `predicted`
         is that member's.
         """
+        shape = (*observation.strategy.shape, 1, self.sample_size)
 
-        def distribution(member):
-            return self.member.distribution(member, observation, predicted)
+        def distribution(actor):
+            mean, log_std = self.member.distribution(actor, observation, predicted)
+            return mean, jnp.broadcast_to(log_std, shape)
 
-        def drawn_log_std(member):
-            _, log_std = distribution(member)
-            return log_std
-
-        log_std = jax.lax.map(drawn_log_std, actor)[observation.strategy]
-        mean = self._drawn(lambda member: distribution(member)[0], actor, observation)
-        return mean, log_std[..., None, :]
+        return self._drawn(distribution, actor, observation)
 
     def action(
         self,
@@ -131,3 +134,10 @@ class MixedPolicy:
             return self.member.act(member, observation)
 
         return self._drawn(act, parameters, observation)
+
+
+def _member(parameters, place):
+    """The parameters of one member, of those of all (K, ...)."""
+    return jax.tree.map(
+        lambda leaf: jax.lax.index_in_dim(leaf, place, keepdims=False), parameters
+    )

@@ -179,9 +179,9 @@ def _strategy(settings, state):
     """() which of its strategies the team flies now."""
     if state.strategies is None:
         return None
-    drawn = state.step // settings.strategy_steps
+    place = state.step // settings.strategy_steps
     # the episode's last observation is that of a step which isn't flown any more
-    return state.strategies[jnp.minimum(drawn, len(state.strategies) - 1)]
+    return state.strategies[jnp.minimum(place, len(state.strategies) - 1)]
 
 
 def _heading(drones):

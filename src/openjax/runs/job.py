@@ -21,6 +21,7 @@ from openjax.policy.growth import with_longer_history
 from openjax.pursuit import Pursuit
 from openjax.runs.other_policy import game_for
 from openjax.store.leaves import named_leaves
+from openjax.store.mixed_policies import member
 from openjax.store.policies import abstract_parameters, load_policy
 from openjax.store.policy_files import fill
 from openjax.store.traced_programs import recall
@@ -116,6 +117,11 @@ class TrainingJob:
         """Raises UserError for what doesn't fit together, before any directory is
         touched.
         """
+        if self.settings.environment.strategies != 1:
+            raise UserError(
+                f"--environment.strategies {self.settings.environment.strategies}: the members of "
+                "a team that draws are trained one by one, then openjax mix makes one of them"
+            )
         check_devices(self.settings, self.devices)
         check_memory(self.settings, self.devices)
         if self.start_from is not None:
@@ -139,7 +145,8 @@ def start_parameters(job: TrainingJob, fresh: PolicyParameters) -> PolicyParamet
     """Those of the policy that the run starts from; `fresh` ones where it has no
     critic, or one of another game.
     """
-    start_policy = load_policy(job.start_from)
+    # of a team that draws, the first one learns on: members learn by themselves
+    start_policy = member(load_policy(job.start_from), 0)
     if isinstance(start_policy.policy, Heuristic):
         raise UserError(
             f"--start_from {job.start_from}: a heuristic has no networks to start from"

@@ -24,6 +24,9 @@ _OF_THE_POLICY = (
     "observe_history_spacing",
     "history_length",
     "history_spacing",
+    "track_unseen",
+    "strategies",
+    "strategy_seconds",
 )
 """Settings that are how a policy sees and steers, and not what game it plays."""
 

@@ -190,6 +190,11 @@ class LoadedPolicy:
                 f"policy {self.source} observes {sizes_of_policy} (own state, history, axes), "
                 f"here are {sizes}; make its game with openjax.make(policy.settings.environment)"
             )
+        if game.strategies > 1 and observation.strategy is None:
+            raise UserError(
+                f"policy {self.source} draws one of {game.strategies} members, here nothing is "
+                "drawn; make its game with openjax.make(policy.settings.environment)"
+            )
         return self.policy.act(self.parameters, observation)
 
 

@@ -19,7 +19,7 @@ from openjax.evaluation.judges.duel import Duel, World
 from openjax.evaluation.judges.receding_horizon import RecedingHorizon
 from openjax.evaluation.judges.settings import PlannerSettings
 from openjax.policy import PolicyParameters
-from openjax.pursuit import PursuitState
+from openjax.pursuit import PursuitSettings, PursuitState
 
 SPREAD = 0.6
 """How far the pieces of a refined plan lead aside, a share of their length: some 40
@@ -66,7 +66,10 @@ class Planner(RecedingHorizon):
         tried = self.candidates(key, plan)  # (B, M, pieces, 3)
         copied = jax.tree.map(
             lambda leaf: jnp.repeat(leaf, settings.plans, axis=0),
-            self._without_foresight(world, key),
+            # a key beside those that `candidates` splits this one into
+            without_foresight(
+                self.duel.environment.settings, world, jax.random.fold_in(key, 1)
+            ),
         )
         pieces = jnp.moveaxis(tried.reshape(-1, *tried.shape[2:]), 1, 0)
 
@@ -79,25 +82,6 @@ class Planner(RecedingHorizon):
         score = jax.vmap(self.promise)(copied[1], end).reshape(plan.shape[0], -1)
         best = jnp.argmax(score, axis=1)
         return jnp.take_along_axis(tried, best[:, None, None, None], axis=1)[:, 0]
-
-    def _without_foresight(self, world, key):
-        """Worlds (B, ...) whose teams may draw other strategies than they will: an
-        evader can tell from what it sees which one they fly, and not which come next.
-        """
-        observation, state = world
-        game = self.duel.environment.settings
-        if state.strategies is None:
-            return world
-        # beside the keys that `candidates` splits this one into
-        redraw_key = jax.random.fold_in(key, 1)
-        other = jax.random.randint(
-            redraw_key, state.strategies.shape, 0, game.strategies, jnp.int32
-        )
-        flown = state.step // game.strategy_steps
-        known = jnp.arange(state.strategies.shape[1]) <= flown[:, None]
-        return observation, state.replace(
-            strategies=jnp.where(known, state.strategies, other)
-        )
 
     def candidates(self, key: jax.Array, plan: jax.Array) -> jax.Array:
         """(B, plans, pieces, 3) the last best plan (B, pieces, 3), the same shifted by
@@ -187,6 +171,22 @@ class Planner(RecedingHorizon):
         newly = end.statistics.captured & ~start.statistics.captured
         horizon = self.settings.pieces * self.settings.piece_steps
         return jnp.where(newly, end.statistics.capture_step - start.step, horizon)
+
+
+def without_foresight(game: PursuitSettings, world: World, key: jax.Array) -> World:
+    """Worlds (B, ...) whose teams draw other strategies than they will: an evader can
+    tell from what it sees which one they fly, and not which come next.
+    """
+    observation, state = world
+    if state.strategies is None:
+        return world
+    other = jax.random.randint(
+        key, state.strategies.shape, 0, game.strategies, jnp.int32
+    )
+    flown = state.step // game.strategy_steps
+    known = jnp.arange(state.strategies.shape[1]) <= flown[:, None]
+    strategies = jnp.where(known, state.strategies, other)
+    return observation, state.replace(strategies=strategies)
 
 
 def unit(vector: jax.Array) -> jax.Array:

@@ -1,0 +1,76 @@
+"""`openjax mix POLICY POLICY ...`: one policy of several, a team that draws which of
+them it flies.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from openjax.command_line import output_console, parse
+from openjax.errors import UserError
+from openjax.files import check_output
+from openjax.ranges import Interval, check_intervals
+
+PROGRAM = "openjax mix"
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Make one policy of several: the team draws which of them it flies, and the evader
+    isn't told (a mixed strategy).
+
+    All must have learned with the same networks and observations.
+    """
+
+    policies: Annotated[tuple[str, ...], tyro.conf.Positional]
+    """Two or more: names, files, or runs' directories."""
+    seconds: Annotated[float, Interval("[0, 1000]")] = 0.4
+    """Time after which the team draws again (s); 0: it draws once an episode. By
+    default sooner than a trap is closed.
+    """
+    out: Path = Path("mixed.npz")
+    """File to write the policy to."""
+
+    def __post_init__(self):
+        check_intervals(self, "")
+
+
+def main(arguments: Sequence[str]) -> None:
+    """The command. Raises UserError for policies that don't fit together."""
+    options = parse(Arguments, Arguments(policies=tyro.MISSING), arguments, PROGRAM)
+    check_output(options.out, "--out")
+    if options.out.suffix != ".npz":
+        raise UserError(f"--out {options.out}: a policy's file ends in .npz")
+    from openjax.store.mixed_policies import as_trained, mixed_policy
+    from openjax.store.policies import load_policy
+    from openjax.store.policy_files import save_policy_file
+
+    policy = mixed_policy(
+        [load_policy(name) for name in options.policies], options.seconds
+    )
+    settings, _ = as_trained(options.policies[0])
+    game = dataclasses.replace(
+        settings.environment,
+        strategies=len(options.policies),
+        strategy_seconds=options.seconds,
+    )
+    members = [{"policy": name, **as_trained(name)[1]} for name in options.policies]
+    save_policy_file(
+        options.out,
+        policy.parameters,
+        dataclasses.replace(settings, environment=game),
+        {"members": members},
+    )
+    console = output_console()
+    console.print(
+        f"{options.out}: draws one of {len(options.policies)} policies "
+        + (f"every {options.seconds:g} s" if options.seconds else "for each episode"),
+        soft_wrap=True,
+    )
+    console.print(
+        f"how well it holds: openjax exploit --policy {options.out}", soft_wrap=True
+    )
