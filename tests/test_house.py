@@ -57,7 +57,7 @@ MOST = {
     "pairs": 14,
     "starred": 4,
     "columns": 0,
-    "names": 255,
+    "names": 128,
     "effects": 28,
 }
 """Places of each kind of hard reading that are left; these numbers only get smaller.

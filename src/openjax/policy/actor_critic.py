@@ -6,7 +6,7 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from openjax.policy.encoder import Encoder, HiddenLayer, padded
+from openjax.policy.encoder import Encoder, HiddenLayer, pad
 from openjax.policy.settings import NetworkSettings
 from openjax.pursuit import Observation
 from openjax.pursuit.axes import turned_back
@@ -23,7 +23,7 @@ class Actor(nn.Module):
     def __call__(
         self,
         observation: Observation,
-        predicted: Float[Array, "*worlds horizons 3"] | None,
+        prediction: Float[Array, "*worlds horizons 3"] | None,
     ) -> tuple[
         Float[Array, "*worlds pursuers sample"],
         Float[Array, " sample"],
@@ -33,13 +33,13 @@ class Actor(nn.Module):
         predicted positions in m.
         """
         settings = self.settings
-        hidden = Encoder(
+        features = Encoder(
             settings.features,
             settings.heads,
             jnp.dtype(settings.compute_type),
             name="encoder",
         )(
-            own_features(observation, predicted),
+            own_features(observation, prediction),
             observation.others,
             observation.pillars,
             observation.pillar_seen,
@@ -53,7 +53,7 @@ class Actor(nn.Module):
             kernel_init=nn.initializers.orthogonal(0.01),
             bias_init=lambda key, shape, dtype: start.astype(dtype),
             name="mean",
-        )(hidden)
+        )(features)
         log_std = self.param(
             "log_std",
             nn.initializers.constant(settings.initial_log_std),
@@ -61,7 +61,7 @@ class Actor(nn.Module):
         )
         if settings.squash == "mean":
             mean = jnp.tanh(mean)
-        return mean, log_std, hidden
+        return mean, log_std, features
 
 
 class Critic(nn.Module):
@@ -73,42 +73,42 @@ class Critic(nn.Module):
     def __call__(
         self,
         observation: Observation,
-        predicted: Float[Array, "*worlds horizons 3"] | None,
-        encoded: Float[Array, "*worlds pursuers features"] | None = None,
+        prediction: Float[Array, "*worlds horizons 3"] | None,
+        encoding: Float[Array, "*worlds pursuers features"] | None = None,
     ) -> Float[Array, "*worlds pursuers"]:
-        """Values; `encoded` is what the actor's encoder made of the observation, if the
-        encoder is shared.
+        """Values; `encoding` is what the actor's encoder made of the observation, if
+        the encoder is shared.
         """
         settings = self.settings
         dtype = jnp.dtype(settings.compute_type)
         sees_state = settings.critic_input == "state"
         if settings.shared_encoder:
-            hidden = encoded
+            features = encoding
             if sees_state:
-                hidden = padded(
+                features = pad(
                     jnp.concatenate(
-                        [encoded, observation.privileged.astype(dtype)], axis=-1
+                        [encoding, observation.privileged.astype(dtype)], axis=-1
                     )
                 )
         else:
-            itself = own_features(observation, predicted)
+            itself = own_features(observation, prediction)
             if sees_state:
                 itself = jnp.concatenate([itself, observation.privileged], axis=-1)
-            hidden = self._encoded(itself, observation, dtype)
+            features = self._encode(itself, observation, dtype)
         # one matrix product over all worlds and pursuers
-        leading = hidden.shape[:-1]
-        hidden = HiddenLayer(settings.features, dtype, name="hidden")(
-            hidden.reshape(math.prod(leading), hidden.shape[-1])
+        leading = features.shape[:-1]
+        features = HiddenLayer(settings.features, dtype, name="hidden")(
+            features.reshape(math.prod(leading), features.shape[-1])
         )
         value = nn.Dense(
             1,
             dtype=jnp.float32,
             kernel_init=nn.initializers.orthogonal(1.0),
             name="value",
-        )(hidden)
+        )(features)
         return value.reshape(leading)
 
-    def _encoded(self, itself, observation, dtype):
+    def _encode(self, itself, observation, dtype):
         """What an encoder of the critic's own makes of a pursuer's own part and the
         rest.
         """
@@ -127,21 +127,21 @@ class Critic(nn.Module):
             x.reshape(number, math.prod(x.shape[len(leading) :]))
             for x in (itself, observation.others, observation.pillars)
         ]
-        hidden = padded(jnp.concatenate(parts, axis=-1))
+        features = pad(jnp.concatenate(parts, axis=-1))
         for name in ("layer_1", "layer_2"):
-            hidden = HiddenLayer(2 * settings.features, dtype, name=name)(hidden)
-        return hidden.reshape(*leading, hidden.shape[-1])
+            features = HiddenLayer(2 * settings.features, dtype, name=name)(features)
+        return features.reshape(*leading, features.shape[-1])
 
 
 def own_features(
-    observation: Observation, predicted: Float[Array, "*worlds horizons 3"] | None
+    observation: Observation, prediction: Float[Array, "*worlds horizons 3"] | None
 ) -> Float[Array, "*worlds pursuers own"]:
     """A pursuer's own part: its state and, relative to it, the predicted evader
     positions (m).
     """
-    if predicted is None:
+    if prediction is None:
         return observation.self_state
-    relative = observation.position[..., :, None, :] - predicted[..., None, :, :]
+    relative = observation.position[..., :, None, :] - prediction[..., None, :, :]
     relative = turned_back(observation.heading, relative)
     return jnp.concatenate(
         [observation.self_state, relative.reshape(*relative.shape[:-2], -1)], axis=-1

@@ -82,7 +82,7 @@ class SelfAttention(nn.Module):
             if x.shape[-2] > 0:  # a single pursuer has no others
                 entities.append((x, *self._embedding(kernel, name, x.shape[-1]), bias))
         if can_compile_for_cuda():
-            return self._fused(token, query, output, entities)
+            return self._attend_fused(token, query, output, entities)
         return self._one_by_one(token, query, output, entities)
 
     def _embedding(self, kernel, name, size):
@@ -103,12 +103,12 @@ class SelfAttention(nn.Module):
         CPU is good at.
         """
         # the pursuer itself is one of the entities, and always there
-        embedded = [token.astype(jnp.float32)]
+        embeddings = [token.astype(jnp.float32)]
         biases = [0.0]
         for x, linear, scale, shift, bias in kinds:
             affine = jnp.stack([linear[-1], scale, shift[0]])
             for m in range(x.shape[-2]):
-                embedded.append(normalised_layer(x[:, m], linear[:-1], affine))
+                embeddings.append(normalised_layer(x[:, m], linear[:-1], affine))
                 biases.append(bias[:, m : m + 1])
         token = token.astype(self.dtype)
         scale = (self.features // self.heads) ** -0.5
@@ -116,13 +116,13 @@ class SelfAttention(nn.Module):
             scale * (token @ query[:, h].astype(self.dtype)).astype(jnp.float32)
             for h in range(self.heads)
         ]
-        means = attend_one_by_one(queries, embedded, biases)
+        means = attend_one_by_one(queries, embeddings, biases)
         return sum(
             means[h].astype(self.dtype) @ output[h].astype(self.dtype)
             for h in range(self.heads)
         )
 
-    def _fused(self, token, query, output, entities):
+    def _attend_fused(self, token, query, output, entities):
         """By the kernels for GPUs, and the formula that stands for them elsewhere."""
         f = self.features
         h = self.heads
@@ -167,13 +167,13 @@ def normalised_linear(x: jax.Array, linear: jax.Array) -> tuple[jax.Array, jax.A
       [x, 1] is LayerNorm(linear' [x, 1]).
     """
     x = jnp.concatenate([x, jnp.ones_like(x[..., :1])], axis=-1)
-    centred = linear - jnp.mean(linear, axis=1, keepdims=True)
+    deviation = linear - jnp.mean(linear, axis=1, keepdims=True)
     # in full precision: a variance of large and small weights is a difference, and a
     # GPU's products of float32 are rounded to ten bits
     exact = functools.partial(jnp.matmul, precision=jax.lax.Precision.HIGHEST)
-    covariance = exact(centred, centred.T) / linear.shape[1]
+    covariance = exact(deviation, deviation.T) / linear.shape[1]
     variance = jnp.sum(exact(x, covariance) * x, axis=-1)
-    return jax.lax.rsqrt(variance + 1e-6), centred
+    return jax.lax.rsqrt(variance + 1e-6), deviation
 
 
 class Encoder(nn.Module):
@@ -206,21 +206,21 @@ class Encoder(nn.Module):
             return x.reshape(math.prod(leading), *x.shape[rows:])
 
         token = HiddenLayer(self.features, self.dtype, name="self_1")(
-            flat(padded(self_state))
+            flat(pad(self_state))
         )
         token = HiddenLayer(self.features, self.dtype, name="self_2")(token)
         attention = SelfAttention(
             self.features, self.heads, self.dtype, name="attention"
         )
         others_mask = None if others_there is None else flat(others_there)
-        hidden = token + attention(
+        features = token + attention(
             token, flat(others), flat(pillars), flat(pillar_seen), others_mask
         )
-        hidden = normalise(
-            hidden, affine_parameters(self, "norm", self.features), activate=False
+        features = normalise(
+            features, affine_parameters(self, "norm", self.features), activate=False
         )
-        hidden = HiddenLayer(self.features, self.dtype, name="hidden")(hidden)
-        return hidden.reshape(*leading, self.features)
+        features = HiddenLayer(self.features, self.dtype, name="hidden")(features)
+        return features.reshape(*leading, self.features)
 
 
 class HiddenLayer(nn.Module):
@@ -240,7 +240,7 @@ class HiddenLayer(nn.Module):
         return normalise(x.astype(self.dtype) @ kernel.astype(self.dtype), affine)
 
 
-def padded(x: jax.Array) -> jax.Array:
+def pad(x: jax.Array) -> jax.Array:
     """(..., S) with zeros up to a multiple of 8: else XLA copies all samples to pad
     them for the matrix unit.
     """

@@ -38,7 +38,7 @@ def with_longer_history(
     place = old.self_size - old.observe_history * OWN_FRAME
     inputs = old.self_size + (3 * len(predictor.horizons) if predictor.enabled else 0)
 
-    def grown(actor: Any) -> Any:
+    def grow(actor: Any) -> Any:
         params = dict(actor["params"])
         encoder = dict(params["encoder"])
         # without the rows for the encoder's padding, which are added anew for the new
@@ -51,4 +51,4 @@ def with_longer_history(
         encoder["self_1"] = {**encoder["self_1"], "kernel": kernel}
         return {**actor, "params": {**params, "encoder": encoder}}
 
-    return parameters.replace(actor=grown(parameters.actor), critic={})
+    return parameters.replace(actor=grow(parameters.actor), critic={})

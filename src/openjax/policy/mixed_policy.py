@@ -58,7 +58,7 @@ class MixedPolicy:
         keys = jax.random.split(key, self.number)
         return jax.vmap(self.member.init, in_axes=(0, None))(keys, observation)
 
-    def _drawn(
+    def _pick(
         self, function: Callable[[Any], Any], parameters: Any, observation: Observation
     ) -> Any:
         """What `function` makes of the parameters of the member that each world has
@@ -96,26 +96,26 @@ class MixedPolicy:
                 predictor, observation.frames, observation.last_seen
             )
 
-        return self._drawn(predict, parameters.predictor, observation)
+        return self._pick(predict, parameters.predictor, observation)
 
     def distribution(
         self,
         actor: Any,
         observation: Observation,
-        predicted: Float[Array, "*worlds horizons 3"] | None,
+        prediction: Float[Array, "*worlds horizons 3"] | None,
     ) -> tuple[
         Float[Array, "*worlds pursuers sample"], Float[Array, "*worlds 1 sample"]
     ]:
-        """Mean and log standard deviation of the drawn member's Gaussian; `predicted`
+        """Mean and log standard deviation of the drawn member's Gaussian; `prediction`
         is that member's.
         """
         shape = (*observation.strategy.shape, 1, self.sample_size)
 
         def distribution(actor):
-            mean, log_std = self.member.distribution(actor, observation, predicted)
+            mean, log_std = self.member.distribution(actor, observation, prediction)
             return mean, jnp.broadcast_to(log_std, shape)
 
-        return self._drawn(distribution, actor, observation)
+        return self._pick(distribution, actor, observation)
 
     def action(
         self,
@@ -133,7 +133,7 @@ class MixedPolicy:
         def act(member):
             return self.member.act(member, observation)
 
-        return self._drawn(act, parameters, observation)
+        return self._pick(act, parameters, observation)
 
 
 def _member(parameters, place):

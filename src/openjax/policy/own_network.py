@@ -56,12 +56,12 @@ def check_network(network: Any, observation: Observation) -> None:
     per_pursuer = worlds.self_state.shape[:-1]
     mean, log_std = jax.eval_shape(network.distribution, actor, worlds)
     value = jax.eval_shape(network.value, critic, worlds)
-    needed = {
+    shapes = {
         "distribution's mean": (mean, (*per_pursuer, 4)),
         "distribution's log standard deviation": (log_std, (4,)),
         "value": (value, per_pursuer),
     }
-    for what, (output, shape) in needed.items():
+    for what, (output, shape) in shapes.items():
         if output.shape != shape:
             raise UserError(
                 f"policy {name}: {what} has shape {output.shape} for two worlds of "
@@ -92,7 +92,7 @@ class OwnPolicy:
         """It predicts nothing."""
 
     def distribution(
-        self, actor: Any, observation: Observation, predicted: None
+        self, actor: Any, observation: Observation, prediction: None
     ) -> tuple[jax.Array, jax.Array]:
         """Mean (..., N, 4) and log standard deviation (4,)."""
         return self.own.distribution(actor, observation)
@@ -104,13 +104,13 @@ class OwnPolicy:
         return jnp.clip(sample, -1.0, 1.0)
 
     def value(
-        self, actor: Any, critic: Any, observation: Observation, predicted: None
+        self, actor: Any, critic: Any, observation: Observation, prediction: None
     ) -> jax.Array:
         """(..., N), normalised."""
         return self.own.value(critic, observation)
 
     def evaluate(
-        self, actor: Any, critic: Any, observation: Observation, predicted: None
+        self, actor: Any, critic: Any, observation: Observation, prediction: None
     ) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Mean, log standard deviation and value."""
         return *self.own.distribution(actor, observation), self.own.value(

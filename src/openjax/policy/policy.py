@@ -85,12 +85,12 @@ class Policy:
         # in this order: the actor sees what the predictor predicts, the critic what the
         # actor's encoder makes of it
         parameters = PolicyParameters(actor={}, critic={}, predictor=predictor)
-        predicted = self.predict(parameters, observation)
-        actor = self._actor.init(actor_key, observation, predicted)
-        encoded = self._actor.apply(actor, observation, predicted)[2]
+        prediction = self.predict(parameters, observation)
+        actor = self._actor.init(actor_key, observation, prediction)
+        encoding = self._actor.apply(actor, observation, prediction)[2]
         return parameters.replace(
             actor=actor,
-            critic=self._critic.init(critic_key, observation, predicted, encoded),
+            critic=self._critic.init(critic_key, observation, prediction, encoding),
         )
 
     def predict(
@@ -118,12 +118,12 @@ class Policy:
         self,
         actor: Any,
         observation: Observation,
-        predicted: Float[Array, "*worlds horizons 3"] | None,
+        prediction: Float[Array, "*worlds horizons 3"] | None,
     ) -> tuple[Float[Array, "*worlds pursuers sample"], Float[Array, " sample"]]:
         """Mean and log standard deviation of the Gaussian over samples; see
         `action`.
         """
-        return self._actor.apply(actor, observation, predicted)[:2]
+        return self._actor.apply(actor, observation, prediction)[:2]
 
     @property
     def sample_size(self) -> int:
@@ -151,36 +151,36 @@ class Policy:
         actor: Any,
         critic: Any,
         observation: Observation,
-        predicted: Float[Array, "*worlds horizons 3"] | None,
+        prediction: Float[Array, "*worlds horizons 3"] | None,
     ) -> Float[Array, "*worlds pursuers"]:
         """Normalised values; the actor's parameters matter if its encoder is shared."""
-        return self.evaluate(actor, critic, observation, predicted)[2]
+        return self.evaluate(actor, critic, observation, prediction)[2]
 
     def evaluate(
         self,
         actor: Any,
         critic: Any,
         observation: Observation,
-        predicted: Float[Array, "*worlds horizons 3"] | None,
+        prediction: Float[Array, "*worlds horizons 3"] | None,
     ) -> tuple[
         Float[Array, "*worlds pursuers sample"],
         Float[Array, " sample"],
         Float[Array, "*worlds pursuers"],
     ]:
         """`distribution` and `value`: mean, log standard deviation, value."""
-        mean, log_std, encoded = self._actor.apply(actor, observation, predicted)
+        mean, log_std, encoding = self._actor.apply(actor, observation, prediction)
         return (
             mean,
             log_std,
-            self._critic.apply(critic, observation, predicted, encoded),
+            self._critic.apply(critic, observation, prediction, encoding),
         )
 
     def act(
         self, parameters: PolicyParameters, observation: Observation
     ) -> Float[Array, "*worlds pursuers 4"]:
         """The mean policy's action in -1..1."""
-        predicted = self.predict(parameters, observation)
-        mean, _ = self.distribution(parameters.actor, observation, predicted)
+        prediction = self.predict(parameters, observation)
+        mean, _ = self.distribution(parameters.actor, observation, prediction)
         return self.action(mean, observation)
 
 
@@ -190,8 +190,8 @@ def gaussian_log_prob(
     log_std: Float[Array, " size"],
 ) -> Float[Array, "*samples"]:
     """Log density of samples under independent Gaussians."""
-    scaled = (sample - mean) * jnp.exp(-log_std)
-    return jnp.sum(-0.5 * scaled**2 - log_std - 0.5 * jnp.log(2 * jnp.pi), axis=-1)
+    score = (sample - mean) * jnp.exp(-log_std)
+    return jnp.sum(-0.5 * score**2 - log_std - 0.5 * jnp.log(2 * jnp.pi), axis=-1)
 
 
 def gaussian_entropy(log_std: Float[Array, " size"]) -> Float[Array, ""]:

@@ -35,19 +35,19 @@ class EvaderPredictor(nn.Module):
         recurrent = self.param(
             "recurrent", nn.initializers.orthogonal(), (units, 4 * units)
         )
-        hidden = cell = jnp.zeros((*frames.shape[:-2], units), jnp.float32)
+        state = cell = jnp.zeros((*frames.shape[:-2], units), jnp.float32)
         for i in range(frames.shape[-2]):
-            gates = inputs[..., i, :] + hidden @ recurrent
+            gates = inputs[..., i, :] + state @ recurrent
             in_gate, forget_gate, candidate, out_gate = jnp.split(gates, 4, axis=-1)
             # one more, so that a fresh cell forgets little (Jozefowicz et al. 2015, An
             # empirical exploration of recurrent network architectures)
             forget = jax.nn.sigmoid(forget_gate + 1.0) * cell
             cell = forget + jax.nn.sigmoid(in_gate) * jnp.tanh(candidate)
-            hidden = jax.nn.sigmoid(out_gate) * jnp.tanh(cell)
+            state = jax.nn.sigmoid(out_gate) * jnp.tanh(cell)
         # small, so that a fresh predictor says what it is relative to: where the evader
         # was last seen, or the arena's middle
         initial = nn.initializers.orthogonal(0.1)
-        output = nn.Dense(3 * len(horizons), kernel_init=initial, name="output")(hidden)
+        output = nn.Dense(3 * len(horizons), kernel_init=initial, name="output")(state)
         output = output.reshape(*output.shape[:-1], len(horizons), 3)
         scale = jnp.array(
             [self.arena_radius, self.arena_radius, self.arena_height / 2], jnp.float32

@@ -277,8 +277,8 @@ class Pursuit:
         last_seen = jnp.where(
             seen, task.evader_position, jnp.array(settings.middle, jnp.float32)
         )
-        framed = frame_pursuers(settings, task.pursuer_position, last_seen, task.active)
-        first = frame(settings, step, framed, task.evader_position, rest, seen)
+        places = frame_pursuers(settings, task.pursuer_position, last_seen, task.active)
+        first = frame(settings, step, places, task.evader_position, rest, seen)
         state = PursuitState(
             task=task,
             drones=drones,
@@ -289,7 +289,7 @@ class Pursuit:
             last_seen=last_seen,
             in_sight=in_sight,
             # the history before the start is the start, as if all had waited there
-            frames=_repeated(first, settings.history_length * settings.history_spacing),
+            frames=_repeat(first, settings.history_length * settings.history_spacing),
             own_history=self._first_own_history(drones, action),
             previous_action=action,
             step=step,
@@ -329,7 +329,7 @@ class Pursuit:
         if not settings.observe_history:
             return None
         first = own_frame(drones.quaternion, drones.velocity, action)
-        return _repeated(
+        return _repeat(
             first, settings.observe_history * settings.observe_history_spacing
         )
 
@@ -345,7 +345,7 @@ class Pursuit:
         """The observation of a state; effects on the sensors act on what a pursuer
         knows of all pursuers.
         """
-        return self._observe(state, self._seen(state.drones, state.vehicles))
+        return self._observe(state, self._see(state.drones, state.vehicles))
 
     def _observe(self, state, seen_drones):
         return (self.observer or observe)(self.settings, state, seen_drones)
@@ -389,7 +389,7 @@ class Pursuit:
         ahead = rotation_axes(drones.quaternion)[0]
         return in_sight & within_view(self.settings, drones.position, ahead, evader)
 
-    def _seen(self, drones, vehicles):
+    def _see(self, drones, vehicles):
         return self.dynamics.seen(drones, self._parameters(vehicles))
 
     def step(
@@ -463,11 +463,11 @@ class Pursuit:
         step = old.step + 1
         active = self._active_after(old)
         in_sight, in_view, seen = self._sights(old.task, active, drones, evader)
-        seen_drones = self._seen(drones, old.vehicles)
+        seen_drones = self._see(drones, old.vehicles)
         thought = thought_place(settings, old.task, seen_drones, active, old.last_seen)
         last_seen = jnp.where(seen, evader, thought)
-        framed = frame_pursuers(settings, seen_drones.position, last_seen, active)
-        newest = frame(settings, step, framed, evader, velocity, seen)
+        places = frame_pursuers(settings, seen_drones.position, last_seen, active)
+        newest = frame(settings, step, places, evader, velocity, seen)
         own_history = old.own_history
         if settings.observe_history:
             newest_own = own_frame(seen_drones.quaternion, seen_drones.velocity, action)
@@ -548,7 +548,7 @@ class Pursuit:
         )
 
 
-def _repeated(first, number):
+def _repeat(first, number):
     """A history (number, ...) of the same moment."""
     return jnp.broadcast_to(first, (number, *first.shape))
 

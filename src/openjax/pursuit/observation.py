@@ -84,8 +84,8 @@ def frame(
     """(F,) one frame of the predictor's history: t/T, evader position and velocity (-5
     where unseen), pursuers. Without `observe_time` t/T stays zero.
     """
-    elapsed = step if settings.observe_time else jnp.zeros_like(step)
-    time = elapsed.astype(jnp.float32)[None] / settings.episode_length
+    steps = step if settings.observe_time else jnp.zeros_like(step)
+    time = steps.astype(jnp.float32)[None] / settings.episode_length
     evader = jnp.where(is_seen, jnp.concatenate([evader, velocity]), HIDDEN)
     return jnp.concatenate([time, evader, pursuers.ravel()])
 
@@ -104,13 +104,13 @@ def frame_pursuers(
     if settings.history_pursuers == "each":
         return position
     offset = position - evader
-    squared = jnp.sum(offset**2, axis=-1)
+    square = jnp.sum(offset**2, axis=-1)
     if active is not None:
-        squared = jnp.where(active, squared, jnp.inf)
+        square = jnp.where(active, square, jnp.inf)
     # sums with weights of zero and one instead of an index, whose gradient is a scatter
-    is_nearest = jnp.arange(squared.shape[0]) == jnp.argmin(squared)
+    is_nearest = jnp.arange(square.shape[0]) == jnp.argmin(square)
     # `PRESS` keeps one that is very near from being all that counts
-    weights = jnp.stack([is_nearest.astype(jnp.float32), 1.0 / (squared + PRESS**2)])
+    weights = jnp.stack([is_nearest.astype(jnp.float32), 1.0 / (square + PRESS**2)])
     return jnp.sum(weights[..., None] * offset, axis=1)
 
 

@@ -280,8 +280,8 @@ class PursuitSettings:
         for name in ("evader_speeds", "capture_radii", "fall_out_seconds"):
             # none at all is fine, but for the seconds of those that fall out
             drawn_from = getattr(self, name)
-            needed = name == "fall_out_seconds" and self.fall_outs
-            if (drawn_from or needed) and (
+            is_needed = name == "fall_out_seconds" and self.fall_outs
+            if (drawn_from or is_needed) and (
                 len(drawn_from) != 2 or drawn_from[0] > drawn_from[1]
             ):
                 raise UserError(

@@ -61,8 +61,8 @@ class Evaders:
         to come counting less.
         """
         critic = jax.tree.map(lambda leaf: leaf[place][None], self.critic)
-        sensed = sense(game, state, self.world_axes[place])
-        share = apply_network(critic, sensed[None, None])[0, 0, 0]
+        senses = sense(game, state, self.world_axes[place])
+        share = apply_network(critic, senses[None, None])[0, 0, 0]
         return hold * share / (1.0 - self.discount[place])
 
     @property
@@ -85,14 +85,14 @@ class ResponseCarry:
 class Decisions:
     """T decisions in L * E worlds."""
 
-    sensed: jax.Array  # (T, L * E, F)
+    senses: jax.Array  # (T, L * E, F)
     way: jax.Array  # (T, L * E) int, which of the ways was chosen
     sample: jax.Array  # (T, L * E, 3)
     log_prob: jax.Array  # (T, L * E)
     # (T, L * E), share of the decision's steps in which the evader was free
     free: jax.Array
     over: jax.Array  # (T, L * E) bool, caught or out of time at its end
-    caught: jax.Array  # (T, L * E) bool
+    is_capture: jax.Array  # (T, L * E) bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,7 +165,7 @@ class BestResponse:
         metrics = {
             "free": jnp.mean(self._by_learner(decisions.free), (0, 2)),
             "episodes": episodes,
-            "capture_rate": jnp.sum(self._by_learner(decisions.caught), (0, 2))
+            "capture_rate": jnp.sum(self._by_learner(decisions.is_capture), (0, 2))
             / jnp.maximum(episodes, 1),
         }
         return ResponseCarry(evaders, optimiser, world, key), metrics
@@ -195,9 +195,9 @@ class BestResponse:
         for it: where it is caught twice in a rollout, at the same one again.
         """
         hold = self.settings.hold
-        sensed = _sense(self.game, evaders, world[1])
+        senses = _sense(self.game, evaders, world[1])
         way_key, noise_key = jax.random.split(key)
-        means, odds = ways(apply_network(evaders.actor, sensed))
+        means, odds = ways(apply_network(evaders.actor, senses))
         way = jax.random.categorical(way_key, odds)
         mean = of_way(means, way)
         log_std = evaders.log_std[:, None]
@@ -205,18 +205,18 @@ class BestResponse:
         velocity = _in_world(evaders, sample, world[1])
         world = self.duel.fly(parameters, world, velocity, hold)
         state = world[1]
-        caught = state.statistics.captured
+        is_capture = state.statistics.captured
         # of a decision in which it was caught, the steps before that
         late = jnp.maximum(state.step - state.statistics.capture_step + 1, 0) / hold
-        over = caught | (state.step >= self.game.episode_length)
+        over = is_capture | (state.step >= self.game.episode_length)
         decision = Decisions(
-            sensed=sensed.reshape(over.size, -1),
+            senses=senses.reshape(over.size, -1),
             way=way.ravel(),
             sample=sample.reshape(over.size, 3),
             log_prob=_log_prob(way, sample, means, odds, log_std).ravel(),
-            free=jnp.where(caught, 1.0 - jnp.minimum(late, 1.0), 1.0),
+            free=jnp.where(is_capture, 1.0 - jnp.minimum(late, 1.0), 1.0),
             over=over,
-            caught=caught,
+            is_capture=is_capture,
         )
 
         def renew(new, old):
@@ -233,7 +233,7 @@ class BestResponse:
 
         def epoch(networks_and_state, key):
             order = jax.random.permutation(key, batch["free"].shape[1])
-            shuffled = jax.tree.map(lambda leaf: leaf[:, order], batch)
+            rows = jax.tree.map(lambda leaf: leaf[:, order], batch)
 
             def update(networks_and_state, i):
                 networks, state = networks_and_state
@@ -241,7 +241,7 @@ class BestResponse:
                 def part(leaf):
                     return jax.lax.dynamic_slice_in_dim(leaf, i * size, size, axis=1)
 
-                gradient = jax.grad(self._loss)(networks, jax.tree.map(part, shuffled))
+                gradient = jax.grad(self._loss)(networks, jax.tree.map(part, rows))
                 change, state = jax.vmap(self.optimiser.update)(
                     gradient, state, networks
                 )
@@ -259,11 +259,11 @@ class BestResponse:
 
     def _batch(self, evaders, decisions, state):
         """(L, T * E, ...) by name: what the loss needs."""
-        sensed = self._by_learner(decisions.sensed)  # (T, L, E, F)
+        senses = self._by_learner(decisions.senses)  # (T, L, E, F)
         of_steps = jax.vmap(
-            lambda sensed: apply_network(evaders.critic, sensed)[..., 0]
+            lambda senses: apply_network(evaders.critic, senses)[..., 0]
         )
-        value = of_steps(sensed)  # (T, L, E)
+        value = of_steps(senses)  # (T, L, E)
         last = apply_network(evaders.critic, _sense(self.game, evaders, state))[..., 0]
         discount = evaders.discount[:, None]
         free = self._by_learner(decisions.free)
@@ -284,10 +284,10 @@ class BestResponse:
 
         start = (jnp.zeros_like(last), last)
         advantage = jax.lax.scan(back, start, (free, over, value), reverse=True)[1]
-        centred = advantage - jnp.mean(advantage, (0, 2), keepdims=True)
-        normal = centred / (jnp.std(advantage, (0, 2), keepdims=True) + 1e-8)
+        deviation = advantage - jnp.mean(advantage, (0, 2), keepdims=True)
+        normal = deviation / (jnp.std(advantage, (0, 2), keepdims=True) + 1e-8)
         rows = {
-            "sensed": sensed,
+            "sensed": senses,
             "way": self._by_learner(decisions.way),
             "sample": self._by_learner(decisions.sample),
             "log_prob": self._by_learner(decisions.log_prob),
@@ -297,8 +297,8 @@ class BestResponse:
         }
 
         def flat(leaf):
-            moved = jnp.moveaxis(leaf, 0, 1)
-            return moved.reshape(moved.shape[0], -1, *moved.shape[3:])
+            by_learner = jnp.moveaxis(leaf, 0, 1)
+            return by_learner.reshape(by_learner.shape[0], -1, *by_learner.shape[3:])
 
         return jax.tree.map(flat, rows)
 
@@ -309,10 +309,8 @@ class BestResponse:
         means, odds = ways(apply_network(actor, part["sensed"]))
         log_prob = _log_prob(part["way"], part["sample"], means, odds, log_std[:, None])
         ratio = jnp.exp(log_prob - part["log_prob"])
-        clipped = jnp.clip(
-            ratio, 1.0 - settings.clip_epsilon, 1.0 + settings.clip_epsilon
-        )
-        surrogate = jnp.minimum(ratio * part["advantage"], clipped * part["advantage"])
+        near = jnp.clip(ratio, 1.0 - settings.clip_epsilon, 1.0 + settings.clip_epsilon)
+        surrogate = jnp.minimum(ratio * part["advantage"], near * part["advantage"])
         value = apply_network(critic, part["sensed"])[..., 0]
         # a value is at most one, an advantage of one standard deviation some hundredths
         error = settings.value_coefficient * (value - part["target"]) ** 2
@@ -333,10 +331,10 @@ def fly_learners(
     learners = evaders.world_axes.size
 
     def one(world, _):
-        decided = likeliest(
+        decision = likeliest(
             apply_network(evaders.actor, _sense(game, evaders, world[1]))
         )
-        velocity = _in_world(evaders, decided, world[1])
+        velocity = _in_world(evaders, decision, world[1])
         return duel.fly(parameters, world, velocity, hold), None
 
     world = copies(start, learners)
@@ -356,13 +354,13 @@ def _axes(evaders, state):
 
 def _sense(game, evaders, state):
     """(L, B, F) what each learner's evaders sense in worlds (L * B, ...)."""
-    sensed = jax.vmap(functools.partial(sense, game))(state, _axes(evaders, state))
-    return sensed.reshape(evaders.world_axes.size, -1, sensed.shape[-1])
+    senses = jax.vmap(functools.partial(sense, game))(state, _axes(evaders, state))
+    return senses.reshape(evaders.world_axes.size, -1, senses.shape[-1])
 
 
-def _in_world(evaders, decided, state):
+def _in_world(evaders, decision, state):
     """(L * B, 3) decisions (L, B, 3) in the axes of worlds (L * B, ...)."""
-    return jax.vmap(to_world)(decided.reshape(-1, 3), state, _axes(evaders, state))
+    return jax.vmap(to_world)(decision.reshape(-1, 3), state, _axes(evaders, state))
 
 
 def spread(number: int) -> np.ndarray:
@@ -376,6 +374,6 @@ def spread(number: int) -> np.ndarray:
 
 
 def _log_prob(way, sample, means, odds, log_std):
-    scaled = (sample - of_way(means, way)) * jnp.exp(-log_std)
-    normal = jnp.sum(-0.5 * scaled**2 - log_std - 0.5 * np.log(2 * np.pi), axis=-1)
+    score = (sample - of_way(means, way)) * jnp.exp(-log_std)
+    normal = jnp.sum(-0.5 * score**2 - log_std - 0.5 * np.log(2 * np.pi), axis=-1)
     return normal + jnp.take_along_axis(odds, way[..., None], axis=-1)[..., 0]

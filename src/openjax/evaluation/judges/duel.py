@@ -65,7 +65,7 @@ class Duel:
 def copies(world: World, number: int) -> World:
     """(number * B, ...): all worlds (B, ...) again and again."""
 
-    def tiled(leaf):
+    def tile(leaf):
         return jnp.tile(leaf, (number, *[1] * (leaf.ndim - 1)))
 
-    return jax.tree.map(tiled, world)
+    return jax.tree.map(tile, world)

@@ -66,7 +66,7 @@ class BothPlanned:
     """B worlds, and what both sides have planned in them."""
 
     world: World
-    prepared: Any
+    preparation: Any
     """What `Ways` has worked out for each."""
     plan: jax.Array  # (B, P, 3), the evader's
     team: TeamPlans
@@ -90,7 +90,7 @@ class Ways:
     """
 
 
-def _straight_length(task, prepared, position, target):
+def _straight_length(task, preparation, position, target):
     return jnp.sqrt(jnp.sum((position - target) ** 2) + 1e-9)
 
 
@@ -127,17 +127,22 @@ class MatrixGame(RecedingHorizon):
 
     @property
     def _planner(self) -> Planner:
-        own = self.settings
-        how = PlannerSettings(own.evader_plans, own.pieces, own.piece_steps, own.replan)
-        return Planner(how, self.duel)
+        settings = self.settings
+        planning = PlannerSettings(
+            settings.evader_plans,
+            settings.pieces,
+            settings.piece_steps,
+            settings.replan,
+        )
+        return Planner(planning, self.duel)
 
     def begin(self, start: World) -> BothPlanned:
         """Worlds (B, ...) at the start of an episode, and plans that are none."""
         game = self.duel.environment.settings
         shape = (start[1].step.size, self.settings.pieces, game.num_pursuers)
         team = TeamPlans(jnp.zeros((*shape, 3)), jnp.ones(shape, bool))
-        prepared = jax.vmap(self.ways.prepare)(start[1].task)
-        return BothPlanned(start, prepared, jnp.zeros((*shape[:2], 3)), team)
+        preparation = jax.vmap(self.ways.prepare)(start[1].task)
+        return BothPlanned(start, preparation, jnp.zeros((*shape[:2], 3)), team)
 
     def replan(
         self, parameters: PolicyParameters, carry: BothPlanned, key: jax.Array
@@ -146,60 +151,62 @@ class MatrixGame(RecedingHorizon):
         evader_key, team_key = jax.random.split(key)
         plans = self._planner.candidates(evader_key, carry.plan)  # (B, E, P, 3)
         teams = self._team_candidates(team_key, carry.team)  # (B, T, P, ...)
-        plan, team = self._decide(parameters, carry.world, carry.prepared, plans, teams)
-        now = jax.tree.map(lambda leaf: leaf[:, 0], team)
-        act = self._act(parameters, carry.prepared, now)
+        plan, team = self._decide(
+            parameters, carry.world, carry.preparation, plans, teams
+        )
+        piece = jax.tree.map(lambda leaf: leaf[:, 0], team)
+        act = self._act(parameters, carry.preparation, piece)
         world = self.duel.fly_actions(
             act, carry.world, plan[:, 0], self.settings.replan
         )
         return carry.replace(world=world, plan=plan, team=team)
 
-    def _decide(self, parameters, world, prepared, plans, teams):
+    def _decide(self, parameters, world, preparation, plans, teams):
         """(B, P, 3) and TeamPlans (B, P, ...): what both sides choose in worlds (B,
         ...) of plans (B, E, P, 3) and (B, T, P, ...).
         """
         settings = self.settings
 
-        def chosen(leaf, place):
-            return jax.vmap(lambda own, place: own[place])(leaf, place)
+        def pick(leaf, place):
+            return jax.vmap(lambda values, place: values[place])(leaf, place)
 
         if settings.full_sight:
-            payoff = self._all_payoffs(parameters, world, prepared, plans, teams)
-            mine, theirs = jax.vmap(lambda own: choose(own, settings.pursuers_last))(
-                payoff
-            )
-            team = jax.tree.map(lambda leaf: chosen(leaf, theirs), teams)
-            return chosen(plans, mine), team
+            payoff = self._all_payoffs(parameters, world, preparation, plans, teams)
+            mine, theirs = jax.vmap(
+                lambda values: choose(values, settings.pursuers_last)
+            )(payoff)
+            team = jax.tree.map(lambda leaf: pick(leaf, theirs), teams)
+            return pick(plans, mine), team
         # the team plans where it takes the evader to be, and the evader knows better
         thought = self._all_payoffs(
-            parameters, as_thought(world), prepared, plans, teams
+            parameters, as_thought(world), preparation, plans, teams
         )
         if settings.pursuers_last:
-            true = self._all_payoffs(parameters, world, prepared, plans, teams)
+            true = self._all_payoffs(parameters, world, preparation, plans, teams)
             mine = jnp.argmax(jnp.min(true, axis=2), axis=1)
-            theirs = jnp.argmin(chosen(thought, mine), axis=1)
-            team = jax.tree.map(lambda leaf: chosen(leaf, theirs), teams)
-            return chosen(plans, mine), team
+            theirs = jnp.argmin(pick(thought, mine), axis=1)
+            team = jax.tree.map(lambda leaf: pick(leaf, theirs), teams)
+            return pick(plans, mine), team
         theirs = jnp.argmin(jnp.max(thought, axis=1), axis=1)
-        team = jax.tree.map(lambda leaf: chosen(leaf, theirs), teams)
+        team = jax.tree.map(lambda leaf: pick(leaf, theirs), teams)
         alone = jax.tree.map(lambda leaf: leaf[:, None], team)
-        true = self._payoffs(parameters, world, prepared, (plans, alone))
-        return chosen(plans, jnp.argmax(true[..., 0], axis=1)), team
+        true = self._payoffs(parameters, world, preparation, (plans, alone))
+        return pick(plans, jnp.argmax(true[..., 0], axis=1)), team
 
-    def _all_payoffs(self, parameters, world, prepared, plans, teams):
+    def _all_payoffs(self, parameters, world, preparation, plans, teams):
         """(B, E, T) what all pairs of plans are worth in worlds (B, ...)."""
         settings = self.settings
         # plans in which no pursuer asks the policy are flown without it, which is most
         # of the work
         with_policy = jax.tree.map(lambda leaf: leaf[:, : settings.team_plans], teams)
-        payoff = self._payoffs(parameters, world, prepared, (plans, with_policy))
+        payoff = self._payoffs(parameters, world, preparation, (plans, with_policy))
         if not settings.direct_plans:
             return payoff
         direct = jax.tree.map(lambda leaf: leaf[:, settings.team_plans :], teams)
-        more = self._payoffs(None, world, prepared, (plans, direct))
+        more = self._payoffs(None, world, preparation, (plans, direct))
         return jnp.concatenate([payoff, more], axis=-1)
 
-    def _payoffs(self, parameters, world, prepared, both):
+    def _payoffs(self, parameters, world, preparation, both):
         """(B, E, T) what all pairs of plans are worth in worlds (B, ...); `parameters`
         None: none of the team's asks the policy.
         """
@@ -217,42 +224,42 @@ class MatrixGame(RecedingHorizon):
         def of_worlds(leaf):
             return jnp.repeat(leaf, evader_plans * team_plans, axis=0)
 
-        copied, prepared = jax.tree.map(of_worlds, (world, prepared))
+        start, preparation = jax.tree.map(of_worlds, (world, preparation))
         pieces = of_pairs(plans, 2), jax.tree.map(lambda leaf: of_pairs(leaf, 1), teams)
 
         def piece(world, both):
             velocity, team = both
-            act = self._act(parameters, prepared, team)
+            act = self._act(parameters, preparation, team)
             return self.duel.fly_actions(
                 act, world, velocity, self.settings.piece_steps
             ), None
 
-        end = jax.lax.scan(piece, copied, pieces)[0][1]
-        payoff = jax.vmap(self._payoff)(copied[1], end, prepared)
+        end = jax.lax.scan(piece, start, pieces)[0][1]
+        payoff = jax.vmap(self._payoff)(start[1], end, preparation)
         return payoff.reshape(number, evader_plans, team_plans)
 
-    def _act(self, parameters, prepared, team):
+    def _act(self, parameters, preparation, team):
         """What the pursuers of worlds (B, ...) do in one piece of their plans (B,
         ...).
         """
         speed = SPEED * self.duel.environment.settings.max_speed
         from_all = jax.vmap(self.ways.length, in_axes=(None, None, 0, 0))
 
-        def flown(observation, state, prepared, beside):
+        def fly(observation, state, preparation, beside):
             place = state.evader_position + LEAD * state.evader_velocity
             if not self.settings.full_sight:
                 place = jnp.where(state.seen, place, state.last_seen)
 
             def total(position):
-                length = from_all(state.task, prepared, position, place + beside)
+                length = from_all(state.task, preparation, position, place + beside)
                 return jnp.sum(length), length
 
             away, length = jax.grad(total, has_aux=True)(state.drones.position)
-            desired = -away * jnp.minimum(speed, length / REACTION)[:, None]
-            return self.flight(observation, state, desired)
+            wish = -away * jnp.minimum(speed, length / REACTION)[:, None]
+            return self.flight(observation, state, wish)
 
         def act(observation, state):
-            direct = jax.vmap(flown)(observation, state, prepared, team.beside)
+            direct = jax.vmap(fly)(observation, state, preparation, team.beside)
             if parameters is None:
                 return direct
             by_policy = self.duel.policy.act(parameters, observation)
@@ -267,48 +274,48 @@ class MatrixGame(RecedingHorizon):
         """
         settings = self.settings
         random_key, direct_key, near_key, who_key = jax.random.split(key, 4)
-        shifted = jax.tree.map(
+        following = jax.tree.map(
             lambda leaf: jnp.concatenate([leaf[:, 1:], leaf[:, -1:]], 1), team
         )
         none = jnp.zeros_like(team.beside)
         policy = TeamPlans(none, jnp.ones_like(team.by_policy))
         at_it = TeamPlans(none, jnp.zeros_like(team.by_policy))
-        known = (policy, at_it, team, shifted)
-        parts = [jax.tree.map(lambda *leaves: jnp.stack(leaves, axis=1), *known)]
-        others = settings.team_plans - len(known)
+        plain = (policy, at_it, team, following)
+        parts = [jax.tree.map(lambda *leaves: jnp.stack(leaves, axis=1), *plain)]
+        others = settings.team_plans - len(plain)
         near = int(settings.refined * others)
         shape = team.by_policy.shape
         parts.append(_random_teams(random_key, shape, others - near, 0.5))
         if near:
-            drawn = _random_teams(near_key, shape, near, 0.5)
+            random = _random_teams(near_key, shape, near, 0.5)
             who = jax.random.randint(who_key, (shape[0], near), 0, shape[-1])
             is_new = (jnp.arange(shape[-1]) == who[..., None])[:, :, None]
 
             def refine(new, old):
-                own = is_new.reshape(*is_new.shape, *[1] * (new.ndim - 4))
-                return jnp.where(own, new, old[:, None])
+                change = is_new.reshape(*is_new.shape, *[1] * (new.ndim - 4))
+                return jnp.where(change, new, old[:, None])
 
-            parts.append(jax.tree.map(refine, drawn, shifted))
+            parts.append(jax.tree.map(refine, random, following))
         if settings.direct_plans:
             parts.append(_random_teams(direct_key, shape, settings.direct_plans, 0.0))
         return jax.tree.map(lambda *leaves: jnp.concatenate(leaves, axis=1), *parts)
 
     def _payoff(
-        self, start: PursuitState, end: PursuitState, prepared: Any
+        self, start: PursuitState, end: PursuitState, preparation: Any
     ) -> jax.Array:
         """() what the end of a pair of plans is worth to the evader, in steps: those
         that it is free first, then how far it is from the pursuers.
         """
         horizon = self.settings.pieces * self.settings.piece_steps
-        crashed = end.statistics.crashed & ~start.statistics.crashed
+        crashes = end.statistics.crashed & ~start.statistics.crashed
         free = self._planner.free_steps(start, end)
         ahead = end.drones.position + self._planner.settings.ahead * end.drones.velocity
         length = jax.vmap(self.ways.length, in_axes=(None, None, 0, None))
-        ways = length(start.task, prepared, ahead, end.evader_position)
+        ways = length(start.task, preparation, ahead, end.evader_position)
         room = jnp.min(ways) + OTHERS * jnp.mean(ways)
         # less than a step, as long as no way goes through a pillar
         room = room / (4.0 * self.duel.environment.settings.arena_radius)
-        return free + room + CRASH * horizon * crashed
+        return free + room + CRASH * horizon * crashes
 
 
 def _random_teams(key, shape, number, by_policy):
@@ -321,15 +328,15 @@ def _random_teams(key, shape, number, by_policy):
     far = BESIDE * jax.random.uniform(far_key, (*shape, 1)) ** (1 / 3)
     beside = far * unit(jax.random.normal(way_key, (*shape, 3)))
     straight = jax.random.bernoulli(straight_key, 0.5, (*shape, 1))
-    drawn = TeamPlans(
+    plans = TeamPlans(
         beside=jnp.where(straight, 0.0, beside),
         by_policy=jax.random.bernoulli(policy_key, by_policy, shape),
     )
     # half of them do the same all the time
     steady = jax.random.bernoulli(turn_key, 0.5, (worlds, number))
 
-    def held(leaf):
+    def hold(leaf):
         same = steady.reshape(*steady.shape, *[1] * (leaf.ndim - 2))
         return jnp.where(same, leaf[:, :, :1], leaf)
 
-    return jax.tree.map(held, drawn)
+    return jax.tree.map(hold, plans)

@@ -17,23 +17,23 @@ def init_network(key: jax.Array, learners: int, sizes: tuple[int, int, int]) -> 
     scales = (1.0, 1.0, 0.01)
     network = {}
     for i, scale in enumerate(scales):
-        key, own = jax.random.split(key)
+        key, layer_key = jax.random.split(key)
         shape = (learners, sizes[i], sizes[i + 1])
         network[f"kernel_{i}"] = (
-            scale * jax.random.normal(own, shape) / jnp.sqrt(sizes[i])
+            scale * jax.random.normal(layer_key, shape) / jnp.sqrt(sizes[i])
         )
         network[f"bias_{i}"] = jnp.zeros((learners, 1, sizes[i + 1]))
     return network
 
 
-def apply_network(network: Network, sensed: jax.Array) -> jax.Array:
+def apply_network(network: Network, senses: jax.Array) -> jax.Array:
     """(L, B, outputs) of inputs (L, B, F), each learner's own."""
-    hidden = sensed
+    features = senses
     for i in range(3):
-        hidden = hidden @ network[f"kernel_{i}"] + network[f"bias_{i}"]
+        features = features @ network[f"kernel_{i}"] + network[f"bias_{i}"]
         if i < 2:
-            hidden = jnp.tanh(hidden)
-    return hidden
+            features = jnp.tanh(features)
+    return features
 
 
 def ways(outputs: jax.Array) -> tuple[jax.Array, jax.Array]:

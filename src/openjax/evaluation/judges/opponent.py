@@ -23,10 +23,10 @@ def opponent(actor: Any, world_axes: jax.Array, hold: int, slots: int) -> Evader
 
     def velocity(scene, memory):
         world = scene.world
-        sensed = sense(scene.settings, world, world_axes, slots)
-        decided = likeliest(apply_network(network, sensed[None, None]))[0, 0]
-        decided = to_world(decided, world, world_axes)
-        decided = jnp.where(world.step % hold == 0, decided, memory[MEMORY:])
-        return scene.reach * decided, memory.at[MEMORY:].set(decided)
+        senses = sense(scene.settings, world, world_axes, slots)
+        decision = likeliest(apply_network(network, senses[None, None]))[0, 0]
+        decision = to_world(decision, world, world_axes)
+        decision = jnp.where(world.step % hold == 0, decision, memory[MEMORY:])
+        return scene.reach * decision, memory.at[MEMORY:].set(decision)
 
     return EvaderKind(velocity, of="file", memory=MEMORY + 3)

@@ -63,25 +63,25 @@ class Planner(RecedingHorizon):
         ...).
         """
         settings = self.settings
-        tried = self.candidates(key, plan)  # (B, M, pieces, 3)
-        copied = jax.tree.map(
+        candidates = self.candidates(key, plan)  # (B, M, pieces, 3)
+        start = jax.tree.map(
             lambda leaf: jnp.repeat(leaf, settings.plans, axis=0),
             # a key beside those that `candidates` splits this one into
             without_foresight(
                 self.duel.environment.settings, world, jax.random.fold_in(key, 1)
             ),
         )
-        pieces = jnp.moveaxis(tried.reshape(-1, *tried.shape[2:]), 1, 0)
+        pieces = jnp.moveaxis(candidates.reshape(-1, *candidates.shape[2:]), 1, 0)
 
         def piece(world, velocity):
             return self.duel.fly(
                 parameters, world, velocity, settings.piece_steps
             ), None
 
-        (_, end), _ = jax.lax.scan(piece, copied, pieces)
-        score = jax.vmap(self.promise)(copied[1], end).reshape(plan.shape[0], -1)
+        (_, end), _ = jax.lax.scan(piece, start, pieces)
+        score = jax.vmap(self.promise)(start[1], end).reshape(plan.shape[0], -1)
         best = jnp.argmax(score, axis=1)
-        return jnp.take_along_axis(tried, best[:, None, None, None], axis=1)[:, 0]
+        return jnp.take_along_axis(candidates, best[:, None, None, None], axis=1)[:, 0]
 
     def candidates(self, key: jax.Array, plan: jax.Array) -> jax.Array:
         """(B, plans, pieces, 3) the last best plan (B, pieces, 3), the same shifted by
@@ -90,7 +90,7 @@ class Planner(RecedingHorizon):
         """
         settings = self.settings
         near_key, straight_key, bent_key = jax.random.split(key, 3)
-        shifted = jnp.concatenate([plan[:, 1:], plan[:, -1:]], axis=1)
+        following = jnp.concatenate([plan[:, 1:], plan[:, -1:]], axis=1)
         others = settings.plans - 2
         near = int(settings.refined * others)
         straight = (others - near) // 3
@@ -100,12 +100,12 @@ class Planner(RecedingHorizon):
         ways = jnp.broadcast_to(ways, (number, straight, settings.pieces, 3))
         parts = [
             plan[:, None],
-            shifted[:, None],
+            following[:, None],
             ways,
             self._bent(bent_key, number, bent),
         ]
         if near:
-            parts.append(self._refined(near_key, shifted, near))
+            parts.append(self._refine(near_key, following, near))
         return jnp.concatenate(parts, axis=1)
 
     def _bent(self, key, number, plans):
@@ -114,31 +114,31 @@ class Planner(RecedingHorizon):
         """
         settings = self.settings
         way_key, turn_key, end_key = jax.random.split(key, 3)
-        drawn = unit(jax.random.normal(way_key, (number, plans, settings.pieces, 3)))
-        turns = jax.random.uniform(turn_key, drawn.shape[:3]) < settings.turn
+        ways = unit(jax.random.normal(way_key, (number, plans, settings.pieces, 3)))
+        turns = jax.random.uniform(turn_key, ways.shape[:3]) < settings.turn
 
-        def follow(before, piece):
+        def follow(last_way, piece):
             way, turn = piece
-            kept = jnp.where(turn[..., None], way, before)
-            return kept, kept
+            way = jnp.where(turn[..., None], way, last_way)
+            return way, way
 
-        pieces = (jnp.moveaxis(drawn, 2, 0), jnp.moveaxis(turns, 2, 0))
-        bent = jnp.moveaxis(jax.lax.scan(follow, drawn[:, :, 0], pieces)[1], 0, 2)
-        left = int(settings.own_rule * plans)
-        if not left:
+        pieces = (jnp.moveaxis(ways, 2, 0), jnp.moveaxis(turns, 2, 0))
+        bent = jnp.moveaxis(jax.lax.scan(follow, ways[:, :, 0], pieces)[1], 0, 2)
+        by_rule = int(settings.own_rule * plans)
+        if not by_rule:
             return bent
         # the first flies by it from the beginning
         end = (
-            jax.random.randint(end_key, (number, left), 0, settings.pieces)
+            jax.random.randint(end_key, (number, by_rule), 0, settings.pieces)
             .at[:, 0]
             .set(0)
         )
         is_own = jnp.arange(settings.pieces) >= end[..., None]
-        return bent.at[:, :left].set(
-            jnp.where(is_own[..., None], jnp.nan, bent[:, :left])
+        return bent.at[:, :by_rule].set(
+            jnp.where(is_own[..., None], jnp.nan, bent[:, :by_rule])
         )
 
-    def _refined(self, key, plan, plans):
+    def _refine(self, key, plan, plans):
         """(B, plans, pieces, 3) a plan (B, pieces, 3), some pieces of which lead
         elsewhere.
         """
@@ -148,11 +148,11 @@ class Planner(RecedingHorizon):
         first = jax.random.randint(first_key, (*shape, 1), 0, pieces)
         last = jax.random.randint(last_key, (*shape, 1), first, pieces)
         place = jnp.arange(pieces)
-        changed = ((place >= first) & (place <= last))[..., None]
+        is_change = ((place >= first) & (place <= last))[..., None]
         aside = SPREAD * jax.random.normal(way_key, (*shape, 1, 3))
         plan = plan[:, None]
         return jnp.where(
-            changed, unit(plan + aside), jnp.broadcast_to(plan, (*shape, pieces, 3))
+            is_change, unit(plan + aside), jnp.broadcast_to(plan, (*shape, pieces, 3))
         )
 
     def promise(self, start: PursuitState, end: PursuitState) -> jax.Array:
@@ -183,9 +183,9 @@ def without_foresight(game: PursuitSettings, world: World, key: jax.Array) -> Wo
     other = jax.random.randint(
         key, state.strategies.shape, 0, game.strategies, jnp.int32
     )
-    flown = state.step // game.strategy_steps
-    known = jnp.arange(state.strategies.shape[1]) <= flown[:, None]
-    strategies = jnp.where(known, state.strategies, other)
+    current = state.step // game.strategy_steps
+    is_known = jnp.arange(state.strategies.shape[1]) <= current[:, None]
+    strategies = jnp.where(is_known, state.strategies, other)
     return observation, state.replace(strategies=strategies)
 
 

@@ -60,5 +60,5 @@ class RecedingHorizon(ABC):
 
         episode = self.duel.environment.settings.episode_length
         keys = jax.random.split(key, episode // self.settings.replan)
-        end, kept = jax.lax.scan(one, self.begin(start), keys)
-        return end.world[1], kept
+        end, records = jax.lax.scan(one, self.begin(start), keys)
+        return end.world[1], records

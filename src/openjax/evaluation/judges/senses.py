@@ -41,13 +41,13 @@ def sense(
       world_axes: () bool.
       slots: of pillars that are sensed, at least the game's; None: as many.
     """
-    turned = _axes(state.evader_position, world_axes)
-    pillars = _pillars(settings, state, turned)
+    axes = _axes(state.evader_position, world_axes)
+    pillars = _pillars(settings, state, axes)
     missing = (slots or len(pillars)) - len(pillars)
     absent = jnp.broadcast_to(jnp.array(_NO_PILLAR), (missing, len(_NO_PILLAR)))
     parts = [
-        _evader(settings, state, turned),
-        _pursuers(settings, state, turned).ravel(),
+        _evader(settings, state, axes),
+        _pursuers(settings, state, axes).ravel(),
         jnp.concatenate([pillars, absent]).ravel(),
     ]
     task = state.task
@@ -69,8 +69,8 @@ def to_world(
     velocity: jax.Array, state: PursuitState, world_axes: jax.Array
 ) -> jax.Array:
     """(3,) in the world of a velocity (3,) in the evader's axes."""
-    turned = _axes(state.evader_position, world_axes)
-    return velocity @ turned
+    axes = _axes(state.evader_position, world_axes)
+    return velocity @ axes
 
 
 def _axes(position, world_axes):
@@ -88,7 +88,7 @@ def _length(vector):
     return jnp.sqrt(jnp.sum(vector**2, axis=-1, keepdims=True) + TINY)
 
 
-def _evader(settings, state, turned):
+def _evader(settings, state, axes):
     """(14,) own place and velocity, the time, and where the pursuers saw it last."""
     position = state.evader_position
     radius = _length(position[:2])
@@ -96,17 +96,17 @@ def _evader(settings, state, turned):
     time = state.step / settings.episode_length
     return jnp.concatenate(
         [
-            turned @ (position - middle) / settings.arena_radius,
+            axes @ (position - middle) / settings.arena_radius,
             1.0 - radius / settings.arena_radius,
             position[2:] / settings.arena_height,
-            turned @ state.evader_velocity / evader_speed(settings, state.task),
-            turned @ (state.last_seen - position) / settings.arena_radius,
+            axes @ state.evader_velocity / evader_speed(settings, state.task),
+            axes @ (state.last_seen - position) / settings.arena_radius,
             jnp.stack([state.seen.astype(jnp.float32), time, 1.0 - time]),
         ]
     )
 
 
-def _pursuers(settings, state, turned):
+def _pursuers(settings, state, axes):
     """(N, 13), the nearest first: where each is, how it flies, where its rotors pull,
     if it sees the evader; empty slots are far away.
     """
@@ -119,12 +119,12 @@ def _pursuers(settings, state, turned):
     closing = -jnp.sum(offset / distance * velocity, axis=-1, keepdims=True)
     rows = jnp.concatenate(
         [
-            offset @ turned.T / near,
+            offset @ axes.T / near,
             distance / near,
             radius / jnp.maximum(distance, radius / 2),
-            velocity @ turned.T,
+            velocity @ axes.T,
             closing,
-            thrust @ turned.T,
+            thrust @ axes.T,
             state.in_sight[:, None].astype(jnp.float32),
         ],
         axis=-1,
@@ -135,7 +135,7 @@ def _pursuers(settings, state, turned):
     return rows[jnp.argsort(distance[:, 0])]
 
 
-def _pillars(settings, state, turned):
+def _pillars(settings, state, axes):
     """(P, 4), the nearest first: where each is, how far its surface, if it is there."""
     task = state.task
     offset = task.pillar_position - state.evader_position[:2]
@@ -143,7 +143,7 @@ def _pillars(settings, state, turned):
     gap = _length(offset) - settings.pillar_radius
     near = jnp.exp(-jnp.maximum(gap, 0.0) / settings.pillar_radius)
     scale = NEAR * capture_radius(settings, task)
-    rows = jnp.concatenate([offset @ turned[:2, :2].T / scale, near], axis=-1)
+    rows = jnp.concatenate([offset @ axes[:2, :2].T / scale, near], axis=-1)
     rows = jnp.concatenate([rows, jnp.ones_like(near)], axis=-1)
     rows = jnp.where(active, rows, jnp.array(_NO_PILLAR))
     return rows[jnp.argsort(jnp.where(active, gap, jnp.inf)[:, 0])]

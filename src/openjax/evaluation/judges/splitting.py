@@ -43,7 +43,7 @@ class Splitting:
         # one task at a time would leave an accelerator idle, all at once need too much
         # memory
         return jax.lax.map(
-            lambda own: self._fly_one(parameters, *own),
+            lambda inputs: self._fly_one(parameters, *inputs),
             (tasks, keys),
             batch_size=TOGETHER,
         )
@@ -61,8 +61,8 @@ class Splitting:
         def piece(carry, key):
             worlds, heading = carry
             turn_key, split_key = jax.random.split(key)
-            heading = self._turned(turn_key, heading)
-            worlds = self._flown(parameters, worlds, heading)
+            heading = self._turn(turn_key, heading)
+            worlds = self._fly_piece(parameters, worlds, heading)
             source = sources(split_key, worlds[1])
             return jax.tree.map(lambda leaf: leaf[source], (worlds, heading)), None
 
@@ -74,21 +74,21 @@ class Splitting:
         longest = statistics.capture_step + ~statistics.captured
         return jax.tree.map(lambda leaf: leaf[jnp.argmax(longest)], statistics)
 
-    def _turned(self, key, heading):
+    def _turn(self, key, heading):
         """(C, 3) unit vectors after a turn of each of (C, 3)."""
         settings = self.settings
         odds_key, small_key, far_key = jax.random.split(key, 3)
         odds = jax.random.uniform(odds_key, (len(heading), 1))
         small = heading + settings.turn * jax.random.normal(small_key, heading.shape)
         small = small / jnp.linalg.norm(small, axis=-1, keepdims=True)
-        turned = jnp.where(
+        other = jnp.where(
             odds < settings.straight_on + settings.small_turn,
             small,
             _directions(far_key, len(heading)),
         )
-        return jnp.where(odds < settings.straight_on, heading, turned)
+        return jnp.where(odds < settings.straight_on, heading, other)
 
-    def _flown(self, parameters, worlds, heading):
+    def _fly_piece(self, parameters, worlds, heading):
         """Worlds (C, ...) after a piece in which each evader flies along its heading
         (C, 3).
         """

@@ -35,9 +35,9 @@ def draw_task(
     def move(task, key):
         return expand_task(settings, key, task), None
 
-    moved = jax.lax.scan(move, task, jax.random.split(keys[3], MOVES))[0]
+    nearby = jax.lax.scan(move, task, jax.random.split(keys[3], MOVES))[0]
     on_layout = jax.random.uniform(keys[4]) < share
-    return jax.tree.map(lambda a, b: jnp.where(on_layout, a, b), moved, uniform)
+    return jax.tree.map(lambda a, b: jnp.where(on_layout, a, b), nearby, uniform)
 
 
 def draw_own_task(
@@ -55,8 +55,8 @@ def draw_own_task(
     one = jax.tree.map(lambda leaf: leaf[place % number][None], layouts)
     any_key, own_key = jax.random.split(key)
     of_any = draw_task(settings, layouts, learning.layouts, any_key)
-    own = draw_task(settings, one, OWN, own_key)
-    return jax.tree.map(lambda a, b: jnp.where(place >= 0, a, b), own, of_any)
+    of_layout = draw_task(settings, one, OWN, own_key)
+    return jax.tree.map(lambda a, b: jnp.where(place >= 0, a, b), of_layout, of_any)
 
 
 def judging_tasks(settings: PursuitSettings, number: int) -> Task:
@@ -64,7 +64,7 @@ def judging_tasks(settings: PursuitSettings, number: int) -> Task:
     slots.
     """
     paper = PursuitSettings()
-    drawn = dataclasses.replace(
+    game = dataclasses.replace(
         settings, min_pillars=paper.min_pillars, max_pillars=paper.max_pillars
     )
-    return uniform_tasks(drawn, number, settings.max_pillars, JUDGE_KEY)
+    return uniform_tasks(game, number, settings.max_pillars, JUDGE_KEY)
