@@ -32,7 +32,7 @@ from openjax.pursuit.shortest_paths import (
     shortest_paths,
 )
 from openjax.pursuit.task import Task, capture_radius
-from openjax.vehicle.vectors import length
+from openjax.vehicle.vectors import length, unit
 
 STEP = 0.04
 """Seconds of a point's step: it flies 4 cm."""
@@ -151,8 +151,7 @@ class TeamSearch:
         """
         shape = (self.plans, *team_plan.until.shape)
         keys = jax.random.split(key, 7)
-        way = jax.random.normal(keys[0], (*shape, 3))
-        way = way / length(way, keepdims=True)
+        way = unit(jax.random.normal(keys[0], (*shape, 3)))
         # evenly in a ball, whose volume grows with the third power of its radius
         far = BESIDE * jax.random.uniform(keys[1], (*shape, 1)) ** (1 / 3)
         angle = jax.random.uniform(keys[2], shape, maxval=2 * jnp.pi)

@@ -274,6 +274,8 @@ class Pursuit:
         )
         rest = jnp.zeros(3, jnp.float32)
         step = jnp.zeros((), jnp.int32)
+        # an evader that nobody has seen yet is taken to be amid the arena, which is
+        # nearest to wherever it may be
         last_seen = jnp.where(
             seen, task.evader_position, jnp.array(settings.middle, jnp.float32)
         )

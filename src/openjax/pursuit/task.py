@@ -351,6 +351,7 @@ def _start_height(settings, z):
 
 def _first_clear(settings, draw, key, task):
     """The first of a few tasks drawn by `draw(key)` that starts clear, else `task`."""
+    # all at once, as in a uniform task: a loop until one is clear has no fixed length
     candidates = jax.vmap(draw)(jax.random.split(key, CANDIDATES))
     clear = jax.vmap(lambda candidate: starts_clear(settings, candidate))(candidates)
     first = jnp.argmax(clear)

@@ -216,6 +216,7 @@ class _Run:
         ]
         if not self.processes.is_first:
             return None
+        # before the last stage: should that be cut off, there is a policy
         self._save_best()
         if (
             outcome.update == self.first_update

@@ -325,6 +325,7 @@ def _random_teams(key, shape, number, by_policy):
     worlds, pieces, pursuers = shape
     shape = (worlds, number, pieces, pursuers)
     way_key, far_key, straight_key, policy_key, turn_key = jax.random.split(key, 5)
+    # evenly in a ball, whose volume grows with the cube
     far = BESIDE * jax.random.uniform(far_key, (*shape, 1)) ** (1 / 3)
     beside = far * unit(jax.random.normal(way_key, (*shape, 3)))
     straight = jax.random.bernoulli(straight_key, 0.5, (*shape, 1))

@@ -119,6 +119,7 @@ def sources(key: jax.Array, state: PursuitState) -> jax.Array:
     copies = free.size
     offset = state.drones.position - state.evader_position[:, None]
     room = jnp.min(jnp.linalg.norm(offset, axis=-1), axis=-1)
+    # minus infinity for those that are caught: they are never drawn
     odds = jnp.log(free.astype(jnp.float32))
     pairs = jax.random.categorical(key, odds, shape=(copies, 2))
     better = jnp.where(room[pairs[:, 0]] >= room[pairs[:, 1]], pairs[:, 0], pairs[:, 1])

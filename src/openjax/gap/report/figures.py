@@ -201,6 +201,7 @@ def _course(report: Report):
     nominal, remaining = course.errors(HORIZONS["velocity"])
     figure, axes = small_figure(2.6)
     time = course.time[-len(remaining) :] - course.time[0]
+    # so many standard deviations hold 90 % of a normal distribution
     band = 1.645 * rms(remaining)
     label = "90 % of what is left" if report.parameters else "90 % of all errors"
     axes.axhspan(-band, band, color=GREY, alpha=0.25, linewidth=0, label=label)
