@@ -126,6 +126,7 @@ class _Graph(Walk):
 
     def _op_clamp(self, operation):
         low, value, high = operation.inputs
+        # ONNX's Clip takes bounds of one number only
         return self.add("Min", [self.add("Max", [low, value]), high])
 
     def _op_convert_element_type(self, operation):

@@ -80,6 +80,7 @@ def read_plan(name_or_path: str | Path) -> SetPoints:
     """The standard plan by its name, or a plan's CSV. Raises UserError where that can't
     be flown.
     """
+    # a file that somebody called so is what they mean
     if str(name_or_path) == STANDARD and not Path(name_or_path).exists():
         return plan_of()
     path = Path(name_or_path)

@@ -123,6 +123,7 @@ def log_of(columns: list[dict[str, Shaped[np.ndarray, "..."]]], name: str) -> Lo
     "0", "1", ...
     """
     time = np.concatenate([c["t"] for c in columns])
+    # stable: rows of one moment stay in the vehicles' order
     order = np.argsort(time, kind="stable")
     table = {n: np.concatenate([c[n] for c in columns])[order] for n in columns[0]}
     vehicle = np.concatenate(

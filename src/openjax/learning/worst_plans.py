@@ -208,6 +208,7 @@ class WorstPlans:
         """
         planning = self.planning
         number = plan.shape[0]
+        # four are none of chance: the last plan, the same later, to stay, its own rule
         straight = (planning.plans - 4) // 3
         turn_key, way_key, straight_key = jax.random.split(key, 3)
         shape = (number, planning.plans - 4 - straight, planning.pieces)

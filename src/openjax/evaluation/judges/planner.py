@@ -91,6 +91,7 @@ class Planner(RecedingHorizon):
         settings = self.settings
         near_key, straight_key, bent_key = jax.random.split(key, 3)
         following = jnp.concatenate([plan[:, 1:], plan[:, -1:]], axis=1)
+        # two are none of chance: the last plan, and the same a piece later
         others = settings.plans - 2
         near = int(settings.refined * others)
         straight = (others - near) // 3

@@ -104,6 +104,7 @@ def under_another(track: Track) -> Chosen:
         gap = other - track.position
         above = (gap[:, 2] > ABOVE[0]) & (gap[:, 2] < ABOVE[1])
         near |= above & (np.hypot(gap[:, 0], gap[:, 1]) < ASIDE)
+    # a row is under the wake for as long after the other one has passed
     late = np.convolve(near, np.ones(1 + round(LINGERS / track.dt)))[: len(near)]
     return late > 0.5
 
