@@ -16,7 +16,7 @@ from openjax.flights.csv_table import write_csv
 from openjax.flights.manoeuvres import references
 from openjax.flights.reading import LogTable
 from openjax.flights.samples import fly, log_of
-from openjax.gap.trims import change_between, compare
+from openjax.gap.trims import change_between, compare, read
 from openjax.gap.trims.days import spread_of_charge
 from openjax.gap.trims.figures import PLACES, FlightFigures, mixer_of
 from openjax.vehicle import load_vehicle
@@ -52,8 +52,15 @@ def folders(tmp_path_factory):
 
 
 @functools.cache
+def figures_in(folder):
+    return read(folder)
+
+
+@functools.cache
 def compared(folders, name):
-    return compare(folders / name, [folders / "monday", folders / "tuesday"])
+    case, new, _ = figures_in(folders / name)
+    old = [f for day in ("monday", "tuesday") for f in figures_in(folders / day)[1]]
+    return change_between(name, new, old, case)
 
 
 def test_the_same_vehicle_has_not_changed(folders):
