@@ -29,8 +29,8 @@ class Arguments:
     out: Path = Path("plan")
     """Folder to write to; must not exist or be empty."""
     vehicle: str | None = None
-    """What flies (crazyflie, brushless, or a vehicle.toml); by default what was
-    diagnosed.
+    """What flies (crazyflie, brushless, or a vehicle.toml); by default the vehicle that
+    was diagnosed, if its file is still there.
     """
 
 
@@ -93,6 +93,9 @@ def _advise(arguments: Arguments) -> tuple[str, list[dict], list[str]]:
     from openjax.vehicle.vehicle_file import load_vehicle_file
 
     report = read_report(Path(arguments.diagnosis))
-    vehicle = arguments.vehicle or report.get("vehicle") or None
+    # a report may have been carried to another machine, without its flights
+    diagnosed = report.get("vehicle") or ""
+    is_here = Path(diagnosed).is_file()
+    vehicle = arguments.vehicle or (diagnosed if is_here else None)
     sentence, advice = advice_for(report, load_vehicle_file(vehicle))
     return sentence, [asdict(p) for p in advice.promises], list(advice.segments)
