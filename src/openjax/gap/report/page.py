@@ -61,6 +61,8 @@ def sentence(report: Report) -> str:
     shows.
     """
     effects = report.named
+    if not effects and report.untested_change is not None:
+        return report.untested_change.sentence()
     if not effects:
         return (VERDICTS_SINCE if report.reference else VERDICTS)[report.verdict]
     what = (

@@ -109,8 +109,20 @@ class Report:
         return [e for e in self.effects if e != "unknown"]
 
     @property
+    def untested_change(self) -> Change | None:
+        """What trims and gains say changed, where nothing is named and these flights
+        couldn't have shown it to the diagnosis; else None.
+        """
+        trims = self.trims
+        if trims is None or self.effects or not trims.effects:
+            return None
+        return trims if set(trims.effects) <= set(self.not_testable) else None
+
+    @property
     def title(self) -> str:
         """The answer in a word."""
+        if self.untested_change is not None:
+            return ", ".join(self.untested_change.effects)
         if self.effects or not self.reference:
             return ", ".join(self.effects) or self.verdict
         return "no change"
@@ -194,6 +206,8 @@ class Report:
 
     def verdict_in_words(self) -> str:
         """What a verdict that names nothing means, and how probable it is."""
+        if self.untested_change is not None:
+            return " ".join(self.untested_change.in_words()[:2])
         meanings = VERDICTS_SINCE if self.reference else VERDICTS
         meaning = meanings.get(self.verdict, "")
         sure = self.probabilities.get(self.verdict)
@@ -211,8 +225,8 @@ class Report:
             lines.append(self.verdict_in_words())
         lines += [f"Sensors: {text}." for text in self.sensors]
         lines += [self.rest, self.reference]
-        if self.trims is not None:
-            lines.append(f"Trims: {self.trims.sentence()}")
+        if self.trims is not None and self.untested_change is None:
+            lines.append(f"Trims and gains: {self.trims.sentence()}")
         if self.effects:
             lines.append(f"Where: {in_words(self.where)}.")
         lines += self._parameters_in_words()

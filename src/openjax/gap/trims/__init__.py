@@ -1,7 +1,8 @@
-"""Trims of two sets of flights of one vehicle, compared with each other instead of with
-the simulator, so that what model and sensors share cancels. Motor commands alone are
-enough, and every further day sharpens what days differ by. So this stays beside the
-diagnosis, which can't be made of motors alone and takes a day's trims for its own.
+"""Trims and gains of two sets of flights of one vehicle, compared with each other instead
+of with the simulator, so that what model and sensors share cancels. Motor commands alone
+are enough, and every further day sharpens what days differ by. So this stays beside the
+diagnosis, which can't be made of motors alone, takes a day's trims for its own, and asks
+for quick turns before it judges gains.
 
 `figures` reads what each flight says about its vehicle; `days` takes a day as a random
 effect; `causes` says what each cause would do, `weigh` how well each explains what

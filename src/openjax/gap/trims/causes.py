@@ -6,6 +6,9 @@ real changes follow its pattern.
     two rotors weaker               the sum of two such
     a weight                        beside a rotor or a side: hover, roll and pitch, no yaw
     the whole vehicle               hover alone (mass, propellers, thrust)
+    motors                          the lag from motors to angular acceleration, and a
+                                    little the gains' estimate
+    gains                           the commands per rate error
     something else                  trims without a pattern
 
 A rotor that is weaker by e at the same command is given 1 / (1 - e) of it. What is cut,
@@ -29,17 +32,27 @@ class Cause:
     prior: float
     effects: tuple[str, ...] = ()
     damage: bool = False  # it also shakes
+    figures: tuple[str, ...] = ()  # that it moves instead of the trims
+    # mean and standard deviation of such a change
+    usual: tuple[float, float] = (0.0, 0.0)
+    what: str = ""
 
 
-# People knock propellers and tape things on more often than they swap motors. The rest
-# of a change, .23, moves no trim (drag, lag, inertia, gains).
+# People knock propellers and tape things on more often than they swap motors, and
+# motors wear. Drag and inertia, .11 of all changes, move nothing of this; a diagnosis
+# names them. Gains it often can't, as it asks for quick turns.
 CAUSES = {
     "one rotor weaker": Cause(0.25, ("motor_imbalance",), damage=True),
     "two rotors weaker": Cause(0.2, ("motor_imbalance",), damage=True),
     "weight": Cause(0.15, ("mass", "com_offset"), damage=True),
     "whole vehicle": Cause(0.1, ("mass", "thrust_scale")),
+    "motors": Cause(0.06, ("motor_lag",), False, ("lag",), (0.2, 0.5), "motors' lag"),
+    "gains": Cause(
+        0.06, ("rate_gains",), False, ("loop_gain",), (0.0, 0.5), "rate gains"
+    ),
     "something else": Cause(0.07),
 }
+LOOP_WITH_MOTORS = 0.3  # standard deviation: motors move the estimate of the gain too
 # mean and standard deviation of the rise of the logarithm with a damage
 SHAKES = (0.4, 0.4)
 USUAL_CHANGE = 0.15  # of a rotor's command, or of the weight
@@ -138,6 +151,17 @@ def hypotheses_of(mixer: np.ndarray, trims: np.ndarray) -> Hypotheses:
     draws = _Draws(mixer, trims)
     _rotors(draws)
     _weights(draws)
+    for cause, cause_card in CAUSES.items():
+        if not cause_card.figures:
+            continue
+        size = cause_card.usual[0] + cause_card.usual[1] * draws.normal[:, 0]
+        each = {
+            n: size * (1 + INEXACT * draws.normal[:, k + 1])
+            for k, n in enumerate(cause_card.figures)
+        }
+        if cause == "motors":
+            each["loop_gain"] = LOOP_WITH_MOTORS * size * draws.normal[:, 2]
+        draws.add(cause, 1.0, each, (), size)
     anything = USUAL_CHANGE / 2 * draws.normal[:, :4]
     each = dict(zip(TRIMS, anything.T, strict=True))
     draws.add("something else", 1.0, each, (), np.abs(anything).sum(1))

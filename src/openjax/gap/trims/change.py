@@ -74,6 +74,11 @@ class Change:
         return tuple(sorted(causes, key=lambda c: -self.causes_here[c]))
 
     @property
+    def trims_changed(self) -> bool:
+        """Whether the most probable cause moves the trims."""
+        return self.changed and not CAUSES[self.likely_causes[0]].figures
+
+    @property
     def effects(self) -> tuple[str, ...]:
         """What changed by the names of the effect library, the most probable first."""
         if not self.changed:
@@ -99,7 +104,7 @@ class Change:
     def in_words(self) -> list[str]:
         """The answer in a few plain sentences."""
         lines = [self.sentence()]
-        if self.changed:
+        if self.trims_changed:
             value, low, high = (
                 100 * v for v in (self.size.value, self.size.low, self.size.high)
             )
@@ -112,6 +117,14 @@ class Change:
                     "These flights can't split the causes named; a weighed vehicle or another "
                     "propeller would."
                 )
+        elif self.changed:
+            causes = (CAUSES[c].figures for c in self.likely_causes)
+            names = dict.fromkeys(n for figures in causes for n in figures)
+            lines += [
+                f"{FIGURES[n].words.capitalize()}: {difference_in_words(n, self.figures[n])}."
+                for n in names
+                if n in self.figures
+            ]
         elif self.probability > 0.2:
             lines.append(
                 f"Below the spread of days; if anything, {self._sentences()[0]}."
@@ -176,8 +189,8 @@ class Change:
         return {
             "changed": self.changed,
             "effects": list(self.effects),
-            "rotors": list(self.rotors) if self.changed else [],
-            "side": self.side if self.changed else "",
+            "rotors": list(self.rotors) if self.trims_changed else [],
+            "side": self.side if self.trims_changed else "",
             "size": round(self.size.value, 4),
             "probabilities": {"no_change": round(1.0 - self.probability, 5)} | causes,
         }
@@ -246,7 +259,8 @@ def _cause_in_words(change: Change, cause: str) -> str:
             if more
             else "it is lighter or stronger"
         )
-    return "something without a known pattern"
+    what = CAUSES[cause].what
+    return f"the {what} changed" if what else "something without a known pattern"
 
 
 def difference_in_words(name: str, d: Interval) -> str:

@@ -10,12 +10,20 @@ import numpy as np
 
 from openjax.flights.flight import Case, Flight
 from openjax.flights.pairs import FULL
-from openjax.flights.signals import RATE, clock_of, in_band, on_clock
+from openjax.flights.signals import RATE, clock_of, first_order, in_band, on_clock
 from openjax.flights.track import GRAVITY, pwm_thrust, to_body
 
 CLEAR_OF_FLOOR = 0.25  # m, where the ground's cushion is gone
 SETTLED = 0.5  # s after take-off and before landing that are left out
 BLOCK = 2.0  # s, over which rows of a flight count as one
+TURNING = (1.0, 10.0)  # Hz, where motors turn the vehicle
+DELAYS = (0, 2, 4, 6)  # rows, of the commands as instruments
+# share of the regressors that commands must explain: weak instruments bias (Staiger,
+# Stock 1997)
+LEAST_EXCITED = 0.7
+# Hz, where the rate loop's proportional part outweighs its integral
+ANSWERING = (4.0, 15.0)
+LAGS = np.geomspace(0.004, 0.2, 40)  # s, time constants that are tried
 SHAKING = (20.0, 45.0)  # Hz
 SLOW = 0.015  # s, rows from which on these don't show
 
@@ -36,12 +44,17 @@ class Figure:
 
 # Trims, as shares of hover: 1 to 2.5 % over days, measured on published flights of two
 # Crazyflies; yaw more, because its torque is a hundredth of thrust times arm and a
-# tilted motor shows in it.
+# tilted motor shows in it. Gains are the firmware's numbers, which no day moves: theirs
+# is what the estimate repeats to in flights of different kinds.
 FIGURES = {
     "hover": Figure("thrust command at hover", "%", 0.0, 0.012, 0.003),
     "roll": Figure("roll trim", "% of hover", 100.0, 0.02, 0.0025),
     "pitch": Figure("pitch trim", "% of hover", 100.0, 0.02, 0.0025),
     "yaw": Figure("yaw trim", "% of hover", 100.0, 0.03, 0.005),
+    "lag": Figure(
+        "time constant from motors to angular acceleration", "%", 0.0, 0.1, 0.05
+    ),
+    "loop_gain": Figure("motor command per rate error", "%", 0.0, 0.02, 0.02),
     "shaking": Figure("gyroscope and motors above 20 Hz", "%", 0.0, 0.35, 0.1),
 }
 PLACES = {name: place for place, name in enumerate(FIGURES)}
@@ -54,9 +67,10 @@ class FlightFigures:
 
     hover: mean thrust command per specific thrust, as a fraction of a rotor's maximum
     at 1 g; roll, pitch, yaw: the mixer's share of it that keeps the vehicle level
-    (left, rear and clockwise rotors harder: positive), also fractions of hover; shaking:
-    the logarithm of the rms of gyroscope and motors above 20 Hz. What the log can't give
-    is missing.
+    (left, rear and clockwise rotors harder: positive), also fractions of hover.
+    Logarithms of: lag, the time constant in s from motors to angular acceleration;
+    loop_gain, command per rate error; shaking, the rms of gyroscope and motors above 20
+    Hz. What the log can't give is missing.
     """
 
     name: str
@@ -104,7 +118,11 @@ def figures_of(flight: Flight, case: Case, day: str) -> FlightFigures | str:
         return f"a motor is at its limit in {full:.0%} of the rows: no trim can be told"
     if case.vehicle_file.motor.command == "pwm":
         motor = pwm_thrust(motor, voltage, vehicle)
-    values = _trims(flight, motor, rows, mixer_of(vehicle)) | _shaking(flight)
+    values = (
+        _trims(flight, motor, rows, mixer_of(vehicle))
+        | _rate_loop(flight, mixer_of(vehicle))
+        | _shaking(flight)
+    )
     mean = None if voltage is None else float(voltage[rows].mean())
     duty = case.vehicle_file.motor.command == "pwm"
     return FlightFigures(flight.name, day, values, mean, duty)
@@ -162,6 +180,66 @@ def _specific_thrust(flight: Flight) -> np.ndarray:
     if flight.quaternion is None:
         return total[:, 2]
     return to_body(flight.interpolated("quaternion"), total)[:, 2]
+
+
+def _rate_loop(flight: Flight, mixer: np.ndarray) -> dict:
+    """How late torques follow the motors, and how strongly the rate loop answers."""
+    grid = clock_of(flight)
+    measured = flight.body_rates is not None and not flight.body_rates_derived
+    if grid is None or len(grid) < 4 * RATE or not measured:
+        return {}
+    torque = on_clock(flight, "motor_command", grid) @ mixer[1:3].T
+    rates = on_clock(flight, "body_rates", grid)[:, :2]
+    commands = on_clock(flight, "command_body_rates", grid)
+    answer = {} if commands is None else _loop(torque, rates, commands[:, :2])
+    return _lag(torque, rates) | answer
+
+
+def _lag(torque, rates) -> dict:
+    """The time constant from roll and pitch torques to angular accelerations: of all
+    first-order lags the one whose output correlates best, by quarters of the flight.
+    """
+    if in_band(rates, TURNING).std(0).min() < 0.15:
+        return {}
+    y = in_band(np.gradient(rates, 1 / RATE, axis=0), TURNING)
+    lagged = np.stack([in_band(first_order(torque, lag), TURNING) for lag in LAGS])
+    estimates = []
+    for part in np.array_split(np.arange(len(y)), 4):
+        cross = (y[part] * lagged[:, part]).sum((1, 2))
+        scores = cross / np.sqrt((lagged[:, part] ** 2).sum((1, 2)))
+        best = int(np.argmax(scores))
+        if not 0 < best < len(LAGS) - 1 or cross[best] <= 0:
+            return {}
+        a, b, c = scores[best - 1 : best + 2]
+        peak = 0.5 * (a - c) / (a - 2 * b + c) * np.log(LAGS[1] / LAGS[0])
+        estimates.append(np.log(LAGS[best]) + peak)
+    return {"lag": (float(np.mean(estimates)), float(np.std(estimates, ddof=1) / 2.0))}
+
+
+def _loop(torque, rates, commands) -> dict:
+    """How strongly the rate loop answers a rate error, beside what it answers to a
+    change of the rates, by quarters of the flight. In closed loop noise is in all
+    three, so the commands are the instruments (two-stage least squares).
+    """
+    # motors hold from a row to the next: rates count in the middle
+    next_rates = np.concatenate([rates[1:], rates[-1:]])
+    error = commands - 0.5 * (rates + next_rates)
+    change = (next_rates - rates) * RATE
+    signals = (torque, error, change, *(np.roll(commands, k, 0) for k in DELAYS))
+    filtered = np.stack([in_band(values, ANSWERING) for values in signals], -1)
+    gains = []
+    for part in np.array_split(filtered, 4):
+        target, regressors, instruments = np.split(
+            part.reshape(-1, len(signals)), (1, 3), axis=1
+        )
+        excited = instruments @ np.linalg.lstsq(instruments, regressors, rcond=None)[0]
+        if min((excited**2).sum(0) / (regressors**2).sum(0)) < LEAST_EXCITED:
+            return {}
+        gains.append(np.linalg.lstsq(excited, target[:, 0], rcond=None)[0][0])
+    if min(gains) <= 0:
+        return {}
+    logs = np.log(gains)
+    return {"loop_gain": (float(logs.mean()), float(logs.std(ddof=1) / 2.0))}
 
 
 def _shaking(flight: Flight) -> dict:
