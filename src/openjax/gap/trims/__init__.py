@@ -111,8 +111,8 @@ def change_between(
 
     return Change(
         name=name,
-        changed=evidence.changed > SHOWN,
-        probability=evidence.changed,
+        changed=evidence.probability > SHOWN,
+        probability=evidence.probability,
         rotors=as_logged(place),
         side=ROTOR_PLACES[place[0]] if len(place) == 1 else SIDES.get(place, ""),
         causes=evidence.causes,

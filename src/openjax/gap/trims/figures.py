@@ -185,8 +185,8 @@ def _specific_thrust(flight: Flight) -> np.ndarray:
 def _rate_loop(flight: Flight, mixer: np.ndarray) -> dict:
     """How late torques follow the motors, and how strongly the rate loop answers."""
     grid = clock_of(flight)
-    measured = flight.body_rates is not None and not flight.body_rates_derived
-    if grid is None or len(grid) < 4 * RATE or not measured:
+    has_rates = flight.body_rates is not None and not flight.body_rates_derived
+    if grid is None or len(grid) < 4 * RATE or not has_rates:
         return {}
     torque = on_clock(flight, "motor_command", grid) @ mixer[1:3].T
     rates = on_clock(flight, "body_rates", grid)[:, :2]
@@ -202,11 +202,11 @@ def _lag(torque, rates) -> dict:
     if in_band(rates, TURNING).std(0).min() < 0.15:
         return {}
     y = in_band(np.gradient(rates, 1 / RATE, axis=0), TURNING)
-    lagged = np.stack([in_band(first_order(torque, lag), TURNING) for lag in LAGS])
+    outputs = np.stack([in_band(first_order(torque, lag), TURNING) for lag in LAGS])
     estimates = []
     for part in np.array_split(np.arange(len(y)), 4):
-        cross = (y[part] * lagged[:, part]).sum((1, 2))
-        scores = cross / np.sqrt((lagged[:, part] ** 2).sum((1, 2)))
+        cross = (y[part] * outputs[:, part]).sum((1, 2))
+        scores = cross / np.sqrt((outputs[:, part] ** 2).sum((1, 2)))
         best = int(np.argmax(scores))
         if not 0 < best < len(LAGS) - 1 or cross[best] <= 0:
             return {}
@@ -226,16 +226,18 @@ def _loop(torque, rates, commands) -> dict:
     error = commands - 0.5 * (rates + next_rates)
     change = (next_rates - rates) * RATE
     signals = (torque, error, change, *(np.roll(commands, k, 0) for k in DELAYS))
-    filtered = np.stack([in_band(values, ANSWERING) for values in signals], -1)
+    band = np.stack([in_band(values, ANSWERING) for values in signals], -1)
     gains = []
-    for part in np.array_split(filtered, 4):
+    for part in np.array_split(band, 4):
         target, regressors, instruments = np.split(
             part.reshape(-1, len(signals)), (1, 3), axis=1
         )
-        excited = instruments @ np.linalg.lstsq(instruments, regressors, rcond=None)[0]
-        if min((excited**2).sum(0) / (regressors**2).sum(0)) < LEAST_EXCITED:
+        projection = (
+            instruments @ np.linalg.lstsq(instruments, regressors, rcond=None)[0]
+        )
+        if min((projection**2).sum(0) / (regressors**2).sum(0)) < LEAST_EXCITED:
             return {}
-        gains.append(np.linalg.lstsq(excited, target[:, 0], rcond=None)[0][0])
+        gains.append(np.linalg.lstsq(projection, target[:, 0], rcond=None)[0][0])
     if min(gains) <= 0:
         return {}
     logs = np.log(gains)

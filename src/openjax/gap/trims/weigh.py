@@ -15,11 +15,11 @@ PRIOR_CHANGED = 0.5
 
 @dataclass(frozen=True)
 class Weighed:
-    """`changed`: probability that something changed; the rest holds if so: `posterior`
+    """`probability` that something changed; the rest holds if so: `posterior`
     (N,) of the hypotheses.
     """
 
-    changed: float
+    probability: float
     causes: dict[str, float]
     places: dict[tuple[int, ...], float]
     posterior: np.ndarray
@@ -131,7 +131,7 @@ def least_shown(
             change[: len(trims)] = trims_with(
                 mixer, trims, 1.0 + middle * (np.arange(4) == rotor)
             )
-            is_shown = weigh(hypotheses, change, scale, freedom).changed > SHOWN
+            is_shown = weigh(hypotheses, change, scale, freedom).probability > SHOWN
             low, high = (low, middle) if is_shown else (middle, high)
         worst = max(worst, high / (1.0 + high))
     return worst
