@@ -2,14 +2,17 @@
 what.
 """
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from openjax.gap.decision import DECISION
 from openjax.gap.model.whitening import Noise
 from openjax.gap.residual import (
     HORIZONS,
+    Check,
     beyond,
     calibration,
     conformal_p,
@@ -85,3 +88,11 @@ def test_a_case_of_the_calibration_stands_out_as_often_as_it_should():
 
 def test_a_log_with_nothing_to_hold_against_each_other_stands_out_nowhere():
     assert conformal_p({}) == (1.0, "")
+
+
+def test_what_was_not_held_against_the_reference_is_rejected_as_without_one():
+    """A battery that nobody logged leaves forces over, and isn't a change."""
+    between = 0.5 * (DECISION.unknown + DECISION.unknown_with_reference)
+    check = Check({}, "forces are left over", between, np.zeros(9), {})
+    assert not check.rejects
+    assert replace(check, by_reference=True).rejects

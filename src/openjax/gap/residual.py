@@ -57,13 +57,17 @@ class Check:
     excess: np.ndarray
     reference: dict[str, float] | None = None
     mostly_unknown: bool = False
+    by_reference: bool = False
+    """Whether what stands out most was held against the reference: of forces and torques
+    it can't be where a battery that nobody logged may have changed them.
+    """
 
     @property
     def level(self) -> float:
         """Share of cases without an unknown cause that may be rejected."""
-        if self.reference is None:
-            return DECISION.unknown
-        return DECISION.unknown_with_reference
+        if self.by_reference:
+            return DECISION.unknown_with_reference
+        return DECISION.unknown
 
     @property
     def rejects(self) -> bool:
@@ -94,14 +98,22 @@ def check_residual(evidence: Evidence, fit: SetFit, nothing: SetFit) -> Check:
     reference = None if evidence.baseline is None else _comparable(evidence)
     p_value, name = conformal_p(measures, reference)
     mostly_unknown = False
-    if reference is not None and name in reference:
+    by_reference = reference is not None and name in reference
+    if by_reference:
         measures_of_nothing, _ = measure(evidence, residuals_of(nothing))
         share = unexplained_share(
             measures[name], reference[name], measures_of_nothing[name]
         )
         mostly_unknown = share > MOSTLY
     finding = HORIZONS.get(name, (0.0, ""))[1]
-    check = Check(measures, finding, p_value, np.zeros(9), reference)
+    check = Check(
+        measures,
+        finding,
+        p_value,
+        np.zeros(9),
+        reference,
+        by_reference=by_reference,
+    )
     if not check.rejects:
         return check
     excess = beyond(axes, reference or {})
