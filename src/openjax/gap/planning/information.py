@@ -22,6 +22,7 @@ from openjax.gap.evidence import gather
 from openjax.gap.model.library import library, places, prior
 from openjax.gap.model.replay import Replay
 from openjax.vehicle.vehicle_file import VehicleFile
+from openjax.vehicle.vehicle_tables import Motor
 
 SECONDS = 10.0  # of each segment that are simulated
 ENOUGH = 0.98  # of what all segments tell together
@@ -121,9 +122,11 @@ def _fewest(apart: np.ndarray, together: np.ndarray) -> list[int]:
 
 
 def _nominal_replay(vehicle_file: VehicleFile) -> Replay:
-    """The replay of every segment, flown by the nominal vehicle."""
+    """The replay of every segment, flown by the vehicle without effects."""
     vehicle = vehicle_file.vehicle
-    file_of_means = replace(vehicle_file, log={"motor_rows": "mean"})
+    # what is simulated commands thrust in the nominal order, whatever its own logs hold
+    log = {"motor_rows": "mean"}
+    file_of_means = replace(vehicle_file, log=log, motor=Motor())
     flights = []
     for number, (name, segment) in enumerate(SEGMENTS.items()):
         air = Turbulence()
