@@ -298,7 +298,7 @@ def test_the_command_writes_everything_or_nothing(
     # what it says of the drag is known; that a command diagnoses is asked where the
     # README's commands are run
     monkeypatch.setattr(
-        "openjax.gap.diagnosis.diagnose_case", lambda case, *_: reports[case.name]
+        "openjax.gap.folders.diagnose_case", lambda case, *_: reports[case.name]
     )
     out = tmp_path / "out"
     assert (
@@ -334,7 +334,7 @@ def test_a_fault_in_one_case_does_not_cost_the_others(
         # KeyError: what no check has foreseen
         return {"drag": reports["drag"]}[case.name]
 
-    monkeypatch.setattr("openjax.gap.diagnosis.diagnose_case", diagnosed)
+    monkeypatch.setattr("openjax.gap.folders.diagnose_case", diagnosed)
     out = tmp_path / "out"
     assert (
         main(
