@@ -2,7 +2,6 @@
 them it flies.
 """
 
-import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -45,24 +44,23 @@ def main(arguments: Sequence[str]) -> None:
     check_output(options.out, "--out")
     if options.out.suffix != ".npz":
         raise UserError(f"--out {options.out}: a policy's file ends in .npz")
-    from openjax.store.mixed_policies import as_trained, mixed_policy
+    from openjax.store.mixed_policies import as_trained, mixed_policy, with_strategies
     from openjax.store.policies import load_policy
     from openjax.store.policy_files import save_policy_file
 
     policy = mixed_policy(
         [load_policy(name) for name in options.policies], options.seconds
     )
-    settings, _ = as_trained(options.policies[0])
-    game = dataclasses.replace(
-        settings.environment,
-        strategies=len(options.policies),
-        strategy_seconds=options.seconds,
-    )
-    members = [{"policy": name, **as_trained(name)[1]} for name in options.policies]
+    files = [as_trained(name) for name in options.policies]
+    settings, _ = files[0]
+    members = [
+        {"policy": name, **notes}
+        for name, (_, notes) in zip(options.policies, files, strict=True)
+    ]
     save_policy_file(
         options.out,
         policy.parameters,
-        dataclasses.replace(settings, environment=game),
+        with_strategies(settings, len(files), options.seconds),
         {"members": members},
     )
     console = output_console()

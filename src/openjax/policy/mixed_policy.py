@@ -5,7 +5,6 @@ Whoever knows a deterministic team can find the one way past it. Against a team 
 draws, an evader needs a way that is past all of its members at once.
 """
 
-import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -17,6 +16,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from openjax.policy.policy import Policy, PolicyParameters
 from openjax.policy.settings import NetworkSettings, PredictorSettings
 from openjax.pursuit import Observation
+from openjax.pursuit.rows import where_rows
 
 
 def mixed_parameters(members: Sequence[PolicyParameters]) -> PolicyParameters:
@@ -64,22 +64,11 @@ class MixedPolicy:
         """What `function` makes of the parameters of the member that each world has
         drawn; leaves with the worlds' axes first.
         """
-        strategy = observation.strategy
-
-        def choose(place, new, old):
-            is_drawn = (strategy == place).reshape(
-                *strategy.shape, *[1] * (new.ndim - strategy.ndim)
-            )
-            return jnp.where(is_drawn, new, old)
-
         # written out and not mapped: exported policies have neither loops nor indices
         result = function(_member(parameters, 0))
         for place in range(1, self.number):
-            result = jax.tree.map(
-                functools.partial(choose, place),
-                function(_member(parameters, place)),
-                result,
-            )
+            is_drawn = observation.strategy == place
+            result = where_rows(is_drawn, function(_member(parameters, place)), result)
         return result
 
     def predict(

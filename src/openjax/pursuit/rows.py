@@ -1,4 +1,4 @@
-"""Rows of trees of arrays that share a leading axis: worlds of a batch, slots of a team."""
+"""Rows of trees of arrays that share leading axes: worlds of a batch, slots of a team."""
 
 from typing import TypeVar
 
@@ -9,14 +9,14 @@ from jaxtyping import Array, Bool
 T = TypeVar("T")
 
 
-def where_rows(mask: Bool[Array, " rows"], new: T, old: T) -> T:
-    """Of two trees (R, ...) the rows of `new` where the mask (R,) holds, else those of
-    `old`.
+def where_rows(mask: Bool[Array, "*rows"], new: T, old: T) -> T:
+    """Of two trees, whose leaves have the mask's axes (...) first, the rows of `new`
+    where the mask holds, else those of `old`.
     """
 
     def select(new_leaf, old_leaf):
-        # the mask's axis is the leaf's first one, so all others are of length one
-        column = mask.reshape(-1, *[1] * (old_leaf.ndim - 1))
-        return jnp.where(column, new_leaf, old_leaf)
+        # all axes after the mask's are of length one
+        rows = mask.reshape(*mask.shape, *[1] * (old_leaf.ndim - mask.ndim))
+        return jnp.where(rows, new_leaf, old_leaf)
 
     return jax.tree.map(select, new, old)

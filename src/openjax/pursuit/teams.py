@@ -120,12 +120,13 @@ def team_mean(
 
 
 def draw_strategies(
-    settings: PursuitSettings, key: PRNGKeyArray
-) -> Int32[Array, " draws"] | None:
-    """(D,) int32, the strategies that a team flies one after another in an episode,
-    each drawn with equal odds; None where the settings know only one.
+    settings: PursuitSettings, key: PRNGKeyArray, worlds: tuple[int, ...] = ()
+) -> Int32[Array, "*worlds draws"] | None:
+    """(*worlds, D) int32, the strategies that a team flies one after another in an
+    episode, each drawn with equal odds; None where the settings know only one.
     """
     if settings.strategies == 1:
         return None
     draws = -(-settings.episode_length // settings.strategy_steps)
-    return jax.random.randint(key, (draws,), 0, settings.strategies, jnp.int32)
+    shape = (*worlds, draws)
+    return jax.random.randint(key, shape, 0, settings.strategies, jnp.int32)

@@ -41,13 +41,10 @@ def mixed_policy(policies: Sequence[LoadedPolicy], seconds: float) -> LoadedPoli
                     "one team must have the same networks"
                 )
         policy.in_game(environment)
-    game = dataclasses.replace(
-        first.settings.environment, strategies=len(policies), strategy_seconds=seconds
-    )
     return LoadedPolicy(
         MixedPolicy(first.policy, len(policies)),
         mixed_parameters([policy.parameters.replace(critic={}) for policy in policies]),
-        dataclasses.replace(first.settings, environment=game),
+        with_strategies(first.settings, len(policies), seconds),
         " + ".join(policy.source for policy in policies),
     )
 
@@ -58,15 +55,24 @@ def member(policy: LoadedPolicy, place: int) -> LoadedPolicy:
     """
     if not isinstance(policy.policy, MixedPolicy):
         return policy
-    game = dataclasses.replace(
-        policy.settings.environment, strategies=1, strategy_seconds=0.0
-    )
     return LoadedPolicy(
         policy.policy.member,
         jax.tree.map(lambda leaf: leaf[place], policy.parameters),
-        dataclasses.replace(policy.settings, environment=game),
+        with_strategies(policy.settings, 1, 0.0),
         f"{policy.source}, member {place}",
     )
+
+
+def with_strategies(
+    settings: TrainSettings, strategies: int, seconds: float
+) -> TrainSettings:
+    """The settings of a policy's file for a team that draws one of so many `strategies`
+    every `seconds` (s; 0: once an episode).
+    """
+    game = dataclasses.replace(
+        settings.environment, strategies=strategies, strategy_seconds=seconds
+    )
+    return dataclasses.replace(settings, environment=game)
 
 
 def as_trained(name: str) -> tuple[TrainSettings, dict]:

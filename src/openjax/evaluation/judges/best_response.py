@@ -33,6 +33,7 @@ from openjax.evaluation.judges.senses import sense, to_world
 from openjax.evaluation.judges.settings import BestResponseSettings
 from openjax.policy import PolicyParameters
 from openjax.pursuit import EpisodeStatistics, PursuitSettings, PursuitState, Task
+from openjax.pursuit.rows import where_rows
 
 FIRST = 0.5
 """Share of the speed that each way has at first."""
@@ -219,10 +220,7 @@ class BestResponse:
             is_capture=is_capture,
         )
 
-        def renew(new, old):
-            return jnp.where(over.reshape(-1, *[1] * (old.ndim - 1)), new, old)
-
-        return jax.tree.map(renew, fresh, world), decision
+        return where_rows(over, fresh, world), decision
 
     def _learn(self, carry, decisions, state, key):
         """The evaders and their optimiser after all epochs."""

@@ -29,6 +29,7 @@ from openjax.evaluation.judges.receding_horizon import RecedingHorizon
 from openjax.evaluation.judges.settings import MatrixGameSettings, PlannerSettings
 from openjax.policy import PolicyParameters
 from openjax.pursuit import Observation, PursuitState, Task
+from openjax.pursuit.rows import where_rows
 
 BESIDE = 0.4
 """Places beside the evader to which a pursuer is sent are at most so far from it
@@ -290,12 +291,8 @@ class MatrixGame(RecedingHorizon):
             random = _random_teams(near_key, shape, near, 0.5)
             who = jax.random.randint(who_key, (shape[0], near), 0, shape[-1])
             is_new = (jnp.arange(shape[-1]) == who[..., None])[:, :, None]
-
-            def refine(new, old):
-                change = is_new.reshape(*is_new.shape, *[1] * (new.ndim - 4))
-                return jnp.where(change, new, old[:, None])
-
-            parts.append(jax.tree.map(refine, random, following))
+            old = jax.tree.map(lambda leaf: leaf[:, None], following)
+            parts.append(where_rows(is_new, random, old))
         if settings.direct_plans:
             parts.append(_random_teams(direct_key, shape, settings.direct_plans, 0.0))
         return jax.tree.map(lambda *leaves: jnp.concatenate(leaves, axis=1), *parts)
@@ -335,9 +332,5 @@ def _random_teams(key, shape, number, by_policy):
     )
     # half of them do the same all the time
     steady = jax.random.bernoulli(turn_key, 0.5, (worlds, number))
-
-    def hold(leaf):
-        same = steady.reshape(*steady.shape, *[1] * (leaf.ndim - 2))
-        return jnp.where(same, leaf[:, :, :1], leaf)
-
-    return jax.tree.map(hold, plans)
+    first = jax.tree.map(lambda leaf: leaf[:, :, :1], plans)
+    return where_rows(steady, first, plans)

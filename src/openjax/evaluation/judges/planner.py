@@ -20,6 +20,7 @@ from openjax.evaluation.judges.receding_horizon import RecedingHorizon
 from openjax.evaluation.judges.settings import PlannerSettings
 from openjax.policy import PolicyParameters
 from openjax.pursuit import PursuitSettings, PursuitState
+from openjax.pursuit.teams import draw_strategies
 
 SPREAD = 0.6
 """How far the pieces of a refined plan lead aside, a share of their length: some 40
@@ -179,11 +180,9 @@ def without_foresight(game: PursuitSettings, world: World, key: jax.Array) -> Wo
     tell from what it sees which one they fly, and not which come next.
     """
     observation, state = world
-    if state.strategies is None:
+    other = draw_strategies(game, key, state.step.shape)
+    if other is None:
         return world
-    other = jax.random.randint(
-        key, state.strategies.shape, 0, game.strategies, jnp.int32
-    )
     current = state.step // game.strategy_steps
     is_known = jnp.arange(state.strategies.shape[1]) <= current[:, None]
     strategies = jnp.where(is_known, state.strategies, other)
