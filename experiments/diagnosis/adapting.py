@@ -303,8 +303,6 @@ def tune(options) -> None:
     cache_programs()
     begin = time.monotonic()
     part, parts = options.part
-    folders = [options.work / cause for cause in CAUSES[part::parts]]
-    folders = [folder for folder in folders if (folder / "said.json").exists()]
     tuner = Tuner(options.policy, options.episodes, options.updates, options.seed)
     found = {
         "policy": options.policy,
@@ -314,11 +312,17 @@ def tune(options) -> None:
         "machine": describe_machine(),
         "vehicles": [],
     }
-    for folder in folders:
+    for cause in CAUSES[part::parts]:
+        said = options.work / cause / "said.json"
+        # `diagnose` may still be under way beside this
+        while not said.exists() and time.monotonic() - begin < options.wait:
+            time.sleep(1.0)
+        if not said.exists():
+            continue
         if time.monotonic() - begin > options.seconds:
-            print("time is up before", folder.name, flush=True)
+            print("time is up before", cause, flush=True)
             break
-        found["vehicles"].append(adapted(tuner, folder))
+        found["vehicles"].append(adapted(tuner, said.parent))
         found["seconds"] = round(time.monotonic() - begin, 1)
         print(json.dumps(found["vehicles"][-1]), flush=True)
         options.out.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
@@ -339,6 +343,9 @@ def main() -> None:
     second.add_argument("--updates", type=int, default=120)
     second.add_argument("--seed", type=int, default=0)
     second.add_argument("--seconds", type=float, default=480.0)
+    second.add_argument(
+        "--wait", type=float, default=0.0, help="s for diagnoses that aren't there yet"
+    )
     for one in (first, second):
         one.add_argument("--work", type=Path, required=True)
     third = commands.add_parser("report")
