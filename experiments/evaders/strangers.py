@@ -60,12 +60,12 @@ def game_of(policy: str, number: int, evaders: tuple[str, ...]) -> PursuitSettin
 
 def teams_of(egos: tuple[str, ...], mates: tuple[str, ...]) -> list[tuple[str, ...]]:
     """All teams of three that are flown: of one policy, of an ego with one or two
-    teammates, of three seeds, and of three methods.
+    teammates, of three seeds or egos, and of three methods.
     """
     found = [(name,) * 3 for name in (*egos, *mates)]
     found += [(ego, mate, mate) for ego in egos for mate in mates]
     found += [(ego, ego, mate) for ego in egos for mate in mates]
-    whole = (SEEDS, (*egos, mates[0]))
+    whole = (SEEDS, egos, (*egos, mates[0]))
     return found + [
         team for team in whole if len(team) == 3 and set(team) <= {*egos, *mates}
     ]

@@ -1,23 +1,30 @@
 #!/bin/bash
-# What isn't known of the policy `teams`, on one to four GPUs, from the repository's root:
-#   experiments/evaders/teams.sh OUTDIR [SECONDS]
+# What a policy for any team catches, on one to four GPUs, from the repository's root:
+#   POLICY=FILE SEEDS="FILE FILE FILE" experiments/evaders/teams.sh OUTDIR [SECONDS]
 #
-# Best responses, the map in two halves, pillars, lost messages, strangers and inertia are jobs in
-# order of worth. Each GPU takes the next one as soon as it is free, and none begins that can't end
-# within SECONDS (350). All that is known lies in OUTDIR/teams.tgz at any time, packed every 20 s;
-# times.txt in it says what ran when.
-# Variables: PYTHON, GPUS (by default all), TINY=1 to try each job at a tiny size on a CPU.
+# POLICY is `teams` by default, one that draws among its members or a single one. SEEDS
+# are single policies of other seeds: their tables, and teams mixed of them.
+# The tables of experiments/results/teams.md, the map in four pieces, best responses,
+# pillars, strangers and inertia are jobs in order of worth. Two of them share each GPU, as
+# one is compiled while the other flies; whoever is free takes the next one, and none
+# begins that can't end within SECONDS (460). All that is known lies in OUTDIR/teams.tgz
+# at any time, packed every 20 s; times.txt in it says what ran when.
+# Variables: PYTHON, GPUS (by default all), SHARE (2 jobs on each), JOBS (names of those
+# that fly; by default all), TINY=1 to try each job at a tiny size on a CPU.
 set -u
 ulimit -n 65536 2>/dev/null
 out=$1
-export PYTHONPATH=$PWD/src:$PWD OPENBLAS_NUM_THREADS=1
+policy=${POLICY:-teams}
+export PYTHONPATH=$PWD/src:$PWD${PYTHONPATH:+:$PYTHONPATH} OPENBLAS_NUM_THREADS=1
 python=${PYTHON:-python3}
 K=$(mktemp -d)
 mkdir -p "$out"
 began=$(date +%s)
-ends=$((began + ${2:-350}))
+ends=$((began + ${2:-460}))
 say() { echo "$(($(date +%s) - began)) $*" >> "$K/times.txt"; }
 gpus=${GPUS:-$(nvidia-smi -L | wc -l)}
+share=${SHARE:-2}
+export XLA_PYTHON_CLIENT_MEM_FRACTION=$(awk "BEGIN { print 0.9 / $share }")
 pack() {
   # in one piece, whenever it is read
   tar -C "$K" -czf "$out/teams.tgz.new" . 2>/dev/null && mv "$out/teams.tgz.new" "$out/teams.tgz"
@@ -27,9 +34,8 @@ packer=$!
 trap 'kill $packer' EXIT
 
 # what is less where it is only tried
-one="" few="" few_map="" planned="" strangers="" speed="" forced=""
-planner_small="--planner_episodes 40"
-planner_large="--planner_episodes 20"
+one="" few="" few_map="" planned="" strangers="" two="" speed="" forced=""
+planner="--planner_episodes 20"
 cell="--speed_ratios 1.3 --radii 0.3" # of teams.md's table
 steps() { echo "$1"; }
 episodes() { echo "$1"; }
@@ -37,53 +43,78 @@ if [ "${TINY:-0}" = 1 ]; then
   one="$cell --batch 64" # of each map one cell a size
   cell=""
   few="--learners 2 --num_envs 16"
-  few_map="--best_response True --learning.learners 2 --learning.num_envs 16"
+  few_map="--best_response True --learning.num_envs 16"
   planned="--planning.plans 3"
-  planner_small="$planned --planner_share 1 --planner_episodes 1"
-  planner_large=$planner_small
+  planner="$planned --planner_share 1 --planner_episodes 1"
   strangers="--episodes 4 --mates flight janosov"
+  two="--episodes 4"
   speed="--worlds 64 --steps 5"
   forced="--sizes 3 --episodes 1"
   steps() { echo 30000; }
   episodes() { echo 2; }
 fi
 
-exploit() { # PURSUERS STEPS EPISODES
-  echo "-m openjax exploit --policy teams --seed 7 --environment.num_pursuers $1" \
-    "--total_steps $(steps "$2") --minutes 1.2 --episodes $(episodes "$3")" \
-    "--uniform $(episodes 256) --out $K/evader_$1.npz --json $K/exploit_$1.json $few $planned"
-}
-map() { # NAME EPISODES SIZES...
-  echo "-m openjax map --policy teams --sizes ${*:3} --episodes $(episodes "$2")" \
-    "--out $K/$1.png --json $K/$1.json $one"
-}
-learned() { echo "$few_map --minutes 1.5 --learning.total_steps $(steps "$1")"; }
-
-# name, seconds on an H100 (estimated), command
+# name, seconds on an H100 that another job shares (estimated), command
 jobs=()
 job() { jobs+=("$1|$2|${*:3}"); }
-# halves of the map: slots for four pursuers, and for eight
-small="1 2 3 4"
-large="5 6 7 8"
+exploit() { # PURSUERS STEPS EPISODES
+  echo "-m openjax exploit --policy $policy --seed 7 --environment.num_pursuers $1" \
+    "--total_steps $(steps "$2") --minutes 3 --episodes $(episodes "$3")" \
+    "--uniform $(episodes 256) --out $K/evader_$1.npz --json $K/exploit_$1.json $few $planned"
+}
+map() { # NAME POLICY EPISODES SIZES...
+  echo "-m openjax map --policy $2 --sizes ${*:4} --episodes $(episodes "$3")" \
+    "--out $K/$1.png --json $K/$1.json $one"
+}
+learned() { # LEARNERS MINUTES
+  echo "$few_map --learning.learners $1 --minutes $2 --learning.total_steps $(steps 400000000)"
+}
 uniform="--scenario uniform"
 scripted="--best_response False"
 messages="--messages.lost 0.2 --messages.late 0.1"
-job exploit_3 140 "$(exploit 3 480000000 100)"
-job empty_small 240 "$(map empty_small 200 $small)" "$(learned 300000000)" \
-  --evaders_out "$K/ev_small.npz" "$planner_small"
-job empty_large 300 "$(map empty_large 200 $large)" "$(learned 200000000)" \
-  --evaders_out "$K/ev_large.npz" "$planner_large"
-job exploit_5 140 "$(exploit 5 300000000 1)"
+tables() { # NAME POLICY SECONDS
+  local kind="$cell $uniform $scripted" whole="1 2 3 4 5 6 7 8"
+  job "$1_sizes" "$3" "$(map "$1_sizes" "$2" 1000 $whole)" $kind
+  job "$1_fall_outs" "$3" "$(map "$1_fall_outs" "$2" 1000 ${whole:2})" $kind --fall_outs 1
+  job "$1_messages" "$3" "$(map "$1_messages" "$2" 400 ${whole:4})" $kind $messages
+  job "$1_all_three" "$3" "$(map "$1_all_three" "$2" 400 ${whole:4})" $kind $messages \
+    --fall_outs 1
+}
+empty() { # SIZE SIZE SECONDS
+  job "empty_$1$2" "$3" "$(map "empty_$1$2" "$policy" 200 $1 $2)" "$(learned 4 1.2)" \
+    --evaders_out "$K/evaders_empty_$1$2.npz" "$planner"
+}
+pillars() { # SIZE SIZE SECONDS
+  job "pillars_$1$2" "$3" "$(map "pillars_$1$2" "$policy" 200 $1 $2)" "$(learned 2 0.8)" \
+    $uniform --planner_share 0
+}
+empty 7 8 380
+empty 5 6 330
+empty 3 4 280
+tables team "$policy" 80
+empty 1 2 200
+job exploit_3 330 "$(exploit 3 480000000 100)"
+for seed in ${SEEDS:-}; do
+  tables "$(basename "$seed" .npz)" "$seed" 40
+done
+[ -z "${SEEDS:-}" ] || job strangers 150 -m experiments.evaders.strangers --only teams \
+  --out "$K/strangers" --egos $SEEDS --mates flight no_clamp_seed_0 janosov --episodes 500 \
+  "$strangers"
+pillars 3 4 180
+pillars 7 8 220
+pillars 5 6 200
+pillars 1 2 150
+job two 90 -m experiments.evaders.strangers --only two --out "$K/two" --egos "$policy" "$two"
+job three 50 "$(map three evaders 1000 3)" $cell $uniform $scripted
+job exploit_5 250 "$(exploit 5 250000000 1)"
+job exploit_2 220 "$(exploit 2 300000000 1)"
+job sight_small 70 "$(map sight_small "$policy" 200 1 2 3 4)" $scripted --sight_angle 90 \
+  --sight_range 1
+job sight_large 120 "$(map sight_large "$policy" 200 5 6 7 8)" $scripted --sight_angle 90 \
+  --sight_range 1
+job silence 150 "$(map silence "$policy" 200 1 2 3 4)" $scripted $messages --batch 2048
 job masks 70 -m experiments.speed.environment_step --masked "$speed"
-job strangers 120 -m experiments.evaders.strangers --only teams --out "$K/strangers" "$strangers"
-job pillars_small 130 "$(map pillars_small 200 $small)" "$(learned 200000000)" $uniform \
-  --planner_share 0
-job pillars_large 70 "$(map pillars_large 200 $large)" $uniform $scripted
-job messages 80 "$(map messages 400 3 4 5 6 7 8)" $cell $uniform $scripted $messages
-job all_three 80 "$(map all_three 400 3 4 5 6 7 8)" $cell $uniform $scripted $messages --fall_outs 1
-job sight_small 45 "$(map sight_small 200 $small)" $scripted --sight_angle 90 --sight_range 1
 job forced 60 -m experiments.evaders.forced --json "$K/forced.json" "$forced"
-job exploit_2 110 "$(exploit 2 300000000 1)"
 
 echo 0 > "$K/.next"
 take() { # the number of the next job
@@ -99,6 +130,7 @@ worker() { # GPU
   export CUDA_VISIBLE_DEVICES=$1
   while number=$(take) && [ "$number" -lt ${#jobs[@]} ]; do
     IFS='|' read -r name seconds command <<< "${jobs[$number]}"
+    [[ " ${JOBS:-$name} " == *" $name "* ]] || continue
     left=$((ends - $(date +%s)))
     # estimates are rough: with a little less it may still end
     if [ "$left" -lt $((seconds * 7 / 10)) ]; then
@@ -111,9 +143,10 @@ worker() { # GPU
   done
 }
 workers=()
-for ((gpu = 0; gpu < gpus; gpu++)); do
-  worker "$gpu" &
+for ((place = 0; place < gpus * share; place++)); do
+  worker $((place % gpus)) &
   workers+=($!)
+  sleep 0.2 # so that the first jobs, the longest, have a GPU each
 done
 wait "${workers[@]}"
 pack

@@ -27,6 +27,7 @@ ALONE = PursuitSettings(
     evaders=("greedy", "learned"),
     history_pursuers="pooled",
     observe_game=True,
+    observe_arena=True,
     reward=REWARD,
 )
 TEAMS = dataclasses.replace(ALONE, num_pursuers=5, team_sizes=(1, 3, 5))
@@ -56,25 +57,31 @@ def flown(settings, task, actions):
 )
 def test_three_of_five_fly_as_three(physics):
     """Whatever the two empty slots do: steps, what is seen, rewards and counts are
-    those of three.
+    those of three, in a narrow arena that is the game's or the task's own.
     """
-    alone = dataclasses.replace(ALONE, physics=physics)
-    task = drawn_task(alone, jax.random.key(3)).replace(
+    alone = dataclasses.replace(ALONE, physics=physics, arena_radius=0.55)
+    task = drawn_task(ALONE, jax.random.key(3)).replace(
         evader=jnp.int32(0),
         evader_speed=jnp.float32(1.1),
         capture_radius=jnp.float32(0.55),
     )
     empty = jnp.concatenate([task.pursuer_position, task.pursuer_position[:2]])
-    wider = task.replace(pursuer_position=empty, active=jnp.arange(5) < 3)
+    wider = task.replace(
+        pursuer_position=empty,
+        active=jnp.arange(5) < 3,
+        arena_radius=jnp.float32(alone.arena_radius),
+    )
     actions = 0.3 * jax.random.normal(jax.random.key(1), (40, 5, 4)) + jnp.array(
         [0.25, 0, 0, 0]
     )
     (seen, reward, info), end = flown(alone, task, actions[:, :3])
-    teams = dataclasses.replace(alone, num_pursuers=5)
+    teams = dataclasses.replace(ALONE, physics=physics, num_pursuers=5)
     (seen_by, reward_of, info_of), end_of = flown(teams, wider, actions)
 
     caught = np.any(info.captured, axis=1)
     assert caught.any() and not caught.all(), "the test shows little"
+    outside = end.statistics.bounds_steps
+    assert outside > 0, "the test shows little of the arena"
     np.testing.assert_allclose(reward_of[:, :3], reward, atol=1e-4)
     assert not np.any(reward_of[:, 3:])
     for name in ("self_state", "pillars", "privileged", "position"):
@@ -96,7 +103,10 @@ def test_three_of_five_fly_as_three(physics):
 
 def test_tasks_draw_teams_speeds_and_radii():
     settings = dataclasses.replace(
-        TEAMS, evader_speeds=(0.8, 2.0), capture_radii=(0.2, 0.4)
+        TEAMS,
+        evader_speeds=(0.8, 2.0),
+        capture_radii=(0.2, 0.4),
+        arena_radii=(0.7, 1.4),
     )
     keys = jax.random.split(jax.random.key(0), 300)
     tasks = jax.jit(jax.vmap(lambda key: uniform_task(settings, key)))(keys)
@@ -105,6 +115,7 @@ def test_tasks_draw_teams_speeds_and_radii():
     for numbers, low, high in (
         (tasks.evader_speed, 0.8, 2.0),
         (tasks.capture_radius, 0.2, 0.4),
+        (tasks.arena_radius, 0.7, 1.4),
     ):
         assert low <= numbers.min() < low + 0.05 and high - 0.05 < numbers.max() <= high
     assert np.all(jax.vmap(lambda task: starts_clear(settings, task))(tasks))
@@ -141,7 +152,7 @@ def test_a_term_of_ones_own_counts_nothing_for_empty_slots():
 
 @pytest.mark.parametrize(
     "changes",
-    [{"team_sizes": (2, 6)}, {"evader_speeds": (1.0,)}, {"capture_radii": (0.4, 0.2)}],
+    [{"team_sizes": (2, 6)}, {"evader_speeds": (1.0,)}, {"arena_radii": (0.9, 0.7)}],
 )
 def test_impossible_teams_are_refused(changes):
     with pytest.raises(UserError, match=next(iter(changes))):

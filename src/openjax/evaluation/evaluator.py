@@ -25,7 +25,7 @@ from openjax.pursuit import (
     scenario_task,
 )
 from openjax.pursuit.statistics import EpisodeStatistics
-from openjax.pursuit.task import capture_radius
+from openjax.pursuit.task import arena_of, capture_radius
 from openjax.pursuit.teams import FAR
 from openjax.show.trajectory import Trajectory
 
@@ -153,7 +153,7 @@ class Flown:
             captured=record.captured[:, members],
             crashed=record.crashed[:, members],
             pillar_position=task.pillar_position[task.pillar_active],
-            arena_radius=settings.arena_radius,
+            arena_radius=float(arena_of(settings, task).arena_radius),
             arena_height=settings.arena_height,
             pillar_radius=settings.pillar_radius,
             capture_radius=float(capture_radius(settings, task)),

@@ -21,6 +21,7 @@ OBSERVED = (
         "observe_time",
         "observe_position",
         "observe_game",
+        "observe_arena",
         "observe_in",
     ),
     *("observe_history", "observe_history_spacing"),

@@ -19,6 +19,7 @@ from openjax.pursuit import (
     uniform_task,
 )
 from openjax.pursuit.collisions import drone_distance
+from openjax.pursuit.task import arena_of
 from openjax.pursuit.teams import park
 
 CLOSE = 0.45
@@ -109,10 +110,9 @@ def draw_anywhere(
 def is_lost(settings: PursuitSettings, state: PursuitState) -> Bool[Array, " worlds"]:
     """(W,) whether a pursuer of worlds (W, ...) has crashed or is far outside."""
     position = state.drones.position
-    outside = (
-        jnp.sum(position[..., :2] ** 2, axis=-1)
-        > (OUTSIDE * settings.arena_radius) ** 2
-    )
+    # of all worlds, or of each
+    radius = jnp.expand_dims(arena_of(settings, state.task).arena_radius, -1)
+    outside = jnp.sum(position[..., :2] ** 2, axis=-1) > (OUTSIDE * radius) ** 2
     outside |= position[..., 2] > OUTSIDE * settings.arena_height
     outside |= nearest_gap(settings, state) < 0.0
     if state.active is not None:

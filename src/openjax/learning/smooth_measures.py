@@ -15,6 +15,7 @@ from openjax.pursuit import PursuitSettings, PursuitState
 from openjax.pursuit.collisions import TOUCH, drone_distance, pillar_distance
 from openjax.pursuit.sensing import sight_room
 from openjax.pursuit.shortest_paths import ShortestPaths, evader_territory, path_length
+from openjax.pursuit.task import arena_of
 from openjax.vehicle import DroneState
 from openjax.vehicle.solids import DRONE_RADIUS
 from openjax.vehicle.vectors import length
@@ -98,7 +99,8 @@ def breach_share(game: PursuitSettings, state: PursuitState) -> Pursuers:
         - game.pillar_clearance
     )
     to_drone = jax.vmap(drone_distance)(position) - game.drone_clearance
-    to_wall = game.arena_radius - length(position[..., :2])
+    radius = arena_of(game, task).arena_radius
+    to_wall = jnp.expand_dims(radius, -1) - length(position[..., :2])
     to_ceiling = game.arena_height - position[..., 2]
 
     def near(distance):

@@ -31,7 +31,7 @@ from openjax.pursuit.shortest_paths import (
     path_length,
     shortest_paths,
 )
-from openjax.pursuit.task import Task, capture_radius
+from openjax.pursuit.task import Task, arena_of, capture_radius
 from openjax.vehicle.vectors import length, unit
 
 STEP = 0.04
@@ -234,7 +234,7 @@ class TeamSearch:
         game = self.game
         # as the game's evader it keeps two centimetres from bounds and pillars
         evader = into_free_space(
-            game,
+            arena_of(game, task),
             points.evader + STEP * velocity,
             task.pillar_position,
             task.pillar_active,
@@ -249,7 +249,10 @@ class TeamSearch:
         position = jnp.clip(points.position + STEP * next_velocity, low, high)
         square = jnp.sum((position - evader) ** 2, axis=-1)
         breach = breaches(
-            self.strict_game, position, task.pillar_position, task.pillar_active
+            arena_of(self.strict_game, task),
+            position,
+            task.pillar_position,
+            task.pillar_active,
         )
         is_caught = points.caught | jnp.any(square < capture_radius(game, task) ** 2)
         return Points(

@@ -55,7 +55,7 @@ from openjax.pursuit.shortest_paths import shortest_paths
 from openjax.pursuit.spaces import Box
 from openjax.pursuit.state import PursuitState
 from openjax.pursuit.statistics import count, empty_statistics
-from openjax.pursuit.task import Task, start_attitude, uniform_task
+from openjax.pursuit.task import Task, arena_of, start_attitude, uniform_task
 from openjax.pursuit.teams import (
     draw_fall_out,
     draw_strategies,
@@ -252,7 +252,7 @@ class Pursuit:
         Returns:
           observation, state, both of one world.
         """
-        settings = self.settings
+        settings = arena_of(self.settings, task)
         task = task.with_starts(task.pursuer_position)
         chex.assert_shape(task.pursuer_position, (settings.num_pursuers, 3))
         chex.assert_shape(task.evader_position, (3,))
@@ -456,7 +456,7 @@ class Pursuit:
         `step` is `move` and this; where the pursuers are flown by something else, real
         vehicles say, this alone. Returns what `step` does.
         """
-        settings = self.settings
+        settings = arena_of(self.settings, state.task)
         old = state
         # the evader answers to the pursuers as they were at the step's start, while
         # they moved
@@ -506,14 +506,15 @@ class Pursuit:
         `active`, and its rewards.
         """
         info = self._events(state).of_team(active)
-        transition = Transition(self.settings, start, state, info)
+        settings = arena_of(self.settings, state.task)
+        transition = Transition(settings, start, state, info)
         rewards, penalty = total_reward(self.terms, transition)
         return info.replace(penalty=penalty), rewards
 
     def _events(self, state):
         """What happened in the step that ended with `state`, but for the penalties."""
-        settings = self.settings
         task = state.task
+        settings = arena_of(self.settings, task)
         drones = state.drones
         position = drones.position
         pillars = task.pillar_position

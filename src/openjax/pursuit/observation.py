@@ -20,7 +20,7 @@ from openjax.pursuit.shapes import (
     Which,
 )
 from openjax.pursuit.state import PursuitState
-from openjax.pursuit.task import capture_radius, evader_speed
+from openjax.pursuit.task import arena_of, capture_radius, evader_speed
 from openjax.pursuit.teams import of_team
 from openjax.vehicle import DroneState
 from openjax.vehicle.family import standard_parameters
@@ -214,6 +214,9 @@ def _own_part(settings, state, seen_drones, turn_back):
             jnp.float32
         )
         parts.append(jnp.broadcast_to(numbers, (len(position), 2)))
+    if settings.observe_arena:
+        radius = jnp.float32(arena_of(settings, state.task).arena_radius)
+        parts.append(jnp.broadcast_to(radius, (len(position), 1)))
     if settings.observe_history:
         spacing = settings.observe_history_spacing
         history = jnp.moveaxis(state.own_history[spacing - 1 :: spacing], 0, 1)

@@ -112,6 +112,11 @@ class PursuitSettings:
     """Most pillars of a uniform task; also the number of pillar slots of a task."""
     arena_radius: Annotated[float, Interval("[0.1, 100]")] = 0.9
     """Of the cylinder that nobody may leave (m)."""
+    arena_radii: Annotated[tuple[float, ...], Interval("[0.1, 100]")] = ()
+    """Smallest and largest radius of the arena (m), between which that of each uniform
+    task is drawn, in place of `arena_radius`; empty: none is drawn. Starts and pillars
+    lie wider apart in a wider one.
+    """
     arena_height: Annotated[float, Interval("[0.3, 100]")] = 1.2
     """Of that cylinder, and of the pillars (m)."""
     pillar_radius: Annotated[float, Interval("[0.001, 10]")] = 0.1
@@ -207,6 +212,10 @@ class PursuitSettings:
     """Also observe the evader's speed, as a multiple of the pursuers', and the capture
     radius in m (not in the paper, where both are the same in all games).
     """
+    observe_arena: bool = False
+    """Also observe the arena's radius in m (not in the paper, where all games have the
+    same).
+    """
     observe_in: Literal["world", "heading"] = "world"
     """Axes of what a pursuer observes. "heading": its own, but upright: a game turned
     about the arena's axis looks the same, at any yaw (not in the paper).
@@ -277,7 +286,8 @@ class PursuitSettings:
                 f"environment.team_sizes {list(self.team_sizes)} need environment.num_pursuers "
                 f"{max(self.team_sizes)}, here it's {self.num_pursuers}"
             )
-        for name in ("evader_speeds", "capture_radii", "fall_out_seconds"):
+        drawn = ("evader_speeds", "capture_radii", "arena_radii", "fall_out_seconds")
+        for name in drawn:
             # none at all is fine, but for the seconds of those that fall out
             drawn_from = getattr(self, name)
             is_needed = name == "fall_out_seconds" and self.fall_outs
@@ -291,11 +301,13 @@ class PursuitSettings:
                 )
 
     def of_one_team(self, number: int) -> "PursuitSettings":
-        """The same game with one size of team, one speed of the evader and one capture
-        radius.
+        """The same game with one size of team, one speed of the evader, one capture
+        radius and one arena.
         """
-        alike = {"team_sizes": (), "evader_speeds": (), "capture_radii": ()}
-        return dataclasses.replace(self, num_pursuers=number, **alike)
+        drawn = ("team_sizes", "evader_speeds", "capture_radii", "arena_radii")
+        return dataclasses.replace(
+            self, num_pursuers=number, **dict.fromkeys(drawn, ())
+        )
 
     @property
     def strategy_steps(self) -> int:
@@ -336,12 +348,13 @@ class PursuitSettings:
         positions.
         """
         # in the order of `Observation.self_state`: evader, quaternion, velocity, two
-        # axes, time, position, the game's numbers, history
+        # axes, time, position, the game's numbers, the arena, history
         base = 3 + 4 + 3 + 3 + 3
         time = 4 if self.observe_time else 0
         position = 3 if self.observe_position else 0
         game = 2 if self.observe_game else 0
-        return base + time + position + game + OWN_FRAME * self.observe_history
+        own = base + time + position + game + self.observe_arena
+        return own + OWN_FRAME * self.observe_history
 
     @property
     def privileged_size(self) -> int:

@@ -108,11 +108,10 @@ def arena_points(settings: PursuitSettings) -> Float[Array, "points 2"]:
     way to construct the sunflower head).
     """
     index = np.arange(POINTS)
-    radius = settings.arena_radius * np.sqrt((index + 0.5) / POINTS)
+    radius = np.sqrt((index + 0.5) / POINTS)
     angle = index * np.pi * (3.0 - np.sqrt(5.0))
-    return jnp.asarray(
-        radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], -1), jnp.float32
-    )
+    points = radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], -1)
+    return settings.arena_radius * jnp.asarray(points, jnp.float32)
 
 
 def evader_territory(

@@ -1,5 +1,7 @@
 """Tasks: where pursuers, evader and pillars start (the paper's task parameter w)."""
 
+import copy
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -73,6 +75,8 @@ class Task:
     """() m/s; None: the settings' one."""
     capture_radius: jax.Array | None = None
     """() m; None: the settings' one."""
+    arena_radius: jax.Array | None = None
+    """() m; None: the settings' one."""
 
     def with_starts(self, position: Team) -> "Task":
         """The same with pursuers that start at (N, 3) m; empty slots stay where they're
@@ -97,6 +101,17 @@ def capture_radius(
     )
 
 
+def arena_of(settings: PursuitSettings, task: Task) -> PursuitSettings:
+    """The game in a task's own arena, whose radius is traced then: such settings are
+    for the functions of one world, and can't be checked, compared or hashed.
+    """
+    if task.arena_radius is None:
+        return settings
+    of_task = copy.copy(settings)
+    object.__setattr__(of_task, "arena_radius", task.arena_radius)
+    return of_task
+
+
 def empty_task(settings: PursuitSettings) -> Task:
     """A task of zeros, of the game's shapes."""
     return Task(
@@ -107,6 +122,7 @@ def empty_task(settings: PursuitSettings) -> Task:
         active=jnp.zeros(settings.num_pursuers, bool) if settings.team_sizes else None,
         evader_speed=jnp.zeros((), jnp.float32) if settings.evader_speeds else None,
         capture_radius=jnp.zeros((), jnp.float32) if settings.capture_radii else None,
+        arena_radius=jnp.zeros((), jnp.float32) if settings.arena_radii else None,
     )
 
 
@@ -125,7 +141,7 @@ def task_descriptor(tasks: Task) -> Float[Array, "tasks features"]:
         tasks.evader_position.reshape(m, -1),
         pillars.reshape(m, -1),
     ]
-    numbers = (tasks.evader_speed, tasks.capture_radius)
+    numbers = (tasks.evader_speed, tasks.capture_radius, tasks.arena_radius)
     parts += [number[:, None] for number in numbers if number is not None]
     return jnp.concatenate(parts, axis=-1)
 
@@ -135,7 +151,10 @@ def starts_clear(settings: PursuitSettings, task: Task) -> Flag:
     () bool.
     """
     breach = breaches(
-        settings, task.pursuer_position, task.pillar_position, task.pillar_active
+        arena_of(settings, task),
+        task.pursuer_position,
+        task.pillar_position,
+        task.pillar_active,
     )
     clear_of_evader = _clear_of(
         settings, task.pillar_position, task.evader_position[None, :2]
@@ -165,9 +184,14 @@ def uniform_task(settings: PursuitSettings, key: PRNGKeyArray) -> Task:
     """
     n = settings.num_pursuers
     position_key, evader_key, number_key, cell_key = jax.random.split(key, 4)
+    arena_radius = _between(settings.arena_radii, key, 7)
+    # in the paper's arena one
+    scale = settings.arena_radius if arena_radius is None else arena_radius
+    scale = scale / PursuitSettings.arena_radius
+    wide = jnp.stack([scale, scale, 1.0]).astype(jnp.float32)
     middle = settings.arena_height / 2
-    low = jnp.array([START_X[0], -START_Y, middle - START_Z], jnp.float32)
-    high = jnp.array([START_X[1], START_Y, middle + START_Z], jnp.float32)
+    low = wide * jnp.array([START_X[0], -START_Y, middle - START_Z], jnp.float32)
+    high = wide * jnp.array([START_X[1], START_Y, middle + START_Z], jnp.float32)
     # each further pursuer about halves the chance that all are apart
     draws = CANDIDATES * 2 ** max(0, n - 3)
     # all candidates at once and the first good one: a loop that draws until one is good
@@ -182,10 +206,10 @@ def uniform_task(settings: PursuitSettings, key: PRNGKeyArray) -> Task:
     mirror = jnp.array([-1.0, 1.0, 1.0], jnp.float32)
     evader = jax.random.uniform(evader_key, (3,), jnp.float32, low, high) * mirror
 
-    cells = jnp.asarray(pillar_cells(), jnp.float32)
+    cells = scale * jnp.asarray(pillar_cells(), jnp.float32)
     vehicles = jnp.concatenate([pursuers, evader[None]])[:, :2]
     holds_vehicle = jnp.all(
-        jnp.abs(cells[:, None] - vehicles[None]) <= PILLAR_GRID / 2, axis=-1
+        jnp.abs(cells[:, None] - vehicles[None]) <= scale * PILLAR_GRID / 2, axis=-1
     )
     free = _clear_of(settings, cells, vehicles) & ~jnp.any(holds_vehicle, axis=-1)
     # the first ones of a random order are a draw without replacement; cells that aren't
@@ -205,6 +229,7 @@ def uniform_task(settings: PursuitSettings, key: PRNGKeyArray) -> Task:
         active=active,
         evader_speed=_between(settings.evader_speeds, key, 5),
         capture_radius=_between(settings.capture_radii, key, 6),
+        arena_radius=arena_radius,
     )
 
 
@@ -230,6 +255,7 @@ def expand_task(
     height. Among a few draws the first that starts clear is taken, else the task
     itself.
     """
+    radius_of_arena = arena_of(settings, task).arena_radius
 
     def draw(key):
         pursuer_key, evader_key = jax.random.split(key)
@@ -240,7 +266,7 @@ def expand_task(
             )
             # who would come too near the wall is drawn back along the radius
             radius = jnp.linalg.norm(candidate[..., :2], axis=-1, keepdims=True)
-            reach = settings.arena_radius - wall_distance
+            reach = radius_of_arena - wall_distance
             xy = candidate[..., :2] * jnp.minimum(
                 1.0, reach / jnp.maximum(radius, 1e-6)
             )
@@ -315,7 +341,7 @@ def scatter_starts(settings: PursuitSettings, key: PRNGKeyArray, task: Task) -> 
     Uniform tasks keep both within 0.76 m of the axis and 1.1 m of each other along x.
     Among a few draws the first that starts clear is taken, else the task itself.
     """
-    reach = settings.arena_radius - WALL_DISTANCE
+    reach = arena_of(settings, task).arena_radius - WALL_DISTANCE
     n = task.pursuer_position.shape[0]
 
     def draw(key):
@@ -400,7 +426,9 @@ def _move_pillars(settings, task, position):
     vehicles = jnp.concatenate([task.pursuer_position, task.evader_position[None]])[
         :, :2
     ]
-    inside = jnp.linalg.norm(position, axis=-1) < PILLAR_REACH
+    radius = arena_of(settings, task).arena_radius
+    reach = PILLAR_REACH * (radius / PursuitSettings.arena_radius)
+    inside = jnp.linalg.norm(position, axis=-1) < reach
     # each pillar by itself: a row may have gaps
     moves = (_clear_of(settings, position, vehicles) & inside & task.pillar_active)[
         :, None

@@ -29,10 +29,13 @@ class Flight:
 
     name: str
     fly: Callable[[Any, Task, jax.Array], EpisodeStatistics]
-    """(the evaders' networks, tasks (B, ...), key) -> statistics (B, ...)."""
+    """(networks, tasks (B, ...), key) -> statistics (B, ...)."""
     episodes: int
     """Of each cell."""
-    networks: Any = None
+    networks: Any
+    """The policy's parameters, and those of evaders that learned. They are handed in,
+    so that policies of one kind share a compiled program.
+    """
     width: int = 1
     """Worlds that an episode needs."""
 
@@ -86,10 +89,10 @@ class MapEvaders:
             Pursuit(self.game), self.loaded.policy, messages=command.messages
         )
 
-        def fly(_, tasks, key):
-            return evaluate(self.loaded.parameters, tasks, key).statistics
+        def fly(parameters, tasks, key):
+            return evaluate(parameters, tasks, key).statistics
 
-        return Flight("scripted evaders", fly, command.episodes)
+        return Flight("scripted evaders", fly, command.episodes, self.loaded.parameters)
 
     def learn(self, tell: Callable[[str], None]) -> tuple[Evaders, list[dict]]:
         """Learners after their training, and what was told on the way."""
@@ -106,14 +109,18 @@ class MapEvaders:
         duel = self.duel
         hold = self.command.learning.hold
 
-        def fly(evaders, tasks, key):
+        def fly(networks, tasks, key):
+            parameters, evaders = networks
             start = duel.start(tasks, key)
-            results = fly_learners(duel, hold, evaders, self.loaded.parameters, start)
+            results = fly_learners(duel, hold, evaders, parameters, start)
             return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), results)
 
-        learners = len(evaders.world_axes)
         return Flight(
-            "evaders that learned", fly, self.command.episodes, evaders, learners
+            "evaders that learned",
+            fly,
+            self.command.episodes,
+            (self.loaded.parameters, evaders),
+            width=len(evaders.world_axes),
         )
 
     @property
@@ -122,15 +129,15 @@ class MapEvaders:
         command = self.command
         planner = Planner(command.planning, self.duel)
 
-        def fly(_, tasks, key):
-            return planner.fly(
-                self.loaded.parameters, planner.duel.start(tasks, key), key
-            )
+        def fly(parameters, tasks, key):
+            return planner.fly(parameters, planner.duel.start(tasks, key), key)
 
         episodes = min(command.planner_episodes, command.episodes)
         # wider than others, as nothing but the ends of its plans is kept
         width = -(-command.planning.plans // 4)
-        return Flight("an evader that plans", fly, episodes, width=width)
+        return Flight(
+            "an evader that plans", fly, episodes, self.loaded.parameters, width
+        )
 
     def evaders(self, tell: Callable[[str], None]) -> tuple[Evaders, list[dict]]:
         """Those of the command's file, or new ones, and what was told while they

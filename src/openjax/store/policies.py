@@ -46,7 +46,11 @@ _OF_THE_WORLD = (
     "time_step",
 )
 """Settings that a policy can't see, and is used to."""
-_DRAWN = {"evader_speed": "evader_speeds", "capture_radius": "capture_radii"}
+_DRAWN = {
+    "evader_speed": "evader_speeds",
+    "capture_radius": "capture_radii",
+    "arena_radius": "arena_radii",
+}
 """Those of them that a training may draw, and from where; a policy for teams sees
 them.
 """

@@ -55,6 +55,8 @@ def sense(
         parts.append(task.evader_speed[None] / settings.max_speed)
     if task.capture_radius is not None:
         parts.append(task.capture_radius[None] / USUAL_RADIUS)
+    if task.arena_radius is not None:
+        parts.append(task.arena_radius[None])
     return jnp.concatenate(parts)
 
 

@@ -2,6 +2,8 @@
 and its velocity in each step.
 """
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -206,10 +208,12 @@ def _wish(settings, rows, world):
     # stands in it once, however many rows have it
     in_game = [name for name in functions if name in behaviours]
     place = [in_game.index(name) if name in in_game else 0 for name in behaviours]
+    scene = scene_of(settings, world)
+    # the scene isn't handed in: its arena may be a number of this world, which settings
+    # that a program is told apart by can't hold
     return jax.lax.switch(
         jnp.asarray(np.array(place, np.int32))[state.kind],
-        [functions[name] for name in in_game],
-        scene_of(settings, world),
+        [functools.partial(functions[name], scene) for name in in_game],
         state.memory,
     )
 

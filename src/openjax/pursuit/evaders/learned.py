@@ -102,9 +102,8 @@ def features(
     settings = scene.settings
     scene = scene.replace(look_ahead=networks["look_ahead"][which])
     # so that all inputs are of the order of one
-    size = np.array(
-        [settings.arena_radius] * 2 + [settings.arena_height / 2], np.float32
-    )
+    radius = jnp.float32(settings.arena_radius)
+    size = jnp.stack([radius, radius, settings.arena_height / 2])
     middle = np.array(settings.middle, np.float32)
     wish = networks["scripted"][which] * greedy(scene, memory)[0]
     outward = scene.position[:2] / jnp.sqrt(jnp.sum(scene.position[:2] ** 2) + 1e-6)
