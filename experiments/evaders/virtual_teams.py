@@ -24,7 +24,7 @@ from openjax.store import TEAM_POLICY
 from openjax.store.policies import load_policy
 
 PORT = 20250
-"""Of the first vehicle; none that a virtual Crazyflie has by default."""
+"""Of the first vehicle, by default; none that a virtual Crazyflie has by itself."""
 LONGEST = 240.0
 """Seconds after which a flight that doesn't end is ended."""
 ASKED = "asked to land"
@@ -55,7 +55,7 @@ def fly(size: int, options: argparse.Namespace, folder: Path) -> dict:
     python = [sys.executable, "-m", "openjax"]
     link = ["--loss", str(options.loss), "--pose_loss", str(options.pose_loss)]
     place = ["--scenario", str(starts)]
-    command = ["virtual_crazyflie", "--number", str(size), "--port", str(PORT)]
+    command = ["virtual_crazyflie", "--number", str(size), "--port", str(options.port)]
     virtual = subprocess.Popen(
         [*python, *command, *place, *link], stdout=subprocess.PIPE, text=True
     )
@@ -65,7 +65,7 @@ def fly(size: int, options: argparse.Namespace, folder: Path) -> dict:
         if "listening" not in said:
             raise RuntimeError(f"virtual_crazyflie: {said.strip()}")
         out = folder / f"flight_{size}"
-        uris = [f"udp://127.0.0.1:{PORT + i}" for i in range(size)]
+        uris = [f"udp://127.0.0.1:{options.port + i}" for i in range(size)]
         command = ["fly", "--policy", options.policy, *place, "--out", str(out)]
         command += ["--episodes", str(options.episodes), "--uri", *uris]
         flown = subprocess.run(
@@ -113,6 +113,9 @@ def main() -> None:
         help="of the poses; with a fifth of them lost openjax fly doesn't take off",
     )
     parser.add_argument("--seed", type=int, default=0, help="draws starts and pillars")
+    parser.add_argument(
+        "--port", type=int, default=PORT, help="others, to fly beside another of these"
+    )
     parser.add_argument("--json", type=Path, required=True)
     options = parser.parse_args()
     loss = {"set-points": options.loss, "poses": options.pose_loss}
