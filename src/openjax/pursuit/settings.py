@@ -286,8 +286,8 @@ class PursuitSettings:
                 f"environment.team_sizes {list(self.team_sizes)} need environment.num_pursuers "
                 f"{max(self.team_sizes)}, here it's {self.num_pursuers}"
             )
-        drawn = ("evader_speeds", "capture_radii", "arena_radii", "fall_out_seconds")
-        for name in drawn:
+        spans = ("evader_speeds", "capture_radii", "arena_radii", "fall_out_seconds")
+        for name in spans:
             # none at all is fine, but for the seconds of those that fall out
             drawn_from = getattr(self, name)
             is_needed = name == "fall_out_seconds" and self.fall_outs
@@ -304,9 +304,9 @@ class PursuitSettings:
         """The same game with one size of team, one speed of the evader, one capture
         radius and one arena.
         """
-        drawn = ("team_sizes", "evader_speeds", "capture_radii", "arena_radii")
+        names = ("team_sizes", "evader_speeds", "capture_radii", "arena_radii")
         return dataclasses.replace(
-            self, num_pursuers=number, **dict.fromkeys(drawn, ())
+            self, num_pursuers=number, **dict.fromkeys(names, ())
         )
 
     @property

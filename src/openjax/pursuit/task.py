@@ -206,8 +206,26 @@ def uniform_task(settings: PursuitSettings, key: PRNGKeyArray) -> Task:
     mirror = jnp.array([-1.0, 1.0, 1.0], jnp.float32)
     evader = jax.random.uniform(evader_key, (3,), jnp.float32, low, high) * mirror
 
+    task = Task(
+        pursuer_position=pursuers,
+        evader_position=evader,
+        pillar_position=jnp.zeros((settings.max_pillars, 2), jnp.float32),
+        pillar_active=jnp.zeros(settings.max_pillars, bool),
+        active=active,
+        evader_speed=_between(settings.evader_speeds, key, 5),
+        capture_radius=_between(settings.capture_radii, key, 6),
+        arena_radius=arena_radius,
+    )
+    return _with_pillars(settings, task, scale, number_key, cell_key)
+
+
+def _with_pillars(settings, task, scale, number_key, cell_key):
+    """The task with pillars on cells of the grid, as much wider as the arena, that are
+    free of vehicles.
+    """
+    starts = jnp.concatenate([task.pursuer_position, task.evader_position[None]])
+    vehicles = starts[:, :2]
     cells = scale * jnp.asarray(pillar_cells(), jnp.float32)
-    vehicles = jnp.concatenate([pursuers, evader[None]])[:, :2]
     holds_vehicle = jnp.all(
         jnp.abs(cells[:, None] - vehicles[None]) <= scale * PILLAR_GRID / 2, axis=-1
     )
@@ -221,16 +239,8 @@ def uniform_task(settings: PursuitSettings, key: PRNGKeyArray) -> Task:
     )
     # fewer than drawn where not enough cells are free
     in_use = (jnp.arange(settings.max_pillars) < number) & free[slots]
-    return Task(
-        pursuer_position=pursuers,
-        evader_position=evader,
-        pillar_position=jnp.where(in_use[:, None], cells[slots], 0.0),
-        pillar_active=in_use,
-        active=active,
-        evader_speed=_between(settings.evader_speeds, key, 5),
-        capture_radius=_between(settings.capture_radii, key, 6),
-        arena_radius=arena_radius,
-    )
+    pillars = jnp.where(in_use[:, None], cells[slots], 0.0)
+    return task.replace(pillar_position=pillars, pillar_active=in_use)
 
 
 def _between(ends, key, number):
