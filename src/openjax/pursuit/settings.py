@@ -353,8 +353,8 @@ class PursuitSettings:
         time = 4 if self.observe_time else 0
         position = 3 if self.observe_position else 0
         game = 2 if self.observe_game else 0
-        own = base + time + position + game + self.observe_arena
-        return own + OWN_FRAME * self.observe_history
+        size = base + time + position + game + self.observe_arena
+        return size + OWN_FRAME * self.observe_history
 
     @property
     def privileged_size(self) -> int:
