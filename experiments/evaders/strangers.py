@@ -195,18 +195,27 @@ def study(options) -> dict:
         two["records"] = fly_two(options)
     if options.only == "two":
         return {"teams": [], "strangers": [], "two": two}
-    flown = fly_teams(options)
+    flown = {
+        tuple(name_of(policy) for policy in team): own
+        for team, own in fly_teams(options).items()
+    }
+    mates = tuple(name_of(mate) for mate in options.mates)
     return {
         "teams": [
             {"members": list(team), **record(*own)} for team, own in flown.items()
         ],
         "strangers": [
-            with_strangers(flown, ego, options.mates, seats)
+            with_strangers(flown, name_of(ego), mates, seats)
             for ego in options.egos
             for seats in (1, 2)
         ],
         "two": two,
     }
+
+
+def name_of(policy: str) -> str:
+    """A policy's name, or that of its file without folder and ending."""
+    return Path(policy).stem
 
 
 def page(results: Mapping) -> Page:

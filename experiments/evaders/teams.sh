@@ -37,11 +37,12 @@ trap 'kill $packer' EXIT
 one="" few="" few_map="" planned="" strangers="" two="" speed="" forced=""
 planner="--planner_episodes 20"
 cell="--speed_ratios 1.3 --radii 0.3" # of teams.md's table
+thin="--speed_ratios 0.8 1.2 1.6 2 3 --radii 0.1 0.2 0.3 0.4 0.5" # every second one
 steps() { echo "$1"; }
 episodes() { echo "$1"; }
 if [ "${TINY:-0}" = 1 ]; then
   one="$cell --batch 64" # of each map one cell a size
-  cell=""
+  cell="" thin=""
   few="--learners 2 --num_envs 16"
   few_map="--best_response True --learning.num_envs 16"
   planned="--planning.plans 3"
@@ -81,11 +82,11 @@ tables() { # NAME POLICY SECONDS
     --fall_outs 1
 }
 empty() { # SIZE SIZE SECONDS
-  job "empty_$1$2" "$3" "$(map "empty_$1$2" "$policy" 200 $1 $2)" "$(learned 4 1.2)" \
+  job "empty_$1$2" "$3" "$(map "empty_$1$2" "$policy" 200 $1 $2)" "$(learned 3 1.5)" \
     --evaders_out "$K/evaders_empty_$1$2.npz" "$planner"
 }
 pillars() { # SIZE SIZE SECONDS
-  job "pillars_$1$2" "$3" "$(map "pillars_$1$2" "$policy" 200 $1 $2)" "$(learned 2 0.8)" \
+  job "pillars_$1$2" "$3" "$(map "pillars_$1$2" "$policy" 200 $1 $2)" "$(learned 2 1)" \
     $uniform --planner_share 0
 }
 empty 7 8 380
@@ -106,13 +107,16 @@ pillars 5 6 200
 pillars 1 2 150
 job two 90 -m experiments.evaders.strangers --only two --out "$K/two" --egos "$policy" "$two"
 job three 50 "$(map three evaders 1000 3)" $cell $uniform $scripted
+job three_cells 60 "$(map three_cells evaders 200 3)" $uniform $scripted
+for radius in 0.7 1.2 1.5; do
+  job "arena_$radius" 60 "$(map "arena_$radius" "$policy" 400 1 2 3 4 5 6 7 8)" $cell $uniform \
+    $scripted --arena_radius "$radius"
+done
 job exploit_5 250 "$(exploit 5 250000000 1)"
 job exploit_2 220 "$(exploit 2 300000000 1)"
-job sight_small 70 "$(map sight_small "$policy" 200 1 2 3 4)" $scripted --sight_angle 90 \
-  --sight_range 1
-job sight_large 120 "$(map sight_large "$policy" 200 5 6 7 8)" $scripted --sight_angle 90 \
-  --sight_range 1
-job silence 150 "$(map silence "$policy" 200 1 2 3 4)" $scripted $messages --batch 2048
+job sight 110 "$(map sight "$policy" 200 1 2 3 4 5 6 7 8)" $thin $scripted \
+  --sight_angle 90 --sight_range 1
+job silence 110 "$(map silence "$policy" 200 2 3 4)" $thin $scripted $messages --batch 2048
 job masks 70 -m experiments.speed.environment_step --masked "$speed"
 job forced 60 -m experiments.evaders.forced --json "$K/forced.json" "$forced"
 

@@ -77,6 +77,7 @@ def map_game(command: MapCommand, game: PursuitSettings) -> PursuitSettings:
         )
     return dataclasses.replace(
         game.of_one_team(largest),
+        arena_radius=command.arena_radius,
         evaders=command.evaders,
         vehicles=(),
         rare_vehicles=0.0,

@@ -166,6 +166,10 @@ class MapCommand:
     """Capture radii (m)."""
     scenario: Literal["empty", "uniform"] = "empty"
     """Uniform tasks, with their pillars or without."""
+    arena_radius: Annotated[float, Interval("[0.1, 100]")] = (
+        PursuitSettings.arena_radius
+    )
+    """Radius of the arena (m)."""
     evaders: tuple[str, ...] = HELD_OUT
     """One of them is drawn for each episode; by default those that no preset trains
     with.

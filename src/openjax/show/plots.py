@@ -6,9 +6,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
+from matplotlib.patheffects import withStroke
 
 from openjax.files import replacing
 from openjax.show.metrics import read_metrics
@@ -122,6 +125,13 @@ def _draw_evader(axes, trajectory):
     return f"captured after {(capture + 1) * trajectory.time_step:.2f} s"
 
 
+BOUNDS = {
+    "forced_below": ("-", "below: points always catch (proved)"),
+    "planar_below": ("--", "below: points always catch (solved, not proved)"),
+}
+"""Lines of a map by the names in its cells: how they are drawn and what they say."""
+
+
 def plot_map(path: Path, cells: Sequence[dict], title: str) -> None:
     """A small map for each size of team: captures over capture radius and speed ratio,
     the line below which a theorem forces one, and, dashed, the one below which points
@@ -146,18 +156,24 @@ def plot_map(path: Path, cells: Sequence[dict], title: str) -> None:
     figure.supxlabel("capture radius [m]", fontsize="medium")
     figure.supylabel("evader's speed / pursuers'", fontsize="medium")
     figure.suptitle(title, fontsize="medium")
+    lines = [
+        Line2D([], [], color="red", linestyle=style, label=words)
+        for style, words in BOUNDS.values()
+    ]
+    # beside the label of the axes, which is in the middle
+    place = {"loc": "outside lower right", "ncols": 2}
+    figure.legend(handles=lines, fontsize="small", frameon=False, **place)
     figure.colorbar(image, ax=panels.tolist(), label="captured", shrink=0.8)
     _save(figure, path)
 
 
 def _draw_map(axes, cells):
     """A team's map; returns the picture, for a colour bar."""
+    viridis = colormaps["viridis"]
     radii = sorted({cell["capture_radius"] for cell in cells})
     ratios = sorted({cell["speed_ratio"] for cell in cells})
     rates = np.full((len(ratios), len(radii)), np.nan)
-    bounds = {
-        name: dict.fromkeys(radii, 0.0) for name in ("forced_below", "planar_below")
-    }
+    bounds = {name: dict.fromkeys(radii, 0.0) for name in BOUNDS}
     for cell in cells:
         row = ratios.index(cell["speed_ratio"])
         column = radii.index(cell["capture_radius"])
@@ -167,9 +183,12 @@ def _draw_map(axes, cells):
         text = f"{cell['capture_rate']:.2f}".replace("0.", ".")
         # the colour map is dark below its middle
         color = "white" if cell["capture_rate"] < 0.5 else "black"
-        axes.text(column, row, text, ha="center", va="center", fontsize=6, color=color)
+        # a line that passes is interrupted
+        halo = withStroke(linewidth=2, foreground=viridis(cell["capture_rate"]))
+        style = {"fontsize": 6, "color": color, "path_effects": [halo]}
+        axes.text(column, row, text, ha="center", va="center", **style)
     image = axes.imshow(
-        rates, origin="lower", vmin=0, vmax=1, cmap="viridis", aspect="auto"
+        rates, origin="lower", vmin=0, vmax=1, cmap=viridis, aspect="auto"
     )
     axes.set_xticks(range(len(radii)), [f"{radius:g}" for radius in radii], fontsize=7)
     axes.set_yticks(range(len(ratios)), [f"{ratio:g}" for ratio in ratios], fontsize=7)
@@ -177,11 +196,10 @@ def _draw_map(axes, cells):
     # middles
     ends = {"left": -0.5, "right": len(ratios) - 0.5}
     edges = np.arange(len(radii) + 1) - 0.5
-    for bound_of, style in zip(bounds.values(), ("-", "--"), strict=True):
+    for name, bound_of in bounds.items():
         height = np.interp(list(bound_of.values()), ratios, range(len(ratios)), **ends)
-        axes.stairs(
-            height, edges, baseline=None, color="red", linewidth=1.5, linestyle=style
-        )
+        style = {"color": "red", "linewidth": 1.5, "linestyle": BOUNDS[name][0]}
+        axes.stairs(height, edges, baseline=None, **style)
     return image
 
 
