@@ -15,6 +15,8 @@ GAME = PursuitSettings(
     observe_in="heading",
     observe_history=2,
     history_length=4,
+    strategies=2,
+    strategy_seconds=0.03,
 )
 STEPS = 12
 
@@ -54,7 +56,7 @@ def test_perfect_messages_give_all_the_games_own_view():
             atol=1e-5,
             err_msg=name,
         )
-    for name in ("last_seen", "frames"):
+    for name in ("last_seen", "frames", "strategy"):
         wanted = np.repeat(getattr(observation, name)[:, None], 3, axis=1)
         np.testing.assert_allclose(
             getattr(views, name), wanted, atol=1e-5, err_msg=name

@@ -225,8 +225,10 @@ def _reports(state):
     )
 
 
-WHOLE = ("last_seen", "frames")
-"""Fields of an observation that a team has in common."""
+WHOLE = ("last_seen", "frames", "strategy")
+"""Fields of an observation that a team has in common; a team that draws has agreed on its
+draws before the game.
+"""
 
 
 def _of_one(observation, i):
