@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from openjax.errors import UserError
+from openjax.flights import sampling
 from openjax.flights.case import load_case
 from openjax.flights.checks import check_flight
 from openjax.flights.csv_table import write_csv
@@ -355,3 +356,9 @@ def test_held_poses_of_a_slower_camera_are_moved_to_their_rows(sample_columns):
     expected = truth.interpolated("velocity", flight.time)
     off = flight.interpolated("velocity") - expected
     assert off.std() < 0.05 * expected.std() and flight.pose_age == 0.0
+
+
+def test_a_last_pose_moves_on_to_its_row():
+    time = np.arange(0.0, 10.0, 0.02)
+    moved = sampling._on_lines(time + 0.015, time, np.stack([3.0 * time, -time], 1))
+    np.testing.assert_allclose(moved[:, 0], 3.0 * (time + 0.015), atol=1e-9)

@@ -225,16 +225,27 @@ def put_in_step(flight: Flight, note) -> Flight:
     for channel in channels:
         values = getattr(flight, channel)
         result = np.full_like(values, np.nan)
-        result[rows] = np.stack(
-            [np.interp(stamps, regular, column) for column in values[rows].T], 1
-        )
+        result[rows] = _on_lines(stamps, regular, values[rows])
         changes[channel] = result
     rate = (len(regular) - 1) / (regular[-1] - regular[0])
     note(
         "held",
         f"poses come at {rate:.0f} Hz of a clock of their own: moved from it to the rows' times",
     )
-    return dataclasses.replace(flight, **changes)
+    # where the body is after the last pose, or before the first, isn't known
+    return dataclasses.replace(flight, **changes).rows(slice(rows[0], rows[-1] + 1))
+
+
+def _on_lines(
+    stamps: np.ndarray, regular: np.ndarray, values: np.ndarray
+) -> np.ndarray:
+    """Values (S, ...) of times `regular` (S,) at the times `stamps` (S,), on lines
+    through their neighbours: the last one's goes on to the end, as a pose that is held
+    there would stand still for a row.
+    """
+    tick = np.clip(np.searchsorted(regular, stamps, "right") - 1, 0, len(regular) - 2)
+    share = (stamps - regular[tick]) / (regular[tick + 1] - regular[tick])
+    return values[tick] + share[:, None] * (values[tick + 1] - values[tick])
 
 
 def _regular_clock(times: np.ndarray, row: float) -> np.ndarray | None:
@@ -256,6 +267,10 @@ def _regular_clock(times: np.ndarray, row: float) -> np.ndarray | None:
     phase = rates[best] * since - middle + 0.5 * row * rates[best]
     ticks = np.floor(phase + EDGE)
     usual = phase - ticks < row * rates[best] + EDGE
+    # No two poses have one tick: where rows are missing, what came before the next pose
+    # is a tick older.
+    order = np.arange(len(ticks))
+    ticks = np.minimum.accumulate((ticks - order)[::-1])[::-1] + order
     slope, start = np.polyfit(ticks[usual], times[usual], 1)
     return start + slope * ticks
 

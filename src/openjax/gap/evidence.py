@@ -150,6 +150,8 @@ def gather(
     # in this order: which clock motors are put on depends on whether pose and gyroscope
     # share one
     tracks, pose, sensors = _sensors(tracks, library)
+    if any(f.body_rates_derived for f in case.flights):
+        pose = None  # rates that were made of the attitude agree with it
     tracks, sensors = _motors(case, tracks, vehicles, sensors)
     tracks = [with_motors(t, v) for t, v in zip(tracks, vehicles, strict=True)]
     # the loop after the radio: it has to know when commands arrive

@@ -232,7 +232,9 @@ def _comparable(evidence: Evidence) -> dict[str, float]:
         p["estimator"].acting() if "estimator" in p else {}
         for p in (channels, baseline.channels)
     ]
-    silent += ("estimator", "position") if bool(shifts[0]) != bool(shifts[1]) else ()
+    # late poses of one of both alone
+    if bool(shifts[0]) != bool(shifts[1]):
+        silent += ("estimator", "position", "accelerometer")
     return {n: v for n, v in baseline.measures.items() if n not in silent}
 
 
