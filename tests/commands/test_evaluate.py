@@ -118,6 +118,7 @@ def test_where_none_is_named_a_policy_flies_that_takes_so_many(tmp_path, capsys)
     arguments = {
         (): "evaders",
         ("--num_pursuers", "5", "--scenario", "uniform"): "teams",
+        ("--environment.num_pursuers", "2"): "teams",
         ("--scenario", str(layout)): "teams",
         ("--num_pursuers", "5", "--scenario", "uniform", "--policy", "flight"): None,
     }

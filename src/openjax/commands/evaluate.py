@@ -48,6 +48,11 @@ class FlightOptions:
     uniform (another task in each episode, as in the validation of a run), or all six;
     these have three pursuers: a policy of another number flies uniform instead.
     """
+    num_pursuers: Annotated[int | None, Interval("[1, 8]")] = None
+    """Pursuers; by default as many as in training. A policy for teams of any size flies
+    three by default, all episodes with one evader's speed, one capture radius and one
+    arena.
+    """
     seed: Seed = 0
     """Draws the start attitudes."""
     opponent: str | None = None
@@ -70,8 +75,10 @@ class FlightOptions:
 
         names = self.policy
         if names is None:
-            number = self.pursuers_of(environment or PursuitSettings())
-            name, line = default_policy(number)
+            game = environment or PursuitSettings()
+            if self.num_pursuers is not None:
+                game = dataclasses.replace(game, num_pursuers=self.num_pursuers)
+            name, line = default_policy(self.pursuers_of(game))
             names = (name,)
             if line:
                 output_console().print(line, soft_wrap=True)
@@ -105,11 +112,6 @@ class EvaluateCommand(FlightOptions):
 
     episodes: Annotated[int, Interval("[1, 1000000]")] = 100
     """Episodes per scenario."""
-    num_pursuers: Annotated[int | None, Interval("[1, 8]")] = None
-    """Pursuers; by default as many as in training. A policy for teams of any size flies
-    three by default, all episodes with one --environment.evader_speed and one
-    --environment.capture_radius.
-    """
     messages: MessageSettings = dataclasses.field(default_factory=MessageSettings)
     json: Path | None = None
     """File to write the records to: an object for one scenario, a list for all."""
@@ -145,15 +147,12 @@ def prepare(command: EvaluateCommand, arguments: Sequence[str]) -> list[tuple]:
     """
     check_output(command.json, "--json")
     policies = []
-    environment = command.environment
-    if command.num_pursuers is not None:
-        environment = dataclasses.replace(
-            environment, num_pursuers=command.num_pursuers
-        )
-    for policy in command.start(environment):
-        default = dataclasses.replace(
-            EvaluateCommand(), environment=policy.settings.environment
-        )
+    for policy in command.start(command.environment):
+        game = policy.settings.environment
+        if game.team_sizes:
+            # so that any number of pursuers may be typed
+            game = game.of_one_team(LAYOUT_PURSUERS)
+        default = dataclasses.replace(EvaluateCommand(), environment=game)
         options = parse(EvaluateCommand, default, arguments, PROGRAM)
         _game(options, policy)
         policies.append((options, policy))
