@@ -54,11 +54,13 @@ def study(options) -> dict:
 
 
 def whole_map(parts: list[dict]) -> dict:
-    """One map of those that `openjax map` wrote of some cells each; of all else, as the
-    machine and how evaders learned, it holds the first one's.
+    """One map of those that `openjax map` wrote of some cells each, and their seconds
+    together; of all else, as the machine and how evaders learned, it holds the first
+    one's.
     """
     cells = [cell for part in parts for cell in part["cells"]]
-    return {**parts[0], "cells": list(by_cell(cells).values())}
+    seconds = sum(part["seconds"] for part in parts)
+    return {**parts[0], "cells": list(by_cell(cells).values()), "seconds": seconds}
 
 
 def by_cell(cells: list[dict]) -> dict[tuple, dict]:
@@ -138,7 +140,11 @@ def draw(results: Mapping, path: Path) -> None:
     """The eight small maps."""
     whole = results["maps"]["empty"]
     cells = cells_against(whole, "learned") or whole["cells"]
-    plot_map(path, cells, f"{whole['policy']}: share of chases that end caught")
+    title = (
+        f"{whole['policy']}: share of chases that end with a capture, of an evader that "
+        "learned to escape"
+    )
+    plot_map(path, cells, title)
 
 
 def main(arguments: list[str]) -> None:

@@ -2,7 +2,8 @@
 
 Each FILE is what `openjax map --speed_ratios 1.3 --radii 0.3 --scenario uniform --json
 FILE` wrote: one cell for each size of team, by the names of `KINDS`. The table shows
-what a policy catches, alone and with what is taken from it.
+what a policy catches, alone and with what is taken from it. `seed_2_sizes=FILE` and
+others like it are what single policies of other trainings catch.
 """
 
 from collections.abc import Mapping
@@ -23,6 +24,8 @@ KINDS = {
     "all_three": "all of these",
 }
 """Maps, and their heads in the table."""
+SEED = "seed_"
+"""How the names of other trainings' maps begin."""
 
 
 def study(options) -> dict:
@@ -44,7 +47,19 @@ def rows_of(maps: Mapping) -> list[dict]:
             size = cell["num_pursuers"]
             row = rows.setdefault(size, {"size": size, "held_out": size not in trained})
             row[kind] = cell
+    for size, rates in seeds_of(maps, "sizes").items():
+        rows[size]["seeds"] = f"{min(rates):.3f} to {max(rates):.3f}"
     return [rows[size] for size in sorted(rows)]
+
+
+def seeds_of(maps: Mapping, kind: str) -> dict[int, list[float]]:
+    """Captures of the trainings by other seeds in maps of a kind, by size of team."""
+    rates = {}
+    for name, content in maps.items():
+        if name.startswith(SEED) and name.endswith(f"_{kind}"):
+            for cell in content["cells"]:
+                rates.setdefault(cell["num_pursuers"], []).append(cell["capture_rate"])
+    return rates
 
 
 def page(results: Mapping) -> Page:
@@ -53,7 +68,13 @@ def page(results: Mapping) -> Page:
         "pursuers": lambda row: (
             f"{row['size']}{' (held out)' if row['held_out'] else ''}"
         ),
-        **{head: f"{kind}.capture_rate:.3f" for kind, head in KINDS.items()},
+        "one policy": "sizes.capture_rate:.3f",
+        "other seeds": "seeds",
+        **{
+            head: f"{kind}.capture_rate:.3f"
+            for kind, head in KINDS.items()
+            if kind != "sizes"
+        },
         "seconds": "sizes.capture_seconds:.2f",
         "crash rate": "sizes.crash_rate:.3f",
     }
