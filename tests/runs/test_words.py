@@ -8,14 +8,13 @@ from openjax.runs.words import closing_words, layouts_like, opening_words
 
 
 def test_another_game_is_said_to_be_one_and_judged_by_layouts_like_it():
-    easy = preset(
-        "quick", environment=dict(evader_speed=0.8, min_pillars=0, max_pillars=3)
-    )
+    game = dict(evader_speed=0.8, arena_radius=1.5, min_pillars=0, max_pillars=3)
+    easy = preset("quick", environment=game)
     assert [layout.name for layout in layouts_like(easy.environment)] == ["empty"]
     lines = closing_words(easy, Path("runs/train"), on_cpu=True)
     assert (
         len(lines) == 3
-        and "0.8 m/s instead of 1.3" in lines[1]
+        and "0.8 m/s instead of 1.3, an arena of 1.5 m instead of 0.9" in lines[1]
         and "0 to 3 pillars" in lines[1]
     )
     assert "--scenario empty" in lines[2] and "--preset paper" in lines[2]

@@ -92,6 +92,14 @@ def _pillars(game):
     return " to ".join(map(str, sorted({game.min_pillars, game.max_pillars})))
 
 
+LENGTHS = {
+    "evader_speed": "the evader flies {} m/s",
+    "capture_radius": "captures within {} m",
+    "arena_radius": "an arena of {} m",
+}
+"""Settings of a game in m or m/s, and what is said of another value."""
+
+
 def unlike_the_papers(game: PursuitSettings, evaders: tuple[str, ...]) -> str:
     """How a game differs from the paper's, as a sentence; empty where it doesn't.
     `evaders`: names or files of those who fly, its own or others.
@@ -104,10 +112,11 @@ def unlike_the_papers(game: PursuitSettings, evaders: tuple[str, ...]) -> str:
         words.append("every pursuer is another vehicle")
     if game.speed_limit != paper.speed_limit:
         words.append("no clamp of the speed")
-    if game.evader_speed < paper.evader_speed:
-        words.append(
-            f"the evader flies {game.evader_speed:g} m/s instead of {paper.evader_speed:g}"
-        )
+    for name, what in LENGTHS.items():
+        value = getattr(game, name)
+        usual = getattr(paper, name)
+        if value != usual:
+            words.append(f"{what.format(f'{value:g}')} instead of {usual:g}")
     if game.num_pursuers != paper.num_pursuers:
         words.append(f"{game.num_pursuers} pursuers instead of {paper.num_pursuers}")
     if _pillars(game) != _pillars(paper):
