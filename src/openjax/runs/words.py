@@ -100,6 +100,13 @@ LENGTHS = {
 """Settings of a game in m or m/s, and what is said of another value."""
 
 
+def _instead(what, value, usual):
+    """A sentence's part, in a list; nothing where the value is the usual one."""
+    if value == usual:
+        return []
+    return [f"{what.format(f'{value:g}')} instead of {usual:g}"]
+
+
 def unlike_the_papers(game: PursuitSettings, evaders: tuple[str, ...]) -> str:
     """How a game differs from the paper's, as a sentence; empty where it doesn't.
     `evaders`: names or files of those who fly, its own or others.
@@ -113,10 +120,7 @@ def unlike_the_papers(game: PursuitSettings, evaders: tuple[str, ...]) -> str:
     if game.speed_limit != paper.speed_limit:
         words.append("no clamp of the speed")
     for name, what in LENGTHS.items():
-        value = getattr(game, name)
-        usual = getattr(paper, name)
-        if value != usual:
-            words.append(f"{what.format(f'{value:g}')} instead of {usual:g}")
+        words += _instead(what, getattr(game, name), getattr(paper, name))
     if game.num_pursuers != paper.num_pursuers:
         words.append(f"{game.num_pursuers} pursuers instead of {paper.num_pursuers}")
     if _pillars(game) != _pillars(paper):
