@@ -11,6 +11,7 @@ flown from the same starts. Draws the eight small maps, and the page to move abo
 from collections import defaultdict
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -60,7 +61,17 @@ def whole_map(parts: list[dict]) -> dict:
     """
     cells = [cell for part in parts for cell in part["cells"]]
     seconds = sum(part["seconds"] for part in parts)
-    return {**parts[0], "cells": list(by_cell(cells).values()), "seconds": seconds}
+    whole = {**parts[0], "cells": list(by_cell(cells).values()), "seconds": seconds}
+    return shortened(whole)
+
+
+def shortened(values: Any) -> Any:
+    """The same with four digits behind the point, which is more than a rate knows."""
+    if isinstance(values, Mapping):
+        return {name: shortened(value) for name, value in values.items()}
+    if isinstance(values, list | tuple):
+        return [shortened(value) for value in values]
+    return round(values, 4) if isinstance(values, float) else values
 
 
 def by_cell(cells: list[dict]) -> dict[tuple, dict]:
