@@ -24,11 +24,13 @@ from openjax.store.policy_files import save_policy_file
 
 @pytest.fixture(scope="module")
 def policy_file(tmp_path_factory):
-    """A small policy with random weights, the predictor's not small, so that a mistake
-    anywhere shows.
+    """A small policy for teams with random weights, the predictor's not small, so that
+    a mistake anywhere shows.
     """
     settings = TrainSettings(
         environment=PursuitSettings(
+            team_sizes=(1, 3),
+            history_pursuers="pooled",
             observe_position=True,
             observe_in="heading",
             observe_history=2,

@@ -35,6 +35,8 @@ EACH = (
     "privileged",
     "position",
     "heading",
+    "active",
+    "others_there",
 )
 """What each pursuer sees for itself; the rest of an observation is the team's."""
 
