@@ -79,6 +79,7 @@ def diagnose(part: Part) -> dict:
     """What is kept of one diagnosis."""
     from openjax.flights.case import load_case
     from openjax.gap.diagnosis import diagnose_case
+    from openjax.gap.report.rules import broken_rules
 
     folder, number, means = part
     case = load_case(folder)
@@ -107,6 +108,7 @@ def diagnose(part: Part) -> dict:
     }
     out["not_testable"] = told["not_testable"]
     out["sensors"] = list(report.sensors)
+    out["broken_rules"] = broken_rules(report)
     if torques is not None:
         out["torques"] = {
             "sentence": torques.sentence(),
@@ -152,6 +154,7 @@ def figures(found: list[dict]) -> dict:
             "first": dict(Counter(c["named"][0] for c in cases)),
             "named_at_half": dict(likely),
             "motors_shown_slow": sum(map(slow, cases)),
+            "broken_rules": sum(bool(c.get("broken_rules")) for c in cases),
         }
     return out
 
