@@ -2,6 +2,7 @@
 honest refusals.
 """
 
+import dataclasses
 import gzip
 import json
 import shutil
@@ -16,9 +17,11 @@ from openjax.commands import diagnose
 from openjax.errors import UserError
 from openjax.flights.case import load_case
 from openjax.flights.csv_table import write_csv
+from openjax.flights.kinematics import read_kinematics
 from openjax.flights.manoeuvres import references
 from openjax.flights.regimes import REGIMES
 from openjax.flights.samples import fly, log_of
+from openjax.gap import evidence
 from openjax.gap.decision import DECISION
 from openjax.gap.diagnosis import diagnose_case, not_testable
 from openjax.gap.evidence import gather
@@ -184,6 +187,19 @@ def test_drag_is_named_from_the_logs_that_there_are(logged, tmp_path):
     if any("share a clock" in text for text in report.sensors):
         hidden = {"inertia", "motor_lag", "yaw_torque", "com_offset", "rate_gains"}
         assert hidden | {"command_latency"} <= set(report.not_testable)
+
+
+def test_rotors_that_differ_are_told_by_torques_alone(folders, monkeypatch):
+    """Where these aren't judged, the little force that they make would have rotors
+    differ by what slow turns do to the thrust.
+    """
+
+    def apart(*arguments):
+        return dataclasses.replace(read_kinematics(*arguments), one_clock=False)
+
+    monkeypatch.setattr(evidence, "read_kinematics", apart)
+    motion = gather(load_case(folders["none"]), library(())).motion
+    assert motion.exposure["motor_imbalance"] == 0.0 < motion.exposure["rotor_drag"]
 
 
 def test_motors_that_were_averaged_before_their_row_are_found_and_name_nothing(

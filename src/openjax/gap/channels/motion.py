@@ -25,6 +25,7 @@ from openjax.gap.model.hypotheses import (
 )
 from openjax.gap.model.library import CARDS, Library, numbers_of
 from openjax.gap.model.observer import TICKS
+from openjax.gap.model.prediction import RATES
 from openjax.gap.model.replay import Replay, make_replay
 from openjax.gap.model.wakes import Gusts, as_loud_as, fit_wake, read_gusts
 from openjax.vehicle.effects import EFFECTS
@@ -215,6 +216,11 @@ def read_motion(reading: Reading, loop: RateLoop | None) -> Motion:
     exposure |= {e: 0.0 for e in library.physics if _is_hidden(CARDS[e], reading)}
     if not sensors.motor_clock:
         exposure |= {e: 0.0 for e in library.physics if _is_lag(e)}
+    if not replay.usable[RATES].any():
+        # Rotors that only differ from each other turn the vehicle. The little force that
+        # comes of it follows slow turns, and would have rotors differ by 40 % whose
+        # motors are within 4 %.
+        exposure |= {e: 0.0 for e in library.physics if CARDS[e].balanced}
     return _beside_others(Motion(replay, library, exposure))
 
 
