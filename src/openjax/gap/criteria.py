@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.stats import chi2
 
-from openjax.gap.channels import between_flights
+from openjax.gap.channels import of_flights
 from openjax.gap.decision import DECISION
 from openjax.gap.model.cross_validation import Validation
 from openjax.gap.model.hypotheses import SetFit
@@ -97,20 +97,32 @@ def log_odds(effects) -> float:
 
 
 def practical(fit: SetFit, torque_response: Measured) -> bool:
-    """Whether every effect of a set is clearly of a size that matters in practice (a
+    """Whether every effect of a set is clearly of a size that matters in practice."""
+    return not too_small(fit, torque_response)
+
+
+def too_small(fit: SetFit, torque_response: Measured) -> tuple[str, ...]:
+    """The effects of a set that aren't clearly of a size that matters in practice (a
     region of practical equivalence on the parameters, Kruschke 2018), by the replay or
     by the `torque_response` that was measured: {(effect, parameter): (value,
     deviation)}. What a card wants confirmed by the latter must be.
     """
-    covariance = fit.covariance + between_flights(fit.covariance, fit.grams[:, 1:, 0])
-    place = {i: k for k, i in enumerate(fit.index.tolist())}
+    information = np.linalg.inv(fit.covariance)
 
     def of_replay(effect: str) -> bool:
-        sizes = CARDS[effect].practical
-        indices = [PLACE[effect, parameter] for parameter in sizes]
+        card = CARDS[effect]
+        indices = [PLACE[effect, parameter] for parameter in card.practical]
+        fixed = [PLACE[effect, parameter] for parameter in card.shape]
+        free = np.flatnonzero(~np.isin(fit.index, fixed))
+        covariance = of_flights(
+            np.linalg.inv(information[np.ix_(free, free)]),
+            fit.grams[:, 1:, 0][:, free],
+        )
+        place = {i: k for k, i in enumerate(fit.index[free].tolist())}
         rows = [place[i] for i in indices]
         away = fit.theta[indices] - fit.replay.absent[indices]
-        least = np.array(list(sizes.values())) * fit.replay.size_factors[indices]
+        least = np.array(list(card.practical.values()))
+        least = least * fit.replay.size_factors[indices]
         return clearly_larger(away, covariance[np.ix_(rows, rows)], least)
 
     def of_response(keys) -> bool:
@@ -131,7 +143,7 @@ def practical(fit: SetFit, torque_response: Measured) -> bool:
         parameters = [(effect, parameter) for parameter in card.practical]
         return not parameters or of_replay(effect) or of_response(parameters)
 
-    return all(of_a_size(e) for e in fit.effects)
+    return tuple(e for e in fit.effects if not of_a_size(e))
 
 
 def clearly_larger(

@@ -7,7 +7,7 @@ effect.
 
 import numpy as np
 
-from openjax.gap.channels import Estimated, robust_deviation
+from openjax.gap.channels import Estimated, of_flights
 from openjax.gap.criteria import REACH
 from openjax.gap.decision import DECISION
 from openjax.gap.evidence import Evidence
@@ -78,9 +78,10 @@ def _of_physics(fit: SetFit, effect: str, parameter) -> Estimated:
     parameter of that unit.
     """
     parameters = EFFECTS[effect].parameters
-    deviation = robust_deviation(fit.covariance, fit.grams[:, 1:, 0])
+    covariance = of_flights(fit.covariance, fit.grams[:, 1:, 0])
+    place = fit.index.tolist().index(PLACE[effect, parameter.name])
     deviation = float(
-        deviation[fit.index.tolist().index(PLACE[effect, parameter.name])]
+        np.sqrt(max(covariance[place, place], fit.covariance[place, place]))
     )
     away = [
         abs(float(fit.theta[PLACE[effect, p.name]]) - parameters[p.name].none)

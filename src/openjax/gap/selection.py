@@ -28,6 +28,7 @@ from openjax.gap.criteria import (
     log_odds,
     possible,
     practical,
+    too_small,
     within_bounds,
     worse,
 )
@@ -50,6 +51,7 @@ FITTED = 10
 FITTED_AGAIN = 6
 SCREENED = 4  # times as many are weighed with bounded nuisances before that
 SIMPLER = 3  # of the best sets, those without one of their effects are fitted as well
+SHEDDING = 6  # of the best sets, those that lose what may not be named
 DRAWS = 400  # of the bootstrap
 ROUNDS = 10  # of the chosen set's last fit, between which nuisances are worked out anew
 
@@ -128,6 +130,7 @@ def search_sets(evidence: Evidence) -> Search:
     search.alone()
     search.enumerate(search.nothing, FITTED)
     search.enumerate(search.best, FITTED_AGAIN, search.beyond_bounds())
+    search.shed()
     return search
 
 
@@ -225,6 +228,21 @@ class Search:
         next_sets += [key - {effect} for key in best[:SIMPLER] for effect in key]
         for key in dict.fromkeys(next_sets):
             self.of_set(key, near.fit)
+
+    def shed(self) -> None:
+        """Fit what is left of the best sets when effects that may not be named go: ones
+        too small to change a simulator for, or beyond their bounds.
+        """
+        torque_response = self.evidence.torque_response
+        best = sorted(self.hypotheses.values(), key=lambda h: -h.score)[:SHEDDING]
+        for hypothesis in best:
+            while True:
+                fit = hypothesis.fit
+                small = too_small(fit, torque_response(hypothesis.effects))
+                out = {e for e in fit.effects if not within_bounds(fit, e)} | set(small)
+                if not out:
+                    break
+                hypothesis = self.of_set(set(hypothesis.effects) - out, fit)
 
     def torque_support(self, key: frozenset) -> float:
         """Nats by which the torques' response speaks for a set with each effect as it

@@ -131,14 +131,19 @@ def _descend(fit: SetFit, iterations: int) -> SetFit:
     # no step longer than three prior deviations: farther away the derivatives say
     # little
     reach = 3.0 * np.sqrt(np.diag(np.linalg.inv(precision)))
+    most = np.array([p.most for e in fit.effects for p in CARDS[e].fitted])
     share = 1.0
     for _ in range(iterations):
         push = fit.grams.sum(0)[1:, 0] - precision @ (fit.theta[index] - mean)
-        step = np.linalg.solve(fit.hessian, push)
+        # what stands at its bound and would go beyond stays there
+        free = np.flatnonzero((fit.theta[index] < most) | (push < 0.0))
+        step = np.zeros(len(index))
+        step[free] = np.linalg.solve(fit.hessian[np.ix_(free, free)], push[free])
         if 0.5 * push @ step < SMALL_STEP:
             break
         theta = fit.theta.copy()
         theta[index] += share * np.clip(step, -reach, reach)
+        theta[index] = np.minimum(theta[index], most)
         ahead = _at(fit.replay, fit.effects, theta)
         gain = fit.objective - ahead.objective
         if gain > 0.0:

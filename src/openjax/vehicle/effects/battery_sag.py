@@ -96,6 +96,7 @@ EFFECT = Effect(
         at_voltage=frozen,
         sample={"exponent": 1.0},
         practical={"exponent": 0.1},
+        shape=("reference",),
         days=0.0,
         next_flight="the same hover on a full and on a nearly empty battery.",
     ),

@@ -11,7 +11,9 @@ from openjax.vehicle.effects.effect import (
 )
 from openjax.vehicle.effects.ground_effect import gain
 
-FARTHEST = 0.06  # m, twice what is usual
+# m, twice what is usual: a ceiling that would have to be higher than the room's is some
+# slow change of thrust
+FARTHEST = 0.06
 
 
 def thrust(parameters, thrust, reaction, context):
@@ -27,13 +29,6 @@ def above(position) -> bool:
     none.
     """
     return bool((position[:, 2] > ARENA_CEILING).any())
-
-
-def within_reach(values, deviations) -> bool:
-    """Whether the rotors stand no further from the tracked point than FARTHEST: a
-    ceiling that would have to be higher than the room's is some slow change of thrust.
-    """
-    return values["offset"] < FARTHEST
 
 
 _SOURCE = "as strong as the ground effect or stronger (Hsiao, Chirarattananon 2019)"
@@ -52,15 +47,22 @@ EFFECT = Effect(
     card=Card(
         fitted=(
             Fitted("strength", mean=0.0, spread=0.8, start=0.4, step=0.01),
-            Fitted("offset", mean=0.012, spread=0.025, start=0.012, step=0.0005),
+            Fitted(
+                "offset",
+                mean=0.012,
+                spread=0.025,
+                start=0.012,
+                step=0.0005,
+                most=FARTHEST,
+            ),
         ),
         others=((0.4, 0.0), (0.4, 0.025), (0.4, 0.05)),
         needs="position",
         coordinate="height",
         impossible=above,
-        possible=within_reach,
         sample={"strength": 0.6, "offset": 0.01},
         practical={"strength": 0.08},
+        shape=("offset",),
         next_flight="slow passes just below the ceiling.",
     ),
 )

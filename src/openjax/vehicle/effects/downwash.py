@@ -90,6 +90,7 @@ EFFECT = Effect(
         coordinate="height below a neighbour",
         sample={"force": 0.05, "length": 0.5, "width": 0.06, "spread": 0.1},
         practical={"force": 0.003},
+        shape=("length", "width", "spread"),
         next_flight="passes of one vehicle 15 to 50 cm above the other.",
     ),
 )

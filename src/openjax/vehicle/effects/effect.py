@@ -181,6 +181,8 @@ class Fitted:
     """Of the difference quotient."""
     error: float = 0.0
     """Standard deviation that the rows of a log leave, whatever a fit says."""
+    most: float = float("inf")
+    """Where the search ends."""
 
 
 # In round numbers: nobody has counted how often vehicles have an effect.
@@ -261,6 +263,11 @@ class Card:
     practical: Mapping[str, float] = field(default_factory=dict)
     """{parameter: how far it must be from doing nothing before anybody would change a
     simulator for it}; one of them is enough.
+    """
+    shape: tuple[str, ...] = ()
+    """Parameters that do nothing by themselves, as they only say how the others' push
+    is spread. While nothing pushes they can have any value (Davies 1987), so the
+    effect's size is asked with each as it was fitted.
     """
     confirmed_by: tuple[tuple[str, str], ...] = ()
     """(effect, parameter) of what the torques' response tells without a model of the

@@ -53,6 +53,7 @@ EFFECT = Effect(
         coordinate="height",
         sample={"strength": 0.8, "offset": 0.01},
         practical={"strength": 0.08},
+        shape=("offset",),
         next_flight="slow passes between 3 and 20 cm above the floor.",
     ),
 )
