@@ -111,7 +111,8 @@ def too_small(fit: SetFit, torque_response: Measured) -> tuple[str, ...]:
 
     def of_replay(effect: str) -> bool:
         card = CARDS[effect]
-        indices = [PLACE[effect, parameter] for parameter in card.practical]
+        names = [p.name for p in card.fitted] if card.departure else card.practical
+        indices = [PLACE[effect, parameter] for parameter in names]
         fixed = [PLACE[effect, parameter] for parameter in card.shape]
         free = np.flatnonzero(~np.isin(fit.index, fixed))
         covariance = of_flights(
@@ -121,6 +122,8 @@ def too_small(fit: SetFit, torque_response: Measured) -> tuple[str, ...]:
         place = {i: k for k, i in enumerate(fit.index[free].tolist())}
         rows = [place[i] for i in indices]
         away = fit.theta[indices] - fit.replay.absent[indices]
+        if card.departure:
+            return departs(away, covariance[np.ix_(rows, rows)], card.departure())
         least = np.array(list(card.practical.values()))
         least = least * fit.replay.size_factors[indices]
         return clearly_larger(away, covariance[np.ix_(rows, rows)], least)
@@ -141,7 +144,9 @@ def too_small(fit: SetFit, torque_response: Measured) -> tuple[str, ...]:
         ):
             return of_response(card.confirmed_by)
         parameters = [(effect, parameter) for parameter in card.practical]
-        return not parameters or of_replay(effect) or of_response(parameters)
+        if not parameters and card.departure is None:
+            return True
+        return of_replay(effect) or of_response(parameters)
 
     return tuple(e for e in fit.effects if not of_a_size(e))
 
@@ -162,6 +167,24 @@ def clearly_larger(
     square = float(away @ np.linalg.solve(covariance, away))
     remaining = 1.0 - np.sqrt(chi2.ppf(0.9, len(away)) / max(square, 1e-12))
     return bool(remaining * np.max(np.abs(away) / least) > 1.0)
+
+
+def departs(
+    away: Float[np.ndarray, " own"],
+    covariance: Float[np.ndarray, "own own"],
+    departure: Float[np.ndarray, "states own"],
+) -> bool:
+    """Whether parameters that are `away` (p,) from doing nothing do clearly more than
+    what begins to matter: what they do, less as much of it as its 90 % region leaves,
+    is above 1 (see `Card.departure`).
+    """
+    directions, scales, _ = np.linalg.svd(departure, full_matrices=False)
+    directions = directions[:, scales > 1e-9 * scales[0]]
+    effect = directions.T @ departure @ away
+    spread = directions.T @ departure @ covariance @ departure.T @ directions
+    square = float(effect @ np.linalg.solve(spread, effect))
+    remaining = 1.0 - np.sqrt(chi2.ppf(0.9, len(effect)) / max(square, 1e-12))
+    return bool(remaining * np.linalg.norm(effect) > 1.0)
 
 
 def possible(fit: SetFit) -> bool:

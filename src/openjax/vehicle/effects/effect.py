@@ -264,6 +264,11 @@ class Card:
     """{parameter: how far it must be from doing nothing before anybody would change a
     simulator for it}; one of them is enough.
     """
+    departure: Callable[[], Any] | None = None
+    """departure() -> (n, p): what a unit of each parameter does in n usual states, such
+    that its root sum of squares is 1 where it begins to matter. In place of `practical`
+    where no parameter by itself says how much the effect does.
+    """
     shape: tuple[str, ...] = ()
     """Parameters that do nothing by themselves, as they only say how the others' push
     is spread. While nothing pushes they can have any value (Davies 1987), so the

@@ -23,12 +23,28 @@ _LARGEST_SLOPE = 2.2
 _USUAL_COMMANDS = np.array([0.45, 0.85])
 
 
+# 1 % of the thrust at the ends of the usual commands
+LEAST_BEND = 0.004
+
+
 def rises(value, deviation):
     """Whether a fitted curve rises over the usual commands as a motor's does; if not,
     the motors don't make this force.
     """
     slope = value["slope"] + 2.0 * value["curvature"] * _USUAL_COMMANDS
     return bool(_LEAST_SLOPE < slope.min() and slope.max() < _LARGEST_SLOPE)
+
+
+def bend():
+    """(n, 3): by what share of the thrust offset, slope and curvature bend the map over
+    the usual commands, beside the straight line through zero that fits best, which is a
+    thrust scale; their root mean square is in units of LEAST_BEND.
+    """
+    commands = np.linspace(*_USUAL_COMMANDS, 9)
+    columns = np.stack([np.ones_like(commands), commands, commands**2], 1)
+    line = commands / np.linalg.norm(commands)
+    columns = columns - np.outer(line, line @ columns)
+    return columns / (commands.mean() * LEAST_BEND * np.sqrt(len(commands)))
 
 
 EFFECT = Effect(
@@ -56,7 +72,7 @@ EFFECT = Effect(
         possible=rises,
         nuisance_duty={"offset": 0.15, "curvature": 0.3},
         sample={"curvature": 0.25},
-        practical={"offset": 0.01, "slope": 0.02, "curvature": 0.05},
+        departure=bend,
         days=0.0,
         next_flight="steps of collective thrust between 40 and 90 %.",
     ),
