@@ -8,9 +8,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from openjax.gap.channels import of_flights
 from openjax.gap.criteria import (
     Gaps,
     clearly_larger,
+    departs,
     difference,
     growth,
     practical,
@@ -18,6 +20,7 @@ from openjax.gap.criteria import (
 )
 from openjax.gap.model.cross_validation import Validation
 from openjax.gap.model.library import ABSENT, places
+from openjax.vehicle.effects.thrust_curve import bend
 
 
 def judged(left: np.ndarray, blocks: int) -> Validation:
@@ -98,6 +101,56 @@ def test_what_only_a_sum_is_known_of_is_clear_by_the_sum():
     assert clearly_larger(np.array([2.5, 0.0]), apart, least)
 
 
+def test_intervals_hold_a_mean_that_three_flights_differ_by():
+    """Flights as loud as usual: `DISPERSION` variances of what their rows say."""
+    rng = np.random.default_rng(4)
+    covariance = np.eye(1) / 3.0
+    flights = np.sqrt(2.6) * rng.standard_normal((4000, 3))
+    reach = (
+        1.645
+        * np.array(
+            [of_flights(covariance, (f - f.mean())[:, None])[0, 0] for f in flights]
+        )
+        ** 0.5
+    )
+    assert 0.87 < (np.abs(flights.mean(1)) < reach).mean() < 0.95
+    # and three that agree by chance aren't believed to
+    alike = of_flights(covariance, np.zeros((3, 1)))[0, 0]
+    assert alike > covariance[0, 0]
+
+
+def test_what_a_scale_does_as_well_is_no_curve():
+    known = 1e-8 * np.eye(3)
+    assert not departs(np.array([0.0, 0.1, 0.0]), known, bend())
+    # 2 % of slope, taken back by the offset where vehicles hover
+    assert not departs(np.array([0.013, -0.02, 0.0]), known, bend())
+    assert departs(np.array([0.0, -0.1, 0.12]), known, bend())
+
+
+def of_one_effect(effect, values, covariance):
+    theta = ABSENT.copy()
+    index = places((effect,))
+    theta[index] = values
+    return SimpleNamespace(
+        effects=(effect,),
+        theta=theta,
+        index=index,
+        covariance=covariance,
+        grams=np.zeros((1, 1 + len(index), 1)),
+        replay=SimpleNamespace(absent=ABSENT, size_factors=np.ones(len(ABSENT))),
+    )
+
+
+def test_a_plane_whose_place_is_not_known_acts_if_its_push_is():
+    """Strength and offset of a ground effect trade places along a line."""
+    along = np.array([0.4, 0.01])
+    covariance = np.outer(along, along) + np.diag([1e-4, 1e-8])
+    fit = of_one_effect("ground_effect", (0.5, 0.012), covariance)
+    assert practical(fit, {})
+    weak = of_one_effect("ground_effect", (0.05, 0.012), covariance)
+    assert not practical(weak, {})
+
+
 @pytest.mark.parametrize(
     ("response", "told"),
     [
@@ -107,15 +160,5 @@ def test_what_only_a_sum_is_known_of_is_clear_by_the_sum():
     ],
 )
 def test_an_inertia_needs_the_response_whatever_the_replay_says(response, told):
-    theta = ABSENT.copy()
-    index = places(("inertia",))
-    theta[index] = 1.4
-    fit = SimpleNamespace(
-        effects=("inertia",),
-        theta=theta,
-        index=index,
-        covariance=1e-6 * np.eye(len(index)),
-        grams=np.zeros((1, 1 + len(index), 1)),
-        replay=SimpleNamespace(absent=ABSENT, size_factors=np.ones(len(ABSENT))),
-    )
+    fit = of_one_effect("inertia", 1.4, 1e-6 * np.eye(3))
     assert practical(fit, response) == told
