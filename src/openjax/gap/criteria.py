@@ -12,6 +12,7 @@ from scipy.stats import chi2
 
 from openjax.gap.channels import of_flights
 from openjax.gap.decision import DECISION
+from openjax.gap.identification.quantities import REACH
 from openjax.gap.model.cross_validation import Validation
 from openjax.gap.model.hypotheses import SetFit
 from openjax.gap.model.library import CARDS, PLACE
@@ -21,7 +22,6 @@ from openjax.gap.shapes import Squares
 # standard errors, as the gain of a true effect is half the square of what it does, and
 # its standard error that square's root.
 DETECTABLE = 2.0 * DECISION.standard_errors**2
-REACH = 1.645  # standard deviations of a 90 % interval
 # Growth of the gap that counts where nuisances are as the best set has them. With .05,
 # errors of the rate loop's form are named as inertia; with .15 or .2 as much is right
 # on the cases tried.

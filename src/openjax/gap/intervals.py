@@ -8,9 +8,9 @@ effect.
 import numpy as np
 
 from openjax.gap.channels import Estimated, of_flights
-from openjax.gap.criteria import REACH
 from openjax.gap.decision import DECISION
 from openjax.gap.evidence import Evidence
+from openjax.gap.identification.quantities import REACH
 from openjax.gap.model.hypotheses import SetFit
 from openjax.gap.model.library import CARDS, PLACE, path_of
 from openjax.gap.report import Estimate

@@ -51,7 +51,6 @@ FITTED = 10
 FITTED_AGAIN = 6
 SCREENED = 4  # times as many are weighed with bounded nuisances before that
 SIMPLER = 3  # of the best sets, those without one of their effects are fitted as well
-SHEDDING = 6  # of the best sets, those that lose what may not be named
 DRAWS = 400  # of the bootstrap
 ROUNDS = 10  # of the chosen set's last fit, between which nuisances are worked out anew
 
@@ -234,7 +233,7 @@ class Search:
         too small to change a simulator for, or beyond their bounds.
         """
         torque_response = self.evidence.torque_response
-        best = sorted(self.hypotheses.values(), key=lambda h: -h.score)[:SHEDDING]
+        best = sorted(self.hypotheses.values(), key=lambda h: -h.score)[:FITTED_AGAIN]
         for hypothesis in best:
             while True:
                 fit = hypothesis.fit

@@ -13,10 +13,10 @@ from openjax.flights.track import specific_force_of, to_body
 from openjax.gap.identification.records import Record
 from openjax.gap.identification.regression import solve
 from openjax.gap.identification.rotor_rows import rotor_rows
+from openjax.gap.identification.search import BLOCK
 
 ORDER = 12  # rows of the noise's autoregression
 ROUNDS = 4
-BLOCK = 1.0  # s over which errors may hang together
 FORM = {"thrust_level": 0.01, "thrust_slope": 0.03}
 """Relative errors of accelerometers' scale and of straight lines through a rotor's
 map.
