@@ -113,8 +113,8 @@ def too_small(fit: SetFit, torque_response: Measured) -> tuple[str, ...]:
         card = CARDS[effect]
         names = [p.name for p in card.fitted] if card.departure else card.practical
         indices = [PLACE[effect, parameter] for parameter in names]
-        fixed = [PLACE[effect, parameter] for parameter in card.shape]
-        free = np.flatnonzero(~np.isin(fit.index, fixed))
+        shape = [PLACE[effect, parameter] for parameter in card.shape]
+        free = np.flatnonzero(~np.isin(fit.index, shape))
         covariance = of_flights(
             np.linalg.inv(information[np.ix_(free, free)]),
             fit.grams[:, 1:, 0][:, free],
@@ -183,8 +183,8 @@ def departs(
     effect = directions.T @ departure @ away
     spread = directions.T @ departure @ covariance @ departure.T @ directions
     square = float(effect @ np.linalg.solve(spread, effect))
-    remaining = 1.0 - np.sqrt(chi2.ppf(0.9, len(effect)) / max(square, 1e-12))
-    return bool(remaining * np.linalg.norm(effect) > 1.0)
+    share = 1.0 - np.sqrt(chi2.ppf(0.9, len(effect)) / max(square, 1e-12))
+    return bool(share * np.linalg.norm(effect) > 1.0)
 
 
 def possible(fit: SetFit) -> bool:

@@ -238,10 +238,12 @@ class Search:
             while True:
                 fit = hypothesis.fit
                 small = too_small(fit, torque_response(hypothesis.effects))
-                out = {e for e in fit.effects if not within_bounds(fit, e)} | set(small)
-                if not out:
+                dropouts = {e for e in fit.effects if not within_bounds(fit, e)} | set(
+                    small
+                )
+                if not dropouts:
                     break
-                hypothesis = self.of_set(set(hypothesis.effects) - out, fit)
+                hypothesis = self.of_set(set(hypothesis.effects) - dropouts, fit)
 
     def torque_support(self, key: frozenset) -> float:
         """Nats by which the torques' response speaks for a set with each effect as it
