@@ -129,7 +129,7 @@ def search_sets(evidence: Evidence) -> Search:
     search.alone()
     search.enumerate(search.nothing, FITTED)
     search.enumerate(search.best, FITTED_AGAIN, search.beyond_bounds())
-    search.shed()
+    search.fit_without_dropouts()
     return search
 
 
@@ -228,7 +228,7 @@ class Search:
         for key in dict.fromkeys(next_sets):
             self.of_set(key, near.fit)
 
-    def shed(self) -> None:
+    def fit_without_dropouts(self) -> None:
         """Fit what is left of the best sets when effects that may not be named go: ones
         too small to change a simulator for, or beyond their bounds.
         """
