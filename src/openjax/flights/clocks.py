@@ -285,4 +285,9 @@ def _torques(track: Track, vehicle) -> np.ndarray:
     mean = (
         track.motor + (response_before - track.motor) * (1.0 - decay) * time / track.dt
     )
-    return mean @ np.stack([place[:, 1], -place[:, 0], spin], 1)
+    # Rotors that differ need unequal commands whenever the thrust changes, and no torque
+    # acts: what goes with the sum tells no time, and in a climb it is all there is.
+    total = mean.sum(1)
+    columns = np.stack([np.ones_like(total), total], 1)
+    torques = mean @ np.stack([place[:, 1], -place[:, 0], spin], 1)
+    return torques - columns @ np.linalg.lstsq(columns, torques, rcond=None)[0]

@@ -180,10 +180,11 @@ def _another_day(
         for n, s in zip(fit.replay.nuisance_names, fit.replay.is_shared, strict=True)
         if s
     ]
+
     names = [" ".join(THETA[i]) for i in fit.index]
     transfers = [n.split(" ")[0] in effects for n in names]
     transfers += [
-        n in sizes and n not in names and n.split(" ")[0] in LASTING
+        n in sizes and n not in names and _is_lasting(n, evidence.sensors.motor_clock)
         for n in shared_names
     ]
     names += shared_names
@@ -203,6 +204,15 @@ def _another_day(
     shifts = (mean + around[transfers]) * unit
     transferred_names = tuple(n for n, k in zip(names, transfers, strict=True) if k)
     return transferred_names, shifts, covariance * np.outer(unit, unit)
+
+
+def _is_lasting(name: str, motor_clock: bool) -> bool:
+    """Whether a number ("effect parameter") is the vehicle's on any day: what motors on
+    a clock of their own make of a lag isn't.
+    """
+    effect, parameter = name.split(" ")
+    is_time = EFFECTS[effect].parameters[parameter].unit == "s"
+    return effect in LASTING and (motor_clock or not is_time)
 
 
 def join(cases: Sequence[Case]) -> Case:
