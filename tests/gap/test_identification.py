@@ -133,6 +133,9 @@ def test_the_first_sentence_and_the_training_know_slow_motors(records):
     low, high = intervals["motor_lag"]["extra_up"]
     assert low < 0.05 < high
     assert "later: its motors take" in found.sentence()
+    assert (low + 0.025, high + 0.025) == pytest.approx(
+        found.quantities["spin_up"].interval90
+    )
     unmapped = replace(found, duty_cycles=True)
     assert set(corrections(unmapped, effects=("inertia", "motor_lag"))[0]) == {
         "motor_lag"

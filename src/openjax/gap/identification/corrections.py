@@ -1,5 +1,7 @@
 """What the simulator that trains should take from an identification."""
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from openjax.gap.identification.quantities import REACH, Identification
@@ -8,6 +10,42 @@ from openjax.vehicle.effects import EFFECTS
 CLEAR = 3.0  # standard deviations from the simulator's value
 MATTERS = {"motor_lag": 0.006, "inertia": 0.15, "yaw_torque": 0.2}
 """s, and shares: differences from which training should know."""
+LAGS = {"extra_up": "spin_up", "extra_down": "spin_down"}
+"""The time constant that an effect's parameter counts from the simulator's."""
+LEAST = 0.04  # of the simulator's number, where an estimate isn't positive
+
+
+@dataclass(frozen=True)
+class _Number:
+    """A positive number of the vehicle: a time constant (s), or a gain as a multiple."""
+
+    effect: str
+    parameter: str
+    value: float
+    nominal: float
+    """The simulator's."""
+    error: float
+    """Standard deviation of the logarithm, as the report's intervals have it."""
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether it differs clearly from the simulator's, and by as much as
+        matters.
+        """
+        ratio = abs(np.log(self.value / self.nominal))
+        size = abs(self.value - self.nominal)
+        return bool(ratio > CLEAR * self.error and size > MATTERS[self.effect])
+
+    @property
+    def ends(self) -> tuple[float, float, float]:
+        """Value of the effect's parameter and the ends of its 90 % interval."""
+        spread = np.exp(np.array([0.0, -REACH, REACH]) * self.error)
+        parameters = self.value * spread - (
+            self.nominal if self.parameter in LAGS else 0.0
+        )
+        least, most = EFFECTS[self.effect].parameters[self.parameter].limits()
+        value, low, high = np.clip(parameters, least, most).tolist()
+        return value, low, high
 
 
 def corrections(identification: Identification, effects) -> tuple[dict, dict]:
@@ -20,33 +58,28 @@ def corrections(identification: Identification, effects) -> tuple[dict, dict]:
         return {}, {}
     values: dict = {}
     intervals: dict = {}
-    estimates = identification.estimates
-    deviation = np.sqrt(np.diag(estimates.covariance))
-    for effect in dict.fromkeys(e for e, _ in estimates.names):
+    numbers = _numbers(identification)
+    for effect in dict.fromkeys(number.effect for number in numbers):
+        of_effect = [number for number in numbers if number.effect == effect]
         if identification.duty_cycles and effect != "motor_lag":
             continue
-        places = [i for i, (e, _) in enumerate(estimates.names) if e == effect]
-        none = 0.0 if effect == "motor_lag" else 1.0
-        off = np.abs(estimates.value[places] - none)
-        clear = (off > CLEAR * deviation[places]) & (off > MATTERS[effect])
-        if effect not in effects and not clear.any():
-            continue
-        for i in places:
-            parameter = estimates.names[i][1]
-            value = float(estimates.value[i])
-            reach = REACH * float(deviation[i])
-            low = (
-                value - reach
-                if effect == "motor_lag"
-                else value * np.exp(-reach / value)
-            )
-            high = (
-                value + reach
-                if effect == "motor_lag"
-                else value * np.exp(reach / value)
-            )
-            least, most = EFFECTS[effect].parameters[parameter].limits()
-            ends = (float(np.clip(end, least, most)) for end in (value, low, high))
-            values.setdefault(effect, {})[parameter] = next(ends)
-            intervals.setdefault(effect, {})[parameter] = tuple(ends)
+        if effect in effects or any(number.is_clear for number in of_effect):
+            values[effect] = {n.parameter: n.ends[0] for n in of_effect}
+            intervals[effect] = {n.parameter: n.ends[1:] for n in of_effect}
     return values, intervals
+
+
+def _numbers(identification: Identification) -> list[_Number]:
+    estimates = identification.estimates
+    deviations = np.sqrt(np.diag(estimates.covariance))
+    out = []
+    for (effect, parameter), value, deviation in zip(
+        estimates.names, estimates.value, deviations, strict=True
+    ):
+        nominal = 1.0
+        if parameter in LAGS:
+            nominal = identification.quantities[LAGS[parameter]].simulator
+            value += nominal
+        has = max(float(value), LEAST * nominal)
+        out.append(_Number(effect, parameter, has, nominal, float(deviation) / has))
+    return out
