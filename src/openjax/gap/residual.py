@@ -35,9 +35,9 @@ HORIZONS = {
 # Share of what grew that effects leave where they aren't what acts: those named beside
 # an unknown cause left .71 to 1, those that act .54 at most (seeds 890 to 893).
 MOSTLY = 0.65
-# Of HORIZONS what another vehicle's gusts shake; where there are any, rows under it
-# don't count.
-HELD_FROM_GUSTS = ("velocity", "rates")
+# Of HORIZONS what forces and torques leave, and so what another vehicle's gusts shake;
+# where there are any, rows under it don't count.
+OF_MOTION = ("velocity", "rates")
 CALIBRATION = Path(__file__).with_name("residual.json")
 
 
@@ -99,7 +99,8 @@ def check_residual(evidence: Evidence, fit: SetFit, nothing: SetFit) -> Check:
     p_value, name = conformal_p(measures, reference)
     mostly_unknown = False
     by_reference = reference is not None and name in reference
-    if by_reference:
+    # sensors that disagree are no rival of a force or torque: neither explains the other
+    if by_reference and name in OF_MOTION:
         measures_of_nothing, _ = measure(evidence, residuals_of(nothing))
         share = unexplained_share(
             measures[name], reference[name], measures_of_nothing[name]
@@ -153,11 +154,32 @@ def measure(
     for name, parts in _series(evidence, residuals).items():
         step = max(round(HORIZONS[name][0] / dt), 1)
         changes = [(p[step:] - p[:-step])[skip:] for p in parts]
-        if name in HELD_FROM_GUSTS and evidence.motion.gusts is not None:
+        if name == "rates":
+            trims = [_trims(t, step)[skip:] for t in evidence.replay.tracks]
+            changes = [_without(m, x) for m, x in zip(changes, trims, strict=True)]
+        if name in OF_MOTION and evidence.motion.gusts is not None:
             calm = [_calm(rows, step)[skip:] for rows in evidence.motion.gusts.rows]
             changes = [m[c] for m, c in zip(changes, calm, strict=True)]
         axes[name] = np.concatenate(changes).std(0)
     return {name: float(size.max()) for name, size in axes.items()}, axes
+
+
+def _trims(track: Track, step: int) -> Float[np.ndarray, "_ trims"]:
+    """(T - step, 3) what torques that are no cause do to body rates over so many rows: a
+    constant one, one that grows as the battery is used, and rotors that differ, by the
+    sum of thrusts. Days move them by more than gusts do, so they say nothing of a
+    change.
+    """
+    thrust = np.cumsum(track.motor.sum(1)) * track.dt
+    turned = thrust[step:] - thrust[:-step]
+    return np.stack(
+        [np.ones_like(turned), np.arange(len(turned)) * track.dt, turned], 1
+    )
+
+
+def _without(changes: Rows, columns: np.ndarray) -> Rows:
+    """Changes (T, 3) less their least-squares part of some columns (T, N)."""
+    return changes - columns @ np.linalg.lstsq(columns, changes, rcond=None)[0]
 
 
 def _calm(rows: Chosen, step: int) -> Chosen:
@@ -226,7 +248,7 @@ def _comparable(evidence: Evidence) -> dict[str, float]:
     the pose nothing where it was moved in time in one of both alone.
     """
     baseline = evidence.baseline
-    silent = ("velocity", "rates") if evidence.charge_unknown else ()
+    silent = OF_MOTION if evidence.charge_unknown else ()
     channels = {c.path: c for c in evidence.channels}
     shifts = [
         p["estimator"].acting() if "estimator" in p else {}
