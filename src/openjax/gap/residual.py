@@ -38,6 +38,9 @@ MOSTLY = 0.65
 # Of HORIZONS what forces and torques leave, and so what another vehicle's gusts shake;
 # where there are any, rows under it don't count.
 OF_MOTION = ("velocity", "rates")
+# s by which poses of case and reference may have been moved apart: what is late also
+# jitters, which no shift takes away.
+MOVED = 0.005
 CALIBRATION = Path(__file__).with_name("residual.json")
 
 
@@ -245,19 +248,22 @@ def _path_against_accelerometer(track: Track) -> np.ndarray:
 def _comparable(evidence: Evidence) -> dict[str, float]:
     """The reference's measures, of which those of forces and torques say nothing where
     a battery that nobody logged makes another thrust of every duty cycle, and those of
-    the pose nothing where it was moved in time in one of both alone.
+    the pose nothing where it was moved in time by other times.
     """
     baseline = evidence.baseline
     silent = OF_MOTION if evidence.charge_unknown else ()
-    channels = {c.path: c for c in evidence.channels}
-    shifts = [
-        p["estimator"].acting() if "estimator" in p else {}
-        for p in (channels, baseline.channels)
+    here = {c.path: c for c in evidence.channels}
+    moved = [
+        _moved(channels.get("estimator")) for channels in (here, baseline.channels)
     ]
-    # late poses of one of both alone
-    if bool(shifts[0]) != bool(shifts[1]):
+    if abs(moved[0] - moved[1]) > MOVED:
         silent += ("estimator", "position", "accelerometer")
     return {n: v for n, v in baseline.measures.items() if n not in silent}
+
+
+def _moved(pose) -> float:
+    """By what time (s) the pose was moved before anything was held against it."""
+    return pose.fit.value if pose is not None and pose.acting() else 0.0
 
 
 def unexplained_share(
