@@ -40,7 +40,7 @@ MOSTLY = 0.65
 OF_MOTION = ("velocity", "rates")
 # s by which poses of case and reference may have been moved apart: what is late also
 # jitters, which no shift takes away.
-MOVED = 0.005
+SHIFT = 0.005
 CALIBRATION = Path(__file__).with_name("residual.json")
 
 
@@ -174,9 +174,9 @@ def _trims(track: Track, step: int) -> Float[np.ndarray, "_ trims"]:
     change.
     """
     thrust = np.cumsum(track.motor.sum(1)) * track.dt
-    turned = thrust[step:] - thrust[:-step]
+    impulse = thrust[step:] - thrust[:-step]
     return np.stack(
-        [np.ones_like(turned), np.arange(len(turned)) * track.dt, turned], 1
+        [np.ones_like(impulse), np.arange(len(impulse)) * track.dt, impulse], 1
     )
 
 
@@ -252,16 +252,14 @@ def _comparable(evidence: Evidence) -> dict[str, float]:
     """
     baseline = evidence.baseline
     silent = OF_MOTION if evidence.charge_unknown else ()
-    here = {c.path: c for c in evidence.channels}
-    moved = [
-        _moved(channels.get("estimator")) for channels in (here, baseline.channels)
-    ]
-    if abs(moved[0] - moved[1]) > MOVED:
+    channels = {c.path: c for c in evidence.channels}
+    shifts = [_shift(c.get("estimator")) for c in (channels, baseline.channels)]
+    if abs(shifts[0] - shifts[1]) > SHIFT:
         silent += ("estimator", "position", "accelerometer")
     return {n: v for n, v in baseline.measures.items() if n not in silent}
 
 
-def _moved(pose) -> float:
+def _shift(pose) -> float:
     """By what time (s) the pose was moved before anything was held against it."""
     return pose.fit.value if pose is not None and pose.acting() else 0.0
 
