@@ -3,6 +3,7 @@ intervals.
 """
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,13 +14,13 @@ from experiments.diagnosis.rate_flights import Truth, fly, rows_of, vehicle_of
 from openjax.flights.clocks import case_on_gyroscope_clock
 from openjax.flights.flight import Case, Flight
 from openjax.gap.identification.corrections import corrections
-from openjax.gap.identification.estimates import of_fit
+from openjax.gap.identification.estimates import ESTIMATED, of_fit
 from openjax.gap.identification.prediction_errors import NAMES
 from openjax.gap.identification.quantities import Identification, doubts, quantities_of
 from openjax.gap.identification.records import Record, records_of
 from openjax.gap.identification.responses import responses
 from openjax.gap.identification.rotor_rows import rotor_rows
-from openjax.gap.identification.support import support
+from openjax.gap.identification.support import predict, support, told_by
 from openjax.gap.identification.torques import identify_torques
 from openjax.gap.model.library import ABSENT, PLACE
 from openjax.gap.report.response import response_of
@@ -214,3 +215,23 @@ def test_a_hover_that_hardly_turns_says_nothing_of_torques(monkeypatch, records)
     assert doubts([still], identify_torques([still], one_clock=False), one_clock=True)
     moving = records["nominal"]
     assert not doubts([moving], identify_torques([moving]), one_clock=True)
+
+
+def test_a_response_tells_back_the_parameters_that_made_it():
+    theta = ABSENT.copy()
+    truth = {
+        ("inertia", "xx"): 1.3,
+        ("inertia", "yy"): 1.2,
+        ("inertia", "zz"): 1.4,
+        ("thrust_scale", "scale"): 0.1,
+    }
+    for key, value in truth.items():
+        theta[PLACE[key]] = value
+    values = predict(SimpleNamespace(names=ESTIMATED, value=None), theta)
+    response = {key: (value, 0.1) for key, value in zip(ESTIMATED, values, strict=True)}
+    told = told_by(response, theta, ("inertia", "thrust_scale"))
+    for axis in ("xx", "yy", "zz"):
+        assert told["inertia", axis][0] == pytest.approx(truth["inertia", axis])
+    # yaw tells a ratio of two numbers, which may both be off
+    told = told_by(response, theta, ("inertia", "yaw_torque"))
+    assert set(told) == {("inertia", "xx"), ("inertia", "yy")}

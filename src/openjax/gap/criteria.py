@@ -142,7 +142,9 @@ def too_small(fit: SetFit, torque_response: Measured) -> tuple[str, ...]:
         if card.needs_response or any(
             key in torque_response for key in card.confirmed_by
         ):
-            return of_response(card.confirmed_by)
+            # what confirms another effect of the set can't confirm this one as well
+            others = set(fit.effects) - {effect}
+            return of_response([k for k in card.confirmed_by if k[0] not in others])
         parameters = [(effect, parameter) for parameter in card.practical]
         if not parameters and card.departure is None:
             return True

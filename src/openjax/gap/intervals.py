@@ -2,15 +2,18 @@
 
 An interval is the fit's, or what flights disagree by where that is more, and never
 narrower than what forms that aren't quite the library's leave: some per cent of the
-effect.
+effect. What the torques' response tells is printed as the response has it, since the
+replay's torques are biased where motors answer gusts.
 """
 
 import numpy as np
 
 from openjax.gap.channels import Estimated, of_flights
+from openjax.gap.criteria import Measured
 from openjax.gap.decision import DECISION
 from openjax.gap.evidence import Evidence
 from openjax.gap.identification.quantities import REACH
+from openjax.gap.identification.support import told_by
 from openjax.gap.model.hypotheses import SetFit
 from openjax.gap.model.library import CARDS, PLACE, path_of
 from openjax.gap.report import Estimate
@@ -23,6 +26,8 @@ def estimates(
 ) -> dict[str, dict[str, Estimate]]:
     """{effect: {parameter: its estimate}} of the named effects."""
     channels = {c.path: c for c in evidence.channels}
+    response = evidence.torque_response(fit.effects)
+    of_torques = told_by(response, fit.theta, fit.effects)
     out = {}
     for effect in effects:
         channel = channels.get(path_of(effect))
@@ -31,7 +36,7 @@ def estimates(
             estimate = (
                 channel.estimate(effect, entry.name)
                 if channel
-                else _of_physics(fit, effect, entry)
+                else _of_physics(fit, effect, entry, of_torques)
             )
             parameter = EFFECTS[effect].parameters[entry.name]
             out[effect][entry.name] = _estimate(
@@ -73,16 +78,20 @@ def interval(estimate: Estimated, parameter) -> tuple[float, float]:
     return value - below, value + above
 
 
-def _of_physics(fit: SetFit, effect: str, parameter) -> Estimated:
-    """A parameter of the fit. Forms may be wrong by a share of the effect's largest
-    parameter of that unit.
+def _of_physics(fit: SetFit, effect: str, parameter, of_torques: Measured) -> Estimated:
+    """A parameter of the fit, or of the torques as they were measured. Forms may be
+    wrong by a share of the effect's largest parameter of that unit.
     """
     parameters = EFFECTS[effect].parameters
-    covariance = of_flights(fit.covariance, fit.grams[:, 1:, 0])
-    place = fit.index.tolist().index(PLACE[effect, parameter.name])
-    deviation = float(
-        np.sqrt(max(covariance[place, place], fit.covariance[place, place]))
-    )
+    key = effect, parameter.name
+    if key in of_torques:
+        value, deviation = of_torques[key]
+    else:
+        covariance = of_flights(fit.covariance, fit.grams[:, 1:, 0])
+        place = fit.index.tolist().index(PLACE[key])
+        variance = max(covariance[place, place], fit.covariance[place, place])
+        value = float(fit.theta[PLACE[key]])
+        deviation = float(np.sqrt(variance))
     away = [
         abs(float(fit.theta[PLACE[effect, p.name]]) - parameters[p.name].none)
         for p in CARDS[effect].fitted
@@ -91,4 +100,4 @@ def _of_physics(fit: SetFit, effect: str, parameter) -> Estimated:
     error = float(
         np.linalg.norm((deviation, DECISION.form_error * max(away), parameter.error))
     )
-    return Estimated(float(fit.theta[PLACE[effect, parameter.name]]), error, error)
+    return Estimated(value, error, error)

@@ -6,6 +6,8 @@ of lag, inertia and yaw torque beside the replay's, as exact as their intervals 
 such vehicles usually differ by.
 """
 
+from collections.abc import Collection, Mapping
+
 import numpy as np
 
 from openjax.gap.identification.estimates import EffectEstimates
@@ -56,15 +58,46 @@ def predict(estimates: EffectEstimates, theta: np.ndarray) -> np.ndarray:
     inertia does.
     """
 
-    def of(effect, parameter):
-        return float(theta[PLACE[effect, parameter]])
-
-    slope = of("thrust_curve", "slope") + 2.0 * HOVER * of("thrust_curve", "curvature")
-    thrust = max(slope * (1.0 + of("thrust_scale", "scale")), 0.1)
-    out = np.array([of(effect, parameter) for effect, parameter in estimates.names])
+    thrust = _thrust_slope(theta)
+    out = np.array([theta[PLACE[key]] for key in estimates.names])
     for number, (effect, _) in enumerate(estimates.names):
         if effect == "inertia":
             out[number] /= thrust
         elif effect == "yaw_torque":
-            out[number] *= thrust / of("inertia", "zz")
+            out[number] *= thrust / theta[PLACE["inertia", "zz"]]
     return out
+
+
+def told_by(
+    response: Mapping[tuple[str, str], tuple[float, float]],
+    theta: np.ndarray,
+    effects: Collection[str],
+) -> dict[tuple[str, str], tuple[float, float]]:
+    """{(effect, parameter): (value, standard deviation)} of the moments of inertia and
+    the yaw torque of a set of effects, by what the torques' `response` tells and the
+    thrust of parameters theta (P,). Of yaw it is the ratio of torque to inertia, which
+    tells neither if both may be off.
+    """
+    thrust = _thrust_slope(theta)
+    out = {}
+    for axis in ("xx", "yy"):
+        if ("inertia", axis) in response:
+            value, deviation = response["inertia", axis]
+            out["inertia", axis] = (value * thrust, deviation * thrust)
+    both = {"inertia", "yaw_torque"} <= set(effects)
+    if ("yaw_torque", "ratio") in response and not both:
+        value, deviation = response["yaw_torque", "ratio"]
+        out["yaw_torque", "ratio"] = (value / thrust, deviation / thrust)
+        inverse = thrust / value
+        out["inertia", "zz"] = (inverse, inverse * deviation / value)
+    return out
+
+
+def _thrust_slope(theta: np.ndarray) -> float:
+    """By how many times the nominal slope thrust rises where vehicles hover."""
+
+    def of(effect, parameter):
+        return float(theta[PLACE[effect, parameter]])
+
+    slope = of("thrust_curve", "slope") + 2.0 * HOVER * of("thrust_curve", "curvature")
+    return max(slope * (1.0 + of("thrust_scale", "scale")), 0.1)
