@@ -13,8 +13,7 @@ from openjax.gap.model.whitening import Noise
 from openjax.gap.residual import (
     HORIZONS,
     Check,
-    _trims,
-    _without,
+    _larger,
     beyond,
     calibration,
     conformal_p,
@@ -100,17 +99,9 @@ def test_what_was_not_held_against_the_reference_is_rejected_as_without_one():
     assert replace(check, by_reference=True).rejects
 
 
-def test_trims_of_a_day_leave_no_torques():
-    rng = np.random.default_rng(2)
-    thrusts = 0.5 + 0.1 * np.sin(2.0 * DT * np.arange(ROWS))
-    track = SimpleNamespace(motor=np.repeat(thrusts[:, None], 4, 1), dt=DT)
-    step = 50
-    trim = np.cumsum(0.3 + 0.8 * thrusts + 0.02 * DT * np.arange(ROWS))[:, None] * DT
-    gust = 1e-3 * np.cumsum(rng.standard_normal((ROWS, 1)), 0)
-
-    def left(torques):
-        return _without(torques[step:] - torques[:-step], _trims(track, step)).std()
-
-    assert left(trim) < 1e-6
-    assert left(gust + trim) == pytest.approx(left(gust), rel=1e-6)
-    assert left(gust) > 0.8 * (gust[step:] - gust[:-step]).std()
+def test_sensors_that_disagree_leave_names_unless_forces_grew_as_well():
+    reference = {"velocity": 0.02, "rates": 0.1, "position": 0.001}
+    calm = {"velocity": 0.022, "rates": 0.09, "position": 0.01}
+    assert _larger(calm, reference, "position") == []
+    assert _larger(calm | {"velocity": 0.1}, reference, "position") == ["velocity"]
+    assert _larger(calm, reference, "rates") == ["rates"]

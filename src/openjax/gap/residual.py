@@ -35,6 +35,9 @@ HORIZONS = {
 # Share of what grew that effects leave where they aren't what acts: those named beside
 # an unknown cause left .71 to 1, those that act .54 at most (seeds 890 to 893).
 MOSTLY = 0.65
+# Standard deviations between days from which forces or torques that are left take names
+# away where sensors disagree more.
+CLEARLY = 3.0
 # Of HORIZONS what forces and torques leave, and so what another vehicle's gusts shake;
 # where there are any, rows under it don't count.
 OF_MOTION = ("velocity", "rates")
@@ -100,15 +103,15 @@ def check_residual(evidence: Evidence, fit: SetFit, nothing: SetFit) -> Check:
     measures, axes = measure(evidence, residuals_of(fit))
     reference = None if evidence.baseline is None else _comparable(evidence)
     p_value, name = conformal_p(measures, reference)
-    mostly_unknown = False
     by_reference = reference is not None and name in reference
-    # sensors that disagree are no rival of a force or torque: neither explains the other
-    if by_reference and name in OF_MOTION:
+    mostly_unknown = False
+    if reference:
         measures_of_nothing, _ = measure(evidence, residuals_of(nothing))
-        share = unexplained_share(
-            measures[name], reference[name], measures_of_nothing[name]
-        )
-        mostly_unknown = share > MOSTLY
+        shares = [
+            unexplained_share(measures[n], reference[n], measures_of_nothing[n])
+            for n in _larger(measures, reference, name)
+        ]
+        mostly_unknown = max(shares, default=0.0) > MOSTLY
     finding = HORIZONS.get(name, (0.0, ""))[1]
     check = Check(
         measures,
@@ -157,32 +160,11 @@ def measure(
     for name, parts in _series(evidence, residuals).items():
         step = max(round(HORIZONS[name][0] / dt), 1)
         changes = [(p[step:] - p[:-step])[skip:] for p in parts]
-        if name == "rates":
-            trims = [_trims(t, step)[skip:] for t in evidence.replay.tracks]
-            changes = [_without(m, x) for m, x in zip(changes, trims, strict=True)]
         if name in OF_MOTION and evidence.motion.gusts is not None:
             calm = [_calm(rows, step)[skip:] for rows in evidence.motion.gusts.rows]
             changes = [m[c] for m, c in zip(changes, calm, strict=True)]
         axes[name] = np.concatenate(changes).std(0)
     return {name: float(size.max()) for name, size in axes.items()}, axes
-
-
-def _trims(track: Track, step: int) -> Float[np.ndarray, "_ trims"]:
-    """(T - step, 3) what torques that are no cause do to body rates over so many rows: a
-    constant one, one that grows as the battery is used, and rotors that differ, by the
-    sum of thrusts. Days move them by more than gusts do, so they say nothing of a
-    change.
-    """
-    thrust = np.cumsum(track.motor.sum(1)) * track.dt
-    impulse = thrust[step:] - thrust[:-step]
-    return np.stack(
-        [np.ones_like(impulse), np.arange(len(impulse)) * track.dt, impulse], 1
-    )
-
-
-def _without(changes: Rows, columns: np.ndarray) -> Rows:
-    """Changes (T, 3) less their least-squares part of some columns (T, N)."""
-    return changes - columns @ np.linalg.lstsq(columns, changes, rcond=None)[0]
 
 
 def _calm(rows: Chosen, step: int) -> Chosen:
@@ -227,10 +209,10 @@ def _series(
             t.position - (np.cumsum(t.velocity, 0) - 0.5 * t.velocity) * t.dt
             for t in tracks
         ]
-        felt = all(
+        has_force = all(
             t.specific_force is not None and t.quaternion is not None for t in tracks
         )
-        if felt and evidence.sensors.one_clock:
+        if has_force and evidence.sensors.one_clock:
             out["accelerometer"] = [_path_against_accelerometer(t) for t in tracks]
     return out
 
@@ -262,6 +244,23 @@ def _comparable(evidence: Evidence) -> dict[str, float]:
 def _shift(pose) -> float:
     """By what time (s) the pose was moved before anything was held against it."""
     return pose.fit.value if pose is not None and pose.acting() else 0.0
+
+
+def _larger(
+    measures: dict[str, float], reference: dict[str, float], finding: str
+) -> list[str]:
+    """What of forces and torques is left more than in the reference: what stands out
+    most, or what does beside sensors that disagree, which by themselves are no rival of
+    a force or torque.
+    """
+    days = dict(zip(HORIZONS, difference_of_days(), strict=True))
+    return [
+        n
+        for n in OF_MOTION
+        if n in measures
+        and n in reference
+        and (n == finding or np.log(measures[n] / reference[n]) > CLEARLY * days[n])
+    ]
 
 
 def unexplained_share(
