@@ -15,7 +15,12 @@ from openjax.learning import (
 )
 from openjax.learning.analytic_gradient import AnalyticGradient, free_flight
 from openjax.learning.first_flights import FirstFlights, first_game
-from openjax.learning.settings import AnalyticSettings, FirstFlightsSettings
+from openjax.learning.settings import (
+    AnalyticSettings,
+    FirstFlightsSettings,
+    WorstPlansSettings,
+)
+from openjax.learning.worst_plans import WorstPlans, planning_game
 
 SETTINGS = changed(
     TrainSettings(),
@@ -79,4 +84,19 @@ def test_stages_by_the_gradient_take_teams():
         return stage.loss(parameters.actor, parameters, starts, starts)
 
     total, _ = jax.eval_shape(last, jax.random.key(0))
+    assert total.shape == () and total.dtype == jnp.float32
+
+    planning = WorstPlansSettings(worlds=2, plans=5, pieces=2, unseen=1.0)
+    game = planning_game(free_flight(parts.environment))
+    against_plans = WorstPlans(planning, game, stage, SETTINGS.generator)
+
+    def at_the_worst_plan(key):
+        parameters = parts.policy.init(key, parts.environment.reset(key)[0])
+        state = against_plans.begin(parameters, key)
+        loss = against_plans.loss(
+            parameters.actor, parameters, state.world, state.plan
+        )
+        return loss[0]
+
+    total = jax.eval_shape(at_the_worst_plan, jax.random.key(0))
     assert total.shape == () and total.dtype == jnp.float32

@@ -241,8 +241,8 @@ def evaders() -> TrainSettings:
 
 def teams() -> TrainSettings:
     """One policy for teams of one to eight pursuers, in honest physics: sizes, the
-    evader's speed and the capture radius are drawn for each task; two, five and seven
-    pursuers are held out. Minutes on one large accelerator.
+    evader's speed, the capture radius and the arena's are drawn for each task; two,
+    five and seven pursuers are held out. Ten minutes on one large accelerator.
     """
     return changed(
         evaders(),
@@ -251,31 +251,38 @@ def teams() -> TrainSettings:
             team_sizes=(1, 3, 4, 6, 8),
             evader_speeds=(0.8, 2.0),
             capture_radii=(0.2, 0.4),
+            arena_radii=(0.7, 1.3),
             # whoever remains flies on as a smaller team, and two learn in no other way:
             # with three of ten, the time observed and no pay of later captures, two
             # caught .92 and the two left of three .95
             fall_outs=0.6,
-            track_unseen=False,
-            reward=dict(unseen=0.0),
             observe_game=True,
+            # where its bounds are, which differ from arena to arena
+            observe_arena=True,
+            observe_position=True,
             history_pursuers="pooled",
-            evaders=("field", "field", "greedy", "wall_runner", "slow_hugger"),
+            evaders=(
+                "field",
+                "greedy",
+                "wall_runner",
+                "slow_hugger",
+                *["learned"] * 6,
+            ),
             # every pursuer is the nominal vehicle, which shows in one frame how it
             # answers
             vehicles=(),
             rare_vehicles=0.0,
             observe_history=0,
         ),
-        analytic=dict(updates=0),
-        worst_plans=dict(worlds=0),
+        # each world has eight slots; the points of a team's plan know of no empty ones
+        analytic=dict(updates=100, look_every=25, worlds=128),
+        worst_plans=dict(worlds=256, team_plans=0),
         vehicles_start=0.0,
         vehicles_ramp=0.0,
-        validation_start=0.0,
         # eight slots are two and a half times the samples of three; somewhat more than
         # half are in use
         num_envs=3840,
-        # three and a half minutes on one H100 or H200; at 180 M captures still rise
-        total_steps=300_000_000,
+        total_steps=280_000_000,
     )
 
 

@@ -152,6 +152,9 @@ def hidden_share(game: PursuitSettings, state: PursuitState) -> Worlds:
             task.pillar_position,
             task.pillar_active,
         )
+        if state.active is not None:
+            # who is parked sees it past all pillars
+            room = jnp.where(state.active, room, -jnp.inf)
         return jax.nn.sigmoid(-jnp.max(room) / SMOOTH_SIGHT)
 
     return jax.vmap(one)(state)
