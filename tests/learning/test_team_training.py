@@ -93,9 +93,7 @@ def test_stages_by_the_gradient_take_teams():
     def at_the_worst_plan(key):
         parameters = parts.policy.init(key, parts.environment.reset(key)[0])
         state = against_plans.begin(parameters, key)
-        loss = against_plans.loss(
-            parameters.actor, parameters, state.world, state.plan
-        )
+        loss = against_plans.loss(parameters.actor, parameters, state.world, state.plan)
         return loss[0]
 
     total = jax.eval_shape(at_the_worst_plan, jax.random.key(0))
