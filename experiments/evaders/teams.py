@@ -3,7 +3,8 @@
 Each FILE is what `openjax map --speed_ratios 1.3 --radii 0.3 --scenario uniform --json
 FILE` wrote: one cell for each size of team, by the names of `KINDS`. The table shows
 what a policy catches, alone and with what is taken from it. `seed_2_sizes=FILE` and
-others like it are what single policies of other trainings catch.
+others like it are what single policies of other trainings catch; `judged=FILE` is what
+`openjax exploit` found of a policy. Names that the table doesn't know are kept.
 """
 
 from collections.abc import Mapping
@@ -69,7 +70,7 @@ def page(results: Mapping) -> Page:
             f"{row['size']}{' (held out)' if row['held_out'] else ''}"
         ),
         "one policy": "sizes.capture_rate:.3f",
-        "other seeds": "seeds",
+        "trained again, three seeds": "seeds",
         **{
             head: f"{kind}.capture_rate:.3f"
             for kind, head in KINDS.items()
