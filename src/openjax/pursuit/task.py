@@ -416,17 +416,27 @@ def line_up_pillars(settings: PursuitSettings, key: PRNGKeyArray, task: Task) ->
 
     The row's middle lies within 0.2 m of the axis along x and y, it is turned by up to
     45 degrees, and its pillars stand 0.2 m (touching) to 0.4 m apart. Those that would
-    come too close to a start or to the wall stay.
+    come too close to a start or to the wall stay. In a wider arena all but the touching
+    ones are farther apart, so that rows close it as often.
     """
+    scale = _arena_scale(settings, task)
     middle_key, angle_key, spacing_key = jax.random.split(key, 3)
-    middle = jax.random.uniform(middle_key, (2,), jnp.float32, -ROW_OFFSET, ROW_OFFSET)
+    middle = scale * jax.random.uniform(
+        middle_key, (2,), jnp.float32, -ROW_OFFSET, ROW_OFFSET
+    )
     angle = jax.random.uniform(angle_key, (), jnp.float32, -np.pi / 4, np.pi / 4)
-    spacing = jax.random.uniform(spacing_key, (), jnp.float32, *ROW_SPACING)
+    spacing = scale * jax.random.uniform(spacing_key, (), jnp.float32, *ROW_SPACING)
+    spacing = jnp.maximum(spacing, ROW_SPACING[0])
     # symmetric about the row's middle, whatever the number of pillars
     number = jnp.sum(task.pillar_active)
     along = (jnp.arange(task.pillar_active.shape[0]) - (number - 1) / 2) * spacing
     direction = jnp.stack([-jnp.sin(angle), jnp.cos(angle)])
     return _move_pillars(settings, task, middle + along[:, None] * direction)
+
+
+def _arena_scale(settings, task):
+    """The radius of a task's arena as a multiple of the paper's."""
+    return arena_of(settings, task).arena_radius / PursuitSettings.arena_radius
 
 
 def _move_pillars(settings, task, position):
@@ -436,8 +446,7 @@ def _move_pillars(settings, task, position):
     vehicles = jnp.concatenate([task.pursuer_position, task.evader_position[None]])[
         :, :2
     ]
-    radius = arena_of(settings, task).arena_radius
-    reach = PILLAR_REACH * (radius / PursuitSettings.arena_radius)
+    reach = PILLAR_REACH * _arena_scale(settings, task)
     inside = jnp.linalg.norm(position, axis=-1) < reach
     # each pillar by itself: a row may have gaps
     moves = (_clear_of(settings, position, vehicles) & inside & task.pillar_active)[
