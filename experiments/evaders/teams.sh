@@ -92,9 +92,9 @@ pillars() { # SIZE SIZE SECONDS
 empty 7 8 380
 empty 5 6 330
 empty 3 4 280
-tables team "$policy" 80
+tables team "$policy" 60
 empty 1 2 200
-job exploit_3 330 "$(exploit 3 480000000 100)"
+job exploit_3 230 "$(exploit 3 480000000 100)"
 for seed in ${SEEDS:-}; do
   tables "$(basename "$seed" .npz)" "$seed" 40
 done
@@ -105,15 +105,15 @@ pillars 3 4 180
 pillars 7 8 220
 pillars 5 6 200
 pillars 1 2 150
-job two 90 -m experiments.evaders.strangers --only two --out "$K/two" --egos "$policy" "$two"
+job two 60 -m experiments.evaders.strangers --only two --out "$K/two" --egos "$policy" "$two"
 job three 50 "$(map three evaders 1000 3)" $cell $uniform $scripted
 job three_cells 60 "$(map three_cells evaders 200 3)" $uniform $scripted
 for radius in 0.7 1.2 1.5; do
   job "arena_$radius" 60 "$(map "arena_$radius" "$policy" 400 1 2 3 4 5 6 7 8)" $cell $uniform \
     $scripted --arena_radius "$radius"
 done
-job exploit_5 250 "$(exploit 5 250000000 1)"
-job exploit_2 220 "$(exploit 2 300000000 1)"
+job exploit_5 180 "$(exploit 5 250000000 1)"
+job exploit_2 150 "$(exploit 2 300000000 1)"
 job sight 110 "$(map sight "$policy" 200 1 2 3 4 5 6 7 8)" $thin $scripted \
   --sight_angle 90 --sight_range 1
 job silence 110 "$(map silence "$policy" 200 2 3 4)" $thin $scripted $messages --batch 2048
