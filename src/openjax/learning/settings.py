@@ -451,6 +451,11 @@ class TrainSettings:
             "predictor: frames of each pursuer are for teams of one size; "
             "environment.history_pursuers pooled would be right",
         )
+        yield (
+            not sizes or not self.worst_plans.team_plans,
+            f"worst_plans.team_plans {self.worst_plans.team_plans} are for teams of one size; 0 "
+            "would be right",
+        )
 
     def _demands_of_evaders(self):
         """Evaders that learn decide evenly within a rollout, and one of them is no

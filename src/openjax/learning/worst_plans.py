@@ -46,6 +46,7 @@ from openjax.learning.team_search import STEP, TeamPlan, TeamSearch, no_plan
 from openjax.policy import PolicyParameters
 from openjax.pursuit import Pursuit, PursuitSettings, PursuitState
 from openjax.pursuit.shapes import Scalar
+from openjax.pursuit.task import evader_speed
 from openjax.vehicle.family import partly_nominal
 from openjax.vehicle.vectors import unit
 
@@ -289,26 +290,29 @@ class WorstPlans:
         def pick(leaf):
             return jax.vmap(lambda values, places: values[places])(leaf, most)
 
-        velocities = self._velocities(pick(trials.plans))
+        task = world[1].task
+        velocities = self._velocities(task, pick(trials.plans))
         keys = jax.random.split(key, plan.shape[0])
         best, promise = jax.vmap(team.search)(
             world[1], paths, velocities, team_plan, keys
         )
         gain = jnp.max(pick(worth), axis=1) - promise
-        way = jax.vmap(team.way)(world[1], paths, best, self._velocities(plan))
+        way = jax.vmap(team.way)(world[1], paths, best, self._velocities(task, plan))
         ends_of_pieces = (
             np.arange(1, self.planning.pieces + 1) * team.steps // self.planning.pieces
         )
         places = way[:, ends_of_pieces - 1]
         return best, Example(places, jnp.clip((gain - MARGIN) / CLEAR, 0.0, 1.0))
 
-    def _velocities(self, plans):
-        """(..., steps, 3) m/s at the points' steps of plans (..., pieces, 3); who flies
-        by its own rule is taken to stay.
+    def _velocities(self, task, plans):
+        """(B, ..., steps, 3) m/s at the points' steps of plans (B, ..., pieces, 3) of
+        the evaders of tasks (B, ...); who flies by its own rule is taken to stay.
         """
         pieces = self.planning.pieces
         piece = np.arange(self.team.steps) * pieces // self.team.steps
-        return self.game.evader_speed * jnp.nan_to_num(plans[..., piece, :])
+        shares = jnp.nan_to_num(plans[..., piece, :])
+        speed = jnp.asarray(evader_speed(self.game, task))
+        return speed.reshape(-1, *[1] * (shares.ndim - 1)) * shares
 
     def promise(
         self, start: PursuitState, end: PursuitState
