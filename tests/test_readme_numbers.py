@@ -138,7 +138,7 @@ def test_diagnosis():
     """The last exam's engine, without a reference, on the cases that it answered
     once.
     """
-    first = read("exam_reference")["sealed_2304"]["figures"]["alone"]["first"]
+    first = read("exam_reference")["sealed_2306"]["figures"]["alone"]["first"]
     label = (
         "diagnosis of 62 simulated cases with one cause: the first cause named is right"
     )
