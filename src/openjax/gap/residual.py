@@ -20,7 +20,10 @@ from openjax.flights.shapes import Chosen
 from openjax.flights.track import Track, specific_force_of, to_body
 from openjax.gap.decision import DECISION
 from openjax.gap.evidence import Evidence
+from openjax.gap.identification.corrections import CLEAR
+from openjax.gap.model.bounds import BOUND
 from openjax.gap.model.hypotheses import SetFit, without_nuisances
+from openjax.gap.model.nuisances import SIZE
 from openjax.gap.model.replay import FORCE, RATES, SKIP, VELOCITY
 from openjax.gap.shapes import Rows
 
@@ -35,15 +38,9 @@ HORIZONS = {
 # Share of what grew that effects leave where they aren't what acts: those named beside
 # an unknown cause left .71 to 1, those that act .54 at most (seeds 890 to 893).
 MOSTLY = 0.65
-# Standard deviations between days from which forces or torques that are left take names
-# away where sensors disagree more.
-CLEARLY = 3.0
 # Of HORIZONS what forces and torques leave, and so what another vehicle's gusts shake;
 # where there are any, rows under it don't count.
 OF_MOTION = ("velocity", "rates")
-# s by which poses of case and reference may have been moved apart: what is late also
-# jitters, which no shift takes away.
-SHIFT = 0.005
 CALIBRATION = Path(__file__).with_name("residual.json")
 
 
@@ -236,7 +233,8 @@ def _comparable(evidence: Evidence) -> dict[str, float]:
     silent = OF_MOTION if evidence.charge_unknown else ()
     channels = {c.path: c for c in evidence.channels}
     shifts = [_shift(c.get("estimator")) for c in (channels, baseline.channels)]
-    if abs(shifts[0] - shifts[1]) > SHIFT:
+    # What is late also jitters, which no shift takes away.
+    if abs(shifts[0] - shifts[1]) > BOUND * SIZE["pose_clock"]:
         silent += ("estimator", "position", "accelerometer")
     return {n: v for n, v in baseline.measures.items() if n not in silent}
 
@@ -259,7 +257,7 @@ def _larger(
         for n in OF_MOTION
         if n in measures
         and n in reference
-        and (n == finding or np.log(measures[n] / reference[n]) > CLEARLY * days[n])
+        and (n == finding or np.log(measures[n] / reference[n]) > CLEAR * days[n])
     ]
 
 

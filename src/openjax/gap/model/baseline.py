@@ -25,9 +25,6 @@ FORM = tuple(e for e in PHYSICS_EFFECTS if CARDS[e].days is not None)
 # it differently. With .5 thirty numbers of five development cases in which nothing acts
 # lay 1.4 standard deviations from their reference, rms.
 FORM_DAYS = 0.75
-# Data that a nat is worth less than by white residuals: the median share of their
-# variance that is white was .38 over 650 pairs of sets.
-COLOURED = 2.6
 
 
 @dataclass(frozen=True, eq=False)
