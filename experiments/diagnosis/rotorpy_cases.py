@@ -30,6 +30,7 @@ from experiments.flying.single_thread import use_single_thread
 
 PATHS = ("circle", "eight", "rocking", "yawing")
 SETS = {"causes": KINDS, "corrections": CORRECTIONS}
+EVERY = KINDS | CORRECTIONS
 LEAST = 4.0 / SAMPLE + 1  # samples that a flight must last
 
 
@@ -37,7 +38,7 @@ def make_case(job):
     """Fly and write one case; returns its answer."""
     seed, number, kind, folder = job
     rng = np.random.default_rng(np.random.SeedSequence([17, seed, number]))
-    draw, effects, _, exposing = (KINDS | CORRECTIONS)[kind]
+    draw, effects, _, exposing = EVERY[kind]
     told = BEFORE.get(kind) or v.draw_told(rng)
     if "mass" in effects:  # a vehicle whose mass is the cause wasn't weighed
         told = replace(told, weighed=False)
@@ -112,7 +113,7 @@ def floor_of(told, drawn, joined, flights):
 
 def answer(name, kind, told, drawn, joined, flights, said):
     """The answer of one case; `said`: magnitudes of each effect."""
-    _, effects, form, _ = (KINDS | CORRECTIONS)[kind]
+    _, effects, form, _ = EVERY[kind]
     seen, floor = floor_of(told, drawn, joined, flights)
     known = np.isfinite(floor)
     severity = float(np.sqrt(np.where(known, seen / floor**2, 0.0).max()))

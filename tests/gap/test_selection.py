@@ -135,7 +135,7 @@ def of_one_effect(effect, values, covariance):
         effects=(effect,),
         theta=theta,
         index=index,
-        covariance=covariance,
+        hessian=np.linalg.inv(covariance),
         grams=np.zeros((1, 1 + len(index), 1)),
         replay=SimpleNamespace(absent=ABSENT, size_factors=np.ones(len(ABSENT))),
     )

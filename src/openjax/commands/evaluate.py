@@ -148,10 +148,8 @@ def prepare(command: EvaluateCommand, arguments: Sequence[str]) -> list[tuple]:
     check_output(command.json, "--json")
     policies = []
     for policy in command.start(command.environment):
-        game = policy.settings.environment
-        if game.team_sizes:
-            # so that any number of pursuers may be typed
-            game = game.of_one_team(LAYOUT_PURSUERS)
+        # of one team, so that any number of pursuers may be typed
+        game = policy.of_team(LAYOUT_PURSUERS).settings.environment
         default = dataclasses.replace(EvaluateCommand(), environment=game)
         options = parse(EvaluateCommand, default, arguments, PROGRAM)
         _game(options, policy)

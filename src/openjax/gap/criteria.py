@@ -107,7 +107,6 @@ def too_small(fit: SetFit, torque_response: Measured) -> tuple[str, ...]:
     by the `torque_response` that was measured: {(effect, parameter): (value,
     deviation)}. What a card wants confirmed by the latter must be.
     """
-    information = np.linalg.inv(fit.covariance)
 
     def of_replay(effect: str) -> bool:
         card = CARDS[effect]
@@ -116,7 +115,7 @@ def too_small(fit: SetFit, torque_response: Measured) -> tuple[str, ...]:
         shape = [PLACE[effect, parameter] for parameter in card.shape]
         free = np.flatnonzero(~np.isin(fit.index, shape))
         covariance = of_flights(
-            np.linalg.inv(information[np.ix_(free, free)]),
+            np.linalg.inv(fit.hessian[np.ix_(free, free)]),
             fit.grams[:, 1:, 0][:, free],
         )
         place = {i: k for k, i in enumerate(fit.index[free].tolist())}
@@ -191,7 +190,12 @@ def departs(
 
 def possible(fit: SetFit) -> bool:
     """Whether all fitted parameters lie within physical bounds."""
-    return all(within_bounds(fit, e) for e in fit.effects)
+    return not beyond_bounds(fit)
+
+
+def beyond_bounds(fit: SetFit) -> frozenset[str]:
+    """The effects of a set whose fitted parameters leave their physical bounds."""
+    return frozenset(e for e in fit.effects if not within_bounds(fit, e))
 
 
 def within_bounds(fit: SetFit, effect: str) -> bool:

@@ -180,7 +180,6 @@ def _another_day(
         for n, s in zip(fit.replay.nuisance_names, fit.replay.is_shared, strict=True)
         if s
     ]
-
     names = [" ".join(THETA[i]) for i in fit.index]
     transfers = [n.split(" ")[0] in effects for n in names]
     transfers += [

@@ -23,13 +23,13 @@ from jaxtyping import Float
 from openjax.gap.criteria import (
     DETECTABLE,
     Gaps,
+    beyond_bounds,
     difference,
     growth,
     log_odds,
     possible,
     practical,
     too_small,
-    within_bounds,
     worse,
 )
 from openjax.gap.evidence import Evidence
@@ -191,8 +191,7 @@ class Search:
         """Effects that leave their physical bounds in the visited set of the largest
         score.
         """
-        best = max(self.hypotheses.values(), key=lambda h: h.score).fit
-        return frozenset(e for e in best.effects if not within_bounds(best, e))
+        return beyond_bounds(max(self.hypotheses.values(), key=lambda h: h.score).fit)
 
     def enumerate(
         self, near: Hypothesis, most: int, without: frozenset = NOTHING
@@ -235,15 +234,11 @@ class Search:
         torque_response = self.evidence.torque_response
         best = sorted(self.hypotheses.values(), key=lambda h: -h.score)[:FITTED_AGAIN]
         for hypothesis in best:
-            while True:
-                fit = hypothesis.fit
-                small = too_small(fit, torque_response(hypothesis.effects))
-                dropouts = {e for e in fit.effects if not within_bounds(fit, e)} | set(
-                    small
-                )
-                if not dropouts:
-                    break
-                hypothesis = self.of_set(set(hypothesis.effects) - dropouts, fit)
+            while dropouts := beyond_bounds(hypothesis.fit).union(
+                too_small(hypothesis.fit, torque_response(hypothesis.effects))
+            ):
+                left = set(hypothesis.effects) - dropouts
+                hypothesis = self.of_set(left, hypothesis.fit)
 
     def torque_support(self, key: frozenset) -> float:
         """Nats by which the torques' response speaks for a set with each effect as it

@@ -263,8 +263,8 @@ def teams() -> TrainSettings:
             num_pursuers=8,
             team_sizes=(1, 3, 4, 6, 8),
             # wider than what can be caught: at 1.3 m/s and .3 m a planner got away in
-            # .46 of the uniform tasks from who trained in these, in .68 from who did in
-            # .8 to 2 m/s and .2 to .4 m (one training each)
+            # .46 of the uniform tasks from one who trained in these, in .68 from a pair
+            # that did in .8 to 2 m/s and .2 to .4 m
             evader_speeds=(0.8, 3.0),
             capture_radii=(0.1, 0.5),
             arena_radii=(0.7, 1.3),

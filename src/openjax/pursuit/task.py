@@ -184,10 +184,13 @@ def uniform_task(settings: PursuitSettings, key: PRNGKeyArray) -> Task:
     """
     n = settings.num_pursuers
     position_key, evader_key, number_key, cell_key = jax.random.split(key, 4)
-    arena_radius = _between(settings.arena_radii, key, 7)
-    # in the paper's arena one
-    scale = settings.arena_radius if arena_radius is None else arena_radius
-    scale = scale / PursuitSettings.arena_radius
+    task = empty_task(settings).replace(
+        active=draw_team(settings, key),
+        evader_speed=_between(settings.evader_speeds, key, 5),
+        capture_radius=_between(settings.capture_radii, key, 6),
+        arena_radius=_between(settings.arena_radii, key, 7),
+    )
+    scale = _arena_scale(settings, task)
     wide = jnp.stack([scale, scale, 1.0]).astype(jnp.float32)
     middle = settings.arena_height / 2
     low = wide * jnp.array([START_X[0], -START_Y, middle - START_Z], jnp.float32)
@@ -197,34 +200,26 @@ def uniform_task(settings: PursuitSettings, key: PRNGKeyArray) -> Task:
     # all candidates at once and the first good one: a loop that draws until one is good
     # would have no fixed length
     candidates = jax.random.uniform(position_key, (draws, n, 3), jnp.float32, low, high)
-    active = draw_team(settings, key)
     is_apart = jax.vmap(
-        lambda p: jnp.all(drone_distance(park(p, active)) >= settings.drone_clearance)
+        lambda p: jnp.all(
+            drone_distance(park(p, task.active)) >= settings.drone_clearance
+        )
     )(candidates)
     # where none is good, `argmax` gives the first: such a task starts in a breach
-    pursuers = park(candidates[jnp.argmax(is_apart)], active)
+    task = task.with_starts(candidates[jnp.argmax(is_apart)])
     mirror = jnp.array([-1.0, 1.0, 1.0], jnp.float32)
     evader = jax.random.uniform(evader_key, (3,), jnp.float32, low, high) * mirror
-
-    task = Task(
-        pursuer_position=pursuers,
-        evader_position=evader,
-        pillar_position=jnp.zeros((settings.max_pillars, 2), jnp.float32),
-        pillar_active=jnp.zeros(settings.max_pillars, bool),
-        active=active,
-        evader_speed=_between(settings.evader_speeds, key, 5),
-        capture_radius=_between(settings.capture_radii, key, 6),
-        arena_radius=arena_radius,
-    )
-    return _with_pillars(settings, task, scale, number_key, cell_key)
+    task = task.replace(evader_position=evader)
+    return _with_pillars(settings, task, number_key, cell_key)
 
 
-def _with_pillars(settings, task, scale, number_key, cell_key):
+def _with_pillars(settings, task, number_key, cell_key):
     """The task with pillars on cells of the grid, as much wider as the arena, that are
     free of vehicles.
     """
     starts = jnp.concatenate([task.pursuer_position, task.evader_position[None]])
     vehicles = starts[:, :2]
+    scale = _arena_scale(settings, task)
     cells = scale * jnp.asarray(pillar_cells(), jnp.float32)
     holds_vehicle = jnp.all(
         jnp.abs(cells[:, None] - vehicles[None]) <= scale * PILLAR_GRID / 2, axis=-1
