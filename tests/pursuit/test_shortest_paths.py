@@ -70,6 +70,18 @@ def test_who_is_too_near_a_pillar_leaves_it():
     assert length(task, [[0.12, 0.01, 0.5]], [-0.6, 0.0, 0.5])[0] < TOLL
 
 
+def test_in_a_larger_arena_of_its_own_a_task_has_ways_round_pillars_farther_out():
+    game = PursuitSettings(min_pillars=1, arena_radii=(1.3, 1.3))
+    task = jax.jit(functools.partial(uniform_task, game))(jax.random.key(0))
+    task = task.replace(
+        pillar_position=jnp.zeros_like(task.pillar_position).at[0].set([1.0, 0.0]),
+        pillar_active=jnp.arange(5) < 1,
+    )
+    paths = jax.jit(functools.partial(shortest_paths, game))(task)
+    ends = jnp.array([[1.0, 0.25, 0.5], [1.0, -0.25, 0.5]])
+    assert path_length(game, task, paths, ends[:1], ends[1])[0] < 1.0
+
+
 def on_a_grid(task, source):
     """The lengths (m) of ways from a place to all cells; a step leads to any cell at
     most three away in x and y.

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from openjax.pursuit.settings import PursuitSettings
 from openjax.pursuit.shapes import Each, Scalar, Team, Vector
-from openjax.pursuit.task import Task, capture_radius, evader_speed
+from openjax.pursuit.task import Task, arena_of, capture_radius, evader_speed
 
 CORNERS = 6
 """Of the polygon about each pillar."""
@@ -48,6 +48,7 @@ class ShortestPaths:
 
 def shortest_paths(settings: PursuitSettings, task: Task) -> ShortestPaths:
     """All corners and the shortest paths between them."""
+    settings = arena_of(settings, task)
     reach = _reach(settings)
     angle = 2.0 * np.pi * np.arange(CORNERS) / CORNERS
     # so far out that the edges between corners touch the circle, and a thousandth
@@ -127,7 +128,7 @@ def evader_territory(
 
     Empty slots' pursuers are parked too far to count.
     """
-    points = arena_points(settings)
+    points = arena_points(arena_of(settings, task))
     place = position[:, None, :2]
     # whoever of the team is sooner at a corner is sooner wherever the path leads from
     # there
