@@ -22,7 +22,7 @@ from openjax.learning.adaptation import (
     off_the_flight,
     starting_parameters,
 )
-from openjax.learning.fine_tuning import clearly_better, fine_tune
+from openjax.learning.fine_tuning import Look, fine_tune, improves
 from openjax.learning.settings import GeneratorSettings, MappoSettings
 from openjax.policy import NetworkSettings, PolicyParameters, PredictorSettings
 from openjax.pursuit import PursuitSettings
@@ -97,10 +97,16 @@ def test_the_game_is_as_vehicles_fly_whatever_the_policy_knew():
 def test_only_what_is_clearly_better_is_kept():
     rng = np.random.default_rng(0)
     before = rng.normal(0.9, 0.3, 1000)  # episodes differ far more than policies do
-    assert clearly_better(before, before + rng.normal(0.02, 0.1, 1000))
-    assert not clearly_better(before, before + rng.normal(0.0, 0.1, 1000))
-    assert not clearly_better(before, before - 0.02)
-    assert not clearly_better(before, before)
+    steps = rng.normal(200.0, 50.0, 1000)
+    first = Look(before, steps)
+    assert improves(first, Look(before + rng.normal(0.02, 0.1, 1000), steps))
+    assert not improves(first, Look(before + rng.normal(0.0, 0.1, 1000), steps))
+    assert not improves(first, Look(before - 0.02, steps))
+    assert not improves(first, first)
+    # sooner counts where nothing else gets worse
+    sooner = steps - rng.normal(10.0, 50.0, 1000)
+    assert improves(first, Look(before, sooner))
+    assert not improves(first, Look(before - 0.001, sooner))
 
 
 def test_the_best_step_on_the_way_is_kept():
@@ -116,14 +122,18 @@ def test_the_best_step_on_the_way_is_kept():
     )
 
     def worth(parameters):
-        return np.full(4, -((float(parameters.actor[0]) - 3.0) ** 2))
+        score = -((float(parameters.actor[0]) - 3.0) ** 2)
+        return Look(np.full(4, score), np.zeros(4))
+
+    def worse_later(parameters):
+        return Look(-parameters.actor, np.zeros(1))
 
     key = jax.random.key(0)
     tuned = fine_tune(adaptation, policy, np.zeros((1, 4)), key, worth)
     assert (
         tuned.update == 3 and tuned.parameters.actor[0] == 3.0 and len(tuned.looks) == 7
     )
-    worse = fine_tune(adaptation, policy, np.zeros((1, 4)), key, lambda p: -p.actor[:1])
+    worse = fine_tune(adaptation, policy, np.zeros((1, 4)), key, worse_later)
     assert worse.update == 0 and worse.parameters.actor[0] == 0.0
 
 

@@ -180,22 +180,20 @@ class Tuner:
         return episode_figures(flown.statistics)
 
     def tuned(self, bounds):
-        """The policy fine-tuned to vehicles of the bounds, as `openjax adapt` does, and
-        after which update it was kept.
-        """
+        """The policy fine-tuned to vehicles of the bounds, as `openjax adapt` does."""
         from openjax.evaluation.validation import selection_score
-        from openjax.learning.fine_tuning import fine_tune
+        from openjax.learning.fine_tuning import Look, fine_tune
 
         usual = self.fly(self.before, self.nominal, 0)
 
-        def scores(parameters):
+        def look(parameters):
             flown = self.fly(parameters, bounds, 0)
             fastest = np.maximum(flown["over_speed_rate"], usual["over_speed_rate"])
             flown["over_speed_rate"] = fastest
-            return selection_score(flown, self.adaptation.game.episode_length)
+            scores = selection_score(flown, self.adaptation.game.episode_length)
+            return Look(scores, flown["capture_step"])
 
-        found = fine_tune(self.adaptation, self.before, bounds, self.key, scores)
-        return found.parameters, found.update
+        return fine_tune(self.adaptation, self.before, bounds, self.key, look)
 
 
 def bounds_in(folder: Path, name: str):
@@ -232,10 +230,12 @@ def adapted(tuner: Tuner, folder: Path) -> dict:
         "nominal": tuner.fly(tuner.before, tuner.nominal, 2),
         "before": tuner.fly(tuner.before, true, 2),
     }
-    out["kept"] = {}
+    out |= {"kept": {}, "looks": {}}
     for name in TUNED if out["loses"] else ():
-        parameters, out["kept"][name] = tuner.tuned(bounds_in(folder, name))
-        flown[name] = tuner.fly(parameters, true, 2)
+        tuned = tuner.tuned(bounds_in(folder, name))
+        out["kept"][name] = tuned.update
+        out["looks"][name] = tuned.looks
+        flown[name] = tuner.fly(tuned.parameters, true, 2)
     out["means"] = {
         w: {n: float(np.mean(f[n])) for n in LOSSES} for w, f in flown.items()
     }

@@ -16,6 +16,16 @@ from openjax.policy import PolicyParameters
 
 
 @dataclass(frozen=True)
+class Look:
+    """A policy's episodes, of the same tasks and vehicles each time."""
+
+    scores: Float[np.ndarray, " episodes"]
+    """What is to be large."""
+    steps: Float[np.ndarray, " episodes"]
+    """Control steps to the capture."""
+
+
+@dataclass(frozen=True)
 class Tuned:
     """What fine-tuning led to."""
 
@@ -34,14 +44,13 @@ def fine_tune(
     parameters: PolicyParameters,
     bounds: Float[Array, "ranges 4"],
     key: PRNGKeyArray,
-    score: Callable[[PolicyParameters], np.ndarray],
+    look: Callable[[PolicyParameters], Look],
 ) -> Tuned:
     """Train `parameters` (from `starting_parameters`) on vehicles within `bounds` (R,
     4), and keep the best on the way.
 
-    `score` gives the scores of episodes (B,), of the same tasks and vehicles each time;
-    what isn't clearly better than the first parameters, by the differences of single
-    episodes, isn't kept.
+    `look` flies a policy; what doesn't improve on the first parameters, by the
+    differences of single episodes, isn't kept.
     """
     settings = adaptation.settings
     bounds = jnp.asarray(bounds)
@@ -49,21 +58,21 @@ def fine_tune(
     flights = adaptation.fly(parameters, fly_key, bounds)
     actor = TrainState(parameters.actor, adaptation.optimiser.init(parameters.actor))
     history = []
-    first = np.asarray(score(parameters))
+    first = look(parameters)
     best = parameters
     best_update = 0
-    looks = {0: float(first.mean())}
+    looks = {0: float(first.scores.mean())}
     for update in range(1, settings.updates + 1):
         step_key = jax.random.fold_in(update_key, update)
         actor, metrics = adaptation.update(actor, parameters, flights, step_key, bounds)
         history.append(metrics)
         if update % settings.look_every == 0 or update == settings.updates:
             candidate = parameters.replace(actor=actor.parameters)
-            scores = np.asarray(score(candidate))
-            looks[update] = float(scores.mean())
+            ahead = look(candidate)
+            looks[update] = float(ahead.scores.mean())
             # better than the best so far by the mean, and than the first ones beyond
             # doubt: each look is another chance to be lucky
-            if looks[update] > looks[best_update] and clearly_better(first, scores):
+            if looks[update] > looks[best_update] and improves(first, ahead):
                 best = candidate
                 best_update = update
     # fetched at the end: to wait for every update's numbers would leave the device idle
@@ -72,6 +81,18 @@ def fine_tune(
         for row in jax.device_get(history)
     ]
     return Tuned(best, best_update, history, looks)
+
+
+def improves(first: Look, ahead: Look) -> bool:
+    """Whether a policy is clearly better, or clearly sooner and no worse.
+
+    In scores a crash is worth thousands of steps, and is rare: where a vehicle costs
+    time alone, a thousand episodes' scores don't tell what is won from chance.
+    """
+    if clearly_better(first.scores, ahead.scores):
+        return True
+    no_worse = ahead.scores.mean() >= first.scores.mean()
+    return bool(no_worse) and clearly_better(-first.steps, -ahead.steps)
 
 
 def clearly_better(

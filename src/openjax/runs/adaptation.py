@@ -25,7 +25,7 @@ from openjax.files import write_json, write_text
 from openjax.flights.case import load_case
 from openjax.interruption import clean_up
 from openjax.learning.adaptation import bounds_of, make_adaptation, starting_parameters
-from openjax.learning.fine_tuning import fine_tune
+from openjax.learning.fine_tuning import Look, fine_tune
 from openjax.learning.train_state import TrainState
 from openjax.runs.adapt_report import FIGURES, WHICH, page
 from openjax.runs.machine import describe_machine
@@ -145,15 +145,16 @@ class _Programs:
         # the same draws for all that is compared, here and in each look
         usual = self._fly(self._parameters, self._chosen_by, 1, self._nominal)
 
-        def scores(policy):
+        def look(policy):
             episodes = self._fly(policy, self._chosen_by, 1, vehicle.bounds)
             episodes["over_speed_rate"] = np.maximum(
                 episodes["over_speed_rate"], usual["over_speed_rate"]
             )
-            return selection_score(episodes, self.game.episode_length)
+            scores = selection_score(episodes, self.game.episode_length)
+            return Look(scores, episodes["capture_step"])
 
         return fine_tune(
-            self.adaptation, self._parameters, vehicle.bounds, self._key, scores
+            self.adaptation, self._parameters, vehicle.bounds, self._key, look
         )
 
     def measure(self, vehicle: _Diagnosed, tuned_parameters) -> dict[str, dict]:
