@@ -27,17 +27,18 @@ PORT = 20250
 """Of the first vehicle, by default; none that a virtual Crazyflie has by itself."""
 LONGEST = 240.0
 """Seconds after which a flight that doesn't end is ended."""
+OPENJAX = [sys.executable, "-m", "openjax"]
 ASKED = "asked to land"
 """A vehicle's reason to come down where nothing went wrong."""
 
 
-def layout(game: PursuitSettings, seed: int) -> str:
-    """A uniform task of a game as a layout's TOML."""
+def layout(game: PursuitSettings, seed: int, places: slice = slice(None)) -> str:
+    """A uniform task of a game as a layout's TOML, with some of its pursuers."""
     task = uniform_task(game, jax.random.key(seed))
     pillars = np.asarray(task.pillar_position)[np.asarray(task.pillar_active)]
     entries = {
         "pillars": pillars[:, :2],
-        "pursuers": np.asarray(task.pursuer_position),
+        "pursuers": np.asarray(task.pursuer_position)[places],
         "evader": np.asarray(task.evader_position),
     }
     lines = (
@@ -52,31 +53,47 @@ def fly(size: int, options: argparse.Namespace, folder: Path) -> dict:
     game = load_policy(options.policy).settings.environment.of_one_team(size)
     starts = folder / f"team_{size}.toml"
     starts.write_text(layout(game, options.seed))
-    python = [sys.executable, "-m", "openjax"]
-    link = ["--loss", str(options.loss), "--pose_loss", str(options.pose_loss)]
-    place = ["--scenario", str(starts)]
-    command = ["virtual_crazyflie", "--number", str(size), "--port", str(options.port)]
-    virtual = subprocess.Popen(
-        [*python, *command, *place, *link], stdout=subprocess.PIPE, text=True
-    )
+    virtual = []
     try:
-        # its first line says that it listens; before that there is nobody to fly
-        said = virtual.stdout.readline()
-        if "listening" not in said:
-            raise RuntimeError(f"virtual_crazyflie: {said.strip()}")
+        for first in range(0, size, options.together):
+            places = slice(first, min(first + options.together, size))
+            own = folder / f"team_{size}_from_{first}.toml"
+            own.write_text(layout(game, options.seed, places))
+            virtual.append(listening(places, own, options))
         out = folder / f"flight_{size}"
         uris = [f"udp://127.0.0.1:{options.port + i}" for i in range(size)]
-        command = ["fly", "--policy", options.policy, *place, "--out", str(out)]
-        command += ["--episodes", str(options.episodes), "--uri", *uris]
+        command = ["fly", "--policy", options.policy, "--scenario", str(starts)]
+        command += ["--out", str(out), "--episodes", str(options.episodes)]
         flown = subprocess.run(
-            [*python, *command], capture_output=True, text=True, timeout=LONGEST
+            [*OPENJAX, *command, "--uri", *uris],
+            capture_output=True,
+            text=True,
+            timeout=LONGEST,
         )
     finally:
-        virtual.send_signal(signal.SIGINT)
-        virtual.wait()
+        for process in virtual:
+            process.send_signal(signal.SIGINT)
+        for process in virtual:
+            process.wait()
     if not (out / "flight.json").is_file():
         raise RuntimeError((flown.stdout + flown.stderr).strip())
     return {"pursuers": size, "status": flown.returncode, **summary(out)}
+
+
+def listening(
+    places: slice, starts: Path, options: argparse.Namespace
+) -> subprocess.Popen:
+    """A process of the vehicles at these places of a team, once it listens."""
+    command = ["virtual_crazyflie", "--number", str(places.stop - places.start)]
+    command += ["--port", str(options.port + places.start), "--scenario", str(starts)]
+    command += ["--loss", str(options.loss), "--pose_loss", str(options.pose_loss)]
+    process = subprocess.Popen([*OPENJAX, *command], stdout=subprocess.PIPE, text=True)
+    # its first line says that it listens; before that there is nobody to fly
+    said = process.stdout.readline()
+    if "listening" not in said:
+        process.wait()
+        raise RuntimeError(f"virtual_crazyflie: {said.strip()}")
+    return process
 
 
 def summary(out: Path) -> dict:
@@ -115,6 +132,12 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="draws starts and pillars")
     parser.add_argument(
         "--port", type=int, default=PORT, help="others, to fly beside another of these"
+    )
+    parser.add_argument(
+        "--together",
+        type=int,
+        default=8,
+        help="vehicles that a process simulates: each packet advances all of them",
     )
     parser.add_argument("--json", type=Path, required=True)
     options = parser.parse_args()
