@@ -72,9 +72,10 @@ def captures(number=64, wish=None, **changes):
 
 def test_the_bound_of_the_papers_arena():
     assert stack_bound(PursuitSettings()) == pytest.approx(0.9 / (0.9 - 0.05**0.5))
-    assert (
-        stack_bound(PursuitSettings(num_pursuers=2)) == 0.0
-    )  # a height of .3 m isn't covered by .3 m
+    # who is midway between two heights is at the radius, and not nearer
+    for number, radius in ((2, 0.3), (6, 0.1)):
+        settings = PursuitSettings(num_pursuers=number, capture_radius=radius)
+        assert stack_bound(settings) == planar_bound(settings) == 0.0
 
 
 def test_points_capture_more_than_on_one_ray():
@@ -94,7 +95,6 @@ def test_points_capture_more_than_on_one_ray():
         half = settings.arena_height / (2 * settings.num_pursuers)
         reach = (settings.capture_radius**2 - half**2) ** 0.5 / settings.arena_radius
         assert distance.min() == pytest.approx(reach, abs=1e-6)
-    assert planar_bound(PursuitSettings(num_pursuers=2)) == 0.0
 
 
 @pytest.mark.slow

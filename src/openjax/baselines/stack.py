@@ -35,11 +35,21 @@ def stack_bound(settings: PursuitSettings) -> float:
     """The ratio of speeds v_e / v_p below which stack forces a capture; 0 where a
     pursuer's height isn't covered.
     """
-    half = settings.arena_height / (2 * settings.num_pursuers)
-    if half >= settings.capture_radius:
+    across = column_reach(settings)
+    if not across:
         return 0.0
-    across = (settings.capture_radius**2 - half**2) ** 0.5
     return settings.arena_radius / max(settings.arena_radius - across, 1e-9)
+
+
+def column_reach(settings: PursuitSettings) -> float:
+    """How far across (m) points capture that fly one above another and cover the whole
+    height; 0 where they don't.
+    """
+    half = settings.arena_height / (2 * settings.num_pursuers)
+    square = settings.capture_radius**2 - half**2
+    # six of .1 m cover 1.2 m, but for an evader midway between two, which is at the
+    # radius itself; a rounding error isn't a reach
+    return square**0.5 if square > 1e-9 else 0.0
 
 
 def planar_bound(settings: PursuitSettings) -> float:
@@ -57,10 +67,9 @@ def planar_bound(settings: PursuitSettings) -> float:
     It isn't proved that neither side does better; the game of both points solved on
     grids says the same within their errors (`experiments.evaders.planar`).
     """
-    half = settings.arena_height / (2 * settings.num_pursuers)
-    if half >= settings.capture_radius:
+    reach = column_reach(settings) / settings.arena_radius
+    if not reach:
         return 0.0
-    reach = (settings.capture_radius**2 - half**2) ** 0.5 / settings.arena_radius
     low = 1.0
     high = LARGEST
     while high - low > 1e-9:
