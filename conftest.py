@@ -112,6 +112,26 @@ command = "thrust"
 
 
 @pytest.fixture(scope="session")
+def ruled_reports():
+    """From here on every report that this process makes is held against the rules of
+    reports.
+    """
+    from openjax.gap import diagnosis
+    from openjax.gap.report.rules import broken_rules
+
+    conclude = diagnosis.conclude
+
+    def ruled(evidence):
+        report = conclude(evidence)
+        assert broken_rules(report) == []
+        return report
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(diagnosis, "conclude", ruled)
+        yield
+
+
+@pytest.fixture(scope="session")
 def sample_columns():
     """Columns of three sample flights of the nominal vehicle: {"flight_a": {"t": ...,
     ...}, ...}.

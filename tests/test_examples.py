@@ -16,6 +16,12 @@ from openjax.show.metrics import read_metrics
 pytestmark = pytest.mark.slow
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
+RULED = """
+import runpy, sys
+report = runpy.run_path(sys.argv[1])["report"]
+from openjax.gap.report.rules import broken_rules
+assert not (broken := broken_rules(report)), broken
+"""
 
 
 @pytest.mark.parametrize(
@@ -116,12 +122,13 @@ def test_an_effect_of_ones_own_is_flown_and_named():
     """In a process of its own: effects are registered before the diagnosis is
     loaded.
     """
-    command = [sys.executable, str(EXAMPLES / "own_effect.py")]
+    command = [sys.executable, "-c", RULED, str(EXAMPLES / "own_effect.py")]
     done = subprocess.run(command, capture_output=True, text=True)
     assert not done.returncode, done.stderr
     assert "tether" in done.stdout
 
 
+@pytest.mark.usefixtures("ruled_reports")
 def test_diagnosis_names_drag(capfd):
     runpy.run_path(str(EXAMPLES / "diagnose_flights.py"))
     assert "drag" in capfd.readouterr().out

@@ -150,6 +150,7 @@ def test_python_of_the_readme_runs():
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("ruled_reports")
 def test_from_sample_flights_to_a_corrected_simulator(tmp_path):
     """sample_flights -> calibrate -> diagnose -> an environment that flies with what
     was found.

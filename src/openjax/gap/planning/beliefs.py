@@ -119,10 +119,10 @@ def next_flight(report: dict, vehicle_file: VehicleFile) -> str:
     """What to fly after a report, by the same rule as `openjax plan`; empty where too
     little is left open.
     """
-    chances = np.array([b.probability for b in beliefs_of(report)])
-    if 1.0 - (chances**2).sum() < OPEN:
+    beliefs = beliefs_of(report)
+    if 1.0 - sum(b.probability**2 for b in beliefs) < OPEN:
         return ""
-    return advice_for(report, vehicle_file)[0]
+    return sentence(advise(beliefs, vehicle_file), report)
 
 
 def sentence(advice: Advice, report: dict) -> str:
