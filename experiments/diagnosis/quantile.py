@@ -6,8 +6,9 @@
 Reads what `development` wrote, without references and with them (`--healthy`). Writes
 the residual check's measures over all cases in which nothing unknown acts, whatever was
 named: the engine takes conformal p-values among them (Vovk, Gammerman, Shafer 2005).
-Without any CASES those of the file stay. Prints the reliability of the probabilities
-under which the right classes are likeliest, beside the one in use.
+Without any CASES those of the file stay. Prints, each beside the one in use, the power
+of level over p-value that makes the odds of an unknown cause likeliest, and the
+reliability of the probabilities under which the right classes are likeliest.
 """
 
 import argparse
@@ -19,7 +20,7 @@ from scipy.optimize import minimize_scalar
 from experiments.diagnosis.development import read_lines
 from openjax.files import write_json
 from openjax.gap.decision import DECISION
-from openjax.gap.residual import calibration
+from openjax.gap.residual import Check, calibration, conformal_p
 
 WITHOUT = ("unknown", "garbage")
 # probability of a class that was ruled out: one case must not decide alone
@@ -46,6 +47,29 @@ def pairs_of(lines: list[dict]) -> list[dict[str, dict[str, float]]]:
         {"case": case, "reference": reference}
         for case, reference in zip(measures_of(good), measures_of(before), strict=True)
     ]
+
+
+def best_power(lines: list[dict]) -> float:
+    """The power of level over p-value that makes it likeliest in which cases something
+    unknown acts.
+    """
+    told = []
+    for line in lines:
+        measures = dict(line["residual"])
+        p_value = measures.pop("p_value")
+        reference = line.get("residual_before") or None
+        _, name = conformal_p(measures, reference)
+        check = Check(
+            {}, "", p_value, np.zeros(9), by_reference=name in (reference or {})
+        )
+        told.append((np.log(check.level / p_value), line["category"] == "unknown"))
+    surprise, unknown = np.array(told).T
+
+    def loss(power: float) -> float:
+        sign = np.where(unknown, -1.0, 1.0)
+        return float(np.logaddexp(0.0, sign * power * surprise).sum())
+
+    return float(minimize_scalar(loss, bounds=(0.3, 5.0), method="bounded").x)
 
 
 def best_reliability(lines: list[dict]) -> float:
@@ -86,8 +110,10 @@ def main() -> None:
     found = {"source": options.source, "cases": cases, "with_reference": pairs}
     write_json(options.out, found)
     graded = [r for r in lines + referred if r["category"] not in ("garbage", "real")]
+    checked = [r for r in graded if r.get("residual")]
     print(
-        f"{len(cases)} cases, {len(pairs)} with a reference; reliability "
+        f"{len(cases)} cases, {len(pairs)} with a reference; power of the odds "
+        f"{best_power(checked):.2f}, in use {DECISION.unknown_odds}; reliability "
         f"{best_reliability(graded):.2f}, in use {DECISION.reliability}"
     )
 
