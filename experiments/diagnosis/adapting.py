@@ -312,7 +312,7 @@ def tune(options) -> None:
         "machine": describe_machine(),
         "vehicles": [],
     }
-    for cause in CAUSES[part::parts]:
+    for cause in options.causes[part::parts]:
         said = options.work / cause / "said.json"
         # `diagnose` may still be under way beside this
         while not said.exists() and time.monotonic() - begin < options.wait:
@@ -333,7 +333,6 @@ def main() -> None:
     commands = parser.add_subparsers(dest="command", required=True)
     first = commands.add_parser("diagnose")
     first.add_argument("--jobs", type=int, default=1)
-    first.add_argument("--causes", nargs="+", choices=CAUSES, default=CAUSES)
     second = commands.add_parser("tune")
     second.add_argument(
         "--part", type=int, nargs=2, default=(0, 1), metavar=("NUMBER", "OF")
@@ -348,6 +347,7 @@ def main() -> None:
     )
     for one in (first, second):
         one.add_argument("--work", type=Path, required=True)
+        one.add_argument("--causes", nargs="+", choices=CAUSES, default=CAUSES)
     third = commands.add_parser("report")
     third.add_argument("parts", type=Path, nargs="+")
     for one in (second, third):
