@@ -20,6 +20,7 @@ from itertools import combinations
 import numpy as np
 from jaxtyping import Float
 
+from openjax.background import side_by_side
 from openjax.gap.criteria import (
     DETECTABLE,
     Gaps,
@@ -157,35 +158,45 @@ class Search:
 
     @cached_property
     def nothing(self) -> Hypothesis:
-        return self.of_fit(self.evidence.motion.nothing)
+        return self.of_set(NOTHING, self.evidence.motion.nothing)
 
     def of_fit(self, fit: SetFit) -> Hypothesis:
         """The hypothesis of a fit."""
-        key = frozenset(fit.effects)
-        if key not in self.hypotheses:
-            table = build(fit, None)
-            validation = cross_validate(table, with_effects(table))
-            support = self.evidence.support(fit.theta)
-            self.hypotheses[key] = Hypothesis(fit, validation, log_odds(key), support)
-        return self.hypotheses[key]
+        table = build(fit, None)
+        validation = cross_validate(table, with_effects(table))
+        support = self.evidence.support(fit.theta)
+        return Hypothesis(fit, validation, log_odds(fit.effects), support)
 
     def of_set(self, effects, near: SetFit) -> Hypothesis:
         """The hypothesis of a set, fitted from a neighbouring set's fit."""
         key = frozenset(effects)
-        if key in self.hypotheses:
-            return self.hypotheses[key]
+        self.of_sets([key], near)
+        return self.hypotheses[key]
+
+    def of_sets(self, sets, near: SetFit) -> None:
+        """`of_set` of several sets, side by side."""
+        keys = dict.fromkeys(map(frozenset, sets))
+        keys = [key for key in keys if key not in self.hypotheses]
+        hypotheses = side_by_side(
+            lambda key: self.of_fit(self._fit_near(key, near)), keys
+        )
+        self.hypotheses |= dict(zip(keys, hypotheses, strict=True))
+
+    def _fit_near(self, key: frozenset, near: SetFit) -> SetFit:
+        """The fit of a set, begun at a neighbouring set's."""
+        if not key:
+            return self.evidence.motion.nothing
         if len(key) == 1:
-            return self.of_fit(self.singles[next(iter(key))])
+            return self.singles[next(iter(key))]
         start = near.theta.copy()
         for new in key - set(near.effects):  # as it was alone
             start[places((new,))] = self.singles[new].theta[places((new,))]
-        return self.of_fit(fit_set(near.replay, [e for e in CARDS if e in key], start))
+        return fit_set(near.replay, [e for e in CARDS if e in key], start)
 
     def alone(self) -> None:
         """Judge the effects that explain most alone."""
         best = sorted(self.singles, key=lambda e: -self.singles[e].score)[:SIMPLER]
-        for effect in best:
-            self.of_set({effect}, self.nothing.fit)
+        self.of_sets([{effect} for effect in best], self.nothing.fit)
 
     def beyond_bounds(self) -> frozenset:
         """Effects that leave their physical bounds in the visited set of the largest
@@ -224,8 +235,7 @@ class Search:
         best = rank([NOTHING, *(k for k in candidates if k != NOTHING)], promise)
         next_sets = [key for key in best if key not in self.hypotheses][:most]
         next_sets += [key - {effect} for key in best[:SIMPLER] for effect in key]
-        for key in dict.fromkeys(next_sets):
-            self.of_set(key, near.fit)
+        self.of_sets(next_sets, near.fit)
 
     def fit_without_dropouts(self) -> None:
         """Fit what is left of the best sets when effects that may not be named go: ones

@@ -14,8 +14,8 @@ from collections.abc import Sequence
 import numpy as np
 
 SMALLEST = 1e-8  # of a command: dead motors have a speed, too
-LANE = 600  # rows
-FORGOTTEN = 10.0  # time constants
+LANE = 150  # rows
+FORGOTTEN = 16.0  # time constants, after which 1e-7 is left
 
 
 def rotor_rows(

@@ -11,6 +11,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float
 
+from openjax.background import side_by_side
 from openjax.gap.model.library import ABSENT, CARDS, PLACE, Library, places, prior
 from openjax.gap.model.replay import GROUPS, SKIP, Replay, block_count
 from openjax.gap.model.whitening import fit_noise
@@ -248,7 +249,8 @@ def fit_singles(replay: Replay, library: Library, exposure) -> dict[str, SetFit]
     visible_effects = [
         effect for effect in library.physics if exposure[effect] >= UNEXPOSED
     ]
-    return {effect: fit_single(replay, effect) for effect in visible_effects}
+    fits = side_by_side(lambda effect: fit_single(replay, effect), visible_effects)
+    return dict(zip(visible_effects, fits, strict=True))
 
 
 def fit_single(replay: Replay, effect: str) -> SetFit:

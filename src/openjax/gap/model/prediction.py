@@ -85,13 +85,15 @@ class Physics:
         """Vehicles and paths of the tracks `numbers`, on the device: a search asks for
         the same few mixtures again and again.
         """
-        cache = self._cache
-        if numbers not in cache:
-            if len(cache) == KEPT:
-                cache.pop(next(iter(cache)))
+        lanes = self._cache.get(numbers)
+        if lanes is None:
             lanes = jax.tree.map(lambda leaf: leaf[list(numbers)], self._nominal)
-            cache[numbers] = jax.device_put(lanes)
-        return cache[numbers]
+            lanes = jax.device_put(lanes)
+            # fits run side by side: what another one has put in meanwhile is as good
+            if len(self._cache) >= KEPT:
+                self._cache.clear()
+            self._cache[numbers] = lanes
+        return lanes
 
     @cached_property
     def _cache(self) -> dict:

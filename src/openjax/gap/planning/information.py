@@ -11,6 +11,7 @@ air is as uneven as in a quiet hall: in still air every segment would tell every
 import itertools
 from dataclasses import dataclass, replace
 
+import jax
 import numpy as np
 
 from openjax.flights.flight import Case
@@ -26,6 +27,7 @@ from openjax.vehicle.vehicle_tables import Motor
 
 SECONDS = 10.0  # of each segment that are simulated
 ENOUGH = 0.98  # of what all segments tell together
+_REPLAYS: dict[tuple, Replay] = {}  # of the last vehicle
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,11 +124,24 @@ def _fewest(apart: np.ndarray, together: np.ndarray) -> list[int]:
 
 
 def _nominal_replay(vehicle_file: VehicleFile) -> Replay:
-    """The replay of every segment, flown by the vehicle without effects."""
+    """The replay of every segment, flown by the vehicle without effects. One vehicle is
+    mostly asked about again and again, and its flights take seconds.
+    """
+    leaves = jax.tree.leaves(vehicle_file.vehicle)
+    numbers = tuple(np.asarray(leaf).tobytes() for leaf in leaves)
+    key = (numbers, vehicle_file.airframe, vehicle_file.mass_weighed)
+    if key not in _REPLAYS:
+        _REPLAYS.clear()
+        _REPLAYS[key] = _fly_segments(vehicle_file)
+    return _REPLAYS[key]
+
+
+def _fly_segments(vehicle_file: VehicleFile) -> Replay:
+    """The replay of `_nominal_replay`."""
     vehicle = vehicle_file.vehicle
     # what is simulated commands thrust in the nominal order, whatever its own logs hold
-    log = {"motor_rows": "mean"}
-    file_of_means = replace(vehicle_file, log=log, motor=Motor())
+    tables = {"log": {"motor_rows": "mean"}, "motor": Motor(), "vehicles": {}}
+    file_of_means = replace(vehicle_file, **tables)
     flights = []
     for number, (name, segment) in enumerate(SEGMENTS.items()):
         air = Turbulence()

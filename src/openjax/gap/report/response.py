@@ -57,10 +57,22 @@ def _picture(identification: Identification) -> str:
     simulated.
     """
     from matplotlib.figure import Figure
+    from matplotlib.ticker import NullLocator
 
     with rc_context(STYLE):
         count = len(identification.responses)
-        figure = Figure(figsize=(2.6 * count, 4.2), layout="constrained")
+        width = 2.6 * count
+        figure = Figure(figsize=(width, 4.2))
+        # inches around and between what is always as large; a layout that is searched
+        # for takes as long as the drawing
+        figure.subplots_adjust(
+            left=0.75 / width,
+            right=1.0 - 0.1 / width,
+            bottom=0.5 / 4.2,
+            top=1.0 - 0.65 / 4.2,
+            wspace=0.3,
+            hspace=0.12,
+        )
         grid = figure.subplots(2, count, sharex=True, squeeze=False)
         for column, (axis, pair) in enumerate(identification.responses.items()):
             lines = (
@@ -82,7 +94,8 @@ def _picture(identification: Identification) -> str:
                 grid[0, column].set(ylabel=unit)
                 grid[1, column].set(ylabel="phase, °")
             grid[1, column].set_xticks([1, 2, 5, 10], ["1", "2", "5", "10"])
+            grid[1, column].xaxis.set_minor_locator(NullLocator())
         figure.legend(
-            *grid[0, 0].get_legend_handles_labels(), loc="outside upper left", ncols=2
+            *grid[0, 0].get_legend_handles_labels(), loc="upper left", ncols=2
         )
         return as_svg(figure, TITLE)
