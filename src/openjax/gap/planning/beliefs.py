@@ -112,7 +112,15 @@ def advice_for(report: dict, vehicle_file: VehicleFile) -> tuple[str, Advice]:
             "one cause is left in the report, and no flight is needed to tell it from others"
         )
     advice = advise(beliefs, vehicle_file)
-    return sentence(advice, report), advice
+    text = sentence(advice, report)
+    if not is_open(beliefs):
+        text = f"Little is left open, and no flight is needed. Who wants to be sure: {text}"
+    return text, advice
+
+
+def is_open(beliefs: list[Belief]) -> bool:
+    """Whether enough is left open for a flight."""
+    return 1.0 - sum(b.probability**2 for b in beliefs) >= OPEN
 
 
 def next_flight(report: dict, vehicle_file: VehicleFile) -> str:
@@ -120,7 +128,7 @@ def next_flight(report: dict, vehicle_file: VehicleFile) -> str:
     little is left open.
     """
     beliefs = beliefs_of(report)
-    if 1.0 - sum(b.probability**2 for b in beliefs) < OPEN:
+    if not is_open(beliefs):
         return ""
     return sentence(advise(beliefs, vehicle_file), report)
 

@@ -226,7 +226,7 @@ class Report:
         lines += [f"Sensors: {text}." for text in self.sensors]
         lines += [self.rest, self.reference]
         if self.trims is not None and self.untested_change is None:
-            lines.append(f"Trims and gains: {self.trims.sentence()}")
+            lines.append(f"Trims and gains alone: {self.trims.sentence()}")
         if self.effects:
             lines.append(f"Where: {in_words(self.where)}.")
         lines += self._parameters_in_words()

@@ -146,7 +146,8 @@ class Change:
         chance = f"{self.probability:.2f}"
         if not self.changed:
             return (
-                f"No change that these flights can show (probability of one: {chance})."
+                "No change beyond what days of such vehicles differ by (probability of one: "
+                f"{chance})."
             )
         causes = " or ".join(self._sentences())
         return f"The vehicle changed (probability {chance}): {causes}."
