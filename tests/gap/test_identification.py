@@ -141,6 +141,11 @@ def test_the_first_sentence_and_the_training_know_slow_motors(records):
     assert set(corrections(unmapped, effects=("inertia", "motor_lag"))[0]) == {
         "motor_lag"
     }
+    # what an emptier battery does to the gains isn't flown with twice
+    value = found.estimates.value + np.array([0.0, 0.0, 0.4, 0.4, 0.0])
+    weaker = replace(found, estimates=replace(found.estimates, value=value))
+    assert "inertia" in corrections(weaker, effects=())[0]
+    assert "inertia" not in corrections(weaker, effects=("battery_sag",))[0]
     # A lag of 75 instead of 25 ms and 4 ms of delay, at 5 Hz.
     ratio = (1 + 2j * np.pi * 5.0 * 0.025) / (1 + 2j * np.pi * 5.0 * 0.075)
     gain, later = found.at(5.0)

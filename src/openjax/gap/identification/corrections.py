@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from openjax.gap.identification.quantities import REACH, Identification
+from openjax.gap.model.library import CARDS
 from openjax.vehicle.effects import EFFECTS
 
 CLEAR = 3.0  # standard deviations from the simulator's value
@@ -51,17 +52,21 @@ class _Number:
 def corrections(identification: Identification, effects) -> tuple[dict, dict]:
     """Values and 90 % intervals {effect: {parameter: ...}} of motor lag, inertia and
     yaw torque as identified: of those `effects`, which were named, and of others that
-    differ clearly and by as much as matters. Of duty cycles only the lag: gains hold
-    their map's slope.
+    differ clearly and by as much as matters. Only the lag of duty cycles, whose map's
+    slope the gains hold, and where an effect is named that does to gains what a larger
+    inertia does.
     """
     if not identification.trustworthy:
         return {}, {}
     values: dict = {}
     intervals: dict = {}
     numbers = _numbers(identification)
+    lag_alone = identification.duty_cycles or any(
+        CARDS[effect].scales_torques for effect in effects if effect in CARDS
+    )
     for effect in dict.fromkeys(number.effect for number in numbers):
         of_effect = [number for number in numbers if number.effect == effect]
-        if identification.duty_cycles and effect != "motor_lag":
+        if lag_alone and effect != "motor_lag":
             continue
         if effect in effects or any(number.is_clear for number in of_effect):
             values[effect] = {n.parameter: n.ends[0] for n in of_effect}

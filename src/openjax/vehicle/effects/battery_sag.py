@@ -91,6 +91,7 @@ EFFECT = Effect(
         nuisance_duty={"exponent": 0.4},
         coordinate="voltage",
         thrust_map=True,
+        scales_torques=True,
         scales_motion=True,
         log_odds=RARE,
         at_voltage=frozen,

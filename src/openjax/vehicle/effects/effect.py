@@ -228,6 +228,10 @@ class Card:
     """Whether it can change all accelerations in proportion: of two such effects
     flights show the product alone, so that no set has both.
     """
+    scales_torques: bool = False
+    """Whether it changes what thrust a motor command makes, and with it the gains of all
+    torques, which are then no inertia's.
+    """
     torque_axes: tuple[int, ...] = ()
     """Axes of the torques by which it is told: what motors do between two rows can
     imitate them.

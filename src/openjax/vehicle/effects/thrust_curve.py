@@ -67,6 +67,7 @@ EFFECT = Effect(
             ),
         ),
         thrust_map=True,
+        scales_torques=True,
         scales_motion=True,
         log_odds=RARE,
         possible=rises,

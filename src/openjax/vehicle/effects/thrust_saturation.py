@@ -75,6 +75,7 @@ EFFECT = Effect(
             (0.7, 0.0),
         ),
         thrust_map=True,
+        scales_torques=True,
         possible=tops_out,
         at_voltage=frozen,
         sample={"limit": 0.82},

@@ -35,6 +35,7 @@ EFFECT = Effect(
         nuisance={"scale": 0.004},
         nuisance_duty={"scale": 0.3},
         thrust_map=True,
+        scales_torques=True,
         scales_motion=True,
         sample={"scale": -0.08},
         practical={"scale": 0.01},
