@@ -8,7 +8,7 @@ import pytest
 
 from openjax.flying.controller import Pose
 from openjax.flying.crtp import Supervisor
-from openjax.flying.preflight import faults
+from openjax.flying.preflight import faults, poses_arriving
 from openjax.flying.state import PoseSample, initial_state
 
 LEVEL = (1.0, 0.0, 0.0, 0.0)
@@ -82,3 +82,40 @@ def test_a_scaled_frame_is_told_by_the_vehicles_own():
     )
     lines = faults(initial_state(((0.66, 0.33, 0.5),)), (scaled,), (100.0,), True)
     assert len(lines) == 1 and "unit" in lines[0]
+
+
+class FullLinks:
+    """Eight vehicles whose poses wait in a stream that holds so many; time is what
+    somebody slept.
+    """
+
+    def __init__(self, room=270):
+        self.counts = [0] * 8
+        self.room = room
+        self.now = 0.0
+        self.waiting = []
+
+    def sleep(self, seconds):
+        first = round(100 * self.now)
+        self.now += seconds
+        for tick in range(first, round(100 * self.now)):
+            poses = [(vehicle, 0.01 * tick) for vehicle in range(8)]
+            self.waiting += poses[: self.room - len(self.waiting)]
+
+    def observe(self):
+        newest = [0.0] * 8
+        for vehicle, time in self.waiting:
+            self.counts[vehicle] += 1
+            newest[vehicle] = time
+        self.waiting = []
+        return [
+            PoseSample(Pose(time, (0.0,) * 3, (0.0,) * 3, LEVEL), 0.0, 4.1, READY, None)
+            for time in newest
+        ]
+
+
+def test_poses_of_eight_vehicles_are_counted_though_few_can_wait(monkeypatch):
+    links = FullLinks()
+    monkeypatch.setattr("openjax.flying.preflight.time.sleep", links.sleep)
+    links.sleep(20.0)  # nobody has read since they were connected
+    assert poses_arriving(links) == pytest.approx([100.0] * 8, abs=2.1)
