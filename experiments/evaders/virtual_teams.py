@@ -32,13 +32,13 @@ ASKED = "asked to land"
 """A vehicle's reason to come down where nothing went wrong."""
 
 
-def layout(game: PursuitSettings, seed: int, places: slice = slice(None)) -> str:
-    """A uniform task of a game as a layout's TOML, with some of its pursuers."""
+def layout(game: PursuitSettings, seed: int) -> str:
+    """A uniform task of a game as a layout's TOML."""
     task = uniform_task(game, jax.random.key(seed))
     pillars = np.asarray(task.pillar_position)[np.asarray(task.pillar_active)]
     entries = {
         "pillars": pillars[:, :2],
-        "pursuers": np.asarray(task.pursuer_position)[places],
+        "pursuers": np.asarray(task.pursuer_position),
         "evader": np.asarray(task.evader_position),
     }
     lines = (
@@ -53,16 +53,12 @@ def fly(size: int, options: argparse.Namespace, folder: Path) -> dict:
     game = load_policy(options.policy).settings.environment.of_one_team(size)
     starts = folder / f"team_{size}.toml"
     starts.write_text(layout(game, options.seed))
-    virtual = []
+    place = ["--scenario", str(starts)]
+    virtual = listening(size, place, options)
     try:
-        for first in range(0, size, options.together):
-            places = slice(first, min(first + options.together, size))
-            own = folder / f"team_{size}_from_{first}.toml"
-            own.write_text(layout(game, options.seed, places))
-            virtual.append(listening(places, own, options))
         out = folder / f"flight_{size}"
         uris = [f"udp://127.0.0.1:{options.port + i}" for i in range(size)]
-        command = ["fly", "--policy", options.policy, "--scenario", str(starts)]
+        command = ["fly", "--policy", options.policy, *place]
         command += ["--out", str(out), "--episodes", str(options.episodes)]
         command += ["--body_logs", str(options.body_logs)]
         flown = subprocess.run(
@@ -72,23 +68,22 @@ def fly(size: int, options: argparse.Namespace, folder: Path) -> dict:
             timeout=LONGEST,
         )
     finally:
-        for process in virtual:
-            process.send_signal(signal.SIGINT)
-        for process in virtual:
-            process.wait()
+        virtual.send_signal(signal.SIGINT)
+        virtual.wait()
     if not (out / "flight.json").is_file():
         raise RuntimeError((flown.stdout + flown.stderr).strip())
     return {"pursuers": size, "status": flown.returncode, **summary(out)}
 
 
 def listening(
-    places: slice, starts: Path, options: argparse.Namespace
+    size: int, place: list[str], options: argparse.Namespace
 ) -> subprocess.Popen:
-    """A process of the vehicles at these places of a team, once it listens."""
-    command = ["virtual_crazyflie", "--number", str(places.stop - places.start)]
-    command += ["--port", str(options.port + places.start), "--scenario", str(starts)]
+    """The virtual Crazyflies' process, once it listens."""
+    command = ["virtual_crazyflie", "--number", str(size), "--port", str(options.port)]
     command += ["--loss", str(options.loss), "--pose_loss", str(options.pose_loss)]
-    process = subprocess.Popen([*OPENJAX, *command], stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        [*OPENJAX, *command, *place], stdout=subprocess.PIPE, text=True
+    )
     # its first line says that it listens; before that there is nobody to fly
     said = process.stdout.readline()
     if "listening" not in said:
@@ -138,14 +133,7 @@ def main() -> None:
         "--body_logs",
         type=int,
         default=1,
-        help="as over a radio: by default openjax fly asks for five over UDP, and of eight "
-        "vehicles 4,800 packets a second are more than cflib's one process takes in",
-    )
-    parser.add_argument(
-        "--together",
-        type=int,
-        default=8,
-        help="vehicles that a process simulates: each packet advances all of them",
+        help="blocks of motors and accelerometer that each logs, as over a radio",
     )
     parser.add_argument("--json", type=Path, required=True)
     options = parser.parse_args()
