@@ -10,7 +10,7 @@
 # begins that can't end within SECONDS (460). All that is known lies in OUTDIR/teams.tgz
 # at any time, packed every 20 s; times.txt in it says what ran when.
 # Variables: PYTHON, GPUS (by default all), SHARE (2 jobs on each), JOBS (names of those
-# that fly; by default all), TINY=1 to try each job at a tiny size on a CPU.
+# that fly, in this order; by default all), TINY=1 to try each at a tiny size on a CPU.
 set -u
 ulimit -n 65536 2>/dev/null
 out=$1
@@ -96,9 +96,9 @@ tables team "$policy" 60
 empty 1 2 200
 job exploit_3 230 "$(exploit 3 480000000 100)"
 for seed in ${SEEDS:-}; do
-  tables "$(basename "$seed" .npz)" "$seed" 40
+  tables "$(basename "$seed" .npz)" "$seed" 30
 done
-[ -z "${SEEDS:-}" ] || job strangers 150 -m experiments.evaders.strangers --only teams \
+[ -z "${SEEDS:-}" ] || job strangers 100 -m experiments.evaders.strangers --only teams \
   --out "$K/strangers" --egos $SEEDS --mates flight no_clamp_seed_0 janosov --episodes 500 \
   "$strangers"
 pillars 3 4 180
@@ -106,7 +106,7 @@ pillars 7 8 220
 pillars 5 6 200
 pillars 1 2 150
 job two 60 -m experiments.evaders.strangers --only two --out "$K/two" --egos "$policy" "$two"
-job three 50 "$(map three evaders 1000 3)" $cell $uniform $scripted
+job three 30 "$(map three evaders 1000 3)" $cell $uniform $scripted
 job three_cells 60 "$(map three_cells evaders 200 3)" $uniform $scripted
 for radius in 0.7 1.2 1.5; do
   job "arena_$radius" 60 "$(map "arena_$radius" "$policy" 400 1 2 3 4 5 6 7 8)" $cell $uniform \
@@ -117,8 +117,20 @@ job exploit_2 150 "$(exploit 2 300000000 1)"
 job sight 110 "$(map sight "$policy" 200 1 2 3 4 5 6 7 8)" $thin $scripted \
   --sight_angle 90 --sight_range 1
 job silence 110 "$(map silence "$policy" 200 2 3 4)" $thin $scripted $messages --batch 2048
-job masks 70 -m experiments.speed.environment_step --masked "$speed"
-job forced 60 -m experiments.evaders.forced --json "$K/forced.json" "$forced"
+job masks 90 -m experiments.speed.environment_step --masked "$speed"
+job forced 75 -m experiments.evaders.forced --json "$K/forced.json" "$forced"
+
+if [ -n "${JOBS:-}" ]; then
+  chosen=()
+  for name in $JOBS; do
+    known=0
+    for entry in "${jobs[@]}"; do
+      [ "${entry%%|*}" = "$name" ] && chosen+=("$entry") && known=1
+    done
+    [ $known = 1 ] || say "$name: no such job"
+  done
+  jobs=("${chosen[@]}")
+fi
 
 echo 0 > "$K/.next"
 take() { # the number of the next job
@@ -134,7 +146,6 @@ worker() { # GPU
   export CUDA_VISIBLE_DEVICES=$1
   while number=$(take) && [ "$number" -lt ${#jobs[@]} ]; do
     IFS='|' read -r name seconds command <<< "${jobs[$number]}"
-    [[ " ${JOBS:-$name} " == *" $name "* ]] || continue
     left=$((ends - $(date +%s)))
     # estimates are rough: with a little less it may still end
     if [ "$left" -lt $((seconds * 7 / 10)) ]; then
