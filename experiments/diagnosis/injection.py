@@ -127,7 +127,9 @@ def rotor_drag(cause, p, c):
     elif cause.form == "rotor_speed":
         # at hover speed the four hubs add up to the size
         p["drag_rotor"][c] = a / (4 * np.sqrt(p["hover"][c]))
-        values["d_z"] = 0.5 * a
+        # beside what a real vehicle drags anyway, which the other forms replace
+        values["d_xy"] = a + float(np.mean(p["drag_xy"][c]))
+        values["d_z"] = 0.5 * a + float(np.mean(p["drag_z"][c]))
     else:
         p["drag_xy"][c] = a
         p["drag_z"][c] = a * ratio
