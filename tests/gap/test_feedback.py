@@ -14,7 +14,7 @@ from openjax.gap.channels.instruments import (
     outputs_of,
     read_feedback,
 )
-from openjax.gap.channels.rate_loop import RateLoop, read_rate_loop
+from openjax.gap.channels.rate_loop import RateLoop, observe_track, read_rate_loop
 from openjax.gap.model.library import Library
 from openjax.vehicle import load_vehicle
 from openjax.vehicle.rate_controller import mixer
@@ -24,10 +24,11 @@ DT = 0.01
 TICKS = 5
 
 
-def flown(seed, p=1.0, gust=0.0, noise=0.005, sampled=False, commands=1.0):
+def flown(seed, p=1.0, gust=0.0, noise=0.005, sampled=False, commands=1.0, pull=0.0):
     """A flight in which commands step every .3 s: rigid body, motors' lag, and the
     firmware's loop at 500 Hz with a P of `p` times the nominal one, gusts of `gust`
-    rad/s^2 and `noise` rad/s in the gyroscope; `commands` times as large.
+    rad/s^2, `pull` rad/s^2 of pitch all the time and `noise` rad/s in the gyroscope;
+    `commands` times as large.
     """
     vehicle = load_vehicle()
     rng = np.random.default_rng(seed)
@@ -79,7 +80,7 @@ def flown(seed, p=1.0, gust=0.0, noise=0.005, sampled=False, commands=1.0):
                 1.0 - np.exp(-h / float(vehicle.motor_time_constant))
             ) * (motors[-1] - thrust)
             push = 0.98 * push + 0.2 * gust * rng.standard_normal(3)
-            rates = rates + h * (turning @ thrust + push)
+            rates = rates + h * (turning @ thrust + push + [0.0, pull, 0.0])
         out["motor"].append(motors[0] if sampled else np.mean(motors, 0))
     sent = np.concatenate([np.full((ROWS, 1), 0.6), command], 1)
     track = Track(
@@ -104,6 +105,20 @@ def test_gains_are_what_the_loop_has_whatever_gusts_and_noise_do(p, sampled):
     assert change[0] == pytest.approx(p - 1.0, abs=2.0 * error[0])
     assert change[3] == pytest.approx(p - 1.0, abs=0.03)
     assert bool(loop(change, error, p - 1.0).acting()) == (p != 1.0)
+
+
+def test_ticks_hold_against_a_pull_as_the_samples_of_the_motors_do():
+    """Not only the first tick of a row, as the log has it: a loop that doesn't know what
+    pulls, such as an offset of the centre of mass, lets go of a quarter of it until the
+    row ends.
+    """
+    track, vehicle, link = flown(1, pull=4.0, sampled=True)
+    _, ticks = observe_track(track, vehicle, link, at_once=True)
+    pitch = -np.asarray(vehicle.rotor_position, float)[:, 0]
+    held, logged = (
+        m[ROWS // 9 :].mean(0) @ pitch for m in (ticks.mean(1), track.motor)
+    )
+    assert held == pytest.approx(logged, rel=0.05)
 
 
 def test_a_vehicle_that_hardly_turns_says_nothing_of_its_gains():
