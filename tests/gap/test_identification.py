@@ -13,6 +13,8 @@ from experiments.diagnosis import rate_flights
 from experiments.diagnosis.rate_flights import Truth, fly, rows_of, vehicle_of
 from openjax.flights.clocks import case_on_gyroscope_clock
 from openjax.flights.flight import Case, Flight
+from openjax.flights.kinematics import Kinematics
+from openjax.gap import evidence
 from openjax.gap.identification.corrections import corrections
 from openjax.gap.identification.estimates import ESTIMATED, of_fit
 from openjax.gap.identification.prediction_errors import NAMES
@@ -211,6 +213,26 @@ def test_no_line_stands_for_motors_that_were_not_logged():
         assert [len(r.rates) for r in parts] == pytest.approx([270] * 3, abs=3)
         assert not any(r.bridges_holes for r in parts)
     assert all(r.bridges_holes for r in records_of(case_without(time % 0.5 > 0.3)))
+
+
+def test_a_gyroscope_that_reads_too_much_is_no_lighter_body(monkeypatch):
+    """With a reference both are read with its gain: of two gains, each with its error,
+    a change of inertia would come.
+    """
+    asked = []
+    monkeypatch.setattr(evidence, "identify", lambda case, _: asked.append(case))
+    rates = np.full((900, 3), 1.1)
+    flight = Flight("a", "a", "0", 0.01 * np.arange(900), body_rates=rates)
+    read = evidence.Evidence(
+        Case("fast", (flight,), load_vehicle_file()),
+        **dict.fromkeys(("library", "tracks", "vehicles", "channels", "motion")),
+        sensors=Kinematics(gain=1.1, tilt=None, one_clock=True, findings={}),
+    )
+    before = SimpleNamespace(identification=SimpleNamespace(gyroscope_gain=1.0))
+    for case in (read, replace(read, baseline=before)):
+        evidence.with_identification(case)
+    alone, beside = (case.flights[0].body_rates for case in asked)
+    assert np.allclose(alone, 1.0) and np.allclose(beside, 1.1)
 
 
 def test_a_hover_that_hardly_turns_says_nothing_of_torques(monkeypatch, records):

@@ -175,12 +175,30 @@ def gather(
 
 def with_identification(evidence: Evidence) -> Evidence:
     """The evidence with what the vehicle does. Motors that a log has late are no lag of
-    the motors.
+    the motors, and a gyroscope that reads too much is no lighter body: its gain is the
+    reference's where there is one, so that both are read alike.
     """
     sensors = evidence.sensors
+    before = None if evidence.baseline is None else evidence.baseline.identification
+    gain = sensors.gain if before is None else before.gyroscope_gain
     in_time = case_on_gyroscope_clock(evidence.case, sensors.motors_late)
-    identification = identify(in_time, sensors.one_clock and sensors.motor_clock)
+    identification = identify(
+        with_gyroscope_gain(in_time, gain), sensors.one_clock and sensors.motor_clock
+    )
+    if identification is not None:
+        identification = replace(identification, gyroscope_gain=gain)
     return replace(evidence, identification=identification)
+
+
+def with_gyroscope_gain(case: Case, gain: float) -> Case:
+    """The case with body rates as a gyroscope without that gain reads them."""
+
+    def corrected(flight):
+        if flight.body_rates is None or flight.body_rates_derived:
+            return flight
+        return replace(flight, body_rates=flight.body_rates / gain)
+
+    return replace(case, flights=tuple(corrected(f) for f in case.flights))
 
 
 def _motors(

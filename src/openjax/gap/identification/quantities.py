@@ -73,7 +73,7 @@ class Identification:
     `remarks`: what to think of when reading them; `estimates` are for the diagnosis;
     `duty_cycles`: what thrust a motor command makes isn't known, so that gains tell its
     map and the inertia together; `single_samples`: not trusted for one reason alone,
-    that rows are such.
+    that rows are such; `gyroscope_gain` that body rates were freed of before.
     """
 
     quantities: dict[str, Quantity]
@@ -83,6 +83,7 @@ class Identification:
     trustworthy: bool = True
     duty_cycles: bool = False
     single_samples: bool = False
+    gyroscope_gain: float = 1.0
 
     def to_dict(self, shares: dict[str, float] | None = None) -> dict:
         """As it stands in `report.json`; `shares` of the gap {effect: share}."""
