@@ -93,6 +93,10 @@ def test_what_no_air_and_no_rotor_does_is_something_else():
     assert seems("motor_imbalance", **rotors)
     # slow turns' thrust, where torques aren't judged
     assert not seems("motor_imbalance", **rotors | dict(m2=0.41, m3=-0.41))
+    assert seems("ground_effect", strength=2.5, offset=0.016)
+    # a thrust that isn't known, in a vehicle that never was below .3 m
+    assert not seems("ground_effect", strength=5.7, offset=-0.001)
+    assert not seems("ceiling_effect", strength=1.9, offset=0.06)
 
 
 def test_above_the_ceiling_there_is_none():

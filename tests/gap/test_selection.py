@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from openjax.gap import selection
 from openjax.gap.channels import of_flights
 from openjax.gap.criteria import (
     Gaps,
@@ -20,6 +21,7 @@ from openjax.gap.criteria import (
 )
 from openjax.gap.model.cross_validation import Validation
 from openjax.gap.model.library import ABSENT, places
+from openjax.gap.selection import Hypothesis
 from openjax.vehicle.effects.thrust_curve import bend
 
 
@@ -88,6 +90,31 @@ def test_an_effect_that_nuisances_take_on_matters_as_what_it_does():
     gaps, own = (Gaps(s, floor, s) for s in (inside, beside))
     assert worse(10.0, 5.0, gaps, own) and not worse(10.0, 5.0, gaps, gaps)
     assert not worse(10.0, 7.0, gaps, own)  # and it isn't clear
+
+
+def test_a_set_that_leaves_its_bounds_once_settled_is_not_chosen(monkeypatch):
+    sets = {frozenset({"mass"}): 0.7, frozenset({"wind"}): 0.2, frozenset(): 0.1}
+    search = SimpleNamespace(
+        hypotheses={
+            key: Hypothesis(SimpleNamespace(effects=tuple(key), replay=None, theta=0.0), None, 0.0)
+            for key in sets
+        },
+        weights=lambda: {
+            key: sets[key] for key, h in search.hypotheses.items() if possible(h.fit)
+        },
+    )  # fmt: skip
+
+    def possible(fit):
+        return not (fit.theta == 10.0 and fit.effects == ("mass",))
+
+    def settled(replay, effects, theta, rounds):
+        return SimpleNamespace(effects=effects, replay=replay, theta=float(rounds))
+
+    monkeypatch.setattr(selection, "possible", possible)
+    monkeypatch.setattr(selection, "fit_set", settled)
+    weights, best, fit = selection.settle(search)
+    assert best.effects == fit.effects == ("wind",)
+    assert frozenset({"mass"}) not in weights
 
 
 def test_what_only_a_sum_is_known_of_is_clear_by_the_sum():

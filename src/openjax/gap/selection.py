@@ -103,8 +103,7 @@ class Selection:
 def select(evidence: Evidence) -> Selection:
     """Choose among the physics effects that the flights can show."""
     search = search_sets(evidence)
-    weights = search.weights()
-    best = search.hypotheses[max(weights, key=weights.get)]
+    weights, best, fit = settle(search)
     without = {
         e: search.of_set(set(best.effects) - {e}, best.fit) for e in best.effects
     }
@@ -114,14 +113,26 @@ def select(evidence: Evidence) -> Selection:
     }
     # strongest is what is missed most, not what is largest: sizes have other units
     ranking = tuple(sorted(gains, key=lambda e: -gains[e]))
-    best = replace(
-        best,
-        fit=fit_set(best.fit.replay, best.effects, best.fit.theta, rounds=ROUNDS),
-    )
+    best = replace(best, fit=fit)
     table = build(best.fit, {})
     return Selection(
         best, table, ranking, weights, search.equivalents(best, ranking), search
     )
+
+
+def settle(search: Search) -> tuple[dict[frozenset, float], Hypothesis, SetFit]:
+    """The weights of the sets, the one that is chosen, and its fit once nuisances and
+    parameters have settled. The search's fits end sooner: a set whose effects only then
+    leave their physical bounds takes that fit, and the choice is made again.
+    """
+    while True:
+        weights = search.weights()
+        key = max(weights, key=weights.get)
+        best = search.hypotheses[key]
+        fit = fit_set(best.fit.replay, best.effects, best.fit.theta, rounds=ROUNDS)
+        if possible(fit):
+            return weights, best, fit
+        search.hypotheses[key] = replace(best, fit=fit)
 
 
 def search_sets(evidence: Evidence) -> Search:

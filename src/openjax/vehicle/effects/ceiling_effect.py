@@ -14,6 +14,7 @@ from openjax.vehicle.effects.ground_effect import gain
 # m, twice what is usual: a ceiling that would have to be higher than the room's is some
 # slow change of thrust
 FARTHEST = 0.06
+STRONGEST = 1.5  # the end of the usual range
 
 
 def thrust(parameters, thrust, reaction, context):
@@ -29,6 +30,13 @@ def above(position) -> bool:
     none.
     """
     return bool((position[:, 2] > ARENA_CEILING).any())
+
+
+def acts(values, deviations) -> bool:
+    """Whether a ceiling can be as strong: a stronger one is some slow change of
+    thrust.
+    """
+    return values["strength"] < STRONGEST
 
 
 _SOURCE = "as strong as the ground effect or stronger (Hsiao, Chirarattananon 2019)"
@@ -60,6 +68,7 @@ EFFECT = Effect(
         needs="position",
         coordinate="height",
         impossible=above,
+        possible=acts,
         sample={"strength": 0.6, "offset": 0.01},
         practical={"strength": 0.08},
         shape=("offset",),

@@ -24,6 +24,18 @@ def thrust(parameters, thrust, reaction, context):
     ), reaction
 
 
+# above what is usual, with the rotors at the plane: more is some slow change of thrust
+STRONGEST = 1.5
+
+
+def acts(values, deviations) -> bool:
+    """Whether a floor can be as strong, at the height of a radius as the offset has
+    it.
+    """
+    height = PROPELLER_RADIUS + values["offset"]
+    return values["strength"] * (PROPELLER_RADIUS / height) ** 2 < STRONGEST
+
+
 _SOURCE = (
     "5-25 % at 5 cm (Cheeseman-Bennett form with free strength; Sanchez-Cuevas et al. 2017 for "
     "multirotors)"
@@ -51,6 +63,7 @@ EFFECT = Effect(
         others=((0.4, 0.0), (0.4, 0.025), (0.4, 0.05)),
         needs="position",
         coordinate="height",
+        possible=acts,
         sample={"strength": 0.8, "offset": 0.01},
         practical={"strength": 0.08},
         shape=("offset",),
