@@ -179,8 +179,8 @@ def with_identification(evidence: Evidence) -> Evidence:
     reference's where there is one, so that both are read alike.
     """
     sensors = evidence.sensors
-    before = None if evidence.baseline is None else evidence.baseline.identification
-    gain = sensors.gain if before is None else before.gyroscope_gain
+    reference = None if evidence.baseline is None else evidence.baseline.identification
+    gain = sensors.gain if reference is None else reference.gyroscope_gain
     in_time = case_on_gyroscope_clock(evidence.case, sensors.motors_late)
     identification = identify(
         with_gyroscope_gain(in_time, gain), sensors.one_clock and sensors.motor_clock
@@ -193,12 +193,12 @@ def with_identification(evidence: Evidence) -> Evidence:
 def with_gyroscope_gain(case: Case, gain: float) -> Case:
     """The case with body rates as a gyroscope without that gain reads them."""
 
-    def corrected(flight):
+    def without_gain(flight):
         if flight.body_rates is None or flight.body_rates_derived:
             return flight
         return replace(flight, body_rates=flight.body_rates / gain)
 
-    return replace(case, flights=tuple(corrected(f) for f in case.flights))
+    return replace(case, flights=tuple(without_gain(f) for f in case.flights))
 
 
 def _motors(
