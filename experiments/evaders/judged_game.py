@@ -27,6 +27,7 @@ from openjax.pursuit import (
     RewardSettings,
     Task,
 )
+from openjax.pursuit.settings import LAYOUT_PURSUERS
 from openjax.runs.exploit import record
 from openjax.store.compiled_programs import cache_programs
 from openjax.store.environments import make_environment
@@ -228,7 +229,7 @@ def judged_game(options: argparse.Namespace) -> JudgedGame:
     nothing.
     """
     cache_programs()
-    loaded = load_policy(options.policy)
+    loaded = load_policy(options.policy).of_team(LAYOUT_PURSUERS)
     own = loaded.settings.environment
     game = dataclasses.replace(
         own,
