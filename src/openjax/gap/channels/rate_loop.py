@@ -196,9 +196,8 @@ def observe_track(track: Track, vehicle, link, at_once=False):
     for width in PUSHES if at_once else PUSHES[:1]:
         *_, rates = observe(vehicle, vehicle, command, motor, gyro, push, dt, at_once)
         miss = track.body_rates[1:] - np.asarray(rates, float)[: rows - 1]
-        step = (
-            miss.copy()
-        )  # undo the observer's own correction of what it missed before
+        # without the observer's own correction of what it missed before
+        step = miss.copy()
         step[1:] -= (1.0 - GYRO_GAIN) * miss[:-1]
         change = smooth(np.concatenate([step, step[-1:]]), width, track.dt) / track.dt
         push = push + pad(change, size)

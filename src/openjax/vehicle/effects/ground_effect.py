@@ -29,8 +29,8 @@ STRONGEST = 1.5
 
 
 def acts(values, deviations) -> bool:
-    """Whether a floor can be as strong, at the height of a radius as the offset has
-    it.
+    """Whether a floor can be as strong; asked at the height of one rotor's radius, as
+    strength and offset trade against each other.
     """
     height = PROPELLER_RADIUS + values["offset"]
     return values["strength"] * (PROPELLER_RADIUS / height) ** 2 < STRONGEST
