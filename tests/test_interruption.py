@@ -10,7 +10,7 @@ import sys
 import pytest
 
 STUCK = """
-import ctypes, sys, types
+import ctypes, signal, sys, types
 from pathlib import Path
 import openjax.__main__ as program
 from openjax import interruption
@@ -84,6 +84,8 @@ def hanging(folder):
     with interruption.clean_up(lambda: compile()):
         compile()
 
+# as in a terminal: a shell lets what it runs in the background ignore Ctrl-C
+signal.signal(signal.SIGINT, signal.default_int_handler)
 moment = globals()[sys.argv[1]]
 fake = types.SimpleNamespace(main=lambda arguments: moment(Path(arguments[0])))
 sys.modules["openjax.commands.train"] = fake

@@ -18,7 +18,14 @@ from scipy.stats import norm
 
 from openjax.flights.track import Track, smooth
 from openjax.gap.channels import Channel, Estimated, robust_deviation
-from openjax.gap.channels.instruments import BAND, COUNT, EDGE, in_force, outputs_of
+from openjax.gap.channels.instruments import (
+    BAND,
+    COUNT,
+    EDGE,
+    SLOW,
+    in_force,
+    outputs_of,
+)
 from openjax.gap.decision import DECISION
 from openjax.gap.model.library import CARDS
 from openjax.gap.model.nuisances import TRIM
@@ -45,7 +52,7 @@ ABOVE_NOISE = 5.0
 LEAST_SECONDS = 6  # without a motor at its limit
 # s over which what pushes the body is smoothed, run by run; where rows are means, which
 # the ticks follow anyway, the first is enough
-PUSHES = (0.06, TRIM, TRIM, TRIM)
+PUSHES = (SLOW, TRIM, TRIM, TRIM)
 SMOOTH = 0.05  # s over which the outputs are compared
 GAINS = ("p", "i", "d")
 
