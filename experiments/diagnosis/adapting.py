@@ -181,17 +181,14 @@ class Tuner:
 
     def tuned(self, bounds):
         """The policy fine-tuned to vehicles of the bounds, as `openjax adapt` does."""
-        from openjax.evaluation.validation import selection_score
-        from openjax.learning.fine_tuning import Look, fine_tune
+        from openjax.learning.fine_tuning import fine_tune
+        from openjax.runs.adaptation import look_of
 
         usual = self.fly(self.before, self.nominal, 0)
+        steps = self.adaptation.game.episode_length
 
         def look(parameters):
-            flown = self.fly(parameters, bounds, 0)
-            fastest = np.maximum(flown["over_speed_rate"], usual["over_speed_rate"])
-            flown["over_speed_rate"] = fastest
-            scores = selection_score(flown, self.adaptation.game.episode_length)
-            return Look(scores, flown["capture_step"])
+            return look_of(self.fly(parameters, bounds, 0), usual, steps)
 
         return fine_tune(self.adaptation, self.before, bounds, self.key, look)
 

@@ -20,7 +20,7 @@ from scipy.optimize import minimize_scalar
 from experiments.diagnosis.development import read_lines
 from openjax.files import write_json
 from openjax.gap.decision import DECISION
-from openjax.gap.residual import Check, calibration, conformal_p
+from openjax.gap.residual import calibration, rejection_level, standing_out
 
 WITHOUT = ("unknown", "garbage")
 # probability of a class that was ruled out: one case must not decide alone
@@ -57,17 +57,15 @@ def best_power(lines: list[dict]) -> float:
     for line in lines:
         measures = dict(line["residual"])
         p_value = measures.pop("p_value")
-        reference = line.get("residual_before") or None
-        _, name = conformal_p(measures, reference)
-        check = Check(
-            {}, "", p_value, np.zeros(9), by_reference=name in (reference or {})
-        )
-        told.append((np.log(check.level / p_value), line["category"] == "unknown"))
-    surprise, unknown = np.array(told).T
+        reference = line.get("residual_before") or {}
+        _, name = standing_out(measures, reference or None)
+        surprise = np.log(rejection_level(name in reference) / p_value)
+        told.append((surprise, line["category"] == "unknown"))
+    surprises, unknown = np.array(told).T
 
     def loss(power: float) -> float:
         sign = np.where(unknown, -1.0, 1.0)
-        return float(np.logaddexp(0.0, sign * power * surprise).sum())
+        return float(np.logaddexp(0.0, sign * power * surprises).sum())
 
     return float(minimize_scalar(loss, bounds=(0.3, 5.0), method="bounded").x)
 

@@ -87,6 +87,7 @@ def listening(
     # its first line says that it listens; before that there is nobody to fly
     said = process.stdout.readline()
     if "listening" not in said:
+        process.send_signal(signal.SIGINT)
         process.wait()
         raise RuntimeError(f"virtual_crazyflie: {said.strip()}")
     return process

@@ -68,9 +68,7 @@ class Check:
     @property
     def level(self) -> float:
         """Share of cases without an unknown cause that may be rejected."""
-        if self.by_reference:
-            return DECISION.unknown_with_reference
-        return DECISION.unknown
+        return rejection_level(self.by_reference)
 
     @property
     def rejects(self) -> bool:
@@ -270,6 +268,13 @@ def unexplained_share(
     """
     remaining = measure**2 - reference**2
     return remaining / max(measure_of_nothing**2 - reference**2, remaining, 1e-24)
+
+
+def rejection_level(by_reference: bool) -> float:
+    """Share of cases without an unknown cause that may be rejected: by a measure that was
+    held against a reference, or by another one.
+    """
+    return DECISION.unknown_with_reference if by_reference else DECISION.unknown
 
 
 def conformal_p(

@@ -103,6 +103,21 @@ def _diagnose(effects: Path, airframe: str) -> _Diagnosed:
     return _Diagnosed(values, family, bounds_of(values, intervals, airframe=airframe))
 
 
+def look_of(
+    episodes: dict[str, np.ndarray], usual: dict[str, np.ndarray], episode_length: int
+) -> Look:
+    """What `fine_tune` asks of a policy's figures (B,), by `selection_score`.
+
+    Speeds over the limit count as far as they are more than in the same `usual` episode,
+    that of the policy as it was with the nominal vehicle: to fly as fast with the
+    diagnosed one is what is wanted, and a vehicle that made a policy slower did nothing
+    good by it.
+    """
+    over_speed_rate = np.maximum(episodes["over_speed_rate"], usual["over_speed_rate"])
+    figures = episodes | {"over_speed_rate": over_speed_rate}
+    return Look(selection_score(figures, episode_length), figures["capture_step"])
+
+
 class _Programs:
     """A policy, and the compiled programs that fine-tune and measure it."""
 
@@ -135,23 +150,14 @@ class _Programs:
 
     def fine_tune(self, vehicle: _Diagnosed):
         """The best of the policy's updates (see
-        `openjax.learning.fine_tuning.fine_tune`), by `selection_score`.
-
-        Speeds over the limit count as far as they are more than in the same episode of
-        the policy as it was with the nominal vehicle: to fly as fast with the diagnosed
-        one is what is wanted, and a vehicle that made a policy slower did nothing good
-        by it.
+        `openjax.learning.fine_tuning.fine_tune`).
         """
         # the same draws for all that is compared, here and in each look
         usual = self._fly(self._parameters, self._chosen_by, 1, self._nominal)
 
         def look(policy):
             episodes = self._fly(policy, self._chosen_by, 1, vehicle.bounds)
-            episodes["over_speed_rate"] = np.maximum(
-                episodes["over_speed_rate"], usual["over_speed_rate"]
-            )
-            scores = selection_score(episodes, self.game.episode_length)
-            return Look(scores, episodes["capture_step"])
+            return look_of(episodes, usual, self.game.episode_length)
 
         return fine_tune(
             self.adaptation, self._parameters, vehicle.bounds, self._key, look
