@@ -27,7 +27,7 @@ from openjax.command_line import run_command
 from openjax.evaluation.episodes import wilson
 from openjax.evaluation.several_evaders import CHOICES, SeveralEvaders, several_tasks
 from openjax.evaluation.strangers import Strangers, bootstrap_mean, observed_by
-from openjax.pursuit import Pursuit, PursuitSettings, uniform_task
+from openjax.pursuit import Pursuit, PursuitSettings, RewardSettings, uniform_task
 from openjax.pursuit.evaders.kinds import HELD_OUT
 from openjax.store.policies import load_policy
 
@@ -52,6 +52,8 @@ def game_of(policy: str, number: int, evaders: tuple[str, ...]) -> PursuitSettin
         vehicles=(),
         rare_vehicles=0.0,
         fall_outs=0.0,
+        # counts for nothing here: no shortest paths
+        reward=RewardSettings(),
     )
     return dataclasses.replace(
         game, evader_speed=1.3 * game.max_speed, capture_radius=0.3

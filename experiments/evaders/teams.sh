@@ -67,8 +67,11 @@ map() { # NAME POLICY EPISODES SIZES...
   echo "-m openjax map --policy $2 --sizes ${*:4} --episodes $(episodes "$3")" \
     "--out $K/$1.png --json $K/$1.json $one"
 }
-learned() { # LEARNERS MINUTES
-  echo "$few_map --learning.learners $1 --minutes $2 --learning.total_steps $(steps 400000000)"
+learned() { # LEARNERS
+  # as many steps of each as in `exploit`, to their end: a rate that falls to zero
+  # counts on it
+  echo "$few_map --learning.learners $1 --minutes 2.5" \
+    "--learning.total_steps $(steps $((50000000 * $1)))"
 }
 uniform="--scenario uniform"
 scripted="--best_response False"
@@ -82,11 +85,11 @@ tables() { # NAME POLICY SECONDS
     --fall_outs 1
 }
 empty() { # SIZE SIZE SECONDS
-  job "empty_$1$2" "$3" "$(map "empty_$1$2" "$policy" 200 $1 $2)" "$(learned 3 1.5)" \
+  job "empty_$1$2" "$3" "$(map "empty_$1$2" "$policy" 200 $1 $2)" "$(learned 3)" \
     --evaders_out "$K/evaders_empty_$1$2.npz" "$planner"
 }
 pillars() { # SIZE SIZE SECONDS
-  job "pillars_$1$2" "$3" "$(map "pillars_$1$2" "$policy" 200 $1 $2)" "$(learned 2 1)" \
+  job "pillars_$1$2" "$3" "$(map "pillars_$1$2" "$policy" 200 $1 $2)" "$(learned 2)" \
     $uniform --planner_share 0
 }
 empty 7 8 380

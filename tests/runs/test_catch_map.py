@@ -12,7 +12,7 @@ from scipy.stats import binomtest
 import openjax
 from openjax.evaluation.episodes import wilson
 from openjax.evaluation.judges.settings import BestResponseSettings, PlannerSettings
-from openjax.pursuit import PursuitSettings
+from openjax.pursuit import PursuitSettings, RewardSettings
 from openjax.runs.catch_map import draw_map, map_game
 from openjax.runs.map_evaders import least_caught
 from openjax.runs.map_page import map_page
@@ -131,3 +131,10 @@ def test_a_policy_for_three_has_one_map():
     assert map_game(dataclasses.replace(COMMAND, sizes=(3,)), three).num_pursuers == 3
     with pytest.raises(openjax.UserError, match="--radii needs"):
         map_game(dataclasses.replace(COMMAND, radii=()), GAME)
+
+
+def test_a_map_knows_no_shortest_paths_whatever_the_training_paid_for():
+    """They would be found anew at each start, for nothing."""
+    paid = dataclasses.replace(GAME, reward=RewardSettings(path=0.5))
+    assert paid.reward.needs_paths
+    assert not map_game(COMMAND, paid).reward.needs_paths

@@ -21,6 +21,7 @@ from openjax.pursuit import (
     EpisodeStatistics,
     Pursuit,
     PursuitSettings,
+    RewardSettings,
     Task,
     uniform_task,
 )
@@ -85,6 +86,9 @@ def map_game(command: MapCommand, game: PursuitSettings) -> PursuitSettings:
         fall_out_seconds=(FALL_OUT, FALL_OUT),
         sight_range=command.sight_range,
         sight_angle=command.sight_angle,
+        # counts for nothing here, and a training's may ask for shortest paths, which
+        # cost time and memory
+        reward=RewardSettings(),
     )
 
 
