@@ -115,7 +115,7 @@ for radius in 0.7 1.2 1.5; do
   job "arena_$radius" 60 "$(map "arena_$radius" "$policy" 400 1 2 3 4 5 6 7 8)" $cell $uniform \
     $scripted --arena_radius "$radius"
 done
-job exploit_5 180 "$(exploit 5 250000000 1)"
+job exploit_5 240 "$(exploit 5 250000000 1)"
 job exploit_2 150 "$(exploit 2 300000000 1)"
 job sight 110 "$(map sight "$policy" 200 1 2 3 4 5 6 7 8)" $thin $scripted \
   --sight_angle 90 --sight_range 1
