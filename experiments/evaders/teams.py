@@ -65,12 +65,14 @@ def seeds_of(maps: Mapping, kind: str) -> dict[int, list[float]]:
 
 def page(results: Mapping) -> Page:
     """One table by size of team."""
+    rates = next(iter(seeds_of(results["maps"], "sizes").values()), [])
+    number = {2: "two", 3: "three"}.get(len(rates), len(rates))
     columns = {
         "pursuers": lambda row: (
             f"{row['size']}{' (held out)' if row['held_out'] else ''}"
         ),
         "one policy": "sizes.capture_rate:.3f",
-        "trained again, three seeds": "seeds",
+        f"trained again, {number} seeds": "seeds",
         **{
             head: f"{kind}.capture_rate:.3f"
             for kind, head in KINDS.items()
