@@ -8,6 +8,7 @@ cells of its own in each. Losses are means over the cells that both maps have, w
 flown from the same starts. Draws the eight small maps, and the page to move about in.
 """
 
+import itertools
 from collections import defaultdict
 from collections.abc import Mapping
 from pathlib import Path
@@ -34,7 +35,9 @@ with.
 WHO = ("scripted", "learned", "planner")
 INERTIA = ("points", "vehicles")
 """Who flies stack where it forces a capture for points, by the names of `forced`."""
-CERTAIN = 0.95
+OFTEN = 0.9
+REACHES = {"reach_20": 0.2, "reach_30": 0.3, "reach_50": 0.5}
+"""m, for which the fastest evader stands in the table that is caught `OFTEN`."""
 BOUNDS = {
     "forced_below": "below the solid line",
     "planar_below": "below the dashed line",
@@ -85,6 +88,17 @@ def mean_rate(cells: list[dict]) -> float | None:
     return float(np.mean([cell["capture_rate"] for cell in cells])) if cells else None
 
 
+def fastest_caught(cells: Mapping, radius: float) -> float | None:
+    """The speed ratio up to which, with this radius, the evader is caught `OFTEN` at
+    each of a size's ratios; None where it is at none.
+    """
+    rates = {
+        key[1]: cell["capture_rate"] for key, cell in cells.items() if key[2] == radius
+    }
+    caught = itertools.takewhile(lambda ratio: rates[ratio] >= OFTEN, sorted(rates))
+    return max(caught, default=None)
+
+
 def mean_difference(cells: Mapping, others: Mapping) -> float | None:
     """Mean of the capture rates of other cells less those of the same cells; None where
     none is in both.
@@ -109,7 +123,9 @@ def rows_of(results: Mapping) -> list[dict]:
         for who, cells in of_size.items():
             own = list(cells.values())
             row[who] = {"mean": mean_rate(own)}
-            row[who]["certain"] = sum(cell["interval"][0] >= CERTAIN for cell in own)
+            row[who]["fastest"] = {
+                name: fastest_caught(cells, reach) for name, reach in REACHES.items()
+            }
             for bound in BOUNDS:
                 below = [cell for cell in own if cell["speed_ratio"] < cell[bound]]
                 row[who][bound] = mean_rate(below)
@@ -131,7 +147,12 @@ def page(results: Mapping) -> Page:
         "pursuers": "size",
         "by rules": "scripted.mean:.3f",
         "learned": "learned.mean:.3f",
-        f"cells surely above {CERTAIN}, learned": "learned.certain",
+        **{
+            f"fastest learned caught {OFTEN:g}, at {reach:g} m": (
+                f"learned.fastest.{name}"
+            )
+            for name, reach in REACHES.items()
+        },
         **{
             f"{head}, learned": f"learned.{bound}:.3f" for bound, head in BOUNDS.items()
         },
@@ -140,7 +161,9 @@ def page(results: Mapping) -> Page:
     losses = {
         kind: f"{kind}:+.3f" for kind in list(KINDS)[1:] if kind in results["maps"]
     }
-    losses |= {f"stack forces, {who}": f"{who}:.2f" for who in INERTIA}
+    losses["inertia, where stack forces"] = lambda row: (
+        None if row["points"] is None else f"{row['vehicles'] - row['points']:+.2f}"
+    )
     short = Table(columns | losses, rows)
     return Page(
         "What can be caught", "Captures over speed ratios and capture radii.", short

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from experiments.evaders.catch_map import fastest_caught
 from experiments.paper import behaviours, main_tables, sweeps, tables
 from experiments.paper.roster import METHODS, seeds_of
 from experiments.paper.values import MAIN
@@ -163,3 +164,10 @@ def test_the_table_of_a_page_is_that_of_the_stored_results(name):
         results = read_json(RESULTS / "tables.json")
     written = (RESULTS / f"{name}.md").read_text(encoding="utf-8")
     assert written == with_table(written, page(results))
+
+
+def test_the_fastest_that_is_caught_is_below_the_first_that_gets_away():
+    rates = {0.8: 0.97, 1.2: 0.9, 1.6: 0.4, 2.0: 0.93}
+    cells = {(3, ratio, 0.3): {"capture_rate": rate} for ratio, rate in rates.items()}
+    assert fastest_caught(cells, 0.3) == 1.2
+    assert fastest_caught({(3, 0.8, 0.3): {"capture_rate": 0.5}}, 0.3) is None
