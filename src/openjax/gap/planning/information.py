@@ -9,7 +9,8 @@ air is as uneven as in a quiet hall: in still air every segment would tell every
 """
 
 import itertools
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
 
 import jax
 import numpy as np
@@ -27,7 +28,6 @@ from openjax.vehicle.vehicle_tables import Motor
 
 SECONDS = 10.0  # of each segment that are simulated
 ENOUGH = 0.98  # of what all segments tell together
-_REPLAYS: dict[tuple, Replay] = {}  # of the last vehicle
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +72,7 @@ class Advice:
 
 def advise(beliefs: list[Belief], vehicle_file: VehicleFile) -> Advice:
     """Rank all segments by what they are expected to tell."""
-    replay = _nominal_replay(vehicle_file)
+    replay = replay_segments(nominal_of(vehicle_file))
     apart = _distances(replay, beliefs)
     weights = np.array([b.probability for b in beliefs])
     together = np.outer(weights, weights)
@@ -123,25 +123,33 @@ def _fewest(apart: np.ndarray, together: np.ndarray) -> list[int]:
     return picks or [int(np.argmax([value(a) for a in apart]))]
 
 
-def _nominal_replay(vehicle_file: VehicleFile) -> Replay:
-    """The replay of every segment, flown by the vehicle without effects. One vehicle is
-    mostly asked about again and again, and its flights take seconds.
-    """
+@dataclass(frozen=True)
+class Nominal:
+    """A vehicle without effects; two with the same numbers are equal."""
+
+    numbers: tuple[bytes, ...]
+    airframe: str
+    mass_weighed: bool
+    vehicle_file: VehicleFile = field(compare=False)
+
+
+def nominal_of(vehicle_file: VehicleFile) -> Nominal:
+    """The vehicle that a file describes, without effects."""
     leaves = jax.tree.leaves(vehicle_file.vehicle)
     numbers = tuple(np.asarray(leaf).tobytes() for leaf in leaves)
-    key = (numbers, vehicle_file.airframe, vehicle_file.mass_weighed)
-    if key not in _REPLAYS:
-        _REPLAYS.clear()
-        _REPLAYS[key] = _fly_segments(vehicle_file)
-    return _REPLAYS[key]
-
-
-def _fly_segments(vehicle_file: VehicleFile) -> Replay:
-    """The replay of `_nominal_replay`."""
-    vehicle = vehicle_file.vehicle
     # what is simulated commands thrust in the nominal order, whatever its own logs hold
     tables = {"log": {"motor_rows": "mean"}, "motor": Motor(), "vehicles": {}}
     file_of_means = replace(vehicle_file, **tables)
+    return Nominal(
+        numbers, vehicle_file.airframe, vehicle_file.mass_weighed, file_of_means
+    )
+
+
+# one vehicle is mostly asked about again and again, and its flights take seconds
+@lru_cache(maxsize=1)
+def replay_segments(nominal: Nominal) -> Replay:
+    """The replay of every segment, flown by a vehicle without effects."""
+    vehicle = nominal.vehicle_file.vehicle
     flights = []
     for number, (name, segment) in enumerate(SEGMENTS.items()):
         air = Turbulence()
@@ -150,7 +158,7 @@ def _fly_segments(vehicle_file: VehicleFile) -> Replay:
         )
         parts, _ = flights_of(log_of(columns, name), (0, 1, 2, 3))
         flights += parts
-    case = Case("segments", tuple(flights), file_of_means)
+    case = Case("segments", tuple(flights), nominal.vehicle_file)
     return gather(case, library()).motion.replay
 
 
