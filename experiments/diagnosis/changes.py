@@ -20,6 +20,7 @@ import numpy as np
 from experiments.table import Page, Table, page_parser, publish
 from openjax.commands.sample_flights import Arguments, make_case
 from openjax.files import read_json
+from openjax.flights.case import read_folder
 from openjax.flights.csv_table import write_csv
 from openjax.flights.manoeuvres import references
 from openjax.flights.samples import fly, log_of
@@ -86,7 +87,7 @@ def vehicle_records(name: str, folder: Path, labels: dict) -> list[dict]:
     others.
     """
     (normal,) = [n for n in NORMAL if (folder / n).is_dir()]
-    case, old, _ = read(folder / normal)
+    case, old, _ = read(read_folder(folder / normal))
     out = []
     for number, day in enumerate(dict.fromkeys(f.day for f in old), 1):
         new, others = (
@@ -101,7 +102,9 @@ def vehicle_records(name: str, folder: Path, labels: dict) -> list[dict]:
             )
     for condition, truth in labels.items():
         if condition != normal:
-            change = change_between(condition, read(folder / condition)[1], old, case)
+            change = change_between(
+                condition, read(read_folder(folder / condition))[1], old, case
+            )
             out.append(record_of(name, condition, truth, change))
     return out
 
@@ -212,7 +215,10 @@ def figure(folder: Path) -> None:
         ):
             columns = fly(vehicle, vehicle, reference, 10 * seed + k, effects)
             write_csv(folder / name / f"{flight}.csv.gz", log_of(columns, flight))
-    change = compare(folder / "tuesday", [folder / "friday", folder / "monday"])
+    change = compare(
+        read_folder(folder / "tuesday"),
+        [read_folder(folder / d) for d in ("friday", "monday")],
+    )
     draw(change).savefig(folder / "what_changed.png", dpi=90)
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from openjax.commands.diagnose import main
 from openjax.errors import UserError
-from openjax.flights.case import load_case
+from openjax.flights.case import load_case, read_folder
 from openjax.flights.csv_table import write_csv
 from openjax.flights.manoeuvres import references
 from openjax.flights.reading import LogTable
@@ -53,7 +53,7 @@ def folders(tmp_path_factory):
 
 @functools.cache
 def figures_in(folder):
-    return read(folder)
+    return read(read_folder(folder))
 
 
 @functools.cache
@@ -132,7 +132,9 @@ def test_poor_logs_tell_as_much_about_trims(folders, tmp_path, kept):
     """
     for name in ("monday", "rotor"):
         with_columns(folders / name, tmp_path / name, kept)
-    change = compare(tmp_path / "rotor", [tmp_path / "monday"])
+    change = compare(
+        read_folder(tmp_path / "rotor"), [read_folder(tmp_path / "monday")]
+    )
     assert change.changed and change.rotors == (3,)
 
 
@@ -153,7 +155,7 @@ def test_a_folder_of_several_vehicles_is_refused(case, tmp_path):
         vehicle = np.full(len(flight), str(number % 2))
         write_csv(tmp_path / flight.log, LogTable(flight.log, columns, vehicle))
     with pytest.raises(UserError, match="several vehicles"):
-        compare(tmp_path, [tmp_path])
+        compare(read_folder(tmp_path), [read_folder(tmp_path)])
 
 
 def trims(day, factors=(1, 1, 1, 1), offset=(0, 0, 0, 0), seed=0, flights=3):
@@ -234,7 +236,9 @@ def test_rotors_are_counted_as_logged(case, folders, tmp_path):
                 tmp_path / name / flight.log,
                 LogTable(flight.log, columns, np.full(len(flight), "0")),
             )
-    change = compare(tmp_path / "rotor", [tmp_path / "monday"])
+    change = compare(
+        read_folder(tmp_path / "rotor"), [read_folder(tmp_path / "monday")]
+    )
     assert change.rotors == (1,) and change.side == "rear left"
 
 

@@ -2,8 +2,8 @@
 with the reason.
 """
 
-import dataclasses
 from collections import Counter
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -29,6 +29,44 @@ NO_LOGS = ("vehicle.toml", MAPPING_FILE)
 SHOWN = 3  # files that are named where none is a log
 
 
+@dataclass(frozen=True, eq=False)
+class LogFolder:
+    """A folder of logs as they were read, not yet checked."""
+
+    path: Path
+    vehicle_file: VehicleFile
+    """Of the nominal vehicle where the folder has none."""
+    has_vehicle_file: bool
+    logs: tuple[tuple[list[Flight], list[Issue]], ...]
+    """The flights of each log, and what was found while it was read."""
+
+    def case(self, comparison: bool = False) -> Case:
+        """Checked, as `load_case` says."""
+        if not self.has_vehicle_file and not comparison:
+            raise TooLittle(
+                f"{self.path}: no vehicle.toml; {_called_otherwise(self.path)}"
+            )
+        flights, issues = _usable(self.logs, self.vehicle_file, comparison)
+        issues += _not_flown(self.vehicle_file, self.logs)
+        if not flights:
+            reasons = [i for i in issues if i.refused]
+            first = (
+                f"{reasons[0].flight}: {reasons[0].issue}"
+                if reasons
+                else "no vehicle in any log"
+            )
+            more = f" (and {len(reasons) - 1} more)" if len(reasons) > 1 else ""
+            raise TooLittle(f"{self.path}: no flight can be used: {first}{more}")
+        # A thrust error is told from the mass only where every vehicle that flew was
+        # weighed.
+        is_weighed = all(
+            self.vehicle_file.mass_weighed_of(flight.vehicle) for flight in flights
+        )
+        vehicle_file = replace(self.vehicle_file, mass_weighed=is_weighed)
+        name = self.path.resolve().name
+        return Case(name, tuple(flights), vehicle_file, tuple(issues), self.path)
+
+
 def load_case(path: str | Path, dtype=jnp.float32, comparison: bool = False) -> Case:
     """Read a case folder: its `vehicle.toml` and its logs (of any format that is
     known). For a `comparison` with other flights motor commands alone are enough, and
@@ -38,6 +76,11 @@ def load_case(path: str | Path, dtype=jnp.float32, comparison: bool = False) -> 
     UserError for a folder without logs or an unusable vehicle file, and of that
     TooLittle if there is no vehicle file or no log is left.
     """
+    return read_folder(path, dtype).case(comparison)
+
+
+def read_folder(path: str | Path, dtype=jnp.float32) -> LogFolder:
+    """Read a folder for one case or several, as `load_case` does."""
     path = Path(path)
     if not path.is_dir():
         what = "is a file" if path.exists() else "no such folder"
@@ -50,31 +93,14 @@ def load_case(path: str | Path, dtype=jnp.float32, comparison: bool = False) -> 
             f"{path}: holds no flight log{_held_instead(path)}{_cases_inside(path)}"
         )
     has_vehicle_file = (path / "vehicle.toml").exists()
-    if not has_vehicle_file and not comparison:
-        raise TooLittle(f"{path}: no vehicle.toml; {_called_otherwise(path)}")
     vehicle_file = load_vehicle_file(
         path / "vehicle.toml" if has_vehicle_file else None, dtype
     )
     mapping = (
         load_mapping(path / MAPPING_FILE) if (path / MAPPING_FILE).exists() else None
     )
-    logs_read = [_read(log, vehicle_file, mapping) for log in logs]
-    flights, issues = _usable(logs_read, vehicle_file, comparison)
-    issues += _not_flown(vehicle_file, logs_read)
-    if not flights:
-        reasons = [i for i in issues if i.refused]
-        first = (
-            f"{reasons[0].flight}: {reasons[0].issue}"
-            if reasons
-            else "no vehicle in any log"
-        )
-        more = f" (and {len(reasons) - 1} more)" if len(reasons) > 1 else ""
-        raise TooLittle(f"{path}: no flight can be used: {first}{more}")
-    # A thrust error is told from the mass only where every vehicle that flew was
-    # weighed.
-    is_weighed = all(vehicle_file.mass_weighed_of(flight.vehicle) for flight in flights)
-    vehicle_file = dataclasses.replace(vehicle_file, mass_weighed=is_weighed)
-    return Case(path.resolve().name, tuple(flights), vehicle_file, tuple(issues), path)
+    logs_read = tuple(_read(log, vehicle_file, mapping) for log in logs)
+    return LogFolder(path, vehicle_file, has_vehicle_file, logs_read)
 
 
 def _not_flown(vehicle_file: VehicleFile, logs_read) -> list[Issue]:

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from openjax.errors import TooLittle
-from openjax.flights.case import load_case
+from openjax.flights.case import read_folder
 from openjax.flights.flight import Case
 from openjax.gap.diagnosis import diagnose_case
 from openjax.gap.planning.beliefs import next_flight
@@ -39,14 +39,16 @@ def diagnose_folder(
       UserError: nothing can be said, or the folders are of several vehicles.
     """
     trims = None
-    if reference:
+    logs = read_folder(folder)
+    logs_before = [read_folder(day) for day in reference]
+    if logs_before:
         with suppress(TooLittle):  # a diagnosis may still be made
-            trims = compare(folder, reference)
+            trims = compare(logs, logs_before)
     try:
-        case = load_case(folder)
+        case = logs.case()
         if trims is not None:
             _check_that_most_show_more(case, trims)
-        days = [load_case(day) for day in reference]
+        days = [day.case() for day in logs_before]
         report = diagnose_case(case, without, progress, days)
     except TooLittle as error:
         if trims is None:

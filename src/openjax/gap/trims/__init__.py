@@ -10,12 +10,11 @@ differs; `change` is what comes out.
 """
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 
 from openjax.errors import TooLittle, UserError
-from openjax.flights.case import load_case
+from openjax.flights.case import LogFolder
 from openjax.flights.flight import Case, Issue
 from openjax.gap.trims.causes import ROTOR_PLACES, SIDES, hypotheses_of
 from openjax.gap.trims.change import SHOWN, Change, Interval
@@ -37,48 +36,46 @@ from openjax.gap.trims.figures import (
 from openjax.gap.trims.weigh import least_shown, weigh
 
 
-def compare(flights: Path, references: Sequence[Path]) -> Change:
+def compare(flights: LogFolder, references: Sequence[LogFolder]) -> Change:
     """What changed in the flights of a folder against those of one or more reference
     folders (days).
 
     Raises UserError for flights of several vehicles, and of that TooLittle for a folder
     without a usable flight.
     """
-    new_case, new, quality = read(Path(flights))
+    new_case, new, quality = read(flights)
     old: list[FlightFigures] = []
     for folder in references:
-        case, figures, issues = read(Path(folder))
+        case, figures, issues = read(folder)
         if {f.vehicle for f in case.flights} != {f.vehicle for f in new_case.flights}:
             raise UserError(
-                f"{folder}: holds flights of another vehicle than {flights}"
+                f"{folder.path}: holds flights of another vehicle than {flights.path}"
             )
         old += figures
         quality += issues
-    return change_between(
-        Path(flights).resolve().name, new, old, new_case, tuple(quality)
-    )
+    return change_between(new_case.name, new, old, new_case, tuple(quality))
 
 
-def read(folder: Path) -> tuple[Case, list[FlightFigures], list[Issue]]:
+def read(folder: LogFolder) -> tuple[Case, list[FlightFigures], list[Issue]]:
     """A folder's case, the figures of its flights by day, and what was left out. Raises
     UserError as `compare`.
     """
-    case = load_case(folder, comparison=True)
+    case = folder.case(comparison=True)
     if len({f.vehicle for f in case.flights}) > 1:
         raise UserError(
-            f"{folder}: holds several vehicles; a comparison is of one vehicle with itself"
+            f"{folder.path}: holds several vehicles; a comparison is of one vehicle with itself"
         )
     quality = list(case.quality)
     figures = []
     for flight in case.flights:
-        values = figures_of(flight, case, str(folder))
+        values = figures_of(flight, case, str(folder.path))
         if isinstance(values, str):
             quality.append(Issue(flight.name, values, refused=True, kind="comparison"))
         else:
             figures.append(values)
     if not figures:
         reasons = "; ".join(dict.fromkeys(i.issue for i in quality if i.refused))
-        raise TooLittle(f"{folder}: no flight can be compared: {reasons}")
+        raise TooLittle(f"{folder.path}: no flight can be compared: {reasons}")
     return case, days_told_apart(figures), quality
 
 
