@@ -8,17 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from openjax.kernels.attention import (
+from openjax.kernels.attention import _reference, _reference_backward
+from openjax.kernels.attention_kernel import (
     BLOCK,
     ROWS,
-    EntityKind,
-    Layout,
-    Operands,
-    _reference,
-    _reference_backward,
     backward_by_kernel,
     forward_by_kernel,
 )
+from openjax.kernels.attention_operands import EntityKind, Layout, Operands
 from openjax.policy import encoder
 from openjax.policy.encoder import SelfAttention, normalised_linear
 

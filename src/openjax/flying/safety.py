@@ -1,13 +1,8 @@
 """Safety of a flight as a pure state machine: what was seen in, set-points out.
 
-Two parts:
-
-* decisions: who flies each vehicle, the policy or the controller that lifts, waits and
-  lands;
-* steering: how a vehicle is flown in each mode.
-
-What is possible, where a vehicle could still stop and what it can follow, is
-`openjax.flying.limits`'.
+Decided is who flies each vehicle, the policy or the controller that lifts, waits and
+lands. How it is flown in each mode is `openjax.flying.steering`'s; what is possible,
+where a vehicle could still stop and what it can follow, is `openjax.flying.limits`'.
 
 `see` (`openjax.flying.estimation`) judges the poses and brings each vehicle's estimate
 to now; `decide` does the rest; `step` is both. Nothing here reads a clock or touches a
@@ -20,35 +15,21 @@ tilted, or outside the arena; no action came in time; a key.
 
 import math
 
-from openjax.flying.controller import (
-    Vector,
-    accelerate,
-    lift_acceleration,
-    turned_on,
-    up,
-    wanted_acceleration,
-    wanted_velocity,
-)
+from openjax.flying.controller import Vector, up
 from openjax.flying.crtp import Supervisor
 from openjax.flying.estimation import see
-from openjax.flying.limits import (
-    APART,
-    fence_velocity,
-    parting_velocity,
-    resting_places,
-    within_reach,
-)
-from openjax.flying.set_point import ANGLES, LEAST_THRUST, MOTORS_OFF, RATES, SetPoint
+from openjax.flying.limits import resting_places
+from openjax.flying.set_point import SetPoint
 from openjax.flying.state import (
     FLYING,
     SPIN_UP,
     Drone,
     Event,
     Mode,
-    PoseSample,
     Request,
     State,
 )
+from openjax.flying.steering import steer
 
 ASIDE = 0.08
 """How far (m) a vehicle may move sideways in the test lift: a hover that starts beside
@@ -56,27 +37,8 @@ its trim.
 """
 RISEN = 0.04
 """The test lift is over this close (m) to its height."""
-LOW = 0.05
-"""Below this height (m) a landing settles."""
-SETTLING = 0.75
-"""A landing ends level for so long (s): from .4 m it comes down at 1.1 m/s. So far may
-the floor be from where it is thought.
-"""
-SETTLING_LIFT = 0.85
-"""It is then carried by this share of its weight."""
-TRIM_GAIN = 0.25
-"""Share of full thrust by which a climb that is off by 1 m/s for 1 s changes the
-trim.
-"""
-TRIM_LIMIT = 0.15
-"""Largest trim, as a share of full thrust."""
 _DOWN = (Mode.GROUND, Mode.LANDED)
 _UNTROUBLED = (Mode.LIFT, Mode.TRANSFER, Mode.READY, Mode.PURSUIT)
-
-
-# --------------------------------------------------------------------------------------
-# Decisions: who flies each vehicle
-# --------------------------------------------------------------------------------------
 
 
 def step(state: State, event: Event) -> tuple[State, tuple[SetPoint, ...]]:
@@ -306,154 +268,3 @@ def resting_places_of(state: State) -> list[Vector]:
     """Where the vehicles of a flight may wait or land (m)."""
     poses = [drone.estimate for drone in state.drones]
     return resting_places(state.settings, state.pillars, poses)
-
-
-# --------------------------------------------------------------------------------------
-# Steering: by the policy within its limits, or by the controller
-# --------------------------------------------------------------------------------------
-
-
-def steer(state: State, i: int, action: SetPoint | None, sample: PoseSample) -> Drone:
-    """Vehicle i after this tick, with its set-point. `action`: the policy's, where
-    there is one.
-    """
-    drone = _watch(state, state.drones[i], sample)._replace(sent=MOTORS_OFF)
-    time = state.time
-    if drone.mode not in FLYING or drone.estimate is None:
-        return drone
-    if drone.mode is Mode.SETTLE and time - drone.since > SETTLING:
-        return drone.to(Mode.LANDED, time)
-    # the last centimetres go level: nothing on board knows exactly where the floor is
-    if drone.mode is Mode.LAND and _is_low(state, drone):
-        drone = drone.to(Mode.SETTLE, time)
-    if drone.mode is Mode.SETTLE:
-        lift = SETTLING_LIFT * (state.airframe.hover_thrust + drone.trim)
-        return drone._replace(sent=SetPoint(ANGLES, thrust=lift))
-    if drone.mode is Mode.PURSUIT and action is not None:
-        return drone._replace(sent=_pursue(state, drone, i, action))
-    return _go(state, drone, i)
-
-
-def _watch(state, drone, sample) -> Drone:
-    """The drone with since when its battery is low and since when it is upside down."""
-
-    def since(begin, is_so):
-        return (state.time if begin is None else begin) if is_so else None
-
-    low = sample.voltage < state.settings.battery_low  # an unknown voltage is not low
-    over = drone.estimate is not None and up(drone.estimate.quaternion) < 0.0
-    is_confirmed = drone.captured.pose is not None and not drone.capture_fault
-    is_alone = drone.mode in FLYING and not is_confirmed
-    return drone._replace(
-        alone_since=since(drone.alone_since, is_alone),
-        low_since=since(drone.low_since, low),
-        over_since=since(drone.over_since, over),
-    )
-
-
-def _is_low(state, drone) -> bool:
-    """Whether a landing is near the floor, or long enough on the way."""
-    overdue = state.time - drone.since > state.settings.landing_time
-    return overdue or drone.estimate.position[2] < LOW
-
-
-def _pursue(state, drone, i, action) -> SetPoint:
-    """The policy's action, or what keeps the drone in the arena and off the others."""
-    settings = state.settings
-    estimate = drone.estimate
-    parting = None
-    if settings.separation > 0.0:
-        poses = [d.estimate if d.mode in FLYING else None for d in state.drones]
-        parting = parting_velocity(settings, i, poses)
-    # who makes room for another mustn't leave the arena for that
-    aim = estimate if parting is None else estimate._replace(velocity=parting)
-    previous = state.drones[i].sent
-    # until its motors have followed it turns on
-    set_point = turned_on(
-        estimate.quaternion, estimate.body_rates, state.airframe.motor_time_constant
-    )
-    lift = max(previous.thrust, LEAST_THRUST) / state.airframe.hover_thrust
-    present = lift_acceleration(set_point, lift)
-    velocity = (
-        fence_velocity(settings, estimate, present)
-        or fence_velocity(settings, aim, present)
-        or parting
-    )
-    if velocity is None:
-        return within_reach(action, previous, state.airframe, state.dt)
-    acceleration = wanted_acceleration(estimate.velocity, velocity)
-    return accelerate(
-        estimate.quaternion, acceleration, state.airframe, drone.trim, RATES
-    )
-
-
-def _go(state, drone, i) -> Drone:
-    """The drone on its way to its anchor, or waiting there, by the controller."""
-    estimate = drone.estimate
-    airframe = state.airframe
-    velocity = _target_velocity(state, drone, i)
-    acceleration = wanted_acceleration(estimate.velocity, velocity)
-    attitude = estimate.quaternion
-    if state.time - drone.seen > state.settings.pose_timeout:
-        # by reckoning: the vehicle does what it is asked for, and is level else
-        share = min(state.dt / state.settings.reaction, 1.0)
-        change = zip(drone.acceleration, acceleration, strict=True)
-        drone = drone._replace(
-            acceleration=tuple(a + share * (b - a) for a, b in change)
-        )
-        attitude = _yaw_only(attitude)
-    else:
-        # not lower: on the floor a vehicle that doesn't climb isn't too heavy
-        if estimate.position[2] > (0.02 if drone.mode is Mode.LIFT else 0.1):
-            error = min(max(velocity[2] - estimate.velocity[2], -0.3), 0.3)
-            trim = min(
-                max(drone.trim + TRIM_GAIN * state.dt * error, -TRIM_LIMIT), TRIM_LIMIT
-            )
-            drone = drone._replace(trim=trim)
-        if drone.mode is Mode.TRANSFER and _is_there(estimate, drone.anchor):
-            drone = drone.to(Mode.READY, state.time)
-    return drone._replace(
-        sent=accelerate(attitude, acceleration, airframe, drone.trim, ANGLES)
-    )
-
-
-def _target_velocity(state, drone, i) -> Vector:
-    """The velocity (m/s) that the drone's mode asks for."""
-    position = drone.estimate.position
-    settings = state.settings
-    if drone.mode is Mode.LAND:
-        x, y, _ = wanted_velocity(position, (*drone.anchor[:2], position[2]), 0.5)
-        slower = 0.6 if position[2] < 0.2 else 1.0
-        return x, y, -slower * settings.landing_speed
-    x, y, z = wanted_velocity(position, drone.anchor, settings.transfer_speed)
-    if drone.mode is not Mode.TRANSFER:
-        return x, y, z
-    if position[2] < 0.2:  # straight up first
-        x = y = 0.0
-    if math.dist(position, drone.anchor) < 0.3:  # starts may be close to each other
-        return x, y, z
-    for j, other in enumerate(state.drones):  # around each other, to the right
-        if j == i or other.estimate is None or other.mode not in FLYING:
-            continue
-        dx = position[0] - other.estimate.position[0]
-        dy = position[1] - other.estimate.position[1]
-        distance = math.hypot(dx, dy)
-        if 1e-6 < distance < APART:
-            push = (APART - distance) / distance * 2.0
-            x = x + push * (dx + dy)
-            y = y + push * (dy - dx)
-    return x, y, z
-
-
-def _is_there(estimate, target) -> bool:
-    return (
-        math.dist(estimate.position, target) < 0.06
-        and math.dist(estimate.velocity, (0.0, 0.0, 0.0)) < 0.15
-    )
-
-
-def _yaw_only(quaternion):
-    """The attitude (4,) wxyz without roll and pitch."""
-    w, _, _, z = quaternion
-    size = math.hypot(w, z)
-    return (w / size, 0.0, 0.0, z / size) if size > 1e-6 else (1.0, 0.0, 0.0, 0.0)

@@ -8,13 +8,8 @@ import jax
 import jax.numpy as jnp
 from jax.typing import DTypeLike
 
-from openjax.kernels.attention import (
-    EntityKind,
-    Layout,
-    Operands,
-    attend,
-    attend_one_by_one,
-)
+from openjax.kernels.attention import attend, attend_one_by_one
+from openjax.kernels.attention_operands import EntityKind, Layout, Operands
 from openjax.kernels.normalisation import normalise, normalised_layer
 from openjax.platform import can_compile_for_cuda
 
