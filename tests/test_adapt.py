@@ -13,17 +13,15 @@ import pytest
 from openjax.commands import adapt
 from openjax.errors import UserError
 from openjax.learning import TrainSettings, build
-from openjax.learning.adaptation import (
-    LAG,
-    AdaptSettings,
+from openjax.learning.adaptation import make_adaptation, off_the_flight
+from openjax.learning.adapting_game import (
     adapting_game,
     bounds_of,
-    make_adaptation,
-    off_the_flight,
     starting_parameters,
 )
 from openjax.learning.fine_tuning import Look, fine_tune, improves
-from openjax.learning.settings import GeneratorSettings, MappoSettings
+from openjax.learning.nominal_flights import LAG
+from openjax.learning.settings import AdaptSettings, GeneratorSettings, MappoSettings
 from openjax.policy import NetworkSettings, PolicyParameters, PredictorSettings
 from openjax.pursuit import PursuitSettings
 from openjax.runs import adaptation

@@ -142,11 +142,8 @@ class Tuner:
         import jax
 
         from openjax.evaluation.validation import uniform_tasks
-        from openjax.learning.adaptation import (
-            bounds_of,
-            make_adaptation,
-            starting_parameters,
-        )
+        from openjax.learning.adaptation import make_adaptation
+        from openjax.learning.adapting_game import bounds_of, starting_parameters
         from openjax.learning.settings import AdaptSettings
         from openjax.runs.adaptation import compile_programs
         from openjax.store.policies import load_policy
@@ -195,7 +192,7 @@ class Tuner:
 
 def bounds_in(folder: Path, name: str):
     """(R, 4) bounds of an effects file; the true vehicle's hold it alone."""
-    from openjax.learning.adaptation import bounds_of
+    from openjax.learning.adapting_game import bounds_of
     from openjax.vehicle.effects.effects_file import load_effects, load_intervals
 
     _, values = load_effects(folder / f"{name}.toml")

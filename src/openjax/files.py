@@ -240,7 +240,8 @@ def check_output_folder(path: str | Path, option: str) -> None:
         # the nearest folder above that is there already
         parent = next(folder for folder in (path, *path.parents) if folder.exists())
         if not parent.is_dir():
-            raise UserError(f"{option} {path}: {parent} is a file; a folder is needed")
+            which = "it" if parent == path else parent
+            raise UserError(f"{option} {path}: {which} is a file; a folder is needed")
         with tempfile.TemporaryFile(dir=parent):
             pass
 

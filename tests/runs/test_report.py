@@ -45,3 +45,11 @@ def test_it_plays_the_runs_game_and_steers_as_it_was_trained_to():
     record = openjax.evaluate(policy, "empty", episodes=1, **vars(game))
     assert record["capture_rate"] == rows[1]["capture_rate"]
     assert record["capture_step"] == 2 * rows[1]["capture_step"]
+
+
+def test_it_sees_what_it_was_trained_to_see_in_games_that_show_more():
+    run = PursuitSettings(observe_game=True, observe_arena=True, history_pursuers=False)
+    policy = openjax.load_policy("flight")
+    game = game_for(Pursuit(run), policy)
+    assert not game.settings.observe_game and not game.settings.observe_arena
+    policy.in_game(game)

@@ -24,7 +24,8 @@ from openjax.evaluation.validation import selection_score, uniform_tasks
 from openjax.files import write_json, write_text
 from openjax.flights.case import load_case
 from openjax.interruption import clean_up
-from openjax.learning.adaptation import bounds_of, make_adaptation, starting_parameters
+from openjax.learning.adaptation import make_adaptation
+from openjax.learning.adapting_game import bounds_of, starting_parameters
 from openjax.learning.fine_tuning import Look, fine_tune
 from openjax.learning.train_state import TrainState
 from openjax.runs.adapt_report import FIGURES, WHICH, page

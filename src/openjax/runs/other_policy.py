@@ -8,27 +8,11 @@ from collections.abc import Sequence
 import jax
 
 from openjax.evaluation.evaluator import Evaluator, layout_slots, layout_tasks
+from openjax.evaluation.strangers import observed_by
 from openjax.evaluation.validation import uniform_tasks
 from openjax.pursuit import Pursuit, Scenario
 from openjax.show.trajectory import Trajectory
 from openjax.store.policies import LoadedPolicy
-
-_OF_THE_POLICY = (
-    "time_step",
-    "substeps",
-    "observed_pillars",
-    "observe_time",
-    "observe_position",
-    "observe_in",
-    "observe_history",
-    "observe_history_spacing",
-    "history_length",
-    "history_spacing",
-    "track_unseen",
-    "strategies",
-    "strategy_seconds",
-)
-"""Settings that are how a policy sees and steers, and not what game it plays."""
 
 
 def game_for(environment: Pursuit, policy: LoadedPolicy) -> Pursuit:
@@ -38,8 +22,9 @@ def game_for(environment: Pursuit, policy: LoadedPolicy) -> Pursuit:
     settings = environment.settings
     game = policy.settings.environment
     settings = dataclasses.replace(
-        settings,
-        **{name: getattr(game, name) for name in _OF_THE_POLICY},
+        observed_by(settings, game),
+        time_step=game.time_step,
+        substeps=game.substeps,
         # as many seconds, in steps of its own
         episode_length=round(
             settings.episode_length * settings.time_step / game.time_step
