@@ -67,6 +67,23 @@ def test_motors_that_act_from_their_row_on_are_no_finding(tracks):
     assert read([moved(t, 0.004) for t in tracks], row=0.001) == read(tracks)
 
 
+def test_rotors_that_turn_the_body_as_they_speed_up_are_no_shift(tracks):
+    """In yaw their reaction comes 20 to 30 ms before their drag."""
+
+    def yawing(track):
+        yaw = np.interp(track.time + 0.025, track.time, track.body_rates[:, 2])
+        gusts = np.random.default_rng(0).standard_normal((len(track), 2))
+        return dataclasses.replace(track, body_rates=np.column_stack([gusts, yaw]))
+
+    assert read([yawing(t) for t in tracks]) == read(tracks)
+
+
+def test_a_flight_whose_loop_answers_late_is_no_clock(tracks):
+    """As in another's wake, which turns the body before the motors answer."""
+    late = [moved(t, -0.04) if k == 1 else t for k, t in enumerate(tracks)]
+    assert read(late) == read(tracks)
+
+
 def test_a_flight_that_turns_slowly_tells_no_clock_of_its_own():
     """At 30 ms beside its peak the likeness of turns of about 1 Hz is still nine tenths
     of it.

@@ -3,9 +3,10 @@ what acts.
 
 Torques turn the body at once: the angular acceleration that motors would make, through
 their lag, is where the cross-correlation with what the gyroscope reads is largest
-(Knapp, Carter 1976). It may come later than the motors' lag says, as slow motors and
-late links do. It can't come earlier: then a row of commands holds what acted before it,
-or the two streams are on different clocks.
+(Knapp, Carter 1976). Roll and pitch tell it: in yaw rotors that speed up turn the body
+before their drag does, which looks like a row's shift. It may come later than the
+motors' lag says, as slow motors and late links do. It can't come earlier: then a row of
+commands holds what acted before it, or the two streams are on different clocks.
 """
 
 import dataclasses
@@ -37,8 +38,8 @@ FOLLOWS = 0.25  # mean squared correlation from which motors and turning belong 
 BETTER = 0.9  # share of it that a peak at another offset may have, and be as good
 # s that motors may seem early: half a row where rows are single samples, and EARLY of a
 # motor that is faster than assumed. The largest in 120 cases of four simulators was
-# .0025.
-EARLY = 0.0015
+# .0025 (steps of an offset are as long).
+EARLY = 0.003
 # Share of a flight's likeness at its own offset that it has at the common one of all
 # flights, from which it tells no other: where a flight hardly turns the curve is flat.
 TELLS = 0.85
@@ -80,7 +81,9 @@ def read_motor_clock(
     usual = float(np.median(list(delays.values()))) if delays else row_time
     least = _least(row, rows)
     alike = not delays or max(delays.values()) - min(delays.values()) < APART
-    if alike and -LATE < usual - row_time <= least:
+    # what gusts and wakes turn the loop answers late: flights in them needn't be alike
+    times = (usual,) if alike else delays.values()
+    if all(-LATE < delay - row_time <= least for delay in times):
         return MotorClock(by_a_row if row_time else {}, True, {})
     if (
         alike
@@ -259,7 +262,7 @@ def _turning(
     track: Track, vehicle, gyroscope: bool
 ) -> tuple[Track, np.ndarray, np.ndarray]:
     """The track, its angular acceleration and that which its motors make, but for their
-    units, (T - 1, 3).
+    units, (T - 1, 2), in roll and pitch.
     """
     rates = track.body_rates
     if not gyroscope or rates is None:
@@ -268,15 +271,16 @@ def _turning(
             np.concatenate([increments[:1], increments])
             + np.concatenate([increments, increments[-1:]])
         )
-    return track, np.diff(rates, axis=0) / track.dt, _torques(track, vehicle)[:-1]
+    acceleration = np.diff(rates[:, :2], axis=0) / track.dt
+    return track, acceleration, _torques(track, vehicle)[:-1]
 
 
 def _torques(track: Track, vehicle) -> np.ndarray:
-    """Torques (T, 3), but for their unit, that motors make in each row through their
-    lag: the mean over the row of a first-order answer to a command that is held.
+    """Torques (T, 2) in roll and pitch, but for their unit, that motors make in each row
+    through their lag: the mean over the row of a first-order answer to a command that is
+    held.
     """
     place = np.asarray(vehicle.rotor_position, float)
-    spin = np.asarray(vehicle.rotor_spin, float)
     time = float(vehicle.motor_time_constant)
     decay = np.exp(-track.dt / time)
     start = decay * track.motor[:1]
@@ -289,5 +293,5 @@ def _torques(track: Track, vehicle) -> np.ndarray:
     # acts: what goes with the sum tells no time, and in a climb it is all there is.
     total = mean.sum(1)
     columns = np.stack([np.ones_like(total), total], 1)
-    torques = mean @ np.stack([place[:, 1], -place[:, 0], spin], 1)
+    torques = mean @ np.stack([place[:, 1], -place[:, 0]], 1)
     return torques - columns @ np.linalg.lstsq(columns, torques, rcond=None)[0]
