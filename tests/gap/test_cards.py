@@ -84,6 +84,9 @@ def test_what_pushes_along_the_motion_is_no_drag():
     assert seems("wind", x=0.5, y=0.0, z=0.0, drag=0.004, along=1.0)
     assert not seems("wind", x=0.5, y=0.0, z=0.0, drag=-0.004, along=1.0)
     assert not seems("wind", x=0.5, y=0.0, z=0.5, drag=0.004, along=-0.1)
+    # a fan is nearly level, and a draught from below is weak
+    assert seems("wind", x=9.2, y=-1.9, z=1.1, drag=0.018, along=1.0)
+    assert not seems("wind", x=4.0, y=0.0, z=1.1, drag=0.018, along=1.0)
 
 
 def test_what_no_air_and_no_rotor_does_is_something_else():

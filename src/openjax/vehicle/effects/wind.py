@@ -28,19 +28,21 @@ def wrench(parameters, context):
 
 STEEPEST = 2.0  # times as much drag along the rotors' axes, twice what is usual
 FASTEST_UP = 1.0  # m/s, the end of the usual range
+LEVEL = 0.2  # of the wind's speed that may rise or fall: a fan isn't quite level
 
 _SOURCE = "indoor draughts and fans, 0.3-3 m/s"
 
 
 def drags(value, deviation):
     """Whether air that moves drags the vehicle along, along the rotors' axes too and not
-    much more there, and rises no faster than draughts do: a thrust that isn't known
-    looks like a gale from below.
+    much more there, and rises no faster than draughts do or than a strong wind that is
+    nearly level: a thrust that isn't known looks like a gale from below.
     """
+    level = LEVEL * (value["x"] ** 2 + value["y"] ** 2) ** 0.5
     return bool(
         value["drag"] > 0.0
         and 0.0 < value["along"] < STEEPEST
-        and abs(value["z"]) < FASTEST_UP
+        and abs(value["z"]) < max(FASTEST_UP, level)
     )
 
 
