@@ -13,6 +13,7 @@ from openjax.gap.model.whitening import Noise
 from openjax.gap.residual import (
     HORIZONS,
     Check,
+    _comparable,
     _larger,
     beyond,
     calibration,
@@ -105,3 +106,24 @@ def test_sensors_that_disagree_leave_names_unless_forces_grew_as_well():
     assert _larger(calm, reference, "position") == []
     assert _larger(calm | {"velocity": 0.1}, reference, "position") == ["velocity"]
     assert _larger(calm, reference, "rates") == ["rates"]
+
+
+@pytest.mark.parametrize(
+    ("shift", "before", "kept"), [(0.0, 0.0, 3), (0.02, 0.0, 0), (0.0, 0.02, 1)]
+)
+def test_a_later_pose_jitters_and_isnt_compared(shift, before, kept):
+    """Where only the reference's is late, its jitter is what is exceeded."""
+
+    def channels(late):
+        fit = SimpleNamespace(value=late)
+        pose = SimpleNamespace(path="estimator", fit=fit, acting=lambda: {"late": 1.0})
+        return {"estimator": pose}
+
+    measures = dict.fromkeys(("estimator", "position", "accelerometer"), 0.1)
+    baseline = SimpleNamespace(measures=measures, channels=channels(before))
+    made = SimpleNamespace(
+        baseline=baseline,
+        charge_unknown=False,
+        channels=tuple(channels(shift).values()),
+    )
+    assert len(_comparable(made)) == kept

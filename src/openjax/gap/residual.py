@@ -102,9 +102,13 @@ def check_residual(evidence: Evidence, fit: SetFit, nothing: SetFit) -> Check:
     by_reference = reference is not None and name in reference
     mostly_unknown = False
     if reference:
-        measures_of_nothing, _ = measure(evidence, residuals_of(nothing))
+        # with its mean, which a steady wind makes
+        squares, squares_of_nothing = (
+            {n: (c**2).mean(0).max() for n, c in _changes(evidence, of).items()}
+            for of in (residuals_of(fit), residuals_of(nothing))
+        )
         shares = [
-            unexplained_share(measures[n], reference[n], measures_of_nothing[n])
+            unexplained_share(squares[n], reference[n] ** 2, squares_of_nothing[n])
             for n in _larger(measures, reference, name)
         ]
         mostly_unknown = max(shares, default=0.0) > MOSTLY
@@ -150,17 +154,23 @@ def measure(
     """{name: measure} of what is left, and {name: (3,) the same by axis}, of which a
     measure is the largest.
     """
+    axes = {n: c.std(0) for n, c in _changes(evidence, residuals).items()}
+    return {name: float(size.max()) for name, size in axes.items()}, axes
+
+
+def _changes(evidence: Evidence, residuals: list[np.ndarray]) -> dict[str, np.ndarray]:
+    """{name of HORIZONS: by how much (rows, 3) what is left changes over its horizon}."""
     dt = evidence.tracks[0].dt
     skip = int(SKIP / dt)
-    axes = {}
+    out = {}
     for name, parts in _series(evidence, residuals).items():
         step = max(round(HORIZONS[name][0] / dt), 1)
         changes = [(p[step:] - p[:-step])[skip:] for p in parts]
         if name in OF_MOTION and evidence.motion.gusts is not None:
             calm = [_calm(rows, step)[skip:] for rows in evidence.motion.gusts.rows]
             changes = [m[c] for m, c in zip(changes, calm, strict=True)]
-        axes[name] = np.concatenate(changes).std(0)
-    return {name: float(size.max()) for name, size in axes.items()}, axes
+        out[name] = np.concatenate(changes)
+    return out
 
 
 def _calm(rows: Chosen, step: int) -> Chosen:
@@ -226,15 +236,18 @@ def _path_against_accelerometer(track: Track) -> np.ndarray:
 def _comparable(evidence: Evidence) -> dict[str, float]:
     """The reference's measures, of which those of forces and torques say nothing where
     a battery that nobody logged makes another thrust of every duty cycle, and those of
-    the pose nothing where it was moved in time by other times.
+    the pose nothing where it was moved in time by other times: of the path that counts
+    where the case's is later.
     """
     baseline = evidence.baseline
     silent = OF_MOTION if evidence.charge_unknown else ()
     channels = {c.path: c for c in evidence.channels}
-    shifts = [_shift(c.get("estimator")) for c in (channels, baseline.channels)]
+    shift = _shift(channels.get("estimator"))
+    reference_shift = _shift(baseline.channels.get("estimator"))
     # What is late also jitters, which no shift takes away.
-    if abs(shifts[0] - shifts[1]) > BOUND * SIZE["pose_clock"]:
-        silent += ("estimator", "position", "accelerometer")
+    if abs(shift - reference_shift) > BOUND * SIZE["pose_clock"]:
+        silent += ("estimator", "accelerometer")
+        silent += ("position",) if shift > reference_shift else ()
     return {n: v for n, v in baseline.measures.items() if n not in silent}
 
 
@@ -260,14 +273,12 @@ def _larger(
     ]
 
 
-def unexplained_share(
-    measure: float, reference: float, measure_of_nothing: float
-) -> float:
-    """Share of what a measure's square has grown by since the reference that the fit
+def unexplained_share(square: float, reference: float, of_nothing: float) -> float:
+    """Share of what a mean square has grown by since the reference that the fit
     leaves.
     """
-    remaining = measure**2 - reference**2
-    return remaining / max(measure_of_nothing**2 - reference**2, remaining, 1e-24)
+    remaining = square - reference
+    return remaining / max(of_nothing - reference, remaining, 1e-24)
 
 
 def rejection_level(by_reference: bool) -> float:
