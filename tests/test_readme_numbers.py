@@ -134,6 +134,20 @@ def test_the_least_of_the_second_judge():
     assert cells(label)[0] == f"{short(least, 2)}; {short(uniform, 2)}"
 
 
+def test_where_a_theorem_forces_a_capture():
+    """Mean over the squares of the map below its solid line."""
+    squares = [
+        square["learned"]["capture_rate"]
+        for square in read("catch_map")["maps"]["empty"]["cells"]
+        if square["speed_ratio"] < square["forced_below"]
+    ]
+    label = (
+        "where a theorem forces points to catch: captures by `teams` of evaders that "
+        "learned"
+    )
+    assert cells(label)[0] == short(np.mean(squares), 2)
+
+
 def test_diagnosis():
     """The last exam's engine, without a reference, on the cases that it answered
     once.

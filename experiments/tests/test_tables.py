@@ -138,6 +138,7 @@ def test_sweeps_say_where_open_is_not_above():
 
 
 STUDIES = {
+    "catch_map": "experiments.evaders.catch_map",
     "changes": "experiments.diagnosis.changes",
     "evaders": "experiments.evaders.cross_play",
     "exam": "experiments.diagnosis.run",
@@ -146,6 +147,7 @@ STUDIES = {
     "flying_real_time": "experiments.flying.real_time",
     "quick": "experiments.paper.quick",
     "seconds": "experiments.speed.seconds",
+    "teams": "experiments.evaders.teams",
     "vehicles": "experiments.flying.vehicles",
     "worlds": "experiments.flying.worlds.study",
 }

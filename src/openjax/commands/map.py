@@ -9,6 +9,7 @@ the line below which a theorem forces one for points without inertia
 
 import dataclasses
 from collections.abc import Sequence
+from pathlib import Path
 
 from openjax.command_line import output_console, parse
 from openjax.errors import UserError
@@ -86,7 +87,7 @@ def _show(command, results, console):
     plot_map(
         command.out,
         cells,
-        f"{command.policy}: captures, {command.scenario}, {who} evaders",
+        f"{Path(command.policy).name}: captures, {command.scenario}, {who} evaders",
     )
     least = min(cells, key=lambda cell: cell["capture_rate"])
     console.print(

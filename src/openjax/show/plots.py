@@ -153,15 +153,17 @@ def plot_map(path: Path, cells: Sequence[dict], title: str) -> None:
         axes.set_title(f"{size} pursuer{'s' if size > 1 else ''}", fontsize="medium")
     for axes in panels[len(sizes) :]:
         axes.set_axis_off()
-    figure.supxlabel("capture radius [m]", fontsize="medium")
-    figure.supylabel("evader's speed / pursuers'", fontsize="medium")
+    # of the panels, as a legend outside covers what a whole figure's axes are called
+    for axes in panels[max(0, len(sizes) - columns) : len(sizes)]:
+        axes.set_xlabel("capture radius [m]", fontsize="small")
+    for axes in panels[::columns]:
+        axes.set_ylabel("evader's speed / pursuers'", fontsize="small")
     figure.suptitle(title, fontsize="medium")
     lines = [
         Line2D([], [], color="red", linestyle=style, label=words)
         for style, words in BOUNDS.values()
     ]
-    # beside the label of the axes, which is in the middle
-    place = {"loc": "outside lower right", "ncols": 2}
+    place = {"loc": "outside lower center", "ncols": min(2, columns)}
     figure.legend(handles=lines, fontsize="small", frameon=False, **place)
     figure.colorbar(image, ax=panels.tolist(), label="captured", shrink=0.8)
     _save(figure, path)
