@@ -54,7 +54,9 @@ def _read(path, what, language, parse: Callable[[str], Any]):
         if not path.exists():
             raise UserError(f"{path}: no such {what}")
         if not path.is_file():
-            raise UserError(f"{path}: is no file; the {what} is one")
+            raise UserError(
+                f"{path}: is no file; the {what} is one{_example(path, language)}"
+            )
         if path.stat().st_size > LARGEST_TEXT:
             raise UserError(
                 f"{path}: {path.stat().st_size} bytes are too many for a {what}"
@@ -77,6 +79,12 @@ def _read(path, what, language, parse: Callable[[str], Any]):
         raise UserError(f"{path}: not readable as {language} ({error})") from None
     _check_plain(path, value)
     return value
+
+
+def _example(folder: Path, language: str) -> str:
+    """Which files of a language a folder holds, in words."""
+    names = sorted(file.name for file in folder.glob(f"*.{language.lower()}"))
+    return f", such as {', '.join(names[:2])} in there" if names else ""
 
 
 def _check_plain(path, value):

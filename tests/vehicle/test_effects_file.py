@@ -128,3 +128,9 @@ def test_what_no_vehicle_has_is_refused_in_one_line(name, key, where, tmp_path):
         f"[{name}]\n{key} = {{ value = {usual}, interval90 = [{least}, {usual}] }}\n"
     )
     assert load_intervals(path)[name][key] == (least, usual)
+
+
+def test_the_folder_of_a_diagnosis_is_answered_with_the_file_in_it(tmp_path):
+    (tmp_path / "effects.toml").write_text("")
+    with pytest.raises(UserError, match="is one, such as effects"):
+        load_effects(tmp_path)

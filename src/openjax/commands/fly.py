@@ -311,9 +311,10 @@ def _check_numbers(arguments, starts, pursuers):
     """Raises UserError where vehicles, starts and pursuers aren't equally many."""
     vehicles = len(arguments.uri)
     if vehicles != pursuers:
+        plural = "s" * (vehicles > 1)
         raise UserError(
-            f"--uri names {vehicles} vehicles, the policy flies {pursuers}: name all after one "
-            "--uri"
+            f"--uri names {vehicles} vehicle{plural}, the policy flies {pursuers}: name all after "
+            "one --uri"
         )
     if starts != pursuers:
         raise UserError(
