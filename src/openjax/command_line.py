@@ -308,6 +308,11 @@ def _unknown(argument, default, program):
     # a setting's own name often comes without its group, or with another: --n_pursuers
     # for --environment.n_pursuers
     close = [option for option in options if last_part(option) == last_part(name)]
-    close = close or difflib.get_close_matches(name, options, n=1, cutoff=0.6)
+    # without the dashes, which all have in common
+    names = {option.lstrip("-"): option for option in options}
+    close = close or [
+        names[word]
+        for word in difflib.get_close_matches(name.lstrip("-"), names, n=1, cutoff=0.6)
+    ]
     hint = f"did you mean {close[0]}?" if close else f"see {program} --help"
     return f"unknown setting {argument.split('=', 1)[0]}; {hint}"

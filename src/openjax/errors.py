@@ -22,7 +22,9 @@ def suggestion(name: str, names: Iterable[str]) -> str:
     one that is nearest, or all.
     """
     names = list(names)
-    close = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
+    # `drag` is short of `rotor_drag` by more than one typing error
+    longer = [other for other in names if name and name in other]
+    close = difflib.get_close_matches(name, names, n=1, cutoff=0.6) or longer
     return f"did you mean {close[0]}?" if close else f"there are {', '.join(names)}"
 
 
