@@ -83,6 +83,18 @@ def test_faster_logs_become_means_over_the_rows_of_the_grid(rate):
     )
 
 
+def test_a_track_ends_where_the_body_is_known():
+    """No pose is held beyond the last one: it would stand still while the body flies."""
+    time = np.arange(0.0, 4.0, 0.01)
+    path = np.stack([time, 0 * time, 0 * time + 0.5], 1)
+    path[np.arange(len(time)) % 7 != 3] = np.nan
+    logged = {"motor_command": np.full((400, 4), 0.5), "body_rates": np.zeros((400, 3))}
+    f = Flight("log.csv:0", "log.csv", "0", time, position=path, **logged)
+    (track,) = flight_tracks(f, Case("case", (f,), load_vehicle_file()))
+    assert len(track) > 390
+    np.testing.assert_allclose(np.diff(track.position[:, 0]), 0.01)
+
+
 @pytest.mark.parametrize("below", [0.0, -1.3, 0.4])
 def test_heights_of_tracks_are_above_the_floor(below):
     """Wherever a lab's z begins: ground and ceiling effect ask for the distance to

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from scipy.ndimage import convolve1d
 from scipy.spatial.transform import Rotation
 
-from openjax.flights.flight import SENSORS, Case, Flight
+from openjax.flights.flight import HOLE, SENSORS, Case, Flight
 from openjax.flights.shapes import Columns, Motors, Quaternions, Times, Vectors
 
 Array = np.ndarray
@@ -82,7 +82,7 @@ def _stretches(flight: Flight, without_holes: Flight, case: Case) -> list[Track]
             max_step=max(MAX_GAP, 3 * flight.row_period), min_duration=MIN_DURATION
         )
     ):
-        part = flight.rows(stretch)
+        part = _between_poses(flight.rows(stretch))
         tracks.append(
             _on_grid(
                 part,
@@ -92,6 +92,17 @@ def _stretches(flight: Flight, without_holes: Flight, case: Case) -> list[Track]
             )
         )
     return tracks
+
+
+def _between_poses(part: Flight) -> Flight:
+    """The rows from the first place to the last one: beyond, where a line would be held,
+    the body isn't known and would stand still for a row or two.
+    """
+    if part.position is None or not len(at := part.sampled("position")[0]):
+        return part
+    if max(at[0] - part.time[0], part.time[-1] - at[-1]) > HOLE:
+        return part  # a hole, which is told elsewhere
+    return part.rows((part.time >= at[0]) & (part.time <= at[-1]))
 
 
 def _grid_of(part):
