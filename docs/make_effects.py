@@ -225,7 +225,7 @@ def _flown(names, parameters, commands):
 
 
 DRAWN = {"command": draw_command, "sensor": draw_sensor, "motor": draw_motor, "thrust": draw_thrust,
-         "wrench": draw_wrench, "body": draw_body}  # fmt: skip
+         "body": draw_body, "wrench": draw_wrench}  # fmt: skip
 """Hook of an effect, and what draws it."""
 
 

@@ -36,6 +36,18 @@ def test_a_card_is_complete(name):
         for s in sizes
     )
     assert card.log_odds < 0
+    assert set(card.coupling) <= {p.name for p in card.fitted} & set(card.practical)
+
+
+def test_what_couples_axes_is_known_apart_from_the_moments():
+    """A body that is heavier all over has no product of inertia for that."""
+    index, _, precision = prior(("inertia",))
+    covariance = np.linalg.inv(precision)
+    coupling = [THETA[i][1] in CARDS["inertia"].coupling for i in index]
+    assert sum(coupling) == 1
+    np.testing.assert_allclose(
+        covariance[coupling][:, ~np.array(coupling)], 0, atol=1e-9
+    )
 
 
 def test_every_fitted_parameter_has_its_own_place():

@@ -187,5 +187,8 @@ def test_a_plane_whose_place_is_not_known_acts_if_its_push_is():
     ],
 )
 def test_an_inertia_needs_the_response_whatever_the_replay_says(response, told):
-    fit = of_one_effect("inertia", 1.4, 1e-6 * np.eye(3))
+    fit = of_one_effect("inertia", (1.4, 1.4, 1.4, 0.01), 1e-6 * np.eye(4))
     assert practical(fit, response) == told
+    # but nothing else makes one axis turn another
+    fit = of_one_effect("inertia", (1.0, 1.0, 1.0, 0.05), 1e-6 * np.eye(4))
+    assert practical(fit, response)

@@ -102,6 +102,27 @@ def test_the_library_is_complete_and_documented():
             assert low - (high - low) * 3 <= parameter.none <= high + (high - low) * 3
 
 
+def test_a_product_of_inertia_turns_the_body_as_its_whole_matrix_does(vehicle):
+    """Newton and Euler's equations with the matrix, moments changed as well."""
+    values = {"xx": 1.2, "yy": 0.9, "xy": 0.07}
+    other = EFFECTS["inertia"].body(given("inertia", **values), vehicle)
+    context = make_context(other, state_at(vehicle, body_rates=(3.0, -2.0, 1.0)))
+    thrust = jnp.array([0.06, 0.08, 0.1, 0.09], jnp.float32)
+    _, more = EFFECTS["inertia"].wrench(
+        given("inertia", **values), context.replace(thrust=thrust)
+    )
+    _, torque = total_wrench(vehicle, thrust, jnp.zeros(4))
+    moments, rates, torque = (
+        np.asarray(v, float) for v in (other.inertia, context.body_rates, torque)
+    )
+    matrix = np.diag(moments)
+    nominal = np.asarray(vehicle.inertia, float)
+    matrix[0, 1] = matrix[1, 0] = 0.07 * np.sqrt(nominal[0] * nominal[1])
+    right = np.linalg.solve(matrix, torque - np.cross(rates, matrix @ rates))
+    as_flown = (torque + more - np.cross(rates, moments * rates)) / moments
+    np.testing.assert_allclose(as_flown, right, rtol=1e-5)
+
+
 def test_body_effects_change_what_they_name(vehicle):
     def changed(name, **values):
         other = EFFECTS[name].body(given(name, **values), vehicle)

@@ -108,9 +108,8 @@ def too_small(fit: SetFit, torque_response: Measured) -> tuple[str, ...]:
     deviation)}. What a card wants confirmed by the latter must be.
     """
 
-    def of_replay(effect: str) -> bool:
+    def of_replay(effect: str, names) -> bool:
         card = CARDS[effect]
-        names = [p.name for p in card.fitted] if card.departure else card.practical
         indices = [PLACE[effect, parameter] for parameter in names]
         shape = [PLACE[effect, parameter] for parameter in card.shape]
         free = np.flatnonzero(~np.isin(fit.index, shape))
@@ -123,7 +122,7 @@ def too_small(fit: SetFit, torque_response: Measured) -> tuple[str, ...]:
         away = fit.theta[indices] - fit.replay.absent[indices]
         if card.departure:
             return departs(away, covariance[np.ix_(rows, rows)], card.departure())
-        least = np.array(list(card.practical.values()))
+        least = np.array([card.practical[p] for p in names])
         least = least * fit.replay.size_factors[indices]
         return clearly_larger(away, covariance[np.ix_(rows, rows)], least)
 
@@ -143,11 +142,13 @@ def too_small(fit: SetFit, torque_response: Measured) -> tuple[str, ...]:
         ):
             # what confirms another effect of the set can't confirm this one as well
             others = set(fit.effects) - {effect}
-            return of_response([k for k in card.confirmed_by if k[0] not in others])
-        parameters = [(effect, parameter) for parameter in card.practical]
-        if not parameters and card.departure is None:
+            keys = [k for k in card.confirmed_by if k[0] not in others]
+            couples = bool(card.coupling) and of_replay(effect, card.coupling)
+            return couples or of_response(keys)
+        names = [p.name for p in card.fitted] if card.departure else card.practical
+        if not names:
             return True
-        return of_replay(effect) or of_response(parameters)
+        return of_replay(effect, names) or of_response([(effect, p) for p in names])
 
     return tuple(e for e in fit.effects if not of_a_size(e))
 

@@ -150,12 +150,7 @@ def not_testable(evidence: Evidence) -> list[str]:
             for e in evidence.library.physics
             if CARDS[e].of_others and e not in missing
         ]
-    silent = [
-        e
-        for e in evidence.library.physics
-        if CARDS[e].needs_response and not evidence.torque_response((e,))
-    ]
-    missing += [e for e in silent if e not in missing]
+    missing += sorted(evidence.silent - set(missing))
     readable_paths = {c.path for c in evidence.channels} | {"physics"}
     missing += [e for e in evidence.library.effects if path_of(e) not in readable_paths]
     return missing + [e for c in evidence.channels for e in c.undetectable()]

@@ -106,11 +106,33 @@ class Evidence:
         names = [key for key in estimates.names if key[0] not in unseen]
         return {(effect, p): estimates.of(effect, p) for effect, p in names}
 
+    @cached_property
+    def silent(self) -> frozenset[str]:
+        """Effects of the library that only a response of the torques would confirm,
+        where none is told.
+        """
+        return frozenset(
+            e
+            for e in self.library.physics
+            if CARDS[e].needs_response and not self.torque_response((e,))
+        )
+
     def support(self, theta: np.ndarray) -> float:
         """Nats by which what the replay doesn't weigh speaks for parameters theta (P,):
         the identified torques, where they are trusted, and gusts under other vehicles.
         """
         return self._of_torques(theta) + self._of_gusts(theta)
+
+    def torque_nats(self, theta: np.ndarray) -> float:
+        """Nats by which the identified torques speak for parameters theta (P,) beside
+        others of the same prior odds: a yaw torque alone leaves roll and pitch as they
+        are, an inertia doesn't.
+        """
+        identification = self.identification
+        if identification is None or not identification.trustworthy:
+            return 0.0
+        pwm = self.case.vehicle_file.motor.command == "pwm"
+        return support(identification.estimates, theta, pwm, acts=True)
 
     def _of_gusts(self, theta: np.ndarray) -> float:
         gusts = self.motion.gusts

@@ -317,17 +317,23 @@ class Search:
 
     def equivalents(self, hypothesis: Hypothesis, effects) -> dict[str, list[str]]:
         """For each named effect those in whose place, of the sets visited, flights
-        don't tell the difference: not a wind that doesn't blow, which is a drag.
+        don't tell the difference: not a wind that doesn't blow, which is a drag, but an
+        inertia that nothing could confirm.
         """
-        torque_response = self.evidence.torque_response
+
+        def is_rival(hypothesis: Hypothesis) -> bool:
+            response = self.evidence.torque_response(hypothesis.effects)
+            small = set(too_small(hypothesis.fit, response))
+            return possible(hypothesis.fit) and small <= self.evidence.silent
+
         out = {}
         for effect in effects:
             rest = frozenset(hypothesis.effects) - {effect}
             alike = [
                 next(iter(key - rest))
                 for key, h in self.hypotheses.items()
-                if len(key - rest) == 1 and rest < key and effect not in key and possible(h.fit)
-                and practical(h.fit, torque_response(key)) and not self.clearly_worse(h, hypothesis)
+                if len(key - rest) == 1 and rest < key and effect not in key
+                and is_rival(h) and not self.clearly_worse(h, hypothesis)
             ]  # fmt: skip
             if alike:
                 out[effect] = sorted(alike)
@@ -349,6 +355,7 @@ class Search:
         pairs = [[difference(a.validation, b.validation) for b in sets] for a in sets]
         _, errors, trust = np.moveaxis(np.array(pairs), 2, 0)
         response = np.array([h.support for h in sets])
+        torques = np.array([self.evidence.torque_nats(h.fit.theta) for h in sets])
         # (D, sets)
         density = weights @ np.array([h.validation.nats for h in sets]).T + response
         nothing = sets.index(self.nothing)
@@ -374,7 +381,7 @@ class Search:
             out |= response[best] - response > DETECTABLE
             usual = ~out & (odds == odds[~out].max())
             first = int(np.argmax(np.where(usual, nats, -np.inf)))
-            evidence = trust[first] * (nats - nats[first]) - costs
+            evidence = trust[first] * (nats - nats[first]) - costs + torques
             choices.append(sets[int(np.argmax(np.where(usual, evidence, -np.inf)))])
         return choices
 

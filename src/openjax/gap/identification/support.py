@@ -26,12 +26,17 @@ HOVER = 0.62  # of the largest thrust, where the slope of a thrust curve is take
 FARTHEST = 40.0  # nats: no response says more, as forms are never quite the model's
 
 
-def support(estimates: EffectEstimates, theta: np.ndarray, pwm: bool) -> float:
+def support(
+    estimates: EffectEstimates, theta: np.ndarray, pwm: bool, acts: bool = False
+) -> float:
     """Log density, up to a constant and at most FARTHEST below the best, of the
-    estimates for parameters theta (P,) of the replay.
+    estimates for parameters theta (P,) of the replay. Where it is known that something
+    `acts`, gains are taken as they were measured.
     """
     usual = np.array([USUAL[e] for e, _ in estimates.names])
     gains = np.array([e != "motor_lag" for e, _ in estimates.names])
+    if acts:
+        usual = np.where(gains, 0.0, usual)
     if pwm:
         usual = np.where(gains, np.hypot(usual, UNKNOWN_MAP), usual)
     return -min(distance(estimates, theta, usual), FARTHEST)

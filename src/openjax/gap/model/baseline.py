@@ -71,8 +71,9 @@ def day_of(effect: str, parameter: str, vehicle, silent: bool) -> float:
     card = CARDS[effect]
     usual = card.nuisance.get(parameter, 0.0)
     usual = float(usual(vehicle) if callable(usual) else usual)
+    common = card.common * (parameter not in card.coupling)
     spread = np.hypot(
-        next(p.spread for p in card.fitted if p.name == parameter), card.common
+        next(p.spread for p in card.fitted if p.name == parameter), common
     )
     spread *= growth(EFFECTS[effect].parameters[parameter].unit, vehicle)
     charge = (

@@ -110,7 +110,8 @@ def prior(
         card = CARDS[effect]
         index += [PLACE[effect, p.name] for p in card.fitted]
         mean += [p.mean for p in card.fitted]
-        block = np.diag([p.spread**2 for p in card.fitted]) + card.common**2
+        common = [card.common * (p.name not in card.coupling) for p in card.fitted]
+        block = np.diag([p.spread**2 for p in card.fitted]) + np.outer(common, common)
         blocks.append(block - BALANCE * block.mean() if card.balanced else block)
     precision = np.linalg.inv(block_diagonal(blocks))
     index = np.array(index, int)

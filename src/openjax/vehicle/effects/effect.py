@@ -31,6 +31,7 @@ class Context:
     quaternion: jax.Array  # (4,) body to world
     velocity: jax.Array  # (3,) m/s, world
     body_rates: jax.Array  # (3,) rad/s
+    inertia: jax.Array  # (3,) kg m^2, principal
     rotor_position: jax.Array  # (4, 3) m, body frame, hubs seen from the centre of mass
     rotor_speed: jax.Array  # (4,) rad/s
     thrust: jax.Array  # (4,) N
@@ -56,6 +57,7 @@ def make_context(vehicle: Vehicle, state: DroneState, **fields) -> Context:
         quaternion=state.quaternion,
         velocity=state.velocity,
         body_rates=state.body_rates,
+        inertia=vehicle.inertia,
         rotor_position=vehicle.rotor_position,
         rotor_speed=state.rotor_speed,
         thrust=rotor_thrust(vehicle, state.rotor_speed),
@@ -205,7 +207,11 @@ class Card:
     "rate_loop" or "estimator".
     """
     common: float = 0.0
-    """Spread that all its parameters share."""
+    """Spread that all its parameters share but those of `coupling`."""
+    coupling: tuple[str, ...] = ()
+    """Parameters by which what turns one axis turns another. Lags, clocks and what
+    motors do unseen stay on their axis, so the replay alone tells these.
+    """
     balanced: bool = False
     """Whether the mean of its parameters belongs to another effect, and is held near
     zero.
