@@ -119,6 +119,7 @@ def test_where_none_is_named_a_policy_flies_that_takes_so_many(tmp_path, capsys)
         (): "evaders",
         ("--num_pursuers", "5", "--scenario", "uniform"): "teams",
         ("--environment.num_pursuers", "2"): "teams",
+        ("--environment.evader_speed", "2", "--scenario", "uniform"): "teams",
         ("--scenario", str(layout)): "teams",
         ("--num_pursuers", "5", "--scenario", "uniform", "--policy", "flight"): None,
     }
@@ -133,4 +134,4 @@ def test_where_none_is_named_a_policy_flies_that_takes_so_many(tmp_path, capsys)
         ((_, loaded),) = evaluate.prepare(command, typed)
         assert loaded.source == name
         said = " ".join(capsys.readouterr().out.split())
-        assert ("evaders flies 3 pursuers only" in said) == (name == "teams")
+        assert ("policy teams: evaders knows" in said) == (name == "teams")

@@ -41,7 +41,8 @@ class FlightOptions:
     """Runs' directories, policy files (.npz), checkpoints, or names of policies in the
     package (flight, open ...) or of heuristics (angelani, janosov, apf, stack), or
     FILE.py:function for a controller of one's own. By default evaders, or teams for
-    another number of pursuers than three.
+    another number of pursuers than three, another speed of the evader, capture radius
+    or arena.
     """
     scenario: str = "all"
     """wall, narrow_gap, random, passage, empty, hidden, a TOML file with an own layout,
@@ -78,7 +79,8 @@ class FlightOptions:
             game = environment or PursuitSettings()
             if self.num_pursuers is not None:
                 game = dataclasses.replace(game, num_pursuers=self.num_pursuers)
-            name, line = default_policy(self.pursuers_of(game))
+            number = self.pursuers_of(game)
+            name, line = default_policy(dataclasses.replace(game, num_pursuers=number))
             names = (name,)
             if line:
                 output_console().print(line, soft_wrap=True)

@@ -186,7 +186,7 @@ def prepare(arguments: Arguments) -> Prepared:
     line = ""
     if name is None:
         number = len(find_scenario(arguments.scenario, PursuitSettings()).pursuers)
-        name, line = default_policy(number)
+        name, line = default_policy(PursuitSettings(num_pursuers=number))
     policy = load_policy(name)
     settings = policy.settings.environment
     scenario = find_scenario(arguments.scenario, settings)

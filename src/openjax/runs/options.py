@@ -105,7 +105,8 @@ class ExploitCommand:
     policy: str | None = None
     """A run's directory, a policy file (.npz), a checkpoint, the name of a policy in
     the package or of a heuristic, or FILE.py:function for a controller of one's own. By
-    default evaders, or teams for another number of pursuers than three.
+    default evaders, or teams for another number of pursuers than three, another speed
+    of the evader, capture radius or arena.
     """
     out: Path = Path("evader.npz")
     """File to write the strongest learned evader to."""
