@@ -128,11 +128,17 @@ class Evidence:
         others of the same prior odds: a yaw torque alone leaves roll and pitch as they
         are, an inertia doesn't.
         """
+        return self._of_response(theta, acts=True)
+
+    def _of_response(self, theta: np.ndarray, acts: bool = False) -> float:
+        """What `support` says of the identified torques; nothing where they aren't
+        trusted.
+        """
         identification = self.identification
         if identification is None or not identification.trustworthy:
             return 0.0
         pwm = self.case.vehicle_file.motor.command == "pwm"
-        return support(identification.estimates, theta, pwm, acts=True)
+        return support(identification.estimates, theta, pwm, acts)
 
     def _of_gusts(self, theta: np.ndarray) -> float:
         gusts = self.motion.gusts
@@ -142,11 +148,7 @@ class Evidence:
 
     def _of_torques(self, theta: np.ndarray) -> float:
         """Two questions: is this a usual vehicle, and is it the one that it was?"""
-        identification = self.identification
-        nats = 0.0
-        if identification is not None and identification.trustworthy:
-            pwm = self.case.vehicle_file.motor.command == "pwm"
-            nats += support(identification.estimates, theta, pwm)
+        nats = self._of_response(theta)
         if self.change is not None:
             nats -= min(distance(self.change, theta), FARTHEST)
         return nats

@@ -96,7 +96,8 @@ def check_residual(evidence: Evidence, fit: SetFit, nothing: SetFit) -> Check:
     """Whether a fit leaves no more than what cases without an unknown cause leave;
     `nothing`: the fit of no effect.
     """
-    measures, axes = measure(evidence, residuals_of(fit))
+    changes = _changes(evidence, residuals_of(fit))
+    measures, axes = _spreads(changes)
     reference = None if evidence.baseline is None else _comparable(evidence)
     p_value, name = conformal_p(measures, reference)
     by_reference = reference is not None and name in reference
@@ -104,8 +105,8 @@ def check_residual(evidence: Evidence, fit: SetFit, nothing: SetFit) -> Check:
     if reference:
         # with its mean, which a steady wind makes
         squares, squares_of_nothing = (
-            {n: (c**2).mean(0).max() for n, c in _changes(evidence, of).items()}
-            for of in (residuals_of(fit), residuals_of(nothing))
+            {n: (c**2).mean(0).max() for n, c in of.items()}
+            for of in (changes, _changes(evidence, residuals_of(nothing)))
         )
         shares = [
             unexplained_share(squares[n], reference[n] ** 2, squares_of_nothing[n])
@@ -154,7 +155,14 @@ def measure(
     """{name: measure} of what is left, and {name: (3,) the same by axis}, of which a
     measure is the largest.
     """
-    axes = {n: c.std(0) for n, c in _changes(evidence, residuals).items()}
+    return _spreads(_changes(evidence, residuals))
+
+
+def _spreads(
+    changes: dict[str, np.ndarray],
+) -> tuple[dict[str, float], dict[str, np.ndarray]]:
+    """As `measure`, of what `_changes` tells."""
+    axes = {name: change.std(0) for name, change in changes.items()}
     return {name: float(size.max()) for name, size in axes.items()}, axes
 
 

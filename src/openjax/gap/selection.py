@@ -322,9 +322,10 @@ class Search:
         """
 
         def is_rival(hypothesis: Hypothesis) -> bool:
+            if not possible(hypothesis.fit):
+                return False
             response = self.evidence.torque_response(hypothesis.effects)
-            small = set(too_small(hypothesis.fit, response))
-            return possible(hypothesis.fit) and small <= self.evidence.silent
+            return self.evidence.silent.issuperset(too_small(hypothesis.fit, response))
 
         out = {}
         for effect in effects:
