@@ -214,8 +214,13 @@ def test_signal_before_the_first_update_ends_at_once_and_loses_nothing(
     while process.poll() is None and line not in _printed(output):
         time.sleep(0.01)
     process.terminate()
-    printed = finish((process, output), status=143)
-    assert printed.splitlines()[-1].startswith("SIGTERM: ")
+    process.wait(timeout=300)
+    printed = _printed(output)
+    # the step is compiled beside what comes before it: where it's ready by the time of
+    # its line, learning has begun, which saves and ends well
+    ends = (0, 143) if line == "compiling the training" else (143,)
+    assert process.returncode in ends, printed
+    assert printed.splitlines()[-1].startswith("SIGTERM: "), printed
     if not (out / "settings.json").exists():
         return
     assert "openjax train --resume" in printed and not list(out.glob(".writing-*"))
