@@ -202,6 +202,22 @@ def test_rotors_that_differ_are_told_by_torques_alone(folders, monkeypatch):
     assert motion.exposure["motor_imbalance"] == 0.0 < motion.exposure["rotor_drag"]
 
 
+def test_a_gyroscope_that_reads_little_is_no_heavy_body(tmp_path):
+    """Beside no attitude, nothing tells the gain of one from the inertia of the
+    other.
+    """
+
+    def logged(columns):
+        rates = {n: 0.92 * columns[n] for n in ("wx", "wy", "wz")}
+        columns = columns | rates
+        return {n: v for n, v in columns.items() if n[0] not in "xyzqv"}
+
+    report = diagnose_case(load_case(_case(tmp_path / "gain", {}, logged=logged)))
+    assert report.effects == ()
+    low, high = report.identification.quantities["inertia_roll"].interval90
+    assert low < 1.0 < high
+
+
 def test_motors_that_were_averaged_before_their_row_are_found_and_name_nothing(
     tmp_path,
 ):

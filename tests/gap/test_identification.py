@@ -220,12 +220,13 @@ def test_a_gyroscope_that_reads_too_much_is_no_lighter_body(monkeypatch):
     a change of inertia would come.
     """
     asked = []
-    monkeypatch.setattr(evidence, "identify", lambda case, _: asked.append(case))
+    monkeypatch.setattr(evidence, "identify", lambda case, *_: asked.append(case))
     rates = np.full((900, 3), 1.1)
     flight = Flight("a", "a", "0", 0.01 * np.arange(900), body_rates=rates)
     read = evidence.Evidence(
         Case("fast", (flight,), load_vehicle_file()),
-        **dict.fromkeys(("library", "tracks", "vehicles", "channels", "motion")),
+        **dict.fromkeys(("library", "vehicles", "channels", "motion")),
+        tracks=[],
         sensors=Kinematics(gain=1.1, tilt=None, one_clock=True, findings={}),
     )
     before = SimpleNamespace(identification=SimpleNamespace(gyroscope_gain=1.0))

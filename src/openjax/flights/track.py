@@ -60,6 +60,11 @@ class Track:
     def __len__(self) -> int:
         return len(self.time)
 
+    @property
+    def logs_attitude(self) -> bool:
+        """Whether there is an attitude that the gyroscope has no part in."""
+        return self.quaternion is not None and not self.attitude_derived
+
 
 def tracks_of(case: Case) -> list[Track]:
     """All usable stretches of a case's flights, in the case's order."""

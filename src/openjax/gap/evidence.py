@@ -35,6 +35,7 @@ from openjax.gap.identification.quantities import Identification, identify
 from openjax.gap.identification.support import distance, support
 from openjax.gap.model.baseline import Baseline
 from openjax.gap.model.library import CARDS, Library, places
+from openjax.gap.model.nuisances import UNKNOWN_GAIN
 from openjax.gap.model.replay import Replay
 
 
@@ -206,8 +207,11 @@ def with_identification(evidence: Evidence) -> Evidence:
     reference = None if evidence.baseline is None else evidence.baseline.identification
     gain = sensors.gain if reference is None else reference.gyroscope_gain
     in_time = case_on_gyroscope_clock(evidence.case, sensors.motors_late)
+    gain_error = 0.0 if all(t.logs_attitude for t in evidence.tracks) else UNKNOWN_GAIN
     identification = identify(
-        with_gyroscope_gain(in_time, gain), sensors.one_clock and sensors.motor_clock
+        with_gyroscope_gain(in_time, gain),
+        sensors.one_clock and sensors.motor_clock,
+        gain_error,
     )
     if identification is not None:
         identification = replace(identification, gyroscope_gain=gain)

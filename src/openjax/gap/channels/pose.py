@@ -96,7 +96,7 @@ class Pose(Channel):
 
 def read_pose(tracks: list[Track], library) -> Pose | None:
     """The pose's channel; None without an attitude."""
-    if any(t.quaternion is None or t.attitude_derived for t in tracks):
+    if not all(t.logs_attitude for t in tracks):
         return None
     clock = BOUND * SIZE["pose_clock"] + max(t.pose_age for t in tracks)
     steps = tuple(max(round(POSE_HORIZON / t.dt), 1) for t in tracks)

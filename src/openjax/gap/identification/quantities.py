@@ -139,15 +139,18 @@ class Identification:
         return float(ratio), float(lead)
 
 
-def identify(case: Case, one_clock: bool = True) -> Identification | None:
+def identify(
+    case: Case, one_clock: bool = True, gain_error: float = 0.0
+) -> Identification | None:
     """What the flights of a case say of the vehicle; None where none has motors and
     body rates. Without `one_clock` streams were found to be apart by times that wander:
-    what is said of torques then isn't trusted.
+    what is said of torques then isn't trusted. `gain_error`: standard deviation of the
+    gyroscope's gain.
     """
     records = records_of(case)
     if not records:
         return None
-    fit = identify_torques(records, one_clock)
+    fit = identify_torques(records, one_clock).with_gain_error(gain_error)
     reasons = doubts(records, fit, one_clock)
     duty_cycles = case.vehicle_file.motor.command == "pwm"
     remarks = (*_remarks(fit), *([MAP] if duty_cycles else []))

@@ -2,7 +2,9 @@
 lags.
 """
 
-from dataclasses import dataclass
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -48,6 +50,18 @@ class TorqueFit:
     def clock(self) -> float:
         """s by which motors act later than logged."""
         return float(self.value[2])
+
+    def with_gain_error(self, error: float) -> TorqueFit:
+        """The fit where the gyroscope's own gain isn't known, but for this standard
+        deviation: it's in every torque's, and as what rows hide the same in a reference.
+        """
+        errors = np.zeros(len(self.value))
+        errors[3:6] = error * self.value[3:6]
+        return replace(
+            self,
+            covariance=self.covariance + np.diag(errors**2),
+            row_errors=np.hypot(self.row_errors, errors),
+        )
 
 
 def begin(problem: Problem, late: float) -> np.ndarray:

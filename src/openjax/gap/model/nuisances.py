@@ -9,6 +9,8 @@ import numpy as np
 from jaxtyping import Float
 
 from openjax.flights.track import GRAVITY, Track, smooth, specific_force_of, to_world
+from openjax.gap.decision import DECISION
+from openjax.gap.model.bounds import BOUND
 from openjax.gap.model.physics import Path
 from openjax.gap.model.prediction import FORCE, RATES, VELOCITY
 from openjax.gap.shapes import Rows
@@ -19,6 +21,10 @@ SIZE = {
         pathlib.Path(__file__).with_suffix(".toml").read_text(encoding="utf-8")
     ).items()
 }
+UNKNOWN_GAIN = DECISION.gyroscope_gain / BOUND
+"""Of a gyroscope that no attitude was logged beside: nothing else tells its gain from
+another inertia about all axes.
+"""
 # s: what motors do more slowly is no answer to a gust, but what the vehicle needs
 TRIM = 0.5
 FEEDBACK_ROWS, QUICK_ROWS = (0, 2), (0, 1, 2)  # rows of delay
@@ -111,6 +117,8 @@ def _sensor_nuisances(
     column(
         "gyroscope's low-pass", RATES, -(spinning - spinning[0]), SIZE["gyroscope_lag"]
     )
+    if not track.logs_attitude:
+        column("gyroscope's gain", RATES, nominal[:, RATES], UNKNOWN_GAIN)
     if track.velocity is not None:
         late = -velocity_change(
             np.cross(np.asarray(path.body_rates, float)[:rows], body)
