@@ -265,3 +265,33 @@ def test_an_angle_with_the_other_sign_is_named(angle, sample_columns):
     other = Rotation.from_euler("ZYX", angles).as_quat(scalar_first=True)
     kept, found = refusals(columns | dict(zip(PARTS, other.T, strict=True)))
     assert kept is None and f"{angle} has the other sign: scale = -1" in found[0].issue
+
+
+def test_a_quick_turn_to_and_fro_the_wrong_way_round_is_no_late_one():
+    """Twice a second half a period is what clocks may be apart by, nearly."""
+    t = np.arange(0.0, 8.0, 0.01)
+    phase = 2.0 * np.pi * 2.0 * t
+    path = 0.012 * np.stack([np.cos(phase), np.sin(1.1 * phase), 0.0 * t], 1)
+    velocity = np.gradient(path, t, axis=0)
+    up = np.gradient(velocity, t, axis=0) + np.array([0.0, 0.0, 9.81])
+    attitude = Rotation.concatenate(
+        [Rotation.align_vectors([u], [[0.0, 0.0, 1.0]])[0] for u in up]
+    )
+    rates = (attitude[:-1].inv() * attitude[1:]).as_rotvec() / 0.01
+    rates = np.concatenate([rates, rates[-1:]])
+    columns = {"t": t, "cmd_thrust": 0.62 + 0.01 * np.cos(3.0 * t)}
+    for names, values in (
+        ("x y z", path + np.array([0.0, 0.0, 0.7])),
+        ("vx vy vz", velocity),
+        ("wx wy wz", rates),
+        ("cmd_wx cmd_wy cmd_wz", rates),
+    ):
+        columns |= dict(zip(names.split(), values.T, strict=True))
+    quaternion = attitude.as_quat(scalar_first=True)
+    right, inverse = (
+        dict(zip(("qw", "qx", "qy", "qz"), (signs * quaternion).T, strict=True))
+        for signs in (np.ones(4), np.array([1.0, -1.0, -1.0, -1.0]))
+    )
+    assert not refusals(columns | right)[1]
+    (found,) = refusals(columns | inverse)[1]
+    assert found.kind == "quaternion" and "from world to body" in found.issue

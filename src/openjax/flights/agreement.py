@@ -8,11 +8,13 @@ pair, that is what is said.
 """
 
 import dataclasses
+import itertools
 
 import numpy as np
 
 from openjax.flights.flight import Finding, Flight, Issue
 from openjax.flights.mending import (
+    QUATERNIONS,
     UPRIGHT,
     agrees,
     attitudes,
@@ -32,8 +34,9 @@ from openjax.flights.signals import clock_of
 from openjax.flights.track import rotation
 
 UNIT = 2.5  # factor about a unit's, within which a gain is that unit
-CLEAR = 0.9  # correlation from which a gain is one
+CLEAR = 0.9  # correlation from which a gain is one, and an attitude the right one
 SAME = 1.4  # factor by which two sensors of one rate may differ
+BETTER = 0.25  # share of what is left of a correlation, below which one is another's
 UNITS = {
     "rad/s": (("deg/s", 180 / np.pi),),
     "m/s": (("mm/s", 1e3),),
@@ -95,12 +98,32 @@ def _contradictions(signals: Signals) -> list[Finding]:
     pairs = list(pairs_of(signals))
     bad = [pair for pair in pairs if pair.bad.any()]
     if not bad:
-        return [finding for pair in pairs for finding in _unit(pair)][:1]
+        units = (finding for pair in pairs for finding in _unit(pair))
+        return _other_quaternion(signals, pairs) or list(units)[:1]
     words = convention_of(signals, bad)
     mending = ("axes", words) if words else mend(signals, bad)
     if mending is not None:
         return [(*mending, [pair.what for pair in bad])]
     return [("garbage", pair.in_words(), [pair.what]) for pair in bad]
+
+
+def _other_quaternion(signals: Signals, pairs: list[Pair]) -> list[Finding]:
+    """A convention of the quaternion by which the attitude turns with the gyroscope so
+    much better that it was only the clocks' free offset that let the two agree: a turn
+    to and fro, the wrong way round, is the right one half a period later.
+    """
+    if signals.quaternion is None:
+        return []
+    turning = [p for p in pairs if p.holds == "body_rates" and p.tells.any()]
+    doubtful = [p for p in turning if p.agreement.correlation[p.tells].min() < CLEAR]
+    for pair, (words, convert) in itertools.product(doubtful, QUATERNIONS.items()):
+        other = dataclasses.replace(signals, quaternion=convert(signals.quaternion))
+        follows = next(p for p in pairs_of(other) if p.what == pair.what).agreement
+        misfit = 1.0 - pair.agreement.correlation[pair.tells]
+        misfit_of_other = 1.0 - follows.correlation[pair.tells]
+        if (misfit_of_other < BETTER * misfit).all() and agrees(other, [pair]):
+            return [("quaternion", words, [pair.what])]
+    return []
 
 
 def _unit(pair: Pair) -> list[Finding]:
