@@ -109,9 +109,17 @@ def test_what_no_air_and_no_rotor_does_is_something_else():
     # slow turns' thrust, where torques aren't judged
     assert not seems("motor_imbalance", **rotors | dict(m2=0.41, m3=-0.41))
     assert seems("ground_effect", strength=2.5, offset=0.016)
+    # a third more thrust at 5 cm, rising to the floor as an exponential does
+    assert seems("ground_effect", strength=3.8, offset=0.011)
     # a thrust that isn't known, in a vehicle that never was below .3 m
     assert not seems("ground_effect", strength=5.7, offset=-0.001)
     assert not seems("ceiling_effect", strength=1.9, offset=0.06)
+
+
+def test_how_blades_pitch_the_body_need_not_be_known():
+    tilt = {"tilt": 0.03, "stiffness": -1e-5}
+    assert seems("blade_flapping", 1e-4, **tilt)
+    assert not seems("blade_flapping", 1e-6, **tilt)
 
 
 def test_above_the_ceiling_there_is_none():

@@ -27,10 +27,11 @@ def wrench(parameters, context):
 
 
 def tilts_back(value, deviation):
-    """Whether blades don't clearly tilt the thrust along the motion (three standard
-    deviations), and pitch the body back.
+    """Whether blades don't clearly (three standard deviations) tilt the thrust along
+    the motion, or pitch the body forward; without motors in the log nothing says how they
+    pitch it.
     """
-    return bool(value["tilt"] > -3.0 * deviation["tilt"] and value["stiffness"] > 0.0)
+    return all(value[name] > -3.0 * deviation[name] for name in ("tilt", "stiffness"))
 
 
 EFFECT = Effect(

@@ -24,8 +24,9 @@ def thrust(parameters, thrust, reaction, context):
     ), reaction
 
 
-# above what is usual, with the rotors at the plane: more is some slow change of thrust
-STRONGEST = 1.5
+# four times what is usual, with the rotors at the plane: more is some slow change of
+# thrust
+STRONGEST = 3.0
 
 
 def acts(values, deviations) -> bool:

@@ -7,8 +7,9 @@ from openjax.vehicle.effects.effect import Card, Effect, Fitted, Parameter
 
 _SHORTEST = 1e-3  # s
 # small brushed motors were measured at up to 0.1 s in all, and no loop flies through
-# more
+# more; one that nothing but the air slows down takes longer for that
 _SLOWEST = 0.1  # s
+_SLOWEST_DOWN = 0.25  # s
 # motors that seem earlier than this are not what they seem
 EARLY = 0.0025  # s
 
@@ -32,7 +33,9 @@ def lags(value, deviation):
     controller answers, and single samples of the motors; a motor's time constant is
     known better than that.
     """
-    return -EARLY < max(value["extra_up"], value["extra_down"]) < _SLOWEST
+    if not -EARLY < max(value["extra_up"], value["extra_down"]):
+        return False
+    return value["extra_up"] < _SLOWEST and value["extra_down"] < _SLOWEST_DOWN
 
 
 def spin_up_error(vehicle):
