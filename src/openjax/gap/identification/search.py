@@ -52,8 +52,9 @@ class TorqueFit:
         return float(self.value[2])
 
     def with_gain_error(self, error: float) -> TorqueFit:
-        """The fit where the gyroscope's own gain isn't known, but for this standard
-        deviation: it's in every torque's, and as what rows hide the same in a reference.
+        """The fit where nothing tells the gyroscope's gain, which is known to this
+        standard deviation alone. It is a part of every torque's gain; a reference of the
+        same vehicle has it too, as it has what rows hide.
         """
         errors = np.zeros(len(self.value))
         errors[3:6] = error * self.value[3:6]

@@ -24,7 +24,7 @@ def thrust(parameters, thrust, reaction, context):
     ), reaction
 
 
-# four times what is usual, with the rotors at the plane: more is some slow change of
+# several times what is usual, with the rotors at the plane: more is some slow change of
 # thrust
 STRONGEST = 3.0
 

@@ -7,7 +7,8 @@ from openjax.vehicle.effects.effect import Card, Effect, Fitted, Parameter
 
 _SHORTEST = 1e-3  # s
 # small brushed motors were measured at up to 0.1 s in all, and no loop flies through
-# more; one that nothing but the air slows down takes longer for that
+# more; a rotor that nothing but the air slows down takes longer for that, and a vehicle
+# flies all the same
 _SLOWEST = 0.1  # s
 _SLOWEST_DOWN = 0.25  # s
 # motors that seem earlier than this are not what they seem
