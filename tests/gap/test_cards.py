@@ -116,6 +116,12 @@ def test_what_no_air_and_no_rotor_does_is_something_else():
     assert not seems("ceiling_effect", strength=1.9, offset=0.06)
 
 
+def test_motors_may_brake_slowly_and_still_no_vehicle_flies_on_slow_ones():
+    assert seems("motor_lag", extra_up=0.045, extra_down=0.157)
+    assert not seems("motor_lag", extra_up=0.157, extra_down=0.157)
+    assert not seems("motor_lag", extra_up=0.045, extra_down=0.5)
+
+
 def test_how_blades_pitch_the_body_need_not_be_known():
     tilt = {"tilt": 0.03, "stiffness": -1e-5}
     assert seems("blade_flapping", 1e-4, **tilt)

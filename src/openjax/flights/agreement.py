@@ -8,16 +8,15 @@ pair, that is what is said.
 """
 
 import dataclasses
-import itertools
 
 import numpy as np
 
 from openjax.flights.flight import Finding, Flight, Issue
 from openjax.flights.mending import (
-    QUATERNIONS,
     UPRIGHT,
     agrees,
     attitudes,
+    by_conventions,
     convention_of,
     frames_of,
     mend,
@@ -116,13 +115,13 @@ def _other_quaternion(signals: Signals, pairs: list[Pair]) -> list[Finding]:
         return []
     turning = [p for p in pairs if p.holds == "body_rates" and p.tells.any()]
     doubtful = [p for p in turning if p.agreement.correlation[p.tells].min() < CLEAR]
-    for pair, (words, convert) in itertools.product(doubtful, QUATERNIONS.items()):
-        other = dataclasses.replace(signals, quaternion=convert(signals.quaternion))
-        follows = next(p for p in pairs_of(other) if p.what == pair.what).agreement
+    for pair in doubtful:
         misfit = 1.0 - pair.agreement.correlation[pair.tells]
-        misfit_of_other = 1.0 - follows.correlation[pair.tells]
-        if (misfit_of_other < BETTER * misfit).all() and agrees(other, [pair]):
-            return [("quaternion", words, [pair.what])]
+        for words, other in by_conventions(signals):
+            follows = next(p for p in pairs_of(other) if p.what == pair.what).agreement
+            misfit_of_other = 1.0 - follows.correlation[pair.tells]
+            if (misfit_of_other < BETTER * misfit).all() and agrees(other, [pair]):
+                return [("quaternion", words, [pair.what])]
     return []
 
 

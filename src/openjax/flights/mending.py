@@ -53,8 +53,7 @@ def mend(signals: Signals, bad: list[Pair]) -> tuple[str, str] | None:
     disagreeing pairs agree.
     """
     if signals.quaternion is not None:
-        for words, convert in QUATERNIONS.items():
-            other = dataclasses.replace(signals, quaternion=convert(signals.quaternion))
+        for words, other in by_conventions(signals):
             if agrees(other, bad):
                 return "quaternion", words
     if signals.velocity is not None and signals.quaternion is not None:
@@ -80,6 +79,15 @@ def convention_of(signals: Signals, bad: list[Pair]) -> str:
     """
     others = ((c.words, c.convert(signals)) for c in CONVENTIONS)
     return next((w for w, other in others if upright(other) and agrees(other, bad)), "")
+
+
+def by_conventions(signals: Signals) -> Iterator[tuple[str, Signals]]:
+    """(what is wrong, the signals without it) by each usual convention of the
+    quaternion.
+    """
+    for words, convert in QUATERNIONS.items():
+        attitude = convert(signals.quaternion)
+        yield words, dataclasses.replace(signals, quaternion=attitude)
 
 
 def attitudes(signals: Signals) -> Iterator[tuple[str, np.ndarray]]:
