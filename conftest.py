@@ -36,9 +36,7 @@ def check_types(function):
 
     def checked_unless_stand_in(*args, **kwargs):
         given = (*args, *kwargs.values())
-        given += tuple(
-            item for value in given if isinstance(value, list | tuple) for item in value
-        )
+        given += tuple(item for value in given if isinstance(value, list | tuple) for item in value)
         # a test that makes a namespace of the few things a function looks at knows what
         # it does
         if not any(isinstance(value, SimpleNamespace) for value in given):
@@ -50,12 +48,9 @@ def check_types(function):
 # shapes and types of arrays in signatures are checked at each call, which is when a
 # function is traced
 _networks = [
-    f"openjax.policy.{name}"
-    for name in ("actor_critic", "encoder", "policy", "predictor")
+    f"openjax.policy.{name}" for name in ("actor_critic", "encoder", "policy", "predictor")
 ]
-_drone = [
-    f"openjax.vehicle.{name}" for name in ("rigid_body", "rate_controller", "stops")
-]
+_drone = [f"openjax.vehicle.{name}" for name in ("rigid_body", "rate_controller", "stops")]
 _rooms = ["openjax.pursuit", "openjax.learning", "openjax.flights", "openjax.gap"]
 install_import_hook([*_networks, *_drone, *_rooms], "conftest.check_types")
 
@@ -75,16 +70,13 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")
 # what one test compiled, its other processes, other workers and the next session
 # needn't compile again
 os.environ.setdefault(
-    "JAX_COMPILATION_CACHE_DIR",
-    str(Path(__file__).parent / ".pytest_cache" / "compiled"),
+    "JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parent / ".pytest_cache" / "compiled")
 )
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "0")
 
 # how long an example takes says how busy the machine is
-settings.register_profile(
-    "suite", deadline=None, suppress_health_check=[HealthCheck.too_slow]
-)
+settings.register_profile("suite", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("suite")
 
 # tracing leaves many objects and little garbage
@@ -143,9 +135,7 @@ def sample_columns():
     vehicle = load_vehicle()
     return {
         name: fly(vehicle, vehicle, reference, seed)[0]
-        for seed, (name, reference) in enumerate(
-            references(seed=1, duration=8.0).items()
-        )
+        for seed, (name, reference) in enumerate(references(seed=1, duration=8.0).items())
     }
 
 

@@ -66,8 +66,7 @@ class Table:
         head = [f"## {self.title}", ""] if self.title else []
         prose = [self.prose, ""] if self.prose else []
         rows = [
-            [cell(record, column) for column in self.columns.values()]
-            for record in self.records
+            [cell(record, column) for column in self.columns.values()] for record in self.records
         ]
         return [*head, *prose, *table(list(self.columns), rows)]
 
@@ -94,9 +93,7 @@ class Page:
         """The Markdown of the one table that stands between the marks of the page of
         results.
         """
-        columns = self.table or next(
-            part for part in self.all_parts() if isinstance(part, Table)
-        )
+        columns = self.table or next(part for part in self.all_parts() if isinstance(part, Table))
         return Table(columns.columns, columns.records).lines()
 
     def lines(self, facts: Mapping) -> list[str]:
@@ -156,9 +153,7 @@ def page_parser(doc: str | None, name: str) -> argparse.ArgumentParser:
         description=doc, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--report", action="store_true", help="from the stored results")
-    parser.add_argument(
-        "--commit", default="", help="where the machine has no repository"
-    )
+    parser.add_argument("--commit", default="", help="where the machine has no repository")
     parser.add_argument("--out", type=Path, default=RESULTS / name)
     return parser
 
@@ -184,10 +179,7 @@ def facts(commit: str | None = None) -> dict:
     the source tree can't tell.
     """
     machine = describe_machine()
-    return {
-        "command": typed_command(),
-        "machine": machine | ({"commit": commit} if commit else {}),
-    }
+    return {"command": typed_command(), "machine": machine | ({"commit": commit} if commit else {})}
 
 
 def publish(
@@ -205,10 +197,7 @@ def publish(
     if not options.report:
         start = time.monotonic()
         results = study(options)
-        write_json(
-            data,
-            {**facts(options.commit), "seconds": time.monotonic() - start, **results},
-        )
+        write_json(data, {**facts(options.commit), "seconds": time.monotonic() - start, **results})
     write_page(options.out, page, read_json(data), draw)
 
 

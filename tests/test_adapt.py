@@ -14,11 +14,7 @@ from openjax.commands import adapt
 from openjax.errors import UserError
 from openjax.learning import TrainSettings, build
 from openjax.learning.adaptation import make_adaptation, off_the_flight
-from openjax.learning.adapting_game import (
-    adapting_game,
-    bounds_of,
-    starting_parameters,
-)
+from openjax.learning.adapting_game import adapting_game, bounds_of, starting_parameters
 from openjax.learning.fine_tuning import Look, fine_tune, improves
 from openjax.learning.nominal_flights import LAG
 from openjax.learning.settings import AdaptSettings, GeneratorSettings, MappoSettings
@@ -35,11 +31,7 @@ pytestmark = pytest.mark.slow
 
 TINY = TrainSettings(
     environment=PursuitSettings(
-        physics="stops",
-        speed_limit="none",
-        episode_length=8,
-        observe_history=2,
-        history_length=2,
+        physics="stops", speed_limit="none", episode_length=8, observe_history=2, history_length=2
     ),
     network=NetworkSettings(features=8, heads=1),
     predictor=PredictorSettings(enabled=False),
@@ -72,23 +64,16 @@ def test_vehicles_are_drawn_from_the_intervals_and_a_share_of_all_else():
     assert drawn["motor_lag.extra_up"][:2] == pytest.approx([0.035, 0.045])
     assert drawn["motor_lag.extra_down"][:2] == pytest.approx([0.027, 0.033])
     assert drawn["rotor_drag.d_xy"][:2] == pytest.approx([0.0, 0.35 * 0.015])
-    assert drawn["yaw_torque.ratio"][:2] == pytest.approx(
-        [1 - 0.35 * 0.85, 1 + 0.35 * 0.1]
-    )
+    assert drawn["yaw_torque.ratio"][:2] == pytest.approx([1 - 0.35 * 0.85, 1 + 0.35 * 0.1])
     assert drawn["ceiling_effect.strength"][:2] == [0.0, 0.0]
     assert bounds_of(VALUES, INTERVALS).shape == bounds_of({}, {}).shape
 
 
 def test_the_game_is_as_vehicles_fly_whatever_the_policy_knew():
     game = adapting_game(PursuitSettings())
-    assert (game.speed_limit, game.substeps, game.start_attitude) == (
-        "none",
-        5,
-        "drawn",
-    )
+    assert (game.speed_limit, game.substeps, game.start_attitude) == ("none", 5, "drawn")
     assert (
-        game.observe_history == 12
-        and adapting_game(PursuitSettings(time_step=0.04)).substeps == 20
+        game.observe_history == 12 and adapting_game(PursuitSettings(time_step=0.04)).substeps == 20
     )
 
 
@@ -128,9 +113,7 @@ def test_the_best_step_on_the_way_is_kept():
 
     key = jax.random.key(0)
     tuned = fine_tune(adaptation, policy, np.zeros((1, 4)), key, worth)
-    assert (
-        tuned.update == 3 and tuned.parameters.actor[0] == 3.0 and len(tuned.looks) == 7
-    )
+    assert tuned.update == 3 and tuned.parameters.actor[0] == 3.0 and len(tuned.looks) == 7
     worse = fine_tune(adaptation, policy, np.zeros((1, 4)), key, worse_later)
     assert worse.update == 0 and worse.parameters.actor[0] == 0.0
 
@@ -138,10 +121,7 @@ def test_the_best_step_on_the_way_is_kept():
 def test_what_is_won_back_is_the_share_of_a_loss_beyond_chance():
     chance = np.random.default_rng(0).normal(0.0, 0.1, 400)
     nominal = {name: np.ones(400) for name in adaptation.LOSSES}
-    before = nominal | {
-        "crash_rate": 1.5 + chance,
-        "capture_step": 1.0 + chance - chance.mean(),
-    }
+    before = nominal | {"crash_rate": 1.5 + chance, "capture_step": 1.0 + chance - chance.mean()}
     after = nominal | {"crash_rate": 1.1 + chance}
     shares = adaptation.won_back({"nominal": nominal, "before": before, "after": after})
     assert shares["crash_rate"] == pytest.approx(0.8, abs=0.01)
@@ -172,13 +152,10 @@ def test_moments_in_flight_are_the_nominal_vehicles_with_a_settled_other_one(
     other = nominal.state.drones
     np.testing.assert_array_equal(own.position, other.position)
     np.testing.assert_array_equal(
-        own.effect_memory["state_latency"]["pose"],
-        other.effect_memory["state_latency"]["pose"],
+        own.effect_memory["state_latency"]["pose"], other.effect_memory["state_latency"]["pose"]
     )
     np.testing.assert_array_equal(flights.position, nominal.position)
-    np.testing.assert_allclose(
-        flights.state.vehicles["mass"]["extra"], 0.008, atol=1e-3
-    )
+    np.testing.assert_allclose(flights.state.vehicles["mass"]["extra"], 0.008, atol=1e-3)
     np.testing.assert_array_equal(nominal.state.vehicles["mass"]["extra"], 0.0)
     assert not np.allclose(own.rotor_speed, other.rotor_speed)
     step = np.asarray(nominal.position)[LAG] - np.asarray(other.position)
@@ -196,9 +173,7 @@ def test_a_flight_may_come_late_but_not_elsewhere():
     assert (np.asarray(away) > 1.0).mean() > 0.9
 
 
-def test_a_policy_is_fine_tuned_measured_and_written(
-    policy_file, tmp_path, monkeypatch
-):
+def test_a_policy_is_fine_tuned_measured_and_written(policy_file, tmp_path, monkeypatch):
     only(("motor_lag", "mass"), monkeypatch)
     effects = tmp_path / "effects.toml"
     save_effects(effects, VALUES, INTERVALS)
@@ -207,9 +182,7 @@ def test_a_policy_is_fine_tuned_measured_and_written(
         effects, str(policy_file), tmp_path / "out", episodes=2, training=training
     )
     results = adaptation.adapt(command)
-    assert json.loads((command.out / "adapt.json").read_text())["effects"] == [
-        "motor_lag"
-    ]
+    assert json.loads((command.out / "adapt.json").read_text())["effects"] == ["motor_lag"]
     assert "motor_lag.extra_up" in (command.out / "adapt.html").read_text()
     before = load_policy(policy_file)
     after = load_policy(command.out / "policy.npz")
@@ -217,18 +190,15 @@ def test_a_policy_is_fine_tuned_measured_and_written(
         "motor_lag.extra_up"
     ] == pytest.approx(0.035)
     changed = not np.allclose(
-        *(jax.tree.leaves(loaded.parameters.actor)[0] for loaded in (before, after)),
-        atol=1e-5,
+        *(jax.tree.leaves(loaded.parameters.actor)[0] for loaded in (before, after)), atol=1e-5
     )
     assert changed == results["kept"].startswith("fine-tuned")
     assert len(results["looks"]) == 2  # before and after its one step
-    assert set(results["nominal"]) == set(adaptation.FIGURES) and set(
-        results["won_back"]
-    ) == set(adaptation.LOSSES)
+    assert set(results["nominal"]) == set(adaptation.FIGURES) and set(results["won_back"]) == set(
+        adaptation.LOSSES
+    )
     with pytest.raises(UserError, match="already exists"):
-        adapt.main(
-            [str(effects), "--policy", str(policy_file), "--out", str(command.out)]
-        )
+        adapt.main([str(effects), "--policy", str(policy_file), "--out", str(command.out)])
 
 
 def test_what_is_not_there_is_refused_before_anything_is_written(tmp_path):

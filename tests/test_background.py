@@ -15,17 +15,11 @@ from openjax.store.leaves import abstract_like, place
 
 
 def start():
-    return {
-        "x": jnp.arange(5.0),
-        "key": jax.random.key(1),
-        "n": jnp.zeros((), jnp.int32),
-    }
+    return {"x": jnp.arange(5.0), "key": jax.random.key(1), "n": jnp.zeros((), jnp.int32)}
 
 
 def count(carry):
-    return {**carry, "x": carry["x"] + 1.0, "n": carry["n"] + 1}, {
-        "sum": jnp.sum(carry["x"])
-    }
+    return {**carry, "x": carry["x"] + 1.0, "n": carry["n"] + 1}, {"sum": jnp.sum(carry["x"])}
 
 
 def test_call_finds_what_was_compiled_ahead():
@@ -58,18 +52,14 @@ def test_what_goes_wrong_in_the_compiler_is_raised_when_waited_for():
     def fail():
         raise MemoryError("too large")
 
-    wait = compile_ahead(
-        SimpleNamespace(lower=lambda *_: SimpleNamespace(compile=fail))
-    )
+    wait = compile_ahead(SimpleNamespace(lower=lambda *_: SimpleNamespace(compile=fail)))
     with pytest.raises(MemoryError, match="too large"):
         wait()
 
 
 def test_waits_no_longer_than_it_is_told():
     go_on = threading.Event()
-    wait = compile_ahead(
-        SimpleNamespace(lower=lambda *_: SimpleNamespace(compile=go_on.wait))
-    )
+    wait = compile_ahead(SimpleNamespace(lower=lambda *_: SimpleNamespace(compile=go_on.wait)))
     with pytest.raises(TimeoutError):
         wait(0.01)
     go_on.set()

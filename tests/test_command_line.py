@@ -28,9 +28,7 @@ print([name for name in ("jax", "mujoco", "flax", "scipy", "matplotlib") if name
 @pytest.mark.parametrize("command", COMMANDS)
 def test_help_needs_no_jax(command):
     done = subprocess.run(
-        [sys.executable, "-c", SCRIPT.format(command=command)],
-        capture_output=True,
-        text=True,
+        [sys.executable, "-c", SCRIPT.format(command=command)], capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
     assert f"usage: openjax {command}" in done.stdout
@@ -53,12 +51,15 @@ def test_every_command_is_told(capsys):
     assert all(f"  {name} " in told for name in COMMANDS)
 
 
+ENTRIES = ("train", "evaluate", "diagnose", "benchmark")
+"""Commands that `python -m openjax.NAME` runs, too."""
+
+
 @pytest.mark.parametrize("command", COMMANDS)
-def test_every_command_is_a_module_of_the_package(command):
-    found = importlib.util.find_spec(f"openjax.{command}")
-    if found.submodule_search_locations:
-        found = importlib.util.find_spec(f"openjax.{command}.__main__")
-    assert found is not None
+def test_every_command_has_its_module(command):
+    assert importlib.util.find_spec(f"openjax.commands.{command}")
+    if command in ENTRIES:
+        assert importlib.util.find_spec(f"openjax.{command}")
 
 
 def test_names_of_effects_without_their_code():

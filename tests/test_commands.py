@@ -54,9 +54,7 @@ def start(arguments):
     environment = {**os.environ, "JAX_LOG_COMPILES": "1"}
     output = tempfile.TemporaryFile("w+")
     command = [sys.executable, "-m", *arguments]
-    process = subprocess.Popen(
-        command, env=environment, stdout=output, stderr=subprocess.STDOUT
-    )
+    process = subprocess.Popen(command, env=environment, stdout=output, stderr=subprocess.STDOUT)
     return process, output
 
 
@@ -87,9 +85,7 @@ def train_arguments(tmp_path_factory):
 def whole_run(tmp_path_factory, train_arguments):
     """A run from start to end, and what it printed."""
     out = tmp_path_factory.mktemp("runs") / "whole"
-    return out, finish(
-        start([*train_arguments, "--compare_with", "angelani", "--out", str(out)])
-    )
+    return out, finish(start([*train_arguments, "--compare_with", "angelani", "--out", str(out)]))
 
 
 def in_process(main, arguments, monkeypatch, capsys):
@@ -102,12 +98,7 @@ def in_process(main, arguments, monkeypatch, capsys):
 
 def test_train_shows_progress_and_leaves_what_the_readme_says(whole_run):
     out, printed = whole_run
-    for line in (
-        "loading JAX",
-        "compiling the training step",
-        "(best so far)",
-        "Before and after",
-    ):
+    for line in ("loading JAX", "compiling the training step", "(best so far)", "Before and after"):
         assert line in printed
     for name in (
         "settings.json",
@@ -124,10 +115,7 @@ def test_train_shows_progress_and_leaves_what_the_readme_says(whole_run):
     layouts = json.loads((out / "layouts.json").read_text())
     scenarios = [row["scenario"] for row in layouts["after"]]
     assert scenarios == ["validation", "validation_far", *SCENARIOS]
-    assert [row["scenario"] for row in layouts["angelani"]] == [
-        scenarios[0],
-        *scenarios[2:],
-    ]
+    assert [row["scenario"] for row in layouts["angelani"]] == [scenarios[0], *scenarios[2:]]
     assert layouts["machine"]["versions"]["jax"] == jax.__version__
 
 
@@ -143,16 +131,7 @@ def test_minutes_are_of_learning_however_long_the_compiler_takes(tmp_path):
         *ALONE,
     ]
     finish(
-        start(
-            [
-                "openjax.train",
-                *arguments,
-                "--minutes",
-                "0.02",
-                "--out",
-                str(tmp_path / "run"),
-            ]
-        )
+        start(["openjax.train", *arguments, "--minutes", "0.02", "--out", str(tmp_path / "run")])
     )
     learnt = list(read_metrics(tmp_path / "run" / "metrics.jsonl", "train"))
     assert 0 < len(learnt) < 100_000_000 // 160
@@ -166,9 +145,7 @@ def test_killed_in_the_middle_of_a_checkpoint_and_resumed_equals_whole(
     checkpoints = Checkpoints(out / "checkpoints")
     deadline = time.monotonic() + 200
     while time.monotonic() < deadline and process.poll() is None:
-        names = (
-            os.listdir(checkpoints.directory) if checkpoints.directory.is_dir() else []
-        )
+        names = os.listdir(checkpoints.directory) if checkpoints.directory.is_dir() else []
         committed = [name for name in names if name.isdecimal()]
         if len(committed) >= 2 and any("tmp" in name for name in names):
             break
@@ -194,18 +171,13 @@ def test_killed_in_the_middle_of_a_checkpoint_and_resumed_equals_whole(
     for name, array in expected.items():
         np.testing.assert_array_equal(array, arrays[name], err_msg=name)
     losses = [
-        [
-            (r["update"], r["value_loss"])
-            for r in read_metrics(path / "metrics.jsonl", "train")
-        ]
+        [(r["update"], r["value_loss"]) for r in read_metrics(path / "metrics.jsonl", "train")]
         for path in (whole_run[0], out)
     ]
     assert losses[0] == losses[1]
 
 
-@pytest.mark.parametrize(
-    "line", ["loading JAX", "compiling the first", "compiling the training"]
-)
+@pytest.mark.parametrize("line", ["loading JAX", "compiling the first", "compiling the training"])
 def test_signal_before_the_first_update_ends_at_once_and_loses_nothing(
     line, whole_run, tmp_path, train_arguments
 ):
@@ -267,9 +239,7 @@ def test_signal_after_the_last_update_loses_nothing(
     # between two updates of the stage the run ends by itself, with what it has learnt
     assert process.returncode in (0, 128 + number), printed
     name = signal.Signals(number).name
-    assert printed.splitlines()[-1].startswith(f"{name}: saved at update {UPDATES}"), (
-        printed
-    )
+    assert printed.splitlines()[-1].startswith(f"{name}: saved at update {UPDATES}"), printed
     assert printed.count(f"{name}: ") == 1 and "Traceback" not in printed
     assert not list(out.rglob(".writing-*"))
     for file in out.glob("*.json"):
@@ -280,9 +250,7 @@ def test_signal_after_the_last_update_loses_nothing(
     policy, _, _ = load_policy_file(out / "policy.npz")
     for leaf, array in expected.items():
         np.testing.assert_array_equal(array, policy[leaf], err_msg=leaf)
-    whole, resumed = (
-        json.loads((d / "layouts.json").read_text()) for d in (ended_run, out)
-    )
+    whole, resumed = (json.loads((d / "layouts.json").read_text()) for d in (ended_run, out))
     assert whole["after"] == resumed["after"]
 
 
@@ -296,9 +264,7 @@ def test_signal_saves_and_exits_cleanly(whole_run, tmp_path, train_arguments):
     started = start([*train_arguments, *ALONE, "--out", str(out)])
     deadline = time.monotonic() + 200
     while time.monotonic() < deadline and started[0].poll() is None:
-        if (out / "metrics.jsonl").exists() and (
-            out / "metrics.jsonl"
-        ).stat().st_size > 0:
+        if (out / "metrics.jsonl").exists() and (out / "metrics.jsonl").stat().st_size > 0:
             break
         time.sleep(0.01)
     started[0].terminate()
@@ -309,15 +275,11 @@ def test_signal_saves_and_exits_cleanly(whole_run, tmp_path, train_arguments):
     assert (out / "policy.npz").exists()
 
 
-def test_nan_stops_the_run_and_leaves_the_state(
-    tmp_path, monkeypatch, capsys, train_arguments
-):
+def test_nan_stops_the_run_and_leaves_the_state(tmp_path, monkeypatch, capsys, train_arguments):
     def make_broken_step(settings, environment, devices):
         def step(carry):
             update = carry.update + 1
-            broken = jax.tree.map(
-                lambda leaf: leaf + (0.0 / (update != 4)), carry.policy.actor
-            )
+            broken = jax.tree.map(lambda leaf: leaf + (0.0 / (update != 4)), carry.policy.actor)
             carry = carry.replace(policy=carry.policy.replace(actor=broken))
             return carry.replace(update=update), {"reward": 0.0 * update}
 
@@ -343,17 +305,10 @@ evader = [-0.6, 0.0, 0.5]
 """
 
 
-def test_evaluate_prints_and_writes_the_records(
-    whole_run, tmp_path, monkeypatch, capsys
-):
+def test_evaluate_prints_and_writes_the_records(whole_run, tmp_path, monkeypatch, capsys):
     records = tmp_path / "records.json"
     arguments = ["--policy", whole_run[0], "--episodes", "4", "--json", records]
-    assert (
-        in_process(
-            evaluate.main, [*arguments, "--scenario", "all"], monkeypatch, capsys
-        )[0]
-        == 0
-    )
+    assert in_process(evaluate.main, [*arguments, "--scenario", "all"], monkeypatch, capsys)[0] == 0
     rows = json.loads(records.read_text())
     assert [tuple(row) for row in rows] == [FIELDS] * 6
     twice = [
@@ -370,9 +325,7 @@ def test_evaluate_prints_and_writes_the_records(
     layout.write_text(LAYOUT)
     for scenario in ("hidden", layout):
         assert (
-            in_process(
-                evaluate.main, [*arguments, "--scenario", scenario], monkeypatch, capsys
-            )[0]
+            in_process(evaluate.main, [*arguments, "--scenario", scenario], monkeypatch, capsys)[0]
             == 0
         )
         row = json.loads(records.read_text())
@@ -387,9 +340,7 @@ def test_shipped_policies_act_in_their_game_and_refuse_another():
     kinds = {}
     for name in shipped_policies():
         policy = openjax.load_policy(name)
-        assert all(
-            np.isfinite(leaf).all() for leaf in jax.tree.leaves(policy.parameters)
-        ), name
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(policy.parameters)), name
         kinds[policy.policy, policy.settings.environment] = (
             policy  # seeds of one kind act by one program
         )
@@ -397,9 +348,7 @@ def test_shipped_policies_act_in_their_game_and_refuse_another():
         policy = policy.of_team(3)
         environment = openjax.make(policy.settings.environment, speed_limit="none")
         observation = jax.eval_shape(environment.reset, jax.random.key(0))[0]
-        observation = jax.tree.map(
-            lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), observation
-        )
+        observation = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), observation)
         action = policy(observation)
         assert action.shape == (3, 4) and bool((abs(action) <= 1).all()), policy.source
     flight = openjax.load_policy("flight")
@@ -417,30 +366,16 @@ def test_benchmark_writes_table_and_file(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(training_step, "make_phases", phases_without)
     file = tmp_path / "speed.json"
     arguments = [*TINY, "--predictor.enabled", "False", "--generator.enabled", "False"]
-    arguments += [
-        "--parts",
-        "rigid",
-        "training",
-        "--envs",
-        "8",
-        "--training_envs",
-        "14",
-    ]
+    arguments += ["--parts", "rigid", "training", "--envs", "8", "--training_envs", "14"]
     arguments += ["--steps", "5", "--seconds", "0.1", "--json", file]
     assert benchmark.main([str(argument) for argument in arguments]) == 0
     printed = capsys.readouterr().out
     assert "env steps/s" in printed and "compile" in printed
     result = json.loads(file.read_text())
     parts = [(row["part"], row["num_envs"]) for row in result["rows"]]
-    assert parts == [
-        ("rigid", 8),
-        ("training", 14),
-        ("- fly", 14),
-        ("- renew", 14),
-    ]
+    assert parts == [("rigid", 8), ("training", 14), ("- fly", 14), ("- renew", 14)]
     assert all(
-        row["env_steps_per_second"] > 0 and row["compile_seconds"] > 0
-        for row in result["rows"]
+        row["env_steps_per_second"] > 0 and row["compile_seconds"] > 0 for row in result["rows"]
     )
     assert {"device", "versions", "commit"} <= result["machine"].keys()
 
@@ -467,21 +402,9 @@ def wrong_layout(change):
             "--environment.pillar_radius 5",
             "leaves no room in an arena of radius 0.9: less than 0.83",
         ),
-        (
-            train,
-            "--mappo.epochs two",
-            "--mappo.epochs is 'two'; expected a whole number",
-        ),
-        (
-            train,
-            "--network.heads 0",
-            "network.heads is 0; it must be a whole number in",
-        ),
-        (
-            train,
-            "--mappo.learning_rate nan",
-            "mappo.learning_rate is nan; it must be in (0, 1]",
-        ),
+        (train, "--mappo.epochs two", "--mappo.epochs is 'two'; expected a whole number"),
+        (train, "--network.heads 0", "network.heads is 0; it must be a whole number in"),
+        (train, "--mappo.learning_rate nan", "mappo.learning_rate is nan; it must be in (0, 1]"),
         (train, "--restart_close 0.5", "restart_close 0.5 needs restart_every"),
         (
             train,
@@ -517,11 +440,7 @@ def wrong_layout(change):
             "--policy {run} --scenario nowhere",
             "no such layout, nor a .toml file; there are wall",
         ),
-        (
-            evaluate,
-            "--policy {run} --scenario {folder}/outside.toml",
-            "outside the arena",
-        ),
+        (evaluate, "--policy {run} --scenario {folder}/outside.toml", "outside the arena"),
         (evaluate, "--policy {run} --scenario {folder}/over.toml", "over the start"),
         (evaluate, "--policy {run} --json {folder}/no/where.json", "doesn't exist"),
         (
@@ -535,11 +454,7 @@ def wrong_layout(change):
             "unknown setting --episode; did you mean --episodes?",
         ),
         (benchmark, "--envs 0", "--envs is 0; it must be a whole number in"),
-        (
-            diagnose,
-            "{folder} --reference",
-            "--reference needs at least one folder of flights",
-        ),
+        (diagnose, "{folder} --reference", "--reference needs at least one folder of flights"),
         (fly, "--policy open --motion_capture nobody:poses", "no such MODULE:FUNCTION"),
     ],
 )
@@ -551,13 +466,9 @@ def test_bad_input_is_one_line_and_status_2(
     (folder / "outside.toml").write_text(wrong_layout("[2.0, 0.3]"))
     (folder / "over.toml").write_text(wrong_layout("[0.6, 0.0]"))
     run = whole_run[0]
-    before = {
-        path: path.stat().st_mtime_ns for path in [*run.rglob("*"), *folder.rglob("*")]
-    }
+    before = {path: path.stat().st_mtime_ns for path in [*run.rglob("*"), *folder.rglob("*")]}
     monkeypatch.chdir(tmp_path)
-    arguments = [
-        argument.format(run=run, folder=folder) for argument in arguments.split()
-    ]
+    arguments = [argument.format(run=run, folder=folder) for argument in arguments.split()]
     status, error = in_process(main.main, arguments, monkeypatch, capsys)
     assert status == 2
     assert len(error.strip().splitlines()) == 1 and message in error

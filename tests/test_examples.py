@@ -24,9 +24,7 @@ assert not (broken := broken_rules(report)), broken
 """
 
 
-@pytest.mark.parametrize(
-    "path", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.stem
-)
+@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.stem)
 def test_example_is_short(path):
     assert len(path.read_text().splitlines()) <= 40
 
@@ -39,9 +37,7 @@ def test_own_game_captures(capsys):
 
 def test_own_controller_is_flown_like_a_policy(capsys):
     runpy.run_path(str(EXAMPLES / "own_controller.py"))
-    rows = {
-        line.split()[0]: line.split() for line in capsys.readouterr().out.splitlines()
-    }
+    rows = {line.split()[0]: line.split() for line in capsys.readouterr().out.splitlines()}
     captured = {name: float(row[2].rstrip(",")) for name, row in rows.items()}
     assert captured["open"] == 1.0  # the shipped policy, in the same game
     # running after a faster one isn't enough
@@ -80,19 +76,13 @@ def test_a_part_of_ones_own_is_trained(part, tiny_preset, tmp_path, capsys):
     assert part == "learner" or "captured in" in printed
     run = tmp_path / "runs" / f"own_{part}"
     metrics = list(read_metrics(run / "metrics.jsonl", "train"))
-    assert (
-        len(metrics) == 2
-        and (run / "chase.gif").is_file()
-        and (run / "policy.npz").is_file()
-    )
+    assert len(metrics) == 2 and (run / "chase.gif").is_file() and (run / "policy.npz").is_file()
     assert ("reinforce_loss" in metrics[0]) == (part == "learner")
     with pytest.raises(openjax.UserError, match="was begun with"):
         openjax.train(resume=run)
     if part == "network":
         assert f'openjax.load_policy("runs/own_{part}", ' in printed
-        with pytest.raises(
-            openjax.UserError, match="a network of one's own: in Python"
-        ):
+        with pytest.raises(openjax.UserError, match="a network of one's own: in Python"):
             openjax.load_policy(run)
     if part == "learner":
         longer = dataclasses.replace(example["settings"], total_steps=960)
@@ -103,11 +93,7 @@ def test_a_part_of_ones_own_is_trained(part, tiny_preset, tmp_path, capsys):
 
 def test_an_evader_of_ones_own_is_flown(capsys):
     runpy.run_path(str(EXAMPLES / "own_evader.py"), run_name="__main__")
-    rows = [
-        line.split()
-        for line in capsys.readouterr().out.splitlines()
-        if "caught in" in line
-    ]
+    rows = [line.split() for line in capsys.readouterr().out.splitlines() if "caught in" in line]
     assert [row[0] for row in rows] == ["field", "foresee"]
     assert float(rows[0][3]) == 1.0
 
@@ -162,6 +148,4 @@ def test_own_importer_reads_a_format_of_its_own(tmp_path, sample_columns):
         importer._IMPORTERS[:] = shipped
     assert [flight.name for flight in case.flights] == ["first.flight.jsonl"]
     assert [issue.issue for issue in case.left_out()] == ["holds no row"]
-    np.testing.assert_allclose(
-        case.flights[0].body_rates[:, 1], columns["wy"][:300], atol=1e-9
-    )
+    np.testing.assert_allclose(case.flights[0].body_rates[:, 1], columns["wy"][:300], atol=1e-9)

@@ -19,9 +19,7 @@ import pytest
 )  # fmt: skip
 def test_modules_load_without_what_they_do_not_need(modules, unwanted):
     script = f"import sys, {', '.join(modules)}; print([name for name in {unwanted.split()} if name in sys.modules])"
-    done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True
-    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert done.stdout == "[]\n", done.stdout + done.stderr
 
 

@@ -99,11 +99,7 @@ def stopped(moment, folder, *numbers):
     """Exit status and standard error of a command that gets signals at a moment."""
     command = [sys.executable, "-c", STUCK, moment, str(folder)]
     process = subprocess.Popen(
-        command,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=os.environ,
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ
     )
     try:
         assert process.stdout.readline() == "now\n", process.stderr.read()
@@ -127,9 +123,7 @@ def stopped(moment, folder, *numbers):
         ("hanging", "stopped"),
     ],
 )
-def test_a_command_in_a_compiler_that_never_ends_is_over_by_one_line(
-    moment, line, tmp_path
-):
+def test_a_command_in_a_compiler_that_never_ends_is_over_by_one_line(moment, line, tmp_path):
     assert stopped(moment, tmp_path, signal.SIGTERM) == (143, f"SIGTERM: {line}\n")
     left = {path.name for path in tmp_path.iterdir()} - {"heavy.py", "__pycache__"}
     assert left == set()
@@ -146,6 +140,4 @@ def test_what_is_learning_saves_first(tmp_path):
 
 def test_a_second_signal_doesnt_wait_for_what_is_learning(tmp_path):
     status, line = stopped("learning_for_ever", tmp_path, signal.SIGTERM, signal.SIGINT)
-    assert (
-        status in (130, 143) and line.endswith(": stopped\n") and line.count("\n") == 1
-    )
+    assert status in (130, 143) and line.endswith(": stopped\n") and line.count("\n") == 1

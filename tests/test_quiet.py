@@ -33,24 +33,13 @@ COMMANDS = (
     "benchmark --parts mjx --envs 2 --steps 2 --seconds 0.01",
 )
 """In the order in which each needs what the one before has written."""
-NOISE = (
-    "warp",
-    "Warning",
-    "WARNING",
-    "font cache",
-    "xla",
-    "tensorboard",
-    "I0000",
-    "E0000",
-)
+NOISE = ("warp", "Warning", "WARNING", "font cache", "xla", "tensorboard", "I0000", "E0000")
 """What lines of these libraries have in common."""
 
 
 def test_commands_say_nothing_that_libraries_say(tmp_path):
     environment = {
-        **{
-            name: value for name, value in os.environ.items() if name != "JAX_PLATFORMS"
-        },
+        **{name: value for name, value in os.environ.items() if name != "JAX_PLATFORMS"},
         "MPLCONFIGDIR": str(tmp_path / "matplotlib"),
         "XDG_CACHE_HOME": str(tmp_path / "cache"),
     }

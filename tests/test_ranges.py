@@ -12,14 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from openjax.command_line import parse
-from openjax.commands import (
-    calibrate,
-    diagnose,
-    export,
-    fly,
-    sample_flights,
-    virtual_crazyflie,
-)
+from openjax.commands import calibrate, diagnose, export, fly, sample_flights, virtual_crazyflie
 from openjax.commands.adapt import AdaptCommand
 from openjax.commands.benchmark import BenchmarkCommand
 from openjax.commands.evaluate import EvaluateCommand
@@ -60,9 +53,7 @@ COMMANDS = (
 )
 OF_FLIGHTS = (calibrate.Arguments, diagnose.Options, sample_flights.Arguments)
 """They can't be made without a folder."""
-FIELDS = [
-    (kind, field) for kind in (*SETTINGS, *COMMANDS) for field in ranged_fields(kind)
-]
+FIELDS = [(kind, field) for kind in (*SETTINGS, *COMMANDS) for field in ranged_fields(kind)]
 
 
 def test_every_number_declares_a_range():
@@ -79,13 +70,9 @@ def outside(interval: Interval):
     """Numbers that aren't in an interval."""
     return st.one_of(
         st.sampled_from([math.nan, math.inf, -math.inf, 10**30, -1e300, 1e300]),
+        st.floats(max_value=interval.low - 1e-3 * (1.0 + abs(interval.low)), allow_infinity=False),
         st.floats(
-            max_value=interval.low - 1e-3 * (1.0 + abs(interval.low)),
-            allow_infinity=False,
-        ),
-        st.floats(
-            min_value=interval.high + 1e-3 * (1.0 + abs(interval.high)),
-            allow_infinity=False,
+            min_value=interval.high + 1e-3 * (1.0 + abs(interval.high)), allow_infinity=False
         ),
         st.integers(max_value=math.ceil(interval.low) - 1),
         st.integers(min_value=math.floor(interval.high) + 1),
@@ -95,15 +82,11 @@ def outside(interval: Interval):
 @given(data=st.data())
 def test_what_is_outside_is_refused_by_name(data):
     kind, field = data.draw(st.sampled_from(FIELDS))
-    value = data.draw(
-        st.one_of(outside(field.interval), st.sampled_from(["1", True, [1], {}]))
-    )
+    value = data.draw(st.one_of(outside(field.interval), st.sampled_from(["1", True, [1], {}])))
     # of a setting, already its making is refused; a command is checked when it was read
     with pytest.raises(UserError) as error:
         check_intervals(
-            dataclasses.replace(
-                kind(), **{field.name: (value,) if field.several else value}
-            )
+            dataclasses.replace(kind(), **{field.name: (value,) if field.several else value})
         )
     message = str(error.value)
     assert field.name in message and str(field.interval) in message
@@ -115,16 +98,12 @@ def test_what_is_inside_is_taken_unless_settings_contradict_each_other(data):
     kind, field = data.draw(
         st.sampled_from([(kind, field) for kind, field in FIELDS if kind in SETTINGS])
     )
-    numbers = st.integers(
-        math.ceil(field.interval.low), math.floor(field.interval.high)
-    )
+    numbers = st.integers(math.ceil(field.interval.low), math.floor(field.interval.high))
     if field.kind is float:
         numbers = st.floats(field.interval.low, field.interval.high)
     value = data.draw(numbers.filter(lambda number: number in field.interval))
     try:
-        made = dataclasses.replace(
-            kind(), **{field.name: (value,) if field.several else value}
-        )
+        made = dataclasses.replace(kind(), **{field.name: (value,) if field.several else value})
     except UserError as error:  # for another reason than its interval
         assert "it must be in" not in str(error) and "whole number in" not in str(error)
         return
@@ -154,7 +133,5 @@ def test_help_shows_the_range(capsys):
         r"(--[\w.]+) (?:INT|FLOAT|\{None\}\|INT|\{None\}\|FLOAT) In [\[(]", shown
     )
     assert not unexplained
-    assert not re.search(r"\.\.\. In | \.\.\. [a-z]", shown), (
-        "goes on in another option's text"
-    )
+    assert not re.search(r"\.\.\. In | \.\.\. [a-z]", shown), "goes on in another option's text"
     assert "--layout_episodes" in shown

@@ -28,11 +28,7 @@ OTHER_RECIPE = "isn't the preset's recipe of today"
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 # folders that building the site leaves
 MADE = ("_build", "jupyter_execute", "measured")
-PAGES = [
-    path
-    for path in sorted((ROOT / "docs").rglob("*.md"))
-    if not set(MADE) & set(path.parts)
-]
+PAGES = [path for path in sorted((ROOT / "docs").rglob("*.md")) if not set(MADE) & set(path.parts)]
 
 
 def test_every_command_and_target_of_the_readme_exists():
@@ -40,9 +36,7 @@ def test_every_command_and_target_of_the_readme_exists():
     for target in set(re.findall(r"\bmake ([a-z]+)\b", README)) - {"it"}:
         assert re.search(rf"^{target}:", makefile, re.MULTILINE), target
     pages = "".join(page.read_text(encoding="utf-8") for page in PAGES)
-    commands = set(
-        re.findall(r"(?:^ *|`)openjax ([a-z]\w+)", README + pages, re.MULTILINE)
-    )
+    commands = set(re.findall(r"(?:^ *|`)openjax ([a-z]\w+)", README + pages, re.MULTILINE))
     assert commands == set(COMMANDS), commands ^ set(COMMANDS)
 
 
@@ -59,9 +53,7 @@ def test_what_the_readmes_commands_write_is_ignored():
 
 def test_modules_that_the_pages_run_are_there():
     for page in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *PAGES):
-        for name in re.findall(
-            r"python -m ([a-z_.]+)", page.read_text(encoding="utf-8")
-        ):
+        for name in re.findall(r"python -m ([a-z_.]+)", page.read_text(encoding="utf-8")):
             assert importlib.util.find_spec(name.rstrip(".")), f"{page.name}: {name}"
 
 
@@ -71,9 +63,7 @@ def test_readme_and_pages_stay_short():
     """
 
     def words(text):
-        text = re.sub(
-            r"^```{eval-rst}.*?^```", "", text, flags=re.MULTILINE | re.DOTALL
-        )
+        text = re.sub(r"^```{eval-rst}.*?^```", "", text, flags=re.MULTILINE | re.DOTALL)
         return len(re.findall(r"\S*[^\W\d_]\S*", text))
 
     assert words(README) <= 1300
@@ -87,12 +77,7 @@ def test_links_lead_somewhere():
     site's pages.
     """
     results = ROOT / "experiments" / "results"
-    for page in (
-        ROOT / "README.md",
-        ROOT / "CONTRIBUTING.md",
-        *PAGES,
-        *results.rglob("*.md"),
-    ):
+    for page in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *PAGES, *results.rglob("*.md")):
         text = page.read_text(encoding="utf-8")
         for path, heading in re.findall(r"\]\((?!http)([^)#]*)#?([^)]*)\)", text):
             target = page.parent / path if path else page
@@ -102,12 +87,10 @@ def test_links_lead_somewhere():
                     f"{page.name}: {path}"
                 )
             if heading:
-                titles = re.findall(
-                    r"^#+ (.*)$", target.read_text(encoding="utf-8"), re.MULTILINE
+                titles = re.findall(r"^#+ (.*)$", target.read_text(encoding="utf-8"), re.MULTILINE)
+                assert heading in [title.lower().replace(" ", "-") for title in titles], (
+                    f"{page.name}: {heading}"
                 )
-                assert heading in [
-                    title.lower().replace(" ", "-") for title in titles
-                ], f"{page.name}: {heading}"
 
 
 def test_the_table_of_experiments_names_them_all():
@@ -172,10 +155,7 @@ def test_from_sample_flights_to_a_corrected_simulator(tmp_path):
     assert report["gap"]["reduction"] > 0.5
     # what the README prints is what is found
     (value,) = re.findall(r"d_xy = ([\d.]+) \[", README)
-    assert (
-        abs(report["parameters"]["rotor_drag"]["d_xy"]["value"] / float(value) - 1)
-        < 0.02
-    )
+    assert abs(report["parameters"]["rotor_drag"]["d_xy"]["value"] / float(value) - 1) < 0.02
     (share,) = re.findall(r"Shares of the gap: rotor_drag ([\d.]+) \[", README)
     assert abs(report["shares"]["effects"]["rotor_drag"]["value"] - float(share)) < 0.03
 
@@ -191,9 +171,7 @@ def test_from_sample_flights_to_a_corrected_simulator(tmp_path):
         return float(jnp.mean(jnp.linalg.norm(state.drones.velocity, axis=-1)))
 
     # the same commands fly slower against the drag that was found
-    assert speed_after_a_second(corrected) < 0.97 * speed_after_a_second(
-        openjax.Pursuit(settings)
-    )
+    assert speed_after_a_second(corrected) < 0.97 * speed_after_a_second(openjax.Pursuit(settings))
 
 
 @pytest.mark.parametrize("name", [DEFAULT_POLICY, TEAM_POLICY])

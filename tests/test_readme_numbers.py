@@ -68,14 +68,9 @@ def test_first_runs():
     runs = [run for run in read("quick")["runs"] if "recipe" not in run]
     assert (len(runs), len({run["seed"] for run in runs})) == (10, 5)
     least = min(
-        row["capture_rate"]
-        for run in runs
-        for row in run["after"]
-        if row["scenario"] in SCENARIOS
+        row["capture_rate"] for run in runs for row in run["after"] if row["scenario"] in SCENARIOS
     )
-    label = (
-        "ten first runs on two cores (preset `quick`): the least captures of a layout"
-    )
+    label = "ten first runs on two cores (preset `quick`): the least captures of a layout"
     assert cells(label)[0] == short(least, 2)
 
 
@@ -111,9 +106,9 @@ def test_the_second_judge(page):
         rates = [short(row["capture_rate"][place], 2) for place in PLACES]
         line = f"| {row['policy']} | {row['judge']} | {' | '.join(rates)} |"
         assert (line in part) == row["shown"], line
-    assert text.index("<!-- judged -->") < text.find(
-        "| layout |", text.index("judged -->")
-    ) or (page != "README.md")
+    assert text.index("<!-- judged -->") < text.find("| layout |", text.index("judged -->")) or (
+        page != "README.md"
+    )
 
 
 def test_the_least_of_the_second_judge():
@@ -121,8 +116,7 @@ def test_the_least_of_the_second_judge():
     rates = [
         row["capture_rate"]
         for row in JUDGED
-        if row["policy"] == "evaders"
-        and row["judge"] in ("evaders that learn", "a planner")
+        if row["policy"] == "evaders" and row["judge"] in ("evaders that learn", "a planner")
     ]
     assert len(rates) == 2
     least = min(rate[layout] for rate in rates for layout in SCENARIOS)
@@ -141,8 +135,7 @@ def test_where_a_theorem_forces_a_capture():
     squares = [
         square
         for square in read("catch_map")["maps"]["empty"]["cells"]
-        if square["speed_ratio"] < square["forced_below"]
-        and square["capture_radius"] >= 0.2
+        if square["speed_ratio"] < square["forced_below"] and square["capture_radius"] >= 0.2
     ]
     rates = [
         np.mean([square[who]["capture_rate"] for square in squares if who in square])
@@ -159,10 +152,7 @@ def test_diagnosis():
     """The last three sealed seeds, without a reference, each answered once."""
     seeds = read("exam_reference")["sealed_2309_to_2311"]
     first = seeds["figures"]["alone"]["first"]
-    label = (
-        "diagnosis of 188 simulated cases with one cause: the first cause named is "
-        "right"
-    )
+    label = "diagnosis of 188 simulated cases with one cause: the first cause named is right"
     assert first["n"] == 188
     assert cells(label)[0] == short(first["hits"] / first["n"], 2)
 

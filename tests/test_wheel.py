@@ -48,11 +48,6 @@ def test_wheel_runs_away_from_the_checkout(tmp_path):
     assert "0.03" in run.stdout
     command = [sys.executable, "-m", "openjax.evaluate", "--help"]
     told = subprocess.run(
-        command,
-        cwd=tmp_path,
-        env=environment,
-        check=True,
-        capture_output=True,
-        text=True,
+        command, cwd=tmp_path, env=environment, check=True, capture_output=True, text=True
     )
     assert "--scenario" in told.stdout

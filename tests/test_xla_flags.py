@@ -23,9 +23,7 @@ print(int(jnp.sum(abs(turned - number**2) > 1e-6 * number**2)))
 
 def run(script: str, flags: str | None) -> subprocess.CompletedProcess:
     """Run in a process that has the suite's flags, some other ones or none."""
-    environment = {
-        name: value for name, value in os.environ.items() if name != "XLA_FLAGS"
-    }
+    environment = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
     environment |= {} if flags is None else {"XLA_FLAGS": flags}
     command = [sys.executable, "-c", script]
     return subprocess.run(command, capture_output=True, text=True, env=environment)

@@ -27,22 +27,8 @@ from experiments.flying.single_thread import use_single_thread
 
 # What a policy can lose by; of the others the game of `flight` feels little.
 CAUSES = (
-    *(
-        "motor_lag",
-        "command_latency",
-        "wind",
-        "packet_loss",
-        "com_offset",
-        "rate_gains",
-    ),
-    *(
-        "mass",
-        "state_latency",
-        "rotor_drag",
-        "inertia",
-        "motor_imbalance",
-        "thrust_saturation",
-    ),
+    *("motor_lag", "command_latency", "wind", "packet_loss", "com_offset", "rate_gains"),
+    *("mass", "state_latency", "rotor_drag", "inertia", "motor_imbalance", "thrust_saturation"),
     *("thrust_scale", "blade_flapping"),
 )
 STRENGTH = 1.5  # of the effect's sample strength
@@ -69,9 +55,7 @@ class Flown:
 
         effect = EFFECTS[self.cause]
         none = effect.none()
-        strong = {
-            k: none[k] + STRENGTH * (v - none[k]) for k, v in effect.card.sample.items()
-        }
+        strong = {k: none[k] + STRENGTH * (v - none[k]) for k, v in effect.card.sample.items()}
         return {self.cause: none | strong}
 
     def case(self):
@@ -84,21 +68,14 @@ class Flown:
         from openjax.vehicle.vehicle_file import load_vehicle_file
 
         told = replace(
-            load_vehicle_file(),
-            mass_weighed=self.cause != "mass",
-            log={"motor_rows": "mean"},
+            load_vehicle_file(), mass_weighed=self.cause != "mass", log={"motor_rows": "mean"}
         )
         found = []
         for place, name in enumerate(SEGMENTS):
             seed = 1000 * SEED + 100 * self.number + place
             reference = ALL[name].reference(SECONDS)
             columns = fly(
-                told.vehicle,
-                told.vehicle,
-                reference,
-                seed,
-                self.effects(),
-                air=Turbulence(),
+                told.vehicle, told.vehicle, reference, seed, self.effects(), air=Turbulence()
             )
             found += flights_of(log_of(columns, name), (0, 1, 2, 3))[0]
         return flight.Case(self.cause, tuple(found), told)
@@ -156,9 +133,7 @@ class Tuner:
         # a third to choose an update by, one to choose vehicles that lose, one to
         # measure by: what was best on tasks is so in part by luck
         self.tasks = [
-            jax.tree.map(
-                lambda leaf, i=i: leaf[i * episodes : (i + 1) * episodes], tasks
-            )
+            jax.tree.map(lambda leaf, i=i: leaf[i * episodes : (i + 1) * episodes], tasks)
             for i in range(3)
         ]
         self.key = jax.random.key(seed)
@@ -230,9 +205,7 @@ def adapted(tuner: Tuner, folder: Path) -> dict:
         out["kept"][name] = tuned.update
         out["looks"][name] = tuned.looks
         flown[name] = tuner.fly(tuned.parameters, true, 2)
-    out["means"] = {
-        w: {n: float(np.mean(f[n])) for n in LOSSES} for w, f in flown.items()
-    }
+    out["means"] = {w: {n: float(np.mean(f[n])) for n in LOSSES} for w, f in flown.items()}
     if out["loses"]:
         out["won"] = {n: won(flown, n) for n in LOSSES}
     return out
@@ -243,10 +216,7 @@ def won(flown: dict, name: str) -> dict:
     true, found, wrong.
     """
     gains = np.array([flown["before"][name] - flown[w][name] for w in TUNED], float)
-    return {
-        "mean": gains.mean(1).tolist(),
-        "cov": (np.cov(gains) / gains.shape[1]).tolist(),
-    }
+    return {"mean": gains.mean(1).tolist(), "cov": (np.cov(gains) / gains.shape[1]).tolist()}
 
 
 def shares(vehicles: list[dict], name: str) -> dict:
@@ -278,9 +248,7 @@ def report(vehicles: list[dict]) -> dict:
     right = [v for v in losers if (v["found"]["named"] or [""])[0] == v["cause"]]
     return {
         "vehicles": len(vehicles),
-        "named_first": sum(
-            (v["found"]["named"] or [""])[0] == v["cause"] for v in vehicles
-        ),
+        "named_first": sum((v["found"]["named"] or [""])[0] == v["cause"] for v in vehicles),
         "lose": [v["cause"] for v in losers],
         "shares": {name: shares(losers, name) for name in LOSSES},
         "shares_where_named_first": {name: shares(right, name) for name in LOSSES},
@@ -328,9 +296,7 @@ def main() -> None:
     first = commands.add_parser("diagnose")
     first.add_argument("--jobs", type=int, default=1)
     second = commands.add_parser("tune")
-    second.add_argument(
-        "--part", type=int, nargs=2, default=(0, 1), metavar=("NUMBER", "OF")
-    )
+    second.add_argument("--part", type=int, nargs=2, default=(0, 1), metavar=("NUMBER", "OF"))
     second.add_argument("--policy", default="flight")
     second.add_argument("--episodes", type=int, default=2048)
     second.add_argument("--updates", type=int, default=120)

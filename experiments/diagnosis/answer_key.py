@@ -6,15 +6,7 @@ import functools
 
 import numpy as np
 
-from experiments.diagnosis import (
-    cases,
-    effects,
-    forces,
-    measure,
-    sensors,
-    unknowns,
-    vehicle,
-)
+from experiments.diagnosis import cases, effects, forces, measure, sensors, unknowns, vehicle
 from experiments.diagnosis.firmware import SAMPLE
 from experiments.diagnosis.fleet import VOCABULARY
 
@@ -37,8 +29,7 @@ def floors(fleet, i, turbulence):
         lasts = [round(r["t"][-1] / SAMPLE) for r in rows]
         both = np.stack([measure.motors_of_log(r, samples) for r in rows], axis=-1)
         logged = np.min(
-            [fleet.replayed(i, fleet.parameters, m, np.array(lasts)) for m in both],
-            axis=0,
+            [fleet.replayed(i, fleet.parameters, m, np.array(lasts)) for m in both], axis=0
         )
         left[:6] = np.maximum(left[:6], logged[:6])
     return np.sqrt((np.array(each) ** 2).mean(axis=0) + left)
@@ -53,9 +44,7 @@ def answer_of(fleet, i, squares, floor, wrong):
     quiet = np.where(
         known, np.maximum(floor**2 - squares["truth"], 0.0), 0.0
     )  # what the sensors add
-    energy = {
-        k: np.where(known, (x + quiet) / floor**2, 0.0) for k, x in squares.items()
-    }
+    energy = {k: np.where(known, (x + quiet) / floor**2, 0.0) for k, x in squares.items()}
     names = [c["effect"] for c in own]
     shows = {}
     for j, name in enumerate(names):
@@ -81,17 +70,12 @@ def answer_of(fleet, i, squares, floor, wrong):
     total = max(float(excess.sum()), 1e-12)
     sums = {n: (energy[n] - energy["truth"]).sum() for n in names if n in energy}
     parts = [n for c in own for n in effects.PARTS.get((c["effect"], c["form"]), ())]
-    causes = [
-        c | {"magnitudes": dict(m)}
-        for c, m in zip(own, fleet.magnitudes[i], strict=True)
-    ]
+    causes = [c | {"magnitudes": dict(m)} for c, m in zip(own, fleet.magnitudes[i], strict=True)]
     for cause in causes:
         if cause["effect"] == "state_latency":
             said = cause["magnitudes"]
             said["logged_ms"] = sensors.pose_lag(said["delay_ms"], spec["sensors"])
-    before, after = (
-        float(np.sqrt(energy[k][known].mean())) for k in ("nominal", "truth")
-    )
+    before, after = (float(np.sqrt(energy[k][known].mean())) for k in ("nominal", "truth"))
     said_floor = [float(f"{f:.3g}") if np.isfinite(f) else None for f in floor]
     expected = {
         "none": ["none"],
@@ -106,9 +90,7 @@ def answer_of(fleet, i, squares, floor, wrong):
         "category": category,
         "effects": names or ([spec["garbage"]] if spec["garbage"] else []),
         "expected": expected.get(category, seen),
-        "acceptable": {
-            n: accepted(n, weighed, shown, scale(n)) for n, shown in shows.items()
-        },
+        "acceptable": {n: accepted(n, weighed, shown, scale(n)) for n, shown in shows.items()},
         "also_fine": spec["also_fine"] + parts + [n for n in names if n not in seen],
         "held_ms": 1e3 / spec["sensors"]["pose_rate"]
         if sensors.holds_poses(spec["sensors"])
@@ -120,11 +102,7 @@ def answer_of(fleet, i, squares, floor, wrong):
         "shares": {n: round(float(s / total), 4) for n, s in sums.items()},
         "energy": {k: [round(float(x), 4) for x in e] for k, e in energy.items()},
         "floor": dict(zip(measure.CHANNELS, said_floor, strict=True)),
-        "gap": {
-            "before": before,
-            "floor": after,
-            "closed_by_truth": 1 - after / before,
-        },
+        "gap": {"before": before, "floor": after, "closed_by_truth": 1 - after / before},
         "wrong_columns": wrong,
         "mass_weighed": weighed,
         "told": spec["told"].__dict__,
@@ -155,14 +133,9 @@ def scale_stands_in(fleet, i, name, squares, floor):
     demands = []
     for p in (fleet.parameters, without):
         p = {k: x[..., c] for k, x in p.items()}
-        active = forces.Active(
-            p, vehicle.nominal_parameters([fleet.told[j] for j in c])
-        )
+        active = forces.Active(p, vehicle.nominal_parameters([fleet.told[j] for j in c]))
         demands.append(
-            [
-                forces.motor_demand(p, active, *now)
-                for now in zip(m, voltage, load, strict=True)
-            ]
+            [forces.motor_demand(p, active, *now) for now in zip(m, voltage, load, strict=True)]
         )
     true, plain = np.array(demands)
     # on the command, so that the rotors' speeds at the start of a window are those that

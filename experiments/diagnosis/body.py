@@ -24,11 +24,7 @@ class Body:
         self.velocity = velocity
         self.q = q
         self.rates = rates
-        self.rotor, self.drive, self.specific = (
-            rotor,
-            rotor.copy(),
-            np.zeros_like(rates),
-        )
+        self.rotor, self.drive, self.specific = (rotor, rotor.copy(), np.zeros_like(rates))
         self.count = rates.shape[1]
         self.wake = bool(np.any(p["wake"] != 0))
         self.gyroscopes = bool(np.any(p["propeller_inertia"] != 0))
@@ -37,32 +33,16 @@ class Body:
         self.principal = p["inertia"][np.arange(3), np.arange(3)]
         self.arm_x = vehicle.ROTOR_X[:, None] - p["com"][0]
         self.arm_y = vehicle.ROTOR_Y[:, None] - p["com"][1]
-        self.up, self.down = (
-            1 - np.exp(-DT / p["tau_up"]),
-            1 - np.exp(-DT / p["tau_down"]),
-        )
+        self.up, self.down = (1 - np.exp(-DT / p["tau_up"]), 1 - np.exp(-DT / p["tau_down"]))
         self.second = np.where(
-            p["tau_second"] > 0,
-            1 - np.exp(-DT / np.maximum(p["tau_second"], 1e-4)),
-            1.0,
+            p["tau_second"] > 0, 1 - np.exp(-DT / np.maximum(p["tau_second"], 1e-4)), 1.0
         )
         self.lifts = p["thrust_constant"] * p["rotor_gain"]
-        self.reacts = (
-            p["torque_ratio"] * p["torque_gain"] * vehicle.SPIN[:, None] * self.lifts
-        )
+        self.reacts = p["torque_ratio"] * p["torque_gain"] * vehicle.SPIN[:, None] * self.lifts
         self.zero = np.zeros(self.count)
 
     def step(
-        self,
-        m,
-        voltage,
-        load,
-        gust_force,
-        gust_torque,
-        slow,
-        others=(),
-        unknowns=None,
-        time=0.0,
+        self, m, voltage, load, gust_force, gust_torque, slow, others=(), unknowns=None, time=0.0
     ):
         """One millisecond under motor commands m (4, B); `others` are positions (3, B)
         of vehicles that may fly above.
@@ -74,18 +54,12 @@ class Body:
             unknowns.look(self.position, self.q, self.velocity, self.rates, m, voltage)
             u = unknowns.motors(u, time)
         before = self.rotor
-        self.drive = self.drive + self.second * (
-            vehicle.MAX_SPEED * np.sqrt(u) - self.drive
-        )
+        self.drive = self.drive + self.second * (vehicle.MAX_SPEED * np.sqrt(u) - self.drive)
         share = np.where(self.drive > self.rotor, self.up, self.down)
         self.rotor = self.rotor + share * (self.drive - self.rotor)
         squared = self.rotor * self.rotor
         spinning = self.gyroscopes and p["propeller_inertia"] * vehicle.SPIN[:, None]
-        thrust = (
-            self.lifts
-            * squared
-            * forces.surface_gain(p, self.active, self.position, self.q)
-        )
+        thrust = self.lifts * squared * forces.surface_gain(p, self.active, self.position, self.q)
         moment = np.stack(
             [
                 (self.arm_y * thrust).sum(0),
@@ -160,8 +134,4 @@ class Battery:
         self.used = self.used + dt * current
         self.load = self.load + (dt / 0.04) * (current - self.load)
         air = self.air
-        return (
-            air["open_voltage"]
-            - air["discharge"] * self.used
-            - air["resistance"] * self.load
-        )
+        return air["open_voltage"] - air["discharge"] * self.used - air["resistance"] * self.load

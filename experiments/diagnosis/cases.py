@@ -59,9 +59,7 @@ COLUMN = {"known": 0, "stranger": 1, "real": 2}
 
 def case_rng(seed, column, number, *more):
     """The random numbers of one case; columns and seeds share none."""
-    return np.random.default_rng(
-        np.random.SeedSequence([13, COLUMN[column], seed, number, *more])
-    )
+    return np.random.default_rng(np.random.SeedSequence([13, COLUMN[column], seed, number, *more]))
 
 
 def label(severity):
@@ -93,10 +91,7 @@ def draw_missions(rng, needed, style, two):
     flights = [flights[i] for i in rng.permutation(3)]
     if not two and not any(f in missions.PAIR for f in flights):
         return [(f,) for f in flights]
-    return [
-        (f, f) if f in missions.PAIR else (f, str(rng.choice(STYLES[style])))
-        for f in flights
-    ]
+    return [(f, f) if f in missions.PAIR else (f, str(rng.choice(STYLES[style]))) for f in flights]
 
 
 def _kinds(column, known, strangers):
@@ -112,9 +107,7 @@ def draw_case(seed, column, number, category, index):
     wrong_form = None
     if column == "real" or (column == "stranger" and rng.random() < 0.5):
         told, wrong_form = real.draw(rng, column == "stranger")
-    turn = int(
-        case_rng(seed, column, 0, 7, sorted(SHARES).index(category)).integers(1000)
-    )
+    turn = int(case_rng(seed, column, 0, 7, sorted(SHARES).index(category)).integers(1000))
     names = list(effects.EFFECTS)
     causes = []
     targets = []
@@ -124,9 +117,7 @@ def draw_case(seed, column, number, category, index):
     if category == "single":
         effect = names[(index + turn) % len(names)]
         causes = [effects.draw(rng, effect)]
-        targets = [
-            _target(rng, ("low", "medium", "high")[(index // len(names) + index) % 3])
-        ]
+        targets = [_target(rng, ("low", "medium", "high")[(index // len(names) + index) % 3])]
     elif category == "pair":
         while True:
             one, two = (str(e) for e in rng.choice(names, 2, replace=False))
@@ -139,9 +130,7 @@ def draw_case(seed, column, number, category, index):
         kind = kinds[(index + turn) % len(kinds)]
         (low, high), unit, logs = unknowns.SITES[kind]
         form = unknowns.FORMS["stranger" if column == "stranger" else "known"]
-        causes = [
-            {"effect": kind, "form": form, "shape": rng.uniform(0, 1, 8).tolist()}
-        ]
+        causes = [{"effect": kind, "form": form, "shape": rng.uniform(0, 1, 8).tolist()}]
         causes[0] |= {"size": float(low * (high / low) ** rng.uniform()), "unit": unit}
         targets = [_target(rng, str(rng.choice(["medium", "high"])))]
         needed = [unknowns.MISSIONS]
@@ -168,9 +157,7 @@ def draw_case(seed, column, number, category, index):
         flights = [(str(rng.choice(BLIND[effect])),) for _ in range(3)]
         channels = effects.EFFECTS[effect].needs
     else:
-        flights = draw_missions(
-            rng, needed, style, rng.random() < 0.12 and category != "garbage"
-        )
+        flights = draw_missions(rng, needed, style, rng.random() < 0.12 and category != "garbage")
     kind = str(rng.choice(_kinds(column, sensors.KINDS, sensors.STRANGERS)))
     if kind == "radio" and any(c["effect"] in TIMED for c in causes):
         kind = "filtered"  # clocks that wander by ten milliseconds can't time anything
@@ -178,13 +165,7 @@ def draw_case(seed, column, number, category, index):
     if "mass" in (c["effect"] for c in causes):
         told = replace(told, weighed=False)
     # 1000 rows a second make long files: the flights are shorter there
-    most = (
-        TICKS
-        if drawn["rate"] <= 250
-        else TICKS // 2
-        if drawn["rate"] <= 500
-        else TICKS * 2 // 5
-    )
+    most = TICKS if drawn["rate"] <= 250 else TICKS // 2 if drawn["rate"] <= 500 else TICKS * 2 // 5
     return {
         "name": f"case_{number:03d}",
         "number": number,
@@ -197,9 +178,7 @@ def draw_case(seed, column, number, category, index):
         "missions": flights,
         "style": style,
         "ticks": [int(rng.integers(8 * most // 10, most + 1)) for _ in flights],
-        "controller": str(
-            rng.choice(_kinds(column, controllers.KINDS, controllers.STRANGERS))
-        ),
+        "controller": str(rng.choice(_kinds(column, controllers.KINDS, controllers.STRANGERS))),
         "sensors": drawn,
         "told": told,
     }
@@ -224,7 +203,5 @@ def reference_of(rng, mission, ticks):
         return list(missions.pair(mission[0], rng, ticks))
     if len(mission) == 2:
         sides = zip(mission, (-1, 1), strict=True)
-        return [
-            missions.apart(missions.single(m, rng, ticks), side) for m, side in sides
-        ]
+        return [missions.apart(missions.single(m, rng, ticks), side) for m, side in sides]
     return [missions.single(mission[0], rng, ticks)]

@@ -34,9 +34,7 @@ EFFECTS = ("motor_lag", "mass", "rotor_drag", "rate_gains", "none")
 NORMAL = ("normal_flight", "reference")
 
 
-def record_of(
-    vehicle: str, condition: str, truth: dict, answer: Report | Change
-) -> dict:
+def record_of(vehicle: str, condition: str, truth: dict, answer: Report | Change) -> dict:
     """One comparison: what was done, and what was said by the diagnosis or by trims
     alone.
     """
@@ -73,12 +71,8 @@ def sample_records(work: Path, seeds: list[int]) -> list[dict]:
     out = []
     for effect in EFFECTS:
         for seed, other in zip(seeds, [*seeds[1:], seeds[0]], strict=True):
-            answer = diagnose_folder(
-                work / f"{effect}_{seed}", [work / f"none_{other}"]
-            )
-            out.append(
-                record_of("sample", f"{effect}, seed {seed}", {"cause": effect}, answer)
-            )
+            answer = diagnose_folder(work / f"{effect}_{seed}", [work / f"none_{other}"])
+            out.append(record_of("sample", f"{effect}, seed {seed}", {"cause": effect}, answer))
     return out
 
 
@@ -90,21 +84,13 @@ def vehicle_records(name: str, folder: Path, labels: dict) -> list[dict]:
     case, old, _ = read(read_folder(folder / normal))
     out = []
     for number, day in enumerate(dict.fromkeys(f.day for f in old), 1):
-        new, others = (
-            [f for f in old if (f.day == day) == own] for own in (True, False)
-        )
+        new, others = ([f for f in old if (f.day == day) == own] for own in (True, False))
         if others:
             change = change_between(day, new, others, case)
-            out.append(
-                record_of(
-                    name, f"normal flights, day {number}", {"cause": "none"}, change
-                )
-            )
+            out.append(record_of(name, f"normal flights, day {number}", {"cause": "none"}, change))
     for condition, truth in labels.items():
         if condition != normal:
-            change = change_between(
-                condition, read(read_folder(folder / condition))[1], old, case
-            )
+            change = change_between(condition, read(read_folder(folder / condition))[1], old, case)
             out.append(record_of(name, condition, truth, change))
     return out
 
@@ -114,9 +100,7 @@ def study(options) -> dict:
     records = sample_records(options.work, options.seeds) if options.seeds else []
     for entry in options.vehicles:
         name, folder, *answers = entry.split("=")
-        labels = read_json(
-            Path(answers[0]) if answers else Path(folder) / "labels.json"
-        )
+        labels = read_json(Path(answers[0]) if answers else Path(folder) / "labels.json")
         records += vehicle_records(name, Path(folder), labels)
     return {"records": records}
 
@@ -145,14 +129,10 @@ def figures_of(records: list[dict]) -> Table:
     count("sample flights without: no change", plain, lambda r: not r["changed"])
     quiet = [r for r in real if r["truth"]["cause"] in ("none", "tape")]
     count(
-        "real, normal flights of another day and tape: no change",
-        quiet,
-        lambda r: not r["changed"],
+        "real, normal flights of another day and tape: no change", quiet, lambda r: not r["changed"]
     )
     deep = [r for r in real if cut(r) >= 4]
-    count(
-        "real, a propeller cut by 4 mm or more: changed", deep, lambda r: r["changed"]
-    )
+    count("real, a propeller cut by 4 mm or more: changed", deep, lambda r: r["changed"])
     shallow = [r for r in real if 0 < cut(r) < 4]
     count("real, cut by less: changed", shallow, lambda r: r["changed"])
     count(
@@ -177,9 +157,7 @@ def page(results: dict) -> Page:
             if "size90" in r
             else None
         ),
-        "least that shows, %": lambda r: (
-            f"{100 * r['least']:.0f}" if "least" in r else None
-        ),
+        "least that shows, %": lambda r: f"{100 * r['least']:.0f}" if "least" in r else None,
     }
     prose = (
         "Two sets of flights of one vehicle are compared; what was changed is known. The real "
@@ -202,22 +180,15 @@ def figure(folder: Path) -> None:
         {"friday": 0.0, "monday": 0.0, "tuesday": 0.22}.items(), 1
     ):
         (folder / name).mkdir(parents=True)
-        factors = 0.02 * rng.standard_normal(4) - weaker * np.array(
-            [0.0, 0.0, 1.0, 0.0]
-        )
+        factors = 0.02 * rng.standard_normal(4) - weaker * np.array([0.0, 0.0, 1.0, 0.0])
         effects = {
-            "motor_imbalance": dict(
-                zip(("m1", "m2", "m3", "m4"), factors.tolist(), strict=True)
-            )
+            "motor_imbalance": dict(zip(("m1", "m2", "m3", "m4"), factors.tolist(), strict=True))
         }
-        for k, (flight, reference) in enumerate(
-            references(seed=seed, duration=8.0).items()
-        ):
+        for k, (flight, reference) in enumerate(references(seed=seed, duration=8.0).items()):
             columns = fly(vehicle, vehicle, reference, 10 * seed + k, effects)
             write_csv(folder / name / f"{flight}.csv.gz", log_of(columns, flight))
     change = compare(
-        read_folder(folder / "tuesday"),
-        [read_folder(folder / d) for d in ("friday", "monday")],
+        read_folder(folder / "tuesday"), [read_folder(folder / d) for d in ("friday", "monday")]
     )
     draw(change).savefig(folder / "what_changed.png", dpi=90)
 
@@ -230,10 +201,7 @@ def main() -> None:
         "--vehicles", nargs="+", default=[], help="real flights: NAME=FOLDER[=ANSWERS]"
     )
     parser.add_argument(
-        "--work",
-        type=Path,
-        default=Path("runs/changes"),
-        help="folder for sample flights",
+        "--work", type=Path, default=Path("runs/changes"), help="folder for sample flights"
     )
     parser.add_argument("--figure", action="store_true")
     options = parser.parse_args()

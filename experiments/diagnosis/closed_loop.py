@@ -21,22 +21,8 @@ from experiments.diagnosis.generate import in_processes
 from experiments.flying.single_thread import use_single_thread
 
 CAUSES = (
-    *(
-        "rotor_drag",
-        "ground_effect",
-        "wind",
-        "com_offset",
-        "blade_flapping",
-        "thrust_curve",
-    ),
-    *(
-        "motor_lag",
-        "inertia",
-        "yaw_torque",
-        "battery_sag",
-        "ceiling_effect",
-        "motor_imbalance",
-    ),
+    *("rotor_drag", "ground_effect", "wind", "com_offset", "blade_flapping", "thrust_curve"),
+    *("motor_lag", "inertia", "yaw_torque", "battery_sag", "ceiling_effect", "motor_imbalance"),
 )
 FLOWN = 2  # segments in a round
 ROUNDS = 2
@@ -197,12 +183,7 @@ def main() -> None:
     command = "python -m experiments.diagnosis.closed_loop"
     command += f" --first {arguments.first} --cases {len(cases)}"
     command += " --each" if arguments.each else ""
-    found = {
-        "command": command,
-        "of": len(cases),
-        "right": figures(cases),
-        "cases": cases,
-    }
+    found = {"command": command, "of": len(cases), "right": figures(cases), "cases": cases}
     arguments.out.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
 
 

@@ -50,17 +50,13 @@ class Controllers:
         out[0] = np.clip(out[0], 0.08, 0.92)
         out[1:] = np.clip(out[1:], -np.pi, np.pi)
         self.command = (
-            out
-            if self.command is None
-            else np.where(k % self.period == 0, out, self.command)
+            out if self.command is None else np.where(k % self.period == 0, out, self.command)
         )
         return self.command
 
     def _collect(self, own, error):
         """Position error integrated with a limit."""
-        held = np.clip(
-            self.integral[:, own] + 0.01 * np.clip(error, -0.2, 0.2), -0.5, 0.5
-        )
+        held = np.clip(self.integral[:, own] + 0.01 * np.clip(error, -0.2, 0.2), -0.5, 0.5)
         self.integral[:, own] = held
         return held
 
@@ -71,9 +67,7 @@ class Controllers:
         stiff, damp, turn = gains
         error = goal["position"] - position
         want = goal["acceleration"] + np.array([[stiff], [stiff], [2 * stiff]]) * error
-        want = want + np.array([[damp], [damp], [1.45 * damp]]) * (
-            goal["velocity"] - velocity
-        )
+        want = want + np.array([[damp], [damp], [1.45 * damp]]) * (goal["velocity"] - velocity)
         want = want + np.array([[1.5], [1.5], [5.0]]) * self._collect(own, error)
         want[2] = np.clip(want[2], -6.0, 8.0) + GRAVITY
         side = np.sqrt(want[0] ** 2 + want[1] ** 2)
@@ -81,9 +75,7 @@ class Controllers:
             1.0, 0.78 * want[2] / np.maximum(side, 1e-9)
         )  # at most 38 degrees of tilt
         w, x, y, z = q
-        up = np.stack(
-            [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)]
-        )
+        up = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
         lean = rotate_back(q, cross(up, want / np.sqrt((want * want).sum(axis=0))))
         heading = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
         twist = (goal["yaw"] - heading + np.pi) % (2 * np.pi) - np.pi
@@ -109,14 +101,10 @@ class Controllers:
         pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
         ahead = want[0] * np.cos(yaw) + want[1] * np.sin(yaw)
         aside = -want[0] * np.sin(yaw) + want[1] * np.cos(yaw)
-        pitch_goal, roll_goal = (
-            np.clip(v / GRAVITY, -0.5, 0.5) for v in (ahead, -aside)
-        )
+        pitch_goal, roll_goal = (np.clip(v / GRAVITY, -0.5, 0.5) for v in (ahead, -aside))
         twist = (goal["yaw"] - yaw + np.pi) % (2 * np.pi) - np.pi
         thrust = self.mass[own] * (GRAVITY + np.clip(want[2], -5, 6)) / self.most[own]
-        return np.stack(
-            [thrust, 6.5 * (roll_goal - roll), 6.5 * (pitch_goal - pitch), 3.5 * twist]
-        )
+        return np.stack([thrust, 6.5 * (roll_goal - roll), 6.5 * (pitch_goal - pitch), 3.5 * twist])
 
     def _preview(self, own, goal, position, q, velocity):
         ahead = position + 0.01 * AHEAD * velocity

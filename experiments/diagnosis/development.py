@@ -71,9 +71,7 @@ def diagnose(job: tuple) -> dict:
 
         try:
             if healthy:
-                options["reference"] = [
-                    load_case(healthy_beside(folder.parent) / folder.name)
-                ]
+                options["reference"] = [load_case(healthy_beside(folder.parent) / folder.name)]
             made = diagnose_case(load_case(folder), **options)
             report = made.to_dict()
             broken = broken_rules(made)
@@ -86,29 +84,14 @@ def diagnose(job: tuple) -> dict:
     seconds = round(time.perf_counter() - start, 2)
     _done = _done + 1
     words = truth.words_of(report)
-    line = {
-        "set": place,
-        "case": folder.name,
-        "category": true.category,
-        "truth": true.effects,
-    }
+    line = {"set": place, "case": folder.name, "category": true.category, "truth": true.effects}
     line |= {"words": words} | truth.judge(true, words)
     right = truth.right_names(true)
     line |= {"right_names": sorted(right)}
-    line |= {
-        "top": truth.top_probability(right, (report or {}).get("probabilities", {}))
-    }
-    line |= {
-        "severity": answer.get("severity"),
-        "magnitudes": parameters(answer, report),
-    }
+    line |= {"top": truth.top_probability(right, (report or {}).get("probabilities", {}))}
+    line |= {"severity": answer.get("severity"), "magnitudes": parameters(answer, report)}
     line |= {"broken_rules": broken}
-    line |= {
-        "seconds": seconds,
-        "first": _done == 1,
-        "error": error,
-        "traceback": trace,
-    }
+    line |= {"seconds": seconds, "first": _done == 1, "error": error, "traceback": trace}
     fields = (
         "probabilities",
         "shares",
@@ -131,11 +114,7 @@ def run(jobs: list[tuple], cores: int, out: Path, seconds: float | None) -> None
     with pool, out.open("a") as file:
         results = pool.imap_unordered(diagnose, jobs)
         for number in range(1, len(jobs) + 1):
-            left = (
-                None
-                if seconds is None
-                else max(seconds - (time.perf_counter() - start), 0.01)
-            )
+            left = None if seconds is None else max(seconds - (time.perf_counter() - start), 0.01)
             try:
                 line = results.next(timeout=left)
             except multiprocessing.TimeoutError:
@@ -153,9 +132,7 @@ def run(jobs: list[tuple], cores: int, out: Path, seconds: float | None) -> None
 
 def read_lines(paths: list[Path]) -> list[dict]:
     """The lines of several files."""
-    return [
-        json.loads(line) for path in paths for line in path.read_text().splitlines()
-    ]
+    return [json.loads(line) for path in paths for line in path.read_text().splitlines()]
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -168,12 +145,8 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, default=Path("cases.jsonl"))
     parser.add_argument("--engine-options", type=json.loads, default={}, metavar="JSON")
     parser.add_argument("--seconds", type=float, help="stop then; what is done counts")
-    parser.add_argument(
-        "--report", nargs="+", type=Path, default=[], help="tables of stored lines"
-    )
-    parser.add_argument(
-        "--healthy", action="store_true", help="use DIR_healthy as references"
-    )
+    parser.add_argument("--report", nargs="+", type=Path, default=[], help="tables of stored lines")
+    parser.add_argument("--healthy", action="store_true", help="use DIR_healthy as references")
     options = parser.parse_args(arguments)
     if options.sets:
         done = (
@@ -181,9 +154,7 @@ def main(arguments: list[str] | None = None) -> None:
             if options.out.exists()
             else ()
         )
-        jobs = find_jobs(
-            options.sets, options.engine_options | {"healthy": options.healthy}
-        )
+        jobs = find_jobs(options.sets, options.engine_options | {"healthy": options.healthy})
         jobs = [job for job in jobs if (job[0], job[1].name) not in done]
         if jobs:
             run(jobs, options.cores, options.out, options.seconds)

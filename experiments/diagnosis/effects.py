@@ -36,18 +36,8 @@ _EFFECTS = {
         ("fast", "laps", "spiral"),
         "p",
     ),
-    "blade_flapping": (
-        (0.05, 3.0),
-        ("linear", "advance_ratio"),
-        ("fast", "agile", "laps"),
-        "pg",
-    ),
-    "wind": (
-        (0.2, 12.0),
-        ("steady", "quadratic", "shear", "gusty"),
-        ("yaw", "fast", "hover"),
-        "p",
-    ),
+    "blade_flapping": ((0.05, 3.0), ("linear", "advance_ratio"), ("fast", "agile", "laps"), "pg"),
+    "wind": ((0.2, 12.0), ("steady", "quadratic", "shear", "gusty"), ("yaw", "fast", "hover"), "p"),
     "ground_effect": ((0.015, 0.35), SURFACE, ("low",), "pm"),
     "ceiling_effect": ((0.015, 0.35), SURFACE, ("high",), "pm"),
     "downwash": ((2.0, 20.0), ("gaussian", "jet"), ("pass", "pass_moving"), "pm"),
@@ -63,29 +53,14 @@ _EFFECTS = {
         ("agile", "step", "yaw"),
         "gcm",
     ),
-    "packet_loss": (
-        (0.01, 0.5),
-        ("independent", "bursts"),
-        ("agile", "step", "yaw"),
-        "gcm",
-    ),
+    "packet_loss": ((0.01, 0.5), ("independent", "bursts"), ("agile", "step", "yaw"), "gcm"),
     "thrust_curve": ((0.05, 1.0), ("quadratic", "power", "dip"), ("climb",), "m"),
     "motor_imbalance": ((0.003, 0.15), ("all", "one_weak"), (), "gm"),
     "com_offset": ((0.05, 8.0), ("torque", "full"), (), "gm"),
     "inertia": ((0.06, 0.6), ("diagonal", "products"), ("agile", "step", "yaw"), "gm"),
     "yaw_torque": ((0.06, 0.85), ("scale",), ("yaw",), "gm"),
-    "rate_gains": (
-        (0.08, 1.0),
-        ("gains", "filtered_d"),
-        ("agile", "step", "yaw"),
-        "gcm",
-    ),
-    "state_latency": (
-        (4.0, 60.0),
-        ("constant", "jitter"),
-        ("agile", "fast", "step"),
-        "pg",
-    ),
+    "rate_gains": ((0.08, 1.0), ("gains", "filtered_d"), ("agile", "step", "yaw"), "gcm"),
+    "state_latency": ((4.0, 60.0), ("constant", "jitter"), ("agile", "fast", "step"), "pg"),
 }
 EFFECTS = {name: Drawn(*drawn) for name, drawn in _EFFECTS.items()}
 # effects that can stand in for one another: not drawn together

@@ -51,11 +51,7 @@ def shares_in_bounds(shares: dict) -> bool:
     values = [p["value"] for p in parts]
     intervals = [(*p["interval90"], p["value"]) for p in parts if p.get("interval90")]
     ordered = all(low <= value <= high for low, high, value in intervals)
-    return (
-        ordered
-        and abs(sum(values) - 1) < 0.02
-        and all(-0.2 <= v <= 1.2 for v in values)
-    )
+    return ordered and abs(sum(values) - 1) < 0.02 and all(-0.2 <= v <= 1.2 for v in values)
 
 
 def figures(lines: list[dict]) -> dict[str, tuple[int, int] | float]:
@@ -75,14 +71,11 @@ def figures(lines: list[dict]) -> dict[str, tuple[int, int] | float]:
         "nothing_else": count(of("single"), lambda r: not r["wrong_names"]),
         "false_unknown": count(named, lambda r: "unknown" in r["words"]),
         "wrong_name": count(of("unknown"), lambda r: r["wrong_names"]),
-        "refused": count(
-            good, lambda r: "garbage" in r["words"] and not r["traceback"]
-        ),
+        "refused": count(good, lambda r: "garbage" in r["words"] and not r["traceback"]),
         "traceback": count(lines, lambda r: r["traceback"]),
         "real": count(real, lambda r: r["right"]),
         "coverage": count(
-            [c for r in named for m in r.get("magnitudes", ()) for c in m["covered"]],
-            bool,
+            [c for r in named for m in r.get("magnitudes", ()) for c in m["covered"]], bool
         ),
         "rules": count(
             [r for r in lines if "broken_rules" in r and "shares" in r],

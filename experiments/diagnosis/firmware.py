@@ -66,9 +66,7 @@ class Firmware:
             np.maximum(self.integral + SAMPLE * error, -self.limit), self.limit
         )
         slope = self.slope_filter(np.rad2deg(self.previous - gyro) / SAMPLE)
-        self.slope = (
-            self.keep * self.slope + (1 - self.keep) * slope if self.slow else slope
-        )
+        self.slope = self.keep * self.slope + (1 - self.keep) * slope if self.slow else slope
         self.previous = gyro
         return vehicle.mix(
             command[0], p["kp"] * error + p["ki"] * self.integral + p["kd"] * self.slope

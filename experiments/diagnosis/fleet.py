@@ -71,22 +71,11 @@ class Fleet:
             self.columns.append(np.arange(start, len(told)))
         self.told, self.partner = told, np.array(partner)
         arrival = np.repeat(10 * np.arange(cases.TICKS)[:, None], len(told), axis=1)
-        self.parameters, strangers, self.magnitudes = self.model(
-            [c for _, c in variants], arrival
-        )
-        reference = {
-            k: np.stack([r[k] for r in references], axis=-1) for k in references[0]
-        }
+        self.parameters, strangers, self.magnitudes = self.model([c for _, c in variants], arrival)
+        reference = {k: np.stack([r[k] for r in references], axis=-1) for k in references[0]}
         air = sensors.stack(airs)
         batch = plant.Batch(
-            told,
-            self.parameters,
-            reference,
-            kinds,
-            self.partner,
-            arrival,
-            air,
-            strangers,
+            told, self.parameters, reference, kinds, self.partner, arrival, air, strangers
         )
         if wakes_from is not None:
             batch.wakes_from = wakes_from
@@ -102,17 +91,11 @@ class Fleet:
         p = vehicle.nominal_parameters(self.told)
         strangers = {}
         magnitudes = []
-        scratch = (
-            np.zeros((cases.TICKS, len(self.told)), int) if arrival is None else arrival
-        )
-        for (spec, _), columns, own in zip(
-            self.variants, self.columns, causes_of, strict=True
-        ):
+        scratch = np.zeros((cases.TICKS, len(self.told)), int) if arrival is None else arrival
+        for (spec, _), columns, own in zip(self.variants, self.columns, causes_of, strict=True):
             sensors.apply_nuisances(p, columns, spec["sensors"])
             real.apply(spec.get("form_errors"), p, columns)
-            p["rotor_gain"][:, columns] *= np.array(spec.get("day", np.ones(4)))[
-                :, None
-            ]
+            p["rotor_gain"][:, columns] *= np.array(spec.get("day", np.ones(4)))[:, None]
             said = []
             for i, cause in enumerate(own):
                 rng = cases.case_rng(self.seed, self.column, spec["number"], 2, i)
@@ -127,18 +110,12 @@ class Fleet:
     def errors(self, causes_of):
         """Mean squares (12, variants) of the model with these causes."""
         links, firmware = np.zeros((2, len(self.told)), bool)
-        for (_, flew), columns, own in zip(
-            self.variants, self.columns, causes_of, strict=True
-        ):
+        for (_, flew), columns, own in zip(self.variants, self.columns, causes_of, strict=True):
             links[columns] = any(c["effect"] in LINK for c in own)
-            firmware[columns] = any(
-                c["effect"] in FIRMWARE and c not in own for c in flew
-            )
+            firmware[columns] = any(c["effect"] in FIRMWARE and c not in own for c in flew)
         known = [[c for c in own if c["effect"] in VOCABULARY] for own in causes_of]
         parameters = self.model(known)[0]
-        rms = measure.errors(
-            self.seen, self.told, parameters, self.partner, firmware, links
-        )
+        rms = measure.errors(self.seen, self.told, parameters, self.partner, firmware, links)
         return np.stack([(rms[:, c] ** 2).mean(axis=1) for c in self.columns], axis=1)
 
     def replayed(self, i, parameters, motors=None, lasts=None):
@@ -152,9 +129,7 @@ class Fleet:
             flown |= {"motor": motors, "crashed": np.minimum(flown["crashed"], lasts)}
         told = [self.told[j] for j in c]
         own = {k: x[..., c] for k, x in parameters.items()}
-        return (
-            measure.errors(flown, told, own, self.partner[c] - c[0], no, no) ** 2
-        ).mean(axis=1)
+        return (measure.errors(flown, told, own, self.partner[c] - c[0], no, no) ** 2).mean(axis=1)
 
     def energies(self):
         """{model: mean squares (12, variants)}: the nominal model, the true one, and
@@ -163,9 +138,7 @@ class Fleet:
         flew = [own for _, own in self.variants]
         out = {"nominal": self.errors([[] for _ in flew]), "truth": self.errors(flew)}
         if any(len(own) > 1 for own in flew):
-            out |= {
-                i: self.errors([own[:i] + own[i + 1 :] for own in flew]) for i in (0, 1)
-            }
+            out |= {i: self.errors([own[:i] + own[i + 1 :] for own in flew]) for i in (0, 1)}
         return out
 
     def lasts(self, i):
@@ -174,9 +147,7 @@ class Fleet:
 
     def _log(self, rng, spec, body, ticks, sensed):
         """The rows of one body, motors as its vehicle commands them."""
-        rows = log_rows(
-            rng, spec["sensors"], self.flown, body, ticks, sensed, spec["told"].hover
-        )
+        rows = log_rows(rng, spec["sensors"], self.flown, body, ticks, sensed, spec["told"].hover)
         return real.as_logged(spec.get("form_errors"), spec["told"], rows)
 
     def rows(self, i, spoiled=False):
@@ -190,18 +161,14 @@ class Fleet:
         j = self.columns[i][0]
         for mission, ticks in zip(spec["missions"], spec["ticks"], strict=True):
             bodies = range(j, j + (2 if len(mission) == 2 else 1))
-            ticks = int(
-                min([ticks] + [self.flown["crashed"][b] // 5 - 5 for b in bodies])
-            )
+            ticks = int(min([ticks] + [self.flown["crashed"][b] // 5 - 5 for b in bodies]))
             out.append([self._log(rng, spec, b, ticks, sensed) for b in bodies])
             j = bodies[-1] + 1
         wrong = []
         if spoiled and spec["garbage"]:
             wrong = garbage.spoil(spec["garbage"], [f[0] for f in out], rng)
             wrong = [
-                c
-                for c in wrong
-                if any(c in sensors.GROUPS[g] for g in spec["sensors"]["channels"])
+                c for c in wrong if any(c in sensors.GROUPS[g] for g in spec["sensors"]["channels"])
             ]
         return out, wrong
 
@@ -216,18 +183,10 @@ def write_flight(path, vehicles, channels):
     for i, rows in enumerate(vehicles):
         table = np.stack([rows[c] for c in columns], axis=1).tolist()
         times = rows["t"].tolist()
-        lines += [
-            (t, f"{t:.4f},{i}," + line % tuple(r))
-            for t, r in zip(times, table, strict=True)
-        ]
+        lines += [(t, f"{t:.4f},{i}," + line % tuple(r)) for t, r in zip(times, table, strict=True)]
     lines.sort(key=lambda entry: entry[0])
     text = (
-        "\n".join(
-            [
-                ",".join(["t", "vehicle", *columns]),
-                *(x.replace("nan", "") for _, x in lines),
-            ]
-        )
+        "\n".join([",".join(["t", "vehicle", *columns]), *(x.replace("nan", "") for _, x in lines)])
         + "\n"
     )
     with open(path, "wb") as raw, gzip.GzipFile("", "wb", 6, raw, mtime=0) as packed:

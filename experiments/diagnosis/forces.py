@@ -23,9 +23,7 @@ class Active:
     """Which parameters differ from their neutral value somewhere in the batch."""
 
     def __init__(self, parameters, neutral):
-        self.names = {
-            k for k, v in parameters.items() if k in neutral and np.any(v != neutral[k])
-        }
+        self.names = {k for k, v in parameters.items() if k in neutral and np.any(v != neutral[k])}
 
     def __call__(self, *names):
         return any(n in self.names for n in names)
@@ -51,9 +49,7 @@ def motor_demand(p, active, m, voltage, load):
         drop = np.clip(p["sag_reference"] - voltage, -1.0, None)
         u = u * (1.0 - p["sag_quadratic"] * (drop + 0.6 * drop * np.abs(drop)))
     if active("sag_load"):
-        u = u * (
-            1.0 - p["sag_load"] * ((p["sag_reference"] - voltage) + 0.1 * (load - 0.6))
-        )
+        u = u * (1.0 - p["sag_load"] * ((p["sag_reference"] - voltage) + 0.1 * (load - 0.6)))
     if active("limit"):
         top = p["limit"] * (1.0 + p["limit_voltage"] * (voltage - 3.6))
         knee = np.maximum(p["limit_knee"], 1e-6)
@@ -66,11 +62,7 @@ def surface_gain(p, active, position, q):
     """Thrust factor of each rotor (4, B) near the floor and the ceiling; 1 where
     neither acts.
     """
-    sides = [
-        s
-        for s in ("ground", "ceiling")
-        if active(s + "_image", s + "_exp", s + "_inverse")
-    ]
+    sides = [s for s in ("ground", "ceiling") if active(s + "_image", s + "_exp", s + "_inverse")]
     if not sides:
         return 1.0
     gain = 1.0
@@ -84,9 +76,7 @@ def surface_gain(p, active, position, q):
         # exponential; the simple (R / z)^2
         ratio = np.minimum((p[side + "_image"] * PROPELLER / (4.0 * d)) ** 2, 0.5)
         gain = (
-            gain
-            + (1.0 / (1.0 - ratio) - 1.0)
-            + p[side + "_exp"] * np.exp(-d / p[side + "_scale"])
+            gain + (1.0 / (1.0 - ratio) - 1.0) + p[side + "_exp"] * np.exp(-d / p[side + "_scale"])
         )
         gain = gain + p[side + "_inverse"] * (PROPELLER / d) ** 2
     return gain
@@ -123,9 +113,7 @@ def air_forces(p, active, q, velocity, rates, speed, thrust, position, gust):
     force = np.zeros_like(vb)
     torque = np.zeros_like(vb)
     if active("drag_xy", "drag_z"):
-        force -= np.stack(
-            [p["drag_xy"] * vb[0], p["drag_xy"] * vb[1], p["drag_z"] * vb[2]]
-        )
+        force -= np.stack([p["drag_xy"] * vb[0], p["drag_xy"] * vb[1], p["drag_z"] * vb[2]])
     if active("drag_quadratic"):
         norm = np.sqrt((vb * vb).sum(axis=0))
         force -= p["drag_quadratic"] * norm * vb * np.array([1.0, 1.0, 0.6])[:, None]
@@ -139,16 +127,10 @@ def air_forces(p, active, q, velocity, rates, speed, thrust, position, gust):
         fy = -c * (vb[1] + rates[2] * x)
         fz = -0.5 * c * (vb[2] + rates[0] * y - rates[1] * x)
         force += np.stack([fx.sum(0), fy.sum(0), fz.sum(0)])
-        torque += np.stack(
-            [(y * fz).sum(0), -(x * fz).sum(0), (x * fy - y * fx).sum(0)]
-        )
+        torque += np.stack([(y * fz).sum(0), -(x * fz).sum(0), (x * fy - y * fx).sum(0)])
     if active("drag_height"):
         torque += np.stack(
-            [
-                -p["drag_height"] * force[1],
-                p["drag_height"] * force[0],
-                np.zeros(vb.shape[1]),
-            ]
+            [-p["drag_height"] * force[1], p["drag_height"] * force[0], np.zeros(vb.shape[1])]
         )
     if active("flap_torque", "flap_tilt"):
         total = thrust.sum(axis=0)
@@ -162,9 +144,7 @@ def air_forces(p, active, q, velocity, rates, speed, thrust, position, gust):
         # the disk tilts back: the torque is along v x e3 = (v_y, -v_x, 0)
         torque += np.stack([bend * vb[1], -bend * vb[0], np.zeros(vb.shape[1])])
     if active("wind_drag", "wind_quadratic"):
-        wind = p["wind"] * (
-            1.0 + p["wind_shear"] * (position[2] - 0.6) + p["wind_gust"] * gust
-        )
+        wind = p["wind"] * (1.0 + p["wind_shear"] * (position[2] - 0.6) + p["wind_gust"] * gust)
         relative = rotate_back(q, wind - velocity)
         norm = np.sqrt((relative * relative).sum(axis=0))
         force += (p["wind_drag"] + p["wind_quadratic"] * norm) * relative

@@ -62,11 +62,7 @@ def spoil(kind, flights, rng):
             for column in COLUMNS[2:]:
                 if column in f:
                     spread = np.nanstd(f[column]) + 1e-3
-                    put(
-                        f,
-                        [column],
-                        [np.nanmean(f[column]) + spread * rng.standard_normal(n)],
-                    )
+                    put(f, [column], [np.nanmean(f[column]) + spread * rng.standard_normal(n)])
         elif kind in ("shuffled_gyro", "shuffled_motors"):
             columns = GYRO if kind == "shuffled_gyro" else MOTOR
             rows = rng.permutation(n)
@@ -80,11 +76,9 @@ def spoil(kind, flights, rng):
         elif kind == "motor_order":
             put(f, MOTOR, [f[MOTOR[k]] for k in order])
         elif kind.startswith("other_flight"):
-            columns = {
-                "gyro": GYRO,
-                "motors": MOTOR,
-                "pose": GROUPS["p"] + GROUPS["s"],
-            }[kind.split("_")[-1]]
+            columns = {"gyro": GYRO, "motors": MOTOR, "pose": GROUPS["p"] + GROUPS["s"]}[
+                kind.split("_")[-1]
+            ]
             columns = [c for c in columns if c in f]
             put(f, columns, [np.resize(other[c], n) for c in columns])
         elif kind == "gyro_in_degrees":
@@ -98,26 +92,17 @@ def spoil(kind, flights, rng):
             put(f, ["qx", "qy", "qz"], [-f[c] for c in ("qx", "qy", "qz")])
         elif kind == "frozen_gyro":
             stop = n // 3
-            put(
-                f, GYRO, [np.where(np.arange(n) < stop, f[c], f[c][stop]) for c in GYRO]
-            )
+            put(f, GYRO, [np.where(np.arange(n) < stop, f[c], f[c][stop]) for c in GYRO])
         elif kind == "late_imu":
             shift = int(np.searchsorted(f["t"], 0.3 + 0.3 * (a + 1) / 3))
             columns = GYRO + ACCEL
             put(
                 f,
                 columns,
-                [
-                    np.concatenate([np.repeat(f[c][:1], shift), f[c][:-shift]])
-                    for c in columns
-                ],
+                [np.concatenate([np.repeat(f[c][:1], shift), f[c][:-shift]]) for c in columns],
             )
         elif kind == "mirrored_pose":
-            put(
-                f,
-                [c for c in ("y", "vy") if c in f],
-                [-f[c] for c in ("y", "vy") if c in f],
-            )
+            put(f, [c for c in ("y", "vy") if c in f], [-f[c] for c in ("y", "vy") if c in f])
             put(f, ["qx", "qz"], [-f["qx"], -f["qz"]])
         elif kind == "accelerometer_in_g":
             put(f, ACCEL, [f[c] / 9.81 for c in ACCEL])

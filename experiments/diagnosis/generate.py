@@ -82,35 +82,22 @@ def fly_chunk(job):
                 crash = 10 * (first.lasts(at) < 0.7)
                 if spec["category"] == "not_testable":  # as large as stays hidden
                     options.append(
-                        (
-                            crash + max(math.log(severity / answer_key.HIDDEN), 0.0),
-                            -n,
-                            severity,
-                        )
+                        (crash + max(math.log(severity / answer_key.HIDDEN), 0.0), -n, severity)
                     )
                 else:
                     options.append(
-                        (
-                            crash + abs(math.log(severity / spec["targets"][i])),
-                            n,
-                            severity,
-                        )
+                        (crash + abs(math.log(severity / spec["targets"][i])), n, severity)
                     )
             _, n, severity = min(options)
             n = abs(n)
-            cause |= {
-                "size": tried[place[name, (i, n)]][2][0]["size"],
-                "alone": round(severity, 3),
-            }
+            cause |= {"size": tried[place[name, (i, n)]][2][0]["size"], "alone": round(severity, 3)}
             chosen[name] = place[name, (i, n)]
             if first.lasts(chosen[name]) < 0.7:  # every size crashes: less of it
                 cause["size"] *= 0.3
                 again.append(spec)
         if len(spec["causes"]) > 1 and spec not in again:
             again.append(spec)
-    second = (
-        Fleet(seed, column, [(s, s["causes"]) for s in again], drawn) if again else None
-    )
+    second = Fleet(seed, column, [(s, s["causes"]) for s in again], drawn) if again else None
     energies_again = second.energies() if again else None
     answers = []
     for spec in specs:
@@ -129,9 +116,7 @@ def fly_chunk(job):
                 squares["nominal"], nominal[:, place[spec["name"], "nominal"]]
             )
         wrong = write_case(fleet, i, Path(folder) / spec["name"], spoiled=True)
-        answers.append(
-            answer_key.answer_of(fleet, i, squares, floors[spec["name"]], wrong)
-        )
+        answers.append(answer_key.answer_of(fleet, i, squares, floors[spec["name"]], wrong))
     return answers
 
 
@@ -153,29 +138,20 @@ def generate(seed, column, count, logs, jobs=1, only=None, healthy=False):
     specs = cases.draw_cases(seed, column, count, only)
     size = max(1, min(CHUNK, math.ceil(len(specs) / jobs)))
     work = [
-        (seed, column, specs[i : i + size], Path(logs), healthy)
-        for i in range(0, len(specs), size)
+        (seed, column, specs[i : i + size], Path(logs), healthy) for i in range(0, len(specs), size)
     ]
     answers = []
     start = time.perf_counter()
     for part in in_processes(fly_chunk, work, jobs):
         answers += part
-        print(
-            f"{len(answers)}/{len(specs)} cases, {time.perf_counter() - start:.0f} s",
-            flush=True,
-        )
+        print(f"{len(answers)}/{len(specs)} cases, {time.perf_counter() - start:.0f} s", flush=True)
     return sorted(answers, key=lambda a: a["case"])
 
 
 def write_answers(path, answers, seed, column):
     """Write the answers as JSON; returns the SHA-256 of the file."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    about = {
-        "seed": seed,
-        "count": len(answers),
-        "column": column,
-        "channels": measure.CHANNELS,
-    }
+    about = {"seed": seed, "count": len(answers), "column": column, "channels": measure.CHANNELS}
     text = json.dumps(about | {"cases": {a["case"]: a for a in answers}}, indent=1)
     path.write_text(text)
     digest = hashlib.sha256(text.encode()).hexdigest()
@@ -199,12 +175,8 @@ def main():
     parser = case_parser(__doc__)
     parser.add_argument("--column", choices=list(cases.COLUMN), default="known")
     parser.add_argument("--count", type=int, default=60)
-    parser.add_argument(
-        "--healthy", action="store_true", help="also LOGS_healthy: references"
-    )
-    parser.add_argument(
-        "--only", help="categories, comma-separated: " + ", ".join(cases.SHARES)
-    )
+    parser.add_argument("--healthy", action="store_true", help="also LOGS_healthy: references")
+    parser.add_argument("--only", help="categories, comma-separated: " + ", ".join(cases.SHARES))
     options = parser.parse_args()
     use_single_thread()
     if options.answers.resolve().is_relative_to(options.logs.resolve()):
@@ -219,9 +191,7 @@ def main():
         only,
         options.healthy,
     )
-    print(
-        "sha256", write_answers(options.answers, answers, options.seed, options.column)
-    )
+    print("sha256", write_answers(options.answers, answers, options.seed, options.column))
 
 
 if __name__ == "__main__":

@@ -42,10 +42,7 @@ def write_healthy(seed, column, specs, folder):
     """
     days = [day_of(seed, column, spec, 0) for spec in specs]
     fleet = Fleet(
-        seed,
-        column,
-        [(s, []) for s in days],
-        {s["name"]: bodies(seed, column, s) for s in days},
+        seed, column, [(s, []) for s in days], {s["name"]: bodies(seed, column, s) for s in days}
     )
     for i, spec in enumerate(days):
         write_case(fleet, i, healthy_beside(folder) / spec["name"])

@@ -52,9 +52,7 @@ TOLD = NAMES[:8]
 def record_of(rates, motor, rate: int, samples: bool, vehicle) -> Record:
     """A record of rows without anything but rates and motors."""
     rest = dict.fromkeys(("force", "velocity", "quaternion", "voltage"))
-    return Record(
-        "flight", 1.0 / rate, rates, motor, vehicle=vehicle, samples=samples, **rest
-    )
+    return Record("flight", 1.0 / rate, rates, motor, vehicle=vehicle, samples=samples, **rest)
 
 
 def fitted(record: Record, free: bool) -> TorqueFit:
@@ -70,15 +68,7 @@ def truth_of(truth: Truth) -> np.ndarray:
     """(8,) the parameters of TOLD."""
     gain = 1.0 / truth.inertia
     return np.array(
-        [
-            truth.up,
-            truth.down,
-            truth.delay,
-            gain,
-            gain,
-            gain * truth.yaw,
-            *[truth.damping] * 2,
-        ]
+        [truth.up, truth.down, truth.delay, gain, gain, gain * truth.yaw, *[truth.damping] * 2]
     )
 
 
@@ -125,13 +115,9 @@ def study() -> list[dict]:
                     "gust": truth.gust,
                     "flights": len(values),
                     "truth": dict(zip(TOLD, right.tolist(), strict=True)),
-                    "mean": dict(
-                        zip(TOLD, np.mean(values, 0).round(5).tolist(), strict=True)
-                    ),
+                    "mean": dict(zip(TOLD, np.mean(values, 0).round(5).tolist(), strict=True)),
                     "inside_90": dict(zip(TOLD, inside.mean(0).tolist(), strict=True)),
-                    "roll_at_2_5_10_hz": np.mean(gains, 0).round(1).tolist()
-                    if gains
-                    else None,
+                    "roll_at_2_5_10_hz": np.mean(gains, 0).round(1).tolist() if gains else None,
                 }
             )
             print(kind, name, gust, out[-1]["mean"], flush=True)
@@ -156,12 +142,7 @@ def summary(rows: list[dict]) -> dict:
             "damping": round(
                 float(
                     np.sqrt(
-                        np.mean(
-                            [
-                                (r["mean"]["damping"] - r["truth"]["damping"]) ** 2
-                                for r in of
-                            ]
-                        )
+                        np.mean([(r["mean"]["damping"] - r["truth"]["damping"]) ** 2 for r in of])
                     )
                 ),
                 3,
@@ -202,15 +183,8 @@ def main() -> None:
     real = {folder.name: of_flights(folder) for folder in arguments.flights}
     rows = study()
     command = "python -m experiments.diagnosis.identification"
-    command += (
-        "".join(f" --flights {name}" for name in real) + f" --out {arguments.out.name}"
-    )
-    found = {
-        "command": command,
-        "summary": summary(rows),
-        "flights": real,
-        "rows": rows,
-    }
+    command += "".join(f" --flights {name}" for name in real) + f" --out {arguments.out.name}"
+    found = {"command": command, "summary": summary(rows), "flights": real, "rows": rows}
     text = json.dumps(found, indent=1)
     arguments.out.write_text(text + "\n", encoding="utf-8")
 

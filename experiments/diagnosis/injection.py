@@ -176,9 +176,7 @@ def surface_effect(cause, p, c, side):
     if cause.form == "inverse_square":
         p[side + "_inverse"][c] = gain * ((0.05 + offset) / PROPELLER) ** 2
     elif cause.form == "cheeseman_bennett":
-        p[side + "_image"][c] = (
-            4 * (0.05 + offset) / PROPELLER * np.sqrt(gain / (1 + gain))
-        )
+        p[side + "_image"][c] = 4 * (0.05 + offset) / PROPELLER * np.sqrt(gain / (1 + gain))
     else:
         scale = 0.035 + 0.04 * cause.shape[2]
         p[side + "_scale"][c] = scale
@@ -305,9 +303,7 @@ def command_latency(cause, arrival, c, rng):
         if cause.form == "jitter":
             extra = a * (0.75 + 0.5 * rng.uniform(0, 1, ticks))
         elif cause.form == "spikes":
-            extra = a * (
-                0.85 + (rng.uniform(0, 1, ticks) < 0.1) * rng.uniform(0.5, 2.5, ticks)
-            )
+            extra = a * (0.85 + (rng.uniform(0, 1, ticks) < 0.1) * rng.uniform(0.5, 2.5, ticks))
         arrival[:, j] += np.rint(extra).astype(arrival.dtype)
     return {"delay_ms": a}
 

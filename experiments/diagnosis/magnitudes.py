@@ -10,10 +10,7 @@ from experiments.diagnosis.vehicle import GRAVITY, PROPELLER
 
 
 def _lag(magnitudes, told):
-    return {
-        f"extra_{k}": magnitudes[f"tau_{k}"] - told["motor_time"]
-        for k in ("up", "down")
-    }
+    return {f"extra_{k}": magnitudes[f"tau_{k}"] - told["motor_time"] for k in ("up", "down")}
 
 
 def _imbalance(magnitudes, told):
@@ -39,27 +36,11 @@ TRUTH = {
         0.0,
     ),
     "thrust_saturation": (("hard",), lambda m, t: {"limit": m["limit"]}, 1.0),
-    "rotor_drag": (
-        ("linear", "raised_hub", "rotor_speed"),
-        lambda m, t: {"d_xy": m["d_xy"]},
-        0.0,
-    ),
-    "blade_flapping": (
-        ("linear",),
-        lambda m, t: {"stiffness": m["torque_N_m_per_m_s"]},
-        0.0,
-    ),
+    "rotor_drag": (("linear", "raised_hub", "rotor_speed"), lambda m, t: {"d_xy": m["d_xy"]}, 0.0),
+    "blade_flapping": (("linear",), lambda m, t: {"stiffness": m["torque_N_m_per_m_s"]}, 0.0),
     "motor_lag": (("slower", "up_down"), _lag, 0.0),
-    "command_latency": (
-        ("constant", "jitter"),
-        lambda m, t: {"delay": 1e-3 * m["delay_ms"]},
-        0.0,
-    ),
-    "packet_loss": (
-        ("independent", "bursts"),
-        lambda m, t: {"probability": m["probability"]},
-        0.0,
-    ),
+    "command_latency": (("constant", "jitter"), lambda m, t: {"delay": 1e-3 * m["delay_ms"]}, 0.0),
+    "packet_loss": (("independent", "bursts"), lambda m, t: {"probability": m["probability"]}, 0.0),
     "thrust_curve": (("quadratic",), lambda m, t: {"curvature": m["curvature"]}, 0.0),
     "motor_imbalance": (("all", "one_weak"), _imbalance, 0.0),
     "com_offset": (
@@ -93,9 +74,7 @@ def parameters(answer, report):
         fitted = said.get(effect)
         if not fitted:
             continue
-        values = {
-            k: v["value"] for k, v in fitted.items() if v.get("value") is not None
-        }
+        values = {k: v["value"] for k, v in fitted.items() if v.get("value") is not None}
         row = {"effect": effect, "covered": []}
         derived = _derived(effect, cause, values)
         if derived is not None:
@@ -116,26 +95,18 @@ def parameters(answer, report):
         for k, t in truth.items():
             interval = fitted[k].get("interval90")
             if interval:
-                row["covered"].append(
-                    bool(interval[0] - centre <= t <= interval[1] - centre)
-                )
-        rows.append(
-            row | {"error": float(np.linalg.norm(estimate - centre - true)) / size}
-        )
+                row["covered"].append(bool(interval[0] - centre <= t <= interval[1] - centre))
+        rows.append(row | {"error": float(np.linalg.norm(estimate - centre - true)) / size})
     return rows
 
 
 def _derived(effect, cause, values):
     m = cause["magnitudes"]
     if effect in ("ground_effect", "ceiling_effect") and "strength" in values:
-        return values["strength"] * (
-            PROPELLER / (0.05 + values.get("offset", 0.0))
-        ) ** 2, m["gain_at_5cm"]
-    if (
-        effect == "wind"
-        and {"x", "y", "drag"} <= set(values)
-        and cause["form"] == "steady"
-    ):
+        return values["strength"] * (PROPELLER / (0.05 + values.get("offset", 0.0))) ** 2, m[
+            "gain_at_5cm"
+        ]
+    if effect == "wind" and {"x", "y", "drag"} <= set(values) and cause["form"] == "steady":
         # the force at rest: speed and drag apart show far less than their product
         said = np.array([values["x"], values["y"]])
         true = np.array([m["w_x"], m["w_y"]])

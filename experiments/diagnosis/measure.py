@@ -26,9 +26,7 @@ from experiments.diagnosis.sensors import GROUPS
 LONG, SHORT, TURN = 125, 25, 50  # samples of 2 ms
 EVERY = 100
 FIRST = 500
-CHANNELS = [
-    f"{c}_{a}" for c in ("force", "torque", "motor", "pose") for a in ("x", "y", "z")
-]
+CHANNELS = [f"{c}_{a}" for c in ("force", "torque", "motor", "pose") for a in ("x", "y", "z")]
 MIX = np.array([[-1, -1, 1, 1], [-1, 1, 1, -1], [-1, 1, -1, 1]]) / 4.0
 THRUST_ALLOWANCE = 0.008  # of the thrust, free in every hypothesis
 
@@ -57,9 +55,9 @@ def errors(flown, told, parameters, partner, other_firmware, links):
     wide = spread(parameters)
     wide_neutral = spread(neutral)
     columns = (np.arange(len(starts))[:, None] * count + partner[None]).reshape(-1)
-    alone = np.tile(
-        np.where(partner == np.arange(count), -10.0, 0.0), len(starts)
-    ) * np.array([[0], [0], [1.0]])
+    alone = np.tile(np.where(partner == np.arange(count), -10.0, 0.0), len(starts)) * np.array(
+        [[0], [0], [1.0]]
+    )
     body = Body(
         wide,
         wide_neutral,
@@ -87,15 +85,11 @@ def errors(flown, told, parameters, partner, other_firmware, links):
         moved += body.velocity - velocity
         if s < SHORT:
             turned += body.rates - rates
-    velocity_error = v.rotate_back(
-        q0, gather("velocity", LONG) - gather("velocity") - moved
-    )
+    velocity_error = v.rotate_back(q0, gather("velocity", LONG) - gather("velocity") - moved)
     rate_error = gather("rates", SHORT) - gather("rates") - turned
 
     def rms(error):
-        squares = np.where(valid, error.reshape(3, len(starts), count) ** 2, 0.0).sum(
-            axis=1
-        )
+        squares = np.where(valid, error.reshape(3, len(starts), count) ** 2, 0.0).sum(axis=1)
         return np.sqrt(squares / np.maximum(valid.sum(axis=0), 1))
 
     turned = np.cumsum(flown["rates"], axis=0, dtype=float) * SAMPLE
@@ -134,9 +128,7 @@ def _motor_errors(flown, parameters, other_firmware, links):
         k: parameters[k][..., own]
         for k in ("kp", "ki", "kd", "gyro_cut", "derivative_cut", "d_filter")
     }
-    gyro, applied, motor = (
-        flown[k][..., own].astype(float) for k in ("gyro", "applied", "motor")
-    )
+    gyro, applied, motor = (flown[k][..., own].astype(float) for k in ("gyro", "applied", "motor"))
     issued = flown["command"][..., own].astype(float)
     late = parameters["link_delay"][own] / 2.0
     each = np.arange(len(own))
@@ -162,9 +154,7 @@ def motors_of_log(rows, samples):
     times = SAMPLE * np.arange(samples)
     logged = np.stack([rows[c] for c in GROUPS["m"]], axis=1)
     held = logged[np.maximum(np.searchsorted(rows["t"], times + 1e-6) - 1, 0)]
-    return np.stack(
-        [held, np.stack([np.interp(times, rows["t"], c) for c in logged.T], axis=1)]
-    )
+    return np.stack([held, np.stack([np.interp(times, rows["t"], c) for c in logged.T], axis=1)])
 
 
 def sensor_floor(sensors, rows, flown, j):
@@ -196,19 +186,15 @@ def sensor_floor(sensors, rows, flown, j):
         flip = np.array([[1.0], [-1], [-1], [-1]])
         angle = 2 * v.multiply(flip * true_q.T, q.T)[1:].T
         drift = smooth_derivative(
-            pose[:, :3] - truth("position", times - delay),
-            float(np.median(np.diff(times))),
+            pose[:, :3] - truth("position", times - delay), float(np.median(np.diff(times)))
         )
         out[:3] = change(times, drift, 0.25)
         if "s" in have:
             times_v, velocity = table("s")
             out[:3] = np.minimum(
-                out[:3],
-                change(times_v, velocity - truth("velocity", times_v - delay), 0.25),
+                out[:3], change(times_v, velocity - truth("velocity", times_v - delay), 0.25)
             )
-        out[3:6] = change(
-            times, smooth_derivative(angle, float(np.median(np.diff(times)))), 0.05
-        )
+        out[3:6] = change(times, smooth_derivative(angle, float(np.median(np.diff(times)))), 0.05)
     if "a" in have:
         times, accel = table("a")
         e = accel - truth("specific", times)
@@ -224,26 +210,17 @@ def sensor_floor(sensors, rows, flown, j):
         noise = e.std(axis=0)
         if angle is not None:
             turned = np.cumsum(e, axis=0) * np.median(np.diff(times))
-            out[9:] = np.hypot(
-                np.sqrt(2) * angle.std(axis=0), change(times, turned, 0.1)
-            )
+            out[9:] = np.hypot(np.sqrt(2) * angle.std(axis=0), change(times, turned, 0.1))
         if "c" in have and "m" in have:
-            slope = (
-                np.diff(flown["gyro"][:, :, j].astype(float), axis=0).std(axis=0)
-                / SAMPLE
-            )
+            slope = np.diff(flown["gyro"][:, :, j].astype(float), axis=0).std(axis=0) / SAMPLE
             counts = v.RATE_KP * np.rad2deg(noise) + 0.3 * v.RATE_KD * np.rad2deg(slope)
             # commands that came between the rows are not in the log
             issued = flown["command"][:, 1:, j].astype(float)
             inside = 0.01 * np.arange(len(flown["command"]))
             last = np.searchsorted(t, inside + 1e-6) - 1
-            known = np.stack([rows[c] for c in GROUPS["c"][1:]], axis=1)[
-                np.maximum(last, 0)
-            ]
+            known = np.stack([rows[c] for c in GROUPS["c"][1:]], axis=1)[np.maximum(last, 0)]
             missed = (issued - known)[(inside > 1.0) & (inside < t[-1])]
-            counts = np.hypot(
-                counts, v.RATE_KP * np.rad2deg(np.sqrt((missed**2).mean(axis=0)))
-            )
+            counts = np.hypot(counts, v.RATE_KP * np.rad2deg(np.sqrt((missed**2).mean(axis=0))))
             out[6:9] = np.hypot(
                 counts / 65536.0 / np.array([2, 2, 1]), 1e-4 * sensors["quantum"] / 3.5
             )

@@ -55,9 +55,7 @@ def _doublets(rng, length, rate, axes, size):
     start = 100
     while start < length - 40:
         axis = rng.choice(axes)
-        amplitude = (
-            rng.uniform(0.4, 1.0) * rng.choice([-1, 1]) * (0.1 if axis == 0 else size)
-        )
+        amplitude = rng.uniform(0.4, 1.0) * rng.choice([-1, 1]) * (0.1 if axis == 0 else size)
         width = rng.integers(4, 9)
         pulses[start : start + width, axis] += amplitude
         pulses[start + width : start + 2 * width, axis] -= amplitude
@@ -98,9 +96,7 @@ def single(kind, rng, length):
         position[:, 2] += rng.uniform(0, 0.12) * np.sin(rng.uniform(0.8, 2.0) * t)
     elif kind == "climb":
         heights = np.where(
-            np.arange(30) % 2 == 0,
-            rng.uniform(0.2, 0.45, 30),
-            rng.uniform(0.75, 1.0, 30),
+            np.arange(30) % 2 == 0, rng.uniform(0.2, 0.45, 30), rng.uniform(0.75, 1.0, 30)
         )
         position[:, 2] = _held(rng, heights[:, None], length, (0.7, 1.3))[:, 0]
         sigma = rng.uniform(0.09, 0.14)
@@ -108,13 +104,9 @@ def single(kind, rng, length):
     elif kind in ("low", "high"):
         bounds = (0.045, 0.22) if kind == "low" else (0.98, 1.15)
         position[:, :2] = _curve(rng, t, rng.uniform(0.3, 0.7), rng.uniform(0.25, 0.45))
-        position[:, 2] = _held(rng, rng.uniform(*bounds, (40, 1)), length, (0.5, 1.4))[
-            :, 0
-        ]
+        position[:, 2] = _held(rng, rng.uniform(*bounds, (40, 1)), length, (0.5, 1.4))[:, 0]
         start = np.clip(t / 2.0, 0, 1)
-        position[:, 2] = (1 - start) * (
-            0.35 if kind == "low" else 0.9
-        ) + start * position[:, 2]
+        position[:, 2] = (1 - start) * (0.35 if kind == "low" else 0.9) + start * position[:, 2]
         sigma = 0.16
     elif kind == "yaw":
         knots = np.c_[rng.uniform(-0.35, 0.35, (24, 2)), rng.uniform(0.4, 0.8, 24)]
@@ -122,9 +114,7 @@ def single(kind, rng, length):
         sigma = 0.25
         yaw = (
             yaw
-            + np.cumsum(
-                _held(rng, rng.uniform(-2.6, 2.6, (30, 1)), length, (0.5, 1.5))[:, 0]
-            )
+            + np.cumsum(_held(rng, rng.uniform(-2.6, 2.6, (30, 1)), length, (0.5, 1.5))[:, 0])
             / RATE
         )
         pulses = _doublets(rng, length, 0.8, [3], 2.2)
@@ -140,9 +130,9 @@ def single(kind, rng, length):
         yaw_rate_of = 0.0
         sigma = 0.15
     elif kind == "step":
-        knots = np.tile(centre, (24, 1)) + rng.choice(
-            [-1, 0, 1], (24, 3)
-        ) * rng.uniform(0.15, 0.35, (24, 3))
+        knots = np.tile(centre, (24, 1)) + rng.choice([-1, 0, 1], (24, 3)) * rng.uniform(
+            0.15, 0.35, (24, 3)
+        )
         position = _held(rng, knots, length, (1.0, 1.8))
         sigma = 0.07
         position[:, 2] = np.clip(position[:, 2], 0.25, 0.95)
@@ -163,10 +153,7 @@ def _smooth(position, yaw, pulses, sigma):
     width = sigma * RATE
 
     def smooth(signal, order):
-        return (
-            gaussian_filter1d(signal, width, axis=0, order=order, mode="nearest")
-            * RATE**order
-        )
+        return gaussian_filter1d(signal, width, axis=0, order=order, mode="nearest") * RATE**order
 
     return {
         "position": smooth(position, 0),
@@ -193,9 +180,7 @@ def pair(kind, rng, length):
     in its wake now and then.
     """
     t = np.arange(length) / RATE
-    lower = np.tile(
-        np.r_[rng.uniform(-0.1, 0.1, 2), rng.uniform(0.3, 0.45)], (length, 1)
-    )
+    lower = np.tile(np.r_[rng.uniform(-0.1, 0.1, 2), rng.uniform(0.3, 0.45)], (length, 1))
     if kind == "pass_moving":
         lower[:, :2] += _curve(rng, t, rng.uniform(0.15, 0.35), 0.2)
     angle = rng.uniform(0, 2 * np.pi)

@@ -32,22 +32,9 @@ def fly(seed: int, options) -> tuple[Path, str]:
     logs = options.work / f"{options.column}_{seed}"
     answers = logs.with_name(logs.name + "_answers.json")
     if not answers.exists():
-        command = [
-            sys.executable,
-            "-m",
-            "experiments.diagnosis.generate",
-            "--seed",
-            str(seed),
-        ]
+        command = [sys.executable, "-m", "experiments.diagnosis.generate", "--seed", str(seed)]
         command += ["--column", options.column, "--count", str(options.count)]
-        command += [
-            "--logs",
-            str(logs),
-            "--answers",
-            str(answers),
-            "--jobs",
-            str(options.cores),
-        ]
+        command += ["--logs", str(logs), "--answers", str(answers), "--jobs", str(options.cores)]
         command += ["--healthy"] if options.healthy else []
         subprocess.run(command, cwd=ROOT, check=True)
     return logs, answers.with_suffix(".sha256").read_text().strip()
@@ -60,13 +47,7 @@ def diagnose(name: str, engine: str, sets: list[str], options) -> list[dict]:
     older = Path(source).resolve().parent / "experiments"
     here = ROOT if ROOT / "experiments" == older or not older.exists() else older.parent
     out = options.work.resolve() / f"{name}.jsonl"
-    command = [
-        sys.executable,
-        "-m",
-        "experiments.diagnosis.development",
-        "--sets",
-        *sets,
-    ]
+    command = [sys.executable, "-m", "experiments.diagnosis.development", "--sets", *sets]
     command += ["--cores", str(options.cores), "--out", str(out)]
     command += ["--healthy"] if reference else []
     command += ["--seconds", str(options.seconds)] if options.seconds else []
@@ -90,12 +71,7 @@ def mcnemar(one: list[dict], other: list[dict]) -> dict[str, dict]:
         gained = sum(a and not b for a, b in pairs)
         lost = sum(b and not a for a, b in pairs)
         p = binomtest(gained, gained + lost).pvalue if gained + lost else 1.0
-        out[figure] = {
-            "n": len(pairs),
-            "gained": gained,
-            "lost": lost,
-            "p": round(float(p), 4),
-        }
+        out[figure] = {"n": len(pairs), "gained": gained, "lost": lost, "p": round(float(p), 4)}
     return out
 
 
@@ -113,26 +89,17 @@ def study(options) -> dict:
     engines = dict(entry.split("=", 1) for entry in options.engines)
     lines = {n: diagnose(n, engine, sets, options) for n, engine in engines.items()}
     for name, found in lines.items():
-        print(
-            "\n".join(
-                [f"## {name}", *figures_table([r | {"set": name} for r in found])]
-            )
-        )
+        print("\n".join([f"## {name}", *figures_table([r | {"set": name} for r in found])]))
     first, *others = engines
     compared = {f"{first} against {o}": mcnemar(lines[first], lines[o]) for o in others}
     print(json.dumps(compared, indent=1))
     return {
         "seeds": options.seeds,
         "column": options.column,
-        "answers_sha256": {
-            str(s): d for s, (_, d) in zip(options.seeds, flown, strict=True)
-        },
+        "answers_sha256": {str(s): d for s, (_, d) in zip(options.seeds, flown, strict=True)},
         "figures": {n: stored_figures(found) for n, found in lines.items()},
         "by_set": {
-            n: {
-                s: stored_figures([r for r in found if r["set"] == s])
-                for s in _sets(found)
-            }
+            n: {s: stored_figures([r for r in found if r["set"] == s]) for s in _sets(found)}
             for n, found in lines.items()
         },
         "beyond_days": {n: beyond_days(found) for n, found in lines.items()},
@@ -148,11 +115,7 @@ def beyond_days(lines: list[dict]) -> dict:
     """First names of single causes that a day's drift of trims and thrust can't
     make.
     """
-    asked = [
-        r
-        for r in lines
-        if r["category"] == "single" and not set(r["truth"]) & set(DRIFTING)
-    ]
+    asked = [r for r in lines if r["category"] == "single" and not set(r["truth"]) & set(DRIFTING)]
     return {"hits": sum(r["right"] for r in asked), "n": len(asked)}
 
 
@@ -168,16 +131,10 @@ def main() -> None:
     parser.add_argument("--column", default="stranger")
     parser.add_argument("--count", type=int, default=120)
     parser.add_argument("--sets", nargs="*", default=[], metavar="DIR[=ANSWERS]")
-    parser.add_argument(
-        "--engines", nargs="+", required=True, metavar="NAME=FOLDER[+reference]"
-    )
-    parser.add_argument(
-        "--healthy", action="store_true", help="fly reference flights as well"
-    )
+    parser.add_argument("--engines", nargs="+", required=True, metavar="NAME=FOLDER[+reference]")
+    parser.add_argument("--healthy", action="store_true", help="fly reference flights as well")
     parser.add_argument("--cores", type=int, default=os.cpu_count() or 1)
-    parser.add_argument(
-        "--seconds", type=float, help="for each engine; what is done counts"
-    )
+    parser.add_argument("--seconds", type=float, help="for each engine; what is done counts")
     parser.add_argument("--work", type=Path, default=Path("runs/paired"))
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()

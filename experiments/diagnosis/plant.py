@@ -61,15 +61,7 @@ def received(arrival, steps):
 
 
 POSE = {"position": 3, "velocity": 3, "quaternion": 4}
-KEPT = {
-    "rates": 3,
-    "specific": 3,
-    "gyro": 3,
-    "rotor": 4,
-    "motor": 4,
-    "integral": 3,
-    "applied": 4,
-}
+KEPT = {"rates": 3, "specific": 3, "gyro": 3, "rotor": 4, "motor": 4, "integral": 3, "applied": 4}
 
 
 class Flight:
@@ -127,14 +119,11 @@ class Flight:
         self.voltage = self.battery.step(np.tile(hover, (4, 1)), 0.0)
         self.commands = np.zeros((ticks, 4, count))
         samples = PER_TICK * ticks
-        self.history = {
-            n: np.zeros((samples, size, count), np.float32) for n, size in POSE.items()
-        }
+        self.history = {n: np.zeros((samples, size, count), np.float32) for n, size in POSE.items()}
         self.columns = np.arange(count)
         far = np.array([[0.0], [0.0], [-10.0]])
         self.partners = [
-            (partner, np.where(partner == self.columns, far, 0.0))
-            for partner in partners
+            (partner, np.where(partner == self.columns, far, 0.0)) for partner in partners
         ]
 
     def look(self):
@@ -145,11 +134,7 @@ class Flight:
         body = self.body
         for name, kept in self.history.items():
             kept[s] = body.q if name == "quaternion" else getattr(body, name)
-        seen = (
-            self.p["gyro_gain"] * body.rates
-            + self.air["gyro_bias"]
-            + self.air["gyro"][s]
-        )
+        seen = self.p["gyro_gain"] * body.rates + self.air["gyro_bias"] + self.air["gyro"][s]
         self.gyro = self.firmware.gyro_filter(seen)
 
     def seen(self):
@@ -160,11 +145,7 @@ class Flight:
         air = self.air
         s = self.sample
         k = self.sample // PER_TICK
-        late = (
-            air["pose_delay"]
-            + p["pose_delay"]
-            + p["pose_jitter"] * air["pose_jitter"][k]
-        )
+        late = air["pose_delay"] + p["pose_delay"] + p["pose_jitter"] * air["pose_jitter"][k]
         back = np.clip(np.maximum(late, 0.0) / 2.0, 0.0, s)
         whole = back.astype(int)
         rest = back - whole
@@ -195,9 +176,7 @@ class Flight:
         air = self.air
         index = self.received[2 * s]
         now = np.where(
-            index >= 0,
-            self.commands[np.maximum(index, 0), :, self.columns].T,
-            self.start,
+            index >= 0, self.commands[np.maximum(index, 0), :, self.columns].T, self.start
         )
         m = self.firmware(now, self.gyro)
         self.voltage = self.battery.step(m, SAMPLE)
@@ -206,9 +185,7 @@ class Flight:
         others = [self.wakes_from(here, here[:, i] + away) for i, away in self.partners]
         for half_step in range(2):
             now_s = SAMPLE * s + DT * half_step
-            self.body.step(
-                m, self.voltage, self.battery.load, *gusts, others, self.unknowns, now_s
-            )
+            self.body.step(m, self.voltage, self.battery.load, *gusts, others, self.unknowns, now_s)
             if self.solids is not None:
                 self.solids.stop(self.body.position, self.body.velocity)
         self.sample += 1
@@ -245,13 +222,8 @@ def fly(batch):
     )
     body = flight.body
     samples = PER_TICK * ticks
-    out = {
-        name: np.zeros((samples, size, count), np.float32)
-        for name, size in KEPT.items()
-    }
-    out |= {
-        name: np.zeros((samples, count), np.float32) for name in ("voltage", "load")
-    }
+    out = {name: np.zeros((samples, size, count), np.float32) for name, size in KEPT.items()}
+    out |= {name: np.zeros((samples, count), np.float32) for name in ("voltage", "load")}
     crashed = np.full(count, samples)
     lever = bool(np.any(p["imu_lever"] != 0))
 
@@ -262,9 +234,7 @@ def fly(batch):
                 1 - 2 * (body.q[1] ** 2 + body.q[2] ** 2) < 0.087
             )
             bad |= body.position[2] > vehicle.CEILING - CLEARANCE
-            bad |= ((body.position**2).sum(axis=0) > 2.5**2) | ~np.isfinite(
-                body.position[0]
-            )
+            bad |= ((body.position**2).sum(axis=0) > 2.5**2) | ~np.isfinite(body.position[0])
             crashed = np.where(bad & (crashed == samples), s, crashed)
             dead = crashed < samples
             # parked, so that one wreck does not spoil the arithmetic of the batch
@@ -273,22 +243,12 @@ def fly(batch):
                     reference["position"][k][:, dead],
                     0.0,
                 )
-                body.rates[:, dead], body.q[:, dead] = (
-                    0.0,
-                    np.array([[1.0], [0], [0], [0]]),
-                )
+                body.rates[:, dead], body.q[:, dead] = (0.0, np.array([[1.0], [0], [0], [0]]))
         flight.look()
         specific = (
-            forces.seen_by_accelerometer(p, body.specific, body.rates)
-            if lever
-            else body.specific
+            forces.seen_by_accelerometer(p, body.specific, body.rates) if lever else body.specific
         )
-        now = {
-            "rates": body.rates,
-            "specific": specific,
-            "gyro": flight.gyro,
-            "rotor": body.rotor,
-        }
+        now = {"rates": body.rates, "specific": specific, "gyro": flight.gyro, "rotor": body.rotor}
         now |= {
             "integral": flight.firmware.integral,
             "voltage": flight.voltage,
@@ -301,8 +261,5 @@ def fly(batch):
         out["applied"][s], out["motor"][s] = flight.step()
     out |= flight.history
     out["command"], out["crashed"] = flight.commands.astype(np.float32), crashed
-    out["pose_delay"], out["pose_jitter"] = (
-        1e-3 * p["pose_delay"],
-        1e-3 * p["pose_jitter"],
-    )
+    out["pose_delay"], out["pose_jitter"] = (1e-3 * p["pose_delay"], 1e-3 * p["pose_jitter"])
     return out

@@ -29,14 +29,8 @@ FLOOR = 1e-3
 
 def measures_of(lines: list[dict]) -> list[dict[str, float]]:
     """The residual's measures in the cases in which nothing unknown acts."""
-    good = [
-        r["residual"]
-        for r in lines
-        if r["category"] not in WITHOUT and r.get("residual")
-    ]
-    return [
-        {n: float(f"{v:.4g}") for n, v in r.items() if n != "p_value"} for r in good
-    ]
+    good = [r["residual"] for r in lines if r["category"] not in WITHOUT and r.get("residual")]
+    return [{n: float(f"{v:.4g}") for n, v in r.items() if n != "p_value"} for r in good]
 
 
 def pairs_of(lines: list[dict]) -> list[dict[str, dict[str, float]]]:
@@ -74,9 +68,7 @@ def best_reliability(lines: list[dict]) -> float:
     """The reliability that makes the right classes likeliest, from probabilities made
     with the one in use.
     """
-    told = [
-        (r["probabilities"], r["right_names"]) for r in lines if r.get("probabilities")
-    ]
+    told = [(r["probabilities"], r["right_names"]) for r in lines if r.get("probabilities")]
 
     def loss(share: float) -> float:
         change = share / DECISION.reliability
@@ -96,9 +88,7 @@ def main() -> None:
     )
     parser.add_argument("cases", nargs="*", type=Path)
     parser.add_argument("--referred", nargs="*", type=Path, default=[])
-    parser.add_argument(
-        "--source", required=True, help="which cases these are, in words"
-    )
+    parser.add_argument("--source", required=True, help="which cases these are, in words")
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()
     lines = read_lines(options.cases)

@@ -19,10 +19,7 @@ TORQUE_PER_THRUST = 0.025  # m
 PLACES = ARM * np.array([[1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0], [1.0, 1.0]])
 SPIN = np.array([-1.0, 1.0, -1.0, 1.0])
 COUNTS = np.rad2deg(1.0) / 65536.0
-GAINS = [
-    COUNTS * np.array(g)[:, None]
-    for g in ([250, 250, 120], [500, 500, 16.7], [2.5, 2.5, 0])
-]
+GAINS = [COUNTS * np.array(g)[:, None] for g in ([250, 250, 120], [500, 500, 16.7], [2.5, 2.5, 0])]
 HOVER = 0.62  # of the largest thrust
 COMMANDS = 2.0  # rad/s
 GYROSCOPE = 0.02  # rad/s
@@ -54,9 +51,7 @@ class Plant:
             return np.array([getattr(t, name) for t in truths], float)
 
         self.inertia = INERTIA[:, None] * of("inertia")
-        self.torque = LARGEST * np.stack(
-            [PLACES[:, 1], -PLACES[:, 0], TORQUE_PER_THRUST * SPIN]
-        )
+        self.torque = LARGEST * np.stack([PLACES[:, 1], -PLACES[:, 0], TORQUE_PER_THRUST * SPIN])
         self.trims = trims
         self.faster = -np.expm1(-STEP / of("up"))
         self.slower = -np.expm1(-STEP / of("down"))
@@ -107,28 +102,19 @@ def fly(truths: list[Truth], seconds: float) -> tuple[np.ndarray, np.ndarray]:
     gusts = noise(count, 2, 3)
     command_steps = noise(count // 5 + 1, 3)
     plant = Plant(truths, 1.0 + TRIM * noise(4))
-    mixer = np.stack(
-        [0.5 * np.sign(PLACES[:, 1]), -0.5 * np.sign(PLACES[:, 0]), SPIN], 1
-    )
+    mixer = np.stack([0.5 * np.sign(PLACES[:, 1]), -0.5 * np.sign(PLACES[:, 0]), SPIN], 1)
     integral, before, wanted = (np.zeros_like(plant.rates) for _ in range(3))
     seen = np.zeros((count, *plant.rates.shape))
     motors = np.zeros((count, *plant.speed.shape))
     for k in range(count):
         if k % 5 == 0:
-            wanted = (
-                0.97 * wanted
-                + COMMANDS * np.sqrt(1.0 - 0.97**2) * command_steps[k // 5]
-            )
+            wanted = 0.97 * wanted + COMMANDS * np.sqrt(1.0 - 0.97**2) * command_steps[k // 5]
         phase = 2.0 * np.pi * TICK * k
         thrust = HOVER + 0.05 * np.sin(0.7 * phase) + 0.03 * np.sin(2.3 * phase)
         seen[k] = plant.rates + gyroscope[k]
         error = wanted - seen[k]
         integral = np.clip(integral + TICK * error, -0.58, 0.58)
-        output = (
-            GAINS[0] * error
-            + GAINS[1] * integral
-            - GAINS[2] * (seen[k] - before) / TICK
-        )
+        output = GAINS[0] * error + GAINS[1] * integral - GAINS[2] * (seen[k] - before) / TICK
         before = seen[k]
         motors[k] = np.clip(thrust + mixer @ output, 0.0, 1.0)
         for half in range(2):

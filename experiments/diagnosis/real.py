@@ -35,9 +35,7 @@ def draw(rng, stranger=False):
         motor_time=round(
             float(rng.uniform(0.065, 0.085) if brushed else rng.uniform(0.02, 0.04)), 4
         ),
-        inertia=tuple(
-            float(f"{v:.4g}") for v in vehicle.INERTIA * size ** rng.uniform(1.0, 1.4)
-        ),
+        inertia=tuple(float(f"{v:.4g}") for v in vehicle.INERTIA * size ** rng.uniform(1.0, 1.4)),
         weighed=bool(rng.random() < 0.6),
     )
     more = 1.5 if stranger else 1.0

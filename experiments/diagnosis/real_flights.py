@@ -47,20 +47,11 @@ def as_means(case):
         whole = end - begin > 0.7 * np.median(end - begin)
         begin = begin[whole]
         end = end[whole]
-        motor = [
-            flight.motor_command[i:j].mean(0) for i, j in zip(begin, end, strict=True)
-        ]
-        sensed = {
-            name: getattr(flight, name)[begin]
-            for name in ("body_rates", "specific_force")
-        }
-        flights.append(
-            replace(flight, time=grid[whole], motor_command=np.array(motor), **sensed)
-        )
+        motor = [flight.motor_command[i:j].mean(0) for i, j in zip(begin, end, strict=True)]
+        sensed = {name: getattr(flight, name)[begin] for name in ("body_rates", "specific_force")}
+        flights.append(replace(flight, time=grid[whole], motor_command=np.array(motor), **sensed))
     log = case.vehicle_file.log | {"motor_rows": "mean"}
-    return replace(
-        case, flights=tuple(flights), vehicle_file=replace(case.vehicle_file, log=log)
-    )
+    return replace(case, flights=tuple(flights), vehicle_file=replace(case.vehicle_file, log=log))
 
 
 Part = tuple[Path, int | None, bool]
@@ -98,9 +89,7 @@ def diagnose(part: Part) -> dict:
     mass = float(case.vehicle_file.vehicle_of(case.flights[0].vehicle).mass)
     out = {"case": name, "mass": mass}
     out["named"] = list(report.effects) or [report.verdict]
-    out["probabilities"] = {
-        e: round(p, 3) for e, p in report.probabilities.items() if p > 0.03
-    }
+    out["probabilities"] = {e: round(p, 3) for e, p in report.probabilities.items() if p > 0.03}
     out["shares"] = told["shares"]["effects"]
     out["parameters"] = {
         effect: {p: [v["value"], *v["interval90"]] for p, v in found.items()}
@@ -110,10 +99,9 @@ def diagnose(part: Part) -> dict:
     out["sensors"] = list(report.sensors)
     out["broken_rules"] = broken_rules(report)
     if torques is not None:
-        out["torques"] = {
-            "sentence": torques.sentence(),
-            "trusted": torques.trustworthy,
-        } | {n: [q.value, *q.interval90] for n, q in torques.quantities.items()}
+        out["torques"] = {"sentence": torques.sentence(), "trusted": torques.trustworthy} | {
+            n: [q.value, *q.interval90] for n, q in torques.quantities.items()
+        }
     out["cpu_seconds"] = round(seconds, 1)
     print(json.dumps(out), flush=True)
     return out
@@ -172,9 +160,7 @@ def draw(cases: list[dict], path: Path) -> None:
     figure, axes = plt.subplots(figsize=(7.0, 4.6), layout="constrained")
     axes.axvspan(*BY_HAND, color="0.88", label="NanoBench by hand")
     for place, case in enumerate(reversed(named)):
-        value, low, high = (
-            v / case["mass"] for v in case["parameters"]["rotor_drag"]["d_xy"]
-        )
+        value, low, high = (v / case["mass"] for v in case["parameters"]["rotor_drag"]["d_xy"])
         first = case["named"][0] == "rotor_drag"
         axes.plot([low, high], [place, place], color="C0", lw=1.5)
         axes.plot(value, place, "o", color="C0", mfc="C0" if first else "white")
@@ -213,10 +199,7 @@ def main() -> None:
     from openjax.runs.machine import describe_machine
 
     parts = [(c, None, False) for f in arguments.folders for c in cases_of(f)]
-    for folders, rows in (
-        (arguments.each, (False,)),
-        (arguments.separate, (False, True)),
-    ):
+    for folders, rows in ((arguments.each, (False,)), (arguments.separate, (False, True))):
         parts += [p for f in folders for c in cases_of(f) for p in flights_of(c, rows)]
     command = "python -m experiments.diagnosis.real_flights"
     command += "".join(f" {f.name}" for f in arguments.folders)

@@ -72,9 +72,7 @@ def summary(changes: np.ndarray) -> dict[str, list[float]]:
         "half of what x and y are apart": 0.5 * (x - y),
         "yaw torque and inertia": changes[:, 4] + 0.5 * (x + y),
     }
-    return {
-        name: np.quantile(v, QUANTILES).round(4).tolist() for name, v in columns.items()
-    }
+    return {name: np.quantile(v, QUANTILES).round(4).tolist() for name, v in columns.items()}
 
 
 def main() -> None:
@@ -94,11 +92,7 @@ def main() -> None:
         with multiprocessing.get_context("spawn").Pool(options.cores) as pool:
             found = [change(here, there) for _, here, there in pool.imap(both, folders)]
         changes += [c for c in found if c is not None]
-    out = {
-        "cases": len(changes),
-        "quantiles": QUANTILES,
-        "changes": summary(np.array(changes)),
-    }
+    out = {"cases": len(changes), "quantiles": QUANTILES, "changes": summary(np.array(changes))}
     options.out.write_text(json.dumps(out, indent=1) + "\n")
     print(json.dumps(out, indent=1))
 

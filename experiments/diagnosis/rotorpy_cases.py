@@ -59,17 +59,8 @@ def make_case(job):
     flown = []
     for name in names:
         for slower in (1.0, 0.7, 0.5, 0.35):  # some vehicles can't follow fast paths
-            air = sensors.draw_air(
-                rng, drawn, ticks, drawn["voltage"] + rng.uniform(-0.15, 0.1)
-            )
-            flight = fly(
-                told,
-                nuisance | changed,
-                wind,
-                trajectory(name, rng, slower),
-                drawn,
-                air,
-            )
+            air = sensors.draw_air(rng, drawn, ticks, drawn["voltage"] + rng.uniform(-0.15, 0.1))
+            flight = fly(told, nuisance | changed, wind, trajectory(name, rng, slower), drawn, air)
             if flight["crashed"][0] >= LEAST:
                 break
         flown.append(flight)
@@ -77,9 +68,7 @@ def make_case(job):
         flights.append([log_rows(rng, drawn, flight, 0, length)])
     joined = {k: np.concatenate([f[k] for f in flown], axis=-1) for k in flown[0]}
     place = Path(folder) / f"case_{number:03d}"
-    fleet.write_logs(
-        place, flights, drawn["channels"], v.toml(told, "RotorPy 3", drawn)
-    )
+    fleet.write_logs(place, flights, drawn["channels"], v.toml(told, "RotorPy 3", drawn))
     return answer(place.name, kind, told, drawn, joined, flights, said)
 
 
@@ -93,22 +82,16 @@ def floor_of(told, drawn, joined, flights):
     p["rotor_gain"] *= 1 + drawn["thrust_offset"]
 
     def errors(flown):
-        return (measure.errors(flown, many, p, np.arange(3), none, none) ** 2).mean(
-            axis=1
-        )
+        return (measure.errors(flown, many, p, np.arange(3), none, none) ** 2).mean(axis=1)
 
     rows = [f[0] for f in flights]
     samples = len(joined["motor"])
     seen = errors(joined)
-    sensed = np.array(
-        [measure.sensor_floor(drawn, r, joined, j) for j, r in enumerate(rows)]
-    )
+    sensed = np.array([measure.sensor_floor(drawn, r, joined, j) for j, r in enumerate(rows)])
     logged = np.stack([measure.motors_of_log(r, samples) for r in rows], axis=-1)
     lasts = np.minimum(joined["crashed"], [round(r["t"][-1] / SAMPLE) for r in rows])
     hidden = [errors(joined | {"motor": m, "crashed": lasts}) for m in logged]
-    return seen, np.sqrt(
-        (sensed**2).mean(axis=0) + np.maximum(np.min(hidden, axis=0) - seen, 0.0)
-    )
+    return seen, np.sqrt((sensed**2).mean(axis=0) + np.maximum(np.min(hidden, axis=0) - seen, 0.0))
 
 
 def answer(name, kind, told, drawn, joined, flights, said):
@@ -118,11 +101,9 @@ def answer(name, kind, told, drawn, joined, flights, said):
     known = np.isfinite(floor)
     severity = float(np.sqrt(np.where(known, seen / floor**2, 0.0).max()))
     truth = [e if e != "unknown" else kind for e in effects]
-    category = {
-        0: "none",
-        1: "unknown" if effects == ["unknown"] else "single",
-        2: "pair",
-    }[len(effects)]
+    category = {0: "none", 1: "unknown" if effects == ["unknown"] else "single", 2: "pair"}[
+        len(effects)
+    ]
     if effects and severity < HIDDEN:
         category = "not_testable"
     forms, each = ([x] if isinstance(x, str | dict) else x for x in (form, said))
@@ -152,12 +133,8 @@ def main():
     use_single_thread()
     kinds = [kind for kind in SETS[options.set] for _ in range(options.each)]
     order = np.random.default_rng(options.seed).permutation(len(kinds))
-    jobs = [
-        (options.seed, n, kinds[i], str(options.logs)) for n, i in enumerate(order, 1)
-    ]
-    answers = sorted(
-        in_processes(make_case, jobs, options.jobs), key=lambda a: a["case"]
-    )
+    jobs = [(options.seed, n, kinds[i], str(options.logs)) for n, i in enumerate(order, 1)]
+    answers = sorted(in_processes(make_case, jobs, options.jobs), key=lambda a: a["case"])
     print("sha256", write_answers(options.answers, answers, options.seed, "rotorpy"))
 
 

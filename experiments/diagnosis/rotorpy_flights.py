@@ -15,10 +15,7 @@ def hubs(x=0.0, y=0.0):
     """Rotors of RotorPy's vehicle, numbered as the firmware has them, about a centre of
     mass at (x, y) m.
     """
-    return {
-        f"r{i + 1}": np.array([v.ROTOR_X[i] - x, v.ROTOR_Y[i] - y, 0.0])
-        for i in range(4)
-    }
+    return {f"r{i + 1}": np.array([v.ROTOR_X[i] - x, v.ROTOR_Y[i] - y, 0.0]) for i in range(4)}
 
 
 def rotorpy_vehicle(told, changed):
@@ -34,20 +31,11 @@ def rotorpy_vehicle(told, changed):
     }
     out |= dict(zip(("Ixx", "Iyy", "Izz"), told.inertia, strict=True))
     out |= dict.fromkeys(
-        ("Ixy", "Iyz", "Ixz", "c_Dx", "c_Dy", "c_Dz", "k_d", "k_z", "k_h", "k_flap"),
-        0.0,
+        ("Ixy", "Iyz", "Ixz", "c_Dx", "c_Dy", "c_Dz", "k_d", "k_z", "k_h", "k_flap"), 0.0
     )
     thrust = told.thrust_constant
-    out |= {
-        "k_eta": thrust,
-        "k_m": told.torque_ratio * thrust,
-        "tau_m": told.motor_time,
-    }
-    out |= {
-        "rotor_speed_min": 0.0,
-        "rotor_speed_max": v.MAX_SPEED,
-        "motor_noise_std": 0.0,
-    }
+    out |= {"k_eta": thrust, "k_m": told.torque_ratio * thrust, "tau_m": told.motor_time}
+    out |= {"rotor_speed_min": 0.0, "rotor_speed_max": v.MAX_SPEED, "motor_noise_std": 0.0}
     if set(changed) - set(out):
         raise ValueError(
             f"not parameters of RotorPy's multirotor: {sorted(set(changed) - set(out))}"
@@ -69,13 +57,9 @@ def _air(kind):
         tunnel = WindTunnel(np.linalg.norm(mean), mean / np.linalg.norm(mean), 0.25)
         return lambda t, x: tunnel.update(t, x - [0.0, 0.0, TUNNEL_HEIGHT])
     steady = ConstantWind(*mean)
-    sway = SinusoidWind(
-        0.25 * mean, np.array([0.4, 0.55, 0.3]), np.array([0.0, 0.7, 0.3])
-    )
+    sway = SinusoidWind(0.25 * mean, np.array([0.4, 0.55, 0.3]), np.array([0.0, 0.7, 0.3]))
     return (
-        steady.update
-        if name == "steady"
-        else lambda t, x: steady.update(t, x) + sway.update(t, x)
+        steady.update if name == "steady" else lambda t, x: steady.update(t, x) + sway.update(t, x)
     )
 
 
@@ -92,12 +76,7 @@ def trajectory(name, rng, slower=1.0):
     if name == "eight":
         a = speed
         return TwoDLissajous(
-            A=0.55,
-            B=0.5,
-            a=a,
-            b=2 * a,
-            height=height,
-            yaw_bool=bool(rng.random() < 0.5),
+            A=0.55, B=0.5, a=a, b=2 * a, height=height, yaw_bool=bool(rng.random() < 0.5)
         )
     radius = rng.uniform(0.4, 0.6)
     rate = speed / 0.5 / (2 * np.pi)
@@ -109,9 +88,7 @@ def trajectory(name, rng, slower=1.0):
         )
     sizes = np.array([radius, radius, rng.uniform(0.05, 0.25)])
     rates = np.array([rate, rate, 0.6 * rate])
-    return ThreeDCircularTraj(
-        np.array([0, 0, height]), sizes, rates, yaw_bool=name == "yawing"
-    )
+    return ThreeDCircularTraj(np.array([0, 0, height]), sizes, rates, yaw_bool=name == "yawing")
 
 
 def fly(told, changed, wind, path, drawn, air):
@@ -143,12 +120,8 @@ def fly(told, changed, wind, path, drawn, air):
     low = Filter(np.array([drawn["gyro_cut"]]), 3, air["gyro_bias"][:, None])
     cell = {k: np.array([air[k]]) for k in ("open_voltage", "discharge", "resistance")}
     battery = Battery(cell, np.array([told.hover]))
-    sizes = POSE | {
-        k: size for k, size in KEPT.items() if k not in ("integral", "applied")
-    }
-    out = {
-        name: np.zeros((samples, size, 1), np.float32) for name, size in sizes.items()
-    }
+    sizes = POSE | {k: size for k, size in KEPT.items() if k not in ("integral", "applied")}
+    out = {name: np.zeros((samples, size, 1), np.float32) for name, size in sizes.items()}
     out |= {name: np.zeros((samples, 1), np.float32) for name in ("voltage", "load")}
     m = np.full((4, 1), told.hover)
     crashed = samples
@@ -156,43 +129,25 @@ def fly(told, changed, wind, path, drawn, air):
     for s in range(samples):
         t = SAMPLE * s
         state["wind"] = wind_at(t, state["x"])
-        gyro = low(
-            state["w"][:, None] + air["gyro_bias"][:, None] + air["gyro"][s][:, None]
-        )
+        gyro = low(state["w"][:, None] + air["gyro_bias"][:, None] + air["gyro"][s][:, None])
         if s % 2 == 0:
             k = s // 5
-            q = (
-                state["q"]
-                + 0.5 * np.append(air["seen_attitude"][k][1:] * 2, 0.0) * state["q"][3]
-            )
+            q = state["q"] + 0.5 * np.append(air["seen_attitude"][k][1:] * 2, 0.0) * state["q"][3]
             seen = {
                 "x": state["x"] + air["seen_position"][k],
                 "v": state["v"] + air["seen_velocity"][k],
             }
             seen |= {"q": q / np.linalg.norm(q), "w": gyro[:, 0]}
             speeds = np.clip(
-                control.update(t, seen, path.update(t))["cmd_motor_speeds"],
-                0.0,
-                v.MAX_SPEED,
+                control.update(t, seen, path.update(t))["cmd_motor_speeds"], 0.0, v.MAX_SPEED
             )
             m = (speeds[:, None] / v.MAX_SPEED) ** 2
         rotation = np.roll(state["q"], 1)[:, None]
-        accel = model.statedot(state, {"cmd_motor_speeds": speeds}, SAMPLE)["vdot"][
-            :, None
-        ]
+        accel = model.statedot(state, {"cmd_motor_speeds": speeds}, SAMPLE)["vdot"][:, None]
         accel[2] += v.GRAVITY
-        names = {
-            "position": "x",
-            "velocity": "v",
-            "rates": "w",
-            "rotor": "rotor_speeds",
-        }
+        names = {"position": "x", "velocity": "v", "rates": "w", "rotor": "rotor_speeds"}
         now = {name: state[theirs][:, None] for name, theirs in names.items()}
-        now |= {
-            "quaternion": rotation,
-            "specific": v.rotate_back(rotation, accel),
-            "gyro": gyro,
-        }
+        now |= {"quaternion": rotation, "specific": v.rotate_back(rotation, accel), "gyro": gyro}
         now |= {"motor": m, "voltage": voltage, "load": battery.load}
         for name, value in now.items():
             out[name][s] = value
@@ -201,8 +156,5 @@ def fly(told, changed, wind, path, drawn, air):
             break
         state = model.step(state, {"cmd_motor_speeds": speeds}, SAMPLE)
         voltage = battery.step(m, SAMPLE)
-    out |= {
-        "command": np.zeros((samples // 5, 4, 1), np.float32),
-        "crashed": np.array([crashed]),
-    }
+    out |= {"command": np.zeros((samples // 5, 4, 1), np.float32), "crashed": np.array([crashed])}
     return out | {"pose_delay": np.zeros(1), "pose_jitter": np.zeros(1)}

@@ -27,11 +27,7 @@ def _parasitic(rng, told, hover):
 
 def _flapping(rng, told, hover):
     k = rng.uniform(0.6e-4, 3e-4)
-    return (
-        {"k_flap": -k / (4 * hover)},
-        None,
-        {"torque_N_m_per_m_s": k, "tilt_rad_per_m_s": 0.0},
-    )
+    return ({"k_flap": -k / (4 * hover)}, None, {"torque_N_m_per_m_s": k, "tilt_rad_per_m_s": 0.0})
 
 
 def _wind(rng, told, hover, name="steady", times=1):
@@ -53,11 +49,7 @@ def _lag(rng, told, hover):
 
 def _mass(rng, told, hover):
     ratio = 1 + rng.choice([-1, 1]) * rng.uniform(0.03, 0.2)
-    return (
-        {"mass": told.mass * ratio},
-        None,
-        {"mass_kg": told.mass * ratio, "ratio": ratio},
-    )
+    return ({"mass": told.mass * ratio}, None, {"mass_kg": told.mass * ratio, "ratio": ratio})
 
 
 def _thrust(rng, told, hover):
@@ -69,19 +61,13 @@ def _thrust(rng, told, hover):
 
 def _inertia(rng, told, hover):
     ratio = rng.uniform(1.15, 1.5, 3)
-    moments = dict(
-        zip(("Ixx", "Iyy", "Izz"), np.array(told.inertia) * ratio, strict=True)
-    )
+    moments = dict(zip(("Ixx", "Iyy", "Izz"), np.array(told.inertia) * ratio, strict=True))
     return moments, None, {"ratio": ratio.tolist()}
 
 
 def _yaw(rng, told, hover):
     ratio = rng.uniform(0.3, 0.8)
-    return (
-        {"k_m": told.torque_ratio * told.thrust_constant * ratio},
-        None,
-        {"ratio": ratio},
-    )
+    return ({"k_m": told.torque_ratio * told.thrust_constant * ratio}, None, {"ratio": ratio})
 
 
 def _offset(rng, told, hover):
@@ -103,10 +89,7 @@ def _noisy(rng, told, hover):
 
 
 def _drag_and_lag(rng, told, hover):
-    (one, _, said_one), (two, _, said_two) = (
-        _drag(rng, told, hover),
-        _lag(rng, told, hover),
-    )
+    (one, _, said_one), (two, _, said_two) = (_drag(rng, told, hover), _lag(rng, told, hover))
     return one | two, None, [said_one, said_two]
 
 
@@ -131,12 +114,7 @@ KINDS = {
     "yaw_torque": (_yaw, ["yaw_torque"], "scale", ("yawing",)),
     "com_offset": (_offset, ["com_offset"], "torque", ()),
     "translational_lift": (_lift, ["unknown"], "outside", LAPS),
-    "wind_tunnel": (
-        partial(_wind, name="tunnel", times=2),
-        ["unknown"],
-        "outside",
-        LAPS,
-    ),
+    "wind_tunnel": (partial(_wind, name="tunnel", times=2), ["unknown"], "outside", LAPS),
     "drag_and_lag": (
         _drag_and_lag,
         ["rotor_drag", "motor_lag"],

@@ -5,13 +5,7 @@ from scipy.signal import butter, lfilter, lfilter_zi
 
 from experiments.diagnosis import unknowns, vehicle
 from experiments.diagnosis.firmware import SAMPLE
-from experiments.diagnosis.sensors import (
-    COLUMNS,
-    DECIMALS,
-    GROUPS,
-    coloured,
-    vibration,
-)
+from experiments.diagnosis.sensors import COLUMNS, DECIMALS, GROUPS, coloured, vibration
 
 
 def at(signal, times):
@@ -68,9 +62,7 @@ def _pose(rng, sensors, flown, j, times, delay):
         )
     q = at(flown["quaternion"][:, :, j].astype(float), when)
     q = vehicle.multiply(q.T, np.concatenate([np.ones((1, n)), 0.5 * angle.T]))
-    return np.concatenate(
-        [position, (q / np.sqrt((q * q).sum(axis=0))).T, velocity], axis=1
-    )
+    return np.concatenate([position, (q / np.sqrt((q * q).sum(axis=0))).T, velocity], axis=1)
 
 
 def smooth_derivative(position, step):
@@ -88,9 +80,7 @@ def _inputs(flown, j, times, hover):
     """What `unknowns.misread` depends on, from the truth at `times`."""
     names = ("position", "quaternion", "velocity", "rates", "motor")
     rows = [at(flown[name][:, :, j].astype(float), times).T for name in names]
-    return unknowns.inputs_of(
-        *rows, at(flown["voltage"][:, j].astype(float), times), hover
-    )
+    return unknowns.inputs_of(*rows, at(flown["voltage"][:, j].astype(float), times), hover)
 
 
 def log_rows(rng, sensors, flown, j, ticks, unknown=(), hover=0.5):
@@ -108,36 +98,23 @@ def log_rows(rng, sensors, flown, j, ticks, unknown=(), hover=0.5):
     n = len(t)
     wander = None
     if sensors["wander"]:
-        wander = coloured(
-            rng, len(flown["rates"]), 2, 2.0, 1e-3 * sensors["wander"], SAMPLE
-        )
+        wander = coloured(rng, len(flown["rates"]), 2, 2.0, 1e-3 * sensors["wander"], SAMPLE)
 
     def stream(signal, times, clock):
         """A 500 Hz signal as its stream delivers it at `times`, by the IMU's clock (0)
         or the motors' (1).
         """
-        own = (
-            np.arange(0, seconds, 1 / sensors["stream_rate"])
-            if sensors["stream_rate"]
-            else times
-        )
-        values = at(
-            signal, own + (0.0 if wander is None else at(wander[:, clock], own))
-        )
+        own = np.arange(0, seconds, 1 / sensors["stream_rate"]) if sensors["stream_rate"] else times
+        values = at(signal, own + (0.0 if wander is None else at(wander[:, clock], own)))
         if own is times:
             return values
         return np.stack(
-            [np.interp(times, own, values[:, i]) for i in range(values.shape[1])],
-            axis=1,
+            [np.interp(times, own, values[:, i]) for i in range(values.shape[1])], axis=1
         )
 
     out = {"t": t}
     # pose: at its own rate, empty cells between, held (stale) or interpolated
-    own = (
-        np.arange(0, seconds, 1 / sensors["pose_rate"])
-        if sensors["pose_rate"] < rate
-        else t
-    )
+    own = np.arange(0, seconds, 1 / sensors["pose_rate"]) if sensors["pose_rate"] < rate else t
     delay = 1e-3 * sensors["pose_delay"] + flown["pose_delay"][j]
     if flown["pose_jitter"][j]:
         delay = delay + flown["pose_jitter"][j] * rng.uniform(-1, 1, len(own))
@@ -169,9 +146,7 @@ def log_rows(rng, sensors, flown, j, ticks, unknown=(), hover=0.5):
     noise = sensors["accel"] * rng.standard_normal((samples, 3))
     noise += coloured(rng, samples, 3, 3.0, 0.02, SAMPLE)
     if sensors["colour"]:
-        noise += coloured(
-            rng, samples, 3, 0.02, 0.4 * sensors["accel"] * sensors["colour"], SAMPLE
-        )
+        noise += coloured(rng, samples, 3, 0.02, 0.4 * sensors["accel"] * sensors["colour"], SAMPLE)
     if sensors["vibration"]:
         noise += vibration(rng, sensors, samples, sensors["vibration"])
     accel = _through(sensors["accel_cut"], accel + noise)
@@ -196,9 +171,7 @@ def log_rows(rng, sensors, flown, j, ticks, unknown=(), hover=0.5):
     voltage[np.concatenate([[False], seldom[1:] == seldom[:-1]])] = np.nan
     gyro = stream(gyro, t, 0) + wrong.get("unknown_gyroscope", 0.0)
     accel = stream(accel, t, 0) + wrong.get("unknown_accelerometer", 0.0)
-    values = np.concatenate(
-        [pose, gyro, accel, command, motors, voltage[:, None]], axis=1
-    )
+    values = np.concatenate([pose, gyro, accel, command, motors, voltage[:, None]], axis=1)
     for i, column in enumerate(COLUMNS[2:]):
         step = 10.0 ** -DECIMALS[column]
         if sensors["quantum"] > 1 and column not in GROUPS["c"]:

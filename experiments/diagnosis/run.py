@@ -22,7 +22,9 @@ from pathlib import Path
 from experiments.diagnosis import development, figures
 from experiments.table import Page, page_parser, publish
 
-LEFT_OUT = "parameters quality gap probabilities not_testable rest false_unknown right_names".split()
+LEFT_OUT = (
+    "parameters quality gap probabilities not_testable rest false_unknown right_names".split()
+)
 ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -35,26 +37,11 @@ def fly(column: str, count: int, options) -> str:
     answers = work / f"{column}_answers.json"
     if not answers.exists():
         module, number = (
-            ("rotorpy_cases", "--each")
-            if column == "rotorpy"
-            else ("generate", "--count")
+            ("rotorpy_cases", "--each") if column == "rotorpy" else ("generate", "--count")
         )
-        command = [
-            sys.executable,
-            "-m",
-            f"experiments.diagnosis.{module}",
-            number,
-            str(count),
-        ]
+        command = [sys.executable, "-m", f"experiments.diagnosis.{module}", number, str(count)]
         command += [] if column == "rotorpy" else ["--column", column]
-        command += [
-            "--seed",
-            str(options.seed),
-            "--logs",
-            str(logs),
-            "--answers",
-            str(answers),
-        ]
+        command += ["--seed", str(options.seed), "--logs", str(logs), "--answers", str(answers)]
         subprocess.run([*command, "--jobs", str(options.cores)], cwd=ROOT, check=True)
     return answers.with_suffix(".sha256").read_text().strip()
 
@@ -63,9 +50,7 @@ def study(options) -> dict:
     """Fly, diagnose and judge all columns."""
     begin = time.perf_counter()
     wanted = dict(entry.split("=") for entry in options.columns)
-    digests = {
-        column: fly(column, int(count), options) for column, count in wanted.items()
-    }
+    digests = {column: fly(column, int(count), options) for column, count in wanted.items()}
     out = options.work / "cases.jsonl"
     sets = [str(options.work / column) for column in wanted] + options.sets
     arguments = ["--sets", *sets, "--cores", str(options.cores), "--out", str(out)]
@@ -78,9 +63,7 @@ def study(options) -> dict:
     ]
     columns = {}
     for name in sorted({x["set"] for x in lines}):
-        columns[name] = {
-            "figures": stored_figures([x for x in lines if x["set"] == name])
-        }
+        columns[name] = {"figures": stored_figures([x for x in lines if x["set"] == name])}
     found = {"seed": options.seed, "note": options.note, "answers_sha256": digests}
     return found | {"columns": columns, "cases": lines}
 
@@ -109,14 +92,11 @@ def page(results: dict) -> Page:
         f"{results['note']}"
     )
     table, misses = (
-        "\n".join(part(results["cases"]))
-        for part in (figures.figures_table, figures.misses)
+        "\n".join(part(results["cases"])) for part in (figures.figures_table, figures.misses)
     )
     misses += results.get("history", "")
     parts = [table, f"## Misses\n\n{misses}"]
-    return Page(
-        "The exam of the diagnosis", prose, parts, figures.shown(results["cases"])
-    )
+    return Page("The exam of the diagnosis", prose, parts, figures.shown(results["cases"]))
 
 
 def main() -> None:
@@ -127,14 +107,9 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--cores", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--note", default="", help="a sentence for the page")
+    parser.add_argument("--seconds", type=float, help="for all; what is done by then counts")
     parser.add_argument(
-        "--seconds", type=float, help="for all; what is done by then counts"
-    )
-    parser.add_argument(
-        "--work",
-        type=Path,
-        default=Path("runs/exam"),
-        help="logs, answers; not committed",
+        "--work", type=Path, default=Path("runs/exam"), help="logs, answers; not committed"
     )
     publish(parser.parse_args(), study, page)
 

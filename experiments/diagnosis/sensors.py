@@ -26,17 +26,7 @@ GROUPS = {
     "v": ["vbat"],
 }
 COLUMNS = ["t", "vehicle", *(column for group in GROUPS.values() for column in group)]
-DIGITS = (
-    (4,) * 3
-    + (5,) * 4
-    + (4,) * 3
-    + (4,) * 3
-    + (3,) * 3
-    + (4,)
-    + (3,) * 3
-    + (4,) * 4
-    + (3,)
-)
+DIGITS = (4,) * 3 + (5,) * 4 + (4,) * 3 + (4,) * 3 + (3,) * 3 + (4,) + (3,) * 3 + (4,) * 4 + (3,)
 LOGGED = {"p": 0.88, "g": 0.9, "a": 0.85, "s": 0.6, "c": 0.75, "m": 0.92, "v": 0.8}
 """How often a log has a group."""
 DECIMALS = dict(zip(COLUMNS[2:], DIGITS, strict=True))
@@ -68,9 +58,7 @@ def _channels(rng, needed):
     """Letters of the logged groups: what an effect needs is there, the rest is drawn;
     always a legal log.
     """
-    have = set(needed) | {
-        letter for letter, chance in LOGGED.items() if rng.random() < chance
-    }
+    have = set(needed) | {letter for letter, chance in LOGGED.items() if rng.random() < chance}
     if "p" not in have:
         have -= {"s"}
         have |= {"a", "g"}
@@ -111,9 +99,7 @@ def draw(rng, kind, needed="", turbulence=None):
         "turbulence": turbulence,
         "gust": float(rng.uniform(*TURBULENCE[turbulence])),
         "pose_delay": float(rng.uniform(0.0, 2.5)),  # ms
-        "pose_rate": int(rng.choice([60, 100, 120, 240]))
-        if rate > 100
-        else min(rate, 100),
+        "pose_rate": int(rng.choice([60, 100, 120, 240])) if rate > 100 else min(rate, 100),
         "position": 2.0e-4 * size,  # m, white
         "angle": 1.8e-3 * size,  # rad, white
         "accel": 0.16 * size,
@@ -144,10 +130,7 @@ def draw(rng, kind, needed="", turbulence=None):
     elif kind == "quantised":
         out |= {"quantum": float(rng.choice([4.0, 10.0, 20.0]))}
     elif kind == "radio":
-        out |= {
-            "wander": float(rng.uniform(2.0, 10.0)),
-            "stream_rate": float(rng.uniform(70, 90)),
-        }
+        out |= {"wander": float(rng.uniform(2.0, 10.0)), "stream_rate": float(rng.uniform(70, 90))}
     elif kind == "estimator":
         out |= {
             "colour": float(rng.uniform(1.5, 4.0)),
@@ -169,14 +152,10 @@ def draw_air(rng, sensors, ticks, voltage, strong=1.0):
     force = coloured(rng, ticks, 3, 0.35, gust, 0.01) + coloured(
         rng, ticks, 3, 0.05, 0.4 * gust, 0.01
     )
-    torque = coloured(rng, ticks, 3, 0.08, 0.013 * gust, 0.01) * np.array(
-        [1.0, 1.0, 0.5]
-    )
+    torque = coloured(rng, ticks, 3, 0.08, 0.013 * gust, 0.01) * np.array([1.0, 1.0, 0.5])
     gyro = sensors["gyro"] * rng.standard_normal((samples, 3))
     if sensors["colour"]:
-        gyro += coloured(
-            rng, samples, 3, 0.02, 0.4 * sensors["gyro"] * sensors["colour"], SAMPLE
-        )
+        gyro += coloured(rng, samples, 3, 0.02, 0.4 * sensors["gyro"] * sensors["colour"], SAMPLE)
     if sensors["vibration"]:
         gyro += vibration(rng, sensors, samples, 0.04 * sensors["vibration"])
     angle = 1.5e-3 * size * rng.standard_normal((ticks, 3))
@@ -213,18 +192,13 @@ def pose_lag(delay_ms, sensors):
 
 def stack(flights):
     """List of `draw_air` dicts to one with the body index last."""
-    return {
-        key: np.stack([np.asarray(f[key]) for f in flights], axis=-1)
-        for key in flights[0]
-    }
+    return {key: np.stack([np.asarray(f[key]) for f in flights], axis=-1) for key in flights[0]}
 
 
 def vibration(rng, sensors, samples, rms):
     frequency = sensors["vibration_frequency"]
     quality = sensors["vibration_quality"]
-    return narrow(rng, samples, 3, frequency, quality, rms, SAMPLE) * np.array(
-        [1.0, 1.0, 0.6]
-    )
+    return narrow(rng, samples, 3, frequency, quality, rms, SAMPLE) * np.array([1.0, 1.0, 0.6])
 
 
 def apply_nuisances(p, columns, sensors):

@@ -38,17 +38,11 @@ def truth_of(answer: dict) -> Truth:
     if isinstance(acceptable, dict):
         shown = answer.get("expected", effects)
         acceptable = [acceptable.get(effect, [effect]) for effect in shown]
-    fine = set(answer.get("also_fine", ())) | {
-        CARRIES[e] for e in effects if e in CARRIES
-    }
+    fine = set(answer.get("also_fine", ())) | {CARRIES[e] for e in effects if e in CARRIES}
     named = answer["category"] in ("single", "pair", "real")
     right = tuple(frozenset(names) for names in acceptable) if named else ()
     return Truth(
-        answer["category"],
-        effects,
-        right,
-        frozenset(fine),
-        answer.get("in_sensors", False),
+        answer["category"], effects, right, frozenset(fine), answer.get("in_sensors", False)
     )
 
 
@@ -67,11 +61,7 @@ def words_of(report: dict | None) -> list[str]:
     verdict = report.get("verdict")
     if verdict in CONTRADICTORY or (report.get("contradictions") and not words):
         return ["garbage"]
-    return (
-        ["unknown", *words]
-        if verdict == "unknown" and "unknown" not in words
-        else words
-    )
+    return ["unknown", *words] if verdict == "unknown" and "unknown" not in words else words
 
 
 def judge(truth: Truth, words: list[str]) -> dict:
@@ -83,8 +73,7 @@ def judge(truth: Truth, words: list[str]) -> dict:
     wrong = [n for n in names if n not in allowed]
     lost = "garbage" in words
     first = next(
-        (n for n in names if n not in truth.fine or any(n in r for r in truth.right)),
-        None,
+        (n for n in names if n not in truth.fine or any(n in r for r in truth.right)), None
     )
     if truth.category == "garbage":
         right = lost
@@ -113,16 +102,12 @@ def right_names(truth: Truth) -> frozenset[str]:
     return frozenset().union(*truth.right) or frozenset(unnamed)
 
 
-def top_probability(
-    right, probabilities: dict[str, float]
-) -> tuple[float, bool] | None:
+def top_probability(right, probabilities: dict[str, float]) -> tuple[float, bool] | None:
     """(probability of the most probable class, whether it is the true one); the names
     that are `right` count as one.
     """
     if not probabilities:
         return None
     together = sum(p for name, p in probabilities.items() if name in right)
-    best = max(
-        (p for name, p in probabilities.items() if name not in right), default=0.0
-    )
+    best = max((p for name, p in probabilities.items() if name not in right), default=0.0)
     return max(together, best), together >= best

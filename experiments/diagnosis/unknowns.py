@@ -49,9 +49,7 @@ INPUTS = {
     "voltage": (1, 0.1),  # V, about 3.7
     "time": (1, 1.0),  # s
 }
-SCALE = np.concatenate(
-    [np.broadcast_to(size, count) for count, size in INPUTS.values()]
-)
+SCALE = np.concatenate([np.broadcast_to(size, count) for count, size in INPUTS.values()])
 SLOWEST, FASTEST = 0.3, 4.0  # Hz, of a kind that time has a part in
 
 
@@ -77,9 +75,7 @@ class Generated:
 
     @staticmethod
     def _draw(cause):
-        rng = np.random.default_rng(
-            (1e9 * np.asarray(cause["shape"])).astype(np.uint32)
-        )
+        rng = np.random.default_rng((1e9 * np.asarray(cause["shape"])).astype(np.uint32))
         names = list(INPUTS)
         chosen = set(rng.choice(names, size=rng.integers(1, 4), replace=False))
         if chosen == {"voltage"}:  # hardly moves within a flight
@@ -115,9 +111,7 @@ class Generated:
         """Values (n,) at inputs (14, n), of which the last row is replaced by the time
         since the onset.
         """
-        x = np.concatenate(
-            [inputs, np.broadcast_to(time - self.onset, (1, inputs.shape[1]))]
-        )
+        x = np.concatenate([inputs, np.broadcast_to(time - self.onset, (1, inputs.shape[1]))])
         waves = np.cos(np.einsum("fin,in->fn", self.waves, x) + self.phases).sum(0)
         smooth = (waves - self.mean - (self.slope * x).sum(0)) * np.sqrt(2.0 / FEATURES)
         value = np.where(self.switching, np.sign(waves - self.mean), smooth)
@@ -129,13 +123,7 @@ def inputs_of(position, q, velocity, rates, motors, voltage, hover):
     velocities and rates (3, n), q and motors (4, n), voltage and hover command (n,).
     """
     middle = position - np.array([[0.0], [0.0], [0.6]])
-    rows = [
-        middle,
-        rotate_back(q, velocity),
-        rates,
-        motors - hover,
-        voltage[None] - 3.7,
-    ]
+    rows = [middle, rotate_back(q, velocity), rates, motors - hover, voltage[None] - 3.7]
     return np.concatenate(rows) / SCALE[:-1, None]
 
 
@@ -162,9 +150,7 @@ class Unknowns:
 
     def look(self, position, q, velocity, rates, motors, voltage):
         """What the bodies do in this step; before `motors` and `wrench`."""
-        self.inputs = inputs_of(
-            position, q, velocity, rates, motors, voltage, self.hover
-        )
+        self.inputs = inputs_of(position, q, velocity, rates, motors, voltage, self.hover)
 
     def _values(self, site, time):
         columns, function, size = self.sites[site]
@@ -186,9 +172,7 @@ class Unknowns:
         if "unknown_force" in self.sites:
             columns, function, values = self._values("unknown_force", time)
             push = 1e-3 * function.axis * values
-            force[:, columns] = np.where(
-                function.world, rotate_back(q[:, columns], push), push
-            )
+            force[:, columns] = np.where(function.world, rotate_back(q[:, columns], push), push)
         if "unknown_torque" in self.sites:
             columns, function, values = self._values("unknown_torque", time)
             torque[:, columns] = 1e-3 * function.axis * values
@@ -202,9 +186,7 @@ def misread(causes, inputs, times):
     out = {}
     for cause in causes:
         function = Generated([cause])
-        values = np.array(
-            [function(inputs[:, k : k + 1], t)[0] for k, t in enumerate(times)]
-        )
+        values = np.array([function(inputs[:, k : k + 1], t)[0] for k, t in enumerate(times)])
         out[cause["effect"]] = cause["size"] * values[:, None] * function.axis[:, 0]
     return out
 

@@ -61,14 +61,10 @@ def draw_told(rng):
         if standard
         else mass * GRAVITY / (4 * rng.uniform(0.5, 0.66) * MAX_SPEED**2)
     )
-    size = (
-        1.0 if standard and rng.random() < 0.5 else mass / MASS * rng.uniform(0.93, 1.1)
-    )
+    size = 1.0 if standard and rng.random() < 0.5 else mass / MASS * rng.uniform(0.93, 1.1)
     ratio = TORQUE_RATIO if rng.random() < 0.6 else rng.uniform(0.006, 0.02)
     time = MOTOR_TIME if standard and rng.random() < 0.5 else rng.uniform(0.02, 0.04)
-    moments = (
-        INERTIA * size if size == 1.0 else INERTIA * size * rng.uniform(0.97, 1.03, 3)
-    )
+    moments = INERTIA * size if size == 1.0 else INERTIA * size * rng.uniform(0.97, 1.03, 3)
     return Told(
         mass=round(mass, 5),
         thrust_constant=float(f"{thrust:.5g}") if not standard else THRUST_CONSTANT,
@@ -94,12 +90,7 @@ def toml(told, source, sensors, command="thrust"):
     lines += ['spin = ["ccw", "cw", "ccw", "cw"]']
     if (told.torque_ratio, told.thrust_constant) != (TORQUE_RATIO, THRUST_CONSTANT):
         lines.append(f"torque_per_thrust = {told.torque_ratio:.4g}")
-    lines += [
-        "",
-        "[log]",
-        f'source = "{source}"',
-        f"motion_capture_rate = {sensors['pose_rate']}",
-    ]
+    lines += ["", "[log]", f'source = "{source}"', f"motion_capture_rate = {sensors['pose_rate']}"]
     lines.append(f'motor_rows = "{"mean" if sensors["motor"] == "mean" else "sample"}"')
     for name, value, nominal, unit in (
         ("thrust_constant", told.thrust_constant, THRUST_CONSTANT, "N s^2"),
@@ -152,9 +143,7 @@ NEUTRAL = {
     "wind_shear": 0.0,
     "wind_gust": 0.0,
     **{
-        f"{side}_{name}": value
-        for side in ("ground", "ceiling")
-        for name, value in SURFACE.items()
+        f"{side}_{name}": value for side in ("ground", "ceiling") for name, value in SURFACE.items()
     },
     "wake": 0.0,  # N
     "wake_height": 0.3,
@@ -227,11 +216,7 @@ def rotate_back(q, v):
 def cross(a, b):
     """Cross product of (3, B) vectors."""
     return np.stack(
-        [
-            a[1] * b[2] - a[2] * b[1],
-            a[2] * b[0] - a[0] * b[2],
-            a[0] * b[1] - a[1] * b[0],
-        ]
+        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
     )
 
 
@@ -262,17 +247,10 @@ def mix(thrust, output):
     """Firmware mixer: collective thrust (B,) 0..1 and outputs (3, B) in counts to motor
     commands (4, B) in 0..1.
     """
-    roll, pitch, yaw = (
-        np.minimum(np.maximum(output, -OUTPUT_LIMIT), OUTPUT_LIMIT) / 65536.0
-    )
+    roll, pitch, yaw = np.minimum(np.maximum(output, -OUTPUT_LIMIT), OUTPUT_LIMIT) / 65536.0
     r = roll / 2
     p = pitch / 2
     m = np.stack(
-        [
-            thrust - r - p - yaw,
-            thrust - r + p + yaw,
-            thrust + r + p - yaw,
-            thrust + r - p + yaw,
-        ]
+        [thrust - r - p - yaw, thrust - r + p + yaw, thrust + r + p - yaw, thrust + r - p + yaw]
     )
     return np.minimum(np.maximum(m, 0.0), 1.0)

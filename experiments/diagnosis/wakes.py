@@ -59,24 +59,17 @@ def drawn(number: int) -> dict:
     effect = CAUSES[number % len(CAUSES)]
     names = list(effects.EFFECTS)
     turn = int(
-        cases.case_rng(
-            SEED, COLUMN, 0, 7, sorted(cases.SHARES).index("single")
-        ).integers(1000)
+        cases.case_rng(SEED, COLUMN, 0, 7, sorted(cases.SHARES).index("single")).integers(1000)
     )
     index = (names.index(effect) - turn) % len(names) + len(names) * number
     spec = cases.draw_case(SEED, COLUMN, number, "single", index)
     (cause,) = spec["causes"]
     low, high = STRENGTHS if effect == "downwash" else effects.EFFECTS[effect].sizes
-    cause |= {
-        "size": float(low * (high / low) ** 0.5),
-        "form": effects.EFFECTS[effect].forms[0],
-    }
+    cause |= {"size": float(low * (high / low) ** 0.5), "form": effects.EFFECTS[effect].forms[0]}
     if effect == "downwash":
         cause["size"] = float(low + (high - low) * cause["shape"][7])
         cause["shape"][1] = 0.3 + 0.25 * cause["shape"][1]  # 4 to 6 cm wide
-    return spec | {
-        "missions": [("pass",) * 2, ("pass_moving",) * 2, spec["missions"][0]]
-    }
+    return spec | {"missions": [("pass",) * 2, ("pass_moving",) * 2, spec["missions"][0]]}
 
 
 def studied(number: int) -> dict:
@@ -100,9 +93,7 @@ def studied(number: int) -> dict:
         "rate": spec["sensors"]["rate"],
         "magnitudes": fleet.magnitudes[0][0],
         "named": list(report.effects) or [report.verdict],
-        "probabilities": {
-            e: round(p, 3) for e, p in report.probabilities.items() if p > 0.03
-        },
+        "probabilities": {e: round(p, 3) for e, p in report.probabilities.items() if p > 0.03},
         "not_testable": "downwash" in report.not_testable,
         "parameters": {
             name: [v.value, *v.interval90]
@@ -120,11 +111,7 @@ def figures(found: list[dict]) -> dict:
     wakes = [c for c in found if c["cause"] == "downwash"]
     others = [c for c in found if c["cause"] != "downwash"]
     named = [c for c in wakes if "downwash" in c["named"]]
-    silent = [
-        c
-        for c in wakes
-        if c["not_testable"] and set(c["named"]) <= {"none", "not_testable"}
-    ]
+    silent = [c for c in wakes if c["not_testable"] and set(c["named"]) <= {"none", "not_testable"}]
     return {
         "wakes": len(wakes),
         "named": len(named),
@@ -152,9 +139,7 @@ def main() -> None:
     command = "python -m experiments.diagnosis.wakes"
     command += f" --first {options.first} --cases {options.cases}"
     out = {"command": command, "figures": figures(found), "cases": found}
-    options.out.write_text(
-        json.dumps(out, indent=1, default=float) + "\n", encoding="utf-8"
-    )
+    options.out.write_text(json.dumps(out, indent=1, default=float) + "\n", encoding="utf-8")
     print(json.dumps(out["figures"]))
 
 

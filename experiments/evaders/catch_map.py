@@ -38,10 +38,7 @@ INERTIA = ("points", "vehicles")
 OFTEN = 0.9
 REACHES = {"reach_20": 0.2, "reach_30": 0.3, "reach_50": 0.5}
 """m, for which the fastest evader stands in the table that is caught `OFTEN`."""
-BOUNDS = {
-    "forced_below": "below the solid line",
-    "planar_below": "below the dashed line",
-}
+BOUNDS = {"forced_below": "below the solid line", "planar_below": "below the dashed line"}
 
 
 def study(options) -> dict:
@@ -92,9 +89,7 @@ def fastest_caught(cells: Mapping, radius: float) -> float | None:
     """The speed ratio up to which, with this radius, the evader is caught `OFTEN` at
     each of a size's ratios; None where it is at none.
     """
-    rates = {
-        key[1]: cell["capture_rate"] for key, cell in cells.items() if key[2] == radius
-    }
+    rates = {key[1]: cell["capture_rate"] for key, cell in cells.items() if key[2] == radius}
     caught = itertools.takewhile(lambda ratio: rates[ratio] >= OFTEN, sorted(rates))
     return max(caught, default=None)
 
@@ -132,9 +127,7 @@ def rows_of(results: Mapping) -> list[dict]:
         row["planner"]["gain"] = mean_difference(of_size["learned"], of_size["planner"])
         for kind in list(KINDS)[1:]:
             if kind in maps:
-                row[kind] = mean_difference(
-                    of_size["scripted"], by_cell(maps[kind]["cells"])
-                )
+                row[kind] = mean_difference(of_size["scripted"], by_cell(maps[kind]["cells"]))
         row |= {who: inertia.get(size, {}).get(who) for who in INERTIA}
         rows.append(row)
     return rows
@@ -148,26 +141,18 @@ def page(results: Mapping) -> Page:
         "by rules": "scripted.mean:.3f",
         "learned": "learned.mean:.3f",
         **{
-            f"fastest learned caught {OFTEN:g}, at {reach:g} m": (
-                f"learned.fastest.{name}"
-            )
+            f"fastest learned caught {OFTEN:g}, at {reach:g} m": (f"learned.fastest.{name}")
             for name, reach in REACHES.items()
         },
-        **{
-            f"{head}, learned": f"learned.{bound}:.3f" for bound, head in BOUNDS.items()
-        },
+        **{f"{head}, learned": f"learned.{bound}:.3f" for bound, head in BOUNDS.items()},
         "planner less learned": "planner.gain:+.3f",
     }
-    losses = {
-        kind: f"{kind}:+.3f" for kind in list(KINDS)[1:] if kind in results["maps"]
-    }
+    losses = {kind: f"{kind}:+.3f" for kind in list(KINDS)[1:] if kind in results["maps"]}
     losses["inertia, where stack forces"] = lambda row: (
         None if row["points"] is None else f"{row['vehicles'] - row['points']:+.2f}"
     )
     short = Table(columns | losses, rows)
-    return Page(
-        "What can be caught", "Captures over speed ratios and capture radii.", short
-    )
+    return Page("What can be caught", "Captures over speed ratios and capture radii.", short)
 
 
 def draw(results: Mapping, path: Path) -> None:
@@ -185,9 +170,7 @@ def main(arguments: list[str]) -> None:
     """The command."""
     parser = page_parser(__doc__, "catch_map")
     parser.add_argument("maps", nargs="*", metavar="NAME=FILE")
-    parser.add_argument(
-        "--page", type=Path, help="file for the page to move about in (HTML)"
-    )
+    parser.add_argument("--page", type=Path, help="file for the page to move about in (HTML)")
     options = parser.parse_args(arguments)
     publish(options, study, page, draw)
     if options.page is not None:

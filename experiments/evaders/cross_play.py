@@ -97,16 +97,9 @@ def fly(name: str, options) -> list[dict]:
     for vehicle in options.vehicles:
         bounds = jnp.asarray(vehicles()[vehicle])
         for i, evader in enumerate(SCRIPTED):  # one at a time: no other is worked out
-            flown = run(
-                bounds, loaded.parameters, tasks, jnp.int32(i), jax.random.key(0)
-            )
+            flown = run(bounds, loaded.parameters, tasks, jnp.int32(i), jax.random.key(0))
             for kind, own in part(jax.tree.map(np.asarray, flown)).items():
-                case = {
-                    "policy": name,
-                    "game": options.game,
-                    "vehicle": vehicle,
-                    "evader": evader,
-                }
+                case = {"policy": name, "game": options.game, "vehicle": vehicle, "evader": evader}
                 records.append({**case, "tasks": kind, **summary(own)})
     return records
 
@@ -126,11 +119,7 @@ def summary(statistics: EpisodeStatistics) -> dict:
 
 def study(options) -> dict:
     """Fly the policies."""
-    return {
-        "flights": nested(
-            [record for name in options.policy for record in fly(name, options)]
-        )
-    }
+    return {"flights": nested([record for name in options.policy for record in fly(name, options)])}
 
 
 def nested(records: list[dict]) -> list[dict]:
@@ -142,11 +131,7 @@ def nested(records: list[dict]) -> list[dict]:
     for record in records:
         case = tuple(record[name] for name in CASE)
         if case not in flights:
-            flights[case] = {
-                **dict(zip(CASE, case, strict=True)),
-                "counts": COUNTS,
-                "evaders": {},
-            }
+            flights[case] = {**dict(zip(CASE, case, strict=True)), "counts": COUNTS, "evaders": {}}
         tasks = flights[case]["evaders"].setdefault(record["evader"], {})
         tasks[record["tasks"]] = [round(record[name], 5) for name in COUNTS]
     return list(flights.values())
@@ -186,17 +171,12 @@ def page(results: dict) -> Page:
         "worst evader, uniform tasks": "worst.uniform",
         "worst evader, layouts": "worst.layouts",
     }
-    rows = [
-        dict(zip(CASE, name, strict=True)) | overview(own)
-        for name, own in by_policy.items()
-    ]
+    rows = [dict(zip(CASE, name, strict=True)) | overview(own) for name, own in by_policy.items()]
     parts: list[Table | str] = [from_outside(), Table(columns, rows, title="Overview")]
     parts += [*told(results, "findings", "What was found"), everyone(by_policy)]
     for name, own in by_policy.items():
         if name[0] == DEFAULT_POLICY:
-            parts.append(
-                by_evader(own, f"{name[0]}, {name[1]} game, {name[2]} vehicle")
-            )
+            parts.append(by_evader(own, f"{name[0]}, {name[1]} game, {name[2]} vehicle"))
     if "runs" in results:
         parts.append(whole_runs(results["runs"]))
     parts += told(results, "tried", "What else was tried") + told(
@@ -219,10 +199,7 @@ def from_outside() -> Table:
     def rate(place: str) -> Callable:
         return lambda row: f"{row['capture_rate'][place]:.2f}".removeprefix("0")
 
-    columns = {
-        "evaders from outside": "evader",
-        **{place: rate(place) for place in places},
-    }
+    columns = {"evaders from outside": "evader", **{place: rate(place) for place in places}}
     prose = (
         f"Tried from outside, at {stored['commit']} on {stored['machine']}, with evaders of other "
         f"code: {stored['episodes_a_layout']} episodes a layout, {stored['uniform_tasks']} uniform "
@@ -239,15 +216,10 @@ def summary_table(by_policy: dict[tuple, list[dict]]) -> Table:
     records = by_policy.get((DEFAULT_POLICY, "honest", "nominal"), [])
     rows = list(outside.records)
     trained = [name for name in SCRIPTED if name not in HELD_OUT]
-    for name, evaders in (
-        ("six that no training met", HELD_OUT),
-        ("the other six", trained),
-    ):
+    for name, evaders in (("six that no training met", HELD_OUT), ("the other six", trained)):
         least = {}
         for place in (*SCENARIOS, "uniform"):
-            cell = [
-                r for r in records if r["tasks"] == place and r["evader"] in evaders
-            ]
+            cell = [r for r in records if r["tasks"] == place and r["evader"] in evaders]
             least[place] = min((r["capture_rate"] for r in cell), default=math.nan)
         rows.append({"evader": f"own scripted evaders, {name}", "capture_rate": least})
     return Table(outside.columns, rows)
@@ -257,8 +229,7 @@ def told(results: dict, name: str, title: str) -> list[str]:
     """A section of what is told in words, if anything is."""
     found = results.get(name, ())
     lines = [
-        f"* {line}: {found[line]}" if isinstance(found, dict) else f"* {line}"
-        for line in found
+        f"* {line}: {found[line]}" if isinstance(found, dict) else f"* {line}" for line in found
     ]
     return ["\n".join([f"## {title}", "", *lines])] if lines else []
 
@@ -293,11 +264,7 @@ def everyone(by_policy: dict[tuple, list[dict]]) -> Table:
         if (game, vehicle) == ("honest", "nominal"):
             rows.append({"policy": policy})
             for evader in SCRIPTED:
-                own = [
-                    r
-                    for r in records
-                    if r["evader"] == evader and r["tasks"] in SCENARIOS
-                ]
+                own = [r for r in records if r["evader"] == evader and r["tasks"] in SCENARIOS]
                 captures, episodes = (
                     sum(r[name] for r in own) for name in ("captures", "episodes")
                 )
@@ -305,10 +272,7 @@ def everyone(by_policy: dict[tuple, list[dict]]) -> Table:
                 rows[-1][evader] = f"{captures / episodes:.2f} [{low:.2f}, {high:.2f}]"
     prose = "Captures in the six layouts, 95 % interval; honest game, nominal vehicle."
     return Table(
-        {name: name for name in ("policy", *SCRIPTED)},
-        rows,
-        "Everyone against everyone",
-        prose,
+        {name: name for name in ("policy", *SCRIPTED)}, rows, "Everyone against everyone", prose
     )
 
 
@@ -316,19 +280,12 @@ def by_evader(records: list[dict], title: str) -> Table:
     """A row for each evader, a column for each kind of tasks."""
     rows = []
     for evader in dict.fromkeys(record["evader"] for record in records):
-        own = {
-            record["tasks"]: record for record in records if record["evader"] == evader
-        }
-        rates = {
-            name: f"{r['capture_rate']:.3f}, {r['crash_rate']:.3f}"
-            for name, r in own.items()
-        }
+        own = {record["tasks"]: record for record in records if record["evader"] == evader}
+        rates = {name: f"{r['capture_rate']:.3f}, {r['crash_rate']:.3f}" for name, r in own.items()}
         least = min(wilson(r["captures"], r["episodes"])[0] for r in own.values())
         rows.append({"evader": evader, "of": EVADERS[evader].of, **rates, "low": least})
     columns = {"evader": "evader", "used for": "of", **{name: name for name in own}}
-    prose = (
-        "The last column is the least lower end of the capture rates' 95 % intervals."
-    )
+    prose = "The last column is the least lower end of the capture rates' 95 % intervals."
     return Table(columns | {"least lower end": "low:.3f"}, rows, title, prose)
 
 
@@ -338,17 +295,9 @@ def whole_runs(runs: list[dict]) -> Table:
     """
     rows = []
     for run in runs:
-        shown = (
-            max(run["validations"], key=lambda row: row["score"]),
-            run["validations"][-1],
-        )
+        shown = (max(run["validations"], key=lambda row: row["score"]), run["validations"][-1])
         rows += [{"run": run["run"], **row} for row in shown]
-    columns = {
-        "run": "run",
-        "M steps": "millions:.0f",
-        "s": "seconds:.0f",
-        "score": "score:.3f",
-    }
+    columns = {"run": "run", "M steps": "millions:.0f", "s": "seconds:.0f", "score": "score:.3f"}
     columns |= {
         "capture": "capture_rate:.3f",
         "crash": "crash_rate:.3f",
@@ -366,10 +315,7 @@ def main(arguments: list[str]) -> int:
     """Evaluate and write both files."""
     parser = page_parser(__doc__, "evaders")
     parser.add_argument(
-        "--policy",
-        nargs="+",
-        default=["flight", "evaders"],
-        help="names, runs or files",
+        "--policy", nargs="+", default=["flight", "evaders"], help="names, runs or files"
     )
     parser.add_argument("--game", choices=GAMES, default="honest")
     parser.add_argument("--physics", choices=("rigid", "stops"), default="rigid")

@@ -100,9 +100,7 @@ class OwnRule(RecedingHorizon):
         """Worlds (B, ...) at the start of an episode."""
         return Flying(start)
 
-    def replan(
-        self, parameters: PolicyParameters, carry: Flying, key: jax.Array
-    ) -> Flying:
+    def replan(self, parameters: PolicyParameters, carry: Flying, key: jax.Array) -> Flying:
         """The same a tenth of a second later."""
         del key
         wish = jnp.full_like(carry.world[1].evader_position, jnp.nan)
@@ -183,9 +181,7 @@ def place_in_view(moments: Moment, tasks: Task, game: PursuitSettings) -> np.nda
     return np.asarray(jax.jit(of_worlds)(moments.pursuers, moments.last_seen, tasks))
 
 
-def out_of_sight(
-    moments: Moment, in_view: np.ndarray, second: int
-) -> list[dict[str, float]]:
+def out_of_sight(moments: Moment, in_view: np.ndarray, second: int) -> list[dict[str, float]]:
     """What becomes of evaders that nobody has seen for so long: a row for each of
     `AGES`; `in_view` (T, B) whether the place is where they are taken to be, and
     `second` moments are one.
@@ -224,12 +220,8 @@ def escapes_parser() -> argparse.ArgumentParser:
     """The options."""
     parser = game_parser(__doc__, episodes=10, uniform=24)
     parser.add_argument("--plans", type=int, default=PlannerSettings().plans)
-    parser.add_argument(
-        "--clock", type=float, help="seconds after which the observed time stops"
-    )
-    parser.add_argument(
-        "--only", type=int, nargs="*", help="numbers of each kind's tasks; all"
-    )
+    parser.add_argument("--clock", type=float, help="seconds after which the observed time stops")
+    parser.add_argument("--only", type=int, nargs="*", help="numbers of each kind's tasks; all")
     parser.add_argument("--opponent", help="file of a learned evader")
     return parser
 
@@ -246,9 +238,7 @@ def evaders_of(game: JudgedGame) -> RecedingHorizon:
     planning = PlannerSettings(options.plans)
     if not options.opponent:
         return Planner(planning, Duel(environment, policy))
-    environment = make_environment(
-        settings, options.vehicle, options.effects, options.opponent
-    )
+    environment = make_environment(settings, options.vehicle, options.effects, options.opponent)
     return OwnRule(planning, Duel(environment, policy))
 
 
@@ -280,10 +270,7 @@ def main() -> None:
         own["out_of_sight"] = out_of_sight(flown, in_view, second)
         found["kinds"][kind] = own
         seconds = time.monotonic() - began
-        print(
-            f"{kind}, {seconds:.0f} s: {own['captures']} of {own['episodes']} caught",
-            flush=True,
-        )
+        print(f"{kind}, {seconds:.0f} s: {own['captures']} of {own['episodes']} caught", flush=True)
         write_json(options.json, found)
 
 

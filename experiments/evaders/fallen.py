@@ -40,9 +40,7 @@ class StoppedClock:
         """The game's own observation with another time."""
         late = jnp.maximum(state.step - self.steps, 0)
         past = jnp.maximum(state.frames[..., 0] - late / settings.episode_length, 0.0)
-        shown = state.replace(
-            step=state.step - late, frames=state.frames.at[..., 0].set(past)
-        )
+        shown = state.replace(step=state.step - late, frames=state.frames.at[..., 0].set(past))
         # who has fallen out stays away, whatever the time that is shown
         if state.gone_after is not None:
             shown = shown.replace(gone_after=state.gone_after - late)
@@ -73,14 +71,10 @@ def fly(options: argparse.Namespace, size: int, fall_outs: float) -> dict:
         cell = jnp.array([size, options.speed_ratio, options.radius], jnp.float32)
         keys = jax.random.split(key, options.episodes)
         tasks = jax.vmap(lambda key: draw_task(game, command, key, cell))(keys)
-        evaluation, record = evaluate(
-            loaded.parameters, tasks.replace(evader=kinds), key
-        )
+        evaluation, record = evaluate(loaded.parameters, tasks.replace(evader=kinds), key)
         return evaluation.statistics, record.pursuers
 
-    statistics, path = jax.tree.map(
-        np.asarray, all_episodes(jax.random.key(options.seed))
-    )
+    statistics, path = jax.tree.map(np.asarray, all_episodes(jax.random.key(options.seed)))
     return {
         "pursuers": size,
         "fall_outs": fall_outs,
@@ -89,9 +83,7 @@ def fly(options: argparse.Namespace, size: int, fall_outs: float) -> dict:
     }
 
 
-def figures(
-    game: PursuitSettings, kinds: np.ndarray, statistics, path: np.ndarray
-) -> dict:
+def figures(game: PursuitSettings, kinds: np.ndarray, statistics, path: np.ndarray) -> dict:
     """Captures of episodes (B,) by second and by evader, crashes, and by second the
     mean speed (m/s) of the pursuers at (B, T, N, 3) m that are there, in episodes whose
     evader is free throughout.
@@ -112,8 +104,7 @@ def figures(
             float((caught & (statistics.capture_step <= end)).mean()) for end in ends
         ],
         "by_evader": {
-            name: float(caught[kinds == place].mean())
-            for place, name in enumerate(game.evaders)
+            name: float(caught[kinds == place].mean()) for place, name in enumerate(game.evaders)
         },
         "speed_by_second": [
             round(float(np.nanmean(free[:, end - second : end - 1])), 3)
@@ -131,19 +122,13 @@ def main() -> None:
     parser.add_argument("--sizes", nargs="+", type=int, default=[2, 3, 4])
     parser.add_argument("--evaders", nargs="+", default=HELD_OUT)
     parser.add_argument("--episodes", type=int, default=1200)
-    parser.add_argument(
-        "--clock", type=float, help="seconds after which the observed time stops"
-    )
+    parser.add_argument("--clock", type=float, help="seconds after which the observed time stops")
     parser.add_argument("--speed_ratio", type=float, default=1.3)
     parser.add_argument("--radius", type=float, default=0.3)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path, required=True)
     options = parser.parse_args()
-    found = {
-        "options": {**vars(options), "json": None},
-        "machine": describe_machine(),
-        "teams": [],
-    }
+    found = {"options": {**vars(options), "json": None}, "machine": describe_machine(), "teams": []}
     for size in options.sizes:
         for fall_outs in (0.0, 1.0) if size > 1 else (0.0,):
             began = time.monotonic()

@@ -40,16 +40,10 @@ def forced_cells(command: MapCommand, size: int) -> list[Cell]:
         game = PursuitSettings(num_pursuers=size, capture_radius=cell.capture_radius)
         return cell.speed_ratio < WITHIN * stack_bound(game)
 
-    return [
-        cell
-        for cell in cells_of(command)
-        if cell.num_pursuers == size and is_forced(cell)
-    ]
+    return [cell for cell in cells_of(command) if cell.num_pursuers == size and is_forced(cell)]
 
 
-def fly(
-    environment: Pursuit, act, command: MapCommand, cells: list[Cell]
-) -> np.ndarray:
+def fly(environment: Pursuit, act, command: MapCommand, cells: list[Cell]) -> np.ndarray:
     """(cells, episodes) whether each episode ends with a capture; `act` observation ->
     (N, 4).
     """
@@ -81,9 +75,7 @@ def flown(size: int, command: MapCommand) -> dict:
     parameters = stack.parameters()
     kinds = {
         "points": fly(points, lambda seen: team.act({}, seen), command, cells),
-        "vehicles": fly(
-            vehicles, lambda seen: stack.act(parameters, seen), command, cells
-        ),
+        "vehicles": fly(vehicles, lambda seen: stack.act(parameters, seen), command, cells),
     }
     records = []
     for place, cell in enumerate(cells):
@@ -91,10 +83,7 @@ def flown(size: int, command: MapCommand) -> dict:
         for kind, caught in kinds.items():
             hits = int(caught[place].sum())
             interval = list(wilson(hits, command.episodes))
-            record[kind] = {
-                "capture_rate": hits / command.episodes,
-                "interval": interval,
-            }
+            record[kind] = {"capture_rate": hits / command.episodes, "interval": interval}
         records.append(record)
     return {
         "pursuers": size,
@@ -123,9 +112,7 @@ def of_policy(paths: list[Path], teams: list[dict]) -> list[dict]:
             "scripted": float(np.mean([cell["capture_rate"] for cell in same])),
         }
         if all("learned" in cell for cell in same):
-            row["learned"] = float(
-                np.mean([cell["learned"]["capture_rate"] for cell in same])
-            )
+            row["learned"] = float(np.mean([cell["learned"]["capture_rate"] for cell in same]))
         rows.append(row)
     return rows
 
@@ -146,9 +133,7 @@ def main() -> None:
         began = time.monotonic()
         # of one size, so that no slot is empty
         found["teams"].append(flown(size, dataclasses.replace(command, sizes=(size,))))
-        row = {
-            name: value for name, value in found["teams"][-1].items() if name != "cells"
-        }
+        row = {name: value for name, value in found["teams"][-1].items() if name != "cells"}
         print(row, f"{time.monotonic() - began:.0f} s", flush=True)
         write_json(options.json, found)
     if options.map:

@@ -24,9 +24,7 @@ SECOND = "learners and planner"
 """The row that goals are about."""
 
 
-def rows_of(
-    found: dict, of_each: Callable[[dict], str]
-) -> Iterator[tuple[str, list[str]]]:
+def rows_of(found: dict, of_each: Callable[[dict], str]) -> Iterator[tuple[str, list[str]]]:
     """Names of judges and a cell for each kind of tasks; what hasn't flown is a
     dash.
     """
@@ -83,9 +81,7 @@ def lines_of(directory: Path, today: dict[str, dict]) -> Iterator[str]:
         found = read_json(path)
         for planner, seconds in found["seconds"].items():
             own = [record for record in found["records"] if record["evader"] == planner]
-            rates = {
-                record["scenario"]: f"{record['capture_rate']:.2f}" for record in own
-            }
+            rates = {record["scenario"]: f"{record['capture_rate']:.2f}" for record in own}
             cells = (rates.get(place, "-") for place in PLACES)
             yield f"| planner, {planner} ({seconds:.0f} s) | {' | '.join(cells)} |"
 

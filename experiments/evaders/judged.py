@@ -44,12 +44,8 @@ JUDGES: Mapping[str, Callable[[str], bool]] = {
     "both plan, evader last, as they see": lambda evader: (
         evader == "both plan, evader last, honest sight"
     ),
-    "both plan, pursuers last, points": lambda evader: (
-        evader == "both plan, pursuers last, points"
-    ),
-    "both plan, evader last, points": lambda evader: (
-        evader == "both plan, evader last, points"
-    ),
+    "both plan, pursuers last, points": lambda evader: evader == "both plan, pursuers last, points",
+    "both plan, evader last, points": lambda evader: evader == "both plan, evader last, points",
     "scripted ones, held out": lambda evader: evader in HELD_OUT,
     "the paper's": lambda evader: evader == "field",
 }
@@ -68,10 +64,7 @@ def row(policy: str, vehicle: str, judge: str, records: list[dict]) -> dict:
         "judge": judge,
         "evaders": len({record["evader"] for record in records}),
         "shown": policy == DEFAULT_POLICY and vehicle == "nominal" and judge in FOR_ALL,
-        **{
-            figure: {own["scenario"]: own[figure] for own in worst}
-            for figure in figures
-        },
+        **{figure: {own["scenario"]: own[figure] for own in worst} for figure in figures},
     }
 
 
@@ -124,8 +117,7 @@ def page(results: Mapping) -> Page:
 
     columns = {
         "policy": lambda row: (
-            row["policy"]
-            + ("" if row["vehicle"] == "nominal" else f", {row['vehicle']} vehicle")
+            row["policy"] + ("" if row["vehicle"] == "nominal" else f", {row['vehicle']} vehicle")
         ),
         "caught least among": "judge",
         **{place: rate(place) for place in PLACES},
@@ -134,9 +126,7 @@ def page(results: Mapping) -> Page:
     rows = [row for row in results["rows"] if is_shown(row, results.get("hidden", []))]
     policies = [row["policy"] for row in rows]
     order = tuple(JUDGES)
-    rows.sort(
-        key=lambda row: (policies.index(row["policy"]), order.index(row["judge"]))
-    )
+    rows.sort(key=lambda row: (policies.index(row["policy"]), order.index(row["judge"])))
     return Page("The second judge", "Least capture rates.", Table(columns, rows))
 
 
@@ -157,20 +147,13 @@ def write_summaries(rows: Sequence[Mapping]) -> None:
     lines = ["| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]
     order = tuple(JUDGES)
     policies = [row["policy"] for row in rows]
-    for row in sorted(
-        rows, key=lambda r: (policies.index(r["policy"]), order.index(r["judge"]))
-    ):
+    for row in sorted(rows, key=lambda r: (policies.index(r["policy"]), order.index(r["judge"]))):
         if row["shown"]:
-            rates = (
-                f"{row['capture_rate'][place]:.2f}".removeprefix("0")
-                for place in PLACES
-            )
+            rates = (f"{row['capture_rate'][place]:.2f}".removeprefix("0") for place in PLACES)
             lines.append(f"| {row['policy']} | {row['judge']} | {' | '.join(rates)} |")
     for page in SUMMARIES:
         path = RESULTS.parent.parent / page
-        before, begin, rest = path.read_text(encoding="utf-8").partition(
-            "<!-- judged -->"
-        )
+        before, begin, rest = path.read_text(encoding="utf-8").partition("<!-- judged -->")
         after = rest.partition("<!-- end of judged -->")[2]
         text = "\n".join([before + begin, *lines, "<!-- end of judged -->"])
         write_text(path, text + after)
@@ -180,9 +163,7 @@ def main(arguments: list[str]) -> None:
     """The command."""
     parser = page_parser(__doc__, "judged")
     parser.add_argument("exploited", nargs="*", metavar="NAME=FILE")
-    parser.add_argument(
-        "--hide", nargs="*", help="POLICY or 'POLICY: JUDGE': rows that stay out"
-    )
+    parser.add_argument("--hide", nargs="*", help="POLICY or 'POLICY: JUDGE': rows that stay out")
     options = parser.parse_args(arguments)
     publish(options, study, page)
     if options.out == RESULTS / "judged":

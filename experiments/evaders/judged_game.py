@@ -20,13 +20,7 @@ from openjax.evaluation.judges.receding_horizon import RecedingHorizon
 from openjax.evaluation.judges.tasks import JUDGE_KEY, judging_tasks
 from openjax.evaluation.validation import uniform_tasks
 from openjax.files import write_json
-from openjax.pursuit import (
-    SCENARIOS,
-    Pursuit,
-    PursuitSettings,
-    RewardSettings,
-    Task,
-)
+from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings, RewardSettings, Task
 from openjax.pursuit.settings import LAYOUT_PURSUERS
 from openjax.runs.exploit import record
 from openjax.store.compiled_programs import cache_programs
@@ -52,11 +46,7 @@ class JudgedGame:
         """
         vehicle = self.options.vehicle or self.environment.settings.airframe
         effects = self.environment.effect_parameters
-        return {
-            "policy": self.loaded.source,
-            "vehicle": str(vehicle),
-            "effects": effects,
-        }
+        return {"policy": self.loaded.source, "vehicle": str(vehicle), "effects": effects}
 
     def records_kept(self, name: str, fly: Callable, found: dict, path: Path) -> None:
         """Fly one evader, and write its records beside those that are `found`, and its
@@ -65,9 +55,7 @@ class JudgedGame:
         """
         self._keep(name, self._flown_in_parts(jax.jit(fly)), found, path)
 
-    def replanned_kept(
-        self, name: str, judge: RecedingHorizon, found: dict, path: Path
-    ) -> None:
+    def replanned_kept(self, name: str, judge: RecedingHorizon, found: dict, path: Path) -> None:
         """The same of who plans again and again, `--slots` episodes side by side: one
         makes room for the next as soon as its evader is caught, so that no crash after
         that is counted.
@@ -117,9 +105,7 @@ class JudgedGame:
             places = order[min(begin, order.size - together) :][:together]
             key = jax.random.fold_in(jax.random.key(self.options.seed), begin)
             tasks = jax.tree.map(lambda leaf, here=places: leaf[here], self.tasks)
-            statistics = jax.tree.map(
-                np.asarray, fly(self.loaded.parameters, tasks, key)
-            )
+            statistics = jax.tree.map(np.asarray, fly(self.loaded.parameters, tasks, key))
             for i, place in enumerate(places.tolist()):
                 flown[place] = jax.tree.map(operator.itemgetter(i), statistics)
             yield flown
@@ -129,16 +115,12 @@ class JudgedGame:
         slots = min(self.options.slots, order.size)
         length = self.environment.settings.episode_length
         key = jax.random.key(self.options.seed)
-        start = jax.jit(lambda tasks: judge.begin(judge.duel.start(tasks, key)))(
-            self.tasks
-        )
+        start = jax.jit(lambda tasks: judge.begin(judge.duel.start(tasks, key)))(self.tasks)
         replan = jax.jit(judge.replan)
 
         @jax.jit
         def begin(carry, slot, place):
-            return jax.tree.map(
-                lambda leaf, new: leaf.at[slot].set(new[place]), carry, start
-            )
+            return jax.tree.map(lambda leaf, new: leaf.at[slot].set(new[place]), carry, start)
 
         left = order.tolist()
         flies = [left.pop(0) for _ in range(slots)]
@@ -151,9 +133,7 @@ class JudgedGame:
             over = np.asarray(state.statistics.captured | (state.step >= length))
             before = len(flown)
             for slot in np.flatnonzero(over).tolist():
-                ended = jax.tree.map(
-                    lambda leaf, i=slot: np.asarray(leaf[i]), state.statistics
-                )
+                ended = jax.tree.map(lambda leaf, i=slot: np.asarray(leaf[i]), state.statistics)
                 flown.setdefault(flies[slot], ended)
                 # with none left, the slot flies on with what it has, and that isn't
                 # kept
@@ -172,28 +152,18 @@ def spread(sizes: Sequence[int]) -> np.ndarray:
     return np.argsort(share, kind="stable")
 
 
-def game_parser(
-    doc: str | None, episodes: int, uniform: int
-) -> argparse.ArgumentParser:
+def game_parser(doc: str | None, episodes: int, uniform: int) -> argparse.ArgumentParser:
     """The options of `judged_game`."""
     parser = argparse.ArgumentParser(description=doc)
     parser.add_argument("--policy", default="evaders")
-    parser.add_argument(
-        "--vehicle", type=Path, help="vehicle.toml; by default the nominal one"
-    )
+    parser.add_argument("--vehicle", type=Path, help="vehicle.toml; by default the nominal one")
     parser.add_argument("--effects", type=Path, help="effects.toml")
     parser.add_argument("--episodes", type=int, default=episodes, help="of each layout")
     parser.add_argument("--uniform", type=int, default=uniform, help="uniform tasks")
+    parser.add_argument("--kinds", nargs="*", help="layouts and uniform; by default all")
+    parser.add_argument("--together", type=int, help="tasks that fly side by side; by default all")
     parser.add_argument(
-        "--kinds", nargs="*", help="layouts and uniform; by default all"
-    )
-    parser.add_argument(
-        "--together", type=int, help="tasks that fly side by side; by default all"
-    )
-    parser.add_argument(
-        "--slots",
-        type=int,
-        help="episodes side by side that end with the capture; for a CPU",
+        "--slots", type=int, help="episodes side by side that end with the capture; for a CPU"
     )
     parser.add_argument(
         "--track_unseen",
@@ -216,12 +186,8 @@ def uniform_of(game: PursuitSettings, options: argparse.Namespace) -> Task:
     if options.fresh is None:
         return judging_tasks(game, options.uniform)
     paper = PursuitSettings()
-    drawn = dataclasses.replace(
-        game, min_pillars=paper.min_pillars, max_pillars=paper.max_pillars
-    )
-    return uniform_tasks(
-        drawn, options.uniform, game.max_pillars, JUDGE_KEY + options.fresh
-    )
+    drawn = dataclasses.replace(game, min_pillars=paper.min_pillars, max_pillars=paper.max_pillars)
+    return uniform_tasks(drawn, options.uniform, game.max_pillars, JUDGE_KEY + options.fresh)
 
 
 def judged_game(options: argparse.Namespace) -> JudgedGame:
@@ -247,8 +213,6 @@ def judged_game(options: argparse.Namespace) -> JudgedGame:
     if options.kinds:
         unknown = [kind for kind in options.kinds if kind not in kinds]
         if unknown:
-            raise UserError(
-                f"--kinds {unknown[0]}: these are known: {', '.join(kinds)}"
-            )
+            raise UserError(f"--kinds {unknown[0]}: these are known: {', '.join(kinds)}")
         kinds = {kind: kinds[kind] for kind in options.kinds}
     return JudgedGame(environment, loaded.in_game(environment), *stack(kinds), options)

@@ -40,9 +40,7 @@ def vehicles_flight(environment: Pursuit) -> VelocityFlight:
 
     def action(observation, state, velocity):
         drones = state.drones
-        known = jnp.concatenate(
-            [drones.position, drones.quaternion, drones.velocity], axis=-1
-        )
+        known = jnp.concatenate([drones.position, drones.quaternion, drones.velocity], axis=-1)
         return velocity_action(craft, observation.replace(self_state=known), velocity)
 
     return action
@@ -78,33 +76,17 @@ def limit_parser() -> argparse.ArgumentParser:
     """The options."""
     defaults = MatrixGameSettings()
     parser = game_parser(__doc__, episodes=16, uniform=48)
+    parser.add_argument("--plans", type=int, default=defaults.team_plans, help="of the pursuers")
     parser.add_argument(
-        "--plans", type=int, default=defaults.team_plans, help="of the pursuers"
+        "--direct_plans", type=int, default=defaults.direct_plans, help="beside, without the policy"
     )
+    parser.add_argument("--evader_plans", type=int, help="by default as many as --plans")
+    parser.add_argument("--pieces", type=int, default=defaults.pieces, help="of .2 s, of each plan")
+    parser.add_argument("--last", choices=SIDES, nargs="*", default=SIDES, help="who knows all")
     parser.add_argument(
-        "--direct_plans",
-        type=int,
-        default=defaults.direct_plans,
-        help="beside, without the policy",
+        "--sight", choices=("full", "honest"), default="full", help="of pursuers that plan"
     )
-    parser.add_argument(
-        "--evader_plans", type=int, help="by default as many as --plans"
-    )
-    parser.add_argument(
-        "--pieces", type=int, default=defaults.pieces, help="of .2 s, of each plan"
-    )
-    parser.add_argument(
-        "--last", choices=SIDES, nargs="*", default=SIDES, help="who knows all"
-    )
-    parser.add_argument(
-        "--sight",
-        choices=("full", "honest"),
-        default="full",
-        help="of pursuers that plan",
-    )
-    parser.add_argument(
-        "--points", action="store_true", help="pursuers without inertia"
-    )
+    parser.add_argument("--points", action="store_true", help="pursuers without inertia")
     return parser
 
 
@@ -117,13 +99,7 @@ def main() -> None:
     else:
         duel = Duel(game.environment, game.loaded.policy)
         flight = vehicles_flight(game.environment)
-    found = {
-        **game.flown,
-        "sight": options.sight,
-        "plans": {},
-        "records": [],
-        "seconds": {},
-    }
+    found = {**game.flown, "sight": options.sight, "plans": {}, "records": [], "seconds": {}}
     ways = ways_round_pillars(game.environment.settings)
     for side in options.last:
         name = f"both plan, {side} last" + HONEST * (options.sight == "honest")

@@ -52,9 +52,7 @@ class Grid:
         """Radii of the pursuer and of the evader, and angles from 0 to pi."""
         return (
             np.linspace(0.0, 1.0, self.radii),
-            np.linspace(0.0, 1.0, self.evader_radii)
-            if self.evader_radii > 1
-            else np.ones(1),
+            np.linspace(0.0, 1.0, self.evader_radii) if self.evader_radii > 1 else np.ones(1),
             np.linspace(0.0, np.pi, 2 * self.radii - 1),
         )
 
@@ -62,9 +60,7 @@ class Grid:
 def moves(directions: int) -> np.ndarray:
     """(K, 2) unit vectors round the circle, and none."""
     angle = np.linspace(0.0, 2 * np.pi, directions, endpoint=False)
-    return np.stack(
-        [np.append(np.cos(angle), 0.0), np.append(np.sin(angle), 0.0)], axis=-1
-    )
+    return np.stack([np.append(np.cos(angle), 0.0), np.append(np.sin(angle), 0.0)], axis=-1)
 
 
 def polar(radius, move):
@@ -96,17 +92,13 @@ class PlanarGame:
         def improve(_, reached):
             return jnp.minimum(now, last(reached))
 
-        return jax.lax.fori_loop(
-            0, round(self.grid.horizon / self.grid.step), improve, now
-        )
+        return jax.lax.fori_loop(0, round(self.grid.horizon / self.grid.step), improve, now)
 
     def evader_first(self, reached: jax.Array) -> jax.Array:
         """W a step earlier, where the pursuer answers the evader's step."""
 
         def answered(radius, turn):
-            return self._least(
-                lambda place: self._after(reached, place, (radius, turn))
-            )
+            return self._least(lambda place: self._after(reached, place, (radius, turn)))
 
         return self._most(answered)
 
@@ -136,9 +128,7 @@ class PlanarGame:
         def around(best, way):
             # along the circle on which it is: on the wall a straight step would lead
             # out of the disc
-            return jnp.maximum(
-                best, value(evader, way * reach / jnp.maximum(evader, reach))
-            ), None
+            return jnp.maximum(best, value(evader, way * reach / jnp.maximum(evader, reach))), None
 
         def straight(best, move):
             return jnp.maximum(best, value(*polar(evader, move))), None
@@ -147,9 +137,7 @@ class PlanarGame:
         best = jax.lax.scan(around, least, jnp.array([-1.0, 0.0, 1.0]))[0]
         if self.grid.evader_radii == 1:
             return best
-        return jax.lax.scan(
-            straight, best, jnp.asarray(moves(self.grid.directions)) * reach
-        )[0]
+        return jax.lax.scan(straight, best, jnp.asarray(moves(self.grid.directions)) * reach)[0]
 
     def _after(self, reached, place, moved):
         """W where a pursuer at `place` (radius, turn) meets an evader that `moved`
@@ -220,10 +208,7 @@ def values(results: dict) -> list[dict]:
     one that may leave it, which is worth what coarser grids say.
     """
     places = range(len(results["free_ratios"]))
-    worth = [
-        np.mean(limits(results["free"], i) - limits(results["wall_alike"], i))
-        for i in places
-    ]
+    worth = [np.mean(limits(results["free"], i) - limits(results["wall_alike"], i)) for i in places]
     rows = []
     for i, ratio in enumerate(results["ratios"]):
         both = limits(results["wall"], i)
@@ -252,12 +237,8 @@ def page(results: dict) -> Page:
         "on one ray": "ray:.3f",
     }
     rows = values(results)
-    shown = Table(
-        columns, [row for row in rows if row["ratio"] not in (1.05, 1.4, 2.25)]
-    )
-    return Page(
-        "Two points in a disc", "Distances in radii.", [Table(columns, rows)], shown
-    )
+    shown = Table(columns, [row for row in rows if row["ratio"] not in (1.05, 1.4, 2.25)])
+    return Page("Two points in a disc", "Distances in radii.", [Table(columns, rows)], shown)
 
 
 def main(arguments: list[str]) -> None:

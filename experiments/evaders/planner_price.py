@@ -37,20 +37,14 @@ PLANNERS = {
     "ahead 1.6 s": {"pieces": 8},
     "short pieces": SHORT | {"turn": 0.25},
     "short, refined": SHORT | {"turn": 0.25, "refined": 0.5},
-    "short, refined, ahead 1.2 s": {
-        "pieces": 12,
-        "piece_steps": 10,
-        "turn": 0.2,
-        "refined": 0.5,
-    },
+    "short, refined, ahead 1.2 s": {"pieces": 12, "piece_steps": 10, "turn": 0.2, "refined": 0.5},
     "refined": {"refined": 0.5},
     "where pursuers are": {"ahead": 0.0},
     "where they are in .3 s": {"ahead": 0.3},
 }
 WITH_OPPONENT = {
     "and its own rule": {"own_rule": 0.5},
-    "short, refined, and its own rule": SHORT
-    | {"turn": 0.25, "refined": 0.3, "own_rule": 0.5},
+    "short, refined, and its own rule": SHORT | {"turn": 0.25, "refined": 0.3, "own_rule": 0.5},
     "12 plans and its own rule": {"plans": 12, "own_rule": 0.5},
     "ahead 1.6 s, and its own rule": {"pieces": 8, "own_rule": 0.5},
 }
@@ -62,16 +56,12 @@ def planners_of(options) -> dict[str, dict]:
     return {name: known[name] for name in options.only or known}
 
 
-def planner_of(
-    game: JudgedGame, settings: PlannerSettings, opponent: str | None
-) -> Planner:
+def planner_of(game: JudgedGame, settings: PlannerSettings, opponent: str | None) -> Planner:
     """One that tries what a learned evader would do, if its settings say so."""
     environment = game.environment
     if opponent and settings.own_rule:
         own = game.options
-        environment = make_environment(
-            environment.settings, own.vehicle, own.effects, opponent
-        )
+        environment = make_environment(environment.settings, own.vehicle, own.effects, opponent)
     return Planner(settings, Duel(environment, game.loaded.policy))
 
 
@@ -95,9 +85,7 @@ def main() -> None:
     """The command."""
     parser = game_parser(__doc__, episodes=50, uniform=128)
     parser.add_argument("--opponent", help="file of a learned evader")
-    parser.add_argument(
-        "--only", nargs="*", metavar="NAME", help="of the planners; by default all"
-    )
+    parser.add_argument("--only", nargs="*", metavar="NAME", help="of the planners; by default all")
     options = parser.parse_args()
     game = judged_game(options)
     key = jax.random.key(options.seed)
@@ -110,8 +98,7 @@ def main() -> None:
         fly_in_slots(game, planners)
         return
     ready = {
-        name: compile_ahead(program(planner), *arguments)
-        for name, planner in planners.items()
+        name: compile_ahead(program(planner), *arguments) for name, planner in planners.items()
     }
     found = {**game.flown, "records": [], "seconds": {}, "planners": {}}
     for name, compiled in ready.items():

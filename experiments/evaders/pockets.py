@@ -65,24 +65,17 @@ def connected(free: np.ndarray, starts: np.ndarray) -> np.ndarray:
     return np.isin(names, list(reached - {0}))
 
 
-def sees(
-    a: np.ndarray, b: np.ndarray, pillars: np.ndarray, radius: float
-) -> np.ndarray:
+def sees(a: np.ndarray, b: np.ndarray, pillars: np.ndarray, radius: float) -> np.ndarray:
     """(K,) whether no pillar lies between places (K, 2)."""
     way = b - a
     to_axis = pillars - a[:, None]
-    along = (
-        np.einsum("kpd,kd->kp", to_axis, way)
-        / np.maximum((way**2).sum(-1), 1e-12)[:, None]
-    )
+    along = np.einsum("kpd,kd->kp", to_axis, way) / np.maximum((way**2).sum(-1), 1e-12)[:, None]
     across = to_axis - along[..., None] * way[:, None]
     blocked = ((across**2).sum(-1) < radius**2) & (along >= 0) & (along <= 1)
     return ~blocked.any(-1)
 
 
-def distances(
-    game, pillars, pursuers, evader, rules: Rules
-) -> tuple[np.ndarray, np.ndarray]:
+def distances(game, pillars, pursuers, evader, rules: Rules) -> tuple[np.ndarray, np.ndarray]:
     """Places (K, 2) of an evader at the height that is worst, and their distances (K,)
     m from the nearest place of a pursuer in sight; infinite beyond `FARTHEST`.
     """
@@ -102,9 +95,7 @@ def distances(
     cells = np.argwhere(open_to_evader)
     found = np.where(free[tuple(cells.T)], 0.0, np.inf)
     reach = int(FARTHEST / CELL)
-    steps = np.stack(np.mgrid[-reach : reach + 1, -reach : reach + 1], axis=-1).reshape(
-        -1, 2
-    )
+    steps = np.stack(np.mgrid[-reach : reach + 1, -reach : reach + 1], axis=-1).reshape(-1, 2)
     length = CELL * np.linalg.norm(steps, axis=-1)
     order = np.argsort(length)
     order = order[length[order] <= FARTHEST]
@@ -140,39 +131,25 @@ def tasks_of(tasks):
     tasks = jax.tree.map(np.asarray, tasks)
     for i in range(len(tasks.evader_position)):
         used = tasks.pillar_active[i]
-        yield (
-            tasks.pillar_position[i][used],
-            tasks.pursuer_position[i],
-            tasks.evader_position[i],
-        )
+        yield (tasks.pillar_position[i][used], tasks.pursuer_position[i], tasks.evader_position[i])
 
 
 def main() -> None:
     """Prints a record a line."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument(
-        "--tasks", type=int, default=64, help="of each kind of drawn ones"
-    )
+    parser.add_argument("--tasks", type=int, default=64, help="of each kind of drawn ones")
     options = parser.parse_args()
     game = PursuitSettings()
     rules = [Rules(m, b) for b in (False, True) for m in MARGINS]
     kinds = {
-        name: [
-            (
-                np.array(s.pillars).reshape(-1, 2),
-                np.array(s.pursuers),
-                np.array(s.evader),
-            )
-        ]
+        name: [(np.array(s.pillars).reshape(-1, 2), np.array(s.pursuers), np.array(s.evader))]
         for name, s in SCENARIOS.items()
     }
     kinds["uniform"] = list(tasks_of(judging_tasks(game, options.tasks)))
     for most in (5, 7):
         settings = dataclasses.replace(game, min_pillars=0, max_pillars=most)
         keys = jax.random.split(jax.random.key(most), options.tasks)
-        drawn = jax.vmap(lambda key, settings=settings: uniform_task(settings, key))(
-            keys
-        )
+        drawn = jax.vmap(lambda key, settings=settings: uniform_task(settings, key))(keys)
         kinds[f"training, 0 to {most}"] = list(tasks_of(drawn))
     for name, tasks in kinds.items():
         for rule in rules:
@@ -185,9 +162,7 @@ def main() -> None:
                         **dataclasses.asdict(rule),
                         "deepest": round(float(deep.max()), 3),
                         "with_pocket": float((deep >= game.capture_radius).mean()),
-                        "out_of_reach": float(
-                            np.mean([one["out_of_reach"] for one in found])
-                        ),
+                        "out_of_reach": float(np.mean([one["out_of_reach"] for one in found])),
                         "where": found[int(deep.argmax())]["where"],
                     }
                 ),

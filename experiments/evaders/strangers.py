@@ -55,9 +55,7 @@ def game_of(policy: str, number: int, evaders: tuple[str, ...]) -> PursuitSettin
         # counts for nothing here: no shortest paths
         reward=RewardSettings(),
     )
-    return dataclasses.replace(
-        game, evader_speed=1.3 * game.max_speed, capture_radius=0.3
-    )
+    return dataclasses.replace(game, evader_speed=1.3 * game.max_speed, capture_radius=0.3)
 
 
 def teams_of(egos: tuple[str, ...], mates: tuple[str, ...]) -> list[tuple[str, ...]]:
@@ -68,9 +66,7 @@ def teams_of(egos: tuple[str, ...], mates: tuple[str, ...]) -> list[tuple[str, .
     found += [(ego, mate, mate) for ego in egos for mate in mates]
     found += [(ego, ego, mate) for ego in egos for mate in mates]
     whole = (SEEDS, egos, (*egos, mates[0]))
-    return found + [
-        team for team in whole if len(team) == 3 and set(team) <= {*egos, *mates}
-    ]
+    return found + [team for team in whole if len(team) == 3 and set(team) <= {*egos, *mates}]
 
 
 def fly_teams(options) -> dict:
@@ -97,9 +93,7 @@ def fly_teams(options) -> dict:
         places = np.array([names.index(name) for name in team])
         # each seat in turn, as seats aren't alike to an evader that starts on one side
         members = np.stack([np.roll(places, i) for i in range(options.episodes)])
-        flown = fly(
-            tuple(parameters), tasks, jnp.asarray(members), jax.random.key(options.seed)
-        )
+        flown = fly(tuple(parameters), tasks, jnp.asarray(members), jax.random.key(options.seed))
         found[team] = np.asarray(flown.captured), np.asarray(flown.crashed)
         print(team, found[team][0].mean(), found[team][1].mean(), flush=True)
     return found
@@ -115,9 +109,7 @@ def record(captured: np.ndarray, crashed: np.ndarray) -> dict:
     }
 
 
-def with_strangers(
-    flown: Mapping, ego: str, mates: tuple[str, ...], seats: int
-) -> dict:
+def with_strangers(flown: Mapping, ego: str, mates: tuple[str, ...], seats: int) -> dict:
     """An ego on so many seats over all teammates: the mean of its captures, and of
     these less those of three such teammates, with intervals.
     """
@@ -151,9 +143,7 @@ def fly_two(options) -> list[dict]:
         def one(key, kind):
             tasks = several_tasks(environment.settings, key, 2).replace(evader=kind)
             several = SeveralEvaders(
-                environment,
-                loaded.policy,
-                lambda *world: jax.lax.switch(choice, choices, *world),
+                environment, loaded.policy, lambda *world: jax.lax.switch(choice, choices, *world)
             )
             return several.fly(parameters, tasks, key)
 
@@ -164,27 +154,16 @@ def fly_two(options) -> list[dict]:
     records = []
     for kind, names in {"training": TRAINED_WITH, "held out": HELD_OUT}.items():
         places = [evaders.index(name) for name in names]
-        kinds = jnp.asarray(
-            generator.choice(places, size=(options.episodes, 2)), jnp.int32
-        )
+        kinds = jnp.asarray(generator.choice(places, size=(options.episodes, 2)), jnp.int32)
         for i, name in enumerate(CHOICES):
             flown = fly(loaded.parameters, keys, kinds, jnp.int32(i))
             both = np.asarray(flown.caught).all(axis=1)
             own = record(both, np.asarray(flown.pursuers.crashed))
-            seconds = (
-                np.asarray(flown.steps).max(axis=1)[both]
-                * environment.settings.time_step
-            )
+            seconds = np.asarray(flown.steps).max(axis=1)[both] * environment.settings.time_step
             one = float(np.asarray(flown.caught).any(axis=1).mean())
             mean = float(seconds.mean()) if both.any() else None
             records.append(
-                {
-                    "evaders": kind,
-                    "choice": name,
-                    **own,
-                    "one_caught": one,
-                    "seconds": mean,
-                }
+                {"evaders": kind, "choice": name, **own, "one_caught": one, "seconds": mean}
             )
             print(records[-1], flush=True)
     return records
@@ -198,14 +177,11 @@ def study(options) -> dict:
     if options.only == "two":
         return {"teams": [], "strangers": [], "two": two}
     flown = {
-        tuple(name_of(policy) for policy in team): own
-        for team, own in fly_teams(options).items()
+        tuple(name_of(policy) for policy in team): own for team, own in fly_teams(options).items()
     }
     mates = tuple(name_of(mate) for mate in options.mates)
     return {
-        "teams": [
-            {"members": list(team), **record(*own)} for team, own in flown.items()
-        ],
+        "teams": [{"members": list(team), **record(*own)} for team, own in flown.items()],
         "strangers": [
             with_strangers(flown, name_of(ego), mates, seats)
             for ego in options.egos
@@ -223,10 +199,7 @@ def name_of(policy: str) -> str:
 def page(results: Mapping) -> Page:
     """What an ego gains beside strangers, then all teams, then two evaders."""
     rows = [
-        {
-            "team": f"{row['ego']} on {row['seats']} of three seats, strangers on the others",
-            **row,
-        }
+        {"team": f"{row['ego']} on {row['seats']} of three seats, strangers on the others", **row}
         for row in results["strangers"]
     ]
     mixed = [row for row in results["teams"] if len(set(row["members"])) == 3]
@@ -234,10 +207,7 @@ def page(results: Mapping) -> Page:
     # None where that part wasn't flown
     chosen = chosen_choice(results["two"]["records"])
     rows += [
-        {
-            **row,
-            "team": f"{results['two']['pursuers']} after two evaders, {row['choice']}",
-        }
+        {**row, "team": f"{results['two']['pursuers']} after two evaders, {row['choice']}"}
         for row in results["two"]["records"]
         if row["evaders"] == "held out" and row["choice"] == chosen
     ]
@@ -252,11 +222,7 @@ def page(results: Mapping) -> Page:
     every = {"members": lambda row: ", ".join(row["members"])} | {
         head: columns[head] for head in ("captures", "95 %", "crash rate")
     }
-    two = {
-        "evaders": "evaders",
-        "who goes for whom": "choice",
-        "one caught": "one_caught:.3f",
-    }
+    two = {"evaders": "evaders", "who goes for whom": "choice", "one caught": "one_caught:.3f"}
     two |= {head: columns[head] for head in ("captures", "95 %", "crash rate")}
     parts = [
         short,
@@ -264,10 +230,7 @@ def page(results: Mapping) -> Page:
         Table(two, results["two"]["records"]),
     ]
     return Page(
-        "Teams of strangers, and two evaders",
-        "Three pursuers, uniform tasks.",
-        parts,
-        short,
+        "Teams of strangers, and two evaders", "Three pursuers, uniform tasks.", parts, short
     )
 
 
@@ -282,11 +245,7 @@ def chosen_choice(records: list[dict]) -> str | None:
 def draw(results: Mapping, path: Path) -> None:
     """Captures of each ego with each teammate, beside three of that teammate."""
     rates = {tuple(row["members"]): row["capture_rate"] for row in results["teams"]}
-    mates = [
-        team[0]
-        for team in rates
-        if len(set(team)) == 1 and team[0] not in _egos(results)
-    ]
+    mates = [team[0] for team in rates if len(set(team)) == 1 and team[0] not in _egos(results)]
     figure = Figure(figsize=(9, 3.4), layout="constrained")
     axes = figure.subplots()
     place = np.arange(len(mates))
@@ -310,9 +269,7 @@ def _egos(results):
 def main(arguments: list[str]) -> None:
     """The command."""
     parser = page_parser(__doc__, "strangers")
-    parser.add_argument(
-        "--egos", nargs="+", default=EGOS, help="policies (the first flies two)"
-    )
+    parser.add_argument("--egos", nargs="+", default=EGOS, help="policies (the first flies two)")
     parser.add_argument("--mates", nargs="+", default=TEAMMATES)
     parser.add_argument("--only", choices=("teams", "two"), help="one of the two parts")
     parser.add_argument("--episodes", type=int, default=500)

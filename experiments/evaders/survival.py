@@ -36,9 +36,7 @@ def curves_of(records: list[dict]) -> list[dict]:
     curves = []
     for kind, belongs in JUDGES.items():
         for place in PLACES:
-            own = [
-                r for r in records if r["scenario"] == place and belongs(r["evader"])
-            ]
+            own = [r for r in records if r["scenario"] == place and belongs(r["evader"])]
             if own:
                 worst = max(own, key=lambda r: np.mean(r["capture_steps"]))
                 curves.append(

@@ -34,9 +34,7 @@ def study(options) -> dict:
     data = options.out.with_suffix(".json")
     stored = read_json(data)["maps"] if data.exists() else {}
     files = dict(item.split("=", 1) for item in options.maps)
-    return {
-        "maps": stored | {name: read_json(Path(file)) for name, file in files.items()}
-    }
+    return {"maps": stored | {name: read_json(Path(file)) for name, file in files.items()}}
 
 
 def rows_of(maps: Mapping) -> list[dict]:
@@ -68,23 +66,15 @@ def page(results: Mapping) -> Page:
     rates = next(iter(seeds_of(results["maps"], "sizes").values()), [])
     number = {2: "two", 3: "three"}.get(len(rates), len(rates))
     columns = {
-        "pursuers": lambda row: (
-            f"{row['size']}{' (held out)' if row['held_out'] else ''}"
-        ),
+        "pursuers": lambda row: f"{row['size']}{' (held out)' if row['held_out'] else ''}",
         "one policy": "sizes.capture_rate:.3f",
         f"trained again, {number} seeds": "seeds",
-        **{
-            head: f"{kind}.capture_rate:.3f"
-            for kind, head in KINDS.items()
-            if kind != "sizes"
-        },
+        **{head: f"{kind}.capture_rate:.3f" for kind, head in KINDS.items() if kind != "sizes"},
         "seconds": "sizes.capture_seconds:.2f",
         "crash rate": "sizes.crash_rate:.3f",
     }
     records = Table(columns, rows_of(results["maps"]))
-    return Page(
-        "One policy for any team", "Shares of episodes with a capture.", records
-    )
+    return Page("One policy for any team", "Shares of episodes with a capture.", records)
 
 
 def draw(results: Mapping, path: Path) -> None:
@@ -99,9 +89,7 @@ def draw(results: Mapping, path: Path) -> None:
         rates = np.array([cell["capture_rate"] for cell in cells])
         ends = np.array([cell["interval"] for cell in cells]).T
         off = np.abs(ends - rates)
-        captures.errorbar(
-            sizes, rates, off, marker=marker, capsize=3, linewidth=1, label=head
-        )
+        captures.errorbar(sizes, rates, off, marker=marker, capsize=3, linewidth=1, label=head)
         crashed = [cell["crash_rate"] for cell in cells]
         crashes.plot(sizes, crashed, marker=marker, linewidth=1, label=head)
     captures.set(xlabel="pursuers", ylabel="episodes with a capture")

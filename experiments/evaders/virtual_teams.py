@@ -42,8 +42,7 @@ def layout(game: PursuitSettings, seed: int) -> str:
         "evader": np.asarray(task.evader_position),
     }
     lines = (
-        f"{name} = {np.round(value.astype(float), 3).tolist()}"
-        for name, value in entries.items()
+        f"{name} = {np.round(value.astype(float), 3).tolist()}" for name, value in entries.items()
     )
     return "\n".join(lines) + "\n"
 
@@ -62,10 +61,7 @@ def fly(size: int, options: argparse.Namespace, folder: Path) -> dict:
         command += ["--out", str(out), "--episodes", str(options.episodes)]
         command += ["--body_logs", str(options.body_logs)]
         flown = subprocess.run(
-            [*OPENJAX, *command, "--uri", *uris],
-            capture_output=True,
-            text=True,
-            timeout=LONGEST,
+            [*OPENJAX, *command, "--uri", *uris], capture_output=True, text=True, timeout=LONGEST
         )
     finally:
         virtual.send_signal(signal.SIGINT)
@@ -75,15 +71,11 @@ def fly(size: int, options: argparse.Namespace, folder: Path) -> dict:
     return {"pursuers": size, "status": flown.returncode, **summary(out)}
 
 
-def listening(
-    size: int, place: list[str], options: argparse.Namespace
-) -> subprocess.Popen:
+def listening(size: int, place: list[str], options: argparse.Namespace) -> subprocess.Popen:
     """The virtual Crazyflies' process, once it listens."""
     command = ["virtual_crazyflie", "--number", str(size), "--port", str(options.port)]
     command += ["--loss", str(options.loss), "--pose_loss", str(options.pose_loss)]
-    process = subprocess.Popen(
-        [*OPENJAX, *command, *place], stdout=subprocess.PIPE, text=True
-    )
+    process = subprocess.Popen([*OPENJAX, *command, *place], stdout=subprocess.PIPE, text=True)
     # its first line says that it listens; before that there is nobody to fly
     said = process.stdout.readline()
     if "listening" not in said:

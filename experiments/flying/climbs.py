@@ -31,9 +31,7 @@ DRIFTS = [(speed, within) for speed in (0.1, 0.2, 0.3, 0.5) for within in (2.0, 
 
 def airborne(flight) -> list[tuple[Pose, tuple]]:
     """Poses and specific forces of a flight, from take-off to landing."""
-    is_known = np.isfinite(
-        np.c_[flight.velocity, flight.quaternion, flight.specific_force]
-    ).all(1)
+    is_known = np.isfinite(np.c_[flight.velocity, flight.quaternion, flight.specific_force]).all(1)
     height = flight.position[:, 2]
     up = np.flatnonzero(height > np.nanmin(height) + RISEN)
     return [
@@ -86,16 +84,12 @@ def study(options) -> dict:
             delays = []
             for begin in begins:
                 end_times = [
-                    judged(f, sign * speed, within, begin)[1]
-                    for f in flights
-                    for sign in (1, -1)
+                    judged(f, sign * speed, within, begin)[1] for f in flights for sign in (1, -1)
                 ]
                 delays += [np.inf if t is None else t - begin for t in end_times]
             delays = np.array(delays)
             row[name] = float((delays < SOON).mean())
-            row[f"{name}_seconds"] = (
-                float(np.median(delays[delays < SOON])) if row[name] else None
-            )
+            row[f"{name}_seconds"] = float(np.median(delays[delays < SOON])) if row[name] else None
         rows.append(row)
     return {
         "flights": len(flights),
@@ -117,15 +111,11 @@ def page(results) -> Page:
         "after (s), late": "late_seconds:.1f",
     }
     return Page(
-        "What an accelerometer tells of a drifting height",
-        prose,
-        Table(columns, results["rows"]),
+        "What an accelerometer tells of a drifting height", prose, Table(columns, results["rows"])
     )
 
 
 if __name__ == "__main__":
     parser = page_parser(__doc__, "flying_climbs")
-    parser.add_argument(
-        "--flights", dest="folders", type=Path, nargs="+", required=True
-    )
+    parser.add_argument("--flights", dest="folders", type=Path, nargs="+", required=True)
     publish(parser.parse_args(), study, page)

@@ -52,9 +52,7 @@ class EstimateDamage:
         """Values with noise."""
         return tuple(value + self._random.gauss(0.0, deviation) for value in values)
 
-    def moved(
-        self, pose: Pose, way: float, speed: float = 0.0, height: bool = False
-    ) -> Pose:
+    def moved(self, pose: Pose, way: float, speed: float = 0.0, height: bool = False) -> Pose:
         """A pose shifted by `way`, its velocity by `speed`, each times the fault's
         amount.
         """
@@ -64,12 +62,8 @@ class EstimateDamage:
         axis = (0.0, 0.0, math.copysign(1.0, level[0])) if height else level
         away = [fault.amount * part for part in axis]
         return pose._replace(
-            position=tuple(
-                p + way * a for p, a in zip(pose.position, away, strict=True)
-            ),
-            velocity=tuple(
-                v + speed * a for v, a in zip(pose.velocity, away, strict=True)
-            ),
+            position=tuple(p + way * a for p, a in zip(pose.position, away, strict=True)),
+            velocity=tuple(v + speed * a for v, a in zip(pose.velocity, away, strict=True)),
         )
 
     def frozen(self, pose: Pose, gyroscope: bool, velocity: bool) -> Pose:
@@ -81,9 +75,7 @@ class EstimateDamage:
         return memory._replace(
             time=pose.time,
             position=self.noisy(memory.position, 0.002),
-            velocity=self.noisy(
-                memory.velocity if velocity else (0.0, 0.0, 0.0), 0.005
-            ),
+            velocity=self.noisy(memory.velocity if velocity else (0.0, 0.0, 0.0), 0.005),
             quaternion=_unit(self.noisy(memory.quaternion, 0.001)),
             body_rates=rates,
         )
@@ -94,9 +86,7 @@ class EstimateDamage:
         parts = {
             name: tuple(
                 a + share * (b - a)
-                for a, b in zip(
-                    getattr(pose, name), getattr(self._held, name), strict=True
-                )
+                for a, b in zip(getattr(pose, name), getattr(self._held, name), strict=True)
             )
             for name in ("position", "velocity", "quaternion")
         }
@@ -127,18 +117,14 @@ DAMAGES = {
     "position wanders": lambda d, pose, t: d.moved(pose, math.sin(SWING * t)),
     "ways are too long": lambda d, pose, t: d.scaled(pose),
     "velocity is held": lambda d, pose, t: pose._replace(velocity=d._held.velocity),
-    "velocity is zero": lambda d, pose, t: pose._replace(
-        velocity=d.noisy((0.0,) * 3, 0.01)
-    ),
+    "velocity is zero": lambda d, pose, t: pose._replace(velocity=d.noisy((0.0,) * 3, 0.01)),
     "frozen, 2 mm of noise": lambda d, pose, t: d.frozen(pose, False, True),
     "frozen, the gyroscope lives": lambda d, pose, t: d.frozen(pose, True, True),
     "frozen, at rest": lambda d, pose, t: d.frozen(pose, False, False),
     "blends into a held pose": lambda d, pose, t: d.blended(pose, t),
     "camera blends into a held pose": lambda d, pose, t: d.blended(pose, t),
     "drifts with its velocity": lambda d, pose, t: d.moved(pose, t, 1.0),
-    "height drifts with its velocity": lambda d, pose, t: d.moved(
-        pose, t, 1.0, height=True
-    ),
+    "height drifts with its velocity": lambda d, pose, t: d.moved(pose, t, 1.0, height=True),
     "drifts gently with its velocity": lambda d, pose, t: d.moved(pose, *_gently(t)),
     "height drifts gently with its velocity": lambda d, pose, t: d.moved(
         pose, *_gently(t), height=True
@@ -146,11 +132,7 @@ DAMAGES = {
 }
 """(damage, true pose, seconds since it began) -> what is received, by kind."""
 GROUPS = {
-    "position or height drifts": (
-        "position drifts",
-        "height drifts",
-        "position wanders",
-    ),
+    "position or height drifts": ("position drifts", "height drifts", "position wanders"),
     "ways are too long": ("ways are too long",),
     "velocity is held or zero": ("velocity is held", "velocity is zero"),
     "all freezes": tuple(kind for kind in DAMAGES if kind.startswith("frozen")),
@@ -227,9 +209,7 @@ def main() -> None:
     for k, layout in enumerate(arguments.layouts):
         first = arguments.seed + k * arguments.each
         seeds = range(first, first + arguments.each)
-        records += fly(
-            arguments.kinds, seeds, layout, arguments.policy, arguments.later
-        )
+        records += fly(arguments.kinds, seeds, layout, arguments.policy, arguments.later)
         write_json(
             arguments.out,
             {

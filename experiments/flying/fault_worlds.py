@@ -18,14 +18,7 @@ import jax
 import numpy as np
 
 import openjax
-from experiments.flying.faults import (
-    ASLEEP,
-    ENDING,
-    Fault,
-    PoseDamage,
-    draw_fault,
-    outcome,
-)
+from experiments.flying.faults import ASLEEP, ENDING, Fault, PoseDamage, draw_fault, outcome
 from openjax.flying.board import SILENCE
 from openjax.flying.controller import Pose
 from openjax.flying.estimation import see
@@ -53,12 +46,7 @@ LAIN = 50
 """A flight whose vehicles lay on the floor with their motors off for so many ticks is
 over.
 """
-PILOTS = (
-    "loop stopped",
-    "links stopped",
-    "loop and links stopped",
-    "loop and guard stopped",
-)
+PILOTS = ("loop stopped", "links stopped", "loop and links stopped", "loop and guard stopped")
 """Somebody else flies after a tenth of a second. (Which one takes over is for real
 processes: `experiments.flying.real_time`.)
 """
@@ -131,18 +119,12 @@ class Worlds:
         self._damage = [damage(fault) for fault in faults]
         vehicles = VirtualVehicles(load_vehicle(), np.tile(starts, (len(faults), 1)))
         self._vehicles = vehicles
-        heard = [
-            fault.kind != "camera drifts" for fault in faults for _ in range(self.n)
-        ]
+        heard = [fault.kind != "camera drifts" for fault in faults for _ in range(self.n)]
         radio = functools.partial(self._received, "radio")
         camera = functools.partial(self._received, "camera")
         self.swarm = SimulatedSwarm(vehicles, heard, radio, camera)
-        pillars = [
-            (x, y, self._game.settings.pillar_radius) for x, y in scenario.pillars
-        ]
-        state = initial_state(
-            [tuple(s) for s in starts.tolist()], pillars, self._game.airframe
-        )
+        pillars = [(x, y, self._game.settings.pillar_radius) for x, y in scenario.pillars]
+        state = initial_state([tuple(s) for s in starts.tolist()], pillars, self._game.airframe)
         state = state._replace(drones=(Drone(Mode.PURSUIT),) * self.n)
         self.states = [state] * len(faults)
         self._landing = [False] * len(faults)
@@ -161,14 +143,8 @@ class Worlds:
         first = w * self.n
         others = ()
         if fault.kind == "camera: bodies swapped":
-            places = [
-                tuple(place)
-                for place in report.position[first : first + self.n].tolist()
-            ]
-            turns = [
-                tuple(turn)
-                for turn in report.quaternion[first : first + self.n].tolist()
-            ]
+            places = [tuple(place) for place in report.position[first : first + self.n].tolist()]
+            turns = [tuple(turn) for turn in report.quaternion[first : first + self.n].tolist()]
             others = [
                 Pose(now, place, (0.0,) * 3, turn)
                 for place, turn in zip(places, turns, strict=True)
@@ -181,9 +157,7 @@ class Worlds:
         samples = list(self.swarm.observe())
         worlds = np.flatnonzero(self._down < LAIN).tolist()
         awake = [
-            w
-            for w in worlds
-            if not (self.faults[w].kind == ASLEEP and self.faults[w].on(now))
+            w for w in worlds if not (self.faults[w].kind == ASLEEP and self.faults[w].on(now))
         ]
         over = set(range(len(self.faults))) - set(worlds)
         self.swarm.asleep = {w * self.n + i for w in over for i in range(self.n)}
@@ -192,17 +166,10 @@ class Worlds:
             drones = self.states[w].drones
             if self._landing[w]:  # who takes over knows no motion capture
                 of_world = samples[first : first + self.n]
-                samples[first : first + self.n] = [
-                    s._replace(captured=None) for s in of_world
-                ]
+                samples[first : first + self.n] = [s._replace(captured=None) for s in of_world]
             self.states[w] = see(self.states[w], now, samples[first : first + self.n])
-            for i, (drone, old) in enumerate(
-                zip(self.states[w].drones, drones, strict=True)
-            ):
-                if (
-                    drone.captured.pose is not old.captured.pose
-                    and drone.feeds_estimator
-                ):
+            for i, (drone, old) in enumerate(zip(self.states[w].drones, drones, strict=True)):
+                if drone.captured.pose is not old.captured.pose and drone.feeds_estimator:
                     self.swarm.believed(first + i, drone.captured.pose)
         if any(Mode.PURSUIT in state.modes for state in self.states):
             self._play_on()
@@ -213,9 +180,7 @@ class Worlds:
         self.swarm.send(set_points)
         self.swarm.advance()
         report = self.swarm.vehicles.report
-        off = np.array(
-            [f.set_point(self.swarm.now).mode == 0 for f in self.swarm.firmware]
-        )
+        off = np.array([f.set_point(self.swarm.now).mode == 0 for f in self.swarm.firmware])
         self._tracks.append(np.column_stack([report.position, off]))
         down = ((report.position[:, 2] < 0.02) & off).reshape(-1, self.n).all(1)
         self._down = np.where(down, self._down + 1, 0)
@@ -252,14 +217,9 @@ class Worlds:
             self.states[w] = take_over(self.states[w], now)
             self._landing[w] = True
         action = None if self._landing[w] else fault.answered(self._actions[w], now)
-        actions = (
-            None
-            if action is None
-            else tuple(from_action(a, THRUST_LIMIT) for a in action)
-        )
+        actions = None if action is None else tuple(from_action(a, THRUST_LIMIT) for a in action)
         landing = on and (
-            fault.kind == "key"
-            or (fault.kind == "guard stopped" and since > 2.0 * SILENCE)
+            fault.kind == "key" or (fault.kind == "guard stopped" and since > 2.0 * SILENCE)
         )
         over = not landing and now >= SECONDS
         request = Request.LAND if landing or over else Request.NONE
@@ -269,13 +229,8 @@ class Worlds:
 
     def records(self, seeds) -> list[dict]:
         """What became of each flight."""
-        track = np.array(self._tracks).reshape(
-            len(self._tracks), len(self.faults), self.n, 4
-        )
-        return [
-            {"seed": seed, **self._record(w, track[:, w])}
-            for w, seed in enumerate(seeds)
-        ]
+        track = np.array(self._tracks).reshape(len(self._tracks), len(self.faults), self.n, 4)
+        return [{"seed": seed, **self._record(w, track[:, w])} for w, seed in enumerate(seeds)]
 
     def _record(self, w, track) -> dict:
         """Where the vehicles of flight w were from its fault on. track (T, N, 4): true
@@ -289,18 +244,13 @@ class Worlds:
         result = outcome(fault, 0.01 * np.arange(len(track)), position, off, begin)
         is_held = result.pop("held")
         is_over = any(d.reason not in ("", OVER) for d in drones)
-        crashed = np.array(
-            [f.crashed for f in self.swarm.firmware[w * self.n : (w + 1) * self.n]]
-        )
+        crashed = np.array([f.crashed for f in self.swarm.firmware[w * self.n : (w + 1) * self.n]])
         pairs = [position[:, i] - position[:, j] for i in range(3) for j in range(i)]
         return {
             "kind": fault.kind,
             "layout": self._layout,
             "captured_by_camera": fault.captured,
-            **{
-                name: getattr(fault, name)
-                for name in ("time", "vehicle", "duration", "amount")
-            },
+            **{name: getattr(fault, name) for name in ("time", "vehicle", "duration", "amount")},
             "ended": is_over,
             "reasons": [d.reason for d in drones],
             **result,

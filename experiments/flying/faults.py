@@ -44,12 +44,9 @@ WILD = {
     "policy wild": lambda tick, n, shape: np.random.default_rng(10 * tick + n).uniform(
         -1.0, 1.0, shape
     ),
-    "policy huge": lambda tick, n, shape: np.random.default_rng(n).choice(
-        (-1e30, 1e30), shape
-    ),
+    "policy huge": lambda tick, n, shape: np.random.default_rng(n).choice((-1e30, 1e30), shape),
     "policy alternating": lambda tick, n, shape: (
-        np.random.default_rng(n).choice((-1.0, 1.0), shape)
-        * (-1) ** (tick // (1 + n % 5))
+        np.random.default_rng(n).choice((-1.0, 1.0), shape) * (-1) ** (tick // (1 + n % 5))
     ),
 }
 """The policy's action (N, 4) at a tick of flight n: drawn anew; one extreme for good;
@@ -138,10 +135,9 @@ def draw_fault(seed: int, latest: float) -> Fault:
     vehicle = rng.randrange(3)
     direction = rng.uniform(0.0, 2.0 * math.pi)
     number = rng.choice((math.nan, math.inf, -math.inf, 1e300))
-    duration = {
-        "camera: one frame wrong": 0.0099,
-        "camera: four frames wrong": 0.0399,
-    }.get(kind, math.inf)
+    duration = {"camera: one frame wrong": 0.0099, "camera: four frames wrong": 0.0399}.get(
+        kind, math.inf
+    )
     if kind.endswith("for a while"):
         duration = rng.uniform(0.05, 1.0)
     elif "none" in kind or "attitude" in kind or kind in PASSING:
@@ -162,9 +158,7 @@ class PoseDamage:
         self._past = defaultdict(lambda: deque(maxlen=50))
         self._field = self._random.randrange(100)
 
-    def __call__(
-        self, source: str, i: int, now: float, pose: Pose, others
-    ) -> Pose | None:
+    def __call__(self, source: str, i: int, now: float, pose: Pose, others) -> Pose | None:
         """The pose received from `source`, "camera" or "radio"; `others`: true poses of
         all.
         """
@@ -178,9 +172,7 @@ class PoseDamage:
         if fault.kind not in names or not mine or not fault.on(now):
             self._held[source, i] = pose
             return pose
-        return self._damaged(
-            fault.kind.replace("poses", "camera"), source, i, now, pose, others
-        )
+        return self._damaged(fault.kind.replace("poses", "camera"), source, i, now, pose, others)
 
     def _damaged(self, kind, source, i, now, pose, others):
         fault = self._fault
@@ -202,9 +194,7 @@ class PoseDamage:
         if what.startswith("drifts"):
             return _shifted(pose, away, since)
         if what == "scaled":
-            return pose._replace(
-                position=tuple(fault.amount * p for p in pose.position)
-            )
+            return pose._replace(position=tuple(fault.amount * p for p in pose.position))
         if what == "no attitude":
             return pose._replace(quaternion=(0.0,) * 4)
         w, x, y, z = pose.quaternion
@@ -217,9 +207,7 @@ class PoseDamage:
             other = others[(i + 1) % len(others)]
             return pose._replace(position=other.position, quaternion=other.quaternion)
         if what == "late":
-            return self._earlier(source, i, round(100 * fault.amount))._replace(
-                time=now
-            )
+            return self._earlier(source, i, round(100 * fault.amount))._replace(time=now)
         if what == "restarts":
             return None if since < 0.5 * fault.amount else _shifted(pose, away, 1.0)
         if what == "clock steps":
@@ -280,9 +268,5 @@ def finite(row: dict) -> dict:
     """A row as JSON has it: null for what is no finite number, and in `not_finite` what
     that was.
     """
-    odd = {
-        name: str(x)
-        for name, x in row.items()
-        if isinstance(x, float) and not math.isfinite(x)
-    }
+    odd = {name: str(x) for name, x in row.items() if isinstance(x, float) and not math.isfinite(x)}
     return {**row, **dict.fromkeys(odd), "not_finite": odd} if odd else row

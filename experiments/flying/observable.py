@@ -39,9 +39,7 @@ DRIFTS |= {".5 m/s within 2 s": (0.5, 2.0), ".5 m/s within 4 s": (0.5, 4.0)}
 FLIGHTS = 300
 
 
-def wandering(
-    rng: np.random.Generator, time_constant: float, size: float
-) -> np.ndarray:
+def wandering(rng: np.random.Generator, time_constant: float, size: float) -> np.ndarray:
     """(T, FLIGHTS, TEAM, 2) of a first-order Gauss-Markov process."""
     steps = round(SECONDS / PERIOD)
     share = PERIOD / time_constant
@@ -138,19 +136,13 @@ def page(results) -> Page:
     """The study's table."""
     prose = "Share of drifts that are told within six seconds, and of flights that end for none."
     columns = {"vehicle": "vehicle", "ended without a drift": "ended:.3f"}
-    columns |= {
-        f"told: {drift}": (lambda row, d=drift: f"{row[d]:.2f}") for drift in DRIFTS
-    }
-    return Page(
-        "What of a gentle drift can be told", prose, Table(columns, results["rows"])
-    )
+    columns |= {f"told: {drift}": (lambda row, d=drift: f"{row[d]:.2f}") for drift in DRIFTS}
+    return Page("What of a gentle drift can be told", prose, Table(columns, results["rows"]))
 
 
 if __name__ == "__main__":
     parser = page_parser(__doc__, "flying_drifts")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--hover", type=float, default=0.0, help="s, before they hunt")
-    parser.add_argument(
-        "--begin", type=float, nargs=2, default=BEGIN, help="s, of a drift"
-    )
+    parser.add_argument("--begin", type=float, nargs=2, default=BEGIN, help="s, of a drift")
     publish(parser.parse_args(), study, page)

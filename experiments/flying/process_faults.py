@@ -5,15 +5,7 @@ import random
 from dataclasses import replace
 from itertools import combinations
 
-from experiments.flying.faults import (
-    BEYOND,
-    CAMERA,
-    GONE,
-    RADIO,
-    WILD,
-    Fault,
-    draw_fault,
-)
+from experiments.flying.faults import BEYOND, CAMERA, GONE, RADIO, WILD, Fault, draw_fault
 
 ROLES = ("loop", "links", "guard")
 SIGNALS = ("KILL", "STOP", "TERM", "HUP", "INT", "TSTP", "QUIT")
@@ -47,11 +39,7 @@ GROUPS = {
     "strangers, a second fly, nothing": ("strangers' packets", "none", "second fly", "none with camera"),
 }  # fmt: skip
 KINDS = [kind for kinds in GROUPS.values() for kind in kinds]
-DRAWN = (
-    *GROUPS["motion capture"],
-    *GROUPS["own estimates, links"],
-    *GROUPS["the policy"][:-1],
-)
+DRAWN = (*GROUPS["motion capture"], *GROUPS["own estimates, links"], *GROUPS["the policy"][:-1])
 """Faults as in simulated time."""
 ENDLESS = (*DRAWN, *GROUPS["strangers, a second fly, nothing"])
 """These needn't end a flight."""
@@ -74,10 +62,7 @@ def fault_of(number: int, kind: str) -> Fault:
     time = rng.uniform(0.3, LATEST)
     vehicle = rng.randrange(3)
     if kind in DRAWN:
-        faults = (
-            draw_fault(seed, LATEST)
-            for seed in range(1000 * number, 1000 * number + 1000)
-        )
+        faults = (draw_fault(seed, LATEST) for seed in range(1000 * number, 1000 * number + 1000))
         return replace(next(like for like in faults if like.kind == kind), time=time)
     if kind in START:
         kind, amount = START[kind]

@@ -78,18 +78,14 @@ class Flown:
             now = time.perf_counter()
             self._drain()
             status = self._ended(pid) if status is None else status
-            if injected is None and now - self._virtual.truth.take_off >= max(
-                self.fault.time, 0.0
-            ):
+            if injected is None and now - self._virtual.truth.take_off >= max(self.fault.time, 0.0):
                 injected = now
                 self._find(pid)
                 self._inject(pid)
             since = now - (injected or begin)
             over = status is not None and (settled or since > 0.2) and self._landed()
             settled = (settled or now) if over else 0.0
-            if (over and now - settled > SETTLE) or since > LONGEST + 25.0 * (
-                injected is None
-            ):
+            if (over and now - settled > SETTLE) or since > LONGEST + 25.0 * (injected is None):
                 break
         self._clean(pid, status)
         return self._record(status, injected, begin)
@@ -145,9 +141,7 @@ class Flown:
         with contextlib.suppress(OSError):
             children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
             spawned = [
-                int(c)
-                for c in children
-                if b"spawn_main" in Path(f"/proc/{c}/cmdline").read_bytes()
+                int(c) for c in children if b"spawn_main" in Path(f"/proc/{c}/cmdline").read_bytes()
             ]
             self._pids.update(zip(("links", "guard"), sorted(spawned), strict=False))
 
@@ -226,18 +220,10 @@ class Flown:
         track = self._virtual.track()
         fault = self.fault
         result = outcome(
-            fault,
-            track["time"],
-            track["position"],
-            track["off"].astype(bool),
-            injected or begin,
+            fault, track["time"], track["position"], track["off"].astype(bool), injected or begin
         )
         is_held = result.pop("held")
-        lines = [
-            line
-            for line in self._said.decode(errors="replace").splitlines()
-            if line.strip()
-        ]
+        lines = [line for line in self._said.decode(errors="replace").splitlines() if line.strip()]
         row = {
             "number": self._number, "kind": self._kind, "time": round(min(max(fault.time, 0.0), 99.0), 2), "status": status,
             "took_off": not math.isinf(self._virtual.truth.take_off), **result, "hard": bool(track["crashed"][is_held].any()),
@@ -270,9 +256,6 @@ class Flown:
 
 def _lives(pid) -> bool:
     try:
-        return (
-            Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0]
-            not in "ZX"
-        )
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] not in "ZX"
     except OSError:
         return False

@@ -70,11 +70,7 @@ def page(results) -> Page:
     records = results["records"]
     for group, kinds in {**GROUPS, "all": KINDS}.items():
         mine = [r for r in records if r["kind"] in kinds]
-        ends = [
-            r["seconds"]
-            for r in mine
-            if r["seconds"] is not None and ends_flight(r["kind"])
-        ]
+        ends = [r["seconds"] for r in mine if r["seconds"] is not None and ends_flight(r["kind"])]
         is_stop = [any(name in r["kind"] for name in STOPPED) for r in mine]
         rows.append({
             "group": group, "flights": len(mine), "well": sum(r["well"] for r in mine),
@@ -99,9 +95,7 @@ def page(results) -> Page:
         for r in records
         if not r["well"]
     ]
-    return Page(
-        "Faults where they happen, in real time", prose, [Table(columns, rows), *ill]
-    )
+    return Page("Faults where they happen, in real time", prose, [Table(columns, rows), *ill])
 
 
 def fly(number: int, kind: str, policy: str) -> dict:

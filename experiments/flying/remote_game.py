@@ -22,9 +22,7 @@ def feed_of(fault: Fault, truth):
             now = max(time.perf_counter() - truth.take_off, -1.0)
             poses = truth.poses()
             for i, pose in enumerate(poses):
-                shaken = tuple(
-                    (np.array(pose.position) + noise.normal(0, 5e-4, 3)).tolist()
-                )
+                shaken = tuple((np.array(pose.position) + noise.normal(0, 5e-4, 3)).tolist())
                 shown = damage("camera", i, now, pose._replace(position=shaken), poses)
                 if shown is not None:
                     update(i, shown.position, shown.quaternion)

@@ -15,15 +15,7 @@ from pathlib import Path
 import tyro
 
 from experiments.flying.fault_worlds import fly
-from experiments.flying.faults import (
-    BEYOND,
-    ENDING,
-    FALL,
-    FOLLOWED,
-    KINDS,
-    MARGIN,
-    finite,
-)
+from experiments.flying.faults import BEYOND, ENDING, FALL, FOLLOWED, KINDS, MARGIN, finite
 from experiments.flying.single_thread import share_out, use_single_thread
 from experiments.table import RESULTS, Page, Table, facts, write_page
 from openjax.files import read_json, write_json
@@ -55,11 +47,7 @@ class Arguments:
 def well(row: dict) -> bool:
     """Whether a flight ended as it must."""
     in_time = row["seconds"] is None or row["seconds"] <= ENDING or row["kind"] in SLOW
-    return (
-        row["out"] <= MARGIN
-        and not (row["fell"] or row["hard"] or row["armed"])
-        and in_time
-    )
+    return row["out"] <= MARGIN and not (row["fell"] or row["hard"] or row["armed"]) and in_time
 
 
 SLOW = (
@@ -82,11 +70,7 @@ def summary(records) -> list[dict]:
         mine = [r for r in records if r["kind"] in kinds]
         if not mine:
             continue
-        seconds = [
-            r["seconds"]
-            for r in mine
-            if r["seconds"] is not None and r["kind"] not in SLOW
-        ]
+        seconds = [r["seconds"] for r in mine if r["seconds"] is not None and r["kind"] not in SLOW]
         rows.append(
             {
                 "kind": kind,
@@ -111,22 +95,13 @@ def jobs_of(arguments: Arguments) -> list[tuple]:
     """
     jobs = []
     drawn = range(arguments.seed, arguments.seed + arguments.faults)
-    seeds = [
-        s
-        for s in drawn
-        if any(part in KINDS[s % len(KINDS)] for part in arguments.kinds)
-    ]
+    seeds = [s for s in drawn if any(part in KINDS[s % len(KINDS)] for part in arguments.kinds)]
     for k, layout in enumerate(arguments.layouts):
         mine = [s for s in seeds if (s // len(KINDS)) % len(arguments.layouts) == k]
         # all batches are of one size: compiled once
         mine += [-1] * (-len(mine) % arguments.batch)
-        batches = [
-            mine[i : i + arguments.batch] for i in range(0, len(mine), arguments.batch)
-        ]
-        jobs += [
-            (batch, layout, arguments.policy, arguments.level_after)
-            for batch in batches
-        ]
+        batches = [mine[i : i + arguments.batch] for i in range(0, len(mine), arguments.batch)]
+        jobs += [(batch, layout, arguments.policy, arguments.level_after) for batch in batches]
     return sorted(jobs, key=lambda job: job[0][0])
 
 
@@ -193,12 +168,7 @@ SHOWN = {
     "poses, gyroscope or packets are lost or wrong": ("poses", "packets", "gyroscope"),
     "processes stop": ("loop", "links", "guard"),
     "the policy is silent, stuck or wild": ("policy",),
-    "a battery, a link or a drone fails, a key": (
-        "battery",
-        "drone",
-        "link lost",
-        "key",
-    ),
+    "a battery, a link or a drone fails, a key": ("battery", "drone", "link lost", "key"),
     "all processes stand still for a while": ("all processes",),
 }
 """Rows of the page, by how the kinds begin; the longest beginning counts."""

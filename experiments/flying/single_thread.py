@@ -45,9 +45,7 @@ def share_out(
             for future in as_completed(job_of):
                 if error := future.exception():
                     failed += 1
-                    reason = (
-                        f"{str(job_of[future])[:200]}: {type(error).__name__}: {error}"
-                    )
+                    reason = f"{str(job_of[future])[:200]}: {type(error).__name__}: {error}"
                     print(reason, file=sys.stderr, flush=True)
                 elif future.result() is not None:
                     yield future.result()

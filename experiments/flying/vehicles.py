@@ -46,9 +46,9 @@ def vehicles(airframe: str = NOMINAL) -> dict[str, np.ndarray]:
     """
     family = vehicle_family(airframe)
     names = [entry.parameter for entry in family]
-    none = np.repeat(
-        [[find_parameter(name)[1].none] for name in names], 4, axis=1
-    ).astype(np.float32)
+    none = np.repeat([[find_parameter(name)[1].none] for name in names], 4, axis=1).astype(
+        np.float32
+    )
     one = none.copy()
     for name, value in TABLE.items():
         one[names.index(name)] = value
@@ -94,9 +94,7 @@ def fly(name: str, options) -> dict[str, dict[str, dict]]:
     """
     policy = load_policy(name)
     game_settings = policy.settings.environment
-    game = game_of(
-        game_settings, options.airframe or game_settings.airframe, options.physics
-    )
+    game = game_of(game_settings, options.airframe or game_settings.airframe, options.physics)
     drawn_from = dataclasses.replace(game, max_pillars=PursuitSettings().max_pillars)
     kinds = {"uniform": uniform_tasks(drawn_from, options.number, game.max_pillars)}
     if options.layouts:
@@ -126,13 +124,8 @@ def finite(summary: dict) -> dict:
 
 def study(options) -> dict:
     """Fly the policies."""
-    drawn_by = {
-        name: getattr(options, name) for name in ("number", "layouts", "airframe")
-    }
-    return {
-        **drawn_by,
-        "policies": {name: fly(name, options) for name in options.policy},
-    }
+    drawn_by = {name: getattr(options, name) for name in ("number", "layouts", "airframe")}
+    return {**drawn_by, "policies": {name: fly(name, options) for name in options.policy}}
 
 
 def page(results: dict) -> Page:
@@ -151,10 +144,7 @@ def page(results: dict) -> Page:
         "motors 40 ms slower, commands 15 ms "
         "and poses 10 ms late, drag of .0125 N s/m; family: the vehicles of the preset flight, "
         "half of them rare ones. " + results.get("note", ""),
-        Table(
-            {"policy": "policy", "vehicle": "vehicle", "tasks": "tasks", **FIGURES},
-            rows,
-        ),
+        Table({"policy": "policy", "vehicle": "vehicle", "tasks": "tasks", **FIGURES}, rows),
         over_layouts(results),
     )
 
@@ -168,13 +158,8 @@ def over_layouts(results: dict) -> Table:
     for name, kinds in results["policies"].items():
         row: dict = {"policy": name}
         for kind, records in kinds.items():
-            layouts = [
-                summary for tasks, summary in records.items() if tasks in SCENARIOS
-            ]
-            for word, figure in (
-                ("captures", "capture_rate"),
-                ("crashes", "crash_rate"),
-            ):
+            layouts = [summary for tasks, summary in records.items() if tasks in SCENARIOS]
+            for word, figure in (("captures", "capture_rate"), ("crashes", "crash_rate")):
                 head = f"{kind}: {word}"
                 row[head] = float(np.mean([summary[figure] for summary in layouts]))
                 columns[head] = lambda r, head=head: f"{r[head]:.3f}"
@@ -186,23 +171,14 @@ def main(arguments: list[str]) -> int:
     """Evaluate and write both files."""
     parser = page_parser(__doc__, "vehicles")
     parser.add_argument(
-        "--policy",
-        nargs="+",
-        default=["open", "flight"],
-        help="names, runs or policy files",
+        "--policy", nargs="+", default=["open", "flight"], help="names, runs or policy files"
     )
     parser.add_argument("--number", type=int, default=1024, help="uniform tasks")
-    parser.add_argument(
-        "--layouts", type=int, default=100, help="episodes of each layout; 0: none"
-    )
+    parser.add_argument("--layouts", type=int, default=100, help="episodes of each layout; 0: none")
     parser.add_argument("--physics", default="rigid")
+    parser.add_argument("--vehicles", nargs="+", choices=list(vehicles()), default=list(vehicles()))
     parser.add_argument(
-        "--vehicles", nargs="+", choices=list(vehicles()), default=list(vehicles())
-    )
-    parser.add_argument(
-        "--airframe",
-        choices=list(AIRFRAMES),
-        help="what flies; default: the policy's own",
+        "--airframe", choices=list(AIRFRAMES), help="what flies; default: the policy's own"
     )
     publish(parser.parse_args(arguments), study, page)
     return 0

@@ -35,22 +35,14 @@ class Truth:
 
     def write(self, now: float, report) -> None:
         """The vehicles are as `report` says at `now` (s)."""
-        of_all = (
-            report.position,
-            report.velocity,
-            report.quaternion,
-            report.body_rates,
-        )
-        self._numbers[1:] = (
-            np.column_stack([np.full(self.number, now), *of_all]).ravel().tolist()
-        )
+        of_all = (report.position, report.velocity, report.quaternion, report.body_rates)
+        self._numbers[1:] = np.column_stack([np.full(self.number, now), *of_all]).ravel().tolist()
 
     def poses(self) -> list[Pose]:
         """Of all vehicles."""
         rows = np.array(self._numbers[1:]).reshape(self.number, _POSE).tolist()
         return [
-            Pose(r[0], tuple(r[1:4]), tuple(r[4:7]), tuple(r[7:11]), tuple(r[11:14]))
-            for r in rows
+            Pose(r[0], tuple(r[1:4]), tuple(r[4:7]), tuple(r[7:11]), tuple(r[11:14])) for r in rows
         ]
 
 
@@ -115,9 +107,7 @@ class _Flown:
     def _reset(self, fault):
         self._fault, self._damage = fault, PoseDamage(fault)
         self._virtual.vehicles.reset()
-        for firmware, link in zip(
-            self._virtual.firmware, self._virtual.links, strict=True
-        ):
+        for firmware, link in zip(self._virtual.firmware, self._virtual.links, strict=True):
             firmware.restart()
             link.faults = link.faults.__class__()
         self._rows = []
@@ -128,24 +118,14 @@ class _Flown:
         """What vehicle i senses, as its log blocks tell it."""
         sensors = self._sensors(i)
         now = time.perf_counter() - self._truth.take_off
-        shown = (
-            sensors.position,
-            sensors.velocity,
-            sensors.quaternion,
-            sensors.body_rates,
-        )
+        shown = (sensors.position, sensors.velocity, sensors.quaternion, sensors.body_rates)
         pose = Pose(now, *(tuple(x.tolist()) for x in shown))
         radioed = self._damage("radio", i, now, pose, ())
         if radioed is pose or radioed is None:
             return sensors
         parts = [
             np.array(p)
-            for p in (
-                radioed.position,
-                radioed.velocity,
-                radioed.quaternion,
-                radioed.body_rates,
-            )
+            for p in (radioed.position, radioed.velocity, radioed.quaternion, radioed.body_rates)
         ]
         return sensors.__class__(
             *parts, sensors.specific_force, sensors.motor_command, sensors.voltage
@@ -177,9 +157,7 @@ class _Flown:
                     "armed": armed,
                     "crashed": crashed,
                 }
-                self._pipe.send(
-                    {name: np.array(values) for name, values in kinds.items()}
-                )
+                self._pipe.send({name: np.array(values) for name, values in kinds.items()})
             else:
                 self._reset(request)
                 self._pipe.send("ready")

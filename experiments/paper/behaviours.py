@@ -64,11 +64,7 @@ def measure(layout: str, paths: Any, statistics: Any) -> dict[str, float | None]
         # beyond the middle plane or in line with the wall: not merely on the way there
         is_near = x < 0.15
         sides = [np.any(is_near & (sign * y > END), axis=-1) for sign in (1.0, -1.0)]
-        return {
-            "both sides": float(
-                np.mean(np.any(sides[0] & sides[1] & is_before, axis=1))
-            )
-        }
+        return {"both sides": float(np.mean(np.any(sides[0] & sides[1] & is_before, axis=1)))}
     if layout == "passage":
         low, high = CORRIDORS
         ways = (y < low, (y > low) & (y < high), y > high)
@@ -81,19 +77,12 @@ def measure(layout: str, paths: Any, statistics: Any) -> dict[str, float | None]
             last = end[b] - 1
             who = int(np.argmax(paths.captured[b, last]))
             velocity = evader[b, last] - evader[b, max(last - 5, 0)]
-            meetings.append(
-                np.dot(velocity, pursuers[b, last, who] - evader[b, last]) > 0.0
-            )
-            ways.append(
-                _way(pursuers[b, : last + 1, who])
-                / max(_way(evader[b, : last + 1]), 1e-6)
-            )
+            meetings.append(np.dot(velocity, pursuers[b, last, who] - evader[b, last]) > 0.0)
+            ways.append(_way(pursuers[b, : last + 1, who]) / max(_way(evader[b, : last + 1]), 1e-6))
         return {"met": _mean(meetings), "shorter way": _mean(ways)}
     is_seen = np.asarray(paths.seen)
     first = np.where(is_seen.any(axis=1), is_seen.argmax(axis=1) + 1, is_seen.shape[1])
-    unseen_share = np.sum(~is_seen & is_before, axis=1) / np.maximum(
-        np.sum(is_before, axis=1), 1
-    )
+    unseen_share = np.sum(~is_seen & is_before, axis=1) / np.maximum(np.sum(is_before, axis=1), 1)
     return {"seen": float(np.mean(first)), "lost": float(np.mean(unseen_share))}
 
 
@@ -101,20 +90,14 @@ def one_episode(paths: Any) -> dict[str, list]:
     """The first episode's paths up to a second after its capture, thinned out."""
     is_caught = np.asarray(paths.captured[0]).any(axis=-1)
     end = (
-        min(int(np.argmax(is_caught)) + 100, len(is_caught))
-        if is_caught.any()
-        else len(is_caught)
+        min(int(np.argmax(is_caught)) + 100, len(is_caught)) if is_caught.any() else len(is_caught)
     )
 
     def thin(values):
         return np.round(np.asarray(values)[0, :end:EVERY], 3).tolist()
 
     capture = int(np.argmax(is_caught)) // EVERY if is_caught.any() else None
-    return {
-        "pursuers": thin(paths.pursuers),
-        "evader": thin(paths.evader),
-        "capture": capture,
-    }
+    return {"pursuers": thin(paths.pursuers), "evader": thin(paths.evader), "capture": capture}
 
 
 def _way(positions):
@@ -136,9 +119,7 @@ def page(results: dict) -> Page:
                 row[method] = [f["layouts"][layout]["behaviour"][name] for f in records]
             rows.append(row)
     meanings = [
-        f"* {layout}, {n}: {text}"
-        for layout, own in MEASURES.items()
-        for n, text in own.items()
+        f"* {layout}, {n}: {text}" for layout, own in MEASURES.items() for n, text in own.items()
     ]
     columns = {"layout": "layout", "behaviour": "name"}
     return Page(
@@ -158,9 +139,7 @@ def draw(results: dict, path: Path) -> None:
     """One episode of every method's first seed on the paper's four layouts."""
     layouts = [layout for layout in MEASURES if layout != "hidden"]
     methods = [method for method in METHODS if flights_of(results, method)]
-    figure = Figure(
-        figsize=(3.1 * len(methods), 3.3 * len(layouts)), layout="constrained"
-    )
+    figure = Figure(figsize=(3.1 * len(methods), 3.3 * len(layouts)), layout="constrained")
     axes = figure.subplots(len(layouts), len(methods), squeeze=False)
     for i, layout in enumerate(layouts):
         for j, method in enumerate(methods):
@@ -171,8 +150,7 @@ def draw(results: dict, path: Path) -> None:
             draw_from_above(axes[i, j], trajectory_of(flown["paths"], layout, title))
             axes[i, j].title.set_fontsize("x-small")
             axes[i, j].set(
-                xlabel=method if i == len(layouts) - 1 else "",
-                ylabel=layout if j == 0 else "",
+                xlabel=method if i == len(layouts) - 1 else "", ylabel=layout if j == 0 else ""
             )
     figure.savefig(path, dpi=70)
 
@@ -187,9 +165,7 @@ def trajectory_of(paths: dict, layout: str, title: str) -> Trajectory:
     return Trajectory(
         title=title,
         pursuer_position=pursuers,
-        pursuer_quaternion=np.broadcast_to(
-            [1.0, 0.0, 0.0, 0.0], (*pursuers.shape[:2], 4)
-        ),
+        pursuer_quaternion=np.broadcast_to([1.0, 0.0, 0.0, 0.0], (*pursuers.shape[:2], 4)),
         evader_position=np.array(paths["evader"]),
         captured=captured,
         crashed=np.zeros_like(captured),

@@ -63,10 +63,7 @@ def fly(
     all `radii` (m).
     """
     settings = environment.settings
-    plain = {
-        field.name: getattr(settings, field.name)
-        for field in dataclasses.fields(settings)
-    }
+    plain = {field.name: getattr(settings, field.name) for field in dataclasses.fields(settings)}
     no_capture = settings.episode_length + 1
     number = speeds.shape[0]
 
@@ -78,9 +75,7 @@ def fly(
         return observation, state, info
 
     def caught(state):
-        games = [
-            dataclasses.replace(settings, capture_radius=radius) for radius in radii
-        ]
+        games = [dataclasses.replace(settings, capture_radius=radius) for radius in radii]
         where = (state.drones.position, state.evader_position, state.in_sight)
         each = [captures(game, *where) for game in games]
         return jnp.any(jnp.stack(each), axis=-1)
@@ -90,29 +85,17 @@ def fly(
         predicted = policy.predict(parameters, observation)
         mean, _ = policy.distribution(parameters.actor, observation, predicted)
         last_seen = observation.last_seen
-        observation, state, info = jax.vmap(step)(
-            state, policy.action(mean, observation), speeds
-        )
-        capture_step = jnp.where(
-            jax.vmap(caught)(state), state.step[:, None], no_capture
-        )
-        guesses = jnp.stack(
-            [last_seen if predicted is None else predicted[:, 0], last_seen]
-        )
+        observation, state, info = jax.vmap(step)(state, policy.action(mean, observation), speeds)
+        capture_step = jnp.where(jax.vmap(caught)(state), state.step[:, None], no_capture)
+        guesses = jnp.stack([last_seen if predicted is None else predicted[:, 0], last_seen])
         errors = errors + jnp.linalg.norm(guesses - state.evader_position, axis=-1)
-        paths = Paths(
-            state.drones.position, state.evader_position, info.seen, info.captured
-        )
+        paths = Paths(state.drones.position, state.evader_position, info.seen, info.captured)
         return (observation, state, jnp.minimum(first, capture_step), errors), paths
 
-    observation, state = jax.vmap(environment.reset_to)(
-        jax.random.split(key, number), tasks
-    )
+    observation, state = jax.vmap(environment.reset_to)(jax.random.split(key, number), tasks)
     first = jnp.full((number, len(radii)), no_capture, jnp.int32)
     start = (observation, state, first, jnp.zeros((2, number), jnp.float32))
-    (_, state, first, errors), paths = jax.lax.scan(
-        one, start, length=settings.episode_length
-    )
+    (_, state, first, errors), paths = jax.lax.scan(one, start, length=settings.episode_length)
     predicted, last_seen = errors / settings.episode_length
     return Flights(
         evaluation=Evaluation(

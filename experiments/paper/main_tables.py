@@ -25,10 +25,7 @@ VARIANTS = ("OPEN", "MAPPO + predictor", "MAPPO + generator", "MAPPO")
 def page(results: dict) -> Page:
     """The three tables."""
     columns = {"layout": "layout", "method": "method"}
-    columns |= {
-        name.replace("_", " "): beside_paper(name, form)
-        for name, form in FIGURES.items()
-    }
+    columns |= {name.replace("_", " "): beside_paper(name, form) for name, form in FIGURES.items()}
     prediction = {
         "layout": "layout",
         "OPEN": "prediction_error:.4f",
@@ -46,15 +43,11 @@ def page(results: dict) -> Page:
         "rate: share of episodes in which any pursuer touches something solid or tips over.",
         (
             Table(
-                columns,
-                cells(results, METHODS, "clamp", LAYOUTS),
-                "Speed clamp, as in the paper",
+                columns, cells(results, METHODS, "clamp", LAYOUTS), "Speed clamp, as in the paper"
             ),
             verdicts(results),
             Table(
-                columns,
-                cells(results, METHODS, "no clamp", LAYOUTS),
-                "Honest physics: no clamp",
+                columns, cells(results, METHODS, "no clamp", LAYOUTS), "Honest physics: no clamp"
             ),
             Table(
                 columns,
@@ -97,18 +90,12 @@ def cells(
     for layout in layouts:
         for method in methods:
             records = [
-                f["layouts"][layout]["record"]
-                for f in flights_of(results, method, condition)
+                f["layouts"][layout]["record"] for f in flights_of(results, method, condition)
             ]
             if records:
-                seeds = {
-                    name: [record.get(name) for record in records]
-                    for name in records[0]
-                }
+                seeds = {name: [record.get(name) for record in records] for name in records[0]}
                 paper = (MAIN.get(layout, {}) | PARTS.get(layout, {})).get(method)
-                row.append(
-                    {**seeds, "layout": layout, "method": method, "paper": paper}
-                )
+                row.append({**seeds, "layout": layout, "method": method, "paper": paper})
     return row
 
 
@@ -147,9 +134,7 @@ def verdicts(results: dict) -> str:
                     above_open.append(f"{layout}: {method} has the better {name}")
                 mean, deviation = record["paper"][i]
                 if sign * (ours - mean) < -deviation - 5e-4:
-                    below_paper.append(
-                        f"{layout}, {method}: {name} {ours:.3g} against {mean:.3g}"
-                    )
+                    below_paper.append(f"{layout}, {method}: {name} {ours:.3g} against {mean:.3g}")
     best = "No method is better than OPEN in any cell."
     if above_open:
         best = f"OPEN is the best but for: {'; '.join(above_open)}."

@@ -31,15 +31,7 @@ from openjax.pursuit import SCENARIOS, Pursuit
 from openjax.store.policies import LoadedPolicy, load_policy
 
 CORES = 2
-TRIED_ON = (
-    "rows .30",
-    "rows .35",
-    "rows .33 to .40",
-    "gates",
-    "cluster",
-    "six pillars",
-    "crashes",
-)
+TRIED_ON = ("rows .30", "rows .35", "rows .33 to .40", "gates", "cluster", "six pillars", "crashes")
 """What variants of the first flights were flown on; spacings in metres."""
 
 
@@ -48,15 +40,7 @@ def train(options: argparse.Namespace, seed: int, cores: list[int]) -> dict:
     command.
     """
     run = options.runs / f"seed_{seed}"
-    command = [
-        sys.executable,
-        "-m",
-        "openjax.train",
-        "--preset",
-        "quick",
-        "--seed",
-        str(seed),
-    ]
+    command = [sys.executable, "-m", "openjax.train", "--preset", "quick", "--seed", str(seed)]
     command += [
         "--out",
         str(run),
@@ -73,17 +57,10 @@ def train(options: argparse.Namespace, seed: int, cores: list[int]) -> dict:
     start = time.monotonic()
     with open(f"{run}.txt", "w") as log:
         pinned = ["taskset", "-c", ",".join(map(str, cores)), *command]
-        subprocess.run(
-            pinned, env=environment, stdout=log, stderr=subprocess.STDOUT, check=True
-        )
+        subprocess.run(pinned, env=environment, stdout=log, stderr=subprocess.STDOUT, check=True)
     seconds = round(time.monotonic() - start)
     print(f"seed {seed}: {seconds} s", flush=True)
-    return {
-        "seed": seed,
-        "jax": jax.__version__,
-        "whole_command": seconds,
-        **record(run),
-    }
+    return {"seed": seed, "jax": jax.__version__, "whole_command": seconds, **record(run)}
 
 
 def record(run: Path) -> dict:
@@ -93,9 +70,7 @@ def record(run: Path) -> dict:
     layouts = read_json(run / "layouts.json")
     policy = load_policy(run)
     figures = {
-        name: layouts[name]
-        for name in ("after", "open", "seconds", "steps")
-        if name in layouts
+        name: layouts[name] for name in ("after", "open", "seconds", "steps") if name in layouts
     }
     step = policy.settings.environment.time_step
     return {"time_step": step, **figures, "every_physics_step": fly_finely(policy)}
@@ -132,17 +107,13 @@ def fly_finely(loaded: LoadedPolicy) -> dict[str, float]:
             return (observation, state), None
 
         start = jax.vmap(game.reset_to)(keys, tasks)
-        return jax.lax.scan(one, start, None, length=own.episode_length)[0][
-            1
-        ].statistics
+        return jax.lax.scan(one, start, None, length=own.episode_length)[0][1].statistics
 
     statistics = episodes(keys, tasks)
     return {
         "capture_rate": float(jnp.mean(statistics.captured)),
         "crash_rate": float(jnp.mean(statistics.crashed)),
-        "capture_seconds": float(jnp.mean(statistics.capture_step))
-        * own.time_step
-        / substeps,
+        "capture_seconds": float(jnp.mean(statistics.capture_step)) * own.time_step / substeps,
     }
 
 
@@ -165,32 +136,22 @@ def page(results: dict) -> Page:
         "JAX": "jax",
         "whole command, s": "whole_command",
         "new tasks": _column("after", "validation"),
-        "... looked at every 10 ms": lambda run: _three(
-            run.get("every_physics_step"), 1.0
-        ),
+        "... looked at every 10 ms": lambda run: _three(run.get("every_physics_step"), 1.0),
         "far starts": _column("after", "validation_far"),
         **{f"`{name}`": _column("after", name) for name in SCENARIOS},
         "new tasks, `open`": _column("open", "validation"),
     }
     parts: list[Table | str] = [Table(columns, results["runs"])]
     if "trials" in results:
-        runs = {
-            name: (lambda row, name=name: spread(row[name], ".2f")) for name in TRIED_ON
-        }
+        runs = {name: (lambda row, name=name: spread(row[name], ".2f")) for name in TRIED_ON}
         parts.append(
-            Table(
-                {"variant": "variant", "updates": "updates", **runs},
-                *results["trials"],
-            )
+            Table({"variant": "variant", "updates": "updates", **runs}, *results["trials"])
         )
     parts.append("\n".join(f"* {finding}" for finding in results.get("findings", ())))
     prose = f"{results['preset']} Each cell: capture rate, seconds to the capture, crash rate. {results.get('note', '')}"
     todays = [run for run in results["runs"] if "recipe" not in run]
     return Page(
-        "The quick preset: what two CPU cores learn",
-        prose,
-        parts,
-        Table(SHOWN, todays[:MOST]),
+        "The quick preset: what two CPU cores learn", prose, parts, Table(SHOWN, todays[:MOST])
     )
 
 
@@ -249,9 +210,7 @@ def main() -> None:
         "--at_once", type=int, default=1, help="runs side by side, on two cores each"
     )
     parser.add_argument("--options", default="", help="more options of openjax.train")
-    parser.add_argument(
-        "--runs", type=Path, default=Path("runs/quick"), help="folder of the runs"
-    )
+    parser.add_argument("--runs", type=Path, default=Path("runs/quick"), help="folder of the runs")
     publish(parser.parse_args(), study, page)
 
 

@@ -37,15 +37,9 @@ def seeds_of(label: str) -> list[tuple[str, int]]:
     beginning = (METHODS | ABLATIONS)[label]
     if beginning in HEURISTICS:
         return [(beginning, seed) for seed in range(SEEDS)]
-    return [
-        (name, 0) for name in shipped_policies() if name.split("_seed_")[0] == beginning
-    ]
+    return [(name, 0) for name in shipped_policies() if name.split("_seed_")[0] == beginning]
 
 
 def flights_of(results: dict, label: str, condition: str = "clamp") -> list[dict]:
     """What tables.py stored of a method, one per seed."""
-    return [
-        f
-        for f in results["flights"]
-        if f["method"] == label and f["condition"] == condition
-    ]
+    return [f for f in results["flights"] if f["method"] == label and f["condition"] == condition]

@@ -14,13 +14,9 @@ def main(arguments: list[str]) -> None:
     for argument in arguments:
         name, _, source = argument.partition("=")
         path = Path(source)
-        _, settings, notes = load_policy_file(
-            path / "policy.npz" if path.is_dir() else path
-        )
+        _, settings, notes = load_policy_file(path / "policy.npz" if path.is_dir() else path)
         target = WEIGHTS / f"{name}.npz"
-        save_policy_file(
-            target, load_policy(source).parameters.replace(critic={}), settings, notes
-        )
+        save_policy_file(target, load_policy(source).parameters.replace(critic={}), settings, notes)
         print(f"{target.name}: {target.stat().st_size / 1024:.0f} KiB")
 
 

@@ -34,9 +34,7 @@ def figures(flown: list[Any], length: int) -> dict:
     rate = np.round(1 - is_missed.mean(axis=1), 5)
     step = np.round(np.where(is_missed, length, first).mean(axis=1), 2)
     place = RADII.index(RADIUS)
-    collisions = [
-        float(np.mean(part.evaluation.statistics.collision_rate)) for part in flown[1:]
-    ]
+    collisions = [float(np.mean(part.evaluation.statistics.collision_rate)) for part in flown[1:]]
     return {
         "radius": {"capture_rate": rate[0].tolist(), "capture_step": step[0].tolist()},
         "speed": {
@@ -50,8 +48,7 @@ def figures(flown: list[Any], length: int) -> dict:
 def seeds_by_method(results: dict) -> dict[str, list[dict]]:
     """The two sweeps of each method's seeds, with the clamp."""
     methods = {
-        label: [flight["sweeps"] for flight in flights_of(results, label)]
-        for label in METHODS
+        label: [flight["sweeps"] for flight in flights_of(results, label)] for label in METHODS
     }
     return {label: seeds for label, seeds in methods.items() if seeds}
 
@@ -93,9 +90,7 @@ def shown(methods: dict[str, list[dict]]) -> Table:
             ("speed", SPEEDS, "m/s", SHOWN_SPEEDS),
         ):
             for value in chosen:
-                rates = [
-                    seed[axis]["capture_rate"][values.index(value)] for seed in seeds
-                ]
+                rates = [seed[axis]["capture_rate"][values.index(value)] for seed in seeds]
                 row[f"{value} {unit}"] = f"{np.mean(rates):.2f}"
         rows.append(row)
     return Table({name: (lambda row, name=name: row[name]) for name in rows[0]}, rows)
@@ -120,12 +115,8 @@ def not_above(methods: dict, axis: str, values: tuple[float, ...], unit: str) ->
     axes_found = []
     for label in methods.keys() - {"OPEN"} if "OPEN" in methods else ():
         for i, value in enumerate(values):
-            rate, step = (
-                mean(label, name, i) for name in ("capture_rate", "capture_step")
-            )
-            best, early = (
-                mean("OPEN", name, i) for name in ("capture_rate", "capture_step")
-            )
+            rate, step = (mean(label, name, i) for name in ("capture_rate", "capture_step"))
+            best, early = (mean("OPEN", name, i) for name in ("capture_rate", "capture_step"))
             if rate > best + 1e-9 or (abs(rate - best) < 1e-9 and step < early):
                 both = f"{rate:.2f} / {step:.0f} against {best:.2f} / {early:.0f}"
                 axes_found.append(f"{label} at {value} {unit} ({both})")
@@ -149,22 +140,13 @@ def draw(results: dict, path: Path) -> None:
         for i, name in enumerate(("capture_rate", "capture_step")):
             for method, seeds in methods.items():
                 values = np.array([seed[axis][name] for seed in seeds])
-                line = {
-                    "color": COLORS[method],
-                    "marker": "o",
-                    "markersize": 3,
-                    "label": method,
-                }
+                line = {"color": COLORS[method], "marker": "o", "markersize": 3, "label": method}
                 axes[i, j].plot(x, values.mean(axis=0), **line)
                 band = {"color": COLORS[method], "alpha": 0.15, "linewidth": 0}
-                axes[i, j].fill_between(
-                    x, values.min(axis=0), values.max(axis=0), **band
-                )
+                axes[i, j].fill_between(x, values.min(axis=0), values.max(axis=0), **band)
             axes[i, j].axvline(own, color="black", linewidth=0.8, linestyle=":")
             axes[i, j].grid(alpha=0.3)
             axes[i, 0].set_ylabel(name.replace("_", " "))
         axes[1, j].set_xlabel(label)
-    axes[0, 0].legend(
-        fontsize="small", title="mean and range over seeds", title_fontsize="small"
-    )
+    axes[0, 0].legend(fontsize="small", title="mean and range over seeds", title_fontsize="small")
     figure.savefig(path, dpi=100)

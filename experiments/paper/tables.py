@@ -27,14 +27,7 @@ from openjax.evaluation.episodes import summarise
 from openjax.evaluation.evaluator import layout_slots, repeat_task, stack
 from openjax.evaluation.result_tables import record_of
 from openjax.files import read_json, to_plain, write_text
-from openjax.pursuit import (
-    SCENARIOS,
-    Pursuit,
-    PursuitSettings,
-    RewardSettings,
-    Task,
-    scenario_task,
-)
+from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings, RewardSettings, Task, scenario_task
 from openjax.store.policies import LoadedPolicy, load_policy
 
 PAGES = {
@@ -68,14 +61,10 @@ def game_of(name: str, limit: str, physics: str) -> tuple[LoadedPolicy, Pursuit]
 def cells_of(evader_speed: float, episodes: int) -> list[tuple[str, float, int]]:
     """Layout, evader speed (m/s) and number of what a policy flies in one call."""
     cells = [(layout, evader_speed, episodes) for layout in LAYOUTS]
-    return cells + [
-        (layout, speed, max(1, episodes // 2)) for layout, speed in sweeps.CELLS
-    ]
+    return cells + [(layout, speed, max(1, episodes // 2)) for layout, speed in sweeps.CELLS]
 
 
-def tasks_of(
-    game: PursuitSettings, cells: list[tuple[str, float, int]]
-) -> dict[int, Task]:
+def tasks_of(game: PursuitSettings, cells: list[tuple[str, float, int]]) -> dict[int, Task]:
     """The tasks of each cell, by its place."""
     return {
         i: repeat_task(scenario_task(game, SCENARIOS[name]), n)
@@ -94,9 +83,7 @@ def call_of(name: str, seed: int, limit: str, physics: str, episodes: int) -> tu
         sweeps.RADII,
         policy.parameters,
         stack(tasks_of(game, cells))[0],
-        jnp.concatenate(
-            [jnp.full(number, speed, jnp.float32) for _, speed, number in cells]
-        ),
+        jnp.concatenate([jnp.full(number, speed, jnp.float32) for _, speed, number in cells]),
         jax.random.key(seed),
     )
 
@@ -112,14 +99,10 @@ def of_policy(name: str, seed: int, limit: str, physics: str, episodes: int) -> 
     parts = list(part(jax.tree.map(np.asarray, fly(*call))).values())
     layouts = {}
     for layout, part in zip(LAYOUTS, parts, strict=False):
-        row = record_of(
-            layout, episodes, summarise(part.evaluation), ("last_seen_error",)
-        )
+        row = record_of(layout, episodes, summarise(part.evaluation), ("last_seen_error",))
         layouts[layout] = {
             "record": row,
-            "behaviour": behaviours.measure(
-                layout, part.paths, part.evaluation.statistics
-            ),
+            "behaviour": behaviours.measure(layout, part.paths, part.evaluation.statistics),
             "paths": behaviours.one_episode(part.paths),
         }
     return {
@@ -138,15 +121,11 @@ def flights_to_keep(options: argparse.Namespace, alike: dict) -> list[dict]:
     records = read_json(path)
     same = {name: records.get(name) for name in alike} == alike
     return [
-        flight
-        for flight in records["flights"]
-        if same and flight["method"] not in options.methods
+        flight for flight in records["flights"] if same and flight["method"] not in options.methods
     ]
 
 
-def calls_of(
-    options: argparse.Namespace,
-) -> dict[tuple[str, str], list[tuple[str, int]]]:
+def calls_of(options: argparse.Namespace) -> dict[tuple[str, str], list[tuple[str, int]]]:
     """Policies and seeds by method and condition; heuristics fly without the clamp,
     too: no training chose their speed.
     """
@@ -182,25 +161,12 @@ def study(options: argparse.Namespace) -> None:
                 # one episode of each method is drawn
                 for layout in record["layouts"].values():
                     del layout["paths"]
-            about = {
-                "method": label,
-                "policy": name,
-                "seed": seed,
-                "condition": condition,
-            }
+            about = {"method": label, "policy": name, "seed": seed, "condition": condition}
             flights.append({**about, "seconds": time.monotonic() - begin, **record})
-            print(
-                f"{time.monotonic() - start:5.0f} s  {label}: {name}, {condition}",
-                flush=True,
-            )
+            print(f"{time.monotonic() - start:5.0f} s  {label}: {name}, {condition}", flush=True)
         # after each, so that an interrupted study leaves what it has
         seconds = time.monotonic() - start
-        results = {
-            **facts(options.commit),
-            "seconds": seconds,
-            **alike,
-            "flights": flights,
-        }
+        results = {**facts(options.commit), "seconds": seconds, **alike, "flights": flights}
         # paths are long: no line for each number
         text = json.dumps(to_plain(results), allow_nan=False, separators=(",", ":"))
         write_text(options.out / "tables.json", text)
@@ -210,23 +176,13 @@ def main(arguments: list[str]) -> int:
     """Fly or read the flights, then write all pages."""
     parser = page_parser(__doc__, ".")
     parser.add_argument(
-        "--episodes",
-        type=int,
-        default=100,
-        help="per seed and layout; half for the sweeps",
+        "--episodes", type=int, default=100, help="per seed and layout; half for the sweeps"
     )
     parser.add_argument(
-        "--physics",
-        choices=("rigid", "mjx"),
-        default="rigid",
-        help="mjx: the same, slower",
+        "--physics", choices=("rigid", "mjx"), default="rigid", help="mjx: the same, slower"
     )
     parser.add_argument(
-        "--methods",
-        nargs="+",
-        choices=LABELS,
-        default=list(LABELS),
-        help="fly these anew",
+        "--methods", nargs="+", choices=LABELS, default=list(LABELS), help="fly these anew"
     )
     options = parser.parse_args(arguments)
     if not options.report:

@@ -31,14 +31,8 @@ def measure(worlds: int, steps: int, contacts: bool, masked: bool) -> dict:
     import openjax
 
     jax.config.update("jax_enable_compilation_cache", False)
-    teams = {
-        "team_sizes": (3,),
-        "evader_speeds": (0.8, 2.0),
-        "capture_radii": (0.2, 0.4),
-    }
-    environment = openjax.make(
-        physics="rigid", contacts=contacts, **(teams if masked else {})
-    )
+    teams = {"team_sizes": (3,), "evader_speeds": (0.8, 2.0), "capture_radii": (0.2, 0.4)}
+    environment = openjax.make(physics="rigid", contacts=contacts, **(teams if masked else {}))
     key = jax.random.key(0)
     state = jax.jit(jax.vmap(environment.reset))(jax.random.split(key, worlds))[1]
     pursuers = environment.settings.num_pursuers
@@ -46,9 +40,7 @@ def measure(worlds: int, steps: int, contacts: bool, masked: bool) -> dict:
     step = jax.vmap(environment.step, in_axes=(None, 0, 0))
 
     def fly(state):
-        return jax.lax.scan(
-            lambda s, _: (step(key, s, action)[1], None), state, length=steps
-        )[0]
+        return jax.lax.scan(lambda s, _: (step(key, s, action)[1], None), state, length=steps)[0]
 
     began = time.perf_counter()
     program = jax.jit(fly).lower(state).compile()
@@ -79,9 +71,7 @@ def main(arguments: list[str]) -> None:
     options = parser.parse_args(arguments)
     if options.here:
         contacts = not options.free
-        print(
-            json.dumps(measure(options.worlds, options.steps, contacts, options.masked))
-        )
+        print(json.dumps(measure(options.worlds, options.steps, contacts, options.masked)))
         return
     plain = [argument for argument in arguments if argument != "--masked"]
     ways = [plain, arguments] if options.masked else [plain]

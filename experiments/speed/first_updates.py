@@ -24,9 +24,7 @@ SEEDS = 5
 UPDATES = 2
 SMALL = changed(
     TrainSettings(),
-    environment=dict(
-        episode_length=12, physics="rigid", history_length=3, capture_radius=1.0
-    ),
+    environment=dict(episode_length=12, physics="rigid", history_length=3, capture_radius=1.0),
     network=dict(features=8, heads=2),
     predictor=dict(units=4, windows=2, steps=1, horizons=(1, 2)),
     mappo=dict(minibatches=2, epochs=2, penalty_start=0.2),
@@ -35,9 +33,7 @@ SMALL = changed(
     rollout_length=4,
     total_steps=24 * 4 * 10,
 )
-REWARD = dict(
-    first_capture=5.0, smoothness=2.0, crash=10.0, first_crash=9.0, lookahead=0.1
-)
+REWARD = dict(first_capture=5.0, smoothness=2.0, crash=10.0, first_crash=9.0, lookahead=0.1)
 RUNS = {
     "plain": SMALL,
     "evaders": changed(
@@ -60,9 +56,7 @@ RUNS = {
     ),
     "bare": changed(
         SMALL,
-        environment=dict(
-            speed_limit="none", substeps=2, physics="stops", reward=REWARD
-        ),
+        environment=dict(speed_limit="none", substeps=2, physics="stops", reward=REWARD),
         network=dict(critic_input="observation", squash="sample"),
         predictor=dict(enabled=False),
         generator=dict(enabled=False),
@@ -85,9 +79,7 @@ def checksums(tree) -> list[str]:
 def equations(jaxpr) -> int:
     """How many a program has, those inside others too."""
     inside = [
-        sub
-        for equation in jaxpr.eqns
-        for sub in jax.extend.core.jaxprs_in_params(equation.params)
+        sub for equation in jaxpr.eqns for sub in jax.extend.core.jaxprs_in_params(equation.params)
     ]
     return len(jaxpr.eqns) + sum(map(equations, inside))
 
@@ -108,9 +100,7 @@ def first_updates(settings: TrainSettings) -> dict:
         for _ in range(UPDATES):
             carry, metrics = compiled(carry)
         record[f"seed {seed}, carry"] = checksums(carry)
-        record[f"seed {seed}, metrics"] = {
-            name: float(metrics[name]) for name in sorted(metrics)
-        }
+        record[f"seed {seed}, metrics"] = {name: float(metrics[name]) for name in sorted(metrics)}
     return record
 
 

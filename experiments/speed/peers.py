@@ -40,16 +40,12 @@ def rate(run, *arguments, steps: int) -> float:
 
 
 def scanned(step, steps: int):
-    return jax.jit(
-        lambda state: jax.lax.scan(lambda s, _: step(s), state, None, length=steps)[0]
-    )
+    return jax.jit(lambda state: jax.lax.scan(lambda s, _: step(s), state, None, length=steps)[0])
 
 
 def openjax_drones(options, contacts: bool = True) -> dict:
     game = openjax.make(contacts=contacts)
-    state = jax.jit(jax.vmap(game.reset))(
-        jax.random.split(jax.random.key(0), options.worlds)
-    )[1]
+    state = jax.jit(jax.vmap(game.reset))(jax.random.split(jax.random.key(0), options.worlds))[1]
     command = action_to_command(jnp.broadcast_to(hover_action(VEHICLE), (3, 4)))
 
     def step(state):
@@ -59,11 +55,7 @@ def openjax_drones(options, contacts: bool = True) -> dict:
         return state.replace(drones=drones), None
 
     number = 3 * options.worlds * options.steps
-    return {
-        "drone_steps_per_second": rate(
-            scanned(step, options.steps), state, steps=number
-        )
-    }
+    return {"drone_steps_per_second": rate(scanned(step, options.steps), state, steps=number)}
 
 
 def crazyflow_drones(options) -> dict:
@@ -75,9 +67,7 @@ def crazyflow_drones(options) -> dict:
     )  # fmt: skip
     sim.mjx_data = None  # for pictures and contact queries: the step doesn't use it
     hover = float(sim.data.params.mass[0]) * 9.81
-    sim.body_rate_control(
-        jnp.full((options.worlds, 3, 4), jnp.array([0.1, 0.1, 0.1, hover]))
-    )
+    sim.body_rate_control(jnp.full((options.worlds, 3, 4), jnp.array([0.1, 0.1, 0.1, hover])))
     number = 3 * options.worlds * options.steps
 
     def run(data):
@@ -100,9 +90,7 @@ def hyperdrone_drones(options) -> dict:
             sim.step(action)
         sim.synchronize()
 
-    return {
-        "drone_steps_per_second": rate(run, steps=3 * options.worlds * options.steps)
-    }
+    return {"drone_steps_per_second": rate(run, steps=3 * options.worlds * options.steps)}
 
 
 def game_steps(options, environment, restarts: bool = True) -> dict:
@@ -111,24 +99,15 @@ def game_steps(options, environment, restarts: bool = True) -> dict:
     keys = jax.random.split(jax.random.key(0), options.worlds)
     state = jax.jit(jax.vmap(environment.reset))(keys)[1]
     actions = {
-        agent: environment.action_space(agent).sample(keys[0])
-        for agent in environment.agents
+        agent: environment.action_space(agent).sample(keys[0]) for agent in environment.agents
     }
 
     def step(state):
-        observed, state, reward, *_ = jax.vmap(advance, (0, 0, None))(
-            keys, state, actions
-        )
+        observed, state, reward, *_ = jax.vmap(advance, (0, 0, None))(keys, state, actions)
         return state, sum(jnp.sum(leaf) for leaf in jax.tree.leaves((observed, reward)))
 
-    run = jax.jit(
-        lambda state: jax.lax.scan(lambda s, _: step(s), state, None, options.steps)
-    )
-    return {
-        "environment_steps_per_second": rate(
-            run, state, steps=options.worlds * options.steps
-        )
-    }
+    run = jax.jit(lambda state: jax.lax.scan(lambda s, _: step(s), state, None, options.steps))
+    return {"environment_steps_per_second": rate(run, state, steps=options.worlds * options.steps)}
 
 
 def jaxmarl_tag(options, restarts: bool = True) -> dict:
@@ -146,9 +125,7 @@ CASES = {
     "openjax, the game without restarts": lambda options: game_steps(
         options, PursuitMultiAgentEnv(), restarts=False
     ),
-    "JaxMARL, simple_tag without restarts": lambda options: jaxmarl_tag(
-        options, restarts=False
-    ),
+    "JaxMARL, simple_tag without restarts": lambda options: jaxmarl_tag(options, restarts=False),
     "Brax's PPO, recovery": lambda options: recovery.brax_ppo(
         options.learning_steps, options.learning_worlds
     ),
@@ -163,9 +140,7 @@ def main(arguments) -> int:
     parser.add_argument("--steps", type=int, default=50, help="steps of a call")
     parser.add_argument("--learning_steps", type=int, default=10_000_000)
     parser.add_argument("--learning_worlds", type=int, default=2048)
-    parser.add_argument(
-        "--sac_steps", type=int, default=20_000, help="of a single drone"
-    )
+    parser.add_argument("--sac_steps", type=int, default=20_000, help="of a single drone")
     parser.add_argument("--only", nargs="*", default=list(CASES), choices=list(CASES))
     parser.add_argument("--json", type=Path, default=Path("peers.json"))
     options = parser.parse_args(arguments)

@@ -43,9 +43,7 @@ def tumble(key):
 
 def see(drone):
     axes = jax.vmap(lambda axis: rotate(drone.quaternion, axis))(jnp.eye(3))
-    return jnp.concatenate(
-        [drone.position, axes.ravel(), drone.velocity, drone.body_rates / 10.0]
-    )
+    return jnp.concatenate([drone.position, axes.ravel(), drone.velocity, drone.body_rates / 10.0])
 
 
 def recover(drone, action):
@@ -56,11 +54,7 @@ def recover(drone, action):
     drone = jax.tree.map(lambda leaf: leaf[0], team)
     distance = jnp.linalg.norm(drone.position)
     speed = jnp.linalg.norm(drone.velocity)
-    reward = (
-        jnp.exp(-3.0 * distance)
-        - 0.05 * speed
-        - 0.01 * jnp.sum(drone.body_rates**2) / 10.0
-    )
+    reward = jnp.exp(-3.0 * distance) - 0.05 * speed - 0.01 * jnp.sum(drone.body_rates**2) / 10.0
     return drone, reward, (distance < 0.2) & (speed < 0.5)
 
 
@@ -96,9 +90,7 @@ def brax_ppo(steps: int, worlds: int = 2048) -> dict:
 
     def note(number, metrics):
         held = float(metrics["eval/episode_held"]) / EPISODE
-        curve.append(
-            {"steps": int(number), "seconds": time.perf_counter() - begin, "held": held}
-        )
+        curve.append({"steps": int(number), "seconds": time.perf_counter() - begin, "held": held})
 
     ppo.train(
         Recovery(), num_timesteps=steps, episode_length=EPISODE, progress_fn=note, num_evals=20,
@@ -133,9 +125,7 @@ class RecoveryEnv(gymnasium.Env):
         return np.asarray(self._see(self._drone)), {}
 
     def step(self, action):
-        self._drone, reward, held = self._recover(
-            self._drone, jnp.asarray(action, jnp.float32)
-        )
+        self._drone, reward, held = self._recover(self._drone, jnp.asarray(action, jnp.float32))
         self._step += 1
         self.held[-1] += float(held) / EPISODE
         seen = np.asarray(self._see(self._drone))
@@ -163,9 +153,7 @@ def rl_tools_sac(steps: int) -> dict:
             break
         if number % (10 * EPISODE) == 0:
             held = max(float(np.mean(one.held[-10:])) for one in environments)
-            curve.append(
-                {"steps": number, "seconds": time.perf_counter() - begin, "held": held}
-            )
+            curve.append({"steps": number, "seconds": time.perf_counter() - begin, "held": held})
             if held >= HOLDS:
                 break
     return summary(curve)

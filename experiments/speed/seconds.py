@@ -54,9 +54,7 @@ class Runner:
         for seed in seeds:
             yield from self.fly(starts[0], seed, self.enough)
 
-    def fly(
-        self, start: str, seed: int, enough: Callable[[dict], bool]
-    ) -> Iterator[dict]:
+    def fly(self, start: str, seed: int, enough: Callable[[dict], bool]) -> Iterator[dict]:
         """One run's curve, until a validation is enough; nothing where the time is
         over.
         """
@@ -78,13 +76,7 @@ class Runner:
             end(process)
             if not validations(file):  # what was kept isn't all
                 shutil.rmtree(cache, ignore_errors=True)
-            yield {
-                "start": start,
-                "seed": seed,
-                "kept": cached,
-                **curve(file),
-                "whole": whole(out),
-            }
+            yield {"start": start, "seed": seed, "kept": cached, **curve(file), "whole": whole(out)}
 
 
 def begin(start: str, seed: int, out: Path, cache: Path) -> subprocess.Popen:
@@ -102,9 +94,7 @@ def begin(start: str, seed: int, out: Path, cache: Path) -> subprocess.Popen:
     ]
     command += ["--compare_with", "none", "--out", str(out)]
     with open(out.with_suffix(".log"), "w") as log:
-        return subprocess.Popen(
-            command, env=environment, stdout=log, stderr=subprocess.STDOUT
-        )
+        return subprocess.Popen(command, env=environment, stdout=log, stderr=subprocess.STDOUT)
 
 
 def end(process: subprocess.Popen) -> None:
@@ -132,9 +122,7 @@ def curve(file: Path) -> dict:
     return {
         "first_update": trained[0]["seconds"] if trained else None,
         "update": float(np.median(seconds)) if len(seconds) else None,
-        "steps_per_second": float(np.median(steps) / np.median(seconds))
-        if len(seconds)
-        else None,
+        "steps_per_second": float(np.median(steps) / np.median(seconds)) if len(seconds) else None,
         "validations": validations(file),
     }
 
@@ -201,17 +189,10 @@ def page(results: dict) -> Page:
     }
     prose = f"Uniform validation tasks. An update is the median of a run's. {results['note']}"
     prose += medians(rows)
-    goals = {
-        name: name for name in ("figure", "goal", "value", "machine", "page or command")
-    }
-    parts = [
-        Table(goals, results.get("goals", []), "Goals"),
-        Table(columns, rows, "Runs"),
-    ]
+    goals = {name: name for name in ("figure", "goal", "value", "machine", "page or command")}
+    parts = [Table(goals, results.get("goals", []), "Goals"), Table(columns, rows, "Runs")]
     shown = [
-        goal
-        for goal in results.get("goals", [])
-        if "evaders.md" not in goal["page or command"]
+        goal for goal in results.get("goals", []) if "evaders.md" not in goal["page or command"]
     ]
     short = {name: name for name in ("figure", "goal", "value")}
     return Page(
@@ -232,12 +213,9 @@ def medians(rows: list[dict]) -> str:
             runs = [
                 run
                 for run in rows
-                if (run["start"], run["kept"]) == (start, cached)
-                and run["validations"][1:]
+                if (run["start"], run["kept"]) == (start, cached) and run["validations"][1:]
             ]
-            seconds = [
-                run["reached"]["seconds"] if run["reached"] else np.inf for run in runs
-            ]
+            seconds = [run["reached"]["seconds"] if run["reached"] else np.inf for run in runs]
             if len(runs) > 2 and np.isfinite(np.median(seconds)):
                 prose += (
                     f" `{start}` with {cached} kept: {np.median(seconds):.1f} s in the median of "
@@ -252,9 +230,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument(
         "--starts", nargs="+", default=["paper"], help="presets, each with its options"
     )
-    parser.add_argument(
-        "--seeds", type=int, nargs="*", default=[], help="of runs until they catch"
-    )
+    parser.add_argument("--seeds", type=int, nargs="*", default=[], help="of runs until they catch")
     parser.add_argument("--whole", action="store_true", help="run those to their end")
     parser.add_argument(
         "--cold", action="store_true", help="run only those, each with nothing kept"
@@ -262,17 +238,11 @@ def main(arguments: list[str]) -> int:
     parser.add_argument(
         "--limit", type=float, default=float("inf"), help="s after which all is over"
     )
+    parser.add_argument("--longest", type=float, default=200.0, help="s that one run may take")
     parser.add_argument(
-        "--longest", type=float, default=200.0, help="s that one run may take"
+        "--cache", type=Path, help="where programs are kept; by default for these runs alone"
     )
-    parser.add_argument(
-        "--cache",
-        type=Path,
-        help="where programs are kept; by default for these runs alone",
-    )
-    parser.add_argument(
-        "--go_on", action="store_true", help="add to the results that are there"
-    )
+    parser.add_argument("--go_on", action="store_true", help="add to the results that are there")
     parser.add_argument("--note", default="")
     publish(parser.parse_args(arguments), study, page)
     return 0

@@ -25,10 +25,7 @@ pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "experiments" / "results"
 PAGES = [
-    *(
-        ROOT / name
-        for name in ("README.md", "CONTRIBUTING.md", "experiments/README.md")
-    ),
+    *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "experiments/README.md")),
     *(ROOT / "docs").glob("*.md"),
     *(ROOT / "docs" / "tutorials").glob("*.md"),
     *RESULTS.rglob("*.md"),
@@ -46,9 +43,7 @@ def commands_in(text: str) -> list[str]:
     it.
     """
     return (
-        []
-        if COMMIT.search(text)
-        else [a + b for a, b in COMMAND.findall(" ".join(text.split()))]
+        [] if COMMIT.search(text) else [a + b for a, b in COMMAND.findall(" ".join(text.split()))]
     )
 
 
@@ -59,9 +54,7 @@ def of_record(stored, parent=None) -> list[str]:
     if isinstance(stored, str):
         return [] if {"program", "commit"} & set(parent or {}) else commands_in(stored)
     if isinstance(stored, dict):
-        return [
-            command for value in stored.values() for command in of_record(value, stored)
-        ]
+        return [command for value in stored.values() for command in of_record(value, stored)]
     if isinstance(stored, list):
         return [command for value in stored for command in of_record(value, parent)]
     return []
@@ -90,9 +83,7 @@ def parse_alone(monkeypatch, words: list[str]) -> None:
     name = words[1] if words[0] == "openjax" else words[2]
     arguments = words[2:] if words[0] == "openjax" else words[3:]
     if name.removeprefix("openjax.") in COMMANDS:
-        module = importlib.import_module(
-            f"openjax.commands.{name.removeprefix('openjax.')}"
-        )
+        module = importlib.import_module(f"openjax.commands.{name.removeprefix('openjax.')}")
         for place in (module, start):
             if parse := getattr(place, "parse", None):
                 monkeypatch.setattr(place, "parse", lambda *a, p=parse: stop(p, *a))
@@ -100,14 +91,10 @@ def parse_alone(monkeypatch, words: list[str]) -> None:
         return
     argparse_parse = argparse.ArgumentParser.parse_args
     monkeypatch.setattr(
-        argparse.ArgumentParser,
-        "parse_args",
-        lambda p, *_: stop(argparse_parse, p, arguments),
+        argparse.ArgumentParser, "parse_args", lambda p, *_: stop(argparse_parse, p, arguments)
     )
     tyro_parse = tyro.cli
-    monkeypatch.setattr(
-        tyro, "cli", lambda kind: stop(tyro_parse, kind, args=arguments)
-    )
+    monkeypatch.setattr(tyro, "cli", lambda kind: stop(tyro_parse, kind, args=arguments))
     runpy.run_module(name, run_name="__main__", alter_sys=True)
 
 
@@ -123,9 +110,7 @@ def typed(command: str) -> list[str]:
 
 
 @pytest.mark.parametrize(
-    "path",
-    [*PAGES, *RESULTS.rglob("*.json")],
-    ids=lambda path: path.relative_to(ROOT).as_posix(),
+    "path", [*PAGES, *RESULTS.rglob("*.json")], ids=lambda path: path.relative_to(ROOT).as_posix()
 )
 def test_commands_can_be_typed(path, monkeypatch):
     text = path.read_text(encoding="utf-8")

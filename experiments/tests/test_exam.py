@@ -33,21 +33,13 @@ def hovering():
     still = {k: np.zeros_like(x) for k, x in laps.items()}
     still["position"][:, 2] = 0.6
     set_up = sensors.draw(rng, "white", "pgacmv", "none")
-    set_up |= {
-        "size": 1e-9,
-        "gyro": 0.0,
-        "gyro_bias": [0.0] * 3,
-        "pose_delay": 0.0,
-        "gust": 0.0,
-    }
+    set_up |= {"size": 1e-9, "gyro": 0.0, "gyro_bias": [0.0] * 3, "pose_delay": 0.0, "gust": 0.0}
     air = sensors.stack([sensors.draw_air(rng, set_up, 300, 3.9) for _ in many])
     air["gyro_bias"] *= 0
     reference = {k: np.stack([still[k], laps[k]], axis=-1) for k in laps}
     arrival = np.repeat(10 * np.arange(300)[:, None], 2, axis=1)
     p = vehicle.nominal_parameters(many)
-    batch = plant.Batch(
-        many, p, reference, ["geometric", "cascade"], np.arange(2), arrival, air
-    )
+    batch = plant.Batch(many, p, reference, ["geometric", "cascade"], np.arange(2), arrival, air)
     return many, p, plant.fly(batch)
 
 
@@ -63,16 +55,12 @@ def test_hover_needs_the_weight_and_motion_agrees_with_the_sensors(hovering):
     accel = np.gradient(speed, 0.002, axis=0)[500:-5]
     accel[:, 2] += 9.81
     force = flown["specific"][500:-5, :, 1]
-    np.testing.assert_allclose(
-        vehicle.rotate_back(q[500:-5].T, accel.T).T, force, atol=0.08
-    )
+    np.testing.assert_allclose(vehicle.rotate_back(q[500:-5].T, accel.T).T, force, atol=0.08)
     turn = 2 * vehicle.multiply((q[:-1] * [1, -1, -1, -1]).T, q[1:].T)[1:].T / 0.002
     np.testing.assert_allclose(turn[500:-5], flown["rates"][501:-5, :, 1], atol=0.05)
 
 
-def test_the_measure_sees_nothing_in_a_true_model_and_a_wrong_thrust_by_its_size(
-    hovering,
-):
+def test_the_measure_sees_nothing_in_a_true_model_and_a_wrong_thrust_by_its_size(hovering):
     many, p, flown = hovering
     none = np.zeros(2, bool)
     assert measure.errors(flown, many, p, np.arange(2), none, none).max() < 2e-3
@@ -103,19 +91,13 @@ def test_drawn_sensors_have_the_noise_that_they_say(hovering):
         "pose_delay": 2.0,
         "quantum": 1.0,
     }
-    rows = log_of(
-        flown, "white", **plain, size=1.0, accel=0.2, position=2e-4, velocity="smooth"
-    )
+    rows = log_of(flown, "white", **plain, size=1.0, accel=0.2, position=2e-4, velocity="smooth")
     at = np.arange(300) * 5
     noise = rows["ax"] - flown["specific"][at, 0, 1]
     assert noise.std() == pytest.approx(0.2, rel=0.15)
-    late = rows["x"] - (
-        flown["position"][at, 0, 1] - 0.002 * flown["velocity"][at, 0, 1]
-    )
+    late = rows["x"] - (flown["position"][at, 0, 1] - 0.002 * flown["velocity"][at, 0, 1])
     assert late[10:].std() == pytest.approx(2.5e-4, rel=0.4)
-    filtered = log_of(
-        flown, "filtered", **plain | {"accel_cut": 30.0}, size=1.0, accel=0.2
-    )
+    filtered = log_of(flown, "filtered", **plain | {"accel_cut": 30.0}, size=1.0, accel=0.2)
     assert (filtered["ax"] - flown["specific"][at, 0, 1])[20:].std() < 0.13
     coarse = log_of(flown, "quantised", **plain | {"quantum": 20.0})
     steps_seen = np.round(coarse["qx"] / 2e-4)
@@ -135,9 +117,7 @@ def test_drawn_sensors_have_the_noise_that_they_say(hovering):
 
 
 def test_the_stranger_column_shares_no_kind_with_the_known_one():
-    known, strange = (
-        cases.draw_cases(3, column, 250) for column in ("known", "stranger")
-    )
+    known, strange = (cases.draw_cases(3, column, 250) for column in ("known", "stranger"))
     for read in (
         lambda c: c["sensors"]["kind"],
         lambda c: c["controller"],
@@ -146,16 +126,14 @@ def test_the_stranger_column_shares_no_kind_with_the_known_one():
     ):
         one, two = ({read(c) for c in column} - {None} for column in (known, strange))
         assert one and two and not one & two
-    assert {
-        c["causes"][0]["effect"] for c in known if c["category"] == "single"
-    } == set(effects.EFFECTS)
+    assert {c["causes"][0]["effect"] for c in known if c["category"] == "single"} == set(
+        effects.EFFECTS
+    )
     assert cases.draw_cases(3, "known", 250) == known
     for c in known:
         for cause in c["causes"]:
             needs = (
-                effects.EFFECTS[cause["effect"]].needs
-                if cause["effect"] in effects.EFFECTS
-                else ""
+                effects.EFFECTS[cause["effect"]].needs if cause["effect"] in effects.EFFECTS else ""
             )
             assert set(needs) <= set(c["sensors"]["channels"])
 
@@ -169,19 +147,14 @@ def test_generated_kinds_differ_and_no_line_in_their_inputs_explains_them():
     function = unknowns.Generated(causes)
     values = []
     for _ in range(600):
-        inputs = np.repeat(
-            rng.standard_normal((len(unknowns.SCALE) - 1, 1)), 40, axis=1
-        )
+        inputs = np.repeat(rng.standard_normal((len(unknowns.SCALE) - 1, 1)), 40, axis=1)
         values.append(np.r_[inputs[:, 0], function(inputs, 50.0 + 10 * rng.uniform())])
     values = np.array(values)
     x = np.c_[np.ones(600), values[:, :-40]]
     f = values[:, -40:]
     line = x @ np.linalg.lstsq(x, f, rcond=None)[0]
     explained = 1 - (f - line).var(0) / f.var(0)
-    assert (
-        np.median(explained) < 0.15
-        and np.abs(np.corrcoef(f.T) - np.eye(40)).max() < 0.6
-    )
+    assert np.median(explained) < 0.15 and np.abs(np.corrcoef(f.T) - np.eye(40)).max() < 0.6
     assert 0.5 < np.median(f.std(0)) < 1.5
 
 
@@ -191,9 +164,7 @@ def test_every_unknown_site_acts(hovering):
     for name, site in unknowns.SITES.items():
         own = cause | {"effect": name, "size": site.sizes[1]}
         if site.logs:
-            one, two = (
-                log_of(flown, "white", unknown=unknown) for unknown in ([], [own])
-            )
+            one, two = (log_of(flown, "white", unknown=unknown) for unknown in ([], [own]))
             wrong = {c for c in one if not np.allclose(one[c], two[c], equal_nan=True)}
             assert wrong and wrong <= set(sensors.GROUPS[site.logs]), name
             continue
@@ -219,12 +190,7 @@ def test_garbage_spoils_what_it_says_and_nothing_else(hovering):
         before = [{k: x.copy() for k, x in f.items()} for f in flights]
         wrong = garbage.spoil(kind, flights, np.random.default_rng(2))
         both = list(zip(flights, before, strict=True))
-        changed = {
-            k
-            for f, o in both
-            for k in f
-            if not np.array_equal(f[k], o[k], equal_nan=True)
-        }
+        changed = {k for f, o in both for k in f if not np.array_equal(f[k], o[k], equal_nan=True)}
         assert changed and changed <= set(wrong), kind
 
 
@@ -252,9 +218,7 @@ def test_written_cases_can_be_read_and_say_what_they_hold(tmp_path, monkeypatch)
         elif answer["effects"] == [
             "rotor_drag"
         ]:  # on laps it shows: the key may not call it hidden
-            assert answer["category"] == "single" and answer["expected"] == [
-                "rotor_drag"
-            ]
+            assert answer["category"] == "single" and answer["expected"] == ["rotor_drag"]
         mass = answer["told"]["mass"]
         assert (
             f"mass = {mass:.5f}"
@@ -276,9 +240,7 @@ def test_rows_that_see_little_of_the_motors_hide_torque(hovering):
         rows = log_of(flown | {"motor": m}, "white", rate=rate, motor="snapshot")
         held, straight = measure.motors_of_log(rows, len(m))
         logged = np.stack([held, held], axis=-1)
-        seen = measure.errors(
-            flown | {"motor": logged}, many, p, np.arange(2), none, none
-        )
+        seen = measure.errors(flown | {"motor": logged}, many, p, np.arange(2), none, none)
         left[rate] = seen[3:6, 1].max()
         assert straight.shape == held.shape
     np.testing.assert_allclose(left[500], 0.0, atol=0.1)

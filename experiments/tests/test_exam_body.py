@@ -33,12 +33,7 @@ def steps(b, number, m=0.0):
     zero = np.zeros_like(b.rates)
     for _ in range(number):
         b.step(
-            np.full((4, b.count), m),
-            np.full(b.count, 3.7),
-            np.full(b.count, 0.6),
-            zero,
-            zero,
-            0.0,
+            np.full((4, b.count), m), np.full(b.count, 3.7), np.full(b.count, 0.6), zero, zero, 0.0
         )
 
 
@@ -58,9 +53,7 @@ def test_a_vehicle_without_thrust_falls_and_turns_as_mechanics_says():
     np.testing.assert_allclose(
         b.position[:, 0], [0.25, -0.1, 1.0 + 0.5 - 0.5 * 9.81 * 0.25], atol=1e-9
     )
-    np.testing.assert_allclose(
-        b.velocity[:, 0], [0.5, -0.2, 1.0 - 9.81 * 0.5], atol=1e-9
-    )
+    np.testing.assert_allclose(b.velocity[:, 0], [0.5, -0.2, 1.0 - 9.81 * 0.5], atol=1e-9)
     np.testing.assert_allclose(momentum(), before, rtol=0.01, atol=2e-7)
     assert energy() == pytest.approx(spin, rel=0.01)
 
@@ -72,10 +65,7 @@ def test_rotors_follow_a_step_with_their_lag_and_hover_carries_the_weight():
     share = b.rotor[0] / (vehicle.MAX_SPEED * 0.5)
     np.testing.assert_allclose(share, 1 - np.exp([-1.0, -0.5]), rtol=1e-6)
     heavy = vehicle.Told(mass=0.04, thrust_constant=3e-8)
-    b = body(
-        vehicle.nominal_parameters([heavy]),
-        speed=vehicle.MAX_SPEED * np.sqrt(heavy.hover),
-    )
+    b = body(vehicle.nominal_parameters([heavy]), speed=vehicle.MAX_SPEED * np.sqrt(heavy.hover))
     steps(b, 10, m=heavy.hover)
     np.testing.assert_allclose(b.specific[:, 0], [0, 0, vehicle.GRAVITY], atol=1e-9)
 
@@ -84,17 +74,13 @@ def test_each_effect_pushes_as_its_formula_says():
     def specific(effect, size, form, shape=(0.25,) * 8, **state):
         p = vehicle.nominal_parameters([vehicle.Told()])
         injection.inject(
-            {"effect": effect, "form": form, "size": size, "shape": list(shape)},
-            p,
-            np.array([0]),
+            {"effect": effect, "form": form, "size": size, "shape": list(shape)}, p, np.array([0])
         )
         b = body(p, speed=vehicle.MAX_SPEED * np.sqrt(vehicle.Told().hover), **state)
         steps(b, 1, m=vehicle.Told().hover)
         return b
 
-    assert specific("thrust_scale", 0.1, "plain").specific[2, 0] == pytest.approx(
-        1.1 * 9.81
-    )
+    assert specific("thrust_scale", 0.1, "plain").specific[2, 0] == pytest.approx(1.1 * 9.81)
     assert specific("mass", 0.1, "plain").specific[2, 0] == pytest.approx(9.81 / 1.1)
     drag = specific("rotor_drag", 0.01, "linear", velocity=[1.0, 0, 0])
     assert drag.specific[0, 0] == pytest.approx(-0.01 / 0.0321)
@@ -103,9 +89,7 @@ def test_each_effect_pushes_as_its_formula_says():
     offset = specific(
         "com_offset", 1.0, "torque", shape=(0.0,) * 8
     )  # 1 mm forward: weight x arm about y
-    assert offset.rates[1, 0] == pytest.approx(
-        0.001 * 0.0321 * 9.81 / 1.4e-5 * 0.001, rel=1e-3
-    )
+    assert offset.rates[1, 0] == pytest.approx(0.001 * 0.0321 * 9.81 / 1.4e-5 * 0.001, rel=1e-3)
     still = specific("wind", 1.0, "steady", shape=(0.0,) * 8)
     assert still.specific[0, 0] == pytest.approx(0.008 / 0.0321)
 
@@ -127,14 +111,7 @@ def test_a_propeller_that_speeds_up_turns_the_body_and_keeps_the_whole_momentum(
     p["rotor_gain"][:, 0] = [1.0, 0.0, 1.0, 0.0]
     b = body(p)
     zero = np.zeros((3, 1))
-    b.step(
-        np.array([[0.5], [0], [0.5], [0]]),
-        np.array([3.7]),
-        np.array([0.6]),
-        zero,
-        zero,
-        0.0,
-    )
+    b.step(np.array([[0.5], [0], [0.5], [0]]), np.array([3.7]), np.array([0.6]), zero, zero, 0.0)
     # a clockwise rotor turns about -z
     spins = (-vehicle.SPIN[:, None] * b.rotor).sum() * 4e-8
     assert b.rates[2, 0] * b.principal[2, 0] == pytest.approx(-spins, rel=1e-6)

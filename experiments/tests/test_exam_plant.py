@@ -75,9 +75,7 @@ def _replay(vehicle, start, motors, commands, from_commands):
             thrust = rotor_thrust(vehicle, rotor)
             reaction = rotor_reaction(vehicle, rotor)
             force, torque = total_wrench(vehicle, thrust, reaction)
-            new = rigid_step(
-                vehicle, state, rotate(state.quaternion, force), torque, dt
-            )
+            new = rigid_step(vehicle, state, rotate(state.quaternion, force), torque, dt)
             rotors = {"rotor_speed": rotor, "rate_integral": integral}
             return new.replace(**rotors, previous_body_rates=state.body_rates), None
 
@@ -114,14 +112,11 @@ def test_nominal_plant_agrees_with_the_rigid_simulator(nominal, from_commands):
 
     def windows(name):
         cut = [
-            np.moveaxis(flown[name][5 * k : 5 * (k + length)][:, :, bodies], 2, 0)
-            for k in starts
+            np.moveaxis(flown[name][5 * k : 5 * (k + length)][:, :, bodies], 2, 0) for k in starts
         ]
         return np.stack(cut).reshape(-1, length, 5, 4)
 
-    replayed = jax.jit(
-        jax.vmap(lambda s, m, c: _replay(load_vehicle(), s, m, c, from_commands))
-    )
+    replayed = jax.jit(jax.vmap(lambda s, m, c: _replay(load_vehicle(), s, m, c, from_commands)))
     velocity, rates = replayed(start, windows("motor"), windows("applied"))
 
     def error(name, values, ticks):
@@ -152,14 +147,9 @@ def test_a_factor_stands_in_for_a_battery_only_while_its_voltage_stays(monkeypat
     let any scale pass for a battery.
     """
     monkeypatch.setattr(cases, "TICKS", 400)
-    sag = effects.draw(np.random.default_rng(1), "battery_sag", "linear") | {
-        "size": 1.2
-    }
+    sag = effects.draw(np.random.default_rng(1), "battery_sag", "linear") | {"size": 1.2}
     for discharge, stands_in in ((0.0, True), (0.2, False)):
         flown = fly(3, causes=[sag], discharge=discharge, resistance=0.0)
         squares = {"truth": flown.replayed(0, flown.parameters)}
         floor = np.sqrt(squares["truth"]) + 0.02
-        assert (
-            answer_key.scale_stands_in(flown, 0, "battery_sag", squares, floor)
-            == stands_in
-        )
+        assert answer_key.scale_stands_in(flown, 0, "battery_sag", squares, floor) == stands_in

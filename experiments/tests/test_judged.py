@@ -42,11 +42,7 @@ RECORDS = [
 
 def test_the_verdict_is_the_evader_that_is_caught_least():
     row = verdict(RECORDS)[0]
-    assert (row["scenario"], row["evader"], row["capture_rate"]) == (
-        "wall",
-        "planner",
-        0.25,
-    )
+    assert (row["scenario"], row["evader"], row["capture_rate"]) == ("wall", "planner", 0.25)
     low, high = row["interval"]
     assert 0.0 < low < 0.25 < high < 1.0
     assert "wall (planner)" in remark(RECORDS)[0]
@@ -54,20 +50,12 @@ def test_the_verdict_is_the_evader_that_is_caught_least():
 
 
 def test_a_slower_vehicle_has_rows_of_its_own():
-    slower = {
-        "records": RECORDS,
-        "effects": load_effects(SLOWER)[1],
-        "vehicle": "crazyflie",
-    }
-    assert (
-        vehicle_of(slower) == "slower" and vehicle_of({"records": RECORDS}) == "nominal"
-    )
+    slower = {"records": RECORDS, "effects": load_effects(SLOWER)[1], "vehicle": "crazyflie"}
+    assert vehicle_of(slower) == "slower" and vehicle_of({"records": RECORDS}) == "nominal"
     learned, planner, paper = rows_of("evaders", slower)
     assert learned["capture_rate"]["random"] == 0.5 and not learned["shown"]
     assert is_shown(paper, []) and not is_shown(paper, ["evaders: the paper's"])
-    assert is_shown(planner, ["evaders: the paper's"]) and not is_shown(
-        planner, ["evaders"]
-    )
+    assert is_shown(planner, ["evaders: the paper's"]) and not is_shown(planner, ["evaders"])
 
 
 def test_the_second_judge_is_the_least_over_learners_and_planner():
@@ -86,13 +74,7 @@ def test_a_curve_is_of_the_strongest_evader_and_ends_where_it_is_free():
     curve = next(c for c in curves_of(RECORDS) if c["evaders"] == "evaders that learn")
     assert curve["strongest"] == "learned 0"
     free = curve["free"]
-    assert (free[0], free[9], free[10], free[20], free[-1]) == (
-        1.0,
-        1.0,
-        0.75,
-        0.5,
-        0.5,
-    )
+    assert (free[0], free[9], free[10], free[20], free[-1]) == (1.0, 1.0, 0.75, 0.5, 0.5)
 
 
 def test_a_team_that_stands_round_the_evader_leaves_a_third_of_the_circle_open():

@@ -29,9 +29,7 @@ def test_a_drone_is_held_where_it_hovers_at_the_goal():
     assert jax.eval_shape(see, drone).shape == (SIZE,)
     assert not bool(advance(drone, jnp.zeros(4))[2])
     still = drone.replace(
-        position=jnp.zeros(3),
-        quaternion=jnp.array([1.0, 0, 0, 0]),
-        body_rates=jnp.zeros(3),
+        position=jnp.zeros(3), quaternion=jnp.array([1.0, 0, 0, 0]), body_rates=jnp.zeros(3)
     )
     _, reward, held = advance(still, jnp.zeros(4))
     assert bool(held) and reward > 0.9
@@ -48,10 +46,7 @@ def test_gymnasium_environment_ends_by_its_time():
 def test_what_is_not_installed_is_left_out_with_a_line(tmp_path):
     file = tmp_path / "peers.json"
     done = subprocess.run(
-        [sys.executable, "-c", BLOCK, str(file)],
-        capture_output=True,
-        text=True,
-        check=True,
+        [sys.executable, "-c", BLOCK, str(file)], capture_output=True, text=True, check=True
     )
     assert done.stdout.count(": left out, ") == 6
     rows = json.loads(file.read_text())["rows"]

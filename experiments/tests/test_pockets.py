@@ -25,9 +25,7 @@ def test_behind_a_pillar_nobody_is_seen():
     np.testing.assert_array_equal(
         sees(a, np.array([0.3, 0.0]) + 0 * a, pillar, 0.1), [False, False]
     )
-    np.testing.assert_array_equal(
-        sees(a, a + np.array([0.1, 0.0]), pillar, 0.1), [True, True]
-    )
+    np.testing.assert_array_equal(sees(a, a + np.array([0.1, 0.0]), pillar, 0.1), [True, True])
 
 
 def test_a_ring_of_pillars_keeps_pursuers_out_and_the_evader_in():
@@ -38,9 +36,7 @@ def test_a_ring_of_pillars_keeps_pursuers_out_and_the_evader_in():
     radius = 0.28 / (2 * np.sin(np.pi / 8))  # of axes .28 m apart
     ring = radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     evader = np.array([0.0, 0.0, 0.6])
-    places, far = distances(
-        GAME, ring, PURSUERS, evader, Rules(margin=0.0, breaches=False)
-    )
+    places, far = distances(GAME, ring, PURSUERS, evader, Rules(margin=0.0, breaches=False))
     at_the_middle = far[np.argmin(np.linalg.norm(places, axis=-1))]
     assert at_the_middle > GAME.capture_radius
     assert np.linalg.norm(places, axis=-1).max() > 0.8, "it may leave through a gap"

@@ -8,9 +8,7 @@ import sys
 from experiments.table import Page, Table, page_parser, publish, write_page
 
 
-def test_results_name_the_command_without_their_own_places_and_the_commit(
-    tmp_path, monkeypatch
-):
+def test_results_name_the_command_without_their_own_places_and_the_commit(tmp_path, monkeypatch):
     arguments = [
         "--number",
         "3",
@@ -30,34 +28,24 @@ def test_results_name_the_command_without_their_own_places_and_the_commit(
 
     def page(results):
         return Page(
-            "Things",
-            f"{results['number']} of them.",
-            Table({"number": "number"}, [results]),
+            "Things", f"{results['number']} of them.", Table({"number": "number"}, [results])
         )
 
     publish(parser.parse_args(arguments), study, page)
     results = json.loads((tmp_path / "page.json").read_text())
     assert results["number"] == 3 and results["seconds"] >= 0
     assert results["command"].endswith(" --number 3 --name 'two words'")
-    assert (
-        results["machine"]["commit"] == "abc" and results["machine"]["versions"]["jax"]
-    )
+    assert results["machine"]["commit"] == "abc" and results["machine"]["versions"]["jax"]
     written = (tmp_path / "page.md").read_text()
-    assert written.startswith(
-        "# Things\n\n3 of them.\n\n| number |\n| --- |\n| 3 |\n\nMade with "
-    )
+    assert written.startswith("# Things\n\n3 of them.\n\n| number |\n| --- |\n| 3 |\n\nMade with ")
     assert f"(abc) by `{results['command']}` on " in written
 
 
 def test_words_of_a_page_stay_and_its_table_is_made_anew(tmp_path, capsys):
     path = tmp_path / "page.md"
-    path.write_text(
-        "# Words\n\n<!-- table -->\n| old |\n<!-- end of table -->\n\nMore words.\n"
-    )
+    path.write_text("# Words\n\n<!-- table -->\n| old |\n<!-- end of table -->\n\nMore words.\n")
     number = {"number": "number"}
-    made = Page(
-        "Things", "", [Table(number, [{"number": 1}])], Table(number, [{"number": 2}])
-    )
+    made = Page("Things", "", [Table(number, [{"number": 1}])], Table(number, [{"number": 2}]))
     write_page(tmp_path / "page", lambda results: made, {"command": "make things"})
     table = "| number |\n| --- |\n| 2 |"
     assert path.read_text() == (

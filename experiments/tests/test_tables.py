@@ -29,16 +29,13 @@ def flight(pursuers, evader, capture, who=0, seen=None):
     if capture is not None:
         captured[0, capture - 1 :, who] = True
     paths = SimpleNamespace(
-        pursuers=np.concatenate([pursuers, np.full((steps, number, 1), 0.5)], axis=-1)[
-            None
-        ],
+        pursuers=np.concatenate([pursuers, np.full((steps, number, 1), 0.5)], axis=-1)[None],
         evader=np.concatenate([evader, np.full((steps, 1), 0.5)], axis=-1)[None],
         seen=np.ones((1, steps), bool) if seen is None else np.asarray(seen)[None],
         captured=captured,
     )
     counted = SimpleNamespace(
-        captured=np.array([capture is not None]),
-        capture_step=np.array([capture or steps]),
+        captured=np.array([capture is not None]), capture_step=np.array([capture or steps])
     )
     return paths, counted
 
@@ -50,20 +47,14 @@ def line(start, end, steps=20):
 @pytest.mark.parametrize(
     ("second", "capture", "expected"), [(-0.7, 20, 1.0), (0.7, 20, 0.0), (-0.7, 5, 0.0)]
 )
-def test_both_sides_means_both_ends_at_once_before_the_capture(
-    second, capture, expected
-):
+def test_both_sides_means_both_ends_at_once_before_the_capture(second, capture, expected):
     first = line([0.6, 0.7], [-0.3, 0.7])
     other = line([0.6, second], [-0.3, second])
-    paths, counted = flight(
-        np.stack([first, other], axis=1), line([-0.8, 0], [-0.8, 0]), capture
-    )
+    paths, counted = flight(np.stack([first, other], axis=1), line([-0.8, 0], [-0.8, 0]), capture)
     assert behaviours.measure("wall", paths, counted)["both sides"] == expected
 
 
-@pytest.mark.parametrize(
-    ("heights", "expected"), [((0.5, 0.0, -0.5), 1.0), ((0.5, 0.1, 0.0), 0.0)]
-)
+@pytest.mark.parametrize(("heights", "expected"), [((0.5, 0.0, -0.5), 1.0), ((0.5, 0.1, 0.0), 0.0)])
 def test_three_ways_are_three_corridors(heights, expected):
     pursuers = np.stack([line([0.5, y], [0.2, y]) for y in heights], axis=1)
     paths, counted = flight(pursuers, line([0, 0.6], [0, 0.6]), None)
@@ -78,9 +69,7 @@ def test_a_catch_from_ahead_is_told_from_one_from_behind_and_ways_are_compared()
     met = behaviours.measure("narrow_gap", *flight(pursuers, evader, 20, who=0))
     followed = behaviours.measure("narrow_gap", *flight(pursuers, evader, 20, who=1))
     assert met["met"] == 1.0 and followed["met"] == 0.0
-    np.testing.assert_allclose(
-        [met["shorter way"], followed["shorter way"]], [0.1, 1.4], rtol=1e-6
-    )
+    np.testing.assert_allclose([met["shorter way"], followed["shorter way"]], [0.1, 1.4], rtol=1e-6)
 
 
 def test_sight_is_counted_until_the_capture():
@@ -94,11 +83,7 @@ def test_every_method_has_its_seeds():
     for method in METHODS:
         seeds = seeds_of(method)
         assert len(seeds) in (0, 3) and len(set(seeds)) == len(seeds)
-    assert [name for name, _ in seeds_of("OPEN")] == [
-        "open",
-        "open_seed_1",
-        "open_seed_2",
-    ]
+    assert [name for name, _ in seeds_of("OPEN")] == ["open", "open_seed_1", "open_seed_2"]
 
 
 def test_the_page_says_where_open_is_not_better_and_where_we_are_worse_than_the_paper():
@@ -114,10 +99,7 @@ def test_the_page_says_where_open_is_not_better_and_where_we_are_worse_than_the_
 
     flown = [flights("OPEN", 1.0, 200, 0.001), flights("APF", 0.26, 150, 0.5)]
     text = main_tables.verdicts({"flights": flown})
-    assert (
-        "wall: APF has the better capture step" in text
-        and "better capture rate" not in text
-    )
+    assert "wall: APF has the better capture step" in text and "better capture rate" not in text
     assert "random, APF: capture rate 0.26 against 0.314" in text
     assert "narrow_gap, APF: capture rate" not in text and "random, OPEN" not in text
 
@@ -126,10 +108,7 @@ def test_sweeps_say_where_open_is_not_above():
     def seeds(rates, steps):
         return [{"radius": {"capture_rate": rates, "capture_step": steps}}]
 
-    methods = {
-        "APF": seeds([0.5, 1.0], [700, 90]),
-        "OPEN": seeds([0.4, 1.0], [700, 100]),
-    }
+    methods = {"APF": seeds([0.5, 1.0], [700, 90]), "OPEN": seeds([0.4, 1.0], [700, 100])}
     text = sweeps.not_above(methods, "radius", (0.1, 0.3), "m")
     assert "APF at 0.1 m (0.50 / 700 against 0.40 / 700); APF at 0.3 m" in text
     assert "No method is above" in sweeps.not_above(

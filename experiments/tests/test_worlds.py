@@ -14,9 +14,7 @@ pytestmark = pytest.mark.slow
 @pytest.fixture(scope="module")
 def start():
     environment = Pursuit(PursuitSettings(physics="rigid", start_attitude="level"))
-    return jax.jit(jax.vmap(environment.reset))(jax.random.split(jax.random.key(2), 2))[
-        1
-    ]
+    return jax.jit(jax.vmap(environment.reset))(jax.random.split(jax.random.key(2), 2))[1]
 
 
 @pytest.mark.parametrize("name", ["plant", "rotorpy"])
@@ -39,9 +37,7 @@ def test_worlds_fly_alike_for_a_moment(start, name):
     assert np.abs(after["position"] - position).max() < 0.03
     pitch = 2 * after["quaternion"][..., 2] / after["quaternion"][..., 0]
     np.testing.assert_allclose(pitch, 0.07, atol=0.04)  # 1 rad/s after the motors' lag
-    np.testing.assert_allclose(
-        world.measure()["position"], after["position"], atol=5e-3
-    )
+    np.testing.assert_allclose(world.measure()["position"], after["position"], atol=5e-3)
 
 
 def test_rotorpy_at_once_is_rotorpy_one_by_one():
@@ -50,14 +46,7 @@ def test_rotorpy_at_once_is_rotorpy_one_by_one():
     """
     multirotor = pytest.importorskip("rotorpy.vehicles.multirotor")
     rng = np.random.default_rng(0)
-    terms = {
-        "c_Dx": 0.01,
-        "c_Dz": 0.02,
-        "k_h": 1e-4,
-        "k_flap": 2e-7,
-        "Ixy": 1e-6,
-        "Ixz": -1.5e-6,
-    }
+    terms = {"c_Dx": 0.01, "c_Dz": 0.02, "k_h": 1e-4, "k_flap": 2e-7, "Ixy": 1e-6, "Ixz": -1.5e-6}
     exact = {"method": "DOP853", "rtol": 1e-10, "atol": 1e-12}
     model = multirotor.Multirotor(crazyflie() | terms, integrator_kwargs=exact)
     attitude = rng.normal(size=(4, 3))
@@ -74,9 +63,7 @@ def test_rotorpy_at_once_is_rotorpy_one_by_one():
         speeds = rng.uniform(0, 2600, (4, 3))  # some beyond what motors can
         bodies.step(speeds, 0.002)
         alone = [
-            model.step(
-                state | {"wind": np.zeros(3)}, {"cmd_motor_speeds": speeds[:, i]}, 0.002
-            )
+            model.step(state | {"wind": np.zeros(3)}, {"cmd_motor_speeds": speeds[:, i]}, 0.002)
             for i, state in enumerate(alone)
         ]
     expected = [np.concatenate([state[name] for name in states]) for state in alone]

@@ -26,11 +26,7 @@ from openjax.ranges import check_intervals, ranged_fields
 
 Command = TypeVar("Command")
 
-_OF_THE_DISK = (
-    "No space left on device",
-    "Disk quota exceeded",
-    "Read-only file system",
-)
+_OF_THE_DISK = ("No space left on device", "Disk quota exceeded", "Read-only file system")
 
 LONGEST = 500
 """Characters of an error's line."""
@@ -203,9 +199,7 @@ def one_line(error: BaseException) -> str | None:
         text = "not enough memory"
     elif _is_out_of_device_memory(error):
         text = f"not enough memory on the device; fewer --num_envs need less ({text})"
-    elif type(error) is RuntimeError and text.startswith(
-        "Unable to initialize backend"
-    ):
+    elif type(error) is RuntimeError and text.startswith("Unable to initialize backend"):
         text = f"JAX finds no device: {text}"
     elif reason := next((reason for reason in _OF_THE_DISK if reason in text), None):
         # libraries that write in C++ tell it in an error of their own
@@ -237,9 +231,7 @@ def quiet_libraries() -> None:
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     for name in ("absl", "jax._src.xla_bridge", "asyncio"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
-    warnings.filterwarnings(
-        "ignore", message="Sharding info not provided when restoring"
-    )
+    warnings.filterwarnings("ignore", message="Sharding info not provided when restoring")
 
 
 def option_names(settings, prefix: str = "") -> list[str]:
@@ -253,9 +245,7 @@ def option_names(settings, prefix: str = "") -> list[str]:
         if dataclasses.is_dataclass(value):
             notes = getattr(hints[field.name], "__metadata__", ())
             has_no_prefix = "" in [getattr(note, "name", None) for note in notes]
-            names += option_names(
-                value, prefix if has_no_prefix else f"{prefix}{field.name}."
-            )
+            names += option_names(value, prefix if has_no_prefix else f"{prefix}{field.name}.")
         else:
             names.append(f"--{prefix}{field.name}")
     return names
@@ -274,9 +264,7 @@ def _one_line(box: str) -> str:
     """The message of tyro's box: what stands in it up to its first rule, below its
     title where no box can be drawn.
     """
-    lines = [
-        line.strip("╰╯│ ") for line in box.splitlines() if not line.startswith("╭")
-    ]
+    lines = [line.strip("╰╯│ ") for line in box.splitlines() if not line.startswith("╭")]
     # paragraphs, between rules and empty lines
     groups = itertools.groupby(lines, key=lambda line: bool(line.strip("─-")))
     paragraphs = [" ".join(group) for says_something, group in groups if says_something]
@@ -285,9 +273,7 @@ def _one_line(box: str) -> str:
     message = " ".join(paragraphs[0].split()) if paragraphs else ""
     if wrong := re.match(r"Error parsing (--\S+): (.*?)\[?('[^']*')\]?\.?$", message):
         option, reason, value = wrong.groups()
-        kind = next(
-            (word for part, word in KINDS.items() if part in reason), "another value"
-        )
+        kind = next((word for part, word in KINDS.items() if part in reason), "another value")
         name = option.replace("-", "_").replace("__", "--", 1)
         return f"{name} is {value}; expected {kind}, see --help"
     return f"{message.rstrip('.')}; see --help"
@@ -311,8 +297,7 @@ def _unknown(argument, default, program):
     # without the dashes, which all have in common
     names = {option.lstrip("-"): option for option in options}
     close = close or [
-        names[word]
-        for word in difflib.get_close_matches(name.lstrip("-"), names, n=1, cutoff=0.6)
+        names[word] for word in difflib.get_close_matches(name.lstrip("-"), names, n=1, cutoff=0.6)
     ]
     hint = f"did you mean {close[0]}?" if close else f"see {program} --help"
     return f"unknown setting {argument.split('=', 1)[0]}; {hint}"

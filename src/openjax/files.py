@@ -54,13 +54,9 @@ def _read(path, what, language, parse: Callable[[str], Any]):
         if not path.exists():
             raise UserError(f"{path}: no such {what}")
         if not path.is_file():
-            raise UserError(
-                f"{path}: is no file; the {what} is one{_example(path, language)}"
-            )
+            raise UserError(f"{path}: is no file; the {what} is one{_example(path, language)}")
         if path.stat().st_size > LARGEST_TEXT:
-            raise UserError(
-                f"{path}: {path.stat().st_size} bytes are too many for a {what}"
-            )
+            raise UserError(f"{path}: {path.stat().st_size} bytes are too many for a {what}")
         # editors of Windows begin with a mark
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
@@ -125,9 +121,7 @@ def replacing(path: str | Path) -> Iterator[Path]:
             _put_in_place(partial, path)
         except BaseException:
             with contextlib.suppress(OSError):
-                shutil.rmtree(partial) if partial.is_dir() else partial.unlink(
-                    missing_ok=True
-                )
+                shutil.rmtree(partial) if partial.is_dir() else partial.unlink(missing_ok=True)
             raise
 
 
@@ -186,8 +180,7 @@ def to_plain(value: Any) -> Any:
     """Dataclasses, tuples and paths as JSON values (dict, list, str, numbers, None)."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {
-            field.name: to_plain(getattr(value, field.name))
-            for field in dataclasses.fields(value)
+            field.name: to_plain(getattr(value, field.name)) for field in dataclasses.fields(value)
         }
     if isinstance(value, dict):
         return {str(key): to_plain(entry) for key, entry in value.items()}
@@ -260,9 +253,7 @@ def check_new_folder(path: str | Path, option: str) -> None:
     """
     path = Path(path)
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
-        raise UserError(
-            f"{option} {path}: exists and isn't an empty folder; name another one"
-        )
+        raise UserError(f"{option} {path}: exists and isn't an empty folder; name another one")
     check_output_folder(path, option)
 
 

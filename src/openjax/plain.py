@@ -57,9 +57,7 @@ def _place(place, key):
 
 def _table(value, place):
     if not isinstance(value, dict):
-        raise UserError(
-            f"{place.removesuffix(ROOT)} is {shown(value)}; expected a table"
-        )
+        raise UserError(f"{place.removesuffix(ROOT)} is {shown(value)}; expected a table")
     return value
 
 
@@ -80,9 +78,7 @@ def _leaf_from_plain(kind, value, place):
         return float(value)
     if kind is Path and isinstance(value, str):
         return Path(value)
-    if kind in WORDS and (
-        not isinstance(value, kind) or (kind is int and isinstance(value, bool))
-    ):
+    if kind in WORDS and (not isinstance(value, kind) or (kind is int and isinstance(value, bool))):
         raise UserError(f"{place} is {shown(value)}; expected {WORDS[kind]}")
     if kind is float and not math.isfinite(value):
         raise UserError(f"{place} is {value}; expected a finite number")
@@ -106,8 +102,7 @@ def _dataclass_from_plain(kind, value, place):
             raise UserError(f"{root} lacks {name}")
     hints = typing.get_type_hints(kind, include_extras=True)
     values = {
-        key: from_plain(hints[key], entry, _place(place, key))
-        for key, entry in entries.items()
+        key: from_plain(hints[key], entry, _place(place, key)) for key, entry in entries.items()
     }
     instance = kind(**values)
     # once more, though most kinds check themselves: here the error names the file

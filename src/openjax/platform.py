@@ -27,11 +27,7 @@ def make_cores_devices() -> None:
     is_chosen = jax.config.jax_num_cpu_devices >= 0 or by_flag
     if not accelerator and not is_chosen:
         # those that this process may use: a container has fewer than the machine
-        cores = (
-            len(os.sched_getaffinity(0))
-            if hasattr(os, "sched_getaffinity")
-            else os.cpu_count()
-        )
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
         with contextlib.suppress(RuntimeError):  # somebody asked before
             jax.config.update("jax_num_cpu_devices", min(cores or 1, MOST_CORES))
 
@@ -63,9 +59,7 @@ def on_platform(reference: Callable, kernel: Callable, *static) -> Callable:
     return run
 
 
-def whole_blocks(
-    array: jax.Array, size: int, axis: int = 0, mode: str = "constant"
-) -> jax.Array:
+def whole_blocks(array: jax.Array, size: int, axis: int = 0, mode: str = "constant") -> jax.Array:
     """`array` padded at the end of `axis` to a multiple of `size`, for a kernel that
     works on whole blocks.
     """

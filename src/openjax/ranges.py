@@ -88,9 +88,7 @@ def ranged_fields(settings: type) -> tuple[Ranged, ...]:
         kind = typing.get_args(hint)[0]
         optional = isinstance(kind, types.UnionType)
         if optional:
-            kind = next(
-                entry for entry in typing.get_args(kind) if entry is not type(None)
-            )
+            kind = next(entry for entry in typing.get_args(kind) if entry is not type(None))
         several = typing.get_origin(kind) is tuple
         if several:
             kind = typing.get_args(kind)[0]
@@ -141,9 +139,7 @@ def changed(settings: Any, **changes) -> Any:
     for name in changes:
         if name not in names:
             of = type(settings).__name__
-            raise UserError(
-                f"{name}: {of} has no such setting; {suggestion(name, names)}"
-            )
+            raise UserError(f"{name}: {of} has no such setting; {suggestion(name, names)}")
     for name, value in changes.items():
         if isinstance(value, dict):
             changes[name] = changed(getattr(settings, name), **value)

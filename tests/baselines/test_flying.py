@@ -36,9 +36,7 @@ def test_the_velocity_controllers_step_response():
     def fly(desired):
         def one(carry, desired):
             observation, state = carry
-            action = velocity_action(
-                craft, observation, jnp.broadcast_to(desired, (2, 3))
-            )
+            action = velocity_action(craft, observation, jnp.broadcast_to(desired, (2, 3)))
             observation, state, *_ = HONEST.step(jax.random.key(0), state, action)
             return (observation, state), (state.drones.velocity, state.drones.position)
 
@@ -66,14 +64,12 @@ def test_surroundings_are_what_the_observation_says():
         return (observation, state), None
 
     start = jax.jit(HONEST.reset_to)(jax.random.key(1), APART)
-    (observation, state), _ = jax.jit(
-        lambda start: jax.lax.scan(one, start, None, length=60)
-    )(start)
+    (observation, state), _ = jax.jit(lambda start: jax.lax.scan(one, start, None, length=60))(
+        start
+    )
     known = jax.jit(lambda observation: surroundings(craft, observation))(observation)
     velocity = np.asarray(state.drones.velocity)
-    np.testing.assert_allclose(
-        known.target_velocity[1], state.evader_velocity, atol=1e-6
-    )
+    np.testing.assert_allclose(known.target_velocity[1], state.evader_velocity, atol=1e-6)
     np.testing.assert_allclose(
         known.from_others_velocity[0, 0], velocity[0] - velocity[1], atol=0.1
     )
@@ -93,15 +89,12 @@ def test_surroundings_are_what_the_observation_says():
 
 
 @pytest.mark.parametrize(
-    ("changes", "complaint"),
-    [({"time_step": 0.05}, "control steps"), ({"mass": 1.5}, "hovers at")],
+    ("changes", "complaint"), [({"time_step": 0.05}, "control steps"), ({"mass": 1.5}, "hovers at")]
 )
 def test_a_heuristic_says_what_it_cannot_fly(changes, complaint):
     environment = Pursuit(PursuitSettings(physics="rigid"))
     if "mass" in changes:
-        vehicle = environment.vehicle.replace(
-            mass=changes["mass"] * environment.vehicle.mass
-        )
+        vehicle = environment.vehicle.replace(mass=changes["mass"] * environment.vehicle.mass)
         environment = Pursuit(environment.settings, vehicle)
     else:
         environment = openjax.make(physics="rigid", **changes)
@@ -109,9 +102,7 @@ def test_a_heuristic_says_what_it_cannot_fly(changes, complaint):
         Heuristic.for_environment("apf", environment)
     with pytest.raises(UserError, match=complaint):
         DacoopPolicy.for_environment(
-            environment,
-            NetworkSettings(output="field"),
-            PredictorSettings(enabled=False),
+            environment, NetworkSettings(output="field"), PredictorSettings(enabled=False)
         )
 
 
@@ -130,9 +121,7 @@ def test_a_velocity_policy_flies_the_velocity_that_its_network_puts_out():
         return (observation, state), None
 
     start = jax.jit(HONEST.reset_to)(jax.random.key(1), APART)
-    (_, state), _ = jax.jit(lambda start: jax.lax.scan(one, start, None, length=80))(
-        start
-    )
+    (_, state), _ = jax.jit(lambda start: jax.lax.scan(one, start, None, length=80))(start)
     diagonal = policy.craft.speed / np.sqrt(2.0)
     expected = [
         [0.3 * policy.craft.speed, -0.4 * policy.craft.speed, 0.0],
@@ -148,23 +137,17 @@ def test_a_velocity_policy_flies_the_velocity_that_its_network_puts_out():
 def test_dacoop_flies_the_field_that_its_network_sets():
     environment = Pursuit(PursuitSettings(physics="rigid"))
     policy = DacoopPolicy.for_environment(
-        environment,
-        NetworkSettings(features=16, output="field"),
-        PredictorSettings(enabled=False),
+        environment, NetworkSettings(features=16, output="field"), PredictorSettings(enabled=False)
     )
     heuristic = Heuristic.for_environment("apf", environment)
     observation, _ = jax.jit(environment.reset)(jax.random.key(0))
-    start = jnp.broadcast_to(
-        jnp.tanh(jnp.array(policy.initial_action)), (3, policy.sample_size)
-    )
+    start = jnp.broadcast_to(jnp.tanh(jnp.array(policy.initial_action)), (3, policy.sample_size))
     fly = jax.jit(policy.action)
     action = fly(start, observation)
 
     @jax.jit
     def follow(observation):
-        desired = apf(
-            heuristic.craft, START, surroundings(heuristic.craft, observation)
-        )
+        desired = apf(heuristic.craft, START, surroundings(heuristic.craft, observation))
         return velocity_action(heuristic.craft, observation, desired)
 
     expected = follow(observation)
@@ -183,10 +166,7 @@ def test_evaluation_through_the_command(tmp_path, capsys):
         "--episodes",
         "4",
     ]
-    assert (
-        main(["--policy", "apf", "--scenario", "empty", "--json", str(out), *options])
-        == 0
-    )
+    assert main(["--policy", "apf", "--scenario", "empty", "--json", str(out), *options]) == 0
     record = json.loads(out.read_text())
     assert (
         record["scenario"] == "empty"
@@ -195,26 +175,8 @@ def test_evaluation_through_the_command(tmp_path, capsys):
     )
     assert record["collision_rate"] < 0.2 and record["over_speed_rate"] == 0.0
     with pytest.raises(UserError, match="control steps"):
-        main(
-            [
-                "--policy",
-                "janosov",
-                "--scenario",
-                "wall",
-                "--environment.time_step",
-                "0.05",
-            ]
-        )
+        main(["--policy", "janosov", "--scenario", "wall", "--environment.time_step", "0.05"])
     with pytest.raises(UserError, match="control steps"):
-        main(
-            [
-                "--policy",
-                "dacoop_seed_0",
-                "--scenario",
-                "wall",
-                "--environment.time_step",
-                "0.05",
-            ]
-        )
+        main(["--policy", "dacoop_seed_0", "--scenario", "wall", "--environment.time_step", "0.05"])
     with pytest.raises(UserError, match="angelani"):
         main(["--policy", "angelany", "--scenario", "wall"])

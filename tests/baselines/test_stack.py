@@ -24,9 +24,7 @@ def round_the_wall(settings, place):
     """
     between = settings.arena_height * jnp.array([1.0, 2.0]) / 3
     step = settings.evader_speed * STEP
-    up = jnp.clip(
-        (between[jnp.argmin(jnp.abs(between - place[2]))] - place[2]) / step, -1.0, 1.0
-    )
+    up = jnp.clip((between[jnp.argmin(jnp.abs(between - place[2]))] - place[2]) / step, -1.0, 1.0)
     radius = jnp.linalg.norm(place[:2])
     out = place[:2] / radius
     outward = jnp.clip((settings.arena_radius - MARGIN - radius) / step, 0.0, 1.0)
@@ -48,9 +46,7 @@ def captures(number=64, wish=None, **changes):
         task = uniform_task(settings, key)
         task = task.replace(pillar_active=jnp.zeros(1, bool))
         observation, state = environment.reset_to(key, task)
-        state = state.replace(
-            evader=draw_evader(settings, key, task.pursuer_position, kind=kind)
-        )
+        state = state.replace(evader=draw_evader(settings, key, task.pursuer_position, kind=kind))
 
         def one(world, _):
             observation, state = world
@@ -59,9 +55,9 @@ def captures(number=64, wish=None, **changes):
             observation, state, *_ = environment.step(key, state, action, wished)
             return (observation, state), None
 
-        return jax.lax.scan(one, (observation, state), length=settings.episode_length)[
-            0
-        ][1].statistics
+        return jax.lax.scan(one, (observation, state), length=settings.episode_length)[0][
+            1
+        ].statistics
 
     keys = jax.random.split(jax.random.key(0), number)
     kinds = jnp.arange(len(EVADERS))
@@ -79,11 +75,7 @@ def test_the_bound_of_the_papers_arena():
 
 
 def test_points_capture_more_than_on_one_ray():
-    for changes in (
-        {},
-        {"num_pursuers": 8},
-        {"num_pursuers": 5, "capture_radius": 0.15},
-    ):
+    for changes in ({}, {"num_pursuers": 8}, {"num_pursuers": 5, "capture_radius": 0.15}):
         settings = PursuitSettings(**changes)
         ratio = planar_bound(settings)
         assert ratio > stack_bound(settings) > 1.0
@@ -108,12 +100,8 @@ def test_every_scripted_evader_is_caught_inside_the_bound():
 @pytest.mark.slow
 @pytest.mark.parametrize(("radius", "most"), [(0.29, 1.0), (0.285, 0.1)])
 def test_the_bound_is_tight(radius, most):
-    inside = PursuitSettings().evader_speed < stack_bound(
-        PursuitSettings(capture_radius=radius)
-    )
-    caught = captures(wish=round_the_wall, capture_radius=radius)[0][
-        EVADERS.index("greedy")
-    ]
+    inside = PursuitSettings().evader_speed < stack_bound(PursuitSettings(capture_radius=radius))
+    caught = captures(wish=round_the_wall, capture_radius=radius)[0][EVADERS.index("greedy")]
     assert inside == caught.all() and caught.mean() <= most
 
 

@@ -46,9 +46,7 @@ def columns_of(plant, effects=None, names=("flight_a", "flight_b", "flight_c")):
     """What is logged of the named sample flights of a plant."""
     return {
         name: fly(plant, NOMINAL, reference, 10 + number, effects)[0]
-        for number, (name, reference) in enumerate(
-            references(seed=1, duration=5.0).items()
-        )
+        for number, (name, reference) in enumerate(references(seed=1, duration=5.0).items())
         if name in names
     }
 
@@ -61,11 +59,7 @@ def case_of(logged, change=lambda columns: columns, weighed=True, **file):
         checked, issues = check_flight(flight, NOMINAL)
         assert not any(i.refused for i in issues), issues
         flights.append(checked)
-    return Case(
-        "case",
-        tuple(flights),
-        VehicleFile(vehicle=NOMINAL, mass_weighed=weighed, **file),
-    )
+    return Case("case", tuple(flights), VehicleFile(vehicle=NOMINAL, mass_weighed=weighed, **file))
 
 
 @pytest.fixture(scope="module")
@@ -86,16 +80,8 @@ def nominal_columns():
 def truths(scale):
     inertia = np.asarray(NOMINAL.inertia)
     return [
-        (
-            "thrust_constant",
-            0,
-            float(NOMINAL.thrust_constant) * scale["thrust_constant"],
-        ),
-        (
-            "torque_constant",
-            0,
-            float(NOMINAL.torque_constant) * scale["torque_constant"],
-        ),
+        ("thrust_constant", 0, float(NOMINAL.thrust_constant) * scale["thrust_constant"]),
+        ("torque_constant", 0, float(NOMINAL.torque_constant) * scale["torque_constant"]),
         (
             "motor_time_constant",
             0,
@@ -115,12 +101,8 @@ def assert_recovered(result, scale, tolerance, but=()):
             # hold them all.
             half_width = 0.5 * np.log(high / low)
             assert (
-                quantity.determined
-                and abs(np.log(quantity.value[axis] / truth)) < 1.5 * half_width
-            ), (
-                name,
-                axis,
-            )
+                quantity.determined and abs(np.log(quantity.value[axis] / truth)) < 1.5 * half_width
+            ), (name, axis)
             assert quantity.value[axis] == pytest.approx(truth, rel=tolerance)
 
 
@@ -138,25 +120,17 @@ def test_the_nominal_vehicle_stays_nominal(nominal_columns):
 
 
 def test_drag_and_an_offset_centre_of_mass_are_not_taken_for_the_constants():
-    effects = {
-        "rotor_drag": {"d_xy": 0.02, "d_z": 0.01},
-        "com_offset": {"x": 0.002, "y": -0.001},
-    }
+    effects = {"rotor_drag": {"d_xy": 0.02, "d_z": 0.01}, "com_offset": {"x": 0.002, "y": -0.001}}
     result = calibrate(case_of(columns_of(NOMINAL, effects)))
-    assert_recovered(
-        result, dict.fromkeys(ALTERED, 1.0), 0.06, but=("motor_time_constant",)
-    )
+    assert_recovered(result, dict.fromkeys(ALTERED, 1.0), 0.06, but=("motor_time_constant",))
     assert result.nuisances["rotor_drag d_xy"][0] == pytest.approx(0.02, rel=0.1)
 
 
 def test_without_weighing_the_assumed_mass_carries_over(altered_case):
     file = dataclasses.replace(altered_case.vehicle_file, mass_weighed=False)
-    heavier = dataclasses.replace(
-        file, vehicle=NOMINAL.replace(mass=NOMINAL.mass * 1.1)
-    )
+    heavier = dataclasses.replace(file, vehicle=NOMINAL.replace(mass=NOMINAL.mass * 1.1))
     weighed, assumed = (
-        calibrate(dataclasses.replace(altered_case, vehicle_file=f))
-        for f in (file, heavier)
+        calibrate(dataclasses.replace(altered_case, vehicle_file=f)) for f in (file, heavier)
     )
     for name in ("thrust_constant", "inertia"):
         ratio = assumed.quantities[name].value[0] / weighed.quantities[name].value[0]
@@ -239,16 +213,12 @@ def test_the_command_writes_a_file_that_loads(case_folder, tmp_path, capsys):
         "motor_time_constant",
         "inertia",
     }
-    np.testing.assert_allclose(
-        file.vehicle.thrust_constant, NOMINAL.thrust_constant, rtol=0.02
-    )
+    np.testing.assert_allclose(file.vehicle.thrust_constant, NOMINAL.thrust_constant, rtol=0.02)
     with pytest.raises(UserError, match="--overwrite"):
         main([str(case_folder), "--out", str(out)])
     (case_folder / "vehicle.toml").write_text(out.read_text())
     again = load_case(case_folder)  # the diagnosis starts from the calibrated vehicle
-    np.testing.assert_array_equal(
-        again.vehicle_file.vehicle.inertia, file.vehicle.inertia
-    )
+    np.testing.assert_array_equal(again.vehicle_file.vehicle.inertia, file.vehicle.inertia)
 
 
 @pytest.mark.parametrize("problem", ["no folder", "unknown key", "no logs"])

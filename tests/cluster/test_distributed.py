@@ -148,17 +148,13 @@ def free_address():
 def wait_for(happened, processes, seconds=480.0):
     deadline = time.monotonic() + seconds
     while not happened():
-        assert time.monotonic() < deadline and all(
-            process.poll() is None for process in processes
-        )
+        assert time.monotonic() < deadline and all(process.poll() is None for process in processes)
         time.sleep(0.01)
 
 
 def train(*options, **popen):
     return subprocess.Popen(
-        [sys.executable, "-m", "openjax.train", *OPTIONS, *map(str, options)],
-        text=True,
-        **popen,
+        [sys.executable, "-m", "openjax.train", *OPTIONS, *map(str, options)], text=True, **popen
     )
 
 
@@ -172,46 +168,19 @@ def killed(tmp_path_factory):
     address = free_address()
     processes = []
     for i in range(2):
-        job = (
-            "--coordinator_address",
-            address,
-            "--num_processes",
-            2,
-            "--process_id",
-            i,
-        )
-        options = (
-            *job,
-            "--devices",
-            "all",
-            "--out",
-            run,
-            "--validation_interval",
-            UPDATES,
-        )
-        with (
-            open(directory / f"{i}.out", "w") as out,
-            open(directory / f"{i}.err", "w") as err,
-        ):
-            processes.append(
-                train(*options, env=environment_with(2), stdout=out, stderr=err)
-            )
+        job = ("--coordinator_address", address, "--num_processes", 2, "--process_id", i)
+        options = (*job, "--devices", "all", "--out", run, "--validation_interval", UPDATES)
+        with open(directory / f"{i}.out", "w") as out, open(directory / f"{i}.err", "w") as err:
+            processes.append(train(*options, env=environment_with(2), stdout=out, stderr=err))
     try:
-        wait_for(
-            lambda: is_checkpoint(run / "checkpoints" / f"{UPDATES:09d}"), processes
-        )
+        wait_for(lambda: is_checkpoint(run / "checkpoints" / f"{UPDATES:09d}"), processes)
         processes[1].send_signal(signal.SIGKILL)
         status = processes[0].wait(480)
     finally:
         for process in processes:
             process.kill()
             process.wait()
-    return (
-        run,
-        status,
-        (directory / "0.err").read_text(),
-        (directory / "1.out").read_text(),
-    )
+    return (run, status, (directory / "0.err").read_text(), (directory / "1.out").read_text())
 
 
 def test_lost_process_ends_the_others_with_one_line(killed):
@@ -230,34 +199,21 @@ def test_only_the_first_process_writes_and_shows(killed):
         "steps/s",
     )  # what the first one tells, beside libraries' notes
     assert not [word for word in shown if word in other], other
-    updates = [
-        record["update"] for record in read_metrics(run / "metrics.jsonl", "train")
-    ]
+    updates = [record["update"] for record in read_metrics(run / "metrics.jsonl", "train")]
     assert updates[:UPDATES] == [1, 2, 3] and len(set(updates)) == len(updates)
 
 
 def test_any_number_of_devices_and_processes_trains_alike_and_goes_on_from_each_other(
     killed, tmp_path
 ):
-    command = [
-        sys.executable,
-        "-c",
-        ONE_PROCESS,
-        str(killed[0]),
-        str(tmp_path),
-        str(UPDATES),
-    ]
-    done = subprocess.run(
-        command, env=environment_with(4), capture_output=True, text=True
-    )
+    command = [sys.executable, "-c", ONE_PROCESS, str(killed[0]), str(tmp_path), str(UPDATES)]
+    done = subprocess.run(command, env=environment_with(4), capture_output=True, text=True)
     assert done.returncode == 0 and "same" in done.stdout, done.stderr[-3000:]
 
 
 def test_worlds_that_cannot_be_shared_out_are_an_error_of_one_line(tmp_path):
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    process = train(
-        "--devices", "all", "--out", tmp_path / "run", env=environment_with(3), **pipes
-    )
+    process = train("--devices", "all", "--out", tmp_path / "run", env=environment_with(3), **pipes)
     _, error = process.communicate()
     assert process.returncode == 2
     assert (
@@ -311,11 +267,7 @@ OPEN_MPI = {
         (SLURM, (None, None, None, True), Membership("gpu03:61447", 2, 1, "slurm")),
         (SLURM, (None, None, None, False), None),
         (SLURM, ("host:1234", 4, 3, True), Membership("host:1234", 4, 3, "deactivate")),
-        (
-            OPEN_MPI,
-            (None, None, None, True),
-            Membership("10.0.0.1:61442", 2, 1, "ompi"),
-        ),
+        (OPEN_MPI, (None, None, None, True), Membership("10.0.0.1:61442", 2, 1, "ompi")),
     ],
 )
 def test_membership_comes_from_the_command_line_or_the_manager(

@@ -29,10 +29,7 @@ def raising(error):
             OSError(28, "No space left on device", "runs/a"),
             "error: runs/a: no space left on device",
         ),
-        (
-            PermissionError(13, "Permission denied", "out"),
-            "error: out: permission denied",
-        ),
+        (PermissionError(13, "Permission denied", "out"), "error: out: permission denied"),
         (
             ValueError("tensorstore: No space left on device [/x]"),
             "error: no space left on device (tensorstore",
@@ -58,9 +55,7 @@ def test_a_mistake_of_openjax_is_not_hidden():
         run_command(raising(ZeroDivisionError("division by zero")))
 
 
-def test_a_terminal_that_lacks_characters_and_a_full_disk_for_the_output(
-    monkeypatch, capsys
-):
+def test_a_terminal_that_lacks_characters_and_a_full_disk_for_the_output(monkeypatch, capsys):
     narrow = io.TextIOWrapper(io.BytesIO(), encoding="latin-1")
     monkeypatch.setattr(sys, "stdout", narrow)
     with pytest.raises(SystemExit) as stop:
@@ -81,10 +76,7 @@ def test_a_terminal_that_lacks_characters_and_a_full_disk_for_the_output(
     [
         ("--num_envs abc", "--num_envs is 'abc'; expected a whole number"),
         ("--minutes soon", "--minutes is 'soon'; expected a number"),
-        (
-            "--learning.learners 2",
-            "unknown setting --learning.learners; did you mean --learners?",
-        ),
+        ("--learning.learners 2", "unknown setting --learning.learners; did you mean --learners?"),
         ("--capture_radius 1", "did you mean --environment.capture_radius?"),
         ("--environment.physics bullet", "Expected one of"),
         ("--learners 65", "learners is 65; it must be a whole number in"),
@@ -101,16 +93,10 @@ def test_numbers_and_truths_may_be_written_as_people_do():
     command = parse(ExploitCommand, ExploitCommand(), line, "openjax exploit")
     settings = command.learning
     game = command.environment
-    assert (settings.total_steps, game.observe_position, command.minutes) == (
-        2_000_000,
-        True,
-        10.0,
-    )
+    assert (settings.total_steps, game.observe_position, command.minutes) == (2_000_000, True, 10.0)
 
 
-def test_what_to_type_next_can_be_typed_where_the_environment_isnt_active(
-    tmp_path, monkeypatch
-):
+def test_what_to_type_next_can_be_typed_where_the_environment_isnt_active(tmp_path, monkeypatch):
     """As after `make train`, which installs into `.venv` and activates nothing."""
     scripts = tmp_path / ".venv" / "bin"
     scripts.mkdir(parents=True)
@@ -119,9 +105,6 @@ def test_what_to_type_next_can_be_typed_where_the_environment_isnt_active(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "executable", str(scripts / "python"))
     monkeypatch.setenv("PATH", str(tmp_path))
-    assert (
-        as_typed("openjax view --policy runs/a")
-        == ".venv/bin/openjax view --policy runs/a"
-    )
+    assert as_typed("openjax view --policy runs/a") == ".venv/bin/openjax view --policy runs/a"
     monkeypatch.setenv("PATH", str(scripts))
     assert as_typed("openjax view --policy runs/a") == "openjax view --policy runs/a"

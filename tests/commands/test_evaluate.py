@@ -43,9 +43,7 @@ def test_an_evader_of_ones_own_is_flown_by_function_and_by_file(tmp_path, capsys
         "    return 0.0 * observation.pillars[:, 0, :4]\n"
     )
     mine = openjax.load_policy(f"{file}:still")
-    by_file = openjax.evaluate(
-        mine, "uniform", episodes=1, opponent=f"{file}:frozen", **game
-    )
+    by_file = openjax.evaluate(mine, "uniform", episodes=1, opponent=f"{file}:frozen", **game)
     assert record == by_file
     command = evaluate.EvaluateCommand(opponent=f"{file}:frozen")
     evaluate._show(command, [(command, "still", [record])])
@@ -63,9 +61,7 @@ def test_an_evader_of_ones_own_is_flown_by_function_and_by_file(tmp_path, capsys
 def test_a_game_that_a_policy_was_never_trained_for_is_said():
     policy = openjax.load_policy("open")
     assert policy.outside_of_training(openjax.make(policy.settings.environment)) == []
-    larger = openjax.make(
-        policy.settings.environment, arena_radius=1.5, airframe="brushless"
-    )
+    larger = openjax.make(policy.settings.environment, arena_radius=1.5, airframe="brushless")
     assert policy.outside_of_training(larger) == [
         "arena_radius 1.5 instead of 0.9",
         "the brushless instead of the crazyflie",
@@ -74,13 +70,7 @@ def test_a_game_that_a_policy_was_never_trained_for_is_said():
 
 
 def test_a_policy_for_teams_flies_with_any_number(tmp_path, capsys):
-    game = dict(
-        physics="rigid",
-        contacts=False,
-        episode_length=5,
-        evaders=("field",),
-        substeps=1,
-    )
+    game = dict(physics="rigid", contacts=False, episode_length=5, evaders=("field",), substeps=1)
     small = dict(
         network=dict(features=8),
         predictor=dict(units=4, horizons=(1, 2), windows=2, steps=1),
@@ -93,28 +83,20 @@ def test_a_policy_for_teams_flies_with_any_number(tmp_path, capsys):
     policy = make_policy(environment, settings.network, settings.predictor)
     kinds = abstract_parameters(environment, policy)
     parameters = jax.tree.map(lambda kind: jnp.zeros(kind.shape), kinds)
-    save_policy_file(
-        tmp_path / "teams.npz", parameters, settings, {}, storage="float32"
-    )
+    save_policy_file(tmp_path / "teams.npz", parameters, settings, {}, storage="float32")
     loaded = openjax.load_policy(tmp_path / "teams.npz")
-    record = openjax.evaluate(
-        loaded, "uniform", episodes=2, num_pursuers=5, evader_speed=1.9
-    )
+    record = openjax.evaluate(loaded, "uniform", episodes=2, num_pursuers=5, evader_speed=1.9)
     assert record["episodes"] == 2 and record["crash_rate"] is not None
     said = " ".join(capsys.readouterr().out.split())
     assert "never trained for this: 5 pursuers, which no team in training had" in said
     pair = loaded.of_team(2)
-    seen = jax.eval_shape(
-        openjax.make(pair.settings.environment).reset, jax.random.key(0)
-    )[0]
+    seen = jax.eval_shape(openjax.make(pair.settings.environment).reset, jax.random.key(0))[0]
     assert jax.eval_shape(pair, seen).shape == (2, 4)
 
 
 def test_where_none_is_named_a_policy_flies_that_takes_so_many(tmp_path, capsys):
     layout = tmp_path / "pair.toml"
-    layout.write_text(
-        "pursuers = [[0.3, 0.0, 0.6], [0.3, 0.3, 0.6]]\nevader = [-0.3, 0.0, 0.6]\n"
-    )
+    layout.write_text("pursuers = [[0.3, 0.0, 0.6], [0.3, 0.3, 0.6]]\nevader = [-0.3, 0.0, 0.6]\n")
     arguments = {
         (): "evaders",
         ("--num_pursuers", "5", "--scenario", "uniform"): "teams",
@@ -124,9 +106,7 @@ def test_where_none_is_named_a_policy_flies_that_takes_so_many(tmp_path, capsys)
         ("--num_pursuers", "5", "--scenario", "uniform", "--policy", "flight"): None,
     }
     for typed, name in arguments.items():
-        command = parse(
-            evaluate.EvaluateCommand, evaluate.EvaluateCommand(), typed, "evaluate"
-        )
+        command = parse(evaluate.EvaluateCommand, evaluate.EvaluateCommand(), typed, "evaluate")
         if name is None:
             with pytest.raises(openjax.UserError, match="num_pursuers 3"):
                 evaluate.prepare(command, typed)

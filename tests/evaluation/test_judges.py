@@ -33,15 +33,10 @@ def state_of(task):
     state = GAME.reset_to(jax.random.key(1), task)[1]
     level = jnp.broadcast_to(jnp.array([1.0, 0.0, 0.0, 0.0]), (3, 4))
     outward = jnp.pad(task.evader_position[:2], (0, 1))
-    drones = state.drones.replace(
-        quaternion=level, velocity=0.1 * task.pursuer_position
-    )
+    drones = state.drones.replace(quaternion=level, velocity=0.1 * task.pursuer_position)
     # what was seen turns with the world
     return state.replace(
-        drones=drones,
-        evader_velocity=outward,
-        last_seen=task.evader_position,
-        step=jnp.int32(7),
+        drones=drones, evader_velocity=outward, last_seen=task.evader_position, step=jnp.int32(7)
     )
 
 
@@ -59,15 +54,11 @@ def test_in_its_own_axes_a_turned_world_is_the_same(world_axes):
     # ahead in its own axes is outwards in the world
     outward = to_world(jnp.array([1.0, 0.0, 0.0]), states[1], jnp.bool_(False))
     position = states[1].evader_position
-    np.testing.assert_allclose(
-        outward[:2], position[:2] / jnp.linalg.norm(position[:2]), atol=1e-5
-    )
+    np.testing.assert_allclose(outward[:2], position[:2] / jnp.linalg.norm(position[:2]), atol=1e-5)
 
 
 def test_more_slots_sense_pillars_that_are_not_there():
-    state = state_of(
-        jax.jit(lambda key: uniform_task(GAME.settings, key))(jax.random.key(0))
-    )
+    state = state_of(jax.jit(lambda key: uniform_task(GAME.settings, key))(jax.random.key(0)))
     few = sense(GAME.settings, state, jnp.bool_(False))
     many = sense(GAME.settings, state, jnp.bool_(False), slots=5)
     np.testing.assert_array_equal(many[: few.size], few)
@@ -79,12 +70,8 @@ def test_more_slots_sense_pillars_that_are_not_there():
 def test_a_specialist_learns_on_a_layout_of_its_own():
     """Of two layouts without and with a pillar, two of four learners have one each."""
     learning = BestResponseSettings(learners=4, specialists=2, layouts=0.0)
-    tasks = jax.vmap(lambda key: uniform_task(GAME.settings, key))(
-        jax.random.split(KEY, 2)
-    )
-    layouts = tasks.replace(
-        pillar_active=jnp.array([[True, False, True], [False, True, False]])
-    )
+    tasks = jax.vmap(lambda key: uniform_task(GAME.settings, key))(jax.random.split(KEY, 2))
+    layouts = tasks.replace(pillar_active=jnp.array([[True, False, True], [False, True, False]]))
     draw = functools.partial(draw_own_task, GAME.settings, layouts, learning)
     keys = jax.random.split(KEY, 4 * 64)
     drawn = jax.jit(jax.vmap(draw))(keys, jnp.repeat(jnp.arange(4), 64)).pillar_active
@@ -98,18 +85,12 @@ def test_who_plans_gets_away_from_slower_points_in_the_open():
     isn't.
     """
     game = game_of_points(
-        arena_radius=10.0,
-        arena_height=10.0,
-        max_speed=1.0,
-        evader_speed=1.3,
-        episode_length=80,
+        arena_radius=10.0, arena_height=10.0, max_speed=1.0, evader_speed=1.3, episode_length=80
     )
     duel = Duel(game, Team(straight))
     task = jax.jit(lambda key: uniform_task(game.settings, key))(jax.random.key(3))
     middle = jnp.array([0.0, 0.0, 5.0])
-    around = middle + 0.6 * jnp.array(
-        [[1.0, 0.0, 0.0], [-0.5, 0.8, 0.0], [-0.5, -0.8, 0.0]]
-    )
+    around = middle + 0.6 * jnp.array([[1.0, 0.0, 0.0], [-0.5, 0.8, 0.0], [-0.5, -0.8, 0.0]])
     task = task.replace(
         evader_position=middle,
         pursuer_position=around,
@@ -141,13 +122,9 @@ def test_plans_end_by_the_evaders_own_rule_and_refined_ones_keep_their_speed():
 
 
 def test_a_value_counts_at_the_end_of_a_plan_unless_it_was_caught():
-    state = state_of(
-        jax.jit(lambda key: uniform_task(GAME.settings, key))(jax.random.key(0))
-    )
+    state = state_of(jax.jit(lambda key: uniform_task(GAME.settings, key))(jax.random.key(0)))
     statistics = state.statistics
-    caught = dataclasses.replace(
-        statistics, captured=jnp.bool_(True), capture_step=state.step + 3
-    )
+    caught = dataclasses.replace(statistics, captured=jnp.bool_(True), capture_step=state.step + 3)
     duel = Duel(GAME, Team(straight))
     plain = Planner(PlannerSettings(), duel)
     valued = Planner(PlannerSettings(), duel, value=lambda state: 9.0)
@@ -159,9 +136,7 @@ def test_a_value_counts_at_the_end_of_a_plan_unless_it_was_caught():
 def test_of_several_ways_the_likeliest_is_flown():
     means = jnp.arange(6.0)
     odds = jnp.array([0.1, 0.7])
-    np.testing.assert_array_equal(
-        likeliest(jnp.concatenate([means, odds])), [3.0, 4.0, 5.0]
-    )
+    np.testing.assert_array_equal(likeliest(jnp.concatenate([means, odds])), [3.0, 4.0, 5.0])
     np.testing.assert_array_equal(likeliest(means[:3]), means[:3])
     spread_out, log_odds = ways(jnp.concatenate([means, odds]))
     assert spread_out.shape == (2, 3)

@@ -27,24 +27,15 @@ def test_pursuers_that_plan_catch_a_slower_evader_that_their_policy_lets_go():
     """The policy hovers; an evader of half their speed that plans is caught all the
     same. Where no pillar stands, who sees honestly sees all.
     """
-    game = game_of_points(
-        num_pursuers=2, evader_speed=0.5, evaders=("field",), episode_length=200
-    )
+    game = game_of_points(num_pursuers=2, evader_speed=0.5, evaders=("field",), episode_length=200)
 
     def flight(observation, state, velocity):
         share = velocity / game.settings.max_speed
         return jnp.concatenate([jnp.zeros((2, 1)), share], axis=-1)
 
-    duel = Duel(
-        game, Team(lambda observation: jnp.zeros_like(observation.self_state[..., :3]))
-    )
+    duel = Duel(game, Team(lambda observation: jnp.zeros_like(observation.self_state[..., :3])))
     place = jnp.array([[[0.5, 0.2, 0.6], [0.5, -0.2, 0.6]]])
-    task = Task(
-        place,
-        jnp.array([[-0.3, 0.0, 0.6]]),
-        jnp.zeros((1, 1, 2)),
-        jnp.zeros((1, 1), bool),
-    )
+    task = Task(place, jnp.array([[-0.3, 0.0, 0.6]]), jnp.zeros((1, 1, 2)), jnp.zeros((1, 1), bool))
     start = duel.start(task, jax.random.key(0))
 
     def flown(last, full_sight):

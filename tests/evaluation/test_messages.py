@@ -30,9 +30,7 @@ def flights(messages):
 
     def one(carry, key):
         state, beliefs = carry
-        observation, state, *_ = game.step(
-            None, state, 0.5 * jax.random.normal(key, (3, 4))
-        )
+        observation, state, *_ = game.step(None, state, 0.5 * jax.random.normal(key, (3, 4)))
         beliefs = hearsay.update(beliefs, state, key)
         views = hearsay.observations(beliefs, state)
         return (state, beliefs), (state, observation, views)
@@ -40,9 +38,7 @@ def flights(messages):
     @jax.jit
     def fly(key):
         state = game.reset(key)[1]
-        return jax.lax.scan(
-            one, (state, hearsay.start(state)), jax.random.split(key, STEPS)
-        )[1]
+        return jax.lax.scan(one, (state, hearsay.start(state)), jax.random.split(key, STEPS))[1]
 
     return fly
 
@@ -51,16 +47,11 @@ def test_perfect_messages_give_all_the_games_own_view():
     _, observation, views = flights(MessageSettings())(jax.random.key(0))
     for name in ("self_state", "others", "pillars", "position", "heading"):
         np.testing.assert_allclose(
-            getattr(views, name)[:, :, 0],
-            getattr(observation, name),
-            atol=1e-5,
-            err_msg=name,
+            getattr(views, name)[:, :, 0], getattr(observation, name), atol=1e-5, err_msg=name
         )
     for name in ("last_seen", "frames", "strategy"):
         wanted = np.repeat(getattr(observation, name)[:, None], 3, axis=1)
-        np.testing.assert_allclose(
-            getattr(views, name), wanted, atol=1e-5, err_msg=name
-        )
+        np.testing.assert_allclose(getattr(views, name), wanted, atol=1e-5, err_msg=name)
 
 
 def test_late_messages_show_teammates_where_they_told_they_would_be():
@@ -73,9 +64,7 @@ def test_late_messages_show_teammates_where_they_told_they_would_be():
     for t in range(delay, STEPS):
         for i in range(3):
             others = np.delete(told[t - delay, :, 2], i)
-            np.testing.assert_allclose(
-                heights[t, i], position[t, i, 2] - others, atol=1e-5
-            )
+            np.testing.assert_allclose(heights[t, i], position[t, i, 2] - others, atol=1e-5)
 
 
 def test_who_hears_nothing_knows_what_it_sees_itself():

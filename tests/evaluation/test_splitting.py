@@ -55,7 +55,5 @@ def test_the_caught_go_on_as_the_free():
     place = np.asarray(sources(jax.random.key(1), state))
     assert place[1] == 1 and place[3] == 3
     assert not np.asarray(caught)[place].any()
-    all_caught = state.replace(
-        statistics=state.statistics.replace(captured=jnp.ones(6, bool))
-    )
+    all_caught = state.replace(statistics=state.statistics.replace(captured=jnp.ones(6, bool)))
     np.testing.assert_array_equal(sources(jax.random.key(1), all_caught), np.arange(6))

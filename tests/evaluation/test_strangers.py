@@ -56,25 +56,17 @@ def test_each_of_a_team_flies_its_own_policy_by_what_that_observes():
         GAME, observe_in="heading", observe_history=2, evaders=("field",)
     )
     games = (Pursuit(GAME), Pursuit(observed_by(GAME, learned_in)))
-    assert (
-        games[1].settings.observe_history == 2
-        and games[1].settings.evaders == GAME.evaders
-    )
+    assert games[1].settings.observe_history == 2 and games[1].settings.evaders == GAME.evaders
     policies = (ByVelocity(2.0), ByVelocity(-1.0))
     keys = jax.random.split(jax.random.key(0), 3)
     tasks = jax.vmap(lambda key: uniform_task(GAME, key))(keys)
     members = jnp.array([[0, 0, 0], [1, 1, 1], [0, 1, 1]])
     key = jax.random.key(1)
-    returns = jax.jit(Strangers(games, policies).fly)(
-        ({}, {}), tasks, members, key
-    ).episode_return
+    returns = jax.jit(Strangers(games, policies).fly)(({}, {}), tasks, members, key).episode_return
     resets = jax.random.split(key, 3)
     for i, (game, policy) in enumerate(zip(games, policies, strict=True)):
         fly = flown_alone(game, policy)
-        alone = [
-            fly(resets[j], jax.tree.map(lambda leaf, j=j: leaf[j], tasks))
-            for j in (i, 2)
-        ]
+        alone = [fly(resets[j], jax.tree.map(lambda leaf, j=j: leaf[j], tasks)) for j in (i, 2)]
         np.testing.assert_allclose(returns[i], alone[0].episode_return, rtol=1e-5)
         assert abs(float(returns[2] - alone[1].episode_return)) > 1e-3
 
@@ -90,15 +82,9 @@ def test_intervals_know_strata():
 def test_who_goes_for_whom():
     pursuers = jnp.array([[0.0, 0, 0], [0.1, 0, 0], [0.2, 0, 0], [1.0, 0, 0]])
     evaders = jnp.array([[0.05, 0.0, 0], [2.0, 0, 0]])
-    wanted = {
-        "nearest": [0, 0, 0, 0],
-        "one_by_one": [0, 0, 0, 0],
-        "shared_out": [0, 0, 1, 1],
-    }
+    wanted = {"nearest": [0, 0, 0, 0], "one_by_one": [0, 0, 0, 0], "shared_out": [0, 0, 1, 1]}
     for name, targets in wanted.items():
-        assert (
-            list(CHOICES[name](pursuers, evaders, jnp.array([True, True]))) == targets
-        ), name
+        assert list(CHOICES[name](pursuers, evaders, jnp.array([True, True]))) == targets, name
         second = CHOICES[name](pursuers, evaders, jnp.array([False, True]))
         assert list(second) == [1, 1, 1, 1], name
 
@@ -111,12 +97,8 @@ def test_an_evader_among_several_flies_as_alone():
     starts = np.asarray(tasks.evader_position)
     assert np.linalg.norm(starts[0] - starts[1]) > 0.05
     policy = ByVelocity(1.0)  # whichever evader it goes for
-    flown = jax.jit(SeveralEvaders(game, policy, CHOICES["nearest"]).fly)(
-        {}, tasks, key
-    )
+    flown = jax.jit(SeveralEvaders(game, policy, CHOICES["nearest"]).fly)({}, tasks, key)
     fly = flown_alone(game, policy)
     for i in range(2):
         alone = fly(key, jax.tree.map(lambda leaf, i=i: leaf[i], tasks))
-        assert (
-            flown.caught[i] == alone.captured and flown.steps[i] == alone.capture_step
-        )
+        assert flown.caught[i] == alone.captured and flown.steps[i] == alone.capture_step

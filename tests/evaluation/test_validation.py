@@ -13,12 +13,7 @@ from hypothesis import strategies as st
 
 from openjax.evaluation.episodes import summarise
 from openjax.evaluation.evaluator import Evaluator
-from openjax.evaluation.validation import (
-    Validation,
-    far_tasks,
-    selection_score,
-    uniform_tasks,
-)
+from openjax.evaluation.validation import Validation, far_tasks, selection_score, uniform_tasks
 from openjax.learning import TrainSettings, build
 from openjax.policy import NetworkSettings, PredictorSettings
 from openjax.pursuit import Pursuit, PursuitSettings, RewardSettings
@@ -36,8 +31,7 @@ def far():
 
 def test_far_tasks_are_fair_and_leave_the_box_of_the_uniform_draw(far):
     narrow = far.replace(
-        pillar_position=far.pillar_position[:, :5],
-        pillar_active=far.pillar_active[:, :5],
+        pillar_position=far.pillar_position[:, :5], pillar_active=far.pillar_active[:, :5]
     )  # the sixth slot is there for the layouts alone
     assert not far.pillar_active[:, 5].any()
     assert jax.vmap(lambda task: starts_clear(SETTINGS, task))(narrow).all()
@@ -55,9 +49,7 @@ def test_far_tasks_are_fair_and_leave_the_box_of_the_uniform_draw(far):
 
 
 def test_fewer_tasks_are_the_first_of_more(far):
-    chex.assert_trees_all_equal(
-        far_tasks(SETTINGS, 3, 6), jax.tree.map(lambda leaf: leaf[:3], far)
-    )
+    chex.assert_trees_all_equal(far_tasks(SETTINGS, 3, 6), jax.tree.map(lambda leaf: leaf[:3], far))
 
 
 def test_uniform_tasks_fly_as_they_would_alone():
@@ -80,9 +72,7 @@ def test_uniform_tasks_fly_as_they_would_alone():
     validation = Validation(environment, policy, run.validation_episodes)
     uniform, far = (kind.evaluation for kind in validation(parameters))
     rewarded = dataclasses.replace(
-        game,
-        max_pillars=6,
-        reward=RewardSettings(smoothness=2.0, first_crash=5000.0, distance=3.0),
+        game, max_pillars=6, reward=RewardSettings(smoothness=2.0, first_crash=5000.0, distance=3.0)
     )
     evaluator = Evaluator(Pursuit(rewarded), policy, 4)
     tasks = {"alone": uniform_tasks(game, 4, 6)}
@@ -90,18 +80,14 @@ def test_uniform_tasks_fly_as_they_would_alone():
     together = summarise(uniform)
     by_itself = summarise(alone)
     assert abs(together.pop("episode_return") - by_itself.pop("episode_return")) > 1.0
-    assert selection_score(together, 3) == pytest.approx(
-        selection_score(by_itself, 3), abs=1e-6
-    )
+    assert selection_score(together, 3) == pytest.approx(selection_score(by_itself, 3), abs=1e-6)
     same = uniform.statistics.replace(episode_return=alone.statistics.episode_return)
     expected = jax.tree.leaves(alone)
     for leaf, other in zip(
         jax.tree.leaves(uniform.replace(statistics=same)), expected, strict=True
     ):
         np.testing.assert_allclose(leaf, other, rtol=1e-5, atol=1e-6)
-    assert not np.allclose(
-        far.statistics.episode_return, uniform.statistics.episode_return
-    )
+    assert not np.allclose(far.statistics.episode_return, uniform.statistics.episode_return)
 
 
 LENGTH = 800
@@ -134,10 +120,6 @@ def test_no_capture_step_makes_up_for_many_failures(summary, step):
     """However much sooner: not for a twentieth of the captures, a tenth of the crashes,
     a hundredth of the steps breached.
     """
-    for name, change in {
-        "capture_rate": -0.05,
-        "crash_rate": 0.1,
-        "collision_rate": 0.01,
-    }.items():
+    for name, change in {"capture_rate": -0.05, "crash_rate": 0.1, "collision_rate": 0.01}.items():
         worse = {**summary, name: summary[name] + change, "capture_step": step}
         assert selection_score(worse, LENGTH) <= selection_score(summary, LENGTH) + 1e-9

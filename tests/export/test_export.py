@@ -43,13 +43,9 @@ def policy_file(tmp_path_factory):
     policy = Policy.for_environment(environment, settings.network, settings.predictor)
     leaves, structure = jax.tree.flatten(abstract_parameters(environment, policy))
     rng = np.random.default_rng(0)
-    moved = [
-        jnp.asarray(0.5 * rng.normal(size=leaf.shape), leaf.dtype) for leaf in leaves
-    ]
+    moved = [jnp.asarray(0.5 * rng.normal(size=leaf.shape), leaf.dtype) for leaf in leaves]
     path = tmp_path_factory.mktemp("policy") / "small.npz"
-    save_policy_file(
-        path, jax.tree.unflatten(structure, moved), settings, storage="float32"
-    )
+    save_policy_file(path, jax.tree.unflatten(structure, moved), settings, storage="float32")
     return path
 
 
@@ -65,19 +61,14 @@ NEEDS_CC = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler 
 
 
 @pytest.mark.parametrize("kind", ["onnx", "jax", pytest.param("c", marks=NEEDS_CC)])
-def test_the_file_acts_as_the_policy_does(
-    policy_file, flown, tmp_path, monkeypatch, kind
-):
+def test_the_file_acts_as_the_policy_does(policy_file, flown, tmp_path, monkeypatch, kind):
     monkeypatch.setattr("openjax.commands.export.observations", lambda *_: dict(flown))
     if kind == "onnx":
         pytest.importorskip("onnxruntime", reason='the extra "export" is not installed')
     report = export(Arguments(str(policy_file), kind, out=tmp_path, observations=64))
     assert report["observations"] == 64
     assert report["largest_difference"] < 1e-5
-    assert json.loads((tmp_path / f"{kind}.json").read_text())["output"]["action"] == [
-        3,
-        4,
-    ]
+    assert json.loads((tmp_path / f"{kind}.json").read_text())["output"]["action"] == [3, 4]
     assert (tmp_path / report["file"]).stat().st_size == report["bytes"]
     assert "privileged" not in report["inputs"] or kind == "jax"
 
@@ -85,9 +76,7 @@ def test_the_file_acts_as_the_policy_does(
 @NEEDS_CC
 def test_a_name_in_no_encoding_is_exported(policy_file, flown, tmp_path, monkeypatch):
     monkeypatch.setattr("openjax.commands.export.observations", lambda *_: dict(flown))
-    odd = shutil.copyfile(
-        policy_file, os.fsdecode(os.fsencode(tmp_path) + b"/policy_\xff.npz")
-    )
+    odd = shutil.copyfile(policy_file, os.fsdecode(os.fsencode(tmp_path) + b"/policy_\xff.npz"))
     export(Arguments(str(odd), "c", out=tmp_path, observations=64))
     assert "policy_\\udcff.npz" in (tmp_path / "policy.c").read_text()
 
@@ -104,19 +93,12 @@ def test_the_c_program_is_one_vehicles_policy_for_any_observation(policy_file, f
         noise = rng.normal(size=values.shape)
         seen[name] = (noise > 0) if values.dtype == bool else noise.astype(np.float32)
     expected = np.asarray(jax.jit(jax.vmap(policy))(Observation(**seen)))[:, :1]
-    own = {
-        name: values[:, :1] if name in EACH else values for name, values in seen.items()
-    }
+    own = {name: values[:, :1] if name in EACH else values for name, values in seen.items()}
     inputs = {
-        name: jax.ShapeDtypeStruct(values.shape[1:], values.dtype)
-        for name, values in own.items()
+        name: jax.ShapeDtypeStruct(values.shape[1:], values.dtype) for name, values in own.items()
     }
     program = c_program(
-        lambda **fields: policy(Observation(**fields)),
-        inputs,
-        "action",
-        "small",
-        "A policy",
+        lambda **fields: policy(Observation(**fields)), inputs, "action", "small", "A policy"
     )
     assert np.ptp(expected, axis=0).min() > 0.01  # a thousand times what may differ
     np.testing.assert_allclose(compile_c(program, "small")(own), expected, atol=1e-5)
@@ -131,9 +113,7 @@ def everything(x, flag):
     table = jnp.arange(12.0).reshape(3, 4)
     y = jnp.einsum("ab,cb->ac", x, table) + jnp.pad(x[:, ::2], ((0, 0), (1, 0)))
     y = jnp.where(flag, jnp.stack([y, -y], 1).sum(1) + y, jnp.clip(y, -1.0, 2.0)) ** 3
-    batched = jnp.einsum(
-        "ab,acd->abcd", y, jnp.stack([y.T @ y, 0.1 * table[:, :3]])
-    ).mean((1, 2))
+    batched = jnp.einsum("ab,acd->abcd", y, jnp.stack([y.T @ y, 0.1 * table[:, :3]])).mean((1, 2))
     return (
         jax.lax.rsqrt(1.0 + jax.nn.softmax(y) ** 2)
         + jnp.concatenate([y[:, 1:], y[:, :1]], 1).T.max(0)[:, None]
@@ -141,18 +121,13 @@ def everything(x, flag):
     )
 
 
-KINDS = {
-    "x": jax.ShapeDtypeStruct((2, 4), jnp.float32),
-    "flag": jax.ShapeDtypeStruct((2, 3), bool),
-}
+KINDS = {"x": jax.ShapeDtypeStruct((2, 4), jnp.float32), "flag": jax.ShapeDtypeStruct((2, 3), bool)}
 X = np.random.default_rng(0).normal(size=(2, 4)).astype(np.float32)
 FLAG = np.array([[True, False, True], [False, True, False]])
 
 
 def test_operations_become_their_counterparts_in_onnx():
-    onnxruntime = pytest.importorskip(
-        "onnxruntime", reason='the extra "export" is not installed'
-    )
+    onnxruntime = pytest.importorskip("onnxruntime", reason='the extra "export" is not installed')
     from openjax.export.onnx_graph import onnx_model
 
     model = onnx_model(everything, KINDS, "y")
@@ -165,14 +140,9 @@ def test_operations_become_their_counterparts_in_onnx():
 
 @NEEDS_CC
 def test_operations_become_their_counterparts_in_c():
-    found = compile_c(
-        c_program(everything, KINDS, "y", "everything", "A test"), "everything"
-    )
+    found = compile_c(c_program(everything, KINDS, "y", "everything", "A test"), "everything")
     np.testing.assert_allclose(
-        found({"x": X[None], "flag": FLAG[None]})[0],
-        everything(X, FLAG),
-        rtol=2e-5,
-        atol=2e-5,
+        found({"x": X[None], "flag": FLAG[None]})[0], everything(X, FLAG), rtol=2e-5, atol=2e-5
     )
 
 

@@ -22,33 +22,23 @@ VEHICLE = load_vehicle()
 
 
 def refusals(columns):
-    (flight,), _ = flights_of(
-        LogTable("flight.csv", columns, np.full(len(columns["t"]), "0"))
-    )
+    (flight,), _ = flights_of(LogTable("flight.csv", columns, np.full(len(columns["t"]), "0")))
     kept, issues = check_flight(flight, VEHICLE)
     return kept, [i for i in issues if i.refused]
 
 
-@pytest.mark.parametrize(
-    "channel", [c for c in CHANNEL_COLUMNS if c != "battery_voltage"]
-)
+@pytest.mark.parametrize("channel", [c for c in CHANNEL_COLUMNS if c != "battery_voltage"])
 @pytest.mark.parametrize("how", ["shuffled", "of another time", "noise"])
 def test_a_channel_that_contradicts_the_others_is_garbage(channel, how, sample_columns):
     columns = sample_columns["flight_b"]
     rng = np.random.default_rng(1)
     rows = len(columns["t"])
-    order = (
-        rng.permutation(rows)
-        if how == "shuffled"
-        else np.roll(np.arange(rows), rows // 3)
-    )
+    order = rng.permutation(rows) if how == "shuffled" else np.roll(np.arange(rows), rows // 3)
     changed = dict(columns)
     for name in CHANNEL_COLUMNS[channel]:
         changed[name] = columns[name][order]
         if how == "noise":
-            changed[name] = columns[name].mean() + columns[
-                name
-            ].std() * rng.standard_normal(rows)
+            changed[name] = columns[name].mean() + columns[name].std() * rng.standard_normal(rows)
     if channel in ("motor_command", "command_thrust"):
         changed |= {n: np.clip(changed[n], 0.0, 1.0) for n in CHANNEL_COLUMNS[channel]}
     kept, found = refusals(changed)
@@ -64,10 +54,7 @@ def test_noise_in_every_column_is_garbage(sample_columns):
         n: v if n == "t" else np.nanmean(v) + np.nanstd(v) * rng.standard_normal(len(v))
         for n, v in columns.items()
     }
-    for names, low, high in (
-        (CHANNEL_COLUMNS["motor_command"], 0, 1),
-        (("cmd_thrust",), 0, 1),
-    ):
+    for names, low, high in ((CHANNEL_COLUMNS["motor_command"], 0, 1), (("cmd_thrust",), 0, 1)):
         noise |= {n: np.clip(noise[n], low, high) for n in names}
     length = np.sqrt(sum(noise[f"q{p}"] ** 2 for p in "wxyz"))
     noise |= {f"q{p}": noise[f"q{p}"] / length for p in "wxyz"}
@@ -128,18 +115,14 @@ def test_an_estimates_wandering_position_is_no_contradiction_while_hovering():
     assert kept is not None, found
 
 
-@pytest.mark.parametrize(
-    ("hover", "contradicts"), [(0.5, [False]), (0.85, []), (None, [True])]
-)
+@pytest.mark.parametrize(("hover", "contradicts"), [(0.5, [False]), (0.85, []), (None, [True])])
 def test_motors_at_their_limit_need_not_add_up_to_the_thrust(hover, contradicts):
     """A light and a heavy vehicle, whose mixer is cut at full thrust; and motors that
     follow another thrust.
     """
     rng = np.random.default_rng(6)
     steps = 3000
-    slow = sosfilt(
-        butter(2, 2.0, fs=100.0, output="sos"), rng.standard_normal((steps, 3)), axis=0
-    )
+    slow = sosfilt(butter(2, 2.0, fs=100.0, output="sos"), rng.standard_normal((steps, 3)), axis=0)
     thrust, roll, other = slow.T / slow.std(0)[:, None] * [[0.01], [0.05], [0.01]]
     center = hover or 0.5
     asked = (
@@ -150,9 +133,7 @@ def test_motors_at_their_limit_need_not_add_up_to_the_thrust(hover, contradicts)
     nothing = dict.fromkeys(
         ("position", "quaternion", "velocity", "body_rates", "force", "commands")
     )
-    logged = Signals(
-        motor=np.clip(asked, 0.0, 1.0), thrust=(center + thrust)[:, None], **nothing
-    )
+    logged = Signals(motor=np.clip(asked, 0.0, 1.0), thrust=(center + thrust)[:, None], **nothing)
     assert [bool(pair.bad.any()) for pair in pairs_of(logged)] == contradicts
 
 
@@ -175,8 +156,7 @@ def test_what_most_flights_contradict_the_calm_ones_must_show_to_be_right(
     calm |= still | {"z": 0.5 + 0.001 * rng.standard_normal(300)}
     calm |= {m: 0.5 + 0.01 * rng.standard_normal(300) for m in ("m1", "m2", "m3", "m4")}
     calm |= {
-        a: (9.81 if a == "az" else 0.0) + 0.1 * rng.standard_normal(300)
-        for a in ("ax", "ay", "az")
+        a: (9.81 if a == "az" else 0.0) + 0.1 * rng.standard_normal(300) for a in ("ax", "ay", "az")
     }
     calm["cmd_thrust"] = (calm["m1"] + calm["m2"] + calm["m3"] + calm["m4"]) / 4
     assert refusals(calm)[1] == []
@@ -210,9 +190,7 @@ PATHS = {
 
 @pytest.mark.parametrize("imu", [True, False])
 @pytest.mark.parametrize("fault", PATHS)
-def test_a_position_moves_as_its_velocity_says_however_slowly(
-    fault, imu, sample_columns
-):
+def test_a_position_moves_as_its_velocity_says_however_slowly(fault, imu, sample_columns):
     """A figure of some decimetres in ten seconds is below the band of the other
     comparisons.
     """
@@ -239,9 +217,7 @@ PARTS = ("qw", "qx", "qy", "qz")
 def test_parts_of_a_quaternion_that_are_swapped_are_named(pair, name, sample_columns):
     """In a single flight, where no other tells what is right."""
     columns = swapped(*pair)(sample_columns[name])
-    order = [
-        dict(zip(pair, pair[::-1], strict=True)).get(part, part)[1] for part in PARTS
-    ]
+    order = [dict(zip(pair, pair[::-1], strict=True)).get(part, part)[1] for part in PARTS]
     kept, found = refusals(columns)
     assert kept is None
     # a level vehicle's yaw: other axes of the world do the same
@@ -274,9 +250,7 @@ def test_a_quick_turn_to_and_fro_the_wrong_way_round_is_no_late_one():
     path = 0.012 * np.stack([np.cos(phase), np.sin(1.1 * phase), 0.0 * t], 1)
     velocity = np.gradient(path, t, axis=0)
     up = np.gradient(velocity, t, axis=0) + np.array([0.0, 0.0, 9.81])
-    attitude = Rotation.concatenate(
-        [Rotation.align_vectors([u], [[0.0, 0.0, 1.0]])[0] for u in up]
-    )
+    attitude = Rotation.concatenate([Rotation.align_vectors([u], [[0.0, 0.0, 1.0]])[0] for u in up])
     rates = (attitude[:-1].inv() * attitude[1:]).as_rotvec() / 0.01
     rates = np.concatenate([rates, rates[-1:]])
     columns = {"t": t, "cmd_thrust": 0.62 + 0.01 * np.cos(3.0 * t)}

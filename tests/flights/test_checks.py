@@ -18,9 +18,7 @@ VEHICLE = load_vehicle()
 
 
 def check(columns, **log):
-    (flight,), _ = flights_of(
-        LogTable("flight.csv", columns, np.full(len(columns["t"]), "0"))
-    )
+    (flight,), _ = flights_of(LogTable("flight.csv", columns, np.full(len(columns["t"]), "0")))
     return check_flight(flight, VEHICLE, log)
 
 
@@ -29,9 +27,7 @@ def scaled(names, factor):
 
 
 def renamed(names, sources):
-    return lambda c: (
-        c | {n: c[s] for n, s in zip(names.split(), sources.split(), strict=True)}
-    )
+    return lambda c: c | {n: c[s] for n, s in zip(names.split(), sources.split(), strict=True)}
 
 
 def without(*names):
@@ -75,11 +71,7 @@ REFUSED = {
         "quaternion",
         "in the order x, y, z, w",
     ),
-    "quaternion world to body": (
-        scaled("qx qy qz", -1),
-        "quaternion",
-        "from world to body",
-    ),
+    "quaternion world to body": (scaled("qx qy qz", -1), "quaternion", "from world to body"),
     "quaternion not unit": (scaled("qw qx qy qz", 0.5), "quaternion", "aren't unit"),
     "motor order": (renamed("m1 m2 m3 m4", "m2 m3 m4 m1"), "motors", "m1 rear_right"),
     "two motors swapped": (renamed("m1 m2", "m2 m1"), "motors", "motor order"),
@@ -93,27 +85,15 @@ REFUSED = {
         "corrupt",
         "commands lie in 0..1",
     ),
-    "two recordings in one file": (
-        lambda c: c | {"t": c["t"] % 4.0},
-        "time",
-        "runs backwards",
-    ),
+    "two recordings in one file": (lambda c: c | {"t": c["t"] % 4.0}, "time", "runs backwards"),
     "frozen clock": (
         lambda c: c | {"t": np.round(c["t"] / 0.05) * 0.05},
         "time",
         "repeat the time",
     ),
-    "no commands": (
-        without("m1", "m2", "m3", "m4", "cmd_thrust"),
-        "columns",
-        "no commands",
-    ),
+    "no commands": (without("m1", "m2", "m3", "m4", "cmd_thrust"), "columns", "no commands"),
     "no state": (without("x", "wx"), "columns", "needs position and orientation"),
-    "too short": (
-        lambda c: {k: v[:150] for k, v in c.items()},
-        "short",
-        "at least 2 s",
-    ),
+    "too short": (lambda c: {k: v[:150] for k, v in c.items()}, "short", "at least 2 s"),
     "never took off": (scaled("m1 m2 m3 m4 cmd_thrust", 0.0), "corrupt", "same value"),
 }
 
@@ -124,9 +104,7 @@ def test_a_planted_fault_is_refused_with_its_name(fault, sample_columns):
     kept, issues = check(plant(sample_columns["flight_c"]))
     assert kept is None
     refusals = [i for i in issues if i.refused]
-    assert [i.kind for i in refusals][:1] == [kind] and words in " ".join(
-        i.issue for i in refusals
-    )
+    assert [i.kind for i in refusals][:1] == [kind] and words in " ".join(i.issue for i in refusals)
 
 
 def test_good_flights_pass_without_a_word(sample_columns):
@@ -147,14 +125,10 @@ def test_good_flights_pass_without_a_word(sample_columns):
 )
 def test_flights_with_the_least_that_is_needed_pass(drop, sample_columns):
     kept, issues = check(without(*drop)(sample_columns["flight_b"]))
-    assert kept is not None and all(
-        "derived from the attitude" in i.issue for i in issues
-    )
+    assert kept is not None and all("derived from the attitude" in i.issue for i in issues)
 
 
-def test_body_rates_come_from_the_attitude_where_no_gyroscope_was_logged(
-    sample_columns,
-):
+def test_body_rates_come_from_the_attitude_where_no_gyroscope_was_logged(sample_columns):
     columns = sample_columns["flight_b"]
     kept, (issue,) = check(without("wx", "wy", "wz", "ax", "ay", "az")(columns))
     assert kept.body_rates_derived and issue.kind == "columns"
@@ -168,13 +142,10 @@ def test_motors_alone_are_enough_for_a_comparison(sample_columns):
     motors = {k: columns[k] for k in ("t", "m1", "m2", "m3", "m4")}
     # two stretches in the air with the ground between: both are kept
     motors = {
-        k: np.where(k == "t" or abs(columns["t"] - 4.0) > 0.5, v, 0.0)
-        for k, v in motors.items()
+        k: np.where(k == "t" or abs(columns["t"] - 4.0) > 0.5, v, 0.0) for k, v in motors.items()
     }
     motors["t"] = columns["t"]
-    (flight,), _ = flights_of(
-        LogTable("flight.csv", motors, np.full(len(columns["t"]), "0"))
-    )
+    (flight,), _ = flights_of(LogTable("flight.csv", motors, np.full(len(columns["t"]), "0")))
     assert check_flight(flight, VEHICLE)[0] is None
     kept, _ = check_flight(flight, VEHICLE, comparison=True)
     assert kept.duration > 7.0 and len(kept.stretches()) == 2
@@ -184,9 +155,9 @@ def test_motors_alone_are_enough_for_a_comparison(sample_columns):
 def test_other_row_rates_pass(rate, sample_columns):
     columns = sample_columns["flight_c"]
     at = np.arange(0.0, columns["t"][-1], 1 / rate)
-    resampled = {
-        k: np.interp(at, columns["t"], v) for k, v in columns.items() if k != "vbat"
-    } | {"t": at}
+    resampled = {k: np.interp(at, columns["t"], v) for k, v in columns.items() if k != "vbat"} | {
+        "t": at
+    }
     kept, issues = check(resampled)
     assert issues == [] and kept.row_period == pytest.approx(1 / rate)
 
@@ -201,9 +172,7 @@ def test_velocity_is_derived_where_it_is_missing(sample_columns):
     )  # m/s; the logged one has 0.005 of noise
 
 
-def test_a_velocity_that_missing_rows_have_spoilt_is_taken_from_the_position(
-    sample_columns,
-):
+def test_a_velocity_that_missing_rows_have_spoilt_is_taken_from_the_position(sample_columns):
     columns = {k: v for k, v in sample_columns["flight_b"].items()}
     position = np.stack([columns[n] for n in "xyz"], 1)
     kept = np.random.default_rng(0).random(len(position)) > 0.02
@@ -221,9 +190,7 @@ def test_a_velocity_that_missing_rows_have_spoilt_is_taken_from_the_position(
     )
     flight, issues = check(columns)
     inside = slice(half, -half)
-    before, after = (
-        np.sqrt(np.mean((v - true)[inside] ** 2)) for v in (spoilt, flight.velocity)
-    )
+    before, after = (np.sqrt(np.mean((v - true)[inside] ** 2)) for v in (spoilt, flight.velocity))
     assert any("velocity in" in i.issue for i in issues) and after < 0.6 * before
 
 
@@ -246,21 +213,15 @@ def test_slips_that_can_be_mended_are_mended_and_named(sample_columns):
     assert "1 gap in time, the longest 0.41 s after t = 4.99" in text
     assert "x, y, z stand still for 1.0 s from t = 3.0" in text
     assert not any(i.refused for i in issues)
-    assert (
-        np.isnan(kept.position[310]).all() and np.isfinite(kept.quaternion[310]).all()
-    )
-    assert (np.diff(kept.time) > 0).all() and (
-        np.abs(np.diff(kept.quaternion, axis=0)) < 0.2
-    ).all()
+    assert np.isnan(kept.position[310]).all() and np.isfinite(kept.quaternion[310]).all()
+    assert (np.diff(kept.time) > 0).all() and (np.abs(np.diff(kept.quaternion, axis=0)) < 0.2).all()
     assert [s.stop - s.start for s in kept.stretches()] == [500, len(kept) - 500]
 
 
 def test_parts_on_the_ground_are_cut_away(sample_columns):
     columns = sample_columns["flight_b"]
     rest = {k: np.full(200, v[0]) for k, v in columns.items() if k != "vbat"}
-    rest |= {m: np.zeros(200) for m in ("m1", "m2", "m3", "m4")} | {
-        "z": np.full(200, 0.05)
-    }
+    rest |= {m: np.zeros(200) for m in ("m1", "m2", "m3", "m4")} | {"z": np.full(200, 0.05)}
     rng = np.random.default_rng(0)
     rest = {
         k: v + (1e-5 * rng.standard_normal(200) if k[0] in "wavxyzq" else 0)
@@ -271,17 +232,13 @@ def test_parts_on_the_ground_are_cut_away(sample_columns):
     joined["t"] = np.r_[rest["t"], 2.0 + columns["t"]]
     kept, issues = check(joined, floor_z=0.05)
     assert [i.kind for i in issues] == ["ground"]
-    assert kept.time[0] == pytest.approx(2.0, abs=0.03) and len(kept) > 0.99 * len(
-        columns["t"]
-    )
+    assert kept.time[0] == pytest.approx(2.0, abs=0.03) and len(kept) > 0.99 * len(columns["t"])
 
 
 def test_one_bad_log_spares_the_others(case_folder, sample_columns):
     bad = scaled("ax ay az", 1 / 9.81)(sample_columns["flight_a"])
     write_csv(case_folder / "flight_a.csv.gz", log_of([bad], "a"))
-    (case_folder / "flight_d.csv.gz").write_bytes(
-        (case_folder / "flight_c.csv.gz").read_bytes()
-    )
+    (case_folder / "flight_d.csv.gz").write_bytes((case_folder / "flight_c.csv.gz").read_bytes())
     (case_folder / "flight_e.csv").write_text("t,wx\n0,1\n0.01,two\n")
     case = load_case(case_folder)
     assert [f.name for f in case.flights] == ["flight_b.csv.gz", "flight_c.csv.gz"]
@@ -293,9 +250,7 @@ def test_one_bad_log_spares_the_others(case_folder, sample_columns):
     }
 
 
-def test_a_copy_with_another_clock_and_layout_is_a_duplicate(
-    case_folder, sample_columns
-):
+def test_a_copy_with_another_clock_and_layout_is_a_duplicate(case_folder, sample_columns):
     shifted = sample_columns["flight_b"] | {"t": sample_columns["flight_b"]["t"] + 3.0}
     write_csv(case_folder / "flight_x.csv", log_of([shifted], "x"))
     case = load_case(case_folder)
@@ -335,9 +290,7 @@ def test_a_case_that_cannot_be_used_is_one_line(case_folder, prepare, reason):
 
 
 def test_a_folder_of_cases_says_where_they_are(case_folder):
-    with pytest.raises(
-        UserError, match=f"cases are folders in it: {case_folder.name}, in all 1"
-    ):
+    with pytest.raises(UserError, match=f"cases are folders in it: {case_folder.name}, in all 1"):
         load_case(case_folder.parent)
 
 
@@ -348,9 +301,7 @@ def test_held_poses_of_a_slower_camera_are_moved_to_their_rows(sample_columns):
     taken = np.floor(time * 55.0 + 1e-9) / 55.0
     pose = "x y z qw qx qy qz".split()
     kept = np.random.default_rng(0).random(len(time)) > 0.04
-    held = {
-        n: np.interp(taken, time, v) if n in pose else v for n, v in columns.items()
-    }
+    held = {n: np.interp(taken, time, v) if n in pose else v for n, v in columns.items()}
     flight, _ = check({n: v[kept] for n, v in without("vx", "vy", "vz")(held).items()})
     truth, _ = check(columns)
     expected = truth.interpolated("velocity", flight.time)

@@ -40,9 +40,7 @@ def moved(track: Track, late: float) -> Track:
     """The track as a logger would write it whose motor commands stand `late` s too
     late.
     """
-    motor = [
-        np.interp(track.time - late, track.time, column) for column in track.motor.T
-    ]
+    motor = [np.interp(track.time - late, track.time, column) for column in track.motor.T]
     return dataclasses.replace(track, motor=np.stack(motor, 1))
 
 
@@ -96,8 +94,7 @@ def test_a_flight_that_turns_slowly_tells_no_clock_of_its_own():
     def offsets(late):  # of a slow flight, beside a fast one whose signals are at once
         signals = zip(("slow", "fast"), (slow, noise), (late, 0), strict=True)
         return clocks._offsets(
-            (SimpleNamespace(name=n, dt=0.01), np.roll(v, rows, 0), v)
-            for n, v, rows in signals
+            (SimpleNamespace(name=n, dt=0.01), np.roll(v, rows, 0), v) for n, v, rows in signals
         )
 
     assert offsets(3) == pytest.approx({"slow": 0.0, "fast": 0.0}, abs=0.003)
@@ -132,11 +129,7 @@ def test_motors_on_another_clock_are_a_finding(tracks, late, which):
     found = read(mixed)
     assert not found.one_clock and list(found.findings) == ["motor clock"]
     words = found.findings["motor clock"]
-    assert (
-        words.count(" ms ")
-        == len(rest)
-        == words.count(" ms late" if late > 0 else " ms early")
-    )
+    assert words.count(" ms ") == len(rest) == words.count(" ms late" if late > 0 else " ms early")
     for number in rest:
         name = mixed[number].name
         assert found.late[name] == pytest.approx(late, abs=0.0076)
@@ -147,9 +140,7 @@ def test_flights_are_put_in_time_as_their_tracks_are(tracks):
     flight = Flight("a", "a", "0", tracks[0].time, motor_command=tracks[0].motor)
     case = Case("case", (flight, dataclasses.replace(flight, name="b")), None)
     first, second = case_on_gyroscope_clock(case, {"a": 0.02}).flights
-    np.testing.assert_allclose(
-        first.motor_command[:-2], flight.motor_command[2:], atol=1e-9
-    )
+    np.testing.assert_allclose(first.motor_command[:-2], flight.motor_command[2:], atol=1e-9)
     assert second.motor_command is flight.motor_command
 
 
@@ -163,9 +154,7 @@ def test_commands_that_motors_obey_before_they_were_sent_are_a_finding(tracks, l
     ]
     words = read_command_clock(mixed, 0.01)
     usual = -0.1 < late < 0.02
-    assert words.count(" ms late" if late > 0 else " ms early") == len(tracks) * (
-        not usual
-    )
+    assert words.count(" ms late" if late > 0 else " ms early") == len(tracks) * (not usual)
     assert bool(words) != usual
 
 
@@ -173,9 +162,7 @@ def test_motors_that_turn_nothing_tell_no_clock(tracks):
     rng = np.random.default_rng(0)
     calm = [
         dataclasses.replace(
-            t,
-            motor=0.6 + 0.01 * rng.standard_normal(t.motor.shape),
-            body_rates=0 * t.body_rates,
+            t, motor=0.6 + 0.01 * rng.standard_normal(t.motor.shape), body_rates=0 * t.body_rates
         )
         for t in tracks
     ]

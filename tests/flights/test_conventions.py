@@ -23,9 +23,7 @@ BODY = np.diag([1.0, -1.0, -1.0])  # FLU to FRD
 
 
 def flight_of(columns):
-    (flight,), _ = flights_of(
-        LogTable("flight.csv", columns, np.full(len(columns["t"]), "0"))
-    )
+    (flight,), _ = flights_of(LogTable("flight.csv", columns, np.full(len(columns["t"]), "0")))
     return flight
 
 
@@ -41,9 +39,7 @@ def into(columns, world, body):
     ):
         names = CHANNEL_COLUMNS[channel]
         if names[0] in columns:
-            out |= dict(
-                zip(names, turn @ np.stack([columns[n] for n in names]), strict=True)
-            )
+            out |= dict(zip(names, turn @ np.stack([columns[n] for n in names]), strict=True))
     quaternion = np.stack([columns[f"q{a}"] for a in "wxyz"], 1)
     matrix = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
     turned = Rotation.from_matrix(world @ matrix @ body.T).as_quat(scalar_first=True)
@@ -52,9 +48,7 @@ def into(columns, world, body):
 
 def with_legacy_pitch(columns, gyroscope=False):
     quaternion = np.stack([columns[f"q{a}"] for a in "wxyz"], 1)
-    yaw, pitch, roll = (
-        Rotation.from_quat(quaternion, scalar_first=True).as_euler("ZYX").T
-    )
+    yaw, pitch, roll = Rotation.from_quat(quaternion, scalar_first=True).as_euler("ZYX").T
     turned = Rotation.from_euler("ZYX", np.stack([yaw, -pitch, roll], 1))
     values = turned.as_quat(scalar_first=True)
     out = columns | {f"q{a}": values[:, i] for i, a in enumerate("wxyz")}
@@ -81,10 +75,7 @@ CASES = {
         lambda c: without(into(c, WORLD, BODY), "position", "velocity", "quaternion"),
         r"body's axes are forward, right, down",
     ),
-    "FRD": (
-        lambda c: into(c, np.eye(3), BODY),
-        r"body's axes are forward, right, down",
-    ),
+    "FRD": (lambda c: into(c, np.eye(3), BODY), r"body's axes are forward, right, down"),
 }
 
 
@@ -92,9 +83,7 @@ CASES = {
 @pytest.mark.parametrize("flight", ["flight_a", "flight_b"])
 def test_another_convention_is_named(name, flight, sample_columns):
     convert, words = CASES[name]
-    kept, issues = check_flight(
-        flight_of(convert(sample_columns[flight])), load_vehicle()
-    )
+    kept, issues = check_flight(flight_of(convert(sample_columns[flight])), load_vehicle())
     refused = [issue.issue for issue in issues if issue.refused]
     assert kept is None
     assert len(refused) == 1, refused
@@ -109,9 +98,7 @@ def test_conventions_leave_what_was_not_logged():
 
 def test_the_pages_recipe_turns_rows_in_ned(tmp_path, sample_columns):
     """The lines under Rows in NED, on a log in NED with angles."""
-    page = (Path(__file__).parents[2] / "docs" / "log_format.md").read_text(
-        encoding="utf-8"
-    )
+    page = (Path(__file__).parents[2] / "docs" / "log_format.md").read_text(encoding="utf-8")
     recipe = page.split("### Rows in NED")[1].split("```toml")[1].split("```")[0]
     (tmp_path / "columns.toml").write_text(recipe)
     (tmp_path / "vehicle.toml").write_text("")
@@ -120,25 +107,18 @@ def test_the_pages_recipe_turns_rows_in_ned(tmp_path, sample_columns):
     quaternion = np.stack([other[f"q{a}"] for a in "wxyz"], 1)
     angles = Rotation.from_quat(quaternion, scalar_first=True).as_euler("ZYX").T
     names = dict(zip("xyz", ("ned_x", "ned_y", "ned_z"), strict=True))
-    names |= {f"v{a}": f"ned_v{a}" for a in "xyz"} | {
-        f"a{a}": f"frd_a{a}" for a in "xyz"
-    }
+    names |= {f"v{a}": f"ned_v{a}" for a in "xyz"} | {f"a{a}": f"frd_a{a}" for a in "xyz"}
     names |= {"wx": "frd_p", "wy": "frd_q", "wz": "frd_r"}
     table = {"t": other["t"]} | {new: other[old] for old, new in names.items()}
     table |= dict(zip(("frd_yaw", "frd_pitch", "frd_roll"), angles, strict=True))
     table |= {f"m{i}": other[f"m{i}"] for i in (1, 2, 3, 4)}
     lines = [
         ",".join(table),
-        *(
-            ",".join(f"{v:.9g}" for v in row)
-            for row in zip(*table.values(), strict=True)
-        ),
+        *(",".join(f"{v:.9g}" for v in row) for row in zip(*table.values(), strict=True)),
     ]
     (tmp_path / "flight.csv").write_text("\n".join(lines))
     (flight,) = load_case(tmp_path).flights
     own = flight_of(columns)
     np.testing.assert_allclose(flight.position, own.position, atol=1e-6)
     np.testing.assert_allclose(flight.specific_force, own.specific_force, atol=1e-6)
-    np.testing.assert_allclose(
-        np.abs((flight.quaternion * own.quaternion).sum(1)), 1.0, atol=1e-6
-    )
+    np.testing.assert_allclose(np.abs((flight.quaternion * own.quaternion).sum(1)), 1.0, atol=1e-6)

@@ -19,18 +19,14 @@ def flight(time, **channels):
 def test_slower_channels_are_interpolated_between_their_own_samples():
     voltage = np.array([4.0, np.nan, np.nan, np.nan, 3.6])
     f = flight([0, 1, 2, 3, 4], battery_voltage=voltage)
-    np.testing.assert_allclose(
-        f.interpolated("battery_voltage"), [4.0, 3.9, 3.8, 3.7, 3.6]
-    )
+    np.testing.assert_allclose(f.interpolated("battery_voltage"), [4.0, 3.9, 3.8, 3.7, 3.6])
     at, values = f.sampled("battery_voltage")
     assert at.tolist() == [0, 4] and values.tolist() == [4.0, 3.6]
 
 
 def test_interpolated_attitudes_are_unit_and_rows_sampled_in_part_do_not_count():
     angle = np.array([0.0, 0.2, np.nan])
-    quaternion = np.stack(
-        [np.cos(angle / 2), 0 * angle, 0 * angle, np.sin(angle / 2)], 1
-    )
+    quaternion = np.stack([np.cos(angle / 2), 0 * angle, 0 * angle, np.sin(angle / 2)], 1)
     quaternion[2, 0] = 1.0
     f = flight([0, 1, 2], quaternion=quaternion)
     middle = f.interpolated("quaternion", np.array([0.5]))[0]
@@ -44,11 +40,7 @@ def test_stretches_break_at_gaps_and_rows_cut_every_channel():
     assert f.stretches() == [slice(0, 100), slice(100, 250)]
     assert f.stretches(min_duration=1.2) == [slice(100, 250)]
     part = f.rows(f.stretches()[1])
-    assert (
-        len(part) == 150
-        and part.motor_command.shape == (150, 4)
-        and part.position is None
-    )
+    assert len(part) == 150 and part.motor_command.shape == (150, 4) and part.position is None
 
 
 def test_others_are_those_of_the_same_log():
@@ -71,13 +63,9 @@ def test_faster_logs_become_means_over_the_rows_of_the_grid(rate):
     (track,) = flight_tracks(f, Case("case", (f,), load_vehicle_file()))
     assert track.dt == pytest.approx(0.01)
     held = np.repeat(jumps, 1000 // rate)  # every ms
-    expected = (
-        held[: len(held) // 10 * 10].reshape(-1, 10).mean(1) if rate > 100 else jumps
-    )
+    expected = held[: len(held) // 10 * 10].reshape(-1, 10).mean(1) if rate > 100 else jumps
     rows = slice(1, len(track) - 2)
-    np.testing.assert_allclose(
-        track.motor[rows, 0], expected[: len(track)][rows], atol=1e-9
-    )
+    np.testing.assert_allclose(track.motor[rows, 0], expected[: len(track)][rows], atol=1e-9)
     np.testing.assert_allclose(
         track.body_rates[rows], np.outer(track.time, [1, 2, -1])[rows], atol=1e-9
     )
@@ -105,14 +93,10 @@ def test_heights_of_tracks_are_above_the_floor(below):
     shift = np.array([0.0, 0.0, below])
     logged = {"motor_command": np.full((400, 4), 0.5), "body_rates": np.zeros((400, 3))}
     flights = [
-        Flight(
-            "log.csv:" + name, "log.csv", name, time, position=place + shift, **logged
-        )
+        Flight("log.csv:" + name, "log.csv", name, time, position=place + shift, **logged)
         for name, place in (("low", path), ("high", path + np.array([0.0, 0.0, 0.4])))
     ]
-    file = replace(
-        load_vehicle_file(), log={"floor_z": below, "ceiling_z": 2.0 + below}
-    )
+    file = replace(load_vehicle_file(), log={"floor_z": below, "ceiling_z": 2.0 + below})
     (track,) = flight_tracks(flights[0], Case("case", tuple(flights), file))
     np.testing.assert_allclose(track.position, path[: len(track)], atol=1e-9)
     np.testing.assert_allclose(track.neighbours[0, :, 2] - track.position[:, 2], 0.4)

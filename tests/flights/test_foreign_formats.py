@@ -79,23 +79,7 @@ def euler(c):
     return roll, pitch, yaw
 
 
-MOTION = (
-    "t",
-    "x",
-    "z",
-    "qw",
-    "qx",
-    "qy",
-    "qz",
-    "wx",
-    "wy",
-    "wz",
-    "ax",
-    "az",
-    "m1",
-    "m2",
-    "m4",
-)
+MOTION = ("t", "x", "z", "qw", "qx", "qy", "qz", "wx", "wy", "wz", "ax", "az", "m1", "m2", "m4")
 
 
 @pytest.mark.parametrize("name", ["Timestamp", "timestamp", "tick"])
@@ -120,10 +104,7 @@ def test_the_clients_log_blocks_of_one_flight_are_one_log(tmp_path, columns):
         rows = slice(None, None, every[block])
         table = {"Timestamp": 500 + np.rint(columns["t"] * 1000)} | values
         write_table(flight / f"{block}.csv", {n: v[rows] for n, v in table.items()})
-    battery = {
-        "Timestamp": np.array([600, 1600, 2600]),
-        "pm.vbat": np.array([4.0, 3.9, 3.8]),
-    }
+    battery = {"Timestamp": np.array([600, 1600, 2600]), "pm.vbat": np.array([4.0, 3.9, 3.8])}
     write_table(flight / "battery.csv", battery)
     assert find_logs(tmp_path) == [flight]
     read = read_log(flight)
@@ -175,21 +156,14 @@ def client_table(columns, begin=81234):
 def test_the_firmwares_ticks_go_before_the_computers_clock(tmp_path, columns):
     """Which says when a packet was received."""
     received = 1.76e9 + columns["t"] + np.random.default_rng(0).uniform(0.0, 0.02, 400)
-    write_table(
-        tmp_path / "log.csv", {"time": received} | client_table(columns), "{:.15g}"
-    )
+    write_table(tmp_path / "log.csv", {"time": received} | client_table(columns), "{:.15g}")
     assert_read(read_log(tmp_path / "log.csv"), columns, MOTION)
 
 
 def test_recordings_of_the_same_ticks_in_one_file_are_none(tmp_path, columns):
-    first, second = (
-        client_table(columns),
-        client_table({n: -v for n, v in columns.items()}),
-    )
+    first, second = (client_table(columns), client_table({n: -v for n, v in columns.items()}))
     second["timestamp"] = first["timestamp"]
-    write_table(
-        tmp_path / "log.csv", {n: np.r_[v, second[n]] for n, v in first.items()}
-    )
+    write_table(tmp_path / "log.csv", {n: np.r_[v, second[n]] for n, v in first.items()})
     with pytest.raises(LogError, match="several recordings in one file"):
         read_log(tmp_path / "log.csv")
 
@@ -204,9 +178,7 @@ def test_log_blocks_beside_others_and_of_another_time(tmp_path, columns):
             ticks = {"Timestamp": begin + np.rint(columns["t"] * 1000)}
             write_table(flight / f"{block}.csv", ticks | values)
         if late:
-            with pytest.raises(
-                LogError, match=r"m1, m2, m3, m4 were logged from 100\.50 to"
-            ):
+            with pytest.raises(LogError, match=r"m1, m2, m3, m4 were logged from 100\.50 to"):
                 read_log(flight)
         else:
             (flight / "battery.csv").write_text("Timestamp,pm.vbat\n")
@@ -231,9 +203,7 @@ def topic_table(columns, name="{topic}.{column}", stamp="{topic}.time"):
     table = {}
     for late, (topic, names) in enumerate(TOPICS.items()):
         rows = slice(4 * late, len(columns["t"]) - 8 + 4 * late)
-        stamps = 1_700_000_000_000_000_000 + np.rint(columns["t"][rows] * 1e9).astype(
-            np.int64
-        )
+        stamps = 1_700_000_000_000_000_000 + np.rint(columns["t"][rows] * 1e9).astype(np.int64)
         table[stamp.format(topic=topic)] = [str(s) for s in stamps]
         table |= {name.format(topic=topic, column=c): columns[c][rows] for c in names}
     return table
@@ -259,10 +229,7 @@ def _first(read, columns):
 def test_columns_toml_names_a_time_for_each_group(tmp_path, columns):
     """Stamps with names that say nothing, one of them in another unit."""
     table = topic_table(columns, "{column}_raw", "{topic}_t")
-    table = {
-        n.replace("motor_t", "stamp 3").replace("_t", " clock"): v
-        for n, v in table.items()
-    }
+    table = {n.replace("motor_t", "stamp 3").replace("_t", " clock"): v for n, v in table.items()}
     table["stamp 3"] = [f"{int(v) * 1e-6:.6f}" for v in table["stamp 3"]]
     write_table(tmp_path / "flight.csv", table)
     groups = {"pose clock": "pose", "imu clock": "imu", "stamp 3": "motor"}
@@ -285,9 +252,7 @@ def test_columns_toml_names_a_time_for_each_group(tmp_path, columns):
 
 
 def test_a_topics_name_may_end_in_an_underscore(tmp_path, columns):
-    write_table(
-        tmp_path / "flight.csv", topic_table(columns, "{topic}_{column}", "{topic}_t")
-    )
+    write_table(tmp_path / "flight.csv", topic_table(columns, "{topic}_{column}", "{topic}_t"))
     write_table(tmp_path / "plain.csv", topic_table(columns))
     read, plain = (read_log(tmp_path / name) for name in ("flight.csv", "plain.csv"))
     assert_read(read, plain.columns, ("t", "x", "qy", "wx", "m1"))
@@ -310,9 +275,7 @@ def test_a_clock_that_stands_is_told(tmp_path, columns, stamp):
     table = topic_table(columns)
     table["motor.time"] = [stamp] * len(table["motor.time"])
     write_table(tmp_path / "flight.csv", table)
-    with pytest.raises(
-        LogError, match=r"motor\.time hardly moves \(1 different of 392 stamps\)"
-    ):
+    with pytest.raises(LogError, match=r"motor\.time hardly moves \(1 different of 392 stamps\)"):
         read_log(tmp_path / "flight.csv")
 
 
@@ -358,25 +321,14 @@ def ulog(topics, parameters):
 
     out = b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 1_000_000)
     out += message("B", bytes(40))
-    out += keyed("I", "char[3] sys_name", b"PX4") + keyed(
-        "I", "char[5] ver_hw", b"FMUV6"
-    )
+    out += keyed("I", "char[3] sys_name", b"PX4") + keyed("I", "char[5] ver_hw", b"FMUV6")
     for topic, (_, fields) in topics.items():
         text = "".join(f"{kind} {name};" for name, (kind, _) in fields.items())
-        out += message(
-            "F", f"{topic}:uint64_t timestamp;{text}uint8_t[6] _padding0;".encode()
-        )
+        out += message("F", f"{topic}:uint64_t timestamp;{text}uint8_t[6] _padding0;".encode())
     for name, value in parameters.items():
         kind, form = ("int32_t", "<i") if isinstance(value, int) else ("float", "<f")
         out += keyed("P", f"{kind} {name}", struct.pack(form, value))
-    records = [
-        (
-            0.0,
-            message(
-                "L", struct.pack("<BQ", 54, 1_400_000) + b"[logger] Start file log"
-            ),
-        )
-    ]
+    records = [(0.0, message("L", struct.pack("<BQ", 54, 1_400_000) + b"[logger] Start file log"))]
     for number, (topic, (times, fields)) in enumerate(topics.items()):
         out += message("A", struct.pack("<BH", 0, number) + topic.encode())
         for row, time in enumerate(times):
@@ -402,9 +354,7 @@ def px4_topics(c, order=("m1", "m3", "m4", "m2")):
     t = c["t"]
     half = np.sqrt(0.5)
     qw, qx, qy, qz = (c[f"q{a}"] for a in "wxyz")
-    turned = np.stack(
-        [half * (qw + qz), half * (qx + qy), half * (qx - qy), half * (qw - qz)], 1
-    )
+    turned = np.stack([half * (qw + qz), half * (qx + qy), half * (qx - qy), half * (qw - qz)], 1)
     turned[::3] *= -1.0  # the same attitude
     slow = slice(None, None, 2)
     motors = np.full((len(t), 12), np.nan)
@@ -414,53 +364,28 @@ def px4_topics(c, order=("m1", "m3", "m4", "m2")):
     sampled = 1_500_000 + np.rint(1e6 * t)
     zero = np.zeros(len(t))
     local = {
-        **{
-            "timestamp_sample": ("uint64_t", sampled[slow]),
-            "ref_timestamp": ("uint64_t", zero),
-        },
+        **{"timestamp_sample": ("uint64_t", sampled[slow]), "ref_timestamp": ("uint64_t", zero)},
         **{"ref_lat": ("double", zero + 47.4), "ref_lon": ("double", zero + 8.5)},
         **{"x": ("float", c["y"][slow]), "y": ("float", c["x"][slow])},
         **{"z": ("float", -c["z"][slow]), "delta_z": ("float", zero)},
         **{"vx": ("float", c["vy"][slow]), "vy": ("float", c["vx"][slow])},
-        **{
-            "vz": ("float", -c["vz"][slow]),
-            "z_deriv": ("float", zero),
-            "heading": ("float", zero),
-        },
+        **{"vz": ("float", -c["vz"][slow]), "z_deriv": ("float", zero), "heading": ("float", zero)},
         **{"xy_valid": ("bool", zero + 1), "z_valid": ("bool", zero + 1)},
     }
     combined = {
-        **{
-            "gyro_rad": ("float[3]", rates),
-            "gyro_integral_dt": ("uint32_t", zero + 4000),
-        },
+        **{"gyro_rad": ("float[3]", rates), "gyro_integral_dt": ("uint32_t", zero + 4000)},
         **{"accelerometer_timestamp_relative": ("int32_t", zero)},
         **{"accelerometer_m_s2": ("float[3]", force)},
         **{"accelerometer_integral_dt": ("uint32_t", zero + 4000)},
-        **{
-            "accelerometer_clipping": ("uint8_t", zero),
-            "gyro_clipping": ("uint8_t", zero),
-        },
+        **{"accelerometer_clipping": ("uint8_t", zero), "gyro_clipping": ("uint8_t", zero)},
     }
     attitude = {
-        **{
-            "timestamp_sample": ("uint64_t", sampled[slow]),
-            "q": ("float[4]", turned[slow]),
-        },
-        **{
-            "delta_q_reset": ("float[4]", turned[slow]),
-            "quat_reset_counter": ("uint8_t", zero),
-        },
+        **{"timestamp_sample": ("uint64_t", sampled[slow]), "q": ("float[4]", turned[slow])},
+        **{"delta_q_reset": ("float[4]", turned[slow]), "quat_reset_counter": ("uint8_t", zero)},
     }
-    control = {
-        "timestamp_sample": ("uint64_t", sampled),
-        "control": ("float[12]", motors),
-    }
+    control = {"timestamp_sample": ("uint64_t", sampled), "control": ("float[12]", motors)}
     rare = t[::50]
-    battery = {
-        "voltage_v": ("float", np.full(len(rare), 15.2)),
-        "id": ("uint8_t", zero),
-    }
+    battery = {"voltage_v": ("float", np.full(len(rare), 15.2)), "id": ("uint8_t", zero)}
     return {
         "vehicle_attitude": (t[slow], attitude),
         "vehicle_local_position": (t[slow], local),
@@ -475,9 +400,7 @@ PX4_NAMES = ("wx", "wy", "wz", "ax", "ay", "az", "m1", "m2", "m3", "m4")
 
 def test_a_px4_log_arrives_in_our_frames_and_order(tmp_path, columns):
     pytest.importorskip("pyulog")
-    (tmp_path / "flight.ulg").write_bytes(
-        ulog(px4_topics(columns), {"THR_MDL_FAC": 0.3})
-    )
+    (tmp_path / "flight.ulg").write_bytes(ulog(px4_topics(columns), {"THR_MDL_FAC": 0.3}))
     assert find_logs(tmp_path) == [tmp_path / "flight.ulg"]
     read = read_log(tmp_path / "flight.ulg")
     assert_read(read, columns, PX4_NAMES)
@@ -506,20 +429,13 @@ def test_a_px4_airframe_is_taken_from_its_parameters(tmp_path, columns):
     wired = ("m4", "m3", "m2", "m1")
     curve = 0.4
     thrust = np.stack([columns[m] for m in wired], 1)
-    signal = (-(1 - curve) + np.sqrt((1 - curve) ** 2 + 4 * curve * thrust)) / (
-        2 * curve
-    )
+    signal = (-(1 - curve) + np.sqrt((1 - curve) ** 2 + 4 * curve * thrust)) / (2 * curve)
     pulses = np.full((len(thrust), 16), 900.0)
     pulses[:, :4] = 1100 + 800 * signal
     number = np.full(len(thrust), 16)
     outputs = {"noutputs": ("uint32_t", number), "output": ("float[16]", pulses)}
     topics["actuator_outputs"] = (columns["t"], outputs)
-    parameters = {
-        "THR_MDL_FAC": curve,
-        "CA_ROTOR_COUNT": 4,
-        "PWM_MIN": 1100,
-        "PWM_MAX": 1900,
-    }
+    parameters = {"THR_MDL_FAC": curve, "CA_ROTOR_COUNT": 4, "PWM_MIN": 1100, "PWM_MAX": 1900}
     for i, (x, y, spin) in enumerate(places.values()):
         parameters |= {f"CA_ROTOR{i}_PX": 0.1 * x, f"CA_ROTOR{i}_PY": 0.1 * y}
         parameters |= {f"CA_ROTOR{i}_KM": 0.05 * spin}
@@ -546,10 +462,7 @@ def _without_fields(topics):
 def _outputs(topics, values):
     rest = {name: topic for name, topic in topics.items() if name != "actuator_motors"}
     return rest | {
-        "actuator_outputs": (
-            topics["sensor_combined"][0],
-            {"output": ("float[16]", values)},
-        )
+        "actuator_outputs": (topics["sensor_combined"][0], {"output": ("float[16]", values)})
     }
 
 
@@ -582,18 +495,14 @@ def _outputs(topics, values):
         ),
     ],
 )
-def test_motors_that_a_px4_log_does_not_have_are_told(
-    tmp_path, columns, change, parameters, words
-):
+def test_motors_that_a_px4_log_does_not_have_are_told(tmp_path, columns, change, parameters, words):
     pytest.importorskip("pyulog")
     (tmp_path / "flight.ulg").write_bytes(ulog(change(px4_topics(columns)), parameters))
     with pytest.raises(LogError, match=words):
         read_log(tmp_path / "flight.ulg")
 
 
-@pytest.mark.parametrize(
-    "data", [b"ULog\x01\x12\x35", b"ULog\x01\x12\x35\x01" + bytes(8)]
-)
+@pytest.mark.parametrize("data", [b"ULog\x01\x12\x35", b"ULog\x01\x12\x35\x01" + bytes(8)])
 def test_a_px4_log_without_a_flight_says_so(tmp_path, data):
     pytest.importorskip("pyulog")
     (tmp_path / "flight.ulg").write_bytes(data)
@@ -620,36 +529,20 @@ def blackbox(c, unit="", fine=1.0):
     whole = np.rint if not unit else np.asarray
     rate = (DEGREES * fine, "") if not unit else (1.0, " (rad/s)")
     zero = np.zeros(len(c["t"]))
-    table = {
-        "loopIteration": np.arange(len(zero)),
-        "time (us)": np.rint(55_158_008 + c["t"] * 1e6),
-    }
+    table = {"loopIteration": np.arange(len(zero)), "time (us)": np.rint(55_158_008 + c["t"] * 1e6)}
     table |= dict.fromkeys((*PID, *(f"rcCommand[{i}]" for i in range(4))), zero)
     table |= {
-        f"setpoint[{i}]": np.rint(c[f"cmd_w{a}"] * DEGREES * fine)
-        for i, a in enumerate("xyz")
+        f"setpoint[{i}]": np.rint(c[f"cmd_w{a}"] * DEGREES * fine) for i, a in enumerate("xyz")
     }
     table["setpoint[3]"] = np.rint(c["cmd_thrust"] * 1000)
-    table |= {
-        "vbatLatest (V)": zero + 16.12,
-        "amperageLatest (A)": zero + 15.2,
-        "rssi": zero + 785,
-    }
-    table |= {
-        f"gyroADC[{i}]{rate[1]}": whole(c[f"w{a}"] * rate[0])
-        for i, a in enumerate("xyz")
-    }
-    table |= {
-        f"accSmooth[{i}]{unit}": whole(c[f"a{a}"] / force) for i, a in enumerate("xyz")
-    }
+    table |= {"vbatLatest (V)": zero + 16.12, "amperageLatest (A)": zero + 15.2, "rssi": zero + 785}
+    table |= {f"gyroADC[{i}]{rate[1]}": whole(c[f"w{a}"] * rate[0]) for i, a in enumerate("xyz")}
+    table |= {f"accSmooth[{i}]{unit}": whole(c[f"a{a}"] / force) for i, a in enumerate("xyz")}
     table |= {f"debug[{i}]": zero for i in range(4)}
     for number, column in enumerate(("m2", "m1", "m3", "m4")):
         table[f"motor[{number}]"] = np.rint(48 + 1999 * c[column])
     table["energyCumulative (mAh)"] = zero
-    table["flightModeFlags (flags)"] = [
-        "0",
-        *["ANGLE_MODE|HORIZON_MODE"] * (len(zero) - 1),
-    ]
+    table["flightModeFlags (flags)"] = ["0", *["ANGLE_MODE|HORIZON_MODE"] * (len(zero) - 1)]
     table["stateFlags (flags)"] = ["0"] * len(zero)
     table["failsafePhase (flags)"] = ["IDLE"] * len(zero)
     return table | {"rxSignalReceived": zero, "rxFlightChannelsValid": zero}
@@ -710,19 +603,13 @@ def write_explorer(path, c, fine):
     table |= {name: np.zeros(len(c["t"])) for name in ("flightModeFlags", "stateFlags")}
     table["failsafePhase"] = table["stateFlags"]
     table["vbatLatest"] = table["vbatLatest"] * 100
-    table |= {
-        f"accSmooth[{i}]": np.rint(c[f"a{a}"] / G * 4096) for i, a in enumerate("xyz")
-    }
+    table |= {f"accSmooth[{i}]": np.rint(c[f"a{a}"] / G * 4096) for i, a in enumerate("xyz")}
     del table["energyCumulative"]
     nothing = np.full(len(c["t"]), np.nan)
-    table |= {
-        f"{name}[{i}]": nothing for name in ("heading", "axisSum") for i in range(3)
-    }
+    table |= {f"{name}[{i}]": nothing for name in ("heading", "axisSum") for i in range(3)}
     quoted = {f'"{name}"': values for name, values in table.items()}
     write_table(path, quoted, form="{:.10g}")
-    text = EXPLORER.format(fine=fine) + path.read_text().replace("nan", "NaN").rstrip(
-        "\n"
-    )
+    text = EXPLORER.format(fine=fine) + path.read_text().replace("nan", "NaN").rstrip("\n")
     path.write_text(text)
 
 
@@ -767,16 +654,12 @@ def test_a_blackbox_without_the_usual_fields(tmp_path, columns):
     refused.
     """
     path = tmp_path / "log.csv"
-    table = {
-        n.replace("gyroADC", "gyroUnfilt"): v for n, v in blackbox(columns).items()
-    }
+    table = {n.replace("gyroADC", "gyroUnfilt"): v for n, v in blackbox(columns).items()}
     write_table(path, table, separator=", ")
     read = read_log(path)
     assert_blackbox(read, columns)
     assert any("gyroUnfilt" in remark for remark in read.remarks)
-    write_table(
-        path, {n: v for n, v in table.items() if "gyro" not in n}, separator=", "
-    )
+    write_table(path, {n: v for n, v in table.items() if "gyro" not in n}, separator=", ")
     with pytest.raises(LogError, match=r"no gyroscope was logged \(gyroADC"):
         read_log(path)
     write_table(path, table | {"motor[4]": table["motor[0]"]}, separator=", ")
@@ -786,9 +669,7 @@ def test_a_blackbox_without_the_usual_fields(tmp_path, columns):
 
 @pytest.mark.parametrize("name", ["LOG00001.BFL", "blackbox.bbl", "LOG1.TXT"])
 def test_a_binary_blackbox_names_its_decoder(tmp_path, name):
-    (tmp_path / name).write_bytes(
-        b"H Product:Blackbox flight data recorder\nH Data version:2\n"
-    )
+    (tmp_path / name).write_bytes(b"H Product:Blackbox flight data recorder\nH Data version:2\n")
     assert find_logs(tmp_path) == [tmp_path / name]
     with pytest.raises(LogError, match=f"blackbox_decode {name}"):
         read_log(tmp_path / name)
@@ -833,8 +714,7 @@ def write_swarm_bag(path, c):
     store.register(get_types_from_msg(DEFINITIONS[LOG_TYPE], LOG_TYPE))
     types = store.types
     log, header, stamp = (
-        types[n]
-        for n in (LOG_TYPE, "std_msgs/msg/Header", "builtin_interfaces/msg/Time")
+        types[n] for n in (LOG_TYPE, "std_msgs/msg/Header", "builtin_interfaces/msg/Time")
     )
     waits = np.random.default_rng(1).integers(0, 8, len(c["t"])) * 1_000_000
     waits[7] = 0
@@ -859,9 +739,7 @@ def write_swarm_bag(path, c):
 def test_crazyswarms_topics_are_named_by_its_yaml(tmp_path, columns):
     pytest.importorskip("rosbags")
     write_swarm_bag(tmp_path / "bag", columns)
-    with pytest.raises(
-        LogError, match=r"/cf1/mixer holds values without names: put the crazyfl"
-    ):
+    with pytest.raises(LogError, match=r"/cf1/mixer holds values without names: put the crazyfl"):
         read_log(tmp_path / "bag")
     names = ", ".join(f'"{name}"' for name in mixer_inputs(columns))
     (tmp_path / "crazyflies.yaml").write_text(SWARM_YAML % names)
@@ -869,14 +747,10 @@ def test_crazyswarms_topics_are_named_by_its_yaml(tmp_path, columns):
     assert set(read.vehicle.tolist()) == {"cf1", "cf2"}
     for vehicle in ("cf1", "cf2"):
         rows = read.vehicle == vehicle
-        own = type(read)(
-            "bag", {n: v[rows] for n, v in read.columns.items()}, read.vehicle[rows]
-        )
+        own = type(read)("bag", {n: v[rows] for n, v in read.columns.items()}, read.vehicle[rows])
         assert_read(own, columns, ("t", "wx", "wy", "wz", "m1", "m2", "m3", "m4"), 2e-4)
     (tmp_path / "crazyflies.yaml").write_text(SWARM_YAML % '"gyro.x"')
-    with pytest.raises(
-        LogError, match=r"/cf1/mixer hold 4 values, but crazyflies\.yaml names 1"
-    ):
+    with pytest.raises(LogError, match=r"/cf1/mixer hold 4 values, but crazyflies\.yaml names 1"):
         read_log(tmp_path / "bag")
 
 
@@ -899,10 +773,7 @@ def add_pose_topics(writer, store, c, without):
     """
     m = {name.rpartition("/")[2]: kind for name, kind in store.types.items()}
     capture = "motion_capture_tracking_interfaces/msg/NamedPoseArray"
-    kinds = {
-        "/cf1/pose": "geometry_msgs/msg/PoseStamped",
-        "/cf1/odom": "nav_msgs/msg/Odometry",
-    }
+    kinds = {"/cf1/pose": "geometry_msgs/msg/PoseStamped", "/cf1/odom": "nav_msgs/msg/Odometry"}
     kinds["/poses"] = capture
     kinds = {name: kind for name, kind in kinds.items() if name not in without}
     topics = {n: writer.add_connection(n, k, typestore=store) for n, k in kinds.items()}
@@ -924,9 +795,7 @@ def add_pose_topics(writer, store, c, without):
             both = m["PoseWithCovariance"](odom, np.zeros(36))
             messages["/cf1/odom"] = m["Odometry"](header, "cf1", both, twist)
         for name in messages.keys() & topics.keys():
-            writer.write(
-                topics[name], at, store.serialize_cdr(messages[name], kinds[name])
-            )
+            writer.write(topics[name], at, store.serialize_cdr(messages[name], kinds[name]))
 
 
 @pytest.mark.parametrize("without, tolerance", [((), 2e-3), (("/poses",), 2e-2)])
@@ -940,9 +809,7 @@ def test_crazyswarms_poses_are_the_fastest_with_the_right_sign(
     store = swarm_store()
     with (
         Reader(tmp_path / "logs") as logs,
-        Writer(
-            tmp_path / "bag", version=8, storage_plugin=StoragePlugin.SQLITE3
-        ) as writer,
+        Writer(tmp_path / "bag", version=8, storage_plugin=StoragePlugin.SQLITE3) as writer,
     ):
         add_pose_topics(writer, store, columns, without)
         copies = {
@@ -954,24 +821,17 @@ def test_crazyswarms_poses_are_the_fastest_with_the_right_sign(
     names = ", ".join(f'"{name}"' for name in mixer_inputs(columns))
     (tmp_path / "crazyflies.yaml").write_text(SWARM_YAML % names)
     read = read_log(tmp_path / "bag")
-    assert without or any(
-        "nothing but poses was logged of wand" in r for r in read.remarks
-    )
+    assert without or any("nothing but poses was logged of wand" in r for r in read.remarks)
     rows = np.flatnonzero(read.vehicle == "cf1")[10:380]
     for name in ("x", "z", "qw", "qx", "qy", "qz"):
         values = read.columns[name][rows]
-        np.testing.assert_allclose(
-            values, columns[name][10:380], atol=tolerance, err_msg=name
-        )
+        np.testing.assert_allclose(values, columns[name][10:380], atol=tolerance, err_msg=name)
 
 
 def test_columns_of_the_formats_own_names_have_their_time_too(tmp_path, columns):
     """Where `columns.toml` names nothing but the times."""
     table = topic_table(columns, "{column}", "{topic}_t")
-    table = {
-        n.replace("_t", " clock") if n.endswith("_t") else n: v
-        for n, v in table.items()
-    }
+    table = {n.replace("_t", " clock") if n.endswith("_t") else n: v for n, v in table.items()}
     write_table(tmp_path / "flight.csv", table)
     groups = {"pose clock": "pose", "imu clock": "imu", "motor clock": "motor"}
     clocks = ", ".join(
@@ -982,9 +842,7 @@ def test_columns_of_the_formats_own_names_have_their_time_too(tmp_path, columns)
     read = read_log(tmp_path / "flight.csv", load_mapping(tmp_path / "columns.toml"))
     first = _first(read, columns)
     for column in ("x", "wx", "m1"):
-        assert_read(
-            read, {column: columns[column][first:]}, (column,), 1e-3, slice(10, 300)
-        )
+        assert_read(read, {column: columns[column][first:]}, (column,), 1e-3, slice(10, 300))
     (tmp_path / "columns.toml").write_text('[columns]\nt = [{ from = "imu clock" }]\n')
     write_table(tmp_path / "flight.csv", {"imu clock": table["imu clock"]})
     with pytest.raises(LogError, match="no column that the log has beside them"):

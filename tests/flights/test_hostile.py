@@ -37,9 +37,7 @@ CELLS = st.sampled_from(
         "é",
     ]
 )
-EDITS = st.lists(
-    st.tuples(st.floats(0, 1), st.integers(0, 40), CELLS), min_size=1, max_size=12
-)
+EDITS = st.lists(st.tuples(st.floats(0, 1), st.integers(0, 40), CELLS), min_size=1, max_size=12)
 
 
 @settings(
@@ -80,19 +78,7 @@ def test_logs_of_unlike_kinds_are_one_case(case_folder, sample_columns):
     alone.
     """
     pose = ("t", "x", "y", "z", "qw", "qx", "qy", "qz", "m1", "m2", "m3", "m4")
-    inertial = (
-        "t",
-        "ax",
-        "ay",
-        "az",
-        "wx",
-        "wy",
-        "wz",
-        "cmd_thrust",
-        "cmd_wx",
-        "cmd_wy",
-        "cmd_wz",
-    )
+    inertial = ("t", "ax", "ay", "az", "wx", "wy", "wz", "cmd_thrust", "cmd_wx", "cmd_wy", "cmd_wz")
     for name, kept in (("flight_b", pose), ("flight_c", inertial)):
         columns = {c: sample_columns[name][c] for c in kept}
         write_csv(case_folder / f"{name}.csv.gz", log_of([columns], name))

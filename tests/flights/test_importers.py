@@ -26,24 +26,15 @@ def micro_sd(events, version=2, cut=0):
     data = struct.pack("<BHH", 0xBC, version, len(events))
     for number, (name, _, variables) in enumerate(events):
         data += (
-            struct.pack("<H", number)
-            + name.encode()
-            + b"\0"
-            + struct.pack("<H", len(variables))
+            struct.pack("<H", number) + name.encode() + b"\0" + struct.pack("<H", len(variables))
         )
         for variable, (letter, _) in variables.items():
             data += f"{variable}({letter})".encode() + b"\0"
     stamped = []
     for number, (_, period, variables) in enumerate(events):
         layout = "<" + "".join(letter for letter, _ in variables.values())
-        for row, values in enumerate(
-            zip(*(v for _, v in variables.values()), strict=True)
-        ):
-            stamp = (
-                5_000_000 + row * period
-                if version == 2
-                else 5_000 + row * period // 1000
-            )
+        for row, values in enumerate(zip(*(v for _, v in variables.values()), strict=True)):
+            stamp = 5_000_000 + row * period if version == 2 else 5_000 + row * period // 1000
             head = struct.pack("<HQ" if version == 2 else "<HI", number, stamp)
             stamped.append((stamp, head + struct.pack(layout, *values)))
     data += b"".join(record for _, record in sorted(stamped, key=lambda s: s[0]))
@@ -69,8 +60,7 @@ def firmware_variables(c):
     }
     variables = {name: ("f", values) for name, values in floats.items()}
     return variables | {
-        f"motor.m{i}": ("H", np.round(c[f"m{i}"] * 65535).astype(int))
-        for i in (1, 2, 3, 4)
+        f"motor.m{i}": ("H", np.round(c[f"m{i}"] * 65535).astype(int)) for i in (1, 2, 3, 4)
     }
 
 
@@ -82,9 +72,7 @@ def columns(sample_columns):
 def assert_same(table, columns, tolerance=3e-5, skip=("vbat", "vx", "vy", "vz")):
     for name, values in columns.items():
         if name not in skip:
-            np.testing.assert_allclose(
-                table.columns[name], values, atol=tolerance, err_msg=name
-            )
+            np.testing.assert_allclose(table.columns[name], values, atol=tolerance, err_msg=name)
 
 
 def test_a_mapping_of_one_column_leaves_the_others_as_they_are(tmp_path, columns):
@@ -120,9 +108,7 @@ def test_a_missing_column_is_named(tmp_path, columns, change, words):
 @pytest.mark.parametrize("version", [1, 2])
 def test_micro_sd_log_of_one_clock(tmp_path, columns, version):
     path = tmp_path / "log00"
-    path.write_bytes(
-        micro_sd([("fixedFrequency", 10_000, firmware_variables(columns))], version)
-    )
+    path.write_bytes(micro_sd([("fixedFrequency", 10_000, firmware_variables(columns))], version))
     assert find_logs(tmp_path) == [path]
     table = read_log(path)
     assert_same(table, columns)
@@ -132,17 +118,11 @@ def test_micro_sd_log_of_one_clock(tmp_path, columns, version):
 def test_micro_sd_streams_are_put_on_the_imu_clock(tmp_path, columns):
     variables = firmware_variables(columns)
     slow = {
-        n: (letter, v[::2])
-        for n, (letter, v) in variables.items()
-        if n.startswith("stateEstimate")
+        n: (letter, v[::2]) for n, (letter, v) in variables.items() if n.startswith("stateEstimate")
     }
     fast = {n: v for n, v in variables.items() if n not in slow}
     battery = {"pm.vbat": ("f", np.linspace(4.0, 3.8, 8))}
-    events = [
-        ("pose", 20_000, slow),
-        ("imu", 10_000, fast),
-        ("power", 1_000_000, battery),
-    ]
+    events = [("pose", 20_000, slow), ("imu", 10_000, fast), ("power", 1_000_000, battery)]
     path = tmp_path / "log01"
     path.write_bytes(micro_sd(events))
     table = read_log(path)
@@ -177,8 +157,7 @@ def test_the_controllers_variables_stand_for_motors_and_gyroscope(tmp_path, colu
     table = read_log(tmp_path / "log04")
     assert "mixer" in table.remarks[0]
     assert_same(
-        table,
-        {n: columns[n] for n in ("m1", "m2", "m3", "m4", "wx", "wy", "wz", "az", "x")},
+        table, {n: columns[n] for n in ("m1", "m2", "m3", "m4", "wx", "wy", "wz", "az", "x")}
     )
     (flight,), _ = flights_of(table)
     assert flight.specific_force is None
@@ -186,9 +165,7 @@ def test_the_controllers_variables_stand_for_motors_and_gyroscope(tmp_path, colu
 
 def test_a_micro_sd_log_cut_off_is_read_as_far_as_it_goes(tmp_path, columns):
     path = tmp_path / "log02"
-    path.write_bytes(
-        micro_sd([("fixedFrequency", 10_000, firmware_variables(columns))], cut=1000)
-    )
+    path.write_bytes(micro_sd([("fixedFrequency", 10_000, firmware_variables(columns))], cut=1000))
     table = read_log(path)
     assert "checksum" in table.remarks[0]
     rows = len(table.columns["t"])
@@ -201,10 +178,7 @@ def test_a_micro_sd_log_cut_off_is_read_as_far_as_it_goes(tmp_path, columns):
     [
         (b"\xbc\x02\x00\xff\x00" + b"x" * 20, "corrupt header"),
         (micro_sd([("e", 10_000, {"a.b": ("f", [])})]), "without a record"),
-        (
-            micro_sd([("e", 10_000, {"a.b": ("f", [1.0, 2.0, 3.0])})]),
-            "neither position",
-        ),
+        (micro_sd([("e", 10_000, {"a.b": ("f", [1.0, 2.0, 3.0])})]), "neither position"),
     ],
 )
 def test_unusable_micro_sd_logs_say_why(tmp_path, data, reason):
@@ -226,17 +200,13 @@ def test_a_mapped_csv_in_other_names_units_and_angles(tmp_path, columns):
     } | {f"u{i}": columns[f"m{i}"] * 255 for i in (1, 2, 3, 4)}
     lines = [";".join([*other, "comment"])]
     lines += [
-        ";".join([*(f"{v:.7f}" for v in row), "text"])
-        for row in zip(*other.values(), strict=True)
+        ";".join([*(f"{v:.7f}" for v in row), "text"]) for row in zip(*other.values(), strict=True)
     ]
     (tmp_path / "other.csv").write_text("\n".join(lines))
     (tmp_path / "columns.toml").write_text(
         'delimiter = ";"\n[columns]\nt = { from = "stamp", unit = "ms" }\n'
         + "".join(f'{a} = {{ from = "p{a}", unit = "mm" }}\n' for a in "xyz")
-        + "".join(
-            f'{a} = {{ from = "{a}", unit = "deg" }}\n'
-            for a in ("roll", "pitch", "yaw")
-        )
+        + "".join(f'{a} = {{ from = "{a}", unit = "deg" }}\n' for a in ("roll", "pitch", "yaw"))
         + "".join(f'm{i} = {{ from = "u{i}", unit = "8bit" }}\n' for i in (1, 2, 3, 4))
     )
     (tmp_path / "vehicle.toml").write_text('[motor]\ncommand = "pwm"\n')
@@ -289,9 +259,7 @@ def write_bag(path, columns, storage):
             "builtin_interfaces/msg/Time",
         )
     }
-    with Writer(
-        path, version=9, storage_plugin=getattr(StoragePlugin, storage)
-    ) as writer:
+    with Writer(path, version=9, storage_plugin=getattr(StoragePlugin, storage)) as writer:
         for number, vehicle in enumerate(("cf1", "cf2")):
             topics = {
                 name: writer.add_connection(f"/{vehicle}/{name}", kind, typestore=store)
@@ -303,19 +271,13 @@ def write_bag(path, columns, storage):
             }
             for k in range(len(columns["t"])):
                 at = 1_700_000_000_000_000_000 + round(columns["t"][k] * 1e9)
-                header = kinds["Header"](
-                    kinds["Time"](at // 10**9, at % 10**9), vehicle
-                )
+                header = kinds["Header"](kinds["Time"](at // 10**9, at % 10**9), vehicle)
                 rates = kinds["Vector3"](*(columns[f"w{a}"][k] for a in "xyz"))
                 force = kinds["Vector3"](*(columns[f"a{a}"][k] for a in "xyz"))
                 none = kinds["Quaternion"](0.0, 0.0, 0.0, 1.0)
                 zero = np.zeros(9)
-                messages = {
-                    "imu": kinds["Imu"](header, none, zero, rates, zero, force, zero)
-                }
-                motors = np.array(
-                    [columns[f"m{i}"][k] for i in (1, 2, 3, 4)], np.float32
-                )
+                messages = {"imu": kinds["Imu"](header, none, zero, rates, zero, force, zero)}
+                motors = np.array([columns[f"m{i}"][k] for i in (1, 2, 3, 4)], np.float32)
                 messages["motors"] = kinds["Float32MultiArray"](
                     kinds["MultiArrayLayout"]([], 0), motors
                 )
@@ -323,21 +285,15 @@ def write_bag(path, columns, storage):
                     point = kinds["Point"](
                         columns["x"][k] + number, columns["y"][k], columns["z"][k]
                     )
-                    attitude = kinds["Quaternion"](
-                        *(columns[f"q{a}"][k] for a in "xyzw")
-                    )
-                    messages["pose"] = kinds["PoseStamped"](
-                        header, kinds["Pose"](point, attitude)
-                    )
+                    attitude = kinds["Quaternion"](*(columns[f"q{a}"][k] for a in "xyzw"))
+                    messages["pose"] = kinds["PoseStamped"](header, kinds["Pose"](point, attitude))
                 for name, message in messages.items():
                     # Received 3 ms after it was stamped; the motors have no stamp of
                     # their own.
                     delay = 0 if name == "motors" else 3_000_000
                     connection = topics[name]
                     writer.write(
-                        connection,
-                        at + delay,
-                        store.serialize_cdr(message, connection.msgtype),
+                        connection, at + delay, store.serialize_cdr(message, connection.msgtype)
                     )
 
 
@@ -354,12 +310,8 @@ def test_ros2_bag_of_two_vehicles(tmp_path, columns, storage):
         own = type(table)(
             "bag", {n: v[rows] for n, v in table.columns.items()}, table.vehicle[rows]
         )
-        assert_same(
-            own, {n: columns[n] for n in ("t", "wx", "wz", "ay", "m1", "m4")}, 1e-5
-        )
-        np.testing.assert_allclose(
-            own.columns["x"][:-1:2], columns["x"][::2] + number, atol=1e-6
-        )
+        assert_same(own, {n: columns[n] for n in ("t", "wx", "wz", "ay", "m1", "m4")}, 1e-5)
+        np.testing.assert_allclose(own.columns["x"][:-1:2], columns["x"][::2] + number, atol=1e-6)
     mapping = tmp_path / "columns.toml"
     mapping.write_text(
         '[columns]\nwx = "/cf2/imu:angular_velocity.x"\nm1 = "/cf2/motors:data[0]"\n'
@@ -434,9 +386,7 @@ def test_what_foxglove_is_given_is_no_log(tmp_path, columns):
 
 def test_a_px4_log_with_flipped_bits_is_read_quietly(tmp_path, capsys):
     pytest.importorskip("pyulog")
-    (tmp_path / "log.ulg").write_bytes(
-        b"ULog\x01\x12\x35\x01" + bytes(8) + b"\xff" * 300
-    )
+    (tmp_path / "log.ulg").write_bytes(b"ULog\x01\x12\x35\x01" + bytes(8) + b"\xff" * 300)
     with pytest.raises(LogError):
         read_log(tmp_path / "log.ulg")
     assert capsys.readouterr() == ("", "")

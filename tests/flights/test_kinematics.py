@@ -25,8 +25,7 @@ def _track(gain=1.0, tilt=0.0, scale=1.0, seed=1, rows=1500):
     dt = 0.01
     time = dt * np.arange(rows)
     rates = np.stack(
-        [1.5 * np.sin(2 * np.pi * f * time + k) for k, f in enumerate((0.9, 1.3, 0.6))],
-        1,
+        [1.5 * np.sin(2 * np.pi * f * time + k) for k, f in enumerate((0.9, 1.3, 0.6))], 1
     )
     quaternion = np.zeros((rows, 4))
     quaternion[0, 0] = 1.0
@@ -38,15 +37,9 @@ def _track(gain=1.0, tilt=0.0, scale=1.0, seed=1, rows=1500):
         quaternion[k] /= np.linalg.norm(quaternion[k])
     acceleration = np.stack([np.sin(2 * np.pi * f * time) for f in (0.5, 0.7, 0.4)], 1)
     velocity = np.cumsum(acceleration, 0) * dt
-    force = np.einsum(
-        "tji,tj->ti", rotation(quaternion), acceleration + np.array([0.0, 0.0, 9.81])
-    )
+    force = np.einsum("tji,tj->ti", rotation(quaternion), acceleration + np.array([0.0, 0.0, 9.81]))
     lean = np.array(
-        [
-            [1.0, 0.0, 0.0],
-            [0.0, np.cos(tilt), -np.sin(tilt)],
-            [0.0, np.sin(tilt), np.cos(tilt)],
-        ]
+        [[1.0, 0.0, 0.0], [0.0, np.cos(tilt), -np.sin(tilt)], [0.0, np.sin(tilt), np.cos(tilt)]]
     )
     half = np.array([np.sin(tilt / 2), 0.0, 0.0])
     w = quaternion[:, :1]
@@ -75,9 +68,7 @@ def test_a_gyroscope_with_another_gain_is_found_and_corrected(gain):
         found.gain == pytest.approx(gain, abs=0.01)
         and list(found.findings) == ["gyroscope gain"] * unusual
     )
-    assert read_kinematics([correct(t, found) for t in tracks]).gain == pytest.approx(
-        1.0, abs=0.01
-    )
+    assert read_kinematics([correct(t, found) for t in tracks]).gain == pytest.approx(1.0, abs=0.01)
 
 
 @pytest.mark.parametrize("scale", [0.8, 1.05, 1.2])
@@ -114,12 +105,10 @@ def test_an_upright_world_needs_no_position(missing):
 def test_streams_on_clocks_that_wander_tell_no_gain():
     track = _track()
     late = np.interp(track.time + 0.12 * np.sin(track.time), track.time, track.time)
-    rates = np.stack(
-        [np.interp(late, track.time, c) for c in 1.1 * track.body_rates.T], 1
-    )
-    assert set(
-        read_kinematics([dataclasses.replace(track, body_rates=rates)]).findings
-    ) == {"clocks"}
+    rates = np.stack([np.interp(late, track.time, c) for c in 1.1 * track.body_rates.T], 1)
+    assert set(read_kinematics([dataclasses.replace(track, body_rates=rates)]).findings) == {
+        "clocks"
+    }
 
 
 def test_noise_of_an_attitude_is_no_matter_of_clocks():
@@ -127,9 +116,7 @@ def test_noise_of_an_attitude_is_no_matter_of_clocks():
     time = 0.01 * np.arange(3000)
 
     def signal(at):
-        return np.stack(
-            [np.sin(2 * np.pi * f * at) * np.sin(0.3 * at) for f in (0.9, 1.3, 0.6)], 1
-        )
+        return np.stack([np.sin(2 * np.pi * f * at) * np.sin(0.3 * at) for f in (0.9, 1.3, 0.6)], 1)
 
     noisy = signal(time) + 0.5 * rng.standard_normal((3000, 3))
     apart = signal(time + 0.04 * np.sign(np.sin(2.0 * time)))

@@ -27,9 +27,7 @@ def test_round_trip_of_every_channel(tmp_path, sample_columns):
     columns = sample_columns["flight_b"]
     for name in ("log.csv", "log.csv.gz"):
         write_csv(
-            tmp_path / name,
-            LogTable(name, columns, np.full(len(columns["t"]), "0")),
-            {"t": 9},
+            tmp_path / name, LogTable(name, columns, np.full(len(columns["t"]), "0")), {"t": 9}
         )
         table = read_csv(tmp_path / name)
         assert set(table.columns) == set(columns) and not table.remarks
@@ -37,9 +35,7 @@ def test_round_trip_of_every_channel(tmp_path, sample_columns):
             np.testing.assert_allclose(
                 table.columns[column], values, atol=1e-6
             )  # NaN where not sampled
-    (a,), (b,) = (
-        flights_of(read_csv(tmp_path / n))[0] for n in ("log.csv", "log.csv.gz")
-    )
+    (a,), (b,) = (flights_of(read_csv(tmp_path / n))[0] for n in ("log.csv", "log.csv.gz"))
     assert a.fingerprint == b.fingerprint
     assert a.quaternion.shape == (len(a), 4) and a.motor_command.shape == (len(a), 4)
 
@@ -57,18 +53,11 @@ def test_empty_cells_are_not_sampled_and_written_nan_is_remarked(tmp_path):
 
 
 def test_vehicles_in_long_format_are_told_apart(tmp_path):
-    rows = [
-        "t,vehicle,x,y,z,vbat",
-        "0,cf2,2,0,1,4.0",
-        "0,cf1,1,0,1,4.0",
-        ".01,cf2,2.5,0,1,4.0",
-    ]
+    rows = ["t,vehicle,x,y,z,vbat", "0,cf2,2,0,1,4.0", "0,cf1,1,0,1,4.0", ".01,cf2,2.5,0,1,4.0"]
     text = "\n".join(rows)
     first, second = flights_of(read_csv(write(tmp_path / "log.csv", text)))[0]
     assert (first.vehicle, second.vehicle) == ("cf2", "cf1")
-    assert first.position[:, 0].tolist() == [2.0, 2.5] and second.position[
-        :, 0
-    ].tolist() == [1.0]
+    assert first.position[:, 0].tolist() == [2.0, 2.5] and second.position[:, 0].tolist() == [1.0]
     assert first.log == second.log == "log.csv" and first.name != second.name
 
 
@@ -82,9 +71,7 @@ def test_motors_arrive_in_the_nominal_order(tmp_path):
 
 
 def test_a_channel_with_a_missing_column_is_left_out_and_named(tmp_path):
-    table = read_csv(
-        write(tmp_path / "log.csv", "t,x,y,wx,wy,wz,colour\n0,1,2,3,4,5,6\n")
-    )
+    table = read_csv(write(tmp_path / "log.csv", "t,x,y,wx,wy,wz,colour\n0,1,2,3,4,5,6\n"))
     (flight,), remarks = flights_of(table)
     assert flight.position is None and flight.body_rates is not None
     assert remarks == [
@@ -130,17 +117,13 @@ def test_corrupt_files_say_so(tmp_path, data):
 
 @pytest.mark.parametrize("end", ["\r", "\r\n"])
 def test_other_line_ends_and_a_last_line_cut_off(tmp_path, end):
-    text = end.join(
-        ["t,wx,wy,wz", *(f"{k / 100:.2f},1,2,3" for k in range(50_000)), "500.00,1"]
-    )
+    text = end.join(["t,wx,wy,wz", *(f"{k / 100:.2f},1,2,3" for k in range(50_000)), "500.00,1"])
     table = read_csv(write(tmp_path / "log.csv", text))
     assert len(table.columns["t"]) == 50_000 and table.columns["wz"][-1] == 3.0
     assert table.remarks == ("the last line is cut off and left out",)
 
 
-def test_a_file_that_unpacks_to_gigabytes_is_refused_before_it_does(
-    tmp_path, monkeypatch
-):
+def test_a_file_that_unpacks_to_gigabytes_is_refused_before_it_does(tmp_path, monkeypatch):
     monkeypatch.setattr(csv_text, "LARGEST", 1 << 20)
     path = tmp_path / "log.csv.gz"
     path.write_bytes(gzip.compress(b"t,wx\n" + b"0," * (1 << 21)))
@@ -160,9 +143,7 @@ def test_many_columns_and_rows_take_as_many_times_the_work(tmp_path, monkeypatch
     """
     calls = Counter()
     number = csv_table._number
-    monkeypatch.setattr(
-        csv_table, "_number", lambda cell: calls.update([1]) or number(cell)
-    )
+    monkeypatch.setattr(csv_table, "_number", lambda cell: calls.update([1]) or number(cell))
     rows = 2_000
     columns = {c: np.ones(rows) for c in HEADER.strip().split(",")}
     write_csv(tmp_path / "log.csv", LogTable("log.csv", columns, np.full(rows, "0")))
@@ -176,32 +157,22 @@ def test_a_log_that_lost_its_line_ends_is_refused_at_its_first_row(tmp_path, nam
     """Half a megabyte of columns: as many names are compared with each other in no
     time.
     """
-    text = (
-        ",".join(f"c{k}" for k in range(names))
-        + "\n"
-        + ",".join("1" for _ in range(names))
-    )
+    text = ",".join(f"c{k}" for k in range(names)) + "\n" + ",".join("1" for _ in range(names))
     start = time.process_time()
-    with pytest.raises(
-        LogError, match=f"has {names} cells, more than 2000 columns"
-    ) as caught:
+    with pytest.raises(LogError, match=f"has {names} cells, more than 2000 columns") as caught:
         read_csv(write(tmp_path / "log.csv", text))
     assert time.process_time() - start < 5.0 and len(str(caught.value)) < 200
 
 
 def test_a_wide_log_names_a_few_of_its_columns(tmp_path):
     text = ",".join(f"c{k}" for k in range(1_500)) + "\n"
-    with pytest.raises(
-        LogError, match=r"c11 and 1488 more: say in columns\.toml"
-    ) as caught:
+    with pytest.raises(LogError, match=r"c11 and 1488 more: say in columns\.toml") as caught:
         read_csv(write(tmp_path / "log.csv", text))
     assert len(str(caught.value)) < 200
 
 
 @pytest.mark.parametrize("line", [b"\n", b" \n", b",\n", b"\r"])
-def test_lines_without_end_are_refused_while_they_are_unpacked(
-    tmp_path, monkeypatch, line
-):
+def test_lines_without_end_are_refused_while_they_are_unpacked(tmp_path, monkeypatch, line):
     """A small file that unpacks to millions of lines never becomes a list of them."""
     monkeypatch.setattr(csv_text, "MOST_ROWS", 10_000)
     unpacked = []
@@ -223,9 +194,7 @@ def test_lines_without_end_are_refused_while_they_are_unpacked(
 
 def test_as_many_vehicles_as_rows_are_no_swarm(tmp_path):
     rows = "\n".join(f"{k / 100},{k},1,2,3" for k in range(500))
-    with pytest.raises(
-        LogError, match="column vehicle holds 500 ids, 0, 1, 2 and 497 more"
-    ):
+    with pytest.raises(LogError, match="column vehicle holds 500 ids, 0, 1, 2 and 497 more"):
         flights_of(read_csv(write(tmp_path / "log.csv", "t,vehicle,wx,wy,wz\n" + rows)))
 
 
@@ -238,22 +207,12 @@ def test_columns_that_nobody_asks_for_may_hold_text(tmp_path, first, name):
     """With a columns.toml too: unmapped ones, and those in whose place another is
     named.
     """
-    sources = {
-        "t": "time",
-        "wx": "gyro",
-        "x": "px",
-        "roll": "r",
-        "pitch": "p",
-        "yaw": "y",
-    }
+    sources = {"t": "time", "wx": "gyro", "x": "px", "roll": "r", "pitch": "p", "yaw": "y"}
     mapping = ColumnMapping({column: Source(raw) for column, raw in sources.items()})
     rows = [f"{k / 100},1,2,3,4,5,{text}" for k, text in enumerate([first, *TEXTS])]
     text = "\n".join([f'time,gyro,px,r,p,y,"{name}"', *rows])
     table = read_log(write(tmp_path / "log.csv", text), mapping)
-    assert (
-        table.columns["wx"].tolist() == [1.0] * len(rows)
-        and table.columns["x"][0] == 2.0
-    )
+    assert table.columns["wx"].tolist() == [1.0] * len(rows) and table.columns["x"][0] == 2.0
     assert table.remarks == (f"unknown column left out: {name}",)
 
 

@@ -17,9 +17,7 @@ from openjax.flights.track import tracks_of
 
 
 def quoted(text):
-    lines = [
-        ",".join(f'"{cell}"' for cell in line.split(",")) for line in text.splitlines()
-    ]
+    lines = [",".join(f'"{cell}"' for cell in line.split(",")) for line in text.splitlines()]
     return ("\ufeff" + "\r\n".join(lines)).encode()
 
 
@@ -71,26 +69,15 @@ def test_what_stands_around_a_table_changes_nothing(tmp_path, text, around, name
 def test_units_in_the_header_are_read(tmp_path, sample_columns, code):
     """In other units than the format's, and however they are written and saved."""
     columns = sample_columns["flight_a"]
-    units = {
-        "t": "ms",
-        "x": "mm",
-        "wx": "°/s",
-        "az": "m/s²",
-        "qw": "-",
-        "vbat": "mV",
-        "m1": "%",
-    }
+    units = {"t": "ms", "x": "mm", "wx": "°/s", "az": "m/s²", "qw": "-", "vbat": "mV", "m1": "%"}
     sizes = {"t": 1e3, "x": 1e3, "wx": np.degrees(1.0), "vbat": 1e3, "m1": 100.0}
     named = {
-        f"{name} [{units[name]}]" if name in units else name: sizes.get(name, 1.0)
-        * values
+        f"{name} [{units[name]}]" if name in units else name: sizes.get(name, 1.0) * values
         for name, values in columns.items()
     }
     path = tmp_path / "flight.csv"
     rows = np.stack(list(named.values()), 1)
-    np.savetxt(
-        path, rows, delimiter=",", header=",".join(named), comments="", encoding=code
-    )
+    np.savetxt(path, rows, delimiter=",", header=",".join(named), comments="", encoding=code)
     read = read_log(path)
     for name, values in columns.items():
         np.testing.assert_allclose(read.columns[name], values, rtol=1e-9, atol=1e-12)
@@ -130,9 +117,7 @@ def test_two_recordings_in_one_file_are_none(tmp_path, text, later):
 
 def test_a_hole_in_every_channel_contradicts_nothing(tmp_path, sample_columns):
     """A line drawn over it does: a velocity that wasn't measured leads nowhere."""
-    columns = {
-        name: values.copy() for name, values in sample_columns["flight_a"].items()
-    }
+    columns = {name: values.copy() for name, values in sample_columns["flight_a"].items()}
     for name, values in columns.items():
         if name != "t":
             values[250:430] = np.nan
@@ -145,9 +130,7 @@ def test_a_hole_in_every_channel_contradicts_nothing(tmp_path, sample_columns):
 
 
 def test_poses_of_a_camera_that_lost_the_body_are_not_sampled(tmp_path, sample_columns):
-    columns = {
-        name: values.copy() for name, values in sample_columns["flight_a"].items()
-    }
+    columns = {name: values.copy() for name, values in sample_columns["flight_a"].items()}
     lost = np.arange(len(columns["t"])) // 37 % 4 == 2
     for name in ("x", "y", "z", "qw", "qx", "qy", "qz"):
         columns[name][lost] = 0.0
@@ -159,9 +142,7 @@ def test_poses_of_a_camera_that_lost_the_body_are_not_sampled(tmp_path, sample_c
 
 
 def test_a_mark_in_place_of_a_position_is_not_sampled(tmp_path, sample_columns):
-    columns = {
-        name: values.copy() for name, values in sample_columns["flight_a"].items()
-    }
+    columns = {name: values.copy() for name, values in sample_columns["flight_a"].items()}
     lost = np.arange(len(columns["t"])) // 37 % 4 == 2
     for name in ("x", "y", "z"):
         columns[name][lost] = -999.0
@@ -215,12 +196,7 @@ def test_no_line_is_drawn_over_a_hole_in_the_motors(tmp_path, sample_columns):
     columns = changed(sample_columns, without_motors)
     write_case(tmp_path, columns)
     first, second = tracks_of(load_case(tmp_path))
-    assert (
-        first.time[-1]
-        < columns["t"][hole.start]
-        <= columns["t"][hole.stop]
-        <= second.time[0]
-    )
+    assert first.time[-1] < columns["t"][hole.start] <= columns["t"][hole.stop] <= second.time[0]
 
 
 def test_an_attitude_of_half_the_angles_is_refused(tmp_path, sample_columns):
@@ -230,9 +206,7 @@ def test_an_attitude_of_half_the_angles_is_refused(tmp_path, sample_columns):
         attitude = Rotation.from_quat(
             np.stack([columns[f"q{a}"] for a in "wxyz"], 1), scalar_first=True
         )
-        half = Rotation.from_rotvec(0.5 * attitude.as_rotvec()).as_quat(
-            scalar_first=True
-        )
+        half = Rotation.from_rotvec(0.5 * attitude.as_rotvec()).as_quat(scalar_first=True)
         return dict(zip(("qw", "qx", "qy", "qz"), half.T, strict=True))
 
     write_case(tmp_path, changed(sample_columns, halved))
@@ -240,12 +214,8 @@ def test_an_attitude_of_half_the_angles_is_refused(tmp_path, sample_columns):
         load_case(tmp_path)
 
 
-@pytest.mark.parametrize(
-    "share, words", [(0.02, "not sampled there"), (0.2, "left out")]
-)
-def test_a_gyroscope_at_its_end_reads_nothing_there(
-    tmp_path, sample_columns, share, words
-):
+@pytest.mark.parametrize("share, words", [(0.02, "not sampled there"), (0.2, "left out")])
+def test_a_gyroscope_at_its_end_reads_nothing_there(tmp_path, sample_columns, share, words):
     def clipped(columns):
         rates = {name: columns[name] for name in ("wx", "wy", "wz")}
         most = np.quantile(np.abs(np.stack(list(rates.values()))).max(0), 1 - share)
@@ -274,9 +244,7 @@ def test_a_coarse_gyroscope_at_the_peaks_of_a_motion_is_not_at_its_end(
         assert not any("the sensor's end" in issue for issue in issues)
 
 
-def test_a_table_of_rows_that_repeat_is_the_flight_without_them(
-    tmp_path, sample_columns
-):
+def test_a_table_of_rows_that_repeat_is_the_flight_without_them(tmp_path, sample_columns):
     """As a logger at 1 kHz leaves it of a vehicle that tells something a hundred times
     a second.
     """
@@ -288,9 +256,7 @@ def test_a_table_of_rows_that_repeat_is_the_flight_without_them(
     write_case(tmp_path, columns)
     (plain,) = load_case(tmp_path).flights
     for channel in ("time", "position", "body_rates", "motor_command"):
-        np.testing.assert_allclose(
-            getattr(flight, channel), getattr(plain, channel), atol=1e-6
-        )
+        np.testing.assert_allclose(getattr(flight, channel), getattr(plain, channel), atol=1e-6)
     assert "90% of the rows repeat the one before" in case.quality[0].issue
 
 
@@ -308,7 +274,5 @@ def test_a_long_stand_before_the_flight_is_no_frozen_sensor(tmp_path, sample_col
 
 def test_a_separator_that_columns_toml_has_wrong_is_said(tmp_path, text):
     (tmp_path / "columns.toml").write_text('delimiter = ","\n[columns]\nt = "t"\n')
-    with pytest.raises(
-        UserError, match=r"separated by ';', and columns\.toml says ','"
-    ):
+    with pytest.raises(UserError, match=r"separated by ';', and columns\.toml says ','"):
         case_of(tmp_path, text.replace(",", ";"))

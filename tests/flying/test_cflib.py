@@ -54,15 +54,9 @@ angles = st.floats(-3.0, 3.0)
 
 @settings(max_examples=50, deadline=None)
 @given(
-    st.sampled_from([RATES, ANGLES]),
-    angles,
-    angles,
-    angles,
-    st.floats(LEAST_THRUST, MOST_THRUST),
+    st.sampled_from([RATES, ANGLES]), angles, angles, angles, st.floats(LEAST_THRUST, MOST_THRUST)
 )
-def test_a_set_point_arrives_on_board_as_it_was_meant(
-    mode, roll, pitch, yaw_rate, thrust
-):
+def test_a_set_point_arrives_on_board_as_it_was_meant(mode, roll, pitch, yaw_rate, thrust):
     from cflib.crazyflie.commander import Commander
 
     firmware = VirtualFirmware(needs_arming=False)
@@ -71,9 +65,7 @@ def test_a_set_point_arrives_on_board_as_it_was_meant(
         firmware.receive(bytes([packet.get_header()]) + bytes(packet.data), 0.0)
 
     wanted = SetPoint(mode, roll, pitch, yaw_rate, thrust)
-    Commander(SimpleNamespace(send_packet=send)).send_setpoint_manual(
-        *manual_arguments(wanted)
-    )
+    Commander(SimpleNamespace(send_packet=send)).send_setpoint_manual(*manual_arguments(wanted))
     got = firmware.set_point(0.0)
     assert got.mode == wanted.mode
     np.testing.assert_allclose(got[1:4], wanted[1:4], atol=1e-5)
@@ -83,15 +75,7 @@ def test_a_set_point_arrives_on_board_as_it_was_meant(
 @contextmanager
 def virtual(*options):
     """Three virtual Crazyflies, by the command that a user gives; their URIs."""
-    command = [
-        sys.executable,
-        "-m",
-        "openjax",
-        "virtual_crazyflie",
-        "--port",
-        "0",
-        *options,
-    ]
+    command = [sys.executable, "-m", "openjax", "virtual_crazyflie", "--port", "0", *options]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:
         yield process.stdout.readline().split("--uri ")[1].split()
@@ -132,9 +116,7 @@ class Hovering:
             pillar_position=np.zeros((1, 2)),
             pillar_active=np.zeros(1, bool),
         )
-        self.settings = SimpleNamespace(
-            num_pursuers=3, pillar_radius=0.1, max_speed=1.0
-        )
+        self.settings = SimpleNamespace(num_pursuers=3, pillar_radius=0.1, max_speed=1.0)
         self.steps = 0
 
     def start(self, poses):
@@ -165,9 +147,7 @@ class Hovering:
 
 def flight_of(links, seconds):
     game = Hovering(links)
-    return Flight(
-        links, game, flight_state(game, 3, PATIENT), Plan(episode_seconds=seconds)
-    )
+    return Flight(links, game, flight_state(game, 3, PATIENT), Plan(episode_seconds=seconds))
 
 
 def fly_hovering(uris, folder, body_logs, seconds):
@@ -201,22 +181,12 @@ def test_a_flight_from_the_floor_to_its_log(uris, tmp_path):
     assert not any(d.contradiction for d in flight.state.drones)
     # a set-point leaves after the poses that it was made of, and those were measured
     # before they arrived
-    assert (
-        0.0
-        < timing["command_age_ms"]["p50"]
-        < timing["measured_to_sent_ms"]["p50"]
-        < 10.0
-    )
+    assert 0.0 < timing["command_age_ms"]["p50"] < timing["measured_to_sent_ms"]["p50"] < 10.0
     assert {f.vehicle for f in case.flights} == {"0", "1", "2"}
     for flown in case.flights:
-        assert (
-            flown.has_pose and flown.has_imu and flown.has_motors and flown.has_commands
-        )
+        assert flown.has_pose and flown.has_imu and flown.has_motors and flown.has_commands
         # what the motors were asked for follows the commanded thrust
-        assert (
-            abs(np.nanmedian(flown.motor_command) - np.nanmedian(flown.command_thrust))
-            < 0.05
-        )
+        assert abs(np.nanmedian(flown.motor_command) - np.nanmedian(flown.command_thrust)) < 0.05
         assert abs(np.nanmedian(flown.specific_force[:, 2]) - 9.81) < 1.0
 
 
@@ -245,9 +215,7 @@ def test_the_log_tells_the_links_latency_and_loss(tmp_path, latency, loss):
         for change in changes:
             since = flown.time - flown.time[change]
             near = logged & (since > -0.005) & (since < latency * 1e-3 + 0.012)
-            same = np.flatnonzero(
-                near & (np.abs(motors - flown.command_thrust[change]) < 4e-5)
-            )
+            same = np.flatnonzero(near & (np.abs(motors - flown.command_thrust[change]) < 4e-5))
             sent += 1
             arrived += len(same) > 0
             delays += [1e3 * since[same[0]]] if len(same) else []
@@ -266,9 +234,7 @@ def test_another_process_lands_and_disarms_what_hangs_in_the_air(uris):
         flight = flight_of(links, 60.0)
         deadline = time.monotonic() + 120.0
         while not flight.state.all_in(Mode.PURSUIT):
-            assert time.monotonic() < deadline, [
-                (d.mode, d.reason) for d in flight.state.drones
-            ]
+            assert time.monotonic() < deadline, [(d.mode, d.reason) for d in flight.state.drones]
             flight.tick(time.perf_counter(), time.perf_counter())
             time.sleep(0.008)
         assert min(s.own.position[2] for s in links.observe()) > 0.3
@@ -293,9 +259,7 @@ def test_another_process_lands_and_disarms_what_hangs_in_the_air(uris):
 @pytest.mark.real_time
 def test_a_broken_link_process_is_an_error_and_not_a_wait(uris):
     with connected(uris, body_logs=0) as links:
-        next(
-            p for p in multiprocessing.active_children() if p.name == "openjax links"
-        ).kill()
+        next(p for p in multiprocessing.active_children() if p.name == "openjax links").kill()
         with pytest.raises(UserError, match="links' process"):
             for _ in range(3):
                 links.send([SetPoint()] * 3)
@@ -319,16 +283,11 @@ def test_motion_capture_is_seen_here_and_on_board():
             state = initial_state([(0.4, 0.0, 0.5)], settings=PATIENT)
             for k in range(40):
                 captured.update(
-                    0,
-                    (0.3 + 0.005 * k, 0.0, 0.5),
-                    (1.0, 0.0, 0.0, 0.0),
-                    at=100.0 + 0.01 * k,
+                    0, (0.3 + 0.005 * k, 0.0, 0.5), (1.0, 0.0, 0.0, 0.0), at=100.0 + 0.01 * k
                 )
                 (sample,) = captured.observe()
                 state = see(state, 100.0 + 0.01 * k, (sample,))
-                captured.believed(
-                    0, state.drones[0].captured.pose, feeds_estimator=True
-                )
+                captured.believed(0, state.drones[0].captured.pose, feeds_estimator=True)
             assert captured.arrivals() == (100.0 + 0.01 * 39,)
             np.testing.assert_allclose(
                 state.drones[0].estimate.velocity, (0.5, 0.0, 0.0), atol=1e-3

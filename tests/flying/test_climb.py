@@ -19,16 +19,12 @@ PUSH = (0.5, 0.0, -0.8)
 
 def in_body(quaternion, vector):
     """A vector of the world in body axes."""
-    return tuple(
-        Rotation.from_quat(quaternion, scalar_first=True).inv().apply(vector).tolist()
-    )
+    return tuple(Rotation.from_quat(quaternion, scalar_first=True).inv().apply(vector).tolist())
 
 
 def felt(pose, following):
     """The specific force (m/s^2, body) between two poses."""
-    gain = [
-        (b - a) / DT for a, b in zip(pose.velocity, following.velocity, strict=True)
-    ]
+    gain = [(b - a) / DT for a, b in zip(pose.velocity, following.velocity, strict=True)]
     gain[2] += GRAVITY
     return in_body(pose.quaternion, gain)
 
@@ -57,9 +53,7 @@ def judged(rows, speed=0.0, axis=2, begin=0.3, logged=True):
         position[axis] += way
         velocity[axis] += drift
         told = pose._replace(position=tuple(position), velocity=tuple(velocity))
-        innovations = innovations.update(told, sent, AIRFRAME).feeling(
-            force if logged else None
-        )
+        innovations = innovations.update(told, sent, AIRFRAME).feeling(force if logged else None)
         if innovations.verdict():
             break
     return innovations, pose

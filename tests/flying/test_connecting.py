@@ -40,9 +40,7 @@ if __name__ == "__main__":
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
-def test_the_links_process_doesnt_outlive_one_that_is_killed_while_it_connects(
-    mute, tmp_path
-):
+def test_the_links_process_doesnt_outlive_one_that_is_killed_while_it_connects(mute, tmp_path):
     script = tmp_path / "connecting.py"
     script.write_text(CONNECTING)
     loop = subprocess.Popen([sys.executable, str(script), mute], stdout=subprocess.PIPE)
@@ -60,9 +58,7 @@ def test_the_links_process_doesnt_outlive_one_that_is_killed_while_it_connects(
         os.kill(loop.pid, signal.SIGKILL)
         loop.wait()
         deadline = time.monotonic() + 60.0  # it would go on trying for longer
-        while (
-            left := [c for c in children if _lives(c)]
-        ) and time.monotonic() < deadline:
+        while (left := [c for c in children if _lives(c)]) and time.monotonic() < deadline:
             time.sleep(0.05)
         assert not left
     finally:

@@ -29,9 +29,7 @@ def team(flights, number):
     acceleration, velocity, _ = flights
     drifts = [Drift()] * 3
     for row in range(len(velocity)):
-        both = zip(
-            acceleration[row, number], velocity[row, number], drifts, strict=True
-        )
+        both = zip(acceleration[row, number], velocity[row, number], drifts, strict=True)
         drifts = [d.update((*a, 0.0), (*v, 0.0), observable.PERIOD) for a, v, d in both]
         yield drifts
 
@@ -40,8 +38,7 @@ def test_sums_are_those_of_the_study(flights):
     acceleration, velocity, _ = flights
     sums = observable.summed(acceleration[:600], velocity[:600])[:, 2]
     flown = [
-        [drift.size for drift in drifts]
-        for drifts, _ in zip(team(flights, 2), sums, strict=False)
+        [drift.size for drift in drifts] for drifts, _ in zip(team(flights, 2), sums, strict=False)
     ]
     # the study learns every tenth row only
     np.testing.assert_allclose(flown[50:], sums[50:], atol=0.03)
@@ -55,9 +52,7 @@ def test_only_the_one_that_drifts_is_told_and_not_a_lone_one(flights):
                 told.setdefault((number, int(vehicle)), row * observable.PERIOD)
             assert drifting(drifts[:1]) == (False,)
     assert told and {vehicle for _, vehicle in told} == {0}
-    assert all(
-        0.5 < when - flights[2][number] < 4.0 for (number, _), when in told.items()
-    )
+    assert all(0.5 < when - flights[2][number] < 4.0 for (number, _), when in told.items())
 
 
 def test_who_drifts_lands_with_the_team(flights):
@@ -73,9 +68,7 @@ def test_who_drifts_lands_with_the_team(flights):
     usual = Drift(squares=1e-4, age=9.0)
     far = Drift(totals=(0.4, 0.0), squares=1e-4, age=9.0)
     drones = tuple(
-        drone._replace(
-            innovations=drone.innovations._replace(drift=far if i == 0 else usual)
-        )
+        drone._replace(innovations=drone.innovations._replace(drift=far if i == 0 else usual))
         for i, drone in enumerate(state.drones)
     )
     state = see(state._replace(drones=drones), 0.05, event(0.051).samples)

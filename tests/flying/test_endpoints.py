@@ -39,8 +39,7 @@ def test_a_vehicle_is_the_same_however_it_is_written(uri, same):
 
 
 @pytest.mark.parametrize(
-    "other",
-    ["udp://127.0.0.1:19851", "udp://10.0.0.1:19850", "radio://0/80/2M/E7E7E7E7E7"],
+    "other", ["udp://127.0.0.1:19851", "udp://10.0.0.1:19850", "radio://0/80/2M/E7E7E7E7E7"]
 )
 def test_others_are_others(other):
     assert endpoint_of(other).name != endpoint_of(FIRST).name
@@ -65,9 +64,7 @@ with sole_command(["udp://127.0.0.1:19980", "udp://127.0.0.1:19981"]):
 """
 
 
-@pytest.mark.skipif(
-    not sys.platform.startswith("linux"), reason="Linux's abstract names"
-)
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="Linux's abstract names")
 def test_a_second_fly_is_refused_first_of_all_until_the_first_is_gone(monkeypatch):
     free = "udp://127.0.0.1:19982"
     first = subprocess.Popen(

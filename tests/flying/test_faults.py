@@ -37,18 +37,14 @@ def test_a_vehicle_of_another_weight_flies_or_is_stopped_before_it_could_fall(sh
     """From the floor, by an airframe of the nominal weight."""
     vehicle = load_vehicle()
     vehicles = VirtualVehicles(vehicle.replace(mass=share * vehicle.mass), [(0.4, 0.0)])
-    swarm = SimulatedSwarm(
-        vehicles, [False], lambda i, now, pose: pose, lambda *_: None
-    )
+    swarm = SimulatedSwarm(vehicles, [False], lambda i, now, pose: pose, lambda *_: None)
     state = initial_state([(0.4, 0.0, 0.5)])
     highest = 0.0
     for tick in range(800):
         if state.all_in(Mode.STOPPED, Mode.LANDED):
             break
         request = {30: Request.TRANSFER, 500: Request.LAND}.get(tick, Request.NONE)
-        state, set_points = step(
-            state, Event(swarm.now, swarm.observe(), None, request)
-        )
+        state, set_points = step(state, Event(swarm.now, swarm.observe(), None, request))
         swarm.send(set_points)
         swarm.advance()
         highest = max(highest, vehicles.report.position[0, 2])
@@ -61,9 +57,7 @@ def test_a_job_that_fails_costs_no_other(capsys):
     with pytest.raises(RuntimeError, match="1 of 3"):
         for root in share_out(math.sqrt, [(4.0,), (-1.0,), (9.0,)], 2):
             done.append(root)
-    assert (
-        sorted(done) == [2.0, 3.0] and "(-1.0,): ValueError" in capsys.readouterr().err
-    )
+    assert sorted(done) == [2.0, 3.0] and "(-1.0,): ValueError" in capsys.readouterr().err
 
 
 def test_what_is_infinite_is_written_as_null_and_named():

@@ -27,10 +27,7 @@ def test_the_packed_tick_plays_as_the_games_own_functions():
 
     def poses(place):
         level = (1.0, 0.0, 0.0, 0.0)
-        return [
-            Pose(0.0, tuple(place + offset), (0.1, 0.2, 0.0), level)
-            for offset in offsets
-        ]
+        return [Pose(0.0, tuple(place + offset), (0.1, 0.2, 0.0), level) for offset in offsets]
 
     play = game.start(poses(np.array([0.0, 0.5, 0.6])))
     state, action = first(task, pose_array(poses(np.array([0.0, 0.5, 0.6]))))
@@ -41,9 +38,7 @@ def test_the_packed_tick_plays_as_the_games_own_functions():
         seen = poses(play.evader_position if step > 20 else 0.3 * play.evader_position)
         play = game.step(seen, evader)
         place = np.zeros(3, np.float32) if evader is None else evader.astype(np.float32)
-        state, action, *rest = tick(
-            state, action, pose_array(seen), place, evader is not None
-        )
+        state, action, *rest = tick(state, action, pose_array(seen), place, evader is not None)
         for mine, expected in zip(play, (action, *rest), strict=True):
             np.testing.assert_allclose(
                 np.asarray(mine, float), np.asarray(expected, float), atol=1e-5
@@ -56,13 +51,9 @@ def test_a_compiler_without_the_option_compiles_as_it_does():
     class Lowered:
         def compile(self, compiler_options=None):
             if compiler_options:
-                raise RuntimeError(
-                    f"no such compile option: {next(iter(compiler_options))}"
-                )
+                raise RuntimeError(f"no such compile option: {next(iter(compiler_options))}")
             return "compiled"
 
     assert compile_in_line(Lowered()) == "compiled"
     double = compile_in_line(jax.jit(lambda x: 2 * x).lower(np.ones(3, np.float32)))
-    np.testing.assert_array_equal(
-        double(np.arange(3, dtype=np.float32)), [0.0, 2.0, 4.0]
-    )
+    np.testing.assert_array_equal(double(np.arange(3, dtype=np.float32)), [0.0, 2.0, 4.0])

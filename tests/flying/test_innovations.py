@@ -7,12 +7,7 @@ import random
 
 import pytest
 
-from openjax.flying.controller import (
-    Pose,
-    lift_acceleration,
-    nominal_airframe,
-    turned_on,
-)
+from openjax.flying.controller import Pose, lift_acceleration, nominal_airframe, turned_on
 from openjax.flying.innovations import Innovations, turn_between
 from openjax.flying.judge import Verdict
 from openjax.flying.safety import step
@@ -44,12 +39,10 @@ def flight(seconds=6.0, push=(0.0, 0.0, 0.0)):
         quaternion = turned_on(quaternion, rates, DT)
         acceleration = lift_acceleration(quaternion, lift)
         faster = tuple(
-            v + DT * (a + p)
-            for v, a, p in zip(velocity, acceleration, push, strict=True)
+            v + DT * (a + p) for v, a, p in zip(velocity, acceleration, push, strict=True)
         )
         position = tuple(
-            p + DT * (v + w) / 2
-            for p, v, w in zip(position, velocity, faster, strict=True)
+            p + DT * (v + w) / 2 for p, v, w in zip(position, velocity, faster, strict=True)
         )
         velocity = faster
 

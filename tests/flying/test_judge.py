@@ -10,14 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from openjax.flying.controller import Pose, moved_on, nominal_airframe
-from openjax.flying.judge import (
-    Track,
-    Verdict,
-    agree,
-    follows,
-    judge,
-    pose_limits,
-)
+from openjax.flying.judge import Track, Verdict, agree, follows, judge, pose_limits
 
 LIMITS = pose_limits(nominal_airframe(), 0.06)
 LEVEL = (1.0, 0.0, 0.0, 0.0)
@@ -38,8 +31,7 @@ def test_a_number_that_is_none_is_refused_in_every_field(field, bad):
         values = list(getattr(HERE, field))
         values[k] = bad
         assert (
-            judge(HERE._replace(**{field: tuple(values)}), None, 0.0, LIMITS)
-            is Verdict.NOT_FINITE
+            judge(HERE._replace(**{field: tuple(values)}), None, 0.0, LIMITS) is Verdict.NOT_FINITE
         )
 
 
@@ -72,10 +64,7 @@ def test_a_vehicle_gets_farther_while_nothing_is_heard_than_while_it_is_landed_b
     """.8 m away after .3 s: the last of many wrong poses, or the first one after a
     radio's outage.
     """
-    assert (
-        judge(HERE._replace(time=0.3, position=(x, 0.0, 0.5)), HERE, unseen, LIMITS)
-        is verdict
-    )
+    assert judge(HERE._replace(time=0.3, position=(x, 0.0, 0.5)), HERE, unseen, LIMITS) is verdict
 
 
 unit = st.floats(-1.0, 1.0)
@@ -87,13 +76,11 @@ def test_what_a_vehicle_can_do_is_believed(push, spin, dt):
     for any time in which nothing is heard.
     """
     thrust = tuple(
-        9.81 / nominal_airframe().hover_thrust * a / max(math.hypot(*push), 1.0)
-        for a in push
+        9.81 / nominal_airframe().hover_thrust * a / max(math.hypot(*push), 1.0) for a in push
     )
     acceleration = (*thrust[:2], thrust[2] - 9.81)
     alpha = [
-        nominal_airframe().angular_acceleration * a / max(math.hypot(*spin), 1.0)
-        for a in spin
+        nominal_airframe().angular_acceleration * a / max(math.hypot(*spin), 1.0) for a in spin
     ]
     drawn = HERE._replace(
         body_rates=tuple(0.5 * dt * a for a in alpha)
@@ -104,9 +91,7 @@ def test_what_a_vehicle_can_do_is_believed(push, spin, dt):
             p + dt * v + 0.5 * dt**2 * a
             for p, v, a in zip(HERE.position, HERE.velocity, acceleration, strict=True)
         ),
-        velocity=tuple(
-            v + dt * a for v, a in zip(HERE.velocity, acceleration, strict=True)
-        ),
+        velocity=tuple(v + dt * a for v, a in zip(HERE.velocity, acceleration, strict=True)),
         body_rates=tuple(dt * a for a in alpha),
     )
     still = HERE._replace(body_rates=(0.0, 0.0, 0.0))
@@ -121,11 +106,7 @@ def test_poses_out_of_order_late_or_from_the_future_change_nothing():
     for time in (0.99, 1.0, 0.5, 1.2, math.nan, math.inf):
         assert (
             track.update(
-                HERE._replace(time=time, position=(0.401, 0.0, 0.5)),
-                1.01,
-                LIMITS,
-                True,
-                None,
+                HERE._replace(time=time, position=(0.401, 0.0, 0.5)), 1.01, LIMITS, True, None
             )
             is track
         )
@@ -134,9 +115,7 @@ def test_poses_out_of_order_late_or_from_the_future_change_nothing():
 
 def test_a_refused_pose_leaves_the_last_good_one():
     wrong = HERE._replace(time=0.01, position=(2.0, 0.0, 0.5))
-    assert Track(HERE).update(wrong, 0.01, LIMITS, True, None) == Track(
-        HERE, Verdict.JUMPED, 0.01
-    )
+    assert Track(HERE).update(wrong, 0.01, LIMITS, True, None) == Track(HERE, Verdict.JUMPED, 0.01)
     assert (
         Track(HERE).update(wrong, 0.01, LIMITS, False, None).pose is wrong
     )  # carried to another place by hand
@@ -146,16 +125,10 @@ def test_agreement_is_of_place_and_attitude_at_one_time():
     fast = replace_velocity(HERE, (2.0, 0.0, 0.0))
     later = moved_on(fast, 0.05)
     assert agree(fast, later, LIMITS) is Verdict.GOOD
-    assert (
-        agree(HERE, HERE._replace(position=(0.55, 0.0, 0.5)), LIMITS) is Verdict.APART
-    )
-    assert (
-        agree(HERE, HERE._replace(quaternion=turned(math.pi)), LIMITS) is Verdict.APART
-    )
+    assert agree(HERE, HERE._replace(position=(0.55, 0.0, 0.5)), LIMITS) is Verdict.APART
+    assert agree(HERE, HERE._replace(quaternion=turned(math.pi)), LIMITS) is Verdict.APART
     scaled = replace(LIMITS, apart=0.05)
-    assert (
-        agree(HERE, HERE._replace(position=(0.48, 0.0, 0.5)), scaled) is Verdict.APART
-    )
+    assert agree(HERE, HERE._replace(position=(0.48, 0.0, 0.5)), scaled) is Verdict.APART
 
 
 def test_the_estimator_on_board_isnt_told_what_it_cant_have_missed():

@@ -39,18 +39,13 @@ class Hovering:
         self.height = 0.0
         self.climb = 0.0
         self._nothing = np.zeros(3)
-        self._action = np.array(
-            [[2 * self.airframe.hover_thrust - 1, 0.0, 0.0, 0.0]] * 3
-        )
+        self._action = np.array([[2 * self.airframe.hover_thrust - 1, 0.0, 0.0, 0.0]] * 3)
 
     def observe(self):
         shake = 1e-4 * np.sin(1e3 * self.now)
         poses = [
             Pose(
-                self.now,
-                (x + shake, y, self.height),
-                (0.0, 0.0, self.climb),
-                (1.0, 0.0, 0.0, 0.0),
+                self.now, (x + shake, y, self.height), (0.0, 0.0, self.climb), (1.0, 0.0, 0.0, 0.0)
             )
             for x, y, _ in STARTS
         ]
@@ -138,9 +133,7 @@ def test_the_record_says_when_each_tick_was_due_and_done(flight):
     assert ticks.shape == (700, 3) and vehicles.shape == (700, 3, 7)
     timing = flight.record.timing()
     assert timing["ticks"] == 700 and timing["missed_deadlines"] == 0
-    assert (
-        timing["command_age_ms"]["p50"] == timing["measured_to_sent_ms"]["max"] == 1.0
-    )
+    assert timing["command_age_ms"]["p50"] == timing["measured_to_sent_ms"]["max"] == 1.0
     assert timing["due_to_sent_ms"]["p99"] == 1.5
 
 

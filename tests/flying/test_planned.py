@@ -12,14 +12,7 @@ from openjax.flying.estimation import see
 from openjax.flying.planned import PlannedFlight
 from openjax.flying.safety import decide
 from openjax.flying.set_point import from_action
-from openjax.flying.state import (
-    Drone,
-    Event,
-    Mode,
-    Request,
-    SafetySettings,
-    initial_state,
-)
+from openjax.flying.state import Drone, Event, Mode, Request, SafetySettings, initial_state
 from openjax.pursuit.environment import THRUST_LIMIT
 from openjax.vehicle import load_vehicle
 from openjax.virtual_crazyflie.simulated import SimulatedSwarm
@@ -47,9 +40,7 @@ def flown(segments, effects=None):
         poses = [d.estimate for d in state.drones]
         play = game.step(poses) if play else game.start(poses)
         actions = tuple(from_action(a, THRUST_LIMIT) for a in play.action)
-        state, sent = decide(
-            state, Event(swarm.now, samples, actions, Request.NONE, "")
-        )
+        state, sent = decide(state, Event(swarm.now, samples, actions, Request.NONE, ""))
         swarm.send(sent)
         swarm.advance()
         positions.append(vehicles.report.position[0])

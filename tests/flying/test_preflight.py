@@ -17,16 +17,10 @@ READY = Supervisor.CAN_BE_ARMED
 AHEAD = math.sqrt(0.5)
 
 
-def sample(
-    x=0.4, y=0.2, z=0.0, quaternion=LEVEL, captured=None, voltage=4.1, bits=READY
-):
+def sample(x=0.4, y=0.2, z=0.0, quaternion=LEVEL, captured=None, voltage=4.1, bits=READY):
     pose = Pose(0.0, (x, y, z), (0.0,) * 3, quaternion)
     return PoseSample(
-        pose,
-        0.0,
-        voltage,
-        bits,
-        None if captured is None else pose._replace(position=captured),
+        pose, 0.0, voltage, bits, None if captured is None else pose._replace(position=captured)
     )
 
 
@@ -37,10 +31,7 @@ def found(first, rates=(100.0, 100.0), guarded=True):
 
 def test_all_well_is_no_line():
     assert found(sample()) == []
-    assert (
-        found(sample(bits=Supervisor.ARMED | Supervisor.AUTO_ARM | Supervisor.CAN_FLY))
-        == []
-    )
+    assert found(sample(bits=Supervisor.ARMED | Supervisor.AUTO_ARM | Supervisor.CAN_FLY)) == []
     assert found(sample(captured=(0.42, 0.2, 0.0))) == []
 
 
@@ -77,9 +68,7 @@ def test_link_and_guard():
 
 
 def test_a_scaled_frame_is_told_by_the_vehicles_own():
-    scaled = sample(0.6, 0.3)._replace(
-        captured=Pose(0.0, (0.72, 0.36, 0.0), (0.0,) * 3, LEVEL)
-    )
+    scaled = sample(0.6, 0.3)._replace(captured=Pose(0.0, (0.72, 0.36, 0.0), (0.0,) * 3, LEVEL))
     lines = faults(initial_state(((0.66, 0.33, 0.5),)), (scaled,), (100.0,), True)
     assert len(lines) == 1 and "unit" in lines[0]
 

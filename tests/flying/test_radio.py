@@ -21,9 +21,7 @@ from openjax.virtual_crazyflie.tables import Sensors
 pytestmark = [pytest.mark.slow, pytest.mark.real_time]
 
 NOTHING = np.zeros(3)
-STILL = Sensors(
-    NOTHING, NOTHING, np.array([1.0, 0, 0, 0]), NOTHING, NOTHING, np.zeros(4)
-)
+STILL = Sensors(NOTHING, NOTHING, np.array([1.0, 0, 0, 0]), NOTHING, NOTHING, np.zeros(4))
 HOVER = SetPoint(RATES, 0.0, 0.0, 0.0, 0.3)
 
 
@@ -69,9 +67,7 @@ def vehicles(monkeypatch):
                 vehicle = air[self._address[0]]
                 said = () if vehicle.dead else tuple(vehicle.receive(bytes(data)))
             time.sleep(1e-3)
-            return SimpleNamespace(
-                ack=not vehicle.dead, data=said, retry=0, powerDet=False
-            )
+            return SimpleNamespace(ack=not vehicle.dead, data=said, retry=0, powerDet=False)
 
         def ignore(self, *_):
             pass

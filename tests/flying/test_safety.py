@@ -13,12 +13,7 @@ from hypothesis import strategies as st
 from openjax.flying.board import Board, Role
 from openjax.flying.controller import Pose, accelerate, nominal_airframe, roll_pitch_yaw
 from openjax.flying.judge import Track
-from openjax.flying.limits import (
-    fence_velocity,
-    parting_velocity,
-    resting_places,
-    stopping_point,
-)
+from openjax.flying.limits import fence_velocity, parting_velocity, resting_places, stopping_point
 from openjax.flying.safety import step
 from openjax.flying.set_point import OFF, RATES, SetPoint, from_action
 from openjax.flying.state import (
@@ -42,17 +37,14 @@ def still(time, place, velocity=(0.0, 0.0, 0.0), quaternion=LEVEL):
     """A pose of a vehicle that hovers, with a measurement's noise: no two are
     identical.
     """
-    return Pose(
-        time, (place[0] + 1e-4 * math.sin(1e3 * time), *place[1:]), velocity, quaternion
-    )
+    return Pose(time, (place[0] + 1e-4 * math.sin(1e3 * time), *place[1:]), velocity, quaternion)
 
 
 def pursuing(velocity=(0.0, 0.0, 0.0)):
     state = initial_state(PLACES)
     poses = [Pose(0.0, p, velocity, LEVEL) for p in PLACES]
     drones = tuple(
-        Drone(Mode.PURSUIT, estimate=p, own=Track(p), seen=0.0, sent=POLICY)
-        for p in poses
+        Drone(Mode.PURSUIT, estimate=p, own=Track(p), seen=0.0, sent=POLICY) for p in poses
     )
     return state._replace(drones=drones)
 
@@ -118,9 +110,7 @@ def test_a_stop_is_heard_by_whoever_lands(role):
 
     last = fly_down(board, role, links, initial_state(PLACES), listen)
     assert last.all_in(Mode.STOPPED)
-    assert (
-        all(OFF not in modes for modes in links.sent[:5]) and links.sent[5] == [OFF] * 3
-    )
+    assert all(OFF not in modes for modes in links.sent[:5]) and links.sent[5] == [OFF] * 3
 
 
 DONGLE = "\0openjax test of a dongle"
@@ -168,9 +158,7 @@ def test_a_lost_pose_lands_that_one_by_reckoning_and_stops_the_others():
     assert out[1].pitch < 0.0  # it brakes
     k0 = state.time
     for k in range(1, 130):
-        old = PoseSample(
-            Pose(0.0, PLACES[1], (0.4, 0.0, 0.0), LEVEL), k0 + 0.01 * k, 4.0
-        )
+        old = PoseSample(Pose(0.0, PLACES[1], (0.4, 0.0, 0.0), LEVEL), k0 + 0.01 * k, 4.0)
         state, _ = step(state, event(k0 + 0.01 * k, _1=old))
     assert state.modes[0] is Mode.LAND and state.modes[2] is Mode.LAND
 
@@ -187,8 +175,7 @@ def test_a_pose_that_jumps_is_not_followed(ticks, mode):
     for k in range(3, 3 + ticks):
         time = 0.01 * k
         state, _ = step(
-            state,
-            event(time, _1=PoseSample(Pose(time, away, (0.0,) * 3, LEVEL), time, 4.0)),
+            state, event(time, _1=PoseSample(Pose(time, away, (0.0,) * 3, LEVEL), time, 4.0))
         )
     assert math.dist(state.drones[1].estimate.position[:2], PLACES[1][:2]) < 0.02
     assert state.modes[1] is mode
@@ -230,10 +217,7 @@ def test_an_own_estimate_that_is_elsewhere_is_not_believed_for_having_waited():
         sample = PoseSample(own, now, 4.0, captured=still(now, PLACES[0]))
         state, _ = step(state, event(now, s0=sample))
         estimate = state.drones[0].estimate
-        assert (
-            math.dist(estimate.position, PLACES[0]) < 0.05
-            and not state.drones[0].capture_fault
-        )
+        assert math.dist(estimate.position, PLACES[0]) < 0.05 and not state.drones[0].capture_fault
 
 
 def test_the_estimator_on_board_is_told_what_is_near_it_and_no_more():
@@ -262,11 +246,7 @@ def test_what_is_out_of_limits_ends_the_game_for_all(pose, reason):
     drone = state.drones[1]._replace(own=Track(pose), estimate=pose)
     state = state._replace(drones=(state.drones[0], drone, state.drones[2]))
     seen = pose._replace(
-        time=0.01,
-        position=(
-            pose.position[0] + 0.01 * pose.velocity[0] + 1e-4,
-            *pose.position[1:],
-        ),
+        time=0.01, position=(pose.position[0] + 0.01 * pose.velocity[0] + 1e-4, *pose.position[1:])
     )
     state, _ = step(state, event(_1=PoseSample(seen, 0.01, 4.0)))
     assert state.drones[1].reason == reason
@@ -284,11 +264,7 @@ def test_a_landing_is_soft_where_the_floor_isnt_where_it_is_thought(error):
     touched = []
     for k in range(1, 600):
         time = 0.01 * k
-        seen = still(
-            time,
-            (*PLACES[1][:2], height + error * min(k / 100, 1.0)),
-            (0.0, 0.0, speed),
-        )
+        seen = still(time, (*PLACES[1][:2], height + error * min(k / 100, 1.0)), (0.0, 0.0, speed))
         request = Request.LAND if k == 1 else Request.NONE
         state, out = step(state, event(time, request, _1=PoseSample(seen, time, 4.0)))
         speed += 0.01 * 9.81 * (out[1].thrust / nominal_airframe().hover_thrust - 1.0)
@@ -306,8 +282,7 @@ def test_who_leans_the_wrong_way_turns_before_it_pushes():
     lean = (math.cos(math.pi / 8), 0.0, math.sin(math.pi / 8), 0.0)
     hover = nominal_airframe().hover_thrust
     thrust = [
-        accelerate(q, (-5.0, 0.0, 0.0), nominal_airframe(), 0.0).thrust
-        for q in (LEVEL, lean)
+        accelerate(q, (-5.0, 0.0, 0.0), nominal_airframe(), 0.0).thrust for q in (LEVEL, lean)
     ]
     assert thrust[0] == pytest.approx(hover)
     assert thrust[1] == pytest.approx(hover * (9.81 - 5.0) / 9.81 * math.sqrt(0.5))
@@ -344,8 +319,7 @@ def test_vehicles_that_close_in_are_parted():
     nearest = math.inf
     for _ in range(200):
         poses = [
-            Pose(0.0, tuple(p), (v, 0.0, 0.0), LEVEL)
-            for p, v in zip(places, speeds, strict=True)
+            Pose(0.0, tuple(p), (v, 0.0, 0.0), LEVEL) for p, v in zip(places, speeds, strict=True)
         ]
         wanted = [parting_velocity(LIMITS, i, poses) for i in range(2)]
         for i in range(2):
@@ -404,9 +378,7 @@ def test_a_battery_must_be_low_for_a_while():
     for k in range(1, 70):
         low = PoseSample(still(0.01 * k, PLACES[0]), 0.01 * k, 3.0)
         state, _ = step(state, event(0.01 * k, _0=low))
-        assert (state.modes[0] is Mode.PURSUIT) == (
-            0.01 * (k - 1) <= LIMITS.battery_time
-        )
+        assert (state.modes[0] is Mode.PURSUIT) == (0.01 * (k - 1) <= LIMITS.battery_time)
 
 
 def test_without_actions_all_wait_and_then_land():
@@ -430,11 +402,7 @@ def test_a_landing_by_reckoning_has_the_time_that_its_height_takes(ceiling):
     """With motors off before they would fall, in a high room from metres."""
     high = initial_state(PLACES, settings=SafetySettings(arena_height=ceiling))
     drones = tuple(
-        Drone(
-            Mode.PURSUIT,
-            estimate=Pose(0.0, (*p[:2], ceiling), (0.0,) * 3, LEVEL),
-            seen=0.0,
-        )
+        Drone(Mode.PURSUIT, estimate=Pose(0.0, (*p[:2], ceiling), (0.0,) * 3, LEVEL), seen=0.0)
         for p in PLACES
     )
     state = high._replace(drones=drones)
@@ -468,29 +436,15 @@ def test_resting_places_are_inside_apart_and_off_the_pillars():
 
 
 def test_the_fence_turns_back_what_could_not_stop_any_more():
-    assert (
-        fence_velocity(LIMITS, Pose(0.0, (0.6, 0.0, 0.5), (0.3, 0.0, 0.0), LEVEL))
-        is None
-    )
+    assert fence_velocity(LIMITS, Pose(0.0, (0.6, 0.0, 0.5), (0.3, 0.0, 0.0), LEVEL)) is None
     back = fence_velocity(LIMITS, Pose(0.0, (0.8, 0.0, 0.5), (1.0, 0.0, 0.0), LEVEL))
     assert back[0] < 0.0
     # 35 degrees outwards must be undone first, 35 inwards brake already
     half = math.radians(17.5)
-    outwards, inwards = (
-        (math.cos(half), 0.0, sign * math.sin(half), 0.0) for sign in (1.0, -1.0)
-    )
-    assert (
-        fence_velocity(LIMITS, Pose(0.0, (0.6, 0.0, 0.5), (1.0, 0.0, 0.0), outwards))[0]
-        < 0.0
-    )
-    assert (
-        fence_velocity(LIMITS, Pose(0.0, (0.65, 0.0, 0.5), (1.0, 0.0, 0.0), LEVEL))
-        is None
-    )
-    assert (
-        fence_velocity(LIMITS, Pose(0.0, (0.7, 0.0, 0.5), (1.0, 0.0, 0.0), inwards))
-        is None
-    )
+    outwards, inwards = ((math.cos(half), 0.0, sign * math.sin(half), 0.0) for sign in (1.0, -1.0))
+    assert fence_velocity(LIMITS, Pose(0.0, (0.6, 0.0, 0.5), (1.0, 0.0, 0.0), outwards))[0] < 0.0
+    assert fence_velocity(LIMITS, Pose(0.0, (0.65, 0.0, 0.5), (1.0, 0.0, 0.0), LEVEL)) is None
+    assert fence_velocity(LIMITS, Pose(0.0, (0.7, 0.0, 0.5), (1.0, 0.0, 0.0), inwards)) is None
 
 
 @given(st.floats(0.0, 3.0), st.floats(-5.0, 14.0))
@@ -540,18 +494,14 @@ def test_any_events_give_finite_set_points_and_ends_are_ends(events):
         now += 0.01
         sightings = tuple(
             PoseSample(
-                None if pose is None else Pose(now - pose[0], *pose[1:]),
-                now - silent,
-                voltage,
+                None if pose is None else Pose(now - pose[0], *pose[1:]), now - silent, voltage
             )
             for pose, silent, voltage in seen
         )
         over = [mode in (Mode.STOPPED,) for mode in state.modes]
         happened = Event(now, sightings, (POLICY,) * 3 if acts else None, request)
         after, out = step(state, happened)
-        assert step(state, happened) == (after, out) or any(
-            map(math.isnan, _numbers(after))
-        )
+        assert step(state, happened) == (after, out) or any(map(math.isnan, _numbers(after)))
         state = after
         for i, o in enumerate(out):
             assert all(map(math.isfinite, (o.roll, o.pitch, o.yaw_rate, o.thrust)))
@@ -563,6 +513,4 @@ def test_any_events_give_finite_set_points_and_ends_are_ends(events):
 
 
 def _numbers(state):
-    return [
-        x for d in state.drones if d.estimate is not None for x in d.estimate.position
-    ]
+    return [x for d in state.drones if d.estimate is not None for x in d.estimate.position]

@@ -43,9 +43,7 @@ class Level:
             pursuer_position=np.array(starts), evader_position=np.array([-0.5, 0.0, 0.5]),
             pillar_position=np.zeros((1, 2)), pillar_active=np.zeros(1, bool),
         )  # fmt: skip
-        self.settings = SimpleNamespace(
-            num_pursuers=3, pillar_radius=0.1, max_speed=1.0
-        )
+        self.settings = SimpleNamespace(num_pursuers=3, pillar_radius=0.1, max_speed=1.0)
 
     def start(self, poses):
         return self.step(poses)
@@ -53,13 +51,9 @@ class Level:
     def step(self, poses, evader=None):
         # angles don't come from rates that are zero: level by what is seen
         action = self._action.copy()
-        action[:, 1:3] = [
-            [-2.0 * p.quaternion[1], -2.0 * p.quaternion[2]] for p in poses
-        ]
+        action[:, 1:3] = [[-2.0 * p.quaternion[1], -2.0 * p.quaternion[2]] for p in poses]
         nothing = self._nothing
-        return Play(
-            action, nothing, nothing, False, False, nothing, nothing.astype(bool)
-        )
+        return Play(action, nothing, nothing, False, False, nothing, nothing.astype(bool))
 
 
 @pytest.fixture(scope="module")
@@ -77,11 +71,7 @@ def flying():
         {"policy": "level", "scenario": "wall", "uris": uris},
     )
     yield lambda number, kind, out=None: Flown(
-        number,
-        kind,
-        virtual,
-        Arguments(uri=uris, episode_seconds=8.0, out=out),
-        prepared,
+        number, kind, virtual, Arguments(uri=uris, episode_seconds=8.0, out=out), prepared
     ).fly()
     virtual.close()
 
@@ -101,9 +91,7 @@ def test_whatever_happens_all_are_down_inside_and_disarmed(flying, kind):
     record = flying(7, kind)
     assert record["well"], str(record)
     assert kind != "KILL guard" or "the guard is gone" in record["said"]
-    assert kind != "Ctrl-C three times" or "pose lost" not in record["said"], (
-        "it landed blindly"
-    )
+    assert kind != "Ctrl-C three times" or "pose lost" not in record["said"], "it landed blindly"
 
 
 def test_a_closed_terminal_doesnt_cost_the_log(flying, tmp_path):

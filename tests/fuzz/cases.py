@@ -25,9 +25,7 @@ _warm: set = set()
 def finite(tree) -> bool:
     """Whether every number of plain values, dataclasses or arrays is finite."""
     if dataclasses.is_dataclass(tree):
-        return all(
-            finite(getattr(tree, field.name)) for field in dataclasses.fields(tree)
-        )
+        return all(finite(getattr(tree, field.name)) for field in dataclasses.fields(tree))
     if isinstance(tree, dict):
         return all(map(finite, tree.values()))
     if isinstance(tree, tuple | list):

@@ -59,9 +59,7 @@ def try_damages(folder: Path, seeds: range) -> list[str]:
     from openjax.store.leaves import abstract_like, named_leaves
 
     saved = {update: dict(np.load(folder / f"{update}.npz")) for update in (1, 2)}
-    abstract = abstract_like(
-        jax.eval_shape(make_start(_tiny_settings()), jax.random.key(0))
-    )
+    abstract = abstract_like(jax.eval_shape(make_start(_tiny_settings()), jax.random.key(0)))
     outcomes = []
     for seed in seeds:
         rng = random.Random(f"damage {seed}")
@@ -90,11 +88,7 @@ def try_damages(folder: Path, seeds: range) -> list[str]:
                     for name, leaf in leaves.items()
                 )
                 outcomes.append(
-                    "silently wrong"
-                    if not good
-                    else "same"
-                    if record.update == 2
-                    else "before"
+                    "silently wrong" if not good else "same" if record.update == 2 else "before"
                 )
             except UserError:
                 outcomes.append("refused")
@@ -109,7 +103,5 @@ def _plain(leaf):
     import jax.numpy as jnp
 
     return np.asarray(
-        jax.random.key_data(leaf)
-        if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
-        else leaf
+        jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf
     )

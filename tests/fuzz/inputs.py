@@ -31,9 +31,7 @@ def fuzz_train(rng: random.Random, folder: Path):
     names = _cached("train options", lambda: option_names(TrainCommand()))
     chosen = rng.choices(names, k=rng.randint(1, 3))
     # a folder of our own unless the option is about one
-    arguments = (
-        [] if {"--out", "--resume"} & set(chosen) else ["--out", str(folder / "run")]
-    )
+    arguments = [] if {"--out", "--resume"} & set(chosen) else ["--out", str(folder / "run")]
     arguments += _hostile_options(rng, chosen, names)
     with _in(folder), contextlib.redirect_stdout(io.StringIO()):
         if membership(arguments) is not None:
@@ -144,17 +142,9 @@ def fuzz_vehicle(rng: random.Random, folder: Path):
 
     from openjax.vehicle.vehicle_file import load_vehicle_file
 
-    file = load_vehicle_file(
-        _write(folder / "vehicle.toml", changed_text(rng, VEHICLE))
-    )
+    file = load_vehicle_file(_write(folder / "vehicle.toml", changed_text(rng, VEHICLE)))
     leaves = {key: np.asarray(leaf) for key, leaf in vars(file.vehicle).items()}
-    for name in (
-        "mass",
-        "thrust_constant",
-        "torque_constant",
-        "motor_time_constant",
-        "inertia",
-    ):
+    for name in ("mass", "thrust_constant", "torque_constant", "motor_time_constant", "inertia"):
         if not (leaves[name] > 0).all():
             raise AssertionError(f"{name} is {leaves[name]}")
     return jax.tree.leaves(file.vehicle)
@@ -209,11 +199,7 @@ def _other_policy(rng, good, kind):
             if part is None
             else {**header, part: changed_values(rng, header[part])}
         )
-        text = (
-            json.dumps(header)
-            if rng.random() < 0.8
-            else changed_text(rng, json.dumps(header))
-        )
+        text = json.dumps(header) if rng.random() < 0.8 else changed_text(rng, json.dumps(header))
         stream = io.BytesIO()
         np.save(stream, np.frombuffer(text.encode("utf-8", "replace"), np.uint8))
         members["openjax.json.npy"] = stream.getvalue()
@@ -224,17 +210,12 @@ def _other_policy(rng, good, kind):
         elif kind < 0.9:  # a header that promises much
             text = f"{{'descr': '<f4', 'fortran_order': False, 'shape': ({rng.choice((10**9, 10**30, -5))},), }}"
             members[name] = (
-                b"\x93NUMPY\x01\x00"
-                + len(text).to_bytes(2, "little")
-                + text.encode()
-                + b"\0" * 64
+                b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text.encode() + b"\0" * 64
             )
         else:
             array = np.load(io.BytesIO(members[name]), allow_pickle=False)
             stream = io.BytesIO()
-            np.save(
-                stream, np.full(array.shape, rng.choice((np.nan, np.inf)), np.float16)
-            )
+            np.save(stream, np.full(array.shape, rng.choice((np.nan, np.inf)), np.float16))
             members[name] = stream.getvalue()
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -273,19 +254,14 @@ def _hostile_options(rng, chosen, names):
         if rng.random() < 0.1:
             name = rng.choice(names).replace("_", "-")
         arguments.append(name)
-        arguments += [
-            rng.choice(VALUES) for _ in range(rng.choice((0, 1, 1, 1, 1, 1, 2)))
-        ]
+        arguments += [rng.choice(VALUES) for _ in range(rng.choice((0, 1, 1, 1, 1, 1, 2)))]
     return [argument for argument in arguments if argument not in ("-h", "--help")]
 
 
 def _sample_case():
     from openjax.commands.sample_flights import main
 
-    with (
-        tempfile.TemporaryDirectory() as folder,
-        contextlib.redirect_stdout(io.StringIO()),
-    ):
+    with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()):
         main([f"{folder}/case", "--duration", "4", "--seed", "0"])
         return {path.name: path.read_bytes() for path in Path(folder, "case").iterdir()}
 

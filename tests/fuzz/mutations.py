@@ -32,11 +32,7 @@ def changed_text(rng: random.Random, text: str) -> str:
         elif kind == 1:
             text = text[:at] + rng.choice(string.printable + "é–\x00") + text[at + 1 :]
         elif kind == 2:
-            text = (
-                text[:at]
-                + rng.choice(VALUES).encode("utf-8", "replace").decode()
-                + text[at:]
-            )
+            text = text[:at] + rng.choice(VALUES).encode("utf-8", "replace").decode() + text[at:]
         elif kind == 3:
             lines = text.splitlines(keepends=True) or [""]
             line = rng.randrange(len(lines))
@@ -57,9 +53,7 @@ def changed_text(rng: random.Random, text: str) -> str:
             if digits:
                 at = rng.choice(digits)
                 text = (
-                    text[:at]
-                    + rng.choice(("e", "-", "99999999", ".", "nan", ""))
-                    + text[at + 1 :]
+                    text[:at] + rng.choice(("e", "-", "99999999", ".", "nan", "")) + text[at + 1 :]
                 )
     return text
 
@@ -75,11 +69,7 @@ def changed_bytes(rng: random.Random, content: bytes) -> bytes:
         data[at:at] = data[at : at + rng.choice((1, 10, 1000))]
     for _ in range(rng.choice((1, 1, 1, 2, 20))):
         # most of what can go wrong in an archive lies at its members' ends
-        at = (
-            rng.randrange(len(data))
-            if rng.random() < 0.5
-            else rng.randrange(min(4096, len(data)))
-        )
+        at = rng.randrange(len(data)) if rng.random() < 0.5 else rng.randrange(min(4096, len(data)))
         data[at] ^= 1 << rng.randrange(8)
     return bytes(data)
 

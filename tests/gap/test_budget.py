@@ -11,9 +11,7 @@ import openjax.gap
 from openjax.vehicle.effects import EFFECTS
 
 ROOM = Path(openjax.gap.__file__).parent
-SOURCES = {
-    path: path.read_text(encoding="utf-8") for path in sorted(ROOM.rglob("*.py"))
-}
+SOURCES = {path: path.read_text(encoding="utf-8") for path in sorted(ROOM.rglob("*.py"))}
 # both may only fall; of the named ones 28 came with the trims of two sets of flights,
 # which were a package of their own, and five with a change of the torques' response
 NUMBERS = 207
@@ -29,20 +27,14 @@ def named_numbers(source: str) -> list[str]:
             for part in ast.walk(node.value)
         ):
             names = [
-                n.id
-                for target in node.targets
-                for n in ast.walk(target)
-                if isinstance(n, ast.Name)
+                n.id for target in node.targets for n in ast.walk(target) if isinstance(n, ast.Name)
             ]
             found += [name for name in names if name.isupper()]
     return found
 
 
 def test_named_numbers_are_within_their_budget():
-    assert (
-        len([n for source in SOURCES.values() for n in named_numbers(source)])
-        <= NUMBERS
-    )
+    assert len([n for source in SOURCES.values() for n in named_numbers(source)]) <= NUMBERS
 
 
 def test_few_numbers_decide_and_each_has_a_meaning_and_a_source():

@@ -24,15 +24,14 @@ def test_a_card_is_complete(name):
         "rate_loop",
         "estimator",
     ) and card.next_flight.endswith(".")
-    assert {p.name for p in card.fitted} <= set(effect.parameters) and set(
-        card.sample
-    ) <= set(effect.parameters)
+    assert {p.name for p in card.fitted} <= set(effect.parameters) and set(card.sample) <= set(
+        effect.parameters
+    )
     assert all(p.spread > 0 and p.step > 0 for p in card.fitted)
     assert all(len(start) == len(card.fitted) for start in card.others)
     sizes = (card.nuisance, card.nuisance_duty, card.nuisance_samples)
     assert all(
-        set(s) <= set(effect.parameters)
-        and all(callable(v) or v > 0 for v in s.values())
+        set(s) <= set(effect.parameters) and all(callable(v) or v > 0 for v in s.values())
         for s in sizes
     )
     assert card.log_odds < 0
@@ -45,9 +44,7 @@ def test_what_couples_axes_is_known_apart_from_the_moments():
     covariance = np.linalg.inv(precision)
     coupling = [THETA[i][1] in CARDS["inertia"].coupling for i in index]
     assert sum(coupling) == 1
-    np.testing.assert_allclose(
-        covariance[coupling][:, ~np.array(coupling)], 0, atol=1e-9
-    )
+    np.testing.assert_allclose(covariance[coupling][:, ~np.array(coupling)], 0, atol=1e-9)
 
 
 def test_every_fitted_parameter_has_its_own_place():
@@ -59,8 +56,7 @@ def test_every_fitted_parameter_has_its_own_place():
     for effect in physics:
         index, mean, precision = prior((effect,))
         assert (
-            len(index) == len(set(index)) == len(mean)
-            and np.linalg.eigvalsh(precision).min() > 0
+            len(index) == len(set(index)) == len(mean) and np.linalg.eigvalsh(precision).min() > 0
         )
 
 
@@ -68,10 +64,7 @@ def test_bounded_least_squares_agree_with_scipy():
     rng = np.random.default_rng(0)
     for size, free in ((6, 2), (30, 0), (30, 7)):
         root = np.concatenate(
-            [
-                rng.standard_normal((size, size)) * 10.0 ** rng.uniform(-2, 2, size),
-                np.eye(size),
-            ]
+            [rng.standard_normal((size, size)) * 10.0 ** rng.uniform(-2, 2, size), np.eye(size)]
         )
         target = root @ (5.0 * rng.standard_normal(size))
         limits = np.full(size, BOUND)
@@ -132,9 +125,7 @@ def test_above_the_ceiling_there_is_none():
     low = np.zeros((5, 3))
     high = np.zeros((5, 3))
     high[2, 2] = 1.3
-    assert CARDS["ceiling_effect"].impossible(high) and not CARDS[
-        "ceiling_effect"
-    ].impossible(low)
+    assert CARDS["ceiling_effect"].impossible(high) and not CARDS["ceiling_effect"].impossible(low)
 
 
 @pytest.mark.parametrize("spread", [0.1, 1.0, 100.0])

@@ -57,13 +57,9 @@ def _case(
     folder.mkdir(parents=True)
     (folder / "vehicle.toml").write_text(VEHICLE.format(weighed=str(weighed).lower()))
     for number, name in enumerate(flights):
-        columns = fly(
-            vehicle, vehicle, found[name], 10 * seed + number, NOTHING | effects
-        )
+        columns = fly(vehicle, vehicle, found[name], 10 * seed + number, NOTHING | effects)
         columns = [logged(c) for c in columns]
-        write_csv(
-            folder / f"flight_{number}.csv.gz", log_of(columns, f"flight_{number}")
-        )
+        write_csv(folder / f"flight_{number}.csv.gz", log_of(columns, f"flight_{number}"))
     return folder
 
 
@@ -78,9 +74,7 @@ def _late(columns):
     """The pose is 4 ms older than its row says."""
     pose = ("x", "y", "z", "qw", "qx", "qy", "qz", "vx", "vy", "vz")
     t = columns["t"]
-    return {
-        n: np.interp(t - 0.004, t, v) if n in pose else v for n, v in columns.items()
-    }
+    return {n: np.interp(t - 0.004, t, v) if n in pose else v for n, v in columns.items()}
 
 
 MOTORS = ("m1", "m2", "m3", "m4")
@@ -104,9 +98,7 @@ def _leaning(columns):
     """No position, in a world that leans by two degrees about x."""
     lean = Rotation.from_rotvec([np.radians(2.0), 0.0, 0.0])
     pose = np.stack([columns[n] for n in ("qw", "qx", "qy", "qz")], 1)
-    turned = (lean * Rotation.from_quat(pose, scalar_first=True)).as_quat(
-        scalar_first=True
-    )
+    turned = (lean * Rotation.from_quat(pose, scalar_first=True)).as_quat(scalar_first=True)
     velocity = lean.apply(np.stack([columns[n] for n in ("vx", "vy", "vz")], 1))
     both = np.concatenate([turned, velocity], 1).T
     names = ("qw", "qx", "qy", "qz", "vx", "vy", "vz")
@@ -120,14 +112,10 @@ def folders(tmp_path_factory):
         "none": _case(root / "none", {}),
         "drag": _case(root / "drag", {"rotor_drag": DRAG}),
         "late": _case(
-            root / "late",
-            {"rotor_drag": {n: 3.0 * v for n, v in DRAG.items()}},
-            logged=_late,
+            root / "late", {"rotor_drag": {n: 3.0 * v for n, v in DRAG.items()}}, logged=_late
         ),
         "mass": _case(root / "mass", {"mass": {"extra": 0.003}}),
-        "weighed": _case(
-            root / "weighed", {"thrust_scale": {"scale": -0.08}}, weighed=True
-        ),
+        "weighed": _case(root / "weighed", {"thrust_scale": {"scale": -0.08}}, weighed=True),
         "held": _case(root / "held", {}, logged=_held),
     }
 
@@ -157,15 +145,9 @@ def test_a_known_cause_is_named_with_its_size(reports):
     assert abs(estimate.value - DRAG["d_xy"]) < 3 * half < 0.01
     assert report.gap.reduction > 0.3 and report.gap.interval90[0] > 0
     share = report.shares.effects["rotor_drag"]
-    assert (
-        share.value > 0.9
-        and share.interval90[0] > 0.8
-        and report.shares.unexplained.value < 0.1
-    )
+    assert share.value > 0.9 and share.interval90[0] > 0.8 and report.shares.unexplained.value < 0.1
     # At the hubs drag turns the vehicle as well.
-    assert any(
-        p.channel.startswith("force") and p.after < p.before for p in report.where[:4]
-    )
+    assert any(p.channel.startswith("force") and p.after < p.before for p in report.where[:4])
 
 
 @pytest.mark.parametrize(
@@ -177,13 +159,8 @@ def test_drag_is_named_from_the_logs_that_there_are(logged, tmp_path):
     """And no torque from motors that share no clock with the gyroscope."""
     folder = _case(tmp_path / "case", {"rotor_drag": DRAG}, weighed=True, logged=logged)
     report = diagnose_case(load_case(folder))
-    assert (
-        report.effects == ("rotor_drag",)
-        and report.shares.effects["rotor_drag"].value > 0.6
-    )
-    assert report.parameters["rotor_drag"]["d_xy"].value == pytest.approx(
-        DRAG["d_xy"], rel=0.1
-    )
+    assert report.effects == ("rotor_drag",) and report.shares.effects["rotor_drag"].value > 0.6
+    assert report.parameters["rotor_drag"]["d_xy"].value == pytest.approx(DRAG["d_xy"], rel=0.1)
     if any("share a clock" in text for text in report.sensors):
         hidden = {"inertia", "motor_lag", "yaw_torque", "com_offset", "rate_gains"}
         assert hidden | {"command_latency"} <= set(report.not_testable)
@@ -218,12 +195,8 @@ def test_a_gyroscope_that_reads_little_is_no_heavy_body(tmp_path):
     assert low < 1.0 < high
 
 
-def test_motors_that_were_averaged_before_their_row_are_found_and_name_nothing(
-    tmp_path,
-):
-    report = diagnose_case(
-        load_case(_case(tmp_path / "mean", {}, logged=_motors_late(1)))
-    )
+def test_motors_that_were_averaged_before_their_row_are_found_and_name_nothing(tmp_path):
+    report = diagnose_case(load_case(_case(tmp_path / "mean", {}, logged=_motors_late(1))))
     assert report.effects == () and "one row earlier" in report.sensors[0]
 
 
@@ -241,12 +214,9 @@ def test_a_pose_that_rows_repeat_is_no_late_pose(reports):
 
 def test_a_strong_cause_outside_the_library_is_unknown_not_its_neighbour(tmp_path):
     strong = _case(
-        tmp_path / "strong",
-        {"rotor_drag": {name: 2.0 * size for name, size in DRAG.items()}},
+        tmp_path / "strong", {"rotor_drag": {name: 2.0 * size for name, size in DRAG.items()}}
     )
-    report = diagnose_case(
-        load_case(strong), without=("rotor_drag", "wind", "blade_flapping")
-    )
+    report = diagnose_case(load_case(strong), without=("rotor_drag", "wind", "blade_flapping"))
     assert report.verdict == "unknown" and report.effects[0] == "unknown"
 
 
@@ -259,9 +229,7 @@ def test_a_mass_is_told_from_thrust_by_how_the_vehicle_turns(reports):
     weighed = reports["weighed"]
     assert weighed.effects == ("thrust_scale",)
     assert "mass" not in weighed.equivalent.get("thrust_scale", [])
-    assert weighed.parameters["thrust_scale"]["scale"].value == pytest.approx(
-        -0.08, abs=0.015
-    )
+    assert weighed.parameters["thrust_scale"]["scale"].value == pytest.approx(-0.08, abs=0.015)
     assert weighed.probabilities["mass"] == 0.0
 
 
@@ -285,17 +253,9 @@ def test_the_report_has_the_agreed_form(reports):
         for effect, values in data["parameters"].items():
             for name, estimate in values.items():
                 assert estimate["unit"] == EFFECTS[effect].parameters[name].unit
-                assert (
-                    estimate["interval90"][0]
-                    <= estimate["value"]
-                    <= estimate["interval90"][1]
-                )
-        assert all(
-            p["channel"] in CHANNELS and p["regime"] in REGIMES for p in data["where"]
-        )
-        assert {"metric", "before", "after", "floor", "reduction", "interval90"} <= set(
-            data["gap"]
-        )
+                assert estimate["interval90"][0] <= estimate["value"] <= estimate["interval90"][1]
+        assert all(p["channel"] in CHANNELS and p["regime"] in REGIMES for p in data["where"])
+        assert {"metric", "before", "after", "floor", "reduction", "interval90"} <= set(data["gap"])
         assert set(data["not_testable"]) <= set(EFFECTS)
         first = data["effects"][0] if data["effects"] else "none"
         assert data["probabilities"][first] == max(data["probabilities"].values())
@@ -305,13 +265,7 @@ def test_the_report_has_the_agreed_form(reports):
             == set(data["parameters"])
         )
         prediction = report.prediction()
-        assert set(prediction) == {
-            "effects",
-            "probabilities",
-            "where",
-            "reduction",
-            "not_testable",
-        }
+        assert set(prediction) == {"effects", "probabilities", "where", "reduction", "not_testable"}
         assert sum(prediction["probabilities"].values()) == pytest.approx(1.0, abs=1e-3)
 
 
@@ -324,35 +278,21 @@ def main(arguments):
         return 2
 
 
-def test_the_command_writes_everything_or_nothing(
-    folders, reports, tmp_path, capsys, monkeypatch
-):
+def test_the_command_writes_everything_or_nothing(folders, reports, tmp_path, capsys, monkeypatch):
     # what it says of the drag is known; that a command diagnoses is asked where the
     # README's commands are run
-    monkeypatch.setattr(
-        "openjax.gap.folders.diagnose_case", lambda case, *_: reports[case.name]
-    )
+    monkeypatch.setattr("openjax.gap.folders.diagnose_case", lambda case, *_: reports[case.name])
     out = tmp_path / "out"
     assert (
-        main(
-            [
-                str(folders["drag"]),
-                "--out",
-                str(out),
-                "--predictions",
-                str(tmp_path / "p.json"),
-            ]
-        )
+        main([str(folders["drag"]), "--out", str(out), "--predictions", str(tmp_path / "p.json")])
         == 0
     )
     names, parameters = load_effects(out / "drag" / "effects.toml")
-    assert names == ("rotor_drag",) and parameters["rotor_drag"][
-        "d_xy"
-    ] == pytest.approx(DRAG["d_xy"], rel=0.1)
+    assert names == ("rotor_drag",) and parameters["rotor_drag"]["d_xy"] == pytest.approx(
+        DRAG["d_xy"], rel=0.1
+    )
     assert "<svg" in (out / "drag" / "report.html").read_text()
-    assert json.loads((tmp_path / "p.json").read_text())["drag"]["effects"] == [
-        "rotor_drag"
-    ]
+    assert json.loads((tmp_path / "p.json").read_text())["drag"]["effects"] == ["rotor_drag"]
     assert sorted(p.name for p in out.iterdir()) == ["drag"]
     capsys.readouterr()
     assert main([str(folders["drag"]), "--out", str(out)]) == 2
@@ -368,18 +308,10 @@ def test_a_fault_in_one_case_does_not_cost_the_others(
 
     monkeypatch.setattr("openjax.gap.folders.diagnose_case", diagnosed)
     out = tmp_path / "out"
-    assert (
-        main(
-            [str(folders["none"]), str(folders["drag"]), "--out", str(out), "--no-html"]
-        )
-        == 0
-    )
+    assert main([str(folders["none"]), str(folders["drag"]), "--out", str(out), "--no-html"]) == 0
     said = capsys.readouterr()
     assert said.err.startswith("error: none: KeyError") and said.err.count("\n") == 1
-    assert (
-        sorted(p.name for p in out.iterdir()) == ["drag"]
-        and "report.html" not in said.out
-    )
+    assert sorted(p.name for p in out.iterdir()) == ["drag"] and "report.html" not in said.out
 
 
 def test_a_log_without_an_attitude_is_diagnosed_and_one_left_out_is_named(
@@ -389,20 +321,15 @@ def test_a_log_without_an_attitude_is_diagnosed_and_one_left_out_is_named(
     shutil.copytree(folders["drag"], folder)
     for path in folder.glob("*.csv.gz"):
         rows = [
-            line.split(",")
-            for line in gzip.decompress(path.read_bytes()).decode().splitlines()
+            line.split(",") for line in gzip.decompress(path.read_bytes()).decode().splitlines()
         ]
-        keep = [
-            k for k, name in enumerate(rows[0]) if name not in ("qw", "qx", "qy", "qz")
-        ]
+        keep = [k for k, name in enumerate(rows[0]) if name not in ("qw", "qx", "qy", "qz")]
         text = "\n".join(",".join(row[k] for k in keep) for row in rows) + "\n"
         path.write_bytes(gzip.compress(text.encode()))
     (folder / "torn.csv").write_text("t,wx\n1,2\n")
     assert main([str(folder), "--out", str(tmp_path / "out")]) == 0
     assert "Left out: torn.csv" in capsys.readouterr().out
-    assert (
-        "Left out: torn.csv" in (tmp_path / "out" / "case" / "report.html").read_text()
-    )
+    assert "Left out: torn.csv" in (tmp_path / "out" / "case" / "report.html").read_text()
 
 
 @pytest.mark.parametrize("kind", ["missing", "empty", "no_commands", "unknown_effect"])

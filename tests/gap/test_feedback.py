@@ -8,12 +8,7 @@ import numpy as np
 import pytest
 
 from openjax.flights.track import Track
-from openjax.gap.channels.instruments import (
-    COUNT,
-    caused_by_commands,
-    outputs_of,
-    read_feedback,
-)
+from openjax.gap.channels.instruments import COUNT, caused_by_commands, outputs_of, read_feedback
 from openjax.gap.channels.rate_loop import RateLoop, observe_track, read_rate_loop
 from openjax.gap.model.library import Library
 from openjax.vehicle import load_vehicle
@@ -33,8 +28,7 @@ def flown(seed, p=1.0, gust=0.0, noise=0.005, sampled=False, commands=1.0, pull=
     vehicle = load_vehicle()
     rng = np.random.default_rng(seed)
     gains = [
-        np.asarray(getattr(vehicle, n), float) * COUNT
-        for n in ("rate_kp", "rate_ki", "rate_kd")
+        np.asarray(getattr(vehicle, n), float) * COUNT for n in ("rate_kp", "rate_ki", "rate_kd")
     ]
     mix = np.asarray(mixer(vehicle), float)
     h = DT / TICKS
@@ -69,16 +63,12 @@ def flown(seed, p=1.0, gust=0.0, noise=0.005, sampled=False, commands=1.0, pull=
                 out["rates"].append(seen)
             error = command[row] - seen
             integral = integral + h * error
-            wanted = (
-                p * gains[0] * error
-                + gains[1] * integral
-                - gains[2] * (seen - before) / h
-            )
+            wanted = p * gains[0] * error + gains[1] * integral - gains[2] * (seen - before) / h
             before = seen
             motors.append(np.clip(0.6 + mix @ wanted, 0.0, 1.0))
-            thrust = thrust + (
-                1.0 - np.exp(-h / float(vehicle.motor_time_constant))
-            ) * (motors[-1] - thrust)
+            thrust = thrust + (1.0 - np.exp(-h / float(vehicle.motor_time_constant))) * (
+                motors[-1] - thrust
+            )
             push = 0.98 * push + 0.2 * gust * rng.standard_normal(3)
             rates = rates + h * (turning @ thrust + push + [0.0, pull, 0.0])
         out["motor"].append(motors[0] if sampled else np.mean(motors, 0))
@@ -93,13 +83,10 @@ def flown(seed, p=1.0, gust=0.0, noise=0.005, sampled=False, commands=1.0, pull=
 
 
 @pytest.mark.parametrize(
-    ("p", "sampled"),
-    [(1.0, False), (1.4, False), (0.7, False), (1.0, True), (1.4, True)],
+    ("p", "sampled"), [(1.0, False), (1.4, False), (0.7, False), (1.0, True), (1.4, True)]
 )
 def test_gains_are_what_the_loop_has_whatever_gusts_and_noise_do(p, sampled):
-    found = read(
-        [flown(seed, p, gust=5.0, sampled=sampled) for seed in range(3)], sampled
-    )
+    found = read([flown(seed, p, gust=5.0, sampled=sampled) for seed in range(3)], sampled)
     change = found.change
     error = found.error
     assert change[0] == pytest.approx(p - 1.0, abs=2.0 * error[0])
@@ -115,9 +102,7 @@ def test_ticks_hold_against_a_pull_as_the_samples_of_the_motors_do():
     track, vehicle, link = flown(1, pull=4.0, sampled=True)
     _, ticks = observe_track(track, vehicle, link, at_once=True)
     pitch = -np.asarray(vehicle.rotor_position, float)[:, 0]
-    held, logged = (
-        m[ROWS // 9 :].mean(0) @ pitch for m in (ticks.mean(1), track.motor)
-    )
+    held, logged = (m[ROWS // 9 :].mean(0) @ pitch for m in (ticks.mean(1), track.motor))
     assert held == pytest.approx(logged, rel=0.05)
 
 
@@ -147,13 +132,9 @@ def test_calm_flights_leave_all_of_the_motors_to_feedback():
     all that the motors did.
     """
     track, vehicle, link = flown(1, gust=20.0)
-    (still,) = read_feedback(
-        [track], [vehicle], [caused_by_commands(track, vehicle, link)]
-    )
+    (still,) = read_feedback([track], [vehicle], [caused_by_commands(track, vehicle, link)])
     quiet, _, _ = flown(1)
-    (driven,) = read_feedback(
-        [quiet], [vehicle], [caused_by_commands(quiet, vehicle, link)]
-    )
+    (driven,) = read_feedback([quiet], [vehicle], [caused_by_commands(quiet, vehicle, link)])
     assert still.acceleration.std() > 5.0 * driven.acceleration.std()
     made = (quiet.motor - quiet.motor.mean(0)) @ outputs_of(vehicle)
     assert made.std() > 0.01
@@ -168,9 +149,7 @@ def loop(change, error, shown=0.4):
 
 def test_gains_of_all_axes_are_one_reading_that_covers_what_they_disagree_by():
     value, error = loop([0.4, 0, 0, 0.4, 0, 0], [0.05] * 6).gain
-    assert value[0] == pytest.approx(0.4) and error[0] == pytest.approx(
-        0.05 / np.sqrt(2.0)
-    )
+    assert value[0] == pytest.approx(0.4) and error[0] == pytest.approx(0.05 / np.sqrt(2.0))
     apart = loop([0.4, 0, 0, -0.4, 0, 0], [0.05] * 6)
     assert apart.gain[1][0] > 0.35
     assert loop([0.4, 0, 0, 0.0, 0, 0], [0.05] * 3 + [np.inf] * 3).acting()

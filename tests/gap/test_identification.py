@@ -62,17 +62,7 @@ def test_truth_lies_within_three_deviations_in_gusts(records, name):
     truth = TRUTHS[name]
     fit = identify_torques([records[name]])
     gain = 1.0 / truth.inertia
-    right = [
-        truth.up,
-        truth.down,
-        truth.delay,
-        gain,
-        gain,
-        gain,
-        truth.damping,
-        truth.damping,
-        0.0,
-    ]
+    right = [truth.up, truth.down, truth.delay, gain, gain, gain, truth.damping, truth.damping, 0.0]
     off = (fit.value - right) / np.sqrt(np.diag(fit.covariance))
     assert np.abs(off[:-1]).max() < 3.0, dict(zip(NAMES, off, strict=True))
 
@@ -101,12 +91,7 @@ def test_the_search_hears_that_slow_motors_are_no_inertia(records):
     assert speaks_for() < lag - 8.0
     assert speaks_for(inertia_xx=3.0, inertia_yy=3.0) < lag - 8.0
     # A weaker thrust would turn it less, too.
-    both = {
-        "inertia_xx": 0.8,
-        "inertia_yy": 0.8,
-        "inertia_zz": 0.8,
-        "thrust_scale_scale": -0.2,
-    }
+    both = {"inertia_xx": 0.8, "inertia_yy": 0.8, "inertia_zz": 0.8, "thrust_scale_scale": -0.2}
     assert speaks_for(motor_lag_extra_up=0.05, motor_lag_extra_down=0.05, **both) > -5.0
 
 
@@ -114,9 +99,7 @@ def test_motors_logged_late_are_a_clock(records):
     record = records["nominal"]
     rows = 4
     cut = len(record.rates) - rows
-    late = Record(
-        **{**vars(record), "rates": record.rates[rows:], "motor": record.motor[:cut]}
-    )
+    late = Record(**{**vars(record), "rates": record.rates[rows:], "motor": record.motor[:cut]})
     fit = identify_torques([late])
     assert abs(fit.clock + rows * record.dt) < 0.005
     assert abs(fit.value[0] - 0.025) < 0.006
@@ -126,23 +109,16 @@ def test_the_first_sentence_and_the_training_know_slow_motors(records):
     record = records["slow motors"]
     fit = identify_torques([record])
     found = Identification(
-        quantities_of([record], fit),
-        responses([record], fit),
-        (),
-        of_fit(fit, [record]),
+        quantities_of([record], fit), responses([record], fit), (), of_fit(fit, [record])
     )
     values, intervals = corrections(found, effects=())
     assert set(values) == {"motor_lag"}
     low, high = intervals["motor_lag"]["extra_up"]
     assert low < 0.05 < high
     assert "later: its motors take" in found.sentence()
-    assert (low + 0.025, high + 0.025) == pytest.approx(
-        found.quantities["spin_up"].interval90
-    )
+    assert (low + 0.025, high + 0.025) == pytest.approx(found.quantities["spin_up"].interval90)
     unmapped = replace(found, duty_cycles=True)
-    assert set(corrections(unmapped, effects=("inertia", "motor_lag"))[0]) == {
-        "motor_lag"
-    }
+    assert set(corrections(unmapped, effects=("inertia", "motor_lag"))[0]) == {"motor_lag"}
     # what an emptier battery does to the gains isn't flown with twice
     value = found.estimates.value + np.array([0.0, 0.0, 0.4, 0.4, 0.0])
     weaker = replace(found, estimates=replace(found.estimates, value=value))
@@ -152,24 +128,17 @@ def test_the_first_sentence_and_the_training_know_slow_motors(records):
     ratio = (1 + 2j * np.pi * 5.0 * 0.025) / (1 + 2j * np.pi * 5.0 * 0.075)
     gain, later = found.at(5.0)
     assert gain == pytest.approx(abs(ratio), rel=0.15)
-    assert later == pytest.approx(
-        np.rad2deg(np.angle(ratio)) - 360.0 * 5.0 * 0.004, abs=8.0
-    )
+    assert later == pytest.approx(np.rad2deg(np.angle(ratio)) - 360.0 * 5.0 * 0.004, abs=8.0)
     page = response_of(found)
     assert page["picture"].startswith("<svg")
-    assert (
-        found.to_dict({"motor_lag": 0.5})["quantities"]["spin_up"]["share_of_gap"]
-        == 0.5
-    )
+    assert found.to_dict({"motor_lag": 0.5})["quantities"]["spin_up"]["share_of_gap"] == 0.5
 
 
 def test_rotors_in_lanes_turn_as_one_long_flight():
     rng = np.random.default_rng(0)
     commands = np.clip(0.5 + 0.2 * rng.standard_normal((700, 4)), 0.0, 1.0)
     up, down, late, dt, fine = 0.03, 0.06, 0.004, 0.01, 50
-    (square, speed), _ = rotor_rows(
-        [commands, commands[:7]], dt, np.array([[up, down, late]])
-    )
+    (square, speed), _ = rotor_rows([commands, commands[:7]], dt, np.array([[up, down, late]]))
     target = np.repeat(np.sqrt(commands), fine, 0)
     target = np.concatenate([target[:1].repeat(round(late / dt * fine), 0), target])
     now = target[0]

@@ -65,9 +65,7 @@ def test_a_report_asks_for_the_flight_that_the_plan_puts_first(tmp_path):
     """They followed rules of their own once."""
     case = tmp_path / "case"
     case.mkdir()
-    (case / "vehicle.toml").write_text(
-        '[vehicle]\nmass = 0.036\n[motor]\ncommand = "pwm"\n'
-    )
+    (case / "vehicle.toml").write_text('[vehicle]\nmass = 0.036\n[motor]\ncommand = "pwm"\n')
     vehicle = load_vehicle_file(case)
     report = between("rotor_drag", "wind") | {"vehicle": str(vehicle.path)}
     (case / "report.json").write_text(json.dumps(report))
@@ -92,9 +90,7 @@ def test_the_standard_plan_stays_in_the_box_for_two_minutes():
     assert len(plan) == 12_000
     assert set(plan.segment) == set(SEGMENTS)
     assert np.linalg.norm(plan.position[:, :2], axis=1).max() < Arena.radius - 0.1
-    assert (
-        LOWEST <= plan.position[:, 2].min() < plan.position[:, 2].max() < Arena.height
-    )
+    assert LOWEST <= plan.position[:, 2].min() < plan.position[:, 2].max() < Arena.height
     assert np.linalg.norm(plan.velocity, axis=1).max() < 2.0
     assert np.linalg.norm(plan.acceleration, axis=1).max() < 7.0
 
@@ -104,11 +100,7 @@ def test_a_plan_is_read_as_it_was_written(tmp_path):
     write_plan(path, plan_of(["hover"]))
     assert np.allclose(read_plan(path).position, plan_of(["hover"]).position, atol=1e-4)
     lines = path.read_text().splitlines()
-    for broken in (
-        lines[:1],
-        [lines[0], lines[1].replace("0.6000", "nan")],
-        ["t,x", "0,1"],
-    ):
+    for broken in (lines[:1], [lines[0], lines[1].replace("0.6000", "nan")], ["t,x", "0,1"]):
         path.write_text("\n".join(broken))
         with pytest.raises(UserError, match=str(path)):
             read_plan(path)

@@ -39,14 +39,10 @@ def test_tracks_and_parameters_that_share_a_call_are_not_mixed_up():
     together = make_physics(tracks, vehicles, ticks).predict(theta)
     for number, track in enumerate(tracks):
         alone = make_physics(
-            tracks[number : number + 1],
-            vehicles[number : number + 1],
-            ticks[number : number + 1],
+            tracks[number : number + 1], vehicles[number : number + 1], ticks[number : number + 1]
         )
         for k, vector in enumerate(theta):
-            np.testing.assert_array_equal(
-                together[number][k], alone.predict(vector[None])[0][0]
-            )
+            np.testing.assert_array_equal(together[number][k], alone.predict(vector[None])[0][0])
         assert together[number].shape == (len(theta), len(track), 9)
     assert len({channels[0, -1, 5] for channels in together}) == 3
     assert len(np.unique(together[0][:, -1, 5])) == len(theta)
@@ -65,9 +61,7 @@ def below(height: float, ceiling: float | None) -> np.ndarray:
         if effect in ("downwash", "ceiling_effect"):
             theta[place] = typical(EFFECTS[effect])[parameter]
     ticks = [np.repeat(track.motor[:, None], TICKS, 1)]
-    return make_physics([track], [load_vehicle()], ticks).predict(theta[None])[0][
-        0, :, 6:
-    ]
+    return make_physics([track], [load_vehicle()], ticks).predict(theta[None])[0][0, :, 6:]
 
 
 @pytest.mark.parametrize("height", [1.25, 1.6, 3.0])
@@ -77,9 +71,7 @@ def test_a_room_higher_than_the_arena_has_the_wakes_and_the_ceiling_that_it_has(
     """
     free = below(0.5, 50.0)
     np.testing.assert_allclose(below(height, None), free, rtol=1e-5, atol=1e-5)
-    np.testing.assert_allclose(
-        below(height, height + 0.5), below(0.5, 1.0), rtol=1e-4, atol=1e-4
-    )
+    np.testing.assert_allclose(below(height, height + 0.5), below(0.5, 1.0), rtol=1e-4, atol=1e-4)
     assert np.abs(below(height, height + 0.5) - free).max() > 0.01
 
 
@@ -119,14 +111,10 @@ def test_a_propeller_that_spins_up_turns_the_body_by_its_angular_momentum():
     track.motor[:] = np.where(harder, 0.4 + 0.2 * np.array([1.0, 0.0, 1.0, 0.0]), 0.4)
     with_propellers = np.repeat(ABSENT[None], 2, 0)
     with_propellers[1, -2] = 0.002
-    physics = make_physics(
-        [track], [vehicle], [np.repeat(track.motor[:, None], TICKS, 1)]
-    )
+    physics = make_physics([track], [vehicle], [np.repeat(track.motor[:, None], TICKS, 1)])
     without, turned = physics.predict(with_propellers)[0][:, -1, RATES]
     gained = np.sqrt([0.6, 0.4, 0.6, 0.4]) - np.sqrt(0.4)
-    gained = (
-        float(vehicle.max_rotor_speed) * gained @ np.asarray(vehicle.rotor_spin, float)
-    )
+    gained = float(vehicle.max_rotor_speed) * gained @ np.asarray(vehicle.rotor_spin, float)
     np.testing.assert_allclose(
         turned - without, [0.0, 0.0, 0.002 * gained], atol=1e-3 * abs(gained) * 0.002
     )

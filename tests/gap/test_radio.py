@@ -33,9 +33,7 @@ def flown(latency, loss, jitter=0.0005, phase=0.004, seed=0, seconds=16.0):
     arrived[0] = True
     time = np.arange(0.0207, seconds - 0.02, 0.002) + latency
     commanded = np.searchsorted(sent, time, side="right") - 1
-    held = np.flatnonzero(arrived)[
-        np.searchsorted(sent[arrived] + latency, time, side="right") - 1
-    ]
+    held = np.flatnonzero(arrived)[np.searchsorted(sent[arrived] + latency, time, side="right") - 1]
     rates = np.stack([np.sin(5 * time), np.cos(4 * time), 0 * time], 1)
     apart = 0.01 * np.array([1, -1, 1, -1]) * np.sin(20 * time)[:, None]
     flight = Flight(
@@ -52,9 +50,7 @@ def flown(latency, loss, jitter=0.0005, phase=0.004, seed=0, seconds=16.0):
 
 
 @pytest.mark.parametrize("phase", [0.0, 0.004, 0.007])
-@pytest.mark.parametrize(
-    ("latency", "loss"), [(0.0, 0.05), (0.0, 0.2), (0.012, 0.05), (0.02, 0.1)]
-)
+@pytest.mark.parametrize(("latency", "loss"), [(0.0, 0.05), (0.0, 0.2), (0.012, 0.05), (0.02, 0.1)])
 def test_a_loss_is_told_alone_and_beside_a_latency(latency, loss, phase):
     tracks, lost = flown(latency, loss, phase=phase)
     radio = read_radio(tracks, library())
@@ -64,8 +60,7 @@ def test_a_loss_is_told_alone_and_beside_a_latency(latency, loss, phase):
 
 
 @pytest.mark.parametrize(
-    ("latency", "jitter"),
-    [(0.0, 0.0005), (0.006, 0.001), (0.012, 0.003), (0.02, 0.0005)],
+    ("latency", "jitter"), [(0.0, 0.0005), (0.006, 0.001), (0.012, 0.003), (0.02, 0.0005)]
 )
 def test_a_latency_that_jitters_is_no_loss(latency, jitter):
     radio = read_radio(flown(latency, 0.0, jitter)[0], library())

@@ -72,9 +72,7 @@ def test_without_an_effect_the_numbers_of_the_others_stay_known():
     names = ("rotor_drag d_xy", "motor_lag extra_up")
     theta = ABSENT.copy()
     theta[[PLACE[tuple(n.split(" "))] for n in names]] = 0.004, 0.003
-    known = Baseline(
-        theta, ("rotor_drag",), names, np.diag([1e-6, 4e-6]), {}, {}, np.zeros(4)
-    )
+    known = Baseline(theta, ("rotor_drag",), names, np.diag([1e-6, 4e-6]), {}, {}, np.zeros(4))
     without = with_some(known, ())
     assert without.numbers == (("motor_lag", "extra_up", 1.0),) and not without.effects
     assert without.theta[PLACE["rotor_drag", "d_xy"]] == 0.0
@@ -85,9 +83,7 @@ def test_without_an_effect_the_numbers_of_the_others_stay_known():
 def test_days_move_the_trims_and_an_unlogged_battery_moves_the_map_of_thrust():
     vehicle = load_vehicle()
     assert day_of("motor_imbalance", "m1", vehicle, silent=False) > 0.01
-    loud, silent = (
-        day_of("thrust_curve", "curvature", vehicle, silent=s) for s in (False, True)
-    )
+    loud, silent = (day_of("thrust_curve", "curvature", vehicle, silent=s) for s in (False, True))
     assert loud < 0.05 and silent > 0.1
 
 
@@ -100,13 +96,8 @@ def test_trims_that_the_reference_has_as_well_are_no_change():
     torque = np.asarray(vehicle.rotor_position)[:, :2].T @ there / 4.0
     np.testing.assert_allclose(torque, [-3e-4, 2e-4], rtol=1e-4)
     known = replace(baseline(), trim=1.2 * there)
-    assert trimmed_before(offset, ("com_offset", "wind"), known, vehicle) == {
-        "com_offset"
-    }
-    assert (
-        trimmed_before(offset, ("com_offset",), replace(known, trim=-there), vehicle)
-        == set()
-    )
+    assert trimmed_before(offset, ("com_offset", "wind"), known, vehicle) == {"com_offset"}
+    assert trimmed_before(offset, ("com_offset",), replace(known, trim=-there), vehicle) == set()
     assert trimmed_before(offset, ("com_offset",), None, vehicle) == set()
 
 
@@ -121,9 +112,7 @@ def test_trims_that_the_reference_has_as_well_are_no_change():
         (0.012, 0.05, False, False),
     ],
 )
-def test_a_delay_that_the_reference_has_as_well_is_no_change(
-    before, error, acted, changed
-):
+def test_a_delay_that_the_reference_has_as_well_is_no_change(before, error, acted, changed):
     def channel(value, error, acts):
         return SimpleNamespace(
             path="estimator",
@@ -157,9 +146,7 @@ def test_a_lag_shows_beside_the_reference_where_rows_hide_it(lag):
 
     theta = ABSENT.copy()
     change = change_of(told(lag), told(0.0), theta)
-    alone = conditional(
-        change, theta, {("motor_lag", "extra_up"), ("motor_lag", "extra_down")}
-    )
+    alone = conditional(change, theta, {("motor_lag", "extra_up"), ("motor_lag", "extra_down")})
     value, deviation = alone.of("motor_lag", "extra_up")
     assert value == pytest.approx(lag, abs=1e-9) and deviation < 0.003
     # with an inertia beside it a lag is told less sharply

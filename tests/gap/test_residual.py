@@ -60,18 +60,13 @@ def left_over(push):
 def test_a_push_is_left_in_its_channel_and_in_no_other():
     calm, small = left_over(np.zeros(ROWS))
     pushed, large = left_over(2.0 * np.sin(3.0 * DT * np.arange(ROWS)))
-    assert (
-        pushed["velocity"] > 0.3 > 0.01 > calm["velocity"]
-        and pushed["rates"] == calm["rates"]
-    )
+    assert pushed["velocity"] > 0.3 > 0.01 > calm["velocity"] and pushed["rates"] == calm["rates"]
     assert small.max() < 0.1 and large[3] > 0.5 and large[[0, 1, 2, 4, 5]].max() < 0.1
 
 
 @pytest.mark.parametrize("name", HORIZONS)
 def test_p_values_fall_with_each_measure_and_none_is_zero(name):
-    usual = {
-        n: float(np.median([c[n] for c in calibration() if n in c])) for n in HORIZONS
-    }
+    usual = {n: float(np.median([c[n] for c in calibration() if n in c])) for n in HORIZONS}
     values = [conformal_p(usual | {name: usual[name] * k}) for k in (1.0, 10.0, 1e3)]
     p_values = [p for p, _ in values]
     assert (
@@ -122,8 +117,6 @@ def test_a_later_pose_jitters_and_isnt_compared(shift, before, kept):
     measures = dict.fromkeys(("estimator", "position", "accelerometer"), 0.1)
     baseline = SimpleNamespace(measures=measures, channels=channels(before))
     made = SimpleNamespace(
-        baseline=baseline,
-        charge_unknown=False,
-        channels=tuple(channels(shift).values()),
+        baseline=baseline, charge_unknown=False, channels=tuple(channels(shift).values())
     )
     assert len(_comparable(made)) == kept

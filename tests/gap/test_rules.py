@@ -34,9 +34,7 @@ GOOD = Report(
 
 
 def inertia(low, value, high):
-    return {
-        "parameters": {"inertia": {"xx": Estimate(value, "1", (low, high), (0.7, 1.6))}}
-    }
+    return {"parameters": {"inertia": {"xx": Estimate(value, "1", (low, high), (0.7, 1.6))}}}
 
 
 BROKEN = {
@@ -59,10 +57,7 @@ BROKEN = {
 def test_a_good_report_breaks_no_rule():
     assert broken_rules(GOOD) == []
     nothing = {"effects": (), "parameters": {}, "verdict": "none", "shares": split({})}
-    said = {
-        "probabilities": {"none": 0.9, "unknown": 0.1},
-        "runner_up": "unknown (0.10)",
-    }
+    said = {"probabilities": {"none": 0.9, "unknown": 0.1}, "runner_up": "unknown (0.10)"}
     assert broken_rules(dataclasses.replace(GOOD, **nothing, **said)) == []
 
 
@@ -77,9 +72,7 @@ def test_probabilities_agree_with_what_is_named(seed):
     """Whatever draws of blocks chose, and however sure the unknown is."""
     rng = np.random.default_rng(seed)
     names = [str(e) for e in rng.permutation(list(EFFECTS))]
-    present = {
-        e: float(p) for e, p in zip(names[:2], rng.uniform(0.5, 1.0, 2), strict=True)
-    }
+    present = {e: float(p) for e, p in zip(names[:2], rng.uniform(0.5, 1.0, 2), strict=True)}
     first, second, rest = (float(v) for v in rng.dirichlet([2.0, 1.0, 0.5]))
     largest = {names[0]: first, names[1]: second, "unexplained": rest}
     alone, pair, nothing, other = (float(v) for v in rng.dirichlet(np.ones(4)))
@@ -107,11 +100,7 @@ def test_an_unknown_that_may_act_and_isnt_the_largest_is_no_reason_for_nothing()
 
 
 def test_what_has_no_share_or_makes_predictions_worse_is_not_named():
-    shares = {
-        "mass": (0.7, (0.6, 0.8)),
-        "inertia": (0.2, (0.1, 0.3)),
-        "wind": (0.0, (0.0, 0.001)),
-    }
+    shares = {"mass": (0.7, (0.6, 0.8)), "inertia": (0.2, (0.1, 0.3)), "wind": (0.0, (0.0, 0.001))}
 
     def shares_of(named):
         worse = {"mass", "inertia"} <= set(named)
@@ -124,9 +113,7 @@ def test_what_has_no_share_or_makes_predictions_worse_is_not_named():
 
 
 def test_nobody_who_logged_one_vehicle_is_sent_for_a_second():
-    one, two = (
-        SimpleNamespace(tracks=[SimpleNamespace(neighbours=[0] * n)]) for n in (0, 1)
-    )
+    one, two = (SimpleNamespace(tracks=[SimpleNamespace(neighbours=[0] * n)]) for n in (0, 1))
     assert "the other" not in _beside_segments(one, ("downwash", "rate_gains", ""))
     assert "rate gains" in _beside_segments(one, ("downwash", "rate_gains", ""))
     assert _beside_segments(one, ("downwash", "none")) == ""

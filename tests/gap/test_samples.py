@@ -70,9 +70,7 @@ def test_a_sample_says_weighed_only_where_its_effect_can_still_be_named(
     main([str(tmp_path / "case"), "--effect", effect])
     case = load_case(tmp_path / "case")
     assert case.vehicle_file.mass_weighed == (effect != "mass")
-    assert effect == "none" or not (
-        case.vehicle_file.mass_weighed and CARDS[effect].weighed
-    )
+    assert effect == "none" or not (case.vehicle_file.mass_weighed and CARDS[effect].weighed)
 
 
 def test_two_effects_act_at_once(tmp_path, monkeypatch, sample_columns):

@@ -10,15 +10,7 @@ import pytest
 
 from openjax.gap import selection
 from openjax.gap.channels import of_flights
-from openjax.gap.criteria import (
-    Gaps,
-    clearly_larger,
-    departs,
-    difference,
-    growth,
-    practical,
-    worse,
-)
+from openjax.gap.criteria import Gaps, clearly_larger, departs, difference, growth, practical, worse
 from openjax.gap.model.cross_validation import Validation
 from openjax.gap.model.library import ABSENT, places
 from openjax.gap.selection import Hypothesis
@@ -30,9 +22,7 @@ def judged(left: np.ndarray, blocks: int) -> Validation:
     starts = np.arange(0, len(left), len(left) // blocks)
     nats = -0.5 * np.add.reduceat(left**2, starts)
     none = np.zeros((2, 1))
-    return Validation(
-        nats, np.ones((blocks, 6)), none, left, starts, none, none, np.arange(0)
-    )
+    return Validation(nats, np.ones((blocks, 6)), none, left, starts, none, none, np.arange(0))
 
 
 def test_the_difference_of_two_hypotheses_has_the_error_that_repeated_noise_shows():
@@ -77,9 +67,7 @@ def test_an_effect_that_nuisances_take_on_matters_as_what_it_does():
 
     def of(taken):
         found = np.array([[1.0, -taken]])
-        return replace(
-            judged(y, 5), error=error, coefficients=found, nuisances=np.array([1])
-        )
+        return replace(judged(y, 5), error=error, coefficients=found, nuisances=np.array([1]))
 
     absorbed, best = of(1.0), of(0.0)
     floor = np.array([0.25 * 500.0])
@@ -135,10 +123,7 @@ def test_intervals_hold_a_mean_that_three_flights_differ_by():
     flights = np.sqrt(2.6) * rng.standard_normal((4000, 3))
     reach = (
         1.645
-        * np.array(
-            [of_flights(covariance, (f - f.mean())[:, None])[0, 0] for f in flights]
-        )
-        ** 0.5
+        * np.array([of_flights(covariance, (f - f.mean())[:, None])[0, 0] for f in flights]) ** 0.5
     )
     assert 0.87 < (np.abs(flights.mean(1)) < reach).mean() < 0.95
     # and three that agree by chance aren't believed to

@@ -7,12 +7,7 @@ import pytest
 from scipy.optimize import minimize
 
 from openjax.gap.model.bounds import BOUND
-from openjax.gap.model.cross_validation import (
-    Equations,
-    cross_validate,
-    promise,
-    promise_unbounded,
-)
+from openjax.gap.model.cross_validation import Equations, cross_validate, promise, promise_unbounded
 from openjax.gap.model.hypotheses import _loudness
 from openjax.gap.model.library import ABSENT
 from openjax.gap.model.table import Model, Table, _errors
@@ -38,9 +33,7 @@ def test_the_gap_holds_the_accelerometer_against_the_velocity_that_it_says():
     """
     specific = np.random.default_rng(1).standard_normal((1, 200, 3))
     errors = _errors(np.concatenate([np.zeros((1, 200, 6)), specific], 2), 0.01)
-    np.testing.assert_allclose(
-        errors[0, 60, 6:], 0.01 * specific[0, 36:61].sum(0), rtol=1e-9
-    )
+    np.testing.assert_allclose(errors[0, 60, 6:], 0.01 * specific[0, 36:61].sum(0), rtol=1e-9)
     assert not errors[..., :6].any()
 
 
@@ -65,10 +58,7 @@ def test_nuisances_of_the_vehicle_are_alike_on_all_blocks_and_bounded_and_a_bloc
     left = [
         r + 3.0 * x[5] for r, x in zip(left, columns, strict=True)
     ]  # and the first be beyond its bound
-    rows = [
-        np.concatenate([r[None], x[2:3], x[5:]])
-        for r, x in zip(left, columns, strict=True)
-    ]
+    rows = [np.concatenate([r[None], x[2:3], x[5:]]) for r, x in zip(left, columns, strict=True)]
     shared = np.array([True, True, False])
     order = np.arange(2)
     white = np.array([x @ x.T for x in rows])
@@ -84,9 +74,7 @@ def test_nuisances_of_the_vehicle_are_alike_on_all_blocks_and_bounded_and_a_bloc
         own = z[3:]
         value = 0.5 * 4.0 * (0.2 + step[0]) ** 2 + 0.5 * (common @ common + own @ own)
         for k, (r, x) in enumerate(zip(left, columns, strict=True)):
-            value += (
-                0.5 * ((r - step @ x[2:3] - common @ x[5:7] - own[k] * x[7]) ** 2).sum()
-            )
+            value += 0.5 * ((r - step @ x[2:3] - common @ x[5:7] - own[k] * x[7]) ** 2).sum()
         return value
 
     bounds = [(None, None)] + [(-BOUND, BOUND)] * 2 + [(None, None)] * 2
@@ -102,9 +90,7 @@ def test_a_block_left_out_is_judged_by_its_marginal_density(columns):
     rows = [x[[0, 7]] for x in columns]
     white = np.array([x @ x.T for x in rows])
     shared = np.array([False])
-    fit = SimpleNamespace(
-        effects=(), replay=SimpleNamespace(absent=ABSENT), theta=ABSENT
-    )
+    fit = SimpleNamespace(effects=(), replay=SimpleNamespace(absent=ABSENT), theta=ABSENT)
     error = np.zeros((2, 1, 2, 2))
     table = Table(fit, white, error, None, np.arange(2), {}, {}, {}, shared, rows)
     model = Model((), np.array([], int), np.zeros(0), np.zeros((0, 0)))

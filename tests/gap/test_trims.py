@@ -43,9 +43,7 @@ def folders(tmp_path_factory):
     ]
     for name, effects, seed in flown:
         (root / name).mkdir()
-        for number, (flight, reference) in enumerate(
-            references(seed=seed, duration=8.0).items()
-        ):
+        for number, (flight, reference) in enumerate(references(seed=seed, duration=8.0).items()):
             columns = fly(VEHICLE, VEHICLE, reference, 10 * seed + number, effects)
             write_csv(root / name / f"{flight}.csv.gz", log_of(columns, flight))
     return root
@@ -71,15 +69,8 @@ def test_the_same_vehicle_has_not_changed(folders):
 
 def test_a_weak_rotor_is_found_with_its_size(folders):
     change = compared(folders, "rotor")
-    assert (
-        change.changed
-        and change.rotors == (3,)
-        and change.effects[0] == "motor_imbalance"
-    )
-    assert (
-        change.size.low < 0.15 < change.size.high
-        and abs(change.size.value - 0.15) < 0.03
-    )
+    assert change.changed and change.rotors == (3,) and change.effects[0] == "motor_imbalance"
+    assert change.size.low < 0.15 < change.size.high and abs(change.size.value - 0.15) < 0.03
 
 
 def test_a_heavier_vehicle_blames_no_rotor(folders):
@@ -109,18 +100,12 @@ def with_columns(folder, into, kept):
     """
     into.mkdir()
     for flight in load_case(folder, comparison=True).flights:
-        columns = {"t": flight.time} | {
-            f"m{i + 1}": flight.motor_command[:, i] for i in range(4)
-        }
+        columns = {"t": flight.time} | {f"m{i + 1}": flight.motor_command[:, i] for i in range(4)}
         if "x" in kept:
             columns |= dict(zip("xyz", flight.position.T, strict=True))
         if "w" in kept:
-            columns |= {
-                f"w{a}": v for a, v in zip("xyz", flight.body_rates.T, strict=True)
-            }
-            columns |= {
-                f"a{a}": v for a, v in zip("xyz", flight.specific_force.T, strict=True)
-            }
+            columns |= {f"w{a}": v for a, v in zip("xyz", flight.body_rates.T, strict=True)}
+            columns |= {f"a{a}": v for a, v in zip("xyz", flight.specific_force.T, strict=True)}
         log = LogTable(flight.log, columns, np.full(len(flight), "0"))
         write_csv(into / flight.log, log)
 
@@ -132,9 +117,7 @@ def test_poor_logs_tell_as_much_about_trims(folders, tmp_path, kept):
     """
     for name in ("monday", "rotor"):
         with_columns(folders / name, tmp_path / name, kept)
-    change = compare(
-        read_folder(tmp_path / "rotor"), [read_folder(tmp_path / "monday")]
-    )
+    change = compare(read_folder(tmp_path / "rotor"), [read_folder(tmp_path / "monday")])
     assert change.changed and change.rotors == (3,)
 
 
@@ -149,9 +132,7 @@ def case(folders):
 
 def test_a_folder_of_several_vehicles_is_refused(case, tmp_path):
     for number, flight in enumerate(case.flights):
-        columns = {"t": flight.time} | {
-            f"m{i + 1}": flight.motor_command[:, i] for i in range(4)
-        }
+        columns = {"t": flight.time} | {f"m{i + 1}": flight.motor_command[:, i] for i in range(4)}
         vehicle = np.full(len(flight), str(number % 2))
         write_csv(tmp_path / flight.log, LogTable(flight.log, columns, vehicle))
     with pytest.raises(UserError, match="several vehicles"):
@@ -196,14 +177,10 @@ def test_the_spread_of_days_is_learnt_and_hides_what_is_smaller(case):
 
 
 def test_sizes_grow_with_the_change_and_intervals_hold_it(case):
-    old = [
-        f for k in range(3) for f in trims(f"d{k}", offset=(0, 0.01 * k, 0, 0), seed=k)
-    ]
+    old = [f for k in range(3) for f in trims(f"d{k}", offset=(0, 0.01 * k, 0, 0), seed=k)]
     sizes = []
     for rise in (0.05, 0.1, 0.2, 0.3):
-        change = change_between(
-            "new", trims("new", factors=(1, 1 + rise, 1, 1), seed=5), old, case
-        )
+        change = change_between("new", trims("new", factors=(1, 1 + rise, 1, 1), seed=5), old, case)
         sizes.append(change.size.value)
         assert change.size.low < rise / (1 + rise) < change.size.high
     assert sizes == sorted(sizes) and change.rotors == (2,)
@@ -211,9 +188,7 @@ def test_sizes_grow_with_the_change_and_intervals_hold_it(case):
 
 def test_two_rotors_of_a_side_are_a_class_with_a_weight_there(case):
     old = [f for k in range(3) for f in trims(f"d{k}", seed=k)]
-    change = change_between(
-        "new", trims("new", factors=(1.15, 1.15, 1, 1), seed=5), old, case
-    )
+    change = change_between("new", trims("new", factors=(1.15, 1.15, 1, 1), seed=5), old, case)
     assert change.changed and change.rotors == (1, 2) and change.side == "right"
     assert {"motor_imbalance", "com_offset"} <= set(change.effects)
     chances = change.prediction()["probabilities"]
@@ -236,9 +211,7 @@ def test_rotors_are_counted_as_logged(case, folders, tmp_path):
                 tmp_path / name / flight.log,
                 LogTable(flight.log, columns, np.full(len(flight), "0")),
             )
-    change = compare(
-        read_folder(tmp_path / "rotor"), [read_folder(tmp_path / "monday")]
-    )
+    change = compare(read_folder(tmp_path / "rotor"), [read_folder(tmp_path / "monday")])
     assert change.rotors == (1,) and change.side == "rear left"
 
 
@@ -270,10 +243,7 @@ def test_motors_alone_get_the_same_report_and_are_told_why_it_is_no_diagnosis(
     assert json.loads(answers.read_text())["rotor"]["rotors"] == [3]
     page = (out / "rotor" / "report.html").read_text()
     assert "<svg" in page and "src=" not in page and "1 of 3 flights holds more" in page
-    assert (
-        "holds no flight log" in capsys.readouterr().err
-        and not (out / "empty").exists()
-    )
+    assert "holds no flight log" in capsys.readouterr().err and not (out / "empty").exists()
 
 
 def test_a_misspelt_effect_is_no_reason_to_compare_trims_alone(folders, tmp_path):

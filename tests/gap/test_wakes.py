@@ -6,14 +6,7 @@ import numpy as np
 import pytest
 
 from openjax.flights.track import Track
-from openjax.gap.model.wakes import (
-    ASIDE,
-    CLEAR,
-    LINGERS,
-    LOUDER,
-    louder_in,
-    under_another,
-)
+from openjax.gap.model.wakes import ASIDE, CLEAR, LINGERS, LOUDER, louder_in, under_another
 
 DT = 0.01
 ROWS = 1000
@@ -24,12 +17,8 @@ def passed(start: float) -> Track:
     `start` s on.
     """
     time = np.arange(ROWS) * DT
-    other = np.stack(
-        [0.8 * np.cos(0.4 * np.pi * (time + start)), 0 * time, 0 * time + 0.8], 1
-    )
-    fields = dict.fromkeys(
-        ("quaternion", "velocity", "specific_force", "command", "motor")
-    )
+    other = np.stack([0.8 * np.cos(0.4 * np.pi * (time + start)), 0 * time, 0 * time + 0.8], 1)
+    fields = dict.fromkeys(("quaternion", "velocity", "specific_force", "command", "motor"))
     return Track(
         name="pass",
         flight="pass",
@@ -51,9 +40,7 @@ def test_only_gusts_that_are_louder_under_another_vehicle_are_found(strength):
     left = []
     for chosen in rows:
         # seconds differ in how loud they are, as those of hover and of turns do
-        loud = np.repeat(rng.uniform(0.7, 1.4, ROWS // 100), 100) * np.where(
-            chosen, strength, 1.0
-        )
+        loud = np.repeat(rng.uniform(0.7, 1.4, ROWS // 100), 100) * np.where(chosen, strength, 1.0)
         left.append((loud[:, None] * rng.standard_normal((ROWS, 2)))[20:])
     ratio, errors = louder_in(tracks, rows, left)
     assert (errors > CLEAR and ratio > LOUDER) == (strength > 1.0)
@@ -66,9 +53,7 @@ def test_a_wake_is_felt_until_it_has_passed():
     gap = track.neighbours[0] - track.position
     near = np.hypot(gap[:, 0], gap[:, 1]) < ASIDE
     late = round(LINGERS / DT)
-    expected = near | np.array(
-        [near[max(k - late, 0) : k + 1].any() for k in range(ROWS)]
-    )
+    expected = near | np.array([near[max(k - late, 0) : k + 1].any() for k in range(ROWS)])
     np.testing.assert_array_equal(chosen, expected)
     below = replace(track, neighbours=track.neighbours - [0.0, 0.0, 0.8])
     assert not under_another(below).any()

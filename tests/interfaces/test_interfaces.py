@@ -82,9 +82,7 @@ def test_gymnasium_vector_env_starts_ended_worlds_anew(game):
 
 
 def test_gymnasium_passes_its_recorder(game):
-    worlds = gymnasium.wrappers.vector.RecordEpisodeStatistics(
-        PursuitVectorEnv(2, game)
-    )
+    worlds = gymnasium.wrappers.vector.RecordEpisodeStatistics(PursuitVectorEnv(2, game))
     worlds.reset(seed=0)
     total = np.zeros(2)
     for _ in range(LENGTH):
@@ -101,26 +99,19 @@ def test_jaxmarl_interface_is_the_game_and_starts_anew(game):
     observations, state = adapter.reset(key)
     jitted = jax.jit(game.step)
     expected, expected_state = jax.jit(game.reset)(key)
-    np.testing.assert_allclose(
-        observations["pursuer_2"], flat_observation(expected)[2], atol=1e-6
-    )
+    np.testing.assert_allclose(observations["pursuer_2"], flat_observation(expected)[2], atol=1e-6)
     actions = {
-        agent: adapter.action_space(agent).sample(jax.random.key(5))
-        for agent in adapter.agents
+        agent: adapter.action_space(agent).sample(jax.random.key(5)) for agent in adapter.agents
     }
     for step in range(1, LENGTH + 1):
         observations, state, rewards, dones, _ = adapter.step(key, state, actions)
         action = jnp.stack([actions[agent] for agent in adapter.agents])
         _, expected_state, reward, *_ = jitted(key, expected_state, action)
-        np.testing.assert_allclose(
-            [rewards[agent] for agent in adapter.agents], reward, rtol=1e-5
-        )
+        np.testing.assert_allclose([rewards[agent] for agent in adapter.agents], reward, rtol=1e-5)
         assert bool(dones["__all__"]) == (step == LENGTH)
     assert int(state.step) == 0  # a new episode
     _, state, *_ = jax.vmap(adapter.step, in_axes=(0, 0, None))(
-        jax.random.split(key, 2),
-        jax.vmap(adapter.reset)(jax.random.split(key, 2))[1],
-        actions,
+        jax.random.split(key, 2), jax.vmap(adapter.reset)(jax.random.split(key, 2))[1], actions
     )
     assert state.step.tolist() == [1, 1]
 
@@ -133,9 +124,7 @@ def test_gymnasium_knows_the_game_by_name_and_its_checker_passes():
         check_env(env.unwrapped, skip_render_check=True)
     first, _ = env.reset(seed=7)
     for step in range(1, LENGTH + 1):
-        observation, reward, terminated, truncated, info = env.step(
-            env.action_space.sample()
-        )
+        observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
         assert terminated == (step == LENGTH) and not truncated
     assert isinstance(reward, float) and info == {"captured": False, "crashed": False}
     assert not np.allclose(first, observation)
@@ -160,9 +149,7 @@ def test_jaxmarl_interface_keeps_a_time_limit_and_what_it_hides(observe_time):
     actions = {agent: jnp.zeros(4) for agent in adapter.agents}
     for step in (1, 2):
         before = state
-        observations, state, _, dones, infos = advance(
-            jax.random.key(step), state, actions
-        )
+        observations, state, _, dones, infos = advance(jax.random.key(step), state, actions)
         assert infos["truncated"].tolist() == [step == 2 and not observe_time] * 3
     assert bool(dones["__all__"])
     assert ("final_obs" in infos) != observe_time
@@ -171,7 +158,5 @@ def test_jaxmarl_interface_keeps_a_time_limit_and_what_it_hides(observe_time):
     if not observe_time:
         last = jax.jit(adapter.step_env)(jax.random.key(2), before, actions)[0]
         for agent in adapter.agents:
-            np.testing.assert_allclose(
-                infos["final_obs"][agent], last[agent], atol=1e-6
-            )
+            np.testing.assert_allclose(infos["final_obs"][agent], last[agent], atol=1e-6)
             assert not np.allclose(observations[agent], last[agent])

@@ -62,12 +62,8 @@ print("trained", actors)
 
 
 @pytest.mark.slow
-def test_the_example_hands_the_game_to_an_unchanged_trainer(
-    tmp_path, monkeypatch, capsys
-):
-    (tmp_path / "jaxmarl.py").write_text(
-        "def make(name, **settings): raise ValueError(name)"
-    )
+def test_the_example_hands_the_game_to_an_unchanged_trainer(tmp_path, monkeypatch, capsys):
+    (tmp_path / "jaxmarl.py").write_text("def make(name, **settings): raise ValueError(name)")
     script = tmp_path / "ippo.py"
     script.write_text(TRAINER)
     monkeypatch.syspath_prepend(tmp_path)

@@ -9,12 +9,7 @@ import numpy as np
 import pytest
 
 from openjax.kernels.attention import _reference, _reference_backward
-from openjax.kernels.attention_kernel import (
-    BLOCK,
-    ROWS,
-    backward_by_kernel,
-    forward_by_kernel,
-)
+from openjax.kernels.attention_kernel import BLOCK, ROWS, backward_by_kernel, forward_by_kernel
 from openjax.kernels.attention_operands import EntityKind, Layout, Operands
 from openjax.policy import encoder
 from openjax.policy.encoder import SelfAttention, normalised_linear
@@ -30,10 +25,7 @@ def shaken(tree, seed, size=0.3):
     leaves, structure = jax.tree.flatten(tree)
     keys = jax.random.split(jax.random.key(seed), len(leaves))
     return structure.unflatten(
-        [
-            x + size * jax.random.normal(k, x.shape)
-            for x, k in zip(leaves, keys, strict=True)
-        ]
+        [x + size * jax.random.normal(k, x.shape) for x, k in zip(leaves, keys, strict=True)]
     )
 
 
@@ -56,9 +48,7 @@ def textbook(p, own, others, pillars, seen):
     tokens = np.concatenate(
         [own[:, None], embedded(others, "others"), embedded(pillars, "pillars")], axis=1
     )
-    there = np.concatenate(
-        [np.ones((len(own), 1 + others.shape[1]), bool), seen], axis=1
-    )
+    there = np.concatenate([np.ones((len(own), 1 + others.shape[1]), bool), seen], axis=1)
     query = own @ p["query"]
     keys = tokens @ p["key"]
     values = tokens @ p["value"]
@@ -66,9 +56,7 @@ def textbook(p, own, others, pillars, seen):
     mixed = []
     for head in range(HEADS):
         part = slice(head * width, (head + 1) * width)
-        score = np.einsum("bd,bmd->bm", query[:, part], keys[..., part]) / np.sqrt(
-            width
-        )
+        score = np.einsum("bd,bmd->bm", query[:, part], keys[..., part]) / np.sqrt(width)
         score = np.where(there, score, -np.inf)
         weight = np.exp(score - score.max(1, keepdims=True))
         weight /= weight.sum(1, keepdims=True)
@@ -81,9 +69,7 @@ def on_machine(monkeypatch):
     """Choose the program for machines with or without CUDA: kernels' formula, or one
     entity at a time.
     """
-    return lambda cuda: monkeypatch.setattr(
-        encoder, "can_compile_for_cuda", lambda: cuda
-    )
+    return lambda cuda: monkeypatch.setattr(encoder, "can_compile_for_cuda", lambda: cuda)
 
 
 @pytest.mark.parametrize("cuda", [True, False])
@@ -97,9 +83,7 @@ def test_folded_attention_is_multi_head_attention_with_one_query(cuda, on_machin
     seen[0], seen[1] = False, True
     pillars[~seen] = -5.0
     module = SelfAttention(FEATURES, HEADS, jnp.float32)
-    arguments = [jnp.asarray(x, jnp.float32) for x in (own, others, pillars)] + [
-        jnp.asarray(seen)
-    ]
+    arguments = [jnp.asarray(x, jnp.float32) for x in (own, others, pillars)] + [jnp.asarray(seen)]
     parameters = shaken(jax.jit(module.init)(jax.random.key(0), *arguments), 1)
     with jax.default_matmul_precision("highest"):
         folded = jax.jit(module.apply)(parameters, *arguments)
@@ -115,17 +99,13 @@ def test_both_programs_have_the_same_gradients(on_machine):
         for k, s in zip(keys[:3], [(20,), (2, 3), (3, 5)], strict=True)
     )
     module = encoder.Encoder(FEATURES, HEADS, jnp.float32)
-    parameters = shaken(
-        jax.jit(module.init)(jax.random.key(0), own, others, pillars, seen), 1
-    )
+    parameters = shaken(jax.jit(module.init)(jax.random.key(0), own, others, pillars, seen), 1)
 
     def gradient(cuda):
         on_machine(cuda)
 
         def loss(parameters, own):
-            return jnp.sum(
-                jnp.sin(module.apply(parameters, own, others, pillars, seen))
-            )
+            return jnp.sum(jnp.sin(module.apply(parameters, own, others, pillars, seen)))
 
         with jax.default_matmul_precision("highest"):
             return jax.jit(jax.grad(loss, argnums=(0, 1)))(parameters, own)
@@ -170,21 +150,13 @@ def test_kernel_is_the_plain_formula_forward_and_backward():
     batch = BLOCK + 2 * ROWS + 3  # not a multiple of the block
     operands = operands_of(batch)
     gradient = jax.random.normal(jax.random.key(9), operands.query.shape)
-    kernel = jax.jit(
-        lambda operands: forward_by_kernel(LAYOUT, operands, interpret=True)
-    )
+    kernel = jax.jit(lambda operands: forward_by_kernel(LAYOUT, operands, interpret=True))
     expected = jax.jit(lambda operands: _reference(LAYOUT, operands))(operands)
     got = kernel(operands)
     assert got.shape == expected.shape
     np.testing.assert_allclose(got, expected, atol=1e-4)
 
     expected = jax.jit(lambda *a: _reference_backward(LAYOUT, *a))(operands, gradient)
-    got = jax.jit(lambda *a: backward_by_kernel(LAYOUT, *a, interpret=True))(
-        operands, gradient
-    )
-    for name, a, b in zip(
-        ("query", "token", "inverse", "weights"), got, expected, strict=True
-    ):
-        np.testing.assert_allclose(
-            a, b, atol=1e-4 * float(jnp.abs(b).max() + 1), err_msg=name
-        )
+    got = jax.jit(lambda *a: backward_by_kernel(LAYOUT, *a, interpret=True))(operands, gradient)
+    for name, a, b in zip(("query", "token", "inverse", "weights"), got, expected, strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-4 * float(jnp.abs(b).max() + 1), err_msg=name)

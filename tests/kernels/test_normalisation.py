@@ -8,12 +8,7 @@ import numpy as np
 import pytest
 
 from openjax.kernels.activation import activation
-from openjax.kernels.normalisation import (
-    ROWS,
-    backward_by_kernel,
-    forward_by_kernel,
-    normalise,
-)
+from openjax.kernels.normalisation import ROWS, backward_by_kernel, forward_by_kernel, normalise
 
 pytestmark = pytest.mark.slow
 
@@ -41,9 +36,7 @@ def flax_layer(x, affine, activate):
 def test_normalise_is_bias_layer_norm_and_activation(activate):
     x, affine, gradient = drawn(20)
     value, pullback = jax.vjp(lambda x, a: normalise(x, a, activate), x, affine)
-    expected, expected_pullback = jax.vjp(
-        lambda x, a: flax_layer(x, a, activate), x, affine
-    )
+    expected, expected_pullback = jax.vjp(lambda x, a: flax_layer(x, a, activate), x, affine)
     np.testing.assert_allclose(value, expected, atol=1e-5)
     for got, want in zip(pullback(gradient), expected_pullback(gradient), strict=True):
         np.testing.assert_allclose(got, want, atol=2e-5)

@@ -42,9 +42,7 @@ def learn(environment: Pursuit, team: Team, draw, steps: int, **changes):
     """
     sizes = {"learners": SIZES["learners"]} if changes.pop("defaults", False) else SIZES
     settings = sizes | changes
-    settings = BestResponseSettings(
-        total_steps=settings["learners"] * steps, **settings
-    )
+    settings = BestResponseSettings(total_steps=settings["learners"] * steps, **settings)
     duel = Duel(environment, team)
     response = BestResponse(settings, duel, draw)
     carry = jax.jit(response.start)(jax.random.key(7))
@@ -59,20 +57,14 @@ def learn(environment: Pursuit, team: Team, draw, steps: int, **changes):
 
 def against_stack(radius: float, steps: int, **changes) -> dict:
     """Captures by stack with this radius (m) within 4 s."""
-    environment = game_of_points(
-        evaders=("field",), capture_radius=radius, episode_length=400
-    )
+    environment = game_of_points(evaders=("field",), capture_radius=radius, episode_length=400)
 
     def draw(key):
         task = uniform_task(environment.settings, key)
         return task.replace(pillar_active=jnp.zeros_like(task.pillar_active))
 
     learned, _ = learn(environment, stack_team(environment), draw, steps, **changes)
-    return {
-        "radius": radius,
-        "steps": steps,
-        "learned": learned.captured.mean(-1).tolist(),
-    }
+    return {"radius": radius, "steps": steps, "learned": learned.captured.mean(-1).tolist()}
 
 
 def straight(observation):
@@ -109,9 +101,7 @@ def draw_between(key) -> Task:
     high = jnp.array([0.8, 1.5, 0.5, 1.0])
     near, far, one, other = jax.random.uniform(key, (4,), minval=low, maxval=high)
     angle = jnp.array([one, jnp.pi + other])
-    level = jnp.array([near, far])[:, None] * jnp.stack(
-        [jnp.cos(angle), jnp.sin(angle)], axis=-1
-    )
+    level = jnp.array([near, far])[:, None] * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
     middle = jnp.array([0.0, 0.0, 5.0])
     pursuers = middle + jnp.pad(level, ((0, 0), (0, 1)))
     return Task(pursuers, middle, jnp.zeros((1, 2)), jnp.zeros(1, bool))
@@ -133,9 +123,7 @@ def longest(
     reach = settings.evader_speed * dt
 
     def fly(pursuers, at_knots):
-        heading = jnp.interp(
-            jnp.linspace(0.0, knots - 1.0, steps), jnp.arange(knots), at_knots
-        )
+        heading = jnp.interp(jnp.linspace(0.0, knots - 1.0, steps), jnp.arange(knots), at_knots)
 
         def one(world, heading):
             evader, pursuers, free = world
@@ -145,9 +133,7 @@ def longest(
             free &= jnp.all(length(evader - pursuers) >= settings.capture_radius)
             return (evader, pursuers, free), free
 
-        kept = jax.lax.scan(one, (jnp.zeros(2), pursuers, jnp.ones((), bool)), heading)[
-            1
-        ]
+        kept = jax.lax.scan(one, (jnp.zeros(2), pursuers, jnp.ones((), bool)), heading)[1]
         return dt * (1 + jnp.sum(kept))
 
     def solve(key, pursuers):
@@ -158,16 +144,12 @@ def longest(
             return (best.mean(0), 0.8 * best.std(0) + 0.2 * normal[1]), jnp.max(found)
 
         ways = 2 * jnp.pi * jnp.arange(64) / 64
-        way = ways[
-            jnp.argmax(jax.vmap(lambda way: fly(pursuers, jnp.full(knots, way)))(ways))
-        ]
+        way = ways[jnp.argmax(jax.vmap(lambda way: fly(pursuers, jnp.full(knots, way)))(ways))]
         normal = jnp.full(knots, way), jnp.full(knots, 0.5)
         return jnp.max(jax.lax.scan(improve, normal, jax.random.split(key, 20))[1])
 
     keys = jax.random.split(jax.random.key(0), len(pursuers))
-    return jax.jit(
-        lambda: jax.lax.map(lambda own: solve(*own), (keys, pursuers), batch_size=8)
-    )()
+    return jax.jit(lambda: jax.lax.map(lambda own: solve(*own), (keys, pursuers), batch_size=8))()
 
 
 if __name__ == "__main__":
@@ -175,28 +157,14 @@ if __name__ == "__main__":
     parser.add_argument("--radius", type=float, help="of a capture by stack, m")
     parser.add_argument("--steps", type=int, default=8_000_000, help="of each seed")
     parser.add_argument(
-        "--defaults",
-        action="store_true",
-        help="an accelerator's: those of `openjax exploit`",
+        "--defaults", action="store_true", help="an accelerator's: those of `openjax exploit`"
     )
     changes = {"seeds": "learners", "worlds": "num_envs"}
-    for name in (
-        "seeds",
-        "worlds",
-        "ways",
-        "minibatches",
-        "epochs",
-        "width",
-        "learning_rate",
-    ):
+    for name in ("seeds", "worlds", "ways", "minibatches", "epochs", "width", "learning_rate"):
         setting = changes.get(name, name)
         kind = float if name == "learning_rate" else int
-        parser.add_argument(
-            f"--{name}", dest=setting, type=kind, default=argparse.SUPPRESS
-        )
+        parser.add_argument(f"--{name}", dest=setting, type=kind, default=argparse.SUPPRESS)
     options = vars(parser.parse_args())
     radius = options.pop("radius")
-    play = (
-        two_against_one if radius is None else functools.partial(against_stack, radius)
-    )
+    play = two_against_one if radius is None else functools.partial(against_stack, radius)
     print(json.dumps(play(**options)))

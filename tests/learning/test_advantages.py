@@ -34,9 +34,7 @@ def test_against_plain_python(trace):
     terminated[-1, 1] = True
     expected = [
         reference(
-            *(x[:, e] for x in (reward, value, next_value, terminated, truncated)),
-            0.9,
-            trace,
+            *(x[:, e] for x in (reward, value, next_value, terminated, truncated)), 0.9, trace
         )
         for e in range(20)
     ]

@@ -14,12 +14,7 @@ from openjax.learning import AnalyticSettings
 from openjax.learning.analytic_gradient import AnalyticGradient, free_flight
 from openjax.learning.drawn_starts import APART, side_by_side
 from openjax.learning.gradient_stage import compile_stage
-from openjax.learning.smooth_measures import (
-    SMOOTH,
-    breach_share,
-    crash_depth,
-    crash_share,
-)
+from openjax.learning.smooth_measures import SMOOTH, breach_share, crash_depth, crash_share
 from openjax.policy import NetworkSettings, Policy, PredictorSettings
 from openjax.pursuit import Pursuit, PursuitSettings, uniform_task
 from openjax.pursuit.collisions import breaches
@@ -31,13 +26,9 @@ GAME = PursuitSettings(min_pillars=0, max_pillars=1)
 def test_all_stand_side_by_side():
     keys = jax.random.split(jax.random.key(0), 64)
     before = jax.jit(jax.vmap(lambda key: uniform_task(GAME, key)))(keys)
-    tasks = jax.jit(jax.vmap(lambda key, task: side_by_side(GAME, key, task)))(
-        keys, before
-    )
+    tasks = jax.jit(jax.vmap(lambda key, task: side_by_side(GAME, key, task)))(keys, before)
     position = np.asarray(tasks.pursuer_position)
-    apart = np.linalg.norm(
-        position[:, :, None] - position[:, None], axis=-1
-    ) + 9 * np.eye(3)
+    apart = np.linalg.norm(position[:, :, None] - position[:, None], axis=-1) + 9 * np.eye(3)
     moved = (position != np.asarray(before.pursuer_position)).any((1, 2))
     assert moved.mean() > 0.5
     assert (apart[moved].min(2) < GAME.drone_clearance + APART + 1e-4).all()
@@ -53,14 +44,10 @@ def test_all_stand_side_by_side():
 def stage():
     """A stage of a small network on a family of one effect, and its parameters."""
     game = PursuitSettings(
-        physics="rigid",
-        max_pillars=4,
-        vehicles=(("rotor_drag.d_xy", 0.0, 0.01, 0.0, 0.02),),
+        physics="rigid", max_pillars=4, vehicles=(("rotor_drag.d_xy", 0.0, 0.01, 0.0, 0.02),)
     )
     policy = Policy.for_environment(
-        Pursuit(game),
-        NetworkSettings(features=8, heads=1),
-        PredictorSettings(enabled=False),
+        Pursuit(game), NetworkSettings(features=8, heads=1), PredictorSettings(enabled=False)
     )
     how = AnalyticSettings(updates=6, worlds=4, learning_rate=3e-3, hold=0.0)
     environment = free_flight(Pursuit(game))
@@ -74,19 +61,15 @@ def stage():
 def test_smooth_breaches_are_those_of_the_game(stage):
     game = stage[0].game
     key = jax.random.split(jax.random.key(2), 3)
-    tasks = jax.jit(jax.vmap(lambda key: uniform_task(game, key)))(
-        jax.random.split(key[0], 256)
-    )
+    tasks = jax.jit(jax.vmap(lambda key: uniform_task(game, key)))(jax.random.split(key[0], 256))
     _, state = jax.jit(jax.vmap(stage[0].environment.reset_to))(
         jax.random.split(key[1], 256), tasks
     )
-    position = jax.random.uniform(
-        key[2], (256, 3, 3), minval=-0.6, maxval=0.6
-    ) * jnp.array([2.0, 2.0, 2.2])
-    state = state.replace(drones=state.drones.replace(position=position))
-    counted = jax.vmap(
-        lambda p, t: breaches(game, p, t.pillar_position, t.pillar_active).total
+    position = jax.random.uniform(key[2], (256, 3, 3), minval=-0.6, maxval=0.6) * jnp.array(
+        [2.0, 2.0, 2.2]
     )
+    state = state.replace(drones=state.drones.replace(position=position))
+    counted = jax.vmap(lambda p, t: breaches(game, p, t.pillar_position, t.pillar_active).total)
     hard = np.asarray(counted(position, tasks))
     smooth = np.asarray(breach_share(game, state))
     assert 0.2 < (hard > 0).mean() < 0.9
@@ -111,15 +94,11 @@ def test_hard_starts_are_those_that_come_nearest(stage):
 
     @jax.jit
     def least(starts):
-        return gradient.fly(parameters.actor, parameters, starts, gradient.steps)[
-            1
-        ].least.min(-1)
+        return gradient.fly(parameters.actor, parameters, starts, gradient.steps)[1].least.min(-1)
 
     bounds = jnp.concatenate([gradient.bounds()] * gradient.settings.draws)
     all_of_them = np.sort(least(gradient.starts(key, bounds)))
-    hard = np.sort(
-        least(jax.jit(gradient.hard_starts)(parameters.actor, parameters, key))
-    )
+    hard = np.sort(least(jax.jit(gradient.hard_starts)(parameters.actor, parameters, key)))
     np.testing.assert_allclose(hard, all_of_them[: gradient.settings.worlds], atol=1e-4)
 
 
@@ -139,9 +118,7 @@ def test_gradient_is_that_of_the_loss_and_learning_follows_it(stage):
 
     def moved(size):
         return loss(
-            jax.tree.map(
-                lambda leaf, along: leaf + size * along, parameters.actor, direction
-            )
+            jax.tree.map(lambda leaf, along: leaf + size * along, parameters.actor, direction)
         )
 
     assert moved(step) - moved(-step) == pytest.approx(2 * step * steepness, rel=0.1)

@@ -26,9 +26,7 @@ def tasks_at(points):
     points = np.asarray(points, np.float32).reshape(-1, 2)
     number = len(points)
     return Task(
-        pursuer_position=jnp.asarray(
-            np.c_[0.25 * points, np.zeros(number)][:, None], jnp.float32
-        ),
+        pursuer_position=jnp.asarray(np.c_[0.25 * points, np.zeros(number)][:, None], jnp.float32),
         evader_position=jnp.zeros((number, 3)),
         pillar_position=jnp.zeros((number, 1, 2)),
         pillar_active=jnp.zeros((number, 1), bool),
@@ -39,10 +37,7 @@ def points_of(archive):
     """Content, slot by slot: (x, y, success rate)."""
     size = int(archive.size)
     xy = 4 * np.asarray(archive.tasks.pursuer_position)[:size, 0, :2]
-    return [
-        (*map(float, p), float(s))
-        for p, s in zip(xy, archive.success[:size], strict=True)
-    ]
+    return [(*map(float, p), float(s)) for p, s in zip(xy, archive.success[:size], strict=True)]
 
 
 @pytest.fixture(scope="module")
@@ -51,10 +46,7 @@ def enter():
 
     def call(archive, points, accepted, success):
         return compiled(
-            archive,
-            tasks_at(points),
-            jnp.asarray(success, jnp.float32),
-            jnp.asarray(accepted),
+            archive, tasks_at(points), jnp.asarray(success, jnp.float32), jnp.asarray(accepted)
         )
 
     return call
@@ -64,11 +56,9 @@ def reference(content, points, accepted, success):
     """Newest first; where there are too many, those farthest from the nearest newer one
     stay.
     """
-    new = [
-        (*map(float, p), s)
-        for p, a, s in zip(points, accepted, success, strict=True)
-        if a
-    ][::-1]
+    new = [(*map(float, p), s) for p, a, s in zip(points, accepted, success, strict=True) if a][
+        ::-1
+    ]
     pool = new + content
     novelty = [
         min([np.inf] + [(x - a) ** 2 + (y - b) ** 2 for a, b, _ in pool[:i]])
@@ -101,9 +91,7 @@ def test_invariants(enter, insertions):
         assert got == content
         # and what this rule is for, said outright
         pool = before + [
-            (*map(float, p), s)
-            for p, a, s in zip(points, accepted, success, strict=True)
-            if a
+            (*map(float, p), s) for p, a, s in zip(points, accepted, success, strict=True) if a
         ]
         assert len(got) == min(len(pool), CAPACITY)
         assert set(got) <= set(pool)  # nothing that wasn't accepted
@@ -117,12 +105,8 @@ def test_invariants(enter, insertions):
 
 def test_of_a_cluster_the_older_go_first(enter):
     archive = empty_archive(empty_task(GAME), CAPACITY)
-    archive = enter(
-        archive, [(-3, 0), (0.1, 0), (0.2, 0), (3, 0)], [True] * 4, [1, 2, 3, 4]
-    )
-    archive = enter(
-        archive, [(0.3, 0), (0.4, 0), (0, 3), (0, -3)], [True] * 4, [5, 6, 7, 8]
-    )
+    archive = enter(archive, [(-3, 0), (0.1, 0), (0.2, 0), (3, 0)], [True] * 4, [1, 2, 3, 4])
+    archive = enter(archive, [(0.3, 0), (0.4, 0), (0, 3), (0, -3)], [True] * 4, [5, 6, 7, 8])
     # 6 is the cluster's newest; of its older members none stays before the four far
     # ones
     assert [s for *_, s in points_of(archive)] == [8, 7, 6, 4, 1]
@@ -148,8 +132,6 @@ def test_draws_are_uniform_over_used_slots(enter):
     drawn = jax.jit(jax.vmap(lambda key: draw(archive, key)))(
         jax.random.split(jax.random.key(0), 3000)
     )
-    x, number = np.unique(
-        4 * np.asarray(drawn.pursuer_position[:, 0, 0]), return_counts=True
-    )
+    x, number = np.unique(4 * np.asarray(drawn.pursuer_position[:, 0, 0]), return_counts=True)
     assert x.tolist() == [1, 2, 4]
     np.testing.assert_allclose(number, 1000, atol=120)

@@ -21,16 +21,12 @@ def tree(key):
 
 def test_mean_of_every_leaf():
     values = tree(jax.random.key(0))
-    means = jax.vmap(lambda x: mean_over_devices(x, "devices"), axis_name="devices")(
-        values
-    )
+    means = jax.vmap(lambda x: mean_over_devices(x, "devices"), axis_name="devices")(values)
     for name, value in values.items():
         assert means[name].dtype == value.dtype
         expected = np.broadcast_to(np.asarray(value, np.float32).mean(0), value.shape)
         tolerance = 1e-6 if value.dtype == jnp.float32 else 1e-2
-        np.testing.assert_allclose(
-            np.asarray(means[name], np.float32), expected, atol=tolerance
-        )
+        np.testing.assert_allclose(np.asarray(means[name], np.float32), expected, atol=tolerance)
 
 
 def test_one_collective_for_all_parameters():

@@ -41,9 +41,7 @@ def test_a_training_step_simulates_exactly_the_steps_that_are_counted():
 
     environment = Watched(TINY.environment)
     parts = build(TINY, environment)
-    carry = jax.eval_shape(
-        lambda key: initial_carry(TINY, parts, key), jax.random.key(0)
-    )
+    carry = jax.eval_shape(lambda key: initial_carry(TINY, parts, key), jax.random.key(0))
     jaxpr = jax.make_jaxpr(make_training_step(TINY, parts))(carry)
     assert len(calls) == 1
     lengths = [
@@ -53,10 +51,6 @@ def test_a_training_step_simulates_exactly_the_steps_that_are_counted():
     ]
     commands = (TINY.rollout_length, TINY.num_envs, TINY.environment.num_pursuers, 4)
     assert (
-        sum(
-            length == TINY.rollout_length and commands in shapes
-            for length, shapes in lengths
-        )
-        == 1
+        sum(length == TINY.rollout_length and commands in shapes for length, shapes in lengths) == 1
     )
     assert TINY.steps_per_update == TINY.rollout_length * TINY.num_envs

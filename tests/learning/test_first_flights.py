@@ -75,15 +75,11 @@ def test_a_game_without_pillars_can_be_learnt():
     how = FirstFlightsSettings(updates=1, worlds=2, steps=2)
     environment = first_game(Pursuit(dataclasses.replace(GAME, max_pillars=0)), how)
     networks = NetworkSettings(features=8, heads=1), PredictorSettings(enabled=False)
-    flights = FirstFlights(
-        how, environment, Policy.for_environment(environment, *networks)
-    )
+    flights = FirstFlights(how, environment, Policy.for_environment(environment, *networks))
 
     def learn(key):
         observation, _ = environment.reset(key)
-        return flights.update(
-            flights.begin(flights.policy.init(key, observation), key), key
-        )[1]
+        return flights.update(flights.begin(flights.policy.init(key, observation), key), key)[1]
 
     assert "distance" in jax.eval_shape(learn, jax.random.key(0))
 
@@ -103,9 +99,7 @@ def test_two_devices_learn_what_one_does():
     def both(parameters, key):
         shares = functools.partial(jax.vmap, axis_name="devices", axis_size=2)
         mine = one.update(one.begin(parameters, key), key)
-        return mine, shares(
-            lambda: two.update(two.begin(parameters, key), key), in_axes=()
-        )()
+        return mine, shares(lambda: two.update(two.begin(parameters, key), key), in_axes=())()
 
     (carry, parts), (their_carry, their_parts) = both(parameters, key)
     for leaf, theirs in zip(
@@ -122,12 +116,8 @@ def test_two_devices_learn_what_one_does():
 
 
 def test_an_evader_within_reach_is_not_free():
-    state = jax.jit(jax.vmap(Pursuit(GAME).reset))(
-        jax.random.split(jax.random.key(0), 4)
-    )[1]
-    near = state.drones.position.at[:, 0].set(
-        state.evader_position + jnp.array([0.1, 0.0, 0.0])
-    )
+    state = jax.jit(jax.vmap(Pursuit(GAME).reset))(jax.random.split(jax.random.key(0), 4))[1]
+    near = state.drones.position.at[:, 0].set(state.evader_position + jnp.array([0.1, 0.0, 0.0]))
     near = state.replace(drones=state.drones.replace(position=near))
     distance = jax.jit(
         lambda s: evader_distance(
@@ -144,19 +134,14 @@ def test_an_evader_within_reach_is_not_free():
 
 def test_one_near_pursuer_lets_others_be_far():
     distance = jnp.array([[0.5, 0.5, 0.5], [0.0, 1.0, 1.0]])
-    assert nearest_distance(distance) == pytest.approx(
-        [0.5, 0.15 * math.log(3.0)], abs=1e-3
-    )
+    assert nearest_distance(distance) == pytest.approx([0.5, 0.15 * math.log(3.0)], abs=1e-3)
     pull = jax.jit(jax.grad(lambda d: nearest_distance(d)[0]))(distance[1:])[0]
     assert pull[0] > 0.99 and pull[1] < 0.01
 
 
 def test_a_tip_over_counts_as_a_touch_does():
     assert (
-        tip_share(jnp.cos(jnp.deg2rad(60.0)))
-        < 0.01
-        < 0.99
-        < tip_share(jnp.cos(jnp.deg2rad(100.0)))
+        tip_share(jnp.cos(jnp.deg2rad(60.0))) < 0.01 < 0.99 < tip_share(jnp.cos(jnp.deg2rad(100.0)))
     )
     assert crash_share(jnp.array(0.1)) < 0.01 < 0.5 < crash_share(jnp.array(0.0))
     assert crash_share(jnp.array(0.1), 0.05) > 0.1  # felt earlier

@@ -22,9 +22,7 @@ KEYS = jax.random.split(jax.random.key(0), 1000)
 @functools.cache
 def generate(settings):
     return jax.jit(
-        jax.vmap(
-            lambda archive, key: generate_task(settings, GAME, archive, key), (None, 0)
-        )
+        jax.vmap(lambda archive, key: generate_task(settings, GAME, archive, key), (None, 0))
     )
 
 
@@ -38,9 +36,7 @@ def archived():
     """
     archive = empty_archive(empty_task(GAME), 8)
     task = Task(
-        pursuer_position=jnp.array(
-            [[-0.5, 0, 0.6], [-0.5, 0.3, 0.6], [-0.5, -0.3, 0.6]]
-        ),
+        pursuer_position=jnp.array([[-0.5, 0, 0.6], [-0.5, 0.3, 0.6], [-0.5, -0.3, 0.6]]),
         evader_position=jnp.array([0.5, 0.0, 0.6]),
         pillar_position=jnp.array([[0.05, 0.05]] + [[0.0, 0.0]] * 4),
         pillar_active=jnp.array([True] + [False] * 4),
@@ -55,10 +51,7 @@ def test_uniform_tasks_without_archived_ones(switch):
         tasks = generated(NOMINAL, empty_archive(empty_task(GAME), 8))
     else:
         tasks = generated(dataclasses.replace(NOMINAL, enabled=False), archived()[0])
-    assert (
-        tasks.pursuer_position[..., 0].min() >= 0.1
-        and tasks.evader_position[:, 0].max() <= -0.1
-    )
+    assert tasks.pursuer_position[..., 0].min() >= 0.1 and tasks.evader_position[:, 0].max() <= -0.1
     assert set(np.asarray(tasks.pillar_active.sum(axis=1))) == {4, 5}
 
 
@@ -67,15 +60,9 @@ def test_archived_tasks_are_expanded_with_probability_p():
     tasks = generated(NOMINAL, archive)
     local = np.asarray(tasks.pillar_active.sum(axis=1)) == 1
     np.testing.assert_allclose(local.mean(), NOMINAL.expansion, atol=0.05)
-    moved = np.asarray(tasks.pursuer_position)[local] - np.asarray(
-        parent.pursuer_position
-    )
-    assert (
-        np.abs(moved).max() <= 0.1 + 1e-6 and np.abs(moved).max(axis=(1, 2)).min() > 0
-    )
-    np.testing.assert_array_equal(
-        np.asarray(tasks.pillar_position)[local][:, 0], np.float32(0.05)
-    )
+    moved = np.asarray(tasks.pursuer_position)[local] - np.asarray(parent.pursuer_position)
+    assert np.abs(moved).max() <= 0.1 + 1e-6 and np.abs(moved).max(axis=(1, 2)).min() > 0
+    np.testing.assert_array_equal(np.asarray(tasks.pillar_position)[local][:, 0], np.float32(0.05))
     assert (np.asarray(tasks.pursuer_position)[~local][..., 0] >= 0.1).all()
 
 
@@ -86,9 +73,7 @@ def test_a_task_keeps_its_evader():
     archive = archive.replace(tasks=of_two, size=jnp.int32(1))
     for expansion, expected in ((0.0, {0, 1, 2}), (1.0, {2})):
         how = dataclasses.replace(NOMINAL, expansion=expansion)
-        generate = jax.jit(
-            jax.vmap(lambda key, how=how: generate_task(how, game, archive, key))
-        )
+        generate = jax.jit(jax.vmap(lambda key, how=how: generate_task(how, game, archive, key)))
         tasks = generate(KEYS[:64])
         assert set(np.asarray(tasks.evader)) == expected
     states = jax.jit(jax.vmap(Pursuit(game).reset_to))(KEYS[:64], tasks)[1]
@@ -106,13 +91,10 @@ def test_a_share_of_uniform_tasks_has_its_pillars_in_a_row():
     plain = generated(NOMINAL, empty_archive(empty_task(GAME), 8))
     varied = generated(rows, empty_archive(empty_task(GAME), 8))
     np.testing.assert_array_equal(varied.pursuer_position, plain.pursuer_position)
-    changed = np.asarray(varied.pillar_position != plain.pillar_position).any(
-        axis=(1, 2)
-    )
+    changed = np.asarray(varied.pillar_position != plain.pillar_position).any(axis=(1, 2))
     np.testing.assert_allclose(changed.mean(), 0.25, atol=0.05)
     shifted = generated(
-        dataclasses.replace(NOMINAL, pillar_shift=0.05),
-        empty_archive(empty_task(GAME), 8),
+        dataclasses.replace(NOMINAL, pillar_shift=0.05), empty_archive(empty_task(GAME), 8)
     )
     moved = np.asarray(shifted.pillar_position - plain.pillar_position)
     assert 0.04 < np.abs(moved).max() <= 0.05 + 1e-6
@@ -128,9 +110,7 @@ def test_unsolved_tasks_of_whole_episodes_enter():
     )
     assert int(archive.size) == 3
     np.testing.assert_allclose(archive.success[:3], [0.9, 0.75, 0.5], atol=1e-6)
-    np.testing.assert_array_equal(
-        archive.tasks.evader_position[:3], tasks.evader_position[4:1:-1]
-    )
+    np.testing.assert_array_equal(archive.tasks.evader_position[:3], tasks.evader_position[4:1:-1])
 
 
 def test_collisions_may_spoil_a_success():
@@ -143,8 +123,4 @@ def test_collisions_may_spoil_a_success():
     strict = dataclasses.replace(NOMINAL, collision_tolerance=0.1)
     assert successes(strict, statistics).tolist() == [True, False, False]
     # while a tenth of the penalties counts, up to 0.1 ** 0.1 = 0.79 is tolerated
-    assert successes(strict, statistics, jnp.float32(0.1)).tolist() == [
-        True,
-        True,
-        False,
-    ]
+    assert successes(strict, statistics, jnp.float32(0.1)).tolist() == [True, True, False]

@@ -65,9 +65,7 @@ def one_update(learner, probe, carry, key):
     policy = learner.policy
     flag_key, noise_key, shuffle_key = jax.random.split(key, 3)
     flag = flags(flag_key, STEPS + 1)
-    late = jnp.broadcast_to(
-        jnp.arange(STEPS, dtype=jnp.float32)[:, None], (STEPS, WORLDS)
-    )
+    late = jnp.broadcast_to(jnp.arange(STEPS, dtype=jnp.float32)[:, None], (STEPS, WORLDS))
     observation = observation_of(flag[:-1], late)
     mean, log_std = policy.distribution(parameters.actor, observation, None)
     action = mean + jnp.exp(log_std) * jax.random.normal(noise_key, mean.shape)
@@ -109,9 +107,7 @@ def trained(settings, policy, updates):
 
     @jax.jit
     def train(probe):
-        parameters = policy.init(
-            jax.random.key(0), observation_of(*map(jnp.array, CORNERS))
-        )
+        parameters = policy.init(jax.random.key(0), observation_of(*map(jnp.array, CORNERS)))
         return jax.lax.scan(
             lambda carry, key: one_update(learner, probe, carry, key),
             (learner.start(parameters, jax.random.key(0)), parameters),
@@ -133,14 +129,9 @@ def probe_of(
     (first action
     - 0.5 flag)^2.
     """
-    numbers = dict(
-        constant=constant, by_flag=by_flag, by_step=by_step, by_action=by_action
-    )
+    numbers = dict(constant=constant, by_flag=by_flag, by_step=by_step, by_action=by_action)
     probe = {name: jnp.float32(value) for name, value in numbers.items()}
-    return probe | {
-        "terminated": jnp.array(terminated),
-        "truncated": jnp.array(truncated),
-    }
+    return probe | {"terminated": jnp.array(terminated), "truncated": jnp.array(truncated)}
 
 
 @pytest.fixture(scope="module")
@@ -156,9 +147,7 @@ def learn():
         mean, std = state.value_scale.moments
         corners = observation_of(*map(jnp.array, CORNERS))
         value = mean + std * POLICY.value(actor, critic, corners, None)[..., 0]
-        return value, POLICY.action(POLICY.distribution(actor, corners, None)[0])[
-            ..., 0, :
-        ]
+        return value, POLICY.action(POLICY.distribution(actor, corners, None)[0])[..., 0, :]
 
     return lambda **probe: jax.device_get(call(probe_of(**probe)))
 
@@ -239,7 +228,5 @@ def test_a_gradient_step_may_see_every_third_step_of_all_worlds():
         np.sort(thirds[:, 2, :, 1], axis=None), np.arange(12)
     )  # none left out
     assert every_nth(steps, None, 1) is steps
-    with pytest.raises(
-        UserError, match="step_subsampling 3 must divide rollout_length 80"
-    ):
+    with pytest.raises(UserError, match="step_subsampling 3 must divide rollout_length 80"):
         preset("paper", mappo=MappoSettings(minibatches=16, step_subsampling=3))

@@ -54,21 +54,14 @@ def recorded():
     def play(parameters, observation, state, key, share):
         noise = jax.random.normal(key, (STEPS, WORLDS, GAME.num_pursuers, 4))
         players = Players(environment, policy, parameters)
-        rollout, last, after = collect(
-            players, (observation, state), Noise(noise), share
-        )
+        rollout, last, after = collect(players, (observation, state), Noise(noise), share)
 
         def one(carry, action):
             observation, state = carry
-            following, state, reward, _, _, info = jax.vmap(
-                environment.step, (None, 0, 0)
-            )(key, state, policy.action(action))
-            return (following, state), (
-                observation,
-                state.evader_position,
-                reward,
-                info.penalty,
+            following, state, reward, _, _, info = jax.vmap(environment.step, (None, 0, 0))(
+                key, state, policy.action(action)
             )
+            return (following, state), (observation, state.evader_position, reward, info.penalty)
 
         (own_last, _), account = jax.lax.scan(one, (observation, state), rollout.action)
         mean, log_std = policy.distribution(
@@ -88,9 +81,7 @@ def recorded():
         )
         runs.append((state, rollout, last, account))
         fresh = reset(jax.random.split(jax.random.key(7), WORLDS))
-        observation, state = jax.tree.map(
-            lambda x, new: x.at[1].set(new[1]), (last, after), fresh
-        )
+        observation, state = jax.tree.map(lambda x, new: x.at[1].set(new[1]), (last, after), fresh)
     return policy, runs
 
 
@@ -109,9 +100,7 @@ def test_a_rollout_is_what_the_game_says(recorded):
         np.testing.assert_allclose(noise_error, 0.0, atol=1e-3)
         # with a share of the penalties the rest of them is given back
         assert penalty.min() <= -10
-        np.testing.assert_allclose(
-            rollout.reward, reward - (1 - share) * penalty, atol=1e-4
-        )
+        np.testing.assert_allclose(rollout.reward, reward - (1 - share) * penalty, atol=1e-4)
     assert runs[1][1].terminated[:, 0].tolist() == [False] * 5 + [True]
     assert not runs[1][1].terminated[:, 1].any() and not runs[0][1].terminated.any()
 
@@ -121,9 +110,7 @@ def test_windows_and_labels_are_those_of_the_game_and_cross_no_reset(recorded):
     room = STEPS - HORIZONS[-1] + 1
     times = jnp.tile(jnp.arange(room), (WORLDS, 1))
     for start, rollout, _, ((observation, evader, _, _), *_) in runs:
-        frames, last_seen, positions = windows_and_labels(
-            policy, 2, start.frames, rollout, times
-        )
+        frames, last_seen, positions = windows_and_labels(policy, 2, start.frames, rollout, times)
         assert frames.shape[1:3] == (room, 3)
         for world in range(WORLDS):
             for t in range(room):
@@ -135,9 +122,7 @@ def test_windows_and_labels_are_those_of_the_game_and_cross_no_reset(recorded):
                 )
                 for k, horizon in enumerate(HORIZONS):
                     np.testing.assert_allclose(
-                        positions[world, t, k],
-                        evader[t + horizon - 1, world],
-                        atol=1e-5,
+                        positions[world, t, k], evader[t + horizon - 1, world], atol=1e-5
                     )
     # the world that was reset starts anew: its windows hold times of the new episode
     # only
@@ -146,9 +131,7 @@ def test_windows_and_labels_are_those_of_the_game_and_cross_no_reset(recorded):
     frames, _, _ = windows_and_labels(policy, 2, start.frames, rollout, times)
     np.testing.assert_allclose(frames[1, :, -1, 0], np.arange(room) / 12, atol=1e-6)
     assert (frames[1, :, :, 0] <= np.arange(room)[:, None] / 12 + 1e-6).all()
-    np.testing.assert_allclose(
-        frames[0, :, -1, 0], (STEPS + np.arange(room)) / 12, atol=1e-6
-    )
+    np.testing.assert_allclose(frames[0, :, -1, 0], (STEPS + np.arange(room)) / 12, atol=1e-6)
 
 
 @pytest.mark.slow
@@ -172,17 +155,13 @@ def test_learns_a_circling_evader():
         phase_key, sign_key = jax.random.split(key)
         sign = jnp.where(jax.random.bernoulli(sign_key), 1.0, -1.0)
         turn = (
-            jax.random.uniform(phase_key, (), maxval=2 * jnp.pi)
-            + sign * 1.3 * 0.01 / radius * time
+            jax.random.uniform(phase_key, (), maxval=2 * jnp.pi) + sign * 1.3 * 0.01 / radius * time
         )
         position = jnp.stack(
-            [radius * jnp.cos(turn), radius * jnp.sin(turn), jnp.full_like(turn, 0.6)],
-            axis=-1,
+            [radius * jnp.cos(turn), radius * jnp.sin(turn), jnp.full_like(turn, 0.6)], axis=-1
         )
         velocity = (
-            1.3
-            * sign
-            * jnp.stack([-jnp.sin(turn), jnp.cos(turn), jnp.zeros_like(turn)], axis=-1)
+            1.3 * sign * jnp.stack([-jnp.sin(turn), jnp.cos(turn), jnp.zeros_like(turn)], axis=-1)
         )
         pursuer = jnp.zeros((len(time), 3))
         return jnp.concatenate(
@@ -218,9 +197,7 @@ def test_learns_a_circling_evader():
     def errors(parameters, key):
         earlier, rollout = rollout_of(key)
         times = jnp.tile(jnp.arange(steps - 4), (worlds, 1))
-        frames, last_seen, positions = windows_and_labels(
-            policy, 1, earlier, rollout, times
-        )
+        frames, last_seen, positions = windows_and_labels(policy, 1, earlier, rollout, times)
         predicted = policy._predictor.apply(parameters, frames, last_seen)
         return [
             jnp.linalg.norm(guess - positions, axis=-1).mean(axis=(0, 1))
@@ -230,9 +207,7 @@ def test_learns_a_circling_evader():
     @jax.jit
     def train(key):
         earlier, rollout = rollout_of(key)
-        parameters = policy._predictor.init(
-            key, earlier, rollout.observation.last_seen[0]
-        )
+        parameters = policy._predictor.init(key, earlier, rollout.observation.last_seen[0])
         parameters = PolicyParameters(actor={}, critic={}, predictor=parameters)
         start = learner.start(parameters, key), parameters
         (_, parameters), loss = jax.lax.scan(update, start, jax.random.split(key, 150))
@@ -260,9 +235,7 @@ def test_the_loss_counts_in_flown_distances_what_was_seen_before():
         return float(prediction_loss(changed, game, predicted, last_seen, true))
 
     assert loss(predicted) == pytest.approx((1 + 4) / 12, rel=1e-5)
-    assert loss(predicted, loss="squared") == pytest.approx(
-        (0.02**2 + 0.4**2) / 6, rel=1e-5
-    )
+    assert loss(predicted, loss="squared") == pytest.approx((0.02**2 + 0.4**2) / 6, rel=1e-5)
 
 
 @pytest.mark.parametrize("decay", [False, True])

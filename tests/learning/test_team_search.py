@@ -8,12 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from openjax.learning.team_search import (
-    ACCELERATION,
-    STEP,
-    TeamSearch,
-    no_plan,
-)
+from openjax.learning.team_search import ACCELERATION, STEP, TeamSearch, no_plan
 from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings, scenario_task
 
 GAME = PursuitSettings(max_pillars=6)

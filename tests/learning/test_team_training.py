@@ -6,20 +6,10 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from openjax.learning import (
-    TrainSettings,
-    build,
-    changed,
-    make_start,
-    make_training_step,
-)
+from openjax.learning import TrainSettings, build, changed, make_start, make_training_step
 from openjax.learning.analytic_gradient import AnalyticGradient, free_flight
 from openjax.learning.first_flights import FirstFlights, first_game
-from openjax.learning.settings import (
-    AnalyticSettings,
-    FirstFlightsSettings,
-    WorstPlansSettings,
-)
+from openjax.learning.settings import AnalyticSettings, FirstFlightsSettings, WorstPlansSettings
 from openjax.learning.worst_plans import WorstPlans, planning_game
 
 SETTINGS = changed(

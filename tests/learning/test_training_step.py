@@ -41,9 +41,7 @@ SETTINGS = TrainSettings(
     network=NetworkSettings(features=8, heads=2),
     predictor=PredictorSettings(units=4, windows=2, steps=1, horizons=(1, 2)),
     mappo=MappoSettings(minibatches=2, epochs=1, penalty_start=0.2, penalty_ramp=0.5),
-    generator=GeneratorSettings(
-        capacity=8, success_low=0.0, success_high=1.0, episodes_per_task=2
-    ),
+    generator=GeneratorSettings(capacity=8, success_low=0.0, success_high=1.0, episodes_per_task=2),
     num_envs=12,
     rollout_length=ROLLOUT,
     total_steps=12 * ROLLOUT * 10,
@@ -71,9 +69,7 @@ def run():
 def _numpy(tree):
     def copied(x):
         return np.array(
-            jax.random.key_data(x)
-            if jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
-            else x
+            jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x
         )
 
     return jax.tree.map(copied, tree)
@@ -84,10 +80,7 @@ def test_compiles_once_and_keeps_the_types_of_its_carry(run):
     assert step._cache_size() == 1
     for leaf in jax.tree.leaves(carry):
         assert isinstance(leaf, jax.Array) and not getattr(leaf, "weak_type", False)
-    shapes = [
-        jax.tree.map(lambda x: (x.shape, x.dtype), tree)
-        for tree in (start, carries[-1])
-    ]
+    shapes = [jax.tree.map(lambda x: (x.shape, x.dtype), tree) for tree in (start, carries[-1])]
     assert shapes[0] == shapes[1]
     # the buffers of the carry that was handed in are used again
     assert (
@@ -107,9 +100,7 @@ def test_metrics_are_finite_numbers(run):
         "kl",
         "reward",
     }
-    assert expected | {"archive_size", "success_rate", "episode_return"} <= set(
-        metrics[0]
-    )
+    assert expected | {"archive_size", "success_rate", "episode_return"} <= set(metrics[0])
     assert all(np.isfinite(list(watched.values())).all() for watched in metrics)
 
 
@@ -122,19 +113,11 @@ def test_each_group_ends_in_its_turn_and_after_its_whole_episode(run):
     for update, carry in enumerate(carries):
         ended = group == (GROUPS - 1 - update) % GROUPS
         np.testing.assert_array_equal(before.step[ended], LENGTH - ROLLOUT)
-        np.testing.assert_array_equal(
-            carry.state.step, np.where(ended, 0, before.step + ROLLOUT)
-        )
+        np.testing.assert_array_equal(carry.state.step, np.where(ended, 0, before.step + ROLLOUT))
         np.testing.assert_array_equal(carry.state.statistics.steps[ended], 0)
-        went_on = (
-            carry.state.task.evader_position[~ended]
-            == before.task.evader_position[~ended]
-        )
+        went_on = carry.state.task.evader_position[~ended] == before.task.evader_position[~ended]
         assert went_on.all()
-        assert np.any(
-            carry.state.task.evader_position[ended]
-            != before.task.evader_position[ended]
-        )
+        assert np.any(carry.state.task.evader_position[ended] != before.task.evader_position[ended])
         ages = np.where(ended, 0, ages + ROLLOUT)
         before = carry.state
     np.testing.assert_array_equal(carries[-1].state.step, ages)
@@ -149,9 +132,7 @@ def test_environments_that_share_a_task_start_alike_but_for_their_attitude(run):
         evader = state.task.evader_position.reshape(-1, GROUPS, 3)
         np.testing.assert_array_equal(evader[0::2], evader[1::2])
         assert np.any(evader[0] != evader[2])
-    assert np.any(
-        start.state.drones.quaternion[0] != start.state.drones.quaternion[GROUPS]
-    )
+    assert np.any(start.state.drones.quaternion[0] != start.state.drones.quaternion[GROUPS])
 
 
 def test_only_whole_episodes_enter_the_archive(run):
@@ -221,10 +202,7 @@ def test_the_step_without_predictor_and_generator_keeps_its_carry():
         dataclasses.replace(SETTINGS, predictor=NO_PREDICTOR, generator=NO_GENERATOR)
     )
     assert before == after and "entropy" in metrics
-    assert (
-        not {"predictor_loss", "prediction_error"} & metrics
-        and before.policy.predictor == {}
-    )
+    assert not {"predictor_loss", "prediction_error"} & metrics and before.policy.predictor == {}
 
 
 @pytest.mark.parametrize("generator", [SETTINGS.generator, NO_GENERATOR])
@@ -239,24 +217,18 @@ def test_the_step_with_several_evaders_keeps_its_carry_and_archives_them(generat
         )
     )
     assert before == after
-    assert (
-        before.archive.tasks.evader.dtype == before.state.task.evader.dtype == jnp.int32
-    )
+    assert before.archive.tasks.evader.dtype == before.state.task.evader.dtype == jnp.int32
 
 
 def test_without_the_generator_every_world_flies_its_own_task():
-    plain = dataclasses.replace(
-        SETTINGS, predictor=NO_PREDICTOR, generator=NO_GENERATOR
-    )
+    plain = dataclasses.replace(SETTINGS, predictor=NO_PREDICTOR, generator=NO_GENERATOR)
     assert plain.episodes_per_task == 1
     evader = np.asarray(make_start(plain)(jax.random.key(0)).state.task.evader_position)
     assert len(np.unique(evader, axis=0)) == plain.num_envs
 
 
 def test_penalties_ramp_up():
-    share = [
-        float(penalty_share_at(SETTINGS, progress)) for progress in (0.0, 0.2, 0.5, 0.9)
-    ]
+    share = [float(penalty_share_at(SETTINGS, progress)) for progress in (0.0, 0.2, 0.5, 0.9)]
     np.testing.assert_allclose(share, [0.2, 0.52, 1.0, 1.0], atol=1e-6)
     assert float(penalty_share_at(TrainSettings(), 0.0)) == 1.0
 
@@ -266,8 +238,7 @@ def test_evaluation_of_a_policy_that_hovers():
     and the evader is always seen.
     """
     layout = dataclasses.replace(
-        SCENARIOS["empty"],
-        pursuers=((0.0, 0.5, 0.5), (0.0, 0.5, 0.62), (0.5, 0.0, 0.5)),
+        SCENARIOS["empty"], pursuers=((0.0, 0.5, 0.5), (0.0, 0.5, 0.62), (0.5, 0.0, 0.5))
     )
     game = PursuitSettings(
         num_pursuers=3,
@@ -278,10 +249,7 @@ def test_evaluation_of_a_policy_that_hovers():
         episode_length=10,
     )
     settings = TrainSettings(
-        environment=game,
-        network=SETTINGS.network,
-        predictor=SETTINGS.predictor,
-        rollout_length=10,
+        environment=game, network=SETTINGS.network, predictor=SETTINGS.predictor, rollout_length=10
     )
     parts = build(settings)
     task = jax.tree.map(lambda x: jnp.stack([x, x]), scenario_task(game, layout))
@@ -301,12 +269,7 @@ def test_evaluation_of_a_policy_that_hovers():
         )
 
     evaluation, trajectory = play(jax.random.key(0), near)
-    assert trajectory.pursuers.shape == (
-        2,
-        10,
-        3,
-        3,
-    ) and trajectory.predicted.shape == (
+    assert trajectory.pursuers.shape == (2, 10, 3, 3) and trajectory.predicted.shape == (
         2,
         10,
         2,
@@ -320,9 +283,7 @@ def test_evaluation_of_a_policy_that_hovers():
     np.testing.assert_allclose(hover_action(parts.environment.vehicle)[1:], 0.0)
     # the predictor's output is zero: it says what keeping the last seen position says
     np.testing.assert_allclose(evaluation.last_seen_error, 0.013, rtol=1e-2)
-    np.testing.assert_allclose(
-        evaluation.prediction_error, evaluation.last_seen_error, rtol=1e-5
-    )
+    np.testing.assert_allclose(evaluation.prediction_error, evaluation.last_seen_error, rtol=1e-5)
     assert trajectory.captured[1, 0, 2] and not trajectory.captured[0].any()
     metrics = summarise(evaluation)
     # two drones are too close all the time; in one of two episodes the evader starts
@@ -348,10 +309,7 @@ def _is_output(path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        (
-            dict(rollout_length=5),
-            "rollout_length 5 must divide environment.episode_length 12",
-        ),
+        (dict(rollout_length=5), "rollout_length 5 must divide environment.episode_length 12"),
         (dict(num_envs=10), "num_envs 10 must be a multiple of 6"),
         (
             dict(mappo=MappoSettings(minibatches=5)),
@@ -374,10 +332,7 @@ def test_presets():
         assert preset(name, seed=3).seed == 3
     paper = preset("paper")
     dear = preset("paper", environment=dict(reward=dict(crash=55.0)))  # all else stays
-    assert (
-        dear != paper
-        and changed(dear, environment=dict(reward=dict(crash=20.0))) == paper
-    )
+    assert dear != paper and changed(dear, environment=dict(reward=dict(crash=20.0))) == paper
     with pytest.raises(UserError, match="crash"):
         preset("paper", environment=dict(reward=dict(crash=float("nan"))))
     with pytest.raises(UserError, match="papers: no such preset; did you mean paper"):
@@ -387,10 +342,7 @@ def test_presets():
 def test_the_worlds_of_every_second_task_start_anew_within_the_episode(no_learning):
     rollouts = 2
     settings = dataclasses.replace(
-        SETTINGS,
-        restart_every=2,
-        restart_steps=rollouts * ROLLOUT,
-        predictor=NO_PREDICTOR,
+        SETTINGS, restart_every=2, restart_steps=rollouts * ROLLOUT, predictor=NO_PREDICTOR
     )
     carry = make_start(settings)(jax.random.key(0))
     step = jax.jit(make_training_step(settings))
@@ -407,9 +359,7 @@ def test_the_worlds_of_every_second_task_start_anew_within_the_episode(no_learni
         anew = brief & (age > 0) & (age % rollouts == 0)
         expected = np.where(ended | anew, 0, expected + ROLLOUT)
         np.testing.assert_array_equal(carry.state.step, expected)
-        moved = np.any(
-            carry.state.task.evader_position != before.task.evader_position, axis=1
-        )
+        moved = np.any(carry.state.task.evader_position != before.task.evader_position, axis=1)
         np.testing.assert_array_equal(moved, ended | anew)
         # of the group that ended only the other task was flown to its end, unless it
         # began late

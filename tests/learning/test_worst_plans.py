@@ -33,9 +33,7 @@ def make_stage(updates):
 
 
 def test_what_evaders_try():
-    stage = dataclasses.replace(
-        make_stage(4), planning=dataclasses.replace(HOW, plans=400)
-    )
+    stage = dataclasses.replace(make_stage(4), planning=dataclasses.replace(HOW, plans=400))
     plan = jax.random.normal(jax.random.key(0), (5, 3, 3))
     tried = np.asarray(stage.candidates(jax.random.key(1), plan))
     assert tried.shape == (5, 400, 3, 3)
@@ -93,14 +91,10 @@ def test_the_worst_plan_is_the_worst_of_those_tried(flown):
             for wish in jnp.repeat(pieces, stage.piece_steps, axis=0):
                 action = act(parameters, observation)
                 observation, state, *_ = step(None, state, action, wish)
-            lead = [
-                jax.tree.map(lambda leaf: leaf[None], one) for one in (start[1], state)
-            ]
+            lead = [jax.tree.map(lambda leaf: leaf[None], one) for one in (start[1], state)]
             promises.append(float(stage.promise(*lead)[0]))
         assert promised[world] == pytest.approx(max(promises), abs=1e-3)
-        np.testing.assert_allclose(
-            worst[world], tried[int(np.argmax(promises))], atol=1e-5
-        )
+        np.testing.assert_allclose(worst[world], tried[int(np.argmax(promises))], atol=1e-5)
 
 
 @pytest.mark.slow
@@ -128,9 +122,7 @@ def test_the_game_that_is_shipped_can_be_learnt_with_team_plans():
     environment = free_flight(Pursuit(game))
     policy = build(settings, environment).policy
     usual = AnalyticGradient(settings.analytic, environment, policy)
-    stage = WorstPlans(
-        settings.worst_plans, planning_game(environment), usual, settings.generator
-    )
+    stage = WorstPlans(settings.worst_plans, planning_game(environment), usual, settings.generator)
 
     def whole(key):
         parameters = policy.init(key, environment.reset(key)[0])

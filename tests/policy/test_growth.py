@@ -19,9 +19,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.mark.parametrize("frames, predicts", [(0, True), (2, False)])
 def test_the_grown_policy_acts_alike(frames, predicts):
-    old = PursuitSettings(
-        physics="rigid", observe_position=True, observe_history=frames
-    )
+    old = PursuitSettings(physics="rigid", observe_position=True, observe_history=frames)
     new = dataclasses.replace(old, observe_history=3)
     network = NetworkSettings(features=8, heads=2)
     predictor = PredictorSettings(enabled=predicts, units=4)
@@ -39,14 +37,10 @@ def test_the_grown_policy_acts_alike(frames, predicts):
                 state = state.replace(own_history=history + 0.1 * count[:, None, None])
             observations.append(world.observe(state))
         parameters = policies[0].init(key, observations[0])
-        actor = jax.tree.map(
-            lambda x: x + 0.3 * jax.random.normal(key, x.shape), parameters.actor
-        )
+        actor = jax.tree.map(lambda x: x + 0.3 * jax.random.normal(key, x.shape), parameters.actor)
         parameters = parameters.replace(actor=actor)
         grown = with_longer_history(parameters, predictor, old, new)
-        return policies[0].act(parameters, observations[0]), policies[1].act(
-            grown, observations[1]
-        )
+        return policies[0].act(parameters, observations[0]), policies[1].act(grown, observations[1])
 
     before, after = both(jax.random.key(0))
     np.testing.assert_allclose(before, after, atol=1e-5)
@@ -56,10 +50,7 @@ def test_the_grown_policy_acts_alike(frames, predicts):
 def test_a_policy_of_the_same_history_is_left_alone():
     settings = PursuitSettings()
     parameters = PolicyParameters(actor={}, critic={}, predictor={})
-    assert (
-        with_longer_history(parameters, PredictorSettings(), settings, settings)
-        is parameters
-    )
+    assert with_longer_history(parameters, PredictorSettings(), settings, settings) is parameters
 
 
 def test_a_policy_without_networks_is_refused():
@@ -67,8 +58,5 @@ def test_a_policy_without_networks_is_refused():
     longer = dataclasses.replace(heuristic.settings.environment, observe_history=12)
     with pytest.raises(openjax.UserError, match="no networks"):
         with_longer_history(
-            heuristic.parameters,
-            PredictorSettings(),
-            heuristic.settings.environment,
-            longer,
+            heuristic.parameters, PredictorSettings(), heuristic.settings.environment, longer
         )

@@ -17,9 +17,7 @@ from tests.policy.parameters import random_parameters
 from tests.policy.test_policy import POLICY, observation_of
 
 DRAWN = jnp.array([1, 0, 2, 1])
-GAME = PursuitSettings(
-    episode_length=100, strategies=3, strategy_seconds=0.25, physics="stops"
-)
+GAME = PursuitSettings(episode_length=100, strategies=3, strategy_seconds=0.25, physics="stops")
 
 
 @pytest.fixture(scope="module")

@@ -62,9 +62,7 @@ def test_empty_slots_change_nothing(networks):
     expected = both(parameters, alone(observation))
     there = observation.others_there[..., None]
     for filling in (observation.others, 7.0):
-        filled = observation.replace(
-            others=jnp.where(there, observation.others, filling)
-        )
+        filled = observation.replace(others=jnp.where(there, observation.others, filling))
         for result, wanted in zip(both(parameters, filled), expected, strict=True):
             np.testing.assert_allclose(result[:TEAM], wanted, atol=1e-5)
 
@@ -75,12 +73,9 @@ def test_teammates_that_change_places_change_actions(networks):
     three = alone(observation)
     each = ("self_state", "pillars", "pillar_seen", "privileged", "position", "heading")
     moved = three.replace(
-        **{name: getattr(three, name)[order] for name in each},
-        others=three.others[order][:, ::-1],
+        **{name: getattr(three, name)[order] for name in each}, others=three.others[order][:, ::-1]
     )
-    for result, wanted in zip(
-        both(parameters, moved), both(parameters, three), strict=True
-    ):
+    for result, wanted in zip(both(parameters, moved), both(parameters, three), strict=True):
         assert np.ptp(wanted, axis=0).max() > 1e-3, "the test shows little"
         np.testing.assert_allclose(result, wanted[order], atol=1e-5)
 
@@ -109,14 +104,10 @@ def test_nothing_is_learnt_from_empty_slots(networks):
         )
         networks = (parameters.actor, parameters.critic)
         return jax.grad(
-            lambda networks: loss(
-                MappoSettings(), policy, networks, batch, jnp.asarray(0.2)
-            )[0]
+            lambda networks: loss(MappoSettings(), policy, networks, batch, jnp.asarray(0.2))[0]
         )(networks)
 
     action = 0.1 * jax.random.normal(jax.random.key(0), (SIZE, 4))
     of_three = jax.jit(gradient)(alone(observation), action[:TEAM])
     of_all = jax.jit(gradient)(observation, action)
-    jax.tree.map(
-        lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), of_all, of_three
-    )
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), of_all, of_three)

@@ -43,22 +43,16 @@ def test_compiled_and_mapped_is_the_same_as_eager_one_by_one(tiny):
         keys, together[1], actions
     )  # what a step returns is what it takes: nothing is compiled again
     eager = tiny.step(keys[2], jax.tree.map(lambda x: x[2], states), actions[2])
-    chex.assert_trees_all_close(
-        jax.tree.map(lambda x: x[2], together), eager, atol=1e-4, rtol=1e-5
-    )
+    chex.assert_trees_all_close(jax.tree.map(lambda x: x[2], together), eager, atol=1e-4, rtol=1e-5)
     chex.assert_trees_all_equal(together, step(keys, states, actions))  # pure
 
 
 def test_arrays_of_another_shape_are_refused_while_tracing(tiny):
     with pytest.raises(AssertionError, match="shape"):
-        jax.eval_shape(
-            tiny.step, KEY, jax.eval_shape(tiny.reset, KEY)[1], jnp.zeros((2, 4))
-        )
+        jax.eval_shape(tiny.step, KEY, jax.eval_shape(tiny.reset, KEY)[1], jnp.zeros((2, 4)))
     task = scenario_task(TINY, SCENARIOS["wall"])
     with pytest.raises(AssertionError, match="shape"):
-        jax.eval_shape(
-            tiny.reset_to, KEY, task.replace(pursuer_position=jnp.zeros((4, 3)))
-        )
+        jax.eval_shape(tiny.reset_to, KEY, task.replace(pursuer_position=jnp.zeros((4, 3))))
 
 
 @pytest.mark.parametrize("observe_time", [True, False])
@@ -68,9 +62,7 @@ def test_the_end_is_terminal_where_the_time_is_observed(observe_time):
     @jax.jit
     def play(key):
         def one(state, _):
-            _, state, _, terminated, truncated, _ = environment.step(
-                key, state, jnp.zeros((3, 4))
-            )
+            _, state, _, terminated, truncated, _ = environment.step(key, state, jnp.zeros((3, 4)))
             return state, (terminated, truncated)
 
         return jax.lax.scan(one, environment.reset(key)[1], length=4)[1]
@@ -87,11 +79,7 @@ def test_the_end_is_terminal_where_the_time_is_observed(observe_time):
     "changes",
     [
         dict(
-            num_pursuers=1,
-            observe_position=True,
-            min_pillars=0,
-            max_pillars=0,
-            history_spacing=2,
+            num_pursuers=1, observe_position=True, min_pillars=0, max_pillars=0, history_spacing=2
         ),
         dict(num_pursuers=8, max_pillars=2, min_pillars=0, speed_limit="none"),
         dict(
@@ -112,9 +100,7 @@ def test_other_sizes(changes):
     @jax.jit
     def play(key):
         observation, state = environment.reset(key)
-        action = jnp.broadcast_to(
-            hover_action(environment.vehicle), (settings.num_pursuers, 4)
-        )
+        action = jnp.broadcast_to(hover_action(environment.vehicle), (settings.num_pursuers, 4))
         return observation, *environment.step(key, state, action)
 
     first, second, state, reward, *_ = play(KEY)
@@ -129,15 +115,11 @@ def test_other_sizes(changes):
     )
     assert reward.shape == (n,) and np.isfinite(reward).all()
     moved = np.linalg.norm(state.evader_position - state.task.evader_position)
-    np.testing.assert_allclose(
-        moved, settings.evader_speed * settings.time_step, rtol=1e-2
-    )
+    np.testing.assert_allclose(moved, settings.evader_speed * settings.time_step, rtol=1e-2)
 
 
 def test_commands():
-    command = action_to_command(
-        jnp.array([[-1.0, 1, -1, 0.5], [0.0, 0, 0, 0], [1.0, 3, 0, 0]])
-    )
+    command = action_to_command(jnp.array([[-1.0, 1, -1, 0.5], [0.0, 0, 0, 0], [1.0, 3, 0, 0]]))
     expected = [[0, np.pi, -np.pi, np.pi / 2], [0.5, 0, 0, 0], [0.9, np.pi, 0, 0]]
     np.testing.assert_allclose(command, expected, atol=1e-6)
 
@@ -170,20 +152,14 @@ def test_order_within_a_step_and_history():
     first, start, (observation, evader, velocity, position, seen) = jax.tree.map(
         np.asarray, play(KEY)
     )
-    np.testing.assert_allclose(
-        evader[0], start.evader_position + 0.01 * velocity[0], atol=1e-6
-    )
-    pillars = jax.tree.map(
-        jnp.asarray, (start.task.pillar_position, start.task.pillar_active)
-    )
+    np.testing.assert_allclose(evader[0], start.evader_position + 0.01 * velocity[0], atol=1e-6)
+    pillars = jax.tree.map(jnp.asarray, (start.task.pillar_position, start.task.pillar_active))
 
     @jax.jit
     @jax.vmap
     def fled(evader, position):
         in_sight = line_of_sight(environment.settings, position, evader, *pillars)
-        return in_sight, field_velocity(
-            environment.settings, evader, position, in_sight, *pillars
-        )
+        return in_sight, field_velocity(environment.settings, evader, position, in_sight, *pillars)
 
     in_sight, expected = fled(
         np.concatenate([start.evader_position[None], evader[:-1]]),
@@ -223,9 +199,7 @@ def test_clamp_cuts_the_norm_of_the_velocity():
 
     clamped, free = step(KEY)
     np.testing.assert_allclose(free, fast, atol=1e-3)
-    np.testing.assert_allclose(
-        clamped, [[0.6, 0.8, 0], [0.3, 0.4, 0], [0, 0, 1]], atol=1e-3
-    )
+    np.testing.assert_allclose(clamped, [[0.6, 0.8, 0], [0.3, 0.4, 0], [0, 0, 1]], atol=1e-3)
 
 
 @pytest.mark.slow
@@ -254,9 +228,7 @@ def test_gradients_of_free_flight_are_finite_and_right(tiny):
         step = 1e-2
         up, _ = value_and_gradient(actions + step * direction, state)
         down, _ = value_and_gradient(actions - step * direction, state)
-    np.testing.assert_allclose(
-        (up - down) / (2 * step), jnp.sum(gradient * direction), rtol=0.05
-    )
+    np.testing.assert_allclose((up - down) / (2 * step), jnp.sum(gradient * direction), rtol=0.05)
 
 
 def test_pillar_and_floor_are_solid():
@@ -316,9 +288,7 @@ def test_physical_effects_act_in_the_game():
     @jax.jit
     def step(key):
         first, state = environment.reset(key)
-        state = state.replace(
-            drones=state.drones.replace(velocity=jnp.ones((3, 3)) * 0.4)
-        )
+        state = state.replace(drones=state.drones.replace(velocity=jnp.ones((3, 3)) * 0.4))
         action = jnp.broadcast_to(hover_action(environment.vehicle), (3, 4))
         observation, state, *_ = environment.step(key, state, action)
         return first, observation, state
@@ -331,8 +301,7 @@ def test_physical_effects_act_in_the_game():
 
 
 @pytest.mark.parametrize(
-    ("physics", "effects"),
-    [("mjx", ()), ("rigid", ()), ("stops", ()), ("rigid", ("rotor_drag",))],
+    ("physics", "effects"), [("mjx", ()), ("rigid", ()), ("stops", ()), ("rigid", ("rotor_drag",))]
 )
 def test_pillars_are_as_wide_and_as_high_as_the_settings_say(physics, effects):
     """Thrown at a pillar of 0.3 m and over one that ends below: stopped at the surface,

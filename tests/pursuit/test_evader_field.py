@@ -17,29 +17,17 @@ FAR = (0.0, 0.0, 50.0)  # exerts 0.02 at most
 
 
 def velocity(
-    evader,
-    pursuers=((FAR),),
-    in_sight=None,
-    pillars=((5.0, 5.0),),
-    active=None,
-    **settings,
+    evader, pursuers=((FAR),), in_sight=None, pillars=((5.0, 5.0),), active=None, **settings
 ):
     pursuers = jnp.asarray(pursuers)
     pillars = jnp.asarray(pillars)
-    in_sight = (
-        jnp.zeros(len(pursuers), bool) if in_sight is None else jnp.asarray(in_sight)
-    )
+    in_sight = jnp.zeros(len(pursuers), bool) if in_sight is None else jnp.asarray(in_sight)
     active = jnp.ones(len(pillars), bool) if active is None else jnp.asarray(active)
     if active.shape == (1,) and pillars[0, 0] == 5.0:
         active = jnp.zeros(1, bool)
     return np.asarray(
         field_velocity(
-            PursuitSettings(**settings),
-            jnp.asarray(evader),
-            pursuers,
-            in_sight,
-            pillars,
-            active,
+            PursuitSettings(**settings), jnp.asarray(evader), pursuers, in_sight, pillars, active
         )
     )
 
@@ -72,23 +60,11 @@ def along(force):
             (-1 / 0.6, 2, 0),
         ),
         (
-            dict(
-                evader=(0.3, 0, 0.6),
-                pillars=[(0.3, 0.3), (0.35, 0.0)],
-                active=[True, False],
-            ),
+            dict(evader=(0.3, 0, 0.6), pillars=[(0.3, 0.3), (0.35, 0.0)], active=[True, False]),
             (-1 / 0.6, -1 / 0.2, 0),
         ),
     ],
-    ids=[
-        "height",
-        "wall",
-        "oblique",
-        "pursuer",
-        "unseen pursuer",
-        "one of two",
-        "active pillar",
-    ],
+    ids=["height", "wall", "oblique", "pursuer", "unseen pursuer", "one of two", "active pillar"],
 )
 def test_forces_worked_out_by_hand(scene, force):
     np.testing.assert_allclose(velocity(**scene), along(force), atol=2e-3)
@@ -106,17 +82,12 @@ def test_no_force_in_the_middle_is_no_velocity():
         (dict(evader=(0.0, 0.0, -0.05)), (0, 0, 1)),
         (dict(evader=(0.3, 0.05, 0.6), pillars=[(0.3, 0.0)], active=[True]), (0, 1, 0)),
         # the push is stronger than any pursuer
-        (
-            dict(evader=(0.95, 0.0, 0.6), pursuers=[(0.9, 0, 0.6)], in_sight=[True]),
-            (-1, 0, 0),
-        ),
+        (dict(evader=(0.95, 0.0, 0.6), pursuers=[(0.9, 0, 0.6)], in_sight=[True]), (-1, 0, 0)),
     ],
     ids=["wall", "ceiling", "floor", "pillar", "against a pursuer"],
 )
 def test_pushed_back_from_where_it_must_not_be(scene, direction):
-    np.testing.assert_allclose(
-        velocity(**scene), SPEED * np.asarray(direction), atol=1e-3
-    )
+    np.testing.assert_allclose(velocity(**scene), SPEED * np.asarray(direction), atol=1e-3)
 
 
 @pytest.fixture(scope="module")
@@ -144,11 +115,7 @@ def flee(settings):
 def test_turning_the_scene_turns_the_velocity(scenes):
     angle = 0.7
     turn = jnp.array(
-        [
-            [np.cos(angle), -np.sin(angle), 0],
-            [np.sin(angle), np.cos(angle), 0],
-            [0, 0, 1],
-        ],
+        [[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]],
         jnp.float32,
     )
 
@@ -164,9 +131,7 @@ def test_turning_the_scene_turns_the_velocity(scenes):
 
 def test_constant_speed_and_the_axis_norm(scenes):
     euclidean = np.asarray(flee(PursuitSettings(evader_speed=2.0))(*scenes))
-    axis = np.asarray(
-        flee(PursuitSettings(evader_speed=2.0, evader_norm="axis"))(*scenes)
-    )
+    axis = np.asarray(flee(PursuitSettings(evader_speed=2.0, evader_norm="axis"))(*scenes))
     np.testing.assert_allclose(np.linalg.norm(euclidean, axis=-1), 2.0, rtol=1e-3)
     np.testing.assert_allclose(np.abs(axis).max(axis=-1), 2.0, rtol=1e-3)
     speed = np.linalg.norm(axis, axis=-1, keepdims=True)

@@ -17,14 +17,7 @@ from openjax.pursuit.evaders import (
     draw_evader,
     init_network,
 )
-from openjax.pursuit.evaders.behaviours import (
-    DIRECTIONS,
-    MARGIN,
-    MEMORY,
-    Scene,
-    directions,
-    greedy,
-)
+from openjax.pursuit.evaders.behaviours import DIRECTIONS, MARGIN, MEMORY, Scene, directions, greedy
 
 ALL = SCRIPTED
 SETTINGS = PursuitSettings(physics="stops", evaders=ALL, episode_length=240)
@@ -42,17 +35,13 @@ def flown():
         lambda *leaves: jnp.repeat(jnp.stack(leaves), 2 * len(ALL), axis=0), *tasks
     )
     kinds = jnp.tile(jnp.arange(len(ALL)), 2 * len(SCENARIOS))
-    actions = jax.random.uniform(
-        jax.random.key(1), (240, 3, 4), minval=-0.3, maxval=0.4
-    )
+    actions = jax.random.uniform(jax.random.key(1), (240, 3, 4), minval=-0.3, maxval=0.4)
 
     @jax.jit
     @jax.vmap
     def fly(key, task, kind):
         _, state = environment.reset_to(key, task)
-        state = state.replace(
-            evader=draw_evader(settings, key, task.pursuer_position, kind=kind)
-        )
+        state = state.replace(evader=draw_evader(settings, key, task.pursuer_position, kind=kind))
 
         def one(state, action):
             _, state, *_ = environment.step(key, state, action)
@@ -91,19 +80,13 @@ def test_speed_and_acceleration_are_bounded(flown):
     )
     to_axis = np.where(np.asarray(states.task.pillar_active), to_axis, np.inf).min(-1)
     # what is in its way stops it at once
-    near = (to_axis < settings.pillar_radius + MARGIN + 0.02) | (
-        place[..., 2] < MARGIN + 0.02
-    )
-    near |= (
-        np.linalg.norm(place[..., :2], axis=-1) > settings.arena_radius - MARGIN - 0.02
-    )
+    near = (to_axis < settings.pillar_radius + MARGIN + 0.02) | (place[..., 2] < MARGIN + 0.02)
+    near |= np.linalg.norm(place[..., :2], axis=-1) > settings.arena_radius - MARGIN - 0.02
     near |= place[..., 2] > settings.arena_height - MARGIN - 0.02
     change = np.linalg.norm(np.diff(velocity, axis=0), axis=-1) / settings.time_step
     free = ~near[1:] & ~near[:-1]
     assert free[:, heavy].sum() > 200
-    assert (
-        change[:, heavy][free[:, heavy]].max() < EVADERS["heavy"].acceleration[0] * 1.01
-    )
+    assert change[:, heavy][free[:, heavy]].max() < EVADERS["heavy"].acceleration[0] * 1.01
     assert change[:, ~heavy].max() > 50  # the others may turn at once
 
 
@@ -113,10 +96,7 @@ def test_frozen_ones_stay_and_the_others_move(flown):
     flown_off = np.linalg.norm(
         np.asarray(states.evader_position) - np.asarray(start.evader_position), axis=-1
     ).max(0)
-    by_kind = {
-        name: flown_off[np.asarray(start.evader.kind) == i]
-        for i, name in enumerate(ALL)
-    }
+    by_kind = {name: flown_off[np.asarray(start.evader.kind) == i] for i, name in enumerate(ALL)}
     assert by_kind.pop("frozen").max() == 0.0
     assert all(moved.max() > 0.3 for moved in by_kind.values()), by_kind
 
@@ -131,8 +111,7 @@ def plain_greedy(settings, position, pursuers, known, pillars, look_ahead, hidin
             )
             if (
                 0 <= along <= 1
-                and np.linalg.norm(a[:2] + along * (b - a)[:2] - pillar)
-                < settings.pillar_radius
+                and np.linalg.norm(a[:2] + along * (b - a)[:2] - pillar) < settings.pillar_radius
             ):
                 return True
         return False
@@ -144,9 +123,7 @@ def plain_greedy(settings, position, pursuers, known, pillars, look_ahead, hidin
         for pillar in pillars:
             offset = end[:2] - pillar
             distance = np.linalg.norm(offset)
-            push += (
-                offset / distance * max(settings.pillar_radius + MARGIN - distance, 0.0)
-            )
+            push += offset / distance * max(settings.pillar_radius + MARGIN - distance, 0.0)
         end[:2] += push
         end[:2] *= min(1.0, (settings.arena_radius - MARGIN) / np.linalg.norm(end[:2]))
         end[2] = np.clip(end[2], MARGIN, settings.arena_height - MARGIN)
@@ -176,10 +153,7 @@ def test_greedy_against_plain_python():
         hiding = draw.choice([0.0, 0.3])
         scene = Scene(
             settings,
-            *(
-                jnp.asarray(x, jnp.float32)
-                for x in (position, np.zeros(3), np.array(pursuers))
-            ),
+            *(jnp.asarray(x, jnp.float32) for x in (position, np.zeros(3), np.array(pursuers))),
             jnp.asarray(known),
             jnp.asarray(padded, jnp.float32),
             jnp.asarray(active),
@@ -219,25 +193,18 @@ def test_draws_of_worlds():
     """
     settings = PursuitSettings(evaders=("field", "greedy", "greedy", "wall_runner"))
     keys = jax.random.split(jax.random.key(5), 6000)
-    drawn = jax.jit(
-        jax.vmap(lambda key: draw_evader(settings, key, jnp.zeros((3, 3))))
-    )(keys)
+    drawn = jax.jit(jax.vmap(lambda key: draw_evader(settings, key, jnp.zeros((3, 3)))))(keys)
     counts = np.bincount(np.asarray(drawn.kind), minlength=4) / 6000
     np.testing.assert_allclose(counts, 0.25, atol=0.03)
     greedy_worlds = np.isin(np.asarray(drawn.kind), (1, 2))
     numbers = {name: np.asarray(value) for name, value in drawn.numbers.items()}
     for name in ("look_ahead", "hiding", "sees_all"):
         values, found = np.unique(numbers[name][greedy_worlds], return_counts=True)
-        wanted, odds = np.unique(
-            np.float32(getattr(EVADERS["greedy"], name)), return_counts=True
-        )
+        wanted, odds = np.unique(np.float32(getattr(EVADERS["greedy"], name)), return_counts=True)
         np.testing.assert_array_equal(values, wanted)
         np.testing.assert_allclose(found / found.sum(), odds / odds.sum(), atol=0.05)
     drawn_for = jax.jit(
-        jax.vmap(
-            lambda key, share: draw_evader(settings, key, jnp.zeros((3, 3)), share),
-            (0, None),
-        )
+        jax.vmap(lambda key, share: draw_evader(settings, key, jnp.zeros((3, 3)), share), (0, None))
     )
     for share in (0.0, 0.4):
         part = drawn_for(keys, jnp.float32(share))
@@ -258,15 +225,10 @@ def test_networks_of_several_seeds_start_at_once():
     """
 
     def start(key):
-        return [
-            jax.vmap(init_network)(jax.random.split(own, 3))
-            for own in jax.random.split(key)
-        ]
+        return [jax.vmap(init_network)(jax.random.split(own, 3)) for own in jax.random.split(key)]
 
     for layers in jax.jit(start)(jax.random.key(0)):
-        np.testing.assert_allclose(
-            np.std(layers["hidden"]["kernel"]), (2 / 64) ** 0.5, rtol=0.05
-        )
+        np.testing.assert_allclose(np.std(layers["hidden"]["kernel"]), (2 / 64) ** 0.5, rtol=0.05)
 
 
 def test_sets_share_nobody_and_unknown_ones_are_refused():

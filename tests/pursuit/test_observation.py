@@ -23,13 +23,9 @@ PILLARS = np.array([[0.0, 0.0], [0.4, 0.3], [-0.4, -0.1], [0.5, 0.5]], np.float3
 _observe = functools.partial(jax.jit, static_argnums=0)(observe)
 
 
-def observed(
-    seen=True, active=(True,) * 4, pillars=PILLARS, quaternion=TURNED, **changes
-):
+def observed(seen=True, active=(True,) * 4, pillars=PILLARS, quaternion=TURNED, **changes):
     settings = PursuitSettings(episode_length=800, **changes)
-    quaternion = jnp.asarray(
-        np.stack([[1, 0, 0, 0], quaternion, [1, 0, 0, 0]]), jnp.float32
-    )
+    quaternion = jnp.asarray(np.stack([[1, 0, 0, 0], quaternion, [1, 0, 0, 0]]), jnp.float32)
     velocity = jnp.asarray(0.1 * np.arange(9).reshape(3, 3), jnp.float32)
     drones = hover_state(load_vehicle(), jnp.asarray(POSITION), quaternion, velocity)
     task = Task(
@@ -63,9 +59,7 @@ def test_own_part():
 def test_unseen_evader_is_marked_for_all_but_not_for_the_critic():
     observation = observed(seen=False)
     np.testing.assert_array_equal(observation.self_state[:, :3], -5.0)
-    np.testing.assert_allclose(
-        observation.privileged[:, :3], POSITION - EVADER, atol=1e-6
-    )
+    np.testing.assert_allclose(observation.privileged[:, :3], POSITION - EVADER, atol=1e-6)
     np.testing.assert_allclose(
         observation.privileged[:, 3:6], np.tile([1.3, 0, 0], (3, 1)), atol=1e-6
     )
@@ -83,12 +77,8 @@ def test_others_are_relative_and_in_order():
     others = np.asarray(observed().others)
     assert others.shape == (3, 2, 3)
     for i, (first, second) in enumerate([(1, 2), (0, 2), (0, 1)]):
-        np.testing.assert_allclose(
-            others[i, 0], POSITION[i] - POSITION[first], atol=1e-6
-        )
-        np.testing.assert_allclose(
-            others[i, 1], POSITION[i] - POSITION[second], atol=1e-6
-        )
+        np.testing.assert_allclose(others[i, 0], POSITION[i] - POSITION[first], atol=1e-6)
+        np.testing.assert_allclose(others[i, 1], POSITION[i] - POSITION[second], atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -105,16 +95,9 @@ def test_nearest_pillars_come_first(active, orders):
     for i, order in enumerate(orders):
         expected = np.full((3, 5), -5.0)
         for slot, pillar in enumerate(order):
-            expected[slot] = [
-                *(POSITION[i, :2] - PILLARS[pillar]),
-                POSITION[i, 2] - 0.6,
-                1.2,
-                0.1,
-            ]
+            expected[slot] = [*(POSITION[i, :2] - PILLARS[pillar]), POSITION[i, 2] - 0.6, 1.2, 0.1]
         np.testing.assert_allclose(observation.pillars[i], expected, atol=1e-6)
-        np.testing.assert_array_equal(
-            observation.pillar_seen[i], np.arange(3) < len(order)
-        )
+        np.testing.assert_array_equal(observation.pillar_seen[i], np.arange(3) < len(order))
 
 
 def test_fewer_slots_than_are_observed():
@@ -127,12 +110,8 @@ def test_body_axes():
     roll = np.array([np.sqrt(0.5), np.sqrt(0.5), 0, 0], np.float32)
     pitch = np.array([np.cos(0.1), 0, np.sin(0.1), 0], np.float32)
     x, z = rotation_axes(jnp.asarray(np.stack([roll, pitch])))
-    np.testing.assert_allclose(
-        z, [[0, -1, 0], [np.sin(0.2), 0, np.cos(0.2)]], atol=1e-6
-    )
-    np.testing.assert_allclose(
-        x, [[1, 0, 0], [np.cos(0.2), 0, -np.sin(0.2)]], atol=1e-6
-    )
+    np.testing.assert_allclose(z, [[0, -1, 0], [np.sin(0.2), 0, np.cos(0.2)]], atol=1e-6)
+    np.testing.assert_allclose(x, [[1, 0, 0], [np.cos(0.2), 0, -np.sin(0.2)]], atol=1e-6)
 
 
 @pytest.mark.parametrize("seen", [True, False])
@@ -175,18 +154,12 @@ def test_in_its_heading_a_turned_game_looks_the_same():
     w, x, y, z = state.drones.quaternion.T
     c = np.cos(angle / 2)
     s = np.sin(angle / 2)
-    quaternion = jnp.stack(
-        [c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w], axis=-1
-    )
+    quaternion = jnp.stack([c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w], axis=-1)
     history = state.own_history.at[..., 3:6].set(rotation_axes(quaternion)[0])
     history = history.at[..., 6:9].set(rotation_axes(quaternion)[1])
     turned = state.replace(
-        task=state.task.replace(
-            pillar_position=state.task.pillar_position @ turn[:2, :2].T
-        ),
-        drones=state.drones.replace(
-            position=state.drones.position @ turn.T, quaternion=quaternion
-        ),
+        task=state.task.replace(pillar_position=state.task.pillar_position @ turn[:2, :2].T),
+        drones=state.drones.replace(position=state.drones.position @ turn.T, quaternion=quaternion),
         evader_position=turn @ state.evader_position,
         last_seen=turn @ state.last_seen,
         own_history=history,
@@ -200,19 +173,13 @@ def test_in_its_heading_a_turned_game_looks_the_same():
         np.testing.assert_allclose(
             getattr(other, name), getattr(observation, name), atol=1e-5, err_msg=name
         )
-    np.testing.assert_allclose(
-        flat_observation(other), flat_observation(observation), atol=1e-5
-    )
+    np.testing.assert_allclose(flat_observation(other), flat_observation(observation), atol=1e-5)
     predicted = jax.random.normal(key, (2, 3))
     np.testing.assert_allclose(
-        own_features(other, predicted @ turn.T),
-        own_features(observation, predicted),
-        atol=1e-5,
+        own_features(other, predicted @ turn.T), own_features(observation, predicted), atol=1e-5
     )
     # the quaternion is that of the axes: yaw is gone, roll and pitch stay
     own = other.self_state
-    for seen, axis in zip(
-        rotation_axes(own[:, 3:7]), (own[:, 10:13], own[:, 13:16]), strict=True
-    ):
+    for seen, axis in zip(rotation_axes(own[:, 3:7]), (own[:, 10:13], own[:, 13:16]), strict=True):
         np.testing.assert_allclose(seen, axis, atol=1e-5)
     np.testing.assert_allclose(own[:, 11], 0.0, atol=1e-6)

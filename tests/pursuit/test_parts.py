@@ -73,14 +73,10 @@ def test_an_evader_of_ones_own_knows_motions_and_draws():
 
 
 def test_an_evader_of_ones_own_stays_within_speed_and_arena():
-    states, _, _ = stepped(
-        make(GAME, evader=lambda scene, memory: (jnp.full(3, 99.0), memory)), 60
-    )
+    states, _, _ = stepped(make(GAME, evader=lambda scene, memory: (jnp.full(3, 99.0), memory)), 60)
     speeds = [float(jnp.linalg.norm(state.evader_velocity)) for state in states]
     assert max(speeds) <= GAME.evader_speed * 1.001
-    assert all(
-        0 < float(state.evader_position[2]) < GAME.arena_height for state in states
-    )
+    assert all(0 < float(state.evader_position[2]) < GAME.arena_height for state in states)
 
 
 def test_settings_alone_do_not_make_an_evader_of_ones_own():
@@ -121,9 +117,7 @@ def test_an_observation_of_ones_own():
         return shipped.replace(self_state=own)
 
     states, observation, _ = stepped(Pursuit(GAME, observer=with_height))
-    np.testing.assert_array_equal(
-        observation.self_state[:, -1], states[-1].drones.position[:, 2]
-    )
+    np.testing.assert_array_equal(observation.self_state[:, -1], states[-1].drones.position[:, 2])
     assert observation.self_state.shape[-1] == GAME.self_size + 1
 
 
@@ -149,10 +143,7 @@ def test_a_part_that_gives_another_shape_is_a_line_with_its_name():
         return scene.position
 
     for part, words in (
-        (
-            {"reward": (Term(of_seven, 1.0),)},
-            r"reward term of_seven gives shape \(7,\)",
-        ),
+        ({"reward": (Term(of_seven, 1.0),)}, r"reward term of_seven gives shape \(7,\)"),
         ({"evaders": (place_alone,)}, r"evader place_alone gives arrays of shapes"),
     ):
         game = Pursuit(GAME, **part)

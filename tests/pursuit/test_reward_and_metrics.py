@@ -23,9 +23,7 @@ SETTINGS = PursuitSettings(
     speed_limit="none",
     physics="rigid",
     contacts=False,
-    reward=RewardSettings(
-        first_capture=20.0, smoothness=2.0, crash=7.0, first_crash=5.0
-    ),
+    reward=RewardSettings(first_capture=20.0, smoothness=2.0, crash=7.0, first_crash=5.0),
 )
 STILL = ((0.0, 0.0, 0.0),) * 3
 APART = ((0.5, 0.0, 0.6), (-0.5, 0.0, 0.6), (0.0, 0.5, 0.6))
@@ -53,9 +51,7 @@ def play():
         state = state.replace(drones=state.drones.replace(velocity=velocity))
 
         def one(state, action):
-            _, state, reward, _, _, info = environment.step(
-                jax.random.key(0), state, action
-            )
+            _, state, reward, _, _, info = environment.step(jax.random.key(0), state, action)
             return state, (reward, info)
 
         state, (reward, info) = jax.lax.scan(one, state, actions)
@@ -75,16 +71,10 @@ def test_capture_bounds_pillar_and_speed(play):
     # 3; 2 nears the pillar in step 4
     start = [(0.315, 0, 0.6), (0, 0.85, 0.6), (-0.4625, 0, 0.6)]
     statistics, reward, info = play(
-        task(start, (0, 0, 0.6), (-0.65, 0)),
-        [(-1, 0, 0), (0, 2, 0), (-0.5, 0, 0)],
-        change=0.1,
+        task(start, (0, 0, 0.6), (-0.65, 0)), [(-1, 0, 0), (0, 2, 0), (-0.5, 0, 0)], change=0.1
     )
     distance = np.array(
-        [
-            [0.305, 0.295, 0.285, 0.275],
-            [0.87, 0.89, 0.91, 0.93],
-            [0.4675, 0.4725, 0.4775, 0.4825],
-        ]
+        [[0.305, 0.295, 0.285, 0.275], [0.87, 0.89, 0.91, 0.93], [0.4675, 0.4725, 0.4775, 0.4825]]
     ).T
     smooth = 2 * np.exp(-np.array([0, 0, 0.1, 0]))[:, None]
     penalty = np.array([[0, -10, 0], [0, -10, 0], [0, -20, 0], [0, -20, -10]])
@@ -94,16 +84,12 @@ def test_capture_bounds_pillar_and_speed(play):
     np.testing.assert_allclose(reward, expected, atol=1e-4)
     assert info.captured.any(axis=1).tolist() == [False, True, True, True]
     assert not info.captured[:, 1:].any()
-    assert (
-        statistics.captured and statistics.capture_step == 2 and statistics.steps == 4
-    )
+    assert statistics.captured and statistics.capture_step == 2 and statistics.steps == 4
     parts = statistics.pillar_steps, statistics.drone_steps, statistics.bounds_steps
     assert [int(part) for part in parts] == [1, 0, 2]
     assert statistics.collision_rate == 0.5 and statistics.over_speed_rate == 1.0
     assert not statistics.crashed
-    np.testing.assert_allclose(
-        statistics.episode_return, expected.mean(axis=1).sum(), rtol=1e-5
-    )
+    np.testing.assert_allclose(statistics.episode_return, expected.mean(axis=1).sum(), rtol=1e-5)
 
 
 def test_no_capture_through_a_pillar(play):
@@ -123,24 +109,18 @@ def test_drones_too_close_and_touching(play):
     assert statistics.drone_steps == 4 and not statistics.crashed
     np.testing.assert_array_equal(info.breaches.drone, [[1, 1, 0]] * 4)
     np.testing.assert_allclose(
-        reward[0],
-        2 - 0.1 * np.array([0.5, np.hypot(0.5, 0.12), 0.5]) - [10, 10, 0],
-        atol=1e-4,
+        reward[0], 2 - 0.1 * np.array([0.5, np.hypot(0.5, 0.12), 0.5]) - [10, 10, 0], atol=1e-4
     )
     touching = [(0.5, 0, 0.6), (0.5, 0.095, 0.6), (-0.5, 0, 0.6)]
     statistics, _, info = play(task(touching, (0, 0, 0.6)))
     assert statistics.crashed
-    np.testing.assert_allclose(
-        info.penalty, [[-22, -22, 0]] + [[-17, -17, 0]] * 3, atol=1e-5
-    )
+    np.testing.assert_allclose(info.penalty, [[-22, -22, 0]] + [[-17, -17, 0]] * 3, atol=1e-5)
 
 
 def test_every_breach_counts():
     position = jnp.array([[0.0, 0.0, 1.25], [0.0, 0.13, 1.15], [0.85, 0.4, 0.5]])
     pillars = jnp.array([[0.15, 0.0], [-0.15, 0.0], [0.0, -0.1]])
-    counted = breaches(
-        PursuitSettings(), position, pillars, jnp.array([True, True, False])
-    )
+    counted = breaches(PursuitSettings(), position, pillars, jnp.array([True, True, False]))
     np.testing.assert_array_equal(counted.pillar, [2, 0, 0])
     np.testing.assert_array_equal(
         counted.drone, [0, 0, 0]
@@ -148,24 +128,14 @@ def test_every_breach_counts():
     np.testing.assert_array_equal(counted.bounds, [1, 0, 1])
     np.testing.assert_array_equal(counted.total, [3, 0, 1])
     wider = breaches(
-        PursuitSettings(),
-        position,
-        pillars,
-        jnp.array([True, True, False]),
-        margin=0.06,
+        PursuitSettings(), position, pillars, jnp.array([True, True, False]), margin=0.06
     )
     np.testing.assert_array_equal(wider.total, [4, 4, 1])
 
 
 def test_crashes():
     position = jnp.array(
-        [
-            [0.5, 0, 0.05],
-            [0.5, 0, 0.07],
-            [-0.5, 0, 0.6],
-            [-0.5, 0.5, 0.6],
-            [0, -0.151, 0.5],
-        ]
+        [[0.5, 0, 0.05], [0.5, 0, 0.07], [-0.5, 0, 0.6], [-0.5, 0.5, 0.6], [0, -0.151, 0.5]]
     )
     up = jnp.array([1.0, 1.0, -0.01, 0.01, 1.0])
     pillars = jnp.array([[0.0, 0.0]])
@@ -214,13 +184,10 @@ def test_lookahead_counts_in_the_reward_what_comes_at_the_present_velocity():
     )  # towards the wall; inwards; still
     drones = state.drones.replace(position=position, velocity=velocity)
     pillar_active = jnp.zeros_like(state.task.pillar_active)
-    state = state.replace(
-        drones=drones, task=state.task.replace(pillar_active=pillar_active)
-    )
+    state = state.replace(drones=drones, task=state.task.replace(pillar_active=pillar_active))
     action = state.previous_action
     with_it, without = (
-        jax.jit(game.step)(jax.random.key(0), state, action)
-        for game in (environment, plain)
+        jax.jit(game.step)(jax.random.key(0), state, action) for game in (environment, plain)
     )
     np.testing.assert_allclose(with_it[2] - without[2], [-10.0, 0.0, 0.0], atol=1e-4)
     assert not with_it[1].statistics.collision_steps.any()

@@ -6,12 +6,7 @@ import numpy as np
 import pytest
 
 from openjax.errors import UserError
-from openjax.pursuit import (
-    SCENARIOS,
-    PursuitSettings,
-    find_scenario,
-    scenario_task,
-)
+from openjax.pursuit import SCENARIOS, PursuitSettings, find_scenario, scenario_task
 from openjax.pursuit.sensing import line_of_sight
 from openjax.pursuit.task import starts_clear
 
@@ -26,11 +21,7 @@ def mirrored(x, y):
 
 RIGHT = {(0.6, 0), (0.8, 0), (0.8, -0.2)}
 TABLE = {  # pillars, pursuers, evader; all at a height of 0.5 m
-    "wall": (
-        mirrored(0, 0.15) | mirrored(0, 0.45),
-        {(0.6, 0.4), (0.6, 0), (0.6, -0.4)},
-        (-0.8, 0),
-    ),
+    "wall": (mirrored(0, 0.15) | mirrored(0, 0.45), {(0.6, 0.4), (0.6, 0), (0.6, -0.4)}, (-0.8, 0)),
     "narrow_gap": (
         mirrored(0.3, 0.3) | {(0, 0.3)},
         {(0, 0.7), (0.2, 0.7), (-0.2, 0.7)},
@@ -47,11 +38,7 @@ TABLE = {  # pillars, pursuers, evader; all at a height of 0.5 m
         (0, 0.6),
     ),
     "empty": (set(), RIGHT, (-0.8, 0)),
-    "hidden": (
-        {(0, 0), (0, 0.2), (0, -0.2), (-0.4, 0.4), (-0.4, -0.4)},
-        RIGHT,
-        (-0.8, 0),
-    ),
+    "hidden": ({(0, 0), (0, 0.2), (0, -0.2), (-0.4, 0.4), (-0.4, -0.4)}, RIGHT, (-0.8, 0)),
 }
 
 
@@ -67,22 +54,19 @@ def test_layouts_are_those_of_the_table_and_start_clear(name):
 
     def rounded(points):
         return {
-            tuple(float(x) for x in np.round(point, 6))
-            for point in np.asarray(points, np.float64)
+            tuple(float(x) for x in np.round(point, 6)) for point in np.asarray(points, np.float64)
         }
 
-    assert rounded(
-        np.asarray(task.pillar_position)[np.asarray(task.pillar_active)]
-    ) == rounded([*map(list, pillars)])
+    assert rounded(np.asarray(task.pillar_position)[np.asarray(task.pillar_active)]) == rounded(
+        [*map(list, pillars)]
+    )
     assert int(task.pillar_active.sum()) == len(pillars)
     assert rounded(task.pursuer_position) == rounded([[*p, 0.5] for p in pursuers])
     np.testing.assert_allclose(task.evader_position, [*evader, 0.5], atol=1e-6)
     assert starts_clear(settings, task)
 
 
-@pytest.mark.parametrize(
-    ("name", "seeing"), [("hidden", 0), ("random", 2), ("empty", 3)]
-)
+@pytest.mark.parametrize(("name", "seeing"), [("hidden", 0), ("random", 2), ("empty", 3)])
 def test_how_many_see_the_evader_at_the_start(name, seeing):
     settings, task = start_of(name)
     sees = line_of_sight(
@@ -146,11 +130,7 @@ def test_own_layout(tmp_path):
         ("pillars", "pillar", "unknown key 'pillar'; did you mean pillars"),
         ("pursuers = ", "name2 = ", "unknown key 'name2'; did you mean name"),
         ("pursuers = [[0.5, 0, 0.6], [0.5, 0.3, 0.6]]", "", "lacks pursuers"),
-        (
-            "[[0.5, 0, 0.6], [0.5, 0.3, 0.6]]",
-            "[]",
-            "has 0 pursuers; 1 to 8 are possible",
-        ),
+        ("[[0.5, 0, 0.6], [0.5, 0.3, 0.6]]", "[]", "has 0 pursuers; 1 to 8 are possible"),
         ("[0.5, 0, 0.6]", "[0.5, 0.25, 0.6]", "two pursuers start inside each other"),
         (
             "[0.5, 0, 0.6]",

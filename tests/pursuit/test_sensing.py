@@ -90,9 +90,7 @@ def test_against_walking_along_the_segment(sight, points):
     # where the nearest point is at an end or the distance the radius within rounding,
     # both answers are right
     foot = np.dot(pillar - start, end - start) / length**2
-    assume(
-        min(abs(foot), abs(1 - foot)) > 1e-3 and abs(distance[nearest] - RADIUS) > 1e-4
-    )
+    assume(min(abs(foot), abs(1 - foot)) > 1e-3 and abs(distance[nearest] - RADIUS) > 1e-4)
     clear = not (0 < nearest < 4000 and distance[nearest] < RADIUS)
     arrays = [jnp.asarray(x, jnp.float32)[None] for x in (start, end, [pillar])]
     assert bool(sight(*arrays, jnp.ones((1, 1), bool))[0]) == clear
@@ -114,21 +112,14 @@ def test_against_walking_along_the_segment(sight, points):
 def test_range_and_cone(target, angle, reach, seen):
     settings = PursuitSettings(sight_angle=angle, sight_range=reach)
     ahead = jnp.array([[1.0, 0.0, 0.0]])
-    assert (
-        bool(within_view(settings, jnp.zeros((1, 3)), ahead, jnp.array(target))[0])
-        == seen
-    )
+    assert bool(within_view(settings, jnp.zeros((1, 3)), ahead, jnp.array(target))[0]) == seen
 
 
 @pytest.mark.slow
 def test_who_looks_away_captures_unseen():
     """Limits of sight hide the evader from the pursuers, and nothing else."""
     settings = PursuitSettings(
-        physics="stops",
-        start_attitude="level",
-        max_pillars=0,
-        min_pillars=0,
-        sight_angle=90.0,
+        physics="stops", start_attitude="level", max_pillars=0, min_pillars=0, sight_angle=90.0
     )
     game = Pursuit(settings)
     _, state = game.reset(jax.random.key(0))
@@ -138,7 +129,5 @@ def test_who_looks_away_captures_unseen():
     observation, state, _, _, _, info = game.follow(state, jnp.zeros((3, 4)), drones)
     assert bool(info.captured[0]) and not bool(info.seen)
     assert np.all(observation.self_state[:, :3] == -5.0)
-    turned = drones.replace(
-        quaternion=jnp.tile(jnp.array([0.0, 0.0, 0.0, 1.0]), (3, 1))
-    )
+    turned = drones.replace(quaternion=jnp.tile(jnp.array([0.0, 0.0, 0.0, 1.0]), (3, 1)))
     assert bool(game.follow(state, jnp.zeros((3, 4)), turned)[-1].seen)

@@ -46,8 +46,7 @@ def length(task, position, target):
 def one_pillar():
     task = jax.jit(functools.partial(uniform_task, GAME))(jax.random.key(0))
     return task.replace(
-        pillar_position=jnp.zeros_like(task.pillar_position),
-        pillar_active=jnp.arange(5) < 1,
+        pillar_position=jnp.zeros_like(task.pillar_position), pillar_active=jnp.arange(5) < 1
     )
 
 
@@ -117,22 +116,16 @@ def cell(place):
 
 def test_round_rows_it_is_as_long_as_on_a_grid():
     keys = jax.random.split(jax.random.key(1), 6)
-    tasks = jax.jit(
-        jax.vmap(lambda key: line_up_pillars(GAME, key, uniform_task(GAME, key)))
-    )(keys)
+    tasks = jax.jit(jax.vmap(lambda key: line_up_pillars(GAME, key, uniform_task(GAME, key))))(keys)
     lengths = jax.vmap(length)(tasks, tasks.pursuer_position, tasks.evader_position)
     height = tasks.pursuer_position[..., 2] - tasks.evader_position[:, None, 2]
     differences = []
     for b, own in enumerate(np.sqrt(np.asarray(lengths**2 - height**2))):
-        grid = on_a_grid(
-            jax.tree.map(lambda leaf, b=b: leaf[b], tasks), tasks.evader_position[b]
-        )
+        grid = on_a_grid(jax.tree.map(lambda leaf, b=b: leaf[b], tasks), tasks.evader_position[b])
         grids = [grid.get(cell(place), math.inf) for place in tasks.pursuer_position[b]]
         # some start nearer a pillar than ways keep: no cell of the grid is theirs
         differences += [
-            mine - theirs
-            for mine, theirs in zip(own, grids, strict=True)
-            if math.isfinite(theirs)
+            mine - theirs for mine, theirs in zip(own, grids, strict=True) if math.isfinite(theirs)
         ]
     assert len(differences) > 12
     # polygons are longer ways than circles; a grid's cells stand aside of the places
@@ -150,10 +143,7 @@ def test_territory_is_where_the_evader_is_sooner_than_anybody_by_the_shortest_pa
     )
     expected = []
     for x, y in np.asarray(arena_points(GAME)):
-        if any(
-            math.dist((x, y), pillar) < GAME.pillar_radius
-            for pillar in task.pillar_position
-        ):
+        if any(math.dist((x, y), pillar) < GAME.pillar_radius for pillar in task.pillar_position):
             continue
         place = jnp.array([x, y, task.evader_position[2]])
         way = float(length(task, position, place).min()) - GAME.capture_radius

@@ -52,9 +52,7 @@ def distances(tasks):
     ]
 
     def to_pillars(points):
-        distance = (
-            np.linalg.norm(points[:, :, None, :2] - pillars[:, None], axis=-1) - 0.1
-        )
+        distance = np.linalg.norm(points[:, :, None, :2] - pillars[:, None], axis=-1) - 0.1
         return np.where(np.asarray(tasks.pillar_active)[:, None], distance, np.inf)
 
     return between, to_pillars(pursuers), to_pillars(evader[:, None])
@@ -76,9 +74,7 @@ def test_uniform_tasks_start_in_their_box_and_clear(uniform):
     for positions in (pursuers.reshape(-1, 3), mirrored):
         low = positions.min(axis=0)
         high = positions.max(axis=0)
-        assert (low >= [0.1, -0.536, 0.5]).all() and (
-            high <= np.float32([0.536, 0.536, 0.7])
-        ).all()
+        assert (low >= [0.1, -0.536, 0.5]).all() and (high <= np.float32([0.536, 0.536, 0.7])).all()
         np.testing.assert_allclose(low, [0.1, -0.536, 0.5], atol=0.02)  # and fill it
         np.testing.assert_allclose(high, [0.536, 0.536, 0.7], atol=0.02)
 
@@ -93,12 +89,12 @@ def test_pillars_of_uniform_tasks(uniform):
     assert (np.linalg.norm(pillars[active], axis=-1) < 0.8).all()
     for cell, used in zip(cells[:500], active[:500], strict=True):
         assert len({tuple(c) for c in cell[used]}) == used.sum()
-    starts = np.concatenate(
-        [uniform.pursuer_position, uniform.evader_position[:, None]], axis=1
-    )[..., :2]
-    same_cell = (np.round(starts / 0.2)[:, :, None] == cells[:, None]).all(
-        axis=-1
-    ) & active[:, None]
+    starts = np.concatenate([uniform.pursuer_position, uniform.evader_position[:, None]], axis=1)[
+        ..., :2
+    ]
+    same_cell = (np.round(starts / 0.2)[:, :, None] == cells[:, None]).all(axis=-1) & active[
+        :, None
+    ]
     assert not same_cell.any()
 
 
@@ -118,28 +114,20 @@ def test_expansion_moves_vehicles_a_little_and_never_into_a_breach(uniform, expa
         for name in ("pillar_position", "pillar_active"):
             np.testing.assert_array_equal(getattr(tasks, name), getattr(uniform, name))
         for name in ("pursuer_position", "evader_position"):
-            moved = np.asarray(getattr(tasks, name)) - np.asarray(
-                getattr(parents, name)
-            )
+            moved = np.asarray(getattr(tasks, name)) - np.asarray(getattr(parents, name))
             # the push back from the rim may turn a move along the axes into an oblique
             # one
             assert np.linalg.norm(moved[..., :2], axis=-1).max() <= 0.1 * 2**0.5 + 1e-6
             assert np.abs(moved[..., 2]).max() <= 0.1 + 1e-6
         assert_clear(tasks)
-    positions = np.concatenate(
-        [tasks.pursuer_position, tasks.evader_position[:, None]], axis=1
-    )
+    positions = np.concatenate([tasks.pursuer_position, tasks.evader_position[:, None]], axis=1)
     assert np.linalg.norm(positions[..., :2], axis=-1).max() <= 0.8 + 1e-6
-    assert (
-        positions[..., 2].min() >= 0.5 - 1e-6 and positions[..., 2].max() <= 0.7 + 1e-6
-    )
+    assert positions[..., 2].min() >= 0.5 - 1e-6 and positions[..., 2].max() <= 0.7 + 1e-6
     assert positions[:, :3, 0].min() < 0.0
     assert (
         np.mean(
             np.any(
-                np.asarray(tasks.evader_position)
-                != np.asarray(parents.evader_position),
-                axis=-1,
+                np.asarray(tasks.evader_position) != np.asarray(parents.evader_position), axis=-1
             )
         )
         > 0.95
@@ -151,9 +139,7 @@ def test_expansion_of_a_task_without_room_is_the_task_itself(uniform):
     turn = 2 * np.pi / 3 * np.arange(3)
     pursuers = 0.5 * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
     ring = np.pi / 3 * np.arange(6)
-    pillars = pursuers[:, None] + 0.1705 * np.stack(
-        [np.cos(ring), np.sin(ring)], axis=-1
-    )
+    pillars = pursuers[:, None] + 0.1705 * np.stack([np.cos(ring), np.sin(ring)], axis=-1)
     task = Task(
         pursuer_position=jnp.asarray(np.c_[pursuers, np.full(3, 0.6)], jnp.float32),
         evader_position=jnp.array([0.0, 0.0, 0.6]),
@@ -161,15 +147,11 @@ def test_expansion_of_a_task_without_room_is_the_task_itself(uniform):
         pillar_active=jnp.ones(18, bool),
     )
     assert starts_clear(SETTINGS, task)
-    drawn = jax.jit(jax.vmap(lambda key: expand_task(SETTINGS, key, task)))(
-        keys(20, 100)
-    )
+    drawn = jax.jit(jax.vmap(lambda key: expand_task(SETTINGS, key, task)))(keys(20, 100))
     for name in ("pursuer_position", "evader_position"):
         np.testing.assert_array_equal(
             getattr(drawn, name),
-            np.tile(getattr(task, name), (100, 1, 1)).reshape(
-                getattr(drawn, name).shape
-            ),
+            np.tile(getattr(task, name), (100, 1, 1)).reshape(getattr(drawn, name).shape),
         )
 
 
@@ -179,9 +161,7 @@ def test_turning_keeps_all_distances(uniform):
         finite = np.isfinite(before)
         np.testing.assert_array_equal(np.isfinite(after), finite)
         np.testing.assert_allclose(after[finite], before[finite], atol=1e-5)
-    np.testing.assert_array_equal(
-        turned.pursuer_position[..., 2], uniform.pursuer_position[..., 2]
-    )
+    np.testing.assert_array_equal(turned.pursuer_position[..., 2], uniform.pursuer_position[..., 2])
     angle = np.arctan2(turned.evader_position[:, 1], turned.evader_position[:, 0])
     # from all sides
     assert np.histogram(angle, 8, (-np.pi, np.pi))[0].min() > DRAWS / 16
@@ -210,8 +190,7 @@ def test_pillars_in_a_row_stand_between_the_sides(uniform):
     active = np.asarray(lined.pillar_active)
     np.testing.assert_array_equal(active, uniform.pillar_active)
     whole = (
-        np.asarray(lined.pillar_position != uniform.pillar_position).any(axis=-1)
-        | ~active
+        np.asarray(lined.pillar_position != uniform.pillar_position).any(axis=-1) | ~active
     ).all(axis=-1)
     assert whole.mean() > 0.1  # rows of which no pillar had to stay
     for pillars, used in zip(
@@ -221,9 +200,7 @@ def test_pillars_in_a_row_stand_between_the_sides(uniform):
         spacing = np.linalg.norm(step, axis=-1)
         np.testing.assert_allclose(spacing, spacing[0], atol=1e-5)
         assert 0.2 - 1e-5 <= spacing[0] <= 0.4 + 1e-5
-        np.testing.assert_allclose(
-            step, np.broadcast_to(step[0], step.shape), atol=1e-5
-        )
+        np.testing.assert_allclose(step, np.broadcast_to(step[0], step.shape), atol=1e-5)
         assert (
             np.abs(step[0, 0]) <= step[0, 1] + 1e-5
         )  # across the line between the sides, within 45 degrees
@@ -251,15 +228,13 @@ def test_close_starts_leave_little_room_beside_a_pillar_or_another_pursuer(unifo
     assert_clear(close)
     moved = np.asarray(close.pursuer_position != uniform.pursuer_position).any(axis=-1)
     assert not moved[:, 0].any() and moved[:, 1:].mean() > 0.9
-    assert (distances(close)[0].reshape(DRAWS, 3, 2).min(axis=-1) < 0.14 + 0.05 + 1e-5)[
-        moved
-    ].all()
+    assert (distances(close)[0].reshape(DRAWS, 3, 2).min(axis=-1) < 0.14 + 0.05 + 1e-5)[moved].all()
 
 
 def test_scattered_starts_fill_the_arena_and_are_clear(uniform):
-    scattered = jax.jit(
-        jax.vmap(lambda key, task: scatter_starts(SETTINGS, key, task))
-    )(keys(35), uniform)
+    scattered = jax.jit(jax.vmap(lambda key, task: scatter_starts(SETTINGS, key, task)))(
+        keys(35), uniform
+    )
     assert_clear(scattered)
     pursuers = np.asarray(scattered.pursuer_position)
     evader = np.asarray(scattered.evader_position)

@@ -11,12 +11,7 @@ import pytest
 
 from openjax import Pursuit, PursuitSettings, UserError
 from openjax.pursuit import RewardSettings, Term, default_reward, expand_task, turn_task
-from openjax.pursuit.task import (
-    close_starts,
-    scatter_starts,
-    starts_clear,
-    uniform_task,
-)
+from openjax.pursuit.task import close_starts, scatter_starts, starts_clear, uniform_task
 
 REWARD = RewardSettings(
     smoothness=2.0, crash=9.0, first_crash=5.0, first_capture=7.0, lookahead=0.2
@@ -39,9 +34,7 @@ def flown(settings, task, actions):
     game = Pursuit(settings)
 
     def one(carry, action):
-        observation, state, reward, _, _, info = game.step(
-            jax.random.key(0), carry, action
-        )
+        observation, state, reward, _, _, info = game.step(jax.random.key(0), carry, action)
         return state, (observation, reward, info)
 
     @jax.jit
@@ -52,18 +45,14 @@ def flown(settings, task, actions):
     return record, state
 
 
-@pytest.mark.parametrize(
-    "physics", ["rigid", pytest.param("stops", marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("physics", ["rigid", pytest.param("stops", marks=pytest.mark.slow)])
 def test_three_of_five_fly_as_three(physics):
     """Whatever the two empty slots do: steps, what is seen, rewards and counts are
     those of three, in a narrow arena that is the game's or the task's own.
     """
     alone = dataclasses.replace(ALONE, physics=physics, arena_radius=0.55)
     task = drawn_task(ALONE, jax.random.key(3)).replace(
-        evader=jnp.int32(0),
-        evader_speed=jnp.float32(1.1),
-        capture_radius=jnp.float32(0.55),
+        evader=jnp.int32(0), evader_speed=jnp.float32(1.1), capture_radius=jnp.float32(0.55)
     )
     empty = jnp.concatenate([task.pursuer_position, task.pursuer_position[:2]])
     wider = task.replace(
@@ -71,9 +60,7 @@ def test_three_of_five_fly_as_three(physics):
         active=jnp.arange(5) < 3,
         arena_radius=jnp.float32(alone.arena_radius),
     )
-    actions = 0.3 * jax.random.normal(jax.random.key(1), (40, 5, 4)) + jnp.array(
-        [0.25, 0, 0, 0]
-    )
+    actions = 0.3 * jax.random.normal(jax.random.key(1), (40, 5, 4)) + jnp.array([0.25, 0, 0, 0])
     (seen, reward, info), end = flown(alone, task, actions[:, :3])
     teams = dataclasses.replace(ALONE, physics=physics, num_pursuers=5)
     (seen_by, reward_of, info_of), end_of = flown(teams, wider, actions)
@@ -94,19 +81,14 @@ def test_three_of_five_fly_as_three(physics):
     assert np.all(seen_by.others[:, :3, 2:] == -5.0)
     np.testing.assert_array_equal(seen_by.others_there[0, :3], [[1, 1, 0, 0]] * 3)
     jax.tree.map(
-        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4),
-        end_of.statistics,
-        end.statistics,
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4), end_of.statistics, end.statistics
     )
     np.testing.assert_allclose(info_of.captured[:, :3], info.captured)
 
 
 def test_tasks_draw_teams_speeds_and_radii():
     settings = dataclasses.replace(
-        TEAMS,
-        evader_speeds=(0.8, 2.0),
-        capture_radii=(0.2, 0.4),
-        arena_radii=(0.7, 1.4),
+        TEAMS, evader_speeds=(0.8, 2.0), capture_radii=(0.2, 0.4), arena_radii=(0.7, 1.4)
     )
     keys = jax.random.split(jax.random.key(0), 300)
     tasks = jax.jit(jax.vmap(lambda key: uniform_task(settings, key)))(keys)
@@ -141,9 +123,7 @@ def test_what_moves_starts_leaves_empty_slots_far_away():
 
 
 def test_a_term_of_ones_own_counts_nothing_for_empty_slots():
-    game = Pursuit(
-        TEAMS, reward=(*default_reward(REWARD), Term(lambda t: jnp.ones(()), 3.0))
-    )
+    game = Pursuit(TEAMS, reward=(*default_reward(REWARD), Term(lambda t: jnp.ones(()), 3.0)))
     task = drawn_task(TEAMS, jax.random.key(0)).replace(active=jnp.arange(5) < 1)
     _, state = jax.jit(game.reset_to)(jax.random.key(0), task)
     reward = jax.jit(game.step)(jax.random.key(0), state, jnp.zeros((5, 4)))[2]
@@ -151,8 +131,7 @@ def test_a_term_of_ones_own_counts_nothing_for_empty_slots():
 
 
 @pytest.mark.parametrize(
-    "changes",
-    [{"team_sizes": (2, 6)}, {"evader_speeds": (1.0,)}, {"arena_radii": (0.9, 0.7)}],
+    "changes", [{"team_sizes": (2, 6)}, {"evader_speeds": (1.0,)}, {"arena_radii": (0.9, 0.7)}]
 )
 def test_impossible_teams_are_refused(changes):
     with pytest.raises(UserError, match=next(iter(changes))):

@@ -40,9 +40,7 @@ def flown():
         observation, state, *_ = environment.step(KEY, state, action)
         return state, (state, observation)
 
-    states, observations = jax.jit(lambda state: jax.lax.scan(one, state, actions)[1])(
-        state
-    )
+    states, observations = jax.jit(lambda state: jax.lax.scan(one, state, actions)[1])(state)
     return environment, observation, state, actions, states, observations
 
 
@@ -56,9 +54,7 @@ def test_every_episode_and_pursuer_has_its_vehicle_and_keeps_it(flown):
     environment, _, state, _, states, _ = flown
     mass = state.vehicles["mass"]["extra"]
     assert len(set(mass.tolist())) == 3
-    np.testing.assert_array_equal(
-        states.vehicles["mass"]["extra"], np.broadcast_to(mass, (10, 3))
-    )
+    np.testing.assert_array_equal(states.vehicles["mass"]["extra"], np.broadcast_to(mass, (10, 3)))
     other = jax.jit(environment.reset)(jax.random.key(5))[1].vehicles["mass"]["extra"]
     assert not set(mass.tolist()) & set(other.tolist())
     assert np.all((mass >= -0.002) & (mass <= 0.004))
@@ -66,9 +62,7 @@ def test_every_episode_and_pursuer_has_its_vehicle_and_keeps_it(flown):
 
 def test_bounds_given_later_go_before_those_of_the_settings():
     bounds = jnp.array([[0.009, 0.01] * 2, [0.0] * 4, [0.0] * 4])
-    reset = jax.jit(
-        lambda bounds: Pursuit(SETTINGS, vehicle_bounds=bounds).reset(KEY)[1].vehicles
-    )
+    reset = jax.jit(lambda bounds: Pursuit(SETTINGS, vehicle_bounds=bounds).reset(KEY)[1].vehicles)
     assert np.all(reset(bounds)["mass"]["extra"] >= 0.009)
 
 
@@ -96,6 +90,4 @@ def test_poses_are_seen_late_by_the_actor_and_truly_by_the_critic(flown):
 def test_without_a_family_nothing_is_carried():
     environment = Pursuit(dataclasses.replace(SETTINGS, vehicles=(), observe_history=0))
     state = jax.eval_shape(environment.reset, KEY)[1]
-    assert not jax.tree.leaves(
-        (state.vehicles, state.own_history, state.drones.effect_memory)
-    )
+    assert not jax.tree.leaves((state.vehicles, state.own_history, state.drones.effect_memory))

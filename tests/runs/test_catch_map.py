@@ -54,13 +54,9 @@ def test_cells_are_games_of_their_own():
         assert cell["capture_rate"] == float(radius == 3.0)
         assert cell["episodes"] == 2
         # one pursuer in the middle leaves .6 m above and below it
-        assert (cell["forced_below"] > 0.0) == (
-            radius == 3.0 or (number == 3 and radius > 0.2)
-        )
+        assert (cell["forced_below"] > 0.0) == (radius == 3.0 or (number == 3 and radius > 0.2))
         assert cell["planar_below"] >= cell["forced_below"] or radius == 3.0
-    shown = re.search(
-        r'<script id="data"[^>]*>(.*?)</script>', map_page({"empty <1>": found})
-    )
+    shown = re.search(r'<script id="data"[^>]*>(.*?)</script>', map_page({"empty <1>": found}))
     (only,) = json.loads(shown[1])
     assert only["name"].startswith("empty <1>, ") and len(only["cells"]) == 12
 
@@ -103,9 +99,7 @@ def test_evaders_learn_and_plan_in_the_cells_and_fly_again_from_their_file(tmp_p
         for who in ("learned", "planner"):
             if who in cell:
                 assert cell[who]["capture_rate"] == float(cell["capture_radius"] == 3.0)
-    planned = [
-        cell["planner"]["episodes"] for cell in found["cells"] if "planner" in cell
-    ]
+    planned = [cell["planner"]["episodes"] for cell in found["cells"] if "planner" in cell]
     assert planned == [1] * 6
     shown = map_page({"empty": found})
     assert "learned to escape from this team" in shown

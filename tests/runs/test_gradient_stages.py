@@ -32,9 +32,7 @@ def test_the_first_flights_stop_when_asked_to():
         lambda: next(asked),
     )
     learnt = learn(fresh, jax.random.key(1))
-    assert len(said) == 1 and said[0].startswith(
-        f"{TOGETHER} of {2 * TOGETHER} updates, "
-    )
+    assert len(said) == 1 and said[0].startswith(f"{TOGETHER} of {2 * TOGETHER} updates, ")
     moved = [
         np.abs(np.asarray(new) - old).max()
         for new, old in zip(

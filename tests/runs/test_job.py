@@ -48,25 +48,16 @@ def test_last_stage_keeps_what_validates_best_and_ends_when_asked(
     crashes, kept, asked_after, planning_worlds, tmp_path
 ):
     small = dict(network=dict(features=8, heads=1), predictor=dict(enabled=False))
-    stage = dict(
-        analytic=dict(updates=10, look_every=5),
-        worst_plans=dict(worlds=planning_worlds),
-    )
+    stage = dict(analytic=dict(updates=10, look_every=5), worst_plans=dict(worlds=planning_worlds))
     settings = preset("quick", **small, **stage)
     environment = Pursuit(settings.environment)
-    observation = jax.eval_shape(
-        lambda key: environment.reset(key)[0], jax.random.key(0)
-    )
-    observation = jax.tree.map(
-        lambda kind: jnp.zeros(kind.shape, kind.dtype), observation
-    )
+    observation = jax.eval_shape(lambda key: environment.reset(key)[0], jax.random.key(0))
+    observation = jax.tree.map(lambda kind: jnp.zeros(kind.shape, kind.dtype), observation)
     parts = build(settings, environment)
     job = SimpleNamespace(settings=settings, parts=parts)
     before = jax.jit(parts.policy.init)(jax.random.key(1), observation)
     directory = RunDirectory(tmp_path)
-    save_policy_file(
-        directory.policy, before, settings, {"update": 7}, storage="float32"
-    )
+    save_policy_file(directory.policy, before, settings, {"update": 7}, storage="float32")
 
     def learn(parameters, key):
         for moved in np.arange(1, 11) / 5:
@@ -82,9 +73,7 @@ def test_last_stage_keeps_what_validates_best_and_ends_when_asked(
     def validate(parameters):
         return GOOD | {"crash_rate": next(rates)}
 
-    message = keep_best(
-        directory, learn, validate, job, lambda: len(updates) >= asked_after
-    )
+    message = keep_best(directory, learn, validate, job, lambda: len(updates) >= asked_after)
     assert len(updates) == min(asked_after, 10) and next(rates, None) is None
     leaves, _, notes = load_policy_file(directory.policy)
     first = named_leaves(before)
@@ -110,9 +99,7 @@ def test_a_run_that_another_jax_goes_on_with_says_so():
 
     assert other_compiler(facts(jax.__version__)) is None
     assert other_compiler({}) is None
-    assert f"JAX 0.9.1 so far; JAX {jax.__version__} goes on" in other_compiler(
-        facts("0.9.1")
-    )
+    assert f"JAX 0.9.1 so far; JAX {jax.__version__} goes on" in other_compiler(facts("0.9.1"))
 
 
 def test_a_start_that_was_never_validated_is_when_the_run_goes_on():
@@ -120,14 +107,10 @@ def test_a_start_that_was_never_validated_is_when_the_run_goes_on():
     unscored = CheckpointRecord(Path("000000000"), 0, None, {})
     assert awaits_validation(unscored, settings, None)
     assert not awaits_validation(unscored, settings, "open")
-    assert not awaits_validation(
-        unscored, preset("quick", first_flights=dict(updates=0)), None
-    )
+    assert not awaits_validation(unscored, preset("quick", first_flights=dict(updates=0)), None)
     scored = CheckpointRecord(Path("000000000"), 0, 0.5, {})
     later = CheckpointRecord(Path("000000007"), 7, None, {})
-    assert not any(
-        awaits_validation(record, settings, None) for record in (scored, later)
-    )
+    assert not any(awaits_validation(record, settings, None) for record in (scored, later))
 
 
 def test_a_program_with_a_function_of_ones_own_is_never_recalled(tmp_path):
@@ -140,7 +123,6 @@ def test_a_program_with_a_function_of_ones_own_is_never_recalled(tmp_path):
     kept = dataclasses.replace(job, traced=tmp_path)
     assert kept.keep is not None
     game = Pursuit(
-        settings.environment,
-        evaders=(lambda scene, memory: (0.0 * memory[:3], memory),),
+        settings.environment, evaders=(lambda scene, memory: (0.0 * memory[:3], memory),)
     )
     assert dataclasses.replace(kept, environment=game).keep is None

@@ -48,9 +48,7 @@ def step(carry):
     key, draw = jax.random.split(carry.key)
     momentum = 0.9 * carry.momentum + jax.random.normal(draw, carry.parameters.shape)
     parameters = carry.parameters - 0.1 * momentum
-    new = carry.replace(
-        parameters=parameters, momentum=momentum, key=key, update=carry.update + 1
-    )
+    new = carry.replace(parameters=parameters, momentum=momentum, key=key, update=carry.update + 1)
     return new, {"loss": jnp.mean(parameters**2)}
 
 
@@ -73,16 +71,9 @@ def run(directory, compiled_step, updates, resume=False, evaluate=None, **plan):
         first = record.update
     else:
         carry = place(init())
-    metrics = MetricsWriter(
-        directory, resumed_update=first if resume else None, tensorboard=False
-    )
-    plan = Plan(
-        total_updates=updates, steps_per_update=10, **{"validation_interval": 4, **plan}
-    )
-    with (
-        Progress("toy", 10 * updates, Console(quiet=True)) as progress,
-        StopRequest() as stop,
-    ):
+    metrics = MetricsWriter(directory, resumed_update=first if resume else None, tensorboard=False)
+    plan = Plan(total_updates=updates, steps_per_update=10, **{"validation_interval": 4, **plan})
+    with Progress("toy", 10 * updates, Console(quiet=True)) as progress, StopRequest() as stop:
         try:
             loop = Loop(
                 compiled_step,
@@ -101,9 +92,7 @@ def run(directory, compiled_step, updates, resume=False, evaluate=None, **plan):
 
 
 def assert_same(a, b):
-    for (name, x), (_, y) in zip(
-        named_leaves(a).items(), named_leaves(b).items(), strict=True
-    ):
+    for (name, x), (_, y) in zip(named_leaves(a).items(), named_leaves(b).items(), strict=True):
         if jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
             x = jax.random.key_data(x)
             y = jax.random.key_data(y)
@@ -112,9 +101,7 @@ def assert_same(a, b):
 
 
 @pytest.mark.parametrize("overlap", [False, True])
-def test_resumed_run_equals_uninterrupted_run_and_compiles_once(
-    tmp_path, compiled, overlap
-):
+def test_resumed_run_equals_uninterrupted_run_and_compiles_once(tmp_path, compiled, overlap):
     whole = run(tmp_path / "whole", compiled, 12)
     run(tmp_path / "parts", compiled, 5, overlap=overlap)
     parts = run(tmp_path / "parts", compiled, 12, resume=True, overlap=overlap)
@@ -127,9 +114,7 @@ def test_resumed_run_equals_uninterrupted_run_and_compiles_once(
     assert losses[0] == losses[1]
 
 
-def test_a_start_that_was_stopped_before_its_validation_ships_the_same_policy(
-    tmp_path, compiled
-):
+def test_a_start_that_was_stopped_before_its_validation_ships_the_same_policy(tmp_path, compiled):
     """The start is the best there is; the run that was stopped finds that out when it
     is resumed.
     """
@@ -142,10 +127,7 @@ def test_a_start_that_was_stopped_before_its_validation_ships_the_same_policy(
     run(tmp_path / "parts", compiled, 8, **plan, time_limit=0.0)
     assert Checkpoints(tmp_path / "parts" / "checkpoints").latest().score is None
     parts = run(tmp_path / "parts", compiled, 8, resume=True, **plan)
-    records = [
-        Checkpoints(tmp_path / name / "checkpoints").best()
-        for name in ("whole", "parts")
-    ]
+    records = [Checkpoints(tmp_path / name / "checkpoints").best() for name in ("whole", "parts")]
     assert [(record.update, record.score) for record in records] == [(0, 1.0)] * 2
     states = [load_arrays(record.path) for record in records]
     for name, array in states[0].items():
@@ -173,9 +155,7 @@ def test_nan_stops_and_leaves_both_states(tmp_path, overlap):
     assert Checkpoints(tmp_path / "checkpoints").latest().update == 4
     report = json.loads((tmp_path / "not_finite" / "report.json").read_text())
     assert report["update"] == 5 and report["leaves"] == ["parameters"]
-    assert is_checkpoint(
-        tmp_path / "not_finite" / f"{report['state_after_update']:09d}"
-    )
+    assert is_checkpoint(tmp_path / "not_finite" / f"{report['state_after_update']:09d}")
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])

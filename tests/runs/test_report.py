@@ -23,25 +23,17 @@ def test_it_plays_the_runs_game_and_steers_as_it_was_trained_to():
     )
     policy = openjax.load_policy("apf")
     rows, flights = compare(policy, Pursuit(run), [SCENARIOS["empty"]], 1, 2)
-    assert [(row["scenario"], row["episodes"]) for row in rows] == [
-        ("validation", 2),
-        ("empty", 1),
-    ]
+    assert [(row["scenario"], row["episodes"]) for row in rows] == [("validation", 2), ("empty", 1)]
     flight = flights[1]
     assert (
         flight.title == "empty, apf"
         and flight.time_step == 0.01
         and len(flight.evader_position) == 120
     )
-    speed = (
-        np.linalg.norm(np.diff(flight.evader_position, axis=0), axis=-1)
-        / flight.time_step
-    )
+    speed = np.linalg.norm(np.diff(flight.evader_position, axis=0), axis=-1) / flight.time_step
     np.testing.assert_allclose(speed, run.evader_speed, rtol=1e-2)
 
-    game = dataclasses.replace(
-        game_for(Pursuit(run), policy).settings, max_pillars=run.max_pillars
-    )
+    game = dataclasses.replace(game_for(Pursuit(run), policy).settings, max_pillars=run.max_pillars)
     record = openjax.evaluate(policy, "empty", episodes=1, **vars(game))
     assert record["capture_rate"] == rows[1]["capture_rate"]
     assert record["capture_step"] == 2 * rows[1]["capture_step"]

@@ -24,8 +24,7 @@ def test_the_papers_game_is_judged_by_all_six():
     paper = preset("paper")
     assert len(layouts_like(paper.environment)) == 6
     assert not any(
-        "Easier" in line
-        for line in closing_words(paper, Path("runs/train"), on_cpu=False)
+        "Easier" in line for line in closing_words(paper, Path("runs/train"), on_cpu=False)
     )
 
 

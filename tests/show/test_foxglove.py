@@ -67,9 +67,7 @@ def test_the_flights_of_a_case_are_read_back(tmp_path, case_folder, sample_colum
         write_flights(ViewCommand(flights=case_folder))
     write_flights(ViewCommand(flights=case_folder, mcap=tmp_path / "case.mcap"))
     found = messages(tmp_path / "case.mcap")
-    assert {
-        f"/flight_{name}/0/{kind}" for name in "abc" for kind in ("log", "pose")
-    } == set(found)
+    assert {f"/flight_{name}/0/{kind}" for name in "abc" for kind in ("log", "pose")} == set(found)
     columns = sample_columns["flight_b"]
     rows = found["/flight_b/0/log"]
     assert len(rows) == len(columns["t"])

@@ -25,8 +25,7 @@ def flights():
     flight = Trajectory(
         title="wall</script>",
         pursuer_position=rng.uniform(-0.5, 0.5, (400, 3, 3)),
-        pursuer_quaternion=quaternion
-        / np.linalg.norm(quaternion, axis=-1, keepdims=True),
+        pursuer_quaternion=quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True),
         evader_position=rng.uniform(-0.5, 0.5, (400, 3)),
         captured=np.arange(400)[:, None] >= np.array([20, 999, 999]),
         pillar_position=np.array([[0.0, 0.2], [0.3, 0.0]]),
@@ -53,12 +52,8 @@ def test_page_holds_the_flight(flights):
     steps = range(0, 220, 2)  # two seconds after the capture
     assert shown["steps"] == len(steps)
     poses = np.array(shown["pursuers"][1]).reshape(-1, 7) / 1000
-    np.testing.assert_allclose(
-        poses[:, :3], flight.pursuer_position[steps, 1], atol=6e-4
-    )
-    np.testing.assert_allclose(
-        poses[:, 3:], flight.pursuer_quaternion[steps, 1], atol=6e-4
-    )
+    np.testing.assert_allclose(poses[:, :3], flight.pursuer_position[steps, 1], atol=6e-4)
+    np.testing.assert_allclose(poses[:, 3:], flight.pursuer_quaternion[steps, 1], atol=6e-4)
     np.testing.assert_allclose(
         np.array(shown["predicted"]).reshape(-1, 3, 3) / 1000,
         flight.predicted[steps][:, ::2],
@@ -76,9 +71,7 @@ def test_server_answers_this_machine_only(flights):
         thread.start()
 
         def status(path, host):
-            connection = http.client.HTTPConnection(
-                "127.0.0.1", server.server_port, timeout=10
-            )
+            connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=10)
             connection.request("GET", path, headers={"Host": host})
             return connection.getresponse().status
 
@@ -91,9 +84,7 @@ def test_server_answers_this_machine_only(flights):
             thread.join()
 
 
-@pytest.mark.skipif(
-    shutil.which("chromium") is None, reason="no chromium on this machine"
-)
+@pytest.mark.skipif(shutil.which("chromium") is None, reason="no chromium on this machine")
 def test_a_browser_draws_it(flights, tmp_path):
     """Pillars' and pursuers' colours are in what a headless browser shows."""
     picture = tmp_path / "page.png"

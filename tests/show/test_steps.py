@@ -14,9 +14,7 @@ from openjax.show.progress import Steps, duration
 def test_time_left_follows_this_machine(monkeypatch):
     now = [100.0]
     monkeypatch.setattr(time, "monotonic", lambda: now[0])
-    steps = Steps(
-        "work", {"slow": 10.0, "fast": 5.0, "last": 5.0}, Console(file=io.StringIO())
-    )
+    steps = Steps("work", {"slow": 10.0, "fast": 5.0, "last": 5.0}, Console(file=io.StringIO()))
     steps.begin("slow")
     assert steps.seconds_left(now[0]) == 20.0
     now[0] += 20.0  # twice what was expected

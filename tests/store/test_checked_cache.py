@@ -50,11 +50,7 @@ def test_flipped_bits_end_no_process_and_change_no_number(tmp_path):
     OPENJAX_FLIPS: how often, else four times.
     """
     flips = int(os.environ.get("OPENJAX_FLIPS", "4"))
-    environment = {
-        **os.environ,
-        "JAX_COMPILATION_CACHE_DIR": str(tmp_path),
-        "JAX_PLATFORMS": "cpu",
-    }
+    environment = {**os.environ, "JAX_COMPILATION_CACHE_DIR": str(tmp_path), "JAX_PLATFORMS": "cpu"}
     command = [sys.executable, "-c", FLIPS, "0", str(flips)]
     ran = subprocess.run(command, capture_output=True, text=True, env=environment)
     assert ran.returncode == 0, ran.stderr[-2000:]
@@ -74,19 +70,14 @@ def test_half_an_entry_is_none(tmp_path):
         assert cache.get("key") == b"program"
 
 
-@pytest.mark.skipif(
-    not hasattr(os, "geteuid"), reason="owners and modes are those of POSIX"
-)
+@pytest.mark.skipif(not hasattr(os, "geteuid"), reason="owners and modes are those of POSIX")
 def test_the_folder_is_the_users_own(tmp_path):
     def folder(cache):
         code = "from openjax.store.compiled_programs import cache_programs; print(cache_programs())"
         environment = {**os.environ, "XDG_CACHE_HOME": str(cache)}
         environment.pop("JAX_COMPILATION_CACHE_DIR", None)
         ran = subprocess.run(
-            [sys.executable, "-c", code],
-            capture_output=True,
-            text=True,
-            env=environment,
+            [sys.executable, "-c", code], capture_output=True, text=True, env=environment
         )
         assert ran.returncode == 0, ran.stderr
         return ran.stdout.strip()

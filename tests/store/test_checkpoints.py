@@ -58,9 +58,7 @@ def test_any_changed_byte_is_found(run):
     rng = np.random.default_rng(0)
     kept = run.directory.with_name("kept")
     shutil.copytree(run.directory, kept)
-    files = sorted(
-        file for file in kept.rglob("*") if file.is_file() and "000000002" in str(file)
-    )
+    files = sorted(file for file in kept.rglob("*") if file.is_file() and "000000002" in str(file))
     abstract = abstract_like(place(init()))
     for number in range(2 * len(files)):
         shutil.rmtree(run.directory)
@@ -81,9 +79,7 @@ def test_any_changed_byte_is_found(run):
         told = is_checkpoint(
             run.directory / "000000002"
         )  # not where nothing says that it was finished
-        assert ["000000002 is damaged" in text for text in warnings] == [True] * told, (
-            damaged
-        )
+        assert ["000000002 is damaged" in text for text in warnings] == [True] * told, damaged
         assert again.load_best(only_n, lambda text: None)[1].update == 1
 
 
@@ -92,10 +88,7 @@ def test_a_damaged_best_checkpoint_gives_way_to_the_next_best(run):
     run.save(4, with_n(4), score=0.4)
     run.wait()
     assert run.best().update == 3
-    file = max(
-        run.best().path.rglob("*"),
-        key=lambda file: file.is_file() and file.stat().st_size,
-    )
+    file = max(run.best().path.rglob("*"), key=lambda file: file.is_file() and file.stat().st_size)
     content = bytearray(file.read_bytes())
     content[len(content) // 2] ^= 1
     file.write_bytes(content)

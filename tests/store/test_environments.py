@@ -14,10 +14,7 @@ def test_an_airframe_by_name_or_by_file_comes_with_its_family(tmp_path):
     flight = preset("flight").environment
     file = tmp_path / "vehicle.toml"
     file.write_text('[vehicle]\nairframe = "brushless"\nmass = 0.041\n')
-    for vehicle, mass in (
-        ("brushless", float(load_vehicle("brushless").mass)),
-        (file, 0.041),
-    ):
+    for vehicle, mass in (("brushless", float(load_vehicle("brushless").mass)), (file, 0.041)):
         game = make_environment(flight, vehicle, None)
         assert game.settings.airframe == "brushless"
         assert game.settings.vehicles == vehicle_family("brushless") != flight.vehicles

@@ -44,28 +44,17 @@ class Outer:
     count: int = 3
 
 
-def test_what_gets_its_name_is_on_the_disk_before_and_the_name_after(
-    tmp_path, monkeypatch
-):
+def test_what_gets_its_name_is_on_the_disk_before_and_the_name_after(tmp_path, monkeypatch):
     happened = []
     fsync = os.fsync
     rename = os.replace
-    monkeypatch.setattr(
-        os, "fsync", lambda of: (happened.append(os.fstat(of).st_ino), fsync(of))
-    )
-    monkeypatch.setattr(
-        os, "replace", lambda *paths: (happened.append("renamed"), rename(*paths))
-    )
+    monkeypatch.setattr(os, "fsync", lambda of: (happened.append(os.fstat(of).st_ino), fsync(of)))
+    monkeypatch.setattr(os, "replace", lambda *paths: (happened.append("renamed"), rename(*paths)))
     with replacing(tmp_path / "run") as partial:
         partial.mkdir()
         (partial / "weights").write_bytes(b"1")
-    inodes = [
-        path.stat().st_ino for path in (tmp_path / "run", tmp_path / "run" / "weights")
-    ]
-    assert set(happened[:2]) == set(inodes) and happened[2:] == [
-        "renamed",
-        tmp_path.stat().st_ino,
-    ]
+    inodes = [path.stat().st_ino for path in (tmp_path / "run", tmp_path / "run" / "weights")]
+    assert set(happened[:2]) == set(inodes) and happened[2:] == ["renamed", tmp_path.stat().st_ino]
 
 
 def test_settings_round_trip_and_are_strict():
@@ -76,10 +65,7 @@ def test_settings_round_trip_and_are_strict():
             {"inner": {"kinds": "a"}},
             r"settings\.inner has the unknown key 'kinds'; did you mean kind",
         ),
-        (
-            {"inner": {"kind": "c"}},
-            r"settings\.inner\.kind is 'c'; expected one of 'a', 'b'",
-        ),
+        ({"inner": {"kind": "c"}}, r"settings\.inner\.kind is 'c'; expected one of 'a', 'b'"),
         ({"count": 2.5}, r"settings\.count is 2\.5; expected a whole number"),
     ):
         with pytest.raises(UserError, match=message):
@@ -90,39 +76,21 @@ def test_metrics_survive_a_kill_and_are_cut_to_the_resumed_update(tmp_path):
     writer = MetricsWriter(tmp_path, tensorboard=False)
     for update in range(1, 6):
         writer.write(
-            "train",
-            update,
-            update * 10,
-            0.1,
-            {"loss": float("nan") if update == 2 else update},
+            "train", update, update * 10, 0.1, {"loss": float("nan") if update == 2 else update}
         )
     # No close: the file must already hold everything. Then a write that a kill cut
     # short.
     with open(tmp_path / "metrics.jsonl", "ab") as file:
         file.write(b'{"event": "train", "upd')
-    assert [r["loss"] for r in read_metrics(tmp_path / "metrics.jsonl")] == [
-        1,
-        None,
-        3,
-        4,
-        5,
-    ]
+    assert [r["loss"] for r in read_metrics(tmp_path / "metrics.jsonl")] == [1, None, 3, 4, 5]
     MetricsWriter(tmp_path, resumed_update=3, tensorboard=False).write(
         "train", 4, 40, 0.1, {"loss": 40}
     )
-    assert [r["loss"] for r in read_metrics(tmp_path / "metrics.jsonl")] == [
-        1,
-        None,
-        3,
-        40,
-    ]
+    assert [r["loss"] for r in read_metrics(tmp_path / "metrics.jsonl")] == [1, None, 3, 40]
 
 
 def test_policy_file_round_trip(tmp_path):
-    parameters = {
-        "actor": {"kernel": jnp.linspace(0, 1, 6).reshape(2, 3)},
-        "count": jnp.int32(3),
-    }
+    parameters = {"actor": {"kernel": jnp.linspace(0, 1, 6).reshape(2, 3)}, "count": jnp.int32(3)}
     path = tmp_path / "policy.npz"
     save_policy_file(path, parameters, Outer(), {"steps": 5})
     leaves, settings, notes = load_policy_file(path)
@@ -130,13 +98,10 @@ def test_policy_file_round_trip(tmp_path):
     np.testing.assert_allclose(
         restored["actor"]["kernel"], parameters["actor"]["kernel"], atol=5e-4
     )
-    assert (
-        restored["actor"]["kernel"].dtype == jnp.float32 and int(restored["count"]) == 3
-    )
+    assert restored["actor"]["kernel"].dtype == jnp.float32 and int(restored["count"]) == 3
     assert from_plain(Outer, settings) == Outer() and notes == {"steps": 5}
     with pytest.raises(
-        UserError,
-        match=r"actor/kernel is \[2, 3\] there, its settings make it \[2, 4\]",
+        UserError, match=r"actor/kernel is \[2, 3\] there, its settings make it \[2, 4\]"
     ):
         fill({"actor": {"kernel": jnp.zeros((2, 4))}}, leaves, str(path))
 
@@ -156,11 +121,7 @@ def trajectory():
     steps = 40
     t = np.linspace(0, 1, steps)
     pursuers = np.stack(
-        [
-            np.stack([0.5 * np.cos(t + i), 0.5 * np.sin(t + i), 0.5 + 0 * t], -1)
-            for i in range(3)
-        ],
-        1,
+        [np.stack([0.5 * np.cos(t + i), 0.5 * np.sin(t + i), 0.5 + 0 * t], -1) for i in range(3)], 1
     )
     captured = np.zeros((steps, 3), bool)
     captured[30:, 1] = True
@@ -191,14 +152,9 @@ def test_animation_is_drawn_without_a_display(tmp_path, trajectory, monkeypatch)
     )
     animate(tmp_path / "chase.gif", [trajectory])
     animate(tmp_path / "both.gif", [trajectory, longer])
-    with (
-        Image.open(tmp_path / "chase.gif") as one,
-        Image.open(tmp_path / "both.gif") as both,
-    ):
+    with Image.open(tmp_path / "chase.gif") as one, Image.open(tmp_path / "both.gif") as both:
         assert (
-            one.n_frames == 5
-            and both.n_frames == 20
-            and both.size == (one.width, 2 * one.height)
+            one.n_frames == 5 and both.n_frames == 20 and both.size == (one.width, 2 * one.height)
         )
 
 
@@ -209,9 +165,7 @@ def test_what_is_near_hides_what_is_far_and_all_stands_on_the_floor(trajectory):
 
     def red(flight):
         shown = np.asarray(draw(flight, 0)).astype(int)
-        return np.argwhere((shown[..., 0] > 150) & (shown[..., 1:].max(axis=-1) < 60))[
-            :, ::-1
-        ]
+        return np.argwhere((shown[..., 0] > 150) & (shown[..., 1:].max(axis=-1) < 60))[:, ::-1]
 
     def alone(place, pillar):
         away = np.full_like(trajectory.pursuer_position, -50.0)
@@ -233,21 +187,14 @@ def test_what_is_near_hides_what_is_far_and_all_stands_on_the_floor(trajectory):
         right = np.cross(ahead, (0, 0, 1)) / np.linalg.norm(np.cross(ahead, (0, 0, 1)))
         off = np.array(place) - camera
         zoom = HEIGHT / 2 / np.tan(OPENING / 2)
-        at = (
-            zoom
-            * np.array([off @ right, -off @ np.cross(right, ahead)])
-            / (off @ ahead)
-        )
+        at = zoom * np.array([off @ right, -off @ np.cross(right, ahead)]) / (off @ ahead)
         assert abs(seen.mean(axis=0) - at - (WIDTH / 2, HEIGHT / 2)).max() < 1.5
         assert len(red(alone(place, place[:2] - 0.2 * towards))) < len(seen) / 4
 
 
 def test_animation_says_when_something_happened(trajectory):
     assert caption(trajectory, 29) == ("wall: 0.3 s", "")
-    assert caption(trajectory, 40) == (
-        "wall: 0.4 s",
-        "caught at 0.3 s, crashed at 0.3 s",
-    )
+    assert caption(trajectory, 40) == ("wall: 0.4 s", "caught at 0.3 s, crashed at 0.3 s")
 
 
 def test_pictures_are_drawn(tmp_path, trajectory):
@@ -265,8 +212,5 @@ def test_pictures_are_drawn(tmp_path, trajectory):
     plot_trajectories(tmp_path / "trajectories.png", [trajectory, trajectory])
     for name in ("training.png", "trajectories.png"):
         with Image.open(tmp_path / name) as image:
-            assert (
-                len(np.unique(np.asarray(image.convert("RGB")).reshape(-1, 3), axis=0))
-                > 10
-            )
+            assert len(np.unique(np.asarray(image.convert("RGB")).reshape(-1, 3), axis=0)) > 10
     assert list((tmp_path / "tensorboard").iterdir())

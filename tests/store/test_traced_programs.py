@@ -56,27 +56,16 @@ def test_what_was_traced_once_is_found_again_and_does_the_same(tmp_path, step, t
     def never(carry):
         raise AssertionError("traced again")
 
-    found = recall(
-        "step", jax.jit(never), lambda: (carry(),), carry(), "these settings", tmp_path
-    )
+    found = recall("step", jax.jit(never), lambda: (carry(),), carry(), "these settings", tmp_path)
     assert outcome(found, carry()) == expected
     with pytest.raises(AssertionError, match="traced again"):
-        recall(
-            "step",
-            jax.jit(never),
-            lambda: (carry(),),
-            carry(),
-            "other settings",
-            tmp_path,
-        )
+        recall("step", jax.jit(never), lambda: (carry(),), carry(), "other settings", tmp_path)
 
     # a damaged file is traced and written anew
     whole = file.read_bytes()
     file.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
     assert outcome(of("these settings"), carry()) == expected
-    again = recall(
-        "step", jax.jit(never), lambda: (carry(),), carry(), "these settings", tmp_path
-    )
+    again = recall("step", jax.jit(never), lambda: (carry(),), carry(), "these settings", tmp_path)
     assert outcome(again, carry()) == expected and list(tmp_path.iterdir()) == [file]
 
 
@@ -87,12 +76,7 @@ def test_a_program_that_cannot_be_kept_is_used_as_it_is(tmp_path):
 
     assert (
         recall(
-            "told",
-            told,
-            lambda: (jnp.zeros(2),),
-            Carry(jnp.zeros(()), jnp.zeros(())),
-            "",
-            tmp_path,
+            "told", told, lambda: (jnp.zeros(2),), Carry(jnp.zeros(()), jnp.zeros(())), "", tmp_path
         )
         is told
     )

@@ -40,22 +40,18 @@ def crashes(number, seed):
     position[beside, 0, :2] = pillar[beside, 0] + outward * draw.uniform(
         0.15, 0.19, (beside.sum(), 1)
     )
-    velocity[beside, 0, :2] = -outward * draw.uniform(
-        0.3, 2, (beside.sum(), 1)
-    ) + draw.normal(0, 0.5, (beside.sum(), 2))
+    velocity[beside, 0, :2] = -outward * draw.uniform(0.3, 2, (beside.sum(), 1)) + draw.normal(
+        0, 0.5, (beside.sum(), 2)
+    )
     position[both, 0, 2] = 0.05 + draw.uniform(0, 0.03, both.sum())
     velocity[both, 0, 2] = -draw.uniform(0.2, 2, both.sum())
     pair = kind == 2
     along = draw.normal(size=(pair.sum(), 3))
     along /= np.linalg.norm(along, axis=-1, keepdims=True)
-    position[pair, 1] = position[pair, 0] + along * draw.uniform(
-        0.1, 0.15, (pair.sum(), 1)
-    )
+    position[pair, 1] = position[pair, 0] + along * draw.uniform(0.1, 0.15, (pair.sum(), 1))
     velocity[pair, 0] += along * draw.uniform(0, 1.5, (pair.sum(), 1))
     velocity[pair, 1] -= along * draw.uniform(0, 1.5, (pair.sum(), 1))
-    to_pillar = (
-        np.linalg.norm(position[:, :, None, :2] - pillar[:, None], axis=-1) - 0.15
-    )
+    to_pillar = np.linalg.norm(position[:, :, None, :2] - pillar[:, None], axis=-1) - 0.15
     apart = [
         np.linalg.norm(position[:, i] - position[:, j], axis=-1)
         for i, j in ((0, 1), (0, 2), (1, 2))
@@ -96,9 +92,7 @@ def flown(start, dtype, steps=STEPS):
 
         return fly(True), fly(False)
 
-    arrays = [
-        jnp.asarray(leaf, bool if leaf.dtype == bool else dtype) for leaf in start
-    ]
+    arrays = [jnp.asarray(leaf, bool if leaf.dtype == bool else dtype) for leaf in start]
     return jax.tree.map(np.asarray, jax.jit(jax.vmap(one))(*arrays))
 
 

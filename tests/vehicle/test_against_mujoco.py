@@ -28,8 +28,7 @@ def hard_manoeuvres():
     """
     draw = np.random.default_rng(0)
     jumps = np.concatenate(
-        [draw.uniform(0.2, 0.95, (10, 1)), draw.uniform(-1, 1, (10, 3)) * [20, 20, 10]],
-        axis=1,
+        [draw.uniform(0.2, 0.95, (10, 1)), draw.uniform(-1, 1, (10, 3)) * [20, 20, 10]], axis=1
     )
     return np.repeat(jumps, STEPS // 10, axis=0)[:, None]
 
@@ -49,9 +48,7 @@ def hard_manoeuvres():
 def test_a_second_of_hard_manoeuvres(airframe, physics, contacts, substeps):
     with jax.enable_x64(True):
         vehicle = load_vehicle(airframe, jnp.float64)
-        step = make_drones_step(
-            physics, dt=0.01 * substeps, substeps=substeps, contacts=contacts
-        )
+        step = make_drones_step(physics, dt=0.01 * substeps, substeps=substeps, contacts=contacts)
         quaternion = QPOS[3:] / np.linalg.norm(QPOS[3:])
         start = hover_state(vehicle, QPOS[None, :3], quaternion[None], QVEL[None, :3])
         start = start.replace(body_rates=jnp.asarray(QVEL[None, 3:]))
@@ -64,9 +61,7 @@ def test_a_second_of_hard_manoeuvres(airframe, physics, contacts, substeps):
         commands = jnp.asarray(hard_manoeuvres())[::substeps]
         _, flown = jax.jit(lambda start: jax.lax.scan(advance, start, commands))(start)
         thrust = np.asarray(
-            jax.vmap(lambda speed: rotor_thrust(vehicle, speed))(
-                flown.rotor_speed[:, 0]
-            )
+            jax.vmap(lambda speed: rotor_thrust(vehicle, speed))(flown.rotor_speed[:, 0])
         )
         if substeps > 1:  # what goes on within a step isn't seen from outside
             thrust = inner_thrusts(vehicle, start, commands, substeps)
@@ -82,18 +77,10 @@ def test_a_second_of_hard_manoeuvres(airframe, physics, contacts, substeps):
         mujoco.mj_step(model, data)
         if (k + 1) % substeps == 0:
             j = (k + 1) // substeps - 1
-            np.testing.assert_allclose(
-                flown.position[j, 0], data.qpos[:3], rtol=0, atol=1e-9
-            )
-            np.testing.assert_allclose(
-                flown.quaternion[j, 0], data.qpos[3:], rtol=0, atol=1e-9
-            )
-            np.testing.assert_allclose(
-                flown.velocity[j, 0], data.qvel[:3], rtol=0, atol=1e-9
-            )
-            np.testing.assert_allclose(
-                flown.body_rates[j, 0], data.qvel[3:], rtol=0, atol=1e-9
-            )
+            np.testing.assert_allclose(flown.position[j, 0], data.qpos[:3], rtol=0, atol=1e-9)
+            np.testing.assert_allclose(flown.quaternion[j, 0], data.qpos[3:], rtol=0, atol=1e-9)
+            np.testing.assert_allclose(flown.velocity[j, 0], data.qvel[:3], rtol=0, atol=1e-9)
+            np.testing.assert_allclose(flown.body_rates[j, 0], data.qvel[3:], rtol=0, atol=1e-9)
     assert np.linalg.norm(data.qvel[3:]) > 5, "the manoeuvres must turn fast"
 
 

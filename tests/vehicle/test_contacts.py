@@ -19,9 +19,7 @@ def flights():
     return start, kind, exact, flown(start, jnp.float32)[0], reference
 
 
-@pytest.mark.parametrize(
-    ("precision", "tolerance"), [("float64", 1e-8), ("float32", 1e-4)]
-)
+@pytest.mark.parametrize(("precision", "tolerance"), [("float64", 1e-8), ("float32", 1e-4)])
 def test_a_tenth_of_a_second_of_crashes(flights, precision, tolerance):
     _, _, exact, rounded, (position, velocity, _) = flights
     got = exact if precision == "float64" else rounded
@@ -37,9 +35,6 @@ def test_the_crashes_are_crashes_of_every_kind(flights):
     anything = touched.any((1, 2, 3))
     assert all(anything[kind == k].mean() > 0.6 for k in range(4)), KINDS
     assert (
-        floor[kind == 0].any((1, 2)).mean() > 0.9
-        and other[kind == 2].any((1, 2, 3)).mean() > 0.5
+        floor[kind == 0].any((1, 2)).mean() > 0.9 and other[kind == 2].any((1, 2, 3)).mean() > 0.5
     )
-    assert (floor[..., None] & pillar).any((1, 2, 3))[kind == 3].mean() > 0.1, (
-        "both at once"
-    )
+    assert (floor[..., None] & pillar).any((1, 2, 3))[kind == 3].mean() > 0.1, "both at once"

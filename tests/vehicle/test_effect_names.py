@@ -20,27 +20,17 @@ def constants(tree):
     """
     said = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
     for node in ast.walk(tree):
-        if (
-            isinstance(node, ast.Constant)
-            and isinstance(node.value, str)
-            and id(node) not in said
-        ):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in said:
             yield node.lineno, node.value
 
 
 def test_no_effects_name_stands_outside_its_file():
     package = Path(openjax.__file__).parent
     names = known_effects().keys() - OWN
-    own = {
-        package / "vehicle" / "effects" / f"{name}.py"
-        for name in names - DISTURBANCES.keys()
-    }
+    own = {package / "vehicle" / "effects" / f"{name}.py" for name in names - DISTURBANCES.keys()}
     assert all(path.is_file() for path in own)
     files = {path for room in ROOMS for path in (package / room).rglob("*.py")}
-    files -= {
-        *(package / "vehicle" / "effects").iterdir(),
-        package / "vehicle" / "disturbances.py",
-    }
+    files -= {*(package / "vehicle" / "effects").iterdir(), package / "vehicle" / "disturbances.py"}
     found = [
         f"{path.relative_to(package)}:{line}: {text}"
         for path in sorted(files)

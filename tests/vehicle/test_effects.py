@@ -47,17 +47,10 @@ def vehicle():
 
 
 def state_at(
-    vehicle,
-    position=(0, 0, 0.6),
-    quaternion=None,
-    velocity=(0, 0, 0),
-    body_rates=(0, 0, 0),
+    vehicle, position=(0, 0, 0.6), quaternion=None, velocity=(0, 0, 0), body_rates=(0, 0, 0)
 ):
     drone = hover_state(
-        vehicle,
-        jnp.asarray(position, jnp.float32),
-        quaternion,
-        jnp.asarray(velocity, jnp.float32),
+        vehicle, jnp.asarray(position, jnp.float32), quaternion, jnp.asarray(velocity, jnp.float32)
     )
     return drone.replace(body_rates=jnp.asarray(body_rates, jnp.float32))
 
@@ -76,18 +69,14 @@ def given(name, **values):
 
 def wrench(vehicle, name, values, others=None, **state):
     context = make_context(vehicle, state_at(vehicle, **state), others_position=others)
-    return jax.tree.map(
-        np.asarray, EFFECTS[name].wrench(given(name, **values), context)
-    )
+    return jax.tree.map(np.asarray, EFFECTS[name].wrench(given(name, **values), context))
 
 
 def rotors(vehicle, name, values, **state):
     """(force, torque) of the rotors at hover with an effect on their thrusts."""
     context = make_context(vehicle, state_at(vehicle, **state))
     reaction = rotor_reaction(vehicle, context.rotor_speed)
-    changed = EFFECTS[name].thrust(
-        given(name, **values), context.thrust, reaction, context
-    )
+    changed = EFFECTS[name].thrust(given(name, **values), context.thrust, reaction, context)
     return jax.tree.map(np.asarray, total_wrench(vehicle, *changed))
 
 
@@ -108,9 +97,7 @@ def test_a_product_of_inertia_turns_the_body_as_its_whole_matrix_does(vehicle):
     other = EFFECTS["inertia"].body(given("inertia", **values), vehicle)
     context = make_context(other, state_at(vehicle, body_rates=(3.0, -2.0, 1.0)))
     thrust = jnp.array([0.06, 0.08, 0.1, 0.09], jnp.float32)
-    _, more = EFFECTS["inertia"].wrench(
-        given("inertia", **values), context.replace(thrust=thrust)
-    )
+    _, more = EFFECTS["inertia"].wrench(given("inertia", **values), context.replace(thrust=thrust))
     _, torque = total_wrench(vehicle, thrust, jnp.zeros(4))
     moments, rates, torque = (
         np.asarray(v, float) for v in (other.inertia, context.body_rates, torque)
@@ -132,10 +119,7 @@ def test_body_effects_change_what_they_name(vehicle):
 
     assert changed("mass", extra=0.00321) == {"mass": pytest.approx(1.1, rel=1e-5)}
     scaled = changed("thrust_scale", scale=-0.1)
-    assert scaled == {
-        "thrust_constant": pytest.approx(0.9),
-        "torque_constant": pytest.approx(0.9),
-    }
+    assert scaled == {"thrust_constant": pytest.approx(0.9), "torque_constant": pytest.approx(0.9)}
     assert changed("yaw_torque", ratio=0.2) == {"torque_constant": pytest.approx(0.2)}
     np.testing.assert_allclose(
         changed("inertia", xx=1.2, zz=0.8)["inertia"], [1.2, 1, 0.8], rtol=1e-5
@@ -145,14 +129,9 @@ def test_body_effects_change_what_they_name(vehicle):
 
 
 def test_motor_lag_has_the_time_constants_that_were_asked_for(vehicle):
-    slow = EFFECTS["motor_lag"].body(
-        given("motor_lag", extra_up=0.035, extra_down=0.055), vehicle
-    )
+    slow = EFFECTS["motor_lag"].body(given("motor_lag", extra_up=0.035, extra_down=0.055), vehicle)
     low, high = float(vehicle.max_rotor_speed) * np.sqrt([0.2, 0.8])
-    for start, command, end, time_constant in (
-        (low, 0.8, high, 0.06),
-        (high, 0.2, low, 0.08),
-    ):
+    for start, command, end, time_constant in ((low, 0.8, high, 0.06), (high, 0.2, low, 0.08)):
         speed = jnp.full(4, start)
         times = 0.0
         while abs(speed[0] - end) > np.exp(-1) * abs(start - end):
@@ -167,9 +146,7 @@ def test_com_offset_and_imbalance_trim_differently(vehicle):
     """
     moved = EFFECTS["com_offset"].body(given("com_offset", x=0.002, y=-0.001), vehicle)
     speed = state_at(vehicle).rotor_speed
-    force, torque = total_wrench(
-        moved, rotor_thrust(moved, speed), rotor_reaction(moved, speed)
-    )
+    force, torque = total_wrench(moved, rotor_thrust(moved, speed), rotor_reaction(moved, speed))
     np.testing.assert_allclose(
         torque, [0.001 * force[2], 0.002 * force[2], 0], rtol=1e-3, atol=1e-8
     )
@@ -184,9 +161,7 @@ def test_battery_sag_follows_the_voltage_or_the_time(vehicle):
     def sagged(**context):
         context = make_context(vehicle, state_at(vehicle), **context)
         return float(
-            EFFECTS["battery_sag"].motor(
-                given("battery_sag", exponent=2.0), command, context
-            )[0]
+            EFFECTS["battery_sag"].motor(given("battery_sag", exponent=2.0), command, context)[0]
         )
 
     assert sagged(battery_voltage=3.9) == pytest.approx(0.6)
@@ -212,9 +187,7 @@ def test_saturation_is_one_sided_and_the_curve_is_not(vehicle):
     np.testing.assert_allclose(bent, 0.01 + command + 0.1 * command**2, rtol=1e-6)
     # Absent, it leaves what a curve, or a battery fuller than its reference, gives
     # beyond the nominal largest thrust.
-    absent = EFFECTS["thrust_saturation"].motor(
-        given("thrust_saturation"), 1.2 * command, low
-    )
+    absent = EFFECTS["thrust_saturation"].motor(given("thrust_saturation"), 1.2 * command, low)
     np.testing.assert_allclose(absent, 1.2 * command, rtol=1e-6)
 
 
@@ -234,31 +207,20 @@ def test_rotor_drag_opposes_motion_and_damps_rates(vehicle):
 
 def test_blade_flapping_tilts_back_and_pitches_up(vehicle):
     force, torque = wrench(
-        vehicle,
-        "blade_flapping",
-        {"tilt": 0.02, "stiffness": 1e-4},
-        velocity=(1.5, 0, 0),
+        vehicle, "blade_flapping", {"tilt": 0.02, "stiffness": 1e-4}, velocity=(1.5, 0, 0)
     )
     weight = float(vehicle.mass * vehicle.gravity)
-    np.testing.assert_allclose(
-        force, [-0.02 * 1.5 * weight, 0, 0], rtol=1e-4, atol=1e-9
-    )
+    np.testing.assert_allclose(force, [-0.02 * 1.5 * weight, 0, 0], rtol=1e-4, atol=1e-9)
     np.testing.assert_allclose(torque, [0, -1.5e-4, 0], rtol=1e-4, atol=1e-9)
-    _, torque = wrench(
-        vehicle, "blade_flapping", {"stiffness": 1e-4}, velocity=(0, 1, 0)
-    )
+    _, torque = wrench(vehicle, "blade_flapping", {"stiffness": 1e-4}, velocity=(0, 1, 0))
     assert torque[0] > 0
 
 
 def test_wind_persists_at_rest_and_turns_with_yaw(vehicle):
     values = {"x": 2.0, "drag": 0.01}
+    np.testing.assert_allclose(wrench(vehicle, "wind", values)[0], [0.02, 0, 0], rtol=1e-5)
     np.testing.assert_allclose(
-        wrench(vehicle, "wind", values)[0], [0.02, 0, 0], rtol=1e-5
-    )
-    np.testing.assert_allclose(
-        wrench(vehicle, "wind", values, quaternion=yawed(np.pi / 2))[0],
-        [0, -0.02, 0],
-        atol=1e-7,
+        wrench(vehicle, "wind", values, quaternion=yawed(np.pi / 2))[0], [0, -0.02, 0], atol=1e-7
     )
     np.testing.assert_allclose(
         wrench(vehicle, "wind", values, velocity=(2, 0, 0))[0], [0, 0, 0], atol=1e-8
@@ -269,9 +231,7 @@ def test_wind_persists_at_rest_and_turns_with_yaw(vehicle):
     moving = dict(velocity=(0.5, -1.0, 2.0), body_rates=(1.0, 2.0, 3.0))
     drag = wrench(vehicle, "rotor_drag", {"d_xy": 0.02, "d_z": 0.008}, **moving)
     np.testing.assert_allclose(
-        np.concatenate(wrench(vehicle, "wind", still, **moving)),
-        np.concatenate(drag),
-        rtol=1e-5,
+        np.concatenate(wrench(vehicle, "wind", still, **moving)), np.concatenate(drag), rtol=1e-5
     )
 
 
@@ -302,18 +262,12 @@ def test_a_near_plane_adds_thrust_and_a_gradient_tilts(vehicle, name, plane, sid
 def test_downwash_pushes_only_what_is_below(vehicle):
     def push(other, **values):
         return wrench(
-            vehicle,
-            "downwash",
-            {"force": 0.1, **values},
-            jnp.array([other]),
-            position=(0, 0, 0.5),
+            vehicle, "downwash", {"force": 0.1, **values}, jnp.array([other]), position=(0, 0, 0.5)
         )
 
     right_under, torque = push([0.0, 0, 0.8], width=0.2, spread=0.0)
     rotor_radius_share = np.exp(-(0.043**2) / (2 * 0.2**2))
-    assert right_under[2] == pytest.approx(
-        -0.1 * np.exp(-0.3 / 0.5) * rotor_radius_share, rel=1e-4
-    )
+    assert right_under[2] == pytest.approx(-0.1 * np.exp(-0.3 / 0.5) * rotor_radius_share, rel=1e-4)
     np.testing.assert_allclose(torque, 0, atol=1e-8)
     assert not push([0.0, 0, 0.3])[0].any()
     assert abs(push([0.5, 0, 0.8])[0][2]) < 1e-6
@@ -336,9 +290,7 @@ def test_latency_delays_by_fractions_of_a_step(vehicle):
         return jnp.stack(got)
 
     np.testing.assert_allclose(received(0.0), 0.1 * np.arange(8), atol=1e-6)
-    np.testing.assert_allclose(
-        received(0.025)[4:], 0.1 * (np.arange(4, 8) - 2.5), atol=1e-5
-    )
+    np.testing.assert_allclose(received(0.025)[4:], 0.1 * (np.arange(4, 8) - 2.5), atol=1e-5)
     slope = jax.jacfwd(received)(
         jnp.float32(0.0)
     )  # a fit that starts from no delay must see where to go
@@ -355,9 +307,7 @@ def test_packet_loss_holds_the_last_command(vehicle):
         memory = effect.initial_memory(vehicle, drone, 0.01, jax.random.key(3))
 
         def advance(memory, command):
-            arrived, memory = effect.command(
-                {"probability": probability}, memory, command, context
-            )
+            arrived, memory = effect.command({"probability": probability}, memory, command, context)
             return memory, arrived[0]
 
         return np.asarray(jax.lax.scan(advance, memory, commands)[1])
@@ -385,9 +335,7 @@ def flight(vehicle, effects, steps=20):
     """
     step = make_drones_step("rigid", effects=effects)
     start = hover_state(
-        vehicle,
-        jnp.array([[0.0, 0, 0.2], [0.01, 0, 0.5]]),
-        velocity=jnp.array([0.5, -0.3, 0.1]),
+        vehicle, jnp.array([[0.0, 0, 0.2], [0.01, 0, 0.5]]), velocity=jnp.array([0.5, -0.3, 0.1])
     )
     start = step.reset(vehicle, start, jax.random.key(0))
 
@@ -428,10 +376,7 @@ def test_each_effect_alone_changes_the_flight(fly, name):
     """And only what it may change: latencies of what is seen leave the flight itself
     alone.
     """
-    (nominal, nominal_seen), (changed, seen) = (
-        fly(),
-        fly(**{name: typical(EFFECTS[name])}),
-    )
+    (nominal, nominal_seen), (changed, seen) = (fly(), fly(**{name: typical(EFFECTS[name])}))
     moved = max(
         float(np.abs(changed.position - nominal.position).max()),
         float(np.abs(changed.body_rates - nominal.body_rates).max()),
@@ -451,9 +396,7 @@ def test_all_effects_together_have_finite_gradients(vehicle):
     """Jitted and differentiated, at typical values and at "no effect"."""
     step = make_drones_step("rigid", effects=tuple(EFFECTS))
     start = hover_state(
-        vehicle,
-        jnp.array([[0.0, 0, 0.1], [0.01, 0, 0.4]]),
-        velocity=jnp.array([0.5, -0.3, 0.1]),
+        vehicle, jnp.array([[0.0, 0, 0.1], [0.01, 0, 0.4]]), velocity=jnp.array([0.5, -0.3, 0.1])
     )
     start = step.reset(vehicle, start, jax.random.key(0))
 
@@ -465,24 +408,13 @@ def test_all_effects_together_have_finite_gradients(vehicle):
 
         drones, _ = jax.lax.scan(advance, start, commands(8))
         seen = step.seen(drones, parameters)
-        return (
-            jnp.sum(seen.position)
-            + jnp.sum(drones.body_rates**2)
-            + jnp.sum(drones.velocity**2)
-        )
+        return jnp.sum(seen.position) + jnp.sum(drones.body_rates**2) + jnp.sum(drones.velocity**2)
 
-    for parameters in (
-        NONE,
-        {name: typical(effect) for name, effect in EFFECTS.items()},
-    ):
+    for parameters in (NONE, {name: typical(effect) for name, effect in EFFECTS.items()}):
         value, slope = loss(jax.tree.map(jnp.float32, parameters))
         assert np.isfinite(value)
         assert np.isfinite(jax.tree.leaves(slope)).all()
-    acting = {
-        name
-        for name in EFFECTS
-        if any(float(entry) != 0 for entry in slope[name].values())
-    }
+    acting = {name for name in EFFECTS if any(float(entry) != 0 for entry in slope[name].values())}
     # whether a packet arrives has no slope
     assert acting >= set(EFFECTS) - {"packet_loss"}
 
@@ -493,14 +425,9 @@ def test_an_effect_of_ones_own(vehicle, nominal):
         name="push",
         description="a constant force",
         parameters={"x": Parameter("N", 0.0, (0.0, 1.0), "made up")},
-        wrench=lambda parameters, context: (
-            jnp.stack([parameters["x"], 0, 0]),
-            jnp.zeros(3),
-        ),
+        wrench=lambda parameters, context: (jnp.stack([parameters["x"], 0, 0]), jnp.zeros(3)),
     )
-    states, _ = flight(vehicle, (push, "mass"), steps=3)(
-        {"push": {"x": jnp.float32(0.0321)}}
-    )
+    states, _ = flight(vehicle, (push, "mass"), steps=3)({"push": {"x": jnp.float32(0.0321)}})
     np.testing.assert_allclose(
         states.velocity[2, :, 0] - nominal.velocity[2, :, 0], 0.03, atol=1e-3
     )
@@ -517,9 +444,9 @@ def test_hooks_map_over_logged_states(vehicle):
     def drag(d_xy):
         contexts = jax.vmap(lambda state: make_context(vehicle, state))(states)
         parameters = {"d_xy": d_xy, "d_z": 0.0}
-        return jax.vmap(
-            lambda context: EFFECTS["rotor_drag"].wrench(parameters, context)[0]
-        )(contexts)
+        return jax.vmap(lambda context: EFFECTS["rotor_drag"].wrench(parameters, context)[0])(
+            contexts
+        )
 
     slope = jax.jacfwd(drag)(jnp.float32(0.01))
     np.testing.assert_allclose(slope[:, 0], -np.linspace(-1, 1, 9), atol=1e-6)
@@ -530,9 +457,7 @@ def test_random_effects_need_a_key_and_differ_between_drones(vehicle):
     start = hover_state(vehicle, jnp.zeros((2, 3)))
     with pytest.raises(UserError, match="needs a key"):
         step.reset(vehicle, start)
-    keys = step.reset(vehicle, start, jax.random.key(1)).effect_memory["packet_loss"][
-        "key"
-    ]
+    keys = step.reset(vehicle, start, jax.random.key(1)).effect_memory["packet_loss"]["key"]
     assert (keys[0] != keys[1]).any()
 
 
@@ -540,12 +465,7 @@ def test_random_effects_need_a_key_and_differ_between_drones(vehicle):
 def test_parameters_of_nothing_are_refused(vehicle, wrong):
     step = make_drones_step("rigid", effects=("wind",))
     with pytest.raises(UserError, match="reset"):
-        step(
-            vehicle,
-            hover_state(vehicle, jnp.zeros((1, 3))),
-            jnp.zeros((1, 4)),
-            *NO_PILLARS,
-        )
+        step(vehicle, hover_state(vehicle, jnp.zeros((1, 3))), jnp.zeros((1, 4)), *NO_PILLARS)
     start = step.reset(vehicle, hover_state(vehicle, jnp.zeros((1, 3))))
     with pytest.raises(UserError):
         step(vehicle, start, jnp.zeros((1, 4)), *NO_PILLARS, wrong)
@@ -555,13 +475,10 @@ def test_rate_gains_act_in_the_controller(vehicle):
     soft = EFFECTS["rate_gains"].body(given("rate_gains", p=0.5, i=0.5, d=0.5), vehicle)
     command = jnp.array([0.5, 0.5, 0, 0])
     nominal, halved = (
-        rate_controller(v, state_at(vehicle), command, 0.01)[0] - 0.5
-        for v in (vehicle, soft)
+        rate_controller(v, state_at(vehicle), command, 0.01)[0] - 0.5 for v in (vehicle, soft)
     )
     np.testing.assert_allclose(halved, 0.5 * nominal, rtol=1e-4)
-    assert float(4 * max_rotor_thrust(soft)) == pytest.approx(
-        float(4 * max_rotor_thrust(vehicle))
-    )
+    assert float(4 * max_rotor_thrust(soft)) == pytest.approx(float(4 * max_rotor_thrust(vehicle)))
 
 
 def test_an_effect_of_ones_own_has_a_name_of_its_own():
@@ -576,19 +493,9 @@ def test_usual_ranges_grow_with_the_vehicle_and_stay_for_a_crazyflie():
     from openjax.vehicle.effects.effect import growth
 
     small = load_vehicle()
-    heavy = small.replace(
-        mass=40.0 * small.mass, rotor_position=6.0 * small.rotor_position
-    )
+    heavy = small.replace(mass=40.0 * small.mass, rotor_position=6.0 * small.rotor_position)
     loaded = small.replace(mass=1.5 * small.mass)
-    grown = {
-        "kg": 40.0,
-        "N": 40.0,
-        "N s/m": 40.0,
-        "m": 6.0,
-        "N m s/m": 240.0,
-        "s": 1.0,
-        "1": 1.0,
-    }
+    grown = {"kg": 40.0, "N": 40.0, "N s/m": 40.0, "m": 6.0, "N m s/m": 240.0, "s": 1.0, "1": 1.0}
     for unit, factor in grown.items():
         assert growth(unit, heavy) == pytest.approx(factor), unit
         assert growth(unit, loaded) == 1.0, unit

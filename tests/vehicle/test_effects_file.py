@@ -15,10 +15,7 @@ def test_everything_comes_back(tmp_path):
     path = tmp_path / "effects.toml"
     written = {name: typical(effect) for name, effect in EFFECTS.items()}
     save_effects(
-        path,
-        written,
-        intervals={"rotor_drag": {"d_xy": (0.01, 0.02)}},
-        notes="three flights",
+        path, written, intervals={"rotor_drag": {"d_xy": (0.01, 0.02)}}, notes="three flights"
     )
     names, read = load_effects(path)
     assert names == tuple(sorted(EFFECTS)) and read == written
@@ -87,17 +84,8 @@ def test_what_no_vehicle_has_is_bounded():
     named = {f"{name}.{key}" for name, key in BOUNDED}
     assert {f"inertia.{axis}" for axis in ("xx", "yy", "zz")} <= named
     assert {"motor_lag.extra_up", "motor_lag.extra_down", "yaw_torque.ratio"} <= named
-    assert {
-        "command_latency.delay",
-        "state_latency.delay",
-        "packet_loss.probability",
-    } <= named
-    assert {
-        "mass.extra",
-        "thrust_scale.scale",
-        "rotor_drag.d_xy",
-        "rate_gains.p",
-    } <= named
+    assert {"command_latency.delay", "state_latency.delay", "packet_loss.probability"} <= named
+    assert {"mass.extra", "thrust_scale.scale", "rotor_drag.d_xy", "rate_gains.p"} <= named
     for effect in EFFECTS.values():
         for parameter in effect.parameters.values():
             low, high = parameter.limits()
@@ -124,9 +112,7 @@ def test_what_no_vehicle_has_is_refused_in_one_line(name, key, where, tmp_path):
         with pytest.raises(UserError, match="can't be; it lies between") as caught:
             read(path)
         assert "\n" not in str(caught.value) and f"{name}.{key}" in str(caught.value)
-    path.write_text(
-        f"[{name}]\n{key} = {{ value = {usual}, interval90 = [{least}, {usual}] }}\n"
-    )
+    path.write_text(f"[{name}]\n{key} = {{ value = {usual}, interval90 = [{least}, {usual}] }}\n")
     assert load_intervals(path)[name][key] == (least, usual)
 
 

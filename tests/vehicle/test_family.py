@@ -44,10 +44,7 @@ def test_each_vehicle_is_drawn_from_its_ranges_and_one_effect_at_most_from_the_r
     for name, low, high, rare_low, rare_high in SMALL:
         effect, _, parameter = name.partition(".")
         value = drawn[effect][parameter]
-        assert np.all(
-            (value >= low) & (value <= high)
-            | (value >= rare_low) & (value <= rare_high)
-        )
+        assert np.all((value >= low) & (value <= high) | (value >= rare_low) & (value <= rare_high))
     assert draw_vehicles((), KEY, 3) == {}
 
 
@@ -57,22 +54,16 @@ def test_standard_parameters_are_zero_without_the_effect(airframe):
     family = vehicle_family(airframe)
     for entry in family:
         effect, _, parameter = entry[0].partition(".")
-        none.setdefault(effect, {})[parameter] = jnp.full(
-            2, find_parameter(entry[0])[1].none
-        )
+        none.setdefault(effect, {})[parameter] = jnp.full(2, find_parameter(entry[0])[1].none)
     np.testing.assert_allclose(standard_parameters(family, none), 0.0, atol=1e-6)
-    spread = np.std(
-        standard_parameters(family, draw_vehicles(family, KEY, 500, 0.5)), axis=0
-    )
+    spread = np.std(standard_parameters(family, draw_vehicles(family, KEY, 500, 0.5)), axis=0)
     assert spread.min() > 0.01 and spread.max() < 3.0
 
 
 def test_a_family_grows_from_the_nominal_vehicle():
     np.testing.assert_allclose(narrowed_bounds(SMALL, 0.0), 0.0)
     np.testing.assert_allclose(narrowed_bounds(SMALL, 1.0), family_bounds(SMALL))
-    np.testing.assert_allclose(
-        narrowed_bounds(SMALL, 0.5)[1], [0.005, 0.01, 0.025, 0.03]
-    )
+    np.testing.assert_allclose(narrowed_bounds(SMALL, 0.5)[1], [0.005, 0.01, 0.025, 0.03])
 
 
 @pytest.mark.parametrize(
@@ -92,16 +83,12 @@ def test_impossible_families_are_refused(entry):
 
 def test_a_drone_of_a_mixed_team_flies_as_in_a_team_of_its_own_kind():
     vehicle = load_vehicle()
-    step = make_drones_step(
-        "rigid", substeps=2, effects=family_effects(SMALL), contacts=False
-    )
+    step = make_drones_step("rigid", substeps=2, effects=family_effects(SMALL), contacts=False)
     apart = jnp.array([[0.0, 0.0, 1.0], [3.0, 0.0, 1.0]])
     start = step.reset(vehicle, hover_state(vehicle, apart), KEY)
     command = jnp.array([[0.8, 0.5, 0.2, 0.1]] * 2)
     fly = jax.jit(
-        lambda drones, parameters: step(
-            vehicle, drones, command, *NO_PILLARS, parameters
-        )
+        lambda drones, parameters: step(vehicle, drones, command, *NO_PILLARS, parameters)
     )
     mixed = {
         "mass": {"extra": jnp.array([0.0, 0.005])},
@@ -111,15 +98,11 @@ def test_a_drone_of_a_mixed_team_flies_as_in_a_team_of_its_own_kind():
     for i in range(2):
         own = jax.tree.map(lambda leaf, i=i: leaf[i], mixed)
         alone = fly(fly(start, own), own)
-        np.testing.assert_allclose(
-            together.velocity[i], alone.velocity[i], rtol=1e-5, atol=1e-7
-        )
+        np.testing.assert_allclose(together.velocity[i], alone.velocity[i], rtol=1e-5, atol=1e-7)
         np.testing.assert_allclose(
             together.body_rates[i], alone.body_rates[i], rtol=1e-4, atol=1e-6
         )
-    assert together.velocity[1, 2] != pytest.approx(
-        float(together.velocity[0, 2]), abs=1e-4
-    )
+    assert together.velocity[1, 2] != pytest.approx(float(together.velocity[0, 2]), abs=1e-4)
 
 
 def test_stops_keeps_drones_out_of_floor_pillars_and_one_another():

@@ -63,29 +63,21 @@ def test_momentum_and_energy_without_forces():
         def advance(drone, _):
             return rigid_step(vehicle, drone, zero, zero, dt), None
 
-        end = jax.jit(
-            lambda drone: jax.lax.scan(advance, drone, None, length=10_000)[0]
-        )(start)
+        end = jax.jit(lambda drone: jax.lax.scan(advance, drone, None, length=10_000)[0])(start)
 
         def spin(drone):
             angular = vehicle.inertia * drone.body_rates
-            return rotate(drone.quaternion, angular), 0.5 * jnp.sum(
-                drone.body_rates * angular
-            )
+            return rotate(drone.quaternion, angular), 0.5 * jnp.sum(drone.body_rates * angular)
 
         (momentum0, energy0), (momentum1, energy1) = spin(start), spin(end)
     assert np.linalg.norm(end.body_rates - start.body_rates) > 1, (
         "the body must tumble for this to mean anything"
     )
-    np.testing.assert_allclose(
-        momentum1, momentum0, atol=2e-3 * np.linalg.norm(momentum0)
-    )
+    np.testing.assert_allclose(momentum1, momentum0, atol=2e-3 * np.linalg.norm(momentum0))
     np.testing.assert_allclose(energy1, energy0, rtol=2e-3)
     # a free fall
     np.testing.assert_allclose(end.velocity, [1, -2, 3 - 9.81], rtol=1e-9)
-    np.testing.assert_allclose(
-        end.position, [1, -2, 3 - 0.5 * 9.81 * (1 + dt)], rtol=1e-9
-    )
+    np.testing.assert_allclose(end.position, [1, -2, 3 - 0.5 * 9.81 * (1 + dt)], rtol=1e-9)
 
 
 def test_hover_holds_for_eight_seconds(vehicle, fly):
@@ -143,9 +135,7 @@ def test_rate_controller_by_hand(vehicle):
         body_rates=jnp.array([2.0, 0, 0]) * degree, previous_body_rates=jnp.array([1.0, 0, 0]) * degree,
         rate_integral=jnp.array([5.0, 40, 0]),
     )  # fmt: skip
-    motors, integral = rate_controller(
-        vehicle, state, jnp.array([0.5, 12 * degree, 0, 0]), 0.01
-    )
+    motors, integral = rate_controller(vehicle, state, jnp.array([0.5, 12 * degree, 0, 0]), 0.01)
     np.testing.assert_allclose(integral, [5.1, 33.3, 0], rtol=1e-5)
     roll = 250 * 10 + 500 * 5.1 - 2.5 * 100
     pitch = 500 * 33.3
@@ -159,10 +149,7 @@ def test_motor_lag_is_exact(vehicle):
     target = float(vehicle.max_rotor_speed) * np.sqrt(0.5)
     once = rotor_speed_step(vehicle, start, jnp.full(4, 0.5), 0.02)
     twice = rotor_speed_step(
-        vehicle,
-        rotor_speed_step(vehicle, start, jnp.full(4, 0.5), 0.01),
-        jnp.full(4, 0.5),
-        0.01,
+        vehicle, rotor_speed_step(vehicle, start, jnp.full(4, 0.5), 0.01), jnp.full(4, 0.5), 0.01
     )
     expected = target + (1000.0 - target) * np.exp(-0.02 / 0.025)
     np.testing.assert_allclose(once, expected, rtol=1e-5)
@@ -211,9 +198,7 @@ def test_precision_is_that_of_the_state(vehicle):
                 pillars = jnp.zeros((1, 2), jnp.float32), jnp.ones(1, bool)
                 command = jnp.zeros((2, 4))
                 end = jax.eval_shape(step, vehicle, start, command, *pillars)
-            for before, after in zip(
-                jax.tree.leaves(start), jax.tree.leaves(end), strict=True
-            ):
+            for before, after in zip(jax.tree.leaves(start), jax.tree.leaves(end), strict=True):
                 assert (after.dtype, after.shape, after.weak_type) == (
                     before.dtype,
                     before.shape,
@@ -222,8 +207,7 @@ def test_precision_is_that_of_the_state(vehicle):
 
 
 @pytest.mark.parametrize(
-    "wrong",
-    [{"physics": "warp"}, {"dt": 0.0}, {"substeps": 0}, {"effects": ("magic",)}],
+    "wrong", [{"physics": "warp"}, {"dt": 0.0}, {"substeps": 0}, {"effects": ("magic",)}]
 )
 def test_an_impossible_step_is_refused(wrong):
     with pytest.raises(UserError):

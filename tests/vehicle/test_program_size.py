@@ -22,8 +22,7 @@ def equations(jaxpr) -> int:
     )
     jaxprs = [leaf for leaf in inner if isinstance(leaf, ClosedJaxpr | Jaxpr)]
     return len(jaxpr.eqns) + sum(
-        equations(inner.jaxpr if isinstance(inner, ClosedJaxpr) else inner)
-        for inner in jaxprs
+        equations(inner.jaxpr if isinstance(inner, ClosedJaxpr) else inner) for inner in jaxprs
     )
 
 

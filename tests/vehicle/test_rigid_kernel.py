@@ -32,9 +32,9 @@ def drawn(*lead):
         leaf + scale * jax.random.normal(key, leaf.shape)
         for leaf, scale, key in zip(leaves, scales, keys, strict=False)
     ]
-    command = jax.random.uniform(
-        keys[7], (*lead, 4), minval=-0.2, maxval=1.2
-    ) * jnp.array([1.0, 9, 9, 9])
+    command = jax.random.uniform(keys[7], (*lead, 4), minval=-0.2, maxval=1.2) * jnp.array(
+        [1.0, 9, 9, 9]
+    )
     return structure.unflatten(leaves), command
 
 
@@ -48,11 +48,7 @@ def crowded(worlds):
     active = jnp.array([True, False])
     lead = (worlds, *pillars.shape)
     drones = drones.replace(position=position)
-    return (
-        drones,
-        command,
-        (jnp.broadcast_to(pillars, lead), jnp.broadcast_to(active, lead[:2])),
-    )
+    return (drones, command, (jnp.broadcast_to(pillars, lead), jnp.broadcast_to(active, lead[:2])))
 
 
 def assert_close(got, expected, tolerance=2e-5):
@@ -100,13 +96,10 @@ def test_kernel_computes_contacts():
 def test_mapped_over_worlds_and_over_vehicles():
     drones, command = drawn(5, 3)
     expected = freely(drones, command)
-    assert_close(
-        jax.jit(jax.vmap(lambda d, c: fly(VEHICLE, d, c)))(drones, command), expected
-    )
+    assert_close(jax.jit(jax.vmap(lambda d, c: fly(VEHICLE, d, c)))(drones, command), expected)
     one_command = jax.jit(jax.vmap(lambda d: fly(VEHICLE, d, command[0])))(drones)
     assert_close(
-        one_command,
-        jax.jit(jax.vmap(lambda d: fly_plainly(VEHICLE, d, command[0])))(drones),
+        one_command, jax.jit(jax.vmap(lambda d: fly_plainly(VEHICLE, d, command[0])))(drones)
     )
     heavier = jax.tree.map(lambda leaf: jnp.stack([leaf, 1.2 * leaf]), VEHICLE)
     first = jax.tree.map(lambda leaf: leaf[0], drones)
@@ -139,13 +132,10 @@ def test_worlds_become_more_worlds_of_one_call(monkeypatch):
     expected = jax.jit(
         jax.vmap(lambda *world: mapped_step(AMONG_SOLIDS.fused_step, VEHICLE, *world))
     )(drones, command, pillars)
-    assert_close(
-        jax.tree.map(lambda leaf: leaf.reshape(6, *leaf.shape[2:]), got), expected
-    )
+    assert_close(jax.tree.map(lambda leaf: leaf.reshape(6, *leaf.shape[2:]), got), expected)
     monkeypatch.setattr("openjax.platform.can_compile_for_cuda", lambda: True)
     many = jax.tree.map(
-        lambda leaf: jax.ShapeDtypeStruct((2, WORTH // 2, *leaf.shape[2:]), leaf.dtype),
-        twice,
+        lambda leaf: jax.ShapeDtypeStruct((2, WORTH // 2, *leaf.shape[2:]), leaf.dtype), twice
     )
     traced = str(jax.make_jaxpr(jax.vmap(jax.vmap(step)))(*many))
     assert f"f32[{WORTH},2,3]" in traced and "platform_index" in traced
@@ -161,9 +151,7 @@ def test_derivatives_are_those_of_the_step(argument):
 
     place = {"vehicle": 1, "command": 2}[argument]
     got = jax.jit(jax.grad(partial(height, fly), place - 1))(VEHICLE.mass, command)
-    expected = jax.jit(jax.grad(partial(height, fly_plainly), place - 1))(
-        VEHICLE.mass, command
-    )
+    expected = jax.jit(jax.grad(partial(height, fly_plainly), place - 1))(VEHICLE.mass, command)
     np.testing.assert_allclose(got, expected, rtol=1e-4)
     assert np.abs(expected).max() > 0
 

@@ -26,14 +26,7 @@ from openjax.vehicle import (
 from openjax.vehicle.arena import Arena
 
 SIZES = {"drones": 3, "pillars": 2, "others": 2, "things": 5}
-MODULES = (
-    parameters,
-    inspect.getmodule(rate_controller),
-    rigid_body,
-    rotors,
-    solids,
-    stops,
-)
+MODULES = (parameters, inspect.getmodule(rate_controller), rigid_body, rotors, solids, stops)
 
 
 def is_array(kind):
@@ -46,22 +39,15 @@ def example(kind, name):
         return tuple(example(part, name) for part in typing.get_args(kind))
     kinds = [kind, *typing.get_args(kind)]
     if arrays := [kind for kind in kinds if is_array(kind)]:
-        shape = tuple(
-            SIZES.get(size) or int(size) for size in arrays[0].dim_str.split()
-        )
+        shape = tuple(SIZES.get(size) or int(size) for size in arrays[0].dim_str.split())
         return jnp.full(shape, "bool" in arrays[0].dtypes or 0.5)
     if kind in (Vehicle, Arena):
         return load_vehicle() if kind is Vehicle else Arena()
     if kind is DroneState:
-        return hover_state(
-            load_vehicle(), jnp.eye(3) if name == "drones" else jnp.ones(3)
-        )
+        return hover_state(load_vehicle(), jnp.eye(3) if name == "drones" else jnp.ones(3))
     if dataclasses.is_dataclass(kind):
         return kind(
-            **{
-                name: example(field, name)
-                for name, field in typing.get_type_hints(kind).items()
-            }
+            **{name: example(field, name) for name, field in typing.get_type_hints(kind).items()}
         )
     return None
 
@@ -83,9 +69,7 @@ def shaped_functions():
             own &= set(inspect.signature(function).parameters) <= set(hints)
             own &= Sequence not in {typing.get_origin(hint) for hint in hints.values()}
             if own and any(
-                is_array(kind)
-                for hint in hints.values()
-                for kind in (hint, *typing.get_args(hint))
+                is_array(kind) for hint in hints.values() for kind in (hint, *typing.get_args(hint))
             ):
                 yield pytest.param(function, hints, id=name)
 
@@ -93,11 +77,7 @@ def shaped_functions():
 @pytest.mark.parametrize(("function", "hints"), shaped_functions())
 def test_results_are_of_their_types(function, hints):
     with jaxtyped("context"):
-        given = {
-            name: example(kind, name)
-            for name, kind in hints.items()
-            if name != "return"
-        }
+        given = {name: example(kind, name) for name, kind in hints.items() if name != "return"}
         for name, kind in hints.items():
             if name != "return" and is_array(kind):
                 check(given[name], kind)

@@ -48,26 +48,17 @@ def fly(request):
         command = jnp.zeros((3, 4)).at[:, 0].set(thrust)
 
         def advance(drones, _):
-            drones = step(
-                vehicle, drones, command, jnp.asarray(PILLARS), jnp.asarray(ACTIVE)
-            )
+            drones = step(vehicle, drones, command, jnp.asarray(PILLARS), jnp.asarray(ACTIVE))
             return drones, (drones.position, drones.velocity)
 
         return jax.lax.scan(
-            advance,
-            hover_state(vehicle, position, quaternion, velocity),
-            None,
-            length=150,
+            advance, hover_state(vehicle, position, quaternion, velocity), None, length=150
         )[1]
 
-    def run(
-        position=START, velocity=((0, 0, 0),) * 3, quaternion=(LEVEL,) * 3, thrust=0.6
-    ):
+    def run(position=START, velocity=((0, 0, 0),) * 3, quaternion=(LEVEL,) * 3, thrust=0.6):
         velocity = np.asarray(velocity, float)
         quaternion = np.asarray(quaternion)
-        return jax.tree.map(
-            np.asarray, flight(np.asarray(position), velocity, quaternion, thrust)
-        )
+        return jax.tree.map(np.asarray, flight(np.asarray(position), velocity, quaternion, thrust))
 
     return run
 
@@ -127,8 +118,7 @@ def test_no_gap_narrower_than_a_drone_is_passed(fly, speed):
         draw.uniform(-0.5, 0.5, 12), draw.uniform(-0.03, 0.03, 12), strict=True
     ):
         heading = (
-            np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-            @ through
+            np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]) @ through
         )
         start = np.array([0.4, 0.3]) + offset * across - 0.2 * heading
         pressed = turned([-heading[1], heading[0], 0], np.pi / 2)
@@ -146,8 +136,7 @@ def test_no_gap_narrower_than_a_drone_is_passed(fly, speed):
 
 def test_drones_keep_their_momentum_when_they_meet(fly):
     position, velocity = fly(
-        position=[[0, 0.3, 0.5], *START[1:]],
-        velocity=[[0, 1, 0], [0, -0.5, 0], [0, 0, 0]],
+        position=[[0, 0.3, 0.5], *START[1:]], velocity=[[0, 1, 0], [0, -0.5, 0], [0, 0, 0]]
     )
     met = np.argmin(np.linalg.norm(position[:, 0] - position[:, 1], axis=-1) > 0.102)
     np.testing.assert_allclose(velocity[met + 3, :2, 1].sum(), 0.5, atol=0.02)
@@ -164,9 +153,7 @@ def test_a_drone_on_the_floor_lies_still(fly):
 
 def test_an_inactive_pillar_is_not_there(fly):
     position, _ = fly(
-        position=[[0, 0, 0.5], *START[1:]],
-        velocity=[[0, -2, 0], [0, 0, 0], [0, 0, 0]],
-        thrust=0.62,
+        position=[[0, 0, 0.5], *START[1:]], velocity=[[0, -2, 0], [0, 0, 0], [0, 0, 0]], thrust=0.62
     )
     assert position[-1, 0, 1] < -0.6
 
@@ -178,17 +165,13 @@ def test_solids_change_nothing_in_free_flight(fly):
     vehicle = load_vehicle()
     step = make_drones_step("rigid", contacts=False)
     velocity = np.array([[0.2, 0.1, 0.3], [-0.1, 0.1, 0.2], [0.0, 0.2, 0.1]])
-    tilt = np.stack(
-        [turned([1, 1, 0], 0.1), turned([1, 0, 1], -0.2), turned([0, 1, 1], 0.1)]
-    )
+    tilt = np.stack([turned([1, 1, 0], 0.1), turned([1, 0, 1], -0.2), turned([0, 1, 1], 0.1)])
     command = jnp.zeros((3, 4)).at[:, 0].set(0.65)
 
     @jax.jit
     def flight(drones):
         def advance(drones, _):
-            drones = step(
-                vehicle, drones, command, jnp.asarray(PILLARS), jnp.asarray(ACTIVE)
-            )
+            drones = step(vehicle, drones, command, jnp.asarray(PILLARS), jnp.asarray(ACTIVE))
             return drones, (drones.position, drones.velocity)
 
         return jax.lax.scan(advance, drones, None, length=60)[1]

@@ -78,9 +78,7 @@ def test_an_empty_file_is_the_nominal_vehicle(tmp_path):
     nominal = load_vehicle()
     file = load_vehicle_file(write(tmp_path, ""))
     for name in ("mass", "inertia", "thrust_constant", "torque_constant", "rotor_spin"):
-        np.testing.assert_array_equal(
-            getattr(file.vehicle, name), getattr(nominal, name)
-        )
+        np.testing.assert_array_equal(getattr(file.vehicle, name), getattr(nominal, name))
     assert file.motor_permutation == (0, 1, 2, 3)
 
 
@@ -88,15 +86,12 @@ def test_spin_follows_the_place_and_can_be_reversed(tmp_path):
     nominal = load_vehicle()
     moved = load_vehicle_file(
         write(
-            tmp_path,
-            '[motor]\norder = ["rear_right", "front_right", "front_left", "rear_left"]\n',
+            tmp_path, '[motor]\norder = ["rear_right", "front_right", "front_left", "rear_left"]\n'
         )
     )
     np.testing.assert_array_equal(moved.vehicle.rotor_spin, nominal.rotor_spin)
     assert moved.motor.spin == ("cw", "ccw", "cw", "ccw")
-    reversed_ = load_vehicle_file(
-        write(tmp_path, '[motor]\nspin = ["cw", "ccw", "cw", "ccw"]\n')
-    )
+    reversed_ = load_vehicle_file(write(tmp_path, '[motor]\nspin = ["cw", "ccw", "cw", "ccw"]\n'))
     np.testing.assert_array_equal(reversed_.vehicle.rotor_spin, -nominal.rotor_spin)
 
 
@@ -116,10 +111,7 @@ def test_saving_keeps_text_and_comments_and_replaces_the_calibration(tmp_path):
 
 def test_a_file_made_from_nothing_reads_back(tmp_path):
     file = VehicleFile(
-        vehicle=load_vehicle(),
-        name="new",
-        motor=Motor(command="pwm"),
-        mass_weighed=True,
+        vehicle=load_vehicle(), name="new", motor=Motor(command="pwm"), mass_weighed=True
     )
     save_vehicle_file(tmp_path / "vehicle.toml", file)
     again = load_vehicle_file(tmp_path)
@@ -142,17 +134,11 @@ def test_a_name_or_a_file_says_the_airframe(tmp_path):
 def test_an_mjcf_of_ones_own_goes_where_its_vehicle_file_goes(tmp_path):
     xml = (assets_directory() / "crazyflie.xml").read_text()
     (tmp_path / "heavy.xml").write_text(xml.replace('mass="0.0321"', 'mass="0.0402"'))
-    file = load_vehicle_file(
-        path := write(tmp_path, '[vehicle]\nairframe = "heavy.xml"\n')
-    )
+    file = load_vehicle_file(path := write(tmp_path, '[vehicle]\nairframe = "heavy.xml"\n'))
     copy_vehicle_file(path, tmp_path / "run" / "vehicle.toml")
-    save_vehicle_file(
-        tmp_path / "case" / "vehicle.toml", dataclasses.replace(file, path=None)
-    )
+    save_vehicle_file(tmp_path / "case" / "vehicle.toml", dataclasses.replace(file, path=None))
     for folder in ("run", "case"):
-        assert float(
-            load_vehicle_file(tmp_path / folder).vehicle.mass
-        ) == pytest.approx(0.0402)
+        assert float(load_vehicle_file(tmp_path / folder).vehicle.mass) == pytest.approx(0.0402)
 
 
 @pytest.mark.parametrize(
@@ -162,10 +148,7 @@ def test_an_mjcf_of_ones_own_goes_where_its_vehicle_file_goes(tmp_path):
         ("[vehicle]\nairframe = '../none.xml'", "name of an MJCF file beside it"),
         ("[vehicle]\nairframe = ''", "it must be crazyflie, brushless, or"),
         ("[vehicle]\nairframe = ['brushless']", "expected text"),
-        (
-            "[vehicle]\nmas = 0.03",
-            "vehicle has the unknown key 'mas'; did you mean mass",
-        ),
+        ("[vehicle]\nmas = 0.03", "vehicle has the unknown key 'mas'; did you mean mass"),
         ("[vehicles.1]\ninertia = 1", "unknown key 'inertia'"),
         ("[motors]\ncommand = 'pwm'", "unknown key 'motors'; did you mean motor"),
         ("[motor]\ncommand = 'rpm'", "motor.command is 'rpm'; expected one of"),
@@ -174,33 +157,18 @@ def test_an_mjcf_of_ones_own_goes_where_its_vehicle_file_goes(tmp_path):
             "motor.order",
         ),
         ("[motor]\nspin = ['cw', 'cw', 'cw', 'ccw']", "motor.spin"),
-        (
-            "[vehicle]\ninertia = [1e-5, 1e-5, 3e-5]",
-            "none of the three is larger than the sum",
-        ),
+        ("[vehicle]\ninertia = [1e-5, 1e-5, 3e-5]", "none of the three is larger than the sum"),
         ("[log]\nfloor_z = 1.0\nceiling_z = 0.9", "must be above floor_z, 1 m"),
-        (
-            "[log]\nmotor_rows = 'average'",
-            "log.motor_rows is 'average'; expected one of",
-        ),
+        ("[log]\nmotor_rows = 'average'", "log.motor_rows is 'average'; expected one of"),
         ("[vehicle]\nmass = 32.1", "it must be in .0.005, 10. kg"),
         ("[vehicle]\nmass = -1", "it must be in"),
         ("[vehicle]\nmass = nan", "finite number"),
         ("[vehicle]\nmass_weighed = 'yes'", "expected true or false"),
-        (
-            "[calibrated.drag]\nvalue = 1",
-            "calibrated: a key is 'drag'; expected one of 'mass'",
-        ),
+        ("[calibrated.drag]\nvalue = 1", "calibrated: a key is 'drag'; expected one of 'mass'"),
         ("[calibrated.mass]\nvalue = 0.03", "calibrated.mass lacks interval90"),
-        (
-            "[calibrated.mass]\nvalue = 30\ninterval90 = [29, 31]\nunit = 'g'",
-            "must be in 'kg'",
-        ),
+        ("[calibrated.mass]\nvalue = 30\ninterval90 = [29, 31]\nunit = 'g'", "must be in 'kg'"),
         ("[calibrated.inertia]\nvalue = 1e-5\ninterval90 = [1e-5, 2e-5]", "3 numbers"),
-        (
-            "[calibrated.mass]\nvalue = 1e-9\ninterval90 = [0, 1]",
-            "far from the nominal",
-        ),
+        ("[calibrated.mass]\nvalue = 1e-9\ninterval90 = [0, 1]", "far from the nominal"),
         ("[log]\nx = " + "[" * 500 + "]" * 500, "nested more than"),
         ("[log]\nx = 1" + "0" * 40, "more than 64 bits"),
         ("[vehicle", "not readable as TOML"),
@@ -229,9 +197,7 @@ def test_a_heavy_vehicle_by_its_mass_and_inertia_has_the_airframes_shape(tmp_pat
     path.write_text(f"[vehicle]\nmass = 1.5\ninertia = {inertia}\n")
     vehicle = load_vehicle_file(path).vehicle
     np.testing.assert_allclose(vehicle.inertia, inertia, rtol=1e-6)
-    np.testing.assert_allclose(
-        vehicle.rotor_position, longer * small.rotor_position, rtol=1e-5
-    )
+    np.testing.assert_allclose(vehicle.rotor_position, longer * small.rotor_position, rtol=1e-5)
     # hover at the same share of the largest thrust, roll torque per inertia as geometry
     # says
     weight = [float(v.mass / v.thrust_constant) for v in (small, vehicle)]

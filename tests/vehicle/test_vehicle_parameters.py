@@ -23,9 +23,7 @@ def test_nominal_numbers_come_out_of_the_compiled_model():
         vehicle = jax.tree.map(np.asarray, load_vehicle(dtype="float64"))
     assert vehicle.mass == pytest.approx(0.0321)
     np.testing.assert_allclose(vehicle.inertia, [1.4e-5, 1.4e-5, 2.17e-5])
-    np.testing.assert_allclose(
-        np.linalg.norm(vehicle.rotor_position, axis=1), 0.043, rtol=1e-6
-    )
+    np.testing.assert_allclose(np.linalg.norm(vehicle.rotor_position, axis=1), 0.043, rtol=1e-6)
     assert np.sign(vehicle.rotor_position).tolist() == [
         [1, -1, 0],
         [-1, -1, 0],
@@ -35,12 +33,12 @@ def test_nominal_numbers_come_out_of_the_compiled_model():
     assert vehicle.rotor_spin.tolist() == [-1, 1, -1, 1]
     assert vehicle.torque_constant == pytest.approx(7.24e-10)
     assert max_rotor_thrust(vehicle) == pytest.approx(0.12596, rel=1e-5)
-    assert 4 * max_rotor_thrust(vehicle) / (
-        vehicle.mass * vehicle.gravity
-    ) == pytest.approx(1.60, abs=0.01)
-    assert 4 * vehicle.thrust_constant * hover_rotor_speed(
-        vehicle
-    ) ** 2 == pytest.approx(0.0321 * 9.81)
+    assert 4 * max_rotor_thrust(vehicle) / (vehicle.mass * vehicle.gravity) == pytest.approx(
+        1.60, abs=0.01
+    )
+    assert 4 * vehicle.thrust_constant * hover_rotor_speed(vehicle) ** 2 == pytest.approx(
+        0.0321 * 9.81
+    )
     np.testing.assert_allclose(vehicle.rate_kp, [250, 250, 120])
     np.testing.assert_allclose(vehicle.rate_integral_limit, [33.3, 33.3, 166.7])
 
@@ -49,16 +47,10 @@ def test_the_brushless_one_meets_its_sources():
     with jax.enable_x64(True):
         vehicle = jax.tree.map(np.asarray, load_vehicle("brushless", "float64"))
     assert vehicle.mass == pytest.approx(0.0434)
-    np.testing.assert_allclose(
-        np.linalg.norm(vehicle.rotor_position, axis=1), 0.05, rtol=1e-4
-    )
+    np.testing.assert_allclose(np.linalg.norm(vehicle.rotor_position, axis=1), 0.05, rtol=1e-4)
     # crazyflow's curves of thrust and torque over rpm, from hover to the firmware's
     # largest thrust
-    rpm = (
-        np.linspace(hover_rotor_speed(vehicle), vehicle.max_rotor_speed, 5)
-        * 60
-        / (2 * np.pi)
-    )
+    rpm = np.linspace(hover_rotor_speed(vehicle), vehicle.max_rotor_speed, 5) * 60 / (2 * np.pi)
     thrust = -3.133427e-7 * rpm + 4.407355e-10 * rpm**2
     torque = 1.658864e-9 * rpm + 2.469348e-12 * rpm**2
     speed = rpm * 2 * np.pi / 60
@@ -69,9 +61,7 @@ def test_the_brushless_one_meets_its_sources():
 
 def test_an_airframe_is_registered_from_outside(tmp_path, monkeypatch):
     monkeypatch.setattr("openjax.vehicle.parameters.AIRFRAMES", dict(AIRFRAMES))
-    with pytest.raises(
-        UserError, match="airframe mine: unknown; there are crazyflie, brushless"
-    ):
+    with pytest.raises(UserError, match="airframe mine: unknown; there are crazyflie, brushless"):
         PursuitSettings(airframe="mine")
     mjcf = tmp_path / "heavy.xml"
     shipped = (assets_directory() / "crazyflie.xml").read_text()

@@ -18,12 +18,7 @@ from openjax.flying.crtp import (
 )
 from openjax.flying.motion_capture import find_feed
 from openjax.flying.set_point import ANGLES, OFF, RATES, SetPoint
-from openjax.virtual_crazyflie.firmware import (
-    LEVEL_AFTER,
-    STOP_AFTER,
-    WATCHDOG,
-    VirtualFirmware,
-)
+from openjax.virtual_crazyflie.firmware import LEVEL_AFTER, STOP_AFTER, WATCHDOG, VirtualFirmware
 from openjax.virtual_crazyflie.link import LinkFaults, VirtualLink
 from openjax.virtual_crazyflie.tables import LOG_VARIABLES, Sensors
 
@@ -40,16 +35,11 @@ SENSORS = Sensors(
 
 def ask(firmware, port, channel, data, now=0.0):
     return [
-        decode(raw)
-        for raw in firmware.receive(Packet(port, channel, bytes(data)).encode(), now)
+        decode(raw) for raw in firmware.receive(Packet(port, channel, bytes(data)).encode(), now)
     ]
 
 
-@given(
-    st.lists(st.floats(-1, 1), min_size=4, max_size=4).filter(
-        lambda q: np.linalg.norm(q) > 0.1
-    )
-)
+@given(st.lists(st.floats(-1, 1), min_size=4, max_size=4).filter(lambda q: np.linalg.norm(q) > 0.1))
 def test_quaternions_come_out_of_32_bits_as_the_same_attitude(wxyz):
     wxyz = np.array(wxyz) / np.linalg.norm(wxyz)
     again = expand_quaternion(compress_quaternion(wxyz))
@@ -66,9 +56,7 @@ def test_a_log_block_holds_what_was_asked_for_in_its_units_and_order():
     firmware = VirtualFirmware()
     names = list(LOG_VARIABLES)
     wanted = [("stateEstimateZ.x", 5), ("gyro.y", 8), ("motor.m3", 2), ("pm.vbatMV", 2)]
-    block = b"".join(
-        struct.pack("<BH", kind, names.index(name)) for name, kind in wanted
-    )
+    block = b"".join(struct.pack("<BH", kind, names.index(name)) for name, kind in wanted)
     assert ask(firmware, Port.LOG, 1, bytes([6, 9]) + block)[0].data == bytes([6, 9, 0])
     assert ask(firmware, Port.LOG, 1, [3, 9, 1])[0].data == bytes([3, 9, 0])
     assert firmware.logs.packets(firmware, 0.009, SENSORS) == []
@@ -96,9 +84,7 @@ def test_old_set_points_are_levelled_and_then_stop_the_motors():
     firmware = VirtualFirmware(needs_arming=False)
     firmware.accept(SetPoint(RATES, 1.0, 2.0, 3.0, 0.6), 10.0)
     assert firmware.set_point(10.4).roll == 1.0
-    assert firmware.set_point(10.01 + LEVEL_AFTER) == SetPoint(
-        ANGLES, 0.0, 0.0, 0.0, 0.6
-    )
+    assert firmware.set_point(10.01 + LEVEL_AFTER) == SetPoint(ANGLES, 0.0, 0.0, 0.0, 0.6)
     assert firmware.set_point(10.01 + STOP_AFTER).mode == OFF
 
 
@@ -143,9 +129,7 @@ def test_no_packet_breaks_it(data, header):
     assert np.isfinite(firmware.set_point(1.0)).all()
 
 
-@pytest.mark.parametrize(
-    "host, port", [("127.0.0.1", 65536), ("nohost.invalid", 1), ("x" * 80, 1)]
-)
+@pytest.mark.parametrize("host, port", [("127.0.0.1", 65536), ("nohost.invalid", 1), ("x" * 80, 1)])
 def test_an_address_that_cannot_be_had_is_named(host, port):
     with pytest.raises(UserError, match=f"UDP port {port} of {host} can't be had"):
         VirtualLink(host, port, LinkFaults(), 0)

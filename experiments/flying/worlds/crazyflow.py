@@ -53,9 +53,7 @@ class CrazyflowBodies(Bodies):
 
     def _slope(self, s, speeds):
         x, velocity, q, rates, rotor = (part.T for part in np.split(s, (3, 6, 10, 13)))
-        x, q, velocity, rates, rotor = self.model(
-            x, q, velocity, rates, speeds.T, rotor_vel=rotor
-        )
+        x, q, velocity, rates, rotor = self.model(x, q, velocity, rates, speeds.T, rotor_vel=rotor)
         return np.concatenate([part.T for part in (x, velocity, q, rates, rotor)])
 
 
@@ -77,9 +75,7 @@ class CrazyflowWorld(RotorPyWorld):
         self._curve = load_params("first_principles", VEHICLE)["rpm2thrust"]
         hover = float(vehicle.mass * vehicle.gravity) / (4 * self._most)
         rotors = self.speeds(np.full((4, start["x"].shape[1]), hover))
-        return CrazyflowBodies(
-            parametrize(dynamics, VEHICLE), start | {"rotor_speeds": rotors}
-        )
+        return CrazyflowBodies(parametrize(dynamics, VEHICLE), start | {"rotor_speeds": rotors})
 
     def speeds(self, motors):
         """See `RotorPyWorld`."""
@@ -94,10 +90,7 @@ class CrazyflowWorld(RotorPyWorld):
 
     def fly(self, command):
         """See `RotorPyWorld`."""
-        row = {
-            name: value.reshape(-1, value.shape[-1])
-            for name, value in self._seen.items()
-        }
+        row = {name: value.reshape(-1, value.shape[-1]) for name, value in self._seen.items()}
         row["body_rates"] = (
             self.bodies.rates + self.air["gyro_bias"] + self.air["gyro"][5 * self.tick]
         ).T
@@ -130,26 +123,19 @@ def main() -> None:
         return worlds[0]
 
     statistics = play(policy, game, tasks, keys, make_world)
-    rows = {
-        n: np.stack([row[n] for row in worlds[0].rows], 1) for n in worlds[0].rows[0]
-    }
+    rows = {n: np.stack([row[n] for row in worlds[0].rows], 1) for n in worlds[0].rows[0]}
     options.out.mkdir(parents=True)
     for i, layout in enumerate(options.layouts):
         vehicles = []
         for j in range(worlds[0].team * i, worlds[0].team * (i + 1)):
             columns = {
-                c: x[j, :, k]
-                for n, x in rows.items()
-                for k, c in enumerate(CHANNEL_COLUMNS[n])
+                c: x[j, :, k] for n, x in rows.items() for k, c in enumerate(CHANNEL_COLUMNS[n])
             }
             vehicles.append({"t": PERIOD * np.arange(game.episode_length)} | columns)
         write_csv(options.out / f"{layout}.csv.gz", log_of(vehicles, layout), {"t": 4})
         print(
             layout,
-            {
-                n: float(getattr(statistics, n)[i])
-                for n in ("captured", "capture_step", "crashed")
-            },
+            {n: float(getattr(statistics, n)[i]) for n in ("captured", "capture_step", "crashed")},
         )
     (options.out / "vehicle.toml").write_text(VEHICLE_TOML, encoding="utf-8")
 

@@ -9,13 +9,7 @@ from typing import Protocol
 import jax
 import numpy as np
 
-from openjax.pursuit import (
-    EpisodeStatistics,
-    Pursuit,
-    PursuitSettings,
-    Task,
-    action_to_command,
-)
+from openjax.pursuit import EpisodeStatistics, Pursuit, PursuitSettings, Task, action_to_command
 from openjax.vehicle import DroneState
 
 Poses = dict[str, np.ndarray]
@@ -47,8 +41,7 @@ def per_world(team: int, position, quaternion, velocity) -> Poses:
     """Poses of bodies in the last axis, (3, W * N) and so on, as `Poses`."""
     parts = {"position": position, "quaternion": quaternion, "velocity": velocity}
     return {
-        n: np.asarray(x).T.reshape(-1, team, len(x)).astype(np.float32)
-        for n, x in parts.items()
+        n: np.asarray(x).T.reshape(-1, team, len(x)).astype(np.float32) for n, x in parts.items()
     }
 
 
@@ -57,10 +50,7 @@ class SeenElsewhere:
 
     def reset(self, vehicle, drones: DroneState, key=None) -> DroneState:
         """Drones that are seen where they are."""
-        shown = {
-            name: getattr(drones, name)
-            for name in ("position", "quaternion", "velocity")
-        }
+        shown = {name: getattr(drones, name) for name in ("position", "quaternion", "velocity")}
         return drones.replace(effect_memory=shown)
 
     def seen(self, drones: DroneState, effect_parameters=None) -> DroneState:
@@ -103,9 +93,7 @@ def _compiled(settings, policy):
     game = Pursuit(settings, dynamics=SeenElsewhere())
 
     def observe(state, seen):
-        return game.observe(
-            state.replace(drones=state.drones.replace(effect_memory=seen))
-        )
+        return game.observe(state.replace(drones=state.drones.replace(effect_memory=seen)))
 
     def act(weights, observation):
         action = policy.act(weights, observation)

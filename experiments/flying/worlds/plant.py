@@ -35,9 +35,7 @@ def sensors_of(seed: int, number: int) -> dict:
     return sensors_drawn | {"rate": 100, "pose_rate": 100, "dropped": 0.0}
 
 
-def air_of(
-    drawn: dict, seed: int, number: int, ticks: int, worlds: range, team: int
-) -> dict:
+def air_of(drawn: dict, seed: int, number: int, ticks: int, worlds: range, team: int) -> dict:
     """Air of the teams of `worlds`, each with its own gusts, noise and battery; bodies
     last.
     """
@@ -46,9 +44,7 @@ def air_of(
         rng = rng_of(seed, number, 3, world)
         voltage = drawn["voltage"] + rng.uniform(-0.15, 0.1)
         for _ in range(team):
-            bodies.append(
-                sensors.draw_air(rng, drawn, ticks, voltage + rng.uniform(-0.02, 0.02))
-            )
+            bodies.append(sensors.draw_air(rng, drawn, ticks, voltage + rng.uniform(-0.02, 0.02)))
     return sensors.stack(bodies)
 
 
@@ -131,27 +127,16 @@ class PlantWorld:
         ticks += 1  # a pose is measured after the last step, too
         arrival = np.repeat(10 * np.arange(ticks)[:, None], count, axis=1)
         if cause is not None:
-            injection.inject(
-                cause, parameters, everyone, arrival, rng_of(seed, number, 4, first)
-            )
+            injection.inject(cause, parameters, everyone, arrival, rng_of(seed, number, 4, first))
         index = everyone.reshape(worlds, self.team)
         self.flight = plant.Flight(
             vehicles_told,
             parameters,
-            air_of(
-                sensors_drawn,
-                seed,
-                number,
-                ticks,
-                range(first, first + worlds),
-                self.team,
-            ),
+            air_of(sensors_drawn, seed, number, ticks, range(first, first + worlds), self.team),
             arrival,
             np.asarray(drones.position, float).reshape(count, 3).T,
             np.asarray(drones.quaternion, float).reshape(count, 4).T,
-            partners=[
-                np.roll(index, -shift, axis=1).ravel() for shift in range(1, self.team)
-            ],
+            partners=[np.roll(index, -shift, axis=1).ravel() for shift in range(1, self.team)],
             solids=solids_of(tasks, self.team),
         )
         self.flight.look()

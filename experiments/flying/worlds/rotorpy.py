@@ -45,9 +45,7 @@ class Bodies:
 
     def __init__(self, model, state: dict[str, np.ndarray]):
         self.model = model
-        self.state = np.concatenate(
-            [state[name] for name in ("x", "v", "q", "w", "rotor_speeds")]
-        )
+        self.state = np.concatenate([state[name] for name in ("x", "v", "q", "w", "rotor_speeds")])
 
     @property
     def position(self) -> np.ndarray:
@@ -98,9 +96,7 @@ class Bodies:
         drag = 0.0
         if model.aero:
             air = v.rotate_back(attitude, s[3:6])
-            at_hubs = air[:, None] + np.cross(
-                rates[:, None], hubs.T[:, :, None], axis=0
-            )
+            at_hubs = air[:, None] + np.cross(rates[:, None], hubs.T[:, :, None], axis=0)
             drag = -np.sqrt((air * air).sum(axis=0)) * (model.drag_matrix @ air)
             force -= rotor * np.einsum("ij,jrb->irb", model.rotor_drag_matrix, at_hubs)
             force[2] += model.k_h * (at_hubs[0] ** 2 + at_hubs[1] ** 2)
@@ -136,9 +132,7 @@ class RotorPyWorld:
       first: number of the first episode, from which its noise is drawn.
     """
 
-    def __init__(
-        self, drones: DroneState, tasks: Task, ticks: int, seed: int, first: int = 0
-    ):
+    def __init__(self, drones: DroneState, tasks: Task, ticks: int, seed: int, first: int = 0):
         worlds, self.team = drones.position.shape[:2]
         count = worlds * self.team
         quaternion = np.asarray(drones.quaternion, float).reshape(count, 4).T
@@ -164,13 +158,9 @@ class RotorPyWorld:
         """
         from rotorpy.vehicles.multirotor import Multirotor
 
-        model = Multirotor(
-            crazyflie(), control_abstraction="cmd_motor_speeds", aero=True
-        )
+        model = Multirotor(crazyflie(), control_abstraction="cmd_motor_speeds", aero=True)
         hover = np.sqrt(model.mass * v.GRAVITY / (4 * model.k_eta))
-        return Bodies(
-            model, start | {"rotor_speeds": np.full((4, start["x"].shape[1]), hover)}
-        )
+        return Bodies(model, start | {"rotor_speeds": np.full((4, start["x"].shape[1]), hover)})
 
     def speeds(self, motors) -> np.ndarray:
         """The rotors' speeds at which motor commands (4, B) settle."""
@@ -179,10 +169,7 @@ class RotorPyWorld:
     def poses(self) -> Poses:
         """Where the vehicles are."""
         return per_world(
-            self.team,
-            self.bodies.position,
-            self.bodies.quaternion,
-            self.bodies.velocity,
+            self.team, self.bodies.position, self.bodies.quaternion, self.bodies.velocity
         )
 
     def measure(self) -> Poses:
@@ -196,9 +183,7 @@ class RotorPyWorld:
         )
         quaternion /= np.sqrt((quaternion * quaternion).sum(axis=0))
         position = bodies.position - delay * bodies.velocity + air["seen_position"][k]
-        return per_world(
-            self.team, position, quaternion, bodies.velocity + air["seen_velocity"][k]
-        )
+        return per_world(self.team, position, quaternion, bodies.velocity + air["seen_velocity"][k])
 
     def fly(self, command) -> None:
         """One tick: five times the rate loop and RotorPy's equations, then solid
@@ -206,9 +191,7 @@ class RotorPyWorld:
         """
         command = command.reshape(-1, 4).T
         for part in range(PER_TICK):
-            noise = (
-                self.air["gyro_bias"] + self.air["gyro"][PER_TICK * self.tick + part]
-            )
+            noise = self.air["gyro_bias"] + self.air["gyro"][PER_TICK * self.tick + part]
             self.motors = self.firmware(command, self.bodies.rates + noise)
             self.bodies.step(self.speeds(self.motors), SAMPLE)
         self.solids.stop(self.bodies.position, self.bodies.velocity)

@@ -76,16 +76,12 @@ def make_world(world: str, ticks: int, start: int, drones, tasks):
     if name == "rotorpy":
         return RotorPyWorld(drones, tasks, ticks, SEED, first=start)
     if name != "plant" or (effect and effect not in SIZES):
-        raise SystemExit(
-            f"world {world!r} is unknown; known: {', '.join((*PLAIN, *CAUSES))}"
-        )
+        raise SystemExit(f"world {world!r} is unknown; known: {', '.join((*PLAIN, *CAUSES))}")
     number = 0 if not effect else 1 + list(SIZES).index(effect)
     cause = None
     if effect:
         form = effects.EFFECTS[effect].forms[0]
-        cause = effects.draw(rng_of(SEED, number, 5), effect, form) | {
-            "size": SIZES[effect]
-        }
+        cause = effects.draw(rng_of(SEED, number, 5), effect, form) | {"size": SIZES[effect]}
     return PlantWorld(drones, tasks, ticks, SEED, number, cause, first=start)
 
 
@@ -113,18 +109,12 @@ def do(job: Job) -> tuple[Job, dict[str, list[float]], float]:
     begin = time.perf_counter()
     loaded, settings = loaded_policy(job.policy, job.held_out)
     task = scenario_task(settings, SCENARIOS[job.layout])
-    tasks = jax.tree.map(
-        lambda leaf: np.repeat(np.asarray(leaf)[None], job.number, axis=0), task
-    )
+    tasks = jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf)[None], job.number, axis=0), task)
     numbers = np.arange(job.start, job.start + job.number)
-    keys = jax.vmap(functools.partial(jax.random.fold_in, jax.random.key(SEED)))(
-        numbers
-    )
+    keys = jax.vmap(functools.partial(jax.random.fold_in, jax.random.key(SEED)))(numbers)
     make = functools.partial(make_world, job.world, settings.episode_length, job.start)
     statistics = play(loaded, settings, tasks, keys, make)
-    figures = {
-        name: np.asarray(getattr(statistics, name), float).tolist() for name in FIGURES
-    }
+    figures = {name: np.asarray(getattr(statistics, name), float).tolist() for name in FIGURES}
     return job, figures, time.perf_counter() - begin
 
 
@@ -148,27 +138,20 @@ def study(options: argparse.Namespace) -> dict:
     ]
     found = defaultdict(lambda: defaultdict(list))
     records = {}
-    results = share_out(
-        do, [(job,) for job in jobs], min(options.jobs, len(jobs)), options.seconds
-    )
+    results = share_out(do, [(job,) for job in jobs], min(options.jobs, len(jobs)), options.seconds)
     for number, (job, figures, seconds) in enumerate(results, 1):
         policy = f"{job.policy}, held-out evaders" if job.held_out else job.policy
         place = found[policy, job.world, job.layout]
         places = records.setdefault(policy, {}).setdefault(job.world, {})
         for name, values in figures.items():
             place[name] += values
-        means = " ".join(
-            f"{name} {np.mean(values):.3f}" for name, values in figures.items()
-        )
+        means = " ".join(f"{name} {np.mean(values):.3f}" for name, values in figures.items())
         of = f"{number}/{len(jobs)} {job.policy} {job.world} {job.layout} {job.start}"
         print(
-            f"{of} {means} ({seconds:.0f} s, {time.monotonic() - started:.0f} s in all)",
-            flush=True,
+            f"{of} {means} ({seconds:.0f} s, {time.monotonic() - started:.0f} s in all)", flush=True
         )
         record = {"episodes": len(place["crashed"])}
-        places[job.layout] = record | {
-            name: float(np.mean(place[name])) for name in FIGURES
-        }
+        places[job.layout] = record | {name: float(np.mean(place[name])) for name in FIGURES}
     return {"records": records}
 
 
@@ -180,22 +163,15 @@ def page(results: dict) -> Page:
             records = worlds.get(world, {})
             about = {"world": world, "policy": policy}
             for layout, record in records.items():
-                rates = {
-                    name: f"{record[name]:.3f}" for name in ("captured", "crashed")
-                }
+                rates = {name: f"{record[name]:.3f}" for name in ("captured", "crashed")}
                 rows.append({**about, "layout": layout, **record, **rates})
             if records:
                 mean = {
-                    name: np.mean([record[name] for record in records.values()])
-                    for name in FIGURES
+                    name: np.mean([record[name] for record in records.values()]) for name in FIGURES
                 }
-                mean["episodes"] = sum(
-                    record["episodes"] for record in records.values()
-                )
+                mean["episodes"] = sum(record["episodes"] for record in records.values())
                 for name in ("captured", "crashed"):
-                    hits = binomtest(
-                        round(mean[name] * mean["episodes"]), mean["episodes"]
-                    )
+                    hits = binomtest(round(mean[name] * mean["episodes"]), mean["episodes"])
                     low, high = hits.proportion_ci(method="wilson")
                     mean[name] = f"{mean[name]:.3f} [{low:.2f}, {high:.2f}]"
                 rows.append({**about, "layout": "**mean**", **mean})
@@ -227,21 +203,13 @@ def overview(records: dict) -> Table:
 
     def mean(policy: str, world: str, figure: str) -> float:
         layouts = records[policy].get(world, {})
-        return (
-            float(np.mean([r[figure] for r in layouts.values()]))
-            if layouts
-            else math.nan
-        )
+        return float(np.mean([r[figure] for r in layouts.values()])) if layouts else math.nan
 
-    worlds_flown = dict.fromkeys(
-        world for worlds in records.values() for world in worlds
-    )
+    worlds_flown = dict.fromkeys(world for worlds in records.values() for world in worlds)
     shown = [world for world in worlds_flown if ":" not in world]
     rows = []
     for world in shown:
-        rates = {
-            (p, f): mean(p, world, f) for p in records for f in ("captured", "crashed")
-        }
+        rates = {(p, f): mean(p, world, f) for p in records for f in ("captured", "crashed")}
         rows.append({"world": world, **rates})
     causes = [world for world in worlds_flown if ":" in world]
     first = next(iter(records))
@@ -276,17 +244,12 @@ def main() -> None:
     """Fly, or read, and write the page."""
     parser = page_parser(__doc__, "worlds")
     parser.add_argument(
-        "--policy",
-        nargs="+",
-        default=["open", "flight"],
-        help="names, runs or policy files",
+        "--policy", nargs="+", default=["open", "flight"], help="names, runs or policy files"
     )
     parser.add_argument(
         "--world", nargs="+", default=list(PLAIN), help=", ".join((*PLAIN, *CAUSES))
     )
-    parser.add_argument(
-        "--held_out", action="store_true", help="against the held-out evaders"
-    )
+    parser.add_argument("--held_out", action="store_true", help="against the held-out evaders")
     parser.add_argument("--layout", nargs="+", default=list(SCENARIOS))
     parser.add_argument("--episodes", type=int, default=100, help="per layout")
     parser.add_argument(
@@ -294,9 +257,6 @@ def main() -> None:
     )
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument(
-        "--seconds",
-        type=float,
-        default=math.inf,
-        help="begin nothing new after this long",
+        "--seconds", type=float, default=math.inf, help="begin nothing new after this long"
     )
     publish(parser.parse_args(), study, page)

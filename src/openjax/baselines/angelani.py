@@ -35,9 +35,7 @@ class AngelaniParameters:
     """Distance from their surface at which that is half of its weight (m)."""
 
 
-def angelani(
-    craft: Craft, parameters: AngelaniParameters, around: Surroundings
-) -> jax.Array:
+def angelani(craft: Craft, parameters: AngelaniParameters, around: Surroundings) -> jax.Array:
     """Desired velocities (..., N, 3), m/s, world.
 
     v = v_max N[N(r_e - r_i) + w_a N(sum_j v_j) + w_r sum_j N(r_i - r_j) / (1 +
@@ -48,9 +46,7 @@ def angelani(
         return jax.nn.sigmoid((middle - distance) / parameters.width)
 
     distance = vectors.length(around.from_others)
-    repulsion = fermi(distance, parameters.repulsion_range)[..., None] * unit(
-        around.from_others
-    )
+    repulsion = fermi(distance, parameters.repulsion_range)[..., None] * unit(around.from_others)
 
     nearness = fermi(around.obstacle_distance, parameters.obstacle_range)
     sideways = jnp.sum(nearness[..., None] * around.obstacle_normal, axis=-2)

@@ -12,13 +12,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from openjax.baselines.parameters import parameter
-from openjax.baselines.surroundings import (
-    Craft,
-    Surroundings,
-    length,
-    level,
-    upward,
-)
+from openjax.baselines.surroundings import Craft, Surroundings, length, level, upward
 from openjax.vehicle.vectors import unit
 
 SAFE_PURSUER = 0.14
@@ -71,9 +65,7 @@ def forces(parameters: ApfParameters, around: Surroundings) -> Forces:
     rho = jnp.asarray(parameters.influence)
     margin = jnp.asarray(parameters.margin)
     # an axis more: each pursuer's parameters hold for all of its obstacles
-    each = push(
-        around.obstacle_distance, eta[..., None], rho[..., None], margin[..., None]
-    )
+    each = push(around.obstacle_distance, eta[..., None], rho[..., None], margin[..., None])
     from_floor = push(around.floor_distance, eta, rho, margin)
     from_ceiling = push(around.ceiling_distance, eta, rho, margin)
 
@@ -116,9 +108,7 @@ def wall_following(field: Forces, velocity: jax.Array) -> jax.Array:
     # 1 is the size of the attraction
     is_pushed = length(field.individual) > 1.0
     heading = jnp.where(is_pushed, field.individual, unit(velocity))[..., :2]
-    side = jnp.where(
-        jnp.sum(tangent * heading, axis=-1, keepdims=True) >= 0.0, 1.0, -1.0
-    )
+    side = jnp.where(jnp.sum(tangent * heading, axis=-1, keepdims=True) >= 0.0, 1.0, -1.0)
     climb = field.attraction + field.repulsion + field.individual
     along = side * tangent + jnp.where(field.inside[..., None], away, 0.0)
     return unit(level(along) + upward(unit(climb)[..., 2]))

@@ -27,10 +27,7 @@ class CraftPolicy(Policy):
 
     @classmethod
     def for_environment(
-        cls,
-        environment: Pursuit,
-        network: NetworkSettings,
-        predictor: PredictorSettings,
+        cls, environment: Pursuit, network: NetworkSettings, predictor: PredictorSettings
     ) -> "CraftPolicy":
         """The policy for an environment; its mean starts at `start`.
 

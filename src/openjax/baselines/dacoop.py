@@ -45,13 +45,9 @@ class DacoopPolicy(CraftPolicy):
         """The action (..., N, 4) in -1..1 that a sample (..., N, 2) of the Gaussian, or
         its mean, stands for.
         """
-        return velocity_action(
-            self.craft, observation, self.desired_velocity(sample, observation)
-        )
+        return velocity_action(self.craft, observation, self.desired_velocity(sample, observation))
 
-    def desired_velocity(
-        self, sample: jax.Array, observation: Observation
-    ) -> jax.Array:
+    def desired_velocity(self, sample: jax.Array, observation: Observation) -> jax.Array:
         """Velocities (..., N, 3), m/s, world, that a sample stands for."""
         parameters = field_parameters(super().action(sample, observation))
         return apf(self.craft, parameters, surroundings(self.craft, observation))
@@ -64,9 +60,7 @@ def field_parameters(output: jax.Array) -> ApfParameters:
         low, high = ranges(ApfParameters)[name]
         outputs[name] = low * (high / low) ** (0.5 * (output[..., i] + 1.0))
     constants = {
-        name: getattr(START, name)
-        for name in ranges(ApfParameters)
-        if name not in LEARNED
+        name: getattr(START, name) for name in ranges(ApfParameters) if name not in LEARNED
     }
     return ApfParameters(**constants, **outputs)
 

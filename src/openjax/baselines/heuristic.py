@@ -93,9 +93,7 @@ class Heuristic(WithoutNetwork):
 
     def mean(self, actor: Any, observation: Observation) -> jax.Array:
         """Action (..., N, 4) in -1..1."""
-        velocity = METHODS[self.name].rule(
-            self.craft, actor, surroundings(self.craft, observation)
-        )
+        velocity = METHODS[self.name].rule(self.craft, actor, surroundings(self.craft, observation))
         return velocity_action(self.craft, observation, velocity)
 
 

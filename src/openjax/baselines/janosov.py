@@ -11,13 +11,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from openjax.baselines.parameters import parameter
-from openjax.baselines.surroundings import (
-    Craft,
-    Surroundings,
-    length,
-    level,
-    upward,
-)
+from openjax.baselines.surroundings import Craft, Surroundings, length, level, upward
 from openjax.vehicle.vectors import unit
 
 
@@ -47,9 +41,7 @@ class JanosovParameters:
     """That size in units of the speed; the prey's over the chasers' in the source."""
 
 
-def janosov(
-    craft: Craft, parameters: JanosovParameters, around: Surroundings
-) -> jax.Array:
+def janosov(craft: Craft, parameters: JanosovParameters, around: Surroundings) -> jax.Array:
     """Desired velocities (..., N, 3), m/s, world: the sum of the terms, cut at the
     largest speed.
     """
@@ -61,33 +53,22 @@ def janosov(
     relative = around.velocity - around.target_velocity
     # a prey that isn't seen has no velocity to be damped against
     is_seen = jnp.any(around.target_velocity != 0.0, axis=-1, keepdims=True)
-    friction = jnp.where(
-        is_seen, relative / jnp.maximum(length(to_target) ** 2, 1e-4), 0.0
-    )
-    chase = unit(
-        unit(prediction - around.position) - parameters.chase_friction * friction
-    )
+    friction = jnp.where(is_seen, relative / jnp.maximum(length(to_target) ** 2, 1e-4), 0.0)
+    chase = unit(unit(prediction - around.position) - parameters.chase_friction * friction)
 
     distance = length(around.from_others)
     away = around.from_others / distance
     spread = away * jnp.maximum(parameters.interaction_range - distance, 0.0)
-    spread = (
-        spread
-        - parameters.interaction_friction * around.from_others_velocity / distance**2
-    )
+    spread = spread - parameters.interaction_friction * around.from_others_velocity / distance**2
     within = distance < parameters.interaction_range
     spread = jnp.sum(jnp.where(within, spread, 0.0), axis=-2)
-    avoidance = jnp.sum(
-        away * jnp.maximum(parameters.avoidance_range - distance, 0.0), axis=-2
-    )
+    avoidance = jnp.sum(away * jnp.maximum(parameters.avoidance_range - distance, 0.0), axis=-2)
 
     def soft_wall(gap):
         """0 from `wall_range` on, 1 at the surface, a half sine between (equation
         6).
         """
-        return 0.5 + 0.5 * jnp.cos(
-            jnp.pi * jnp.clip(gap / parameters.wall_range, 0.0, 1.0)
-        )
+        return 0.5 + 0.5 * jnp.cos(jnp.pi * jnp.clip(gap / parameters.wall_range, 0.0, 1.0))
 
     nearness = soft_wall(around.obstacle_distance)
     sideways = jnp.sum(nearness[..., None] * around.obstacle_normal, axis=-2)
@@ -95,10 +76,7 @@ def janosov(
     vertical = soft_wall(around.floor_distance) - soft_wall(around.ceiling_distance)
     walls = level(sideways) + upward(vertical)
     terms = (
-        chase
-        + parameters.interaction * unit(spread)
-        + unit(avoidance)
-        + parameters.wall * walls
+        chase + parameters.interaction * unit(spread) + unit(avoidance) + parameters.wall * walls
     )
     # cut, not normalised: a chaser whose terms cancel hovers
     return craft.speed * terms / jnp.maximum(length(terms), 1.0)

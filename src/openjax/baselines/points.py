@@ -27,9 +27,7 @@ class Points:
         """They start where they are."""
         return drones
 
-    def __call__(
-        self, vehicle, drones: DroneState, command: jax.Array, *_
-    ) -> DroneState:
+    def __call__(self, vehicle, drones: DroneState, command: jax.Array, *_) -> DroneState:
         """The points a step later; nothing is solid to them."""
         share = command[:, 1:] / jnp.pi
         velocity = self.speed * share / jnp.maximum(length(share), 1.0)
@@ -44,12 +42,7 @@ class Points:
 
 def game_of_points(**changes) -> Pursuit:
     """A game of points in an arena without pillars, if its tasks have none."""
-    defaults = {
-        "physics": "stops",
-        "speed_limit": "none",
-        "min_pillars": 0,
-        "max_pillars": 1,
-    }
+    defaults = {"physics": "stops", "speed_limit": "none", "min_pillars": 0, "max_pillars": 1}
     settings = PursuitSettings(**(defaults | changes))
     return Pursuit(settings, dynamics=Points(settings.max_speed, settings.time_step))
 
@@ -71,14 +64,11 @@ class Team:
 def stack_team(environment: Pursuit) -> Team:
     """Stack, by points that correct themselves within a step."""
     settings = environment.settings
-    craft = dataclasses.replace(
-        Craft.of(environment), speed=settings.max_speed, response=0.0
-    )
+    craft = dataclasses.replace(Craft.of(environment), speed=settings.max_speed, response=0.0)
     # a gain of one over the step: what is amiss is gone at the next one
     parameters = StackParameters(tolerance=0.05, gain=1.0 / settings.time_step)
     return Team(
         lambda observation: (
-            stack(craft, parameters, surroundings(craft, observation))
-            / settings.max_speed
+            stack(craft, parameters, surroundings(craft, observation)) / settings.max_speed
         )
     )

@@ -111,9 +111,7 @@ def stack(craft: Craft, parameters: StackParameters, around: Surroundings) -> ja
     aside = jnp.stack([-out[..., 1], out[..., 0]], axis=-1)
     along = jnp.sum(place * out, axis=-1)
     across = jnp.sum(place * aside, axis=-1)
-    ready = (jnp.abs(height) < parameters.tolerance) & (
-        jnp.abs(across) < parameters.tolerance
-    )
+    ready = (jnp.abs(height) < parameters.tolerance) & (jnp.abs(across) < parameters.tolerance)
     # all must stand before any moves: the bound holds for a whole stack only
     ready = jnp.all(ready & (along > -parameters.tolerance), axis=-1, keepdims=True)
 
@@ -133,9 +131,7 @@ def stack(craft: Craft, parameters: StackParameters, around: Surroundings) -> ja
 
     # before that each flies to its place on the axis
     gather = -parameters.gain * place
-    size = jnp.sqrt(
-        jnp.sum(gather**2, axis=-1) + (parameters.gain * height) ** 2 + 1e-12
-    )
+    size = jnp.sqrt(jnp.sum(gather**2, axis=-1) + (parameters.gain * height) ** 2 + 1e-12)
     gather = gather * jnp.minimum(1.0, craft.speed / size)[..., None]
     rise = parameters.gain * height * jnp.minimum(1.0, craft.speed / size)
     level = jnp.where(ready[..., None], forwards, gather)

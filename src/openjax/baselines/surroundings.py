@@ -146,11 +146,7 @@ def _obstacles(craft, observation):
     to_pillar = jnp.where(observation.pillar_seen, across - pillar[..., 4], jnp.inf)
     radius = vectors.length(position[..., :2], keepdims=True)
     normal = jnp.concatenate(
-        [
-            pillar[..., :2] / across[..., None],
-            (-position[..., :2] / radius)[..., None, :],
-        ],
-        axis=-2,
+        [pillar[..., :2] / across[..., None], (-position[..., :2] / radius)[..., None, :]], axis=-2
     )
     distance = jnp.concatenate([to_pillar, craft.arena_radius - radius], axis=-1)
     # along today's normal: straight on, a drone might come out behind a pillar

@@ -131,9 +131,7 @@ def calibrate(case: Case) -> Calibration:
         )
     evidence = gather(dataclasses.replace(case, flights=usable), library())
     exposure = evidence.motion.exposure
-    effects = [
-        e for e in CARDS if e in FITTED or (e in BESIDE and exposure[e] >= UNEXPOSED)
-    ]
+    effects = [e for e in CARDS if e in FITTED or (e in BESIDE and exposure[e] >= UNEXPOSED)]
     replay = _without_numbers(evidence.replay)
     fit = fit_set(replay, effects, iterations=ITERATIONS)
     nothing = fit_set(replay, ())
@@ -177,11 +175,7 @@ def logarithms(theta: np.ndarray, vehicle, duty_cycles: bool) -> dict[str, np.nd
     """
     at = {key: theta[place] for key, place in PLACE.items() if key[0] in FITTED}
     thrust = 1.0 + at["thrust_scale", "scale"]
-    torque = (
-        (1.0 if duty_cycles else thrust)
-        * at["yaw_torque", "ratio"]
-        / at["inertia", "zz"]
-    )
+    torque = (1.0 if duty_cycles else thrust) * at["yaw_torque", "ratio"] / at["inertia", "zz"]
     lag = 0.5 * (at["motor_lag", "extra_up"] + at["motor_lag", "extra_down"])
     estimates = {
         "thrust_constant": [thrust],
@@ -189,14 +183,10 @@ def logarithms(theta: np.ndarray, vehicle, duty_cycles: bool) -> dict[str, np.nd
         "motor_time_constant": [1.0 + lag / float(vehicle.motor_time_constant)],
         "inertia": [at["inertia", "xx"], at["inertia", "yy"]],
     }
-    return {
-        name: np.log(np.maximum(values, 1e-3)) for name, values in estimates.items()
-    }
+    return {name: np.log(np.maximum(values, 1e-3)) for name, values in estimates.items()}
 
 
-def _quantities(
-    evidence: Evidence, fit: SetFit, rates_fit: bool
-) -> dict[str, Quantity]:
+def _quantities(evidence: Evidence, fit: SetFit, rates_fit: bool) -> dict[str, Quantity]:
     file = evidence.case.vehicle_file
     vehicle = evidence.vehicles[0]
     duty_cycles = file.motor.command == "pwm"
@@ -277,9 +267,7 @@ def _cannot_tell(
     out = []
     untold = []
     if file.motor.command == "pwm":
-        out.append(
-            _UNKNOWN_MAP.format(scale=1.0 + fit.theta[PLACE["thrust_scale", "scale"]])
-        )
+        out.append(_UNKNOWN_MAP.format(scale=1.0 + fit.theta[PLACE["thrust_scale", "scale"]]))
         untold.append("thrust_constant")
     if not file.mass_weighed:
         out.append(_NOT_WEIGHED.format(grams=float(evidence.vehicles[0].mass) * 1e3))
@@ -289,29 +277,19 @@ def _cannot_tell(
         untold += TOLD_BY_RATES
     names = [n for n in _ADVICE if n not in untold and not quantities[n].determined]
     return out + [
-        f"{n.replace('_', ' ')}: these flights hardly excite it; {_ADVICE[n]}"
-        for n in names
+        f"{n.replace('_', ' ')}: these flights hardly excite it; {_ADVICE[n]}" for n in names
     ]
 
 
-def _explained_shares(
-    replay, nothing: SetFit, fit: SetFit
-) -> dict[str, tuple[float, float]]:
+def _explained_shares(replay, nothing: SetFit, fit: SetFit) -> dict[str, tuple[float, float]]:
     """Per kind of channel the share of its changes over HORIZON that the nominal
     vehicle explains, and the fitted one.
     """
-    kinds = {
-        "body rates": slice(0, 3),
-        "velocity": slice(3, 6),
-        "specific force": slice(8, 9),
-    }
+    kinds = {"body rates": slice(0, 3), "velocity": slice(3, 6), "specific force": slice(8, 9)}
     steps = [max(round(HORIZON / t.dt), 1) for t in replay.tracks]
 
     def square(values, channels) -> float:
-        changes = (
-            v[n:, channels] - v[:-n, channels]
-            for v, n in zip(values, steps, strict=True)
-        )
+        changes = (v[n:, channels] - v[:-n, channels] for v, n in zip(values, steps, strict=True))
         return float(sum((c**2).sum() for c in changes))
 
     residuals = (residuals_of(nothing), residuals_of(fit))
@@ -319,7 +297,5 @@ def _explained_shares(
     for kind, channels in kinds.items():
         if replay.usable[channels].all():
             total = square(replay.measurements, channels)
-            shares[kind] = tuple(
-                1.0 - square(residual, channels) / total for residual in residuals
-            )
+            shares[kind] = tuple(1.0 - square(residual, channels) / total for residual in residuals)
     return shares

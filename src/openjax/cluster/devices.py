@@ -66,9 +66,7 @@ def check_memory(settings: TrainSettings, number: int) -> None:
     tasks = 3 * game.num_pursuers + 3 + 3 * game.max_pillars
     observation_size = game.self_size + game.privileged_size + 5 * game.observed_pillars
     history = game.history_length * game.history_spacing * game.frame_size
-    per_world = (
-        tasks + history + settings.rollout_length * game.num_pursuers * observation_size
-    )
+    per_world = tasks + history + settings.rollout_length * game.num_pursuers * observation_size
     shared_out = settings.num_envs * per_world / number
     validation = 2 * settings.validation_episodes * (tasks + history)
     # four bytes a number; the archive and the validation are the same on each device
@@ -107,9 +105,7 @@ def everywhere(number: int) -> jax.sharding.Sharding:
 def own_copy(tree: Any) -> Any:
     """Arrays that every device has whole, on this process' first device."""
     device = jax.local_devices()[0]
-    return jax.tree.map(
-        lambda leaf: jax.device_put(leaf.addressable_data(0), device), tree
-    )
+    return jax.tree.map(lambda leaf: jax.device_put(leaf.addressable_data(0), device), tree)
 
 
 def make_device_step(settings: TrainSettings, parts: Parts, number: int) -> Callable:
@@ -137,14 +133,9 @@ def make_device_first_flights(
     carry = FirstCarry(same, same, PartitionSpec(AXIS), same)
     begin = _shared_out(number, flights.begin, (same, same), carry)
     some = _shared_out(
-        number,
-        make_first_flights(flights, together),
-        (carry, same, same),
-        (carry, same),
+        number, make_first_flights(flights, together), (carry, same, same), (carry, same)
     )
-    at = {
-        name: NamedSharding(_mesh(number), spec) for name, spec in vars(carry).items()
-    }
+    at = {name: NamedSharding(_mesh(number), spec) for name, spec in vars(carry).items()}
     return begin, some, FirstCarry(**at)
 
 
@@ -180,6 +171,4 @@ def _mesh(number):
 
 def _carry_of(shared_out, same):
     fields = TrainCarry.__dataclass_fields__
-    return TrainCarry(
-        **{name: shared_out if name in _SHARED_OUT else same for name in fields}
-    )
+    return TrainCarry(**{name: shared_out if name in _SHARED_OUT else same for name in fields})

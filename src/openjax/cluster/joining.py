@@ -76,9 +76,7 @@ def find_membership(
             "number less one"
         )
     if not all_devices:
-        raise UserError(
-            f"{number} processes train on all of their devices; add --devices all"
-        )
+        raise UserError(f"{number} processes train on all of their devices; add --devices all")
     return Membership(address, number, index, detection) if number > 1 else None
 
 
@@ -92,9 +90,7 @@ def _detect(place):
     from jax._src.clusters import ClusterEnv
 
     for name in _MANAGERS:
-        kind = next(
-            (kind for kind in ClusterEnv._cluster_types if kind.name == name), None
-        )
+        kind = next((kind for kind in ClusterEnv._cluster_types if kind.name == name), None)
         if kind is not None and kind.is_env_present():
             address, number, index = place
             parameters = ClusterEnv.auto_detect_unset_distributed_params(
@@ -116,9 +112,7 @@ def join(membership: Membership | None) -> Iterator[Processes]:
         yield Processes()
         return
     with _connect(membership) as (connections, address):
-        processes = Processes(
-            membership.num_processes, membership.process_id, connections
-        )
+        processes = Processes(membership.num_processes, membership.process_id, connections)
         _tune_alone()
         try:
             import jax
@@ -192,9 +186,7 @@ def _listen(port):
     both = socket.has_dualstack_ipv6()
     try:
         return socket.create_server(
-            ("", port),
-            family=socket.AF_INET6 if both else socket.AF_INET,
-            dualstack_ipv6=both,
+            ("", port), family=socket.AF_INET6 if both else socket.AF_INET, dualstack_ipv6=both
         )
     except OSError as error:
         raise UserError(
@@ -223,9 +215,7 @@ def _held_open(host, port):
                     continue
                 server_end.settimeout(None)
                 for source, sink in ((client, server_end), (server_end, client)):
-                    threading.Thread(
-                        target=_pump, args=(source, sink), daemon=True
-                    ).start()
+                    threading.Thread(target=_pump, args=(source, sink), daemon=True).start()
 
     with socket.create_server(("127.0.0.1", 0)) as server:
         threading.Thread(target=serve, daemon=True).start()

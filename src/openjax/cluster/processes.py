@@ -45,10 +45,7 @@ class Processes:
     """
 
     def __init__(
-        self,
-        number: int = 1,
-        index: int = 0,
-        connections: dict[int, Connection] | None = None,
+        self, number: int = 1, index: int = 0, connections: dict[int, Connection] | None = None
     ):
         """`connections` by process: to all others on process 0, to process 0
         elsewhere.
@@ -103,11 +100,7 @@ class Processes:
         self._ending.acquire(blocking=False)
         # what all did wrong, each reports by itself in the meantime
         self._send_all(
-            {
-                "error": f"process {self.index} ended: {text}",
-                "status": status,
-                "after": GRACE,
-            }
+            {"error": f"process {self.index} ended: {text}", "status": status, "after": GRACE}
         )
         for link in self._links.values():
             link.close(2 * GRACE)
@@ -135,9 +128,7 @@ class Processes:
             return
         if self.is_first:
             self._send_all(message, but=source)
-        timer = threading.Timer(
-            message["after"], _exit, (message["status"], message["error"])
-        )
+        timer = threading.Timer(message["after"], _exit, (message["status"], message["error"]))
         timer.daemon = True
         timer.start()
 
@@ -166,9 +157,7 @@ class _Link:
 
     def start(self) -> None:
         for target in (self._read, self._beat):
-            threading.Thread(
-                target=target, name=f"process {self._other}", daemon=True
-            ).start()
+            threading.Thread(target=target, name=f"process {self._other}", daemon=True).start()
 
     def send(self, message: dict) -> None:
         # what is wrong, the reader sees

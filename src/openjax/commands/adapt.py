@@ -23,14 +23,10 @@ def main(arguments: Sequence[str]) -> int:
     """
     command = parse(AdaptCommand, AdaptCommand(), arguments, "openjax adapt")
     if not command.flights.exists():
-        raise UserError(
-            f"{command.flights}: no such folder of flights, nor effects.toml"
-        )
+        raise UserError(f"{command.flights}: no such folder of flights, nor effects.toml")
     check_output_folder(command.out, "--out")
     if command.out.exists() and not command.overwrite:
-        raise UserError(
-            f"{command.out} already exists: choose another --out or give --overwrite"
-        )
+        raise UserError(f"{command.out} already exists: choose another --out or give --overwrite")
     if command.compilation_cache:
         cache_programs()
     import jax
@@ -40,13 +36,9 @@ def main(arguments: Sequence[str]) -> int:
 
     console = output_console()
     on_cpu = jax.default_backend() == "cpu"
-    command = dataclasses.replace(
-        command, episodes=command.episodes or (128 if on_cpu else 1024)
-    )
+    command = dataclasses.replace(command, episodes=command.episodes or (128 if on_cpu else 1024))
     check(command)
-    with Steps(
-        f"adapting {command.policy}", ON_CPU if on_cpu else STEPS, console
-    ) as steps:
+    with Steps(f"adapting {command.policy}", ON_CPU if on_cpu else STEPS, console) as steps:
         results = adapt(command, steps.begin)
     for line in in_words(results):
         console.print(line, soft_wrap=True)

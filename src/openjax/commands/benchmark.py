@@ -50,9 +50,7 @@ def main(arguments: Sequence[str]) -> int:
     facts = {"command": " ".join([PROGRAM, *arguments]), "machine": machine}
     facts["compilation_cache"] = jax.config.jax_compilation_cache_dir is not None
     sweep = _sweep(command)
-    with Steps(
-        "measuring", {name: seconds for name, *_, seconds in sweep}, console
-    ) as steps:
+    with Steps("measuring", {name: seconds for name, *_, seconds in sweep}, console) as steps:
         for name, part, number, _ in sweep:
             steps.begin(name)
             for case in cases(command, part, number):
@@ -61,9 +59,7 @@ def main(arguments: Sequence[str]) -> int:
                 console.print(_line(rows[-1]), soft_wrap=True)
                 # after each measurement, so that an interrupted sweep leaves what it
                 # has
-                write_json(
-                    command.json, {**facts, "settings": command.settings, "rows": rows}
-                )
+                write_json(command.json, {**facts, "settings": command.settings, "rows": rows})
     if sentence := _programs_and_step(rows):
         print(sentence)
     print(f"written to {command.json}")
@@ -95,10 +91,7 @@ def _sweep(command) -> list[tuple[str, str, int, float]]:
             numbers = command.training_envs
             programs = 5 * len(command.devices)
         seconds = SECONDS[part] + programs * command.seconds
-        sweep += [
-            (f"{part}, {number:,} environments", part, number, seconds)
-            for number in numbers
-        ]
+        sweep += [(f"{part}, {number:,} environments", part, number, seconds) for number in numbers]
     return sweep
 
 
@@ -125,9 +118,7 @@ def _row(case, settings, timing) -> dict:
     if case.name in PHYSICS:
         physics = case.name.split("_")[0]
     # without seconds it ran out of memory
-    speed = (
-        None if timing.seconds is None else case.num_envs * case.steps / timing.seconds
-    )
+    speed = None if timing.seconds is None else case.num_envs * case.steps / timing.seconds
     return {
         "part": case.name,
         "physics": physics,

@@ -45,11 +45,7 @@ def run(arguments: Arguments, console: Console):
     from openjax.flights.case import load_case
     from openjax.vehicle.vehicle_file import load_vehicle_file, save_vehicle_file
 
-    out = (
-        arguments.case / "vehicle_calibrated.toml"
-        if arguments.out is None
-        else arguments.out
-    )
+    out = arguments.case / "vehicle_calibrated.toml" if arguments.out is None else arguments.out
     if out.exists() and not arguments.overwrite:
         raise UserError(
             f"{out}: exists already; use --overwrite to replace it or --out for another file"
@@ -80,9 +76,7 @@ def run(arguments: Arguments, console: Console):
 
 def _print(result, console: Console) -> None:
     title = f"Calibrated on {len(result.flights)} flights, {result.seconds:.0f} s"
-    table = numbers_table(
-        title, ("quantity", "value", "90 % interval", "of nominal", "")
-    )
+    table = numbers_table(title, ("quantity", "value", "90 % interval", "of nominal", ""))
     for name, quantity in result.quantities.items():
         for i, value in enumerate(quantity.value):
             label = name.replace("_", " ")

@@ -90,14 +90,10 @@ def train(
 def _train(command, parts):
     """The policy of a run, as `train` gives it."""
     with quiet_compiler():
-        status = start(
-            command, ["(called from Python)"], time.monotonic(), Processes(), parts
-        )
+        status = start(command, ["(called from Python)"], time.monotonic(), Processes(), parts)
     run = command.resume or command.out
     if status:
-        raise UserError(
-            f"training in {run} stopped at a NaN; what is left to look at lies there"
-        )
+        raise UserError(f"training in {run} stopped at a NaN; what is left to look at lies there")
     return load_policy(run, parts.environment, parts.policy)
 
 
@@ -148,9 +144,7 @@ def evaluate(
     if isinstance(policy, str | Path):
         policy = load_policy(policy)
     elif not isinstance(policy, LoadedPolicy):
-        policy = own_controller(
-            policy, changed(PursuitSettings(), **changes), "own controller"
-        )
+        policy = own_controller(policy, changed(PursuitSettings(), **changes), "own controller")
     number = changes.pop("num_pursuers", None)
     command = EvaluateCommand(
         policy=(policy.source,),

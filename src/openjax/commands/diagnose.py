@@ -15,12 +15,7 @@ import tyro
 from rich.panel import Panel
 from rich.text import Text
 
-from openjax.command_line import (
-    one_line,
-    one_thread_for_matrices,
-    output_console,
-    parse,
-)
+from openjax.command_line import one_line, one_thread_for_matrices, output_console, parse
 from openjax.errors import UserError
 from openjax.files import check_output, check_output_folder, replacing, write_json
 from openjax.show.progress import Steps
@@ -30,9 +25,7 @@ from openjax.vehicle.effect_names import effect_names
 PROGRAM = "openjax diagnose"
 SECONDS = 5.0
 """Of a case on a laptop, about."""
-_WITHOUT_HELP = (
-    f"Effects that are not to be looked for: any of {', '.join(effect_names())}."
-)
+_WITHOUT_HELP = f"Effects that are not to be looked for: any of {', '.join(effect_names())}."
 
 
 @dataclass(frozen=True)
@@ -66,9 +59,7 @@ def main(arguments: Sequence[str]) -> int:
     """Run the command; the exit status is 0, or 2 if nothing could be diagnosed."""
     options = parse(Options, Options(cases=tyro.MISSING), arguments, PROGRAM)
     if "--reference" in arguments and not options.reference:
-        raise UserError(
-            "--reference needs at least one folder of flights before the change"
-        )
+        raise UserError("--reference needs at least one folder of flights before the change")
     return run(options)
 
 
@@ -89,9 +80,7 @@ def run(options: Options) -> int:
     for i, (folder, name) in enumerate(zip(options.cases, names, strict=True)):
         try:
             # shows how long all that are still to come will take
-            with Steps(
-                "diagnosing", {case: SECONDS for case in names[i:]}, console
-            ) as steps:
+            with Steps("diagnosing", {case: SECONDS for case in names[i:]}, console) as steps:
                 steps.begin(name)
                 title, lines, prediction = _diagnosis(
                     options, folder, name, partial(steps.begin, name)
@@ -99,17 +88,13 @@ def run(options: Options) -> int:
         except UserError as error:
             failures += 1
             print(f"error: {one_line(error)}", file=sys.stderr)
-        except (
-            Exception
-        ) as error:  # a fault of the program in one case must not cost the others
+        except Exception as error:  # a fault of the program in one case must not cost the others
             failures += 1
             print(f"error: {_unforeseen(name, error)}", file=sys.stderr)
         else:
             predictions[name] = prediction
             console.print(
-                Panel(
-                    Text("\n".join(lines)), title=f"{name}: {title}", title_align="left"
-                )
+                Panel(Text("\n".join(lines)), title=f"{name}: {title}", title_align="left")
             )
     if options.predictions is not None and predictions:
         write_json(options.predictions, predictions)
@@ -127,9 +112,7 @@ def _checked_names(options: Options) -> list[str]:
     names = [case.resolve().name for case in options.cases]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
-        raise UserError(
-            f"two cases are called {twice!r}: their reports would overwrite each other"
-        )
+        raise UserError(f"two cases are called {twice!r}: their reports would overwrite each other")
     cases = {case.resolve() for case in options.cases}
     itself = next((day for day in options.reference if day.resolve() in cases), None)
     if itself is not None:
@@ -164,13 +147,10 @@ def _diagnosis(
     with replacing(options.out / name) as partial_folder:
         partial_folder.mkdir()
         write_report(answer, partial_folder, options.html)
-    report_file = (
-        options.out / name / ("report.html" if options.html else "report.json")
-    )
+    report_file = options.out / name / ("report.html" if options.html else "report.json")
     more = f" (and {len(answer.notes) - 1} more in the report)"
     remark = [
-        f"Noted in the logs: {text}{more * (len(answer.notes) > 1)}."
-        for text in answer.notes[:1]
+        f"Noted in the logs: {text}{more * (len(answer.notes) > 1)}." for text in answer.notes[:1]
     ]
     lines = [*remark, *answer.in_words(), f"({seconds:.1f} s; {report_file})"]
     return answer.title, lines, answer.prediction()

@@ -159,9 +159,7 @@ def prepare(command: EvaluateCommand, arguments: Sequence[str]) -> list[tuple]:
     return policies
 
 
-def fly_scenarios(
-    command: EvaluateCommand, policy, evaluators: dict
-) -> tuple[list[dict], list]:
+def fly_scenarios(command: EvaluateCommand, policy, evaluators: dict) -> tuple[list[dict], list]:
     """A record (see `openjax.evaluation.evaluator.FIELDS`) and the first episode's
     `Trajectory` per scenario.
 
@@ -203,9 +201,7 @@ def fly_scenarios(
     with Steps(f"flying {policy.source}", durations, output_console()) as steps:
 
         def tell(layout):
-            steps.begin(
-                layout, "compiled first" if not is_compiled and layout == first else ""
-            )
+            steps.begin(layout, "compiled first" if not is_compiled and layout == first else "")
 
         episodes = evaluators[kind].fly(
             policy.parameters, tasks, jax.random.key(command.seed), tell
@@ -221,11 +217,7 @@ def _settings(command):
     number = command.num_pursuers
     if settings.team_sizes:
         return settings.of_one_team(number or LAYOUT_PURSUERS)
-    return (
-        settings
-        if number is None
-        else dataclasses.replace(settings, num_pursuers=number)
-    )
+    return settings if number is None else dataclasses.replace(settings, num_pursuers=number)
 
 
 def _game(command, policy):
@@ -245,14 +237,10 @@ def _game(command, policy):
             "each pursuer by what it knows"
         )
     number = settings.num_pursuers
-    team_size = (
-        number if policy.any_number else policy.settings.environment.num_pursuers
-    )
+    team_size = number if policy.any_number else policy.settings.environment.num_pursuers
     layouts = []
     if command.scenario == "all":
-        layouts = [
-            layout for layout in SCENARIOS.values() if len(layout.pursuers) == team_size
-        ]
+        layouts = [layout for layout in SCENARIOS.values() if len(layout.pursuers) == team_size]
     elif command.scenario != "uniform":
         layouts = [find_scenario(command.scenario, settings)]
     in_layout = len(layouts[0].pursuers) if layouts else number
@@ -282,19 +270,13 @@ def _environment(command, game, policy):
 
     trained_in = policy.environment
     if trained_in is None:
-        return make_environment(
-            game, command.vehicle, command.effects, command.opponent
-        )
+        return make_environment(game, command.vehicle, command.effects, command.opponent)
     if trained_in.evaders and not command.opponent:
         # these come below
         game = dataclasses.replace(game, evaders=PursuitSettings().evaders)
-    environment = make_environment(
-        game, command.vehicle, command.effects, command.opponent
-    )
+    environment = make_environment(game, command.vehicle, command.effects, command.opponent)
     evaders = environment.evaders if command.opponent else trained_in.evaders
-    return dataclasses.replace(
-        environment, observer=trained_in.observer, evaders=evaders
-    )
+    return dataclasses.replace(environment, observer=trained_in.observer, evaders=evaders)
 
 
 def _show(command, results):
@@ -309,15 +291,12 @@ def _show(command, results):
         settings = _settings(options)
         evaders = (options.opponent,) if options.opponent else settings.evaders
         game = unlike_the_papers(settings, evaders)
-        console.print(
-            results_table(f"{source}, mean policy, seed {command.seed}", rows, game)
-        )
+        console.print(results_table(f"{source}, mean policy, seed {command.seed}", rows, game))
     if len(results) > 1:
         console.print(spread_table([rows for *_, rows in results]))
     if command.json is not None:
         by_policy = {
-            source: rows if command.scenario == "all" else rows[0]
-            for _, source, rows in results
+            source: rows if command.scenario == "all" else rows[0] for _, source, rows in results
         }
         results_of_one = next(iter(by_policy.values()))
         write_json(command.json, results_of_one if len(results) == 1 else by_policy)

@@ -73,9 +73,7 @@ def observations(policy, number: int, seed: int) -> dict:
 
     from openjax.pursuit import Pursuit
 
-    settings = dataclasses.replace(
-        policy.settings.environment, physics="rigid", vehicles=()
-    )
+    settings = dataclasses.replace(policy.settings.environment, physics="rigid", vehicles=())
     environment = Pursuit(settings)
     worlds = 64
     steps = -(-number // worlds)  # rounded up
@@ -89,9 +87,9 @@ def observations(policy, number: int, seed: int) -> dict:
             # some noise, or all worlds would soon look alike
             noise = 0.3 * jax.random.normal(key, state.previous_action.shape)
             action = jnp.clip(policy(observation) + noise, -1.0, 1.0)
-            next_observation, state, *_ = jax.vmap(
-                environment.step, in_axes=(None, 0, 0)
-            )(key, state, action)
+            next_observation, state, *_ = jax.vmap(environment.step, in_axes=(None, 0, 0))(
+                key, state, action
+            )
             return (next_observation, state), observation
 
         return jax.lax.scan(step, (observation, state), jax.random.split(key, steps))[1]
@@ -106,9 +104,7 @@ def observations(policy, number: int, seed: int) -> dict:
     return fields
 
 
-def export(
-    arguments: Arguments, tell: Callable[[str], None] = lambda step: None
-) -> dict:
+def export(arguments: Arguments, tell: Callable[[str], None] = lambda step: None) -> dict:
     """Write the files; returns what FORMAT.json says. `tell` hears the steps. Raises
     UserError if it can't be, or differs.
     """
@@ -123,8 +119,7 @@ def export(
     tell(playing)
     samples, reference_actions = _samples(policy, arguments)
     inputs = {
-        name: jax.ShapeDtypeStruct(array.shape[1:], array.dtype)
-        for name, array in samples.items()
+        name: jax.ShapeDtypeStruct(array.shape[1:], array.dtype) for name, array in samples.items()
     }
     tell(comparing)
     write = {"onnx": _onnx, "jax": _jax, "c": _c}[arguments.format]
@@ -182,8 +177,7 @@ def _difference(actions, reference_actions, source):
 
 def _describe(inputs) -> dict:
     return {
-        name: {"shape": list(kind.shape), "type": str(kind.dtype)}
-        for name, kind in inputs.items()
+        name: {"shape": list(kind.shape), "type": str(kind.dtype)} for name, kind in inputs.items()
     }
 
 
@@ -199,21 +193,15 @@ def _onnx(act, inputs, samples, source):
     try:
         import onnxruntime
     except ImportError as error:
-        raise UserError(
-            "onnxruntime is missing: pip install onnx onnxruntime"
-        ) from error
+        raise UserError("onnxruntime is missing: pip install onnx onnxruntime") from error
     data = model.SerializeToString()
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
-    session = onnxruntime.InferenceSession(
-        data, options, providers=["CPUExecutionProvider"]
-    )
+    session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
     input_names = [value.name for value in session.get_inputs()]
     actions = []
     for i in range(len(samples["frames"])):
-        actions += session.run(
-            None, {name: np.asarray(samples[name][i]) for name in input_names}
-        )
+        actions += session.run(None, {name: np.asarray(samples[name][i]) for name in input_names})
     extra = {
         "inputs": _describe({name: inputs[name] for name in input_names}),
         "numbers": size(model),

@@ -128,25 +128,16 @@ def _fly(arguments: Arguments, preparation: Prepared | None) -> None:
         session.check()
         plan = Plan(arguments.episodes, arguments.episode_seconds or math.inf)
         flight = Flight(
-            session.links,
-            setup.game,
-            setup.state,
-            plan,
-            session.requests,
-            session.watch,
+            session.links, setup.game, setup.state, plan, session.requests, session.watch
         )
-        console.print(
-            "flying: space or q stops all motors; l, Ctrl-C or Ctrl-Z land; h waits"
-        )
+        console.print("flying: space or q stops all motors; l, Ctrl-C or Ctrl-Z land; h waits")
         samples, complaint = session.fly(flight)
     # before a word is said: the terminal may be gone
     if arguments.out is not None and samples:
         try:
             _write(arguments.out, setup, flight, samples, session.scheduler)
         except OSError as error:
-            complaint = "; ".join(
-                filter(None, (complaint, f"no log: {one_line(error)}"))
-            )
+            complaint = "; ".join(filter(None, (complaint, f"no log: {one_line(error)}")))
     _show(console, flight, arguments.plan is not None)
     if session.scheduler != "real time":
         console.print(
@@ -198,10 +189,7 @@ def prepare(arguments: Arguments) -> Prepared:
     # a layout may have more pillars than the policy was trained with; it observes the
     # nearest ones
     slots = max(settings.max_pillars, len(scenario.pillars))
-    game = Game(
-        policy,
-        scenario_task(dataclasses.replace(settings, max_pillars=slots), scenario),
-    )
+    game = Game(policy, scenario_task(dataclasses.replace(settings, max_pillars=slots), scenario))
     game.airframe = airframe_of(vehicle.vehicle)
     uris = uris_of(arguments)
     state = flight_state(game, len(uris), arguments.safety)
@@ -243,12 +231,7 @@ def _session(arguments: Arguments):
         # a radio has less room, which commands and poses need first
         body_logs = 5 if all(uri.startswith("udp:") for uri in uris) else 1
     return SessionSettings(
-        uris,
-        body_logs,
-        arguments.watchdog,
-        arguments.guard,
-        arguments.guard_after,
-        feed,
+        uris, body_logs, arguments.watchdog, arguments.guard, arguments.guard_after, feed
     )
 
 
@@ -256,8 +239,7 @@ def _remarks(arguments: Arguments, game, vehicle) -> tuple[str, ...]:
     """What somebody should know before the vehicles rise."""
     settings = game.settings
     length = min(
-        settings.episode_length * settings.time_step,
-        arguments.episode_seconds or math.inf,
+        settings.episode_length * settings.time_step, arguments.episode_seconds or math.inf
     )
     remarks = _time_remark(arguments, arguments.episodes * length)
     if vehicle.airframe == settings.airframe:
@@ -357,11 +339,7 @@ def _show(console, flight, is_plan):
         f"({timing['missed_share']:.2%})"
     )
     for number, game in enumerate(() if is_plan else record.episodes):
-        outcome = (
-            f"caught at step {game['capture_step']}"
-            if game["capture_step"]
-            else "not caught"
-        )
+        outcome = f"caught at step {game['capture_step']}" if game["capture_step"] else "not caught"
         console.print(
             f"game {number}: {outcome}, {game['steps']} steps, {game['breaches']} with a breach"
         )

@@ -47,11 +47,7 @@ def main(arguments: Sequence[str]) -> int:
     less = ON_CPU if jax.default_backend() == "cpu" else {}
     if not command.messages.perfect:
         less = less | {"best_response": False}  # who learns doesn't know what was heard
-    sizes = (
-        {}
-        if game_of_training.team_sizes
-        else {"sizes": (game_of_training.num_pursuers,)}
-    )
+    sizes = {} if game_of_training.team_sizes else {"sizes": (game_of_training.num_pursuers,)}
     default = dataclasses.replace(MapCommand(), **less, **sizes)
     command = parse(MapCommand, default, arguments, PROGRAM)
     for option in ("out", "json", "page", "evaders_out"):
@@ -66,9 +62,7 @@ def main(arguments: Sequence[str]) -> int:
         if command.json is not None:
             write_json(command.json, results)
 
-    results = draw_map(
-        command, policy, lambda text: console.print(text, soft_wrap=True), keep
-    )
+    results = draw_map(command, policy, lambda text: console.print(text, soft_wrap=True), keep)
     if command.page is not None:
         write_text(command.page, map_page({command.scenario: results}))
     _show(command, results, console)

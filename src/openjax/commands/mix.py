@@ -48,14 +48,11 @@ def main(arguments: Sequence[str]) -> None:
     from openjax.store.policies import load_policy
     from openjax.store.policy_files import save_policy_file
 
-    policy = mixed_policy(
-        [load_policy(name) for name in options.policies], options.seconds
-    )
+    policy = mixed_policy([load_policy(name) for name in options.policies], options.seconds)
     files = [as_trained(name) for name in options.policies]
     settings, _ = files[0]
     members = [
-        {"policy": name, **notes}
-        for name, (_, notes) in zip(options.policies, files, strict=True)
+        {"policy": name, **notes} for name, (_, notes) in zip(options.policies, files, strict=True)
     ]
     save_policy_file(
         options.out,
@@ -69,6 +66,4 @@ def main(arguments: Sequence[str]) -> None:
         + (f"every {options.seconds:g} s" if options.seconds else "for each episode"),
         soft_wrap=True,
     )
-    console.print(
-        f"how well it holds: openjax exploit --policy {options.out}", soft_wrap=True
-    )
+    console.print(f"how well it holds: openjax exploit --policy {options.out}", soft_wrap=True)

@@ -62,23 +62,17 @@ def make_plan(arguments: Arguments) -> list[str]:
         folder.mkdir()
         write_plan(folder / "plan.csv", plan)
         write_json(
-            folder / "plan.json",
-            {"sentence": sentence, "segments": promises, "fly": segments},
+            folder / "plan.json", {"sentence": sentence, "segments": promises, "fly": segments}
         )
     rows = [
-        f"  {p['segment']:6} {p['value']:.3f}  {SEGMENTS[p['segment']].shows}"
-        for p in promises
+        f"  {p['segment']:6} {p['value']:.3f}  {SEGMENTS[p['segment']].shows}" for p in promises
     ]
     if rows:
         rows.insert(0, "How probably a segment tells two of the believed causes apart:")
     file = arguments.out / "plan.csv"
     seconds = len(plan) * PERIOD
     limit = SafetySettings().alone_time
-    lands = (
-        ""
-        if seconds < limit
-        else f" Without --motion_capture it lands after {limit:g} s."
-    )
+    lands = "" if seconds < limit else f" Without --motion_capture it lands after {limit:g} s."
     return [
         sentence,
         *rows,

@@ -17,9 +17,7 @@ from openjax.ranges import Interval, Seed
 from openjax.vehicle.effect_names import effect_names
 
 PROGRAM = "openjax sample_flights"
-DECIMALS = {"t": 2, "vbat": 3} | dict.fromkeys(
-    "x y z qw qx qy qz m1 m2 m3 m4".split(), 5
-)
+DECIMALS = {"t": 2, "vbat": 3} | dict.fromkeys("x y z qw qx qy qz m1 m2 m3 m4".split(), 5)
 _REST = 4  # decimals of all other columns
 _EFFECT_HELP = (
     "What the vehicle suffers from that the simulator doesn't know, one effect or several at once: "
@@ -63,9 +61,7 @@ def make_case(arguments: Arguments) -> list[Path]:
     log = {"source": source, "motor_rows": "mean", "floor_z": 0.0}
     # On a scale a vehicle that weighs more would have shown it.
     is_weighed = not any(EFFECTS[name].card.weighed for name in names)
-    vehicle_file = dataclasses.replace(
-        load_vehicle_file(), mass_weighed=is_weighed, log=log
-    )
+    vehicle_file = dataclasses.replace(load_vehicle_file(), mass_weighed=is_weighed, log=log)
     decimals = {c: DECIMALS.get(c, _REST) for c in LOG_COLUMNS}
     of_others = any(EFFECTS[name].card.of_others for name in names)
     flights = references(arguments.seed, arguments.duration, neighbour=of_others)
@@ -74,31 +70,23 @@ def make_case(arguments: Arguments) -> list[Path]:
         for number, (name, reference) in enumerate(flights.items()):
             # the vehicle that flies is the one that is described, but for the effects
             seed = 1000 * arguments.seed + number
-            columns = fly(
-                vehicle_file.vehicle, vehicle_file.vehicle, reference, seed, effects
-            )
+            columns = fly(vehicle_file.vehicle, vehicle_file.vehicle, reference, seed, effects)
             write_csv(folder / f"{name}.csv.gz", log_of(columns, name), decimals)
         save_vehicle_file(folder / "vehicle.toml", vehicle_file)
     return sorted(arguments.out.iterdir())
 
 
-def _checked_effects(
-    names: tuple[str, ...], library: Collection[str]
-) -> tuple[str, ...]:
+def _checked_effects(names: tuple[str, ...], library: Collection[str]) -> tuple[str, ...]:
     """The effects that act. Raises UserError for one that there isn't, twice the same,
     or none beside others.
     """
     for name in names:
         if name not in ("none", *library):
-            raise UserError(
-                f"--effect {name}: no such effect; {suggestion(name, library)}"
-            )
+            raise UserError(f"--effect {name}: no such effect; {suggestion(name, library)}")
     is_unclear = "none" in names and len(names) > 1
     if len(set(names)) < len(names) or not names or is_unclear:
         words = " ".join(names) or "nothing"
-        raise UserError(
-            f"--effect {words}: name none alone, or each effect that acts once"
-        )
+        raise UserError(f"--effect {words}: name none alone, or each effect that acts once")
     return tuple(name for name in names if name != "none")
 
 

@@ -66,9 +66,7 @@ def main(arguments: Sequence[str]) -> int:
 
         channels = []
         for policy, flight in flights:
-            channels += trajectory_channels(
-                f"{Path(policy).name}/{flight.title}", flight
-            )
+            channels += trajectory_channels(f"{Path(policy).name}/{flight.title}", flight)
         write_mcap(command.mcap, channels)
         console.print(_written_line(command.mcap))
     if command.gif is not None:
@@ -104,9 +102,7 @@ def write_flights(command: ViewCommand) -> None:
     from openjax.show.foxglove import write_mcap
 
     if command.mcap is None:
-        raise UserError(
-            "--flights shows logs in Foxglove: name the file to write, --mcap FILE"
-        )
+        raise UserError("--flights shows logs in Foxglove: name the file to write, --mcap FILE")
     nameless = not (command.flights / "vehicle.toml").exists()
     # to look at, any vehicle will do
     case = load_case(command.flights, comparison=nameless)
@@ -124,14 +120,11 @@ def fly_all(command: ViewCommand) -> list[tuple[str, Trajectory]]:
     flights = []
     evaluators = {}
     options = {
-        field.name: getattr(command, field.name)
-        for field in dataclasses.fields(FlightOptions)
+        field.name: getattr(command, field.name) for field in dataclasses.fields(FlightOptions)
     }
     for policy in command.start():
         # each policy flies the game that it was trained in
-        evaluation = EvaluateCommand(
-            **options, episodes=1, environment=policy.settings.environment
-        )
+        evaluation = EvaluateCommand(**options, episodes=1, environment=policy.settings.environment)
         _, episodes = fly_scenarios(evaluation, policy, evaluators)
         flights += [(policy.source, episode) for episode in episodes]
     return flights
@@ -148,9 +141,7 @@ def page_server(page: str, port: int) -> ThreadingHTTPServer:
 
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self):
-            host = self.headers.get("Host", "").rpartition(":")[0] or self.headers.get(
-                "Host", ""
-            )
+            host = self.headers.get("Host", "").rpartition(":")[0] or self.headers.get("Host", "")
             is_page = self.path == "/" and host in OWN_NAMES
             self.send_response(200 if is_page else 404)
             self.send_header("Content-Type", "text/html; charset=utf-8")

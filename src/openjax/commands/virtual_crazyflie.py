@@ -56,9 +56,7 @@ class Arguments:
     """
     seconds: Annotated[float | None, Interval("(0, 1e9]")] = None
     """End after this time; by default only when interrupted."""
-    link: Annotated[LinkFaults, tyro.conf.arg(name="")] = field(
-        default_factory=LinkFaults
-    )
+    link: Annotated[LinkFaults, tyro.conf.arg(name="")] = field(default_factory=LinkFaults)
 
 
 def make(arguments: Arguments):
@@ -77,9 +75,7 @@ def make(arguments: Arguments):
     stands += [(0.2 * i, -1.4) for i in range(arguments.number - len(stands))]
     effects = load_effects(arguments.effects)[1] if arguments.effects else {}
     vehicle = load_vehicle_file(arguments.vehicle).vehicle
-    vehicles = VirtualVehicles(
-        vehicle, stands, effects, arguments.battery, arguments.endurance
-    )
+    vehicles = VirtualVehicles(vehicle, stands, effects, arguments.battery, arguments.endurance)
     return VirtualCrazyflies(
         vehicles, arguments.host, arguments.port, arguments.link, arguments.needs_arming
     )

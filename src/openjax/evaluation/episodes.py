@@ -45,9 +45,7 @@ def make_evaluate(
     policy: Policy,
     trajectory: bool = False,
     messages: MessageSettings | None = None,
-) -> Callable[
-    [PolicyParameters, Task, jax.Array], Evaluation | tuple[Evaluation, EpisodeRecord]
-]:
+) -> Callable[[PolicyParameters, Task, jax.Array], Evaluation | tuple[Evaluation, EpisodeRecord]]:
     """`evaluate(parameters, tasks, key)`: one episode per task (leading axis B), to be
     compiled by the caller.
 
@@ -108,10 +106,7 @@ class _Episodes:
             beliefs = jax.vmap(self.hearsay.update)(beliefs, state, keys)
         guesses = [last_seen if prediction is None else prediction[:, 0], last_seen]
         errors = errors + jnp.stack(
-            [
-                jnp.linalg.norm(guess - state.evader_position, axis=-1)
-                for guess in guesses
-            ]
+            [jnp.linalg.norm(guess - state.evader_position, axis=-1) for guess in guesses]
         )
         record = None
         if self.trajectory:

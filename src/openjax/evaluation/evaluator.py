@@ -16,14 +16,7 @@ from openjax.evaluation.episodes import Evaluation, make_evaluate, summarise
 from openjax.evaluation.message_settings import MessageSettings
 from openjax.evaluation.result_tables import record_of
 from openjax.policy import Policy, PolicyParameters
-from openjax.pursuit import (
-    SCENARIOS,
-    Pursuit,
-    PursuitSettings,
-    Scenario,
-    Task,
-    scenario_task,
-)
+from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings, Scenario, Task, scenario_task
 from openjax.pursuit.statistics import EpisodeStatistics
 from openjax.pursuit.task import arena_of, capture_radius
 from openjax.pursuit.teams import FAR
@@ -94,9 +87,7 @@ class Evaluator:
             # the program knows one size: the last batch is filled up with the last task
             index = np.minimum(np.arange(start, start + self.batch), number - 1)
             part = jax.tree.map(operator.itemgetter(index), tasks)
-            evaluation, record = self._evaluate(
-                parameters, part, jax.random.fold_in(key, i)
-            )
+            evaluation, record = self._evaluate(parameters, part, jax.random.fold_in(key, i))
             asked_for = slice(min(self.batch, number - start))
             evaluation = jax.tree.map(np.asarray, evaluation)
             evaluations.append(jax.tree.map(operator.itemgetter(asked_for), evaluation))
@@ -104,9 +95,7 @@ class Evaluator:
             records.append(record)
         return jax.tree.map(lambda *parts: np.concatenate(parts), *evaluations), records
 
-    def compile_ahead(
-        self, parameters: PolicyParameters, task: Task
-    ) -> Callable[[], None]:
+    def compile_ahead(self, parameters: PolicyParameters, task: Task) -> Callable[[], None]:
         """Start to compile for parameters and tasks of these shapes, of which `task`
         has a leading axis of any length.
         """
@@ -115,9 +104,7 @@ class Evaluator:
             return jax.ShapeDtypeStruct((self.batch, *leaf.shape[1:]), leaf.dtype)
 
         key = jax.random.fold_in(jax.random.key(0), 0)
-        return compile_ahead(
-            self._evaluate, parameters, jax.tree.map(one_batch, task), key
-        )
+        return compile_ahead(self._evaluate, parameters, jax.tree.map(one_batch, task), key)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -192,17 +179,12 @@ def layout_slots(settings: PursuitSettings) -> int:
     """Pillar slots that hold every layout and uniform task, so that one compiled
     evaluation serves all.
     """
-    return max(
-        settings.max_pillars,
-        *(len(scenario.pillars) for scenario in SCENARIOS.values()),
-    )
+    return max(settings.max_pillars, *(len(scenario.pillars) for scenario in SCENARIOS.values()))
 
 
 def repeat_task(task: Task, number: int) -> Task:
     """`number` copies along a new leading axis."""
-    return jax.tree.map(
-        lambda leaf: jnp.broadcast_to(leaf, (number, *leaf.shape)), task
-    )
+    return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (number, *leaf.shape)), task)
 
 
 def stack(kinds: Mapping[str, Task]) -> tuple[Task, Callable[[Any], dict[str, Any]]]:
@@ -230,6 +212,5 @@ def layout_tasks(
 ) -> dict[str, Task]:
     """So many times each layout, by name."""
     return {
-        layout.name: repeat_task(scenario_task(settings, layout), episodes)
-        for layout in scenarios
+        layout.name: repeat_task(scenario_task(settings, layout), episodes) for layout in scenarios
     }

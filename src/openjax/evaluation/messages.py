@@ -81,8 +81,7 @@ class Hearsay:
 
         # as if all had said the same since long before
         on_the_way = jax.tree.map(
-            lambda leaf: jnp.broadcast_to(leaf, (self.delay, *leaf.shape)),
-            _reports(state),
+            lambda leaf: jnp.broadcast_to(leaf, (self.delay, *leaf.shape)), _reports(state)
         )
         return Beliefs(
             position=each(state.drones.position),
@@ -105,9 +104,7 @@ class Hearsay:
         reports = _reports(state)
         # what is on the way as a queue: a new report joins it, the oldest one arrives
         line = jax.tree.map(
-            lambda old, new: jnp.concatenate([old, new[None]]),
-            beliefs.on_the_way,
-            reports,
+            lambda old, new: jnp.concatenate([old, new[None]]), beliefs.on_the_way, reports
         )
         arriving = jax.tree.map(lambda leaf: leaf[0], line)
         # (N, N): row by row what each pursuer hears of each
@@ -164,12 +161,7 @@ class Hearsay:
             place = self._place(belief, state.step)
             own_frame = frame_pursuers(settings, place, belief.last_seen, state.active)
             return frame(
-                settings,
-                state.step,
-                own_frame,
-                belief.evader,
-                belief.evader_velocity,
-                belief.seen,
+                settings, state.step, own_frame, belief.evader, belief.evader_velocity, belief.seen
             )
 
         # what is on the way has another leading axis than the pursuers'

@@ -23,9 +23,7 @@ FIELDS = (
 """What a record of an evaluation holds, in this order."""
 
 
-def record_of(
-    scenario: str, episodes: int, summary: dict, extra: tuple[str, ...] = ()
-) -> dict:
+def record_of(scenario: str, episodes: int, summary: dict, extra: tuple[str, ...] = ()) -> dict:
     """A summary as a record with exactly `FIELDS` (and `extra` ones); what isn't a
     number is None.
     """
@@ -61,14 +59,11 @@ def results_table(title: str, rows: Sequence[dict], game: str) -> Table:
             f"{row['capture_step']:.0f}",
             f"{row['collision_rate']:.4f}",
             "/".join(
-                f"{parts[name]:.3f}".removeprefix("0")
-                for name in ("pillar", "drone", "bounds")
+                f"{parts[name]:.3f}".removeprefix("0") for name in ("pillar", "drone", "bounds")
             ),
             f"{row['crash_rate']:.3f}",
             f"{row['over_speed_rate']:.4f}",
-            "–"
-            if row["prediction_error"] is None
-            else f"{row['prediction_error']:.4f}",
+            "–" if row["prediction_error"] is None else f"{row['prediction_error']:.4f}",
         )
     return table
 
@@ -86,12 +81,7 @@ def spread_table(results: Sequence[Sequence[dict]]) -> Table:
     )
     table = numbers_table(title, ("scenario", *(label for _, label, _ in columns)))
     for rows in zip(*results, strict=True):
-        values = [
-            (np.array([row[name] for row in rows]), style) for name, _, style in columns
-        ]
-        cells = [
-            f"{value.mean():{style}} ± {value.std(ddof=1):{style}}"
-            for value, style in values
-        ]
+        values = [(np.array([row[name] for row in rows]), style) for name, _, style in columns]
+        cells = [f"{value.mean():{style}} ± {value.std(ddof=1):{style}}" for value, style in values]
         table.add_row(rows[0]["scenario"], *cells)
     return table

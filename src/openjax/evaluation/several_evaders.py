@@ -15,13 +15,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int32
 
 from openjax.policy import Policy, PolicyParameters
-from openjax.pursuit import (
-    EpisodeStatistics,
-    Pursuit,
-    PursuitSettings,
-    Task,
-    uniform_task,
-)
+from openjax.pursuit import EpisodeStatistics, Pursuit, PursuitSettings, Task, uniform_task
 
 Choice = Callable[
     [Float[Array, "drones 3"], Float[Array, "evaders 3"], Bool[Array, " evaders"]],
@@ -85,12 +79,8 @@ def several_tasks(settings: PursuitSettings, key: jax.Array, number: int) -> Tas
     starts = [task.evader_position]
     starts += [uniform_task(settings, other).evader_position for other in others]
     starts = jnp.stack(starts)
-    offset = jnp.linalg.norm(
-        task.pillar_position[:, None] - starts[None, :, :2], axis=-1
-    )
-    clear = jnp.all(
-        offset >= settings.pillar_radius + settings.pillar_clearance, axis=1
-    )
+    offset = jnp.linalg.norm(task.pillar_position[:, None] - starts[None, :, :2], axis=-1)
+    clear = jnp.all(offset >= settings.pillar_radius + settings.pillar_clearance, axis=1)
     task = task.replace(pillar_active=task.pillar_active & clear)
     return jax.vmap(lambda start: task.replace(evader_position=start))(starts)
 

@@ -33,9 +33,7 @@ OBSERVED = (
 
 def observed_by(game: PursuitSettings, policy: PursuitSettings) -> PursuitSettings:
     """A game as the pursuers of a policy observe it, who learned in another one."""
-    return dataclasses.replace(
-        game, **{name: getattr(policy, name) for name in OBSERVED}
-    )
+    return dataclasses.replace(game, **{name: getattr(policy, name) for name in OBSERVED})
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,9 +63,7 @@ class Strangers:
         """
         keys = jax.random.split(key, members.shape[0])
         # each draws the same from the same key
-        worlds = tuple(
-            jax.vmap(game.reset_to)(keys, tasks) for game in self.environments
-        )
+        worlds = tuple(jax.vmap(game.reset_to)(keys, tasks) for game in self.environments)
         which = jnp.arange(members.shape[1])
 
         def one(worlds, _):
@@ -80,9 +76,7 @@ class Strangers:
                 ],
                 axis=1,
             )
-            action = jax.vmap(lambda of_policy, member: of_policy[member, which])(
-                actions, members
-            )
+            action = jax.vmap(lambda of_policy, member: of_policy[member, which])(actions, members)
             action = jnp.clip(action, -1.0, 1.0)
             drones = jax.vmap(self.environments[0].move)(worlds[0][1], action)
             results = []
@@ -95,9 +89,7 @@ class Strangers:
         return jax.lax.scan(one, worlds, length=length)[0][0][1].statistics
 
 
-def bootstrap_mean(
-    values: np.ndarray, seed: int = 0, draws: int = 5000
-) -> tuple[float, float]:
+def bootstrap_mean(values: np.ndarray, seed: int = 0, draws: int = 5000) -> tuple[float, float]:
     """95 % interval of the mean over strata (M) and their episodes (E), (M, E):
     episodes are drawn anew within each stratum (the stratified bootstrap of Agarwal et
     al., 2021).

@@ -9,14 +9,7 @@ import jax.numpy as jnp
 
 from openjax.evaluation.evaluator import Evaluator, Flown, layout_slots
 from openjax.policy import Policy, PolicyParameters
-from openjax.pursuit import (
-    Pursuit,
-    PursuitSettings,
-    Task,
-    expand_task,
-    turn_task,
-    uniform_task,
-)
+from openjax.pursuit import Pursuit, PursuitSettings, Task, expand_task, turn_task, uniform_task
 
 VALIDATION_KEY = 20_000_003
 """The validation tasks are drawn from this key in all runs, so that runs can be
@@ -60,9 +53,7 @@ def far_tasks(settings: PursuitSettings, number: int, slots: int) -> Task:
         return far_task
 
     # of another key than the uniform ones: no task is in both
-    keys = jax.random.split(
-        jax.random.fold_in(jax.random.key(VALIDATION_KEY), 1), number
-    )
+    keys = jax.random.split(jax.random.fold_in(jax.random.key(VALIDATION_KEY), 1), number)
     return _with_slots(jax.jit(jax.vmap(draw))(keys), slots)
 
 
@@ -78,24 +69,16 @@ class Validation:
     """
 
     def __init__(
-        self,
-        environment: Pursuit,
-        policy: Policy,
-        number: int,
-        evaders: tuple[str, ...] = (),
+        self, environment: Pursuit, policy: Policy, number: int, evaders: tuple[str, ...] = ()
     ):
         settings = environment.settings
         self.number = number
         # drawn by the run's own game, which a wider one would draw otherwise; flown
         # with more slots
         slots = layout_slots(settings)
-        game = dataclasses.replace(
-            settings, max_pillars=slots, evaders=evaders or settings.evaders
-        )
+        game = dataclasses.replace(settings, max_pillars=slots, evaders=evaders or settings.evaders)
         changes = {"evaders": None} if evaders else {}
-        wide_game = dataclasses.replace(
-            environment, settings=game, dynamics=None, **changes
-        )
+        wide_game = dataclasses.replace(environment, settings=game, dynamics=None, **changes)
         self.evaluator = Evaluator(wide_game, policy, 2 * number)
         self.tasks: dict[str, Task] = {
             "validation": uniform_tasks(settings, self.number, slots),
@@ -137,14 +120,9 @@ def flat_metrics(uniform: dict, far: dict) -> dict[str, float]:
     """
 
     def flat(summary):
-        values = {
-            name: value
-            for name, value in summary.items()
-            if not isinstance(value, dict)
-        }
+        values = {name: value for name, value in summary.items() if not isinstance(value, dict)}
         return values | {
-            f"collision_{part}": value
-            for part, value in summary["collision_parts"].items()
+            f"collision_{part}": value for part, value in summary["collision_parts"].items()
         }
 
     return flat(uniform) | {f"far_{name}": value for name, value in flat(far).items()}

@@ -16,16 +16,7 @@ from openjax.errors import UserError
 from openjax.export.c_program import CProgram
 from openjax.interruption import unfinished
 
-FLAGS = (
-    "-std=c99",
-    "-O2",
-    "-Wall",
-    "-Wextra",
-    "-Werror",
-    "-pedantic",
-    "-shared",
-    "-fPIC",
-)
+FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-pedantic", "-shared", "-fPIC")
 
 
 class Compiled:
@@ -37,14 +28,7 @@ class Compiled:
             (folder / f"{name}.h").write_text(program.header, encoding="utf-8")
             (folder / f"{name}.c").write_text(program.source, encoding="utf-8")
             library = folder / f"{name}.so"
-            command = [
-                compiler,
-                *FLAGS,
-                "-o",
-                str(library),
-                str(folder / f"{name}.c"),
-                "-lm",
-            ]
+            command = [compiler, *FLAGS, "-o", str(library), str(folder / f"{name}.c"), "-lm"]
             ran = subprocess.run(command, capture_output=True, text=True, check=False)
             if ran.returncode != 0:
                 errors = [line for line in ran.stderr.splitlines() if "error" in line]
@@ -59,8 +43,7 @@ class Compiled:
             fields.append((field, number * math.prod(kind.shape)))
         observation = type("Observation", (ctypes.Structure,), {"_fields_": fields})()
         self._observation = {
-            name: np.ctypeslib.as_array(getattr(observation, name))
-            for name in self._inputs
+            name: np.ctypeslib.as_array(getattr(observation, name)) for name in self._inputs
         }
         # nobody clears it on a vehicle either: what is read before it was written shows
         # as NaN
@@ -84,9 +67,7 @@ class Compiled:
 
     def seconds(self, repeats: int = 500) -> float:
         """Of one call; the best of five batches."""
-        batches = timeit.repeat(
-            lambda: self._function(*self._pointers), number=repeats, repeat=5
-        )
+        batches = timeit.repeat(lambda: self._function(*self._pointers), number=repeats, repeat=5)
         return min(batches) / repeats
 
 

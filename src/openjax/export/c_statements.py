@@ -73,19 +73,14 @@ class Array:
         return f"{self.name}[{' + '.join(terms) or '0'}]"
 
     def part(
-        self,
-        starts: Sequence[int],
-        shape: Sequence[int],
-        steps: Sequence[int] | None = None,
+        self, starts: Sequence[int], shape: Sequence[int], steps: Sequence[int] | None = None
     ) -> "Array":
         """Entries from `starts` on, every `steps`-th of each axis."""
         steps = steps or [1] * len(shape)
         offset_of_part = sum(
             start * stride for start, stride in zip(starts, self.strides, strict=True)
         )
-        strides = tuple(
-            step * stride for step, stride in zip(steps, self.strides, strict=True)
-        )
+        strides = tuple(step * stride for step, stride in zip(steps, self.strides, strict=True))
         offset = int(self.offset + offset_of_part)
         return replace(self, shape=tuple(shape), strides=strides, offset=offset)
 
@@ -127,14 +122,10 @@ class Writer(Walk):
         strides = list(row_by_row(value.shape))
         for axis in range(value.ndim):
             one = value.take([0], axis)
-            if value.shape[axis] > 1 and np.array_equal(
-                np.broadcast_to(one, value.shape), value
-            ):
+            if value.shape[axis] > 1 and np.array_equal(np.broadcast_to(one, value.shape), value):
                 value = one
                 # outer axes are that much closer together now
-                strides = [
-                    s // shape[axis] if a < axis else s for a, s in enumerate(strides)
-                ]
+                strides = [s // shape[axis] if a < axis else s for a, s in enumerate(strides)]
                 strides[axis] = 0
         if value.size == 1:
             return Array("", shape, tuple(strides), number=literal(value.item()))
@@ -161,15 +152,10 @@ class Writer(Walk):
     def write(self, out: Array, form: str, values: Sequence[Array]) -> Array:
         """Write every entry of an array, which is the form of those of `values`."""
         arrays = [out, *values]
-        if all(
-            array.number or (array.dense and array.shape == out.shape)
-            for array in arrays
-        ):
+        if all(array.number or (array.dense and array.shape == out.shape) for array in arrays):
             # entry by entry in the order of memory: one loop does for all axes
             flat_shape = (math.prod(out.shape),)
-            arrays = [
-                replace(array, shape=flat_shape, strides=(1,)) for array in arrays
-            ]
+            arrays = [replace(array, shape=flat_shape, strides=(1,)) for array in arrays]
         indices = index_names(arrays[0].shape)
         target, *operands = (array.at(indices) for array in arrays)
         body = f"{target} = {form.format(*operands)};"
@@ -198,15 +184,11 @@ class Writer(Walk):
             )
         return operation.inputs[0]
 
-    _op_copy = _op_copy_p = _op_optimization_barrier = _op_convert_element_type = (
-        _op_stop_gradient
-    )
+    _op_copy = _op_copy_p = _op_optimization_barrier = _op_convert_element_type = _op_stop_gradient
 
     def _op_elementwise(self, operation):
         self.functions += math.prod(operation.shape) * (operation.name in FUNCTIONS)
-        return self._elementwise(
-            ELEMENTWISE[operation.name], operation.inputs, operation.shape
-        )
+        return self._elementwise(ELEMENTWISE[operation.name], operation.inputs, operation.shape)
 
     def _power(self, value, exponent, operation):
         factors = " * ".join(["{0}"] * abs(exponent)) or "1.0f"
@@ -233,9 +215,7 @@ class Writer(Walk):
 
     def _reshape(self, value, shape):
         value = self.array(value)
-        if [size for size in value.shape if size > 1] == [
-            size for size in shape if size > 1
-        ]:
+        if [size for size in value.shape if size > 1] == [size for size in shape if size > 1]:
             # only axes of length one come or go: the others keep their strides
             dimensions = zip(value.strides, value.shape, strict=True)
             strides = iter([stride for stride, size in dimensions if size > 1])
@@ -303,9 +283,7 @@ class Writer(Walk):
                 replace(array, offset=array.offset + k * size).start
                 for array, size in zip(arrays, sizes, strict=True)
             ]
-            self.emit(
-                f"product({', '.join(places)}, {rows}, {inner}, {columns});", arrays
-            )
+            self.emit(f"product({', '.join(places)}, {rows}, {inner}, {columns});", arrays)
         self.multiply_adds += batches * rows * inner * columns
         return out
 

@@ -58,10 +58,7 @@ def loops(sizes, indices, body: str) -> str:
     if "\n" in body:
         body = "{\n" + indent(body) + "\n}"
     return "\n".join(
-        [
-            *(4 * " " * k + head for k, head in enumerate(heads)),
-            indent(body, len(heads)),
-        ]
+        [*(4 * " " * k + head for k, head in enumerate(heads)), indent(body, len(heads))]
     )
 
 
@@ -92,6 +89,4 @@ def number_rows(value: np.ndarray) -> str:
     """Entries of a const array (N,), eight to a line."""
     # brackets are for negative numbers within formulas
     literals = [literal(number).strip("()") for number in value.tolist()]
-    return "\n".join(
-        ", ".join(literals[k : k + 8]) + "," for k in range(0, len(literals), 8)
-    )
+    return "\n".join(", ".join(literals[k : k + 8]) + "," for k in range(0, len(literals), 8))

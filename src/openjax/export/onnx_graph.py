@@ -49,11 +49,7 @@ _ELEMENTWISE = {
     "copy_p": "Identity",
     "optimization_barrier": "Identity",
 }
-_REDUCE = {
-    "reduce_sum": "ReduceSum",
-    "reduce_max": "ReduceMax",
-    "reduce_min": "ReduceMin",
-}
+_REDUCE = {"reduce_sum": "ReduceSum", "reduce_max": "ReduceMax", "reduce_min": "ReduceMin"}
 
 
 class _Graph(Walk):
@@ -79,9 +75,7 @@ class _Graph(Walk):
             return value
         self._count += 1
         name = f"c{self._count}"
-        self.initializers.append(
-            self.numpy_helper.from_array(np.ascontiguousarray(value), name)
-        )
+        self.initializers.append(self.numpy_helper.from_array(np.ascontiguousarray(value), name))
         return name
 
     def add(self, kind: str, inputs: Sequence, outputs: int = 1, **attributes):
@@ -130,9 +124,7 @@ class _Graph(Walk):
         return self.add("Min", [self.add("Max", [low, value]), high])
 
     def _op_convert_element_type(self, operation):
-        kind = self.helper.np_dtype_to_tensor_dtype(
-            np.dtype(operation.parameters["new_dtype"])
-        )
+        kind = self.helper.np_dtype_to_tensor_dtype(np.dtype(operation.parameters["new_dtype"]))
         return self.add("Cast", operation.inputs, to=kind)
 
     def _op_broadcast_in_dim(self, operation):
@@ -167,9 +159,7 @@ class _Graph(Walk):
 
     def _op_reduce_sum(self, operation):
         axes = _whole(operation.parameters["axes"])
-        return self.add(
-            _REDUCE[operation.name], [operation.inputs[0], axes], keepdims=0
-        )
+        return self.add(_REDUCE[operation.name], [operation.inputs[0], axes], keepdims=0)
 
     _op_reduce_max = _op_reduce_min = _op_reduce_sum
 
@@ -178,9 +168,7 @@ def _whole(numbers):
     return np.array(list(numbers), np.int64)
 
 
-def onnx_model(
-    function: Callable, inputs: dict[str, jax.ShapeDtypeStruct], output: str
-):
+def onnx_model(function: Callable, inputs: dict[str, jax.ShapeDtypeStruct], output: str):
     """An ONNX model of `function(**inputs)`, which returns one array; inputs that it
     doesn't read are left out.
 
@@ -208,11 +196,7 @@ def onnx_model(
         helper.make_graph(
             graph.nodes,
             "openjax_policy",
-            [
-                describe(name, kind)
-                for name, kind in inputs.items()
-                if name in names_read
-            ],
+            [describe(name, kind) for name, kind in inputs.items() if name in names_read],
             [helper.make_tensor_value_info(output, TensorProto.FLOAT, out.shape)],
             graph.initializers,
         ),

@@ -68,18 +68,14 @@ class Walk:
         return self._transpose(operation.inputs[0], operation.parameters["permutation"])
 
     def _op_concatenate(self, operation: Operation):
-        return self._join(
-            operation.inputs, operation.shape, operation.parameters["dimension"]
-        )
+        return self._join(operation.inputs, operation.shape, operation.parameters["dimension"])
 
     def _op_stack(self, operation: Operation):
         shape = operation.shape
         axis = operation.parameters["axis"]
         part_shape = (*shape[:axis], 1, *shape[axis + 1 :])
         return self._join(
-            [self._reshape(value, part_shape) for value in operation.inputs],
-            shape,
-            axis,
+            [self._reshape(value, part_shape) for value in operation.inputs], shape, axis
         )
 
     def _op_integer_pow(self, operation: Operation):
@@ -94,14 +90,10 @@ class Walk:
         factors = []
         # each factor as matrices: axes of a kind are joined, and what is summed over
         # stands last on the left side, first on the right
-        for side, (value, shape) in enumerate(
-            zip(operation.inputs, operation.shapes, strict=True)
-        ):
+        for side, (value, shape) in enumerate(zip(operation.inputs, operation.shapes, strict=True)):
             batch = batches[side]
             sum_axes = sums[side]
-            free = [
-                axis for axis in range(len(shape)) if axis not in (*batch, *sum_axes)
-            ]
+            free = [axis for axis in range(len(shape)) if axis not in (*batch, *sum_axes)]
             groups = (batch, sum_axes, free) if side else (batch, free, sum_axes)
             matrix = [math.prod(shape[axis] for axis in group) for group in groups]
             matrix = tuple(matrix if batch else matrix[1:])
@@ -111,11 +103,7 @@ class Walk:
         shape = (*sizes[0][:-1], sizes[1][-1])
         first, second = factors
         product = self._product(first, second, shape)
-        return (
-            product
-            if shape == operation.shape
-            else self._reshape(product, operation.shape)
-        )
+        return product if shape == operation.shape else self._reshape(product, operation.shape)
 
     def _as_matrices(self, value, shape, order, matrix):
         """A value with its axes in another order and joined to those of `matrix`; what
@@ -123,16 +111,10 @@ class Walk:
         """
         if order != sorted(order):
             value = (
-                np.transpose(value, order)
-                if _is_known(value)
-                else self._transpose(value, order)
+                np.transpose(value, order) if _is_known(value) else self._transpose(value, order)
             )
         if matrix != tuple(shape[axis] for axis in order):
-            value = (
-                np.reshape(value, matrix)
-                if _is_known(value)
-                else self._reshape(value, matrix)
-            )
+            value = np.reshape(value, matrix) if _is_known(value) else self._reshape(value, matrix)
         return value
 
     def run(self, jaxpr, consts, inputs) -> list:
@@ -158,9 +140,7 @@ class Walk:
             return self.run(branch.jaxpr, branch.consts, inputs[1:])
         if name in _INLINE:
             inner = next(
-                parameters[key]
-                for key in ("jaxpr", "call_jaxpr", "fun_jaxpr")
-                if key in parameters
+                parameters[key] for key in ("jaxpr", "call_jaxpr", "fun_jaxpr") if key in parameters
             )
             consts = getattr(inner, "consts", ())
             return self.run(getattr(inner, "jaxpr", inner), consts, inputs)
@@ -168,9 +148,7 @@ class Walk:
             results = equation.primitive.bind(*inputs, **parameters)
             results = results if equation.primitive.multiple_results else [results]
             return [np.asarray(value) for value in results]
-        rule = getattr(
-            self, f"_op_{'elementwise' if name in self.elementwise else name}", None
-        )
+        rule = getattr(self, f"_op_{'elementwise' if name in self.elementwise else name}", None)
         # refused, and not left out: a policy that is nearly right is worse than none
         if rule is None:
             raise UserError(
@@ -192,9 +170,7 @@ def outer_padding(operation: Operation) -> tuple[list[int], list[int]]:
     """
     low, high, between = zip(*operation.parameters["padding_config"], strict=True)
     if any(between) or min(*low, *high, 0) < 0:
-        raise UserError(
-            "the policy pads between entries or cuts, which no export knows yet"
-        )
+        raise UserError("the policy pads between entries or cuts, which no export knows yet")
     return list(low), list(high)
 
 

@@ -47,10 +47,7 @@ def check_agreement(flight: Flight, vehicle) -> list[Issue]:
     """Findings on a flight that has passed the other checks (sorted, finite, airborne);
     every one refuses it. `vehicle` gives the rotors' places and spins.
     """
-    issues = [
-        ("garbage", text, ())
-        for text in (*copied_columns(flight), *rows_at_random(flight))
-    ]
+    issues = [("garbage", text, ()) for text in (*copied_columns(flight), *rows_at_random(flight))]
     grid = clock_of(flight)
     if grid is not None and not issues:
         signals = Signals.of(flight, grid)
@@ -62,10 +59,7 @@ def check_agreement(flight: Flight, vehicle) -> list[Issue]:
             or list(path_findings(signals))
             or order_findings(signals, vehicle)
         )
-    return [
-        Issue(flight.name, text, True, kind, tuple(against))
-        for kind, text, against in issues
-    ]
+    return [Issue(flight.name, text, True, kind, tuple(against)) for kind, text, against in issues]
 
 
 def shown_right(flight: Flight, vehicle) -> set[str]:
@@ -77,9 +71,7 @@ def shown_right(flight: Flight, vehicle) -> set[str]:
         return set()
     signals = Signals.of(flight, grid)
     channels = {
-        pair.what
-        for pair in pairs_of(signals)
-        if pair.tells.sum() >= min(2, len(pair.tells))
+        pair.what for pair in pairs_of(signals) if pair.tells.sum() >= min(2, len(pair.tells))
     }
     return channels | ({MOTORS} if torques_fit(signals, vehicle) else set())
 
@@ -168,11 +160,7 @@ def _inversions(signals: Signals) -> list[Finding]:
             return [("quaternion", words, ["the attitude's thrust"])]
     text = f"by its attitude the vehicle flies upside down (mean cosine of its tilt {upright:.2f})"
     return [
-        (
-            "quaternion",
-            f"{text}: qw, qx, qy, qz hold something else",
-            ["the attitude's thrust"],
-        )
+        ("quaternion", f"{text}: qw, qx, qy, qz hold something else", ["the attitude's thrust"])
     ]
 
 

@@ -12,9 +12,7 @@ BELOW = 0.3
 GROUND_CLEARANCE = 0.02  # m above the floor
 
 
-def airborne_part(
-    flight: Flight, floor_z: float | None, note, every: bool = False
-) -> Flight:
+def airborne_part(flight: Flight, floor_z: float | None, note, every: bool = False) -> Flight:
     """Cut to the longest airborne stretch, or to `every` one of a useful length. Off
     the ground: motors give at least 40 % of their usual command, and the vehicle isn't
     at rest on the floor; shorter dips (half a second) are manoeuvres.
@@ -26,8 +24,7 @@ def airborne_part(
     airborne = flight.time[stop - 1] - flight.time[start]
     if airborne < SHORTEST:
         raise Refused(
-            "short",
-            f"airborne for {airborne:.1f} s only; at least {SHORTEST:g} s are needed",
+            "short", f"airborne for {airborne:.1f} s only; at least {SHORTEST:g} s are needed"
         )
     if every:
         is_long = np.zeros(len(flight), bool)
@@ -44,11 +41,7 @@ def airborne_part(
 
 def _on_ground(flight, floor_z):
     """(T,) whether the vehicle stands, as `airborne_part` says it."""
-    drive = (
-        flight.motor_command
-        if flight.motor_command is not None
-        else flight.command_thrust
-    )
+    drive = flight.motor_command if flight.motor_command is not None else flight.command_thrust
     drive = drive if drive.ndim == 1 else drive.mean(1)
     rows = np.isfinite(drive)
     drive = np.interp(flight.time, flight.time[rows], drive[rows])
@@ -84,9 +77,7 @@ def check_above_floor(flight: Flight, floor: float) -> None:
         )
 
 
-def _long_runs(
-    flags: np.ndarray, time: np.ndarray, shortest: float = 0.5
-) -> np.ndarray:
+def _long_runs(flags: np.ndarray, time: np.ndarray, shortest: float = 0.5) -> np.ndarray:
     """`flags` (T,) without runs of less than `shortest` s: a dip of thrust in the air
     is a manoeuvre.
     """

@@ -41,10 +41,7 @@ def derive_attitude(flight: Flight, note) -> Flight:
             quaternion[rows] = _attitude(part)
     if np.isnan(quaternion).all():
         return flight
-    note(
-        "columns",
-        "no attitude was logged: it is derived from gyroscope, accelerometer and path",
-    )
+    note("columns", "no attitude was logged: it is derived from gyroscope, accelerometer and path")
     return dataclasses.replace(flight, quaternion=quaternion, attitude_derived=True)
 
 
@@ -70,9 +67,7 @@ def _attitude(part: Flight) -> np.ndarray:
     bias = np.zeros(3)
     total = np.zeros((knots, 3))
     for _ in range(STEPS):
-        push, drift = _step(
-            attitude, force - bias, (ends, velocity_force, weights), total
-        )
+        push, drift = _step(attitude, force - bias, (ends, velocity_force, weights), total)
         bias = bias + push
         total = total + drift
         attitude = Rotation.from_rotvec(_hats(time - time[0], knots) @ drift) * attitude
@@ -101,9 +96,7 @@ def _step(attitude: Rotation, force: np.ndarray, windows, total: np.ndarray):
     by_bias = -turn / FELT
     # (W, 3, 3)
     by_turn = np.stack([np.cross(axis, measured_force) for axis in np.eye(3)], 2) / FELT
-    columns = np.einsum("wk,wij->wikj", weights, by_turn).reshape(
-        len(measured_force), 3, 3 * knots
-    )
+    columns = np.einsum("wk,wij->wikj", weights, by_turn).reshape(len(measured_force), 3, 3 * knots)
     columns = np.concatenate([by_bias, columns], 2).reshape(-1, 3 + 3 * knots)
     # The gyroscope's error walks at random from knot to knot.
     walk = np.kron(np.diff(np.eye(knots), axis=0), np.eye(3)) / WANDER
@@ -138,9 +131,7 @@ def _kabsch(vectors: np.ndarray, targets: np.ndarray) -> Rotation:
 def _means(values: np.ndarray, ends: np.ndarray) -> np.ndarray:
     """Means (W, C) of rows (T, C) between ends (W + 1,), by the trapezoidal rule."""
     middle = 0.5 * (values[1:] + values[:-1])
-    return (
-        np.add.reduceat(middle[: ends[-1]], ends[:-1], axis=0) / np.diff(ends)[:, None]
-    )
+    return np.add.reduceat(middle[: ends[-1]], ends[:-1], axis=0) / np.diff(ends)[:, None]
 
 
 def _hats(time: np.ndarray, knots: int) -> np.ndarray:

@@ -43,25 +43,19 @@ class LogFolder:
     def case(self, comparison: bool = False) -> Case:
         """Checked, as `load_case` says."""
         if not self.has_vehicle_file and not comparison:
-            raise TooLittle(
-                f"{self.path}: no vehicle.toml; {_called_otherwise(self.path)}"
-            )
+            raise TooLittle(f"{self.path}: no vehicle.toml; {_called_otherwise(self.path)}")
         flights, issues = _usable(self.logs, self.vehicle_file, comparison)
         issues += _not_flown(self.vehicle_file, self.logs)
         if not flights:
             reasons = [i for i in issues if i.refused]
             first = (
-                f"{reasons[0].flight}: {reasons[0].issue}"
-                if reasons
-                else "no vehicle in any log"
+                f"{reasons[0].flight}: {reasons[0].issue}" if reasons else "no vehicle in any log"
             )
             more = f" (and {len(reasons) - 1} more)" if len(reasons) > 1 else ""
             raise TooLittle(f"{self.path}: no flight can be used: {first}{more}")
         # A thrust error is told from the mass only where every vehicle that flew was
         # weighed.
-        is_weighed = all(
-            self.vehicle_file.mass_weighed_of(flight.vehicle) for flight in flights
-        )
+        is_weighed = all(self.vehicle_file.mass_weighed_of(flight.vehicle) for flight in flights)
         vehicle_file = replace(self.vehicle_file, mass_weighed=is_weighed)
         name = self.path.resolve().name
         return Case(name, tuple(flights), vehicle_file, tuple(issues), self.path)
@@ -84,21 +78,13 @@ def read_folder(path: str | Path, dtype=jnp.float32) -> LogFolder:
     path = Path(path)
     if not path.is_dir():
         what = "is a file" if path.exists() else "no such folder"
-        raise UserError(
-            f"{path}: {what}; a case is a folder of flight logs with a vehicle.toml"
-        )
+        raise UserError(f"{path}: {what}; a case is a folder of flight logs with a vehicle.toml")
     logs = find_logs(path)
     if not logs:
-        raise UserError(
-            f"{path}: holds no flight log{_held_instead(path)}{_cases_inside(path)}"
-        )
+        raise UserError(f"{path}: holds no flight log{_held_instead(path)}{_cases_inside(path)}")
     has_vehicle_file = (path / "vehicle.toml").exists()
-    vehicle_file = load_vehicle_file(
-        path / "vehicle.toml" if has_vehicle_file else None, dtype
-    )
-    mapping = (
-        load_mapping(path / MAPPING_FILE) if (path / MAPPING_FILE).exists() else None
-    )
+    vehicle_file = load_vehicle_file(path / "vehicle.toml" if has_vehicle_file else None, dtype)
+    mapping = load_mapping(path / MAPPING_FILE) if (path / MAPPING_FILE).exists() else None
     logs_read = tuple(_read(log, vehicle_file, mapping) for log in logs)
     return LogFolder(path, vehicle_file, has_vehicle_file, logs_read)
 
@@ -107,9 +93,7 @@ def _not_flown(vehicle_file: VehicleFile, logs_read) -> list[Issue]:
     """What the vehicle file says of vehicles that are in none of the logs: an id with
     another spelling, whose mass would go unnoticed.
     """
-    vehicles = sorted(
-        {flight.vehicle for flights, _ in logs_read for flight in flights}
-    )
+    vehicles = sorted({flight.vehicle for flights, _ in logs_read for flight in flights})
     others = sorted(set(vehicle_file.vehicles) - set(vehicles))
     if not others or not vehicles:
         return []
@@ -122,9 +106,7 @@ def _held_instead(path: Path) -> str:
     """What a folder without a log holds, in words, and what a log is."""
     others = sorted(file.name for file in path.iterdir() if file.name not in NO_LOGS)
     formats = f"known are {', '.join(importer.name for importer in importers())}"
-    listing = ", ".join(others[:SHOWN]) + f" and {len(others) - SHOWN} more" * (
-        len(others) > SHOWN
-    )
+    listing = ", ".join(others[:SHOWN]) + f" and {len(others) - SHOWN} more" * (len(others) > SHOWN)
     return f": {formats}; it holds {listing}" if others else f"; {formats}"
 
 
@@ -142,9 +124,7 @@ def _called_otherwise(path: Path) -> str:
 def _cases_inside(path):
     """In words: which cases a folder holds, where somebody gave the one above."""
     cases = sorted(file.parent.name for file in path.glob("*/vehicle.toml"))
-    return (
-        f"; cases are folders in it: {cases[0]}, in all {len(cases)}" if cases else ""
-    )
+    return f"; cases are folders in it: {cases[0]}, in all {len(cases)}" if cases else ""
 
 
 def _usable(
@@ -160,9 +140,7 @@ def _usable(
     for name, original in copies.items():
         text = f"the same values as {original}: a copy, left out"
         issues.append(Issue(name, text, refused=True, kind="duplicate"))
-    results = [
-        _check(f, vehicle_file, comparison) for f in flights if f.log not in copies
-    ]
+    results = [_check(f, vehicle_file, comparison) for f in flights if f.log not in copies]
     issues += [issue for _, of_flight in results for issue in of_flight]
     usable, refusals = _without_distrust(
         [f for f, _ in results if f is not None], issues, vehicle_file
@@ -184,11 +162,7 @@ def _without_distrust(
     out = []
     refusals = []
     for flight, right in zip(flights, channels, strict=True):
-        doubts = [
-            what
-            for what in failures
-            if what not in right and failures[what] > counts[what]
-        ]
+        doubts = [what for what in failures if what not in right and failures[what] > counts[what]]
         if not doubts:
             out.append(flight)
         else:
@@ -224,9 +198,7 @@ def _read(
 ) -> tuple[list[Flight], list[Issue]]:
     """The flights of one log, and what was found."""
     try:
-        flights, remarks = flights_of(
-            read_log(log, mapping), vehicle_file.motor_permutation
-        )
+        flights, remarks = flights_of(read_log(log, mapping), vehicle_file.motor_permutation)
     except LogError as error:
         return [], [Issue(log.name, str(error), refused=True, kind="reading")]
     return flights, [Issue(log.name, remark, kind="columns") for remark in remarks]

@@ -8,12 +8,7 @@ from openjax.flights.attitude import derive_attitude
 from openjax.flights.derived import derive_rates, derive_velocity, mend_velocity
 from openjax.flights.flight import Flight, Issue, Refused
 from openjax.flights.range_checks import in_range
-from openjax.flights.sampling import (
-    drop_frozen,
-    drop_held_rows,
-    drop_repeats,
-    put_in_step,
-)
+from openjax.flights.sampling import drop_frozen, drop_held_rows, drop_repeats, put_in_step
 from openjax.flights.time_checks import in_time, while_motors_turn
 
 
@@ -46,10 +41,7 @@ def check_flight(
         check_above_floor(result, 0.0 if floor is None else float(floor))
         _has_what_is_needed(result, comparison)
     except Refused as refused:
-        return None, [
-            *issues,
-            Issue(flight.name, str(refused), refused=True, kind=refused.kind),
-        ]
+        return None, [*issues, Issue(flight.name, str(refused), refused=True, kind=refused.kind)]
     disagreements = check_agreement(result, vehicle)
     return (None if disagreements else result), issues + disagreements
 
@@ -68,9 +60,7 @@ def duplicates(flights: list[Flight]) -> dict[str, str]:
 def _has_what_is_needed(flight: Flight, comparison: bool) -> None:
     if comparison:
         if not flight.has_motors:
-            raise Refused(
-                "columns", "holds no motor commands (m1..m4), which a comparison needs"
-            )
+            raise Refused("columns", "holds no motor commands (m1..m4), which a comparison needs")
         return
     # A gyroscope beside the motors shows what torques do; nothing less shows anything.
     if not (flight.has_pose or flight.body_rates is not None):
@@ -79,16 +69,12 @@ def _has_what_is_needed(flight: Flight, comparison: bool) -> None:
         raise Refused("columns", f"needs position and orientation ({pose}) or {imu}")
     if not (flight.has_motors or flight.has_commands):
         raise Refused(
-            "columns",
-            "holds no commands: needs m1..m4, or cmd_thrust and cmd_wx, cmd_wy, cmd_wz",
+            "columns", "holds no commands: needs m1..m4, or cmd_thrust and cmd_wx, cmd_wy, cmd_wz"
         )
 
 
 def _with_forces(flight: Flight, note) -> Flight:
     """The flight, noted where it holds nothing that a force moves."""
     if not (flight.has_pose or flight.has_imu):
-        note(
-            "columns",
-            "no accelerometer, nor a pose: torques alone can be told; log ax, ay, az",
-        )
+        note("columns", "no accelerometer, nor a pose: torques alone can be told; log ax, ay, az")
     return flight

@@ -63,11 +63,7 @@ class MotorClock:
 
 
 def read_motor_clock(
-    tracks: Sequence[Track],
-    vehicles,
-    row: float,
-    rows: str = "mean",
-    gyroscope: bool = True,
+    tracks: Sequence[Track], vehicles, row: float, rows: str = "mean", gyroscope: bool = True
 ) -> MotorClock:
     """Compare motors and turning of all tracks of one case with their nominal
     `vehicles`. `row`: s between the log's own rows; `rows`: what is said of them, see
@@ -85,20 +81,13 @@ def read_motor_clock(
     times = (usual,) if alike else delays.values()
     if all(-LATE < delay - row_time <= least for delay in times):
         return MotorClock(by_a_row if row_time else {}, True, {})
-    if (
-        alike
-        and not row_time
-        and row >= SLOWEST_ROW
-        and least < usual < 1.5 * row + EARLY
-    ):
+    if alike and not row_time and row >= SLOWEST_ROW and least < usual < 1.5 * row + EARLY:
         text = (
             f"motor commands act {1e3 * usual:.0f} ms before their row: rows hold what acted since "
             "the last one, and are read one row earlier"
         )
         return MotorClock(by_a_row, True, {"motor rows": text})
-    words = _in_words(
-        {flight: time for flight, time in delays.items() if abs(time) > least}
-    )
+    words = _in_words({flight: time for flight, time in delays.items() if abs(time) > least})
     text = (
         f"motors and {'gyroscope' if gyroscope else 'attitude'} don't share a clock: motor "
         f"commands are {words}; they are moved by that, and torques, lags and latencies can't be "
@@ -164,9 +153,7 @@ def read_command_clock(tracks: Sequence[Track], row: float) -> str:
     """
     both = [t for t in tracks if t.command is not None and t.motor is not None]
     pairs = ((t, t.motor.mean(1)[:, None], t.command[:, :1]) for t in both)
-    delays = {
-        f: -d for f, d in _offsets(pairs).items() if not -1.5 * row - EARLY < d < LINK
-    }
+    delays = {f: -d for f, d in _offsets(pairs).items() if not -1.5 * row - EARLY < d < LINK}
     return (
         f"commands and motors don't share a clock: commands are {_in_words(delays)}; they aren't "
         "used, and link and rate controller can't be told from these logs"
@@ -187,9 +174,7 @@ def _offsets(signals) -> dict[str, float]:
     likeness: dict[str, list] = {}
     for track, effect, cause in signals:
         if (correlation := _likeness(effect, cause, track.dt)) is not None:
-            likeness.setdefault(_flight_of(track), []).append(
-                (correlation, track.dt / FINER)
-            )
+            likeness.setdefault(_flight_of(track), []).append((correlation, track.dt / FINER))
     curves = {}
     for flight, parts in likeness.items():
         # Stretches of one flight may have rows of another length: all on the grid of
@@ -238,18 +223,12 @@ def _likeness(effect: np.ndarray, cause: np.ndarray, dt: float) -> np.ndarray | 
     if len(effect) < 4 * edge:
         return None
     # of slow rows the band ends before the highest frequency that they can hold
-    band = butter(
-        2, (BAND[0], min(BAND[1], 0.4 / dt)), "bandpass", fs=1 / dt, output="sos"
-    )
+    band = butter(2, (BAND[0], min(BAND[1], 0.4 / dt)), "bandpass", fs=1 / dt, output="sos")
     bands = (sosfiltfilt(band, v, axis=0)[edge:-edge] for v in (effect, cause))
     # The one turn at a start outweighs a whole flight.
-    effect, cause = (
-        np.clip(v, -u, u) for v in bands for u in [LOUD * np.median(np.abs(v), 0)]
-    )
+    effect, cause = (np.clip(v, -u, u) for v in bands for u in [LOUD * np.median(np.abs(v), 0)])
     size = 1 << int(np.ceil(np.log2(2 * len(effect))))
-    spectrum = np.fft.rfft(effect, size, axis=0) * np.conj(
-        np.fft.rfft(cause, size, axis=0)
-    )
+    spectrum = np.fft.rfft(effect, size, axis=0) * np.conj(np.fft.rfft(cause, size, axis=0))
     steps = int(REACH / dt) * FINER
     cross = FINER * np.fft.irfft(spectrum, FINER * size, axis=0)
     cross = np.concatenate([cross[-steps:], cross[: steps + 1]])
@@ -258,9 +237,7 @@ def _likeness(effect: np.ndarray, cause: np.ndarray, dt: float) -> np.ndarray | 
     return (np.abs(correlation) * correlation).mean(1)
 
 
-def _turning(
-    track: Track, vehicle, gyroscope: bool
-) -> tuple[Track, np.ndarray, np.ndarray]:
+def _turning(track: Track, vehicle, gyroscope: bool) -> tuple[Track, np.ndarray, np.ndarray]:
     """The track, its angular acceleration and that which its motors make, but for their
     units, (T - 1, 2), in roll and pitch.
     """
@@ -286,9 +263,7 @@ def _torques(track: Track, vehicle) -> np.ndarray:
     start = decay * track.motor[:1]
     response = lfilter([1.0 - decay], [1.0, -decay], track.motor, axis=0, zi=start)[0]
     response_before = np.concatenate([track.motor[:1], response[:-1]])
-    mean = (
-        track.motor + (response_before - track.motor) * (1.0 - decay) * time / track.dt
-    )
+    mean = track.motor + (response_before - track.motor) * (1.0 - decay) * time / track.dt
     # Rotors that differ need unequal commands whenever the thrust changes, and no torque
     # acts: what goes with the sum tells no time, and in a climb it is all there is.
     total = mean.sum(1)

@@ -46,9 +46,7 @@ def other_pitch(signals: Signals) -> Signals:
     if signals.quaternion is not None:
         attitude = Rotation.from_quat(signals.quaternion, scalar_first=True)
         angles = attitude.as_euler("ZYX") * [1.0, -1.0, 1.0]
-        changes["quaternion"] = Rotation.from_euler("ZYX", angles).as_quat(
-            scalar_first=True
-        )
+        changes["quaternion"] = Rotation.from_euler("ZYX", angles).as_quat(scalar_first=True)
     if signals.body_rates is not None:
         changes["body_rates"] = signals.body_rates * [1.0, -1.0, 1.0]
     return dataclasses.replace(signals, **changes)

@@ -53,20 +53,14 @@ def read_csv(
     header = header._replace(line=above + header.line)
     _check_header(header, time)
     names = header.names
-    places = [
-        i
-        for i, name in enumerate(names)
-        if name != "vehicle" and name in readable_columns
-    ]
+    places = [i for i, name in enumerate(names) if name != "vehicle" and name in readable_columns]
     rows, remarks = _whole_lines(lines, header)
     number = _number if header.delimiter == "," else _number_with_comma
     rows, unit_remarks = _without_units(rows, header, places, number)
     remarks += unit_remarks
     unknown = [n for n in names if n and n not in readable_columns]
     if unknown:
-        remarks.append(
-            f"unknown column{'s' * (len(unknown) > 1)} left out: {name_list(unknown)}"
-        )
+        remarks.append(f"unknown column{'s' * (len(unknown) > 1)} left out: {name_list(unknown)}")
     values = _numbers(rows, header, places, number)
     remarks += _not_numbers(np.isinf(values), [names[i] for i in places])
     # the two could be told apart so far: empty cells, and such as hold no number
@@ -83,10 +77,7 @@ def read_csv(
 
 
 def _numbers(
-    rows: list[tuple[int, str]],
-    header: Header,
-    places: list[int],
-    number: Callable[[str], float],
+    rows: list[tuple[int, str]], header: Header, places: list[int], number: Callable[[str], float]
 ) -> np.ndarray:
     """(R, columns) of the columns `places`. Raises LogError where a cell is no
     number.
@@ -128,9 +119,7 @@ def _vehicles(rows: list[tuple[int, str]], delimiter: str, column: int) -> np.nd
     return np.array([cell.strip(' \t"') or "0" for cell in cells])
 
 
-def write_csv(
-    path: str | Path, table: LogTable, decimals: dict[str, int] | None = None
-) -> None:
+def write_csv(path: str | Path, table: LogTable, decimals: dict[str, int] | None = None) -> None:
     """Write a table as a log (gzipped where the name ends in `.gz`, with no time stamp
     in it: same data, same bytes). `decimals` per column; 6 where it isn't named. A NaN
     becomes an empty cell.
@@ -183,16 +172,12 @@ def _check_separator(line: str, delimiter: str, time: str) -> None:
     """
     other = max(SEPARATORS, key=line.count)
     if line.count(other) > 1:
-        raise LogError(
-            f"columns are separated by {other!r}, and columns.toml says {delimiter!r}"
-        )
+        raise LogError(f"columns are separated by {other!r}, and columns.toml says {delimiter!r}")
     if len(line.split()) > 2 and time in line.split():
         raise LogError("columns are separated by spaces; the log format wants ','")
 
 
-def _whole_lines(
-    lines: list[str], header: Header
-) -> tuple[list[tuple[int, str]], list[str]]:
+def _whole_lines(lines: list[str], header: Header) -> tuple[list[tuple[int, str]], list[str]]:
     """The lines below the header that aren't blank, each with its number in the file,
     and a remark where the last was cut off: power went while it was written.
     """
@@ -200,17 +185,12 @@ def _whole_lines(
     cells = len(header.names)
     rows = enumerate(lines[header.line + 1 :], header.line + 2)
     whole_lines = [
-        (number, remove_quotes(line, delimiter))
-        for number, line in rows
-        if line.strip()
+        (number, remove_quotes(line, delimiter)) for number, line in rows if line.strip()
     ]
     # a delimiter at the end of each line but the header's, as a loop in C writes it
-    if whole_lines and all(
-        line.count(delimiter) == cells for _, line in whole_lines[:2]
-    ):
+    if whole_lines and all(line.count(delimiter) == cells for _, line in whole_lines[:2]):
         whole_lines = [
-            (number, line.rstrip().removesuffix(delimiter))
-            for number, line in whole_lines
+            (number, line.rstrip().removesuffix(delimiter)) for number, line in whole_lines
         ]
     remarks = []
     if len(whole_lines) > 1 and whole_lines[-1][1].count(delimiter) + 1 < cells:
@@ -227,10 +207,7 @@ def _whole_lines(
 
 
 def _without_units(
-    rows: list[tuple[int, str]],
-    header: Header,
-    places: list[int],
-    number: Callable[[str], float],
+    rows: list[tuple[int, str]], header: Header, places: list[int], number: Callable[[str], float]
 ) -> tuple[list[tuple[int, str]], list[str]]:
     """The lines without a first one that holds units or other words, and a remark on
     it.

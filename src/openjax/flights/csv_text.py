@@ -99,9 +99,7 @@ def find_header(lines: list[str], delimiter: str = "") -> Header:
 
     Raises LogError where there is no text.
     """
-    written_lines = [
-        (i, line) for i, line in enumerate(lines[:MOST_ABOVE]) if line.strip()
-    ]
+    written_lines = [(i, line) for i, line in enumerate(lines[:MOST_ABOVE]) if line.strip()]
     if not written_lines:
         raise LogError("is empty: no column names")
     (at, line), *below = written_lines
@@ -112,10 +110,7 @@ def find_header(lines: list[str], delimiter: str = "") -> Header:
         (at, line), *below = below
     line = line.removeprefix(COMMENT)  # where numpy.savetxt puts the names
     delimiter = delimiter or max(SEPARATORS, key=line.count)
-    names = [
-        name.strip().strip('"')
-        for name in remove_quotes(line, delimiter).split(delimiter)
-    ]
+    names = [name.strip().strip('"') for name in remove_quotes(line, delimiter).split(delimiter)]
     return Header(names, delimiter, at)
 
 
@@ -140,9 +135,7 @@ def _open(path: Path, stack: ExitStack) -> io.BufferedIOBase:
     with path.open("rb") as file:
         start = file.read(len(ZIP))
     if start == ZIP:
-        raise LogError(
-            "is a zip archive or a spreadsheet: unpack it, or save it as CSV"
-        )
+        raise LogError("is a zip archive or a spreadsheet: unpack it, or save it as CSV")
     is_packed = start.startswith(GZIP)
     return stack.enter_context(gzip.open(path) if is_packed else path.open("rb"))
 

@@ -40,9 +40,7 @@ def mend_velocity(flight: Flight, note) -> Flight:
     """
     if flight.velocity is None or flight.position is None:
         return flight
-    rows = np.flatnonzero(
-        np.isfinite(flight.position).all(1) & np.isfinite(flight.velocity).all(1)
-    )
+    rows = np.flatnonzero(np.isfinite(flight.position).all(1) & np.isfinite(flight.velocity).all(1))
     if len(rows) < 10 * BESIDE_GAP:
         return flight
     time = flight.time[rows]
@@ -70,16 +68,14 @@ def mend_velocity(flight: Flight, note) -> Flight:
     return dataclasses.replace(flight, velocity=velocity)
 
 
-def _slopes(
-    time: np.ndarray, values: np.ndarray, half: int
-) -> tuple[np.ndarray, np.ndarray]:
+def _slopes(time: np.ndarray, values: np.ndarray, half: int) -> tuple[np.ndarray, np.ndarray]:
     """Derivatives (R, C) of values (R, C) by local quadratic fits over 2 `half` + 1
     rows (Savitzky-Golay, for uneven steps too), and how far in time (R,) each fit
     reaches.
     """
-    index = np.clip(np.arange(len(time)), half, len(time) - half - 1)[
-        :, None
-    ] + np.arange(-half, half + 1)
+    index = np.clip(np.arange(len(time)), half, len(time) - half - 1)[:, None] + np.arange(
+        -half, half + 1
+    )
     dt = time[index] - time[:, None]
     basis = np.stack([np.ones_like(dt), dt, dt**2], -1)
     normal = np.einsum("rki,rkj->rij", basis, basis)
@@ -118,9 +114,7 @@ def _enough(attitude: np.ndarray, step: float) -> int:
     """
     # Third differences hold little motion; of white noise s they are sqrt(20) s, and
     # their median size .6745 of that.
-    noise = float(np.median(np.abs(np.diff(attitude, 3, axis=0)))) / (
-        0.6745 * np.sqrt(20.0)
-    )
+    noise = float(np.median(np.abs(np.diff(attitude, 3, axis=0)))) / (0.6745 * np.sqrt(20.0))
     half = 1
     while half < len(attitude) // 2 and 2.0 * noise / step > RATE_NOISE * np.sqrt(
         half * (half + 1) * (2 * half + 1) / 3.0

@@ -107,9 +107,7 @@ class Flight:
     @property
     def row_period(self) -> float:
         """s, median step between rows."""
-        return (
-            float(np.median(np.diff(self.time))) if len(self.time) > 1 else float("nan")
-        )
+        return float(np.median(np.diff(self.time))) if len(self.time) > 1 else float("nan")
 
     @property
     def has_pose(self) -> bool:
@@ -131,9 +129,7 @@ class Flight:
         """Whether commanded thrust and body rates are logged."""
         return self.command_thrust is not None and self.command_body_rates is not None
 
-    def sampled(
-        self, channel: str
-    ) -> tuple[Float[Array, " samples"], Float[Array, "samples ..."]]:
+    def sampled(self, channel: str) -> tuple[Float[Array, " samples"], Float[Array, "samples ..."]]:
         """Times (S,) and values (S, ...) of the rows at which `channel` was sampled in
         full.
         """
@@ -185,9 +181,7 @@ class Flight:
             out /= np.linalg.norm(out, axis=1, keepdims=True)
         return out.reshape((len(time), *values.shape[1:]))
 
-    def stretches(
-        self, max_step: float | None = None, min_duration: float = 0.0
-    ) -> list[slice]:
+    def stretches(self, max_step: float | None = None, min_duration: float = 0.0) -> list[slice]:
         """Slices of rows without a gap in time longer than `max_step` s (default 5 row
         periods).
         """
@@ -195,18 +189,12 @@ class Flight:
         breaks = np.flatnonzero(np.diff(self.time) > max_step) + 1
         edges = [0, *breaks.tolist(), len(self.time)]
         slices = [slice(a, b) for a, b in itertools.pairwise(edges)]
-        return [
-            s
-            for s in slices
-            if self.time[s.stop - 1] - self.time[s.start] >= min_duration
-        ]
+        return [s for s in slices if self.time[s.stop - 1] - self.time[s.start] >= min_duration]
 
     def rows(self, rows: slice | Array) -> Flight:
         """The flight with a subset of its rows."""
         channels = {
-            c: getattr(self, c)[rows]
-            for c in CHANNEL_COLUMNS
-            if getattr(self, c) is not None
+            c: getattr(self, c)[rows] for c in CHANNEL_COLUMNS if getattr(self, c) is not None
         }
         return dataclasses.replace(self, time=self.time[rows], **channels)
 
@@ -227,11 +215,7 @@ class Case:
         """The other vehicles that flew together with `flight` (neighbours, for
         downwash).
         """
-        return tuple(
-            f
-            for f in self.flights
-            if f.log == flight.log and f.vehicle != flight.vehicle
-        )
+        return tuple(f for f in self.flights if f.log == flight.log and f.vehicle != flight.vehicle)
 
     def left_out(self) -> tuple[Issue, ...]:
         """What refused a log or a vehicle of it."""

@@ -25,8 +25,6 @@ def flight_channels(flight: Flight) -> list[Channel]:
     channels = [Channel(f"{name}/log", "openjax.LogRow", rows)]
     if flight.position is not None:
         channels.append(
-            pose_channel(
-                f"{name}/pose", flight.time, flight.position, flight.quaternion
-            )
+            pose_channel(f"{name}/pose", flight.time, flight.position, flight.quaternion)
         )
     return channels

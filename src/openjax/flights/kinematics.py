@@ -69,9 +69,7 @@ def read_kinematics(tracks: list[Track], limits) -> Kinematics:
     tilt = None
     findings = {}
     if words := _unusual(gain, error, limits.gyroscope_gain):
-        findings["gyroscope gain"] = (
-            f"the gyroscope reads {words} times the rate of the attitude"
-        )
+        findings["gyroscope gain"] = f"the gyroscope reads {words} times the rate of the attitude"
     scale = _gains(_streams(tracks, _accelerating, (BAND[0], SLOW)))
     if words := _unusual(scale[0], scale[1], limits.gyroscope_gain):
         findings["scale"] = (
@@ -87,11 +85,7 @@ def read_kinematics(tracks: list[Track], limits) -> Kinematics:
     if (world := _world(tracks)) is not None:
         lean, lean_error = world
         size = float(np.hypot(*lean))
-        tilt = (
-            lean
-            if size >= limits.standard_errors * float(np.hypot(*lean_error))
-            else None
-        )
+        tilt = lean if size >= limits.standard_errors * float(np.hypot(*lean_error)) else None
         # of the error's two axes what lies along the lean
         along = lean / max(size, 1e-12)
         error_along = float(np.sqrt(along**2 @ lean_error**2))
@@ -100,9 +94,7 @@ def read_kinematics(tracks: list[Track], limits) -> Kinematics:
                 f"motion capture's world leans by {np.degrees(size):.1f} degrees against gravity "
                 f"({np.degrees(lean[0]):+.1f} about x, {np.degrees(lean[1]):+.1f} about y)"
             )
-    return Kinematics(
-        _of_one_chip(gain, error, limits.standard_errors), tilt, one_clock, findings
-    )
+    return Kinematics(_of_one_chip(gain, error, limits.standard_errors), tilt, one_clock, findings)
 
 
 def _of_one_chip(gain: np.ndarray, error: np.ndarray, standard_errors: float) -> float:
@@ -117,9 +109,7 @@ def _of_one_chip(gain: np.ndarray, error: np.ndarray, standard_errors: float) ->
     weight = 1.0 / np.maximum(error[is_known], 1e-6) ** 2
     mean = float((weight * gain).sum() / weight.sum())
     dispersion = (weight * (gain - mean) ** 2).sum() / max(len(gain) - 1, 1)
-    clear = abs(mean - 1.0) > standard_errors * np.sqrt(
-        max(dispersion, 1.0) / weight.sum()
-    )
+    clear = abs(mean - 1.0) > standard_errors * np.sqrt(max(dispersion, 1.0) / weight.sum())
     return mean if clear else 1.0
 
 
@@ -133,9 +123,7 @@ def _unusual(gain: np.ndarray, error: np.ndarray, usual: float) -> str:
     # unit
     if off.sum() < 2:
         return ""
-    return ", ".join(
-        f"{a} {g:.3f}" for a, g, o in zip("xyz", gain, off, strict=True) if o
-    )
+    return ", ".join(f"{a} {g:.3f}" for a, g, o in zip("xyz", gain, off, strict=True) if o)
 
 
 def correct(track: Track, kinematics: Kinematics) -> Track:
@@ -145,9 +133,7 @@ def correct(track: Track, kinematics: Kinematics) -> Track:
         changes["body_rates"] = track.body_rates / kinematics.gain
     if kinematics.tilt is not None:
         turn = Rotation.from_rotvec([*-kinematics.tilt, 0.0])
-        channels = [
-            n for n in ("position", "velocity") if getattr(track, n) is not None
-        ]
+        channels = [n for n in ("position", "velocity") if getattr(track, n) is not None]
         changes |= {name: turn.apply(getattr(track, name)) for name in channels}
         attitude = turn * Rotation.from_quat(track.quaternion, scalar_first=True)
         changes["quaternion"] = attitude.as_quat(scalar_first=True)
@@ -169,11 +155,7 @@ def _accelerating(track: Track) -> tuple[np.ndarray, np.ndarray] | None:
     """What the accelerometer feels (T, 3) and the acceleration of the position (T, 3),
     m/s^2 in the world.
     """
-    if (
-        track.quaternion is None
-        or track.position is None
-        or track.specific_force is None
-    ):
+    if track.quaternion is None or track.position is None or track.specific_force is None:
         return None
     force = to_world(track.quaternion, track.specific_force)
     velocity = np.gradient(track.position, track.dt, axis=0)
@@ -223,12 +205,7 @@ def _gains(streams) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     error = _jackknife(sums, gain_of)
     # The quieter of the two: noise alone is no motion.
     moving = np.sqrt(np.minimum(total[0], total[2]) / total[3]) > LEAST
-    return (
-        np.where(moving & (coherence > COHERENT), gain, np.nan),
-        error,
-        coherence,
-        moving,
-    )
+    return (np.where(moving & (coherence > COHERENT), gain, np.nan), error, coherence, moving)
 
 
 def _wander(streams) -> float:
@@ -260,9 +237,7 @@ def _jackknife(sums: np.ndarray, statistic) -> np.ndarray:
     out.
     """
     left_out = np.array([statistic(sums.sum(0) - s) for s in sums])
-    return np.sqrt(
-        (len(sums) - 1) / len(sums) * ((left_out - left_out.mean(0)) ** 2).sum(0)
-    )
+    return np.sqrt((len(sums) - 1) / len(sums) * ((left_out - left_out.mean(0)) ** 2).sum(0))
 
 
 def _world(tracks) -> tuple[np.ndarray, np.ndarray] | None:
@@ -273,16 +248,10 @@ def _world(tracks) -> tuple[np.ndarray, np.ndarray] | None:
     grams = []
     flights = list(dict.fromkeys(t.flight for t in tracks))
     for track in tracks:
-        if (
-            track.quaternion is None
-            or track.velocity is None
-            or track.specific_force is None
-        ):
+        if track.quaternion is None or track.velocity is None or track.specific_force is None:
             return None
         turn = rotation(track.quaternion)
-        rest = to_world(track.quaternion, track.specific_force) - np.array(
-            [0.0, 0.0, GRAVITY]
-        )
+        rest = to_world(track.quaternion, track.specific_force) - np.array([0.0, 0.0, GRAVITY])
         low = butter(2, SLOW, fs=1.0 / track.dt, output="sos")
         edge = int(EDGE / track.dt)
         size = max(int(BLOCK / track.dt), 1)
@@ -295,9 +264,7 @@ def _world(tracks) -> tuple[np.ndarray, np.ndarray] | None:
         first_bias = 2 + 3 * flights.index(track.flight)
         bias[:, :, first_bias : first_bias + 3] = turn
         both = np.concatenate([bias, rest[:, :, None]], 2).reshape(len(track), -1)
-        both = sosfiltfilt(low, both, axis=0)[edge:-edge].reshape(
-            -1, 3, bias.shape[2] + 1
-        )
+        both = sosfiltfilt(low, both, axis=0)[edge:-edge].reshape(-1, 3, bias.shape[2] + 1)
         for k in range(0, len(both) - size // 2, size):
             part = both[k : k + size].reshape(-1, both.shape[2])
             grams.append(part.T @ part)

@@ -61,9 +61,7 @@ def references(
 def _way_points(rng, t, duration):
     """(T, 3) m, from corner to corner."""
     leg = 1.6  # s
-    corners = rng.uniform(
-        [-0.6, -0.6, 0.3], [0.6, 0.6, 1.0], (int(duration / leg) + 2, 3)
-    )
+    corners = rng.uniform([-0.6, -0.6, 0.3], [0.6, 0.6, 1.0], (int(duration / leg) + 2, 3))
     # one of three is near the floor and one near the ceiling, whose effects it shows
     corners[3::3, 2] = rng.uniform(0.06, 0.1, len(corners[3::3]))
     corners[2::3, 2] = rng.uniform(1.05, 1.12, len(corners[2::3]))
@@ -92,9 +90,7 @@ def _doublets(t, duration):
         axis = k % 4
         sign = 1 if (k // 4) % 2 == 0 else -1
         at = (t >= begin) & (t < begin + 0.16)
-        doublets[at, axis] += (
-            sign * size[axis] * np.where(t[at] < begin + 0.08, 1.0, -1.0)
-        )
+        doublets[at, axis] += sign * size[axis] * np.where(t[at] < begin + 0.08, 1.0, -1.0)
     return doublets
 
 

@@ -25,9 +25,7 @@ RELABELLINGS = [
 WANTED = "the log format wants w, x, y, z from body to world"
 INVERSE = np.array([1.0, -1.0, -1.0, -1.0])
 QUATERNIONS = {
-    f"the quaternion is in the order x, y, z, w; {WANTED}": lambda q: q[
-        :, [3, 0, 1, 2]
-    ],
+    f"the quaternion is in the order x, y, z, w; {WANTED}": lambda q: q[:, [3, 0, 1, 2]],
     f"the quaternion is from world to body; {WANTED}": lambda q: q * INVERSE,
     f"the quaternion is in the order x, y, z, w and from world to body; {WANTED}": lambda q: (
         q[:, [3, 0, 1, 2]] * INVERSE
@@ -43,9 +41,9 @@ def agrees(signals: Signals, bad: list[Pair]) -> bool:
     fit.
     """
     pairs = {pair.what: pair for pair in pairs_of(signals)}
-    return all(
-        pair.what in pairs and pairs[pair.what].fits for pair in bad
-    ) and not any(pair.bad.any() for pair in pairs.values())
+    return all(pair.what in pairs and pairs[pair.what].fits for pair in bad) and not any(
+        pair.bad.any() for pair in pairs.values()
+    )
 
 
 def mend(signals: Signals, bad: list[Pair]) -> tuple[str, str] | None:
@@ -100,9 +98,7 @@ def attitudes(signals: Signals) -> Iterator[tuple[str, np.ndarray]]:
     angles = Rotation.from_quat(signals.quaternion, scalar_first=True).as_euler("ZYX")
     for k, name in ((1, "pitch"), (2, "roll"), (0, "yaw")):
         signs = np.where(np.arange(3) == k, -1.0, 1.0)
-        mirror_image = Rotation.from_euler("ZYX", angles * signs).as_quat(
-            scalar_first=True
-        )
+        mirror_image = Rotation.from_euler("ZYX", angles * signs).as_quat(scalar_first=True)
         words = f"{name} has the other sign: scale = -1 for {name} in columns.toml"
         yield f"{words}, or the quaternion of the angle that it should be", mirror_image
     for order in itertools.permutations(range(4)):
@@ -111,10 +107,7 @@ def attitudes(signals: Signals) -> Iterator[tuple[str, np.ndarray]]:
             if _turns_with(signals, attitude):
                 # quaternion[:, order[i]] is what should stand at i
                 order_words = ", ".join("wxyz"[order.index(i)] for i in range(4))
-                yield (
-                    f"the quaternion is in the order {order_words}{way}; {WANTED}",
-                    attitude,
-                )
+                yield (f"the quaternion is in the order {order_words}{way}; {WANTED}", attitude)
 
 
 def _turns_with(signals: Signals, attitude: np.ndarray) -> bool:
@@ -125,9 +118,7 @@ def _turns_with(signals: Signals, attitude: np.ndarray) -> bool:
         return True
     attitude_rates = in_band(rates_of(attitude), WIDE)
     gyroscope_rates = in_band(signals.body_rates, WIDE)
-    power = max(
-        float(np.sqrt((attitude_rates**2).sum() * (gyroscope_rates**2).sum())), 1e-12
-    )
+    power = max(float(np.sqrt((attitude_rates**2).sum() * (gyroscope_rates**2).sum())), 1e-12)
     return float((attitude_rates * gyroscope_rates).sum()) > FOLLOWED * power
 
 
@@ -144,9 +135,7 @@ def _relabel(signals: Signals, pair: Pair, bad: list[Pair]) -> str:
         if pair.holds == "position" and signals.velocity is not None:
             changes["velocity"] = signals.velocity[:, order] * signs
         other = next(
-            p
-            for p in pairs_of(dataclasses.replace(signals, **changes))
-            if p.what == pair.what
+            p for p in pairs_of(dataclasses.replace(signals, **changes)) if p.what == pair.what
         )
         score = float(other.agreement.correlation.sum())
         # of labellings that fit alike the first stays, whatever rounding says
@@ -157,13 +146,9 @@ def _relabel(signals: Signals, pair: Pair, bad: list[Pair]) -> str:
     if not agrees(dataclasses.replace(signals, **changes), bad):
         return ""
     # values[:, order[i]] is what column i should hold
-    axis_words = {
-        order[i]: f"{'minus ' if signs[i] < 0 else ''}{'xyz'[i]}" for i in range(3)
-    }
+    axis_words = {order[i]: f"{'minus ' if signs[i] < 0 else ''}{'xyz'[i]}" for i in range(3)}
     words = ", ".join(
-        f"{names[k]} holds {axis_words[k]}"
-        for k in range(3)
-        if axis_words[k] != "xyz"[k]
+        f"{names[k]} holds {axis_words[k]}" for k in range(3) if axis_words[k] != "xyz"[k]
     )
     return f"{pair.holds.replace('_', ' ')} axes: {words}, by {pair.what}"
 

@@ -64,9 +64,7 @@ def _torques(signals: Signals, vehicle) -> dict[tuple, np.ndarray]:
     # roll, pitch and yaw torque per thrust
     mixing = np.stack([place[:, 1], -place[:, 0], spin])
     turns = in_band(np.gradient(signals.rates, 1 / RATE, axis=0), TURNING)
-    thrusts = in_band(
-        first_order(signals.motor, float(vehicle.motor_time_constant)), TURNING
-    )
+    thrusts = in_band(first_order(signals.motor, float(vehicle.motor_time_constant)), TURNING)
     if (thrusts.std(0) < 1e-6).all():
         return {}
     # Motors are correlated, so whole torques are scored: by the moments of angular
@@ -77,9 +75,7 @@ def _torques(signals: Signals, vehicle) -> dict[tuple, np.ndarray]:
     torques = {}
     for order, flip in itertools.product(itertools.permutations(range(4)), (1.0, -1.0)):
         mixer_rows = mixing[:, order] * [[1.0], [1.0], [flip]]
-        power = np.einsum("ij,ljk,ik->li", mixer_rows, among, mixer_rows) * (
-            turns**2
-        ).sum(0)
+        power = np.einsum("ij,ljk,ik->li", mixer_rows, among, mixer_rows) * (turns**2).sum(0)
         each = (mixer_rows * cross).sum(2) / np.sqrt(np.maximum(power, 1e-24))
         torques[order, flip] = each[int(np.argmax(each.sum(1)))]
     return torques
@@ -87,9 +83,7 @@ def _torques(signals: Signals, vehicle) -> dict[tuple, np.ndarray]:
 
 def _order_in_words(order: tuple[int, ...], flip: float) -> str:
     if order == IDENTITY[0]:
-        text = (
-            "the rotors' spin is opposite: yaw accelerates against the torque of m1..m4"
-        )
+        text = "the rotors' spin is opposite: yaw accelerates against the torque of m1..m4"
         return f"{text}; reverse motor.spin in vehicle.toml"
     names = ("front_right", "rear_right", "rear_left", "front_left")
     words = ", ".join(f"m{i + 1} {names[o]}" for i, o in enumerate(order))

@@ -69,20 +69,9 @@ class Signals:
             "body_rates": flight.body_rates_derived,
             "quaternion": flight.attitude_derived,
         }
-        channels = (
-            "position",
-            "quaternion",
-            "velocity",
-            "body_rates",
-            "specific_force",
-        )
+        channels = ("position", "quaternion", "velocity", "body_rates", "specific_force")
         channels += ("motor_command", "command_thrust", "command_body_rates")
-        return cls(
-            *(
-                None if is_derived.get(c) else on_clock(flight, c, grid)
-                for c in channels
-            )
-        )
+        return cls(*(None if is_derived.get(c) else on_clock(flight, c, grid) for c in channels))
 
     @cached_property
     def rates(self) -> Vectors | None:
@@ -108,9 +97,7 @@ class Signals:
             return np.gradient(self.velocity, 1 / RATE, axis=0), 1
         if self.position is None:
             return None, 2
-        return np.gradient(
-            np.gradient(self.position, 1 / RATE, axis=0), 1 / RATE, axis=0
-        ), 2
+        return np.gradient(np.gradient(self.position, 1 / RATE, axis=0), 1 / RATE, axis=0), 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,26 +127,19 @@ class Pair:
     @property
     def tells(self) -> Bool[np.ndarray, " columns"]:
         """(C,) whether the reference moves enough for a column to contradict it."""
-        return (self.agreement.reference > self.least) & (
-            self.agreement.expectation > TELLS
-        )
+        return (self.agreement.reference > self.least) & (self.agreement.expectation > TELLS)
 
     @property
     def bad(self) -> Bool[np.ndarray, " columns"]:
         """(C,) whether a column contradicts its reference."""
-        return self.tells & (
-            self.agreement.correlation < AGREE * self.agreement.expectation
-        )
+        return self.tells & (self.agreement.correlation < AGREE * self.agreement.expectation)
 
     @property
     def fits(self) -> bool:
         """Whether all columns that could contradict their reference clearly follow
         it.
         """
-        shares = (
-            self.agreement.correlation[self.tells]
-            / self.agreement.expectation[self.tells]
-        )
+        shares = self.agreement.correlation[self.tells] / self.agreement.expectation[self.tells]
         return bool(len(shares) and shares.min() > FITS)
 
     def in_words(self) -> str:
@@ -233,9 +213,7 @@ def _derived_pairs(s: Signals) -> Iterator[Pair]:
         )
 
 
-def _felt(
-    s: Signals, acceleration: np.ndarray, along: np.ndarray, order: int
-) -> Iterator[Pair]:
+def _felt(s: Signals, acceleration: np.ndarray, along: np.ndarray, order: int) -> Iterator[Pair]:
     """The path's acceleration with what an attitude and an accelerometer make of it;
     `along` (T, 1) is that along the body's z axis.
     """
@@ -355,9 +333,7 @@ def agreement(
     return Agreement(correlation, expectation, aligned_part, rms_y)
 
 
-def _noise(
-    values: np.ndarray, band: tuple[float, float], derivatives: int | None
-) -> np.ndarray:
+def _noise(values: np.ndarray, band: tuple[float, float], derivatives: int | None) -> np.ndarray:
     """Noise (C,) in the band, if all above 20 Hz is the white noise of what was
     differentiated.
     """
@@ -366,8 +342,7 @@ def _noise(
     # up to a tenth below the highest frequency of the clock
     high = (20.0, 45.0)
     power = [
-        np.mean(np.sin(2 * np.pi * np.linspace(*b, 50) / RATE) ** (2 * derivatives))
-        * (b[1] - b[0])
+        np.mean(np.sin(2 * np.pi * np.linspace(*b, 50) / RATE) ** (2 * derivatives)) * (b[1] - b[0])
         for b in (band, high)
     ]
     return in_band(values, high).std(0) * np.sqrt(power[0] / power[1])

@@ -85,29 +85,21 @@ def read_plan(name_or_path: str | Path) -> SetPoints:
         return plan_of()
     path = Path(name_or_path)
     if not path.is_file():
-        raise UserError(
-            f"{path}: no such plan; {STANDARD!r} or a CSV of openjax plan is needed"
-        )
+        raise UserError(f"{path}: no such plan; {STANDARD!r} or a CSV of openjax plan is needed")
     lines = path.read_text(encoding="utf-8").splitlines()
     if not lines or tuple(lines[0].split(",")) != COLUMNS:
-        raise UserError(
-            f"{path}: not a plan; its first line must be {','.join(COLUMNS)}"
-        )
+        raise UserError(f"{path}: not a plan; its first line must be {','.join(COLUMNS)}")
     cells = [line.split(",") for line in lines[1:] if line]
     if not cells:
         raise UserError(f"{path}: a plan without rows; write one with openjax plan")
     try:
         numbers = np.array([row[:-1] for row in cells], float)
     except ValueError:
-        raise UserError(
-            f"{path}: a plan has {len(COLUMNS) - 1} numbers in every row"
-        ) from None
+        raise UserError(f"{path}: a plan has {len(COLUMNS) - 1} numbers in every row") from None
     if numbers.shape[1] != len(COLUMNS) - 1:
         raise UserError(f"{path}: a plan has {len(COLUMNS) - 1} numbers in every row")
     if not (np.abs(numbers[:, 1:]) < FARTHEST).all():
-        raise UserError(
-            f"{path}: a number of the plan is not finite or beyond {FARTHEST:g}"
-        )
+        raise UserError(f"{path}: a number of the plan is not finite or beyond {FARTHEST:g}")
     if not np.allclose(np.diff(numbers[:, 0]), PERIOD, atol=1e-3):
         raise UserError(f"{path}: a plan's rows must be {1e3 * PERIOD:g} ms apart")
     return SetPoints(

@@ -46,20 +46,12 @@ def gravity_findings(force: np.ndarray | None) -> list[Finding]:
     )
     if unit:
         return [
-            (
-                "units",
-                f"ax, ay, az are {unit} (mean {size:.2f}); the log format wants m/s^2",
-                (),
-            )
+            ("units", f"ax, ay, az are {unit} (mean {size:.2f}); the log format wants m/s^2", ())
         ]
     if not 4.0 < size < 30.0:
         reason = "gravity was taken out" if size < 0.6 else "wrong unit or corrupt"
-        text = (
-            f"the mean specific force is {size:.3g} m/s^2 and not near 9.81: {reason}"
-        )
-        return [
-            ("units", f"{text}; the log format wants +9.81 m/s^2 on z at hover", ())
-        ]
+        text = f"the mean specific force is {size:.3g} m/s^2 and not near 9.81: {reason}"
+        return [("units", f"{text}; the log format wants +9.81 m/s^2 on z at hover", ())]
     if axis != 2 or mean[2] < 0:
         sign = "minus " if mean[axis] < 0 else ""
         text = f"accelerometer axes: a{'xyz'[axis]} holds {sign}z (median {mean[axis]:.1f} m/s^2)"
@@ -125,9 +117,7 @@ def copied_columns(flight: Flight) -> Iterator[str]:
     """Columns of one channel that hold the same values."""
     for channel in ("position", "velocity", "body_rates", "specific_force"):
         if getattr(flight, channel) is not None:
-            columns = zip(
-                CHANNEL_COLUMNS[channel], flight.sampled(channel)[1].T, strict=True
-            )
+            columns = zip(CHANNEL_COLUMNS[channel], flight.sampled(channel)[1].T, strict=True)
             for (a, one), (b, other) in itertools.combinations(columns, 2):
                 if np.ptp(one) > 0 and np.array_equal(one, other):
                     yield f"contradictory: {a} and {b} hold the same values in every row"
@@ -138,9 +128,7 @@ def rows_at_random(flight: Flight) -> Iterator[str]:
     variance itself.
     """
     for channel, least in CONTINUOUS.items():
-        if getattr(flight, channel) is None or (
-            channel == "velocity" and flight.velocity_derived
-        ):
+        if getattr(flight, channel) is None or (channel == "velocity" and flight.velocity_derived):
             continue
         time, values = flight.sampled(channel)
         is_near = np.diff(time) < 0.03  # s: longer steps say nothing about continuity
@@ -151,9 +139,7 @@ def rows_at_random(flight: Flight) -> Iterator[str]:
         ratio = 0.5 * (steps**2).mean(0) / np.maximum(spread**2, 1e-18)
         bad = (ratio > RANDOM) & (spread > least)
         if bad.any():
-            names = ", ".join(
-                n for n, b in zip(CHANNEL_COLUMNS[channel], bad, strict=True) if b
-            )
+            names = ", ".join(n for n, b in zip(CHANNEL_COLUMNS[channel], bad, strict=True) if b)
             yield (
                 f"contradictory: the rows of {names} follow each other at random "
                 f"({100 * ratio[bad].max():.0f} % of "

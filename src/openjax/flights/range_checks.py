@@ -29,10 +29,7 @@ def _of_unit_length(quaternion: np.ndarray, note) -> np.ndarray:
     unit = quaternion / norm[:, None]
     bad = off > 0.05
     if bad.any():
-        note(
-            "quaternion",
-            f"{bad.sum()} quaternions far from unit length are taken as not sampled",
-        )
+        note("quaternion", f"{bad.sum()} quaternions far from unit length are taken as not sampled")
         unit[bad] = np.nan
     elif np.nanmax(off) > 2e-3:
         note(
@@ -57,27 +54,18 @@ def in_range(flight: Flight, note) -> Flight:
         changes["quaternion"] = _of_unit_length(flight.quaternion, note)
     # a hall's origin may be far away, but none of these flights goes so far
     if flight.position is not None and np.nanmax(np.abs(flight.position)) > 100.0:
-        span = np.nanmax(
-            np.ptp(flight.position[np.isfinite(flight.position).all(1)], axis=0)
-        )
+        span = np.nanmax(np.ptp(flight.position[np.isfinite(flight.position).all(1)], axis=0))
         if span > 20.0:
-            raise Refused(
-                "units", f"x, y, z span {span:.0f}: in cm or mm? The log format wants m"
-            )
+            raise Refused("units", f"x, y, z span {span:.0f}: in cm or mm? The log format wants m")
     if flight.body_rates is not None:
         _refuse_degrees(flight.body_rates)
     voltage = flight.battery_voltage
     if voltage is not None:
         middle = float(np.nanmedian(voltage))
         if middle > 100:
-            raise Refused(
-                "units", f"vbat is {middle:.0f}: in mV? The log format wants V"
-            )
+            raise Refused("units", f"vbat is {middle:.0f}: in mV? The log format wants V")
         if not 2.0 < middle < 30.0:
-            note(
-                "corrupt",
-                f"vbat is {middle:.2g} V, which no battery in flight has; left out",
-            )
+            note("corrupt", f"vbat is {middle:.2g} V, which no battery in flight has; left out")
             changes["battery_voltage"] = None
     return dataclasses.replace(flight, **changes) if changes else flight
 
@@ -108,9 +96,7 @@ def _without_saturated(flight: Flight, note) -> Flight:
         if share < SATURATED or most < LEAST_RANGE[channel] or not _piled_up(size):
             continue
         columns = zip(CHANNEL_COLUMNS[channel], at_end.any(0), strict=True)
-        text = (
-            f"{', '.join(c for c, ends in columns if ends)} read {most:g} or -{most:g}"
-        )
+        text = f"{', '.join(c for c, ends in columns if ends)} read {most:g} or -{most:g}"
         text += f" in {share:.0%} of the rows, the sensor's end"
         if share < OFTEN:
             note("corrupt", f"{text}: taken as not sampled there")
@@ -151,14 +137,9 @@ def _without_lost_poses(flight: Flight, note) -> Flight:
     is_lost = (flight.quaternion == 0.0).all(1)
     if not is_lost.any():
         return flight
-    note(
-        "corrupt",
-        f"{is_lost.sum()} poses whose quaternion is zero are taken as not sampled",
-    )
+    note("corrupt", f"{is_lost.sum()} poses whose quaternion is zero are taken as not sampled")
     channels = [c for c in ("position", "quaternion") if getattr(flight, c) is not None]
-    changes = {
-        c: np.where(is_lost[:, None], np.nan, getattr(flight, c)) for c in channels
-    }
+    changes = {c: np.where(is_lost[:, None], np.nan, getattr(flight, c)) for c in channels}
     return dataclasses.replace(flight, **changes)
 
 
@@ -173,9 +154,7 @@ def _share_of_one(values: np.ndarray, columns: str) -> None:
             if high > 2100
             else "a pulse width in microseconds"
         )
-        raise Refused(
-            "units", f"{columns} reach {high:.0f}: {hint}; the log format wants 0..1"
-        )
+        raise Refused("units", f"{columns} reach {high:.0f}: {hint}; the log format wants 0..1")
     if high > 1.02:
         hint = "a wrong scale or corrupt"
         # per cent end at a hundred, 8-bit counts at 255
@@ -183,13 +162,9 @@ def _share_of_one(values: np.ndarray, columns: str) -> None:
             hint = "8-bit counts"
         elif high > 2:
             hint = "per cent"
-        raise Refused(
-            "units", f"{columns} reach {high:.3g}: {hint}; the log format wants 0..1"
-        )
+        raise Refused("units", f"{columns} reach {high:.3g}: {hint}; the log format wants 0..1")
     if low < -0.02:
-        raise Refused(
-            "corrupt", f"{columns} go down to {low:.3g}; commands lie in 0..1"
-        )
+        raise Refused("corrupt", f"{columns} go down to {low:.3g}; commands lie in 0..1")
 
 
 def _without_flips(quaternion: np.ndarray) -> np.ndarray:

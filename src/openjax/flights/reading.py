@@ -12,11 +12,7 @@ import numpy as np
 from openjax.flights.csv_text import LogError
 from openjax.flights.flight import CHANNEL_COLUMNS, Flight
 
-LOG_COLUMNS = (
-    "t",
-    "vehicle",
-    *(c for columns in CHANNEL_COLUMNS.values() for c in columns),
-)
+LOG_COLUMNS = ("t", "vehicle", *(c for columns in CHANNEL_COLUMNS.values() for c in columns))
 
 # channels of which a part is a mistake, not a choice
 WHOLE = ("quaternion", "motor_command")
@@ -52,14 +48,10 @@ def flights_of(
             f"no column t; the log has {name_list(table.columns)}: name it in columns.toml"
         )
     remarks = list(table.remarks)
-    all_channels = {
-        c: _channel(table, c, names, remarks) for c, names in CHANNEL_COLUMNS.items()
-    }
+    all_channels = {c: _channel(table, c, names, remarks) for c, names in CHANNEL_COLUMNS.items()}
     channels = {c: v for c, v in all_channels.items() if v is not None}
     if "motor_command" in channels:
-        channels["motor_command"] = channels["motor_command"][
-            :, list(motor_permutation)
-        ]
+        channels["motor_command"] = channels["motor_command"][:, list(motor_permutation)]
     # of all vehicles at once: a copy of a log is one of all of its flights
     fingerprint = _fingerprint(channels)
     ids = list(dict.fromkeys(table.vehicle.tolist()))
@@ -74,22 +66,16 @@ def flights_of(
         rows = np.flatnonzero(table.vehicle == vehicle_id)
         # in the long format a vehicle's rows hold what it logged, and nothing of the
         # others'
-        arrays = {
-            c: v[rows] for c, v in channels.items() if not np.isnan(v[rows]).all()
-        }
+        arrays = {c: v[rows] for c, v in channels.items() if not np.isnan(v[rows]).all()}
         name = table.name if len(ids) == 1 else f"{table.name}:{vehicle_id}"
         time = table.columns["t"][rows]
         flights.append(
-            Flight(
-                name, table.name, vehicle_id, time, fingerprint=fingerprint, **arrays
-            )
+            Flight(name, table.name, vehicle_id, time, fingerprint=fingerprint, **arrays)
         )
     return flights, remarks
 
 
-def _channel(
-    table: LogTable, channel: str, names, remarks: list[str]
-) -> np.ndarray | None:
+def _channel(table: LogTable, channel: str, names, remarks: list[str]) -> np.ndarray | None:
     """(T,) or (T, columns) of one channel; None where it wasn't logged."""
     present = [n for n in names if n in table.columns]
     if len(present) < len(names):
@@ -97,8 +83,7 @@ def _channel(
         if present and channel in WHOLE:
             hint = "; motors are counted from 1" * (absent == "m4")
             raise LogError(
-                f"{', '.join(present)} without {absent}: log {absent}, or none of "
-                f"them{hint}"
+                f"{', '.join(present)} without {absent}: log {absent}, or none of them{hint}"
             )
         if present:
             remarks.append(

@@ -27,9 +27,7 @@ def regimes_of(track: Track) -> dict[str, Chosen]:
     rows = len(track)
     nowhere = np.zeros(rows, bool)
     collective = smooth(track.motor.mean(1), 0.05, track.dt)
-    change = np.abs(
-        np.gradient(smooth(track.motor, 0.03, track.dt), track.dt, axis=0)
-    ).max(1)
+    change = np.abs(np.gradient(smooth(track.motor, 0.03, track.dt), track.dt, axis=0)).max(1)
     masks = {r: nowhere for r in REGIMES}
     masks["high_thrust"] = track.motor.max(1) > 0.8
     masks["transient"] = change > max(1.0, float(np.quantile(change, 0.8)))

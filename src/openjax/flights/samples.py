@@ -91,18 +91,10 @@ def fly(
     """
     sensors = SensorModel() if sensors is None else sensors
     names = tuple(sorted(effects or {}))
-    parameters = composition.complete_parameters(
-        composition.resolve(names), effects, jnp.float32
-    )
+    parameters = composition.complete_parameters(composition.resolve(names), effects, jnp.float32)
     velocity = np.gradient(reference.position, PERIOD, axis=0)
     acceleration = np.gradient(velocity, PERIOD, axis=0)
-    targets = (
-        reference.position,
-        velocity,
-        acceleration,
-        reference.yaw,
-        reference.extra_command,
-    )
+    targets = (reference.position, velocity, acceleration, reference.yaw, reference.extra_command)
     targets = tuple(jnp.asarray(w, jnp.float32) for w in targets)
     start = jnp.float32(reference.open_circuit_voltage)
     length, count = reference.position.shape[:2]
@@ -126,9 +118,7 @@ def log_of(columns: list[dict[str, Shaped[np.ndarray, "..."]]], name: str) -> Lo
     # stable: rows of one moment stay in the vehicles' order
     order = np.argsort(time, kind="stable")
     table = {n: np.concatenate([c[n] for c in columns])[order] for n in columns[0]}
-    vehicle = np.concatenate(
-        [np.full(len(c["t"]), str(i)) for i, c in enumerate(columns)]
-    )[order]
+    vehicle = np.concatenate([np.full(len(c["t"]), str(i)) for i, c in enumerate(columns)])[order]
     return LogTable(name, table, vehicle)
 
 
@@ -150,9 +140,9 @@ def _fly(
     key, bias_key, memory_key = jax.random.split(key, 3)
     gyro_bias = sensors.gyro_bias * jax.random.normal(bias_key, (count, 3))
     drones = hover_state(plant, target[0][0], velocity=target[1][0])
-    memory = jax.vmap(
-        lambda d, k: composition.initial_memory(effects, plant, d, PERIOD, k)
-    )(drones, jax.random.split(memory_key, count))
+    memory = jax.vmap(lambda d, k: composition.initial_memory(effects, plant, d, PERIOD, k))(
+        drones, jax.random.split(memory_key, count)
+    )
     drones = drones.replace(effect_memory=memory)
 
     def contexts(drones, load, air_time, dt):
@@ -163,25 +153,16 @@ def _fly(
 
         def build(d, neighbours, v):
             return make_context(
-                vehicle,
-                d,
-                others_position=neighbours,
-                battery_voltage=v,
-                air_time=air_time,
-                dt=dt,
+                vehicle, d, others_position=neighbours, battery_voltage=v, air_time=air_time, dt=dt
             )
 
-        return jax.vmap(build)(
-            drones, drones.position[others(count)], under_load
-        ), under_load
+        return jax.vmap(build)(drones, drones.position[others(count)], under_load), under_load
 
     def row(carry, inputs):
         drones, integral, force, load, key = carry
         wanted_row, air_time, gust = inputs
         key, noise_key = jax.random.split(key)
-        measured_state = jax.vmap(partial(composition.seen_state, effects, parameters))(
-            drones
-        )
+        measured_state = jax.vmap(partial(composition.seen_state, effects, parameters))(drones)
         command_sent, integral = jax.vmap(_position_controller, (None, 0, 0, 0))(
             model, measured_state, integral, wanted_row
         )
@@ -195,39 +176,27 @@ def _fly(
             gyro = drones.body_rates + gyro_bias + sensors.gyro_noise * noise
 
             def control(d, g, c):
-                return rate_controller(
-                    vehicle, d.replace(body_rates=g), c, PERIOD / RATE_LOOPS
-                )
+                return rate_controller(vehicle, d.replace(body_rates=g), c, PERIOD / RATE_LOOPS)
 
             motor, rate_integral = jax.vmap(control)(drones, gyro, command)
-            drones = drones.replace(
-                rate_integral=rate_integral, previous_body_rates=gyro
-            )
+            drones = drones.replace(rate_integral=rate_integral, previous_body_rates=gyro)
             for _ in range(SUBSTEPS):
-                context, _ = contexts(
-                    drones, load, air_time, PERIOD / RATE_LOOPS / SUBSTEPS
+                context, _ = contexts(drones, load, air_time, PERIOD / RATE_LOOPS / SUBSTEPS)
+                drones, force = jax.vmap(partial(_physics, vehicle, effects, parameters))(
+                    drones, motor, context, gust
                 )
-                drones, force = jax.vmap(
-                    partial(_physics, vehicle, effects, parameters)
-                )(drones, motor, context, gust)
             return (drones, force), motor
 
         noise = jax.random.normal(noise_key, (RATE_LOOPS, count, 3))
-        (state_after, force_after), motors = jax.lax.scan(
-            rate_loop, (drones, force), noise
-        )
+        (state_after, force_after), motors = jax.lax.scan(rate_loop, (drones, force), noise)
         motors = motors.mean(0)
-        memory = jax.vmap(
-            lambda d: composition.record(effects, d.effect_memory, d, PERIOD)
-        )(state_after)
+        memory = jax.vmap(lambda d: composition.record(effects, d.effect_memory, d, PERIOD))(
+            state_after
+        )
         state_after = state_after.replace(effect_memory=memory)
         # What motion capture and estimator deliver is what the controller sees; the IMU
         # knows the moment itself.
-        pose = (
-            measured_state.position,
-            measured_state.quaternion,
-            measured_state.velocity,
-        )
+        pose = (measured_state.position, measured_state.quaternion, measured_state.velocity)
         log = (
             *pose,
             drones.body_rates + gyro_bias,
@@ -246,24 +215,18 @@ def _fly(
     return jax.lax.scan(row, start, (target, air_time, gusts))[1]
 
 
-def _physics(
-    vehicle, effects, parameters, drone: DroneState, motor_command, context, gust
-):
+def _physics(vehicle, effects, parameters, drone: DroneState, motor_command, context, gust):
     """One physics step of one drone; its state, and the force without gravity in the
     body frame (3,) N. `gust` (6,): force in the world's axes and torque of turbulent
     air, or None.
     """
-    motor_command = composition.change_motor_command(
-        effects, parameters, motor_command, context
-    )
+    motor_command = composition.change_motor_command(effects, parameters, motor_command, context)
     speed = rotor_speed_step(vehicle, drone.rotor_speed, motor_command, context.dt)
     force, torque = composition.wrench(effects, parameters, vehicle, speed, context)
     if gust is not None:
         force = force + rotate_inverse(drone.quaternion, gust[:3])
         torque = torque + gust[3:]
-    drone = rigid_step(
-        vehicle, drone, rotate(drone.quaternion, force), torque, context.dt
-    )
+    drone = rigid_step(vehicle, drone, rotate(drone.quaternion, force), torque, context.dt)
     return drone.replace(rotor_speed=speed), force
 
 
@@ -275,9 +238,7 @@ def _position_controller(model: Vehicle, state: DroneState, integral, target):
     position, velocity, acceleration, yaw, extra = target
     error = position - state.position
     integral = jnp.clip(integral + error * PERIOD, -0.5, 0.5)
-    pull = (
-        acceleration + 9.0 * error + 5.0 * (velocity - state.velocity) + 5.0 * integral
-    )
+    pull = acceleration + 9.0 * error + 5.0 * (velocity - state.velocity) + 5.0 * integral
     pull = jnp.clip(pull, -6.0, 6.0) + jnp.array([0.0, 0.0, 1.0]) * model.gravity
     up = rotate(state.quaternion, jnp.array([0.0, 0.0, 1.0]))
     thrust = model.mass * jnp.dot(pull, up) / (4 * max_rotor_thrust(model))
@@ -291,9 +252,7 @@ def _position_controller(model: Vehicle, state: DroneState, integral, target):
     return jnp.clip(command, limit * jnp.array([0.05, -1, -1, -1]), limit), integral
 
 
-def _columns(
-    rows, rng: np.random.Generator, sensors: SensorModel
-) -> dict[str, np.ndarray]:
+def _columns(rows, rng: np.random.Generator, sensors: SensorModel) -> dict[str, np.ndarray]:
     """The log's columns of one vehicle: true rows through the sensors."""
     position, quaternion, velocity, gyro, specific_force, command, motors, voltage = (
         np.asarray(r, float) for r in rows
@@ -303,9 +262,7 @@ def _columns(
     def noisy(values, size):
         return values + size * rng.standard_normal(values.shape)
 
-    specific_force = specific_force + sensors.accelerometer_bias * rng.standard_normal(
-        3
-    )
+    specific_force = specific_force + sensors.accelerometer_bias * rng.standard_normal(3)
 
     def shaken(attitudes):
         return _turn(attitudes, noisy(np.zeros((count, 3)), sensors.attitude_noise))
@@ -324,9 +281,7 @@ def _columns(
         columns |= dict(zip(names, values.T, strict=True))
     # a battery is logged at 10 Hz
     every_tenth = np.arange(count) % 10 == 0
-    return columns | {
-        "vbat": np.where(every_tenth, noisy(voltage, sensors.voltage_noise), np.nan)
-    }
+    return columns | {"vbat": np.where(every_tenth, noisy(voltage, sensors.voltage_noise), np.nan)}
 
 
 def _turn(quaternion: np.ndarray, rotation: np.ndarray) -> np.ndarray:

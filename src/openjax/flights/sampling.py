@@ -42,9 +42,7 @@ def _even(time: np.ndarray) -> bool:
     """
     steps = np.diff(time)
     middle = float(np.median(steps))
-    return bool(
-        (steps > 0.5 * middle).mean() > 0.95 and steps.max() < max(5.0 * middle, 0.5)
-    )
+    return bool((steps > 0.5 * middle).mean() > 0.95 and steps.max() < max(5.0 * middle, 0.5))
 
 
 def drop_frozen(flight: Flight, note) -> Flight:
@@ -64,11 +62,7 @@ def drop_frozen(flight: Flight, note) -> Flight:
             if frozen.any():
                 changes[channel] = _unsample(values, frozen)
                 rows = rows[~frozen[rows]]
-        if (
-            channel != "battery_voltage"
-            and len(rows) > 1
-            and (hole := _hole(flight.time, rows))
-        ):
+        if channel != "battery_voltage" and len(rows) > 1 and (hole := _hole(flight.time, rows)):
             holes.setdefault(hole, []).append(names)
     for hole, names in holes.items():
         note("gaps", f"{', '.join(names)}: {hole}")
@@ -90,16 +84,13 @@ def _standing_still(flight: Flight, channel: str, rows, note) -> np.ndarray:
     if len(dead):
         names = ", ".join(columns[i] for i in dead)
         raise Refused(
-            "corrupt",
-            f"{names}: the same value {table[rows[0], dead[0]]:g} in every row",
+            "corrupt", f"{names}: the same value {table[rows[0], dead[0]]:g} in every row"
         )
     frozen = _frozen(table, rows, flight.time, as_one)
     if frozen.any():
         share = frozen.mean()
         start = flight.time[np.argmax(frozen)]
-        sentence = (
-            f"stand still for {share * flight.duration:.1f} s from t = {start:.2f}"
-        )
+        sentence = f"stand still for {share * flight.duration:.1f} s from t = {start:.2f}"
         words = f"{', '.join(columns)} {sentence}"
         if share > 0.5:
             raise Refused("corrupt", f"{words}: frozen for {share:.0%} of the flight")
@@ -125,9 +116,7 @@ def _hole(time: np.ndarray, rows: np.ndarray) -> str:
     """
     steps = np.diff(time[rows])
     hole = int(np.argmax(steps))
-    if rows[hole + 1] - rows[hole] <= 1 or steps[hole] <= max(
-        0.2, 10 * np.median(steps)
-    ):
+    if rows[hole + 1] - rows[hole] <= 1 or steps[hole] <= max(0.2, 10 * np.median(steps)):
         return ""
     return f"not sampled for {steps[hole]:.2f} s after t = {time[rows][hole]:.2f}"
 
@@ -138,13 +127,9 @@ def drop_held_rows(flight: Flight, note) -> Flight:
     battery's. Longer stretches without a change are a stand, or frozen.
     """
     channels = [
-        c
-        for c in CHANNEL_COLUMNS
-        if c != "battery_voltage" and getattr(flight, c) is not None
+        c for c in CHANNEL_COLUMNS if c != "battery_voltage" and getattr(flight, c) is not None
     ]
-    table = np.column_stack(
-        [getattr(flight, c).reshape(len(flight), -1) for c in channels]
-    )
+    table = np.column_stack([getattr(flight, c).reshape(len(flight), -1) for c in channels])
     same = (table[1:] == table[:-1]) | (np.isnan(table[1:]) & np.isnan(table[:-1]))
     is_held = np.r_[False, same.all(1)]
     for begin, end in runs_of(is_held):
@@ -153,8 +138,7 @@ def drop_held_rows(flight: Flight, note) -> Flight:
     if is_held.mean() < HELD or np.median(np.diff(flight.time[~is_held])) > SLOWEST:
         return flight
     note(
-        "held",
-        f"{is_held.mean():.0%} of the rows repeat the one before in every column: left out",
+        "held", f"{is_held.mean():.0%} of the rows repeat the one before in every column: left out"
     )
     return flight.rows(~is_held)
 
@@ -165,16 +149,11 @@ def drop_repeats(flight: Flight, note) -> Flight:
     it by up to a row.
     """
     changes = {}
-    for group in (
-        ("position", "quaternion", "velocity"),
-        ("body_rates", "specific_force"),
-    ):
+    for group in (("position", "quaternion", "velocity"), ("body_rates", "specific_force")):
         channels = [c for c in group if getattr(flight, c) is not None]
         if not channels:
             continue
-        stack = np.concatenate(
-            [getattr(flight, c).reshape(len(flight), -1) for c in channels], 1
-        )
+        stack = np.concatenate([getattr(flight, c).reshape(len(flight), -1) for c in channels], 1)
         repeats = np.r_[False, (np.diff(stack, axis=0) == 0).all(1)]
         if repeats.mean() < HELD:
             continue
@@ -196,20 +175,12 @@ def put_in_step(flight: Flight, note) -> Flight:
     regular. Poses are on a line through their rows; a held one is half a row late on
     the mean.
     """
-    channels = [
-        c
-        for c in ("position", "quaternion", "velocity")
-        if getattr(flight, c) is not None
-    ]
+    channels = [c for c in ("position", "quaternion", "velocity") if getattr(flight, c) is not None]
     if not channels:
         return flight
     rows = np.flatnonzero(
         np.all(
-            [
-                np.isfinite(getattr(flight, c).reshape(len(flight), -1)).all(1)
-                for c in channels
-            ],
-            0,
+            [np.isfinite(getattr(flight, c).reshape(len(flight), -1)).all(1) for c in channels], 0
         )
     )
     if len(rows) < IN_STEP or len(rows) > (1.0 - HELD) * len(flight):
@@ -236,9 +207,7 @@ def put_in_step(flight: Flight, note) -> Flight:
     return dataclasses.replace(flight, **changes).rows(slice(rows[0], rows[-1] + 1))
 
 
-def _on_lines(
-    stamps: np.ndarray, regular: np.ndarray, values: np.ndarray
-) -> np.ndarray:
+def _on_lines(stamps: np.ndarray, regular: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Values (S, ...) of times `regular` (S,) at the times `stamps` (S,), on lines
     through their neighbours: the last one's goes on to the end, as a pose that is held
     there would stand still for a row.
@@ -282,9 +251,7 @@ def _unsample(values: np.ndarray, rows: np.ndarray) -> np.ndarray:
     return result
 
 
-def _frozen(
-    table: np.ndarray, rows: np.ndarray, time: np.ndarray, as_one: bool
-) -> np.ndarray:
+def _frozen(table: np.ndarray, rows: np.ndarray, time: np.ndarray, as_one: bool) -> np.ndarray:
     """(T,) True in runs of at least FROZEN seconds in which a column (all columns if
     `as_one`) doesn't change though it does elsewhere. Runs at the column's extremes
     are saturation, not a frozen sensor.

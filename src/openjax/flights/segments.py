@@ -84,9 +84,7 @@ def _doublets(t: np.ndarray) -> np.ndarray:
         sign = 1.0 if number // 4 % 2 else -1.0
         half = 0.08
         inside = (t >= begin) & (t < begin + 2.0 * half)
-        out[inside, axis] = (
-            sign * DOUBLETS[axis] * np.where(t[inside] < begin + half, 1.0, -1.0)
-        )
+        out[inside, axis] = sign * DOUBLETS[axis] * np.where(t[inside] < begin + half, 1.0, -1.0)
     return out
 
 
@@ -107,9 +105,7 @@ def _rest(t, ease):
 
 
 def _climbing(t, ease):
-    height = (
-        0.5 * (HIGHEST - 0.15 + 0.35) - MIDDLE + 0.3 * np.sin(2.0 * np.pi * 0.5 * t)
-    )
+    height = 0.5 * (HIGHEST - 0.15 + 0.35) - MIDDLE + 0.3 * np.sin(2.0 * np.pi * 0.5 * t)
     return _middle(t) + ease * _at(0.0 * t, 0.0, height), 0.0 * t
 
 
@@ -129,15 +125,9 @@ def _level(height):
 
 
 SEGMENTS: dict[str, Segment] = {
-    "yaw": Segment(
-        20.0, "turning on the spot with small random body rates", _turning, _dither
-    ),
-    "agile": Segment(
-        20.0, "a quick figure with small random body rates", _agile, _dither
-    ),
-    "step": Segment(
-        20.0, "doublets of thrust and of every body rate in hover", _rest, _doublets
-    ),
+    "yaw": Segment(20.0, "turning on the spot with small random body rates", _turning, _dither),
+    "agile": Segment(20.0, "a quick figure with small random body rates", _agile, _dither),
+    "step": Segment(20.0, "doublets of thrust and of every body rate in hover", _rest, _doublets),
     "climb": Segment(15.0, "quick climbs and descents", _climbing),
     "fast": Segment(20.0, "fast straight passes, nose first and side first", _fast),
     "low": Segment(10.0, "slow passes just above the floor", _level(LOWEST)),

@@ -64,16 +64,10 @@ def on_clock(flight: Flight, channel: str, grid: Times) -> Columns | None:
         width = round(1 / (RATE * step))
         values = uniform_filter1d(values, width, axis=0, mode="nearest")
     out = np.stack([np.interp(grid, at, column) for column in values.T], 1)
-    return (
-        out / np.linalg.norm(out, axis=1, keepdims=True)
-        if channel == "quaternion"
-        else out
-    )
+    return out / np.linalg.norm(out, axis=1, keepdims=True) if channel == "quaternion" else out
 
 
-def in_band(
-    values: Columns, band: tuple[float, float]
-) -> Float[np.ndarray, "inner columns"]:
+def in_band(values: Columns, band: tuple[float, float]) -> Float[np.ndarray, "inner columns"]:
     """`values` (T, C) between two frequencies, without delay, and without the ends
     where that isn't right.
     """

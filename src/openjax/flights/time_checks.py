@@ -31,10 +31,7 @@ def in_time(flight: Flight, note) -> Flight:
             "frozen, or too coarse",
         )
     if repeats.any():
-        note(
-            "time",
-            f"{repeats.sum()} rows repeat the time of the row before and are left out",
-        )
+        note("time", f"{repeats.sum()} rows repeat the time of the row before and are left out")
         flight = flight.rows(np.r_[True, ~repeats])
     step = flight.row_period
     _refuse_units(step)
@@ -43,9 +40,7 @@ def in_time(flight: Flight, note) -> Flight:
     if len(gaps):
         longest = gaps[np.argmax(steps[gaps])]
         number = f"{len(gaps)} gap{'s' * (len(gaps) > 1)}"
-        places = (
-            f"the longest {steps[longest]:.2f} s after t = {flight.time[longest]:.2f}"
-        )
+        places = f"the longest {steps[longest]:.2f} s after t = {flight.time[longest]:.2f}"
         note("gaps", f"{number} in time, {places}")
     return flight
 
@@ -54,11 +49,7 @@ def while_motors_turn(flight: Flight, note) -> Flight:
     """Without the time before motors first turn and after they last do: what stands
     still there is a vehicle on the ground, not a frozen sensor.
     """
-    drive = (
-        flight.motor_command
-        if flight.motor_command is not None
-        else flight.command_thrust
-    )
+    drive = flight.motor_command if flight.motor_command is not None else flight.command_thrust
     if drive is None:
         return flight
     turning = np.flatnonzero((drive.reshape(len(drive), -1) > AT_REST).any(1))
@@ -90,9 +81,7 @@ def _written_once(flight: Flight, note) -> Flight:
     """Without rows that repeat the one before in every column, as where a log was
     written twice.
     """
-    channels = [
-        getattr(flight, c) for c in CHANNEL_COLUMNS if getattr(flight, c) is not None
-    ]
+    channels = [getattr(flight, c) for c in CHANNEL_COLUMNS if getattr(flight, c) is not None]
     table = np.column_stack([flight.time, *(v.reshape(len(v), -1) for v in channels)])
     same = (table[1:] == table[:-1]) | (np.isnan(table[1:]) & np.isnan(table[:-1]))
     repeats = np.r_[False, same.all(1)]
@@ -105,24 +94,16 @@ def _written_once(flight: Flight, note) -> Flight:
 def _refuse_units(step: float) -> None:
     """Refuse rows that are too far apart or too close, in seconds."""
     if step > SLOWEST:
-        for unit, factor in (
-            ("milliseconds", 1e3),
-            ("microseconds", 1e6),
-            ("nanoseconds", 1e9),
-        ):
+        for unit, factor in (("milliseconds", 1e3), ("microseconds", 1e6), ("nanoseconds", 1e9)):
             # a unit is named if in it rows would come at 20 to 2,000 Hz
             if 5e-4 <= step / factor <= SLOWEST:
                 hint = " or counts rows" if step == 1.0 else ""
                 raise Refused(
                     "units",
-                    f"t is in {unit}{hint} (rows {step:g} apart); the log format "
-                    "wants seconds",
+                    f"t is in {unit}{hint} (rows {step:g} apart); the log format wants seconds",
                 )
-        raise Refused(
-            "time", f"rows are {step:g} s apart; at least 20 rows per second are needed"
-        )
+        raise Refused("time", f"rows are {step:g} s apart; at least 20 rows per second are needed")
     if step < 2e-4:
         raise Refused(
-            "units",
-            f"rows are {step:g} s apart: t is not in seconds, or the clock is corrupt",
+            "units", f"rows are {step:g} s apart: t is not in seconds, or the clock is corrupt"
         )

@@ -83,17 +83,12 @@ def _stretches(flight: Flight, without_holes: Flight, case: Case) -> list[Track]
     """Tracks of rows of a flight as it was `logged`."""
     tracks = []
     for number, stretch in enumerate(
-        flight.stretches(
-            max_step=max(MAX_GAP, 3 * flight.row_period), min_duration=MIN_DURATION
-        )
+        flight.stretches(max_step=max(MAX_GAP, 3 * flight.row_period), min_duration=MIN_DURATION)
     ):
         part = _between_poses(flight.rows(stretch))
         tracks.append(
             _on_grid(
-                part,
-                without_holes,
-                case,
-                f"{flight.name}#{number}" if number else flight.name,
+                part, without_holes, case, f"{flight.name}#{number}" if number else flight.name
             )
         )
     return tracks
@@ -203,10 +198,7 @@ def _missing(stamps: Array, grid: Array, period: float) -> Array:
     """(T,) the rows of a grid with no logged row within half a period and a bit."""
     following_row = np.clip(np.searchsorted(stamps, grid), 1, len(stamps) - 1)
     return (
-        np.minimum(
-            np.abs(grid - stamps[following_row - 1]),
-            np.abs(stamps[following_row] - grid),
-        )
+        np.minimum(np.abs(grid - stamps[following_row - 1]), np.abs(stamps[following_row] - grid))
         > 0.6 * period
     )
 
@@ -227,9 +219,7 @@ def _means(at, values, begin, period, is_held):
     """Means (G, C) of samples (S, C) over periods, of samples that stay until the next
     (`is_held`) or of lines between them.
     """
-    step = np.diff(at)[:, None] * (
-        values[:-1] if is_held else 0.5 * (values[1:] + values[:-1])
-    )
+    step = np.diff(at)[:, None] * (values[:-1] if is_held else 0.5 * (values[1:] + values[:-1]))
     integral = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(step, 0)])
     # at the end of a log a mean is of what is left of it
     begin = np.clip(begin, at[0], at[-1] - 0.5 * period)
@@ -268,9 +258,7 @@ def pwm_thrust(duty: Motors, voltage: Times | None, vehicle) -> Motors:
     g^2 + 0.088 g for g grams of thrust of all four rotors.
     """
     volts = duty * (3.7 if voltage is None else voltage[:, None])
-    grams = (0.088 - np.sqrt(np.maximum(0.088**2 - 4 * 0.0006239 * volts, 0.0))) / (
-        2 * 0.0006239
-    )
+    grams = (0.088 - np.sqrt(np.maximum(0.088**2 - 4 * 0.0006239 * volts, 0.0))) / (2 * 0.0006239)
     newtons = grams * 1e-3 * GRAVITY / 4
     return newtons / float(vehicle.thrust_constant * vehicle.max_rotor_speed**2)
 
@@ -283,9 +271,7 @@ def smooth(
     if n < 2:
         return values
     window = np.hanning(n + 2)[1:-1]
-    return convolve1d(
-        values, window / window.sum(), axis=0, mode="nearest", origin=n % 2 - 1
-    )
+    return convolve1d(values, window / window.sum(), axis=0, mode="nearest", origin=n % 2 - 1)
 
 
 def rotation(quaternion: Quaternions) -> Float[Array, "rows 3 3"]:
@@ -303,15 +289,12 @@ def to_world(quaternion: Quaternions, vector: Vectors) -> Vectors:
     return np.einsum("tij,tj->ti", rotation(quaternion), vector)
 
 
-def specific_force_of(
-    quaternion: Quaternions, velocity: Vectors, period: float
-) -> Vectors:
+def specific_force_of(quaternion: Quaternions, velocity: Vectors, period: float) -> Vectors:
     """Force per mass (T, 3), m/s^2 in the body frame, that a path with velocities (T,
     3) every `period` s needs.
     """
     return to_body(
-        quaternion,
-        np.gradient(velocity, period, axis=0) + np.array([0.0, 0.0, GRAVITY]),
+        quaternion, np.gradient(velocity, period, axis=0) + np.array([0.0, 0.0, GRAVITY])
     )
 
 
@@ -323,24 +306,14 @@ def turn_increments(quaternion: Quaternions) -> Float[Array, "turns 3"]:
 
 def earlier(values: Columns, delay: float, track: Track) -> Columns:
     """Rows (T, C) of a track as they were `delay` s earlier."""
-    return np.stack(
-        [np.interp(track.time - delay, track.time, column) for column in values.T], 1
-    )
+    return np.stack([np.interp(track.time - delay, track.time, column) for column in values.T], 1)
 
 
 def without_delay(track: Track, delay: float) -> Track:
     """The track with its pose `delay` s younger than logged."""
-    pose = [
-        n
-        for n in ("position", "quaternion", "velocity")
-        if getattr(track, n) is not None
-    ]
+    pose = [n for n in ("position", "quaternion", "velocity") if getattr(track, n) is not None]
     channels = {n: earlier(getattr(track, n), -delay, track) for n in pose}
-    channels["quaternion"] /= np.linalg.norm(
-        channels["quaternion"], axis=1, keepdims=True
-    )
+    channels["quaternion"] /= np.linalg.norm(channels["quaternion"], axis=1, keepdims=True)
     if len(track.neighbours):  # the same cameras saw them
-        channels["neighbours"] = np.stack(
-            [earlier(p, -delay, track) for p in track.neighbours]
-        )
+        channels["neighbours"] = np.stack([earlier(p, -delay, track) for p in track.neighbours])
     return replace(track, **channels)

@@ -28,16 +28,7 @@ _BEATS = 5
 _PIDS = 8
 _HEAD = 11
 _EACH = 17
-DEAF = (
-    "SIGHUP",
-    "SIGINT",
-    "SIGTSTP",
-    "SIGTERM",
-    "SIGQUIT",
-    "SIGTTOU",
-    "SIGTTIN",
-    "SIGPIPE",
-)
+DEAF = ("SIGHUP", "SIGINT", "SIGTSTP", "SIGTERM", "SIGQUIT", "SIGTTOU", "SIGTTIN", "SIGPIPE")
 """Signals that a terminal, or its end, sends to all that it started."""
 
 
@@ -126,12 +117,7 @@ class Board:
             has_estimate = drone.estimate is not None
             # a row has its place for a pose's 14 numbers, known or not
             pose = numbers_of(drone.estimate) if has_estimate else (0.0,) * 14
-            numbers += [
-                float(_MODES.index(drone.mode)),
-                drone.trim,
-                float(has_estimate),
-                *pose,
-            ]
+            numbers += [float(_MODES.index(drone.mode)), drone.trim, float(has_estimate), *pose]
         self._numbers[_HEAD:] = numbers
         self.flying = state.flying
         # the beat comes last: who takes over for a silent process finds a page that is
@@ -147,9 +133,7 @@ class Board:
             start = _HEAD + _EACH * i
             mode, trim, has_estimate, *numbers = self._numbers[start : start + _EACH]
             pose = moved_on(pose_of(numbers), time) if has_estimate else None
-            drones.append(
-                drone._replace(mode=_MODES[int(mode)], trim=trim, estimate=pose)
-            )
+            drones.append(drone._replace(mode=_MODES[int(mode)], trim=trim, estimate=pose))
         # from now on: that no action came while nobody flew is no reason to stop
         return state._replace(drones=tuple(drones), time=time, action_time=time)
 

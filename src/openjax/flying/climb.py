@@ -54,9 +54,7 @@ class Climb(NamedTuple):
         force_climb = math.nan if force is None else felt_climb(pose.quaternion, force)
         if not 0.0 < dt <= LONGEST or math.isnan(force_climb + self.felt):
             return self._replace(time=pose.time, speed=speed, felt=force_climb)
-        beyond = (
-            speed - self.speed - dt * (0.5 * (force_climb + self.felt) + self.offset)
-        )
+        beyond = speed - self.speed - dt * (0.5 * (force_climb + self.felt) + self.offset)
         age = self.age + dt
         decay = math.exp(-dt / WINDOW)
         total = decay * self.total + beyond

@@ -43,13 +43,7 @@ class Pose(NamedTuple):
 
 def numbers_of(pose: Pose) -> tuple[float, ...]:
     """The 14 numbers of a pose, in the order of its fields."""
-    return (
-        pose.time,
-        *pose.position,
-        *pose.velocity,
-        *pose.quaternion,
-        *pose.body_rates,
-    )
+    return (pose.time, *pose.position, *pose.velocity, *pose.quaternion, *pose.body_rates)
 
 
 def pose_of(numbers: Sequence[float]) -> Pose:
@@ -145,16 +139,12 @@ def moved_on(pose: Pose, time: float) -> Pose:
     age = time - pose.time
     if age == 0.0:
         return pose
-    position = tuple(
-        p + age * v for p, v in zip(pose.position, pose.velocity, strict=True)
-    )
+    position = tuple(p + age * v for p, v in zip(pose.position, pose.velocity, strict=True))
     quaternion = turned_on(pose.quaternion, pose.body_rates, age)
     return pose._replace(time=time, position=position, quaternion=quaternion)
 
 
-def turned_on(
-    quaternion, rates: Vector, duration: float
-) -> tuple[float, float, float, float]:
+def turned_on(quaternion, rates: Vector, duration: float) -> tuple[float, float, float, float]:
     """The attitude, wxyz, after turning at body rates (rad/s) for `duration` (s)."""
     # to first order: nothing turns far in the hundredths of a second between two poses
     w, x, y, z = quaternion
@@ -181,9 +171,7 @@ def wanted_acceleration(velocity: Vector, target: Vector) -> Vector:
     """The acceleration (m/s^2, world) that leads from a velocity to the `target`,
     within the tilt limit.
     """
-    ax, ay, az = (
-        VELOCITY_GAIN * (w - v) for w, v in zip(target, velocity, strict=True)
-    )
+    ax, ay, az = (VELOCITY_GAIN * (w - v) for w, v in zip(target, velocity, strict=True))
     # height first: the tilt that is left for the rest follows from the lift
     az = min(max(az, -CLIMB_LIMIT), CLIMB_LIMIT)
     level = math.hypot(ax, ay)
@@ -193,11 +181,7 @@ def wanted_acceleration(velocity: Vector, target: Vector) -> Vector:
 
 
 def accelerate(
-    quaternion,
-    acceleration: Vector,
-    airframe: Airframe,
-    trim: float,
-    mode: int = ANGLES,
+    quaternion, acceleration: Vector, airframe: Airframe, trim: float, mode: int = ANGLES
 ) -> SetPoint:
     """The set-point for an acceleration (m/s^2, world) at an attitude, yaw to zero.
 
@@ -214,10 +198,7 @@ def accelerate(
     # a positive pitch leans the thrust forward, a positive roll to the right
     wanted_pitch = math.atan2(forward, GRAVITY + az)
     wanted_roll = math.asin(min(max(-lateral / lift, -1.0), 1.0))
-    along = sum(
-        a * b
-        for a, b in zip(body_axis(quaternion), (ax, ay, GRAVITY + az), strict=True)
-    )
+    along = sum(a * b for a, b in zip(body_axis(quaternion), (ax, ay, GRAVITY + az), strict=True))
     thrust = (airframe.hover_thrust + trim) * max(along, 0.0) / GRAVITY
     yaw_rate = -YAW_GAIN * yaw
     # where rates are sent nobody on board tracks the angles

@@ -104,11 +104,7 @@ LOG_TYPES = {
     "float": (7, "f"),
     "FP16": (8, "e"),
 }
-PARAMETER_TYPES = {
-    "uint8_t": (0x08, "B"),
-    "uint16_t": (0x09, "H"),
-    "float": (0x06, "f"),
-}
+PARAMETER_TYPES = {"uint8_t": (0x08, "B"), "uint16_t": (0x09, "H"), "float": (0x06, "f")}
 READ_ONLY = 0x40
 """Added to a parameter's type in the table of contents."""
 LOG_FORMATS = dict(LOG_TYPES.values())

@@ -89,13 +89,9 @@ class Drift(NamedTuple):
         decay = math.exp(-dt / WINDOW)
         totals = tuple(
             decay * total + dt * (acceleration - fit.at(speed))
-            for total, (fit, acceleration, speed) in zip(
-                self.totals, level, strict=False
-            )
+            for total, (fit, acceleration, speed) in zip(self.totals, level, strict=False)
         )
-        fits = tuple(
-            fit.update(acceleration, speed, dt) for fit, acceleration, speed in level
-        )
+        fits = tuple(fit.update(acceleration, speed, dt) for fit, acceleration, speed in level)
         worth = dt if self.age > LEARNT else 0.0
         squares = self.squares + worth * sum(part**2 for part in totals)
         return Drift(fits, totals, squares, self.age + dt)
@@ -119,9 +115,7 @@ def drifting(drifts: Sequence[Drift]) -> tuple[bool, ...]:
     tells that of a lone one.
     """
     usual = [drift.usual for drift in drifts]
-    largest = [
-        max((*usual[:i], *usual[i + 1 :]), default=math.inf) for i in range(len(usual))
-    ]
+    largest = [max((*usual[:i], *usual[i + 1 :]), default=math.inf) for i in range(len(usual))]
     return tuple(
         drift.age > LEARNT and drift.size > max(FLOOR, RATIO * others)
         for drift, others in zip(drifts, largest, strict=True)

@@ -70,15 +70,11 @@ def _address(host: str) -> str:
 def _radio(parts) -> Endpoint:
     """The dongle is no part of the name: two dongles reach the same vehicle."""
     path_parts = parts.path.strip("/").split("/")
-    channel, rate, address = (*path_parts, "", "", "")[
-        :3
-    ]  # any of them may be left out
+    channel, rate, address = (*path_parts, "", "", "")[:3]  # any of them may be left out
     number = int(channel) if channel else CHANNEL
     rate = rate.upper() or RATE
     address = (address or ADDRESS).upper().rjust(10, "0")
-    is_radio = (
-        rate in RATES and 0 <= number <= 125 and re.fullmatch("[0-9A-F]{10}", address)
-    )
+    is_radio = rate in RATES and 0 <= number <= 125 and re.fullmatch("[0-9A-F]{10}", address)
     if not parts.netloc or not is_radio:
         raise ValueError
     vehicle = f"{number}/{rate}/{address}"
@@ -111,9 +107,7 @@ def sole_command(uris: Sequence[str]) -> Iterator[None]:
     """
     with contextlib.ExitStack() as stack:
         for uri, endpoint in zip(uris, endpoints_of(uris), strict=True):
-            name = stack.enter_context(
-                socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-            )
+            name = stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_STREAM))
             try:
                 name.bind(f"\0openjax.fly {endpoint.name}")
             except OSError as error:

@@ -34,9 +34,7 @@ def see(state: State, time: float, samples: Sequence[PoseSample]) -> State:
     drift = drifting([drone.innovations.drift for drone in drones])
     return state._replace(
         drones=tuple(
-            _without_drift(state, drone)
-            if drifts and sample.captured is None
-            else drone
+            _without_drift(state, drone) if drifts and sample.captured is None else drone
             for drone, drifts, sample in zip(drones, drift, samples, strict=True)
         )
     )
@@ -62,9 +60,7 @@ def _estimate(state, drone, sample) -> Drone:
     """The drone with its estimate now, after what was newly told of it."""
     time = state.time
     limits = state.limits
-    moving = drone.mode in FLYING and not (
-        drone.mode is Mode.LIFT and time - drone.since < SPIN_UP
-    )
+    moving = drone.mode in FLYING and not (drone.mode is Mode.LIFT and time - drone.since < SPIN_UP)
     by_capture = sample.captured is not None and not drone.capture_fault
     track = _onboard_track(state, drone, sample, by_capture, moving)
     drone = _consistent(state, drone, track, sample.force)
@@ -75,9 +71,7 @@ def _estimate(state, drone, sample) -> Drone:
     if source.fresh(time, limits) and not is_contradiction:
         estimate = moved_on(source.pose, max(time, source.pose.time))
         level = level_acceleration(estimate.quaternion)
-        return drone._replace(
-            estimate=estimate, seen=source.pose.time, acceleration=level
-        )
+        return drone._replace(estimate=estimate, seen=source.pose.time, acceleration=level)
     return drone if drone.estimate is None else _reckon(state, drone)
 
 
@@ -86,9 +80,7 @@ def _reckon(state, drone) -> Drone:
     # without a pose nothing tells how it turns
     old = drone.estimate
     dt = state.dt
-    velocity = tuple(
-        v + dt * a for v, a in zip(old.velocity, drone.acceleration, strict=True)
-    )
+    velocity = tuple(v + dt * a for v, a in zip(old.velocity, drone.acceleration, strict=True))
     position = tuple(p + dt * v for p, v in zip(old.position, velocity, strict=True))
     estimate = old._replace(time=state.time, position=position, velocity=velocity)
     return drone._replace(estimate=estimate)
@@ -109,12 +101,10 @@ def _consistent(state, drone, own_track, force) -> Drone:
         # what told nothing but wrong poses until it was lost may tell believable ones,
         # of another place, once anything can have happened
         verdict_lost = own_track.verdict and not any(
-            track.fresh(state.time, state.limits)
-            for track in (own_track, drone.captured)
+            track.fresh(state.time, state.limits) for track in (own_track, drone.captured)
         )
         return drone._replace(
-            own=own_track,
-            contradiction=own_track.verdict if verdict_lost else Verdict.GOOD,
+            own=own_track, contradiction=own_track.verdict if verdict_lost else Verdict.GOOD
         )
     is_refused = bool(drone.own.verdict)
     innovations = drone.innovations.update(
@@ -126,15 +116,11 @@ def _consistent(state, drone, own_track, force) -> Drone:
     if not verdict:
         return drone._replace(own=own_track, innovations=innovations)
     drone = drone._replace(
-        own=drone.own._replace(verdict=verdict),
-        innovations=innovations,
-        contradiction=verdict,
+        own=drone.own._replace(verdict=verdict), innovations=innovations, contradiction=verdict
     )
     # motion capture tells otherwise than the estimate, so it isn't what the estimate
     # followed
-    if capture.pose is not None and not follows(
-        capture.pose, own_track.pose, state.limits
-    ):
+    if capture.pose is not None and not follows(capture.pose, own_track.pose, state.limits):
         return drone
     # neither is believed any more: back to where the sums say that the vehicle is
     estimate = moved_on(innovations.corrected_pose(), state.time)
@@ -155,10 +141,7 @@ def _onboard_track(state, drone, sample, by_capture, moving) -> Track:
     next_track = track.update(sample.own, time, limits, moving, drone.estimate)
     capture = drone.captured
     to_confirm = (
-        moving
-        and by_capture
-        and next_track.pose is not track.pose
-        and capture.fresh(time, limits)
+        moving and by_capture and next_track.pose is not track.pose and capture.fresh(time, limits)
     )
     if to_confirm and agree(capture.pose, next_track.pose, limits) is Verdict.APART:
         return next_track._replace(pose=track.pose, verdict=Verdict.JUMPED)
@@ -190,9 +173,7 @@ def _with_capture(state, drone, sample, moving) -> Drone:
         innovations = Innovations()
     elif track.pose is capture and capture is not drone.captured.pose:
         is_refused = bool(drone.captured.verdict)
-        innovations = innovations.update(
-            capture, as_sent(drone.sent), state.airframe, is_refused
-        )
+        innovations = innovations.update(capture, as_sent(drone.sent), state.airframe, is_refused)
         capture_fault = innovations.verdict()
     if capture_fault:
         track = track._replace(pose=drone.captured.pose, verdict=capture_fault)
@@ -219,6 +200,5 @@ def _with_motion(pose, last, estimate) -> Pose:
         for p, q, v in zip(pose.position, last.position, last.velocity, strict=True)
     )
     return pose._replace(
-        velocity=velocity,
-        body_rates=pose.body_rates if estimate is None else estimate.body_rates,
+        velocity=velocity, body_rates=pose.body_rates if estimate is None else estimate.body_rates
     )

@@ -60,18 +60,14 @@ def write_case(
 
     def write(game):
         path, ticks = game
-        write_csv(
-            path, _table(path.name, samples, sent_at[ticks], commands[ticks]), DECIMALS
-        )
+        write_csv(path, _table(path.name, samples, sent_at[ticks], commands[ticks]), DECIMALS)
         return path
 
     # half of the time is zlib's, which lets others run
     with ThreadPoolExecutor(4) as pool:
         files = list(pool.map(write, games))
     save_vehicle_file(folder / "vehicle.toml", vehicle)
-    text = json.dumps(
-        {**about, "timing": record.timing(), "games": record.episodes}, indent=1
-    )
+    text = json.dumps({**about, "timing": record.timing(), "games": record.episodes}, indent=1)
     (folder / "flight.json").write_text(text + "\n", encoding="utf-8")
     return [*files, folder / "vehicle.toml", folder / "flight.json"]
 
@@ -85,14 +81,10 @@ def _table(name: str, samples, sent_at: np.ndarray, commands: np.ndarray) -> Log
       sent_at: (T,) s, when the set-points of each tick had left.
       commands: (T, N, 5) of them: mode, thrust, body rates.
     """
-    rows = [
-        _rows(vehicle, sent_at, commands[:, i]) for i, vehicle in enumerate(samples)
-    ]
+    rows = [_rows(vehicle, sent_at, commands[:, i]) for i, vehicle in enumerate(samples)]
     log = log_of(rows, name)
     # a column that nobody filled in would say that there was such a sensor
-    columns = {
-        n: column for n, column in log.columns.items() if not np.isnan(column).all()
-    }
+    columns = {n: column for n, column in log.columns.items() if not np.isnan(column).all()}
     return LogTable(name, columns, log.vehicle)
 
 
@@ -135,9 +127,7 @@ def _rows(vehicle: Samples, sent_at, commands) -> dict[str, np.ndarray]:
     """
     sources = [source.during(sent_at[0], sent_at[-1]) for source in _sources(vehicle)]
     times = np.unique(np.concatenate([source.time for source in sources]))
-    rows = {
-        n: np.full(len(times), np.nan) for n in ("t", *_POSE, *_BODY, *_COMMAND, "vbat")
-    }
+    rows = {n: np.full(len(times), np.nan) for n in ("t", *_POSE, *_BODY, *_COMMAND, "vbat")}
     rows["t"] = times - sent_at[0]
     for source in sources:
         at = np.searchsorted(times, source.time)

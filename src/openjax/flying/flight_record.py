@@ -34,15 +34,11 @@ class FlightRecord:
           set_points: each vehicle's.
         """
         self._rows.extend(tick)
-        for arrival, measured_at, s in zip(
-            arrivals, measured_times, set_points, strict=True
-        ):
+        for arrival, measured_at, s in zip(arrivals, measured_times, set_points, strict=True):
             # what a packet holds, not what was asked for: a diagnosis must know what
             # was sent
             s = s if s.mode == OFF else as_sent(s)
-            self._rows.extend(
-                (arrival, measured_at, s.mode, s.thrust, s.roll, s.pitch, s.yaw_rate)
-            )
+            self._rows.extend((arrival, measured_at, s.mode, s.thrust, s.roll, s.pitch, s.yaw_rate))
 
     def table(self) -> tuple[np.ndarray, np.ndarray]:
         """(T, 3) due, sent, game; (T, N, 7) arrival, measured, mode, thrust, roll,
@@ -82,7 +78,4 @@ class FlightRecord:
 
 def _percentiles(values) -> dict:
     at = np.percentile(values, [50, 99, 99.9, 100])
-    return {
-        n: round(float(v), 3)
-        for n, v in zip(("p50", "p99", "p99.9", "max"), at, strict=True)
-    }
+    return {n: round(float(v), 3) for n, v in zip(("p50", "p99", "p99.9", "max"), at, strict=True)}

@@ -43,15 +43,11 @@ def game_functions(policy):
     """
     # what shapes a training world, but not a measured one: the vehicles drawn for it,
     # the clamp
-    settings = dataclasses.replace(
-        policy.settings.environment, vehicles=(), speed_limit="none"
-    )
+    settings = dataclasses.replace(policy.settings.environment, vehicles=(), speed_limit="none")
     environment = Pursuit(settings)
 
     def drones_of(poses):
-        position, quaternion, velocity, body_rates = jnp.split(
-            poses, (3, 7, 10), axis=1
-        )
+        position, quaternion, velocity, body_rates = jnp.split(poses, (3, 7, 10), axis=1)
         quaternion = quaternion / jnp.linalg.norm(quaternion, axis=1, keepdims=True)
         return {
             "position": position,
@@ -156,20 +152,10 @@ class Game:
         measured, at (3,) `evader`.
         """
         is_measured = np.asarray(evader is not None)
-        place = (
-            np.zeros(3, np.float32)
-            if evader is None
-            else np.asarray(evader, np.float32)
-        )
-        self._flat, results = self._tick(
-            self._flat, pose_array(poses), place, is_measured
-        )
-        action, position, velocity, captured, over, breaches, crashed = map(
-            np.asarray, results
-        )
-        return Play(
-            action, position, velocity, bool(captured), bool(over), breaches, crashed
-        )
+        place = np.zeros(3, np.float32) if evader is None else np.asarray(evader, np.float32)
+        self._flat, results = self._tick(self._flat, pose_array(poses), place, is_measured)
+        action, position, velocity, captured, over, breaches, crashed = map(np.asarray, results)
+        return Play(action, position, velocity, bool(captured), bool(over), breaches, crashed)
 
 
 def pose_array(poses) -> np.ndarray:

@@ -51,19 +51,12 @@ class Guard:
     def wait(self, timeout: float = 20.0) -> None:
         """Return once it watches, which takes a second, or doesn't by then (s)."""
         deadline = time.monotonic() + timeout
-        while (
-            not self.lives()
-            and time.monotonic() < deadline
-            and self._process.is_alive()
-        ):
+        while not self.lives() and time.monotonic() < deadline and self._process.is_alive():
             time.sleep(0.02)
 
     def lives(self) -> bool:
         """Whether anything was heard of it lately."""
-        return (
-            self._board.silent(Role.GUARD, time.perf_counter())
-            < 2.0 * self._board.silence
-        )
+        return self._board.silent(Role.GUARD, time.perf_counter()) < 2.0 * self._board.silence
 
     def close(self) -> None:
         """End it; the vehicles are down or someone else's."""
@@ -92,9 +85,7 @@ def watch(board: Board, parent: int, links: RawLinks, state: State) -> None:
             board.pilot = Role.GUARD
             board.beat(Role.GUARD, time_read + OPENING)
             board.end_process(Role.LINKS)
-            say(
-                "openjax fly: nothing from the links' process, the guard lands all vehicles"
-            )
+            say("openjax fly: nothing from the links' process, the guard lands all vehicles")
             links.open()
             fly_down(board, Role.GUARD, links, state)
         # on the floor, but armed: whoever comes near must not be met by a motor
@@ -102,10 +93,6 @@ def watch(board: Board, parent: int, links: RawLinks, state: State) -> None:
             board.end_process(Role.LINKS)
             links.open()
             disarm(links, board, Role.GUARD)
-        elif (
-            not board.flying
-            and os.getppid() != parent
-            and (links_silent or not board.armed)
-        ):
+        elif not board.flying and os.getppid() != parent and (links_silent or not board.armed):
             break
     os._exit(0)  # the links' threads would take a second each

@@ -100,11 +100,7 @@ class Innovations(NamedTuple):
     climb: Climb = Climb()
 
     def update(
-        self,
-        pose: Pose,
-        command: SetPoint,
-        airframe: Airframe,
-        is_refused: bool = False,
+        self, pose: Pose, command: SetPoint, airframe: Airframe, is_refused: bool = False
     ) -> "Innovations":
         """With the next pose; `command` has acted since the last one.
 
@@ -114,9 +110,7 @@ class Innovations(NamedTuple):
         last = self.pose
         longest = math.inf if is_refused else LONGEST
         if last is None or not 0.0 < pose.time - last.time <= longest:
-            return self._replace(
-                pose=pose, thrust=command.thrust, rates=pose.body_rates
-            )
+            return self._replace(pose=pose, thrust=command.thrust, rates=pose.body_rates)
         dt = pose.time - last.time
         thrust, rates = self._response(pose, command, airframe, dt)
         # the trapezoidal rule: exact for an acceleration that stays

@@ -83,17 +83,11 @@ class PoseLimits:
 
 def pose_limits(airframe: Airframe, horizon: float) -> PoseLimits:
     """The limits of a vehicle's poses. `horizon`: see `PoseLimits`."""
-    return PoseLimits(
-        airframe.acceleration, airframe.angular_acceleration, horizon=horizon
-    )
+    return PoseLimits(airframe.acceleration, airframe.angular_acceleration, horizon=horizon)
 
 
 def judge(
-    pose: Pose,
-    last: Pose | None,
-    unseen: float,
-    limits: PoseLimits,
-    prediction: Pose | None = None,
+    pose: Pose, last: Pose | None, unseen: float, limits: PoseLimits, prediction: Pose | None = None
 ) -> Verdict:
     """What is wrong with a pose.
 
@@ -170,11 +164,7 @@ class Track(NamedTuple):
         else:
             prediction = None if prediction is None else moved_on(prediction, pose.time)
             verdict = judge(
-                pose,
-                last,
-                pose.time - max(self.last_time, last.time),
-                limits,
-                prediction,
+                pose, last, pose.time - max(self.last_time, last.time), limits, prediction
             )
         return Track(last if verdict else pose, verdict, pose.time)
 

@@ -85,10 +85,7 @@ def parting_velocity(
         distance = math.dist(pose.position, other.position)
         if distance < 1e-6:  # no way leads apart from there
             continue
-        away = tuple(
-            (p - q) / distance
-            for p, q in zip(pose.position, other.position, strict=True)
-        )
+        away = tuple((p - q) / distance for p, q in zip(pose.position, other.position, strict=True))
         approach = zip(away, pose.velocity, other.velocity, strict=True)
         # along the line between them; what moves apart needs no room
         closing = max(sum(a * (w - v) for a, v, w in approach), 0.0)
@@ -98,15 +95,12 @@ def parting_velocity(
             # half of the approach: the other brakes the other half
             push = 0.5 * closing + min(lack / settings.reaction, FASTEST_PUSH)
             velocity = tuple(
-                w + push * a
-                for w, a in zip(velocity or pose.velocity, away, strict=True)
+                w + push * a for w, a in zip(velocity or pose.velocity, away, strict=True)
             )
     return velocity
 
 
-def within_reach(
-    action: SetPoint, previous: SetPoint, airframe: Airframe, dt: float
-) -> SetPoint:
+def within_reach(action: SetPoint, previous: SetPoint, airframe: Airframe, dt: float) -> SetPoint:
     """The action within its bounds, and no farther from what was sent `dt` (s) before
     than the vehicle can follow.
 
@@ -115,9 +109,7 @@ def within_reach(
     """
 
     def near(value, old, room):
-        return (
-            min(max(value, old - room), old + room) if previous.mode == RATES else value
-        )
+        return min(max(value, old - room), old + room) if previous.mode == RATES else value
 
     def rate(value, old):
         return near(min(max(value, -math.pi), math.pi), old, turn)
@@ -145,9 +137,7 @@ def resting_places(
       poses: of the vehicles; None for one that was never seen.
     """
     nowhere = (0.0, 0.0, 0.0)
-    stops = [
-        nowhere if pose is None else stopping_point(settings, pose) for pose in poses
-    ]
+    stops = [nowhere if pose is None else stopping_point(settings, pose) for pose in poses]
     reach = settings.arena_radius - CLEARANCE
     low = HEADROOM
     high = settings.arena_height - HEADROOM
@@ -166,9 +156,7 @@ def resting_places(
             # the wall last, so that no push leads out of the arena
             inside = min(1.0, reach / max(math.hypot(*place[:2]), 1e-6))
             next_places.append((place[0] * inside, place[1] * inside, place[2]))
-        if all(
-            math.dist(a, b) < 1e-4 for a, b in zip(next_places, places, strict=True)
-        ):
+        if all(math.dist(a, b) < 1e-4 for a, b in zip(next_places, places, strict=True)):
             break
         places = next_places
     return places
@@ -184,10 +172,6 @@ def _push_away(place, other, distance, share=1.0, direction=1.0) -> Vector:
     distance_now = math.hypot(dx, dy)
     if distance_now >= distance:
         return place
-    dx, dy = (
-        (dx / distance_now, dy / distance_now)
-        if distance_now > 1e-6
-        else (direction, 0.0)
-    )
+    dx, dy = (dx / distance_now, dy / distance_now) if distance_now > 1e-6 else (direction, 0.0)
     lack = share * (distance - distance_now)
     return place[0] + lack * dx, place[1] + lack * dy, place[2]

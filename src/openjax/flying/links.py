@@ -108,9 +108,7 @@ class Links:
         connection = Connection(self._uris, self._body_logs, self._watchdog, timeout)
         ends = Ends(self._contacts, stream, commands, control)
         arguments = (connection, ends, self.board, os.getpid(), self._state)
-        self._process = context.Process(
-            target=serve, args=arguments, name="openjax links"
-        )
+        self._process = context.Process(target=serve, args=arguments, name="openjax links")
         start_deaf(self._process)
         for end in (stream, commands, control):
             end.close()
@@ -166,13 +164,9 @@ class Links:
             data = self._rest + data
             complete = len(data) - len(data) % POSE_RECORD.size
             self._rest = data[complete:]
-            for (
-                vehicle,
-                supervisor,
-                arrival,
-                voltage,
-                *numbers,
-            ) in POSE_RECORD.iter_unpack(data[:complete]):
+            for vehicle, supervisor, arrival, voltage, *numbers in POSE_RECORD.iter_unpack(
+                data[:complete]
+            ):
                 force = tuple(numbers[:3])
                 self._samples[vehicle] = PoseSample(
                     own=pose_of(numbers[3:]),
@@ -194,9 +188,7 @@ class Links:
         """What is known of each vehicle now."""
         self._drain()
         samples = zip(self._samples, self._contacts, strict=True)
-        return tuple(
-            sample._replace(last_contact=contact) for sample, contact in samples
-        )
+        return tuple(sample._replace(last_contact=contact) for sample, contact in samples)
 
     def arrivals(self) -> tuple[float, ...]:
         """When each vehicle's newest pose arrived (s, host)."""
@@ -218,9 +210,7 @@ class Links:
             number = 0
             # an answer that came too late for its tick may still be there
             while number != self._count:
-                number, sent_at = SENT_RECORD.unpack(
-                    self._commands.recv(SENT_RECORD.size)
-                )
+                number, sent_at = SENT_RECORD.unpack(self._commands.recv(SENT_RECORD.size))
         except OSError as error:
             raise LinksGone("the links' process is gone or stuck") from error
         return sent_at

@@ -88,10 +88,7 @@ def serve(
     gc.collect()
     gc.disable()
     threading.Thread(
-        target=_send_on,
-        args=(swarm, ends.commands, board),
-        daemon=True,
-        name="set-points",
+        target=_send_on, args=(swarm, ends.commands, board), daemon=True, name="set-points"
     ).start()
     ends.control.send((None, swarm.pose_blocks()))
     with contextlib.suppress(EOFError, OSError):
@@ -130,11 +127,7 @@ def _answer(swarm: Swarm, control, board: Board) -> None:
     while True:
         number, name, arguments = control.recv()
         disarming = name in ("disarm", "close")
-        result = (
-            disarm(swarm, board, Role.LINKS)
-            if disarming
-            else getattr(swarm, name)(*arguments)
-        )
+        result = disarm(swarm, board, Role.LINKS) if disarming else getattr(swarm, name)(*arguments)
         if number:
             control.send((number, result))
         if name == "close":
@@ -165,9 +158,7 @@ def _watch(swarm: Swarm, board: Board, parent: int, state: State | None) -> None
         time_read = time.perf_counter()
         board.beat(Role.LINKS, time_read)
         silent = board.silent(Role.LOOP, time_read)
-        is_over = board.pilot is Role.LINKS or (
-            board.pilot is Role.LOOP and silent > board.silence
-        )
+        is_over = board.pilot is Role.LINKS or (board.pilot is Role.LOOP and silent > board.silence)
         if is_over and board.flying and state is not None:
             say(
                 f"openjax fly: the loop, heard {silent:.2f} s ago, left all vehicles to the links' "

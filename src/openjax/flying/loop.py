@@ -20,14 +20,7 @@ from openjax.flying.game import Game
 from openjax.flying.links import Links
 from openjax.flying.safety import decide
 from openjax.flying.set_point import RATES, from_action
-from openjax.flying.state import (
-    Event,
-    Mode,
-    Request,
-    SafetySettings,
-    State,
-    initial_state,
-)
+from openjax.flying.state import Event, Mode, Request, SafetySettings, State, initial_state
 from openjax.flying.ticks import TickSchedule, await_poses, measured_times
 from openjax.pursuit.environment import THRUST_LIMIT
 
@@ -107,9 +100,7 @@ class Flight:
             self._since = perf_counter()
             while not self.over:
                 self.tick(perf_counter(), schedule.due)
-                due = schedule.next(
-                    perf_counter(), measured_times(self.vehicles.observe())
-                )
+                due = schedule.next(perf_counter(), measured_times(self.vehicles.observe()))
                 self.record.skipped = schedule.skipped
                 await_poses(self.vehicles, due)
         finally:
@@ -133,16 +124,12 @@ class Flight:
         samples = self.vehicles.observe()
         old_drones = self.state.drones
         self.state = see(self.state, time, samples)
-        for i, (drone, old) in enumerate(
-            zip(self.state.drones, old_drones, strict=True)
-        ):
+        for i, (drone, old) in enumerate(zip(self.state.drones, old_drones, strict=True)):
             # only what was believed goes to the estimators on board, and each pose once
             if drone.captured.pose is not old.captured.pose:
                 self.vehicles.believed(i, drone.captured.pose, drone.feeds_estimator)
         # the operator before the watch, the watch before the plan
-        request = self._requests() or (
-            Request.LAND if self._alarm else self._plan(time)
-        )
+        request = self._requests() or (Request.LAND if self._alarm else self._plan(time))
         actions = None
         if self._episode >= 0 or request is Request.PURSUE:
             actions = self._actions(time, request is Request.PURSUE)
@@ -164,9 +151,7 @@ class Flight:
         plan = self.plan
         delay = time - self._since
         # each vehicle must have said where it stands before any rises
-        if state.all_in(Mode.GROUND) and all(
-            d.estimate is not None for d in state.drones
-        ):
+        if state.all_in(Mode.GROUND) and all(d.estimate is not None for d in state.drones):
             return Request.TRANSFER
         if state.all_in(Mode.READY) and self._episode < 0:
             if time - max(d.since for d in state.drones) < SETTLE:
@@ -178,9 +163,7 @@ class Flight:
         if any(mode in underway for mode in state.modes) and delay > TRANSFER:
             self._alarm = f"not all at their starts after {TRANSFER:g} s"
             return Request.LAND
-        if self._episode >= 0 and (
-            self._play.over or time - self._begun > plan.episode_seconds
-        ):
+        if self._episode >= 0 and (self._play.over or time - self._begun > plan.episode_seconds):
             self._end_episode("over")
             self._since = time
             return Request.TRANSFER  # back to the starts, also to land there
@@ -195,13 +178,7 @@ class Flight:
             self._play = self.game.start(poses[: self._pursuers])
             self._episode = len(self.record.episodes)
             self._begun = time
-            notes = {
-                "capture_step": None,
-                "breaches": 0,
-                "crash": False,
-                "steps": 0,
-                "end": "",
-            }
+            notes = {"capture_step": None, "breaches": 0, "crash": False, "steps": 0, "end": ""}
             self.record.episodes.append(notes | {"over_speed": 0})
         else:
             evader = np.array(poses[-1].position) if self._evader_flies else None
@@ -232,9 +209,7 @@ class Flight:
         velocity = tuple(float(v) for v in self._play.evader_velocity)
         acceleration = wanted_acceleration(pose.velocity, velocity)
         trim = self.state.drones[-1].trim
-        return accelerate(
-            pose.quaternion, acceleration, self.state.airframe, trim, RATES
-        )
+        return accelerate(pose.quaternion, acceleration, self.state.airframe, trim, RATES)
 
     def _end_episode(self, reason):
         self.record.episodes[-1]["end"] = reason

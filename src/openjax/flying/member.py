@@ -69,9 +69,7 @@ class Member:
 
     def sample(self) -> PoseSample:
         """What is known of it."""
-        is_recent = (
-            self.pose is not None and abs(self.pose.time - self.felt[0]) <= FORCE_AGE
-        )
+        is_recent = self.pose is not None and abs(self.pose.time - self.felt[0]) <= FORCE_AGE
         return PoseSample(
             own=self.pose,
             last_contact=self.last_contact,

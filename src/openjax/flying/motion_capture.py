@@ -42,9 +42,7 @@ def find_feed(name: str) -> Callable:
     try:
         feed = pkgutil.resolve_name(name)
     except (ImportError, AttributeError, ValueError) as error:
-        raise UserError(
-            f"--motion_capture {name}: no such MODULE:FUNCTION ({error})"
-        ) from error
+        raise UserError(f"--motion_capture {name}: no such MODULE:FUNCTION ({error})") from error
     finally:
         sys.path.pop(0)
     if not callable(feed):
@@ -68,9 +66,7 @@ class MotionCaptured(Links):
             target=function, args=(self.update,), daemon=True, name="motion capture"
         ).start()
 
-    def update(
-        self, vehicle: int, position, quaternion, at: float | None = None
-    ) -> None:
+    def update(self, vehicle: int, position, quaternion, at: float | None = None) -> None:
         """Vehicle `vehicle` was seen at position (3,) m, attitude (4,) wxyz, at `at`
         (s, host clock; default now).
 
@@ -113,9 +109,7 @@ class MotionCaptured(Links):
     def observe(self) -> tuple[PoseSample, ...]:
         """What is known of each vehicle now."""
         samples = super().observe()
-        return tuple(
-            s._replace(captured=p) for p, s in zip(self._captured, samples, strict=True)
-        )
+        return tuple(s._replace(captured=p) for p, s in zip(self._captured, samples, strict=True))
 
     def arrivals(self) -> tuple[float, ...]:
         """When each vehicle's newest pose of motion capture arrived (s, host)."""

@@ -42,9 +42,7 @@ class PlannedFlight:
 
     def __init__(self, plan: SetPoints, airframe: Airframe):
         self.airframe = airframe
-        self.settings = SimpleNamespace(
-            num_pursuers=1, pillar_radius=0.0, max_speed=FASTEST
-        )
+        self.settings = SimpleNamespace(num_pursuers=1, pillar_radius=0.0, max_speed=FASTEST)
         self.task = SimpleNamespace(
             pursuer_position=plan.position[:1],
             evader_position=np.zeros(3),
@@ -88,22 +86,15 @@ class PlannedFlight:
         self._trim = min(max(self._trim, -MOST_TRIM), MOST_TRIM)
         velocity = plan.velocity[row] + POSITION_GAIN * error
         pull = (
-            np.array(wanted_acceleration(pose.velocity, tuple(velocity)))
-            + plan.acceleration[row]
+            np.array(wanted_acceleration(pose.velocity, tuple(velocity))) + plan.acceleration[row]
         )
-        set_point = accelerate(
-            pose.quaternion, tuple(pull), self.airframe, self._trim, RATES
-        )
+        set_point = accelerate(pose.quaternion, tuple(pull), self.airframe, self._trim, RATES)
         yaw = roll_pitch_yaw(pose.quaternion)[2]
         turn = math.remainder(plan.yaw[row] - yaw, 2.0 * math.pi)
         # what the plan itself turns until the next row is asked for beside the error's
         # share
         ahead = plan.yaw[min(row + 1, len(plan) - 1)] - plan.yaw[row]
-        rates = np.array(
-            [set_point.roll, set_point.pitch, YAW_GAIN * turn + ahead / PERIOD]
-        )
+        rates = np.array([set_point.roll, set_point.pitch, YAW_GAIN * turn + ahead / PERIOD])
         thrust = set_point.thrust + plan.extra[row, 0]
         rates = rates + plan.extra[row, 1:]
-        return np.clip(
-            np.concatenate([[2.0 * thrust - 1.0], rates / math.pi]), -1.0, 1.0
-        )
+        return np.clip(np.concatenate([[2.0 * thrust - 1.0], rates / math.pi]), -1.0, 1.0)

@@ -65,12 +65,8 @@ def faults(
     """
     lines = []
     if not has_guard:
-        lines.append(
-            "the guard's process isn't there; try again, with fewer programs running"
-        )
-    for i, (sample, start, rate) in enumerate(
-        zip(samples, state.starts, rates, strict=True)
-    ):
+        lines.append("the guard's process isn't there; try again, with fewer programs running")
+    for i, (sample, start, rate) in enumerate(zip(samples, state.starts, rates, strict=True)):
         pose_faults = [
             *_firmware_faults(state.settings, sample, rate),
             *_pose_faults(state, sample, start),
@@ -88,9 +84,7 @@ def _firmware_faults(settings, sample, rate) -> Iterator[str]:
         yield "its firmware says tumbled or crashed; look at it, put it upright, restart it"
     elif bits & Supervisor.LOCKED:
         yield "its firmware is locked after an emergency stop; restart it"
-    elif bits & Supervisor.FLYING or (
-        bits & Supervisor.ARMED and not bits & Supervisor.AUTO_ARM
-    ):
+    elif bits & Supervisor.FLYING or (bits & Supervisor.ARMED and not bits & Supervisor.AUTO_ARM):
         yield "it is armed or flies already; end the program that commands it"
     elif not bits & (Supervisor.CAN_BE_ARMED | Supervisor.CAN_FLY):
         yield "its firmware can't be armed; look at its console"

@@ -26,9 +26,7 @@ class RawLinks:
       on.
     """
 
-    def __init__(
-        self, uris: Sequence[str], pose_blocks: Sequence[int], watchdog: bool = True
-    ):
+    def __init__(self, uris: Sequence[str], pose_blocks: Sequence[int], watchdog: bool = True):
         self._members: list[Member] = []
         self._blocks = tuple(pose_blocks)
         self._links = dict.fromkeys(uris)
@@ -49,9 +47,7 @@ class RawLinks:
             # a dongle belongs to one process: as long as the links' process has it, it
             # can't be opened
             if link is None and (uri.startswith("udp:") or not udp_only):
-                self._links[uri] = cflib.crtp.get_link_driver(
-                    uri, lambda *_: None, lambda *_: None
-                )
+                self._links[uri] = cflib.crtp.get_link_driver(uri, lambda *_: None, lambda *_: None)
                 never_wait(self._links[uri])
 
     def observe(self) -> tuple[PoseSample, ...]:
@@ -62,18 +58,12 @@ class RawLinks:
             while (packet := link.receive_packet(0)) is not None:
                 member.last_contact = time.perf_counter()
                 data = bytes(packet.data)
-                if (packet.port, packet.channel) != (Port.LOG, 2) or data[:1] != bytes(
-                    [block]
-                ):
+                if (packet.port, packet.channel) != (Port.LOG, 2) or data[:1] != bytes([block]):
                     continue
                 # block, three bytes of time, and the variables
                 if len(data) == 4 + struct.calcsize(self._layout):
                     values = dict(
-                        zip(
-                            self._names,
-                            struct.unpack(self._layout, data[4:]),
-                            strict=True,
-                        )
+                        zip(self._names, struct.unpack(self._layout, data[4:]), strict=True)
                     )
                     member.pose_arrived(int.from_bytes(data[1:4], "little"), values)
         return tuple(member.sample() for member in self._members)

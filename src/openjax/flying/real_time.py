@@ -39,11 +39,7 @@ def compile_in_line(program):
     """
     try:
         return program.compile(compiler_options=IN_LINE)
-    except (
-        RuntimeError,
-        ValueError,
-        TypeError,
-    ):  # a compiler that knows no such option
+    except (RuntimeError, ValueError, TypeError):  # a compiler that knows no such option
         return program.compile()
 
 

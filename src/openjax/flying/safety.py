@@ -20,15 +20,7 @@ from openjax.flying.crtp import Supervisor
 from openjax.flying.estimation import see
 from openjax.flying.limits import resting_places
 from openjax.flying.set_point import SetPoint
-from openjax.flying.state import (
-    FLYING,
-    SPIN_UP,
-    Drone,
-    Event,
-    Mode,
-    Request,
-    State,
-)
+from openjax.flying.state import FLYING, SPIN_UP, Drone, Event, Mode, Request, State
 from openjax.flying.steering import steer
 
 ASIDE = 0.08
@@ -52,9 +44,7 @@ def decide(state: State, event: Event) -> tuple[State, tuple[SetPoint, ...]]:
     """
     time = event.time
     actions = event.actions
-    finite = actions is not None and all(
-        math.isfinite(x) for action in actions for x in action
-    )
+    finite = actions is not None and all(math.isfinite(x) for action in actions for x in action)
     action_time = time if finite else state.action_time
     # requests first, so that troubles have the last word
     drones = _request(state, event)
@@ -68,16 +58,12 @@ def decide(state: State, event: Event) -> tuple[State, tuple[SetPoint, ...]]:
     else:
         # the clock of the actions starts with the game
         action_time = time
-    state = state._replace(
-        drones=_react(state, drones, troubles), action_time=action_time
-    )
+    state = state._replace(drones=_react(state, drones, troubles), action_time=action_time)
     next_drones = tuple(
         steer(state, i, actions[i] if finite else None, sample)
         for i, sample in enumerate(event.samples)
     )
-    return state._replace(drones=next_drones), tuple(
-        drone.sent for drone in next_drones
-    )
+    return state._replace(drones=next_drones), tuple(drone.sent for drone in next_drones)
 
 
 def _request(state, event) -> tuple[Drone, ...]:
@@ -97,15 +83,11 @@ def _request(state, event) -> tuple[Drone, ...]:
         # who was in trouble, or landed for some reason, never rises again in this
         # flight
         able = (*_DOWN, Mode.HOLD, Mode.PURSUIT, Mode.READY)
-        if all(
-            d.mode in able and not d.reason and d.estimate is not None for d in drones
-        ):
+        if all(d.mode in able and not d.reason and d.estimate is not None for d in drones):
             answer = _transfer
     if answer is None:
         return drones
-    return tuple(
-        answer(state, event, d, a) for d, a in zip(drones, anchors, strict=True)
-    )
+    return tuple(answer(state, event, d, a) for d, a in zip(drones, anchors, strict=True))
 
 
 def _land(state, event, drone, anchor) -> Drone:
@@ -122,9 +104,7 @@ def _land(state, event, drone, anchor) -> Drone:
 
 def _hold(state, event, drone, anchor) -> Drone:
     """The drone waiting at its anchor, if it flies and isn't in trouble."""
-    return (
-        drone.to(Mode.HOLD, event.time, anchor) if drone.mode in _UNTROUBLED else drone
-    )
+    return drone.to(Mode.HOLD, event.time, anchor) if drone.mode in _UNTROUBLED else drone
 
 
 def _transfer(state, event, drone, start) -> Drone:
@@ -133,12 +113,8 @@ def _transfer(state, event, drone, start) -> Drone:
         return drone.to(Mode.TRANSFER, event.time, start)
     x, y, z = drone.estimate.position
     tracks = (drone.own, drone.captured)
-    stand = tuple(
-        None if track.pose is None else track.pose.position for track in tracks
-    )
-    return drone.to(Mode.LIFT, event.time, (x, y, z + state.settings.lift))._replace(
-        stand=stand
-    )
+    stand = tuple(None if track.pose is None else track.pose.position for track in tracks)
+    return drone.to(Mode.LIFT, event.time, (x, y, z + state.settings.lift))._replace(stand=stand)
 
 
 def lift_fault(state: State, drone: Drone) -> str:
@@ -158,9 +134,7 @@ def lift_fault(state: State, drone: Drone) -> str:
     if any(math.hypot(x, y) > ASIDE for x, y, _ in moves):
         return "the test lift went sideways: do the poses' axes and yaw agree with the vehicle's?"
     if len(moves) == 2 and math.dist(moves[0], moves[1]) > ASIDE / 2:
-        return (
-            "motion capture and own estimate rose differently: do axes and scale agree?"
-        )
+        return "motion capture and own estimate rose differently: do axes and scale agree?"
     if state.time - drone.since > settings.lift_time:
         return (
             f"not {settings.lift:g} m up after {settings.lift_time:g} s: do the poses' z and the "
@@ -182,10 +156,7 @@ def _trouble(state, drone, sample) -> tuple[Mode, str] | None:
     if drone.mode is Mode.LIFT:  # from there it may fall
         fault = loss or lift_fault(state, drone)
         return (Mode.STOPPED, fault) if fault else None
-    if (
-        drone.over_since is not None
-        and state.time - drone.over_since > state.settings.tumble_time
-    ):
+    if drone.over_since is not None and state.time - drone.over_since > state.settings.tumble_time:
         return Mode.STOPPED, "tumbled"
     # who lands already goes on landing, whatever else is wrong with it
     fault = loss
@@ -211,10 +182,7 @@ def _unfit(state, drone) -> str:
         return "battery low"
     if drone.alone_since is not None and time - drone.alone_since > settings.alone_time:
         return f"{settings.alone_time:g} s by its own estimate alone"
-    if (
-        drone.own.pose is not None
-        and time - drone.own.pose.time > settings.link_timeout
-    ):
+    if drone.own.pose is not None and time - drone.own.pose.time > settings.link_timeout:
         return f"own estimate lost ({drone.own.verdict or 'silent'})"
     x, y, z = drone.estimate.position
     if math.hypot(x, y) > settings.arena_radius + settings.outside:
@@ -235,13 +203,9 @@ def _react(state, drones, troubles) -> tuple[Drone, ...]:
     time = state.time
     team = any(d.reason for d in drones) or any(troubles)
     anchors = resting_places_of(state) if team else [None] * len(drones)
-    all_up = (
-        all(d.mode is Mode.LIFT and _has_lifted(d, time) for d in drones) and not team
-    )
+    all_up = all(d.mode is Mode.LIFT and _has_lifted(d, time) for d in drones) and not team
     reactions = []
-    for drone, trouble, anchor, start in zip(
-        drones, troubles, anchors, state.starts, strict=True
-    ):
+    for drone, trouble, anchor, start in zip(drones, troubles, anchors, state.starts, strict=True):
         waits = time - drone.since > state.settings.hold_time
         if trouble is not None and trouble[0] is not drone.mode:
             mode, reason = trouble

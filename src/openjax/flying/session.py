@@ -69,11 +69,7 @@ class Session:
         self._state = state
         kind = Links if settings.feed is None else MotionCaptured
         self.links = kind(
-            settings.uris,
-            settings.body_logs,
-            settings.watchdog,
-            state,
-            settings.silence,
+            settings.uris, settings.body_logs, settings.watchdog, state, settings.silence
         )
         self.requests = Operator()
         self._guard: Guard | None = None
@@ -180,8 +176,7 @@ class Session:
             self._listen()
             lander = max(lander, board.pilot)
             if all(
-                board.silent(role, time_read) > board.silence
-                for role in (Role.LINKS, Role.GUARD)
+                board.silent(role, time_read) > board.silence for role in (Role.LINKS, Role.GUARD)
             ):
                 lander = Role.LOOP
                 # should one of them wake up, two would fly, and a dongle serves one
@@ -212,10 +207,6 @@ class Session:
                 return
             if time.monotonic() > deadline:
                 uris: Sequence[str] = self._settings.uris
-                silent = ", ".join(
-                    uri for uri, is_old in zip(uris, old, strict=True) if is_old
-                )
-                raise UserError(
-                    f"no pose from {silent} within {POSES:g} s; is its position known?"
-                )
+                silent = ", ".join(uri for uri, is_old in zip(uris, old, strict=True) if is_old)
+                raise UserError(f"no pose from {silent} within {POSES:g} s; is its position known?")
             self.links.wait(time_read + 0.02)

@@ -60,9 +60,7 @@ def as_sent(set_point: SetPoint) -> SetPoint:
     """The set-point with the thrust that is left of it in a packet: that is what a log
     should hold.
     """
-    return set_point._replace(
-        thrust=min(max(set_point.thrust, LEAST_THRUST), MOST_THRUST)
-    )
+    return set_point._replace(thrust=min(max(set_point.thrust, LEAST_THRUST), MOST_THRUST))
 
 
 def from_action(action, thrust_limit: float) -> SetPoint:

@@ -13,12 +13,7 @@ from openjax.flying.controller import (
     wanted_acceleration,
     wanted_velocity,
 )
-from openjax.flying.limits import (
-    APART,
-    fence_velocity,
-    parting_velocity,
-    within_reach,
-)
+from openjax.flying.limits import APART, fence_velocity, parting_velocity, within_reach
 from openjax.flying.set_point import ANGLES, LEAST_THRUST, MOTORS_OFF, RATES, SetPoint
 from openjax.flying.state import FLYING, Drone, Mode, PoseSample, State
 
@@ -107,9 +102,7 @@ def _pursue(state, drone, i, action) -> SetPoint:
     if velocity is None:
         return within_reach(action, previous, state.airframe, state.dt)
     acceleration = wanted_acceleration(estimate.velocity, velocity)
-    return accelerate(
-        estimate.quaternion, acceleration, state.airframe, drone.trim, RATES
-    )
+    return accelerate(estimate.quaternion, acceleration, state.airframe, drone.trim, RATES)
 
 
 def _go(state, drone, i) -> Drone:
@@ -123,23 +116,17 @@ def _go(state, drone, i) -> Drone:
         # by reckoning: the vehicle does what it is asked for, and is level else
         share = min(state.dt / state.settings.reaction, 1.0)
         change = zip(drone.acceleration, acceleration, strict=True)
-        drone = drone._replace(
-            acceleration=tuple(a + share * (b - a) for a, b in change)
-        )
+        drone = drone._replace(acceleration=tuple(a + share * (b - a) for a, b in change))
         attitude = _yaw_only(attitude)
     else:
         # not lower: on the floor a vehicle that doesn't climb isn't too heavy
         if estimate.position[2] > (0.02 if drone.mode is Mode.LIFT else 0.1):
             error = min(max(velocity[2] - estimate.velocity[2], -0.3), 0.3)
-            trim = min(
-                max(drone.trim + TRIM_GAIN * state.dt * error, -TRIM_LIMIT), TRIM_LIMIT
-            )
+            trim = min(max(drone.trim + TRIM_GAIN * state.dt * error, -TRIM_LIMIT), TRIM_LIMIT)
             drone = drone._replace(trim=trim)
         if drone.mode is Mode.TRANSFER and _is_there(estimate, drone.anchor):
             drone = drone.to(Mode.READY, state.time)
-    return drone._replace(
-        sent=accelerate(attitude, acceleration, airframe, drone.trim, ANGLES)
-    )
+    return drone._replace(sent=accelerate(attitude, acceleration, airframe, drone.trim, ANGLES))
 
 
 def _target_velocity(state, drone, i) -> Vector:

@@ -61,11 +61,7 @@ class Swarm:
             raise UserError(
                 f"{error.name or 'cflib'} is missing: pip install cflib (it is GPLv3)"
             ) from error
-        for name in (
-            "cflib.crazyflie",
-            "cflib.crazyflie.toccache",
-            "cflib.crazyflie.log",
-        ):
+        for name in ("cflib.crazyflie", "cflib.crazyflie.toccache", "cflib.crazyflie.log"):
             logging.getLogger(name).setLevel(logging.CRITICAL)
         # cflib's list of drivers is the process' own: a second call would add them
         # again
@@ -92,9 +88,7 @@ class Swarm:
         if member.uri.startswith("udp:"):
             question = "does openjax virtual_crazyflie run"
         reason = member.error or "locked"
-        raise UserError(
-            f"{member.uri}: no connection ({reason}); {question}, is the URI right?"
-        )
+        raise UserError(f"{member.uri}: no connection ({reason}); {question}, is the URI right?")
 
     def _answers(self, member, make, timeout) -> bool:
         """Whether the vehicle has told all that `cflib` asks for."""
@@ -126,9 +120,7 @@ class Swarm:
                 block = LogConfig(f"openjax{number}", PERIOD_MS)
                 for name, fetch_as in kind:
                     block.add_variable(name, fetch_as)
-                arrival = (
-                    member.pose_arrived if kind is POSE_BLOCK else member.body_arrived
-                )
+                arrival = member.pose_arrived if kind is POSE_BLOCK else member.body_arrived
                 block.data_received_cb.add_callback(arrival)
                 try:
                     member.crazyflie.log.add_config(block)
@@ -148,9 +140,7 @@ class Swarm:
         for _ in range(TRIES):
             self._start_in_step()
             sleep(5e-3 * PERIOD_MS)
-            if all(
-                len(set(m.phases.values())) == self._body_logs for m in self.members
-            ):
+            if all(len(set(m.phases.values())) == self._body_logs for m in self.members):
                 break
 
     def _start_in_step(self):
@@ -159,11 +149,7 @@ class Swarm:
         """
         begin = perf_counter() + 0.01
         for number in range(1 + self._body_logs):
-            due = (
-                begin + 1e-3 * PERIOD_MS * (number - 0.5) / self._body_logs
-                if number
-                else begin
-            )
+            due = begin + 1e-3 * PERIOD_MS * (number - 0.5) / self._body_logs if number else begin
             while perf_counter() < due:
                 sleep(1e-4)
             for member in self.members:
@@ -211,9 +197,7 @@ class Swarm:
         """What was recorded of each vehicle until now: poses and bodies, rows of
         float64 as in `Samples`.
         """
-        return [
-            (member.poses.tobytes(), member.bodies.tobytes()) for member in self.members
-        ]
+        return [(member.poses.tobytes(), member.bodies.tobytes()) for member in self.members]
 
     def close(self) -> None:
         """Motors off, disarmed, links closed."""

@@ -75,10 +75,7 @@ def fly_down(
         say("openjax fly: all vehicles are down and disarmed")
         time.sleep(3.0 * board.silence)
         for other in Role:  # what still hangs would only be in the way
-            if (
-                other is not role
-                and board.silent(other, time.perf_counter()) > 3.0 * board.silence
-            ):
+            if other is not role and board.silent(other, time.perf_counter()) > 3.0 * board.silence:
                 board.end_process(other)
     return state
 
@@ -96,9 +93,7 @@ def disarm(vehicles: Swarm | RawLinks, board: Board, role: Role) -> bool:
         time.sleep(0.03)
         # a vehicle that arms by itself always says that it is armed
         either = Supervisor.ARMED | Supervisor.AUTO_ARM
-        any_armed = any(
-            s.supervisor & either == Supervisor.ARMED for s in vehicles.observe()
-        )
+        any_armed = any(s.supervisor & either == Supervisor.ARMED for s in vehicles.observe())
         if not any_armed or time.perf_counter() > deadline:
             board.armed = any_armed
             return not any_armed

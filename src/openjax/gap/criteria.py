@@ -42,11 +42,7 @@ def difference(better: Validation, other: Validation) -> tuple[float, float, flo
     cross = np.add.reduceat(change * better.residuals, better.starts)
     energy = np.add.reduceat(change * change, better.starts)
     square = max(float((cross**2).sum()), float(energy.sum()), 1e-12)
-    return (
-        float((cross + 0.5 * energy).sum()),
-        square**0.5,
-        float(energy.sum()) / square,
-    )
+    return (float((cross + 0.5 * energy).sum()), square**0.5, float(energy.sum()) / square)
 
 
 def growth(
@@ -114,8 +110,7 @@ def too_small(fit: SetFit, torque_response: Measured) -> tuple[str, ...]:
         shape = [PLACE[effect, parameter] for parameter in card.shape]
         free = np.flatnonzero(~np.isin(fit.index, shape))
         covariance = of_flights(
-            np.linalg.inv(fit.hessian[np.ix_(free, free)]),
-            fit.grams[:, 1:, 0][:, free],
+            np.linalg.inv(fit.hessian[np.ix_(free, free)]), fit.grams[:, 1:, 0][:, free]
         )
         place = {i: k for k, i in enumerate(fit.index[free].tolist())}
         rows = [place[i] for i in indices]
@@ -137,9 +132,7 @@ def too_small(fit: SetFit, torque_response: Measured) -> tuple[str, ...]:
 
     def of_a_size(effect: str) -> bool:
         card = CARDS[effect]
-        if card.needs_response or any(
-            key in torque_response for key in card.confirmed_by
-        ):
+        if card.needs_response or any(key in torque_response for key in card.confirmed_by):
             # what confirms another effect of the set can't confirm this one as well
             others = set(fit.effects) - {effect}
             keys = [k for k in card.confirmed_by if k[0] not in others]

@@ -16,14 +16,7 @@ from openjax.gap.model.bounds import BOUND
 from openjax.gap.model.library import CARDS, PLACE, library, path_of
 from openjax.gap.planning.beliefs import acts_in_physics
 from openjax.gap.probabilities import agreeing, probabilities
-from openjax.gap.reference import (
-    OF_DAYS,
-    borne_out,
-    differs,
-    join,
-    read_reference,
-    trimmed_before,
-)
+from openjax.gap.reference import OF_DAYS, borne_out, differs, join, read_reference, trimmed_before
 from openjax.gap.report import Report
 from openjax.gap.report.rules import LEAST_SHARE
 from openjax.gap.residual import Check, check_residual
@@ -34,10 +27,7 @@ from openjax.vehicle.effects import EFFECTS
 
 
 def diagnose_case(
-    case: Case,
-    without: Iterable[str] = (),
-    progress=None,
-    reference: Sequence[Case] = (),
+    case: Case, without: Iterable[str] = (), progress=None, reference: Sequence[Case] = ()
 ) -> Report:
     """Diagnose the flights of a case.
 
@@ -54,10 +44,7 @@ def diagnose_case(
     begin = time.perf_counter()
     baseline = read_reference(join(reference), progress) if reference else None
     evidence = gather(case, library(without), progress, baseline)
-    if (
-        baseline is not None
-        and (both := borne_out(evidence)).effects != baseline.effects
-    ):
+    if baseline is not None and (both := borne_out(evidence)).effects != baseline.effects:
         # what only the reference's flights looked like isn't this vehicle's nominal
         # state
         evidence = gather(case, library(without), progress, both)
@@ -88,9 +75,7 @@ def conclude(evidence: Evidence) -> Report:
     if check.mostly_unknown:  # what acts is something else
         old |= set(selection.effects)
     candidates = [e for e, p in acting.items() if p >= 0.5 and e not in old]
-    parts = worth_naming(
-        lambda names: split(evidence, selection, check.excess, names), candidates
-    )
+    parts = worth_naming(lambda names: split(evidence, selection, check.excess, names), candidates)
     present = {e: acting[e] for e in parts.effects}
     rejects = (set(candidates) | old) - set(present)
     weights = Counter()
@@ -98,9 +83,7 @@ def conclude(evidence: Evidence) -> Report:
         # a set with an effect that isn't worth a name stands for the rest of it
         weights[effects - rejects] += weight
     possible = evidence.library.effects
-    chances = probabilities(
-        present, parts.largest, check.probability, weights, possible
-    )
+    chances = probabilities(present, parts.largest, check.probability, weights, possible)
     sure = max((share.interval90[0] for share in parts.effects.values()), default=0.0)
     chances = agreeing(chances, words(check, parts) or ("none",), sure)
     return _report(evidence, selection, check, parts, chances)
@@ -113,9 +96,7 @@ def worth_naming(shares_of: Callable[[list[str]], Split], effects: list[str]) ->
     """
     parts = shares_of(effects)
     while effects:
-        dropouts = [
-            e for e in effects if parts.effects[e].interval90[1] < least_share(e)
-        ]
+        dropouts = [e for e in effects if parts.effects[e].interval90[1] < least_share(e)]
         if not dropouts and parts.gap.reduction < 0.0:
             dropouts = [min(effects, key=lambda e: parts.effects[e].value)]
         if not dropouts:
@@ -145,11 +126,7 @@ def not_testable(evidence: Evidence) -> list[str]:
     missing = [e for e in evidence.library.physics if motion.exposure[e] < DETECTABLE]
     # what is felt of a wake isn't the mean that the effect holds
     if motion.gusts is not None:
-        missing += [
-            e
-            for e in evidence.library.physics
-            if CARDS[e].of_others and e not in missing
-        ]
+        missing += [e for e in evidence.library.physics if CARDS[e].of_others and e not in missing]
     missing += sorted(evidence.silent - set(missing))
     readable_paths = {c.path for c in evidence.channels} | {"physics"}
     missing += [e for e in evidence.library.effects if path_of(e) not in readable_paths]
@@ -163,22 +140,14 @@ def _report(
     effects = words(check, parts)
     missing = [e for e in not_testable(evidence) if e not in effects]
     # that nothing is named says little where half of the library couldn't have shown
-    nothing = (
-        "not_testable" if len(missing) >= len(evidence.library.effects) // 2 else "none"
-    )
+    nothing = "not_testable" if len(missing) >= len(evidence.library.effects) // 2 else "none"
     causes = [e for e in effects if e != "unknown"]
-    equivalent = {
-        e: selection.equivalent[e] for e in causes if e in selection.equivalent
-    }
+    equivalent = {e: selection.equivalent[e] for e in causes if e in selection.equivalent}
     second = _runner_up(chances, effects, equivalent)
     others = [o for e in causes for o in equivalent.get(e, ())]
     return Report(
         case=evidence.case.name,
-        verdict=nothing
-        if not effects
-        else "unknown"
-        if effects[0] == "unknown"
-        else "effect",
+        verdict=nothing if not effects else "unknown" if effects[0] == "unknown" else "effect",
         effects=effects,
         probabilities=chances,
         shares=parts,
@@ -196,9 +165,7 @@ def _report(
         rest=check.in_words(),
         sensors=tuple(evidence.sensors.findings.values()),
         contradictions=tuple(
-            f"{i.flight}: {i.issue}"
-            for i in evidence.case.quality
-            if i.kind == "garbage"
+            f"{i.flight}: {i.issue}" for i in evidence.case.quality if i.kind == "garbage"
         ),
         nuisances=_nuisances(evidence, selection),
         reference=_reference_in_words(evidence, causes),
@@ -242,10 +209,7 @@ def _runner_up(chances, effects, equivalent) -> str:
     """The likeliest cause that is neither named nor would do as well; empty if hardly
     likely.
     """
-    answers = {
-        *(effects or ("none",)),
-        *(o for others in equivalent.values() for o in others),
-    }
+    answers = {*(effects or ("none",)), *(o for others in equivalent.values() for o in others)}
     second = max((e for e in chances if e not in answers), key=chances.get, default="")
     return second if second and chances[second] > 0.01 else ""
 
@@ -276,8 +240,7 @@ def _nuisances(evidence: Evidence, selection: Selection) -> dict[str, str]:
     entries = {
         n: f"{v:+.2f} of its usual size{at(v)}"
         for n, v in zip(names, sizes, strict=True)
-        if n
-        not in reference_names  # what the reference knows together has sizes of its own
+        if n not in reference_names  # what the reference knows together has sizes of its own
     }
     if evidence.sensors.gain != 1.0:
         entries["gyroscope gain"] = f"{evidence.sensors.gain:.3f}"

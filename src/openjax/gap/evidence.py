@@ -24,12 +24,7 @@ from openjax.gap.channels.pose import Pose, read_pose
 from openjax.gap.channels.radio import read_radio
 from openjax.gap.channels.rate_loop import read_rate_loop, with_motors
 from openjax.gap.decision import DECISION
-from openjax.gap.identification.changes import (
-    FARTHEST,
-    change_of,
-    comparable,
-    conditional,
-)
+from openjax.gap.identification.changes import FARTHEST, change_of, comparable, conditional
 from openjax.gap.identification.estimates import EffectEstimates
 from openjax.gap.identification.quantities import Identification, identify
 from openjax.gap.identification.support import distance, support
@@ -156,11 +151,7 @@ class Evidence:
 
 
 def gather(
-    case: Case,
-    library: Library,
-    progress=None,
-    baseline: Baseline | None = None,
-    reference=False,
+    case: Case, library: Library, progress=None, baseline: Baseline | None = None, reference=False
 ) -> Evidence:
     """Read a case by all its channels. `baseline`: what the vehicle is like while
     nothing acts; `reference`: these flights are to tell that. Raises TooLittle where no
@@ -193,9 +184,7 @@ def gather(
     if motion.gusts is not None:
         finding = {"gusts under others": motion.gusts.in_words()}
         sensors = replace(sensors, findings=sensors.findings | finding)
-    return Evidence(
-        case, library, tracks, vehicles, sensors, channels, motion, baseline
-    )
+    return Evidence(case, library, tracks, vehicles, sensors, channels, motion, baseline)
 
 
 def with_identification(evidence: Evidence) -> Evidence:
@@ -209,9 +198,7 @@ def with_identification(evidence: Evidence) -> Evidence:
     in_time = case_on_gyroscope_clock(evidence.case, sensors.motors_late)
     gain_error = 0.0 if all(t.logs_attitude for t in evidence.tracks) else UNKNOWN_GAIN
     identification = identify(
-        with_gyroscope_gain(in_time, gain),
-        sensors.one_clock and sensors.motor_clock,
-        gain_error,
+        with_gyroscope_gain(in_time, gain), sensors.one_clock and sensors.motor_clock, gain_error
     )
     if identification is not None:
         identification = replace(identification, gyroscope_gain=gain)
@@ -229,9 +216,7 @@ def with_gyroscope_gain(case: Case, gain: float) -> Case:
     return replace(case, flights=tuple(without_gain(f) for f in case.flights))
 
 
-def _motors(
-    case: Case, tracks, vehicles, sensors: Kinematics
-) -> tuple[list[Track], Kinematics]:
+def _motors(case: Case, tracks, vehicles, sensors: Kinematics) -> tuple[list[Track], Kinematics]:
     """The tracks with motor commands when they act, and what the sensors say with what
     the motors' clock says.
     """
@@ -244,9 +229,7 @@ def _motors(
     clock = read_motor_clock(tracks, vehicles, row, motor_rows(case))
     if not sensors.one_clock:
         # Forces are compared with the pose: motors are put on its clock.
-        pose = read_motor_clock(
-            tracks, vehicles, row, motor_rows(case), gyroscope=False
-        )
+        pose = read_motor_clock(tracks, vehicles, row, motor_rows(case), gyroscope=False)
         clock = replace(pose, one_clock=pose.one_clock and clock.one_clock)
     findings = sensors.findings | clock.findings
     sensors = replace(
@@ -257,9 +240,7 @@ def _motors(
 
 def _tracks(case: Case) -> tuple[list[Track], list]:
     """The stretches of all flights and their nominal vehicles."""
-    tracks = [
-        t for t in tracks_of(case) if t.motor is not None or t.command is not None
-    ]
+    tracks = [t for t in tracks_of(case) if t.motor is not None or t.command is not None]
     if not tracks:
         raise TooLittle(
             f"{case.name}: no flight has 2 s without a gap, with body rates and commands or motors"
@@ -268,9 +249,7 @@ def _tracks(case: Case) -> tuple[list[Track], list]:
     return tracks, [case.vehicle_of(flights[t.name.split("#")[0]]) for t in tracks]
 
 
-def _sensors(
-    tracks: list[Track], library: Library
-) -> tuple[list[Track], Pose | None, Kinematics]:
+def _sensors(tracks: list[Track], library: Library) -> tuple[list[Track], Pose | None, Kinematics]:
     """The tracks as sensors that agree would have them, the pose's channel, and what
     the sensors say of each other.
     """

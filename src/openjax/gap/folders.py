@@ -17,10 +17,7 @@ from openjax.gap.trims import Change, compare
 
 
 def diagnose_folder(
-    folder: Path,
-    reference: Sequence[Path] = (),
-    without: Iterable[str] = (),
-    progress=None,
+    folder: Path, reference: Sequence[Path] = (), without: Iterable[str] = (), progress=None
 ) -> Report | Change:
     """Diagnose the flights of a folder.
 
@@ -72,6 +69,4 @@ def _check_that_most_show_more(case: Case, trims: Change) -> None:
     few = len(case.flights)
     number = len(trims.flights)
     if 2 * few < number:
-        raise TooLittle(
-            f"{few} of {number} flights hold{'s' * (few == 1)} more than motors"
-        )
+        raise TooLittle(f"{few} of {number} flights hold{'s' * (few == 1)} more than motors")

@@ -21,9 +21,7 @@ from openjax.vehicle.effects import EFFECTS
 from openjax.vehicle.effects.effect import Parameter
 
 
-def estimates(
-    evidence: Evidence, fit: SetFit, effects
-) -> dict[str, dict[str, Estimate]]:
+def estimates(evidence: Evidence, fit: SetFit, effects) -> dict[str, dict[str, Estimate]]:
     """{effect: {parameter: its estimate}} of the named effects."""
     channels = {c.path: c for c in evidence.channels}
     response = evidence.torque_response(fit.effects)
@@ -39,9 +37,7 @@ def estimates(
                 else _of_physics(fit, effect, entry, of_torques)
             )
             parameter = EFFECTS[effect].parameters[entry.name]
-            out[effect][entry.name] = _estimate(
-                estimate, parameter, evidence.vehicles[0]
-            )
+            out[effect][entry.name] = _estimate(estimate, parameter, evidence.vehicles[0])
     return out
 
 
@@ -72,9 +68,7 @@ def interval(estimate: Estimated, parameter) -> tuple[float, float]:
     below = REACH * estimate.below
     above = REACH * estimate.above
     if parameter.none == 1.0 and value > 0.0:
-        return value * float(np.exp(-below / value)), value * float(
-            np.exp(above / value)
-        )
+        return value * float(np.exp(-below / value)), value * float(np.exp(above / value))
     return value - below, value + above
 
 
@@ -97,7 +91,5 @@ def _of_physics(fit: SetFit, effect: str, parameter, of_torques: Measured) -> Es
         for p in CARDS[effect].fitted
         if parameters[p.name].unit == parameters[parameter.name].unit
     ]
-    error = float(
-        np.linalg.norm((deviation, DECISION.form_error * max(away), parameter.error))
-    )
+    error = float(np.linalg.norm((deviation, DECISION.form_error * max(away), parameter.error)))
     return Estimated(value, error, error)

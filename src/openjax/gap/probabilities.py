@@ -13,11 +13,7 @@ from openjax.vehicle.effects import EFFECTS
 
 
 def probabilities(
-    present,
-    largest,
-    unknown: float,
-    weights,
-    possible: Collection[str] = tuple(EFFECTS),
+    present, largest, unknown: float, weights, possible: Collection[str] = tuple(EFFECTS)
 ) -> dict[str, float]:
     """{cause, "none", "unknown": probability of being the strongest}, whose sum is one.
 
@@ -44,9 +40,7 @@ def probabilities(
     return reliable(chance, DECISION.reliability, {*possible, "none", "unknown"})
 
 
-def reliable(
-    chance: dict[str, float], share: float, causes: Collection[str]
-) -> dict[str, float]:
+def reliable(chance: dict[str, float], share: float, causes: Collection[str]) -> dict[str, float]:
     """Probabilities of a choice that is right in no more than a `share` of the cases,
     however often draws repeat it: what is left goes to all `causes` alike.
     """

@@ -17,15 +17,7 @@ from openjax.gap.evidence import Evidence, gather, with_identification
 from openjax.gap.model.baseline import FORM, Baseline, day_of, transfer
 from openjax.gap.model.cross_validation import Equations
 from openjax.gap.model.hypotheses import SetFit, fit_set
-from openjax.gap.model.library import (
-    ABSENT,
-    CARDS,
-    PLACE,
-    THETA,
-    Library,
-    library,
-    places,
-)
+from openjax.gap.model.library import ABSENT, CARDS, PLACE, THETA, Library, library, places
 from openjax.gap.model.table import build, with_effects
 from openjax.gap.residual import measure, residuals_of
 from openjax.gap.selection import search_sets
@@ -41,9 +33,7 @@ ROUNDS = 3  # of the fit, between which nuisances are worked out anew
 OF_DAYS = tuple(e for e, card in CARDS.items() if card.trim is not None)
 # Rare names of what a vehicle with nothing wrong has as well, as flapping of drag.
 LASTING = tuple(e for e in FORM if e not in OF_DAYS)  # what no day moves
-OTHER_NAMES = tuple(
-    e for e in CARDS if CARDS[e].log_odds <= VERY_RARE and e not in FORM
-)
+OTHER_NAMES = tuple(e for e in CARDS if CARDS[e].log_odds <= VERY_RARE and e not in FORM)
 
 
 def read_reference(case: Case, progress=None) -> Baseline:
@@ -51,9 +41,7 @@ def read_reference(case: Case, progress=None) -> Baseline:
     diagnosis would choose, of which those of the vehicle's form stay, and the numbers
     that every vehicle has. Raises UserError as `gather`.
     """
-    effects = Library(
-        tuple(e for e in library().effects if e not in (*OF_DAYS, *OTHER_NAMES))
-    )
+    effects = Library(tuple(e for e in library().effects if e not in (*OF_DAYS, *OTHER_NAMES)))
     evidence = gather(case, effects, progress, reference=True)
     search = search_sets(evidence)
     best = search.choose(np.ones((1, len(search.nothing.validation.nats))))[0].fit
@@ -70,9 +58,7 @@ def read_reference(case: Case, progress=None) -> Baseline:
     trim = _trim_of_a_day(fit, evidence.vehicles[0])
     # last, as what the vehicle is like is sought in the motion alone
     response = with_identification(evidence).identification
-    return Baseline(
-        theta, lasting, names, covariance, measures, channels, trim, response
-    )
+    return Baseline(theta, lasting, names, covariance, measures, channels, trim, response)
 
 
 def borne_out(evidence: Evidence) -> Baseline:
@@ -82,14 +68,11 @@ def borne_out(evidence: Evidence) -> Baseline:
     """
     replay, baseline = evidence.replay, evidence.baseline
     subsets = [
-        s
-        for n in range(len(baseline.effects) + 1)
-        for s in combinations(baseline.effects, n)
+        s for n in range(len(baseline.effects) + 1) for s in combinations(baseline.effects, n)
     ]
     thetas = np.array([with_some(baseline, s).theta for s in subsets])
     residuals = [
-        y[None] - p
-        for y, p in zip(replay.measurements, replay.predict(thetas), strict=True)
+        y[None] - p for y, p in zip(replay.measurements, replay.predict(thetas), strict=True)
     ]
     squares = np.diag(replay.grams(residuals).sum(0))
     candidates = np.flatnonzero(squares <= (1.0 + SPOKEN_AGAINST) * squares.min())
@@ -105,16 +88,10 @@ def with_some(baseline: Baseline, effects) -> Baseline:
     removed_effects = set(baseline.effects) - set(effects)
     theta = baseline.theta.copy()
     theta[places(removed_effects)] = ABSENT[places(removed_effects)]
-    rows = [
-        k
-        for k, n in enumerate(baseline.names)
-        if n.split(" ")[0] not in removed_effects
-    ]
+    rows = [k for k, n in enumerate(baseline.names) if n.split(" ")[0] not in removed_effects]
     names = tuple(baseline.names[k] for k in rows)
     covariance = baseline.covariance[np.ix_(rows, rows)]
-    return replace(
-        baseline, theta=theta, effects=effects, names=names, covariance=covariance
-    )
+    return replace(baseline, theta=theta, effects=effects, names=names, covariance=covariance)
 
 
 def trim_of(theta: np.ndarray, effects, vehicle) -> np.ndarray:
@@ -123,16 +100,12 @@ def trim_of(theta: np.ndarray, effects, vehicle) -> np.ndarray:
     """
     out = np.zeros(4)
     for effect in (e for e in effects if e in OF_DAYS):
-        values = {
-            p.name: float(theta[PLACE[effect, p.name]]) for p in CARDS[effect].fitted
-        }
+        values = {p.name: float(theta[PLACE[effect, p.name]]) for p in CARDS[effect].fitted}
         out += CARDS[effect].trim(values, vehicle)
     return out
 
 
-def trimmed_before(
-    theta: np.ndarray, effects, baseline: Baseline | None, vehicle
-) -> set[str]:
+def trimmed_before(theta: np.ndarray, effects, baseline: Baseline | None, vehicle) -> set[str]:
     """Those of the `effects` that are no change: trims that are more the
     reference's than not, though no day need have the trims of another one.
     """
@@ -149,11 +122,7 @@ def _trim_of_a_day(fit: SetFit, vehicle) -> np.ndarray:
     table = build(fit, None)
     equations = Equations(table, with_effects(table))
     sizes = equations.solve(table.total)[2][len(fit.index) :]
-    names = [
-        n
-        for n, s in zip(fit.replay.nuisance_names, fit.replay.is_shared, strict=True)
-        if s
-    ]
+    names = [n for n, s in zip(fit.replay.nuisance_names, fit.replay.is_shared, strict=True) if s]
     size_of = dict(zip(names, sizes.tolist(), strict=True))
     theta = ABSENT.copy()
     for e, p, size in fit.replay.numbers:
@@ -162,9 +131,7 @@ def _trim_of_a_day(fit: SetFit, vehicle) -> np.ndarray:
     return trim_of(theta, OF_DAYS, vehicle)
 
 
-def _another_day(
-    evidence: Evidence, fit: SetFit, effects
-) -> tuple[tuple[str, ...], ...]:
+def _another_day(evidence: Evidence, fit: SetFit, effects) -> tuple[tuple[str, ...], ...]:
     """Names, mean and covariance of the numbers of the `effects` (away from the fit, in
     their units) and of the other numbers of a vehicle that no day moves, as they are on
     another day. The other nuisances aren't transferred: what they take depends on what
@@ -176,9 +143,7 @@ def _another_day(
     inside = len(fit.index)
     sizes = {f"{e} {p}": size for e, p, size in fit.replay.numbers}
     shared_names = [
-        n
-        for n, s in zip(fit.replay.nuisance_names, fit.replay.is_shared, strict=True)
-        if s
+        n for n, s in zip(fit.replay.nuisance_names, fit.replay.is_shared, strict=True) if s
     ]
     names = [" ".join(THETA[i]) for i in fit.index]
     transfers = [n.split(" ")[0] in effects for n in names]
@@ -226,9 +191,7 @@ def join(cases: Sequence[Case]) -> Case:
                 "reference is of one vehicle"
             )
     flights = [
-        replace(f, name=f"{c.name}/{f.name}", log=f"{c.name}/{f.log}")
-        if len(cases) > 1
-        else f
+        replace(f, name=f"{c.name}/{f.name}", log=f"{c.name}/{f.log}") if len(cases) > 1 else f
         for c in cases
         for f in c.flights
     ]
@@ -242,9 +205,7 @@ def differs(channel: Channel, effect: str, baseline: Baseline | None) -> bool:
     reference in which it doesn't act says the same only where it is nearer to the case
     than to nothing.
     """
-    channel_before = (
-        baseline.channels.get(channel.path) if baseline is not None else None
-    )
+    channel_before = baseline.channels.get(channel.path) if baseline is not None else None
     if channel_before is None:
         return True
     acts_there = effect in channel_before.acting()
@@ -255,14 +216,9 @@ def differs(channel: Channel, effect: str, baseline: Baseline | None) -> bool:
         none = EFFECTS[effect].parameters[parameter.name].none
         apart = abs(estimate.value - estimate_before.value)
         error = np.hypot(
-            max(estimate.below, estimate.above),
-            max(estimate_before.below, estimate_before.above),
+            max(estimate.below, estimate.above), max(estimate_before.below, estimate_before.above)
         )
-        least = max(
-            DECISION.standard_errors * error, DECISION.form_error * abs(estimate.value)
-        )
-        if apart > least or (
-            not acts_there and apart > abs(estimate_before.value - none)
-        ):
+        least = max(DECISION.standard_errors * error, DECISION.form_error * abs(estimate.value))
+        if apart > least or (not acts_there and apart > abs(estimate_before.value - none)):
             return True
     return False

@@ -114,14 +114,7 @@ def check_residual(evidence: Evidence, fit: SetFit, nothing: SetFit) -> Check:
         ]
         mostly_unknown = max(shares, default=0.0) > MOSTLY
     finding = HORIZONS.get(name, (0.0, ""))[1]
-    check = Check(
-        measures,
-        finding,
-        p_value,
-        np.zeros(9),
-        reference,
-        by_reference=by_reference,
-    )
+    check = Check(measures, finding, p_value, np.zeros(9), reference, by_reference=by_reference)
     if not check.rejects:
         return check
     excess = beyond(axes, reference or {})
@@ -158,9 +151,7 @@ def measure(
     return _spreads(_changes(evidence, residuals))
 
 
-def _spreads(
-    changes: dict[str, np.ndarray],
-) -> tuple[dict[str, float], dict[str, np.ndarray]]:
+def _spreads(changes: dict[str, np.ndarray]) -> tuple[dict[str, float], dict[str, np.ndarray]]:
     """As `measure`, of what `_changes` tells."""
     axes = {name: change.std(0) for name, change in changes.items()}
     return {name: float(size.max()) for name, size in axes.items()}, axes
@@ -202,20 +193,14 @@ def beyond(axes: dict[str, np.ndarray], reference: dict[str, float]) -> np.ndarr
     return out
 
 
-def _series(
-    evidence: Evidence, residuals: list[np.ndarray]
-) -> dict[str, list[np.ndarray]]:
+def _series(evidence: Evidence, residuals: list[np.ndarray]) -> dict[str, list[np.ndarray]]:
     """{name of HORIZONS: what is left (T, 3) of each track, added up} of what was
     logged.
     """
     usable = evidence.replay.usable
     tracks = evidence.replay.tracks
     motion = {"rates": RATES, "velocity": VELOCITY}
-    out = {
-        n: [r[:, axes] for r in residuals]
-        for n, axes in motion.items()
-        if usable[axes.start]
-    }
+    out = {n: [r[:, axes] for r in residuals] for n, axes in motion.items() if usable[axes.start]}
     out |= {c.path: c.fit.residual for c in evidence.channels if c.path in HORIZONS}
     if all(t.position is not None and t.velocity is not None for t in tracks):
         out["position"] = [
@@ -223,9 +208,7 @@ def _series(
             t.position - (np.cumsum(t.velocity, 0) - 0.5 * t.velocity) * t.dt
             for t in tracks
         ]
-        has_force = all(
-            t.specific_force is not None and t.quaternion is not None for t in tracks
-        )
+        has_force = all(t.specific_force is not None and t.quaternion is not None for t in tracks)
         if has_force and evidence.sensors.one_clock:
             out["accelerometer"] = [_path_against_accelerometer(t) for t in tracks]
     return out
@@ -235,9 +218,7 @@ def _path_against_accelerometer(track: Track) -> np.ndarray:
     """Velocity (T, 3) body axes by which the accelerometer and the path's acceleration
     come apart, its bias aside.
     """
-    apart = track.specific_force - specific_force_of(
-        track.quaternion, track.velocity, track.dt
-    )
+    apart = track.specific_force - specific_force_of(track.quaternion, track.velocity, track.dt)
     return np.cumsum(apart - apart.mean(0), 0) * track.dt
 
 
@@ -264,9 +245,7 @@ def _shift(pose) -> float:
     return pose.fit.value if pose is not None and pose.acting() else 0.0
 
 
-def _larger(
-    measures: dict[str, float], reference: dict[str, float], finding: str
-) -> list[str]:
+def _larger(measures: dict[str, float], reference: dict[str, float], finding: str) -> list[str]:
     """What of forces and torques is left more than in the reference: what stands out
     most, or what does beside sensors that disagree, which by themselves are no rival of
     a force or torque.
@@ -357,9 +336,7 @@ def standing_out(
 
 def logarithms(measures: dict[str, float]) -> np.ndarray:
     """(measures,) in the order of HORIZONS, NaN where there is none."""
-    return np.log(
-        [max(measures[n], 1e-12) if n in measures else np.nan for n in HORIZONS]
-    )
+    return np.log([max(measures[n], 1e-12) if n in measures else np.nan for n in HORIZONS])
 
 
 @cache

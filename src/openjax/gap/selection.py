@@ -104,9 +104,7 @@ def select(evidence: Evidence) -> Selection:
     """Choose among the physics effects that the flights can show."""
     search = search_sets(evidence)
     weights, best, fit = settle(search)
-    without = {
-        e: search.of_set(set(best.effects) - {e}, best.fit) for e in best.effects
-    }
+    without = {e: search.of_set(set(best.effects) - {e}, best.fit) for e in best.effects}
     gains = {
         e: growth(h.validation.squares.sum(0), best.validation.squares.sum(0))
         for e, h in without.items()
@@ -115,9 +113,7 @@ def select(evidence: Evidence) -> Selection:
     ranking = tuple(sorted(gains, key=lambda e: -gains[e]))
     best = replace(best, fit=fit)
     table = build(best.fit, {})
-    return Selection(
-        best, table, ranking, weights, search.equivalents(best, ranking), search
-    )
+    return Selection(best, table, ranking, weights, search.equivalents(best, ranking), search)
 
 
 def settle(search: Search) -> tuple[dict[frozenset, float], Hypothesis, SetFit]:
@@ -188,9 +184,7 @@ class Search:
         """`of_set` of several sets, side by side."""
         keys = dict.fromkeys(map(frozenset, sets))
         keys = [key for key in keys if key not in self.hypotheses]
-        hypotheses = side_by_side(
-            lambda key: self.of_fit(self._fit_near(key, near)), keys
-        )
+        hypotheses = side_by_side(lambda key: self.of_fit(self._fit_near(key, near)), keys)
         self.hypotheses |= dict(zip(keys, hypotheses, strict=True))
 
     def _fit_near(self, key: frozenset, near: SetFit) -> SetFit:
@@ -215,18 +209,14 @@ class Search:
         """
         return beyond_bounds(max(self.hypotheses.values(), key=lambda h: h.score).fit)
 
-    def enumerate(
-        self, near: Hypothesis, most: int, without: frozenset = NOTHING
-    ) -> None:
+    def enumerate(self, near: Hypothesis, most: int, without: frozenset = NOTHING) -> None:
         """Fit and judge the most promising sets of up to LARGEST effects that weren't
         visited yet, by the model linearised around the hypothesis `near`, and what is
         left of each when one of its effects goes; sets with an effect of `without`
         aside.
         """
         table = build(near.fit, self.singles)
-        models = {
-            key: self._model(table, key) for key in self.sets() if not key & without
-        }
+        models = {key: self._model(table, key) for key in self.sets() if not key & without}
 
         def rank(keys, promise_of):
             score = {
@@ -236,11 +226,7 @@ class Search:
                 + self.torque_support(k)
                 for k in keys
             }
-            return [
-                k
-                for k in sorted(keys, key=lambda k: -score[k])
-                if score[k] > score[NOTHING]
-            ]
+            return [k for k in sorted(keys, key=lambda k: -score[k]) if score[k] > score[NOTHING]]
 
         candidates = rank(models, promise_unbounded)[: SCREENED * most]
         best = rank([NOTHING, *(k for k in candidates if k != NOTHING)], promise)
@@ -275,8 +261,7 @@ class Search:
         """A set in the table of another one."""
         present = set(table.fit.effects)
         come, leaving = (
-            [e for e in CARDS if e in change]
-            for change in (key - present, present - key)
+            [e for e in CARDS if e in change] for change in (key - present, present - key)
         )
         return with_effects(table, come, leaving)
 
@@ -291,10 +276,7 @@ class Search:
     @property
     def best(self) -> Hypothesis:
         """Of the visited sets that are possible the one of the largest score."""
-        return max(
-            (h for h in self.hypotheses.values() if possible(h.fit)),
-            key=lambda h: h.score,
-        )
+        return max((h for h in self.hypotheses.values() if possible(h.fit)), key=lambda h: h.score)
 
     def clearly_worse(self, other: Hypothesis, best: Hypothesis) -> bool:
         """Whether flights tell a hypothesis from the best one, and it leaves a gap so

@@ -145,9 +145,7 @@ def shares_of_squares(
     whole = np.maximum(raw, bare) - 1.0
     # without a gap, all there is are the sensors
     sure = whole > 2.0 * DECISION.least_gap
-    remainder = np.where(
-        sure, np.clip((full - 1.0) / np.where(sure, whole, 1.0), 0.0, 1.0), 0.0
-    )
+    remainder = np.where(sure, np.clip((full - 1.0) / np.where(sure, whole, 1.0), 0.0, 1.0), 0.0)
     useful = np.maximum(level[:, 3:] - full[:, None], 0.0) * sure[:, None]
     useful[:, -1] += 1e-12  # the sensors take all where nothing else is of use
     shares = useful / useful.sum(1, keepdims=True) * (1.0 - remainder)[:, None]
@@ -185,9 +183,7 @@ def _squares_of_sets(
 
     def squares(present, off=None) -> dict[str, np.ndarray]:
         absent = [e for e in effects if e not in present and e in selection.fit.effects]
-        motion = (
-            ablate(table, coefficients, (*never, *absent), off) / table.rows[:, None]
-        )
+        motion = ablate(table, coefficients, (*never, *absent), off) / table.rows[:, None]
         channels = np.array(ERRORS)[evidence.replay.usable > 0]
         of_motion = dict(zip(channels, motion.T, strict=True))
         of_channels = [e for e in present if e not in selection.fit.effects]
@@ -208,16 +204,11 @@ def _other_squares(evidence: Evidence, effects, table) -> dict[str, np.ndarray]:
     for channel in evidence.channels:
         for name, series in channel.residuals(effects).items():
             blocks = []
-            for track, errors, count in zip(
-                evidence.tracks, series, counts, strict=True
-            ):
+            for track, errors, count in zip(evidence.tracks, series, counts, strict=True):
                 # of some channels one number is known of a whole flight
                 errors_in_blocks = errors[int(SKIP / track.dt) :]
                 if len(errors) == 1:
                     errors_in_blocks = np.repeat(errors, count)
-                blocks += [
-                    float((b**2).mean())
-                    for b in np.array_split(errors_in_blocks, count)
-                ]
+                blocks += [float((b**2).mean()) for b in np.array_split(errors_in_blocks, count)]
             out[name] = np.array(blocks)
     return out

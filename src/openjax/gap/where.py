@@ -50,10 +50,7 @@ def locate(evidence: Evidence, fit: SetFit, effects=()) -> list[Place]:
     `effects` all named effects.
     """
     names = [e for e in effects if e in fit.effects]
-    masks = [
-        {r: m[int(SKIP / t.dt) :] for r, m in regimes_of(t).items()}
-        for t in evidence.tracks
-    ]
+    masks = [{r: m[int(SKIP / t.dt) :] for r, m in regimes_of(t).items()} for t in evidence.tracks]
     inside = {r: np.concatenate([m[r] for m in masks]) for r in REGIMES}
     seconds = {r: int(m.sum()) * evidence.tracks[0].dt for r, m in inside.items()}
     places = []
@@ -63,20 +60,14 @@ def locate(evidence: Evidence, fit: SetFit, effects=()) -> list[Place]:
         for regime in (r for r in REGIMES if seconds[r] >= LEAST_TIME):
             b, a = (float(p[inside[regime]].mean() / floor) for p in powers[:2])
             excess = max(b - 1.0, 0.0) * seconds[regime]
-            places.append(
-                Place(channel, regime, excess, b**0.5, a**0.5, seconds[regime])
-            )
+            places.append(Place(channel, regime, excess, b**0.5, a**0.5, seconds[regime]))
     total = sum(p.share for p in places) or 1.0
-    return sorted(
-        (replace(p, share=p.share / total) for p in places), key=lambda p: -p.share
-    )
+    return sorted((replace(p, share=p.share / total) for p in places), key=lambda p: -p.share)
 
 
 def before_and_after(
     fit: SetFit, effects
-) -> tuple[
-    list[Float[np.ndarray, "_ channels"]], list[Float[np.ndarray, "_ channels"]]
-]:
+) -> tuple[list[Float[np.ndarray, "_ channels"]], list[Float[np.ndarray, "_ channels"]]]:
     """Residuals (T, 9) of each track without some `effects` of a fit, all else as
     with them, and with them: the same before as the gap's.
     """
@@ -85,14 +76,10 @@ def before_and_after(
     place = places(effects)
     without[place] = ABSENT[place]
     predictions = fit.replay.predict(np.stack([fit.theta, without]))
-    return [
-        a + m[0] - m[1] for a, m in zip(residuals, predictions, strict=True)
-    ], residuals
+    return [a + m[0] - m[1] for a, m in zip(residuals, predictions, strict=True)], residuals
 
 
-def _motion_powers(
-    evidence: Evidence, fit: SetFit, effects
-) -> dict[str, list[np.ndarray]]:
+def _motion_powers(evidence: Evidence, fit: SetFit, effects) -> dict[str, list[np.ndarray]]:
     """{channel: squared smoothed disturbances (rows,) before, after and at the
     floor}.
     """
@@ -132,9 +119,7 @@ def _other_powers(evidence: Evidence, effects) -> dict[str, list[np.ndarray]]:
     return powers_of
 
 
-def _mean_squares(
-    evidence: Evidence, errors: dict, scale: dict[str, float]
-) -> np.ndarray:
+def _mean_squares(evidence: Evidence, errors: dict, scale: dict[str, float]) -> np.ndarray:
     """(rows,) mean over a channel's series of their squared errors, each in units of
     its scale.
     """
@@ -154,7 +139,5 @@ def in_words(places: list[Place]) -> str:
         kind, _, axis = place.channel.partition("_")
         name = f"{words[kind]} {axis}" if kind in words else place.channel
         regime = place.regime.replace("_", " ")
-        parts.append(
-            f"{name} in {regime} flight ({place.before:.1f} times the noise floor)"
-        )
+        parts.append(f"{name} in {regime} flight ({place.before:.1f} times the noise floor)")
     return "; ".join(parts) or "no channel stands out of the noise"

@@ -34,8 +34,7 @@ def flat_observation(observation: Observation) -> jax.Array:
         observation.others.reshape(*lead, -1),
         observation.pillars.reshape(*lead, -1),
         turned_back(
-            observation.heading,
-            observation.position - observation.last_seen[..., None, :],
+            observation.heading, observation.position - observation.last_seen[..., None, :]
         ),
     )
     return jnp.concatenate(parts, axis=-1)

@@ -31,9 +31,7 @@ class _Team:
         self._number = settings.num_pursuers
         size = (self._number * flat_size(settings),)
         self.observation_space = spaces.Box(-np.inf, np.inf, size, np.float32)
-        self.action_space = spaces.Box(
-            -1.0, 1.0, (self._number * ACTION_SIZE,), np.float32
-        )
+        self.action_space = spaces.Box(-1.0, 1.0, (self._number * ACTION_SIZE,), np.float32)
 
     def reset(self, key):
         observation, state = self.environment.reset(key)
@@ -94,13 +92,7 @@ class PursuitEnv(Env):
         observation, self._state, *rest = self._step(self._state, action)
         reward, terminated, truncated, events = jax.device_get(rest)
         info = {name: bool(value) for name, value in events.items()}
-        return (
-            np.array(observation),
-            float(reward),
-            bool(terminated),
-            bool(truncated),
-            info,
-        )
+        return (np.array(observation), float(reward), bool(terminated), bool(truncated), info)
 
 
 class PursuitVectorEnv(VectorEnv):
@@ -122,9 +114,7 @@ class PursuitVectorEnv(VectorEnv):
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}  # noqa: RUF012
 
-    def __init__(
-        self, num_envs: int = 1, environment: Pursuit | None = None, **changes
-    ):
+    def __init__(self, num_envs: int = 1, environment: Pursuit | None = None, **changes):
         team = _Team(environment, changes)
         self.environment = team.environment
         self.num_envs = num_envs
@@ -164,9 +154,7 @@ class PursuitVectorEnv(VectorEnv):
             infos["final_obs"] = to_numpy(observation)
             infos["_final_obs"] = over
             observation, self._state = where_rows(
-                jnp.asarray(over),
-                (fresh_observation, fresh),
-                (observation, self._state),
+                jnp.asarray(over), (fresh_observation, fresh), (observation, self._state)
             )
         return *to_numpy((observation, reward, terminated, truncated)), infos
 

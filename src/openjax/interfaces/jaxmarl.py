@@ -28,12 +28,8 @@ class PursuitMultiAgentEnv:
         self.num_agents = self.environment.settings.num_pursuers
         self.agents = [f"pursuer_{i}" for i in range(self.num_agents)]
         size = flat_size(self.environment.settings)
-        self.observation_spaces = {
-            agent: Box(-jnp.inf, jnp.inf, (size,)) for agent in self.agents
-        }
-        self.action_spaces = {
-            agent: Box(-1.0, 1.0, (ACTION_SIZE,)) for agent in self.agents
-        }
+        self.observation_spaces = {agent: Box(-jnp.inf, jnp.inf, (size,)) for agent in self.agents}
+        self.action_spaces = {agent: Box(-1.0, 1.0, (ACTION_SIZE,)) for agent in self.agents}
 
     @property
     def name(self) -> str:
@@ -56,11 +52,7 @@ class PursuitMultiAgentEnv:
 
     @functools.partial(jax.jit, static_argnums=0)
     def step(
-        self,
-        key: jax.Array,
-        state: PursuitState,
-        actions: dict[str, jax.Array],
-        reset_state=None,
+        self, key: jax.Array, state: PursuitState, actions: dict[str, jax.Array], reset_state=None
     ):
         """`step_env`, and a new episode (of `reset_state`, where given) in place of one
         that has ended.
@@ -77,9 +69,7 @@ class PursuitMultiAgentEnv:
         )
         return observations, state, rewards, dones, infos
 
-    def step_env(
-        self, key: jax.Array, state: PursuitState, actions: dict[str, jax.Array]
-    ):
+    def step_env(self, key: jax.Array, state: PursuitState, actions: dict[str, jax.Array]):
         """One control step: observations, state, rewards, dones (with `__all__`),
         infos, all by agent.
 
@@ -98,11 +88,7 @@ class PursuitMultiAgentEnv:
         # of each agent, as JaxMARL's wrappers stack what is in `infos`
         is_cut = jnp.broadcast_to(truncated, info.captured.shape)
         # (N,) each
-        infos = {
-            "captured": info.captured,
-            "crashed": info.crashed,
-            "truncated": is_cut,
-        }
+        infos = {"captured": info.captured, "crashed": info.crashed, "truncated": is_cut}
         if not self.environment.settings.observe_time:
             infos["final_obs"] = observations
         return observations, state, self._by_agent(reward), dones, infos

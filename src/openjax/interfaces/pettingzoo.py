@@ -33,9 +33,7 @@ class PursuitParallelEnv(ParallelEnv):
         self.possible_agents = [f"pursuer_{i}" for i in range(settings.num_pursuers)]
         self.agents: list[str] = []
         self.render_mode = None
-        self._observation_space = spaces.Box(
-            -np.inf, np.inf, (flat_size(settings),), np.float32
-        )
+        self._observation_space = spaces.Box(-np.inf, np.inf, (flat_size(settings),), np.float32)
         self._action_space = spaces.Box(-1.0, 1.0, (ACTION_SIZE,), np.float32)
         self._key = jax.random.key(0)
         self._state = None
@@ -68,9 +66,7 @@ class PursuitParallelEnv(ParallelEnv):
             [jnp.asarray(actions[agent], jnp.float32) for agent in self.possible_agents]
         )
         # any key will do: the game draws nothing after its reset
-        observation, self._state, *results = self._step(
-            jax.random.key(0), self._state, action
-        )
+        observation, self._state, *results = self._step(jax.random.key(0), self._state, action)
         reward, terminated, truncated, info = to_numpy(results)
         infos = [
             {"captured": bool(captured), "crashed": bool(crashed)}

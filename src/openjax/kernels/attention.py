@@ -59,9 +59,7 @@ def attend_one_by_one(
         top = jax.lax.stop_gradient(functools.reduce(jnp.maximum, scores))
         parts = [jnp.exp(score - top) for score in scores]
         inverse = 1.0 / functools.reduce(jnp.add, parts)
-        products = [
-            (part * inverse) * e for part, e in zip(parts, entities, strict=True)
-        ]
+        products = [(part * inverse) * e for part, e in zip(parts, entities, strict=True)]
         means.append(functools.reduce(jnp.add, products))
     return means
 
@@ -89,12 +87,9 @@ def _reference(layout, operands):
     entities = [token.astype(jnp.float32)]
     for m, (row, size, weight) in enumerate(layout.entities):
         linear = (
-            inputs[row : row + size].T @ weights[weight : weight + size]
-            + weights[weight + size]
+            inputs[row : row + size].T @ weights[weight : weight + size] + weights[weight + size]
         )
-        entities.append(
-            activation(inverse[m][:, None] * linear + weights[weight + size + 1])
-        )
+        entities.append(activation(inverse[m][:, None] * linear + weights[weight + size + 1]))
     entities = jnp.stack(entities, axis=1)
     heads = query.reshape(batch, layout.heads, layout.features).astype(jnp.float32)
     score = layout.scale * jnp.einsum("bhf,bmf->bhm", heads, entities)
@@ -106,9 +101,7 @@ def _reference(layout, operands):
 
 def _reference_backward(layout, operands, gradient):
     def of_differentiable(query, token, inverse, weights):
-        return _reference(
-            layout, Operands(query, token, operands.inputs, inverse, weights)
-        )
+        return _reference(layout, Operands(query, token, operands.inputs, inverse, weights))
 
     query, token, _, inverse, weights = operands
     _, pullback = jax.vjp(of_differentiable, query, token, inverse, weights)

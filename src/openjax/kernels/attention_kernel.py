@@ -11,11 +11,7 @@ import jax.numpy as jnp
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton as pallas_triton
 
-from openjax.kernels.activation import (
-    activation,
-    activation_and_slope,
-    kernel_arithmetic,
-)
+from openjax.kernels.activation import activation, activation_and_slope, kernel_arithmetic
 from openjax.kernels.attention_operands import Layout, Operands
 from openjax.platform import whole_blocks
 
@@ -53,9 +49,7 @@ class _Entities(NamedTuple):
         row, size, weight = self.layout.entities[m]
         linear = self.w_ref[weight + size, :][None, :]
         for i in range(size):
-            linear = self.add(
-                self.x(row + i)[:, None], self.w_ref[weight + i, :][None, :], linear
-            )
+            linear = self.add(self.x(row + i)[:, None], self.w_ref[weight + i, :][None, :], linear)
         shift = self.w_ref[weight + size + 1, :][None, :]
         return linear, self.add(self.inverse(m)[:, None], linear, shift)
 
@@ -64,10 +58,7 @@ class _Entities(NamedTuple):
         scores = [jnp.sum(query * entity, axis=1) for entity in entities]
         # the pursuer itself, the first one, is always there and has no bias
         biases = [self.x(self.layout.input_rows + m) for m in range(len(entities) - 1)]
-        return [
-            scores[0],
-            *(score + bias for score, bias in zip(scores[1:], biases, strict=True)),
-        ]
+        return [scores[0], *(score + bias for score, bias in zip(scores[1:], biases, strict=True))]
 
 
 def _softmax(scores):
@@ -79,14 +70,10 @@ def _softmax(scores):
     return [p / total for p in parts]
 
 
-def _forward_kernel(
-    layout, arithmetic, q_ref, token_ref, x_ref, inverse_ref, w_ref, out_ref
-):
+def _forward_kernel(layout, arithmetic, q_ref, token_ref, x_ref, inverse_ref, w_ref, out_ref):
     f = layout.features
     add = arithmetic.multiply_add
-    entities = _Entities(
-        layout, add, lambda row: x_ref[row, :], lambda m: inverse_ref[m, :], w_ref
-    )
+    entities = _Entities(layout, add, lambda row: x_ref[row, :], lambda m: inverse_ref[m, :], w_ref)
     entities_in_rows = [token_ref[...].astype(jnp.float32)]
     for m in range(len(layout.entities)):
         _, normal = entities.linear(m)
@@ -120,11 +107,7 @@ def _backward_kernel(
     def block(j, sums):
         rows = pl.ds(j * ROWS, ROWS)
         entities = _Entities(
-            layout,
-            add,
-            lambda row: x_ref[row, rows],
-            lambda m: inverse_ref[m, rows],
-            w_ref,
+            layout, add, lambda row: x_ref[row, rows], lambda m: inverse_ref[m, rows], w_ref
         )
         # forward once more: to embed them again costs less than to have kept them
         entities_in_rows = [token_ref[rows, :].astype(jnp.float32)]
@@ -141,23 +124,15 @@ def _backward_kernel(
             query = q_ref[rows, h * f : (h + 1) * f].astype(jnp.float32) * layout.scale
             gradient = g_ref[rows, h * f : (h + 1) * f].astype(jnp.float32)
             weight = _softmax(entities.scores(query, entities_in_rows))
-            dweight = [
-                jnp.sum(gradient * entity, axis=1) for entity in entities_in_rows
-            ]
+            dweight = [jnp.sum(gradient * entity, axis=1) for entity in entities_in_rows]
             # the softmax's own derivative: w_m (d_m - sum w d)
-            mean = functools.reduce(
-                jnp.add, [w * d for w, d in zip(weight, dweight, strict=True)]
-            )
+            mean = functools.reduce(jnp.add, [w * d for w, d in zip(weight, dweight, strict=True)])
             dquery = jnp.zeros_like(query)
             for m, entity in enumerate(entities_in_rows):
                 dscore = (weight[m] * (dweight[m] - mean))[:, None]
                 dquery = add(dscore, entity, dquery)
-                dentities[m] = add(
-                    weight[m][:, None], gradient, add(dscore, query, dentities[m])
-                )
-            dq_ref[rows, h * f : (h + 1) * f] = (dquery * layout.scale).astype(
-                dq_ref.dtype
-            )
+                dentities[m] = add(weight[m][:, None], gradient, add(dscore, query, dentities[m]))
+            dq_ref[rows, h * f : (h + 1) * f] = (dquery * layout.scale).astype(dq_ref.dtype)
         dtoken_ref[rows, :] = dentities[0].astype(dtoken_ref.dtype)
         # of the weights a row each, summed over samples only when all blocks are done
         sums = list(sums)
@@ -166,9 +141,7 @@ def _backward_kernel(
             dinverse_ref[m, rows] = jnp.sum(dnormal * linears[m], axis=1)
             dlinear = dnormal * entities.inverse(m)[:, None]
             for i in range(size):
-                sums[weight + i] = add(
-                    dlinear, entities.x(row + i)[:, None], sums[weight + i]
-                )
+                sums[weight + i] = add(dlinear, entities.x(row + i)[:, None], sums[weight + i])
             sums[weight + size] = sums[weight + size] + dlinear
             sums[weight + size + 1] = sums[weight + size + 1] + dnormal
         return tuple(sums)
@@ -212,17 +185,13 @@ def forward_by_kernel(layout, operands, interpret=False):
     operands, specs = _in_blocks(operands, ROWS)
     query = operands.query
     mean = pl.pallas_call(
-        functools.partial(
-            _forward_kernel, layout, kernel_arithmetic(query.dtype, interpret)
-        ),
+        functools.partial(_forward_kernel, layout, kernel_arithmetic(query.dtype, interpret)),
         out_shape=jax.ShapeDtypeStruct(query.shape, query.dtype),
         grid=(query.shape[0] // ROWS,),
         in_specs=list(specs),
         out_specs=specs.query,
         interpret=interpret,
-        compiler_params=pallas_triton.CompilerParams(
-            num_warps=FORWARD_WARPS, num_stages=1
-        ),
+        compiler_params=pallas_triton.CompilerParams(num_warps=FORWARD_WARPS, num_stages=1),
         name="attend",
     )(*operands)
     return mean[:batch]
@@ -240,9 +209,7 @@ def backward_by_kernel(layout, operands, gradient, interpret=False):
     query, token, _, inverse, weights = operands
     programs = token.shape[0] // BLOCK
     dquery, dtoken, dinverse, parts = pl.pallas_call(
-        functools.partial(
-            _backward_kernel, layout, kernel_arithmetic(query.dtype, interpret)
-        ),
+        functools.partial(_backward_kernel, layout, kernel_arithmetic(query.dtype, interpret)),
         out_shape=(
             jax.ShapeDtypeStruct(query.shape, query.dtype),
             jax.ShapeDtypeStruct(token.shape, token.dtype),
@@ -259,9 +226,7 @@ def backward_by_kernel(layout, operands, gradient, interpret=False):
             pl.BlockSpec((1, *weights.shape), lambda i: (i, 0, 0)),
         ),
         interpret=interpret,
-        compiler_params=pallas_triton.CompilerParams(
-            num_warps=BACKWARD_WARPS, num_stages=1
-        ),
+        compiler_params=pallas_triton.CompilerParams(num_warps=BACKWARD_WARPS, num_stages=1),
         name="attend_backward",
     )(*operands, gradient)
     return dquery[:batch], dtoken[:batch], dinverse[:, :batch], jnp.sum(parts, axis=0)

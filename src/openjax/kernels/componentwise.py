@@ -17,11 +17,7 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 _CALLS = ("jit", "pjit", "closed_call", "custom_jvp_call")
-_REDUCTIONS = {
-    "reduce_sum": operator.add,
-    "reduce_or": operator.or_,
-    "reduce_and": operator.and_,
-}
+_REDUCTIONS = {"reduce_sum": operator.add, "reduce_or": operator.or_, "reduce_and": operator.and_}
 _ELEMENTWISE = frozenset(
     "abs add and atan2 clamp convert_element_type copy cos div eq exp expm1 ge gt integer_pow le "
     "log lt max min mul ne "
@@ -79,9 +75,7 @@ def _apply(equation, inputs):
     name = equation.primitive.name
     parameters = equation.params
     if name in _CALLS:
-        inner = (
-            parameters["jaxpr"] if "jaxpr" in parameters else parameters["call_jaxpr"]
-        )
+        inner = parameters["jaxpr"] if "jaxpr" in parameters else parameters["call_jaxpr"]
         return _evaluate(inner.jaxpr, inner.consts, inputs)
     if name in _ELEMENTWISE:
         return [_each(functools.partial(_bind, equation), inputs)]
@@ -92,15 +86,11 @@ def _apply(equation, inputs):
     if name == "reduce" and _is_sum(parameters["jaxpr"]):
         # several sums at once: the arrays first, then as many starts, which are zero
         arrays = inputs[: len(inputs) // 2]
-        return [
-            _total(operator.add, array, parameters["dimensions"]) for array in arrays
-        ]
+        return [_total(operator.add, array, parameters["dimensions"]) for array in arrays]
     if name == "unstack":
         axis = parameters["axis"]
         array = inputs[0]
-        return [
-            np.squeeze(part, axis) for part in np.split(array, array.shape[axis], axis)
-        ]
+        return [np.squeeze(part, axis) for part in np.split(array, array.shape[axis], axis)]
     if name not in _MOVES:
         raise NotImplementedError(f"component by component: {name}")
     return [_MOVES[name](inputs, parameters)]
@@ -113,17 +103,13 @@ def _is_sum(combination):
 
 def _slice(inputs, parameters):
     strides = parameters["strides"] or (1,) * inputs[0].ndim
-    ranges = zip(
-        parameters["start_indices"], parameters["limit_indices"], strides, strict=True
-    )
+    ranges = zip(parameters["start_indices"], parameters["limit_indices"], strides, strict=True)
     return inputs[0][tuple(slice(start, stop, step) for start, stop, step in ranges)]
 
 
 def _broadcast(inputs, parameters):
     shape = [1] * len(parameters["shape"])
-    for axis, size in zip(
-        parameters["broadcast_dimensions"], inputs[0].shape, strict=True
-    ):
+    for axis, size in zip(parameters["broadcast_dimensions"], inputs[0].shape, strict=True):
         shape[axis] = size
     return np.broadcast_to(inputs[0].reshape(shape), parameters["shape"])
 
@@ -131,16 +117,10 @@ def _broadcast(inputs, parameters):
 _MOVES = {
     "slice": _slice,
     "broadcast_in_dim": _broadcast,
-    "squeeze": lambda inputs, parameters: np.squeeze(
-        inputs[0], tuple(parameters["dimensions"])
-    ),
+    "squeeze": lambda inputs, parameters: np.squeeze(inputs[0], tuple(parameters["dimensions"])),
     "reshape": lambda inputs, parameters: inputs[0].reshape(parameters["new_sizes"]),
-    "transpose": lambda inputs, parameters: inputs[0].transpose(
-        parameters["permutation"]
-    ),
-    "concatenate": lambda inputs, parameters: np.concatenate(
-        inputs, parameters["dimension"]
-    ),
+    "transpose": lambda inputs, parameters: inputs[0].transpose(parameters["permutation"]),
+    "concatenate": lambda inputs, parameters: np.concatenate(inputs, parameters["dimension"]),
     "stack": lambda inputs, parameters: np.stack(inputs, parameters["axis"]),
     "rev": lambda inputs, parameters: np.flip(inputs[0], parameters["dimensions"]),
 }
@@ -152,9 +132,7 @@ def _each(function, arrays):
     """
     shape = np.broadcast_shapes(*(array.shape for array in arrays))
     flat = (np.broadcast_to(array, shape).ravel() for array in arrays)
-    return split(function(operands) for operands in zip(*flat, strict=True)).reshape(
-        shape
-    )
+    return split(function(operands) for operands in zip(*flat, strict=True)).reshape(shape)
 
 
 def _bind(equation, operands):

@@ -13,11 +13,7 @@ import jax.numpy as jnp
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton as pallas_triton
 
-from openjax.kernels.activation import (
-    activation,
-    activation_and_slope,
-    kernel_arithmetic,
-)
+from openjax.kernels.activation import activation, activation_and_slope, kernel_arithmetic
 from openjax.platform import on_platform, whole_blocks
 
 ROWS = 64
@@ -70,9 +66,7 @@ def _forward(x, affine, activate):
 
 
 def _backward(activate, residuals, gradient):
-    return on_platform(_reference_backward, backward_by_kernel, activate)(
-        *residuals, gradient
-    )
+    return on_platform(_reference_backward, backward_by_kernel, activate)(*residuals, gradient)
 
 
 normalise.defvjp(_forward, _backward)
@@ -105,17 +99,11 @@ def _reference_backward(activate, x, affine, gradient):
 
 def _forward_kernel(activate, arithmetic, x_ref, affine_ref, out_ref):
     standard, _ = _standardise(x_ref[...], affine_ref[0, :][None, :])
-    out = arithmetic.multiply_add(
-        standard, affine_ref[1, :][None, :], affine_ref[2, :][None, :]
-    )
-    out_ref[...] = (activation(out, arithmetic) if activate else out).astype(
-        out_ref.dtype
-    )
+    out = arithmetic.multiply_add(standard, affine_ref[1, :][None, :], affine_ref[2, :][None, :])
+    out_ref[...] = (activation(out, arithmetic) if activate else out).astype(out_ref.dtype)
 
 
-def _backward_kernel(
-    activate, arithmetic, x_ref, affine_ref, g_ref, dx_ref, daffine_ref
-):
+def _backward_kernel(activate, arithmetic, x_ref, affine_ref, g_ref, dx_ref, daffine_ref):
     standard, inverse = _standardise(x_ref[...], affine_ref[0, :][None, :])
     scale = affine_ref[1, :][None, :]
     dout = g_ref[...].astype(jnp.float32)
@@ -140,9 +128,7 @@ def forward_by_kernel(activate, x, affine, interpret=False):
     blocks = whole_blocks(x, ROWS)
     block = pl.BlockSpec((ROWS, x.shape[1]), lambda i: (i, 0))
     out = pl.pallas_call(
-        functools.partial(
-            _forward_kernel, activate, kernel_arithmetic(x.dtype, interpret)
-        ),
+        functools.partial(_forward_kernel, activate, kernel_arithmetic(x.dtype, interpret)),
         out_shape=jax.ShapeDtypeStruct(blocks.shape, blocks.dtype),
         grid=(blocks.shape[0] // ROWS,),
         in_specs=[block, pl.BlockSpec(affine.shape, lambda i: (0, 0))],
@@ -164,9 +150,7 @@ def backward_by_kernel(activate, x, affine, gradient, interpret=False):
     features = x.shape[1]
     block = pl.BlockSpec((ROWS, features), lambda i: (i, 0))
     dx, parts = pl.pallas_call(
-        functools.partial(
-            _backward_kernel, activate, kernel_arithmetic(x.dtype, interpret)
-        ),
+        functools.partial(_backward_kernel, activate, kernel_arithmetic(x.dtype, interpret)),
         out_shape=(
             jax.ShapeDtypeStruct(blocks.shape, blocks.dtype),
             jax.ShapeDtypeStruct((programs, 3, features), jnp.float32),

@@ -114,9 +114,7 @@ class _Stage:
         task_key, reset_key, moment_key = jax.random.split(key, 3)
         task_keys = jax.random.split(task_key, worlds)
         tasks = jax.vmap(lambda key: draw_start(self.free, key))(task_keys)
-        _, starts = jax.vmap(pursuit.reset_to)(
-            jax.random.split(reset_key, worlds), tasks
-        )
+        _, starts = jax.vmap(pursuit.reset_to)(jax.random.split(reset_key, worlds), tasks)
         start_indices = jax.random.choice(
             moment_key, flights.position.shape[1], (worlds,), replace=False
         )
@@ -148,16 +146,11 @@ class _Stage:
         team = state.drones.position.shape[:2]  # worlds, pursuers
         observation = jax.vmap(pursuit.observe)(state)
         first = (observation, state, jnp.full(team, jnp.inf), jnp.zeros(team))
-        (_, end, least, breach), (path, speed) = jax.lax.scan(
-            one, first, None, length=STEPS
-        )
+        (_, end, least, breach), (path, speed) = jax.lax.scan(one, first, None, length=STEPS)
         crash = jnp.mean(crash_share(least), axis=-1)
         # only at the end: a dive saves some starts. Flights follow the nominal
         # vehicle's speeds
-        fast = (
-            jnp.sqrt(jnp.sum(end.drones.velocity[:worlds] ** 2, axis=-1) + 1e-9)
-            - FASTEST
-        )
+        fast = jnp.sqrt(jnp.sum(end.drones.velocity[:worlds] ** 2, axis=-1) + 1e-9) - FASTEST
         low = LOWEST - end.drones.position[:worlds, :, 2]
         off = off_the_flight(path[:, worlds:], speed[:, worlds:], position, velocity)
         parts = {
@@ -198,9 +191,7 @@ def off_the_flight(
     def at(lag):
         part = slice(LAG - lag, LAG - lag + position.shape[0])
         off = jnp.sum(((position - target[part]) / NEAR_POSITION) ** 2, axis=-1)
-        off = off + jnp.sum(
-            ((velocity - target_velocity[part]) / NEAR_VELOCITY) ** 2, axis=-1
-        )
+        off = off + jnp.sum(((velocity - target_velocity[part]) / NEAR_VELOCITY) ** 2, axis=-1)
         return jnp.sqrt(1.0 + off) - 1.0
 
     # every other lag: between them a flight moves less than `NEAR_POSITION`

@@ -40,9 +40,7 @@ def adapting_game(game: PursuitSettings) -> PursuitSettings:
     )
 
 
-def starting_parameters(
-    parameters: PolicyParameters, settings: TrainSettings
-) -> PolicyParameters:
+def starting_parameters(parameters: PolicyParameters, settings: TrainSettings) -> PolicyParameters:
     """A policy as it begins in `adapting_game`, without its critic; it acts as
     before.
     """

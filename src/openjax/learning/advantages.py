@@ -39,7 +39,5 @@ def generalised_advantages(
         advantage = error + decay * later_advantage
         return advantage, advantage
 
-    _, advantage = jax.lax.scan(
-        backwards, jnp.zeros_like(error[0]), (error, decay), reverse=True
-    )
+    _, advantage = jax.lax.scan(backwards, jnp.zeros_like(error[0]), (error, decay), reverse=True)
     return advantage

@@ -105,9 +105,7 @@ class AnalyticGradient:
         """What the actor acts on: observations and predictions, without a gradient
         through the predictor.
         """
-        return observation, jax.lax.stop_gradient(
-            self.policy.predict(parameters, observation)
-        )
+        return observation, jax.lax.stop_gradient(self.policy.predict(parameters, observation))
 
     def fly(
         self,
@@ -156,12 +154,10 @@ class AnalyticGradient:
                 encounter.upright, rotation_axes(state.drones.quaternion)[1][..., 2]
             ),
             breach=encounter.breach + breach_share(self.game, state) / steps,
-            excess=encounter.excess
-            + jax.nn.relu(speed(state.drones) - limit) / FAST / steps,
+            excess=encounter.excess + jax.nn.relu(speed(state.drones) - limit) / FAST / steps,
             distance=encounter.distance + nearest_distance(beyond_rest) / steps,
             free=encounter.free + free_share(radius, distance) / steps,
-            territory=encounter.territory
-            + territory_share(self.game, state, paths) / steps,
+            territory=encounter.territory + territory_share(self.game, state, paths) / steps,
             unseen=encounter.unseen + hidden_share(self.game, state) / steps,
         )
 
@@ -176,9 +172,7 @@ class AnalyticGradient:
         task_key, reset_key = jax.random.split(key)
         number = bounds.shape[0]
         return jax.vmap(one)(
-            jax.random.split(task_key, number),
-            jax.random.split(reset_key, number),
-            bounds,
+            jax.random.split(task_key, number), jax.random.split(reset_key, number), bounds
         )
 
     def flights(self, parameters: PolicyParameters, key: PRNGKeyArray, bounds: Bounds):
@@ -188,21 +182,15 @@ class AnalyticGradient:
             world = self.fly(parameters.actor, parameters, world, self.steps)[0]
             return world, world
 
-        worlds = jax.lax.scan(
-            segment, self.starts(key, bounds), None, length=self.moments
-        )[1]
+        worlds = jax.lax.scan(segment, self.starts(key, bounds), None, length=self.moments)[1]
         return jax.tree.map(lambda leaf: jax.lax.collapse(leaf, 0, 2), worlds)
 
     def hard_starts(self, actor: Any, parameters: PolicyParameters, key: PRNGKeyArray):
         """Of `settings.draws` times as many starts those with the least gaps on the
         actor's way: few of all come near a crash.
         """
-        starts = self.starts(
-            key, jnp.concatenate([self.bounds()] * self.settings.draws)
-        )
-        least = jnp.min(
-            self.fly(actor, parameters, starts, self.steps)[1].least, axis=-1
-        )
+        starts = self.starts(key, jnp.concatenate([self.bounds()] * self.settings.draws))
+        least = jnp.min(self.fly(actor, parameters, starts, self.steps)[1].least, axis=-1)
         hardest = jax.lax.top_k(-least, self.settings.worlds)[1]
         return jax.tree.map(lambda leaf: leaf[hardest], starts)
 
@@ -213,9 +201,7 @@ class AnalyticGradient:
         settings = self.settings
         number = starts[1].step.shape[0]
         observation, prediction = self.inputs(parameters, flying[0])
-        start_mean, log_std = self.policy.distribution(
-            parameters.actor, observation, prediction
-        )
+        start_mean, log_std = self.policy.distribution(parameters.actor, observation, prediction)
         mean, _ = self.policy.distribution(actor, observation, prediction)
         change = (mean - start_mean) * jnp.exp(-log_std)
         # starts and flights by one program, the starts first
@@ -230,10 +216,7 @@ class AnalyticGradient:
             # a dive saves some of those that start tilted towards something, so there
             # the speed is free but for its end
             "ends": (END, jax.nn.relu(fast) + jax.nn.relu(low)),
-            "crashes_in_flight": (
-                CRASH_IN_FLIGHT,
-                crash_share(encounter.least[number:]),
-            ),
+            "crashes_in_flight": (CRASH_IN_FLIGHT, crash_share(encounter.least[number:])),
             "breaches_in_flight": (settings.breach, encounter.breach[number:]),
             "speed_in_flight": (settings.speed, encounter.excess[number:]),
             "change": (settings.hold, jnp.sum(change**2, axis=-1)),
@@ -249,20 +232,14 @@ class AnalyticGradient:
         """Worlds along the policy's flights, of which each update learns from some."""
         return self.flights(parameters, key, self.bounds())
 
-    def gradient(
-        self, actor: Any, parameters: PolicyParameters, flights, key: PRNGKeyArray
-    ):
+    def gradient(self, actor: Any, parameters: PolicyParameters, flights, key: PRNGKeyArray):
         """The actor's gradient, and the loss's parts."""
         start_key, choice_key = jax.random.split(key)
         moments = flights[1].step.shape[0]
-        moment_indices = jax.random.randint(
-            choice_key, (self.settings.worlds,), 0, moments
-        )
+        moment_indices = jax.random.randint(choice_key, (self.settings.worlds,), 0, moments)
         flying = jax.tree.map(lambda leaf: leaf[moment_indices], flights)
         starts = self.hard_starts(actor, parameters, start_key)
-        gradient, parts = jax.grad(self.loss, has_aux=True)(
-            actor, parameters, starts, flying
-        )
+        gradient, parts = jax.grad(self.loss, has_aux=True)(actor, parameters, starts, flying)
         return finite_or_zero(gradient), parts
 
     @property
@@ -280,16 +257,12 @@ class AnalyticGradient:
         """(B, R, 4) of each world's vehicles: the game's family, and a share of nominal
         ones.
         """
-        return partly_nominal(
-            self.game.vehicles, self.settings.worlds, self.settings.nominal
-        )
+        return partly_nominal(self.game.vehicles, self.settings.worlds, self.settings.nominal)
 
     @functools.cached_property
     def optimiser(self) -> optax.GradientTransformation:
         """Adam with clipped gradients; its step size falls linearly to a twentieth."""
-        return clipped_descent(
-            falling_rate(self.settings.learning_rate, self.settings.updates)
-        )
+        return clipped_descent(falling_rate(self.settings.learning_rate, self.settings.updates))
 
 
 def free_flight(environment: Pursuit) -> Pursuit:

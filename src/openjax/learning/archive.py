@@ -31,9 +31,7 @@ class TaskArchive:
 def empty_archive(task: Any, capacity: int) -> TaskArchive:
     """An archive without tasks, for tasks like `task`."""
     return TaskArchive(
-        tasks=jax.tree.map(
-            lambda leaf: jnp.zeros((capacity, *leaf.shape), leaf.dtype), task
-        ),
+        tasks=jax.tree.map(lambda leaf: jnp.zeros((capacity, *leaf.shape), leaf.dtype), task),
         success=jnp.zeros((capacity,), jnp.float32),
         size=jnp.zeros((), jnp.int32),
     )
@@ -66,9 +64,7 @@ def insert(
     m = success.shape[0]
     chex.assert_tree_shape_prefix(tasks, (m,))
     # newest first, as the archive is
-    pool = jax.tree.map(
-        lambda new, old: jnp.concatenate([new[::-1], old]), tasks, archive.tasks
-    )
+    pool = jax.tree.map(lambda new, old: jnp.concatenate([new[::-1], old]), tasks, archive.tasks)
     pool_success = jnp.concatenate([success[::-1], archive.success])
     is_used = jnp.concatenate([is_accepted[::-1], jnp.arange(capacity) < archive.size])
 

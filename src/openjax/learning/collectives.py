@@ -31,9 +31,7 @@ def gather_over_devices(tree, axis: str | None):
     return jax.tree.map(lambda x: jax.lax.all_gather(x, axis, tiled=True), tree)
 
 
-def own_share(
-    x: Shaped[Array, " whole *rest"], axis: str | None
-) -> Shaped[Array, " share *rest"]:
+def own_share(x: Shaped[Array, " whole *rest"], axis: str | None) -> Shaped[Array, " share *rest"]:
     """This device's part of an array that all devices have whole."""
     if axis is None:
         return x
@@ -42,9 +40,7 @@ def own_share(
     return jax.lax.dynamic_slice_in_dim(x, first, share)
 
 
-def own_keys(
-    key: PRNGKeyArray, number: int, axis: str | None
-) -> Key[Array, " {number}"]:
+def own_keys(key: PRNGKeyArray, number: int, axis: str | None) -> Key[Array, " {number}"]:
     """This device's (number,) keys out of one split for all devices: the same ones
     however many devices there are.
     """

@@ -49,18 +49,14 @@ def side_by_side(settings: PursuitSettings, key: PRNGKeyArray, task: Task) -> Ta
     would breach something.
     """
     position = task.pursuer_position
-    for i, pursuer_key in enumerate(
-        jax.random.split(key, position.shape[0] - 1), start=1
-    ):
+    for i, pursuer_key in enumerate(jax.random.split(key, position.shape[0] - 1), start=1):
         which_key, direction_key, gap_key = jax.random.split(pursuer_key, 3)
         # rather beside than above one another
         away = jax.random.normal(direction_key, (3,)) * jnp.array([1.0, 1.0, 0.3])
         gap = settings.drone_clearance + jax.random.uniform(gap_key, (), maxval=APART)
         neighbour = position[jax.random.randint(which_key, (), 0, i)]
         position = position.at[i].set(neighbour + gap * away / jnp.linalg.norm(away))
-    to_axis = jnp.linalg.norm(
-        position[:, None, :2] - task.pillar_position[None], axis=-1
-    )
+    to_axis = jnp.linalg.norm(position[:, None, :2] - task.pillar_position[None], axis=-1)
     room = settings.pillar_radius + settings.pillar_clearance
     if task.active is not None:
         to_axis = jnp.where(task.active[:, None], to_axis, jnp.inf)
@@ -77,25 +73,17 @@ def draw_start(settings: PursuitSettings, key: PRNGKeyArray) -> Task:
     task_key, turn_key, start_key, choice_key = jax.random.split(key, 4)
     task = turn_task(turn_key, uniform_task(settings, task_key))
     close_task = close_starts(settings, start_key, task, MOST)
-    beside = (
-        side_by_side(settings, start_key, task)
-        if settings.num_pursuers > 1
-        else close_task
-    )
+    beside = side_by_side(settings, start_key, task) if settings.num_pursuers > 1 else close_task
     kind = jax.random.uniform(choice_key)
     return jax.tree.map(
-        lambda a, b, c: jnp.where(
-            kind < CLOSE, a, jnp.where(kind < CLOSE + SIDE_BY_SIDE, b, c)
-        ),
+        lambda a, b, c: jnp.where(kind < CLOSE, a, jnp.where(kind < CLOSE + SIDE_BY_SIDE, b, c)),
         close_task,
         beside,
         task,
     )
 
 
-def draw_anywhere(
-    settings: PursuitSettings, tasks: GeneratorSettings, key: PRNGKeyArray
-) -> Task:
+def draw_anywhere(settings: PursuitSettings, tasks: GeneratorSettings, key: PRNGKeyArray) -> Task:
     """A task like the uniform ones that a generator with settings `tasks` draws,
     turned; with its starts, or with any others.
     """

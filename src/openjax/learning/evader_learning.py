@@ -90,9 +90,7 @@ class EvaderLearning:
         """Of each network."""
         settings = self.settings
         steps = self.updates * settings.epochs * settings.minibatches
-        rate = optax.linear_schedule(
-            settings.learning_rate, settings.learning_rate_end, steps
-        )
+        rate = optax.linear_schedule(settings.learning_rate, settings.learning_rate_end, steps)
         return clipped_adam(1.0, rate)
 
     def start(self, key: PRNGKeyArray) -> LearningEvaders:
@@ -100,12 +98,10 @@ class EvaderLearning:
         (`openjax.pursuit.evaders.init_network`).
         """
         numbers = jnp.arange(self.number)
-        init = jax.vmap(
-            functools.partial(init_network, own_axes=self.settings.own_axes)
+        init = jax.vmap(functools.partial(init_network, own_axes=self.settings.own_axes))
+        actor_keys, critic_keys = jax.vmap(lambda key: jax.random.split(key, self.number))(
+            jax.random.split(key)
         )
-        actor_keys, critic_keys = jax.vmap(
-            lambda key: jax.random.split(key, self.number)
-        )(jax.random.split(key))
         actor = init(actor_keys, numbers)
         critic = init(critic_keys, numbers)
         log_std = jnp.full((self.number, 3), self.settings.initial_log_std, jnp.float32)
@@ -129,17 +125,12 @@ class EvaderLearning:
         which = learned_place(settings.evaders, state.evader.kind)
 
         def one(which, state):
-            return features(
-                networks, which, scene_of(settings, state), state.evader.memory
-            )
+            return features(networks, which, scene_of(settings, state), state.evader.memory)
 
         return which, jax.vmap(one)(which, state)
 
     def act(
-        self,
-        evaders: LearningEvaders,
-        state: PursuitState,
-        noise: Float[Array, "worlds 3"],
+        self, evaders: LearningEvaders, state: PursuitState, noise: Float[Array, "worlds 3"]
     ) -> tuple[Float[Array, "worlds 3"], EvaderSamples]:
         """Wishes (E, 3) in worlds (E, ...), NaN where none of the networks acts, and
         the samples; noise (E, 3).
@@ -157,9 +148,7 @@ class EvaderLearning:
         log_std = jax.nn.one_hot(which, self.number + self.settings.past) @ spread
         sample = mean + jnp.exp(log_std) * noise
         log_prob = jax.vmap(gaussian_log_prob)(sample, mean, log_std)
-        samples = EvaderSamples(
-            features, which, sample, log_prob, ~state.statistics.captured
-        )
+        samples = EvaderSamples(features, which, sample, log_prob, ~state.statistics.captured)
         desired_velocity = jnp.where((which >= 0)[:, None], sample, jnp.nan)
         # a program of its own: the compiler doesn't fuse the evaders' rules with the
         # physics
@@ -194,11 +183,7 @@ class EvaderLearning:
         (networks, state), _ = jax.lax.scan(step, start, order)
         actor, critic, log_std = networks
         evaders = evaders.replace(
-            actor=actor,
-            critic=critic,
-            log_std=log_std,
-            optimiser=state,
-            update=evaders.update + 1,
+            actor=actor, critic=critic, log_std=log_std, optimiser=state, update=evaders.update + 1
         )
         if not self.settings.past:
             return evaders
@@ -212,9 +197,7 @@ class EvaderLearning:
         network_key, place_key, past_key = jax.random.split(key, 3)
         network = jax.random.randint(network_key, (), 0, self.number)
         place = jax.random.randint(place_key, (), 0, self.settings.pool)
-        slots = jax.random.randint(
-            past_key, (self.settings.past,), 0, self.settings.pool
-        )
+        slots = jax.random.randint(past_key, (self.settings.past,), 0, self.settings.pool)
 
         def renew(pool, actor):
             return pool.at[place].set(jnp.where(due, actor[network], pool[place]))
@@ -248,9 +231,7 @@ class EvaderLearning:
             gradient = jax.vmap(jax.grad(self._loss))(networks, belongs, taken_worlds)
             # a mean over all worlds: `weight` makes up for how few of them are a
             # network's
-            return jax.tree.map(
-                lambda total, some: total + some / total_worlds, total, gradient
-            )
+            return jax.tree.map(lambda total, some: total + some / total_worlds, total, gradient)
 
         rounds = jnp.max(-(-number // some))  # rounded up
         return jax.lax.fori_loop(0, rounds, add, jax.tree.map(jnp.zeros_like, networks))
@@ -263,9 +244,7 @@ class EvaderLearning:
         actor, critic, log_std = networks
         features, sample, log_prob, weight, advantage, target = part
         weight = belongs[:, None] * weight
-        log_ratio = (
-            gaussian_log_prob(sample, outputs(actor, features)[0], log_std) - log_prob
-        )
+        log_ratio = gaussian_log_prob(sample, outputs(actor, features)[0], log_std) - log_prob
         # samples of other networks count for nothing, and mustn't overflow: zero times
         # infinity is no number
         ratio = jnp.exp(jnp.where(weight > 0.0, log_ratio, 0.0))
@@ -305,28 +284,17 @@ class EvaderLearning:
         flying = samples.flying[..., None] * self._by_network(samples.which[0])
         # each network's samples weigh as much in all, however soon its worlds are
         # caught
-        scale = 1.0 / jnp.maximum(
-            mean_over_devices(jnp.mean(flying, (0, 1)), axis), 1e-4
-        )
+        scale = 1.0 / jnp.maximum(mean_over_devices(jnp.mean(flying, (0, 1)), axis), 1e-4)
         weight = jnp.sum(scale * flying, axis=-1)
 
         def mean(x):
             """Of what each sample's network met, (T, E)."""
-            by_network = mean_over_devices(
-                jnp.mean(scale * flying * x[..., None], (0, 1)), axis
-            )
+            by_network = mean_over_devices(jnp.mean(scale * flying * x[..., None], (0, 1)), axis)
             return self._by_network(samples.which[0]) @ by_network
 
         deviation = advantage - mean(advantage)
         normal = deviation / (jnp.sqrt(mean(deviation**2)) + 1e-8)
-        batch = (
-            samples.seen,
-            samples.sample,
-            samples.log_prob,
-            weight,
-            normal,
-            advantage + value,
-        )
+        batch = (samples.seen, samples.sample, samples.log_prob, weight, normal, advantage + value)
         which = minibatches(samples.which[:1], settings.minibatches)[..., 0]  # (M, W)
         belongs = which[:, None] == jnp.arange(self.number)[:, None]  # (M, K, W)
         # False comes before True: a network's own worlds first

@@ -77,8 +77,7 @@ def fine_tune(
                 best_update = update
     # fetched at the end: to wait for every update's numbers would leave the device idle
     history = [
-        {name: float(value) for name, value in row.items()}
-        for row in jax.device_get(history)
+        {name: float(value) for name, value in row.items()} for row in jax.device_get(history)
     ]
     return Tuned(best, best_update, history, looks)
 

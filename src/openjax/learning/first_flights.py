@@ -29,11 +29,7 @@ from openjax.learning.gradient_step import (
     renew,
     weighted_sum,
 )
-from openjax.learning.settings import (
-    AnalyticSettings,
-    FirstFlightsSettings,
-    GeneratorSettings,
-)
+from openjax.learning.settings import AnalyticSettings, FirstFlightsSettings, GeneratorSettings
 from openjax.learning.smooth_measures import crash_share, tip_share
 from openjax.policy import Policy, PolicyParameters
 from openjax.pursuit import Pursuit
@@ -141,9 +137,7 @@ class FirstFlights:
         total, means = weighted_sum(parts)
         return total, (end, means)
 
-    def update(
-        self, carry: FirstCarry, key: PRNGKeyArray
-    ) -> tuple[FirstCarry, dict[str, Scalar]]:
+    def update(self, carry: FirstCarry, key: PRNGKeyArray) -> tuple[FirstCarry, dict[str, Scalar]]:
         """The carry after an update, and the parts of the loss."""
         parameters = carry.parameters
         world = carry.world
@@ -156,17 +150,12 @@ class FirstFlights:
         # comes near
         step = 1.0 / (self.settings.penalty_ramp * max(self.settings.updates, 1))
         ramp = jnp.minimum(
-            ramp + jnp.where(parts["free"] < self.settings.penalty_free, step, 0.0),
-            1.0,
+            ramp + jnp.where(parts["free"] < self.settings.penalty_free, step, 0.0), 1.0
         )
         change, state = self.optimiser.update(finite_or_zero(gradient), carry.optimiser)
-        parameters = parameters.replace(
-            actor=optax.apply_updates(parameters.actor, change)
-        )
+        parameters = parameters.replace(actor=optax.apply_updates(parameters.actor, change))
         start_key, choice_key = jax.random.split(key)
-        worlds_drawn = (
-            jax.random.uniform(choice_key, (self.settings.worlds,)) < self.settings.anew
-        )
+        worlds_drawn = jax.random.uniform(choice_key, (self.settings.worlds,)) < self.settings.anew
         over = self._over(end[1]) | own_share(worlds_drawn, self.axis)
         world = renew(over, end, self.start(start_key))
         return FirstCarry(parameters, state, world, ramp), parts
@@ -190,10 +179,7 @@ class FirstFlights:
     def begin(self, parameters: PolicyParameters, key: PRNGKeyArray) -> FirstCarry:
         """The carry of `update` before the first one."""
         return FirstCarry(
-            parameters,
-            self.optimiser.init(parameters.actor),
-            self.start(key),
-            jnp.zeros(()),
+            parameters, self.optimiser.init(parameters.actor), self.start(key), jnp.zeros(())
         )
 
 
@@ -203,9 +189,7 @@ def make_first_flights(flights: FirstFlights, together: int) -> Callable:
     """
 
     def some(carry, key, updates_done):
-        keys = jax.vmap(lambda i: jax.random.fold_in(key, i))(
-            updates_done + jnp.arange(together)
-        )
+        keys = jax.vmap(lambda i: jax.random.fold_in(key, i))(updates_done + jnp.arange(together))
         carry, parts = jax.lax.scan(flights.update, carry, keys)
         return carry, jax.tree.map(jnp.mean, parts)
 

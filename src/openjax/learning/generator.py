@@ -53,9 +53,7 @@ def generate_task(
 def _archived_or_uniform(settings, environment, archive, key):
     uniform_key, turn_key, choice_key, draw_key, expand_key = jax.random.split(key, 5)
     uniform = uniform_task(environment, uniform_key)
-    uniform = vary_pillars(
-        settings, environment, jax.random.fold_in(uniform_key, 1), uniform
-    )
+    uniform = vary_pillars(settings, environment, jax.random.fold_in(uniform_key, 1), uniform)
     if len(set(environment.evaders)) > 1:
         kind = jax.random.randint(
             jax.random.fold_in(uniform_key, 2), (), 0, len(environment.evaders)
@@ -76,9 +74,7 @@ def _archived_or_uniform(settings, environment, archive, key):
 
 
 def successes(
-    settings: GeneratorSettings,
-    statistics: EpisodeStatistics,
-    penalty_share: Scalar | float = 1.0,
+    settings: GeneratorSettings, statistics: EpisodeStatistics, penalty_share: Scalar | float = 1.0
 ) -> Bool[Array, "*worlds"]:
     """Whether episodes count as solved: captured, and (by setting) with few collisions.
     Any leading axes.

@@ -63,9 +63,7 @@ def update(programs: Sequence[Callable[[Turn, tuple], Any]], turn: Turn) -> Upda
 
 def compile_stage(
     stage: GradientStage, parameters: PolicyParameters
-) -> Callable[
-    [PolicyParameters, jax.Array], Iterator[tuple[PolicyParameters, dict[str, float]]]
-]:
+) -> Callable[[PolicyParameters, jax.Array], Iterator[tuple[PolicyParameters, dict[str, float]]]]:
     """Start to compile the stage for parameters of these shapes (or abstract ones), in
     the background.
 

@@ -79,9 +79,7 @@ def mean_step(
         prediction = jax.lax.stop_gradient(policy.predict(parameters, observation))
         mean, _ = policy.distribution(actor, observation, prediction)
         # no key: the game draws nothing after its reset
-        observation, state, *_ = step(
-            None, state, policy.action(mean, observation), wish
-        )
+        observation, state, *_ = step(None, state, policy.action(mean, observation), wish)
         return observation, state
 
     return fly_on

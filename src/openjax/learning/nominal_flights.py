@@ -12,13 +12,7 @@ from flax import struct
 from openjax.learning.adapting_game import bounds_of
 from openjax.learning.gradient_step import mean_step
 from openjax.policy import Policy
-from openjax.pursuit import (
-    Pursuit,
-    PursuitSettings,
-    PursuitState,
-    turn_task,
-    uniform_task,
-)
+from openjax.pursuit import Pursuit, PursuitSettings, PursuitState, turn_task, uniform_task
 from openjax.vehicle import Vehicle
 from openjax.vehicle.family import draw_vehicles, known_effects
 
@@ -74,12 +68,8 @@ class NominalFlights:
         nominal = self._pursuit(bounds_of({}, {}, rest=0.0))
         number = self.number
         task_key, reset_key, moment_key, vehicle_key = jax.random.split(key, 4)
-        tasks = jax.vmap(lambda key: _task(self.game, key))(
-            jax.random.split(task_key, number)
-        )
-        _, start = jax.vmap(nominal.reset_to)(
-            jax.random.split(reset_key, number), tasks
-        )
+        tasks = jax.vmap(lambda key: _task(self.game, key))(jax.random.split(task_key, number))
+        _, start = jax.vmap(nominal.reset_to)(jax.random.split(reset_key, number), tasks)
         moment = jax.random.randint(moment_key, (number,), SETTLE, FLIGHT - STEPS)
         fly_on = mean_step(nominal, self.policy, parameters)
 
@@ -94,9 +84,7 @@ class NominalFlights:
             return (observation, state, at_settling, at_moment), track
 
         first = (jax.vmap(nominal.observe)(start), start, start, start)
-        (_, _, at_settling, at_moment), tracks = jax.lax.scan(
-            one, first, jnp.arange(FLIGHT)
-        )
+        (_, _, at_settling, at_moment), tracks = jax.lax.scan(one, first, jnp.arange(FLIGHT))
         steps = moment + jnp.arange(-LAG, STEPS)[:, None]
         position, velocity = (track[steps, jnp.arange(number)] for track in tracks)
         state_of_vehicle = self._settle(parameters, at_settling, vehicle_key, bounds)
@@ -141,23 +129,14 @@ def _in_its_place(flight: PursuitState, nominal: PursuitState) -> PursuitState:
     `nominal`; rotors, controllers, commands on the way, effects, and what the policy
     remembers of the vehicle from `flight`.
     """
-    kinematic = (
-        "position",
-        "quaternion",
-        "velocity",
-        "body_rates",
-        "previous_body_rates",
-    )
-    sensors = {
-        name for name, effect in known_effects().items() if effect.sensor is not None
-    }
+    kinematic = ("position", "quaternion", "velocity", "body_rates", "previous_body_rates")
+    sensors = {name for name, effect in known_effects().items() if effect.sensor is not None}
     memory = {
         name: nominal.drones.effect_memory[name] if name in sensors else memory
         for name, memory in flight.drones.effect_memory.items()
     }
     drones = flight.drones.replace(
-        **{name: getattr(nominal.drones, name) for name in kinematic},
-        effect_memory=memory,
+        **{name: getattr(nominal.drones, name) for name in kinematic}, effect_memory=memory
     )
     return nominal.replace(
         vehicles=flight.vehicles,

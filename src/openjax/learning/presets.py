@@ -30,19 +30,13 @@ def quick() -> TrainSettings:
             substeps=4,
             episode_length=200,
             history_length=5,
-            reward=RewardSettings(
-                crash=10.0, first_crash=300.0, margin=0.03, lookahead=0.15
-            ),
+            reward=RewardSettings(crash=10.0, first_crash=300.0, margin=0.03, lookahead=0.15),
         ),
         # in so short a run the mean policy learns faster this way; over longer ones the
         # other is better
         # a small noise, so that MAPPO doesn't unlearn what the first flights taught
         network=NetworkSettings(
-            features=64,
-            heads=2,
-            squash="sample",
-            initial_log_std=-3.0,
-            critic_encoder="layers",
+            features=64, heads=2, squash="sample", initial_log_std=-3.0, critic_encoder="layers"
         ),
         predictor=PredictorSettings(units=16, horizons=(1, 2, 3, 5, 10)),
         # its critic knows nothing when it begins, and its actor is good already: it
@@ -70,9 +64,7 @@ def quick() -> TrainSettings:
         ),
         # few tasks reach the archive in so short a run; drawn from too often, they'd be
         # all that is learnt
-        generator=GeneratorSettings(
-            capacity=500, expansion=0.3, pillar_shift=0.1, row_share=0.25
-        ),
+        generator=GeneratorSettings(capacity=500, expansion=0.3, pillar_shift=0.1, row_share=0.25),
         num_envs=640,
         rollout_length=20,
         total_steps=640_000,
@@ -90,11 +82,7 @@ def paper() -> TrainSettings:
             # turned, the game looks the same: half of the steps to .99
             observe_in="heading",
             reward=RewardSettings(
-                collision=40.0,
-                crash=20.0,
-                first_crash=5000.0,
-                margin=0.03,
-                lookahead=0.15,
+                collision=40.0, crash=20.0, first_crash=5000.0, margin=0.03, lookahead=0.15
             ),
         ),
         # one encoder for actor and critic, and every second step: 4.2 M environment
@@ -183,9 +171,7 @@ _PAY_OF_CAPTURES = dict(
 
 _AGAINST_PLANS = dict(
     # more updates change nothing: plans that survive fall from .84 to .48 in a dozen
-    analytic=dict(
-        updates=150, look_every=50, worlds=256, learning_rate=8e-4, hold=0.01
-    ),
+    analytic=dict(updates=150, look_every=50, worlds=256, learning_rate=8e-4, hold=0.01),
     # after plans of .8 s a planner got away in .42 of `random`, after these of 1.2 s in
     # .16
     worst_plans=dict(worlds=512, pieces=6, unseen=1.0, hold_unseen=0.02, team_plans=48),
@@ -202,13 +188,7 @@ def evaders() -> TrainSettings:
     return changed(
         flight(),
         environment=dict(
-            evaders=(
-                "field",
-                "greedy",
-                "wall_runner",
-                "slow_hugger",
-                *["learned"] * 8,
-            ),
+            evaders=("field", "greedy", "wall_runner", "slow_hugger", *["learned"] * 8),
             observe_in="heading",
             # Who knows the time risks less and less as it passes: pursuers flew .70 m/s
             # at first and .33 in the eighth second, and an evader that lasted so long
@@ -220,12 +200,7 @@ def evaders() -> TrainSettings:
         ),
         # as long as a breach costs less than a step in reach pays, pursuers learn to
         # hold an evader from beyond the wall
-        mappo=dict(
-            target_kl=0.02,
-            step_subsampling=2,
-            entropy_coefficient=2e-3,
-            penalty_ramp=0.5,
-        ),
+        mappo=dict(target_kl=0.02, step_subsampling=2, entropy_coefficient=2e-3, penalty_ramp=0.5),
         **_AGAINST_PLANS,
         evader_learning=dict(past=3),
         vehicles_start=0.08,
@@ -243,12 +218,8 @@ def evaders() -> TrainSettings:
 # isn't: each costs 8/3 of what it costs among three, or they press on past every bound
 # (breaches of .001 became .022). The points of a team's plan know of no empty slots
 _TEAMS_AGAINST_PLANS = dict(
-    analytic=dict(
-        updates=150, look_every=50, worlds=128, breach=5.3, speed=1.6, hold=0.027
-    ),
-    worst_plans=dict(
-        worlds=256, crash=21.0, breach=5.3, hold_unseen=0.053, team_plans=0
-    ),
+    analytic=dict(updates=150, look_every=50, worlds=128, breach=5.3, speed=1.6, hold=0.027),
+    worst_plans=dict(worlds=256, crash=21.0, breach=5.3, hold_unseen=0.053, team_plans=0),
 )
 
 
@@ -278,13 +249,7 @@ def teams() -> TrainSettings:
             history_pursuers="pooled",
             # round pillars: by the straight distance they wait behind a wall's gaps
             reward=dict(distance=0.0, path=0.5),
-            evaders=(
-                "field",
-                "greedy",
-                "wall_runner",
-                "slow_hugger",
-                *["learned"] * 6,
-            ),
+            evaders=("field", "greedy", "wall_runner", "slow_hugger", *["learned"] * 6),
             # every pursuer is the nominal vehicle, which shows in one frame how it
             # answers
             vehicles=(),
@@ -325,8 +290,7 @@ def dacoop() -> TrainSettings:
 
 
 PRESETS = {
-    recipe.__name__: recipe
-    for recipe in (quick, paper, flight, evaders, teams, mappo, dacoop)
+    recipe.__name__: recipe for recipe in (quick, paper, flight, evaders, teams, mappo, dacoop)
 }
 
 

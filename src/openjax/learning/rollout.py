@@ -81,9 +81,7 @@ def collect(
       the rollout, and observation and state after it.
     """
     pursuers = players.environment.settings.num_pursuers
-    chex.assert_shape(
-        noise.pursuers, (None, None, pursuers, players.policy.sample_size)
-    )
+    chex.assert_shape(noise.pursuers, (None, None, pursuers, players.policy.sample_size))
     chex.assert_tree_shape_prefix(world, noise.pursuers.shape[1:2])
     step = _step(players, penalty_share)
     if not players.evaders:
@@ -113,9 +111,7 @@ def _step(players, penalty_share):
     of evaders that learn -> worlds after it, record.
     """
     policy = players.policy
-    move = jax.vmap(
-        players.environment.step, in_axes=(None, 0, 0, 0 if players.evaders else None)
-    )
+    move = jax.vmap(players.environment.step, in_axes=(None, 0, 0, 0 if players.evaders else None))
 
     def step(world, noise, desired_velocities=None):
         observation, state = world
@@ -146,8 +142,6 @@ def _sample(players, observation, noise):
     """Predictions, samples of the policy and their log probabilities."""
     policy = players.policy
     prediction = policy.predict(players.parameters, observation)
-    mean, log_std = policy.distribution(
-        players.parameters.actor, observation, prediction
-    )
+    mean, log_std = policy.distribution(players.parameters.actor, observation, prediction)
     action = mean + jnp.exp(log_std) * noise
     return prediction, action, gaussian_log_prob(action, mean, log_std)

@@ -95,17 +95,11 @@ class Schedule:
         # last, so that it has the word: what ends its episode is not started anew as
         # well
         source = jnp.where(behind == 0, number + member, source)
-        return jax.tree.map(
-            lambda x, new: jnp.concatenate([x, new])[source], worlds, fresh
-        )
+        return jax.tree.map(lambda x, new: jnp.concatenate([x, new])[source], worlds, fresh)
 
     def lasting(self, number: int) -> Bool[np.ndarray, " {number}"]:
         """(number,) bool of a group's members: those that are never started anew within
         an episode.
         """
         task = np.arange(number) // self.share
-        return (
-            task % self.restart_every != 0
-            if self.restart_every
-            else np.ones(number, bool)
-        )
+        return task % self.restart_every != 0 if self.restart_every else np.ones(number, bool)

@@ -334,9 +334,7 @@ class TrainSettings:
     first_flights: FirstFlightsSettings = field(default_factory=FirstFlightsSettings)
     analytic: AnalyticSettings = field(default_factory=AnalyticSettings)
     worst_plans: WorstPlansSettings = field(default_factory=WorstPlansSettings)
-    evader_learning: EvaderLearningSettings = field(
-        default_factory=EvaderLearningSettings
-    )
+    evader_learning: EvaderLearningSettings = field(default_factory=EvaderLearningSettings)
     num_envs: Annotated[int, Interval("[1, 16777216]")] = 2560
     """Worlds that are simulated at once."""
     rollout_length: Annotated[int, Interval("[1, 100000]")] = 80
@@ -416,10 +414,7 @@ class TrainSettings:
         )
         # with 1 all worlds would start anew in their middle, and no episode would be
         # whole
-        yield (
-            self.restart_every != 1,
-            "restart_every is 1; 0 (never) or at least 2 are possible",
-        )
+        yield (self.restart_every != 1, "restart_every is 1; 0 (never) or at least 2 are possible")
         yield (
             self.restart_steps >= rollout and self.restart_steps % rollout == 0,
             f"restart_steps {self.restart_steps} must be a multiple of rollout_length {rollout}",
@@ -445,9 +440,7 @@ class TrainSettings:
             "attention would be right",
         )
         yield (
-            not sizes
-            or not self.predictor.enabled
-            or self.environment.history_pursuers != "each",
+            not sizes or not self.predictor.enabled or self.environment.history_pursuers != "each",
             "predictor: frames of each pursuer are for teams of one size; "
             "environment.history_pursuers pooled would be right",
         )
@@ -536,9 +529,7 @@ class TrainSettings:
         # counted in rollouts; not at the age at which the episode ends anyhow
         every = self.restart_steps // self.rollout_length
         ages = tuple(range(every, self.start_groups, every))
-        return Schedule(
-            self.start_groups, self.episodes_per_task, self.restart_every, ages
-        )
+        return Schedule(self.start_groups, self.episodes_per_task, self.restart_every, ages)
 
     @property
     def steps_per_update(self) -> int:

@@ -52,9 +52,7 @@ def nearest_gap(game: PursuitSettings, state: PursuitState) -> Pursuers:
     """
     position = state.drones.position
     task = state.task
-    to_pillar = jax.vmap(lambda p, q: pillar_distance(game, p, q))(
-        position, task.pillar_position
-    )
+    to_pillar = jax.vmap(lambda p, q: pillar_distance(game, p, q))(position, task.pillar_position)
     active = task.pillar_active[:, None]
     gap = jnp.min(to_pillar, axis=-1, where=active, initial=jnp.inf) - DRONE_RADIUS
     if game.num_pursuers > 1:
@@ -63,9 +61,7 @@ def nearest_gap(game: PursuitSettings, state: PursuitState) -> Pursuers:
     return jnp.minimum(gap, position[..., 2] - DRONE_RADIUS)
 
 
-def crash_share(
-    gap: Float[Array, "*worlds"], smooth: float = SMOOTH
-) -> Float[Array, "*worlds"]:
+def crash_share(gap: Float[Array, "*worlds"], smooth: float = SMOOTH) -> Float[Array, "*worlds"]:
     """How much of a crash a least gap (m) counts as, from 1 to 0 over `smooth` (m): it
     has a gradient before a touch.
     """
@@ -91,13 +87,8 @@ def breach_share(game: PursuitSettings, state: PursuitState) -> Pursuers:
     """
     position = state.drones.position
     task = state.task
-    to_pillar = jax.vmap(lambda p, q: pillar_distance(game, p, q))(
-        position, task.pillar_position
-    )
-    to_pillar = (
-        jnp.where(task.pillar_active[:, None], to_pillar, jnp.inf)
-        - game.pillar_clearance
-    )
+    to_pillar = jax.vmap(lambda p, q: pillar_distance(game, p, q))(position, task.pillar_position)
+    to_pillar = jnp.where(task.pillar_active[:, None], to_pillar, jnp.inf) - game.pillar_clearance
     to_drone = jax.vmap(drone_distance)(position) - game.drone_clearance
     radius = arena_of(game, task).arena_radius
     to_wall = jnp.expand_dims(radius, -1) - length(position[..., :2])
@@ -111,9 +102,7 @@ def breach_share(game: PursuitSettings, state: PursuitState) -> Pursuers:
     return total if state.active is None else jnp.where(state.active, total, 0.0)
 
 
-def evader_distance(
-    game: PursuitSettings, state: PursuitState, paths: ShortestPaths
-) -> Pursuers:
+def evader_distance(game: PursuitSettings, state: PursuitState, paths: ShortestPaths) -> Pursuers:
     """(W, N) m, shortest paths from pursuers of worlds (W, ...) to the evader, whose
     flight has no gradient: its answers are a cliff.
     """
@@ -123,9 +112,7 @@ def evader_distance(
     )
 
 
-def territory_share(
-    game: PursuitSettings, state: PursuitState, paths: ShortestPaths
-) -> Worlds:
+def territory_share(game: PursuitSettings, state: PursuitState, paths: ShortestPaths) -> Worlds:
     """(W,) share of the arena that the evader of worlds (W, ...) can be at before any
     pursuer; its flight has no gradient.
     """
@@ -146,11 +133,7 @@ def hidden_share(game: PursuitSettings, state: PursuitState) -> Worlds:
         task = state.task
         target = jax.lax.stop_gradient(state.evader_position)
         room = sight_room(
-            game,
-            state.drones.position,
-            target,
-            task.pillar_position,
-            task.pillar_active,
+            game, state.drones.position, target, task.pillar_position, task.pillar_active
         )
         if state.active is not None:
             # who is parked sees it past all pillars

@@ -25,12 +25,7 @@ from openjax.pursuit import PursuitSettings, PursuitState
 from openjax.pursuit.collisions import breaches
 from openjax.pursuit.evaders.behaviours import into_free_space
 from openjax.pursuit.shapes import Scalar, Team, Vector
-from openjax.pursuit.shortest_paths import (
-    ROOM,
-    ShortestPaths,
-    path_length,
-    shortest_paths,
-)
+from openjax.pursuit.shortest_paths import ROOM, ShortestPaths, path_length, shortest_paths
 from openjax.pursuit.task import Task, arena_of, capture_radius
 from openjax.vehicle.vectors import length, unit
 
@@ -156,22 +151,16 @@ class TeamSearch:
         far = BESIDE * jax.random.uniform(keys[1], (*shape, 1)) ** (1 / 3)
         angle = jax.random.uniform(keys[2], shape, maxval=2 * jnp.pi)
         # evenly in a disc, whose area grows with the square
-        out = (
-            0.9 * self.game.arena_radius * jnp.sqrt(jax.random.uniform(keys[3], shape))
-        )
+        out = 0.9 * self.game.arena_radius * jnp.sqrt(jax.random.uniform(keys[3], shape))
         height = self.game.arena_height * jax.random.uniform(
             keys[4], shape, minval=0.15, maxval=0.9
         )
-        anywhere = jnp.stack(
-            [out * jnp.cos(angle), out * jnp.sin(angle), height], axis=-1
-        )
+        anywhere = jnp.stack([out * jnp.cos(angle), out * jnp.sin(angle), height], axis=-1)
         kind = jax.random.uniform(keys[5], shape)
         is_fixed = kind > 1.0 - ANYWHERE
         until = self.seconds * jax.random.uniform(keys[6], shape, maxval=LONGEST)
         until = jnp.where(kind < STRAIGHT, 0.0, until)
-        random_plan = TeamPlan(
-            jnp.where(is_fixed[..., None], anywhere, far * way), is_fixed, until
-        )
+        random_plan = TeamPlan(jnp.where(is_fixed[..., None], anywhere, far * way), is_fixed, until)
         straight = no_plan(team_plan.until.shape[0])
         return jax.tree.map(
             lambda leaf, *first: leaf.at[: len(first)].set(jnp.stack(first)),
@@ -188,25 +177,19 @@ class TeamSearch:
         high = jnp.array([jnp.inf, jnp.inf, self.game.arena_height - LOWEST])
         return jnp.clip(place, low, high)
 
-    def desired_velocity(
-        self, task, paths: ShortestPaths, position: Team, target: Team
-    ) -> Team:
+    def desired_velocity(self, task, paths: ShortestPaths, position: Team, target: Team) -> Team:
         """(N, 3) m/s, along the shortest path to (N, 3) targets."""
 
         def one(position, target):
             def way(position):
-                return path_length(
-                    self.narrow_game, task, paths, position[None], target
-                )[0]
+                return path_length(self.narrow_game, task, paths, position[None], target)[0]
 
             far, away = jax.value_and_grad(way)(position)
             return -away * jnp.minimum(self.game.max_speed, far / BRAKING)
 
         return jax.vmap(one)(position, target)
 
-    def fly(
-        self, task, paths: ShortestPaths, start: Points, plan: TeamPlan, velocities
-    ):
+    def fly(self, task, paths: ShortestPaths, start: Points, plan: TeamPlan, velocities):
         """Points at the end of a plan against (steps, 3) velocities of the evader in
         m/s, and where the pursuers were after each step (steps, N, 3).
         """
@@ -224,9 +207,7 @@ class TeamSearch:
             return points, jnp.stack(places)
 
         firsts = jnp.arange(0, self.steps, STRIDE)
-        end, places = jax.lax.scan(
-            stride, start, (firsts, velocities.reshape(-1, STRIDE, 3))
-        )
+        end, places = jax.lax.scan(stride, start, (firsts, velocities.reshape(-1, STRIDE, 3)))
         return end, places.reshape(-1, *places.shape[2:])
 
     def _after_step(self, task, points, velocity_wish, velocity):
@@ -241,18 +222,13 @@ class TeamSearch:
         )
         push = (velocity_wish - points.velocity) / RESPONSE
         size = length(push, keepdims=True)
-        next_velocity = points.velocity + STEP * push * jnp.minimum(
-            1.0, ACCELERATION / size
-        )
+        next_velocity = points.velocity + STEP * push * jnp.minimum(1.0, ACCELERATION / size)
         low = jnp.array([-jnp.inf, -jnp.inf, LEAST_HEIGHT])
         high = jnp.array([jnp.inf, jnp.inf, game.arena_height])
         position = jnp.clip(points.position + STEP * next_velocity, low, high)
         square = jnp.sum((position - evader) ** 2, axis=-1)
         breach = breaches(
-            arena_of(self.strict_game, task),
-            position,
-            task.pillar_position,
-            task.pillar_active,
+            arena_of(self.strict_game, task), position, task.pillar_position, task.pillar_active
         )
         is_caught = points.caught | jnp.any(square < capture_radius(game, task) ** 2)
         return Points(
@@ -276,12 +252,7 @@ class TeamSearch:
         drones = state.drones
         none = jnp.zeros((), jnp.int32)
         return Points(
-            drones.position,
-            drones.velocity,
-            state.evader_position,
-            jnp.zeros((), bool),
-            none,
-            none,
+            drones.position, drones.velocity, state.evader_position, jnp.zeros((), bool), none, none
         )
 
     def search(
@@ -300,18 +271,14 @@ class TeamSearch:
         teams = self.candidates(key, team_plan)
 
         def pair(team, velocity):
-            return self.payoff(
-                task, paths, self.fly(task, paths, start, team, velocity)[0]
-            )
+            return self.payoff(task, paths, self.fly(task, paths, start, team, velocity)[0])
 
         payoff = jax.vmap(jax.vmap(pair, (None, 0)), (0, None))(teams, velocities)
         worth = jnp.max(payoff, axis=1)
         best = jnp.argmin(worth)
         return jax.tree.map(lambda leaf: leaf[best], teams), worth[best]
 
-    def way(
-        self, state: PursuitState, paths: ShortestPaths, plan: TeamPlan, velocity
-    ) -> Places:
+    def way(self, state: PursuitState, paths: ShortestPaths, plan: TeamPlan, velocity) -> Places:
         """Where the pursuers of one world are after each step of a plan against the
         evader's (steps, 3) m/s.
         """
@@ -319,9 +286,7 @@ class TeamSearch:
 
     def room(self, state: PursuitState, paths: ShortestPaths) -> Scalar:
         """() of a step, how far a world's evader is from the pursuers."""
-        return self._room(
-            state.task, paths, state.drones.position, state.evader_position
-        )
+        return self._room(state.task, paths, state.drones.position, state.evader_position)
 
     def _room(self, task, paths, position, evader):
         ways = path_length(self.narrow_game, task, paths, position, evader)

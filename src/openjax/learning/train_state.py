@@ -25,16 +25,12 @@ class TrainState:
         """One step against `gradient`, a tree like the parameters; `others` is what
         else the optimiser's update takes.
         """
-        update, state = optimiser.update(
-            gradient, self.optimiser, self.parameters, **others
-        )
+        update, state = optimiser.update(gradient, self.optimiser, self.parameters, **others)
         return TrainState(optax.apply_updates(self.parameters, update), state)
 
 
 def clipped_adam(
-    max_norm: float,
-    rate: optax.ScalarOrSchedule,
-    last: optax.GradientTransformation | None = None,
+    max_norm: float, rate: optax.ScalarOrSchedule, last: optax.GradientTransformation | None = None
 ) -> optax.GradientTransformationExtraArgs:
     """Adam of gradients cut at norm `max_norm`, and one more transformation behind it.
 

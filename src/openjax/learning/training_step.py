@@ -16,32 +16,16 @@ from jaxtyping import PRNGKeyArray
 
 import openjax.baselines  # noqa: F401  registers its policies
 from openjax.learning.archive import TaskArchive, empty_archive
-from openjax.learning.collectives import (
-    gather_over_devices,
-    mean_over_devices,
-    own_keys,
-)
+from openjax.learning.collectives import gather_over_devices, mean_over_devices, own_keys
 from openjax.learning.evader_learning import EvaderLearning
 from openjax.learning.generator import generate_task, select, successes, task_like
 from openjax.learning.learners.evasion import EvaderLearner
-from openjax.learning.learners.learner import (
-    Flown,
-    Learner,
-    check_learners,
-    check_learning,
-)
+from openjax.learning.learners.learner import Flown, Learner, check_learners, check_learning
 from openjax.learning.learners.mappo import Mappo
 from openjax.learning.learners.predictor_update import PredictorLearner
 from openjax.learning.rollout import Noise, Players, collect
 from openjax.learning.settings import TrainSettings
-from openjax.policy import (
-    Network,
-    OwnPolicy,
-    Policy,
-    PolicyParameters,
-    check_network,
-    make_policy,
-)
+from openjax.policy import Network, OwnPolicy, Policy, PolicyParameters, check_network, make_policy
 from openjax.pursuit import Observation, Pursuit, PursuitState
 from openjax.pursuit.evaders import learned_place
 from openjax.pursuit.shapes import Scalar
@@ -132,15 +116,11 @@ def make_start(
     return jax.jit(functools.partial(initial_carry, settings, parts or build(settings)))
 
 
-def initial_carry(
-    settings: TrainSettings, parts: Parts, key: PRNGKeyArray
-) -> TrainCarry:
+def initial_carry(settings: TrainSettings, parts: Parts, key: PRNGKeyArray) -> TrainCarry:
     """The carry of a run's start; `parts` are what `build` gives."""
     # vehicles and evaders as at the beginning of their curricula
     environment = _starting(settings, parts.environment, 0.0)
-    archive = empty_archive(
-        task_like(parts.environment.settings), settings.generator.capacity
-    )
+    archive = empty_archive(task_like(parts.environment.settings), settings.generator.capacity)
     key, policy_key, task_key, reset_key = jax.random.split(key, 4)
     tasks = _tasks(
         settings,
@@ -154,9 +134,7 @@ def initial_carry(
     )
     # staggered: the groups begin in the middle of an episode, so that from the first
     # update on one of them ends its episodes with each rollout
-    state = state.replace(
-        step=settings.schedule.age(settings.num_envs) * settings.rollout_length
-    )
+    state = state.replace(step=settings.schedule.age(settings.num_envs) * settings.rollout_length)
     observation = jax.vmap(environment.observe)(state)
     policy = parts.policy.init(policy_key, jax.tree.map(lambda x: x[0], observation))
     learners = {
@@ -196,9 +174,7 @@ class Phases:
 
     fly: Callable[[TrainCarry], tuple[TrainCarry, Flown, dict[str, jax.Array]]]
     """carry -> carry after a rollout, what is learnt from it, metrics"""
-    learn: tuple[
-        Callable[[TrainCarry, Flown], tuple[TrainCarry, dict[str, jax.Array]]], ...
-    ]
+    learn: tuple[Callable[[TrainCarry, Flown], tuple[TrainCarry, dict[str, jax.Array]]], ...]
     """(carry, flown) -> carry after an update, metrics; one for each learner"""
     renew: Callable[[TrainCarry], tuple[TrainCarry, dict[str, jax.Array]]]
     """carry -> carry whose worlds have new tasks where their episodes have just ended,
@@ -272,9 +248,7 @@ class _Step:
         hold = settings.evader_learning.hold
         if act is not None:
             decisions = (steps // hold, 3)
-            draws = jax.vmap(
-                lambda k: jax.random.normal(jax.random.fold_in(k, 1), decisions)
-            )(keys)
+            draws = jax.vmap(lambda k: jax.random.normal(jax.random.fold_in(k, 1), decisions))(keys)
             noise = noise.replace(evaders=jnp.moveaxis(draws, 1, 0))
         players = Players(self.parts.environment, policy, carry.policy, act, hold)
         world = (carry.observation, carry.state)
@@ -315,9 +289,7 @@ class _Step:
             result = learner.learn(old_state, carry.policy, experience, key)
             check_learning(name, result, old_state)
             state, policy, metrics = result
-            return carry.replace(
-                policy=policy, learners={**carry.learners, name: state}
-            ), metrics
+            return carry.replace(policy=policy, learners={**carry.learners, name: state}), metrics
 
         learn.__name__ = f"learn_{name}"
         return learn
@@ -342,9 +314,7 @@ class _Step:
         numbers = members.step.shape[0], schedule.restarts(carry.state.step.shape[0])
         keys = self._key(carry, "tasks"), self._key(carry, "resets")
         fresh = self._fresh(starting, archive, keys, numbers)
-        observation, state = schedule.renew(
-            (carry.observation, carry.state), fresh, group
-        )
+        observation, state = schedule.renew((carry.observation, carry.state), fresh, group)
         carry = carry.replace(
             observation=observation,
             state=state,
@@ -364,9 +334,7 @@ class _Step:
         settings = self.settings
         share = settings.episodes_per_task
         task_numbers = [number // share for number in numbers]
-        close = jnp.repeat(
-            jnp.array([0.0, settings.restart_close]), np.array(task_numbers)
-        )
+        close = jnp.repeat(jnp.array([0.0, settings.restart_close]), np.array(task_numbers))
         task_key, reset_key = keys
 
         def of_worlds(key, numbers):
@@ -377,9 +345,7 @@ class _Step:
             )
             return jnp.concatenate(list(parts))
 
-        tasks = _tasks(
-            settings, environment, archive, of_worlds(task_key, task_numbers), close
-        )
+        tasks = _tasks(settings, environment, archive, of_worlds(task_key, task_numbers), close)
         return jax.vmap(environment.reset_to)(of_worlds(reset_key, numbers), tasks)
 
     def _key(self, carry, name):
@@ -434,13 +400,9 @@ def _tasks(settings, environment, archive, keys, close=None):
     """One task per key, repeated for the environments that share it; shares `close` of
     pursuers start close to something.
     """
-    draw = functools.partial(
-        generate_task, settings.generator, environment.settings, archive
-    )
+    draw = functools.partial(generate_task, settings.generator, environment.settings, archive)
     tasks = jax.vmap(draw)(keys, close if settings.restart_close else None)
-    return jax.tree.map(
-        lambda x: jnp.repeat(x, settings.episodes_per_task, axis=0), tasks
-    )
+    return jax.tree.map(lambda x: jnp.repeat(x, settings.episodes_per_task, axis=0), tasks)
 
 
 def _selection(settings, archive, members, penalty_share, axis):
@@ -471,19 +433,13 @@ def _selection(settings, archive, members, penalty_share, axis):
         "success_rate": is_solved.ravel(),
     }
     if "learned" in settings.environment.evaders:
-        by_network = (
-            learned_place(settings.environment.evaders, members.evader.kind) >= 0
-        )
-        metrics |= {
-            "learned": by_network,
-            "learned_capture_rate": by_network & statistics.captured,
-        }
+        by_network = learned_place(settings.environment.evaders, members.evader.kind) >= 0
+        metrics |= {"learned": by_network, "learned_capture_rate": by_network & statistics.captured}
     # worlds that were started anew within their episode flew a shorter one, which is no
     # fair sample
     lasting = settings.schedule.lasting(statistics.steps.shape[0])
     metrics = {
-        name: jnp.mean(value.astype(jnp.float32)[lasting])
-        for name, value in metrics.items()
+        name: jnp.mean(value.astype(jnp.float32)[lasting]) for name, value in metrics.items()
     }
     metrics = mean_over_devices(metrics, axis)
     if "learned" in metrics:

@@ -36,11 +36,7 @@ from openjax.learning.gradient_step import (
     renew,
     weighted_sum,
 )
-from openjax.learning.settings import (
-    AnalyticSettings,
-    GeneratorSettings,
-    WorstPlansSettings,
-)
+from openjax.learning.settings import AnalyticSettings, GeneratorSettings, WorstPlansSettings
 from openjax.learning.smooth_measures import crash_share
 from openjax.learning.team_search import STEP, TeamPlan, TeamSearch, no_plan
 from openjax.policy import PolicyParameters
@@ -180,9 +176,7 @@ class WorstPlans:
         if self.planning.team_plans:
             none = no_plan(self.game.num_pursuers)
             team = jax.tree.map(lambda leaf: jnp.stack([leaf] * worlds), none)
-        return Planned(
-            self.optimiser.init(parameters.actor), self.start(key), plan, team
-        )
+        return Planned(self.optimiser.init(parameters.actor), self.start(key), plan, team)
 
     def record(self, parameters: PolicyParameters, key: PRNGKeyArray):
         """Flights for the usual part."""
@@ -216,9 +210,7 @@ class WorstPlans:
         random_ways = unit(jax.random.normal(way_key, (*shape, 3)))
         turns = jax.random.bernoulli(turn_key, 0.5, shape)
         # the last piece at which a way turned is the one that it flies
-        last_turn = jax.lax.cummax(
-            jnp.where(turns, jnp.arange(planning.pieces), 0), axis=2
-        )
+        last_turn = jax.lax.cummax(jnp.where(turns, jnp.arange(planning.pieces), 0), axis=2)
         bent = jnp.take_along_axis(random_ways, last_turn[..., None], axis=2)
         ways = unit(jax.random.normal(straight_key, (number, straight, 1, 3)))
         parts = [
@@ -232,12 +224,7 @@ class WorstPlans:
         return jnp.concatenate(parts, axis=1)
 
     def attempts(
-        self,
-        actor: Any,
-        parameters: PolicyParameters,
-        world,
-        plan: Plan,
-        key: PRNGKeyArray,
+        self, actor: Any, parameters: PolicyParameters, world, plan: Plan, key: PRNGKeyArray
     ) -> Tried:
         """All plans tried in worlds (B, ...), and what became of them; `plan` is the
         rest of the last one.
@@ -262,9 +249,7 @@ class WorstPlans:
         def by_world(leaf):
             return leaf.reshape(-1, number, *leaf.shape[1:])
 
-        return Tried(
-            plans, by_world(promise), by_world(free), jax.tree.map(by_world, end)
-        )
+        return Tried(plans, by_world(promise), by_world(free), jax.tree.map(by_world, end))
 
     def _free(self, start, end):
         """(W,) control steps of a plan in which the evader was free."""
@@ -283,9 +268,7 @@ class WorstPlans:
         paths = jax.vmap(team.paths)(world[1].task)
         room = jax.vmap(jax.vmap(team.room, (0, None)))(trials.end, paths)
         worth = trials.free * (self.game.time_step / STEP) + room
-        most = jax.lax.top_k(
-            trials.promise_of_plans, min(ANSWERS, self.planning.plans)
-        )[1]
+        most = jax.lax.top_k(trials.promise_of_plans, min(ANSWERS, self.planning.plans))[1]
 
         def pick(leaf):
             return jax.vmap(lambda values, places: values[places])(leaf, most)
@@ -293,14 +276,10 @@ class WorstPlans:
         task = world[1].task
         velocities = self._velocities(task, pick(trials.plans))
         keys = jax.random.split(key, plan.shape[0])
-        best, promise = jax.vmap(team.search)(
-            world[1], paths, velocities, team_plan, keys
-        )
+        best, promise = jax.vmap(team.search)(world[1], paths, velocities, team_plan, keys)
         gain = jnp.max(pick(worth), axis=1) - promise
         way = jax.vmap(team.way)(world[1], paths, best, self._velocities(task, plan))
-        ends_of_pieces = (
-            np.arange(1, self.planning.pieces + 1) * team.steps // self.planning.pieces
-        )
+        ends_of_pieces = np.arange(1, self.planning.pieces + 1) * team.steps // self.planning.pieces
         places = way[:, ends_of_pieces - 1]
         return best, Example(places, jnp.clip((gain - MARGIN) / CLEAR, 0.0, 1.0))
 
@@ -314,9 +293,7 @@ class WorstPlans:
         speed = jnp.asarray(evader_speed(self.game, task))
         return speed.reshape(-1, *[1] * (shares.ndim - 1)) * shares
 
-    def promise(
-        self, start: PursuitState, end: PursuitState
-    ) -> Float[Array, " worlds"]:
+    def promise(self, start: PursuitState, end: PursuitState) -> Float[Array, " worlds"]:
         """(W,) how good the end of a plan is for the evader: steps free first, then the
         room that is left.
         """
@@ -341,18 +318,14 @@ class WorstPlans:
         policy = self.usual.policy
 
         def piece(world, wish):
-            world, encounter = self.flight.fly(
-                actor, parameters, world, self.piece_steps, wish
-            )
+            world, encounter = self.flight.fly(actor, parameters, world, self.piece_steps, wish)
             return world, (world, encounter)
 
         # one body for all pieces: each would take a GPU's compiler half a minute
         worlds, encounter = jax.lax.scan(piece, world, jnp.moveaxis(plan, 1, 0))[1]
         next_worlds = jax.tree.map(lambda leaf: jax.lax.stop_gradient(leaf[0]), worlds)
         observation, prediction = self.usual.inputs(parameters, world[0])
-        reference_mean, log_std = policy.distribution(
-            parameters.actor, observation, prediction
-        )
+        reference_mean, log_std = policy.distribution(parameters.actor, observation, prediction)
         mean, _ = policy.distribution(actor, observation, prediction)
         change = (mean - reference_mean) * jnp.exp(-log_std)
         # the gradient knows where the evader is, and who doesn't see it can't learn
@@ -406,15 +379,11 @@ class WorstPlans:
         """
         key = _keys(turn)[0]
         state = turn.state
-        trials = self.attempts(
-            turn.actor, turn.parameters, state.world, state.plan, key
-        )
+        trials = self.attempts(turn.actor, turn.parameters, state.world, state.plan, key)
         plan, promise = worst_of(trials)
         if state.team is None:
             return plan, promise, None, None
-        team, example = self.show(
-            trials, state.world, state.team, plan, jax.random.fold_in(key, 1)
-        )
+        team, example = self.show(trials, state.world, state.team, plan, jax.random.fold_in(key, 1))
         team = team.replace(until=team.until - self.planning.piece_seconds)
         return plan, promise, team, example
 

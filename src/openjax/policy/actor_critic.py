@@ -21,9 +21,7 @@ class Actor(nn.Module):
 
     @nn.compact
     def __call__(
-        self,
-        observation: Observation,
-        prediction: Float[Array, "*worlds horizons 3"] | None,
+        self, observation: Observation, prediction: Float[Array, "*worlds horizons 3"] | None
     ) -> tuple[
         Float[Array, "*worlds pursuers sample"],
         Float[Array, " sample"],
@@ -34,10 +32,7 @@ class Actor(nn.Module):
         """
         settings = self.settings
         features = Encoder(
-            settings.features,
-            settings.heads,
-            jnp.dtype(settings.compute_type),
-            name="encoder",
+            settings.features, settings.heads, jnp.dtype(settings.compute_type), name="encoder"
         )(
             own_features(observation, prediction),
             observation.others,
@@ -86,9 +81,7 @@ class Critic(nn.Module):
             features = encoding
             if sees_state:
                 features = pad(
-                    jnp.concatenate(
-                        [encoding, observation.privileged.astype(dtype)], axis=-1
-                    )
+                    jnp.concatenate([encoding, observation.privileged.astype(dtype)], axis=-1)
                 )
         else:
             itself = own_features(observation, prediction)
@@ -101,10 +94,7 @@ class Critic(nn.Module):
             features.reshape(math.prod(leading), features.shape[-1])
         )
         value = nn.Dense(
-            1,
-            dtype=jnp.float32,
-            kernel_init=nn.initializers.orthogonal(1.0),
-            name="value",
+            1, dtype=jnp.float32, kernel_init=nn.initializers.orthogonal(1.0), name="value"
         )(features)
         return value.reshape(leading)
 

@@ -70,10 +70,7 @@ class SelfAttention(nn.Module):
         if others_there is not None:
             other_bias = jnp.where(others_there, 0.0, MASKED)
         entities = []
-        for name, x, bias in (
-            ("others", others, other_bias),
-            ("pillars", pillars, pillar_bias),
-        ):
+        for name, x, bias in (("others", others, other_bias), ("pillars", pillars, pillar_bias)):
             if x.shape[-2] > 0:  # a single pursuer has no others
                 entities.append((x, *self._embedding(kernel, name, x.shape[-1]), bias))
         if can_compile_for_cuda():
@@ -85,9 +82,7 @@ class SelfAttention(nn.Module):
         the bias in their last row, scale and shift.
         """
         f = self.features
-        weights = kernel(
-            f"{name}_kernel", (size, f), nn.initializers.orthogonal(2**0.5)
-        )
+        weights = kernel(f"{name}_kernel", (size, f), nn.initializers.orthogonal(2**0.5))
         bias = kernel(f"{name}_bias", (1, f), nn.initializers.zeros_init())
         scale = kernel(f"{name}_scale", (f,), nn.initializers.ones_init())
         shift = kernel(f"{name}_shift", (1, f), nn.initializers.zeros_init())
@@ -113,8 +108,7 @@ class SelfAttention(nn.Module):
         ]
         means = attend_one_by_one(queries, embeddings, biases)
         return sum(
-            means[h].astype(self.dtype) @ output[h].astype(self.dtype)
-            for h in range(self.heads)
+            means[h].astype(self.dtype) @ output[h].astype(self.dtype) for h in range(self.heads)
         )
 
     def _attend_fused(self, token, query, output, entities):
@@ -200,13 +194,9 @@ class Encoder(nn.Module):
             # size from
             return x.reshape(math.prod(leading), *x.shape[rows:])
 
-        token = HiddenLayer(self.features, self.dtype, name="self_1")(
-            flat(pad(self_state))
-        )
+        token = HiddenLayer(self.features, self.dtype, name="self_1")(flat(pad(self_state)))
         token = HiddenLayer(self.features, self.dtype, name="self_2")(token)
-        attention = SelfAttention(
-            self.features, self.heads, self.dtype, name="attention"
-        )
+        attention = SelfAttention(self.features, self.heads, self.dtype, name="attention")
         others_mask = None if others_there is None else flat(others_there)
         features = token + attention(
             token, flat(others), flat(pillars), flat(pillar_seen), others_mask

@@ -81,9 +81,7 @@ class MixedPolicy:
             return None
 
         def predict(predictor):
-            return self.member.predict_from(
-                predictor, observation.frames, observation.last_seen
-            )
+            return self.member.predict_from(predictor, observation.frames, observation.last_seen)
 
         return self._pick(predict, parameters.predictor, observation)
 
@@ -92,9 +90,7 @@ class MixedPolicy:
         actor: Any,
         observation: Observation,
         prediction: Float[Array, "*worlds horizons 3"] | None,
-    ) -> tuple[
-        Float[Array, "*worlds pursuers sample"], Float[Array, "*worlds 1 sample"]
-    ]:
+    ) -> tuple[Float[Array, "*worlds pursuers sample"], Float[Array, "*worlds 1 sample"]]:
         """Mean and log standard deviation of the drawn member's Gaussian; `prediction`
         is that member's.
         """
@@ -127,6 +123,4 @@ class MixedPolicy:
 
 def _member(parameters, place):
     """The parameters of one member, of those of all (K, ...)."""
-    return jax.tree.map(
-        lambda leaf: jax.lax.index_in_dim(leaf, place, keepdims=False), parameters
-    )
+    return jax.tree.map(lambda leaf: jax.lax.index_in_dim(leaf, place, keepdims=False), parameters)

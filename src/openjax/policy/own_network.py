@@ -23,9 +23,7 @@ class Network(Protocol):
         a world.
         """
 
-    def distribution(
-        self, actor: Any, observation: Observation
-    ) -> tuple[jax.Array, jax.Array]:
+    def distribution(self, actor: Any, observation: Observation) -> tuple[jax.Array, jax.Array]:
         """Mean (..., N, 4) and log standard deviation (4,) of the Gaussian over
         actions: collective thrust, roll, pitch and yaw rate; samples are cut to -1..1.
         """
@@ -45,8 +43,7 @@ def check_network(network: Any, observation: Observation) -> None:
         raise UserError(f"policy {name}: a class; an object of it would be right")
     if not isinstance(network, Network):
         raise UserError(
-            f"policy {name}: init, distribution and value are needed; see "
-            "openjax.policy.Network"
+            f"policy {name}: init, distribution and value are needed; see openjax.policy.Network"
         )
     actor, critic = jax.eval_shape(network.init, jax.random.key(0), observation)
     # with another leading axis than a world's, as a rollout has
@@ -78,9 +75,7 @@ class OwnPolicy:
     own: Network
     network: NetworkSettings = field(default_factory=NetworkSettings)
     """Says nothing here."""
-    predictor: PredictorSettings = field(
-        default_factory=lambda: PredictorSettings(enabled=False)
-    )
+    predictor: PredictorSettings = field(default_factory=lambda: PredictorSettings(enabled=False))
     sample_size: int = 4
 
     def init(self, key: jax.Array, observation: Observation) -> PolicyParameters:
@@ -97,9 +92,7 @@ class OwnPolicy:
         """Mean (..., N, 4) and log standard deviation (4,)."""
         return self.own.distribution(actor, observation)
 
-    def action(
-        self, sample: jax.Array, observation: Observation | None = None
-    ) -> jax.Array:
+    def action(self, sample: jax.Array, observation: Observation | None = None) -> jax.Array:
         """The sample, cut to -1..1."""
         return jnp.clip(sample, -1.0, 1.0)
 
@@ -113,9 +106,7 @@ class OwnPolicy:
         self, actor: Any, critic: Any, observation: Observation, prediction: None
     ) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Mean, log standard deviation and value."""
-        return *self.own.distribution(actor, observation), self.own.value(
-            critic, observation
-        )
+        return *self.own.distribution(actor, observation), self.own.value(critic, observation)
 
     def act(self, parameters: PolicyParameters, observation: Observation) -> jax.Array:
         """The mean's action (..., N, 4)."""

@@ -41,10 +41,7 @@ class Policy:
 
     @classmethod
     def for_environment(
-        cls,
-        environment: Pursuit,
-        network: NetworkSettings,
-        predictor: PredictorSettings,
+        cls, environment: Pursuit, network: NetworkSettings, predictor: PredictorSettings
     ) -> "Policy":
         """The policy for an environment: its arena's size, and a start that hovers its
         vehicle.
@@ -89,8 +86,7 @@ class Policy:
         actor = self._actor.init(actor_key, observation, prediction)
         encoding = self._actor.apply(actor, observation, prediction)[2]
         return parameters.replace(
-            actor=actor,
-            critic=self._critic.init(critic_key, observation, prediction, encoding),
+            actor=actor, critic=self._critic.init(critic_key, observation, prediction, encoding)
         )
 
     def predict(
@@ -99,9 +95,7 @@ class Policy:
         """Predicted evader positions in the world (m); None without a predictor."""
         if not self.predictor.enabled:
             return None
-        return self.predict_from(
-            parameters.predictor, observation.frames, observation.last_seen
-        )
+        return self.predict_from(parameters.predictor, observation.frames, observation.last_seen)
 
     def predict_from(
         self,
@@ -140,11 +134,7 @@ class Policy:
         Policies whose samples aren't commands work the four out from the `observation`
         (`openjax.baselines.dacoop`).
         """
-        return (
-            jnp.clip(sample, -1.0, 1.0)
-            if self.network.squash == "mean"
-            else jnp.tanh(sample)
-        )
+        return jnp.clip(sample, -1.0, 1.0) if self.network.squash == "mean" else jnp.tanh(sample)
 
     def value(
         self,
@@ -169,11 +159,7 @@ class Policy:
     ]:
         """`distribution` and `value`: mean, log standard deviation, value."""
         mean, log_std, encoding = self._actor.apply(actor, observation, prediction)
-        return (
-            mean,
-            log_std,
-            self._critic.apply(critic, observation, prediction, encoding),
-        )
+        return (mean, log_std, self._critic.apply(critic, observation, prediction, encoding))
 
     def act(
         self, parameters: PolicyParameters, observation: Observation

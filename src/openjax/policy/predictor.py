@@ -21,9 +21,7 @@ class EvaderPredictor(nn.Module):
 
     @nn.compact
     def __call__(
-        self,
-        frames: Float[Array, "*worlds window features"],
-        last_seen: Float[Array, "*worlds 3"],
+        self, frames: Float[Array, "*worlds window features"], last_seen: Float[Array, "*worlds 3"]
     ) -> Float[Array, "*worlds horizons 3"]:
         """Positions (m, world) from frames, oldest first, and where the evader was last
         seen (m).
@@ -32,9 +30,7 @@ class EvaderPredictor(nn.Module):
         horizons = self.settings.horizons
         # all frames' projections in one product; only the recurrent part is sequential
         inputs = nn.Dense(4 * units, name="input")(frames)
-        recurrent = self.param(
-            "recurrent", nn.initializers.orthogonal(), (units, 4 * units)
-        )
+        recurrent = self.param("recurrent", nn.initializers.orthogonal(), (units, 4 * units))
         state = cell = jnp.zeros((*frames.shape[:-2], units), jnp.float32)
         for i in range(frames.shape[-2]):
             gates = inputs[..., i, :] + state @ recurrent
@@ -56,6 +52,4 @@ class EvaderPredictor(nn.Module):
             # within a horizon the evader moves a tenth of the arena or so: outputs of
             # one order
             return last_seen[..., None, :] + 0.1 * scale * output
-        return (
-            jnp.array([0.0, 0.0, self.arena_height / 2], jnp.float32) + scale * output
-        )
+        return jnp.array([0.0, 0.0, self.arena_height / 2], jnp.float32) + scale * output

@@ -89,8 +89,7 @@ class PredictorSettings:
     def __post_init__(self):
         check_intervals(self, "predictor.")
         rising = all(
-            horizon < later_horizon
-            for horizon, later_horizon in itertools.pairwise(self.horizons)
+            horizon < later_horizon for horizon, later_horizon in itertools.pairwise(self.horizons)
         )
         if not self.horizons or self.horizons[0] != 1 or not rising:
             raise UserError(

@@ -62,9 +62,7 @@ def breaches(
     near_drone = drone_distance(position) < settings.drone_clearance + margin
     # the floor is none of these bounds: touching it is a crash
     above = position[:, 2] > settings.arena_height - margin
-    outside = (
-        jnp.sum(position[:, :2] ** 2, axis=-1) > (settings.arena_radius - margin) ** 2
-    )
+    outside = jnp.sum(position[:, :2] ** 2, axis=-1) > (settings.arena_radius - margin) ** 2
     return Breaches(
         pillar=jnp.sum(near_pillar, axis=-1).astype(jnp.float32),
         drone=jnp.sum(near_drone, axis=-1).astype(jnp.float32),
@@ -89,8 +87,7 @@ def crashed(
     reach = DRONE_RADIUS + TOUCH + margin
     on_floor = position[:, 2] < reach
     on_pillar = jnp.any(
-        pillar_active & (pillar_distance(settings, position, pillar_position) < reach),
-        axis=-1,
+        pillar_active & (pillar_distance(settings, position, pillar_position) < reach), axis=-1
     )
     # two radii, but one touch and one margin
     on_drone = jnp.any(drone_distance(position) < DRONE_RADIUS + reach, axis=-1)

@@ -23,13 +23,7 @@ from openjax.pursuit.evaders import (
 )
 from openjax.pursuit.hiding import thought_place
 from openjax.pursuit.info import StepInfo
-from openjax.pursuit.observation import (
-    Observation,
-    frame,
-    frame_pursuers,
-    observe,
-    own_frame,
-)
+from openjax.pursuit.observation import Observation, frame, frame_pursuers, observe, own_frame
 from openjax.pursuit.reward import (
     Term,
     Transition,
@@ -41,27 +35,13 @@ from openjax.pursuit.reward import (
 )
 from openjax.pursuit.sensing import line_of_sight, within_view
 from openjax.pursuit.settings import PursuitSettings
-from openjax.pursuit.shapes import (
-    Actions,
-    Active,
-    Commands,
-    Each,
-    Flag,
-    Pillars,
-    Scalar,
-    Vector,
-)
+from openjax.pursuit.shapes import Actions, Active, Commands, Each, Flag, Pillars, Scalar, Vector
 from openjax.pursuit.shortest_paths import shortest_paths
 from openjax.pursuit.spaces import Box
 from openjax.pursuit.state import PursuitState
 from openjax.pursuit.statistics import count, empty_statistics
 from openjax.pursuit.task import Task, arena_of, start_attitude, uniform_task
-from openjax.pursuit.teams import (
-    draw_fall_out,
-    draw_strategies,
-    held,
-    still_there,
-)
+from openjax.pursuit.teams import draw_fall_out, draw_strategies, held, still_there
 from openjax.ranges import changed
 from openjax.vehicle import (
     DroneState,
@@ -98,9 +78,7 @@ def action_to_command(action: Float[Array, "*drones 4"]) -> Float[Array, "*drone
 class Dynamics(Protocol):
     """What moves the pursuers: `openjax.vehicle.DronesStep`, or a world outside."""
 
-    def reset(
-        self, vehicle: Vehicle, drones: DroneState, key: PRNGKeyArray
-    ) -> DroneState:
+    def reset(self, vehicle: Vehicle, drones: DroneState, key: PRNGKeyArray) -> DroneState:
         """The drones (leading axis N) at the start of an episode."""
 
     def __call__(
@@ -175,9 +153,7 @@ class Pursuit:
         complete = {
             "evaders": evaders,
             "settings": settings,
-            "vehicle": load_vehicle(settings.airframe)
-            if self.vehicle is None
-            else self.vehicle,
+            "vehicle": load_vehicle(settings.airframe) if self.vehicle is None else self.vehicle,
             "effects": tuple(self.effects),
             "reward": None if self.reward is None else check_terms(self.reward),
             "effect_parameters": self.effect_parameters or {},
@@ -208,9 +184,7 @@ class Pursuit:
     @property
     def terms(self) -> tuple[Term, ...]:
         """The reward's terms."""
-        return (
-            default_reward(self.settings.reward) if self.reward is None else self.reward
-        )
+        return default_reward(self.settings.reward) if self.reward is None else self.reward
 
     @property
     def action_space(self) -> Box:
@@ -223,9 +197,7 @@ class Pursuit:
     def observation_space(self) -> Observation:
         """An `Observation` whose leaves are the boxes of its arrays."""
         kinds = jax.eval_shape(lambda key: self.reset(key)[0], jax.random.key(0))
-        return jax.tree.map(
-            lambda kind: Box(-jnp.inf, jnp.inf, kind.shape, kind.dtype), kinds
-        )
+        return jax.tree.map(lambda kind: Box(-jnp.inf, jnp.inf, kind.shape, kind.dtype), kinds)
 
     def reset(self, key: PRNGKeyArray) -> tuple[Observation, PursuitState]:
         """Start an episode of a uniformly drawn task.
@@ -239,9 +211,7 @@ class Pursuit:
         task_key, reset_key = jax.random.split(key)
         return self.reset_to(reset_key, uniform_task(self.settings, task_key))
 
-    def reset_to(
-        self, key: PRNGKeyArray, task: Task
-    ) -> tuple[Observation, PursuitState]:
+    def reset_to(self, key: PRNGKeyArray, task: Task) -> tuple[Observation, PursuitState]:
         """Start an episode of `task`.
 
         Args:
@@ -266,19 +236,13 @@ class Pursuit:
         hovering = functools.partial(hover_state, self.vehicle)
         drones = jax.vmap(hovering)(task.pursuer_position, quaternion)
         drones = self.dynamics.reset(self.vehicle, drones, effect_key)
-        action = jnp.broadcast_to(
-            hover_action(self.vehicle), (settings.num_pursuers, 4)
-        )
-        in_sight, in_view, seen = self._sights(
-            task, task.active, drones, task.evader_position
-        )
+        action = jnp.broadcast_to(hover_action(self.vehicle), (settings.num_pursuers, 4))
+        in_sight, in_view, seen = self._sights(task, task.active, drones, task.evader_position)
         rest = jnp.zeros(3, jnp.float32)
         step = jnp.zeros((), jnp.int32)
         # an evader that nobody has seen yet is taken to be amid the arena, which is
         # nearest to wherever it may be
-        last_seen = jnp.where(
-            seen, task.evader_position, jnp.array(settings.middle, jnp.float32)
-        )
+        last_seen = jnp.where(seen, task.evader_position, jnp.array(settings.middle, jnp.float32))
         places = frame_pursuers(settings, task.pursuer_position, last_seen, task.active)
         first = frame(settings, step, places, task.evader_position, rest, seen)
         state = PursuitState(
@@ -298,9 +262,7 @@ class Pursuit:
             statistics=empty_statistics(settings.episode_length),
             gone_after=draw_fall_out(settings, fall_out_key, task.active),
             in_view=in_view,
-            paths=shortest_paths(settings, task)
-            if settings.reward.needs_paths
-            else None,
+            paths=shortest_paths(settings, task) if settings.reward.needs_paths else None,
             strategies=draw_strategies(settings, strategy_key),
         )
         return self.observe(state), state
@@ -319,9 +281,7 @@ class Pursuit:
     def _draw_evader(self, key, task):
         """The evader of an episode; the one that the task names, where it names one."""
         rows = self.evader_rows
-        return draw_row(
-            rows, key, task.pursuer_position, self.evader_share, task.evader
-        )
+        return draw_row(rows, key, task.pursuer_position, self.evader_share, task.evader)
 
     def _first_own_history(self, drones, action):
         """What pursuers remember of themselves at the start; None where that isn't
@@ -331,9 +291,7 @@ class Pursuit:
         if not settings.observe_history:
             return None
         first = own_frame(drones.quaternion, drones.velocity, action)
-        return _repeat(
-            first, settings.observe_history * settings.observe_history_spacing
-        )
+        return _repeat(first, settings.observe_history * settings.observe_history_spacing)
 
     def with_bounds(self, vehicle_bounds: Float[Array, "ranges 4"]) -> "Pursuit":
         """The same game with vehicles drawn within these bounds (R, 4)."""
@@ -444,11 +402,7 @@ class Pursuit:
         return held(self._active_after(state), drones)
 
     def follow(
-        self,
-        state: PursuitState,
-        action: Actions,
-        drones: DroneState,
-        wish: Vector | None = None,
+        self, state: PursuitState, action: Actions, drones: DroneState, wish: Vector | None = None
     ) -> tuple[Observation, PursuitState, Each, Flag, Flag, StepInfo]:
         """The game's part of a step that began at `state` with `action` and ended with
         the pursuers as `drones`.
@@ -488,18 +442,9 @@ class Pursuit:
             step=step,
         )
         info, rewards = self._outcome(old, state, active)
-        state = state.replace(
-            statistics=count(old.statistics, step, info, rewards, active)
-        )
+        state = state.replace(statistics=count(old.statistics, step, info, rewards, active))
         terminated, truncated = self._end(step)
-        return (
-            self._observe(state, seen_drones),
-            state,
-            rewards,
-            terminated,
-            truncated,
-            info,
-        )
+        return (self._observe(state, seen_drones), state, rewards, terminated, truncated, info)
 
     def _outcome(self, start, state, active):
         """What happened in a step from `start` to `state` to the slots that are
@@ -522,11 +467,7 @@ class Pursuit:
         body_z_up = rotation_axes(drones.quaternion)[1][:, 2]
         return StepInfo(
             captured=captures(
-                settings,
-                position,
-                state.evader_position,
-                state.in_sight,
-                task.capture_radius,
+                settings, position, state.evader_position, state.in_sight, task.capture_radius
             ),
             seen=state.seen,
             breaches=breaches(settings, position, pillars, pillar_active),
@@ -544,11 +485,7 @@ class Pursuit:
         """
         over = step >= self.settings.episode_length
         no_time_limit = jnp.zeros((), bool)
-        return (
-            (over, no_time_limit)
-            if self.settings.observe_time
-            else (no_time_limit, over)
-        )
+        return (over, no_time_limit) if self.settings.observe_time else (no_time_limit, over)
 
 
 def _repeat(first, number):

@@ -49,11 +49,7 @@ def thought_place(
 
 
 def nearest_hidden(
-    settings: PursuitSettings,
-    task: Task,
-    drones: DroneState,
-    active: Which | None,
-    thought: Vector,
+    settings: PursuitSettings, task: Task, drones: DroneState, active: Which | None, thought: Vector
 ) -> Vector:
     """(3,) m, where an evader can be that was thought to be at (3,) and isn't seen by N
     drones: there, if that place is hidden, or at the nearest of the places round it
@@ -86,9 +82,7 @@ def _is_seen(settings, task, drones, active, place) -> Bool[Array, " places"]:
     ahead = rotation_axes(drones.quaternion)[0]
 
     def of_one(place):
-        sees = line_of_sight(
-            settings, position, place, task.pillar_position, task.pillar_active
-        )
+        sees = line_of_sight(settings, position, place, task.pillar_position, task.pillar_active)
         if settings.limited_sight:
             sees &= within_view(settings, position, ahead, place)
         return jnp.any(sees if active is None else sees & active)

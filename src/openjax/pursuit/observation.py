@@ -10,15 +10,7 @@ from jaxtyping import Array, Float
 from openjax.pursuit.axes import rotation_axes, turned_back
 from openjax.pursuit.collisions import pillar_distance
 from openjax.pursuit.settings import HIDDEN, PursuitSettings
-from openjax.pursuit.shapes import (
-    Actions,
-    Count,
-    Flag,
-    Quaternions,
-    Team,
-    Vector,
-    Which,
-)
+from openjax.pursuit.shapes import Actions, Count, Flag, Quaternions, Team, Vector, Which
 from openjax.pursuit.state import PursuitState
 from openjax.pursuit.task import arena_of, capture_radius, evader_speed
 from openjax.pursuit.teams import of_team
@@ -123,9 +115,7 @@ def own_frame(
     return jnp.concatenate([velocity, *rotation_axes(quaternion), action], axis=-1)
 
 
-def observe(
-    settings: PursuitSettings, state: PursuitState, seen_drones: DroneState
-) -> Observation:
+def observe(settings: PursuitSettings, state: PursuitState, seen_drones: DroneState) -> Observation:
     """The observation of all N pursuers in `state`; the evader seen by one is seen by
     all.
 
@@ -143,9 +133,7 @@ def observe(
         itself.
         """
         # slices and no index: the gradient of an index is a scatter
-        return jnp.stack(
-            [jnp.concatenate([values[:i], values[i + 1 :]]) for i in range(n)]
-        )
+        return jnp.stack([jnp.concatenate([values[:i], values[i + 1 :]]) for i in range(n)])
 
     others = turn_back(position[:, None] - of_others(position))
     active = state.active
@@ -198,9 +186,7 @@ def _own_part(settings, state, seen_drones, turn_back):
     body_x, body_z = map(turn_back, rotation_axes(quaternion))
     if settings.observe_in == "heading":
         quaternion = _quaternion(body_x, body_z)
-    to_evader = jnp.where(
-        state.seen, turn_back(position - state.evader_position), HIDDEN
-    )
+    to_evader = jnp.where(state.seen, turn_back(position - state.evader_position), HIDDEN)
     parts = [to_evader, quaternion, turn_back(seen_drones.velocity), body_x, body_z]
     if settings.observe_time:
         time = state.step.astype(jnp.float32) / settings.episode_length
@@ -210,9 +196,7 @@ def _own_part(settings, state, seen_drones, turn_back):
         parts.append(turn_back(position))
     if settings.observe_game:
         speed = evader_speed(settings, state.task) / settings.max_speed
-        numbers = jnp.stack([speed, capture_radius(settings, state.task)]).astype(
-            jnp.float32
-        )
+        numbers = jnp.stack([speed, capture_radius(settings, state.task)]).astype(jnp.float32)
         parts.append(jnp.broadcast_to(numbers, (len(position), 2)))
     if settings.observe_arena:
         radius = jnp.float32(arena_of(settings, state.task).arena_radius)
@@ -269,17 +253,13 @@ def _nearest_pillars(settings, position, pillar_position, pillar_active):
     slots = pillar_position.shape[0]
     # a network has inputs for k pillars, a task may have fewer slots
     if slots < k:
-        pillar_position = jnp.concatenate(
-            [pillar_position, jnp.zeros((k - slots, 2), jnp.float32)]
-        )
+        pillar_position = jnp.concatenate([pillar_position, jnp.zeros((k - slots, 2), jnp.float32)])
         pillar_active = jnp.concatenate([pillar_active, jnp.zeros(k - slots, bool)])
     distance = pillar_distance(settings, position, pillar_position)
     distance = jnp.where(pillar_active[None], distance, jnp.inf)
     # rank by counting nearer ones: for a handful of pillars much cheaper on an
     # accelerator than a sort
-    earlier = (
-        jnp.arange(distance.shape[1])[:, None] < jnp.arange(distance.shape[1])[None]
-    )
+    earlier = jnp.arange(distance.shape[1])[:, None] < jnp.arange(distance.shape[1])[None]
     nearer = (distance[:, :, None] < distance[:, None, :]) | (
         (distance[:, :, None] == distance[:, None, :]) & earlier[None]
     )
@@ -291,9 +271,7 @@ def _nearest_pillars(settings, position, pillar_position, pillar_active):
         [
             position[:, None, :2] - axis,
             # a pillar's centre is at half of its height
-            jnp.broadcast_to(
-                position[:, None, 2:] - settings.arena_height / 2, (n, k, 1)
-            ),
+            jnp.broadcast_to(position[:, None, 2:] - settings.arena_height / 2, (n, k, 1)),
             jnp.full((n, k, 1), settings.arena_height, jnp.float32),
             jnp.full((n, k, 1), settings.pillar_radius, jnp.float32),
         ],

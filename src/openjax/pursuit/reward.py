@@ -20,16 +20,7 @@ from openjax.pursuit.axes import rotation_axes
 from openjax.pursuit.collisions import breaches, crashed
 from openjax.pursuit.info import StepInfo
 from openjax.pursuit.settings import PursuitSettings, RewardSettings
-from openjax.pursuit.shapes import (
-    Active,
-    Each,
-    Flag,
-    Pillars,
-    Scalar,
-    Team,
-    Vector,
-    Which,
-)
+from openjax.pursuit.shapes import Active, Each, Flag, Pillars, Scalar, Team, Vector, Which
 from openjax.pursuit.shortest_paths import evader_territory, path_length
 from openjax.pursuit.state import PursuitState
 from openjax.pursuit.teams import of_team
@@ -99,14 +90,12 @@ def check_terms(terms: Any) -> tuple[Term, ...]:
     """Terms that somebody hands in, as a tuple. Raises UserError for anything else."""
     if not isinstance(terms, tuple | list):
         raise UserError(
-            f"reward: {part_name(terms)} is no tuple; (Term(function, weight), ...) would "
-            "be right"
+            f"reward: {part_name(terms)} is no tuple; (Term(function, weight), ...) would be right"
         )
     for term in terms:
         if not isinstance(term, Term):
             raise UserError(
-                f"reward: {part_name(term)} is no Term; Term(function, weight) would be "
-                "right"
+                f"reward: {part_name(term)} is no Term; Term(function, weight) would be right"
             )
     return tuple(terms)
 
@@ -134,9 +123,7 @@ def total_reward(terms: tuple[Term, ...], transition: Transition) -> tuple[Each,
     nothing = jnp.zeros(transition.settings.num_pursuers, jnp.float32)
 
     def total(is_penalty):
-        values = [
-            _weigh(term, transition) for term in terms if term.penalty == is_penalty
-        ]
+        values = [_weigh(term, transition) for term in terms if term.penalty == is_penalty]
         return functools.reduce(operator.add, values) if values else nothing
 
     penalty = jnp.broadcast_to(total(True), nothing.shape)
@@ -244,9 +231,7 @@ def breach_number(transition: Transition) -> Each:
     pillars, pillar_active = transition.pillars
     breach = transition.info.breaches
     if weights.margin != 0.0:
-        breach = breaches(
-            settings, drones.position, pillars, pillar_active, weights.margin
-        )
+        breach = breaches(settings, drones.position, pillars, pillar_active, weights.margin)
     if weights.lookahead != 0.0:
         ahead = drones.position + weights.lookahead * drones.velocity
         breach_ahead = breaches(settings, ahead, pillars, pillar_active)

@@ -37,9 +37,7 @@ def _layout(name, pillars, pursuers, evader):
     def lift(xy):
         return (*xy, FLIGHT_HEIGHT)
 
-    return Scenario(
-        name, tuple(pillars), tuple(lift(xy) for xy in pursuers), lift(evader)
-    )
+    return Scenario(name, tuple(pillars), tuple(lift(xy) for xy in pursuers), lift(evader))
 
 
 # The starts of the layouts "empty" and "hidden", close together on the right.
@@ -64,27 +62,13 @@ SCENARIOS: dict[str, Scenario] = {
         ),
         _layout(
             "random",
-            (
-                (0.6, 0.4),
-                (-0.6, 0.4),
-                (-0.2, 0.4),
-                (0.0, 0.2),
-                (-0.2, -0.4),
-                (0.0, -0.2),
-            ),
+            ((0.6, 0.4), (-0.6, 0.4), (-0.2, 0.4), (0.0, 0.2), (-0.2, -0.4), (0.0, -0.2)),
             ((0.6, 0.0), (0.8, 0.0), (0.8, -0.2)),
             (-0.8, 0.0),
         ),
         _layout(
             "passage",
-            (
-                (0.0, 0.3),
-                (0.2, 0.3),
-                (-0.2, 0.3),
-                (0.0, -0.2),
-                (0.2, -0.2),
-                (-0.2, -0.2),
-            ),
+            ((0.0, 0.3), (0.2, 0.3), (-0.2, 0.3), (0.0, -0.2), (0.2, -0.2), (-0.2, -0.2)),
             ((0.6, 0.0), (0.8, 0.2), (0.8, -0.2)),
             (0.0, 0.6),
         ),
@@ -118,9 +102,7 @@ def scenario_task(settings: PursuitSettings, scenario: Scenario) -> Task:
             f"{settings.num_pursuers}"
         )
     pillars = np.zeros((slots, 2), np.float32)
-    pillars[:pillar_number] = np.asarray(scenario.pillars, np.float32).reshape(
-        pillar_number, 2
-    )
+    pillars[:pillar_number] = np.asarray(scenario.pillars, np.float32).reshape(pillar_number, 2)
     return Task(
         pursuer_position=jnp.asarray(scenario.pursuers, jnp.float32),
         evader_position=jnp.asarray(scenario.evader, jnp.float32),

@@ -88,10 +88,6 @@ def within_view(
     offset = target - position
     distance = length(offset)
     # a whole turn is everywhere, what lies exactly behind included
-    least = (
-        np.cos(np.deg2rad(settings.sight_angle) / 2)
-        if settings.sight_angle < 360.0
-        else -2.0
-    )
+    least = np.cos(np.deg2rad(settings.sight_angle) / 2) if settings.sight_angle < 360.0 else -2.0
     in_cone = jnp.sum(offset * ahead, axis=-1) >= least * distance
     return (distance <= settings.sight_range) & in_cone

@@ -305,9 +305,7 @@ class PursuitSettings:
         radius and one arena.
         """
         names = ("team_sizes", "evader_speeds", "capture_radii", "arena_radii")
-        return dataclasses.replace(
-            self, num_pursuers=number, **dict.fromkeys(names, ())
-        )
+        return dataclasses.replace(self, num_pursuers=number, **dict.fromkeys(names, ()))
 
     @property
     def strategy_steps(self) -> int:

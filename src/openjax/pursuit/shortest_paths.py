@@ -77,11 +77,7 @@ def shortest_paths(settings: PursuitSettings, task: Task) -> ShortestPaths:
 
 
 def path_length(
-    settings: PursuitSettings,
-    task: Task,
-    paths: ShortestPaths,
-    position: Team,
-    target: Vector,
+    settings: PursuitSettings, task: Task, paths: ShortestPaths, position: Team, target: Vector
 ) -> Each:
     """(N,) m, of the shortest path from each of (N, 3) positions to (3,) a target; its
     gradient points along the path.
@@ -116,11 +112,7 @@ def arena_points(settings: PursuitSettings) -> Float[Array, "points 2"]:
 
 
 def evader_territory(
-    settings: PursuitSettings,
-    task: Task,
-    paths: ShortestPaths,
-    position: Team,
-    target: Vector,
+    settings: PursuitSettings, task: Task, paths: ShortestPaths, position: Team, target: Vector
 ) -> Scalar:
     """() share of the arena that the evader at (3,) is at before any of the pursuers at
     (N, 3) has it within the capture radius: smooth, in the plane, and with the evader
@@ -142,9 +134,7 @@ def evader_territory(
     evader = jnp.sqrt(jnp.sum((points - target[:2]) ** 2, axis=-1) + 1e-12)
     first = jax.nn.sigmoid((pursuers - evader / evader_speed(settings, task)) / SMOOTH)
     to_axis = jnp.sum((points[:, None] - task.pillar_position) ** 2, axis=-1)
-    inside = jnp.any(
-        (to_axis < settings.pillar_radius**2) & task.pillar_active, axis=-1
-    )
+    inside = jnp.any((to_axis < settings.pillar_radius**2) & task.pillar_active, axis=-1)
     return jnp.mean(first, where=~inside)
 
 

@@ -85,20 +85,14 @@ class Task:
         return self.replace(pursuer_position=park(position, self.active))
 
 
-def evader_speed(
-    settings: PursuitSettings, task: Task
-) -> float | Float[Array, "*worlds"]:
+def evader_speed(settings: PursuitSettings, task: Task) -> float | Float[Array, "*worlds"]:
     """m/s, of the evader in a task."""
     return settings.evader_speed if task.evader_speed is None else task.evader_speed
 
 
-def capture_radius(
-    settings: PursuitSettings, task: Task
-) -> float | Float[Array, "*worlds"]:
+def capture_radius(settings: PursuitSettings, task: Task) -> float | Float[Array, "*worlds"]:
     """m, in a task."""
-    return (
-        settings.capture_radius if task.capture_radius is None else task.capture_radius
-    )
+    return settings.capture_radius if task.capture_radius is None else task.capture_radius
 
 
 def arena_of(settings: PursuitSettings, task: Task) -> PursuitSettings:
@@ -136,11 +130,7 @@ def task_descriptor(tasks: Task) -> Float[Array, "tasks features"]:
     pursuers = tasks.pursuer_position
     if tasks.active is not None:
         pursuers = jnp.where(tasks.active[..., None], pursuers, OUTSIDE)
-    parts = [
-        pursuers.reshape(m, -1),
-        tasks.evader_position.reshape(m, -1),
-        pillars.reshape(m, -1),
-    ]
+    parts = [pursuers.reshape(m, -1), tasks.evader_position.reshape(m, -1), pillars.reshape(m, -1)]
     numbers = (tasks.evader_speed, tasks.capture_radius, tasks.arena_radius)
     parts += [number[:, None] for number in numbers if number is not None]
     return jnp.concatenate(parts, axis=-1)
@@ -151,14 +141,9 @@ def starts_clear(settings: PursuitSettings, task: Task) -> Flag:
     () bool.
     """
     breach = breaches(
-        arena_of(settings, task),
-        task.pursuer_position,
-        task.pillar_position,
-        task.pillar_active,
+        arena_of(settings, task), task.pursuer_position, task.pillar_position, task.pillar_active
     )
-    clear_of_evader = _clear_of(
-        settings, task.pillar_position, task.evader_position[None, :2]
-    )
+    clear_of_evader = _clear_of(settings, task.pillar_position, task.evader_position[None, :2])
     is_breach = jnp.any(of_team(task.active, breach.total) > 0)
     is_over_evader = jnp.any(task.pillar_active & ~clear_of_evader)
     return ~(is_breach | is_over_evader)
@@ -201,9 +186,7 @@ def uniform_task(settings: PursuitSettings, key: PRNGKeyArray) -> Task:
     # would have no fixed length
     candidates = jax.random.uniform(position_key, (draws, n, 3), jnp.float32, low, high)
     is_apart = jax.vmap(
-        lambda p: jnp.all(
-            drone_distance(park(p, task.active)) >= settings.drone_clearance
-        )
+        lambda p: jnp.all(drone_distance(park(p, task.active)) >= settings.drone_clearance)
     )(candidates)
     # where none is good, `argmax` gives the first: such a task starts in a breach
     task = task.with_starts(candidates[jnp.argmax(is_apart)])
@@ -229,9 +212,7 @@ def _with_pillars(settings, task, number_key, cell_key):
     # free come last
     rank = jnp.where(free, jax.random.uniform(cell_key, (cells.shape[0],)), -1.0)
     slots = jax.lax.top_k(rank, settings.max_pillars)[1]
-    number = jax.random.randint(
-        number_key, (), settings.min_pillars, settings.max_pillars + 1
-    )
+    number = jax.random.randint(number_key, (), settings.min_pillars, settings.max_pillars + 1)
     # fewer than drawn where not enough cells are free
     in_use = (jnp.arange(settings.max_pillars) < number) & free[slots]
     pillars = jnp.where(in_use[:, None], cells[slots], 0.0)
@@ -248,10 +229,7 @@ def _between(ends, key, number):
 
 
 def expand_task(
-    settings: PursuitSettings,
-    key: PRNGKeyArray,
-    task: Task,
-    wall_distance: float = WALL_DISTANCE,
+    settings: PursuitSettings, key: PRNGKeyArray, task: Task, wall_distance: float = WALL_DISTANCE
 ) -> Task:
     """Move every vehicle of a task a little and keep its pillars: the paper's local
     expansion.
@@ -272,12 +250,8 @@ def expand_task(
             # who would come too near the wall is drawn back along the radius
             radius = jnp.linalg.norm(candidate[..., :2], axis=-1, keepdims=True)
             reach = radius_of_arena - wall_distance
-            xy = candidate[..., :2] * jnp.minimum(
-                1.0, reach / jnp.maximum(radius, 1e-6)
-            )
-            return jnp.concatenate(
-                [xy, _start_height(settings, candidate[..., 2:])], axis=-1
-            )
+            xy = candidate[..., :2] * jnp.minimum(1.0, reach / jnp.maximum(radius, 1e-6))
+            return jnp.concatenate([xy, _start_height(settings, candidate[..., 2:])], axis=-1)
 
         candidate = task.replace(evader_position=move(evader_key, task.evader_position))
         return candidate.with_starts(move(pursuer_key, task.pursuer_position))
@@ -305,18 +279,14 @@ def close_starts(
         before it.
         """
         kind_key, which_key, direction_key, gap_key = jax.random.split(key, 4)
-        pillar = jax.random.categorical(
-            which_key, jnp.where(task.pillar_active, 0.0, -jnp.inf)
-        )
+        pillar = jax.random.categorical(which_key, jnp.where(task.pillar_active, 0.0, -jnp.inf))
         beside = jnp.append(task.pillar_position[pillar], position[i, 2])
         by_pursuer = (jax.random.bernoulli(kind_key) | no_pillar) & (i > 0)
         # the pillar's key once more: of the two draws only one is used
         partner = jax.random.randint(which_key, (), 0, max(i, 1))
         anchor = jnp.where(by_pursuer, position[partner], beside)
         clearance = jnp.where(
-            by_pursuer,
-            settings.drone_clearance,
-            settings.pillar_radius + settings.pillar_clearance,
+            by_pursuer, settings.drone_clearance, settings.pillar_radius + settings.pillar_clearance
         )
         # normal numbers point in all directions alike
         away = jax.random.normal(direction_key, (3,))
@@ -356,9 +326,7 @@ def scatter_starts(settings: PursuitSettings, key: PRNGKeyArray, task: Task) -> 
         share, turn = jax.random.uniform(middle_key, (2, 2))
         angle = 2.0 * np.pi * turn
         xy = reach * jnp.sqrt(share) * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
-        offset = jax.random.uniform(
-            offset_key, (n, 2), minval=-NEIGHBOURS, maxval=NEIGHBOURS
-        )
+        offset = jax.random.uniform(offset_key, (n, 2), minval=-NEIGHBOURS, maxval=NEIGHBOURS)
         # one factor for all: in some tasks they start together, in others all over the
         # arena
         pursuers = xy[:, 0] + offset * jax.random.uniform(apart_key)
@@ -387,21 +355,15 @@ def _first_clear(settings, draw, key, task):
     clear = jax.vmap(lambda candidate: starts_clear(settings, candidate))(candidates)
     first = jnp.argmax(clear)
     return jax.tree.map(
-        lambda tasks, seed: jnp.where(jnp.any(clear), tasks[first], seed),
-        candidates,
-        task,
+        lambda tasks, seed: jnp.where(jnp.any(clear), tasks[first], seed), candidates, task
     )
 
 
-def shift_pillars(
-    settings: PursuitSettings, key: PRNGKeyArray, task: Task, reach: float
-) -> Task:
+def shift_pillars(settings: PursuitSettings, key: PRNGKeyArray, task: Task, reach: float) -> Task:
     """Move each pillar by up to `reach` (m) along x and y; those that would come too
     close to a start stay.
     """
-    offset = jax.random.uniform(
-        key, task.pillar_position.shape, jnp.float32, -reach, reach
-    )
+    offset = jax.random.uniform(key, task.pillar_position.shape, jnp.float32, -reach, reach)
     return _move_pillars(settings, task, task.pillar_position + offset)
 
 
@@ -416,9 +378,7 @@ def line_up_pillars(settings: PursuitSettings, key: PRNGKeyArray, task: Task) ->
     """
     scale = _arena_scale(settings, task)
     middle_key, angle_key, spacing_key = jax.random.split(key, 3)
-    middle = scale * jax.random.uniform(
-        middle_key, (2,), jnp.float32, -ROW_OFFSET, ROW_OFFSET
-    )
+    middle = scale * jax.random.uniform(middle_key, (2,), jnp.float32, -ROW_OFFSET, ROW_OFFSET)
     angle = jax.random.uniform(angle_key, (), jnp.float32, -np.pi / 4, np.pi / 4)
     spacing = scale * jax.random.uniform(spacing_key, (), jnp.float32, *ROW_SPACING)
     spacing = jnp.maximum(spacing, ROW_SPACING[0])
@@ -438,18 +398,12 @@ def _move_pillars(settings, task, position):
     """The task with those pillars moved that stay within reach of the axis and clear of
     all starts.
     """
-    vehicles = jnp.concatenate([task.pursuer_position, task.evader_position[None]])[
-        :, :2
-    ]
+    vehicles = jnp.concatenate([task.pursuer_position, task.evader_position[None]])[:, :2]
     reach = PILLAR_REACH * _arena_scale(settings, task)
     inside = jnp.linalg.norm(position, axis=-1) < reach
     # each pillar by itself: a row may have gaps
-    moves = (_clear_of(settings, position, vehicles) & inside & task.pillar_active)[
-        :, None
-    ]
-    return task.replace(
-        pillar_position=jnp.where(moves, position, task.pillar_position)
-    )
+    moves = (_clear_of(settings, position, vehicles) & inside & task.pillar_active)[:, None]
+    return task.replace(pillar_position=jnp.where(moves, position, task.pillar_position))
 
 
 def _clear_of(settings, pillars, vehicles):
@@ -457,9 +411,7 @@ def _clear_of(settings, pillars, vehicles):
     2).
     """
     distance = jnp.linalg.norm(pillars[:, None] - vehicles[None], axis=-1)
-    return jnp.all(
-        distance >= settings.pillar_radius + settings.pillar_clearance, axis=-1
-    )
+    return jnp.all(distance >= settings.pillar_radius + settings.pillar_clearance, axis=-1)
 
 
 def turn_task(key: PRNGKeyArray, task: Task) -> Task:
@@ -477,8 +429,7 @@ def turn_task(key: PRNGKeyArray, task: Task) -> Task:
         return jnp.concatenate([xy, position[..., 2:]], axis=-1)
 
     turned_task = task.replace(
-        evader_position=turn(task.evader_position),
-        pillar_position=turn(task.pillar_position),
+        evader_position=turn(task.evader_position), pillar_position=turn(task.pillar_position)
     )
     return turned_task.with_starts(turn(task.pursuer_position))
 

@@ -49,16 +49,12 @@ def draw_fall_out(
     active = jnp.ones(number, bool) if active is None else active
     whether_key, which_key, when_key = jax.random.split(key, 3)
     # an empty slot's number is below all that are drawn
-    member = jnp.argmax(
-        jnp.where(active, jax.random.uniform(which_key, (number,)), -1.0)
-    )
+    member = jnp.argmax(jnp.where(active, jax.random.uniform(which_key, (number,)), -1.0))
     low, high = settings.fall_out_seconds
     seconds = jax.random.uniform(when_key, minval=low, maxval=high)
     last = jnp.round(seconds / settings.time_step).astype(jnp.int32)
     # the last one stays, or nobody were left to learn from
-    falls = jax.random.bernoulli(whether_key, settings.fall_outs) & (
-        jnp.sum(active) > 1
-    )
+    falls = jax.random.bernoulli(whether_key, settings.fall_outs) & (jnp.sum(active) > 1)
     is_gone = falls & (jnp.arange(number) == member)
     return jnp.where(is_gone, last, settings.episode_length)
 

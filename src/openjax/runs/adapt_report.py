@@ -2,13 +2,7 @@
 
 from pathlib import Path
 
-FIGURES = (
-    "capture_rate",
-    "capture_step",
-    "collision_rate",
-    "crash_rate",
-    "over_speed_rate",
-)
+FIGURES = ("capture_rate", "capture_step", "collision_rate", "crash_rate", "over_speed_rate")
 """Of episodes, in the order in which they are told."""
 WHICH = ("nominal", "before", "after")
 """Whose: the policy's as it was, with the nominal and with the diagnosed vehicle, and
@@ -19,8 +13,7 @@ the adapted policy's with that one.
 def in_words(results: dict) -> list[str]:
     """What was found and gained."""
     effects = (
-        ", ".join(results["effects"])
-        or "no effect: the simulator is right to within the noise"
+        ", ".join(results["effects"]) or "no effect: the simulator is right to within the noise"
     )
     changes = []
     for name in FIGURES:
@@ -54,9 +47,7 @@ def page(results: dict) -> str:
         "which": WHICH,
         "picture": _picture(results),
     }
-    return fill_template(
-        "adapt.html.jinja", Path(__file__).parent, results=results, **values
-    )
+    return fill_template("adapt.html.jinja", Path(__file__).parent, results=results, **values)
 
 
 def _picture(results):
@@ -72,9 +63,7 @@ def _picture(results):
     }
     with rc_context(STYLE):
         figure = Figure(figsize=(11, 3.2), layout="constrained")
-        for axes, (name, title) in zip(
-            figure.subplots(1, len(rates)), rates.items(), strict=True
-        ):
+        for axes, (name, title) in zip(figure.subplots(1, len(rates)), rates.items(), strict=True):
             course = [row[name] for row in results["history"]]
             axes.plot(range(1, len(course) + 1), course)
             axes.set(title=title, xlabel="update", ylim=(0, None))

@@ -55,15 +55,11 @@ def check(command: AdaptCommand) -> None:
     Raises UserError.
     """
     if isinstance(load_policy(command.policy).policy, Heuristic):
-        raise UserError(
-            f"--policy {command.policy}: a heuristic has no networks that could learn"
-        )
+        raise UserError(f"--policy {command.policy}: a heuristic has no networks that could learn")
     (load_case if command.flights.is_dir() else load_effects)(command.flights)
 
 
-def adapt(
-    command: AdaptCommand, tell: Callable[[str], None] = lambda step: None
-) -> dict:
+def adapt(command: AdaptCommand, tell: Callable[[str], None] = lambda step: None) -> dict:
     """Do all of it and write it down; `tell` hears the steps. Raises UserError for
     flights that can't be diagnosed or an unusable policy.
     """
@@ -132,9 +128,7 @@ class _Programs:
         tasks = uniform_tasks(self.game, 2 * command.episodes, self.game.max_pillars)
         self._chosen_by = jax.tree.map(lambda leaf: leaf[: command.episodes], tasks)
         self._measured_on = jax.tree.map(lambda leaf: leaf[command.episodes :], tasks)
-        self._parameters = starting_parameters(
-            self.loaded.parameters, self.loaded.settings
-        )
+        self._parameters = starting_parameters(self.loaded.parameters, self.loaded.settings)
         self._nominal = bounds_of({}, {}, rest=0.0)
         self.ready = compile_programs(
             self.adaptation, self._parameters, self._chosen_by, self._nominal
@@ -145,9 +139,7 @@ class _Programs:
         ones.
         """
         key = jax.random.fold_in(self._key, number)
-        return episode_figures(
-            self.adaptation.evaluate(parameters, tasks, key, bounds).statistics
-        )
+        return episode_figures(self.adaptation.evaluate(parameters, tasks, key, bounds).statistics)
 
     def fine_tune(self, vehicle: _Diagnosed):
         """The best of the policy's updates (see
@@ -160,9 +152,7 @@ class _Programs:
             episodes = self._fly(policy, self._chosen_by, 1, vehicle.bounds)
             return look_of(episodes, usual, self.game.episode_length)
 
-        return fine_tune(
-            self.adaptation, self._parameters, vehicle.bounds, self._key, look
-        )
+        return fine_tune(self.adaptation, self._parameters, vehicle.bounds, self._key, look)
 
     def measure(self, vehicle: _Diagnosed, tuned_parameters) -> dict[str, dict]:
         """Figures (B,) of `WHICH` on tasks that no checkpoint was chosen by."""
@@ -184,9 +174,7 @@ def _results(command, vehicle, rates, tuning) -> dict:
         effect, _, key = name.partition(".")
         if effect in vehicle.values:
             value = vehicle.values[effect].get(key)
-            parameters.append(
-                {"parameter": name, "value": value, "low": low, "high": high}
-            )
+            parameters.append({"parameter": name, "value": value, "low": low, "high": high})
     return {
         "command": f"openjax adapt {command.flights} --policy {command.policy} --out {command.out}",
         "machine": describe_machine(),
@@ -218,11 +206,7 @@ def _write(command, programs, vehicle, tuning, results):
         "machine": results["machine"],
     }
     save_policy_file(
-        command.out / "policy.npz",
-        tuning.parameters,
-        settings,
-        notes,
-        storage="float32",
+        command.out / "policy.npz", tuning.parameters, settings, notes, storage="float32"
     )
     write_json(command.out / "adapt.json", results)
     write_text(command.out / "adapt.html", page(results))
@@ -241,9 +225,7 @@ def won_back(rates: dict) -> dict[str, float | None]:
         loss = rates["before"][name] - rates["nominal"][name]
         loss_left = rates["after"][name] - rates["nominal"][name]
         beyond_chance = loss.mean() > ERRORS * loss.std() / len(loss) ** 0.5
-        shares[name] = (
-            float(1.0 - loss_left.mean() / loss.mean()) if beyond_chance else None
-        )
+        shares[name] = float(1.0 - loss_left.mean() / loss.mean()) if beyond_chance else None
     return shares
 
 
@@ -261,14 +243,7 @@ def _diagnosis(command: AdaptCommand) -> Iterator[Callable[[], Path]]:
     # take turns
     shutil.rmtree(out, ignore_errors=True)
     process = subprocess.Popen(
-        [
-            sys.executable,
-            "-m",
-            "openjax.diagnose",
-            str(command.flights),
-            "--out",
-            str(out),
-        ],
+        [sys.executable, "-m", "openjax.diagnose", str(command.flights), "--out", str(out)],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
         text=True,
@@ -278,9 +253,7 @@ def _diagnosis(command: AdaptCommand) -> Iterator[Callable[[], Path]]:
     def effects():
         complaint = process.communicate()[1].strip()
         if process.returncode != 0:
-            last = (
-                complaint.splitlines()[-1] if complaint else "it ended without a word"
-            )
+            last = complaint.splitlines()[-1] if complaint else "it ended without a word"
             raise UserError(f"{name}: no diagnosis: {last.removeprefix('error: ')}")
         return out / name / "effects.toml"
 

@@ -45,9 +45,7 @@ def cases(command: BenchmarkCommand, part: str, num_envs: int) -> Iterator[Case]
         for number in command.devices:
             fitting = fitting_settings(settings, num_envs, number)
             for name, function, arguments in _training(fitting, number):
-                yield Case(
-                    name, fitting.num_envs, fitting.rollout_length, function, arguments
-                )
+                yield Case(name, fitting.num_envs, fitting.rollout_length, function, arguments)
         return
     if part == "rollout":
         function, arguments = _rollout(settings, num_envs, steps)
@@ -66,11 +64,7 @@ def _training(settings, devices):
     carry = make_start(settings)(jax.random.key(0))
     if devices > 1:
         step = make_device_step(settings, build(settings), devices)
-        yield (
-            f"training, {devices} devices",
-            step,
-            (place(carry, carry_shardings(devices)),),
-        )
+        yield (f"training, {devices} devices", step, (place(carry, carry_shardings(devices)),))
         return
     phases = training_step.make_phases(settings)
     yield "training", training_step.make_training_step(settings), (carry,)
@@ -83,9 +77,7 @@ def _training(settings, devices):
     yield "- renew", phases.renew, (carry,)
 
 
-def fitting_settings(
-    settings: TrainSettings, num_envs: int, devices: int = 1
-) -> TrainSettings:
+def fitting_settings(settings: TrainSettings, num_envs: int, devices: int = 1) -> TrainSettings:
     """The settings with the nearest number of environments from above that they and so
     many devices allow.
     """
@@ -112,12 +104,8 @@ def _physics(part, settings, num_envs, steps):
         contacts=not part.endswith("_free"),
     )
     tasks = uniform_tasks(game, num_envs, game.max_pillars)
-    drones = jax.jit(
-        jax.vmap(lambda task: hover_state(vehicle, task.pursuer_position))
-    )(tasks)
-    command = action_to_command(
-        jnp.broadcast_to(hover_action(vehicle), (game.num_pursuers, 4))
-    )
+    drones = jax.jit(jax.vmap(lambda task: hover_state(vehicle, task.pursuer_position)))(tasks)
+    command = action_to_command(jnp.broadcast_to(hover_action(vehicle), (game.num_pursuers, 4)))
     command = command.at[:, 1:].add(0.1)
 
     def run(drones, tasks):
@@ -132,13 +120,9 @@ def _physics(part, settings, num_envs, steps):
 
 def _environment(settings, num_envs, steps):
     environment = Pursuit(settings.environment)
-    state = jax.jit(jax.vmap(environment.reset))(
-        jax.random.split(jax.random.key(0), num_envs)
-    )[1]
+    state = jax.jit(jax.vmap(environment.reset))(jax.random.split(jax.random.key(0), num_envs))[1]
     key = jax.random.key(1)
-    action = 0.1 * jax.random.normal(
-        key, (num_envs, settings.environment.num_pursuers, 4)
-    )
+    action = 0.1 * jax.random.normal(key, (num_envs, settings.environment.num_pursuers, 4))
     action = jnp.tanh(action + hover_action(environment.vehicle))
 
     def run(state, action):
@@ -147,9 +131,7 @@ def _environment(settings, num_envs, steps):
                 key, state, action
             )
             # Observation and reward are used, else the compiler would leave them out.
-            total = sum(
-                jnp.sum(leaf) for leaf in jax.tree.leaves(observation)
-            ) + jnp.sum(reward)
+            total = sum(jnp.sum(leaf) for leaf in jax.tree.leaves(observation)) + jnp.sum(reward)
             return state, total
 
         return jax.lax.scan(one, state, None, length=steps)
@@ -166,16 +148,9 @@ def _rollout(settings, num_envs, steps):
     parameters = jax.jit(parts.policy.init)(jax.random.key(1), first)
 
     def run(parameters, observation, state, key):
-        shape = (
-            steps,
-            num_envs,
-            settings.environment.num_pursuers,
-            parts.policy.sample_size,
-        )
+        shape = (steps, num_envs, settings.environment.num_pursuers, parts.policy.sample_size)
         players = Players(environment, parts.policy, parameters)
-        return collect(
-            players, (observation, state), Noise(jax.random.normal(key, shape))
-        )
+        return collect(players, (observation, state), Noise(jax.random.normal(key, shape)))
 
     return run, (parameters, observation, state, jax.random.key(2))
 
@@ -225,9 +200,7 @@ def time_compiled(case: Case, min_seconds: float) -> Timing:
         if "RESOURCE_EXHAUSTED" not in str(error):
             raise
         return Timing(compile_seconds, None, None, 0, memory)
-    return Timing(
-        compile_seconds, float(np.median(times)), max(times), len(times), memory
-    )
+    return Timing(compile_seconds, float(np.median(times)), max(times), len(times), memory)
 
 
 def _memory(executable):

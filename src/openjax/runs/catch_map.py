@@ -92,9 +92,7 @@ def map_game(command: MapCommand, game: PursuitSettings) -> PursuitSettings:
     )
 
 
-def draw_task(
-    game: PursuitSettings, command: MapCommand, key: jax.Array, cell: jax.Array
-) -> Task:
+def draw_task(game: PursuitSettings, command: MapCommand, key: jax.Array, cell: jax.Array) -> Task:
     """A uniform task in a cell (3,), without pillars where these are left away. Tasks
     of one key differ in nothing else.
     """
@@ -105,9 +103,7 @@ def draw_task(
         active = jnp.arange(game.num_pursuers) < number
     if command.scenario == "empty":
         task = task.replace(pillar_active=jnp.zeros_like(task.pillar_active))
-    task = task.replace(
-        active=active, evader_speed=ratio * game.max_speed, capture_radius=radius
-    )
+    task = task.replace(active=active, evader_speed=ratio * game.max_speed, capture_radius=radius)
     return task.with_starts(task.pursuer_position)
 
 
@@ -247,15 +243,11 @@ class _Flyer:
             key = jax.random.fold_in(first, 1 + start)
             statistics = fly(flight.networks, keys[episode], values, key)
             parts.append(jax.tree.map(np.asarray, statistics))
-            self.tell(
-                f"{flight.name}: {min(start + batch, number)} of {number} episodes"
-            )
+            self.tell(f"{flight.name}: {min(start + batch, number)} of {number} episodes")
         results = jax.tree.map(lambda *leaves: np.concatenate(leaves)[:number], *parts)
         starts = range(0, number, episodes)
         return [
-            jax.tree.map(
-                lambda leaf, start=start: leaf[start : start + episodes], results
-            )
+            jax.tree.map(lambda leaf, start=start: leaf[start : start + episodes], results)
             for start in starts
         ]
 
@@ -268,9 +260,7 @@ def _of_least_caught(statistics):
     return jax.tree.map(lambda leaf: leaf[np.arange(len(least)), least], statistics)
 
 
-def cell_record(
-    game: PursuitSettings, cell: Cell, statistics: EpisodeStatistics
-) -> dict:
+def cell_record(game: PursuitSettings, cell: Cell, statistics: EpisodeStatistics) -> dict:
     """A cell's figures with scripted evaders, and the speed ratios below which a
     theorem forces a capture for points (`openjax.baselines.stack`): all on one ray, and
     as the game in a plane has it.
@@ -292,9 +282,7 @@ def figures(game: PursuitSettings, statistics: EpisodeStatistics) -> dict:
     """
     is_caught = statistics.captured
     seconds = (
-        statistics.capture_step[is_caught].mean() * game.time_step
-        if is_caught.any()
-        else None
+        statistics.capture_step[is_caught].mean() * game.time_step if is_caught.any() else None
     )
     return {
         "episodes": len(is_caught),

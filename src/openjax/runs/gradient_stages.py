@@ -32,9 +32,7 @@ TOGETHER = 100
 """Updates of the first stage in one call: some seconds on a CPU."""
 
 
-def compile_last_stage(
-    settings: TrainSettings, environment: Pursuit, policy: Any
-) -> Callable:
+def compile_last_stage(settings: TrainSettings, environment: Pursuit, policy: Any) -> Callable:
     """The stage after MAPPO, compiled for parameters of these shapes; see
     `compile_stage`.
     """
@@ -43,17 +41,11 @@ def compile_last_stage(
         stage = AnalyticGradient(settings.analytic, free_flight(environment), exact)
     else:
         # networks that learned with the policy aren't in its file
-        names = tuple(
-            name for name in environment.settings.evaders if name != "learned"
-        )
-        game_settings = dataclasses.replace(
-            environment.settings, evaders=names or ("field",)
-        )
+        names = tuple(name for name in environment.settings.evaders if name != "learned")
+        game_settings = dataclasses.replace(environment.settings, evaders=names or ("field",))
         game = free_flight(dataclasses.replace(environment, settings=game_settings))
         usual = AnalyticGradient(settings.analytic, game, exact)
-        stage = WorstPlans(
-            settings.worst_plans, planning_game(game), usual, settings.generator
-        )
+        stage = WorstPlans(settings.worst_plans, planning_game(game), usual, settings.generator)
     return compile_stage(stage, abstract_like(policy))
 
 
@@ -71,9 +63,7 @@ def compile_first_flights(
     say: Callable[[str], None],
     over: Callable[[], bool],
     keep: Callable | None = None,
-) -> tuple[
-    Callable[[], Any], Callable[[PolicyParameters, jax.Array], PolicyParameters | None]
-]:
+) -> tuple[Callable[[], Any], Callable[[PolicyParameters, jax.Array], PolicyParameters | None]]:
     """Start to compile the stage before MAPPO for parameters of these shapes, in the
     background.
 
@@ -134,12 +124,7 @@ def _compiling(flights, policy, devices, at, keep):
     policy, key, updates_done = abstract_like((policy, key, updates_done), at)
     carry = abstract_like(jax.eval_shape(begin, policy, key), shardings)
     if keep is not None and devices == 1:
-        some = keep(
-            "first_flights",
-            jax.jit(some),
-            lambda: (carry, key, updates_done),
-            carry=carry,
-        )
+        some = keep("first_flights", jax.jit(some), lambda: (carry, key, updates_done), carry=carry)
     options = compiler_options(devices, brief=True)
     some = jax.jit(some, donate_argnums=0, compiler_options=options)
     lowered_some = some.lower(carry, key, updates_done)
@@ -152,12 +137,8 @@ def _number_of_devices(policy, worlds):
     """How many devices share worlds whose policy lies on some of this process; 1 where
     they can't.
     """
-    places = {getattr(leaf, "sharding", None) for leaf in jax.tree.leaves(policy)} - {
-        None
-    }
-    number = max(
-        (len(at.device_set) for at in places if at.is_fully_addressable), default=1
-    )
+    places = {getattr(leaf, "sharding", None) for leaf in jax.tree.leaves(policy)} - {None}
+    number = max((len(at.device_set) for at in places if at.is_fully_addressable), default=1)
     return number if worlds % number == 0 else 1
 
 

@@ -40,11 +40,7 @@ class OwnParts:
         """What they are: a run that was begun with them goes on with the same ones
         only.
         """
-        parts = [
-            field.name
-            for field in dataclasses.fields(self)
-            if getattr(self, field.name)
-        ]
+        parts = [field.name for field in dataclasses.fields(self) if getattr(self, field.name)]
         return parts + [f"learner {name}" for name in self.learners or ()]
 
 
@@ -78,9 +74,7 @@ class TrainingJob:
     @functools.cached_property
     def parts(self) -> Parts:
         """Environment, policy and learners."""
-        return build(
-            self.settings, self.environment, self.own.policy, self.own.learners
-        )
+        return build(self.settings, self.environment, self.own.policy, self.own.learners)
 
     @property
     def made_from(self) -> str:
@@ -93,9 +87,7 @@ class TrainingJob:
         leaves = jax.tree.leaves((game.vehicle, game.effect_parameters))
         arrays = [np.asarray(leaf).tolist() for leaf in leaves]
         names = str(jax.tree.structure(game.effect_parameters))
-        return repr(
-            (self.devices, settings, game.settings, game.effects, names, arrays)
-        )
+        return repr((self.devices, settings, game.settings, game.effects, names, arrays))
 
     @property
     def keep(self) -> Callable | None:
@@ -103,13 +95,7 @@ class TrainingJob:
         functions of one's own are in them, whose text nobody knows.
         """
         game = self.environment
-        if (
-            self.traced is None
-            or self.own.names
-            or game.evaders
-            or game.reward
-            or game.observer
-        ):
+        if self.traced is None or self.own.names or game.evaders or game.reward or game.observer:
             return None
         return functools.partial(recall, made_from=self.made_from, folder=self.traced)
 
@@ -131,9 +117,7 @@ class TrainingJob:
             other = load_policy(self.compare_with)
             other.in_game(game_for(self.environment, other))
         if self.own.policy is not None:
-            stages = (
-                self.settings.first_flights.updates or self.settings.analytic.updates
-            )
+            stages = self.settings.first_flights.updates or self.settings.analytic.updates
             if stages:
                 raise UserError(
                     "first_flights.updates and analytic.updates must be 0 for a policy of one's "
@@ -148,9 +132,7 @@ def start_parameters(job: TrainingJob, fresh: PolicyParameters) -> PolicyParamet
     # of a team that draws, the first one learns on: members learn by themselves
     start_policy = member(load_policy(job.start_from), 0)
     if isinstance(start_policy.policy, Heuristic):
-        raise UserError(
-            f"--start_from {job.start_from}: a heuristic has no networks to start from"
-        )
+        raise UserError(f"--start_from {job.start_from}: a heuristic has no networks to start from")
     settings = start_policy.settings
     axes = job.settings.environment.observe_in
     policy_axes = settings.environment.observe_in
@@ -161,15 +143,10 @@ def start_parameters(job: TrainingJob, fresh: PolicyParameters) -> PolicyParamet
             "(--environment.observe_in)"
         )
     old = with_longer_history(
-        start_policy.parameters,
-        settings.predictor,
-        settings.environment,
-        job.settings.environment,
+        start_policy.parameters, settings.predictor, settings.environment, job.settings.environment
     )
     leaves = named_leaves(old.replace(critic={}))
-    leaves_filled = fill(
-        fresh.replace(critic={}), leaves, f"--start_from {job.start_from}"
-    )
+    leaves_filled = fill(fresh.replace(critic={}), leaves, f"--start_from {job.start_from}")
     # a critic may see other numbers in another game; it is learnt anew sooner than an
     # actor
     fits = jax.tree.map(jnp.shape, old.critic) == jax.tree.map(jnp.shape, fresh.critic)

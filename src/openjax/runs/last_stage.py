@@ -25,9 +25,7 @@ distances in a third of a hundredth more of the steps, which is half of this.
 
 def keep_best(
     directory: RunDirectory,
-    learn: Callable[
-        [PolicyParameters, jax.Array], Iterator[tuple[PolicyParameters, dict]]
-    ],
+    learn: Callable[[PolicyParameters, jax.Array], Iterator[tuple[PolicyParameters, dict]]],
     validate: Callable[[PolicyParameters], dict],
     job: TrainingJob,
     over: Callable[[], bool],
@@ -68,27 +66,17 @@ def keep_best(
         scores.append(selection_score(looks[-1], length))
         if _is_better(settings, scores, best):
             best = len(looks) - 1
-            better = {
-                "far_validation_score": scores[best],
-                "analytic_updates": len(history),
-            }
+            better = {"far_validation_score": scores[best], "analytic_updates": len(history)}
             # at once: a stage that is ended early leaves the best of what it was
             save_policy_file(
-                directory.policy,
-                parameters,
-                settings,
-                {**notes, **better},
-                storage="float32",
+                directory.policy, parameters, settings, {**notes, **better}, storage="float32"
             )
     facts = {
         "seconds": round(time.monotonic() - began, 1),
         "kept": looks[best]["update"],
         "validation_scores": scores,
     }
-    write_json(
-        directory.path / "analytic.json",
-        {**facts, "validation": looks, "history": history},
-    )
+    write_json(directory.path / "analytic.json", {**facts, "validation": looks, "history": history})
     return _in_words(facts, len(history), scores[best])
 
 
@@ -102,9 +90,7 @@ def _in_words(facts, updates, score):
     is kept.
     """
     scores = facts["validation_scores"]
-    course = (
-        f"{scores[0]:.4f} -> {score:.4f} after {facts['kept']} of {updates} updates"
-    )
+    course = f"{scores[0]:.4f} -> {score:.4f} after {facts['kept']} of {updates} updates"
     if not facts["kept"]:
         most = max(scores[1:], default=scores[0])
         course = f"{scores[0]:.4f}, at most {most:.4f} after it, not kept"

@@ -143,16 +143,9 @@ class Loop:
         self._started = self._saved_at = time.monotonic()
         best = self.checkpoints.best()
         self._best_score = best.score if best else -float("inf")
-        overlap = (
-            jax.devices()[0].platform != "cpu" if plan.overlap is None else plan.overlap
-        )
+        overlap = jax.devices()[0].platform != "cpu" if plan.overlap is None else plan.overlap
         reason, _ = self._decide()
-        if (
-            plan.validate_start
-            and self.evaluate is not None
-            and update == 0
-            and reason is None
-        ):
+        if plan.validate_start and self.evaluate is not None and update == 0 and reason is None:
             self._save(0, carry, validate=True)
         if reason is None:
             self.progress.phase("compiling the training step", announce=False)
@@ -193,20 +186,11 @@ class Loop:
         """
         update = results.number
         has_nan = np.asarray(results.broken)
-        values = {
-            name: float(value)
-            for name, value in jax.device_get(results.metrics).items()
-        }
+        values = {name: float(value) for name, value in jax.device_get(results.metrics).items()}
         self._log("train", update, values)
         if has_nan.any():
-            leaves = [
-                name
-                for name, bad in zip(float_leaves(carry), has_nan, strict=True)
-                if bad
-            ]
-            raise self._leave_broken_state(
-                carry, update_reached, update, leaves, values
-            )
+            leaves = [name for name, bad in zip(float_leaves(carry), has_nan, strict=True) if bad]
+            raise self._leave_broken_state(carry, update_reached, update, leaves, values)
         self.progress.phase("training", announce=update == self.first_update + 1)
         self.progress.update(update * self.plan.steps_per_update, values)
 
@@ -214,9 +198,7 @@ class Loop:
         """Why to stop, and whether a checkpoint is late: a signal to any process
         counts, and the first one's clock.
         """
-        checkpoint_due = (
-            time.monotonic() - self._saved_at > self.plan.checkpoint_seconds
-        )
+        checkpoint_due = time.monotonic() - self._saved_at > self.plan.checkpoint_seconds
         decision = self.everyone(
             [self.stop.name, self._seconds() >= self.plan.time_limit, checkpoint_due]
         )
@@ -247,8 +229,7 @@ class Loop:
         save_state(place / f"{update_reached:09d}", carry, {"update": update_reached})
         # JSON has no NaN
         metrics = {
-            name: value if np.isfinite(value) else str(value)
-            for name, value in values.items()
+            name: value if np.isfinite(value) else str(value) for name, value in values.items()
         }
         report = {
             "update": update,
@@ -265,6 +246,4 @@ class Loop:
         names = ", ".join(leaves[:3])
         if len(leaves) > 3:
             names += f" and {len(leaves) - 3} more"
-        return NotFiniteError(
-            f"NaN in update {update} in {names}; the state is in {place}, {good}"
-        )
+        return NotFiniteError(f"NaN in update {update} in {names}; the state is in {place}, {good}")

@@ -21,9 +21,7 @@ def describe_machine() -> dict:
     devices = jax.devices()
     return {
         # of a CPU, JAX's kind is "cpu", which tells no two apart
-        "device": devices[0].device_kind
-        if devices[0].platform != "cpu"
-        else _processor(),
+        "device": devices[0].device_kind if devices[0].platform != "cpu" else _processor(),
         "platform": devices[0].platform,
         "device_count": len(devices),
         "processes": jax.process_count(),
@@ -31,8 +29,7 @@ def describe_machine() -> dict:
         if hasattr(os, "sched_getaffinity")
         else os.cpu_count(),
         "python": platform.python_version(),
-        "versions": {"openjax": openjax.__version__}
-        | {name: version(name) for name in _PACKAGES},
+        "versions": {"openjax": openjax.__version__} | {name: version(name) for name in _PACKAGES},
         **commit(),
         "date": datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
     }
@@ -47,10 +44,7 @@ def commit() -> dict:
     revision = _git(source, "rev-parse", "HEAD")
     # installed from a wheel, the files may lie inside another repository, whose commit
     # says nothing
-    if (
-        revision is None
-        or _git(source, "ls-files", "--error-unmatch", str(this_file)) is None
-    ):
+    if revision is None or _git(source, "ls-files", "--error-unmatch", str(this_file)) is None:
         return {"commit": None, "commit_clean": None}
     changes = _git(source, "status", "--porcelain", "--", str(source))
     return {"commit": revision, "commit_clean": changes == ""}

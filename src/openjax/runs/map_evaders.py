@@ -57,10 +57,7 @@ class MapEvaders:
         """The game with an evader that is told where to fly; its own rule is the
         cheapest one.
         """
-        return Duel(
-            Pursuit(dataclasses.replace(self.game, evaders=("field",))),
-            self.loaded.policy,
-        )
+        return Duel(Pursuit(dataclasses.replace(self.game, evaders=("field",))), self.loaded.policy)
 
     @property
     def response(self) -> BestResponse:
@@ -71,12 +68,8 @@ class MapEvaders:
         def draw_task(key):
             keys = jax.random.split(key, 4)
             cell = [jax.random.choice(keys[0], sizes)]
-            for key, values in zip(
-                keys[1:3], (command.speed_ratios, command.radii), strict=True
-            ):
-                cell.append(
-                    jax.random.uniform(key, (), minval=min(values), maxval=max(values))
-                )
+            for key, values in zip(keys[1:3], (command.speed_ratios, command.radii), strict=True):
+                cell.append(jax.random.uniform(key, (), minval=min(values), maxval=max(values)))
             return self.draw(keys[3], jnp.stack(cell))
 
         return BestResponse(command.learning, self.duel, draw_task)
@@ -85,9 +78,7 @@ class MapEvaders:
     def scripted(self) -> Flight:
         """Scripted ones, which know nothing of the team."""
         command = self.command
-        evaluate = make_evaluate(
-            Pursuit(self.game), self.loaded.policy, messages=command.messages
-        )
+        evaluate = make_evaluate(Pursuit(self.game), self.loaded.policy, messages=command.messages)
 
         def fly(parameters, tasks, key):
             return evaluate(parameters, tasks, key).statistics
@@ -135,9 +126,7 @@ class MapEvaders:
         episodes = min(command.planner_episodes, command.episodes)
         # wider than others, as nothing but the ends of its plans is kept
         width = -(-command.planning.plans // 4)
-        return Flight(
-            "an evader that plans", fly, episodes, self.loaded.parameters, width
-        )
+        return Flight("an evader that plans", fly, episodes, self.loaded.parameters, width)
 
     def evaders(self, tell: Callable[[str], None]) -> tuple[Evaders, list[dict]]:
         """Those of the command's file, or new ones, and what was told while they
@@ -154,17 +143,9 @@ class MapEvaders:
 
     def save(self, path: Path, evaders: Evaders, curve: list[dict]) -> None:
         """Write those that learned, for `load`."""
-        notes = {
-            "policy": self.loaded.source,
-            "scenario": self.command.scenario,
-            "curve": curve,
-        }
-        content = {
-            "map_evaders": {"actor": evaders.actor, "world_axes": evaders.world_axes}
-        }
-        save_policy_file(
-            path, content, {"environment": self.game}, notes, storage="float32"
-        )
+        notes = {"policy": self.loaded.source, "scenario": self.command.scenario, "curve": curve}
+        content = {"map_evaders": {"actor": evaders.actor, "world_axes": evaders.world_axes}}
+        save_policy_file(path, content, {"environment": self.game}, notes, storage="float32")
 
     def load(self, path: Path) -> tuple[Evaders, list[dict]]:
         """What `save` wrote; they can fly, not learn on.
@@ -176,9 +157,7 @@ class MapEvaders:
             raise UserError(
                 f"--learned {path}: no such file; openjax map writes one by --evaders_out"
             )
-        leaves, _, notes = load_policy_file(
-            path, "file of a map's evaders", "openjax map"
-        )
+        leaves, _, notes = load_policy_file(path, "file of a map's evaders", "openjax map")
         if "map_evaders/world_axes" not in leaves:
             raise UserError(
                 f"--learned {path}: holds no evaders of a map; openjax map writes one by "
@@ -189,9 +168,7 @@ class MapEvaders:
         response = dataclasses.replace(self.response, settings=settings)
         # how many learned the file says, whatever the command does
         kinds = jax.eval_shape(response.start, jax.random.key(0)).evaders
-        abstract = {
-            "map_evaders": {"actor": kinds.actor, "world_axes": kinds.world_axes}
-        }
+        abstract = {"map_evaders": {"actor": kinds.actor, "world_axes": kinds.world_axes}}
         content = fill(abstract, leaves, str(path))["map_evaders"]
         evaders = jax.tree.map(lambda kind: jnp.zeros(kind.shape, kind.dtype), kinds)
         return evaders.replace(**content), notes.get("curve", [])

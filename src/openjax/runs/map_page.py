@@ -9,14 +9,7 @@ from openjax.runs.catch_map import cells_against
 from openjax.show.pages import fill_template
 
 SHOWN = (
-    *(
-        "num_pursuers",
-        "speed_ratio",
-        "capture_radius",
-        "episodes",
-        "capture_rate",
-        "interval",
-    ),
+    *("num_pursuers", "speed_ratio", "capture_radius", "episodes", "capture_rate", "interval"),
     *("capture_seconds", "crash_rate", "forced_below", "planar_below", "planner"),
 )
 """What a page has of a cell."""

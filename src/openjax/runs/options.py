@@ -91,9 +91,9 @@ class TrainCommand:
     """Policy (a name, a file, a run) that the final table and the animation show beside
     the trained one, or none; by default open after the preset quick.
     """
-    settings: Annotated[
-        tyro.conf.FlagConversionOff[TrainSettings], tyro.conf.arg(name="")
-    ] = dataclasses.field(default_factory=TrainSettings)
+    settings: Annotated[tyro.conf.FlagConversionOff[TrainSettings], tyro.conf.arg(name="")] = (
+        dataclasses.field(default_factory=TrainSettings)
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -131,8 +131,8 @@ class ExploitCommand:
     planner: tyro.conf.FlagConversionOff[bool] = True
     """Fly an evader that plans in the true simulation, too."""
     planning: PlannerSettings = dataclasses.field(default_factory=PlannerSettings)
-    learning: Annotated[BestResponseSettings, tyro.conf.arg(name="")] = (
-        dataclasses.field(default_factory=BestResponseSettings)
+    learning: Annotated[BestResponseSettings, tyro.conf.arg(name="")] = dataclasses.field(
+        default_factory=BestResponseSettings
     )
     environment: tyro.conf.FlagConversionOff[PursuitSettings] = dataclasses.field(
         default_factory=PursuitSettings
@@ -167,9 +167,7 @@ class MapCommand:
     """Capture radii (m)."""
     scenario: Literal["empty", "uniform"] = "empty"
     """Uniform tasks, with their pillars or without."""
-    arena_radius: Annotated[float, Interval("[0.1, 100]")] = (
-        PursuitSettings.arena_radius
-    )
+    arena_radius: Annotated[float, Interval("[0.1, 100]")] = PursuitSettings.arena_radius
     """Radius of the arena (m)."""
     evaders: tuple[str, ...] = HELD_OUT
     """One of them is drawn for each episode; by default those that no preset trains
@@ -246,9 +244,7 @@ class AdaptCommand:
     training: AdaptSettings = dataclasses.field(default_factory=AdaptSettings)
 
 
-Part = Literal[
-    "rigid_free", "rigid", "mjx_free", "mjx", "environment", "rollout", "training"
-]
+Part = Literal["rigid_free", "rigid", "mjx_free", "mjx", "environment", "rollout", "training"]
 PARTS = get_args(Part)
 
 
@@ -280,6 +276,6 @@ class BenchmarkCommand:
     """Shortest time to measure each."""
     json: Path = Path("benchmark.json")
     """File of the results."""
-    settings: Annotated[
-        tyro.conf.FlagConversionOff[TrainSettings], tyro.conf.arg(name="")
-    ] = dataclasses.field(default_factory=TrainSettings)
+    settings: Annotated[tyro.conf.FlagConversionOff[TrainSettings], tyro.conf.arg(name="")] = (
+        dataclasses.field(default_factory=TrainSettings)
+    )

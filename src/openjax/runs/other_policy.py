@@ -26,14 +26,10 @@ def game_for(environment: Pursuit, policy: LoadedPolicy) -> Pursuit:
         time_step=game.time_step,
         substeps=game.substeps,
         # as many seconds, in steps of its own
-        episode_length=round(
-            settings.episode_length * settings.time_step / game.time_step
-        ),
+        episode_length=round(settings.episode_length * settings.time_step / game.time_step),
         max_pillars=layout_slots(settings),
     )
-    return dataclasses.replace(
-        environment, settings=settings, dynamics=None, observer=None
-    )
+    return dataclasses.replace(environment, settings=settings, dynamics=None, observer=None)
 
 
 def compare(
@@ -63,11 +59,7 @@ def compare(
     game = game_for(environment, policy)
     settings = game.settings
     policy = policy.in_game(game)
-    tasks = {
-        "validation": uniform_tasks(
-            environment.settings, validation, settings.max_pillars
-        )
-    }
+    tasks = {"validation": uniform_tasks(environment.settings, validation, settings.max_pillars)}
     tasks |= layout_tasks(settings, scenarios, episodes)
     # all in one batch, which is flown once
     evaluator = Evaluator(game, policy.policy, validation + episodes * len(scenarios))

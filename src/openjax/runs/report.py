@@ -39,10 +39,7 @@ def report(
     layouts = layouts_like(settings.environment)
     abstract = jax.eval_shape(lambda: outcome.carry.policy)
     rows = {}
-    for moment, path in (
-        ("before", directory.start_policy),
-        ("after", directory.policy),
-    ):
+    for moment, path in (("before", directory.start_policy), ("after", directory.policy)):
         progress.phase(f"evaluating the policy {moment} training on the layouts")
         parameters = fill(abstract, load_policy_file(path)[0], str(path))
         kinds, pictures = _fly(validation, parameters, layouts, job.layout_episodes)
@@ -62,11 +59,7 @@ def report(
     _draw(directory, flights, other_flights)
     progress.phase("done", announce=False)
     return before_after_table(
-        rows["before"],
-        rows["after"],
-        settings.environment.time_step,
-        job.compare_with,
-        other_rows,
+        rows["before"], rows["after"], settings.environment.time_step, job.compare_with, other_rows
     )
 
 
@@ -95,9 +88,7 @@ def _fly(validation, parameters, layouts, episodes):
     kinds_flown = validation(parameters)
     if not layouts:
         number = min(3, validation.number)
-        return kinds_flown, [
-            (kinds_flown[0], i, f"validation task {i + 1}") for i in range(number)
-        ]
+        return kinds_flown, [(kinds_flown[0], i, f"validation task {i + 1}") for i in range(number)]
     evaluator = validation.evaluator
     tasks = layout_tasks(evaluator.settings, layouts, episodes)
     kinds = evaluator.fly(parameters, tasks, jax.random.key(0))
@@ -116,14 +107,10 @@ def _draw(directory, flights, other_flights):
     captures = [flight for flight in flights if flight.capture_index is not None]
     best_flight = (captures or flights)[0]
     beside = [
-        flight
-        for flight in other_flights
-        if flight.title.startswith(f"{best_flight.title}, ")
+        flight for flight in other_flights if flight.title.startswith(f"{best_flight.title}, ")
     ]
     if beside:
-        best_flight = dataclasses.replace(
-            best_flight, title=f"{best_flight.title}, this run"
-        )
+        best_flight = dataclasses.replace(best_flight, title=f"{best_flight.title}, this run")
     animate(directory.path / "chase.gif", [best_flight, *beside])
 
 
@@ -155,9 +142,7 @@ def before_after_table(
         del columns[2]
         last.append(f"policy {other}:\nrate, seconds, crash")
     heads = ["", *(head for head, *_ in columns), *last]
-    table = numbers_table(
-        "Before and after training, in the game that was trained", heads
-    )
+    table = numbers_table("Before and after training, in the game that was trained", heads)
     by_scenario = {row["scenario"]: row for row in other_rows}
 
     def numbers(row):

@@ -27,13 +27,7 @@ from openjax.store.checkpoints import Checkpoints
 from openjax.store.compiled_programs import cache_programs
 from openjax.store.environments import is_evader_file, make_environment
 from openjax.store.policies import known_policies
-from openjax.store.run_directory import (
-    RunDirectory,
-    check_free,
-    create_run,
-    lock_run,
-    open_run,
-)
+from openjax.store.run_directory import RunDirectory, check_free, create_run, lock_run, open_run
 from openjax.vehicle.vehicle_file import copy_vehicle_file, load_vehicle_file
 
 
@@ -182,11 +176,7 @@ def prepare(
         own=parts,
     )
     job.check()
-    return (
-        job,
-        directory,
-        {name: path for name, path in files.items() if path is not None},
-    )
+    return (job, directory, {name: path for name, path in files.items() if path is not None})
 
 
 def _has_begun(run):
@@ -232,10 +222,7 @@ def _files(command, old_run):
         "evader.npz": command.opponent,
     }
     # an option goes before what a resumed run has kept
-    return {
-        name: path or (old_run and old_run.optional(name))
-        for name, path in options.items()
-    }
+    return {name: path or (old_run and old_run.optional(name)) for name, path in options.items()}
 
 
 def _check_parts(parts, files, facts):
@@ -243,9 +230,7 @@ def _check_parts(parts, files, facts):
     that is resumed, whose facts these are.
     """
     if parts.environment is not None and any(files.values()):
-        raise UserError(
-            "an environment of one's own has its vehicle, effects and evader already"
-        )
+        raise UserError("an environment of one's own has its vehicle, effects and evader already")
     # a new run may have any; one that is resumed and says nothing had none
     first = facts.get("own_parts", []) if facts else parts.names
     if first != parts.names:
@@ -268,9 +253,7 @@ def _free_directory(command, processes):
 def _layout_episodes(environment):
     """How often each layout is flown where nobody says."""
     settings = environment.settings
-    differ = (
-        settings.start_attitude == "drawn" or settings.vehicles or environment.effects
-    )
+    differ = settings.start_attitude == "drawn" or settings.vehicles or environment.effects
     if not differ:  # one episode says all
         return 1
     return 32 if jax.default_backend() == "cpu" else 100
@@ -279,27 +262,18 @@ def _layout_episodes(environment):
 def _comparison(command, facts):
     """The policy to compare with; None for none."""
     if command.compare_with is not None:
-        return (
-            None if command.compare_with == "none" else _lasting(command.compare_with)
-        )
+        return None if command.compare_with == "none" else _lasting(command.compare_with)
     if command.resume is not None:
         return facts.get("compare_with")
     # beside a run of minutes, a policy of hours shows what more time is worth
-    fits = (
-        command.settings.environment.num_pursuers
-        == TrainSettings().environment.num_pursuers
-    )
+    fits = command.settings.environment.num_pursuers == TrainSettings().environment.num_pursuers
     return "open" if fits and (command.preset or default_preset()) == "quick" else None
 
 
 def _lasting(start_from):
     """The name of a policy, or a path that also holds in other folders."""
     # what isn't there is left as it was typed, and the error that follows names it so
-    if (
-        start_from is None
-        or start_from in known_policies()
-        or not Path(start_from).exists()
-    ):
+    if start_from is None or start_from in known_policies() or not Path(start_from).exists():
         return start_from
     return str(Path(start_from).absolute())
 

@@ -23,11 +23,7 @@ from openjax.evaluation.validation import Validation, flat_metrics, selection_sc
 from openjax.interruption import StopRequest
 from openjax.learning import TrainSettings, make_start
 from openjax.learning.train_state import policy_leaf
-from openjax.runs.gradient_stages import (
-    compile_first_flights,
-    compile_last_stage,
-    first_flights,
-)
+from openjax.runs.gradient_stages import compile_first_flights, compile_last_stage, first_flights
 from openjax.runs.job import TrainingJob, start_parameters
 from openjax.runs.last_stage import keep_best
 from openjax.runs.loop import Loop, NotFiniteError, Outcome, Plan, guarded
@@ -61,9 +57,7 @@ def run_job(job: TrainingJob, directory: RunDirectory, console: Console) -> int:
     title = f"openjax.train → {directory.path}"
     with contextlib.ExitStack() as stack:
         stop = stack.enter_context(StopRequest())
-        progress = stack.enter_context(
-            Progress(title, job.settings.total_steps, console)
-        )
+        progress = stack.enter_context(Progress(title, job.settings.total_steps, console))
         run = _Run(job, directory, stop, progress)
         stack.enter_context(interruption.clean_up(run.checkpoints.abandon))
         stack.enter_context(interruption.last_words(run.last_words))
@@ -76,10 +70,7 @@ def run_job(job: TrainingJob, directory: RunDirectory, console: Console) -> int:
     if table is not None:
         console.print(table)
         for line in closing_words(
-            job.settings,
-            directory.path,
-            jax.default_backend() == "cpu",
-            job.own.policy is not None,
+            job.settings, directory.path, jax.default_backend() == "cpu", job.own.policy is not None
         ):
             console.print(line, soft_wrap=True)
         console.print(
@@ -95,11 +86,7 @@ class _Run:
     """
 
     def __init__(
-        self,
-        job: TrainingJob,
-        directory: RunDirectory,
-        stop: StopRequest,
-        progress: Progress,
+        self, job: TrainingJob, directory: RunDirectory, stop: StopRequest, progress: Progress
     ):
         self.job = job
         self.directory = directory
@@ -123,9 +110,7 @@ class _Run:
         self.first_flights = None
         self.validation = None
         self.last_stage = None
-        self.processes.advice = (
-            f"go on with openjax train --resume {directory.path} --devices all"
-        )
+        self.processes.advice = f"go on with openjax train --resume {directory.path} --devices all"
 
     def train(self) -> Outcome | None:
         """Compile and train; None where a signal or the time limit came before anything
@@ -140,14 +125,10 @@ class _Run:
             self.progress.message(
                 "all updates are done; --total_steps N goes on to more. Its report is made anew"
             )
-        self.progress.phase(
-            "compiling the start: networks, first tasks", announce=latest is None
-        )
+        self.progress.phase("compiling the start: networks, first tasks", announce=latest is None)
         start, step, self.abstract = _programs(job)
         # takes longest, so it comes first
-        step_ready = (
-            _nothing_to_wait_for if first_done else compile_ahead(step, self.abstract)
-        )
+        step_ready = _nothing_to_wait_for if first_done else compile_ahead(step, self.abstract)
         self.first_flights = self._first_flights()
         carry, self.first_update, seconds = self._first_carry(start)
         if self.processes.is_first:
@@ -158,9 +139,7 @@ class _Run:
             self.progress.message(f"{limit}; ending as soon as the compiler does")
             return None
         with self._metrics() as metrics:
-            self.progress.phase(
-                "compiling the training step", announce=not (first_done or over)
-            )
+            self.progress.phase("compiling the training step", announce=not (first_done or over))
             self._compile_beside(_nothing_to_wait_for if over else step_ready)
             self.began = min(self.began, time.monotonic())
             loop = self._loop(step, metrics, seconds)
@@ -211,30 +190,21 @@ class _Run:
         signal ended the run.
         """
         settings = self.settings
-        signals = [
-            name for name in self.processes.everyone(self.stop.name) if name is not None
-        ]
+        signals = [name for name in self.processes.everyone(self.stop.name) if name is not None]
         if not self.processes.is_first:
             return None
         # before the last stage: should that be cut off, there is a policy
         self._save_best()
-        if (
-            outcome.update == self.first_update
-            and settings.total_updates > outcome.update
-        ):
+        if outcome.update == self.first_update and settings.total_updates > outcome.update:
             moment = f"before its first update, {outcome.seconds:.0f} s after the start"
-            self.progress.message(
-                f"MAPPO did not begin: {outcome.stopped_by} came {moment}"
-            )
+            self.progress.message(f"MAPPO did not begin: {outcome.stopped_by} came {moment}")
         if not signals and settings.analytic.updates:
             self.progress.phase("learning by the gradient through the simulation")
             self.progress.message(self._learn_last())
         if stop_name := (*signals, self.stop.name)[0]:
             self.progress.message(f"{stop_name}: {self.last_words()}")
             return None
-        return report(
-            self.job, self.directory, self.validation(), outcome, self.progress
-        )
+        return report(self.job, self.directory, self.validation(), outcome, self.progress)
 
     def _learn_last(self):
         """The last stage; what to tell of it."""
@@ -247,11 +217,7 @@ class _Run:
         learn = self.last_stage()
         with self.stop.while_learning():
             return keep_best(
-                self.directory,
-                learn,
-                validate,
-                self.job,
-                lambda: self.stop.name is not None,
+                self.directory, learn, validate, self.job, lambda: self.stop.name is not None
             )
 
     def _await_validation(self):
@@ -284,13 +250,9 @@ class _Run:
         checkpoints = self.checkpoints
         checkpoints.remove_unfinished()
         if self.processes.of_first(checkpoints.any_finished()):
-            carry, record = checkpoints.restore_latest(
-                self.abstract, self.progress.message
-            )
+            carry, record = checkpoints.restore_latest(self.abstract, self.progress.message)
             self.taught = awaits_validation(record, settings, job.facts["start_from"])
-            self.progress.message(
-                f"resumed at update {record.update} of {settings.total_updates}"
-            )
+            self.progress.message(f"resumed at update {record.update} of {settings.total_updates}")
             return carry, record.update, float(record.notes.get("seconds", 0.0))
         carry = start(jax.random.key(settings.seed))
         if job.start_from is not None:
@@ -310,12 +272,8 @@ class _Run:
                 self._prepare_validation()
             ready()
             self.began = time.monotonic()
-            self.progress.phase(
-                "learning to fly by the gradient through the simulation"
-            )
-            policy = learn(
-                carry.policy, jax.random.fold_in(jax.random.key(settings.seed), 1)
-            )
+            self.progress.phase("learning to fly by the gradient through the simulation")
+            policy = learn(carry.policy, jax.random.fold_in(jax.random.key(settings.seed), 1))
             self.taught = policy is not None
             if self.taught:
                 carry = carry.replace(policy=policy)
@@ -326,9 +284,7 @@ class _Run:
         if not self.processes.is_first:
             return contextlib.nullcontext()
         steps = self.first_update * self.settings.steps_per_update
-        writer = MetricsWriter(
-            self.directory.path, self.first_update or None, resumed_steps=steps
-        )
+        writer = MetricsWriter(self.directory.path, self.first_update or None, resumed_steps=steps)
         return contextlib.closing(writer)
 
     def _compile_beside(self, step_ready):
@@ -407,9 +363,7 @@ class _Run:
             **self.job.facts,
         }
         parameters = fill(self.abstract.policy, leaves, str(record.path))
-        save_policy_file(
-            self.directory.policy, parameters, self.settings, notes, storage="float32"
-        )
+        save_policy_file(self.directory.policy, parameters, self.settings, notes, storage="float32")
 
 
 def _nothing_to_wait_for(*_):
@@ -439,15 +393,11 @@ def _programs(job):
     settings = job.settings
     shardings = carry_shardings(job.devices)
     start = make_start(settings, job.parts)
-    abstract = abstract_like(
-        jax.eval_shape(start, jax.random.key(settings.seed)), shardings
-    )
+    abstract = abstract_like(jax.eval_shape(start, jax.random.key(settings.seed)), shardings)
     same = everywhere(job.devices)
     step = guarded(make_device_step(settings, job.parts, job.devices))
     # where kept traces have been tried
-    can_keep = job.devices == 1 or (
-        jax.default_backend() == "cpu" and jax.process_count() == 1
-    )
+    can_keep = job.devices == 1 or (jax.default_backend() == "cpu" and jax.process_count() == 1)
     if can_keep and (keep := job.keep):
         step = keep("step", step, lambda: (abstract,), carry=abstract)
         fresh = start

@@ -77,11 +77,7 @@ def closing_words(
     if own_network:
         steps = [f'openjax.load_policy("{run}", environment, network) in Python']
     if on_cpu:
-        steps.append(
-            as_typed(
-                "openjax train --preset paper (the real game, two minutes on a GPU)"
-            )
-        )
+        steps.append(as_typed("openjax train --preset paper (the real game, two minutes on a GPU)"))
     steps.append(f"{as_typed('openjax sample_flights flights')}, then")
     steps.append(as_typed("openjax diagnose flights (from flight logs to a cause)"))
     return [*lines, "\n  ".join(["Next:", *steps])]
@@ -126,9 +122,7 @@ def unlike_the_papers(game: PursuitSettings, evaders: tuple[str, ...]) -> str:
     if _pillars(game) != _pillars(paper):
         words.append(f"{_pillars(game)} pillars instead of {_pillars(paper)}")
     if game.observed_pillars != paper.observed_pillars:
-        words.append(
-            f"{game.observed_pillars} pillars in view instead of {paper.observed_pillars}"
-        )
+        words.append(f"{game.observed_pillars} pillars in view instead of {paper.observed_pillars}")
     if game.start_attitude != paper.start_attitude:
         words.append("level starts instead of tilted ones")
     if game.time_step > paper.time_step:

@@ -26,21 +26,14 @@ EVADER = {"r": 0.85, "g": 0.3, "b": 0.2, "a": 1.0}
 
 _VECTOR = {"type": "object", "properties": {a: {"type": "number"} for a in "xyz"}}
 _QUATERNION = {"type": "object", "properties": {a: {"type": "number"} for a in "xyzw"}}
-_POSE = {
-    "type": "object",
-    "properties": {"position": _VECTOR, "orientation": _QUATERNION},
-}
+_POSE = {"type": "object", "properties": {"position": _VECTOR, "orientation": _QUATERNION}}
 _TIME = {
     "type": "object",
     "title": "time",
     "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}},
 }
 SCHEMAS = {
-    "foxglove.PoseInFrame": {
-        "timestamp": _TIME,
-        "frame_id": {"type": "string"},
-        "pose": _POSE,
-    },
+    "foxglove.PoseInFrame": {"timestamp": _TIME, "frame_id": {"type": "string"}, "pose": _POSE},
     "foxglove.SceneUpdate": {
         "deletions": {"type": "array", "items": {"type": "object"}},
         "entities": {"type": "array", "items": {"type": "object"}},
@@ -64,9 +57,7 @@ def write_mcap(path: Path, channels: Iterable[Channel]) -> None:
     try:
         from mcap.writer import Writer
     except ImportError as error:
-        raise UserError(
-            f"{path}: writing MCAP needs the mcap library: pip install mcap"
-        ) from error
+        raise UserError(f"{path}: writing MCAP needs the mcap library: pip install mcap") from error
     with replacing(path) as partial, partial.open("wb") as file:
         writer = Writer(file)
         writer.start(profile="", library="openjax")
@@ -77,9 +68,7 @@ def write_mcap(path: Path, channels: Iterable[Channel]) -> None:
             number = writer.register_channel(channel.topic, "json", schema_id)
             for time, message in channel.messages:
                 stamp = round(1e9 * time)
-                text = json.dumps(
-                    _stamp(channel.schema, message, stamp), allow_nan=False
-                )
+                text = json.dumps(_stamp(channel.schema, message, stamp), allow_nan=False)
                 writer.add_message(number, stamp, text.encode(), stamp)
         writer.finish()
 
@@ -106,16 +95,11 @@ def pose_channel(topic: str, time, position, quaternion=None) -> Channel:
     """The poses of one vehicle: times (T,) s, positions (T, 3) m, attitudes (T, 4) wxyz
     or None; rows that weren't sampled are left out.
     """
-    attitude = (
-        np.tile([1.0, 0.0, 0.0, 0.0], (len(time), 1))
-        if quaternion is None
-        else quaternion
-    )
+    attitude = np.tile([1.0, 0.0, 0.0, 0.0], (len(time), 1)) if quaternion is None else quaternion
     # JSON has no NaN
     rows = np.flatnonzero(np.isfinite(position).all(1) & np.isfinite(attitude).all(1))
     messages = [
-        (float(time[k]), {"frame_id": WORLD, "pose": pose(position[k], attitude[k])})
-        for k in rows
+        (float(time[k]), {"frame_id": WORLD, "pose": pose(position[k], attitude[k])}) for k in rows
     ]
     return Channel(topic, "foxglove.PoseInFrame", messages)
 
@@ -129,10 +113,7 @@ def trajectory_channels(name: str, flight: Trajectory) -> list[Channel]:
     steps = np.arange(0, flight.end(seconds=2.0), every)
     time = steps * flight.time_step
     drones = {
-        f"pursuer_{k + 1}": (
-            flight.pursuer_position[steps, k],
-            flight.pursuer_quaternion[steps, k],
-        )
+        f"pursuer_{k + 1}": (flight.pursuer_position[steps, k], flight.pursuer_quaternion[steps, k])
         for k in range(flight.pursuer_position.shape[1])
     }
     drones["evader"] = (flight.evader_position[steps], None)
@@ -145,9 +126,7 @@ def trajectory_channels(name: str, flight: Trajectory) -> list[Channel]:
         entities = []
         for drone, (position, _) in drones.items():
             colour = EVADER if drone == "evader" else PURSUER
-            entities.append(
-                _entity(drone, "spheres", position[row], 2 * RADIUS, colour)
-            )
+            entities.append(_entity(drone, "spheres", position[row], 2 * RADIUS, colour))
         scenes.append((float(moment), {"entities": entities}))
     if len(scenes):
         # in the first scene only: what stands stays
@@ -158,11 +137,7 @@ def trajectory_channels(name: str, flight: Trajectory) -> list[Channel]:
 def _entity(name: str, kind: str, position, size, colour: dict) -> dict:
     """One body of a scene, which stays until the same name comes again."""
     extent = np.broadcast_to(np.asarray(size, float), 3).tolist()
-    body = {
-        "pose": pose(position),
-        "size": dict(zip("xyz", extent, strict=True)),
-        "color": colour,
-    }
+    body = {"pose": pose(position), "size": dict(zip("xyz", extent, strict=True)), "color": colour}
     if kind == "cylinders":
         body |= {"bottom_scale": 1.0, "top_scale": 1.0}
     lifetime = {"sec": 0, "nsec": 0}  # for ever
@@ -180,11 +155,7 @@ def _pillars(flight: Trajectory) -> list[dict]:
     diameter = 2 * flight.pillar_radius
     return [
         _entity(
-            f"pillar_{k + 1}",
-            "cylinders",
-            (*at, height / 2),
-            (diameter, diameter, height),
-            PILLAR,
+            f"pillar_{k + 1}", "cylinders", (*at, height / 2), (diameter, diameter, height), PILLAR
         )
         for k, at in enumerate(np.asarray(flight.pillar_position, float))
     ]

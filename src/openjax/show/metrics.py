@@ -54,12 +54,7 @@ class MetricsWriter:
             )
 
     def write(
-        self,
-        event: str,
-        update: int,
-        steps: int,
-        seconds: float,
-        values: dict[str, float],
+        self, event: str, update: int, steps: int, seconds: float, values: dict[str, float]
     ) -> None:
         """Log one record.
 
@@ -78,10 +73,7 @@ class MetricsWriter:
             "steps": int(steps),
             "seconds": round(seconds, 3),
         }
-        record |= {
-            name: value if math.isfinite(value) else None
-            for name, value in numbers.items()
-        }
+        record |= {name: value if math.isfinite(value) else None for name, value in numbers.items()}
         self._file.write((json.dumps(record) + "\n").encode())
         if self._events is not None:
             for name, value in numbers.items():

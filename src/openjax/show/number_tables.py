@@ -6,9 +6,7 @@ from rich import box
 from rich.table import Table
 
 
-def numbers_table(
-    title: str, heads: Sequence[str], caption: str | None = None
-) -> Table:
+def numbers_table(title: str, heads: Sequence[str], caption: str | None = None) -> Table:
     """An empty table; the first column holds names, the others numbers."""
     looks = {
         "title_justify": "left",

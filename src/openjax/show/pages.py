@@ -25,14 +25,7 @@ STYLE = {
     "axes.spines.right": False,
     "legend.frameon": False,
     **dict.fromkeys(
-        (
-            "text.color",
-            "axes.labelcolor",
-            "axes.edgecolor",
-            "xtick.color",
-            "ytick.color",
-        ),
-        INK,
+        ("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color"), INK
     ),
 }
 
@@ -73,6 +66,4 @@ def as_svg(figure: Figure, salt: str) -> str:
     text = data.getvalue()
     # without the XML declaration, which only a file of its own has
     text = text[text.index("<svg") :].replace(INK, "currentColor")
-    return re.sub(
-        r'<svg ([^>]*?)height="[^"]*"([^>]*?)width="[^"]*"', r"<svg \1\2", text, count=1
-    )
+    return re.sub(r'<svg ([^>]*?)height="[^"]*"([^>]*?)width="[^"]*"', r"<svg \1\2", text, count=1)

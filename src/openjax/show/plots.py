@@ -58,11 +58,7 @@ def plot_trajectories(path: Path, trajectories: Sequence[Trajectory]) -> None:
         for artist, label in zip(artists, labels, strict=True):
             legend.setdefault(label, artist)
     figure.legend(
-        legend.values(),
-        legend,
-        loc="outside lower center",
-        ncols=len(legend),
-        fontsize="small",
+        legend.values(), legend, loc="outside lower center", ncols=len(legend), fontsize="small"
     )
     _save(figure, path)
 
@@ -74,11 +70,7 @@ def draw_from_above(axes: Axes, trajectory: Trajectory) -> None:
         axes.add_patch(Circle(pillar, trajectory.pillar_radius, color="0.6"))
     limit = 1.08 * trajectory.arena_radius
     axes.set(
-        xlim=(-limit, limit),
-        ylim=(-limit, limit),
-        aspect="equal",
-        xlabel="x [m]",
-        ylabel="y [m]",
+        xlim=(-limit, limit), ylim=(-limit, limit), aspect="equal", xlabel="x [m]", ylabel="y [m]"
     )
     _draw_pursuers(axes, trajectory)
     outcome = _draw_evader(axes, trajectory)
@@ -96,9 +88,7 @@ def _draw_pursuers(axes, trajectory):
         axes.plot(x[-1], y[-1], "o", color=color, markersize=4)
         crash = trajectory.crash_of(i)
         if crash is not None and crash < end:
-            axes.plot(
-                x[crash], y[crash], "X", color="black", markersize=9, label="crash"
-            )
+            axes.plot(x[crash], y[crash], "X", color="black", markersize=9, label="crash")
 
 
 def _draw_evader(axes, trajectory):
@@ -114,13 +104,7 @@ def _draw_evader(axes, trajectory):
     radius = trajectory.capture_radius
     axes.add_patch(Circle((x, y), radius, fill=False, color="0.5", linestyle=":"))
     axes.plot(
-        x,
-        y,
-        "*",
-        color="gold",
-        markeredgecolor="black",
-        markersize=14,
-        label="first capture",
+        x, y, "*", color="gold", markeredgecolor="black", markersize=14, label="first capture"
     )
     return f"captured after {(capture + 1) * trajectory.time_step:.2f} s"
 
@@ -142,14 +126,10 @@ def plot_map(path: Path, cells: Sequence[dict], title: str) -> None:
     sizes = sorted({cell["num_pursuers"] for cell in cells})
     columns = min(4, len(sizes))
     rows = -(-len(sizes) // columns)
-    figure = Figure(
-        figsize=(3.1 * columns + 1.2, 3.0 * rows + 0.5), layout="constrained"
-    )
+    figure = Figure(figsize=(3.1 * columns + 1.2, 3.0 * rows + 0.5), layout="constrained")
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
     for axes, size in zip(panels, sizes, strict=False):
-        image = _draw_map(
-            axes, [cell for cell in cells if cell["num_pursuers"] == size]
-        )
+        image = _draw_map(axes, [cell for cell in cells if cell["num_pursuers"] == size])
         axes.set_title(f"{size} pursuer{'s' if size > 1 else ''}", fontsize="medium")
     for axes in panels[len(sizes) :]:
         axes.set_axis_off()
@@ -189,9 +169,7 @@ def _draw_map(axes, cells):
         halo = withStroke(linewidth=2, foreground=viridis(cell["capture_rate"]))
         style = {"fontsize": 6, "color": color, "path_effects": [halo]}
         axes.text(column, row, text, ha="center", va="center", **style)
-    image = axes.imshow(
-        rates, origin="lower", vmin=0, vmax=1, cmap=viridis, aspect="auto"
-    )
+    image = axes.imshow(rates, origin="lower", vmin=0, vmax=1, cmap=viridis, aspect="auto")
     axes.set_xticks(range(len(radii)), [f"{radius:g}" for radius in radii], fontsize=7)
     axes.set_yticks(range(len(ratios)), [f"{ratio:g}" for ratio in ratios], fontsize=7)
     # a picture's axes count cells: a ratio between two of them lies between their
@@ -214,11 +192,7 @@ def plot_training(path: Path, metrics_path: Path) -> None:
     figure = Figure(figsize=(11, 6), layout="constrained")
     curves = (
         (training, {"color": "tab:blue", "linewidth": 1}, "training"),
-        (
-            evaluation,
-            {"color": "tab:orange", "marker": "o", "markersize": 3},
-            "validation tasks",
-        ),
+        (evaluation, {"color": "tab:orange", "marker": "o", "markersize": 3}, "validation tasks"),
     )
     for axes, (name, label) in zip(figure.subplots(2, 3).ravel(), _CURVES, strict=True):
         for records, style, legend in curves:

@@ -38,10 +38,7 @@ class _Display:
         self._spinner = Spinner("dots")
         transient = not (stays and terminal)
         self._live = Live(
-            get_renderable=self._render,
-            console=console,
-            auto_refresh=terminal,
-            transient=transient,
+            get_renderable=self._render, console=console, auto_refresh=terminal, transient=transient
         )
 
     def __enter__(self):
@@ -139,17 +136,13 @@ class Progress(_Display):
         if self._values or self._validation:
             table = Table.grid(padding=(0, 3))
             table.add_row(
-                "",
-                Text("training", style="bold"),
-                Text("validation tasks", style="bold"),
+                "", Text("training", style="bold"), Text("validation tasks", style="bold")
             )
             training = _labels(self._values)
             validation = _labels(self._validation)
             for label in _SHOWN.values():
                 if label in training or label in validation:
-                    table.add_row(
-                        Text(label), training.get(label, ""), validation.get(label, "")
-                    )
+                    table.add_row(Text(label), training.get(label, ""), validation.get(label, ""))
             rows.append(table)
         return Panel(Group(*rows), title=self._title, title_align="left")
 
@@ -181,9 +174,7 @@ def duration(seconds: float) -> str:
     """Minutes and seconds, 3:02, and hours where there are any."""
     minutes, seconds = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
-    return (
-        f"{hours}:{minutes:02d}:{seconds:02d}" if hours else f"{minutes}:{seconds:02d}"
-    )
+    return f"{hours}:{minutes:02d}:{seconds:02d}" if hours else f"{minutes}:{seconds:02d}"
 
 
 class Steps(_Display):
@@ -209,9 +200,7 @@ class Steps(_Display):
 
     def __enter__(self):
         if self._total > LONG and not self._console.is_terminal:
-            self._console.print(
-                f"{self._title}: about {duration(self._total)} ...", soft_wrap=True
-            )
+            self._console.print(f"{self._title}: about {duration(self._total)} ...", soft_wrap=True)
         return super().__enter__()
 
     def begin(self, step: str, note: str = "") -> None:

@@ -24,13 +24,9 @@ def replay_page(flights: Sequence[tuple[str, Trajectory]]) -> str:
     Args:
       flights: (policy's name, episode) pairs; an episode's title is its layout's name.
     """
-    data = json.dumps(
-        [_plain(policy, flight) for policy, flight in flights], separators=(",", ":")
-    )
+    data = json.dumps([_plain(policy, flight) for policy, flight in flights], separators=(",", ":"))
     # within a script element "<" may only stand escaped
-    return TEMPLATE.read_text(encoding="utf-8").replace(
-        "@DATA@", data.replace("<", "\\u003c")
-    )
+    return TEMPLATE.read_text(encoding="utf-8").replace("@DATA@", data.replace("<", "\\u003c"))
 
 
 def write_replay(path: Path, flights: Sequence[tuple[str, Trajectory]]) -> None:
@@ -52,9 +48,7 @@ def _plain(policy: str, flight: Trajectory) -> dict:
         """The frame of a step; None for no step, or one after the last frame."""
         return None if index is None or index // every >= len(poses) else index // every
 
-    poses = np.concatenate(
-        [flight.pursuer_position, flight.pursuer_quaternion], axis=-1
-    )[steps]
+    poses = np.concatenate([flight.pursuer_position, flight.pursuer_quaternion], axis=-1)[steps]
     plain = {
         "layout": flight.title,
         "policy": policy,
@@ -72,13 +66,8 @@ def _plain(policy: str, flight: Trajectory) -> dict:
         "seen": [] if flight.seen is None else _spans(flight.seen[steps]),
     }
     if flight.predicted is not None:
-        horizons = (
-            np.linspace(0, flight.predicted.shape[1] - 1, AHEAD).round().astype(int)
-        )
-        plain |= {
-            "predicted": thousandths(flight.predicted[steps][:, horizons]),
-            "ahead": AHEAD,
-        }
+        horizons = np.linspace(0, flight.predicted.shape[1] - 1, AHEAD).round().astype(int)
+        plain |= {"predicted": thousandths(flight.predicted[steps][:, horizons]), "ahead": AHEAD}
     return plain
 
 

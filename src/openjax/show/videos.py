@@ -74,10 +74,7 @@ def _stack(films):
     frame.
     """
     length = max(map(len, films))
-    return [
-        np.concatenate([film[min(i, len(film) - 1)] for film in films])
-        for i in range(length)
-    ]
+    return [np.concatenate([film[min(i, len(film) - 1)] for film in films]) for i in range(length)]
 
 
 def caption(trajectory: Trajectory, step: int) -> tuple[str, str]:
@@ -85,15 +82,10 @@ def caption(trajectory: Trajectory, step: int) -> tuple[str, str]:
     until then.
     """
     events = []
-    for word, index in (
-        ("caught", trajectory.capture_index),
-        ("crashed", trajectory.crash_index),
-    ):
+    for word, index in (("caught", trajectory.capture_index), ("crashed", trajectory.crash_index)):
         if index is not None and index <= step:
             events.append(f"{word} at {(index + 1) * trajectory.time_step:.1f} s")
-    return f"{trajectory.title}: {(step + 1) * trajectory.time_step:.1f} s", ", ".join(
-        events
-    )
+    return f"{trajectory.title}: {(step + 1) * trajectory.time_step:.1f} s", ", ".join(events)
 
 
 def _frame(trajectory, step):
@@ -130,9 +122,7 @@ def _things(pen, trajectory, step):
     """
     for place in trajectory.pillar_position:
         yield place, partial(pen.pillar, place, trajectory.pillar_radius), ()
-    bodies = Rotation.from_quat(
-        trajectory.pursuer_quaternion[step], scalar_first=True
-    ).as_matrix()
+    bodies = Rotation.from_quat(trajectory.pursuer_quaternion[step], scalar_first=True).as_matrix()
     for i, body in enumerate(bodies):
         color = _rgb(PURSUER_COLORS[i % len(PURSUER_COLORS)])
         path = trajectory.pursuer_position[:, i]

@@ -59,9 +59,7 @@ def load_state(path: Path, abstract: Any) -> Any:
     # Orbax can't write arrays without elements; they hold nothing, so they are made
     # anew.
     leaves = [
-        arrays[name]
-        if leaf.size
-        else jnp.zeros(leaf.shape, leaf.dtype, device=leaf.sharding)
+        arrays[name] if leaf.size else jnp.zeros(leaf.shape, leaf.dtype, device=leaf.sharding)
         for name, leaf in named_leaves(abstract).items()
     ]
     return jax.tree.unflatten(jax.tree.structure(abstract), leaves)
@@ -101,9 +99,7 @@ def load_arrays(
         return np.asarray(jax.random.key_data(leaf) if is_key else leaf)
 
     return {
-        names[name]: plain(leaf)
-        for name, leaf in checkpoint.items()
-        if names[name] is not None
+        names[name]: plain(leaf) for name, leaf in checkpoint.items() if names[name] is not None
     }
 
 
@@ -132,10 +128,7 @@ def commit(path: Path, write: Any) -> None:
         # there
         for path_written in (*_files(path), path, path.parent):
             flush(path_written)
-        lines = [
-            f"{_checksum(file)}  {file.relative_to(path).as_posix()}"
-            for file in _files(path)
-        ]
+        lines = [f"{_checksum(file)}  {file.relative_to(path).as_posix()}" for file in _files(path)]
         write_text(_checksums_file(path), "\n".join(lines) + "\n")
 
 
@@ -144,27 +137,21 @@ def check_state(path: Path) -> None:
     as they were written.
     """
     if not is_checkpoint(path):
-        raise UserError(
-            f"{path} is no checkpoint; expected a directory written by openjax.train"
-        )
+        raise UserError(f"{path} is no checkpoint; expected a directory written by openjax.train")
     try:
         lines = _checksums_file(path).read_text(encoding="utf-8").splitlines()
         checksums = {}
         for line in lines:
             checksum, _, name = line.partition("  ")
             checksums[name] = checksum
-        actual = {
-            file.relative_to(path).as_posix(): _checksum(file) for file in _files(path)
-        }
+        actual = {file.relative_to(path).as_posix(): _checksum(file) for file in _files(path)}
         # names that only one of them has, or with another checksum
         different = sorted(dict(checksums.items() ^ actual.items()))
     except (OSError, UnicodeDecodeError) as error:
         raise DamagedError(f"checkpoint {path} is damaged ({error})") from error
     if different or not checksums:
         place = different[0] if different else _CHECKSUMS
-        raise DamagedError(
-            f"checkpoint {path} is damaged: {place[:80]} isn't as it was written"
-        )
+        raise DamagedError(f"checkpoint {path} is damaged: {place[:80]} isn't as it was written")
 
 
 def remove_state(path: Path) -> None:
@@ -208,10 +195,7 @@ def _check_same_shapes(path, metadata, leaves):
         is_key = jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
         shape_of_leaf = jax.eval_shape(jax.random.key_data, leaf) if is_key else leaf
         shape = tuple(metadata[name].shape)
-        if (
-            shape != tuple(shape_of_leaf.shape)
-            or metadata[name].dtype != shape_of_leaf.dtype
-        ):
+        if shape != tuple(shape_of_leaf.shape) or metadata[name].dtype != shape_of_leaf.dtype:
             raise UserError(
                 f"checkpoint {path} is of another shape: {name} is "
                 f"{metadata[name].dtype}{list(shape)} there, the settings make it "

@@ -58,9 +58,7 @@ class Checkpoints:
       processes: that share the directory; None: this one alone.
     """
 
-    def __init__(
-        self, directory: Path, keep_last: int = 2, processes: Processes | None = None
-    ):
+    def __init__(self, directory: Path, keep_last: int = 2, processes: Processes | None = None):
         self.directory = Path(directory).absolute()
         self.keep_last = keep_last
         self._processes = processes or Processes()
@@ -86,18 +84,14 @@ class Checkpoints:
 
     def any_finished(self) -> bool:
         """Whether there is a checkpoint, damaged or not."""
-        return any(
-            is_checkpoint(path) for path in self.directory.glob("[0-9]" * _DIGITS)
-        )
+        return any(is_checkpoint(path) for path in self.directory.glob("[0-9]" * _DIGITS))
 
     def last_finished(self) -> int | None:
         """The update of the newest checkpoint, damaged or not; by the names of files
         alone, so that it may be asked at any time.
         """
         paths = self.directory.glob("[0-9]" * _DIGITS)
-        return max(
-            (int(path.name) for path in paths if is_checkpoint(path)), default=None
-        )
+        return max((int(path.name) for path in paths if is_checkpoint(path)), default=None)
 
     def load_best(
         self, name_of: Callable[[str], str | None], warn: Callable[[str], None]
@@ -123,9 +117,7 @@ class Checkpoints:
         evaluated.
         """
         records = [record for record in self.records() if record.score is not None]
-        return max(
-            records, key=lambda record: (record.score, record.update), default=None
-        )
+        return max(records, key=lambda record: (record.score, record.update), default=None)
 
     def latest(self) -> CheckpointRecord | None:
         """The newest committed checkpoint."""
@@ -133,11 +125,7 @@ class Checkpoints:
         return records[-1] if records else None
 
     def save(
-        self,
-        update: int,
-        carry: Any,
-        score: float | None = None,
-        notes: dict | None = None,
+        self, update: int, carry: Any, score: float | None = None, notes: dict | None = None
     ) -> None:
         """Start writing a checkpoint; returns when the arrays are copied, so that the
         carry may be donated.
@@ -163,8 +151,7 @@ class Checkpoints:
         if not is_checkpoint(path) or path.name in self._damaged:
             return False
         return score is None or any(
-            record.path == path and record.score is not None
-            for record in self.records()
+            record.path == path and record.score is not None for record in self.records()
         )
 
     def abandon(self) -> None:
@@ -195,9 +182,7 @@ class Checkpoints:
                 remove_state(record.path)
                 self._known.pop(record.path.name, None)
 
-    def restore_latest(
-        self, abstract: Any, warn=lambda text: None
-    ) -> tuple[Any, CheckpointRecord]:
+    def restore_latest(self, abstract: Any, warn=lambda text: None) -> tuple[Any, CheckpointRecord]:
         """The newest checkpoint that can be read; damaged ones are passed over with a
         warning.
 
@@ -218,14 +203,10 @@ class Checkpoints:
                 failure = "damaged"
             except UserError:
                 raise
-            except (
-                Exception
-            ) as error:  # orbax and tensorstore raise many kinds on damaged files
+            except Exception as error:  # orbax and tensorstore raise many kinds on damaged files
                 failure = type(error).__name__
             # where one process can't read its part, all go on to the one before
-            failures = [
-                failure for failure in self._processes.everyone(failure) if failure
-            ]
+            failures = [failure for failure in self._processes.everyone(failure) if failure]
             if not failures:
                 return carry, records[name]
             warn(f"{path} can't be read ({failures[0]}), using the one before it")
@@ -248,7 +229,5 @@ def _record(path):
     try:
         notes = dict(load_orbax().metadata(path.absolute()).custom_metadata or {})
     except Exception as error:  # orbax and tensorstore raise many kinds
-        raise DamagedError(
-            f"checkpoint {path} can't be read ({type(error).__name__})"
-        ) from error
+        raise DamagedError(f"checkpoint {path} can't be read ({type(error).__name__})") from error
     return CheckpointRecord(path, int(path.name), notes.pop("score", None), notes)

@@ -46,8 +46,7 @@ def cache_programs() -> Path | None:
         return None
     if setting is not None and folder.exists() and not _is_private(folder):
         _LOGGER.warning(
-            "others can write to %s, and so run what they like here: chmod go-w it",
-            folder,
+            "others can write to %s, and so run what they like here: chmod go-w it", folder
         )
     use_checked_cache()
     jax.config.update("jax_compilation_cache_dir", str(folder))

@@ -41,9 +41,7 @@ def with_airframe(settings: PursuitSettings, vehicle: Path | None) -> PursuitSet
     Raises:
       UserError: a file that can't be used.
     """
-    airframe = (
-        settings.airframe if vehicle is None else load_vehicle_file(vehicle).airframe
-    )
+    airframe = settings.airframe if vehicle is None else load_vehicle_file(vehicle).airframe
     # a vehicle of one's own is no airframe by name: it flies in the game as it is
     if airframe == settings.airframe or airframe not in AIRFRAMES:
         return settings
@@ -89,19 +87,13 @@ def is_evader_file(opponent: Any) -> bool:
 
 
 def save_evader(
-    path: Path,
-    evader: tuple[Any, jax.Array],
-    hold: int,
-    game: PursuitSettings,
-    notes: dict,
+    path: Path, evader: tuple[Any, jax.Array], hold: int, game: PursuitSettings, notes: dict
 ) -> None:
     """Write a learned evader, its actor and whether it sees in the world's axes, how
     many control steps it holds a decision, and the game that it learned.
     """
     actor, world_axes = evader
-    content = {
-        "evader": {"actor": actor, "world_axes": world_axes, "hold": jnp.int32(hold)}
-    }
+    content = {"evader": {"actor": actor, "world_axes": world_axes, "hold": jnp.int32(hold)}}
     save_policy_file(path, content, {"environment": game}, notes, storage="float32")
 
 
@@ -153,17 +145,11 @@ def find_opponent(evader: str | Path | Evader, game: PursuitSettings) -> Evader:
     _check_game(path, learned_in, game)
     slots = learned_in["max_pillars"]
     # the network's sizes are those of its biases
-    width, outputs = (
-        leaves[f"evader/actor/bias_{layer}"].shape[-1] for layer in (0, 2)
-    )
+    width, outputs = (leaves[f"evader/actor/bias_{layer}"].shape[-1] for layer in (0, 2))
     sizes = (number_of_senses(game.num_pursuers, slots), width, outputs)
     actor = jax.eval_shape(lambda key: init_network(key, 1, sizes), jax.random.key(0))
-    one = jax.tree.map(
-        lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), actor
-    )
+    one = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), actor)
     scalar = {"world_axes": jnp.bool_, "hold": jnp.int32}
     abstract = {name: jax.ShapeDtypeStruct((), kind) for name, kind in scalar.items()}
     content = fill({"evader": {"actor": one, **abstract}}, leaves, str(path))["evader"]
-    return learned_opponent(
-        content["actor"], content["world_axes"], int(content["hold"]), slots
-    )
+    return learned_opponent(content["actor"], content["world_axes"], int(content["hold"]), slots)

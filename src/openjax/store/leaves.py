@@ -12,10 +12,7 @@ import numpy as np
 def named_leaves(tree: Any) -> dict[str, Any]:
     """Leaves by their path, for example `actor/params/Dense_0/kernel`."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
-    return {
-        jax.tree_util.keystr(path, simple=True, separator="/"): leaf
-        for path, leaf in leaves
-    }
+    return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
 
 
 def place(carry: Any, shardings: Any = None) -> Any:
@@ -35,9 +32,7 @@ def place(carry: Any, shardings: Any = None) -> Any:
             numbers = put(jax.random.key_data(leaf), sharding)
             return jax.random.wrap_key_data(numbers, impl=jax.random.key_impl(leaf))
         # each process has the whole carry, and hands in its own devices' share
-        return jax.make_array_from_callback(
-            leaf.shape, sharding, np.asarray(leaf).__getitem__
-        )
+        return jax.make_array_from_callback(leaf.shape, sharding, np.asarray(leaf).__getitem__)
 
     return jax.tree.map(put, carry, jax.tree.broadcast(shardings, carry))
 
@@ -52,9 +47,7 @@ def abstract_like(carry: Any, shardings: Any = None) -> Any:
     """
     shardings = first_device() if shardings is None else shardings
     return jax.tree.map(
-        lambda leaf, sharding: jax.ShapeDtypeStruct(
-            leaf.shape, leaf.dtype, sharding=sharding
-        ),
+        lambda leaf, sharding: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding),
         carry,
         jax.tree.broadcast(shardings, carry),
     )

@@ -63,9 +63,7 @@ def member(policy: LoadedPolicy, place: int) -> LoadedPolicy:
     )
 
 
-def with_strategies(
-    settings: TrainSettings, strategies: int, seconds: float
-) -> TrainSettings:
+def with_strategies(settings: TrainSettings, strategies: int, seconds: float) -> TrainSettings:
     """The settings of a policy's file for a team that draws one of so many `strategies`
     every `seconds` (s; 0: once an episode).
     """

@@ -132,13 +132,9 @@ class LoadedPolicy:
         if isinstance(self.policy, CraftPolicy):
             craft = Craft.of(environment)
             check_flyable(
-                f"the policy's output {self.settings.network.output}",
-                craft,
-                game.time_step,
+                f"the policy's output {self.settings.network.output}", craft, game.time_step
             )
-            return dataclasses.replace(
-                self, policy=dataclasses.replace(self.policy, craft=craft)
-            )
+            return dataclasses.replace(self, policy=dataclasses.replace(self.policy, craft=craft))
         return self
 
     def outside_of_training(self, environment: Pursuit) -> list[str]:
@@ -162,13 +158,9 @@ class LoadedPolicy:
         if self.any_number and game.num_pursuers not in game_of_training.team_sizes:
             words.append(f"{game.num_pursuers} pursuers, which no team in training had")
         if game.airframe != game_of_training.airframe:
-            words.append(
-                f"the {game.airframe} instead of the {game_of_training.airframe}"
-            )
+            words.append(f"the {game.airframe} instead of the {game_of_training.airframe}")
         elif environment.effects and not game_of_training.vehicles:
-            words.append(
-                f"{', '.join(environment.effects)}, which no vehicle in training had"
-            )
+            words.append(f"{', '.join(environment.effects)}, which no vehicle in training had")
         return words
 
     def __call__(self, observation: Observation) -> jax.Array:
@@ -183,12 +175,7 @@ class LoadedPolicy:
             return self.policy.act(self.parameters, observation)
         axes = "world" if observation.heading is None else "heading"
         sizes = (observation.self_state.shape[-1], *observation.frames.shape[-2:], axes)
-        sizes_of_policy = (
-            game.self_size,
-            game.history_length,
-            game.frame_size,
-            game.observe_in,
-        )
+        sizes_of_policy = (game.self_size, game.history_length, game.frame_size, game.observe_in)
         if sizes != sizes_of_policy:
             raise UserError(
                 f"policy {self.source} observes {sizes_of_policy} (own state, history, axes), "
@@ -229,9 +216,7 @@ def load_policy(
         return _heuristic(source)
     if is_own_code(source):
         what = "function {}(observation) that gives actions (N, 4)"
-        return own_controller(
-            own_code("--policy", source, (), what), PursuitSettings(), source
-        )
+        return own_controller(own_code("--policy", source, (), what), PursuitSettings(), source)
     if str(name_or_path) in shipped_policies():
         return _from_file(WEIGHTS / f"{name_or_path}.npz", source)
     if is_run(path):
@@ -268,9 +253,7 @@ def own_controller(
     nothing = PolicyParameters(actor={}, critic={}, predictor={})
     # which fits all games
     lengths = dict.fromkeys(("rollout_length", "restart_steps"), game.episode_length)
-    settings = TrainSettings(
-        environment=game, predictor=OwnController.predictor, **lengths
-    )
+    settings = TrainSettings(environment=game, predictor=OwnController.predictor, **lengths)
     return LoadedPolicy(OwnController(function), nothing, settings, source)
 
 
@@ -319,21 +302,13 @@ def _from_run(run, source):
 def _build(settings, leaves, source):
     game = settings.environment
     # learned evaders' networks aren't in a policy's file
-    evaders = (
-        tuple(name for name in game.evaders if name in SCRIPTED)
-        or PursuitSettings().evaders
-    )
-    settings = dataclasses.replace(
-        settings, environment=dataclasses.replace(game, evaders=evaders)
-    )
+    evaders = tuple(name for name in game.evaders if name in SCRIPTED) or PursuitSettings().evaders
+    settings = dataclasses.replace(settings, environment=dataclasses.replace(game, evaders=evaders))
     if jax.default_backend() == "cpu":  # CPUs emulate bfloat16, slowly
         settings = dataclasses.replace(
-            settings,
-            network=dataclasses.replace(settings.network, compute_type="float32"),
+            settings, network=dataclasses.replace(settings.network, compute_type="float32")
         )
-    policy, abstract = _initial(
-        settings.environment, settings.network, settings.predictor
-    )
+    policy, abstract = _initial(settings.environment, settings.network, settings.predictor)
     if not any(name.startswith("critic/") for name in leaves):
         # Shipped without: flying needs no critic.
         abstract = abstract.replace(critic={})
@@ -342,9 +317,7 @@ def _build(settings, leaves, source):
 
 
 @functools.lru_cache(maxsize=8)
-def _initial(
-    game: PursuitSettings, network: NetworkSettings, predictor: PredictorSettings
-):
+def _initial(game: PursuitSettings, network: NetworkSettings, predictor: PredictorSettings):
     """The networks of these settings and the kinds of their parameters, which take a
     second to trace.
     """

@@ -28,11 +28,7 @@ WEIGHTS = Path(__file__).resolve().parents[1] / "weights"
 
 
 def save_policy_file(
-    path: Path,
-    parameters: Any,
-    settings: Any,
-    notes: dict | None = None,
-    storage: str = "float16",
+    path: Path, parameters: Any, settings: Any, notes: dict | None = None, storage: str = "float16"
 ) -> None:
     """Write a policy.
 
@@ -53,13 +49,9 @@ def save_policy_file(
     arrays = {}
     for name, leaf in named_leaves(parameters).items():
         # NumPy's files know no bfloat16
-        array = np.asarray(
-            leaf.astype(jnp.float32) if leaf.dtype == jnp.bfloat16 else leaf
-        )
+        array = np.asarray(leaf.astype(jnp.float32) if leaf.dtype == jnp.bfloat16 else leaf)
         header["dtypes"][name] = str(leaf.dtype)
-        arrays[name] = (
-            array.astype(storage) if np.issubdtype(array.dtype, np.floating) else array
-        )
+        arrays[name] = array.astype(storage) if np.issubdtype(array.dtype, np.floating) else array
     arrays[_HEADER] = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
     with replacing(path) as partial:
         np.savez_compressed(partial, **arrays)
@@ -80,8 +72,7 @@ def load_policy_file(
         if not isinstance(header, dict) or header.get("format") != _FORMAT:
             raise UserError(f"{path} isn't of the format {_FORMAT!r}")
         leaves = {
-            name: array.astype(_dtype(header["dtypes"][name]))
-            for name, array in arrays.items()
+            name: array.astype(_dtype(header["dtypes"][name])) for name, array in arrays.items()
         }
         settings = header["settings"]
         notes = header["notes"]
@@ -98,9 +89,7 @@ def load_policy_file(
     # float16 turns what is larger than 65,504 into infinity, and a flipped bit may do
     # it, too
     unequal = [
-        name
-        for name, leaf in leaves.items()
-        if not np.isfinite(leaf.astype(np.float32)).all()
+        name for name, leaf in leaves.items() if not np.isfinite(leaf.astype(np.float32)).all()
     ]
     if unequal:
         raise UserError(f"{path} holds numbers that aren't finite, in {unequal[0]}")

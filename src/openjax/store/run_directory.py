@@ -21,13 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from openjax.errors import UserError
-from openjax.files import (
-    WRITING,
-    check_output_folder,
-    read_json,
-    remove_unfinished,
-    write_json,
-)
+from openjax.files import WRITING, check_output_folder, read_json, remove_unfinished, write_json
 from openjax.learning import TrainSettings
 from openjax.plain import from_plain
 
@@ -84,9 +78,7 @@ class RunDirectory:
         """Record the settings (nested dataclass) and facts like machine and command
         line.
         """
-        write_json(
-            self.settings_file, {"format": _FORMAT, "settings": settings, **facts}
-        )
+        write_json(self.settings_file, {"format": _FORMAT, "settings": settings, **facts})
 
     def read_facts(self) -> dict:
         """What `write_settings` was told beside the settings."""
@@ -102,9 +94,7 @@ class RunDirectory:
         content = read_json(self.settings_file)
         if not isinstance(content, dict) or content.get("format") != _FORMAT:
             raise UserError(f"{self.settings_file} isn't of the format {_FORMAT!r}")
-        return from_plain(
-            TrainSettings, content.get("settings"), f"{self.settings_file}: "
-        )
+        return from_plain(TrainSettings, content.get("settings"), f"{self.settings_file}: ")
 
 
 def is_run(path: Path) -> bool:

@@ -55,9 +55,7 @@ def recall(
     program = _read(file)
     if program is None:
         try:
-            write_checked(
-                file, bytes(_export(function, arguments(), type(carry)).serialize())
-            )
+            write_checked(file, bytes(_export(function, arguments(), type(carry)).serialize()))
         except (ValueError, NotImplementedError, ImportError, OSError):
             # a call that can't be kept, a full disk
             return function
@@ -85,8 +83,7 @@ def _export(function, arguments, kind):
         return _replace(results, kind, jax.tree.leaves)
 
     leaves = [
-        jax.ShapeDtypeStruct(leaf.shape, leaf.dtype)
-        for leaf in jax.tree.leaves(tuple(arguments))
+        jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(tuple(arguments))
     ]
     checks = [export.DisabledSafetyCheck.custom_call(name) for name in _KERNELS]
     return export.export(jax.jit(of_leaves), disabled_checks=checks)(*leaves)
@@ -98,9 +95,7 @@ def _replace(tree, kind, change):
     def is_one(part):
         return isinstance(part, kind)
 
-    return jax.tree.map(
-        lambda part: change(part) if is_one(part) else part, tree, is_leaf=is_one
-    )
+    return jax.tree.map(lambda part: change(part) if is_one(part) else part, tree, is_leaf=is_one)
 
 
 def _read(file):
@@ -113,29 +108,16 @@ def _key(name, carry, made_from):
     """What a program depends on, in short."""
     # all sources: which of them a program depends on, nobody knows without tracing it
     digest = hashlib.sha256()
-    sources = [
-        *Path(openjax.__file__).parent.rglob("*.py"),
-        *assets_directory().iterdir(),
-    ]
+    sources = [*Path(openjax.__file__).parent.rglob("*.py"), *assets_directory().iterdir()]
     for path in sorted(path for path in sources if path.is_file()):
         digest.update(path.name.encode() + path.read_bytes())
     kinds = [(leaf.shape, str(leaf.dtype)) for leaf in jax.tree.leaves(carry)]
     # where programs are cached changes none of them
     options = {
-        name: value
-        for name, value in sorted(jax.config.values.items())
-        if "cache" not in name
+        name: value for name, value in sorted(jax.config.values.items()) if "cache" not in name
     }
     versions = [importlib.metadata.version(library) for library in _LIBRARIES]
     devices = [(device.platform, device.device_kind) for device in jax.devices()]
-    parts = (
-        name,
-        made_from,
-        kinds,
-        str(jax.tree.structure(carry)),
-        options,
-        versions,
-        devices,
-    )
+    parts = (name, made_from, kinds, str(jax.tree.structure(carry)), options, versions, devices)
     digest.update(repr(parts).encode())
     return digest.hexdigest()[:32]

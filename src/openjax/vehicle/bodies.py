@@ -13,12 +13,7 @@ from openjax.vehicle.mjx_body import make_world, mjx_step
 from openjax.vehicle.parameters import Vehicle
 from openjax.vehicle.rigid_body import rigid_step
 from openjax.vehicle.shapes import Active, Pillars, Team, Vector
-from openjax.vehicle.solids import (
-    Surroundings,
-    encounters,
-    place_solids,
-    surroundings,
-)
+from openjax.vehicle.solids import Surroundings, encounters, place_solids, surroundings
 from openjax.vehicle.state import DroneState
 
 
@@ -69,9 +64,7 @@ class Bodies:
         """
         if not self.contacts or self.physics == "stops":
             return None
-        return surroundings(
-            drones.position, drones.velocity, pillar_position, pillar_active
-        )
+        return surroundings(drones.position, drones.velocity, pillar_position, pillar_active)
 
     def rigid(
         self,
@@ -97,9 +90,7 @@ class Bodies:
     def _mjx(self, world, vehicle, drone, force, torque, around):
         shapes = None
         if around is not None:
-            gaps = encounters(
-                self.arena, drone.position, drone.velocity, around, self.dt
-            )
+            gaps = encounters(self.arena, drone.position, drone.velocity, around, self.dt)
             shapes = place_solids(gaps)
         return mjx_step(world, vehicle, shapes, drone, force, torque, self.dt)
 

@@ -63,9 +63,7 @@ def looped_contact_acceleration(
         # where nothing is hit, the sums aren't used
         solver_gap = shown_gap(gap, gap_ahead, True)
         reference = _reference(thing, normal, solver_gap, velocity, dt)
-        terms = _terms(
-            thing, normal, solver_gap, _along(normal, acceleration) - reference
-        )
+        terms = _terms(thing, normal, solver_gap, _along(normal, acceleration) - reference)
         sums = tuple(a + b for a, b in zip(sums, terms, strict=True))
         return jnp.minimum(least, gap_ahead), sums
 
@@ -83,9 +81,7 @@ def _fold(function, start, groups):
         def one(k, value, thing=thing):
             return function(value, thing(k))
 
-        start = (
-            one(0, start) if number == 1 else jax.lax.fori_loop(0, number, one, start)
-        )
+        start = one(0, start) if number == 1 else jax.lax.fori_loop(0, number, one, start)
     return start
 
 
@@ -99,12 +95,8 @@ def _reference(thing, normal, gap, velocity, dt):
     `gap`.
     """
     # divided in the drones' precision, as what it is compared with
-    stiffness, damping, impedance = (
-        jnp.asarray(number, gap.dtype) for number in thing.contact
-    )
-    return (
-        -(damping / dt * _along(normal, velocity) + stiffness / dt**2 * gap) / impedance
-    )
+    stiffness, damping, impedance = (jnp.asarray(number, gap.dtype) for number in thing.contact)
+    return -(damping / dt * _along(normal, velocity) + stiffness / dt**2 * gap) / impedance
 
 
 def _terms(thing, normal, gap, lacking):
@@ -114,9 +106,7 @@ def _terms(thing, normal, gap, lacking):
     """
     x, y, z = normal
     impedance = jnp.asarray(thing.contact.impedance, gap.dtype)
-    weight = jnp.where(
-        (gap < 0.0) & (lacking < 0.0), impedance / (1.0 - impedance), 0.0
-    )
+    weight = jnp.where((gap < 0.0) & (lacking < 0.0), impedance / (1.0 - impedance), 0.0)
     pulls = [weight * lacking * part for part in normal]
     # the matrix is symmetric: six of its nine entries
     entries = ((x, x), (y, y), (z, z), (x, y), (x, z), (y, z))

@@ -40,10 +40,7 @@ def _jitter_command(parameters, memory, command, context):
     draw, key = _draw(memory)
     delay = parameters["longest"] * jax.random.uniform(draw, (), command.dtype)
     part = jnp.clip(delay / context.dt, 0.0, 1.0)
-    return command + part * (memory["previous"] - command), {
-        "previous": command,
-        "key": key,
-    }
+    return command + part * (memory["previous"] - command), {"previous": command, "key": key}
 
 
 COMMAND_JITTER = Effect(
@@ -70,9 +67,7 @@ def _gust_wrench(parameters, context):
     ratios = jnp.array([1.0, 1.31, 0.77], context.velocity.dtype)
     angle = parameters["rate"] * context.air_time * ratios
     size = jnp.stack([parameters["x"], parameters["y"], parameters["z"]])
-    force = rotate_inverse(
-        context.quaternion, size * jnp.sin(angle + parameters["phase"])
-    )
+    force = rotate_inverse(context.quaternion, size * jnp.sin(angle + parameters["phase"]))
     return force, jnp.zeros_like(force)
 
 
@@ -126,9 +121,7 @@ def _noise_sensor(parameters, memory, state):
         state.quaternion, jnp.concatenate([jnp.ones_like(turn[:1]), turn])
     )
     return state.replace(
-        position=state.position
-        - delay * state.velocity
-        + parameters["position"] * position,
+        position=state.position - delay * state.velocity + parameters["position"] * position,
         velocity=state.velocity + parameters["velocity"] * velocity,
         quaternion=quaternion * jax.lax.rsqrt(jnp.sum(quaternion * quaternion)),
     )

@@ -51,9 +51,7 @@ def motors(
       gravity, torque (3,) N m about the centre of mass, body frame.
     """
     motor_command, integral = rate_controller(vehicle, drone, command, dt)
-    motor_command = composition.change_motor_command(
-        effects, parameters, motor_command, context
-    )
+    motor_command = composition.change_motor_command(effects, parameters, motor_command, context)
     speed = rotor_speed_step(vehicle, drone.rotor_speed, motor_command, dt)
     force, torque = composition.wrench(effects, parameters, vehicle, speed, context)
     drone = drone.replace(
@@ -105,11 +103,7 @@ class DronesStep:
             # one kernel holds the motors, the body and its contacts
             around = (pillar_position, pillar_active) if self.contacts else None
             drones = step_many(
-                self.fused_step,
-                vehicle,
-                drones.replace(effect_memory=()),
-                command,
-                around,
+                self.fused_step, vehicle, drones.replace(effect_memory=()), command, around
             )
             return drones.replace(effect_memory=memory)
 
@@ -120,9 +114,7 @@ class DronesStep:
         command, drones = self._receive(vehicle, parameters, drones, command)
 
         def substep(drones):
-            drones, force, torque = self._turn_motors(
-                vehicle, parameters, command, drones
-            )
+            drones, force, torque = self._turn_motors(vehicle, parameters, command, drones)
             around = self._bodies.around(drones, pillar_position, pillar_active)
             return self._bodies(vehicle, drones, force, torque, around)
 
@@ -148,9 +140,7 @@ class DronesStep:
         def memory(drone, n):
             # by number, so that what a drone draws doesn't depend on how many there are
             drone_key = None if key is None else jax.random.fold_in(key, n)
-            return composition.initial_memory(
-                self.effects, vehicle, drone, self.dt, drone_key
-            )
+            return composition.initial_memory(self.effects, vehicle, drone, self.dt, drone_key)
 
         return drones.replace(effect_memory=jax.vmap(memory)(drones, number))
 
@@ -171,9 +161,7 @@ class DronesStep:
 
     def _parameters(self, values, drones):
         """Parameters (N,) of every effect."""
-        parameters = composition.complete_parameters(
-            self.effects, values, drones.position.dtype
-        )
+        parameters = composition.complete_parameters(self.effects, values, drones.position.dtype)
         number = drones.position.shape[0]
         return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (number,)), parameters)
 
@@ -182,11 +170,7 @@ class DronesStep:
         first.
         """
         change = functools.partial(composition.change_body, self.effects)
-        return (
-            jax.vmap(change, (0, None))(parameters, vehicle)
-            if self.effects
-            else vehicle
-        )
+        return jax.vmap(change, (0, None))(parameters, vehicle) if self.effects else vehicle
 
     def _contexts(self, vehicle, drones, dt) -> Context:
         neighbours = drones.position[others(drones.position.shape[0])]
@@ -201,9 +185,7 @@ class DronesStep:
                 dt=dt,
             )
 
-        return jax.vmap(context, (vehicles_axis(vehicle), 0, 0))(
-            vehicle, drones, neighbours
-        )
+        return jax.vmap(context, (vehicles_axis(vehicle), 0, 0))(vehicle, drones, neighbours)
 
     def _receive(self, vehicle, parameters, drones, command):
         """The commands that reach the rate controllers, and the drones with the memory
@@ -211,9 +193,7 @@ class DronesStep:
         """
         contexts = self._contexts(vehicle, drones, self.dt)
         change = functools.partial(composition.change_command, self.effects)
-        command, memory = jax.vmap(change)(
-            parameters, drones.effect_memory, command, contexts
-        )
+        command, memory = jax.vmap(change)(parameters, drones.effect_memory, command, contexts)
         return command, drones.replace(effect_memory=memory)
 
     def _turn_motors(self, vehicle, parameters, command, drones):
@@ -230,27 +210,21 @@ class DronesStep:
         """One drone without effects up to its accelerations in free flight; see
         `FusedStep`.
         """
-        drone, force, torque = motors(
-            (), vehicle, {}, drone, command, None, self._bodies.dt
-        )
+        drone, force, torque = motors((), vehicle, {}, drone, command, None, self._bodies.dt)
         acceleration, angular = accelerations(vehicle, drone, force, torque)
         return drone, acceleration, angular
 
     def _remember(self, drones):
         """The drones with the effects' memory at the end of a step."""
         record = functools.partial(composition.record, self.effects, dt=self.dt)
-        return drones.replace(
-            effect_memory=jax.vmap(record)(drones.effect_memory, drones)
-        )
+        return drones.replace(effect_memory=jax.vmap(record)(drones.effect_memory, drones))
 
 
 def _repeat(substep, drones, number):
     """`drones` after so many substeps; a single one isn't worth a loop."""
     if number == 1:
         return substep(drones)
-    drones, _ = jax.lax.scan(
-        lambda drones, _: (substep(drones), None), drones, length=number
-    )
+    drones, _ = jax.lax.scan(lambda drones, _: (substep(drones), None), drones, length=number)
     return drones
 
 
@@ -293,13 +267,6 @@ def make_drones_step(
         raise UserError(
             f"dt {dt} with {substeps} substeps: dt > 0 and substeps >= 1 would be right"
         )
-    if (
-        physics == "mjx"
-        and contacts
-        and max_pillars is not None
-        and num_drones is not None
-    ):
+    if physics == "mjx" and contacts and max_pillars is not None and num_drones is not None:
         make_world(arena, max_pillars, num_drones - 1, dt / substeps, True)
-    return DronesStep(
-        physics, dt, substeps, contacts, arena, composition.resolve(effects)
-    )
+    return DronesStep(physics, dt, substeps, contacts, arena, composition.resolve(effects))

@@ -10,6 +10,4 @@ def effect_names() -> tuple[str, ...]:
     and the file has its name.
     """
     files = sorted((Path(__file__).parent / "effects").glob("*.py"))
-    return tuple(
-        file.stem for file in files if "\nEFFECT = " in file.read_text(encoding="utf-8")
-    )
+    return tuple(file.stem for file in files if "\nEFFECT = " in file.read_text(encoding="utf-8"))

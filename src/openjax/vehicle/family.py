@@ -108,9 +108,7 @@ def narrowed_bounds(ranges: Sequence[VehicleRange], share) -> jax.Array:
     return none + share * (family_bounds(ranges) - none)
 
 
-def partly_nominal(
-    ranges: Sequence[VehicleRange], worlds: int, share: float
-) -> jax.Array:
+def partly_nominal(ranges: Sequence[VehicleRange], worlds: int, share: float) -> jax.Array:
     """(W, R, 4) bounds of the family for each world; this share of them has nominal
     vehicles.
     """
@@ -139,9 +137,7 @@ def draw_vehicles(
         return {}
     names = [effect.name for effect in family_effects(ranges)]
     bounds = family_bounds(ranges) if bounds is None else bounds
-    owner = np.array(
-        [names.index(entry.parameter.partition(".")[0]) for entry in ranges]
-    )
+    owner = np.array([names.index(entry.parameter.partition(".")[0]) for entry in ranges])
     value_key, chosen_key, rare_key = jax.random.split(key, 3)
     # one draw serves both widths: which of them holds is chosen afterwards
     share = jax.random.uniform(value_key, (number, len(ranges)))
@@ -171,9 +167,7 @@ def standard_parameters(ranges: Sequence[VehicleRange], parameters: dict) -> jax
         effect, _, name = entry.parameter.partition(".")
         _, parameter = find_parameter(entry.parameter)
         low, high = parameter.prior
-        columns.append(
-            (parameters[effect][name] - parameter.none) / (0.5 * (high - low))
-        )
+        columns.append((parameters[effect][name] - parameter.none) / (0.5 * (high - low)))
     return jnp.stack(columns, axis=-1)
 
 
@@ -230,9 +224,7 @@ def adapted_family(
             if estimate is None:
                 # an effect that the airframe's family lacks stays as the nominal
                 # vehicle has it
-                usual_range = usual.get(
-                    name, VehicleRange(name, none, none, none, none)
-                )
+                usual_range = usual.get(name, VehicleRange(name, none, none, none, none))
                 low = none + rest * (usual_range.low - none)
                 high = none + rest * (usual_range.high - none)
             else:
@@ -241,7 +233,5 @@ def adapted_family(
                 about = (value - margin, value + margin)
                 low, high = intervals.get(effect.name, {}).get(key, about)
             # one vehicle has no rare cousins: the wider range is the same
-            family.append(
-                VehicleRange(name, float(low), float(high), float(low), float(high))
-            )
+            family.append(VehicleRange(name, float(low), float(high), float(low), float(high)))
     return tuple(family)

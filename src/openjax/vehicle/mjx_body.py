@@ -50,9 +50,7 @@ class World(NamedTuple):
     data: mjx.Data
 
 
-def world_xml(
-    arena: Arena, n_pillars: int, n_others: int, dt: float, contacts: bool = True
-) -> str:
+def world_xml(arena: Arena, n_pillars: int, n_others: int, dt: float, contacts: bool = True) -> str:
     """MJCF of one drone; a step lasts dt seconds. The drone's geom comes after those of
     `solids_xml`.
 
@@ -81,15 +79,11 @@ def world_xml(
 
 
 @lru_cache(maxsize=32)
-def make_world(
-    arena: Arena, n_pillars: int, n_others: int, dt: float, contacts: bool
-) -> World:
+def make_world(arena: Arena, n_pillars: int, n_others: int, dt: float, contacts: bool) -> World:
     """The compiled world; numpy arrays, so that it can be closed over by compiled code
     of any precision.
     """
-    model = mujoco.MjModel.from_xml_string(
-        world_xml(arena, n_pillars, n_others, dt, contacts)
-    )
+    model = mujoco.MjModel.from_xml_string(world_xml(arena, n_pillars, n_others, dt, contacts))
     device = jax.local_devices()[0]  # of several processes each builds its own
 
     def build():
@@ -157,9 +151,7 @@ def mjx_step(
         opt=model.opt.replace(gravity=gravity),
     )
     if shapes is not None:
-        model = model.replace(
-            geom_pos=jnp.concatenate([shapes, jnp.zeros((1, 3), dtype)])
-        )
+        model = model.replace(geom_pos=jnp.concatenate([shapes, jnp.zeros((1, 3), dtype)]))
     data = data.replace(
         qpos=jnp.concatenate([drone.position, drone.quaternion]),
         qvel=jnp.concatenate([drone.velocity, drone.body_rates]),
@@ -170,9 +162,7 @@ def mjx_step(
     if shapes is not None:
         # The solver's line search leaves float32 noise of some 1e-3 m/s^2 even where
         # nothing is touched.
-        contact = jnp.where(
-            jnp.any(data.qfrc_constraint != 0), data.qacc - data.qacc_smooth, 0.0
-        )
+        contact = jnp.where(jnp.any(data.qfrc_constraint != 0), data.qacc - data.qacc_smooth, 0.0)
         qacc = qacc + jax.lax.stop_gradient(contact)
     qacc = qacc.astype(dtype)
     return euler_step(drone, qacc[:3], qacc[3:], dt)

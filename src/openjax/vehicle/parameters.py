@@ -101,16 +101,13 @@ def read_mjcf(path: str) -> dict[str, np.ndarray]:
     # of a gear's six numbers the last is the torque about z per thrust, signed by the
     # rotor's spin
     torque_per_thrust = model.actuator_gear[actuators, 5]
-    numbers = {
-        name: _number(model, path, name, size) for name, size in _NUMBERS.items()
-    }
+    numbers = {name: _number(model, path, name, size) for name, size in _NUMBERS.items()}
     return {
         "mass": model.body_mass[body],
         "inertia": model.body_inertia[body].copy(),
         "rotor_position": model.site_pos[sites],
         "rotor_spin": np.sign(torque_per_thrust),
-        "torque_constant": np.abs(torque_per_thrust).mean()
-        * numbers["thrust_constant"],
+        "torque_constant": np.abs(torque_per_thrust).mean() * numbers["thrust_constant"],
         "motor_slowdown_ratio": np.float64(1.0),
         "gravity": -model.opt.gravity[2],
         **numbers,
@@ -119,9 +116,7 @@ def read_mjcf(path: str) -> dict[str, np.ndarray]:
 
 def _find(model, path, kind, name):
     """The index of a named part of a model. Raises UserError where it has none."""
-    index = mujoco.mj_name2id(
-        model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), name
-    )
+    index = mujoco.mj_name2id(model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), name)
     if index < 0:
         raise UserError(f"{path}: has no {kind} named {name!r}, which a vehicle needs")
     return index
@@ -133,9 +128,7 @@ def _number(model, path, name, size):
     start = model.numeric_adr[index]
     count = model.numeric_size[index]
     if count != size:
-        raise UserError(
-            f"{path}: numeric {name!r} holds {count} values, {size} would be right"
-        )
+        raise UserError(f"{path}: numeric {name!r} holds {count} values, {size} would be right")
     values = np.array(model.numeric_data[start : start + count])
     return values[0] if size == 1 else values
 
@@ -155,9 +148,7 @@ def register_airframe(name: str, mjcf: str | Path) -> None:
     """
     path = Path(mjcf).resolve()
     if AIRFRAMES.get(name, path) != path:
-        raise UserError(
-            f"airframe {name}: there is one of that name ({AIRFRAMES[name]})"
-        )
+        raise UserError(f"airframe {name}: there is one of that name ({AIRFRAMES[name]})")
     read_mjcf(str(path))  # says now what is wrong with it, and not when a game is made
     AIRFRAMES[name] = path
 
@@ -173,15 +164,9 @@ def find_mjcf(name_or_path: str | Path) -> Path:
     none.
     """
     shipped_file = AIRFRAMES.get(str(name_or_path))
-    path = (
-        Path(name_or_path)
-        if shipped_file is None
-        else assets_directory() / shipped_file
-    )
+    path = Path(name_or_path) if shipped_file is None else assets_directory() / shipped_file
     if not path.is_file():
-        raise UserError(
-            f"{path}: no such MJCF file, nor an airframe ({', '.join(AIRFRAMES)})"
-        )
+        raise UserError(f"{path}: no such MJCF file, nor an airframe ({', '.join(AIRFRAMES)})")
     return path
 
 
@@ -192,9 +177,7 @@ def load_vehicle(airframe: str | Path = NOMINAL, dtype=jnp.float32) -> Vehicle:
       UserError: the file is missing, isn't MJCF or lacks a part of a vehicle.
     """
     numbers = read_mjcf(str(find_mjcf(airframe).resolve()))
-    return Vehicle(
-        **{name: jnp.asarray(value, dtype) for name, value in numbers.items()}
-    )
+    return Vehicle(**{name: jnp.asarray(value, dtype) for name, value in numbers.items()})
 
 
 def hover_rotor_speed(vehicle: Vehicle) -> Scalar:

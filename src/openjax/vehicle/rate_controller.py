@@ -22,9 +22,7 @@ def mixer(vehicle: Vehicle) -> Hubs:
     # nose up, which is negative about y
     x = vehicle.rotor_position[:, 0]
     y = vehicle.rotor_position[:, 1]
-    return jnp.stack(
-        [0.5 * jnp.sign(y), -0.5 * jnp.sign(x), vehicle.rotor_spin], axis=-1
-    )
+    return jnp.stack([0.5 * jnp.sign(y), -0.5 * jnp.sign(x), vehicle.rotor_spin], axis=-1)
 
 
 def rate_controller(
@@ -41,9 +39,7 @@ def rate_controller(
     # limited as on board, so that a vehicle that is held fast doesn't wind it up
     integral = jnp.clip(state.rate_integral + error * dt, -limit, limit)
     slope = (state.body_rates - state.previous_body_rates) * (_DEGREES / dt)
-    output = (
-        vehicle.rate_kp * error + vehicle.rate_ki * integral - vehicle.rate_kd * slope
-    )
+    output = vehicle.rate_kp * error + vehicle.rate_ki * integral - vehicle.rate_kd * slope
     output = jnp.clip(output, -_AXIS_LIMIT, _AXIS_LIMIT)
     counts = COUNTS * command[0] + jnp.sum(mixer(vehicle) * output, axis=-1)
     # each motor is cut by itself, as on board: at full thrust a turn costs thrust

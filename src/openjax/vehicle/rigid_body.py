@@ -33,11 +33,7 @@ def cross(a: Vector, b: Vector) -> Vector:
     `jnp.cross`.
     """
     return jnp.stack(
-        [
-            a[1] * b[2] - a[2] * b[1],
-            a[2] * b[0] - a[0] * b[2],
-            a[0] * b[1] - a[1] * b[0],
-        ]
+        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
     )
 
 
@@ -51,9 +47,7 @@ def quaternion_multiply(a: Quaternion, b: Quaternion) -> Quaternion:
     ])  # fmt: skip
 
 
-def quaternion_integrate(
-    quaternion: Quaternion, body_rates: Vector, dt: Seconds
-) -> Quaternion:
+def quaternion_integrate(quaternion: Quaternion, body_rates: Vector, dt: Seconds) -> Quaternion:
     """Attitude (4,) after dt seconds at constant body rates (3,) rad/s: exact, and
     smooth at zero rate.
     """
@@ -65,9 +59,7 @@ def quaternion_integrate(
     angle = jnp.sqrt(jnp.where(tiny, 1.0, square))
     cosine = jnp.where(tiny, 1.0 - square / 2, jnp.cos(angle))
     sinc = jnp.where(tiny, 1.0 - square / 6, jnp.sin(angle) / angle)
-    product = quaternion_multiply(
-        quaternion, jnp.concatenate([cosine[None], sinc * half])
-    )
+    product = quaternion_multiply(quaternion, jnp.concatenate([cosine[None], sinc * half]))
     # rounding would let the length drift over an episode
     return product * jax.lax.rsqrt(jnp.sum(product * product))
 
@@ -99,9 +91,7 @@ def accelerations(
     up = jnp.array([0, 0, 1], force_world.dtype)
     acceleration = force_world / vehicle.mass - vehicle.gravity * up
     momentum = vehicle.inertia * drone.body_rates
-    return acceleration, (
-        torque_body - cross(drone.body_rates, momentum)
-    ) / vehicle.inertia
+    return acceleration, (torque_body - cross(drone.body_rates, momentum)) / vehicle.inertia
 
 
 def rigid_step(
@@ -118,9 +108,7 @@ def rigid_step(
     acceleration (3,) m/s^2 that the drone would have in free flight to what contacts
     add.
     """
-    acceleration, angular_acceleration = accelerations(
-        vehicle, drone, force_world, torque_body
-    )
+    acceleration, angular_acceleration = accelerations(vehicle, drone, force_world, torque_body)
     if contact is not None:
         # as by MJX, gradients are those of free flight: what contacts add is a constant
         # to them

@@ -22,13 +22,7 @@ from openjax.vehicle.arena import Arena
 from openjax.vehicle.contacts import contact_acceleration, looped_contact_acceleration
 from openjax.vehicle.parameters import Vehicle
 from openjax.vehicle.rigid_body import euler_step
-from openjax.vehicle.solids import (
-    Surroundings,
-    floor,
-    other_drone,
-    pillar,
-    surroundings,
-)
+from openjax.vehicle.solids import Surroundings, floor, other_drone, pillar, surroundings
 from openjax.vehicle.state import DroneState
 
 WORTH = 16384
@@ -43,9 +37,7 @@ WARPS = 4
 class FusedStep(NamedTuple):
     """What a step does to one drone: hashable, since compiled code is kept for each."""
 
-    accelerate: Callable[
-        [Vehicle, DroneState, jax.Array], tuple[DroneState, jax.Array, jax.Array]
-    ]
+    accelerate: Callable[[Vehicle, DroneState, jax.Array], tuple[DroneState, jax.Array, jax.Array]]
     """(vehicle, drone, command (4,)) -> the drone with its controller and rotors a
     substep later, its accelerations (3,) m/s^2 world and (3,) rad/s^2 body in free
     flight.
@@ -62,12 +54,7 @@ class FusedStep(NamedTuple):
         next_drone, acceleration, angular = self.accelerate(vehicle, drone, command)
         if around is not None:
             extra = contact_acceleration(
-                self.arena,
-                drone.position,
-                drone.velocity,
-                acceleration,
-                around,
-                self.dt,
+                self.arena, drone.position, drone.velocity, acceleration, around, self.dt
             )
             # as by MJX, gradients are those of free flight: what contacts add is a
             # constant to them
@@ -125,9 +112,7 @@ def looped_step(
 
     @jax.checkpoint
     def substep(drones, _):
-        return mapped_step(
-            step._replace(substeps=1), vehicle, drones, command, pillars
-        ), None
+        return mapped_step(step._replace(substeps=1), vehicle, drones, command, pillars), None
 
     drones, _ = jax.lax.scan(substep, drones, length=step.substeps)
     return drones
@@ -150,18 +135,12 @@ def _many_worlds(step):
         vehicle, drones, command, pillars = arguments
         # the kernel holds one vehicle's numbers: of many vehicles it isn't taken
         if any(jax.tree.leaves(in_batched[0])):
-            axes = jax.tree.map(
-                lambda is_many: 0 if is_many else None, tuple(in_batched)
-            )
+            axes = jax.tree.map(lambda is_many: 0 if is_many else None, tuple(in_batched))
             drones_after = jax.vmap(plain_step, axes)(vehicle, drones, command, pillars)
         else:
 
             def flat(leaf, is_many):
-                leaf = (
-                    leaf
-                    if is_many
-                    else jnp.broadcast_to(leaf, (axis_size, *leaf.shape))
-                )
+                leaf = leaf if is_many else jnp.broadcast_to(leaf, (axis_size, *leaf.shape))
                 return jax.lax.collapse(leaf, 0, 2)
 
             # two axes of worlds become one, and two again afterwards
@@ -175,19 +154,12 @@ def _many_worlds(step):
 
     differentiable = jax.custom_jvp(run)
     loop_step = jax.vmap(functools.partial(looped_step, step), (None, 0, 0, 0))
-    differentiable.defjvp(
-        lambda primals, tangents: jax.jvp(loop_step, primals, tangents)
-    )
+    differentiable.defjvp(lambda primals, tangents: jax.jvp(loop_step, primals, tangents))
     return differentiable
 
 
 def kernel_call(
-    step: FusedStep,
-    vehicle: Vehicle,
-    drones: DroneState,
-    command,
-    pillars,
-    interpret=False,
+    step: FusedStep, vehicle: Vehicle, drones: DroneState, command, pillars, interpret=False
 ) -> DroneState:
     """`step` of W worlds of n drones by the kernel; `interpret` runs it anywhere,
     slowly.
@@ -199,9 +171,7 @@ def kernel_call(
     single = step._replace(substeps=1)  # drones see where the others are after each
 
     def substep(drones, _):
-        return _one_call(
-            single, vehicle, _Worlds(drones, command, pillars), interpret
-        ), None
+        return _one_call(single, vehicle, _Worlds(drones, command, pillars), interpret), None
 
     drones, _ = jax.lax.scan(substep, drones, length=step.substeps)
     return drones
@@ -220,10 +190,7 @@ class _Worlds(NamedTuple):
         """
         number = self.command.shape[0] * self.command.shape[1]
         leaves = jax.tree.leaves((self.drones, self.command))
-        return [
-            whole_blocks(leaf.reshape(number, -1), DRONES, mode="edge")
-            for leaf in leaves
-        ]
+        return [whole_blocks(leaf.reshape(number, -1), DRONES, mode="edge") for leaf in leaves]
 
     def around(self):
         """What each drone looks up: where all drones and pillars are; nothing in free
@@ -243,10 +210,7 @@ class _Worlds(NamedTuple):
         """The drones again from their leaves' rows."""
         leaves, structure = jax.tree.flatten(self.drones)
         number = self.command.shape[0] * self.command.shape[1]
-        full = [
-            row[:number].reshape(leaf.shape)
-            for row, leaf in zip(rows, leaves, strict=True)
-        ]
+        full = [row[:number].reshape(leaf.shape) for row, leaf in zip(rows, leaves, strict=True)]
         return structure.unflatten(full)
 
 
@@ -270,9 +234,7 @@ def _one_call(step, vehicle, worlds, interpret):
         grid=(rows[0].shape[0] // DRONES,),
         in_specs=[pl.BlockSpec(constants.shape, lambda i: (0,)), *blocks, *specs],
         out_specs=blocks[:-1],
-        input_output_aliases={
-            i + 1: i for i in range(len(outputs)) if i not in looked_up
-        },
+        input_output_aliases={i + 1: i for i in range(len(outputs)) if i not in looked_up},
         interpret=interpret,
         compiler_params=pallas_triton.CompilerParams(num_warps=WARPS, num_stages=1),
         name="rigid_step",
@@ -284,39 +246,29 @@ def _kernel(step, vehicle, worlds):
     """The program of a block of drones, each of which is done component by
     component.
     """
-    drone, command = jax.tree.map(
-        lambda leaf: leaf[0, 0], (worlds.drones, worlds.command)
-    )
+    drone, command = jax.tree.map(lambda leaf: leaf[0, 0], (worlds.drones, worlds.command))
     leaves = jax.tree.leaves(drone)
     accelerate = jax.make_jaxpr(step.accelerate)(vehicle, drone, command)
     move = functools.partial(euler_step, dt=step.dt)
     move = jax.make_jaxpr(move)(drone, drone.position, drone.position)
 
     def kernel(constants_ref, *refs):
-        state = [
-            [ref[:, i] for i in range(ref.shape[1])] for ref in refs[: len(leaves)]
-        ]
+        state = [[ref[:, i] for i in range(ref.shape[1])] for ref in refs[: len(leaves)]]
         command = split(refs[len(leaves)][:, i] for i in range(4))
         around = refs[len(leaves) + 1 : -len(leaves)]
         constants = _numbers(constants_ref, jax.tree.leaves(vehicle))
 
         def substep(_, state):
             parts = [
-                split(row).reshape(leaf.shape)
-                for row, leaf in zip(state, leaves, strict=True)
+                split(row).reshape(leaf.shape) for row, leaf in zip(state, leaves, strict=True)
             ]
-            *rotation, free, angular = evaluate(
-                accelerate, [*constants, *parts, command]
-            )
+            *rotation, free, angular = evaluate(accelerate, [*constants, *parts, command])
             if around:
                 drone_before = jax.tree.structure(drone).unflatten(parts)
-                free = free + _contacts(
-                    step, drone_before, free, worlds.command.shape[:2], around
-                )
+                free = free + _contacts(step, drone_before, free, worlds.command.shape[:2], around)
             next_parts = evaluate(move, [*rotation, free, angular])
             return [
-                [jnp.broadcast_to(part, (DRONES,)) for part in leaf.ravel()]
-                for leaf in next_parts
+                [jnp.broadcast_to(part, (DRONES,)) for part in leaf.ravel()] for leaf in next_parts
             ]
 
         if step.substeps == 1:  # not worth a loop
@@ -370,7 +322,5 @@ def _contacts(step, drone, free, sizes, around):
         (1, lambda _: floor(place)),
     )
     return split(
-        looped_contact_acceleration(
-            place, tuple(drone.velocity), tuple(free), groups, step.dt
-        )
+        looped_contact_acceleration(place, tuple(drone.velocity), tuple(free), groups, step.dt)
     )

@@ -46,9 +46,7 @@ def rotor_reaction(vehicle: Vehicle, rotor_speed: Rotors) -> Rotors:
     return vehicle.rotor_spin * vehicle.torque_constant * jnp.square(rotor_speed)
 
 
-def total_wrench(
-    vehicle: Vehicle, thrust: Rotors, reaction: Rotors
-) -> tuple[Vector, Vector]:
+def total_wrench(vehicle: Vehicle, thrust: Rotors, reaction: Rotors) -> tuple[Vector, Vector]:
     """Force (3,) N and torque about the centre of mass (3,) N m of the rotors, body
     frame.
 

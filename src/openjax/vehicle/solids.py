@@ -100,9 +100,7 @@ _NEAR = 0.04
 _TOUCHING = -1e-6  # m, gap at which a contact acts but doesn't push
 
 
-def solids_xml(
-    arena: Arena, n_pillars: int, n_others: int, dt: float
-) -> tuple[str, str]:
+def solids_xml(arena: Arena, n_pillars: int, n_others: int, dt: float) -> tuple[str, str]:
     """MJCF of the shapes (floor, pillars, other drones) and of their contact pairs with
     the geom "drone".
     """
@@ -131,9 +129,7 @@ def _pair(name, contact, dt):
 
 def others(n: int) -> np.ndarray:
     """(n, n - 1) indices of the other drones, for each of n."""
-    return np.array([[j for j in range(n) if j != i] for i in range(n)], int).reshape(
-        n, n - 1
-    )
+    return np.array([[j for j in range(n) if j != i] for i in range(n)], int).reshape(n, n - 1)
 
 
 def surroundings(
@@ -164,18 +160,14 @@ def floor(position: Components) -> Thing:
     return Thing(place, place[2], _STILL, DRONE_RADIUS, _FIXED)
 
 
-def pillar(
-    arena: Arena, position: Components, place: Sequence[jax.Array], active
-) -> Thing:
+def pillar(arena: Arena, position: Components, place: Sequence[jax.Array], active) -> Thing:
     """A pillar at `place` (x, y) m to drones at `position`; where it isn't `active`, it
     stands far below.
     """
     half = arena.height / 2
     height = jnp.where(active, half, PARKED).astype(position[2].dtype)
     level = jnp.clip(position[2] - height, -half, half) + height
-    return Thing(
-        (*place, height), level, _STILL, arena.pillar_radius + DRONE_RADIUS, _FIXED
-    )
+    return Thing((*place, height), level, _STILL, arena.pillar_radius + DRONE_RADIUS, _FIXED)
 
 
 def other_drone(position: Components, velocity: Components) -> Thing:
@@ -223,9 +215,7 @@ def approach(position, velocity, thing: Thing, dt: Seconds):
     three components each, and a thing.
     """
     nearest = (*thing.place[:2], thing.level)
-    away = tuple(
-        component - other for component, other in zip(position, nearest, strict=True)
-    )
+    away = tuple(component - other for component, other in zip(position, nearest, strict=True))
     # the root keeps a slope where a drone is in the middle of a thing
     distance = jnp.sqrt(sum(part * part for part in away) + 1e-12)
     normal = tuple(part / distance for part in away)

@@ -45,9 +45,7 @@ def hover_state(
     level = (1, 0, 0, 0)
     quaternion = jnp.asarray(level if quaternion is None else quaternion, dtype)
     velocity = jnp.asarray((0, 0, 0) if velocity is None else velocity, dtype)
-    lead = jnp.broadcast_shapes(
-        position.shape[:-1], quaternion.shape[:-1], velocity.shape[:-1]
-    )
+    lead = jnp.broadcast_shapes(position.shape[:-1], quaternion.shape[:-1], velocity.shape[:-1])
     zeros = jnp.zeros((*lead, 3), dtype)
     return DroneState(
         position=jnp.broadcast_to(position, (*lead, 3)),

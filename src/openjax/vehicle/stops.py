@@ -26,12 +26,7 @@ def stop(
     if pillar_position.shape[0]:
         away = position[:, None, :2] - pillar_position[None]
         position, velocity = _push(
-            position,
-            velocity,
-            away,
-            arena.pillar_radius + DRONE_RADIUS,
-            pillar_active[None],
-            1.0,
+            position, velocity, away, arena.pillar_radius + DRONE_RADIUS, pillar_active[None], 1.0
         )
     if position.shape[0] > 1:
         offset = position[:, None] - position[None]
@@ -61,9 +56,7 @@ def _push(position, velocity, away, reach, solid, share, moving=None):
     hit = solid & (distance < reach)
     depth = jnp.where(hit, share * (reach - distance), 0.0)
     # only what goes inwards is taken off: who leaves already keeps its velocity
-    approach = jnp.where(
-        hit, share * jnp.minimum(jnp.sum(normal * moving, axis=-1), 0.0), 0.0
-    )
+    approach = jnp.where(hit, share * jnp.minimum(jnp.sum(normal * moving, axis=-1), 0.0), 0.0)
     shift = jnp.sum(depth[..., None] * normal, axis=1)
     change = jnp.sum(approach[..., None] * normal, axis=1)
     return position.at[:, :size].add(shift), velocity.at[:, :size].add(-change)

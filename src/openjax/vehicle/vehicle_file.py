@@ -88,9 +88,7 @@ def load_vehicle_file(path: str | Path | None = None, dtype=jnp.float32) -> Vehi
     """
     path = Path(NOMINAL if path is None else path)
     if str(path) in AIRFRAMES and not path.exists():
-        return VehicleFile(
-            load_vehicle(str(path), dtype), _usual_name(str(path)), str(path)
-        )
+        return VehicleFile(load_vehicle(str(path), dtype), _usual_name(str(path)), str(path))
     # a name without a suffix was meant for an airframe, or for a folder
     if not path.exists() and not path.suffix:
         raise UserError(
@@ -168,9 +166,7 @@ def _from_tables(plain: dict, path: Path, dtype) -> VehicleFile:
     motor = tables.motor
     # [log] may hold anything: only what openjax reads of it is checked
     log_keys = {f.name for f in fields(LogKeys)}
-    log = from_plain(
-        LogKeys, {k: v for k, v in tables.log.items() if k in log_keys}, f"{root}log"
-    )
+    log = from_plain(LogKeys, {k: v for k, v in tables.log.items() if k in log_keys}, f"{root}log")
     if log.ceiling_z is not None and log.ceiling_z <= log.floor_z:
         raise UserError(
             f"{root}log.ceiling_z is {log.ceiling_z:g}; it must be above floor_z, {log.floor_z:g} m"

@@ -53,9 +53,7 @@ def spins_of(motor: Motor, nominal: Vehicle, root: str) -> tuple[Spin, ...]:
     # an array of NumPy's: going through one of JAX's compiles, which a flight can't
     # that writes its log in a fork
     usual = ["cw" if spin > 0 else "ccw" for spin in np.asarray(nominal.rotor_spin)]
-    spins = motor.spin or tuple(
-        usual[NOMINAL_ORDER.index(place)] for place in motor.order
-    )
+    spins = motor.spin or tuple(usual[NOMINAL_ORDER.index(place)] for place in motor.order)
     if sorted(spins) != ["ccw", "ccw", "cw", "cw"]:
         raise UserError(
             f'{root}motor.spin is {list(spins)}; it must hold two "cw" and two "ccw", in the order '
@@ -64,9 +62,7 @@ def spins_of(motor: Motor, nominal: Vehicle, root: str) -> tuple[Spin, ...]:
     return spins
 
 
-def with_size(
-    nominal: Vehicle, table: VehicleTable, mjcf: Path | None, root: str
-) -> Vehicle:
+def with_size(nominal: Vehicle, table: VehicleTable, mjcf: Path | None, root: str) -> Vehicle:
     """The nominal vehicle with the moments of inertia that the file gives. One that is
     far heavier or lighter and has no MJCF is taken to be of the same shape: its rotors
     lift the same multiple of its weight, and its arms are longer as its radius of
@@ -91,23 +87,17 @@ def with_size(
     if mjcf is None and not 1.0 / SAME_ROTORS <= heavier <= SAME_ROTORS:
         # moments over mass are the squared radius of gyration, along which the arms
         # grow
-        wider = (
-            np.mean(np.asarray(table.inertia) / np.asarray(nominal.inertia)) / heavier
-        )
+        wider = np.mean(np.asarray(table.inertia) / np.asarray(nominal.inertia)) / heavier
         longer = float(np.sqrt(wider))
         changes |= {
             "rotor_position": longer * np.asarray(nominal.rotor_position),
             "thrust_constant": heavier * float(np.asarray(nominal.thrust_constant)),
-            "torque_constant": heavier
-            * longer
-            * float(np.asarray(nominal.torque_constant)),
+            "torque_constant": heavier * longer * float(np.asarray(nominal.torque_constant)),
         }
     return with_values(nominal, **changes)
 
 
-def with_numbers(
-    nominal: Vehicle, mass: float | None, motor: Motor, calibration: dict
-) -> Vehicle:
+def with_numbers(nominal: Vehicle, mass: float | None, motor: Motor, calibration: dict) -> Vehicle:
     """The nominal vehicle with everything that the file says of it; what a calibration
     found counts most.
     """
@@ -131,9 +121,7 @@ def with_numbers(
 def with_values(vehicle: Vehicle, **values) -> Vehicle:
     """The vehicle with other values of some fields, in its own precision."""
     dtype = vehicle.mass.dtype
-    return vehicle.replace(
-        **{name: jnp.asarray(value, dtype) for name, value in values.items()}
-    )
+    return vehicle.replace(**{name: jnp.asarray(value, dtype) for name, value in values.items()})
 
 
 def calibrated_value(
@@ -141,25 +129,15 @@ def calibrated_value(
 ) -> CalibratedValue:
     """A calibrated quantity of the file. Raises UserError for one that can't be."""
     if (entry.unit or CALIBRATED_UNITS[name]) != CALIBRATED_UNITS[name]:
-        raise UserError(
-            f"{place} is in {entry.unit!r}; it must be in {CALIBRATED_UNITS[name]!r}"
-        )
+        raise UserError(f"{place} is in {entry.unit!r}; it must be in {CALIBRATED_UNITS[name]!r}")
     usual = np.atleast_1d(np.asarray(getattr(nominal, name)))
     value = np.atleast_1d(entry.value)
     interval = np.atleast_2d(entry.interval90)
     if value.shape != usual.shape or interval.shape != (usual.size, 2):
         number = f"{usual.size} number{'s' * (usual.size > 1)}"
-        raise UserError(
-            f"{place} needs value ({number}) and interval90 ([low, high] each)"
-        )
+        raise UserError(f"{place} needs value ({number}) and interval90 ([low, high] each)")
     if not ((usual / FAR <= value) & (value <= usual * FAR)).all():
-        raise UserError(
-            f"{place}: {value.tolist()} is far from the nominal {usual.tolist()}"
-        )
+        raise UserError(f"{place}: {value.tolist()} is far from the nominal {usual.tolist()}")
     if not (interval[:, 0] <= interval[:, 1]).all():
-        raise UserError(
-            f"{place}: interval90 is {interval.tolist()}; low must not exceed high"
-        )
-    return CalibratedValue(
-        tuple(value.tolist()), tuple(map(tuple, interval.tolist())), entry.notes
-    )
+        raise UserError(f"{place}: interval90 is {interval.tolist()}; low must not exceed high")
+    return CalibratedValue(tuple(value.tolist()), tuple(map(tuple, interval.tolist())), entry.notes)

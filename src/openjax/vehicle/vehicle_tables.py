@@ -40,9 +40,7 @@ class VehicleTable(Overrides):
     """`[vehicle]`."""
 
     airframe: str = NOMINAL
-    inertia: Annotated[
-        tuple[float, float, float] | None, Interval("(0, 10]", "kg m^2")
-    ] = None
+    inertia: Annotated[tuple[float, float, float] | None, Interval("(0, 10]", "kg m^2")] = None
     """About the body's x, y and z."""
 
 

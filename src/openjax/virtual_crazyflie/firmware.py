@@ -105,12 +105,7 @@ class VirtualFirmware:
         """
         if self._watchdog_time is not None and time - self._watchdog_time > WATCHDOG:
             self.emergency = True
-        if (
-            self._set_point_time is None
-            or not self.armed
-            or self.crashed
-            or self.emergency
-        ):
+        if self._set_point_time is None or not self.armed or self.crashed or self.emergency:
             return SetPoint()
         age = time - self._set_point_time
         # nothing to time out: an armed vehicle waits for its first set-point
@@ -175,11 +170,7 @@ class VirtualFirmware:
     def _link(self, packet, time):
         if packet.channel == 0:  # echo
             return [packet]
-        return (
-            [packet._replace(data=b"Bitcraze Crazyflie\0")]
-            if packet.channel == 1
-            else []
-        )
+        return [packet._replace(data=b"Bitcraze Crazyflie\0")] if packet.channel == 1 else []
 
     def _platform(self, packet, time):
         command = packet.data[0]
@@ -188,9 +179,7 @@ class VirtualFirmware:
             answer = answers.get(command, b"")
             return [packet._replace(data=bytes([command]) + answer)]
         if packet.channel == 0 and command == 1:
-            return [
-                packet._replace(data=bytes([command, *self._arm(bool(packet.data[1]))]))
-            ]
+            return [packet._replace(data=bytes([command, *self._arm(bool(packet.data[1]))]))]
         return []
 
     def _arm(self, do_arm):
@@ -219,11 +208,7 @@ class VirtualFirmware:
         elif packet.channel == 1 and command == SupervisorCommand.FEED_WATCHDOG:
             self.feed_watchdog(time)
             answer = b""
-        return (
-            []
-            if answer is None
-            else [packet._replace(data=bytes([command | 0x80]) + answer)]
-        )
+        return [] if answer is None else [packet._replace(data=bytes([command | 0x80]) + answer)]
 
     def _memory(self, packet, time):
         """How many memories there are: none."""
@@ -277,9 +262,7 @@ class VirtualFirmware:
         """
         if np.isfinite(degrees).all():
             roll, pitch, yaw_rate = np.radians(degrees).tolist()
-            self.accept(
-                SetPoint(mode, roll, -pitch, yaw_rate, thrust / (FULL_SCALE + 1)), time
-            )
+            self.accept(SetPoint(mode, roll, -pitch, yaw_rate, thrust / (FULL_SCALE + 1)), time)
 
     def accept(self, set_point: SetPoint, time: float) -> None:
         """Take a set-point as it comes out of a packet: no thrust means motors off."""
@@ -295,19 +278,13 @@ class VirtualFirmware:
         """
         command = packet.data[0]
         if command == 3:
-            return [
-                packet._replace(data=struct.pack("<BHI", 3, len(names), crc) + limits)
-            ]
+            return [packet._replace(data=struct.pack("<BHI", 3, len(names), crc) + limits)]
         if command == 2:
             (ident,) = struct.unpack("<H", packet.data[1:3])
             if ident >= len(names):
                 return [packet._replace(data=b"\x02")]
             name = names[ident].replace(".", "\0").encode() + b"\0"
-            return [
-                packet._replace(
-                    data=packet.data[:3] + bytes([type_of(names[ident])]) + name
-                )
-            ]
+            return [packet._replace(data=packet.data[:3] + bytes([type_of(names[ident])]) + name)]
         return []
 
     def _log(self, packet, time):
@@ -331,9 +308,7 @@ class VirtualFirmware:
 
             def type_of(name):
                 read_only = name.split(".")[0] == READ_ONLY_GROUP
-                return PARAMETER_TYPES[PARAMETERS[name][0]][0] | (
-                    READ_ONLY if read_only else 0
-                )
+                return PARAMETER_TYPES[PARAMETERS[name][0]][0] | (READ_ONLY if read_only else 0)
 
             return self._contents(packet, PARAMETER_NAMES, PARAMETER_CRC, b"", type_of)
         if packet.channel in (1, 2):

@@ -112,9 +112,7 @@ class VirtualLink:
             return
         self._count += 1
         delay = 1e-3 * self.faults.pose_latency_ms if log_data else 0.0
-        heapq.heappush(
-            self._outgoing, (time + delay, self._count, raw, peer or self._listener)
-        )
+        heapq.heappush(self._outgoing, (time + delay, self._count, raw, peer or self._listener))
 
     def flush(self, time: float) -> None:
         """Put on the wire what is due."""

@@ -8,14 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from openjax.flying.crtp import (
-    LOG_FORMATS,
-    MAX_LOG_DATA,
-    LogCommand,
-    Packet,
-    Port,
-    pack_number,
-)
+from openjax.flying.crtp import LOG_FORMATS, MAX_LOG_DATA, LogCommand, Packet, Port, pack_number
 from openjax.virtual_crazyflie.tables import LOG_NAMES, LOG_VARIABLES, Sensors
 
 MAX_BLOCKS = 16
@@ -93,9 +86,7 @@ class LogBlocks:
 
     def next(self) -> float:
         """When the next log packet is due (s); infinite if no block runs."""
-        return min(
-            (b.due for b in self._blocks.values() if b.period > 0), default=np.inf
-        )
+        return min((b.due for b in self._blocks.values() if b.period > 0), default=np.inf)
 
     def packets(self, firmware, time: float, sensors: Sensors) -> list[bytes]:
         """The log packets due at `time`, stamped with it in milliseconds."""
@@ -110,7 +101,5 @@ class LogBlocks:
                 pack_number(fmt, LOG_VARIABLES[name][1](firmware, sensors))
                 for name, fmt in block.variables
             )
-            packets.append(
-                Packet(Port.LOG, 2, bytes([ident]) + stamp + values).encode()
-            )
+            packets.append(Packet(Port.LOG, 2, bytes([ident]) + stamp + values).encode())
         return packets

@@ -87,13 +87,9 @@ class VirtualCrazyflies:
             for answer in self.firmware[i].receive(raw, max(due, self.time)):
                 self.links[i].send(answer, until, peer)
         self._advance(until)
-        for i, (firmware, link) in enumerate(
-            zip(self.firmware, self.links, strict=True)
-        ):
+        for i, (firmware, link) in enumerate(zip(self.firmware, self.links, strict=True)):
             if firmware.logs.next() <= self.time:
-                for packet in firmware.logs.packets(
-                    firmware, self.time, self.vehicles.sensors(i)
-                ):
+                for packet in firmware.logs.packets(firmware, self.time, self.vehicles.sensors(i)):
                     link.send(packet, until)
             link.flush(until)
 

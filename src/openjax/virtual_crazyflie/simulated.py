@@ -58,11 +58,7 @@ class SimulatedSwarm:
     """
 
     def __init__(
-        self,
-        vehicles: VirtualVehicles,
-        following: Sequence[bool],
-        radio: Damage,
-        camera: Damage,
+        self, vehicles: VirtualVehicles, following: Sequence[bool], radio: Damage, camera: Damage
     ):
         self.vehicles = vehicles
         self.now = 0.0
@@ -107,9 +103,7 @@ class SimulatedSwarm:
 
     def advance(self) -> None:
         """One tick of 10 ms."""
-        set_points = np.array(
-            [f.set_point(self.now) for f in self.firmware], np.float32
-        )
+        set_points = np.array([f.set_point(self.now) for f in self.firmware], np.float32)
         steps = round(TICK / STEP)
         report = self.vehicles.advance(set_points, steps)
         self._steps += steps
@@ -132,18 +126,14 @@ class SimulatedSwarm:
         rates = report.body_rates.tolist()
         voltage = self.vehicles.voltage().tolist()
         # in g, as half-precision numbers
-        force = (
-            9.81 * (report.specific_force / 9.81).astype(np.float16).astype(float)
-        ).tolist()
+        force = (9.81 * (report.specific_force / 9.81).astype(np.float16).astype(float)).tolist()
         for i, old in enumerate(self._samples):
             if i in self.asleep:
                 continue
             shaken = [q + noise(0.0, CAMERA_NOISE) for q in quaternion[i]]
             size = math.sqrt(sum(q * q for q in shaken))
             place = tuple(p + noise(0.0, CAMERA_NOISE) for p in position[i])
-            capture = Pose(
-                self.now, place, (0.0, 0.0, 0.0), tuple(q / size for q in shaken)
-            )
+            capture = Pose(self.now, place, (0.0, 0.0, 0.0), tuple(q / size for q in shaken))
             # as exact as a packet's 32 bits
             on_board = expand_quaternion(compress_quaternion(quaternion[i]))
             own_place, own_velocity = map(tuple, estimate[i])
@@ -154,9 +144,7 @@ class SimulatedSwarm:
                 own=own_estimate or old.own,
                 last_contact=self.now if own_estimate else old.last_contact,
                 voltage=voltage[i] if voltage_of_link is None else voltage_of_link,
-                supervisor=self.firmware[i].supervisor_info
-                if own_estimate
-                else old.supervisor,
+                supervisor=self.firmware[i].supervisor_info if own_estimate else old.supervisor,
                 captured=self._camera(i, self.now, capture) or old.captured,
                 force=tuple(force[i]) if own_estimate else old.force,
             )

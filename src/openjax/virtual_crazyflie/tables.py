@@ -40,33 +40,18 @@ def _log_variables() -> dict[str, tuple[str, Callable]]:
     for i, axis in enumerate("xyz"):
         table[f"stateEstimate.{axis}"] = ("float", lambda f, s, i=i: s.position[i])
         table[f"stateEstimate.v{axis}"] = ("float", lambda f, s, i=i: s.velocity[i])
-        table[f"stateEstimateZ.{axis}"] = (
-            "int16_t",
-            lambda f, s, i=i: 1000 * s.position[i],
-        )
-        table[f"stateEstimateZ.v{axis}"] = (
-            "int16_t",
-            lambda f, s, i=i: 1000 * s.velocity[i],
-        )
+        table[f"stateEstimateZ.{axis}"] = ("int16_t", lambda f, s, i=i: 1000 * s.position[i])
+        table[f"stateEstimateZ.v{axis}"] = ("int16_t", lambda f, s, i=i: 1000 * s.velocity[i])
         table[f"acc.{axis}"] = ("float", lambda f, s, i=i: s.specific_force[i] / 9.81)
         table[f"gyro.{axis}"] = ("float", lambda f, s, i=i: np.degrees(s.body_rates[i]))
         table[f"locSrv.{axis}"] = ("float", lambda f, s, i=i: f.external_pose[i])
     for i, name in enumerate(("roll", "pitch", "yaw")):
-        table[f"stateEstimate.{name}"] = (
-            "float",
-            lambda f, s, i=i: _angles(s.quaternion)[i],
-        )
+        table[f"stateEstimate.{name}"] = ("float", lambda f, s, i=i: _angles(s.quaternion)[i])
     for i, name in enumerate(("qw", "qx", "qy", "qz")):
         table[f"stateEstimate.{name}"] = ("float", lambda f, s, i=i: s.quaternion[i])
         table[f"locSrv.{name}"] = ("float", lambda f, s, i=i: f.external_pose[3 + i])
-        table[f"motor.m{i + 1}"] = (
-            "uint16_t",
-            lambda f, s, i=i: FULL_SCALE * s.motor_command[i],
-        )
-    table["stateEstimateZ.quat"] = (
-        "uint32_t",
-        lambda f, s: compress_quaternion(s.quaternion),
-    )
+        table[f"motor.m{i + 1}"] = ("uint16_t", lambda f, s, i=i: FULL_SCALE * s.motor_command[i])
+    table["stateEstimateZ.quat"] = ("uint32_t", lambda f, s: compress_quaternion(s.quaternion))
     table["pm.vbat"] = ("float", lambda f, s: s.voltage)
     table["pm.vbatMV"] = ("uint16_t", lambda f, s: 1000 * s.voltage)
     table["supervisor.info"] = ("uint16_t", lambda f, s: f.supervisor_info)

@@ -14,13 +14,7 @@ from openjax.errors import UserError
 from openjax.flying.controller import airframe_of
 from openjax.flying.real_time import compile_in_line
 from openjax.flying.set_point import ANGLES, OFF
-from openjax.vehicle import (
-    Vehicle,
-    hover_state,
-    make_drones_step,
-    rotate,
-    rotate_inverse,
-)
+from openjax.vehicle import Vehicle, hover_state, make_drones_step, rotate, rotate_inverse
 from openjax.vehicle.effects import composition
 from openjax.vehicle.rate_controller import rate_controller
 from openjax.virtual_crazyflie.tables import Sensors
@@ -102,9 +96,7 @@ class VirtualVehicles:
         drones = self._step.reset(vehicle, drones, jax.random.key(0))
         flat, self._unflatten = ravel_pytree(drones)
         nothing = np.zeros((self.number, 5), np.float32)
-        self._advance = compile_in_line(
-            jax.jit(self._program).lower(flat, nothing, np.int32(1))
-        )
+        self._advance = compile_in_line(jax.jit(self._program).lower(flat, nothing, np.int32(1)))
         self._charge = float(battery)
         self._endurance = float(endurance)
         self._begin = np.asarray(flat)
@@ -124,9 +116,7 @@ class VirtualVehicles:
         self._state, report = self._advance(self._state, set_points, np.int32(steps))
         self.report = Report._make(np.asarray(leaf, np.float64) for leaf in report)
         share = self.report.motor_command.mean(1) / self._hover
-        self.battery = np.maximum(
-            self.battery - steps * STEP * share / self._endurance, 0.0
-        )
+        self.battery = np.maximum(self.battery - steps * STEP * share / self._endurance, 0.0)
         return self.report
 
     def _program(self, flat, set_points, steps):
@@ -135,20 +125,14 @@ class VirtualVehicles:
         effects = self._step.effects
         no_pillar = jnp.zeros((1, 2))
         inactive = jnp.zeros(1, bool)
-        complete = composition.complete_parameters(
-            effects, self._parameters, jnp.float32
-        )
+        complete = composition.complete_parameters(effects, self._parameters, jnp.float32)
         plant = composition.change_body(effects, complete, vehicle)
 
         def step(_, carry):
             drones, _, has_crashed = carry
             command = commands(drones.quaternion, set_points)
-            motor, _ = jax.vmap(lambda d, c: rate_controller(plant, d, c, STEP))(
-                drones, command
-            )
-            new = self._step(
-                vehicle, drones, command, no_pillar, inactive, self._parameters
-            )
+            motor, _ = jax.vmap(lambda d, c: rate_controller(plant, d, c, STEP))(drones, command)
+            new = self._step(vehicle, drones, command, no_pillar, inactive, self._parameters)
             # from what the step did, so that the accelerometer feels every effect
             acceleration = (new.velocity - drones.velocity) / STEP
             new, on_floor, hit = _stand(new)
@@ -178,11 +162,7 @@ class VirtualVehicles:
 
     def voltage(self) -> np.ndarray:
         """(N,) V, of the batteries under their loads."""
-        return (
-            FULL_VOLTAGE
-            - SPENT * (1.0 - self.battery)
-            - SAG * self.report.motor_command.mean(1)
-        )
+        return FULL_VOLTAGE - SPENT * (1.0 - self.battery) - SAG * self.report.motor_command.mean(1)
 
     def sensors(self, i: int) -> Sensors:
         """What vehicle i senses."""
@@ -227,9 +207,7 @@ def _stand(drones):
     """
     # one that rises already isn't held, however low it is
     below = (drones.position[:, 2] <= 0.0) & (drones.velocity[:, 2] <= 0.0)
-    up = jax.vmap(lambda q: rotate(q, jnp.array([0.0, 0.0, 1.0])))(drones.quaternion)[
-        :, 2
-    ]
+    up = jax.vmap(lambda q: rotate(q, jnp.array([0.0, 0.0, 1.0])))(drones.quaternion)[:, 2]
     hit = below & ((drones.velocity[:, 2] < -CRASH_SPEED) | (up < CRASH_TILT))
     w = drones.quaternion[:, 0]
     z = drones.quaternion[:, 3]
@@ -241,9 +219,7 @@ def _stand(drones):
 
     rest = jnp.zeros_like(drones.velocity)
     drones = drones.replace(
-        position=drones.position.at[:, 2].set(
-            jnp.where(below, 0.0, drones.position[:, 2])
-        ),
+        position=drones.position.at[:, 2].set(jnp.where(below, 0.0, drones.position[:, 2])),
         velocity=keep(rest, drones.velocity),
         quaternion=keep(level, drones.quaternion),
         body_rates=keep(rest, drones.body_rates),

@@ -22,13 +22,7 @@ import optax
 from flax import struct
 
 from openjax.evaluation.judges.duel import Duel, World, copies
-from openjax.evaluation.judges.networks import (
-    apply_network,
-    init_network,
-    likeliest,
-    of_way,
-    ways,
-)
+from openjax.evaluation.judges.networks import apply_network, init_network, likeliest, of_way, ways
 from openjax.evaluation.judges.senses import sense, to_world
 from openjax.evaluation.judges.settings import BestResponseSettings
 from openjax.policy import PolicyParameters
@@ -113,9 +107,7 @@ class BestResponse:
         one's.
         """
         settings = self.settings
-        rate = optax.linear_schedule(
-            settings.learning_rate, 0.0, settings.gradient_steps
-        )
+        rate = optax.linear_schedule(settings.learning_rate, 0.0, settings.gradient_steps)
         return optax.chain(optax.clip_by_global_norm(1.0), optax.adam(rate, eps=1e-5))
 
     @property
@@ -141,13 +133,9 @@ class BestResponse:
             critic=init_network(critic_key, learners, (inputs, width, 1)),
             log_std=log_std,
             world_axes=jnp.arange(learners) % 2 == 1,
-            discount=jnp.asarray(
-                self.settings.discounts(self.game.time_step), jnp.float32
-            ),
+            discount=jnp.asarray(self.settings.discounts(self.game.time_step), jnp.float32),
         )
-        return ResponseCarry(
-            evaders, jax.vmap(self.optimiser.init)(evaders.networks), world, key
-        )
+        return ResponseCarry(evaders, jax.vmap(self.optimiser.init)(evaders.networks), world, key)
 
     def step(
         self, parameters: PolicyParameters, carry: ResponseCarry
@@ -157,9 +145,7 @@ class BestResponse:
         """
         key, noise_key, world_key, order_key = jax.random.split(carry.key, 4)
         keys = jax.random.split(noise_key, self.settings.rollout_length)
-        decide = functools.partial(
-            self._decide, parameters, carry.evaders, self._fresh(world_key)
-        )
+        decide = functools.partial(self._decide, parameters, carry.evaders, self._fresh(world_key))
         world, decisions = jax.lax.scan(decide, carry.world, keys)
         evaders, optimiser = self._learn(carry, decisions, world[1], order_key)
         episodes = jnp.sum(self._by_learner(decisions.over), (0, 2))
@@ -179,9 +165,7 @@ class BestResponse:
     def _fresh(self, key):
         """All worlds at the start of an episode."""
         task_key, reset_key = jax.random.split(key)
-        learners = jnp.repeat(
-            jnp.arange(self.settings.learners), self.settings.num_envs
-        )
+        learners = jnp.repeat(jnp.arange(self.settings.learners), self.settings.num_envs)
         keys = jax.random.split(task_key, learners.size)
         if self.draw_own_task is None:
             tasks = jax.vmap(self.draw_task)(keys)
@@ -240,9 +224,7 @@ class BestResponse:
                     return jax.lax.dynamic_slice_in_dim(leaf, i * size, size, axis=1)
 
                 gradient = jax.grad(self._loss)(networks, jax.tree.map(part, rows))
-                change, state = jax.vmap(self.optimiser.update)(
-                    gradient, state, networks
-                )
+                change, state = jax.vmap(self.optimiser.update)(gradient, state, networks)
                 return (optax.apply_updates(networks, change), state), None
 
             indices = jnp.arange(settings.minibatches)
@@ -258,9 +240,7 @@ class BestResponse:
     def _batch(self, evaders, decisions, state):
         """(L, T * E, ...) by name: what the loss needs."""
         senses = self._by_learner(decisions.senses)  # (T, L, E, F)
-        of_steps = jax.vmap(
-            lambda senses: apply_network(evaders.critic, senses)[..., 0]
-        )
+        of_steps = jax.vmap(lambda senses: apply_network(evaders.critic, senses)[..., 0])
         value = of_steps(senses)  # (T, L, E)
         last = apply_network(evaders.critic, _sense(self.game, evaders, state))[..., 0]
         discount = evaders.discount[:, None]
@@ -271,12 +251,8 @@ class BestResponse:
             advantage, following = carry
             free, over, value = step
             # values are shares of the time to come: at most one
-            target = (1.0 - discount) * free + discount * jnp.where(
-                over, 0.0, following
-            )
-            trace = (
-                discount * self.settings.gae_lambda * jnp.where(over, 0.0, advantage)
-            )
+            target = (1.0 - discount) * free + discount * jnp.where(over, 0.0, following)
+            trace = discount * self.settings.gae_lambda * jnp.where(over, 0.0, advantage)
             advantage = target - value + trace
             return (advantage, value), advantage
 
@@ -312,9 +288,7 @@ class BestResponse:
         value = apply_network(critic, part["sensed"])[..., 0]
         # a value is at most one, an advantage of one standard deviation some hundredths
         error = settings.value_coefficient * (value - part["target"]) ** 2
-        spread_out = jnp.sum(log_std, -1) - jnp.mean(
-            jnp.sum(jnp.exp(odds) * odds, -1), axis=1
-        )
+        spread_out = jnp.sum(log_std, -1) - jnp.mean(jnp.sum(jnp.exp(odds) * odds, -1), axis=1)
         entropy = settings.entropy_coefficient * spread_out
         return jnp.sum(jnp.mean(error - surrogate, axis=1) - entropy)
 
@@ -329,16 +303,12 @@ def fly_learners(
     learners = evaders.world_axes.size
 
     def one(world, _):
-        decision = likeliest(
-            apply_network(evaders.actor, _sense(game, evaders, world[1]))
-        )
+        decision = likeliest(apply_network(evaders.actor, _sense(game, evaders, world[1])))
         velocity = _in_world(evaders, decision, world[1])
         return duel.fly(parameters, world, velocity, hold), None
 
     world = copies(start, learners)
-    statistics = jax.lax.scan(one, world, length=game.episode_length // hold)[0][
-        1
-    ].statistics
+    statistics = jax.lax.scan(one, world, length=game.episode_length // hold)[0][1].statistics
     return jax.tree.map(lambda leaf: leaf.reshape(learners, -1), statistics)
 
 

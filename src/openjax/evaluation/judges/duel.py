@@ -26,11 +26,7 @@ class Duel:
         return jax.vmap(self.environment.reset_to)(keys, tasks)
 
     def fly(
-        self,
-        parameters: PolicyParameters,
-        world: World,
-        velocity: jax.Array,
-        steps: int,
+        self, parameters: PolicyParameters, world: World, velocity: jax.Array, steps: int
     ) -> World:
         """Worlds (B, ...) after control steps in which the evader flies `velocity` (B,
         3), as shares of its speed in the world's axes.

@@ -130,10 +130,7 @@ class MatrixGame(RecedingHorizon):
     def _planner(self) -> Planner:
         settings = self.settings
         planning = PlannerSettings(
-            settings.evader_plans,
-            settings.pieces,
-            settings.piece_steps,
-            settings.replan,
+            settings.evader_plans, settings.pieces, settings.piece_steps, settings.replan
         )
         return Planner(planning, self.duel)
 
@@ -152,14 +149,10 @@ class MatrixGame(RecedingHorizon):
         evader_key, team_key = jax.random.split(key)
         plans = self._planner.candidates(evader_key, carry.plan)  # (B, E, P, 3)
         teams = self._team_candidates(team_key, carry.team)  # (B, T, P, ...)
-        plan, team = self._decide(
-            parameters, carry.world, carry.preparation, plans, teams
-        )
+        plan, team = self._decide(parameters, carry.world, carry.preparation, plans, teams)
         piece = jax.tree.map(lambda leaf: leaf[:, 0], team)
         act = self._act(parameters, carry.preparation, piece)
-        world = self.duel.fly_actions(
-            act, carry.world, plan[:, 0], self.settings.replan
-        )
+        world = self.duel.fly_actions(act, carry.world, plan[:, 0], self.settings.replan)
         return carry.replace(world=world, plan=plan, team=team)
 
     def _decide(self, parameters, world, preparation, plans, teams):
@@ -173,15 +166,11 @@ class MatrixGame(RecedingHorizon):
 
         if settings.full_sight:
             payoff = self._all_payoffs(parameters, world, preparation, plans, teams)
-            mine, theirs = jax.vmap(
-                lambda values: choose(values, settings.pursuers_last)
-            )(payoff)
+            mine, theirs = jax.vmap(lambda values: choose(values, settings.pursuers_last))(payoff)
             team = jax.tree.map(lambda leaf: pick(leaf, theirs), teams)
             return pick(plans, mine), team
         # the team plans where it takes the evader to be, and the evader knows better
-        thought = self._all_payoffs(
-            parameters, as_thought(world), preparation, plans, teams
-        )
+        thought = self._all_payoffs(parameters, as_thought(world), preparation, plans, teams)
         if settings.pursuers_last:
             true = self._all_payoffs(parameters, world, preparation, plans, teams)
             mine = jnp.argmax(jnp.min(true, axis=2), axis=1)
@@ -231,9 +220,7 @@ class MatrixGame(RecedingHorizon):
         def piece(world, both):
             velocity, team = both
             act = self._act(parameters, preparation, team)
-            return self.duel.fly_actions(
-                act, world, velocity, self.settings.piece_steps
-            ), None
+            return self.duel.fly_actions(act, world, velocity, self.settings.piece_steps), None
 
         end = jax.lax.scan(piece, start, pieces)[0][1]
         payoff = jax.vmap(self._payoff)(start[1], end, preparation)
@@ -275,9 +262,7 @@ class MatrixGame(RecedingHorizon):
         """
         settings = self.settings
         random_key, direct_key, near_key, who_key = jax.random.split(key, 4)
-        following = jax.tree.map(
-            lambda leaf: jnp.concatenate([leaf[:, 1:], leaf[:, -1:]], 1), team
-        )
+        following = jax.tree.map(lambda leaf: jnp.concatenate([leaf[:, 1:], leaf[:, -1:]], 1), team)
         none = jnp.zeros_like(team.beside)
         policy = TeamPlans(none, jnp.ones_like(team.by_policy))
         at_it = TeamPlans(none, jnp.zeros_like(team.by_policy))
@@ -297,9 +282,7 @@ class MatrixGame(RecedingHorizon):
             parts.append(_random_teams(direct_key, shape, settings.direct_plans, 0.0))
         return jax.tree.map(lambda *leaves: jnp.concatenate(leaves, axis=1), *parts)
 
-    def _payoff(
-        self, start: PursuitState, end: PursuitState, preparation: Any
-    ) -> jax.Array:
+    def _payoff(self, start: PursuitState, end: PursuitState, preparation: Any) -> jax.Array:
         """() what the end of a pair of plans is worth to the evader, in steps: those
         that it is free first, then how far it is from the pursuers.
         """

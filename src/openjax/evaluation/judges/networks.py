@@ -19,9 +19,7 @@ def init_network(key: jax.Array, learners: int, sizes: tuple[int, int, int]) -> 
     for i, scale in enumerate(scales):
         key, layer_key = jax.random.split(key)
         shape = (learners, sizes[i], sizes[i + 1])
-        network[f"kernel_{i}"] = (
-            scale * jax.random.normal(layer_key, shape) / jnp.sqrt(sizes[i])
-        )
+        network[f"kernel_{i}"] = scale * jax.random.normal(layer_key, shape) / jnp.sqrt(sizes[i])
         network[f"bias_{i}"] = jnp.zeros((learners, 1, sizes[i + 1]))
     return network
 

@@ -51,9 +51,7 @@ class Planner(RecedingHorizon):
         """Worlds (B, ...) at the start of an episode, and plans that are none."""
         return Planned(start, jnp.zeros((start[1].step.size, self.settings.pieces, 3)))
 
-    def replan(
-        self, parameters: PolicyParameters, carry: Planned, key: jax.Array
-    ) -> Planned:
+    def replan(self, parameters: PolicyParameters, carry: Planned, key: jax.Array) -> Planned:
         """The same after it has planned once and flown until the next time."""
         plan = self._best(parameters, carry.world, carry.plan, key)
         world = self.duel.fly(parameters, carry.world, plan[:, 0], self.settings.replan)
@@ -68,16 +66,12 @@ class Planner(RecedingHorizon):
         start = jax.tree.map(
             lambda leaf: jnp.repeat(leaf, settings.plans, axis=0),
             # a key beside those that `candidates` splits this one into
-            without_foresight(
-                self.duel.environment.settings, world, jax.random.fold_in(key, 1)
-            ),
+            without_foresight(self.duel.environment.settings, world, jax.random.fold_in(key, 1)),
         )
         pieces = jnp.moveaxis(candidates.reshape(-1, *candidates.shape[2:]), 1, 0)
 
         def piece(world, velocity):
-            return self.duel.fly(
-                parameters, world, velocity, settings.piece_steps
-            ), None
+            return self.duel.fly(parameters, world, velocity, settings.piece_steps), None
 
         (_, end), _ = jax.lax.scan(piece, start, pieces)
         score = jax.vmap(self.promise)(start[1], end).reshape(plan.shape[0], -1)
@@ -100,12 +94,7 @@ class Planner(RecedingHorizon):
         number = plan.shape[0]
         ways = unit(jax.random.normal(straight_key, (number, straight, 1, 3)))
         ways = jnp.broadcast_to(ways, (number, straight, settings.pieces, 3))
-        parts = [
-            plan[:, None],
-            following[:, None],
-            ways,
-            self._bent(bent_key, number, bent),
-        ]
+        parts = [plan[:, None], following[:, None], ways, self._bent(bent_key, number, bent)]
         if near:
             parts.append(self._refine(near_key, following, near))
         return jnp.concatenate(parts, axis=1)
@@ -130,15 +119,9 @@ class Planner(RecedingHorizon):
         if not by_rule:
             return bent
         # the first flies by it from the beginning
-        end = (
-            jax.random.randint(end_key, (number, by_rule), 0, settings.pieces)
-            .at[:, 0]
-            .set(0)
-        )
+        end = jax.random.randint(end_key, (number, by_rule), 0, settings.pieces).at[:, 0].set(0)
         is_own = jnp.arange(settings.pieces) >= end[..., None]
-        return bent.at[:, :by_rule].set(
-            jnp.where(is_own[..., None], jnp.nan, bent[:, :by_rule])
-        )
+        return bent.at[:, :by_rule].set(jnp.where(is_own[..., None], jnp.nan, bent[:, :by_rule]))
 
     def _refine(self, key, plan, plans):
         """(B, plans, pieces, 3) a plan (B, pieces, 3), some pieces of which lead
@@ -153,9 +136,7 @@ class Planner(RecedingHorizon):
         is_change = ((place >= first) & (place <= last))[..., None]
         aside = SPREAD * jax.random.normal(way_key, (*shape, 1, 3))
         plan = plan[:, None]
-        return jnp.where(
-            is_change, unit(plan + aside), jnp.broadcast_to(plan, (*shape, pieces, 3))
-        )
+        return jnp.where(is_change, unit(plan + aside), jnp.broadcast_to(plan, (*shape, pieces, 3)))
 
     def promise(self, start: PursuitState, end: PursuitState) -> jax.Array:
         """() how good the end of a plan is: steps free first, then the room that is
@@ -191,6 +172,4 @@ def without_foresight(game: PursuitSettings, world: World, key: jax.Array) -> Wo
 
 def unit(vector: jax.Array) -> jax.Array:
     """(..., 3) of length one."""
-    return vector / jnp.sqrt(
-        jnp.sum(vector**2, axis=-1, keepdims=True) + np.float32(1e-12)
-    )
+    return vector / jnp.sqrt(jnp.sum(vector**2, axis=-1, keepdims=True) + np.float32(1e-12))

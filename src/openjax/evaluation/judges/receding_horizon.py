@@ -36,9 +36,7 @@ class RecedingHorizon(ABC):
     def replan(self, parameters: PolicyParameters, carry: Any, key: jax.Array) -> Any:
         """The same after it has planned once and flown until the next time."""
 
-    def fly(
-        self, parameters: PolicyParameters, start: World, key: jax.Array
-    ) -> EpisodeStatistics:
+    def fly(self, parameters: PolicyParameters, start: World, key: jax.Array) -> EpisodeStatistics:
         """Statistics (B,) of one episode from each of B starts."""
         end, _ = self.fly_and_keep(parameters, start, key, lambda state: None)
         return end.statistics

@@ -15,17 +15,11 @@ def with_scripted(environment: Pursuit) -> Pursuit:
     `openjax.pursuit.evaders.SCRIPTED`; not to be called while something is traced.
     """
     settings = dataclasses.replace(environment.settings, evaders=SCRIPTED)
-    return dataclasses.replace(
-        environment, settings=settings, evaders=None, dynamics=None
-    )
+    return dataclasses.replace(environment, settings=settings, evaders=None, dynamics=None)
 
 
 def fly_scripted(
-    duel: Duel,
-    parameters: PolicyParameters,
-    tasks: Task,
-    place: jax.Array,
-    key: jax.Array,
+    duel: Duel, parameters: PolicyParameters, tasks: Task, place: jax.Array, key: jax.Array
 ) -> EpisodeStatistics:
     """Statistics (B,): an episode of one evader on each of tasks (B, ...).
 
@@ -41,9 +35,7 @@ def fly_scripted(
     def begin(key, task):
         observation, state = game.reset_to(key, task)
         pursuers = task.pursuer_position
-        evader = draw_evader(
-            game.settings, jax.random.fold_in(key, 3), pursuers, kind=place
-        )
+        evader = draw_evader(game.settings, jax.random.fold_in(key, 3), pursuers, kind=place)
         return observation, state.replace(evader=evader)
 
     def step(state, action):
@@ -59,6 +51,4 @@ def fly_scripted(
 
     keys = jax.random.split(key, tasks.evader_position.shape[0])
     world = jax.vmap(begin)(keys, tasks)
-    return jax.lax.scan(one, world, length=game.settings.episode_length)[0][
-        1
-    ].statistics
+    return jax.lax.scan(one, world, length=game.settings.episode_length)[0][1].statistics

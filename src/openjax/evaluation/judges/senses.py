@@ -28,10 +28,7 @@ USUAL_RADIUS = 0.3
 
 
 def sense(
-    settings: PursuitSettings,
-    state: PursuitState,
-    world_axes: jax.Array,
-    slots: int | None = None,
+    settings: PursuitSettings, state: PursuitState, world_axes: jax.Array, slots: int | None = None
 ) -> jax.Array:
     """(F,) float32, of the order of one, of one world.
 
@@ -67,9 +64,7 @@ def number_of_senses(pursuers: int, slots: int) -> int:
     return _EVADER + _PURSUER * pursuers + len(_NO_PILLAR) * slots
 
 
-def to_world(
-    velocity: jax.Array, state: PursuitState, world_axes: jax.Array
-) -> jax.Array:
+def to_world(velocity: jax.Array, state: PursuitState, world_axes: jax.Array) -> jax.Array:
     """(3,) in the world of a velocity (3,) in the evader's axes."""
     axes = _axes(state.evader_position, world_axes)
     return velocity @ axes
@@ -79,9 +74,7 @@ def _axes(position, world_axes):
     """(3, 3) rows: the evader's axes in the world."""
     radius = jnp.sqrt(jnp.sum(position[:2] ** 2) + TINY)
     # on the axis there is no outward direction
-    outward = jnp.where(
-        world_axes | (radius < 1e-3), jnp.array([1.0, 0.0]), position[:2] / radius
-    )
+    outward = jnp.where(world_axes | (radius < 1e-3), jnp.array([1.0, 0.0]), position[:2] / radius)
     cos, sin = outward
     return jnp.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
 

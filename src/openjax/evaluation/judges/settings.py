@@ -73,9 +73,7 @@ class BestResponseSettings:
                 f"specialists {self.specialists}: at most the {self.learners} learners can be some"
             )
         if not self.foresight or min(self.foresight) <= 0.0:
-            raise UserError(
-                f"foresight {self.foresight}: seconds above zero are needed"
-            )
+            raise UserError(f"foresight {self.foresight}: seconds above zero are needed")
         if self.num_envs * self.rollout_length % self.minibatches:
             raise UserError(
                 f"num_envs {self.num_envs} times rollout_length {self.rollout_length} must be a "
@@ -100,9 +98,7 @@ class BestResponseSettings:
     def discounts(self, time_step: float) -> list[float]:
         """Of a decision, of each learner; `time_step` of the game in seconds."""
         decision = self.hold * time_step
-        seconds = (
-            self.foresight[i % len(self.foresight)] for i in range(self.learners)
-        )
+        seconds = (self.foresight[i % len(self.foresight)] for i in range(self.learners))
         return [1.0 - decision / (decision + second) for second in seconds]
 
 

@@ -33,9 +33,7 @@ class Splitting:
     environment: Pursuit
     policy: Policy
 
-    def fly(
-        self, parameters: PolicyParameters, tasks: Task, key: jax.Array
-    ) -> EpisodeStatistics:
+    def fly(self, parameters: PolicyParameters, tasks: Task, key: jax.Array) -> EpisodeStatistics:
         """Statistics (B,) of the copy that was free the longest, for each of tasks (B,
         ...).
         """
@@ -43,9 +41,7 @@ class Splitting:
         # one task at a time would leave an accelerator idle, all at once need too much
         # memory
         return jax.lax.map(
-            lambda inputs: self._fly_one(parameters, *inputs),
-            (tasks, keys),
-            batch_size=TOGETHER,
+            lambda inputs: self._fly_one(parameters, *inputs), (tasks, keys), batch_size=TOGETHER
         )
 
     def _fly_one(self, parameters, task, key):
@@ -53,9 +49,7 @@ class Splitting:
         copies = self.settings.copies
         start_key, heading_key, pieces_key = jax.random.split(key, 3)
         world = self.environment.reset_to(start_key, task)
-        worlds = jax.tree.map(
-            lambda leaf: jnp.broadcast_to(leaf, (copies, *leaf.shape)), world
-        )
+        worlds = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (copies, *leaf.shape)), world)
         heading = _directions(heading_key, copies)
 
         def piece(carry, key):

@@ -19,13 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from openjax.flights.csv_text import find_header, head_of
-from openjax.flights.importers.columns import (
-    UNITS,
-    ColumnMapping,
-    Source,
-    Stream,
-    merge_streams,
-)
+from openjax.flights.importers.columns import UNITS, ColumnMapping, Source, Stream, merge_streams
 from openjax.flights.importers.csv_files import delimiter_of, is_csv, raw_columns
 from openjax.flights.importers.importer import Importer
 from openjax.flights.reading import CHANNEL_COLUMNS, LogError, LogTable
@@ -57,10 +51,7 @@ def is_blackbox_csv(path: Path) -> bool:
 def is_beside(path: Path) -> bool:
     """Whether a file is no log of its own, but what a decoder wrote beside one."""
     ending = next((end for end in BESIDE if path.name.endswith(end)), None)
-    return (
-        ending is not None
-        and path.with_name(path.name.removesuffix(ending) + ".csv").exists()
-    )
+    return ending is not None and path.with_name(path.name.removesuffix(ending) + ".csv").exists()
 
 
 def _lines_above(lines: list[str]) -> int | None:
@@ -102,9 +93,7 @@ def read_blackbox_csv(path: Path, mapping: ColumnMapping | None = None) -> LogTa
     above = _lines_above(lines) or 0
     names = find_header(lines[above:], delimiter).names
     headers = _headers(lines[:above])
-    log_file = path.with_name(
-        path.name.removesuffix(".gz").removesuffix(".csv") + HEADERS_FILE
-    )
+    log_file = path.with_name(path.name.removesuffix(".gz").removesuffix(".csv") + HEADERS_FILE)
     if log_file.is_file():
         # what a decoder put beside the table goes before what stands above it
         headers |= _headers(head_of(log_file))
@@ -116,23 +105,16 @@ def read_blackbox_csv(path: Path, mapping: ColumnMapping | None = None) -> LogTa
     usual = _usual(fields, headers)
     time = fields.get("time", "time")
     mapping_columns = {} if mapping is None else mapping.columns
-    columns_read = (
-        time,
-        *(source.name for source in (*usual.values(), *mapping_columns.values())),
-    )
+    columns_read = (time, *(source.name for source in (*usual.values(), *mapping_columns.values())))
     raw, more_remarks = raw_columns(path, columns_read, time, delimiter, above)
     remarks += more_remarks
-    columns = (
-        usual | _force(raw, fields, headers, remarks) | _motors(raw, fields, remarks)
-    )
+    columns = usual | _force(raw, fields, headers, remarks) | _motors(raw, fields, remarks)
     if mapping is not None:
         columns = mapping.over(columns)
     seconds = raw[time] * UNITS.get(_FIELD.fullmatch(time)[2] or "us", UNITS["us"])
     table = merge_streams([Stream(seconds, raw)], columns)
     table["t"] = table["t"] - table["t"][0]
-    for motor in set(CHANNEL_COLUMNS["motor_command"]) & set(table) - set(
-        mapping_columns
-    ):
+    for motor in set(CHANNEL_COLUMNS["motor_command"]) & set(table) - set(mapping_columns):
         # a motor at rest is below DShot's least
         table[motor] = np.maximum(table[motor], 0.0)
     return LogTable(path.name, table, np.full(len(table["t"]), "0"), tuple(remarks))
@@ -145,13 +127,9 @@ def _without_filter(fields: dict[str, str]) -> list[str]:
     if "gyroADC[0]" in fields:
         return []
     if "gyroUnfilt[0]" not in fields:
-        raise LogError(
-            "no gyroscope was logged (gyroADC[0..2]): switch it on in the blackbox"
-        )
+        raise LogError("no gyroscope was logged (gyroADC[0..2]): switch it on in the blackbox")
     fields |= {f"gyroADC[{i}]": fields[f"gyroUnfilt[{i}]"] for i in range(3)}
-    return [
-        "gyroADC wasn't logged: gyroUnfilt, before Betaflight's filters, stands for it"
-    ]
+    return ["gyroADC wasn't logged: gyroUnfilt, before Betaflight's filters, stands for it"]
 
 
 def _usual(fields: dict[str, str], headers: dict[str, str]) -> dict[str, Source]:
@@ -165,8 +143,7 @@ def _usual(fields: dict[str, str], headers: dict[str, str]) -> dict[str, Source]
     old = headers.get("firmwareVersion", "4").startswith(("2.", "3."))
     channels = {f"w{a}": (f"gyroADC[{i}]", count / fine) for i, a in enumerate("xyz")}
     channels |= {
-        f"cmd_w{a}": (f"setpoint[{i}]", UNITS["deg/s"] / fine)
-        for i, a in enumerate("xyz")
+        f"cmd_w{a}": (f"setpoint[{i}]", UNITS["deg/s"] / fine) for i, a in enumerate("xyz")
     }
     channels |= {f"a{a}": (f"accSmooth[{i}]", 1.0) for i, a in enumerate("xyz")}
     channels |= {column: (f"motor[{i}]", 1.0) for column, i in MOTOR_OF.items()}
@@ -210,12 +187,9 @@ def _force(
     if not counts:
         magnitude = np.nanmedian(np.linalg.norm([raw[name] for name in names], axis=0))
         counts = 2.0 ** np.rint(np.log2(max(magnitude, 1.0)))
-        remarks.append(
-            f"accSmooth is in the sensor's counts: {counts:g} are taken for 1 g"
-        )
+        remarks.append(f"accSmooth is in the sensor's counts: {counts:g} are taken for 1 g")
     return {
-        f"a{a}": Source(name, UNITS["g"] / counts)
-        for a, name in zip("xyz", names, strict=True)
+        f"a{a}": Source(name, UNITS["g"] / counts) for a, name in zip("xyz", names, strict=True)
     }
 
 
@@ -223,9 +197,7 @@ def _motors(raw, fields: dict[str, str], remarks: list[str]) -> dict[str, Source
     """The motors' columns, as shares of the range of the protocol that they show:
     pulses are never below their least, and DShot's largest is beyond that of pulses.
     """
-    names = {
-        c: fields[f"motor[{i}]"] for c, i in MOTOR_OF.items() if f"motor[{i}]" in fields
-    }
+    names = {c: fields[f"motor[{i}]"] for c, i in MOTOR_OF.items() if f"motor[{i}]" in fields}
     values = [raw[name] for name in names.values() if name in raw]
     if not values:
         return {}
@@ -242,6 +214,4 @@ def _motors(raw, fields: dict[str, str], remarks: list[str]) -> dict[str, Source
 
 
 CSV_IMPORTER = Importer("Betaflight blackbox CSV", is_blackbox_csv, read_blackbox_csv)
-BINARY_IMPORTER = Importer(
-    "Betaflight blackbox", is_blackbox_binary, read_blackbox_binary
-)
+BINARY_IMPORTER = Importer("Betaflight blackbox", is_blackbox_binary, read_blackbox_binary)

@@ -111,9 +111,7 @@ class ColumnMapping:
         format that it puts nothing in the place of.
         """
         usual = dict.fromkeys(c for c in LOG_COLUMNS if c not in self.columns)
-        usual = (
-            usual if not set(EULER) & set(self.columns) else _without_attitude(usual)
-        )
+        usual = usual if not set(EULER) & set(self.columns) else _without_attitude(usual)
         return (*usual, *(source.name for source in self.columns.values()))
 
     def over(self, usual: dict[str, Source]) -> dict[str, Source]:
@@ -121,9 +119,7 @@ class ColumnMapping:
         names; time is no source.
         """
         base = _without_attitude(usual) if set(EULER) & set(self.columns) else usual
-        return base | {
-            c: s for c, s in self.columns.items() if c not in ("t", "vehicle")
-        }
+        return base | {c: s for c, s in self.columns.items() if c not in ("t", "vehicle")}
 
     def table(self, name: str, raw: LogTable) -> LogTable:
         """A raw CSV table with its columns renamed and converted; time starts at zero.
@@ -133,9 +129,7 @@ class ColumnMapping:
         """
         sources = {source.name for source in self.columns.values()}
         named_columns = {
-            c: v
-            for c, v in raw.columns.items()
-            if c in LOG_COLUMNS and c not in sources
+            c: v for c, v in raw.columns.items() if c in LOG_COLUMNS and c not in sources
         }
         columns = (
             named_columns
@@ -147,9 +141,7 @@ class ColumnMapping:
             if column == "vehicle":
                 continue
             if source.name in raw.columns:
-                columns[column] = (
-                    source.scale * raw.columns[source.name] + source.offset
-                )
+                columns[column] = source.scale * raw.columns[source.name] + source.offset
             else:
                 columns.pop(column, None)
                 remarks.append(f"no column {source.name!r} for {column}")
@@ -169,9 +161,7 @@ def load_mapping(path: str | Path) -> ColumnMapping:
     unknown = sorted(set(tables) - {"delimiter", "columns"})
     if unknown or not isinstance(tables.get("columns"), dict):
         problem = f"unknown key {unknown[0]!r}" if unknown else "no table [columns]"
-        raise UserError(
-            f"{path}: {problem}; it may hold delimiter and must hold [columns]"
-        )
+        raise UserError(f"{path}: {problem}; it may hold delimiter and must hold [columns]")
     delimiter = tables.get("delimiter", "")
     if not isinstance(delimiter, str) or len(delimiter) != ("delimiter" in tables):
         raise UserError(f"{path}: delimiter must be one character")
@@ -207,11 +197,7 @@ def _clock(entry, path: Path) -> Clock:
             f"{path}: a time stamp is `of` {unknown[0]!r}; it must be a list of columns out of "
             f"{', '.join(possible)}"
         )
-    rest = (
-        {k: v for k, v in entry.items() if k != "of"}
-        if isinstance(entry, dict)
-        else entry
-    )
+    rest = {k: v for k, v in entry.items() if k != "of"} if isinstance(entry, dict) else entry
     return Clock(source_of("t", rest, path), tuple(columns))
 
 
@@ -271,20 +257,14 @@ def _convert(
     return time[order], columns | _without_flips(columns)
 
 
-def _at_one_time(
-    streams, clock: np.ndarray
-) -> list[tuple[np.ndarray, dict[str, np.ndarray]]]:
+def _at_one_time(streams, clock: np.ndarray) -> list[tuple[np.ndarray, dict[str, np.ndarray]]]:
     """The streams that were logged while the clock ran. Raises LogError for one that
     wasn't, where no other one has its columns; the battery may be missing.
     """
     beside = [u for u in streams if u[0][0] <= clock[-1] and u[0][-1] >= clock[0]]
-    elsewhere = {
-        column for _, columns_of_stream in beside for column in columns_of_stream
-    }
+    elsewhere = {column for _, columns_of_stream in beside for column in columns_of_stream}
     for time, columns_of_stream in streams:
-        absent = [
-            column for column in columns_of_stream if column not in elsewhere | {"vbat"}
-        ]
+        absent = [column for column in columns_of_stream if column not in elsewhere | {"vbat"}]
         if absent:
             raise LogError(
                 f"{', '.join(absent)} were logged from {time[0]:.2f} to {time[-1]:.2f} s, and "
@@ -318,13 +298,9 @@ def with_quaternion(
     """Roll, pitch, yaw replaced by the quaternion, unless that is there."""
     angles = [columns.get(name) for name in EULER]
     rest = {c: v for c, v in columns.items() if c not in EULER}
-    if any(a is None for a in angles) or all(
-        c in rest for c in CHANNEL_COLUMNS["quaternion"]
-    ):
+    if any(a is None for a in angles) or all(c in rest for c in CHANNEL_COLUMNS["quaternion"]):
         return rest
-    attitude = Rotation.from_euler("ZYX", np.stack(angles[::-1], 1)).as_quat(
-        scalar_first=True
-    )
+    attitude = Rotation.from_euler("ZYX", np.stack(angles[::-1], 1)).as_quat(scalar_first=True)
     return rest | dict(zip(CHANNEL_COLUMNS["quaternion"], attitude.T, strict=True))
 
 
@@ -380,9 +356,7 @@ def source_of(column: str, entry, path: Path) -> Source:
         )
     unit = entry.get("unit", "1")
     if unit not in UNITS:
-        raise UserError(
-            f"{path}: unknown unit {unit!r} for {column}; known are {', '.join(UNITS)}"
-        )
+        raise UserError(f"{path}: unknown unit {unit!r} for {column}; known are {', '.join(UNITS)}")
     numbers = (entry.get("scale", 1.0), entry.get("offset", 0.0))
     if not all(type(n) in (int, float) and math.isfinite(n) for n in numbers):
         raise UserError(f"{path}: scale and offset of {column} must be numbers")

@@ -25,15 +25,7 @@ from openjax.flights.importers.importer import Importer
 from openjax.flights.reading import LogError, LogTable
 
 TIME_NAMES = ("timestamp", "tick", "ticks", "time", "time_ms", "timestamp_ms", "t")
-GROUPS = (
-    "stateEstimate",
-    "stateEstimateZ",
-    "stabilizer",
-    "kalman",
-    "gyro",
-    "acc",
-    "controller",
-)
+GROUPS = ("stateEstimate", "stateEstimateZ", "stabilizer", "kalman", "gyro", "acc", "controller")
 """Of log variables whose names no other program has; other programs have a `motor.m1`,
 too.
 """
@@ -68,9 +60,7 @@ def _blocks(folder: Path) -> list[Path]:
 def time_name(names: list[str]) -> str | None:
     """The column that holds the time: the firmware's own rather than the computer's."""
     candidates = [name for name in names if name.lower() in TIME_NAMES]
-    return min(
-        candidates, key=lambda name: TIME_NAMES.index(name.lower()), default=None
-    )
+    return min(candidates, key=lambda name: TIME_NAMES.index(name.lower()), default=None)
 
 
 def read_client_log(path: Path, mapping: ColumnMapping | None = None) -> LogTable:
@@ -93,9 +83,7 @@ def read_client_log(path: Path, mapping: ColumnMapping | None = None) -> LogTabl
     columns, more_remarks = firmware_columns(streams, mapping)
     table = merge_streams(streams, columns)
     table["t"] = table["t"] - table["t"][0]
-    return LogTable(
-        path.name, table, np.full(len(table["t"]), "0"), (*remarks, *more_remarks)
-    )
+    return LogTable(path.name, table, np.full(len(table["t"]), "0"), (*remarks, *more_remarks))
 
 
 def _block(path: Path, mapping: ColumnMapping | None) -> tuple[Stream, list[str]]:
@@ -105,14 +93,8 @@ def _block(path: Path, mapping: ColumnMapping | None) -> tuple[Stream, list[str]
     mapping_columns = {} if mapping is None else mapping.columns
     time = mapping_columns["t"].name if "t" in mapping_columns else time_name(names)
     if time is None:
-        raise LogError(
-            f"no column {' or '.join(TIME_NAMES[:2])}: which holds the ticks in ms?"
-        )
-    variables = (
-        time,
-        *VARIABLES,
-        *(source.name for source in mapping_columns.values()),
-    )
+        raise LogError(f"no column {' or '.join(TIME_NAMES[:2])}: which holds the ticks in ms?")
+    variables = (time, *VARIABLES, *(source.name for source in mapping_columns.values()))
     values, remarks = raw_columns(path, variables, time, delimiter)
     ticks = values.pop(time)
     scale = mapping_columns["t"].scale if "t" in mapping_columns else _tick(ticks)
@@ -129,6 +111,4 @@ def _tick(ticks: np.ndarray) -> float:
     return 1e-3 if is_whole and np.median(steps) <= SELDOM else seconds_per_unit(ticks)
 
 
-IMPORTER = Importer(
-    "CSV of the Crazyflie's client or cflib", is_client_log, read_client_log
-)
+IMPORTER = Importer("CSV of the Crazyflie's client or cflib", is_client_log, read_client_log)

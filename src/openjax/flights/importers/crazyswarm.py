@@ -48,10 +48,7 @@ def custom_topics(bag: Path) -> list[dict]:
 
     topics = []
     for path in sorted(
-        p
-        for folder in (bag, bag.parent)
-        if folder.is_dir()
-        for p in folder.glob("*.y*ml")
+        p for folder in (bag, bag.parent) if folder.is_dir() for p in folder.glob("*.y*ml")
     ):
         if not path.is_file() or path.stat().st_size > LARGEST_YAML:
             continue
@@ -59,9 +56,7 @@ def custom_topics(bag: Path) -> list[dict]:
             tables = YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))
         except (YAMLError, UnicodeDecodeError, OSError):
             continue
-        if isinstance(tables, dict) and any(
-            k in tables for k in ("all", "robots", "robot_types")
-        ):
+        if isinstance(tables, dict) and any(k in tables for k in ("all", "robots", "robot_types")):
             topics.append(tables)
     return topics
 
@@ -74,14 +69,8 @@ def variables_of(topic: str, files: list[dict]) -> tuple[str, ...] | None:
     for tables in files:
         robot = _table(tables, "robots", vehicle)
         kind = robot.get("type")
-        for owner in (
-            robot,
-            _table(tables, "robot_types", kind),
-            _table(tables, "all"),
-        ):
-            variables = _table(owner, "firmware_logging", "custom_topics", name).get(
-                "vars"
-            )
+        for owner in (robot, _table(tables, "robot_types", kind), _table(tables, "all")):
+            variables = _table(owner, "firmware_logging", "custom_topics", name).get("vars")
             if isinstance(variables, list):
                 return tuple(str(variable) for variable in variables)
     return None
@@ -94,9 +83,7 @@ def _table(tables, *keys) -> dict:
     return tables if isinstance(tables, dict) else {}
 
 
-def log_stream(
-    topic: str, variables: tuple[str, ...], messages
-) -> tuple[Stream, float]:
+def log_stream(topic: str, variables: tuple[str, ...], messages) -> tuple[Stream, float]:
     """A topic's messages [(stamp in ns, message)] as a stream of log variables at the
     firmware's ticks, which don't wait for the radio, and by how much stamps are ahead
     of ticks at least (s). Raises LogError where messages hold another number of values.
@@ -109,9 +96,7 @@ def log_stream(
         )
     values = np.array([message.values for _, message in messages], float)
     ticks = np.array([message.timestamp for _, message in messages], float) * 1e-3
-    ahead = float(
-        np.min(np.array([stamp for stamp, _ in messages], float) * 1e-9 - ticks)
-    )
+    ahead = float(np.min(np.array([stamp for stamp, _ in messages], float) * 1e-9 - ticks))
     by_variable = dict(zip(variables, values.T, strict=True))
     return with_mixer(Stream(ticks, by_variable)), ahead
 
@@ -132,10 +117,7 @@ def pose_streams(topic: str, messages) -> dict[str, Stream]:
     streams = {}
     for name, rows in by_body.items():
         time, *values = np.array(rows, float).T
-        columns = {
-            pose_source(topic, name, c): v
-            for c, v in zip(POSE_FIELDS, values, strict=True)
-        }
+        columns = {pose_source(topic, name, c): v for c, v in zip(POSE_FIELDS, values, strict=True)}
         streams[name] = Stream(time, columns)
     return streams
 

@@ -53,9 +53,7 @@ def raw_columns(
     table = read_csv(path, delimiter, names, time, above)
     if time not in table.columns:
         raise LogError(f"column {time} holds no number")
-    return table.columns, [
-        r for r in table.remarks if not r.startswith("unknown column")
-    ]
+    return table.columns, [r for r in table.remarks if not r.startswith("unknown column")]
 
 
 def seconds_per_unit(time: Shaped[np.ndarray, " rows"]) -> float:

@@ -15,9 +15,7 @@ FIRMWARE_SOURCES = {
     for column, entries in read_toml(_FILE).items()
 }
 """Log variables of the firmware that hold each column, best first."""
-MIXER_INPUTS = tuple(
-    f"controller.cmd_{name}" for name in ("thrust", "roll", "pitch", "yaw")
-)
+MIXER_INPUTS = tuple(f"controller.cmd_{name}" for name in ("thrust", "roll", "pitch", "yaw"))
 VARIABLES = frozenset(
     source.name for sources in FIRMWARE_SOURCES.values() for source in sources
 ) | set(MIXER_INPUTS)
@@ -36,15 +34,11 @@ def firmware_columns(
         column: next((source for source in sources if source.name in names), None)
         for column, sources in FIRMWARE_SOURCES.items()
     }
-    columns = {
-        column: source for column, source in present.items() if source is not None
-    }
+    columns = {column: source for column, source in present.items() if source is not None}
     remarks = []
     if mapping is not None:
         columns = mapping.over(columns)
-        absent = [
-            source.name for source in columns.values() if source.name not in names
-        ]
+        absent = [source.name for source in columns.values() if source.name not in names]
         remarks += [f"no log variable {name!r}" for name in absent]
     if columns.get("m1", Source("")).name == "mixer.m1":
         remarks.append(MIXED)

@@ -42,10 +42,7 @@ def register(importer: Importer) -> Importer:
     """Add an importer, which is asked before those that are there already; one of the
     same name takes the other's place. Returns it.
     """
-    _IMPORTERS[:] = [
-        importer,
-        *(other for other in _IMPORTERS if other.name != importer.name),
-    ]
+    _IMPORTERS[:] = [importer, *(other for other in _IMPORTERS if other.name != importer.name)]
     return importer
 
 

@@ -12,14 +12,7 @@ from openjax.flights.reading import LOG_COLUMNS, LogTable
 
 WITH_UNIT = re.compile(r"(\w+) *[(\[](.+)[)\]]")
 """A name with its unit: "wx [deg/s]", "x (m)"."""
-WRITTEN = {
-    "m/s2": "m/s^2",
-    "m/s²": "m/s^2",
-    "°": "deg",
-    "°/s": "deg/s",
-    "%": "percent",
-    "-": "1",
-}
+WRITTEN = {"m/s2": "m/s^2", "m/s²": "m/s^2", "°": "deg", "°/s": "deg/s", "%": "percent", "-": "1"}
 """Other spellings of units."""
 
 

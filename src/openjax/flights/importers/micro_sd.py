@@ -31,11 +31,7 @@ def is_micro_sd(path: Path) -> bool:
         return False
     with path.open("rb") as file:
         head = file.read(5)
-    return (
-        len(head) == 5
-        and head[0] == MAGIC
-        and int.from_bytes(head[1:3], "little") in _VERSIONS
-    )
+    return len(head) == 5 and head[0] == MAGIC and int.from_bytes(head[1:3], "little") in _VERSIONS
 
 
 def read_micro_sd(path: str | Path, mapping: ColumnMapping | None = None) -> LogTable:
@@ -86,9 +82,7 @@ def decode(data: bytes) -> tuple[list[Stream], list[str]]:
             stamps, payloads = zip(*records, strict=True)
             rows = np.frombuffer(b"".join(payloads), dtype)
             time = np.array(stamps, np.float64) * tick
-            streams.append(
-                Stream(time, {name: rows[name].astype(float) for name in dtype.names})
-            )
+            streams.append(Stream(time, {name: rows[name].astype(float) for name in dtype.names}))
     if not streams:
         raise LogError("micro-SD log without a record")
     return streams, remarks
@@ -106,9 +100,7 @@ def _records(
         event, stamp = struct.unpack_from(head, data, at)
         if event not in events:
             if end != len(data):
-                raise LogError(
-                    f"micro-SD log with an unknown event {event} at byte {at}: corrupt"
-                )
+                raise LogError(f"micro-SD log with an unknown event {event} at byte {at}: corrupt")
             break
         size = events[event].itemsize
         at += head_size

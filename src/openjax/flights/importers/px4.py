@@ -19,23 +19,13 @@ import numpy as np
 
 from openjax.errors import UserError
 from openjax.flights.csv_text import LARGEST, LogError
-from openjax.flights.importers.columns import (
-    ColumnMapping,
-    Source,
-    Stream,
-    merge_streams,
-)
+from openjax.flights.importers.columns import ColumnMapping, Source, Stream, merge_streams
 from openjax.flights.importers.importer import Importer
 from openjax.flights.reading import LogTable
 
 MAGIC = b"ULog\x01\x12\x35"
 QUAD_X = ("front_right", "rear_left", "front_left", "rear_right")  # PX4's motors 1 to 4
-COLUMN_OF = {
-    "front_right": "m1",
-    "rear_right": "m2",
-    "rear_left": "m3",
-    "front_left": "m4",
-}
+COLUMN_OF = {"front_right": "m1", "rear_right": "m2", "rear_left": "m3", "front_left": "m4"}
 PULSE = (1000.0, 2000.0)  # us, PX4's defaults of PWM_MIN and PWM_MAX
 SELDOM = 3  # values outside of its range that an output may have
 MOTOR_1 = 101  # the output function of motor 1 in PWM_MAIN_FUNCi
@@ -64,11 +54,7 @@ TOPICS: dict[str, dict[str, tuple[str, float]]] = {
         "wy": ("xyz[1]", -1.0),
         "wz": ("xyz[2]", -1.0),
     },
-    "vehicle_acceleration": {
-        "ax": ("xyz[0]", 1.0),
-        "ay": ("xyz[1]", -1.0),
-        "az": ("xyz[2]", -1.0),
-    },
+    "vehicle_acceleration": {"ax": ("xyz[0]", 1.0), "ay": ("xyz[1]", -1.0), "az": ("xyz[2]", -1.0)},
     "vehicle_rates_setpoint": {
         "cmd_thrust": ("thrust_body[2]", -1.0),
         "cmd_wx": ("roll", 1.0),
@@ -100,14 +86,10 @@ def read_ulog(path: Path, mapping: ColumnMapping | None = None) -> LogTable:
     library.
     """
     mapping_columns = {} if mapping is None else mapping.over({})
-    log = _parse(
-        path, {source.name.partition(":")[0] for source in mapping_columns.values()}
-    )
+    log = _parse(path, {source.name.partition(":")[0] for source in mapping_columns.values()})
     # of several sensors of a kind the first
     topics = {data.name: data for data in log.data_list if data.multi_id == 0}
-    streams = {
-        name: _stream(data, log.start_timestamp) for name, data in topics.items()
-    }
+    streams = {name: _stream(data, log.start_timestamp) for name, data in topics.items()}
     if f"{ATTITUDE}:q[0]" in streams.get(ATTITUDE, Stream(np.empty(0), {})).values:
         streams[ATTITUDE] = _turn(streams[ATTITUDE])
     motors, remarks = _motors(streams, log.initial_parameters)
@@ -223,28 +205,19 @@ def _motors(streams, parameters) -> tuple[Stream | None, list[str]]:
         stream = streams[OUTPUTS]
         outputs = [_output_of(motor, parameters) for motor in range(4)]
         values = _fields(stream, [f"{OUTPUTS}:output[{o}]" for o in outputs])
-        signals = [
-            _signal(v, o, parameters) for v, o in zip(values, outputs, strict=True)
-        ]
+        signals = [_signal(v, o, parameters) for v, o in zip(values, outputs, strict=True)]
         curve = float(parameters.get("THR_MDL_FAC", 0.0))
         # PX4's own model of a motor, by which it turns thrust into a signal
         thrust = [curve * s**2 + (1.0 - curve) * s for s in signals]
     else:
         return None, []
     remarks = [] if MOTORS in streams else ["motors are taken from actuator_outputs"]
-    columns = {
-        COLUMN_OF[place]: values for place, values in zip(places, thrust, strict=True)
-    }
+    columns = {COLUMN_OF[place]: values for place, values in zip(places, thrust, strict=True)}
     spins = [parameters.get(f"CA_ROTOR{i}_KM") for i in range(4)]
     if None not in spins:
-        turns = {
-            p: "ccw" if spin > 0 else "cw"
-            for p, spin in zip(places, spins, strict=True)
-        }
+        turns = {p: "ccw" if spin > 0 else "cw" for p, spin in zip(places, spins, strict=True)}
         order = ", ".join(f'"{turns[place]}"' for place in COLUMN_OF)
-        remarks.append(
-            f"by the log's parameters, motor.spin in vehicle.toml is [{order}]"
-        )
+        remarks.append(f"by the log's parameters, motor.spin in vehicle.toml is [{order}]")
     return Stream(stream.time, columns), remarks
 
 
@@ -260,20 +233,15 @@ def _places(parameters) -> tuple[str, ...]:
     """Where PX4's motors 1 to 4 sit. Raises LogError where that isn't four corners."""
     count = int(parameters.get("CA_ROTOR_COUNT", 4))
     if count != 4:
-        raise LogError(
-            f"the airframe has {count} rotors (CA_ROTOR_COUNT); four are needed"
-        )
+        raise LogError(f"the airframe has {count} rotors (CA_ROTOR_COUNT); four are needed")
     corners = [[parameters.get(f"CA_ROTOR{i}_P{a}") for a in "XY"] for i in range(4)]
     if any(None in corner for corner in corners):
         return QUAD_X
     places = tuple(
-        f"{'front' if x > 0 else 'rear'}_{'right' if y > 0 else 'left'}"
-        for x, y in corners
+        f"{'front' if x > 0 else 'rear'}_{'right' if y > 0 else 'left'}" for x, y in corners
     )
     if set(places) != set(COLUMN_OF):
-        raise LogError(
-            f"rotors sit at {', '.join(places)} (CA_ROTORi_PX, _PY): no quad X"
-        )
+        raise LogError(f"rotors sit at {', '.join(places)} (CA_ROTORi_PX, _PY): no quad X")
     return places
 
 
@@ -281,9 +249,7 @@ def _output_of(motor: int, parameters) -> int:
     """Index of the output that a motor, from 0 on, is on: by PWM_MAIN_FUNCi, or its own
     number. Raises LogError where it is on outputs of another kind.
     """
-    elsewhere = [
-        n for n, f in parameters.items() if "_FUNC" in n and f == MOTOR_1 + motor
-    ]
+    elsewhere = [n for n, f in parameters.items() if "_FUNC" in n and f == MOTOR_1 + motor]
     if elsewhere and not elsewhere[0].startswith("PWM_MAIN"):
         raise LogError(
             f"motor {motor + 1} is on {elsewhere[0]}, and the first actuator_outputs are the main "
@@ -296,11 +262,7 @@ def _output_of(motor: int, parameters) -> int:
 def _signal(output: np.ndarray, index: int, parameters) -> np.ndarray:
     """An output as a share of its range. Raises LogError where that isn't its range."""
     least, most = (
-        float(
-            parameters.get(
-                f"PWM_MAIN_{end}{index + 1}", parameters.get(f"PWM_{end}", usual)
-            )
-        )
+        float(parameters.get(f"PWM_MAIN_{end}{index + 1}", parameters.get(f"PWM_{end}", usual)))
         for end, usual in (("MIN", PULSE[0]), ("MAX", PULSE[1]))
     )
     # a motor that is disarmed has one value or two below the least

@@ -13,13 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from openjax.errors import UserError
-from openjax.flights.importers.columns import (
-    EULER,
-    ColumnMapping,
-    Source,
-    Stream,
-    merge_streams,
-)
+from openjax.flights.importers.columns import EULER, ColumnMapping, Source, Stream, merge_streams
 from openjax.flights.importers.crazyswarm import (
     DEFINITIONS,
     LOG_TYPE,
@@ -61,9 +55,7 @@ KNOWN_TYPES = {
     "geometry_msgs/msg/PoseWithCovarianceStamped": _pose(
         "pose.pose.position", "pose.pose.orientation"
     ),
-    "geometry_msgs/msg/TransformStamped": _pose(
-        "transform.translation", "transform.rotation"
-    ),
+    "geometry_msgs/msg/TransformStamped": _pose("transform.translation", "transform.rotation"),
     ODOMETRY: _pose("pose.pose.position", "pose.pose.orientation"),
     "sensor_msgs/msg/BatteryState": {"vbat": "voltage"},
     "crazyflie_interfaces/msg/Status": {"vbat": "battery_voltage"},
@@ -133,9 +125,7 @@ def read_bag(path: str | Path, mapping: ColumnMapping | None = None) -> LogTable
             vehicles, remarks = _vehicles(reader, mapping, path)
     except LogError:
         raise
-    except (
-        Exception
-    ) as error:  # the library raises many kinds for a damaged bag; all mean the same
+    except Exception as error:  # the library raises many kinds for a damaged bag; all mean the same
         raise LogError(
             f"ROS bag can't be read: {str(error).splitlines()[0] if str(error) else type(error)}"
         ) from error
@@ -173,20 +163,14 @@ class _Recording:
         # what comes later replaces what came before: the fastest of the lowest rank
         # goes last
         topics.sort(key=lambda topic: topic[:2], reverse=True)
-        columns = {
-            c: source for *_, of_stream in topics for c, source in of_stream.items()
-        }
+        columns = {c: source for *_, of_stream in topics for c, source in of_stream.items()}
         poses = [topic for topic in topics if "x" in topic[2]]
         if "x" in by_name and poses:
-            with_position = next(
-                s for s in self.log_streams if by_name["x"].name in s.values
-            )
+            with_position = next(s for s in self.log_streams if by_name["x"].name in s.values)
             if 2 * poses[-1][1] < _period(with_position):
                 by_name = {c: source for c, source in by_name.items() if c not in _POSE}
         if set(EULER) <= set(by_name):
-            columns = {
-                c: source for c, source in columns.items() if c not in _QUATERNION
-            }
+            columns = {c: source for c, source in columns.items() if c not in _QUATERNION}
         return columns | by_name, remarks
 
     def all_streams(self) -> list[Stream]:
@@ -194,9 +178,7 @@ class _Recording:
         that a stamp is ahead of its tick is what the clocks are apart.
         """
         ahead = min(self.ahead, default=0.0)
-        streams = [
-            Stream(stream.time + ahead, stream.values) for stream in self.log_streams
-        ]
+        streams = [Stream(stream.time + ahead, stream.values) for stream in self.log_streams]
         return [*streams, *self.streams]
 
 
@@ -267,29 +249,22 @@ def _merge(
     tables = {}
     for vehicle, recording in vehicles.items():
         if mapping is not None:
-            columns = {
-                c: s for c, s in mapping.columns.items() if c not in ("t", "vehicle")
-            }
+            columns = {c: s for c, s in mapping.columns.items() if c not in ("t", "vehicle")}
         else:
             columns, more_remarks = recording.columns()
             remarks += more_remarks
         try:
-            tables[vehicle.strip("/") or "0"] = merge_streams(
-                recording.all_streams(), columns
-            )
+            tables[vehicle.strip("/") or "0"] = merge_streams(recording.all_streams(), columns)
         except LogError as error:
             remarks.append(f"topics of {vehicle or '/'}: {error}")
     if not tables:
         raise LogError(
-            "; ".join(remarks)
-            or "holds no topic of a known type; name its topics in columns.toml"
+            "; ".join(remarks) or "holds no topic of a known type; name its topics in columns.toml"
         )
     return tables, remarks
 
 
-def _wanted_columns(
-    connections, mapping: ColumnMapping | None
-) -> dict[str, dict[str, str]]:
+def _wanted_columns(connections, mapping: ColumnMapping | None) -> dict[str, dict[str, str]]:
     """Topic -> {column: field} of what is to be read."""
     topics: dict[str, dict[str, str]] = {}
     if mapping is not None:
@@ -314,9 +289,7 @@ def _stream(reader, connection, fields: dict[str, str]) -> Stream:
     rows = []
     for stamp, message in _messages(reader, connection):
         times.append(stamp)
-        rows.append(
-            [_field(message, field, connection.topic) for field in fields.values()]
-        )
+        rows.append([_field(message, field, connection.topic) for field in fields.values()])
     values = np.asarray(rows, float).reshape(len(rows), len(fields))
     by_field = {
         f"{connection.topic}:{field}": column
@@ -327,11 +300,7 @@ def _stream(reader, connection, fields: dict[str, str]) -> Stream:
 
 def _period(stream: Stream) -> float:
     """s between a stream's samples."""
-    return (
-        float(np.median(np.diff(np.sort(stream.time))))
-        if len(stream.time) > 1
-        else np.inf
-    )
+    return float(np.median(np.diff(np.sort(stream.time)))) if len(stream.time) > 1 else np.inf
 
 
 def _messages(reader, connection):
@@ -355,16 +324,12 @@ def _field(message, path: str, topic: str) -> float:
         raise LogError(f"messages of {topic} have no number {path!r}") from error
 
 
-def _join(
-    name: str, tables: dict[str, dict[str, np.ndarray]], remarks: list[str]
-) -> LogTable:
+def _join(name: str, tables: dict[str, dict[str, np.ndarray]], remarks: list[str]) -> LogTable:
     """The vehicles' columns in the long format, time from the first row of any."""
     start = min(t["t"][0] for t in tables.values())
     names = sorted({c for t in tables.values() for c in t})
     columns = {
-        c: np.concatenate(
-            [t.get(c, np.full(len(t["t"]), np.nan)) for t in tables.values()]
-        )
+        c: np.concatenate([t.get(c, np.full(len(t["t"]), np.nan)) for t in tables.values()])
         for c in names
     }
     columns["t"] = columns["t"] - start

@@ -14,13 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from openjax.errors import suggestion
-from openjax.flights.importers.columns import (
-    EULER,
-    ColumnMapping,
-    Source,
-    Stream,
-    merge_streams,
-)
+from openjax.flights.importers.columns import EULER, ColumnMapping, Source, Stream, merge_streams
 from openjax.flights.importers.csv_files import (
     delimiter_of,
     header_of,
@@ -33,9 +27,7 @@ from openjax.flights.reading import LOG_COLUMNS, LONGEST_NAME, LogError, LogTabl
 
 SEPARATORS = "./:"
 MOST_NAMES = 100  # of a header among which a name that isn't there is looked for
-_STAMP = re.compile(
-    rf"(.+?)(?:[{SEPARATORS}]header)?[{SEPARATORS}_](time|timestamp|stamp|t)", re.I
-)
+_STAMP = re.compile(rf"(.+?)(?:[{SEPARATORS}]header)?[{SEPARATORS}_](time|timestamp|stamp|t)", re.I)
 # What the last part of a name holds by the topic that it stands in: "vel.x" is vx.
 GROUPS = {
     "pos": {a: a for a in "xyz"},
@@ -61,11 +53,7 @@ def stamps_of(names: list[str]) -> dict[str, str]:
 
 def topic_of(name: str, topics) -> str | None:
     """The topic of a column: the longest that its name begins with."""
-    mine = [
-        t
-        for t in topics
-        if name == t or re.match(rf"{re.escape(t)}[{SEPARATORS}_]", name)
-    ]
+    mine = [t for t in topics if name == t or re.match(rf"{re.escape(t)}[{SEPARATORS}_]", name)]
     # a column of imu_2 begins like imu as well
     return max(mine, key=len, default=None)
 
@@ -88,9 +76,7 @@ def read_topic_times(path: Path, mapping: ColumnMapping | None = None) -> LogTab
         sources = _map(names, mapping)
     clock_of = _clocks(sources, stamps, mapping)
     columns_read = (*stamps.values(), *(source.name for source in sources.values()))
-    raw, remarks = raw_columns(
-        path, columns_read, next(iter(stamps.values())), delimiter
-    )
+    raw, remarks = raw_columns(path, columns_read, next(iter(stamps.values())), delimiter)
     streams = _streams(raw, sources, clock_of, mapping)
     if repeats:
         remarks.append(
@@ -102,9 +88,7 @@ def read_topic_times(path: Path, mapping: ColumnMapping | None = None) -> LogTab
     remarks += [f"no column {name!r}" for name in absent]
     clocks = sorted(set(clock_of.values()))
     if mapping is not None and not mapping.clocks and len(clocks) > 1:
-        remarks.append(
-            f"each topic's columns are at its own times: {', '.join(clocks)}"
-        )
+        remarks.append(f"each topic's columns are at its own times: {', '.join(clocks)}")
     table = merge_streams(streams, sources)
     table["t"] = table["t"] - table["t"][0]
     return LogTable(path.name, table, np.full(len(table["t"]), "0"), tuple(remarks))
@@ -117,15 +101,11 @@ def _map(names: list[str], mapping: ColumnMapping) -> dict[str, Source]:
     usual = {name: Source(name) for name in names if name in LOG_COLUMNS[2:]}
     sources = mapping.over(usual)
     if not {source.name for source in sources.values()} & set(names):
-        raise LogError(
-            "columns.toml names times, and no column that the log has beside them"
-        )
+        raise LogError("columns.toml names times, and no column that the log has beside them")
     return sources
 
 
-def recognise(
-    names: list[str], stamps: dict[str, str]
-) -> tuple[dict[str, Source], list[str]]:
+def recognise(names: list[str], stamps: dict[str, str]) -> tuple[dict[str, Source], list[str]]:
     """{column: source} of what a header's names say by themselves, and the names of
     columns that are there already. Raises LogError for nothing.
     """
@@ -138,9 +118,7 @@ def recognise(
         short = name[len(topic) + 1 :]  # "wx" of "imu_wx"
         *groups, last = re.split(rf"[{SEPARATORS}]", name)
         last = short if short in LOG_COLUMNS[2:] else last
-        column = next(
-            (GROUPS[g][last] for g in groups[::-1] if last in GROUPS.get(g, ())), last
-        )
+        column = next((GROUPS[g][last] for g in groups[::-1] if last in GROUPS.get(g, ())), last)
         if column in LOG_COLUMNS[2:] or column in EULER:
             if column in sources:
                 repeats.append(name)
@@ -169,9 +147,7 @@ def _named_stamps(names: list[str], mapping: ColumnMapping | None) -> dict[str, 
     return stamps
 
 
-def _clocks(
-    sources, stamps: dict[str, str], mapping: ColumnMapping | None
-) -> dict[str, str]:
+def _clocks(sources, stamps: dict[str, str], mapping: ColumnMapping | None) -> dict[str, str]:
     """{column: the time stamp's column} of what is read: what `columns.toml` says, its
     topic's, or else the first that it names. Raises LogError for a column that has
     none.
@@ -179,16 +155,12 @@ def _clocks(
     named_sources = {}
     usual = None
     if mapping is not None:
-        named_sources = {
-            column: c.source.name for c in mapping.clocks for column in c.columns
-        }
+        named_sources = {column: c.source.name for c in mapping.clocks for column in c.columns}
         usual = mapping.columns["t"].name if "t" in mapping.columns else None
     clock_of = {}
     for column, source in sources.items():
         topic = topic_of(source.name, stamps)
-        clock_of[column] = named_sources.get(
-            column, usual if topic is None else stamps[topic]
-        )
+        clock_of[column] = named_sources.get(column, usual if topic is None else stamps[topic])
         if clock_of[column] is None:
             raise LogError(f"column {source.name!r} has no time stamp: name it for t")
     return clock_of
@@ -199,22 +171,13 @@ def _streams(raw, sources, clock_of: dict[str, str], mapping) -> list[Stream]:
     repeat a stamp hold nothing new.
     """
     clocks = [clock for clock in dict.fromkeys(clock_of.values()) if clock in raw]
-    units = (
-        {}
-        if mapping is None
-        else {c.source.name: c.source.scale for c in mapping.clocks}
-    )
-    usual = (
-        None
-        if mapping is None or "t" not in mapping.columns
-        else mapping.columns["t"].scale
-    )
+    units = {} if mapping is None else {c.source.name: c.source.scale for c in mapping.clocks}
+    usual = None if mapping is None or "t" not in mapping.columns else mapping.columns["t"].scale
     scale = {c: units.get(c, usual or seconds_per_unit(raw[c])) for c in clocks}
     # Stamps since 1970 in ns are known to 256 ns as floats; their differences lose no
     # more.
     begin = {
-        unit: min(np.nanmin(raw[c]) for c in clocks if scale[c] == unit)
-        for unit in scale.values()
+        unit: min(np.nanmin(raw[c]) for c in clocks if scale[c] == unit) for unit in scale.values()
     }
     start = min(unit * first for unit, first in begin.items())
     streams = []
@@ -234,6 +197,4 @@ def _streams(raw, sources, clock_of: dict[str, str], mapping) -> list[Stream]:
     return streams
 
 
-IMPORTER = Importer(
-    "CSV with a time stamp for each topic", has_topic_times, read_topic_times
-)
+IMPORTER = Importer("CSV with a time stamp for each topic", has_topic_times, read_topic_times)

@@ -57,11 +57,7 @@ class Channel(Protocol):
         than an effect's form may be wrong by.
         """
         acting = self.acting()
-        return {
-            e: p
-            for e, p in acting.items()
-            if self.growth(e, acting) > DECISION.form_error
-        }
+        return {e: p for e, p in acting.items() if self.growth(e, acting) > DECISION.form_error}
 
     def growth(self, effect: str, acting) -> float:
         """By what share the channel's errors are larger without an effect than with all
@@ -70,9 +66,7 @@ class Channel(Protocol):
 
         def squares(effects):
             residuals = self.residuals(effects).values()
-            return np.array(
-                [np.mean(np.concatenate(series) ** 2) for series in residuals]
-            )
+            return np.array([np.mean(np.concatenate(series) ** 2) for series in residuals])
 
         ratio = squares(set(acting) - {effect}) / squares(acting)
         return float(np.sqrt(ratio.mean())) - 1.0

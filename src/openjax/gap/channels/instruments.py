@@ -75,13 +75,9 @@ def read_feedback(tracks, vehicles, by_commands) -> list[Feedback]:
     # to gusts in.
     motor_outputs = [m - m.mean(0) for m in motor_outputs]
     power = sum((c * c).sum(0) for c in commanded_outputs)
-    common = sum(
-        (c * m).sum(0) for c, m in zip(commanded_outputs, motor_outputs, strict=True)
-    )
+    common = sum((c * m).sum(0) for c, m in zip(commanded_outputs, motor_outputs, strict=True))
     share = common / np.maximum(power, 1e-12)
-    rest = [
-        m - share * c for c, m in zip(commanded_outputs, motor_outputs, strict=True)
-    ]
+    rest = [m - share * c for c, m in zip(commanded_outputs, motor_outputs, strict=True)]
     return [_feedback(r, t, v) for r, t, v in zip(rest, tracks, vehicles, strict=True)]
 
 
@@ -95,9 +91,7 @@ def _feedback(rest: np.ndarray, track: Track, vehicle) -> Feedback:
     return Feedback(
         acceleration=_turning(quick_part @ by_outputs, track, vehicle),
         trim=_turning(slow_motors - track.motor.mean(0), track, vehicle),
-        quick=_turning(
-            track.motor - smooth(track.motor, QUICK, track.dt), track, vehicle
-        ),
+        quick=_turning(track.motor - smooth(track.motor, QUICK, track.dt), track, vehicle),
     )
 
 
@@ -119,9 +113,7 @@ def caused_by_commands(
     motors, rates = respond_to_commands(
         vehicle, pad(commands, bucket(len(track))), np.float32(track.dt)
     )
-    return np.asarray(motors, float)[: len(track)], np.asarray(rates, float)[
-        : len(track)
-    ]
+    return np.asarray(motors, float)[: len(track)], np.asarray(rates, float)[: len(track)]
 
 
 def _turning(motors: np.ndarray, track: Track, vehicle) -> np.ndarray:
@@ -136,7 +128,5 @@ def _turning(motors: np.ndarray, track: Track, vehicle) -> np.ndarray:
     place = np.asarray(vehicle.rotor_position, float)
     spin = np.asarray(vehicle.rotor_spin, float)
     ratio = float(vehicle.torque_constant / vehicle.thrust_constant)
-    torque = np.stack(
-        [thrust @ place[:, 1], -thrust @ place[:, 0], ratio * (thrust @ spin)], 1
-    )
+    torque = np.stack([thrust @ place[:, 1], -thrust @ place[:, 0], ratio * (thrust @ spin)], 1)
     return torque / np.asarray(vehicle.inertia, float)

@@ -16,13 +16,7 @@ from openjax.flights.track import GRID_PERIOD, Track
 from openjax.gap.channels.instruments import caused_by_commands, read_feedback
 from openjax.gap.channels.rate_loop import ROW_DELAY, RateLoop
 from openjax.gap.model.baseline import Baseline, with_days
-from openjax.gap.model.hypotheses import (
-    UNEXPOSED,
-    SetFit,
-    fit_set,
-    fit_singles,
-    model_noise,
-)
+from openjax.gap.model.hypotheses import UNEXPOSED, SetFit, fit_set, fit_singles, model_noise
 from openjax.gap.model.library import CARDS, Library, numbers_of
 from openjax.gap.model.observer import TICKS
 from openjax.gap.model.prediction import RATES
@@ -83,10 +77,7 @@ class Reading:
             return usual
         reference_numbers = self.baseline.numbers
         keys = {number[:2] for number in reference_numbers}
-        return (
-            *reference_numbers,
-            *(number for number in usual if number[:2] not in keys),
-        )
+        return (*reference_numbers, *(number for number in usual if number[:2] not in keys))
 
     @property
     def lacks_thrust_map(self) -> bool:
@@ -102,20 +93,14 @@ class Reading:
         found to be its gain.
         """
         gain = self.sensors.gain
-        return [
-            dataclasses.replace(t, body_rates=t.body_rates * gain) for t in self.tracks
-        ]
+        return [dataclasses.replace(t, body_rates=t.body_rates * gain) for t in self.tracks]
 
     @cached_property
     def by_commands(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """`caused_by_commands` of each track."""
-        links = (
-            self.arrivals if self.arrivals is not None else [None] * len(self.tracks)
-        )
+        links = self.arrivals if self.arrivals is not None else [None] * len(self.tracks)
         each = zip(self.tracks, self.vehicles, links, strict=True)
-        return [
-            caused_by_commands(track, vehicle, link) for track, vehicle, link in each
-        ]
+        return [caused_by_commands(track, vehicle, link) for track, vehicle, link in each]
 
 
 def motor_rows(case: Case) -> str:
@@ -138,9 +123,7 @@ def make_reading(
     shortest = min(f.row_period for f in case.flights)
     slow = shortest > 0.8 * GRID_PERIOD  # faster logs are averaged
     seldom = max(t.dt for t in tracks) > SLOW_ROWS * GRID_PERIOD
-    at_once = (
-        motor_rows(case) == "sample" and slow and all(t.motors_logged for t in tracks)
-    )
+    at_once = motor_rows(case) == "sample" and slow and all(t.motors_logged for t in tracks)
     # said, not assumed
     means = case.vehicle_file.log.get("motor_rows", "").startswith("mean")
     few = not means and not slow and GRID_PERIOD / shortest < FEW_ROWS
@@ -190,27 +173,15 @@ def read_motion(reading: Reading, loop: RateLoop | None) -> Motion:
     tracks = reading.tracks
     sensors = reading.sensors
     library = reading.library
-    ticks = (
-        [np.repeat(t.motor[:, None], TICKS, 1) for t in tracks]
-        if loop is None
-        else loop.ticks
-    )
+    ticks = [np.repeat(t.motor[:, None], TICKS, 1) for t in tracks] if loop is None else loop.ticks
     if loop is not None and reading.at_once:
         # single samples: what the ticks did on the mean is nearer to what drove the row
         both = zip(tracks, ticks, strict=True)
-        tracks = [
-            dataclasses.replace(track, motor=motor.mean(1)) for track, motor in both
-        ]
+        tracks = [dataclasses.replace(track, motor=motor.mean(1)) for track, motor in both]
     feedback = read_feedback(tracks, reading.vehicles, reading.by_commands)
     clocks = sensors.one_clock, reading.at_once
     replay = make_replay(
-        tracks,
-        reading.vehicles,
-        ticks,
-        feedback,
-        reading.numbers,
-        clocks,
-        reading.baseline,
+        tracks, reading.vehicles, ticks, feedback, reading.numbers, clocks, reading.baseline
     )
     replay, exposure = model_noise(replay, library)
     exposure |= {e: 0.0 for e in library.physics if _is_hidden(CARDS[e], reading)}
@@ -229,15 +200,9 @@ def _beside_others(motion: Motion) -> Motion:
     if not any(len(track.neighbours) for track in motion.replay.tracks):
         return motion
     visible_effects = [
-        e
-        for e in motion.library.physics
-        if CARDS[e].of_others and motion.exposure[e] >= UNEXPOSED
+        e for e in motion.library.physics if CARDS[e].of_others and motion.exposure[e] >= UNEXPOSED
     ]
-    fit = (
-        fit_wake(motion.replay, visible_effects[0])
-        if visible_effects
-        else motion.nothing
-    )
+    fit = fit_wake(motion.replay, visible_effects[0]) if visible_effects else motion.nothing
     gusts = read_gusts(fit)
     # nuisances are as around nothing again
     replay = dataclasses.replace(motion.replay, physics=fit.replay.physics)
@@ -249,9 +214,7 @@ def _beside_others(motion: Motion) -> Motion:
 
 def _is_lag(effect: str) -> bool:
     """Whether an effect is a time by which something comes later."""
-    return any(
-        EFFECTS[effect].parameters[p.name].unit == "s" for p in CARDS[effect].fitted
-    )
+    return any(EFFECTS[effect].parameters[p.name].unit == "s" for p in CARDS[effect].fitted)
 
 
 def _is_hidden(card, reading: Reading) -> bool:
@@ -263,14 +226,10 @@ def _is_hidden(card, reading: Reading) -> bool:
         return True
     # Torques alone tell a weaker push from nothing: heavier moments of inertia look the
     # same.
-    weightless = any(
-        t.velocity is None and t.specific_force is None for t in reading.tracks
-    )
+    weightless = any(t.velocity is None and t.specific_force is None for t in reading.tracks)
     if card.needs_force and weightless:
         return True
-    if (reading.blind and card.torque_axes) or (
-        reading.lacks_thrust_map and card.thrust_map
-    ):
+    if (reading.blind and card.torque_axes) or (reading.lacks_thrust_map and card.thrust_map):
         return True
     return card.impossible is not None and any(
         t.ceiling is None and card.impossible(t.position) for t in reading.tracks

@@ -56,42 +56,25 @@ class Pose(Channel):
     @property
     def late(self) -> bool:
         """Whether the pose clearly is late, be it by little."""
-        return (
-            self.fit.value > DECISION.standard_errors * self.fit.error
-            and self.fit.nats > 0.0
-        )
+        return self.fit.value > DECISION.standard_errors * self.fit.error and self.fit.nats > 0.0
 
     def acting(self) -> dict[str, float]:
         odds = {
-            e: self.fit.nats + CARDS[e].log_odds
-            for e in self.names
-            if self.fit.value > self.clock
+            e: self.fit.nats + CARDS[e].log_odds for e in self.names if self.fit.value > self.clock
         }
-        return {
-            e: 1.0 - DECISION.unknown
-            for e, nats in odds.items()
-            if self.late and nats > 0.0
-        }
+        return {e: 1.0 - DECISION.unknown for e, nats in odds.items() if self.late and nats > 0.0}
 
     def estimate(self, effect: str, parameter: str) -> Estimated:
         # The delay is against the gyroscope, and a gyroscope may be late itself.
-        return Estimated(
-            self.fit.value, self.fit.error, self.fit.error + GYROSCOPE_LATE
-        )
+        return Estimated(self.fit.value, self.fit.error, self.fit.error + GYROSCOPE_LATE)
 
     def residuals(self, effects) -> dict[str, list[np.ndarray]]:
-        angles = (
-            self.fit.residual
-            if set(effects) & set(self.names)
-            else self.fit.nominal_residual
-        )
+        angles = self.fit.residual if set(effects) & set(self.names) else self.fit.nominal_residual
         changes = [
             np.concatenate([np.zeros((n, 3)), r[n:] - r[:-n]])
             for r, n in zip(angles, self.steps, strict=True)
         ]
-        return {
-            f"pose {axis}": [m[:, k] for m in changes] for k, axis in enumerate("xyz")
-        }
+        return {f"pose {axis}": [m[:, k] for m in changes] for k, axis in enumerate("xyz")}
 
 
 def read_pose(tracks: list[Track], library) -> Pose | None:
@@ -137,25 +120,13 @@ def _read_around(tracks: list[Track], delay: float) -> Delay:
         time = (track.time - track.time[0])[:, None]
         drift = [GYRO_BIAS * axis * time for axis in np.eye(3)]
         tilt_columns = [
-            SIZE["imu_tilt"]
-            * np.concatenate([start, np.cumsum(np.cross(axis, between), 0)])
+            SIZE["imu_tilt"] * np.concatenate([start, np.cumsum(np.cross(axis, between), 0)])
             for axis in np.eye(3)
         ]
         turned_so_far = np.concatenate([start, np.cumsum(between, 0)])
-        gain_columns = [
-            SIZE["gyroscope_gain"] * axis * turned_so_far for axis in np.eye(3)
-        ]
+        gain_columns = [SIZE["gyroscope_gain"] * axis * turned_so_far for axis in np.eye(3)]
         data.append(
-            np.stack(
-                [
-                    y,
-                    late,
-                    *drift,
-                    *tilt_columns,
-                    *gain_columns,
-                    SIZE["pose_clock"] * late,
-                ]
-            )
+            np.stack([y, late, *drift, *tilt_columns, *gain_columns, SIZE["pose_clock"] * late])
         )
     return _fit(data)
 
@@ -174,8 +145,7 @@ def _fit(data: list[np.ndarray]) -> Delay:
             for w, c in zip(white, cross, strict=True)
         ]
         gram = sum(
-            w[:2] @ w[:2].T - c.T @ t
-            for w, c, t in zip(white, cross, nuisances, strict=True)
+            w[:2] @ w[:2].T - c.T @ t for w, c, t in zip(white, cross, nuisances, strict=True)
         )
         precision = gram[1, 1] + 1.0 / DELAY_SPREAD**2
         value = gram[1, 0] / precision

@@ -91,9 +91,7 @@ class Radio(Channel):
     @property
     def loss(self) -> float:
         """Share of the packets that were lost."""
-        return float(
-            self.losing.lost_rows.sum() / max(self.losing.telling_rows.sum(), 1)
-        )
+        return float(self.losing.lost_rows.sum() / max(self.losing.telling_rows.sum(), 1))
 
     @property
     def readable(self) -> bool:
@@ -118,9 +116,7 @@ class Radio(Channel):
             and gain[LOSS] > CLEAR
             and self.losing.ambiguous_rows.sum() < 0.5 * self.losing.lost_rows.sum()
         )
-        return frozenset(
-            p for p, on in ((DELAY, late), (LOSS, loses)) if on and p in self.names
-        )
+        return frozenset(p for p, on in ((DELAY, late), (LOSS, loses)) if on and p in self.names)
 
     @property
     def arrivals(self) -> list:
@@ -131,42 +127,27 @@ class Radio(Channel):
         return {self.names[p]: 1.0 - DECISION.unknown for p in sorted(self.off_nominal)}
 
     def undetectable(self) -> list[str]:
-        changes_enough = (
-            self.links[frozenset({DELAY, LOSS})].informative.sum() >= FEWEST
-        )
+        changes_enough = self.links[frozenset({DELAY, LOSS})].informative.sum() >= FEWEST
         return [] if self.readable and changes_enough else list(self.names.values())
 
     def estimate(self, effect: str, parameter: str) -> Estimated:
         if parameter == DELAY:
-            error = float(
-                np.hypot(DELAY_STEP, ROW_ERROR[self.single_samples] * self.row)
-            )
+            error = float(np.hypot(DELAY_STEP, ROW_ERROR[self.single_samples] * self.row))
             return Estimated(self.delay, error, error)
         link = self.links[frozenset({DELAY, LOSS})]
         packets = max(link.telling_rows.sum(), 1)
         each = link.lost_rows / np.maximum(link.telling_rows, 1)
         # Packets are lost in bursts: how much flights differ tells more than how many
         # there were.
-        apart = (
-            few(len(each)) * each.std(ddof=1) / np.sqrt(len(each))
-            if len(each) > 1
-            else 0.0
-        )
+        apart = few(len(each)) * each.std(ddof=1) / np.sqrt(len(each)) if len(each) > 1 else 0.0
         error = float(
-            np.hypot(np.sqrt(self.loss * (1 - self.loss) / packets), apart)
-            + 0.5 / packets
+            np.hypot(np.sqrt(self.loss * (1 - self.loss) / packets), apart) + 0.5 / packets
         )
         return Estimated(self.loss, error, error)
 
     def residuals(self, effects) -> dict[str, list[np.ndarray]]:
-        link = self.links[
-            frozenset(p for p, effect in self.names.items() if effect in effects)
-        ]
-        return {
-            "motors all": [
-                np.array([np.hypot(link.misfit, TOLERANCE)]) for _ in link.arrivals
-            ]
-        }
+        link = self.links[frozenset(p for p, effect in self.names.items() if effect in effects)]
+        return {"motors all": [np.array([np.hypot(link.misfit, TOLERANCE)]) for _ in link.arrivals]}
 
 
 def read_radio(tracks: list[Track], library, single_samples: bool = False) -> Radio:
@@ -218,9 +199,7 @@ def _late_error(track: Track, delay: float) -> np.ndarray:
 
 def _late(values: np.ndarray, rows: int) -> np.ndarray:
     """Values so many rows later, the first one before."""
-    return np.concatenate(
-        [np.repeat(values[:1], rows, 0), values[: len(values) - rows]]
-    )
+    return np.concatenate([np.repeat(values[:1], rows, 0), values[: len(values) - rows]])
 
 
 def _rows_late(track: Track, delay: float) -> tuple[int, float]:
@@ -244,9 +223,7 @@ def _link_rows(track: Track, delay: float) -> tuple[int, float, np.ndarray, np.n
     motors = held_means(times, thrust, track.time + delay, track.dt)
     rows = int(np.ceil(delay / track.dt - 1e-9))
     for shift in range(1, rows + 1):  # what a row holds then is in these
-        clean = clean & np.concatenate(
-            [clean[shift:], np.zeros(min(shift, len(clean)), bool)]
-        )
+        clean = clean & np.concatenate([clean[shift:], np.zeros(min(shift, len(clean)), bool)])
     return 0, 0.0, motors, clean
 
 

@@ -18,14 +18,7 @@ from scipy.stats import norm
 
 from openjax.flights.track import Track, smooth
 from openjax.gap.channels import Channel, Estimated, robust_deviation
-from openjax.gap.channels.instruments import (
-    BAND,
-    COUNT,
-    EDGE,
-    SLOW,
-    in_force,
-    outputs_of,
-)
+from openjax.gap.channels.instruments import BAND, COUNT, EDGE, SLOW, in_force, outputs_of
 from openjax.gap.decision import DECISION
 from openjax.gap.model.library import CARDS
 from openjax.gap.model.nuisances import TRIM
@@ -99,19 +92,12 @@ class RateLoop(Channel):
         error = np.minimum(self.error[[0, 3]], PRIOR[0])
         # Savage and Dickey's
         nats = 0.5 * (change / error) ** 2 - np.log(PRIOR[0] / error)
-        chance = norm.cdf((change - DECISION.form_error) / error) * (
-            1.0 - DECISION.unknown
-        )
-        odds = {
-            e: chance[nats + CARDS[e].log_odds > 0.0].max(initial=0.0)
-            for e in self.names
-        }
+        chance = norm.cdf((change - DECISION.form_error) / error) * (1.0 - DECISION.unknown)
+        odds = {e: chance[nats + CARDS[e].log_odds > 0.0].max(initial=0.0) for e in self.names}
         return {e: float(p) for e, p in odds.items() if p > 0.5}
 
     def undetectable(self) -> list[str]:
-        detectable = (
-            PRIOR[0] > 2.0 * DECISION.standard_errors * self.error[[0, 3]].min()
-        )
+        detectable = PRIOR[0] > 2.0 * DECISION.standard_errors * self.error[[0, 3]].min()
         return [] if detectable else list(self.names)
 
     def estimate(self, effect: str, parameter: str) -> Estimated:
@@ -122,11 +108,7 @@ class RateLoop(Channel):
     def residuals(self, effects) -> dict[str, list[np.ndarray]]:
         changes = -self.gain[0] if set(effects) & set(self.names) else np.zeros(3)
         weights = np.append(1.0, changes)
-        out: dict[str, list[np.ndarray]] = {
-            "motors roll": [],
-            "motors pitch": [],
-            "motors yaw": [],
-        }
+        out: dict[str, list[np.ndarray]] = {"motors roll": [], "motors pitch": [], "motors yaw": []}
         for outputs in self.outputs:
             errors = detrend(np.tensordot(weights, outputs, 1), axis=0)
             for column, series in zip(errors.T, out.values(), strict=True):
@@ -154,9 +136,7 @@ def read_rate_loop(reading) -> RateLoop:
         ) @ outputs_of(vehicle)
         slopes = [(variant - nominal) / GAIN_STEP for variant in larger]
         outputs.append(np.stack([logged_outputs - nominal, *slopes]))
-        series.append(
-            _series(track, vehicle, in_force(track, link), commanded_rates, reading)
-        )
+        series.append(_series(track, vehicle, in_force(track, link), commanded_rates, reading))
     change, error = read_gains(reading, series, ticks)
     names = reading.library.of("rate_loop")
     return RateLoop(
@@ -209,9 +189,7 @@ def observe_track(track: Track, vehicle, link, at_once=False):
         change = smooth(np.concatenate([step, step[-1:]]), width, track.dt) / track.dt
         push = push + pad(change, size)
     gains = ("rate_kp", "rate_ki", "rate_kd")
-    larger = [
-        vehicle.replace(**{n: (1.0 + GAIN_STEP) * getattr(vehicle, n)}) for n in gains
-    ]
+    larger = [vehicle.replace(**{n: (1.0 + GAIN_STEP) * getattr(vehicle, n)}) for n in gains]
     runs = [
         observe(controller, vehicle, command, motor, gyro, push, dt, at_once)
         for controller in (vehicle, *larger)
@@ -267,9 +245,7 @@ def excitation(track: Track, vehicle, series: np.ndarray) -> np.ndarray:
 
 
 def _band(dt: float) -> np.ndarray:
-    return butter(
-        2, (BAND[0], min(BAND[1], 0.4 / dt)), "bandpass", fs=1.0 / dt, output="sos"
-    )
+    return butter(2, (BAND[0], min(BAND[1], 0.4 / dt)), "bandpass", fs=1.0 / dt, output="sos")
 
 
 def _series(
@@ -360,9 +336,5 @@ def _moments(moments: np.ndarray, units: np.ndarray) -> tuple[np.ndarray, np.nda
         weight = np.linalg.inv(spread + 1e-9 * np.trace(spread) * np.eye(5))
         covariance = np.linalg.inv(total[:, 1:].T @ weight @ total[:, 1:] + precision)
         theta = covariance @ total[:, 1:].T @ weight @ total[:, 0]
-    pushes = (
-        np.array([each[units == u].sum(0) for u in np.unique(units)])
-        @ weight
-        @ total[:, 1:]
-    )
+    pushes = np.array([each[units == u].sum(0) for u in np.unique(units)]) @ weight @ total[:, 1:]
     return theta, robust_deviation(covariance, pushes)

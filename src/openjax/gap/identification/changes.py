@@ -94,8 +94,7 @@ def _of_noise(case: EffectEstimates, reference: EffectEstimates) -> np.ndarray:
     where one set of flights turns less than the other.
     """
     weaker = [
-        np.minimum(NOISE_IN_GAIN / e.fit.turning**2, LARGEST_ERROR)
-        for e in (case, reference)
+        np.minimum(NOISE_IN_GAIN / e.fit.turning**2, LARGEST_ERROR) for e in (case, reference)
     ]
     squares = np.square(weaker[0] - weaker[1])
     of_parameter = dict(zip(("xx", "yy", "ratio"), squares, strict=True))

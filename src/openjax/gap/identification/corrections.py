@@ -41,9 +41,7 @@ class _Number:
     def ends(self) -> tuple[float, float, float]:
         """Value of the effect's parameter and the ends of its 90 % interval."""
         spread = np.exp(np.array([0.0, -REACH, REACH]) * self.error)
-        parameters = self.value * spread - (
-            self.nominal if self.parameter in LAGS else 0.0
-        )
+        parameters = self.value * spread - (self.nominal if self.parameter in LAGS else 0.0)
         least, most = EFFECTS[self.effect].parameters[self.parameter].limits()
         value, low, high = np.clip(parameters, least, most).tolist()
         return value, low, high

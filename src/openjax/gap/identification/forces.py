@@ -37,9 +37,7 @@ def identify_forces(records: list[Record], lags: np.ndarray) -> Numbers:
     full = 4.0 * float(vehicle.thrust_constant * vehicle.max_rotor_speed**2) / mass
     thrusts = [full * t for t in _thrusts(with_force, lags)]
     forces = [_force(r) for r in with_force]
-    level = np.array(
-        [f[:, 2].mean() / t.mean() for f, t in zip(forces, thrusts, strict=True)]
-    )
+    level = np.array([f[:, 2].mean() / t.mean() for f, t in zip(forces, thrusts, strict=True)])
     spread = level.std() / np.sqrt(len(level))
     numbers = {"thrust_level": (float(level.mean()), float(spread))}
     columns = {"thrust_slope": thrusts}
@@ -48,9 +46,7 @@ def identify_forces(records: list[Record], lags: np.ndarray) -> Numbers:
         columns["sag"] = [
             (r.voltage - middle) * t for r, t in zip(with_force, thrusts, strict=True)
         ]
-    moving = all(
-        r.velocity is not None and r.quaternion is not None for r in with_force
-    )
+    moving = all(r.velocity is not None and r.quaternion is not None for r in with_force)
     if moving:
         speeds = [to_body(r.quaternion, r.velocity) for r in with_force]
         columns["drag_z"] = [-s[:, 2] / mass for s in speeds]
@@ -73,15 +69,11 @@ def trims(records: list[Record]) -> Numbers:
     x, y = np.asarray(records[0].vehicle.rotor_position, float)[:, :2].T
     spin = np.asarray(records[0].vehicle.rotor_spin, float)
     signs = np.sign(np.stack([y, -x, spin]))
-    shares = np.array(
-        [(r.motor @ signs.T).mean(0) / r.motor.sum(1).mean() for r in records]
-    )
+    shares = np.array([(r.motor @ signs.T).mean(0) / r.motor.sum(1).mean() for r in records])
     error = shares.std(0) / np.sqrt(len(shares))
     return {
         f"{axis}_trim": (float(v), float(e))
-        for axis, v, e in zip(
-            ("roll", "pitch", "yaw"), shares.mean(0), error, strict=True
-        )
+        for axis, v, e in zip(("roll", "pitch", "yaw"), shares.mean(0), error, strict=True)
     }
 
 
@@ -95,9 +87,7 @@ def _force(record: Record) -> np.ndarray | None:
 
 def _thrusts(records: list[Record], lags: np.ndarray) -> list[np.ndarray]:
     """(T,) thrust at each row's time, as a share of the largest, of each record."""
-    rotors = rotor_rows(
-        [r.motor for r in records], records[0].dt, np.asarray(lags, float)[None]
-    )
+    rotors = rotor_rows([r.motor for r in records], records[0].dt, np.asarray(lags, float)[None])
     # a row's speed is the one at its end, where the next row begins
     return [(np.concatenate([s[0, :1], s[0, :-1]]) ** 2).mean(1) for _, s in rotors]
 
@@ -130,16 +120,12 @@ def _regression(outputs: list, columns: dict[str, list], dt: float) -> Numbers:
     }
 
 
-def _autoregression(
-    outputs: list, columns: list, coefficients: np.ndarray
-) -> np.ndarray:
+def _autoregression(outputs: list, columns: list, coefficients: np.ndarray) -> np.ndarray:
     """1 - a_1 q^-1 - ... of what coefficients leave of the outputs."""
     pasts = []
     nexts = []
     for number, y in enumerate(outputs):
-        rest = y - sum(
-            c * column[number] for c, column in zip(coefficients, columns, strict=False)
-        )
+        rest = y - sum(c * column[number] for c, column in zip(coefficients, columns, strict=False))
         rest = rest - rest.mean()
         rows = np.arange(ORDER, len(rest))
         pasts.append(rest[rows[:, None] - 1 - np.arange(ORDER)])

@@ -20,12 +20,7 @@ import numpy as np
 from scipy.signal import butter, lfilter
 
 from openjax.gap.identification.records import Record
-from openjax.gap.identification.regression import (
-    Regression,
-    lag_columns,
-    polynomial,
-    solve,
-)
+from openjax.gap.identification.regression import Regression, lag_columns, polynomial, solve
 from openjax.gap.identification.rotor_rows import rotor_rows
 
 NAMES = (
@@ -81,9 +76,7 @@ class Problem:
         self.top_speed = float(vehicle.max_rotor_speed)
         up = float(vehicle.motor_time_constant)
         down = up * float(vehicle.motor_slowdown_ratio)
-        self.start = np.array(
-            [np.log(up), np.log(down), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]
-        )
+        self.start = np.array([np.log(up), np.log(down), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
         self.precision = np.diag(SPREAD**-2.0)
         self.precision[:2, :2] += np.array([[1.0, -1.0], [-1.0, 1.0]]) / UNEQUAL**2
         self.new = [self._new(r) if r.hides_ticks else None for r in records]
@@ -117,22 +110,15 @@ class Problem:
         rotors = rotor_rows([r.motor for r in self.records], self.dt, lags)
         both = zip(self.records, rotors, strict=True)
         return [
-            self._errors_of(value, record.rates, square, speed)
-            for record, (square, speed) in both
+            self._errors_of(value, record.rates, square, speed) for record, (square, speed) in both
         ]
 
     def _errors_of(
-        self,
-        value: np.ndarray,
-        rates: np.ndarray,
-        square: np.ndarray,
-        speed: np.ndarray,
+        self, value: np.ndarray, rates: np.ndarray, square: np.ndarray, speed: np.ndarray
     ):
         """`errors` of one record, whose rotors turned so."""
         unit = square @ self.base.T
-        acceleration = (
-            self.top_speed * np.diff(speed, axis=1, prepend=speed[:, :1]) @ self.spin
-        )
+        acceleration = self.top_speed * np.diff(speed, axis=1, prepend=speed[:, :1]) @ self.spin
         gyroscopic = np.cross(rates, self.inertia * rates) / self.inertia
         gains = value[3:6]
         damping = value[[6, 6, 7]]
@@ -201,10 +187,7 @@ class Problem:
         coefficients = regression.solve(following)
         errors = following - past @ coefficients
         whitening = polynomial(coefficients[:order])
-        slopes = [
-            -lfilter(whitening, [1.0], s[:, :, axis], axis=1)
-            for _, s in errors_of_records
-        ]
+        slopes = [-lfilter(whitening, [1.0], s[:, :, axis], axis=1) for _, s in errors_of_records]
         slopes = np.concatenate([s[:, order + 1 :] for s in slopes], 1).T
         return errors, slopes - past @ regression.solve(slopes), coefficients[:order]
 
@@ -214,8 +197,7 @@ class Problem:
         """
         free = max(round(FREE / self.dt), 1)
         return [
-            np.concatenate([np.zeros(row), new[: len(new) - row]])[:, None]
-            for row in range(free)
+            np.concatenate([np.zeros(row), new[: len(new) - row]])[:, None] for row in range(free)
         ]
 
 

@@ -89,8 +89,7 @@ class Identification:
         """As it stands in `report.json`; `shares` of the gap {effect: share}."""
         shares = shares or {}
         quantities = {
-            name: asdict(q)
-            | {"differs": q.differs, "share_of_gap": shares.get(q.effect)}
+            name: asdict(q) | {"differs": q.differs, "share_of_gap": shares.get(q.effect)}
             for name, q in self.quantities.items()
         }
         return {
@@ -104,9 +103,7 @@ class Identification:
     def sentence(self) -> str:
         """What the vehicle does, in one sentence."""
         if not self.trustworthy:
-            return (
-                f"How torques answer can't be told from these logs: {self.remarks[0]}."
-            )
+            return f"How torques answer can't be told from these logs: {self.remarks[0]}."
         ratio, lead = self.at(TALKED_OF)
         lag = self.quantities["spin_up"]
         if ALIKE[0] < ratio < ALIKE[1] and abs(lead) < ALIKE_PHASE:
@@ -139,9 +136,7 @@ class Identification:
         return float(ratio), float(lead)
 
 
-def identify(
-    case: Case, one_clock: bool = True, gain_error: float = 0.0
-) -> Identification | None:
+def identify(case: Case, one_clock: bool = True, gain_error: float = 0.0) -> Identification | None:
     """What the flights of a case say of the vehicle; None where none has motors and
     body rates. Without `one_clock` streams were found to be apart by times that wander:
     what is said of torques then isn't trusted. `gain_error`: standard deviation of the
@@ -180,9 +175,7 @@ def quantities_of(records: list[Record], fit: TorqueFit) -> dict[str, Quantity]:
         "yaw_ratio": numbers.pop("yaw_gain"),
     }
     numbers.pop("propellers")
-    numbers |= gains | identify_forces(
-        records, np.maximum(fit.value[:3], [1e-3, 1e-3, 0.0])
-    )
+    numbers |= gains | identify_forces(records, np.maximum(fit.value[:3], [1e-3, 1e-3, 0.0]))
     usual |= dict.fromkeys((*gains, "thrust_level", "thrust_slope"), 1.0)
     # Trims hold against what else acts too: they belong to no simulator's number but
     # zero.
@@ -219,9 +212,7 @@ def doubts(records: list[Record], fit: TorqueFit, one_clock: bool) -> tuple[str,
     """Why what is said of torques isn't to be trusted."""
     reasons = []
     if not one_clock:
-        reasons.append(
-            "the streams of motors and sensors are apart by times that wander"
-        )
+        reasons.append("the streams of motors and sensors are apart by times that wander")
     if any(r.bridges_holes for r in records):
         reasons.append(
             "motors or body rates are missing so often that no second is whole; log them without "
@@ -242,7 +233,5 @@ def _remarks(fit: TorqueFit) -> tuple[str, ...]:
     error = float(np.sqrt(fit.covariance[2, 2]))
     if abs(clock) > CLOCK + 2.0 * error:
         direction = "later" if clock > 0.0 else "earlier"
-        remarks.append(
-            f"motors answer {1e3 * abs(clock):.0f} ms {direction} than logged"
-        )
+        remarks.append(f"motors answer {1e3 * abs(clock):.0f} ms {direction} than logged")
     return tuple(remarks)

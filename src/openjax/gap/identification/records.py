@@ -68,18 +68,13 @@ def records_of(case: Case) -> list[Record]:
     """All stretches of a case's flights with body rates and motor commands."""
     records = []
     for flight in case.flights:
-        if (
-            not flight.has_motors
-            or flight.body_rates is None
-            or flight.body_rates_derived
-        ):
+        if not flight.has_motors or flight.body_rates is None or flight.body_rates_derived:
             continue
         holes = flight.in_holes(TORQUES, MAX_GAP, MISSED_SAMPLES)
         parts = _records(flight.rows(~holes), flight, case, SHORTEST_PART)
         if not parts:
             parts = [
-                replace(r, bridges_holes=bool(holes.any()))
-                for r in _records(flight, flight, case)
+                replace(r, bridges_holes=bool(holes.any())) for r in _records(flight, flight, case)
             ]
         records += parts
     # One estimator reads rows of one period: the one that holds most of the flights.
@@ -94,9 +89,7 @@ def _records(rows: Flight, flight: Flight, case: Case, least: float = MIN_DURATI
     tenth to a fifth.
     """
     records = []
-    for stretch in rows.stretches(
-        max(MAX_GAP, MISSED_SAMPLES * flight.row_period), least
-    ):
+    for stretch in rows.stretches(max(MAX_GAP, MISSED_SAMPLES * flight.row_period), least):
         records += _in_the_air(_record(rows.rows(stretch), flight, case), least)
     return records
 
@@ -107,9 +100,7 @@ def _in_the_air(record: Record, least: float) -> list[Record]:
     """
     hover = float(hover_share(record.vehicle))
     airborne = smooth(record.motor.mean(1), 0.5, record.dt) > CARRIED * hover
-    edges = np.flatnonzero(
-        np.diff(np.concatenate([[False], airborne, [False]]).astype(int))
-    )
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], airborne, [False]]).astype(int)))
     away = round(TAKE_OFF / record.dt)
     parts = []
     for begin, end in edges.reshape(-1, 2):

@@ -64,8 +64,7 @@ def responses(records: list[Record], fit: TorqueFit) -> dict[str, Pair]:
     rng = np.random.default_rng(0)
     errors = problem.errors(nominal)
     rates_of_nominal = [
-        _nominal_rates(r, error, rng)
-        for r, (error, _) in zip(problem.records, errors, strict=True)
+        _nominal_rates(r, error, rng) for r, (error, _) in zip(problem.records, errors, strict=True)
     ]
     for axis in range(3):
         rates = [r.rates[:, axis] for r in problem.records]
@@ -99,9 +98,7 @@ def _of_thrust(problem: Problem, rng) -> Pair:
     shares = [r.motor.mean(1) for r in problem.records]
     forces = [r.force[:, 2] for r in problem.records]
     vehicle = problem.records[0].vehicle
-    full = 4.0 * float(
-        vehicle.thrust_constant * vehicle.max_rotor_speed**2 / vehicle.mass
-    )
+    full = 4.0 * float(vehicle.thrust_constant * vehicle.max_rotor_speed**2 / vehicle.mass)
     lags = value_at(problem.start)[None, :3]
     nominal_forces = []
     for _, speed in rotor_rows([r.motor for r in problem.records], problem.dt, lags):
@@ -137,9 +134,7 @@ def _arx(problem: Problem, outputs: list, inputs: list, at_once: float | None):
         ones[:, number] = 1.0
         following = y[order + 1 :]
         if at_once is not None:
-            past = np.concatenate(
-                [output_columns, _windows(u[:-1], order, order - 1), ones], 1
-            )
+            past = np.concatenate([output_columns, _windows(u[:-1], order, order - 1), ones], 1)
             new = input_columns[:, 0] - past @ solve(past, input_columns[:, 0])
             following = following - at_once * input_columns[:, 0]
             input_columns = np.concatenate([input_columns[:, 1:], new[:, None]], 1)
@@ -156,20 +151,14 @@ def _arx(problem: Problem, outputs: list, inputs: list, at_once: float | None):
     if at_once is not None:
         # The last column is what was new, not a past input: the input's own comes
         # first.
-        coefficients = np.concatenate(
-            [solution[:order], [at_once], solution[order : count - 1]]
-        )
-        places = np.concatenate(
-            [np.arange(order), [count - 1], np.arange(order, count - 1)]
-        )
+        coefficients = np.concatenate([solution[:order], [at_once], solution[order : count - 1]])
+        places = np.concatenate([np.arange(order), [count - 1], np.arange(order, count - 1)])
         covariance = covariance[np.ix_(places, places)]
         covariance[order] = covariance[:, order] = 0.0
     return coefficients, covariance
 
 
-def _response(
-    axis: str, coefficients, covariance, dt: float, derivative: bool
-) -> Response:
+def _response(axis: str, coefficients, covariance, dt: float, derivative: bool) -> Response:
     frequency = FREQUENCIES[HIGHEST / dt >= FREQUENCIES]
     rng = np.random.default_rng(1)
     values, vectors = np.linalg.eigh(covariance)

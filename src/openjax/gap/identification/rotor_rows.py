@@ -25,9 +25,7 @@ def rotor_rows(
     the largest, for each of some flights' commands (T, 4) in rows of dt s, with B
     `lags` (B, 3): time constants of speeding up and of slowing down, and delay, s.
     """
-    lanes = _Lanes(
-        [len(c) for c in commands], int(np.ceil(FORGOTTEN * lags[:, :2].max() / dt))
-    )
+    lanes = _Lanes([len(c) for c in commands], int(np.ceil(FORGOTTEN * lags[:, :2].max() / dt)))
     targets_of_flights = [np.sqrt(np.clip(c, SMALLEST, None)) for c in commands]
     whole = np.floor(lags[:, 2] / dt).astype(int)
     late = lags[:, 2] - whole * dt
@@ -72,10 +70,7 @@ class _Part:
         falls = off > 0.0
         decay = np.where(falls, self.decay_down, self.decay_up)
         moving = 2.0 * target * (1.0 - decay) + 0.5 * off * (1.0 - decay * decay)
-        return (
-            target * target * self.span
-            + off * np.where(falls, self.down, self.up) * moving
-        )
+        return target * target * self.span + off * np.where(falls, self.down, self.up) * moving
 
 
 class _Lanes:
@@ -95,15 +90,11 @@ class _Lanes:
             rows.append(first + np.clip(begins + np.arange(lead + LANE), 0, count - 1))
         self.rows = np.concatenate(rows).T  # (lead + LANE, lanes)
 
-    def run(
-        self, parts: list[_Part], targets: list[list[np.ndarray]]
-    ) -> list[np.ndarray]:
+    def run(self, parts: list[_Part], targets: list[list[np.ndarray]]) -> list[np.ndarray]:
         """Speeds (B, T, 4) at the rows' begin of each flight, for its targets
         (B, T, 4) in the two parts of a row.
         """
-        target_lanes = [
-            np.moveaxis(np.concatenate(t, 1)[:, self.rows], 1, 0) for t in targets
-        ]
+        target_lanes = [np.moveaxis(np.concatenate(t, 1)[:, self.rows], 1, 0) for t in targets]
         speed = target_lanes[0][0]  # (B, lanes, 4)
         begin = np.empty_like(target_lanes[0])
         for row, (first, second) in enumerate(zip(*target_lanes, strict=True)):

@@ -8,12 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from openjax.gap.identification.prediction_errors import (
-    LOGARITHMS,
-    TINY,
-    Problem,
-    value_at,
-)
+from openjax.gap.identification.prediction_errors import LOGARITHMS, TINY, Problem, value_at
 from openjax.gap.identification.row_errors import hidden_errors, turning
 
 SEARCHED = np.array([[0.002, 0.15], [0.02, 5.0]])
@@ -120,8 +115,7 @@ def search(problem: Problem, place: np.ndarray) -> TorqueFit:
     row_errors = hidden_errors(problem, axes)
     return TorqueFit(
         value_at(value),
-        (_covariance(problem, value, axes) + np.diag(row_errors**2))
-        * np.outer(scale, scale),
+        (_covariance(problem, value, axes) + np.diag(row_errors**2)) * np.outer(scale, scale),
         loss,
         [a[2] for a in axes],
         np.array([a[0].var() for a in axes]),
@@ -168,9 +162,7 @@ def _covariance(problem: Problem, value, axes) -> np.ndarray:
     scores = np.zeros_like(hessian)
     for errors, slopes, _ in axes:
         pieces = np.arange(0, len(errors), max(int(BLOCK / problem.dt), 1))
-        sums = np.add.reduceat(slopes * errors[:, None], pieces, 0) / (
-            errors.var() + TINY
-        )
+        sums = np.add.reduceat(slopes * errors[:, None], pieces, 0) / (errors.var() + TINY)
         scores += sums.T @ sums
     wider = np.trace(scores @ inverse) / len(hessian)
     return inverse * max(1.0, wider)

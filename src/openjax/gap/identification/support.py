@@ -26,9 +26,7 @@ HOVER = 0.62  # of the largest thrust, where the slope of a thrust curve is take
 FARTHEST = 40.0  # nats: no response says more, as forms are never quite the model's
 
 
-def support(
-    estimates: EffectEstimates, theta: np.ndarray, pwm: bool, acts: bool = False
-) -> float:
+def support(estimates: EffectEstimates, theta: np.ndarray, pwm: bool, acts: bool = False) -> float:
     """Log density, up to a constant and at most FARTHEST below the best, of the
     estimates for parameters theta (P,) of the replay. Where it is known that something
     `acts`, gains are taken as they were measured.

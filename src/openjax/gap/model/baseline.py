@@ -72,24 +72,14 @@ def day_of(effect: str, parameter: str, vehicle, silent: bool) -> float:
     usual = card.nuisance.get(parameter, 0.0)
     usual = float(usual(vehicle) if callable(usual) else usual)
     common = card.common * (parameter not in card.coupling)
-    spread = np.hypot(
-        next(p.spread for p in card.fitted if p.name == parameter), common
-    )
+    spread = np.hypot(next(p.spread for p in card.fitted if p.name == parameter), common)
     spread *= growth(EFFECTS[effect].parameters[parameter].unit, vehicle)
-    charge = (
-        card.nuisance_duty.get(parameter, 0.0) if silent and card.thrust_map else 0.0
-    )
-    return max(
-        charge, card.days or 0.0, FORM_DAYS * usual, DECISION.form_error * float(spread)
-    )
+    charge = card.nuisance_duty.get(parameter, 0.0) if silent and card.thrust_map else 0.0
+    return max(charge, card.days or 0.0, FORM_DAYS * usual, DECISION.form_error * float(spread))
 
 
 def transfer(
-    hessian: np.ndarray,
-    push: np.ndarray,
-    prior: np.ndarray,
-    of_a_day: np.ndarray,
-    days: np.ndarray,
+    hessian: np.ndarray, push: np.ndarray, prior: np.ndarray, of_a_day: np.ndarray, days: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Mean and covariance, on another day, of the numbers that are not `of_a_day` (N,).
 
@@ -104,9 +94,7 @@ def transfer(
     solution = np.linalg.solve(
         inside, np.column_stack([hessian[np.ix_(day_rows, rest)], push[day_rows]])
     )
-    data = (
-        hessian[np.ix_(rest, rest)] - hessian[np.ix_(rest, day_rows)] @ solution[:, :-1]
-    )
+    data = hessian[np.ix_(rest, rest)] - hessian[np.ix_(rest, day_rows)] @ solution[:, :-1]
     right = push[rest] - hessian[np.ix_(rest, day_rows)] @ solution[:, -1]
     # (I + D S) of information D
     gain = np.eye(len(rest)) + data * np.square(days[rest])

@@ -61,9 +61,7 @@ class Equations:
     @cached_property
     def columns(self) -> np.ndarray:
         """The table's columns whose coefficients are solved for."""
-        return np.concatenate(
-            [self.model.free, self.table.nuisances[self.table.is_shared]]
-        )
+        return np.concatenate([self.model.free, self.table.nuisances[self.table.is_shared]])
 
     def solve(self, sums: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Hessian, right side and solution from `table.marginal` summed (C, C) over the
@@ -91,10 +89,7 @@ def promise_unbounded(table: Table, model: Model) -> float:
     """`promise` with nuisances of any size, which costs next to nothing."""
     columns = [0, *model.parts]
     hessian = table.fully_marginal[np.ix_(model.free, model.free)] + model.precision
-    push = (
-        table.fully_marginal[model.free][:, columns].sum(1)
-        + model.precision @ model.mean
-    )
+    push = table.fully_marginal[model.free][:, columns].sum(1) + model.precision @ model.mean
     square = table.fully_marginal[np.ix_(columns, columns)].sum()
     return float(0.5 * push @ np.linalg.solve(hessian, push) - 0.5 * square)
 
@@ -115,9 +110,7 @@ def fit_to_others(table: Table, model: Model) -> np.ndarray:
     equations = Equations(table, model)
     sums = table.total
     others = (equations.solve(sums - block)[2] for block in table.marginal)
-    return np.array(
-        [equations.coefficients(solution, k) for k, solution in enumerate(others)]
-    )
+    return np.array([equations.coefficients(solution, k) for k, solution in enumerate(others)])
 
 
 def cross_validate(table: Table, model: Model) -> Validation:
@@ -126,9 +119,7 @@ def cross_validate(table: Table, model: Model) -> Validation:
     # |y - Nv|^2 + |v|^2 at its least is y'(I + NN')^-1 y: what a block's nuisances take
     # costs.
     each = zip(coefficients, table.columns, strict=True)
-    residuals = [
-        np.concatenate([u @ columns, u[table.block_nuisances]]) for u, columns in each
-    ]
+    residuals = [np.concatenate([u @ columns, u[table.block_nuisances]]) for u, columns in each]
     return Validation(
         nats=np.array([-0.5 * (r @ r) for r in residuals]),
         squares=_squares(table.error, coefficients),
@@ -146,9 +137,7 @@ def _squares(error: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
     """Squared errors (B, K) by their quadratic forms (B, K, C, C), with coefficients
     (B, C).
     """
-    return np.einsum(
-        "bkc,bc->bk", np.einsum("bkcd,bd->bkc", error, coefficients), coefficients
-    )
+    return np.einsum("bkc,bc->bk", np.einsum("bkcd,bd->bkc", error, coefficients), coefficients)
 
 
 def ablate(
@@ -164,9 +153,7 @@ def ablate(
     for effect in drop:
         # parameters that another effect shares stay as they were fitted
         columns = [
-            table.derivative[int(i)]
-            for i in places((effect,))
-            if int(i) not in shared_places
+            table.derivative[int(i)] for i in places((effect,)) if int(i) not in shared_places
         ]
         coefficients[:, columns] = 0.0
         coefficients[:, table.part[effect]] = 1.0

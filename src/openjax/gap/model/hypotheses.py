@@ -73,17 +73,12 @@ class SetFit:
         """{effect: {parameter: (value, standard deviation)}} of the set's own
         effects.
         """
-        deviation = dict(
-            zip(self.index.tolist(), np.sqrt(np.diag(self.covariance)), strict=True)
-        )
+        deviation = dict(zip(self.index.tolist(), np.sqrt(np.diag(self.covariance)), strict=True))
 
         def estimate(key):
             return float(self.theta[PLACE[key]]), float(deviation[PLACE[key]])
 
-        return {
-            e: {p.name: estimate((e, p.name)) for p in CARDS[e].fitted}
-            for e in self.effects
-        }
+        return {e: {p.name: estimate((e, p.name)) for p in CARDS[e].fitted} for e in self.effects}
 
 
 def fit_set(
@@ -126,9 +121,7 @@ def _descend(fit: SetFit, iterations: int) -> SetFit:
     """Steps of Gauss and Newton, half of one that overshoots, while they gain
     anything.
     """
-    index, mean, precision = prior(
-        fit.effects, fit.replay.absent, fit.replay.size_factors
-    )
+    index, mean, precision = prior(fit.effects, fit.replay.absent, fit.replay.size_factors)
     # no step longer than three prior deviations: farther away the derivatives say
     # little
     reach = 3.0 * np.sqrt(np.diag(np.linalg.inv(precision)))
@@ -162,18 +155,12 @@ def model_noise(replay: Replay, library: Library) -> tuple[Replay, dict[str, flo
     library may act at once, and what each effect would show if it acted as at its start
     (nats, nuisances marginalised): its exposure.
     """
-    starts = [
-        (effect, theta)
-        for effect in library.physics
-        for theta in _starts(effect, replay)
-    ]
+    starts = [(effect, theta) for effect in library.physics for theta in _starts(effect, replay)]
     index, _, precision = prior(library.physics, size_factors=replay.size_factors)
     columns = replay.linearise(replay.absent, index)
     ahead = np.array([theta for _, theta in starts])
     predictions = (
-        replay.predict(ahead)
-        if starts
-        else [np.zeros((0, *n.shape)) for n in replay.nominal]
+        replay.predict(ahead) if starts else [np.zeros((0, *n.shape)) for n in replay.nominal]
     )
     each = zip(columns, predictions, replay.nominal, strict=True)
     columns = [np.concatenate([c, m - n[None]]) for c, m, n in each]
@@ -187,12 +174,8 @@ def model_noise(replay: Replay, library: Library) -> tuple[Replay, dict[str, flo
         if with_effects:
             gram = replay.grams(columns).sum(0)
             amplitudes = np.linalg.solve(gram[1:, 1:] + penalty, gram[1:, 0])
-        residuals_of_tracks = [
-            c[0] - np.tensordot(amplitudes, c[1:], 1) for c in columns
-        ]
-        residuals = [
-            without_nuisances(replay, r, k) for k, r in enumerate(residuals_of_tracks)
-        ]
+        residuals_of_tracks = [c[0] - np.tensordot(amplitudes, c[1:], 1) for c in columns]
+        residuals = [without_nuisances(replay, r, k) for k, r in enumerate(residuals_of_tracks)]
         replay = with_noise_of(replay, residuals)
     squares = np.diag(replay.grams(columns).sum(0))[1 + size :]
     exposure = {e: 0.0 for e in library.physics}
@@ -201,23 +184,17 @@ def model_noise(replay: Replay, library: Library) -> tuple[Replay, dict[str, flo
     return replay, exposure
 
 
-def with_noise_of(
-    replay: Replay, residuals: list[Float[np.ndarray, "_ channels"]]
-) -> Replay:
+def with_noise_of(replay: Replay, residuals: list[Float[np.ndarray, "_ channels"]]) -> Replay:
     """The replay with noise models of residuals; channels that weren't logged keep the
     present ones.
     """
     skip = int(SKIP / replay.tracks[0].dt)
     noises = tuple(
-        fit_noise(axes, residuals, integrates, skip=skip)
-        if replay.usable[axes[0]]
-        else old
+        fit_noise(axes, residuals, integrates, skip=skip) if replay.usable[axes[0]] else old
         for (axes, integrates), old in zip(GROUPS, replay.noises, strict=True)
     )
     replay = replace(replay, noises=noises, loudness=None)
-    return replace(
-        replay, loudness=tuple(_loudness(replay, r, k) for k, r in enumerate(residuals))
-    )
+    return replace(replay, loudness=tuple(_loudness(replay, r, k) for k, r in enumerate(residuals)))
 
 
 def _loudness(replay: Replay, residual: np.ndarray, track: int) -> np.ndarray:
@@ -231,9 +208,7 @@ def _loudness(replay: Replay, residual: np.ndarray, track: int) -> np.ndarray:
     for rows in np.array_split(np.arange(len(squares)), blocks):
         for axes, _ in GROUPS:
             block = np.ix_(rows, axes)
-            out[block] = (squares[block].sum() + STEADY) / (
-                squares[block].size + STEADY
-            )
+            out[block] = (squares[block].sum() + STEADY) / (squares[block].size + STEADY)
     return np.sqrt(out)
 
 
@@ -246,9 +221,7 @@ def without_nuisances(replay: Replay, residual: Rows, track: int) -> Rows:
 
 def fit_singles(replay: Replay, library: Library, exposure) -> dict[str, SetFit]:
     """The fit of every effect alone that the flights could show."""
-    visible_effects = [
-        effect for effect in library.physics if exposure[effect] >= UNEXPOSED
-    ]
+    visible_effects = [effect for effect in library.physics if exposure[effect] >= UNEXPOSED]
     fits = side_by_side(lambda effect: fit_single(replay, effect), visible_effects)
     return dict(zip(visible_effects, fits, strict=True))
 
@@ -276,7 +249,6 @@ def _best_start(replay: Replay, effect: str) -> np.ndarray:
     if len(starts) == 1:
         return starts[0]
     residuals = [
-        y[None] - p
-        for y, p in zip(replay.measurements, replay.predict(starts), strict=True)
+        y[None] - p for y, p in zip(replay.measurements, replay.predict(starts), strict=True)
     ]
     return starts[int(np.argmin(np.diag(replay.grams(residuals).sum(0))))]

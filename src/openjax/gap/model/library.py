@@ -61,9 +61,7 @@ PHYSICS_EFFECTS = tuple(e for e in CARDS if CARDS[e].path == "physics")
 THETA = tuple((e, p.name) for e in PHYSICS_EFFECTS for p in CARDS[e].fitted)
 PLACE = {key: number for number, key in enumerate(THETA)}
 ABSENT = np.array([EFFECTS[e].parameters[p].none for e, p in THETA] + [0.0, 0.0])
-STEP = np.array(
-    [p.step for e in PHYSICS_EFFECTS for p in CARDS[e].fitted] + [1e-3, 2e-4]
-)
+STEP = np.array([p.step for e in PHYSICS_EFFECTS for p in CARDS[e].fitted] + [1e-3, 2e-4])
 
 
 def path_of(effect: str) -> str:
@@ -75,9 +73,7 @@ def library(without=()) -> Library:
     """All effects but those in `without`. Raises UserError for unknown names."""
     for name in without:
         if name not in EFFECTS:
-            raise UserError(
-                f"--without {name}: no such effect; {suggestion(name, EFFECTS)}"
-            )
+            raise UserError(f"--without {name}: no such effect; {suggestion(name, EFFECTS)}")
     return Library(tuple(e for e in EFFECTS if e in CARDS and e not in without))
 
 
@@ -96,9 +92,7 @@ def growths(vehicle) -> Parameters:
 
 def prior(
     effects, absent: Parameters = ABSENT, size_factors: Parameters | None = None
-) -> tuple[
-    Int[np.ndarray, " own"], Float[np.ndarray, " own"], Float[np.ndarray, "own own"]
-]:
+) -> tuple[Int[np.ndarray, " own"], Float[np.ndarray, " own"], Float[np.ndarray, "own own"]]:
     """Indices (p,), mean (p,) and precision (p, p) of the parameters of a set of
     physics effects, for a vehicle that has `absent` (P,) while nothing acts and sizes
     that are `size_factors` (P,).

@@ -33,9 +33,7 @@ FEEDBACK_ROWS, QUICK_ROWS = (0, 2), (0, 1, 2)  # rows of delay
 OF_A_BLOCK = ("feedback",)
 
 
-def columns_of(
-    track: Track, path: Path, nominal, feedback, at_once: bool
-) -> dict[str, Rows]:
+def columns_of(track: Track, path: Path, nominal, feedback, at_once: bool) -> dict[str, Rows]:
     """{name: column (T, 9)} of one track, of what doesn't depend on what acts; the
     arguments as in `make_replay`.
     """
@@ -43,15 +41,11 @@ def columns_of(
     # slow parts are the same some rows later
     columns |= _late_torques("trim", track, feedback.trim, (0,))
     if at_once:
-        columns |= _late_torques(
-            "motors within a row", track, feedback.quick, QUICK_ROWS
-        )
+        columns |= _late_torques("motors within a row", track, feedback.quick, QUICK_ROWS)
     return columns | _sensor_nuisances(track, path, nominal)
 
 
-def _sensor_nuisances(
-    track: Track, path: Path, nominal: np.ndarray
-) -> dict[str, np.ndarray]:
+def _sensor_nuisances(track: Track, path: Path, nominal: np.ndarray) -> dict[str, np.ndarray]:
     """Mounting, biases and clocks of the sensors, and what a rigid body with small
     errors does: columns (T, 9).
     """
@@ -87,12 +81,7 @@ def _sensor_nuisances(
             SIZE["accelerometer_bias"],
         )
     for name, axis in zip("xyz", np.eye(3), strict=True):
-        column(
-            f"IMU tilt {name}",
-            RATES,
-            -np.cross(axis, rates - rates[0]),
-            SIZE["imu_tilt"],
-        )
+        column(f"IMU tilt {name}", RATES, -np.cross(axis, rates - rates[0]), SIZE["imu_tilt"])
         column(f"IMU tilt {name}", FORCE, -np.cross(axis, force), SIZE["imu_tilt"])
     for axis, name in enumerate("xyz"):
         # Euler's equations: about an axis acts the product of the other two rates
@@ -114,15 +103,11 @@ def _sensor_nuisances(
         SIZE["accelerometer_lag"],
     )
     spinning = np.gradient(nominal[:, RATES], track.dt, axis=0)
-    column(
-        "gyroscope's low-pass", RATES, -(spinning - spinning[0]), SIZE["gyroscope_lag"]
-    )
+    column("gyroscope's low-pass", RATES, -(spinning - spinning[0]), SIZE["gyroscope_lag"])
     if not track.logs_attitude:
         column("gyroscope's gain", RATES, nominal[:, RATES], UNKNOWN_GAIN)
     if track.velocity is not None:
-        late = -velocity_change(
-            np.cross(np.asarray(path.body_rates, float)[:rows], body)
-        )
+        late = -velocity_change(np.cross(np.asarray(path.body_rates, float)[:rows], body))
         late += smooth(np.gradient(track.velocity, track.dt, axis=0), 0.05, track.dt)
         column("clock of the pose", VELOCITY, late, SIZE["pose_clock"])
     return columns
@@ -136,13 +121,8 @@ def _late_torques(
     """
     columns = {}
     for rows in delays:
-        late = np.concatenate(
-            [np.zeros((rows, 3)), acceleration[: len(acceleration) - rows]]
-        )
-        for axes, mask in (
-            ("roll and pitch", [1.0, 1.0, 0.0]),
-            ("yaw", [0.0, 0.0, 1.0]),
-        ):
+        late = np.concatenate([np.zeros((rows, 3)), acceleration[: len(acceleration) - rows]])
+        for axes, mask in (("roll and pitch", [1.0, 1.0, 0.0]), ("yaw", [0.0, 0.0, 1.0])):
             columns[f"{name}, {axes}, {rows} rows late"] = (
                 torque_channels(late * mask, track.dt) * SIZE["feedback"]
             )

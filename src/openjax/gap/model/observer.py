@@ -16,12 +16,7 @@ import jax.numpy as jnp
 
 from openjax.vehicle import DroneState
 from openjax.vehicle.rate_controller import rate_controller
-from openjax.vehicle.rotors import (
-    rotor_reaction,
-    rotor_speed_step,
-    rotor_thrust,
-    total_wrench,
-)
+from openjax.vehicle.rotors import rotor_reaction, rotor_speed_step, rotor_thrust, total_wrench
 
 TICKS = 5  # of the rate loop per row
 # share of a gyro innovation that corrects the observer, near the optimum for usual
@@ -79,9 +74,7 @@ def observe(controller, vehicle, command, motor, gyro, disturbance, dt, at_once=
     tick = _ticking(controller, vehicle, dt / TICKS)
 
     def ticks(state, command, offset, push):
-        return jax.lax.scan(
-            lambda s, c: tick(s, c, offset, push), state, command, unroll=True
-        )
+        return jax.lax.scan(lambda s, c: tick(s, c, offset, push), state, command, unroll=True)
 
     def row(carry, inputs):
         command, motors, gyro_next, push = inputs
@@ -104,15 +97,9 @@ def observe(controller, vehicle, command, motor, gyro, disturbance, dt, at_once=
             # The log's mean, within a motor's limits: what a limit cuts off one tick,
             # the others must have had.
             for _ in range(3):
-                motor_ticks = jnp.clip(
-                    motor_ticks + (motors - motor_ticks.mean(0)), 0.0, 1.0
-                )
+                motor_ticks = jnp.clip(motor_ticks + (motors - motor_ticks.mean(0)), 0.0, 1.0)
         step = GYRO_GAIN * (gyro_next - rates)
-        return ((rates + step, previous + step, *rest), shortfall), (
-            requests,
-            motor_ticks,
-            rates,
-        )
+        return ((rates + step, previous + step, *rest), shortfall), (requests, motor_ticks, rates)
 
     speed = vehicle.max_rotor_speed * jnp.sqrt(jnp.clip(motor[0], 1e-4, 1.0))
     gyro_next = jnp.concatenate([gyro[1:], gyro[-1:]])
@@ -135,8 +122,6 @@ def respond_to_commands(vehicle, command, dt):
         )
         return carry, (motors.mean(0), 0.5 * (start + carry[0]))
 
-    speed = vehicle.max_rotor_speed * jnp.sqrt(
-        jnp.clip(jnp.full(4, command[0, 0]), 1e-4, 1.0)
-    )
+    speed = vehicle.max_rotor_speed * jnp.sqrt(jnp.clip(jnp.full(4, command[0, 0]), 1e-4, 1.0))
     start = (command[0, 1:], command[0, 1:], jnp.zeros(3), speed)
     return jax.lax.scan(row, start, command)[1]

@@ -21,12 +21,7 @@ from openjax.vehicle.effects.composition import (
     change_thrust,
 )
 from openjax.vehicle.rigid_body import rotate
-from openjax.vehicle.rotors import (
-    commanded_rotor_speed,
-    rotor_reaction,
-    rotor_thrust,
-    total_wrench,
-)
+from openjax.vehicle.rotors import commanded_rotor_speed, rotor_reaction, rotor_thrust, total_wrench
 
 
 @flax.struct.dataclass
@@ -66,23 +61,16 @@ def _rotors(vehicle, targets_in_ticks, commands, dt, late):
     step = dt / targets_in_ticks.shape[1]
     # As `rotor_speed_step`, with what doesn't change outside the loop.
     faster = -jnp.expm1(-step / vehicle.motor_time_constant)
-    slower = -jnp.expm1(
-        -step / (vehicle.motor_time_constant * vehicle.motor_slowdown_ratio)
-    )
+    slower = -jnp.expm1(-step / (vehicle.motor_time_constant * vehicle.motor_slowdown_ratio))
 
     def row(speed, targets):
         total = 0.0
         start_speed = speed
         for tick in range(len(targets)):
             target = targets[tick]
-            next_speed = speed + (target - speed) * jnp.where(
-                target < speed, slower, faster
-            )
+            next_speed = speed + (target - speed) * jnp.where(target < speed, slower, faster)
             # Mean of the square over a tick, in which the speed is nearly straight.
-            total = (
-                total
-                + (speed * speed + speed * next_speed + next_speed * next_speed) / 3.0
-            )
+            total = total + (speed * speed + speed * next_speed + next_speed * next_speed) / 3.0
             speed = next_speed
         return speed, (total / len(targets), (speed - start_speed) / dt)
 
@@ -100,9 +88,7 @@ def _values(effects, parameters, theta) -> dict[str, dict[str, jax.Array]]:
     values = {}
     for effect in effects:
         absent = effect.none()
-        values[effect.name] = {
-            k: jnp.asarray(v, theta.dtype) for k, v in absent.items()
-        }
+        values[effect.name] = {k: jnp.asarray(v, theta.dtype) for k, v in absent.items()}
     for number, (effect, parameter) in enumerate(parameters):
         values[effect] = {**values[effect], parameter: theta[number]}
     return values
@@ -131,9 +117,7 @@ def _channels(effects, parameters, theta, vehicle, path: Path):
     def context(position, quaternion, velocity, rates, voltage, others, speed):
         state = _state(position, quaternion, velocity, rates, speed)
         room = {"others_position": others, "ceiling_height": path.ceiling}
-        return make_context(
-            changed_vehicle, state, battery_voltage=voltage, dt=step, **room
-        )
+        return make_context(changed_vehicle, state, battery_voltage=voltage, dt=step, **room)
 
     along = (
         path.position,
@@ -146,18 +130,12 @@ def _channels(effects, parameters, theta, vehicle, path: Path):
     at_rest = jax.vmap(context)(*along, jnp.zeros_like(path.motor[:, 0]))
 
     def motor_requests(commands, around):
-        return jax.vmap(lambda m: change_motor_command(effects, values, m, around))(
-            commands
-        )
+        return jax.vmap(lambda m: change_motor_command(effects, values, m, around))(commands)
 
     motors = jax.vmap(motor_requests)(path.motor, at_rest)
 
     speed, sped_up = _rotors(
-        changed_vehicle,
-        commanded_rotor_speed(changed_vehicle, motors),
-        motors,
-        path.dt,
-        theta[-1],
+        changed_vehicle, commanded_rotor_speed(changed_vehicle, motors), motors, path.dt, theta[-1]
     )
     spun_up = theta[-2] * (sped_up @ changed_vehicle.rotor_spin)
 
@@ -177,8 +155,6 @@ def _channels(effects, parameters, theta, vehicle, path: Path):
         angular = angular.at[2].add(spun_up)  # what speeds a rotor up turns the body
         specific = force / changed_vehicle.mass
         gravity = jnp.array([0.0, 0.0, 1.0], force.dtype) * changed_vehicle.gravity
-        return jnp.concatenate(
-            [angular, rotate(quaternion, specific) - gravity, specific]
-        )
+        return jnp.concatenate([angular, rotate(quaternion, specific) - gravity, specific])
 
     return jax.vmap(wrench)(*along, speed, spun_up)

@@ -51,9 +51,7 @@ class Physics:
     vehicles: tuple
     paths: tuple[Path, ...]
 
-    def predict(
-        self, theta: Hypotheses
-    ) -> list[Float[np.ndarray, "hypotheses _ channels"]]:
+    def predict(self, theta: Hypotheses) -> list[Float[np.ndarray, "hypotheses _ channels"]]:
         """Channels (B, T, 9) of each track for parameter vectors theta (B, P)."""
         theta = np.asarray(theta, np.float32)
         run = compiled_physics(PHYSICS_EFFECTS, THETA)
@@ -69,10 +67,7 @@ class Physics:
         for numbers, rows in running:
             for number, lane in zip(numbers, np.asarray(rows), strict=False):
                 parts[number].append(lane[: len(self.tracks[number])])
-        return [
-            _integrate(np.stack(p), t.dt)
-            for p, t in zip(parts, self.tracks, strict=True)
-        ]
+        return [_integrate(np.stack(p), t.dt) for p, t in zip(parts, self.tracks, strict=True)]
 
     @cached_property
     def size_factors(self) -> Parameters:
@@ -116,10 +111,7 @@ def make_physics(tracks, vehicles, motor_ticks) -> Physics:
     return Physics(
         tuple(tracks),
         tuple(jax.tree.map(np.float32, v) for v in vehicles),
-        tuple(
-            _path(t, m, size, neighbours)
-            for t, m in zip(tracks, motor_ticks, strict=True)
-        ),
+        tuple(_path(t, m, size, neighbours) for t, m in zip(tracks, motor_ticks, strict=True)),
     )
 
 
@@ -131,32 +123,18 @@ def _path(track: Track, ticks: np.ndarray, size: int, neighbours: int) -> Path:
 
     unknown = np.zeros((rows, 3))
     quaternion = (
-        track.quaternion
-        if track.quaternion is not None
-        else np.tile([1.0, 0, 0, 0], (rows, 1))
+        track.quaternion if track.quaternion is not None else np.tile([1.0, 0, 0, 0], (rows, 1))
     )
     quaternion = middle(quaternion)
     quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
     # Without a pose the vehicle is taken to be in mid-air, far from everything.
-    position = (
-        track.position
-        if track.position is not None
-        else unknown + np.array([0.0, 0.0, 0.6])
-    )
-    position, *neighbours_at = (
-        _inside(p, track.ceiling) for p in (position, *track.neighbours)
-    )
+    position = track.position if track.position is not None else unknown + np.array([0.0, 0.0, 0.6])
+    position, *neighbours_at = (_inside(p, track.ceiling) for p in (position, *track.neighbours))
     velocity = track.velocity if track.velocity is not None else unknown
     # Who didn't fly along is far away.
     others = [middle(p) for p in neighbours_at]
-    others += [np.tile(np.float32([50.0, 50.0, -50.0]), (size, 1))] * (
-        neighbours - len(others)
-    )
-    voltage = (
-        np.full(size, np.nan, np.float32)
-        if track.voltage is None
-        else middle(track.voltage)
-    )
+    others += [np.tile(np.float32([50.0, 50.0, -50.0]), (size, 1))] * (neighbours - len(others))
+    voltage = np.full(size, np.nan, np.float32) if track.voltage is None else middle(track.voltage)
     return Path(
         middle(position),
         quaternion,

@@ -112,9 +112,7 @@ class Replay:
     def _roots(self) -> list[np.ndarray]:
         return [np.linalg.cholesky(np.eye(len(g)) + g) for g in self.nuisance_grams]
 
-    def predict(
-        self, theta: Hypotheses
-    ) -> list[Float[np.ndarray, "hypotheses _ channels"]]:
+    def predict(self, theta: Hypotheses) -> list[Float[np.ndarray, "hypotheses _ channels"]]:
         """Channels (B, T, 9) of each track for parameter vectors theta (B, P)."""
         return self.physics.predict(theta)
 
@@ -123,10 +121,7 @@ class Replay:
         moment of inertia scales the torques that are left once an effect is accounted
         for, not those of motors that hold against it.
         """
-        places = [PLACE[key[:2]] for key in self.numbers] + [
-            len(theta) - 2,
-            len(theta) - 1,
-        ]
+        places = [PLACE[key[:2]] for key in self.numbers] + [len(theta) - 2, len(theta) - 1]
         columns = []
         derivatives = (column[1:] for column in self.linearise(theta, places))
         for m, old, size in zip(derivatives, self.columns, self.sizes, strict=True):
@@ -169,8 +164,7 @@ class Replay:
         gram = self.nuisance_grams[track]
         n = self.whitened_nuisances[track]
         return np.linalg.solve(
-            np.eye(len(gram)) + gram,
-            n.reshape(len(n), -1) @ self.whiten(residual, track).ravel(),
+            np.eye(len(gram)) + gram, n.reshape(len(n), -1) @ self.whiten(residual, track).ravel()
         )
 
     def linearise(
@@ -190,13 +184,7 @@ class Replay:
 
 
 def make_replay(
-    tracks,
-    vehicles,
-    motor_ticks,
-    feedback,
-    numbers,
-    clocks=(True, False),
-    baseline=None,
+    tracks, vehicles, motor_ticks, feedback, numbers, clocks=(True, False), baseline=None
 ) -> Replay:
     """Replay of tracks with their nominal vehicles and motor commands (T, TICKS, 4) of
     the rate loop's ticks. `feedback` of each track: what it made of the motors may be
@@ -227,14 +215,8 @@ def make_replay(
             tracks, physics.paths, nominal, feedback, strict=True
         )
     ]
-    names = tuple(
-        dict.fromkeys(name for columns in columns_of_tracks for name in columns)
-    )
-    moving = (
-        *(" ".join(key[:2]) for key in numbers),
-        "propellers' inertia",
-        *MOTORS_LATE,
-    )
+    names = tuple(dict.fromkeys(name for columns in columns_of_tracks for name in columns))
+    moving = (*(" ".join(key[:2]) for key in numbers), "propellers' inertia", *MOTORS_LATE)
     usual_sizes = [key[2] for key in numbers]
     apart = SIZE["motor_clock" if one_clock else "streams_apart"]
     sizes = [
@@ -260,15 +242,12 @@ def make_replay(
         sizes,
         numbers,
         usable,
-        tuple(
-            first_noise(a, i, d) for (a, i), d in zip(GROUPS, FIRST_NOISE, strict=True)
-        ),
+        tuple(first_noise(a, i, d) for (a, i), d in zip(GROUPS, FIRST_NOISE, strict=True)),
         absent=absent.copy(),
     ).around(absent)
     if not any(CARDS[key[0]].balanced for key in numbers):  # trims are told otherwise
         replay = replace(
-            replay,
-            columns=[_without_mean_torque(c, len(numbers)) for c in replay.columns],
+            replay, columns=[_without_mean_torque(c, len(numbers)) for c in replay.columns]
         )
     mixing = None if baseline is None else baseline.mixing(replay.nuisance_names)
     return replace(replay, mixing=mixing)
@@ -281,9 +260,7 @@ def _without_mean_torque(nuisances: np.ndarray, count: int) -> np.ndarray:
     """
     out = nuisances.copy()
     # of integrals a mean torque is the straight line to their end
-    out[:count, :, RATES] -= (
-        np.linspace(0.0, 1.0, out.shape[1])[:, None] * out[:count, -1:, RATES]
-    )
+    out[:count, :, RATES] -= np.linspace(0.0, 1.0, out.shape[1])[:, None] * out[:count, -1:, RATES]
     return out
 
 

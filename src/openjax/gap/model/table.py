@@ -78,8 +78,7 @@ class Table:
         """
         inside = self.white[:, self.block_nuisances][:, :, self.block_nuisances]
         return np.linalg.solve(
-            inside + np.eye(len(self.block_nuisances)),
-            self.white[:, self.block_nuisances],
+            inside + np.eye(len(self.block_nuisances)), self.white[:, self.block_nuisances]
         )
 
     @cached_property
@@ -91,9 +90,7 @@ class Table:
     def fully_marginal(self) -> np.ndarray:
         """(C, C): `total` with the shared nuisances marginalised as well."""
         case_nuisances = self.nuisances[self.is_shared]
-        inside = self.total[np.ix_(case_nuisances, case_nuisances)] + np.eye(
-            len(case_nuisances)
-        )
+        inside = self.total[np.ix_(case_nuisances, case_nuisances)] + np.eye(len(case_nuisances))
         return self.total - self.total[:, case_nuisances] @ np.linalg.solve(
             inside, self.total[case_nuisances]
         )
@@ -139,22 +136,16 @@ def build(fit: SetFit, singles: dict[str, SetFit] | None) -> Table:
     rows = []
     track_of = []
     whole = []
-    for number, (c, m, track) in enumerate(
-        zip(columns, predictions, replay.tracks, strict=True)
-    ):
+    for number, (c, m, track) in enumerate(zip(columns, predictions, replay.tracks, strict=True)):
         residual = replay.measurements[number] - c[0]
         nuisances = replay.nuisances[number]
-        x = np.concatenate(
-            [c, m[: len(others)] - residual, residual - m[len(others) :], nuisances]
-        )
+        x = np.concatenate([c, m[: len(others)] - residual, residual - m[len(others) :], nuisances])
         without = replay.whiten(x[: -len(nuisances)], number)
         w = np.concatenate([without, replay.whitened_nuisances[number]])
         count = block_count(w.shape[1], track.dt)
         # of the longest predictions, a quarter of a second, the first ends at row 25
         e = _errors(x, track.dt)[:, max(int(SKIP / track.dt), 25) :, replay.usable > 0]
-        for a, b in zip(
-            np.array_split(w, count, 1), np.array_split(e, count, 1), strict=True
-        ):
+        for a, b in zip(np.array_split(w, count, 1), np.array_split(e, count, 1), strict=True):
             flat = a.reshape(len(x), -1)
             whole.append(flat)
             white.append(flat @ flat.T)
@@ -211,18 +202,11 @@ def with_effects(table: Table, add=(), drop=()) -> Model:
         spread = np.array([p.spread for p in CARDS[effect].fitted])
         spread = spread * table.fit.replay.size_factors[place]
         derivatives = [table.derivative[int(i)] for i in place]
-        inside = [
-            k
-            for k, column in enumerate(derivatives)
-            if column not in derivatives_of_set
-        ]
+        inside = [k for k, column in enumerate(derivatives) if column not in derivatives_of_set]
         free.append(np.array([derivatives[k] for k in inside], int))
         means.append(np.zeros(len(inside)))
         blocks.append(np.diag(1.0 / spread[inside] ** 2))
     free = np.concatenate(free).astype(int)
     return Model(
-        tuple(table.part[e] for e in drop),
-        free,
-        np.concatenate(means),
-        block_diagonal(blocks),
+        tuple(table.part[e] for e in drop), free, np.concatenate(means), block_diagonal(blocks)
     )

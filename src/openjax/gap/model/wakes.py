@@ -160,16 +160,12 @@ def louder_in(
     ratio = float(parts[0].mean() - parts[1].mean())
     freedom = spread.sum() ** 2 / (spread**2 / [len(part) - 1 for part in parts]).sum()
     # as many standard errors of a normal distribution as Student's says
-    return float(np.exp(ratio)), float(
-        -norm.ppf(t.sf(ratio / spread.sum() ** 0.5, freedom))
-    )
+    return float(np.exp(ratio)), float(-norm.ppf(t.sf(ratio / spread.sum() ** 0.5, freedom)))
 
 
 def _stretches(squares: np.ndarray, mask: Chosen, dt: float) -> list[float]:
     """Mean squares of stretches of chosen rows, none longer than a block."""
-    edges = np.flatnonzero(np.diff(mask.astype(int), prepend=0, append=0)).reshape(
-        -1, 2
-    )
+    edges = np.flatnonzero(np.diff(mask.astype(int), prepend=0, append=0)).reshape(-1, 2)
     means = []
     for begin, end in edges:
         pieces = max(round((end - begin) * dt / BLOCK), 1)
@@ -179,9 +175,7 @@ def _stretches(squares: np.ndarray, mask: Chosen, dt: float) -> list[float]:
     return means
 
 
-def as_loud_as(
-    gusts: Gusts, replay: Replay, effects: Sequence[str]
-) -> tuple[Replay, Gusts]:
+def as_loud_as(gusts: Gusts, replay: Replay, effects: Sequence[str]) -> tuple[Replay, Gusts]:
     """A replay whose noise is as loud under other vehicles as the gusts are, and these
     with the nats that the effect of wakes, if there is one in `effects`, loses by that.
     """
@@ -189,9 +183,7 @@ def as_loud_as(
     loss = 0.0
     for effect in effects:
         quiet = fit_single(replay, effect).score - fit_set(replay, ()).score
-        loss = max(
-            quiet - fit_single(louder, effect).score + fit_set(louder, ()).score, 0.0
-        )
+        loss = max(quiet - fit_single(louder, effect).score + fit_set(louder, ()).score, 0.0)
     return louder, replace(gusts, nats=gusts.nats + loss)
 
 
@@ -199,20 +191,14 @@ def _louder(replay: Replay, gusts: Gusts) -> Replay:
     if replay.loudness is None:
         return replay
     loudness = []
-    for track, mask, loud in zip(
-        replay.tracks, gusts.rows, replay.loudness, strict=True
-    ):
+    for track, mask, loud in zip(replay.tracks, gusts.rows, replay.loudness, strict=True):
         inside_rows = mask[int(SKIP / track.dt) :]
         loudness_here = loud.copy()
         for axes, ratio in gusts.louder.items():
             quiet = (
-                np.sqrt((loud[~inside_rows][:, axes] ** 2).mean())
-                if (~inside_rows).any()
-                else 1.0
+                np.sqrt((loud[~inside_rows][:, axes] ** 2).mean()) if (~inside_rows).any() else 1.0
             )
             columns = np.ix_(inside_rows, axes)
-            loudness_here[columns] = np.maximum(
-                loudness_here[columns], quiet * ratio**0.5
-            )
+            loudness_here[columns] = np.maximum(loudness_here[columns], quiet * ratio**0.5)
         loudness.append(loudness_here)
     return replace(replay, loudness=tuple(loudness))

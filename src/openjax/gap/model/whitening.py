@@ -59,9 +59,7 @@ def whiten(
 def first_noise(axes, integrates: bool, deviation: float) -> Noise:
     """A noise model to begin with: sensor noise and some white steps."""
     step = 0.15 if integrates else 0.0
-    numerator, denominator = _kalman(
-        memory=0.9, gust=0.04, step=step, integrates=integrates
-    )
+    numerator, denominator = _kalman(memory=0.9, gust=0.04, step=step, integrates=integrates)
     return Noise(tuple(axes), numerator, denominator, deviation)
 
 

@@ -35,9 +35,7 @@ def read_report(folder: Path) -> dict:
         report = json.loads(path.read_text(encoding="utf-8"))
     except (ValueError, UnicodeDecodeError):
         raise UserError(f"{path}: isn't JSON; diagnose the flights again") from None
-    if not isinstance(report, dict) or not {"probabilities", "parameters"} <= set(
-        report
-    ):
+    if not isinstance(report, dict) or not {"probabilities", "parameters"} <= set(report):
         if isinstance(report, dict) and "rotors" in report:
             raise UserError(
                 f"{path}: compares trims alone, of which no flight tells more; diagnose flights "
@@ -54,17 +52,13 @@ def beliefs_of(report: dict) -> list[Belief]:
     """
     chances = report["probabilities"]
     causes = [e for e in report.get("effects", ()) if acts_in_physics(e)]
-    chances_of: dict[tuple[str, ...], float] = {
-        (): max(chances.get("none", 0.0), UNTESTED)
-    }
+    chances_of: dict[tuple[str, ...], float] = {(): max(chances.get("none", 0.0), UNTESTED)}
     # what a report names is believed together, as it was found together
     if causes:
         sure = max(chances.get(e, 0.0) for e in causes)
         chances_of[tuple(causes)] = max(sure, UNTESTED)
         for effect in causes:
-            for other in filter(
-                acts_in_physics, report.get("equivalent", {}).get(effect, ())
-            ):
+            for other in filter(acts_in_physics, report.get("equivalent", {}).get(effect, ())):
                 # As likely as the one that it would do as well as.
                 rest = tuple(e for e in causes if e != effect)
                 chances_of[(*rest, other)] = max(chances.get(effect, 0.0), UNTESTED)
@@ -75,10 +69,7 @@ def beliefs_of(report: dict) -> list[Belief]:
     for effect in filter(acts_in_physics, report.get("not_testable", ())):
         chances_of.setdefault((effect,), UNTESTED)
     whole = sum(chances_of.values())
-    return [
-        Belief(e, _theta(e, report["parameters"]), p / whole)
-        for e, p in chances_of.items()
-    ]
+    return [Belief(e, _theta(e, report["parameters"]), p / whole) for e, p in chances_of.items()]
 
 
 def acts_in_physics(effect: str) -> bool:
@@ -158,14 +149,7 @@ def _to_mend(report: dict) -> list[str]:
     issues = [entry["issue"] for entry in report.get("quality", ())]
     reasons = {
         "log the motors' means at 100 Hz": ("sample", remarks),
-        "log motors and gyroscope on one clock": (
-            "don't share a clock",
-            report.get("sensors", ()),
-        ),
+        "log motors and gyroscope on one clock": ("don't share a clock", report.get("sensors", ())),
         "log the accelerometer": ("torques alone can be told", issues),
     }
-    return [
-        mend
-        for mend, (sign, texts) in reasons.items()
-        if any(sign in text for text in texts)
-    ]
+    return [mend for mend, (sign, texts) in reasons.items() if any(sign in text for text in texts)]

@@ -84,9 +84,7 @@ def advise(beliefs: list[Belief], vehicle_file: VehicleFile) -> Advice:
         i, j = np.unravel_index(int(np.argmax(beyond)), gains.shape)
         pair = (beliefs[i].name, beliefs[j].name)
         promises.append(
-            Promise(
-                name.split(".")[0], float(gains.sum()), pair, float(apart[number, i, j])
-            )
+            Promise(name.split(".")[0], float(gains.sum()), pair, float(apart[number, i, j]))
         )
     picks = _fewest(apart, together)
     best = apart.max(0)
@@ -140,9 +138,7 @@ def nominal_of(vehicle_file: VehicleFile) -> Nominal:
     # what is simulated commands thrust in the nominal order, whatever its own logs hold
     tables = {"log": {"motor_rows": "mean"}, "motor": Motor(), "vehicles": {}}
     file_of_means = replace(vehicle_file, **tables)
-    return Nominal(
-        numbers, vehicle_file.airframe, vehicle_file.mass_weighed, file_of_means
-    )
+    return Nominal(numbers, vehicle_file.airframe, vehicle_file.mass_weighed, file_of_means)
 
 
 # one vehicle is mostly asked about again and again, and its flights take seconds
@@ -153,9 +149,7 @@ def replay_segments(nominal: Nominal) -> Replay:
     flights = []
     for number, (name, segment) in enumerate(SEGMENTS.items()):
         air = Turbulence()
-        columns = fly(
-            vehicle, vehicle, segment.reference(SECONDS), seed=number, air=air
-        )
+        columns = fly(vehicle, vehicle, segment.reference(SECONDS), seed=number, air=air)
         parts, _ = flights_of(log_of(columns, name), (0, 1, 2, 3))
         flights += parts
     case = Case("segments", tuple(flights), nominal.vehicle_file)
@@ -170,8 +164,7 @@ def _distances(replay: Replay, beliefs: list[Belief]) -> np.ndarray:
         index = places(belief.effects)
         slopes = [c[1:] for c in replay.linearise(belief.theta, index)]
         columns = [
-            np.concatenate([p - p[j][None], s])
-            for p, s in zip(predictions, slopes, strict=True)
+            np.concatenate([p - p[j][None], s]) for p, s in zip(predictions, slopes, strict=True)
         ]
         grams = replay.grams(columns)
         count = len(beliefs)
@@ -179,9 +172,7 @@ def _distances(replay: Replay, beliefs: list[Belief]) -> np.ndarray:
         for flight, gram in enumerate(grams):
             inside = gram[count:, count:] + precision
             projection = np.linalg.solve(inside, gram[count:, :count])
-            distances = np.diag(
-                gram[:count, :count] - gram[:count, count:] @ projection
-            )
+            distances = np.diag(gram[:count, :count] - gram[:count, count:] @ projection)
             out[flight, :, j] = 0.5 * np.maximum(distances, 0.0)
     return of_pairs(out, beliefs)
 

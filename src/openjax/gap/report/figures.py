@@ -14,15 +14,7 @@ from openjax.gap.model.table import HORIZONS
 from openjax.gap.report.report import Report
 from openjax.gap.residual import disturbances
 from openjax.gap.where import CALM, before_and_after
-from openjax.show.pages import (
-    AFTER,
-    BEFORE,
-    GREY,
-    STYLE,
-    add_legend,
-    as_svg,
-    small_figure,
-)
+from openjax.show.pages import AFTER, BEFORE, GREY, STYLE, add_legend, as_svg, small_figure
 
 HORIZONS_SHOWN = (0.02, 0.05, 0.1, 0.25, 0.5, 1.0)  # s
 BINS = 15
@@ -68,22 +60,11 @@ def _places(report: Report):
     axes.plot(nominal, rows, "o", color=BEFORE, markersize=7, label="nominal simulator")
     if report.parameters:
         axes.plot(
-            with_effects,
-            rows,
-            "o",
-            color=AFTER,
-            markersize=7,
-            label="with the named effects",
+            with_effects, rows, "o", color=AFTER, markersize=7, label="with the named effects"
         )
     axes.axvline(1.0, color=GREY, linestyle=":", linewidth=1.2)
-    axes.set_yticks(
-        rows, [f"{p.channel}, {p.regime}".replace("_", " ") for p in places]
-    )
-    axes.set(
-        xlabel="error, in units of the noise",
-        xlim=(0, None),
-        ylim=(-0.6, len(places) - 0.4),
-    )
+    axes.set_yticks(rows, [f"{p.channel}, {p.regime}".replace("_", " ") for p in places])
+    axes.set(xlabel="error, in units of the noise", xlim=(0, None), ylim=(-0.6, len(places) - 0.4))
     add_legend(axes)
     return (
         "Where the gap lies",
@@ -222,18 +203,8 @@ def _lines(report: Report, nominal, with_effects) -> Sequence[tuple]:
     effects were named.
     """
     if not report.parameters:
-        return (
-            (
-                nominal,
-                AFTER if report.verdict == "none" else BEFORE,
-                "nominal simulator",
-            ),
-        )
-    return (nominal, BEFORE, "nominal simulator"), (
-        with_effects,
-        AFTER,
-        "with the named effects",
-    )
+        return ((nominal, AFTER if report.verdict == "none" else BEFORE, "nominal simulator"),)
+    return (nominal, BEFORE, "nominal simulator"), (with_effects, AFTER, "with the named effects")
 
 
 def _horizons(report: Report):
@@ -268,11 +239,7 @@ def _coordinate(report: Report):
     """
     evidence = report.plots["evidence"]
     effects = report.named
-    if (
-        not effects
-        or not evidence.replay.usable[3]
-        or evidence.tracks[0].quaternion is None
-    ):
+    if not effects or not evidence.replay.usable[3] or evidence.tracks[0].quaternion is None:
         return None
     coordinate = CARDS[effects[0]].coordinate
     if not coordinate:  # its force follows none, or it makes torques or delays
@@ -297,8 +264,7 @@ def _coordinate(report: Report):
     }
     axes.axhline(0.0, color=GREY, linestyle=":", linewidth=1.2)
     axes.set(
-        xlabel=units.get(coordinate, f"{coordinate} [m]"),
-        ylabel="missing acceleration [m/s²]",
+        xlabel=units.get(coordinate, f"{coordinate} [m]"), ylabel="missing acceleration [m/s²]"
     )
     add_legend(axes)
     return (

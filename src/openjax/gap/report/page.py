@@ -65,16 +65,11 @@ def sentence(report: Report) -> str:
         return report.untested_change.sentence()
     if not effects:
         return (VERDICTS_SINCE if report.reference else VERDICTS)[report.verdict]
-    what = (
-        "What changed since the reference"
-        if report.reference
-        else "What the simulator misses"
-    )
+    what = "What changed since the reference" if report.reference else "What the simulator misses"
     values = [report.shares.effects[effect].value for effect in effects]
     names = [report.class_of(effect).replace("_", " ") for effect in effects]
     parts = " and ".join(
-        f"{name} ({100 * value:.0f} %)"
-        for name, value in zip(names, values, strict=True)
+        f"{name} ({100 * value:.0f} %)" for name, value in zip(names, values, strict=True)
     )
     whole = sum(values)
     if whole < MOST:
@@ -116,9 +111,7 @@ def shares(report: Report) -> list[dict]:
         """Within the chart: an estimate's interval may leave it."""
         return min(max(100.0 * value, 0.0), 100.0)
 
-    rows = [
-        row(effect, share, "effect") for effect, share in report.shares.effects.items()
-    ]
+    rows = [row(effect, share, "effect") for effect, share in report.shares.effects.items()]
     rows.append(row("sensors and clocks", report.shares.sensors, "nuisance"))
     rows.append(row("unexplained", report.shares.unexplained, "unexplained"))
     return rows
@@ -135,9 +128,7 @@ def next_steps(report: Report, folder: Path | None = None) -> list[tuple[str, st
         for name, others in report.equivalent.items()
     ]
     if alike or report.next_flight:
-        reason = (
-            f"{''.join(alike)}{report.next_flight} Then diagnose all of them again."
-        )
+        reason = f"{''.join(alike)}{report.next_flight} Then diagnose all of them again."
         steps.append((reason, "openjax plan . --out next_flight"))
     if report.parameters:
         names = ", ".join(effect.replace("_", " ") for effect in report.parameters)
@@ -147,8 +138,7 @@ def next_steps(report: Report, folder: Path | None = None) -> list[tuple[str, st
         steps.append(("Or train from scratch in the corrected simulator:", train))
     if report.left_out:
         reason = (
-            "Mend the logs that were left out, and diagnose again: each says above what is "
-            "wrong."
+            "Mend the logs that were left out, and diagnose again: each says above what is wrong."
         )
         steps.append((reason, ""))
     case = _case_from(report, folder)

@@ -139,19 +139,13 @@ class Report:
     @property
     def notes(self) -> list[str]:
         """What was found in the logs that were used."""
-        return [
-            f"{q['flight']}: {q['issue']}"
-            for q in self.quality
-            if not q.get("left_out")
-        ]
+        return [f"{q['flight']}: {q['issue']}" for q in self.quality if not q.get("left_out")]
 
     def prediction(self) -> dict:
         """The case's entry in a predictions file."""
         return {
             "effects": list(self.effects),
-            "probabilities": {
-                k: round(v, 5) for k, v in self.probabilities.items() if v >= 5e-6
-            },
+            "probabilities": {k: round(v, 5) for k, v in self.probabilities.items() if v >= 5e-6},
             "where": in_words(self.where),
             "reduction": round(min(max(self.gap.reduction, 0.0), 1.0), 4),
             "not_testable": list(self.not_testable),
@@ -165,15 +159,11 @@ class Report:
             "unexplained": self.shares.unexplained,
         }
         estimates = {
-            effect: {
-                name: asdict(v) | {"unusual": v.unusual} for name, v in values.items()
-            }
+            effect: {name: asdict(v) | {"unusual": v.unusual} for name, v in values.items()}
             for effect, values in self.parameters.items()
         }
         apart = ("case", "plots", "seconds", "identification", "trims")
-        plain = {
-            f.name: getattr(self, f.name) for f in fields(self) if f.name not in apart
-        }
+        plain = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in apart}
         if self.identification is not None:
             of_gap = {e: share.value for e, share in self.shares.effects.items()}
             plain["identification"] = self.identification.to_dict(of_gap)
@@ -194,9 +184,7 @@ class Report:
             share = self.shares.effects[effect]
             low, high = share.interval90
             interval = f"[{_short(low)}, {_short(high)}]"
-            class_shares.append(
-                f"{self.class_of(effect)} {_short(share.value)} {interval}"
-            )
+            class_shares.append(f"{self.class_of(effect)} {_short(share.value)} {interval}")
         parts = [
             *([", ".join(class_shares)] if class_shares else []),
             f"sensors and clocks {_short(self.shares.sensors.value)}",
@@ -240,9 +228,7 @@ class Report:
         if self.runner_up:
             lines.append(f"Runner-up: {self.runner_up}.")
         if self.not_testable:
-            lines.append(
-                f"Not testable with these flights: {', '.join(self.not_testable)}."
-            )
+            lines.append(f"Not testable with these flights: {', '.join(self.not_testable)}.")
         lines.append(self.next_flight)
         if self.to_show:
             lines.append(f"To show {self.to_show}")
@@ -261,9 +247,7 @@ class Report:
                     "vehicle, and alike?"
                 )
         for effect, others in self.equivalent.items():
-            doubts.append(
-                f"These flights can't tell {effect} from {', '.join(others)}."
-            )
+            doubts.append(f"These flights can't tell {effect} from {', '.join(others)}.")
         return lines + doubts
 
 

@@ -84,9 +84,7 @@ def _picture(identification: Identification) -> str:
                     low, middle, high = np.array(values).T
                     axes = grid[row, column]
                     axes.plot(response.frequency, middle, color=color, label=name)
-                    axes.fill_between(
-                        response.frequency, low, high, color=color, alpha=0.25
-                    )
+                    axes.fill_between(response.frequency, low, high, color=color, alpha=0.25)
             unit = "m/s² per unit" if axis == "thrust" else "rad/s² per unit"
             grid[0, column].set(title=axis, xscale="log", ylim=(0.0, None))
             grid[1, column].set(xlabel="frequency, Hz")
@@ -95,7 +93,5 @@ def _picture(identification: Identification) -> str:
                 grid[1, column].set(ylabel="phase, °")
             grid[1, column].set_xticks([1, 2, 5, 10], ["1", "2", "5", "10"])
             grid[1, column].xaxis.set_minor_locator(NullLocator())
-        figure.legend(
-            *grid[0, 0].get_legend_handles_labels(), loc="upper left", ncols=2
-        )
+        figure.legend(*grid[0, 0].get_legend_handles_labels(), loc="upper left", ncols=2)
         return as_svg(figure, TITLE)

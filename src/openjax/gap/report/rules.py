@@ -66,8 +66,6 @@ def _likelihood(report: Report) -> Iterator[str]:
     second = report.runner_up.partition(" (")[0]
     if second and chance.get(second, 0.0) > likelihood + ROUNDING:
         yield f"the runner-up {second} ({chance[second]:.2f}) is likelier than {', '.join(answers)}"
-    sure = max(
-        (report.shares.effects[e].interval90[0] for e in report.named), default=0.0
-    )
+    sure = max((report.shares.effects[e].interval90[0] for e in report.named), default=0.0)
     if sure > SURE_SHARE and chance.get("none", 0.0) > NOTHING + ROUNDING:
         yield f"none ({chance['none']:.2f}) beside a share of at least {sure:.2f}"

@@ -18,8 +18,7 @@ def content_of(change: Change) -> dict:
     with rc_context(STYLE):
         picture = as_svg(draw(change), change.name)
     differences = [
-        (FIGURES[name].words, difference_in_words(name, d))
-        for name, d in change.figures.items()
+        (FIGURES[name].words, difference_in_words(name, d)) for name, d in change.figures.items()
     ]
     return {"lines": change.in_words(), "picture": picture, "differences": differences}
 
@@ -50,28 +49,12 @@ def _draw_trim(axis, change, name, level):
             values = _in_percent(of_day, name, level)
             place = k + 0.6 * ((j + 0.5) / len(days) - 0.5)
             axis.plot(
-                np.full(len(values), place),
-                values,
-                "o",
-                ms=5,
-                color=(GREY, BEFORE)[k],
-                alpha=0.8,
+                np.full(len(values), place), values, "o", ms=5, color=(GREY, BEFORE)[k], alpha=0.8
             )
     middle = _in_percent(change.reference, name, level).mean()
     spread = 100 * change.spread[name]
-    axis.axhspan(
-        middle - 1.645 * spread,
-        middle + 1.645 * spread,
-        color=AFTER,
-        alpha=0.12,
-        lw=0,
-    )
-    axis.set(
-        title=name,
-        xticks=(0, 1),
-        xticklabels=("reference", "new"),
-        xlim=(-0.6, 1.6),
-    )
+    axis.axhspan(middle - 1.645 * spread, middle + 1.645 * spread, color=AFTER, alpha=0.12, lw=0)
+    axis.set(title=name, xticks=(0, 1), xticklabels=("reference", "new"), xlim=(-0.6, 1.6))
 
 
 def draw(change: Change):
@@ -86,14 +69,9 @@ def draw(change: Change):
     axes[0].set_ylabel("% of hover (band: 90 % of normal days)")
     places = sorted(change.places.items(), key=lambda item: -item[1])[:6]
     names = [
-        "all" if len(p) == 4 else "+".join(f"m{i}" for i in p) or "no rotor's"
-        for p, _ in places
+        "all" if len(p) == 4 else "+".join(f"m{i}" for i in p) or "no rotor's" for p, _ in places
     ]
     shares = [change.probability * share for _, share in places]
-    axes[4].barh(
-        ["no change", *names][::-1],
-        [1 - change.probability, *shares][::-1],
-        color=AFTER,
-    )
+    axes[4].barh(["no change", *names][::-1], [1 - change.probability, *shares][::-1], color=AFTER)
     axes[4].set(title="probability", xlim=(0, 1))
     return figure

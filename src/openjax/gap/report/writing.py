@@ -35,9 +35,7 @@ def _page(answer: Report | Change, folder: Path) -> str:
     from openjax.gap.report.page import page_of
     from openjax.gap.report.trims_page import page_of_trims
 
-    return (
-        page_of(answer, folder) if isinstance(answer, Report) else page_of_trims(answer)
-    )
+    return page_of(answer, folder) if isinstance(answer, Report) else page_of_trims(answer)
 
 
 def to_fly(report: Report) -> tuple[Values, Intervals]:
@@ -48,18 +46,12 @@ def to_fly(report: Report) -> tuple[Values, Intervals]:
     intervals: Intervals = {}
     for effect, estimates in report.parameters.items():
         values[effect] = {name: estimate.value for name, estimate in estimates.items()}
-        intervals[effect] = {
-            name: estimate.interval90 for name, estimate in estimates.items()
-        }
+        intervals[effect] = {name: estimate.interval90 for name, estimate in estimates.items()}
     if report.identification is not None:
         # what was measured directly is more exact than what was fitted beside all else
         better, narrower = corrections(report.identification, report.named)
-        values |= {
-            e: values.get(e, {}) | parameters for e, parameters in better.items()
-        }
-        intervals |= {
-            e: intervals.get(e, {}) | parameters for e, parameters in narrower.items()
-        }
+        values |= {e: values.get(e, {}) | parameters for e, parameters in better.items()}
+        intervals |= {e: intervals.get(e, {}) | parameters for e, parameters in narrower.items()}
     # what wasn't fitted keeps the value at which it does nothing
     values = {e: EFFECTS[e].none() | parameters for e, parameters in values.items()}
     voltage = _median_voltage(report)
@@ -68,9 +60,7 @@ def to_fly(report: Report) -> tuple[Values, Intervals]:
     for effect, parameters in values.items():
         at_voltage = CARDS[effect].at_voltage
         if at_voltage is not None:
-            values[effect], intervals[effect] = at_voltage(
-                parameters, intervals[effect], voltage
-            )
+            values[effect], intervals[effect] = at_voltage(parameters, intervals[effect], voltage)
     return values, intervals
 
 

@@ -26,13 +26,7 @@ from openjax.gap.trims.days import (
     spread_of_charge,
     spread_of_days,
 )
-from openjax.gap.trims.figures import (
-    FIGURES,
-    TRIMS,
-    FlightFigures,
-    figures_of,
-    mixer_of,
-)
+from openjax.gap.trims.figures import FIGURES, TRIMS, FlightFigures, figures_of, mixer_of
 from openjax.gap.trims.weigh import least_shown, weigh
 
 
@@ -48,9 +42,7 @@ def compare(flights: LogFolder, references: Sequence[LogFolder]) -> Change:
     for folder in references:
         case, figures, issues = read(folder)
         if {f.vehicle for f in case.flights} != {f.vehicle for f in new_case.flights}:
-            raise UserError(
-                f"{folder.path}: holds flights of another vehicle than {flights.path}"
-            )
+            raise UserError(f"{folder.path}: holds flights of another vehicle than {flights.path}")
         old += figures
         quality += issues
     return change_between(new_case.name, new, old, new_case, tuple(quality))

@@ -47,9 +47,7 @@ CAUSES = {
     "weight": Cause(0.15, ("mass", "com_offset"), damage=True),
     "whole vehicle": Cause(0.1, ("mass", "thrust_scale")),
     "motors": Cause(0.06, ("motor_lag",), False, ("lag",), (0.2, 0.5), "motors' lag"),
-    "gains": Cause(
-        0.06, ("rate_gains",), False, ("loop_gain",), (0.0, 0.5), "rate gains"
-    ),
+    "gains": Cause(0.06, ("rate_gains",), False, ("loop_gain",), (0.0, 0.5), "rate gains"),
     "something else": Cause(0.07),
 }
 LOOP_WITH_MOTORS = 0.3  # standard deviation: motors move the estimate of the gain too
@@ -96,9 +94,7 @@ class _Draws:
         # a normal's quantiles at the very ends are infinite
         even = np.clip(qmc.Sobol(11, seed=0).random(DRAWS), 1e-6, 1 - 1e-6)
         sign = np.where(even[:, 2] < STRONGER, -1.0, 1.0)
-        self.sizes = (
-            np.abs(norm.ppf(0.5 + 0.5 * even[:, :2])) * USUAL_CHANGE * sign[:, None]
-        )
+        self.sizes = np.abs(norm.ppf(0.5 + 0.5 * even[:, :2])) * USUAL_CHANGE * sign[:, None]
         self.places, self.normal = even[:, 3:5], norm.ppf(even[:, 5:])
         self.mixer = mixer
         self.trims = trims
@@ -107,9 +103,7 @@ class _Draws:
         }
         self.parts: list[tuple] = []
 
-    def add(
-        self, cause: str, share: float, change: dict, place, size: np.ndarray
-    ) -> None:
+    def add(self, cause: str, share: float, change: dict, place, size: np.ndarray) -> None:
         """Draws of a cause at a place; `change`: {figure: (DRAWS,)}."""
         table = np.zeros((DRAWS, len(PLACES)))
         for name, values in change.items():
@@ -120,18 +114,14 @@ class _Draws:
         rotor = np.broadcast_to(
             place if isinstance(place, np.ndarray) else self.place_of[place], DRAWS
         )
-        self.parts.append(
-            (table, weight, np.full(DRAWS, list(CAUSES).index(cause)), rotor, size)
-        )
+        self.parts.append((table, weight, np.full(DRAWS, list(CAUSES).index(cause)), rotor, size))
 
     def trims_of(self, factors: np.ndarray) -> dict:
         """What rotor commands that rise by `factors` (DRAWS, 4) do to the trims,
         inexactly.
         """
         change = trims_with(self.mixer, self.trims, np.maximum(factors, 0.2))
-        return dict(
-            zip(TRIMS, (change * (1.0 + INEXACT * self.normal[:, :4])).T, strict=True)
-        )
+        return dict(zip(TRIMS, (change * (1.0 + INEXACT * self.normal[:, :4])).T, strict=True))
 
 
 def trims_with(mixer: np.ndarray, trims: np.ndarray, factors: np.ndarray) -> np.ndarray:
@@ -179,9 +169,7 @@ def _rotors(draws: _Draws) -> None:
     for rotor in range(4):
         factors = np.ones((DRAWS, 4))
         factors[:, rotor] += sizes[:, 0]
-        draws.add(
-            "one rotor weaker", 0.25, draws.trims_of(factors), (rotor,), losses[:, 0]
-        )
+        draws.add("one rotor weaker", 0.25, draws.trims_of(factors), (rotor,), losses[:, 0])
     for pair, side in SIDES.items():
         factors = np.ones((DRAWS, 4))
         factors[:, pair] += sizes
@@ -190,9 +178,7 @@ def _rotors(draws: _Draws) -> None:
             is_single = np.abs(sizes[:, other]) < LEAST_PARTNER * np.abs(sizes[:, one])
             places[is_single] = pair[one]
         share = 0.05 if side == "diagonal" else 0.225
-        draws.add(
-            "two rotors weaker", share, draws.trims_of(factors), places, losses.sum(1)
-        )
+        draws.add("two rotors weaker", share, draws.trims_of(factors), places, losses.sum(1))
 
 
 def _weights(draws: _Draws) -> None:

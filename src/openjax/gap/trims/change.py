@@ -55,9 +55,7 @@ class Change:
         """Whether a battery's charge may differ unseen: duty cycles without a
         voltage.
         """
-        return any(
-            f.duty and f.voltage is None for f in (*self.reference, *self.flights)
-        )
+        return any(f.duty and f.voltage is None for f in (*self.reference, *self.flights))
 
     @property
     def days(self) -> int:
@@ -105,13 +103,9 @@ class Change:
         """The answer in a few plain sentences."""
         lines = [self.sentence()]
         if self.trims_changed:
-            value, low, high = (
-                100 * v for v in (self.size.value, self.size.low, self.size.high)
-            )
+            value, low, high = (100 * v for v in (self.size.value, self.size.low, self.size.high))
             end = " lost." if value > 0 else " (negative: it got stronger or lighter)."
-            lines.append(
-                f"Size: {value:.0f} % [{low:.0f}, {high:.0f}] of a rotor's thrust{end}"
-            )
+            lines.append(f"Size: {value:.0f} % [{low:.0f}, {high:.0f}] of a rotor's thrust{end}")
             if len(self._sentences()) > 1:
                 lines.append(
                     "These flights can't split the causes named; a weighed vehicle or another "
@@ -126,9 +120,7 @@ class Change:
                 if n in self.figures
             ]
         elif self.probability > 0.2:
-            lines.append(
-                f"Below the spread of days; if anything, {self._sentences()[0]}."
-            )
+            lines.append(f"Below the spread of days; if anything, {self._sentences()[0]}.")
         if self.charge_unknown:
             lines.append(
                 "What may differ is the battery: an emptier one makes less thrust of a duty cycle. "
@@ -154,9 +146,7 @@ class Change:
 
     def _sentences(self) -> list[str]:
         """The likely causes in words, each once."""
-        return list(
-            dict.fromkeys(_cause_in_words(self, cause) for cause in self.likely_causes)
-        )
+        return list(dict.fromkeys(_cause_in_words(self, cause) for cause in self.likely_causes))
 
     def _differences(self) -> list[str]:
         """By what trims differ, and what that is compared with."""
@@ -184,8 +174,7 @@ class Change:
         each cause add up to one.
         """
         causes = {
-            c.replace(" ", "_"): round(self.probability * p, 5)
-            for c, p in self.causes.items()
+            c.replace(" ", "_"): round(self.probability * p, 5) for c, p in self.causes.items()
         }
         return {
             "changed": self.changed,
@@ -210,10 +199,7 @@ class Change:
                 if v > 5e-4
             },
             "figures": {
-                n: {
-                    "value": round(v.value, 5),
-                    "interval90": [round(v.low, 5), round(v.high, 5)],
-                }
+                n: {"value": round(v.value, 5), "interval90": [round(v.low, 5), round(v.high, 5)]}
                 for n, v in self.figures.items()
             },
             "days": {
@@ -244,15 +230,10 @@ def _cause_in_words(change: Change, cause: str) -> str:
         return f"one of rotors {rotors} ({change.side}) is {weaker}"
     if cause.endswith("weaker"):
         return (
-            f"rotor{'s' * several} {rotors} ({change.side}) "
-            f"{'are' if several else 'is'} {weaker}"
+            f"rotor{'s' * several} {rotors} ({change.side}) {'are' if several else 'is'} {weaker}"
         )
     if cause == "weight":
-        beside = (
-            f" at the {change.side}"
-            if change.side and change.side != "diagonal"
-            else ""
-        )
+        beside = f" at the {change.side}" if change.side and change.side != "diagonal" else ""
         return f"a weight was {'added' if more else 'taken off'}{beside}"
     if cause == "whole vehicle":
         return (

@@ -17,9 +17,7 @@ from scipy.cluster.hierarchy import fcluster, linkage
 
 from openjax.gap.trims.figures import FIGURES, PLACES, FlightFigures
 
-DAY_SPREAD, WITHIN_DAY = np.array(
-    [(figure.day, figure.within) for figure in FIGURES.values()]
-).T
+DAY_SPREAD, WITHIN_DAY = np.array([(figure.day, figure.within) for figure in FIGURES.values()]).T
 HOVER = PLACES["hover"]
 PRIOR_DAYS = 6.0  # days of experience that this prior is worth
 # of hover: roll and pitch trims further apart were flown on different days
@@ -43,12 +41,9 @@ def days_told_apart(figures: Sequence[FlightFigures]) -> list[FlightFigures]:
         return list(figures)
     trims = np.array([f.all()[0][1:3] for f in figures])
     error = max(float(np.median([f.all()[1][1:3].max() for f in figures])), 1e-9)
-    groups = fcluster(
-        linkage(trims, "complete"), max(SAME_DAY, 3.0 * error), "distance"
-    )
+    groups = fcluster(linkage(trims, "complete"), max(SAME_DAY, 3.0 * error), "distance")
     return [
-        dataclasses.replace(f, day=f"{f.day}#{g}")
-        for f, g in zip(figures, groups, strict=True)
+        dataclasses.replace(f, day=f"{f.day}#{g}") for f, g in zip(figures, groups, strict=True)
     ]
 
 
@@ -101,9 +96,7 @@ def battery_of(figures: Sequence[FlightFigures]) -> Battery:
     precision = xx / noise + 1 / sigma**2
     voltage = float(np.mean(voltages)) if voltages else 0.0
     return Battery(
-        voltage,
-        float((xy / noise + mean / sigma**2) / precision),
-        float(precision**-0.5),
+        voltage, float((xy / noise + mean / sigma**2) / precision), float(precision**-0.5)
     )
 
 
@@ -128,9 +121,7 @@ def by_day(figures: Sequence[FlightFigures], battery: Battery) -> Days:
     return Days(days, mean, np.sqrt(np.nansum(variances, 0)) / count)
 
 
-def _at_voltage(
-    flight: FlightFigures, battery: Battery
-) -> tuple[np.ndarray, np.ndarray]:
+def _at_voltage(flight: FlightFigures, battery: Battery) -> tuple[np.ndarray, np.ndarray]:
     """Figures and errors (F,), the logarithm of hover at the battery's voltage."""
     value, error = (part.copy() for part in flight.all())
     error[HOVER] /= value[HOVER]
@@ -166,9 +157,7 @@ def spread_of_days(*sets: Days) -> tuple[np.ndarray, np.ndarray]:
     return np.sqrt(total / freedom), freedom
 
 
-def error_of(
-    old: Days, new: Days, spread: np.ndarray, charge: np.ndarray
-) -> np.ndarray:
+def error_of(old: Days, new: Days, spread: np.ndarray, charge: np.ndarray) -> np.ndarray:
     """Standard deviation (F,) of the difference of two sets' means: of their days, of
     their flights, and of the battery's `charge`.
     """

@@ -51,9 +51,7 @@ FIGURES = {
     "roll": Figure("roll trim", "% of hover", 100.0, 0.02, 0.0025),
     "pitch": Figure("pitch trim", "% of hover", 100.0, 0.02, 0.0025),
     "yaw": Figure("yaw trim", "% of hover", 100.0, 0.03, 0.005),
-    "lag": Figure(
-        "time constant from motors to angular acceleration", "%", 0.0, 0.1, 0.05
-    ),
+    "lag": Figure("time constant from motors to angular acceleration", "%", 0.0, 0.1, 0.05),
     "loop_gain": Figure("motor command per rate error", "%", 0.0, 0.02, 0.02),
     "shaking": Figure("gyroscope and motors above 20 Hz", "%", 0.0, 0.35, 0.1),
 }
@@ -93,23 +91,14 @@ def mixer_of(vehicle) -> np.ndarray:
     """
     place = np.asarray(vehicle.rotor_position, float)
     spin = np.asarray(vehicle.rotor_spin, float)
-    return (
-        np.stack(
-            [np.ones(4), np.sign(place[:, 1]), -np.sign(place[:, 0]), np.sign(spin)]
-        )
-        / 4.0
-    )
+    return np.stack([np.ones(4), np.sign(place[:, 1]), -np.sign(place[:, 0]), np.sign(spin)]) / 4.0
 
 
 def figures_of(flight: Flight, case: Case, day: str) -> FlightFigures | str:
     """The figures of a flight checked for a comparison, or why it has none."""
     vehicle = case.vehicle_of(flight)
     motor = flight.interpolated("motor_command")
-    voltage = (
-        None
-        if flight.battery_voltage is None
-        else flight.interpolated("battery_voltage")
-    )
+    voltage = None if flight.battery_voltage is None else flight.interpolated("battery_voltage")
     rows = _in_the_air(flight, case)
     if rows.sum() < 100 or flight.row_period * rows.sum() < 2.0:
         return "less than 2 s clear of the floor"
@@ -143,17 +132,13 @@ def _in_the_air(flight: Flight, case: Case) -> np.ndarray:
     return rows
 
 
-def _trims(
-    flight: Flight, motor: np.ndarray, rows: np.ndarray, mixer: np.ndarray
-) -> dict:
+def _trims(flight: Flight, motor: np.ndarray, rows: np.ndarray, mixer: np.ndarray) -> dict:
     wrench = motor @ mixer.T
     specific_thrust = _specific_thrust(flight)
     block = (flight.time // BLOCK).astype(int)[rows]
     _, block = np.unique(block, return_inverse=True)
     count = np.bincount(block)
-    means = np.stack(
-        [np.bincount(block, c[rows]) / count for c in (*wrench.T, specific_thrust)], 1
-    )
+    means = np.stack([np.bincount(block, c[rows]) / count for c in (*wrench.T, specific_thrust)], 1)
     means = means[count > 0.5 * np.median(count)]
     weight = means.sum(0)
     out = {}
@@ -229,12 +214,8 @@ def _loop(torque, rates, commands) -> dict:
     band = np.stack([in_band(values, ANSWERING) for values in signals], -1)
     gains = []
     for part in np.array_split(band, 4):
-        target, regressors, instruments = np.split(
-            part.reshape(-1, len(signals)), (1, 3), axis=1
-        )
-        projection = (
-            instruments @ np.linalg.lstsq(instruments, regressors, rcond=None)[0]
-        )
+        target, regressors, instruments = np.split(part.reshape(-1, len(signals)), (1, 3), axis=1)
+        projection = instruments @ np.linalg.lstsq(instruments, regressors, rcond=None)[0]
         if min((projection**2).sum(0) / (regressors**2).sum(0)) < LEAST_EXCITED:
             return {}
         gains.append(np.linalg.lstsq(projection, target[:, 0], rcond=None)[0][0])
@@ -259,12 +240,6 @@ def _shaking(flight: Flight) -> dict:
         for channel in ("body_rates", "motor_command")
     ]
     each = np.mean(
-        [
-            [0.5 * np.log((p**2).sum(1).mean() + 1e-12) for p in power]
-            for power in parts
-        ],
-        0,
+        [[0.5 * np.log((p**2).sum(1).mean() + 1e-12) for p in power] for power in parts], 0
     )
-    return {
-        "shaking": (float(each.mean()), float(each.std(ddof=1) / np.sqrt(len(each))))
-    }
+    return {"shaking": (float(each.mean()), float(each.std(ddof=1) / np.sqrt(len(each))))}

@@ -34,27 +34,19 @@ class Weighed:
         if self.places[best] > 0.5:
             return best, [best]
         sides = {
-            side: [side, side[:1], side[1:]]
-            for side, name in SIDES.items()
-            if name != "diagonal"
+            side: [side, side[:1], side[1:]] for side, name in SIDES.items() if name != "diagonal"
         }
-        shares = {
-            side: sum(self.places[p] for p in within) for side, within in sides.items()
-        }
+        shares = {side: sum(self.places[p] for p in within) for side, within in sides.items()}
         side = max(shares, key=lambda p: shares[p])
         return (side, sides[side]) if shares[side] > 0.5 else (best, [best])
 
     def _within(self, places: list[tuple[int, ...]]) -> np.ndarray:
-        return np.isin(
-            self.hypotheses.place, [self.hypotheses.places.index(p) for p in places]
-        )
+        return np.isin(self.hypotheses.place, [self.hypotheses.places.index(p) for p in places])
 
     def causes_at(self, places: list[tuple[int, ...]]) -> dict[str, float]:
         """Probability of each cause at some places."""
         inside = self._within(places)
-        each = np.bincount(
-            self.hypotheses.cause[inside], self.posterior[inside], len(CAUSES)
-        )
+        each = np.bincount(self.hypotheses.cause[inside], self.posterior[inside], len(CAUSES))
         return dict(zip(CAUSES, (each / each.sum()).tolist(), strict=True))
 
     def size(self, places: list[tuple[int, ...]]) -> Interval:
@@ -64,17 +56,13 @@ class Weighed:
         share = np.cumsum(self.posterior[inside][order])
         values = self.hypotheses.size[inside][order]
         low, middle, high = (
-            float(values[np.searchsorted(share, q * share[-1])])
-            for q in (0.05, 0.5, 0.95)
+            float(values[np.searchsorted(share, q * share[-1])]) for q in (0.05, 0.5, 0.95)
         )
         return Interval(middle, low, high)
 
 
 def weigh(
-    hypotheses: Hypotheses,
-    difference: np.ndarray,
-    scale: np.ndarray,
-    freedom: np.ndarray,
+    hypotheses: Hypotheses, difference: np.ndarray, scale: np.ndarray, freedom: np.ndarray
 ) -> Weighed:
     """Posterior of every cause, place and size: Student's distribution around the
     change that each predicts.
@@ -101,12 +89,9 @@ def weigh(
     total = posterior.sum() + (1.0 - PRIOR_CHANGED) * np.exp(none - top)
     probability = float(posterior.sum() / total)
     posterior /= posterior.sum()
-    causes = {
-        c: float(posterior[hypotheses.cause == k].sum()) for k, c in enumerate(CAUSES)
-    }
+    causes = {c: float(posterior[hypotheses.cause == k].sum()) for k, c in enumerate(CAUSES)}
     places = {
-        p: float(posterior[hypotheses.place == k].sum())
-        for k, p in enumerate(hypotheses.places)
+        p: float(posterior[hypotheses.place == k].sum()) for k, p in enumerate(hypotheses.places)
     }
     return Weighed(probability, causes, places, posterior, hypotheses)
 
@@ -128,9 +113,7 @@ def least_shown(
         for _ in range(8):
             middle = 0.5 * (low + high)
             change = np.full(len(scale), np.nan)
-            change[: len(trims)] = trims_with(
-                mixer, trims, 1.0 + middle * (np.arange(4) == rotor)
-            )
+            change[: len(trims)] = trims_with(mixer, trims, 1.0 + middle * (np.arange(4) == rotor))
             is_shown = weigh(hypotheses, change, scale, freedom).probability > SHOWN
             low, high = (low, middle) if is_shown else (middle, high)
         worst = max(worst, high / (1.0 + high))

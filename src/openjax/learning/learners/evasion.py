@@ -6,11 +6,7 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from openjax.learning.evader_learning import (
-    EvaderLearning,
-    EvaderSamples,
-    LearningEvaders,
-)
+from openjax.learning.evader_learning import EvaderLearning, EvaderSamples, LearningEvaders
 from openjax.learning.learners.learner import Flown
 from openjax.policy import PolicyParameters
 from openjax.pursuit import PursuitState
@@ -29,10 +25,7 @@ class EvaderLearner:
         return self.learning.start(key)
 
     def act(
-        self,
-        state: LearningEvaders,
-        worlds: PursuitState,
-        noise: Float[Array, "worlds 3"],
+        self, state: LearningEvaders, worlds: PursuitState, noise: Float[Array, "worlds 3"]
     ) -> tuple[Float[Array, "worlds 3"], EvaderSamples]:
         """Desired velocities (E, 3) in worlds (E, ...) as shares of the speed, NaN
         where none of these evaders flies, and the samples; noise (E, 3).
@@ -48,7 +41,5 @@ class EvaderLearner:
     ) -> tuple[LearningEvaders, PolicyParameters, dict[str, Any]]:
         """After all epochs on the samples of a rollout."""
         samples = experience.rollout.learning
-        state = self.learning.learn(
-            state, samples, experience.state, key, experience.axis
-        )
+        state = self.learning.learn(state, samples, experience.state, key, experience.axis)
         return state, parameters, {"evader_noise": jnp.mean(state.log_std)}

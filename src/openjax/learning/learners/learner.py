@@ -54,11 +54,7 @@ class Learner(Protocol):
         """Its state before the first update of a policy with fresh `parameters`."""
 
     def learn(
-        self,
-        state: Any,
-        parameters: PolicyParameters,
-        experience: Flown,
-        key: PRNGKeyArray,
+        self, state: Any, parameters: PolicyParameters, experience: Flown, key: PRNGKeyArray
     ) -> tuple[Any, PolicyParameters, dict[str, Scalar]]:
         """After a rollout: its state, the policy's parameters, and () metrics by name.
 

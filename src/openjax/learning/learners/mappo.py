@@ -16,13 +16,7 @@ from openjax.learning.collectives import joint_moments, minibatches
 from openjax.learning.learners.learner import Flown
 from openjax.learning.settings import MappoSettings
 from openjax.learning.train_state import TrainState, clipped_adam, shuffle
-from openjax.policy import (
-    OwnPolicy,
-    Policy,
-    PolicyParameters,
-    gaussian_entropy,
-    gaussian_log_prob,
-)
+from openjax.policy import OwnPolicy, Policy, PolicyParameters, gaussian_entropy, gaussian_log_prob
 from openjax.pursuit import Observation
 from openjax.pursuit.shapes import Scalar
 from openjax.pursuit.teams import team_mean
@@ -108,9 +102,7 @@ def follow_kl(target: float) -> optax.GradientTransformationExtraArgs:
 
 def make_optimiser(
     settings: MappoSettings, total_updates: int
-) -> tuple[
-    optax.GradientTransformationExtraArgs, optax.GradientTransformationExtraArgs
-]:
+) -> tuple[optax.GradientTransformationExtraArgs, optax.GradientTransformationExtraArgs]:
     """Optimisers of actor and critic; the step size falls linearly to zero over the
     run, the actor's may start late.
 
@@ -146,17 +138,13 @@ def loss(
     there.
     """
     actor, critic = parameters
-    mean, log_std, value = policy.evaluate(
-        actor, critic, batch.observation, batch.predicted
-    )
+    mean, log_std, value = policy.evaluate(actor, critic, batch.observation, batch.predicted)
     log_ratio = gaussian_log_prob(batch.action, mean, log_std) - batch.log_prob
     ratio = jnp.exp(log_ratio)
     clipped_ratio = jnp.clip(ratio, 1.0 - clip, 1.0 + clip)
     mean_of = functools.partial(team_mean, batch.observation.active)
     # the lesser of both: a pessimistic bound (Schulman et al., 2017, section 3)
-    surrogate = mean_of(
-        jnp.minimum(ratio * batch.advantage, clipped_ratio * batch.advantage)
-    )
+    surrogate = mean_of(jnp.minimum(ratio * batch.advantage, clipped_ratio * batch.advantage))
     entropy = gaussian_entropy(log_std)
     policy_loss = -surrogate - settings.entropy_coefficient * entropy
     value_loss = mean_of(optax.huber_loss(value, batch.target, delta=settings.huber))
@@ -212,17 +200,11 @@ class Mappo:
         """Before the first update: no steps taken, no returns seen."""
         actor, critic = self.optimisers
         return MappoState(
-            actor.init(parameters.actor),
-            critic.init(parameters.critic),
-            initial_value_scale(),
+            actor.init(parameters.actor), critic.init(parameters.critic), initial_value_scale()
         )
 
     def learn(
-        self,
-        state: MappoState,
-        parameters: PolicyParameters,
-        experience: Flown,
-        key: PRNGKeyArray,
+        self, state: MappoState, parameters: PolicyParameters, experience: Flown, key: PRNGKeyArray
     ) -> tuple[MappoState, PolicyParameters, dict[str, Scalar]]:
         """All epochs of the policy update on one rollout; `key` shuffles."""
         estimates = self._estimates(state.value_scale, parameters, experience)
@@ -236,9 +218,7 @@ class Mappo:
         actor = TrainState(parameters.actor, state.actor)
         critic = TrainState(parameters.critic, state.critic)
         (actor, critic), metrics = self._epochs((actor, critic), batch, experience, key)
-        parameters = parameters.replace(
-            actor=actor.parameters, critic=critic.parameters
-        )
+        parameters = parameters.replace(actor=actor.parameters, critic=critic.parameters)
         metrics["explained_variance"] = estimates.explained_variance
         metrics["value_scale"] = std
         return MappoState(actor.optimiser, critic.optimiser, scale), parameters, metrics
@@ -256,9 +236,7 @@ class Mappo:
         observation, prediction = jax.tree.map(
             lambda x, last: jnp.concatenate([x, last[None]]), inputs, last_inputs
         )
-        values = self.policy.value(
-            parameters.actor, parameters.critic, observation, prediction
-        )
+        values = self.policy.value(parameters.actor, parameters.critic, observation, prediction)
         values = mean + std * values
         value = values[:-1]
         next_values = values[1:]
@@ -290,9 +268,7 @@ class Mappo:
         """The running moments after these returns."""
         decay = self.settings.value_norm_decay
         active = experience.rollout.observation.active
-        mean, square = experience.mean(
-            (team_mean(active, returns), team_mean(active, returns**2))
-        )
+        mean, square = experience.mean((team_mean(active, returns), team_mean(active, returns**2)))
         return ValueScale(
             mean=decay * scale.mean + (1 - decay) * mean,
             square=decay * scale.square + (1 - decay) * square,
@@ -305,9 +281,7 @@ class Mappo:
         """
         rollout = experience.rollout
         # over the whole rollout, not in each minibatch, whose moments are noisier
-        mean, std = joint_moments(
-            advantage, experience.axis, rollout.observation.active
-        )
+        mean, std = joint_moments(advantage, experience.axis, rollout.observation.active)
         batch = Batch(
             observation=rollout.observation.replace(frames=None),
             predicted=rollout.predicted,
@@ -353,10 +327,7 @@ class Mappo:
             return (actor, critic), jnp.stack([watch[name] for name in WATCHED])
 
         steps = self._order(key)
-        start = (
-            actor.replace(parameters=actor_vector),
-            critic.replace(parameters=critic_vector),
-        )
+        start = (actor.replace(parameters=actor_vector), critic.replace(parameters=critic_vector))
         (actor, critic), measures = jax.lax.scan(gradient_step, start, steps)
         actor = actor.replace(parameters=to_actor(actor.parameters))
         critic = critic.replace(parameters=to_critic(critic.parameters))
@@ -372,9 +343,7 @@ class Mappo:
         if settings.step_subsampling == 1:
             return order, None
         draw = jax.random.fold_in(key, 1)
-        return order, jax.random.randint(
-            draw, order.shape, 0, settings.step_subsampling
-        )
+        return order, jax.random.randint(draw, order.shape, 0, settings.step_subsampling)
 
 
 def every_nth(x, first, number):

@@ -26,9 +26,7 @@ def make_predictor_optimiser(
     """Adam, with gradients cut at norm 1."""
     step_size = settings.learning_rate
     if settings.decay:
-        step_size = optax.linear_schedule(
-            step_size, 0.0, total_updates * settings.steps
-        )
+        step_size = optax.linear_schedule(step_size, 0.0, total_updates * settings.steps)
     return optax.chain(optax.clip_by_global_norm(1.0), optax.adam(step_size))
 
 
@@ -93,9 +91,7 @@ def prediction_loss(
         return jnp.mean(error**2)
     # in units of the distance that the evader flies within each horizon, all horizons
     # weigh alike
-    is_flown = (
-        game.evader_speed * game.time_step * jnp.array(settings.horizons, jnp.float32)
-    )
+    is_flown = game.evader_speed * game.time_step * jnp.array(settings.horizons, jnp.float32)
     # the arena's middle stands for an evader that nobody has seen yet
     was_seen = jnp.any(last_seen != jnp.array(game.middle, jnp.float32), axis=-1)
     return jnp.mean(was_seen[..., None, None] * (error / is_flown[:, None]) ** 2)
@@ -123,11 +119,7 @@ class PredictorLearner:
         return self.optimiser.init(parameters.predictor)
 
     def learn(
-        self,
-        state: Any,
-        parameters: PolicyParameters,
-        experience: Flown,
-        key: PRNGKeyArray,
+        self, state: Any, parameters: PolicyParameters, experience: Flown, key: PRNGKeyArray
     ) -> tuple[Any, PolicyParameters, dict[str, Scalar]]:
         """After the gradient steps on one rollout; `key` draws the windows."""
         rollout = experience.rollout
@@ -167,9 +159,7 @@ class PredictorLearner:
         keys = own_keys(key, experience.frames.shape[0], experience.axis)
         # later windows would have labels beyond the rollout
         room = rollout.reward.shape[0] - settings.horizons[-1] + 1
-        times = jax.vmap(
-            lambda key: jax.random.permutation(key, room)[: settings.windows]
-        )(keys)
+        times = jax.vmap(lambda key: jax.random.permutation(key, room)[: settings.windows])(keys)
         data = windows_and_labels(
             self.policy, self.game.history_spacing, experience.frames, rollout, times
         )

@@ -95,9 +95,7 @@ def directions(number: int) -> Float[np.ndarray, "{number} 3"]:
     z = 1.0 - 2.0 * i / number
     angle = np.pi * (1.0 + 5.0**0.5) * i
     radius = np.sqrt(1.0 - z**2)
-    return np.stack(
-        [radius * np.cos(angle), radius * np.sin(angle), z], axis=-1
-    ).astype(np.float32)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=-1).astype(np.float32)
 
 
 def into_free_space(
@@ -114,13 +112,9 @@ def into_free_space(
     offset = xy[..., None, :] - pillar_position
     distance = _length(offset)
     depth = jnp.maximum(settings.pillar_radius + MARGIN - distance, 0.0)
-    xy = xy + jnp.sum(
-        jnp.where(pillar_active[:, None], offset / distance * depth, 0.0), axis=-2
-    )
+    xy = xy + jnp.sum(jnp.where(pillar_active[:, None], offset / distance * depth, 0.0), axis=-2)
     xy = xy * jnp.minimum(1.0, (settings.arena_radius - MARGIN) / _length(xy))
-    return jnp.concatenate(
-        [xy, jnp.clip(z, MARGIN, settings.arena_height - MARGIN)], axis=-1
-    )
+    return jnp.concatenate([xy, jnp.clip(z, MARGIN, settings.arena_height - MARGIN)], axis=-1)
 
 
 def greedy(scene: Scene, memory: Memory) -> tuple[Vector, Memory]:
@@ -142,9 +136,7 @@ def two_step(scene: Scene, memory: Memory) -> tuple[Vector, Memory]:
     def best_after(end):
         # as if they knew where it goes, at full speed: nothing is worse for it
         to_end = end - scene.pursuers
-        step = jnp.minimum(
-            scene.settings.max_speed * scene.look_ahead / _length(to_end), 1.0
-        )
+        step = jnp.minimum(scene.settings.max_speed * scene.look_ahead / _length(to_end), 1.0)
         answer = scene.pursuers + step * to_end
         second, open_then = _ends(scene, end, candidates)
         nearness = jnp.where(open_then, _nearness(scene, second, answer), -jnp.inf)
@@ -168,9 +160,7 @@ def wall_runner(scene: Scene, memory: Memory) -> tuple[Vector, Memory]:
     side = jnp.where(threat[0] * out[1] - threat[1] * out[0] >= 0.0, 1.0, -1.0)
     # towards its distance from the wall, from either side
     outward = jnp.clip((settings.arena_radius - AROUND - radius) / AROUND, -1.0, 1.0)
-    goal = jnp.where(
-        threat[2] > settings.arena_height / 2, AROUND, settings.arena_height - AROUND
-    )
+    goal = jnp.where(threat[2] > settings.arena_height / 2, AROUND, settings.arena_height - AROUND)
     climb = 0.5 * jnp.clip((goal - scene.position[2:]) / AROUND, -1.0, 1.0)
     return unit(jnp.concatenate([side * tangent + outward * out, climb])), memory
 
@@ -182,16 +172,10 @@ def pillar_hugger(scene: Scene, memory: Memory) -> tuple[Vector, Memory]:
     threat = scene.nearest
     pillars = scene.pillar_position
     behind = pillars - threat[:2]
-    behind = pillars + behind / _length(behind) * (
-        scene.settings.pillar_radius + AROUND
-    )
-    distance = jnp.where(
-        scene.pillar_active, _length(behind - scene.position[:2])[:, 0], jnp.inf
-    )
+    behind = pillars + behind / _length(behind) * (scene.settings.pillar_radius + AROUND)
+    distance = jnp.where(scene.pillar_active, _length(behind - scene.position[:2])[:, 0], jnp.inf)
     is_chosen = jnp.arange(distance.shape[0])[:, None] == jnp.argmin(distance)
-    goal = jnp.concatenate(
-        [jnp.sum(jnp.where(is_chosen, behind, 0.0), axis=0), scene.position[2:]]
-    )
+    goal = jnp.concatenate([jnp.sum(jnp.where(is_chosen, behind, 0.0), axis=0), scene.position[2:]])
     to_goal = goal - scene.position
     away = unit(scene.position - threat)
     to_cover = to_goal / jnp.maximum(_length(to_goal), AROUND)

@@ -10,12 +10,7 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from openjax.errors import UserError, part_name
-from openjax.pursuit.evaders.behaviours import (
-    BEHAVIOURS,
-    MEMORY,
-    Scene,
-    into_free_space,
-)
+from openjax.pursuit.evaders.behaviours import BEHAVIOURS, MEMORY, Scene, into_free_space
 from openjax.pursuit.evaders.evader_state import EvaderState
 from openjax.pursuit.evaders.field import field_velocity
 from openjax.pursuit.evaders.kinds import NUMBERS, UNBOUNDED, EvaderKind, evader_rows
@@ -72,9 +67,7 @@ def draw_row(
     if share is not None:
         # at half the speed when they come in: who can't catch yet learns nothing from
         # one that is always away
-        kind = jnp.where(
-            jax.random.uniform(jax.random.fold_in(kind_key, 1)) < share, kind, 0
-        )
+        kind = jnp.where(jax.random.uniform(jax.random.fold_in(kind_key, 1)) < share, kind, 0)
         slow = jnp.where(kind == 0, 1.0, 0.5 + 0.5 * share)
     draws = jax.random.uniform(number_key, (len(NUMBERS),))
     numbers = {
@@ -102,9 +95,7 @@ def _draw(values, kind, draw):
     """One of `values[kind]`, by the uniform `draw`."""
     # a table needs rows of one length: filled up with zeros, which no draw reaches
     width = max(len(row) for row in values)
-    table = np.array(
-        [[*row, *[0.0] * (width - len(row))] for row in values], np.float32
-    )
+    table = np.array([[*row, *[0.0] * (width - len(row))] for row in values], np.float32)
     lengths = np.array([len(row) for row in values], np.float32)
     place = (draw * jnp.asarray(lengths)[kind]).astype(jnp.int32)
     return jnp.asarray(table)[kind, place]
@@ -135,12 +126,8 @@ def evader_velocity(
     world = jax.lax.stop_gradient(world)
     state = world.evader
     if state is None:
-        velocity = _fly(
-            settings, world, evader_speed(settings, world.task), UNBOUNDED, wish
-        )
-        return jnp.where(
-            jnp.any(jnp.isnan(wish)), _field(settings, world), velocity
-        ), None
+        velocity = _fly(settings, world, evader_speed(settings, world.task), UNBOUNDED, wish)
+        return jnp.where(jnp.any(jnp.isnan(wish)), _field(settings, world), velocity), None
     own_wish, memory = _wish(settings, rows, world)
     by_itself = jnp.ones((), bool) if wish is None else jnp.any(jnp.isnan(wish))
     speed = state.numbers["speed"] * evader_speed(settings, world.task)
@@ -187,11 +174,7 @@ def _field(settings, world):
         world.task.pillar_active,
     )
     task_speed = world.task.evader_speed
-    return (
-        velocity
-        if task_speed is None
-        else velocity * (task_speed / settings.evader_speed)
-    )
+    return velocity if task_speed is None else velocity * (task_speed / settings.evader_speed)
 
 
 def _wish(settings, rows, world):
@@ -200,9 +183,7 @@ def _wish(settings, rows, world):
     """
     state = world.evader
     behaviours = [row.behaviour for row in rows]
-    handed_in = {
-        row.behaviour: _like_shipped(row) for row in rows if callable(row.behaviour)
-    }
+    handed_in = {row.behaviour: _like_shipped(row) for row in rows if callable(row.behaviour)}
     functions = {**BEHAVIOURS, "learned": learning, **handed_in}
     # mapped over worlds, a switch works all of them out and selects: each behaviour
     # stands in it once, however many rows have it
@@ -257,9 +238,7 @@ def _fly(settings, world, speed, acceleration, wish):
     dt = settings.time_step
     start = world.evader_position
     previous = world.evader_velocity
-    velocity = at_most(
-        previous + at_most(speed * wish - previous, acceleration * dt), speed
-    )
+    velocity = at_most(previous + at_most(speed * wish - previous, acceleration * dt), speed)
     # past what is solid it slides along the surface: where it would end is moved out of
     # there
     pillars = world.task.pillar_position

@@ -38,24 +38,16 @@ def field_velocity(
     radius = jnp.sqrt(_norm_squared(evader[:2])[0] + 1e-12)
     outward = evader[:2] / radius
     to_wall = settings.arena_radius - radius
-    wall = -outward * jnp.where(
-        to_wall > 0.0, 1.0 / (jnp.maximum(to_wall, 0.0) + EPSILON), INWARD
-    )
+    wall = -outward * jnp.where(to_wall > 0.0, 1.0 / (jnp.maximum(to_wall, 0.0) + EPSILON), INWARD)
 
     to_ceiling = settings.arena_height - evader[2]
-    ceiling = jnp.where(
-        to_ceiling > 0.0, 1.0 / (jnp.maximum(to_ceiling, 0.0) + EPSILON), INWARD
-    )
-    floor = jnp.where(
-        evader[2] > 0.0, 1.0 / (jnp.maximum(evader[2], 0.0) + EPSILON), INWARD
-    )
+    ceiling = jnp.where(to_ceiling > 0.0, 1.0 / (jnp.maximum(to_ceiling, 0.0) + EPSILON), INWARD)
+    floor = jnp.where(evader[2] > 0.0, 1.0 / (jnp.maximum(evader[2], 0.0) + EPSILON), INWARD)
 
     from_pillar = evader[None, :2] - pillar_position
     distance = jnp.sqrt(_norm_squared(from_pillar) + 1e-12)
     to_surface = distance - settings.pillar_radius
-    strength = jnp.where(
-        to_surface > 0.0, 1.0 / (jnp.maximum(to_surface, 0.0) + EPSILON), INWARD
-    )
+    strength = jnp.where(to_surface > 0.0, 1.0 / (jnp.maximum(to_surface, 0.0) + EPSILON), INWARD)
     push = from_pillar / distance * strength
     pillars = jnp.sum(jnp.where(pillar_active[:, None], push, 0.0), axis=0)
 

@@ -65,11 +65,7 @@ EVADERS = {
     # wait a pillar's width away for good
     "slow_hugger": EvaderKind("pillar_hugger", "train", speed=(0.4, 0.7)),
     "heavy": EvaderKind(
-        "greedy",
-        "validation",
-        look_ahead=(0.2,),
-        acceleration=(8.0,),
-        hiding=(0.0, 0.3),
+        "greedy", "validation", look_ahead=(0.2,), acceleration=(8.0,), hiding=(0.0, 0.3)
     ),
     "pillar_hugger": EvaderKind("pillar_hugger", "validation"),
     "greedy_far": EvaderKind("greedy", "held out", look_ahead=(0.4,)),
@@ -115,18 +111,14 @@ def evader_rows(
     return tuple(next(rest) if name == "own" else EVADERS[name] for name in names)
 
 
-def handed_in(
-    evaders: Any,
-) -> tuple[tuple[str, ...], tuple[EvaderKind, ...]]:
+def handed_in(evaders: Any) -> tuple[tuple[str, ...], tuple[EvaderKind, ...]]:
     """Names of evaders for the settings, and the rows of those that have none.
 
     Raises:
       UserError: something that is no evader, or no tuple of them.
     """
     if not isinstance(evaders, tuple | list):
-        raise UserError(
-            f"evaders: {part_name(evaders)} is no tuple; (evader, ...) would be right"
-        )
+        raise UserError(f"evaders: {part_name(evaders)} is no tuple; (evader, ...) would be right")
     for one in evaders:
         if not (isinstance(one, str | EvaderKind) or callable(one)):
             raise UserError(
@@ -146,6 +138,4 @@ def check_evaders(names: tuple[str, ...]) -> None:
         )
     for name in names:
         if name not in EVADERS:
-            raise UserError(
-                f"evader {str(name)[:60]}: unknown; {suggestion(str(name), SCRIPTED)}"
-            )
+            raise UserError(f"evader {str(name)[:60]}: unknown; {suggestion(str(name), SCRIPTED)}")

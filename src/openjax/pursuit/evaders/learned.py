@@ -42,9 +42,7 @@ _PILLAR = 4
 """And of each pillar: offset (2), distance, in use."""
 
 
-def learned_place(
-    names: tuple[str, ...], kind: Int32[Array, "*worlds"]
-) -> Int32[Array, "*worlds"]:
+def learned_place(names: tuple[str, ...], kind: Int32[Array, "*worlds"]) -> Int32[Array, "*worlds"]:
     """The place among the learned evaders of those at the places `kind` (...) in
     `names`; -1 for others.
     """
@@ -61,12 +59,7 @@ def init_network(
     With `own_axes` it sees in axes of its own, x away from the arena's axis, so that a
     game that is turned looks the same.
     """
-    inputs = {
-        "pursuer": _PURSUER,
-        "pillar": _PILLAR,
-        "own": _OWN + 3 * WIDTH,
-        "hidden": WIDTH,
-    }
+    inputs = {"pursuer": _PURSUER, "pillar": _PILLAR, "own": _OWN + 3 * WIDTH, "hidden": WIDTH}
     # no orthogonal ones: several decompositions at once may wait for each other for
     # ever on a CPU of two cores
     initial = jax.nn.initializers.he_normal()
@@ -107,9 +100,7 @@ def features(
     middle = np.array(settings.middle, np.float32)
     wish = networks["scripted"][which] * greedy(scene, memory)[0]
     outward = scene.position[:2] / jnp.sqrt(jnp.sum(scene.position[:2] ** 2) + 1e-6)
-    outward = jnp.where(
-        networks["own_axes"][which] > 0, outward, np.array([1.0, 0.0], np.float32)
-    )
+    outward = jnp.where(networks["own_axes"][which] > 0, outward, np.array([1.0, 0.0], np.float32))
     turn_back = functools.partial(turned_back, outward)
     itself = [
         turn_back((scene.position - middle) / size),
@@ -156,9 +147,7 @@ def _pillar_features(scene, turn_back):
     offset = scene.pillar_position - scene.position[:2]
     distance = length(offset, keepdims=True)
     in_use = scene.pillar_active[:, None]
-    return jnp.where(
-        in_use, jnp.concatenate([turn_back(offset), distance, in_use], axis=-1), 0.0
-    )
+    return jnp.where(in_use, jnp.concatenate([turn_back(offset), distance, in_use], axis=-1), 0.0)
 
 
 def outputs(
@@ -174,9 +163,7 @@ def outputs(
     pillars = jnp.where(inputs["in_use"][..., None], pillars, 0.0)
     if "active" in inputs:
         active = inputs["active"][..., None]
-        mean = jnp.sum(active * pursuers, axis=-2) / jnp.maximum(
-            jnp.sum(active, axis=-2), 1
-        )
+        mean = jnp.sum(active * pursuers, axis=-2) / jnp.maximum(jnp.sum(active, axis=-2), 1)
         most = jnp.max(jnp.where(active, pursuers, -1.0), axis=-2)  # a tanh's least
     else:
         mean = jnp.mean(pursuers, axis=-2)
@@ -194,18 +181,12 @@ def outputs(
 def remember(scene: Scene, memory: Memory) -> Memory:
     """The memory after this step."""
     return jnp.concatenate(
-        [
-            memory[:MEMORY],
-            memory[MEMORY + scene.pursuers.size :],
-            scene.pursuers.ravel(),
-        ]
+        [memory[:MEMORY], memory[MEMORY + scene.pursuers.size :], scene.pursuers.ravel()]
     )
 
 
 def outputs_of(
-    networks: dict[str, Any],
-    which: Int32[Array, "*batch"],
-    inputs: dict[str, jax.Array],
+    networks: dict[str, Any], which: Int32[Array, "*batch"], inputs: dict[str, jax.Array]
 ) -> tuple[Float[Array, "*batch 3"], Float[Array, "*batch"]]:
     """`outputs` of the one of K networks, every leaf with their axis first, that
     `which` (...) names for each of the features.
@@ -213,9 +194,7 @@ def outputs_of(
     # all of them: cheaper than their parameters by world
     wishes, values = jax.vmap(outputs, (0, None))(networks, inputs)
     one_hot = jax.nn.one_hot(which, values.shape[0], axis=0)
-    return jnp.sum(one_hot[..., None] * wishes, axis=0), jnp.sum(
-        one_hot * values, axis=0
-    )
+    return jnp.sum(one_hot[..., None] * wishes, axis=0), jnp.sum(one_hot * values, axis=0)
 
 
 def learning(scene: Scene, memory: Memory) -> tuple[Vector, Memory]:

@@ -17,14 +17,7 @@ from openjax.vehicle.effects.composition import (
     resolve,
     seen_state,
 )
-from openjax.vehicle.effects.effect import (
-    Card,
-    Context,
-    Effect,
-    Fitted,
-    Parameter,
-    make_context,
-)
+from openjax.vehicle.effects.effect import Card, Context, Effect, Fitted, Parameter, make_context
 from openjax.vehicle.effects.effects_file import load_effects, save_effects
 from openjax.vehicle.effects.registry import EFFECTS, register_effect
 

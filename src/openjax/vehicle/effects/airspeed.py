@@ -21,9 +21,7 @@ def hub_velocity(context: Context) -> jax.Array:
     rates too.
     """
     velocity = body_velocity(context)
-    return jax.vmap(lambda r: velocity + cross(context.body_rates, r))(
-        context.rotor_position
-    )
+    return jax.vmap(lambda r: velocity + cross(context.body_rates, r))(context.rotor_position)
 
 
 def hub_height(context: Context) -> jax.Array:

@@ -4,14 +4,7 @@ battery gives now.
 
 import jax.numpy as jnp
 
-from openjax.vehicle.effects.effect import (
-    NOT_NEGATIVE,
-    RARE,
-    Card,
-    Effect,
-    Fitted,
-    Parameter,
-)
+from openjax.vehicle.effects.effect import NOT_NEGATIVE, RARE, Card, Effect, Fitted, Parameter
 
 
 def voltage(parameters, context):
@@ -31,9 +24,7 @@ def motor(parameters, motor_command, context):
     return motor_command * ratio ** parameters["exponent"]
 
 
-_CELL = (
-    "one-cell LiPo: 4.2 V full, about 3.2 V empty under load, seven minutes of hover"
-)
+_CELL = "one-cell LiPo: 4.2 V full, about 3.2 V empty under load, seven minutes of hover"
 
 
 def frozen(values, intervals, voltage):
@@ -58,27 +49,13 @@ EFFECT = Effect(
             ),
         ),
         "reference": Parameter(
-            "V",
-            3.9,
-            (3.7, 4.2),
-            _CELL,
-            "voltage at which the nominal thrust holds",
-            NOT_NEGATIVE,
+            "V", 3.9, (3.7, 4.2), _CELL, "voltage at which the nominal thrust holds", NOT_NEGATIVE
         ),
         "full": Parameter(
-            "V",
-            4.0,
-            (3.8, 4.15),
-            _CELL,
-            "voltage at take-off, where none is logged",
-            NOT_NEGATIVE,
+            "V", 4.0, (3.8, 4.15), _CELL, "voltage at take-off, where none is logged", NOT_NEGATIVE
         ),
         "discharge": Parameter(
-            "V/s",
-            0.0017,
-            (0.001, 0.003),
-            _CELL,
-            "loss per second, where none is logged",
+            "V/s", 0.0017, (0.001, 0.003), _CELL, "loss per second, where none is logged"
         ),
     },
     motor=motor,

@@ -3,27 +3,16 @@
 import jax.numpy as jnp
 
 from openjax.vehicle.effects.airspeed import body_velocity, hub_velocity, hub_wrench
-from openjax.vehicle.effects.effect import (
-    NOT_NEGATIVE,
-    VERY_RARE,
-    Card,
-    Effect,
-    Fitted,
-    Parameter,
-)
+from openjax.vehicle.effects.effect import NOT_NEGATIVE, VERY_RARE, Card, Effect, Fitted, Parameter
 
 
 def wrench(parameters, context):
     """-tilt T_i v_xy at each hub, and the torque stiffness (v x e3)."""
     in_plane = hub_velocity(context) * jnp.array([1, 1, 0], context.velocity.dtype)
-    force, torque = hub_wrench(
-        context, -parameters["tilt"] * context.thrust[:, None] * in_plane
-    )
+    force, torque = hub_wrench(context, -parameters["tilt"] * context.thrust[:, None] * in_plane)
     vx, vy, _ = body_velocity(context)
     # v x e3 = (vy, -vx, 0): flying forward pitches the nose up, which brakes
-    return force, torque + parameters["stiffness"] * jnp.stack(
-        [vy, -vx, jnp.zeros_like(vx)]
-    )
+    return force, torque + parameters["stiffness"] * jnp.stack([vy, -vx, jnp.zeros_like(vx)])
 
 
 def tilts_back(value, deviation):

@@ -20,9 +20,7 @@ STRONGEST = 1.5  # the end of the usual range
 def thrust(parameters, thrust, reaction, context):
     """The ground effect mirrored at the ceiling, per rotor."""
     distance = context.ceiling_height - hub_height(context)
-    return thrust * gain(
-        parameters["strength"], distance + parameters["offset"]
-    ), reaction
+    return thrust * gain(parameters["strength"], distance + parameters["offset"]), reaction
 
 
 def above(position) -> bool:
@@ -47,22 +45,13 @@ EFFECT = Effect(
     formula=r"T_i' = T_i\left(1 + s\,\frac{R^2}{(h_c - z_i + \delta)^2}\right)",
     parameters={
         "strength": Parameter("1", 0.0, (0.2, 1.5), _SOURCE, domain=NOT_NEGATIVE),
-        "offset": Parameter(
-            "m", 0.0, (0.0, 0.03), "distance of the rotors from the tracked point"
-        ),
+        "offset": Parameter("m", 0.0, (0.0, 0.03), "distance of the rotors from the tracked point"),
     },
     thrust=thrust,
     card=Card(
         fitted=(
             Fitted("strength", mean=0.0, spread=0.8, start=0.4, step=0.01),
-            Fitted(
-                "offset",
-                mean=0.012,
-                spread=0.025,
-                start=0.012,
-                step=0.0005,
-                most=FARTHEST,
-            ),
+            Fitted("offset", mean=0.012, spread=0.025, start=0.012, step=0.0005, most=FARTHEST),
         ),
         others=((0.4, 0.0), (0.4, 0.025), (0.4, 0.05)),
         needs="position",

@@ -20,9 +20,7 @@ def as_rotors(values, vehicle):
     """(4,) shares of the rotors' thrust that turn the body as much."""
     places = np.asarray(vehicle.rotor_position, float)[:, :2]
     # a centre of mass farther forward is as if the front rotors pushed less
-    return -places @ (
-        np.array([values["x"], values["y"]]) / np.mean(np.square(places), 0)
-    )
+    return -places @ (np.array([values["x"], values["y"]]) / np.mean(np.square(places), 0))
 
 
 _SOURCE = "battery and decks shift it by 0.05-8 mm"
@@ -35,11 +33,7 @@ EFFECT = Effect(
         "x": Parameter("m", 0.0, (-0.008, 0.008), _SOURCE, "forward"),
         "y": Parameter("m", 0.0, (-0.008, 0.008), _SOURCE, "left"),
         "z": Parameter(
-            "m",
-            0.0,
-            (-0.01, 0.01),
-            _SOURCE,
-            "up; felt only through forces in the rotor plane",
+            "m", 0.0, (-0.01, 0.01), _SOURCE, "up; felt only through forces in the rotor plane"
         ),
     },
     body=body,

@@ -46,8 +46,7 @@ def complete_parameters(
         for parameter in values:
             find_effect(name, parameter, effects=by_name)
     complete = {
-        name: {**effect.none(), **partial.get(name, {})}
-        for name, effect in by_name.items()
+        name: {**effect.none(), **partial.get(name, {})} for name, effect in by_name.items()
     }
     return jax.tree.map(lambda value: jnp.asarray(value, dtype), complete)
 
@@ -84,9 +83,7 @@ def change_command(effects, parameters, memory, command, context: Context):
     """The command (4,) that reaches the rate controller, and the memory after it."""
     for effect in effects:
         if effect.command is not None:
-            result = effect.command(
-                parameters[effect.name], memory[effect.name], command, context
-            )
+            result = effect.command(parameters[effect.name], memory[effect.name], command, context)
             _check_pair(effect, "command", result)
             _check_shapes(effect, "command", result[0], command)
             command, memory_of_effect = result
@@ -145,9 +142,7 @@ def wrench(effects, parameters, vehicle: Vehicle, rotor_speed, context: Context 
     force, torque = total_wrench(vehicle, thrust, reaction)
     # drag and flapping grow with the thrust that the rotors really give, ground effect
     # included
-    more_force, more_torque = added_wrench(
-        effects, parameters, context.replace(thrust=thrust)
-    )
+    more_force, more_torque = added_wrench(effects, parameters, context.replace(thrust=thrust))
     return force + more_force, torque + more_torque
 
 
@@ -172,10 +167,7 @@ def record(effects, memory, state: DroneState, dt):
         return memory
     # a new dictionary: a state that is written to would change for whoever still holds
     # it
-    memory = {
-        **memory,
-        AIR_TIME: memory[AIR_TIME] + jnp.asarray(dt, memory[AIR_TIME].dtype),
-    }
+    memory = {**memory, AIR_TIME: memory[AIR_TIME] + jnp.asarray(dt, memory[AIR_TIME].dtype)}
     for effect in effects:
         if effect.record is not None:
             memory[effect.name] = effect.record(memory[effect.name], state)
@@ -186,9 +178,7 @@ def seen_state(effects, parameters, state: DroneState) -> DroneState:
     """What the off-board controller sees of one drone in `state`."""
     for effect in effects:
         if effect.sensor is not None:
-            result = effect.sensor(
-                parameters[effect.name], state.effect_memory[effect.name], state
-            )
+            result = effect.sensor(parameters[effect.name], state.effect_memory[effect.name], state)
             _check_shapes(effect, "sensor", result, state)
             state = result
     return state

@@ -25,12 +25,8 @@ def wrench(parameters, context):
     width = parameters["width"] + parameters["spread"] * dz
     strength = jnp.exp(-dz / parameters["length"] - square / (2.0 * width**2))
     # (4,)
-    push = (
-        -0.25 * parameters["force"] * jnp.sum(jnp.where(above, strength, 0.0), axis=1)
-    )
-    up = rotate_inverse(
-        context.quaternion, jnp.array([0, 0, 1], context.position.dtype)
-    )
+    push = -0.25 * parameters["force"] * jnp.sum(jnp.where(above, strength, 0.0), axis=1)
+    up = rotate_inverse(context.quaternion, jnp.array([0, 0, 1], context.position.dtype))
     return hub_wrench(context, push[:, None] * up)
 
 
@@ -47,12 +43,7 @@ EFFECT = Effect(
     formula=r"f = -A\,e^{-\Delta z/h}\,e^{-r^2/2s^2}\,e_z,\quad s = w + b\,\Delta z",
     parameters={
         "force": Parameter(
-            "N",
-            0.0,
-            (0.03, 0.2),
-            _SOURCE,
-            "right under the other vehicle",
-            NOT_NEGATIVE,
+            "N", 0.0, (0.03, 0.2), _SOURCE, "right under the other vehicle", NOT_NEGATIVE
         ),
         "length": Parameter("m", 0.5, (0.2, 1.0), _SOURCE, "decay below", NOT_NEGATIVE),
         "width": Parameter(
@@ -64,11 +55,7 @@ EFFECT = Effect(
             NOT_NEGATIVE,
         ),
         "spread": Parameter(
-            "1",
-            0.1,
-            (0.0, 0.3),
-            "turbulent jets widen by about 0.1 m per m",
-            domain=NOT_NEGATIVE,
+            "1", 0.1, (0.0, 0.3), "turbulent jets widen by about 0.1 m per m", domain=NOT_NEGATIVE
         ),
     },
     wrench=wrench,

@@ -85,13 +85,7 @@ it.
 # Forces are shares of the weight; drag over mass is alike, since the rotors of larger
 # vehicles push more air at the same speed; places of things on a vehicle are shares of
 # its arm. Speeds of the air, times, voltages and shares don't grow.
-GROWTH = {
-    "kg": (1, 0),
-    "N": (1, 0),
-    "N s/m": (1, 0),
-    "N m s/m": (1, 1),
-    "m": (0, 1),
-}
+GROWTH = {"kg": (1, 0), "N": (1, 0), "N s/m": (1, 0), "N m s/m": (1, 1), "m": (0, 1)}
 """Unit of a parameter -> powers of the vehicle's mass and of its arm by which its usual
 range grows.
 """
@@ -132,9 +126,7 @@ def _mass(vehicle: Vehicle) -> float:
 
 def _arm(vehicle: Vehicle) -> float:
     """m, from the centre of mass to a rotor, on the mean."""
-    return float(
-        np.linalg.norm(np.asarray(vehicle.rotor_position)[:, :2], axis=1).mean()
-    )
+    return float(np.linalg.norm(np.asarray(vehicle.rotor_position)[:, :2], axis=1).mean())
 
 
 @dataclass(frozen=True)
@@ -248,9 +240,7 @@ class Card:
     """possible({parameter: value}, {parameter: deviation}): whether fitted values lie
     within physical bounds.
     """
-    nuisance: Mapping[str, float | Callable[[Vehicle], float]] = field(
-        default_factory=dict
-    )
+    nuisance: Mapping[str, float | Callable[[Vehicle], float]] = field(default_factory=dict)
     """{parameter: by how much the vehicle's number is usually off}, as a number or a
     function of the vehicle: free in every hypothesis, never a cause.
     """
@@ -305,9 +295,7 @@ class Card:
 
 # Hooks of one drone; `parameters` is {name: () array}, `memory` a pytree of arrays.
 BodyHook = Callable[[Mapping[str, Any], Vehicle], Vehicle]
-CommandHook = Callable[
-    [Mapping[str, Any], Any, jax.Array, Context], tuple[jax.Array, Any]
-]
+CommandHook = Callable[[Mapping[str, Any], Any, jax.Array, Context], tuple[jax.Array, Any]]
 MotorHook = Callable[[Mapping[str, Any], jax.Array, Context], jax.Array]
 ThrustHook = Callable[
     [Mapping[str, Any], jax.Array, jax.Array, Context], tuple[jax.Array, jax.Array]

@@ -36,9 +36,7 @@ class _Entry:
     interval90: tuple[float, float] | None = None
 
 
-def load_effects(
-    path: str | Path,
-) -> tuple[tuple[str, ...], dict[str, dict[str, float]]]:
+def load_effects(path: str | Path) -> tuple[tuple[str, ...], dict[str, dict[str, float]]]:
     """Names of the effects, sorted, and {effect: {parameter: value}} from an effects
     file.
 
@@ -59,9 +57,7 @@ def load_intervals(path: str | Path) -> dict[str, dict[str, tuple[float, float]]
     """
     by_name = {}
     for name, entries in _read(Path(path)).items():
-        intervals = {
-            key: entry.interval90 for key, entry in entries.items() if entry.interval90
-        }
+        intervals = {key: entry.interval90 for key, entry in entries.items() if entry.interval90}
         if intervals:
             by_name[name] = intervals
     return by_name
@@ -76,9 +72,7 @@ def _read(path: Path) -> dict[str, dict[str, _Entry]]:
         if not isinstance(entries, dict):
             raise UserError(f"{path}: [{name}] must be a table of its parameters")
         find_effect(name, prefix=f"{path}: ")
-        values[name] = {
-            key: _entry(path, name, key, entry) for key, entry in entries.items()
-        }
+        values[name] = {key: _entry(path, name, key, entry) for key, entry in entries.items()}
     return values
 
 
@@ -86,13 +80,9 @@ def _entry(path: Path, name: str, key: str, text) -> _Entry:
     """One parameter's entry from what TOML reads, a number or a table."""
     place = f"{path}: {name}.{key}"
     parameter = find_effect(name, key, f"{path}: ").parameters[key]
-    entry = from_plain(
-        _Entry, text if isinstance(text, dict) else {"value": text}, place
-    )
+    entry = from_plain(_Entry, text if isinstance(text, dict) else {"value": text}, place)
     if entry.unit not in (None, parameter.unit):
-        raise UserError(
-            f"{place} is in {entry.unit!r}; {parameter.unit!r} would be right"
-        )
+        raise UserError(f"{place} is in {entry.unit!r}; {parameter.unit!r} would be right")
     if entry.interval90 is not None and not entry.interval90[0] <= entry.interval90[1]:
         raise UserError(
             f"{place}: interval90 is {list(entry.interval90)}; low must not exceed high"

@@ -19,9 +19,7 @@ def thrust(parameters, thrust, reaction, context):
     over.
     """
     height = hub_height(context) - context.floor_height
-    return thrust * gain(
-        parameters["strength"], height + parameters["offset"]
-    ), reaction
+    return thrust * gain(parameters["strength"], height + parameters["offset"]), reaction
 
 
 # several times what is usual, with the rotors at the plane: more is some slow change of
@@ -49,10 +47,7 @@ EFFECT = Effect(
     parameters={
         "strength": Parameter("1", 0.0, (0.2, 1.2), _SOURCE, domain=NOT_NEGATIVE),
         "offset": Parameter(
-            "m",
-            0.0,
-            (0.0, 0.03),
-            "height of the rotors above the tracked point, mocap offset",
+            "m", 0.0, (0.0, 0.03), "height of the rotors above the tracked point, mocap offset"
         ),
     },
     thrust=thrust,

@@ -28,11 +28,7 @@ def wrench(parameters, context):
     torque = torque - jnp.cross(rates, context.inertia * rates)
     # diag(x, y) J^-1 is one and this:
     across = product * jnp.stack(
-        [
-            product * torque[0] - x * torque[1],
-            product * torque[1] - y * torque[0],
-            zero,
-        ]
+        [product * torque[0] - x * torque[1], product * torque[1] - y * torque[0], zero]
     )
     return jnp.zeros_like(rates), gyroscopic + across / (x * y - product**2)
 
@@ -47,9 +43,7 @@ def heavy_inside(value, deviation):
     return all(1 / 3 < value[axis] < 3 for axis in AXES) and abs(value["xy"]) < 1 / 6
 
 
-_SOURCE = (
-    "published values for the Crazyflie, with and without decks: 0.7-1.6 of nominal"
-)
+_SOURCE = "published values for the Crazyflie, with and without decks: 0.7-1.6 of nominal"
 
 EFFECT = Effect(
     name="inertia",
@@ -60,9 +54,7 @@ EFFECT = Effect(
         r"J' = \mathrm{diag}(k_{xx}, k_{yy}, k_{zz})\,J, \quad "
         r"J'_{xy} = k_{xy}\sqrt{J_{xx} J_{yy}}"
     ),
-    parameters={
-        axis: Parameter("1", 1.0, (0.7, 1.6), _SOURCE, domain=RATIO) for axis in AXES
-    }
+    parameters={axis: Parameter("1", 1.0, (0.7, 1.6), _SOURCE, domain=RATIO) for axis in AXES}
     | {
         "xy": Parameter(
             "1",

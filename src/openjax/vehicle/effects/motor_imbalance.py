@@ -49,9 +49,7 @@ EFFECT = Effect(
         sample={"m1": 0.06, "m2": -0.04, "m3": 0.02, "m4": -0.05},
         practical={"m1": 0.002, "m2": 0.002, "m3": 0.002, "m4": 0.002},
         days=0.03,
-        trim=lambda values, vehicle: np.array(
-            [values[m] for m in ("m1", "m2", "m3", "m4")]
-        ),
+        trim=lambda values, vehicle: np.array([values[m] for m in ("m1", "m2", "m3", "m4")]),
         next_flight="hover and climbs at several thrusts, with yaw free.",
     ),
 )

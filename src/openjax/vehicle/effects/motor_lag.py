@@ -20,10 +20,7 @@ def body(parameters, vehicle):
     second to it.
     """
     up = jnp.maximum(vehicle.motor_time_constant + parameters["extra_up"], _SHORTEST)
-    down = (
-        vehicle.motor_time_constant * vehicle.motor_slowdown_ratio
-        + parameters["extra_down"]
-    )
+    down = vehicle.motor_time_constant * vehicle.motor_slowdown_ratio + parameters["extra_down"]
     return vehicle.replace(
         motor_time_constant=up, motor_slowdown_ratio=jnp.maximum(down, _SHORTEST) / up
     )
@@ -73,36 +70,17 @@ EFFECT = Effect(
     ),
     parameters={
         "extra_up": Parameter(
-            "s",
-            0.0,
-            (-0.005, 0.095),
-            _SOURCE,
-            "added to the time constant of speeding up",
-            up,
+            "s", 0.0, (-0.005, 0.095), _SOURCE, "added to the time constant of speeding up", up
         ),
         "extra_down": Parameter(
-            "s",
-            0.0,
-            (-0.005, 0.095),
-            _SOURCE,
-            "added to the time constant of slowing down",
-            down,
+            "s", 0.0, (-0.005, 0.095), _SOURCE, "added to the time constant of slowing down", down
         ),
     },
     body=body,
     card=Card(
         fitted=(
-            Fitted(
-                "extra_up", mean=0.0, spread=0.03, start=0.01, step=0.0005, error=0.001
-            ),
-            Fitted(
-                "extra_down",
-                mean=0.0,
-                spread=0.03,
-                start=0.01,
-                step=0.0005,
-                error=0.001,
-            ),
+            Fitted("extra_up", mean=0.0, spread=0.03, start=0.01, step=0.0005, error=0.001),
+            Fitted("extra_down", mean=0.0, spread=0.03, start=0.01, step=0.0005, error=0.001),
         ),
         common=0.03,
         possible=lags,

@@ -13,10 +13,7 @@ from openjax.vehicle.parameters import hover_command
 
 
 def initial_memory(vehicle, state, dt, key):
-    return {
-        "held": hover_command(vehicle, state.position.dtype),
-        "key": jax.random.key_data(key),
-    }
+    return {"held": hover_command(vehicle, state.position.dtype), "key": jax.random.key_data(key)}
 
 
 def command(parameters, memory, command, context):

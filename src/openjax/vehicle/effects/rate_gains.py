@@ -21,15 +21,12 @@ EFFECT = Effect(
     description="gains of the rate controller as multiples of the assumed ones",
     formula=r"K_P' = k_p K_P,\quad K_I' = k_i K_I,\quad K_D' = k_d K_D",
     parameters={
-        gain: Parameter("1", 1.0, (0.5, 2.0), _SOURCE, domain=NOT_NEGATIVE)
-        for gain in GAINS
+        gain: Parameter("1", 1.0, (0.5, 2.0), _SOURCE, domain=NOT_NEGATIVE) for gain in GAINS
     },
     body=body,
     card=Card(
         path="rate_loop",
-        fitted=tuple(
-            Fitted(gain, mean=1.0, spread=0.4, start=1.0, step=0.05) for gain in GAINS
-        ),
+        fitted=tuple(Fitted(gain, mean=1.0, spread=0.4, start=1.0, step=0.05) for gain in GAINS),
         sample=dict.fromkeys(GAINS, 0.65),
         next_flight="roll, pitch and yaw doublets with commands and motor commands logged.",
     ),

@@ -44,9 +44,7 @@ def find_effect(
     parameter.
     """
     if name not in effects:
-        raise UserError(
-            f"{prefix}effect {name!r} is unknown; {suggestion(name, effects)}"
-        )
+        raise UserError(f"{prefix}effect {name!r} is unknown; {suggestion(name, effects)}")
     parameters = effects[name].parameters
     if parameter is not None and parameter not in parameters:
         raise UserError(

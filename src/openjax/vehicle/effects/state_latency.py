@@ -45,11 +45,7 @@ EFFECT = Effect(
     formula=r"(p, q, v)_{\mathrm{seen}}(t) = (p, q, v)(t - \Delta)",
     parameters={
         "delay": Parameter(
-            "s",
-            0.0,
-            (0.004, 0.06),
-            "motion capture, filtering and network",
-            domain=NOT_NEGATIVE,
+            "s", 0.0, (0.004, 0.06), "motion capture, filtering and network", domain=NOT_NEGATIVE
         )
     },
     sensor=sensor,

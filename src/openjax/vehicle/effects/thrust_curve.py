@@ -12,8 +12,7 @@ def motor(parameters, motor_command, context):
 
 
 _SOURCE = (
-    "spread of quadratic thrust maps published for the Crazyflie, as shares of the "
-    "largest thrust"
+    "spread of quadratic thrust maps published for the Crazyflie, as shares of the largest thrust"
 )
 
 # A straight line rises by 1; these are what powers of the command from 0.6 to 1.9 rise
@@ -62,9 +61,7 @@ EFFECT = Effect(
         fitted=(
             Fitted("offset", mean=0.0, spread=0.08, start=0.02, step=0.001),
             Fitted("slope", mean=1.0, spread=0.2, start=0.95, step=0.001),
-            Fitted(
-                "curvature", mean=0.0, spread=0.25, start=0.02, step=0.001, error=0.1
-            ),
+            Fitted("curvature", mean=0.0, spread=0.25, start=0.02, step=0.001, error=0.1),
         ),
         thrust_map=True,
         scales_torques=True,

@@ -29,9 +29,7 @@ def frozen(values, intervals, voltage):
     """The limit as it is at one voltage."""
     factor = 1.0 + values["voltage_slope"] * (voltage - _REFERENCE_VOLTAGE)
     limit = tuple(factor * v for v in intervals["limit"])
-    return values | {"limit": values["limit"] * factor, "voltage_slope": 0.0}, {
-        "limit": limit
-    }
+    return values | {"limit": values["limit"] * factor, "voltage_slope": 0.0}, {"limit": limit}
 
 
 EFFECT = Effect(

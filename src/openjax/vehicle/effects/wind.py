@@ -5,14 +5,7 @@ persists at rest.
 import jax.numpy as jnp
 
 from openjax.vehicle.effects.airspeed import hub_velocity, hub_wrench
-from openjax.vehicle.effects.effect import (
-    NOT_NEGATIVE,
-    VERY_RARE,
-    Card,
-    Effect,
-    Fitted,
-    Parameter,
-)
+from openjax.vehicle.effects.effect import NOT_NEGATIVE, VERY_RARE, Card, Effect, Fitted, Parameter
 from openjax.vehicle.rigid_body import rotate_inverse
 
 
@@ -54,9 +47,7 @@ EFFECT = Effect(
         "x": Parameter("m/s", 0.0, (-3.0, 3.0), _SOURCE, "velocity of the air"),
         "y": Parameter("m/s", 0.0, (-3.0, 3.0), _SOURCE, "velocity of the air"),
         "z": Parameter("m/s", 0.0, (-1.0, 1.0), _SOURCE, "velocity of the air"),
-        "drag": Parameter(
-            "N s/m", 0.0, (0.005, 0.03), "as for rotor_drag", domain=NOT_NEGATIVE
-        ),
+        "drag": Parameter("N s/m", 0.0, (0.005, 0.03), "as for rotor_drag", domain=NOT_NEGATIVE),
         "along": Parameter(
             "1",
             1.0,

@@ -5,9 +5,7 @@ from openjax.vehicle.effects.effect import RATIO, Card, Effect, Fitted, Paramete
 
 def body(parameters, vehicle):
     """The torque constant alone: roll and pitch come from the thrusts, which stay."""
-    return vehicle.replace(
-        torque_constant=vehicle.torque_constant * parameters["ratio"]
-    )
+    return vehicle.replace(torque_constant=vehicle.torque_constant * parameters["ratio"])
 
 
 EFFECT = Effect(
