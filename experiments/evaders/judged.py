@@ -3,19 +3,20 @@
 
 Each FILE is what `openjax exploit --policy NAME --json FILE` wrote: evaders that
 learned against the policy, one that plans in the true simulation, and the scripted
-ones; or what the programs `limit` and `apart` beside this one wrote. None of them
-trained the pursuers. The slower vehicle is `--effects experiments/flying/slower.toml`.
+ones; or what the program `apart` beside this one wrote. None of them trained the
+pursuers. The slower vehicle is `--effects experiments/flying/slower.toml`.
 Stores the least capture rate of each kind, makes the table of judged.md, and writes the
-rows of weights that ship into README and model cards.
+figures of README and pages (`experiments.figures`).
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
+from experiments import figures
 from experiments.flying.vehicles import SLOWER
 from experiments.table import RESULTS, Page, Table, page_parser, publish
 from openjax.command_line import run_command
-from openjax.files import read_json, write_text
+from openjax.files import read_json
 from openjax.pursuit import SCENARIOS
 from openjax.pursuit.evaders import HELD_OUT
 from openjax.runs.exploit_report import verdict
@@ -26,26 +27,10 @@ from openjax.vehicle.parameters import NOMINAL
 FACTS = ("command", "machine", "seconds")
 """What is another in each run; the rest of what is stored is kept."""
 PLACES = (*SCENARIOS, "uniform")
-SUMMARIES = ("README.md", "docs/model_cards.md")
-"""Pages that show the rows of weights that ship ..."""
-LIMITS = "both plan"
-"""How the names of judges begin that say more of the game than of a policy."""
-FOR_ALL = ("evaders that learn", "a planner", "scripted ones, held out", "the paper's")
-"""... of these judges, whose episodes are many."""
 JUDGES: Mapping[str, Callable[[str], bool]] = {
     "evaders that learn": lambda evader: evader.startswith("learned"),
     "a planner": lambda evader: evader.startswith("planner"),
     "splitting, kept apart": lambda evader: evader == "splitting",
-    "both plan, pursuers last": lambda evader: evader == "both plan, pursuers last",
-    "both plan, evader last": lambda evader: evader == "both plan, evader last",
-    "both plan, pursuers last, as they see": lambda evader: (
-        evader == "both plan, pursuers last, honest sight"
-    ),
-    "both plan, evader last, as they see": lambda evader: (
-        evader == "both plan, evader last, honest sight"
-    ),
-    "both plan, pursuers last, points": lambda evader: evader == "both plan, pursuers last, points",
-    "both plan, evader last, points": lambda evader: evader == "both plan, evader last, points",
     "scripted ones, held out": lambda evader: evader in HELD_OUT,
     "the paper's": lambda evader: evader == "field",
 }
@@ -57,14 +42,13 @@ def row(policy: str, vehicle: str, judge: str, records: list[dict]) -> dict:
     of 95 %.
     """
     worst = verdict(records)
-    figures = ("capture_rate", "interval", "crash_rate")
+    fields = ("capture_rate", "interval", "crash_rate")
     return {
         "policy": policy,
         "vehicle": vehicle,
         "judge": judge,
         "evaders": len({record["evader"] for record in records}),
-        "shown": policy == DEFAULT_POLICY and vehicle == "nominal" and judge in FOR_ALL,
-        **{figure: {own["scenario"]: own[figure] for own in worst} for figure in figures},
+        **{figure: {own["scenario"]: own[figure] for own in worst} for figure in fields},
     }
 
 
@@ -105,8 +89,7 @@ def study(options) -> dict:
         run = {name: found[name] for name in ("curve", "seconds") if name in found}
         runs[f"{policy}, {vehicle_of(found)}"] = run
     kept = {name: value for name, value in stored.items() if name not in FACTS}
-    hidden = options.hide if options.hide is not None else stored.get("hidden", [])
-    return {**kept, "rows": rows, "runs": runs, "hidden": hidden}
+    return {**kept, "rows": rows, "runs": runs}
 
 
 def page(results: Mapping) -> Page:
@@ -123,51 +106,23 @@ def page(results: Mapping) -> Page:
         **{place: rate(place) for place in PLACES},
         "most crashes": lambda row: f"{max(row['crash_rate'].values()):.2f}",
     }
-    rows = [row for row in results["rows"] if is_shown(row, results.get("hidden", []))]
+    hardest = tuple(JUDGES)[:2]
+    # of other weights than those that ship, what finds most
+    rows = [r for r in results["rows"] if r["policy"] == DEFAULT_POLICY or r["judge"] in hardest]
     policies = [row["policy"] for row in rows]
     order = tuple(JUDGES)
     rows.sort(key=lambda row: (policies.index(row["policy"]), order.index(row["judge"])))
     return Page("The second judge", "Least capture rates.", Table(columns, rows))
 
 
-def is_shown(row: Mapping, hidden: Sequence[str]) -> bool:
-    """Whether the table has a row: of weights that don't ship, only what finds most,
-    and what the game allows.
-    """
-    finds_most = row["judge"] in tuple(JUDGES)[:2] or row["judge"].startswith(LIMITS)
-    is_hidden = {row["policy"], f"{row['policy']}: {row['judge']}"} & set(hidden)
-    return not is_hidden and (finds_most or row["policy"] == DEFAULT_POLICY)
-
-
-def write_summaries(rows: Sequence[Mapping]) -> None:
-    """The rows of weights that ship, and of those before them, on the pages that users
-    read.
-    """
-    heads = ["policy", "caught least among", *PLACES]
-    lines = ["| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]
-    order = tuple(JUDGES)
-    policies = [row["policy"] for row in rows]
-    for row in sorted(rows, key=lambda r: (policies.index(r["policy"]), order.index(r["judge"]))):
-        if row["shown"]:
-            rates = (f"{row['capture_rate'][place]:.2f}".removeprefix("0") for place in PLACES)
-            lines.append(f"| {row['policy']} | {row['judge']} | {' | '.join(rates)} |")
-    for page in SUMMARIES:
-        path = RESULTS.parent.parent / page
-        before, begin, rest = path.read_text(encoding="utf-8").partition("<!-- judged -->")
-        after = rest.partition("<!-- end of judged -->")[2]
-        text = "\n".join([before + begin, *lines, "<!-- end of judged -->"])
-        write_text(path, text + after)
-
-
 def main(arguments: list[str]) -> None:
     """The command."""
     parser = page_parser(__doc__, "judged")
     parser.add_argument("exploited", nargs="*", metavar="NAME=FILE")
-    parser.add_argument("--hide", nargs="*", help="POLICY or 'POLICY: JUDGE': rows that stay out")
     options = parser.parse_args(arguments)
     publish(options, study, page)
     if options.out == RESULTS / "judged":
-        write_summaries(read_json(options.out.with_suffix(".json"))["rows"])
+        figures.main([])
 
 
 if __name__ == "__main__":

@@ -1,0 +1,257 @@
+"""Figures that several pages show, each from one stored result: `python -m
+experiments.figures` writes them.
+
+A page has a block between `<!-- NAME -->` and `<!-- end of NAME -->`; `BLOCKS` has its
+text, computed from `experiments/results/*.json`. `tests/test_readme_numbers.py` fails
+while a page shows anything else.
+"""
+
+import textwrap
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from experiments.paper.values import means
+from openjax.command_line import run_command
+from openjax.files import read_json, read_toml, write_text
+from openjax.pursuit import SCENARIOS, PursuitSettings
+from openjax.store import DEFAULT_POLICY
+
+ROOT = Path(__file__).parents[1]
+RESULTS = ROOT / "experiments" / "results"
+LEARNED, PLANNER = "evaders that learn", "a planner"
+"""The two judges of a policy that find most."""
+JUDGES = {
+    LEARNED: "evaders that learned against it",
+    PLANNER: "an evader that plans in the true simulation",
+    "scripted ones, held out": "scripted evaders, held out of training",
+    "the paper's": "the paper's evader",
+}
+WIDTH = 100
+PLACES = (*SCENARIOS, "uniform")
+
+
+def read(name: str) -> dict:
+    """A stored result."""
+    return read_json(RESULTS / f"{name}.json")
+
+
+def rates(policy: str, judge: str) -> dict[str, float]:
+    """By layout, and on uniform tasks: capture rate of the evader that is caught least."""
+    rows = [
+        row for row in read("judged")["rows"] if (row["policy"], row["judge"]) == (policy, judge)
+    ]
+    (row,) = [row for row in rows if row["vehicle"] == "nominal"]
+    return row["capture_rate"]
+
+
+def worst(rate: dict[str, float]) -> float:
+    """The least of the six layouts."""
+    return min(rate[layout] for layout in SCENARIOS)
+
+
+def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table."""
+    lines = [heads, ["---"] * len(heads), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def judged() -> str:
+    """The default policy against each kind of evader, by layout."""
+    rows = []
+    for judge, told in JUDGES.items():
+        rate = rates(DEFAULT_POLICY, judge)
+        rows.append([told, *(f"{rate[place]:.2f}" for place in PLACES)])
+    return table(["hardest evader among", *PLACES], rows)
+
+
+def members() -> str:
+    """Why the default policy is two: each member alone against evaders that learned."""
+    alone = [worst(rates(f"{DEFAULT_POLICY}, member {n}", LEARNED)) for n in (1, 2)]
+    both = worst(rates(DEFAULT_POLICY, LEARNED))
+    return textwrap.fill(
+        f"`{DEFAULT_POLICY}` is two policies, and the team switches between them at random every "
+        "0.4 s. Against evaders that learned, it catches "
+        f"{both:.2f} in the worst layout. Alone, its two members catch {alone[0]:.2f} and "
+        f"{alone[1]:.2f}.",
+        WIDTH,
+    )
+
+
+def hold() -> str:
+    """How often the default policy catches the hardest evaders."""
+    learned, planner = (rates(DEFAULT_POLICY, judge) for judge in (LEARNED, PLANNER))
+    return textwrap.fill(
+        f"`{DEFAULT_POLICY}` catches the hardest of eight evaders that learned against it in "
+        f"{learned['uniform']:.2f} of uniform tasks, and in {worst(learned):.2f} of the episodes "
+        "of its worst layout. It catches an evader that plans in the true simulation in "
+        f"{planner['uniform']:.2f} of uniform tasks, and in {worst(planner):.2f} of its worst "
+        "layout.",
+        WIDTH,
+    )
+
+
+def paper_game() -> tuple[list[str], list[str]]:
+    """Rows on `open` in the paper's game: captures of the worst layout, and steps to the
+    capture beside the paper's.
+    """
+    seeds = read("headline")["records"]["clamp, drawn starts"].values()
+    flown = {
+        layout: [r for own in seeds for r in own if r["scenario"] == layout] for layout in SCENARIOS
+    }
+    assert all(len(records) == 3 for records in flown.values())
+
+    def mean(layout: str, field: str) -> float:
+        return float(np.mean([record[field] for record in flown[layout]]))
+
+    shared = [layout for layout in SCENARIOS if means(layout, "OPEN")]
+    steps = np.mean([mean(layout, "capture_step") for layout in shared])
+    paper = np.mean([means(layout, "OPEN")[1] for layout in shared])
+    captures = min(mean(layout, "capture_rate") for layout in SCENARIOS)
+    page = "[layouts](experiments/results/headline.md)"
+    game = "The paper's game, three seeds of `open`"
+    return (
+        [f"{game}, worst of six unseen layouts: capture rate", f"{captures:.2f}", page],
+        [
+            f"{game}, the paper's {len(shared)} layouts: mean steps to capture",
+            f"{steps:.0f} (paper: {paper:.0f})",
+            page,
+        ],
+    )
+
+
+def whole_runs() -> list[str]:
+    """The slowest whole run of the preset `paper`, with nothing compiled before."""
+    runs = [run for run in read("seconds")["runs"] if run.get("whole") and run["kept"] == "nothing"]
+    seconds = [run["whole"]["seconds"] for run in runs]
+    assert len(seconds) == 5
+    told = "Training on one H100, preset `paper`, nothing compiled before: slowest of five runs"
+    return [told, f"{max(seconds):.0f} s", "[seconds](experiments/results/seconds.md)"]
+
+
+def first_runs() -> list[str]:
+    """The least captures of the preset `quick` on two cores, by today's recipe."""
+    runs = [run for run in read("quick")["runs"] if "recipe" not in run]
+    assert (len(runs), len({run["seed"] for run in runs})) == (10, 5)
+    records = [row for run in runs for row in run["after"] if row["scenario"] in SCENARIOS]
+    told = "Training on two CPU cores, preset `quick`: worst layout of ten runs, capture rate"
+    least = min(row["capture_rate"] for row in records)
+    return [told, f"{least:.2f}", "[quick](experiments/results/quick.md)"]
+
+
+def judged_rows() -> list[list[str]]:
+    """The default policy against the two hardest kinds of evaders."""
+    rows = []
+    for judge in (LEARNED, PLANNER):
+        rate = rates(DEFAULT_POLICY, judge)
+        told = f"`{DEFAULT_POLICY}` against {JUDGES[judge]}"
+        for place, value in (("worst layout", worst(rate)), ("uniform tasks", rate["uniform"])):
+            page = "[judged](experiments/results/judged.md)"
+            rows.append([f"{told}, {place}: capture rate", f"{value:.2f}", page])
+    return rows
+
+
+def slower_vehicle() -> list[str]:
+    """Mean crash rate of `flight` over the six layouts."""
+    layouts = read("vehicles")["policies"]["flight"]["table"]
+    crashes = np.mean([layouts[name]["crash_rate"] for name in SCENARIOS])
+    told = "`flight` on a slower Crazyflie, without the speed clamp: crash rate"
+    return [told, f"{crashes:.3f}", "[vehicles](experiments/results/vehicles.md)"]
+
+
+def forced() -> list[str]:
+    """Captures of `teams` where a theorem forces points to catch, at reaches at which no
+    planner dodges.
+    """
+    squares = [
+        square["learned"]["capture_rate"]
+        for square in read("catch_map")["maps"]["empty"]["cells"]
+        if square["speed_ratio"] < square["forced_below"] and square["capture_radius"] >= 0.2
+        if "learned" in square
+    ]
+    told = "`teams` where points can force a capture, reach 0.2 m or more: capture rate"
+    return [told, f"{np.mean(squares):.2f}", "[map](experiments/results/catch_map.md)"]
+
+
+def diagnosis() -> list[str]:
+    """The last three sealed seeds, without a reference, each answered once."""
+    first = read("exam_reference")["sealed_2309_to_2311"]["figures"]["alone"]["first"]
+    told = f"Diagnosis of {first['n']} simulated cases with one cause: right cause first"
+    return [
+        told,
+        f"{first['hits'] / first['n']:.2f}",
+        "[exam](experiments/results/exam_reference.md)",
+    ]
+
+
+def results() -> str:
+    """The README's table."""
+    rows = [whole_runs(), first_runs(), *paper_game(), *judged_rows(), slower_vehicle(), forced()]
+    return table(["What was measured", "Result", "Details"], [*rows, diagnosis()])
+
+
+def game() -> str:
+    """The paper's game, as the settings' defaults have it."""
+    own = PursuitSettings()
+    row = [
+        f"radius {own.arena_radius} m, height {own.arena_height} m, "
+        f"{own.min_pillars} to {own.max_pillars} pillars",
+        f"{own.num_pursuers}, up to {own.max_speed:g} m/s",
+        f"{own.evader_speed} m/s, a point",
+        f"within {own.capture_radius} m, in {own.episode_length * own.time_step:.0f} s",
+        f"thrust and body rates, {1 / own.time_step:.0f} Hz",
+    ]
+    return table(["arena", "pursuers", "evader", "capture", "commands"], [row])
+
+
+def clone() -> str:
+    """The commands that install, with the address of pyproject.toml."""
+    address = read_toml(ROOT / "pyproject.toml")["tool"]["openjax"]["repository"]
+    commands = (
+        (f"git clone {address} openjax && cd openjax", ""),
+        ("make train", "installs into .venv, trains a team, shows what it learned"),
+        (". .venv/bin/activate", "makes `openjax` a command"),
+    )
+    lines = [f"{command:27} # {told}" if told else command for command, told in commands]
+    return "\n".join(["```", *lines, "```"])
+
+
+BLOCKS: dict[str, Callable[[], str]] = {
+    "clone": clone,
+    "results": results,
+    "judged": judged,
+    "members": members,
+    "hold": hold,
+    "game": game,
+}
+PAGES = (
+    "README.md",
+    "docs/how_it_works.md",
+    "docs/model_cards.md",
+    "docs/questions.md",
+    "docs/start.md",
+    "experiments/results/judged.md",
+)
+
+
+def rendered(text: str) -> str:
+    """A page's text with today's figures."""
+    for name, block in BLOCKS.items():
+        before, begin, rest = text.partition(f"<!-- {name} -->\n")
+        _, end, after = rest.partition(f"<!-- end of {name} -->")
+        if begin:
+            assert end, f"no end of {name}"
+            text = before + begin + block() + "\n" + end + after
+    return text
+
+
+def main(_: list[str]) -> None:
+    """Write the blocks of all pages."""
+    for name in PAGES:
+        path = ROOT / name
+        write_text(path, rendered(path.read_text(encoding="utf-8")))
+
+
+if __name__ == "__main__":
+    run_command(main)
