@@ -1,14 +1,13 @@
 """The judge that is kept apart: `python -m experiments.evaders.apart --policy P --json
 FILE`.
 
-Evaders by splitting (`openjax.evaluation.judges.splitting`), on weights that are done:
+Evaders by splitting (`experiments.evaders.splitting`), on weights that are done:
 whoever chooses weights by it has a judge less. Records as `openjax exploit --json`
 writes them.
 """
 
 from experiments.evaders.judged_game import game_parser, judged_game
-from openjax.evaluation.judges.settings import SplittingSettings
-from openjax.evaluation.judges.splitting import Splitting
+from experiments.evaders.splitting import Splitting, SplittingSettings
 
 NAME = "splitting"
 

@@ -16,8 +16,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from experiments.evaders.points import game_of_points, stack_team
 from openjax.baselines import Heuristic
-from openjax.baselines.points import game_of_points, stack_team
 from openjax.baselines.stack import stack_bound
 from openjax.evaluation.episodes import wilson
 from openjax.files import read_json, write_json

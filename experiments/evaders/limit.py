@@ -14,12 +14,11 @@ import jax
 import jax.numpy as jnp
 
 from experiments.evaders.judged_game import JudgedGame, game_parser, judged_game
-from openjax.baselines.points import Points, Team
+from experiments.evaders.matrix_game import MatrixGame, MatrixGameSettings, VelocityFlight, Ways
+from experiments.evaders.points import Points, Team
 from openjax.baselines.surroundings import Craft
 from openjax.baselines.velocity_controller import velocity_action
 from openjax.evaluation.judges.duel import Duel
-from openjax.evaluation.judges.matrix_game import MatrixGame, VelocityFlight, Ways
-from openjax.evaluation.judges.settings import MatrixGameSettings
 from openjax.pursuit import Pursuit, PursuitSettings
 from openjax.pursuit.shortest_paths import path_length, shortest_paths
 from openjax.vehicle import hover_share

@@ -22,11 +22,11 @@ import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 
+from experiments.evaders.mixed_teams import Strangers, bootstrap_mean
+from experiments.evaders.several_evaders import CHOICES, SeveralEvaders, several_tasks
 from experiments.table import Page, Table, page_parser, publish
 from openjax.command_line import run_command
 from openjax.evaluation.episodes import wilson
-from openjax.evaluation.several_evaders import CHOICES, SeveralEvaders, several_tasks
-from openjax.evaluation.strangers import Strangers, bootstrap_mean, observed_by
 from openjax.pursuit import Pursuit, PursuitSettings, RewardSettings, uniform_task
 from openjax.pursuit.evaders.kinds import HELD_OUT
 from openjax.store.policies import load_policy
@@ -80,7 +80,7 @@ def fly_teams(options) -> dict:
     parameters = []
     for name in names:
         loaded = load_policy(name)
-        environment = Pursuit(observed_by(game, loaded.settings.environment))
+        environment = Pursuit(game.observed_as(loaded.settings.environment))
         loaded = loaded.in_game(environment)
         environments.append(environment)
         policies.append(loaded.policy)

@@ -15,6 +15,7 @@ import types
 from typing import TYPE_CHECKING
 
 from openjax.lazy import lazy_names
+from openjax.version import __version__ as __version__
 from openjax.xla_flags import avoid_wrong_sums
 
 if TYPE_CHECKING:  # so that editors complete and check what is loaded on first use only
@@ -28,8 +29,6 @@ if TYPE_CHECKING:  # so that editors complete and check what is loaded on first 
     from openjax.pursuit.settings import PursuitSettings as PursuitSettings
     from openjax.pursuit.task import Task as Task
     from openjax.store.policies import load_policy as load_policy
-
-__version__ = "0.1.0"
 
 avoid_wrong_sums()  # before JAX looks for its devices
 

@@ -4,8 +4,9 @@ import importlib
 import sys
 from collections.abc import Sequence
 
-from openjax import __version__, interruption
+from openjax import interruption
 from openjax.errors import UserError, suggestion
+from openjax.version import __version__
 
 COMMANDS = {
     "train": "train pursuers, or go on with a run",

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from openjax.baselines.points import Team, game_of_points
+from experiments.evaders.points import Team, game_of_points
 from openjax.evaluation.judges.duel import Duel
 from openjax.evaluation.judges.networks import likeliest, ways
 from openjax.evaluation.judges.planner import Planner

@@ -14,7 +14,7 @@ import json
 import jax
 import jax.numpy as jnp
 
-from openjax.baselines.points import Team, game_of_points, stack_team
+from experiments.evaders.points import Team, game_of_points, stack_team
 from openjax.baselines.surroundings import length
 from openjax.evaluation.judges.best_response import BestResponse, fly_learners
 from openjax.evaluation.judges.duel import Duel

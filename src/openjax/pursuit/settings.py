@@ -20,6 +20,14 @@ OWN_FRAME = 13
 LAYOUT_PURSUERS = 3
 """Pursuers of the six layouts, and so of a policy for teams of any size by default."""
 
+OBSERVED = (
+    *("observed_pillars", "observe_time", "observe_position", "observe_game"),
+    *("observe_arena", "observe_in", "observe_history", "observe_history_spacing"),
+    *("history_length", "history_spacing", "history_pursuers"),
+    *("track_unseen", "strategies", "strategy_seconds"),
+)
+"""The settings that say what a pursuer observes; all others are the game's."""
+
 
 @dataclass(frozen=True)
 class RewardSettings:
@@ -306,6 +314,10 @@ class PursuitSettings:
         """
         names = ("team_sizes", "evader_speeds", "capture_radii", "arena_radii")
         return dataclasses.replace(self, num_pursuers=number, **dict.fromkeys(names, ()))
+
+    def observed_as(self, other: "PursuitSettings") -> "PursuitSettings":
+        """The same game as pursuers observe it who learned in another one."""
+        return dataclasses.replace(self, **{name: getattr(other, name) for name in OBSERVED})
 
     @property
     def strategy_steps(self) -> int:

@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 
-import openjax
+from openjax.version import __version__
 
 _PACKAGES = ("jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "numpy")
 
@@ -29,7 +29,7 @@ def describe_machine() -> dict:
         if hasattr(os, "sched_getaffinity")
         else os.cpu_count(),
         "python": platform.python_version(),
-        "versions": {"openjax": openjax.__version__} | {name: version(name) for name in _PACKAGES},
+        "versions": {"openjax": __version__} | {name: version(name) for name in _PACKAGES},
         **commit(),
         "date": datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
     }

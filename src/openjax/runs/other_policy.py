@@ -8,7 +8,6 @@ from collections.abc import Sequence
 import jax
 
 from openjax.evaluation.evaluator import Evaluator, layout_slots, layout_tasks
-from openjax.evaluation.strangers import observed_by
 from openjax.evaluation.validation import uniform_tasks
 from openjax.pursuit import Pursuit, Scenario
 from openjax.show.trajectory import Trajectory
@@ -22,7 +21,7 @@ def game_for(environment: Pursuit, policy: LoadedPolicy) -> Pursuit:
     settings = environment.settings
     game = policy.settings.environment
     settings = dataclasses.replace(
-        observed_by(settings, game),
+        settings.observed_as(game),
         time_step=game.time_step,
         substeps=game.substeps,
         # as many seconds, in steps of its own

@@ -11,7 +11,6 @@ from typing import Any
 import jax
 from jax import export
 
-import openjax
 from openjax.files import read_checked, write_checked
 from openjax.vehicle.parameters import assets_directory
 
@@ -108,7 +107,7 @@ def _key(name, carry, made_from):
     """What a program depends on, in short."""
     # all sources: which of them a program depends on, nobody knows without tracing it
     digest = hashlib.sha256()
-    sources = [*Path(openjax.__file__).parent.rglob("*.py"), *assets_directory().iterdir()]
+    sources = [*Path(__file__).parents[1].rglob("*.py"), *assets_directory().iterdir()]
     for path in sorted(path for path in sources if path.is_file()):
         digest.update(path.name.encode() + path.read_bytes())
     kinds = [(leaf.shape, str(leaf.dtype)) for leaf in jax.tree.leaves(carry)]

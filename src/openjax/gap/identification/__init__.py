@@ -7,7 +7,6 @@ import importlib
 _ELSEWHERE = {
     "Identification": "openjax.gap.identification.quantities",
     "identify": "openjax.gap.identification.quantities",
-    "effect_estimates": "openjax.gap.identification.estimates",
 }
 
 __all__ = list(_ELSEWHERE)

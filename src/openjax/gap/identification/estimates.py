@@ -6,10 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from openjax.flights.flight import Case
-from openjax.gap.identification.records import Record, records_of
+from openjax.gap.identification.records import Record
 from openjax.gap.identification.search import TorqueFit
-from openjax.gap.identification.torques import identify_torques
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,20 +43,13 @@ stands.
 """
 
 
-def effect_estimates(case: Case) -> EffectEstimates | None:
-    """What the torques of a case's flights say of motor lag, inertia and yaw torque,
-    with nothing taken for granted of the loop around them; None where no flight has
-    motors and body rates.
+def of_fit(fit: TorqueFit, records: list[Record]) -> EffectEstimates:
+    """What a fit of the torques says of motor lag, inertia and yaw torque, with nothing
+    taken for granted of the loop around them.
 
     A slow motor and a large inertia both weaken the response, and only the lag turns
     its phase: the covariance says how well these flights tell them apart.
     """
-    records = records_of(case)
-    return of_fit(identify_torques(records), records) if records else None
-
-
-def of_fit(fit: TorqueFit, records: list[Record]) -> EffectEstimates:
-    """The estimates of a fit, in the coordinates of the effects."""
     vehicle = records[0].vehicle
     up = float(vehicle.motor_time_constant)
     down = up * float(vehicle.motor_slowdown_ratio)

@@ -5,7 +5,6 @@ like. So a world has a state for each policy, with its own frames and history; d
 and evader are the same in all of them.
 """
 
-import dataclasses
 from dataclasses import dataclass
 
 import jax
@@ -13,27 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from openjax.policy import Policy, PolicyParameters
-from openjax.pursuit import EpisodeStatistics, Pursuit, PursuitSettings, Task
-
-OBSERVED = (
-    *(
-        "observed_pillars",
-        "observe_time",
-        "observe_position",
-        "observe_game",
-        "observe_arena",
-        "observe_in",
-    ),
-    *("observe_history", "observe_history_spacing"),
-    *("history_length", "history_spacing", "history_pursuers"),
-    *("track_unseen", "strategies", "strategy_seconds"),
-)
-"""The settings that say what a pursuer observes; all others are the game's."""
-
-
-def observed_by(game: PursuitSettings, policy: PursuitSettings) -> PursuitSettings:
-    """A game as the pursuers of a policy observe it, who learned in another one."""
-    return dataclasses.replace(game, **{name: getattr(policy, name) for name in OBSERVED})
+from openjax.pursuit import EpisodeStatistics, Pursuit, Task
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from openjax.evaluation.several_evaders import CHOICES, SeveralEvaders, several_tasks
-from openjax.evaluation.strangers import Strangers, bootstrap_mean, observed_by
+from experiments.evaders.mixed_teams import Strangers, bootstrap_mean
+from experiments.evaders.several_evaders import CHOICES, SeveralEvaders, several_tasks
 from openjax.pursuit import Pursuit, PursuitSettings, uniform_task
 
 GAME = PursuitSettings(
@@ -55,7 +55,7 @@ def test_each_of_a_team_flies_its_own_policy_by_what_that_observes():
     learned_in = dataclasses.replace(
         GAME, observe_in="heading", observe_history=2, evaders=("field",)
     )
-    games = (Pursuit(GAME), Pursuit(observed_by(GAME, learned_in)))
+    games = (Pursuit(GAME), Pursuit(GAME.observed_as(learned_in)))
     assert games[1].settings.observe_history == 2 and games[1].settings.evaders == GAME.evaders
     policies = (ByVelocity(2.0), ByVelocity(-1.0))
     keys = jax.random.split(jax.random.key(0), 3)

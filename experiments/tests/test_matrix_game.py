@@ -5,10 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from openjax.baselines.points import Team, game_of_points
+from experiments.evaders.matrix_game import MatrixGame, MatrixGameSettings, choose
+from experiments.evaders.points import Team, game_of_points
 from openjax.evaluation.judges.duel import Duel
-from openjax.evaluation.judges.matrix_game import MatrixGame, choose
-from openjax.evaluation.judges.settings import MatrixGameSettings
 from openjax.pursuit import Task
 
 PAYOFF = jnp.array([[3.0, 1.0], [0.0, 2.0], [0.5, 0.9]])

@@ -17,7 +17,7 @@ is, and nobody would go round.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
@@ -26,10 +26,11 @@ from flax import struct
 from openjax.evaluation.judges.duel import Duel, World
 from openjax.evaluation.judges.planner import Planner, unit
 from openjax.evaluation.judges.receding_horizon import RecedingHorizon
-from openjax.evaluation.judges.settings import MatrixGameSettings, PlannerSettings
+from openjax.evaluation.judges.settings import PlannerSettings
 from openjax.policy import PolicyParameters
 from openjax.pursuit import Observation, PursuitState, Task
 from openjax.pursuit.rows import where_rows
+from openjax.ranges import Interval, check_intervals
 
 BESIDE = 0.4
 """Places beside the evader to which a pursuer is sent are at most so far from it
@@ -52,6 +53,42 @@ OTHERS = 0.5
 nearest may be before a pillar or above the ceiling's edge, and then it's for the others
 to come round.
 """
+
+
+@dataclass(frozen=True)
+class MatrixGameSettings:
+    """How both sides plan. All pairs of plans are flown: of 16 each and .8 s, every .1
+    s, 2,048 steps for one of the game.
+    """
+
+    pursuers_last: bool = True
+    """Whether the pursuers choose knowing the evader's plan, or the evader knowing
+    theirs.
+    """
+    evader_plans: Annotated[int, Interval("[3, 1000]")] = 16
+    team_plans: Annotated[int, Interval("[5, 1000]")] = 16
+    """In which pursuers may fly as the policy does."""
+    direct_plans: Annotated[int, Interval("[0, 1000]")] = 0
+    """Of the team beside those, in which none does: flown without the policy, for
+    less.
+    """
+    refined: Annotated[float, Interval("[0, 1]")] = 0.5
+    """Share of the team's new plans that are the last one with another task for one
+    pursuer.
+    """
+    pieces: Annotated[int, Interval("[1, 100]")] = 4
+    """Pieces of a plan, one after the other."""
+    piece_steps: Annotated[int, Interval("[1, 1000]")] = 20
+    """Control steps of each piece."""
+    replan: Annotated[int, Interval("[1, 1000]")] = 10
+    """Control steps after which both sides plan anew."""
+    full_sight: bool = True
+    """Whether pursuers that plan see through pillars. Without it, a team that doesn't
+    see the evader plans as if it were where the game takes it to be.
+    """
+
+    def __post_init__(self):
+        check_intervals(self)
 
 
 @struct.dataclass

@@ -4,9 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from openjax.baselines.points import Team, game_of_points
-from openjax.evaluation.judges.settings import SplittingSettings
-from openjax.evaluation.judges.splitting import Splitting, sources
+from experiments.evaders.points import Team, game_of_points
+from experiments.evaders.splitting import Splitting, SplittingSettings, sources
 from openjax.pursuit import Task
 
 SETTINGS = SplittingSettings(copies=256)

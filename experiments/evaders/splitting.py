@@ -13,16 +13,36 @@ winners", 1994.
 """
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import jax
 import jax.numpy as jnp
 
-from openjax.evaluation.judges.settings import SplittingSettings
 from openjax.policy import Policy, PolicyParameters
 from openjax.pursuit import EpisodeStatistics, Pursuit, PursuitState, Task
+from openjax.ranges import Interval, check_intervals
 
 TOGETHER = 32
 """Tasks that are flown side by side."""
+
+
+@dataclass(frozen=True)
+class SplittingSettings:
+    """How many copies an evader by splitting has, and how they turn."""
+
+    copies: Annotated[int, Interval("[2, 1000000]")] = 1024
+    """Of each episode."""
+    piece_steps: Annotated[int, Interval("[1, 1000]")] = 10
+    """Control steps between two turns: .1 s, in which an evader moves 13 cm."""
+    straight_on: Annotated[float, Interval("[0, 1]")] = 0.7
+    """Odds of flying on as before."""
+    small_turn: Annotated[float, Interval("[0, 1]")] = 0.25
+    """Odds of a turn by some `turn`; else it's anywhere."""
+    turn: Annotated[float, Interval("[0, 10]")] = 0.2
+    """Of a small turn, radians."""
+
+    def __post_init__(self):
+        check_intervals(self)
 
 
 @dataclass(frozen=True, eq=False)
