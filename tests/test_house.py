@@ -23,7 +23,7 @@ OVER = {"lines": 36, "branches": 8, "arguments": 48}
 `gap` and the experiments alone.
 """
 FLOORS = (
-    "errors lazy platform background xla_flags interruption",
+    "errors lazy platform background xla_flags interruption version",
     "files ranges kernels",
     "plain command_line",
     "vehicle show",
