@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from openjax.commands import adapt
+from openjax.commands import adapt, adapt_policy
 from openjax.errors import UserError
 from openjax.learning import TrainSettings, build
 from openjax.learning.adaptation import make_adaptation, off_the_flight
@@ -20,7 +20,6 @@ from openjax.learning.nominal_flights import LAG
 from openjax.learning.settings import AdaptSettings, GeneratorSettings, MappoSettings
 from openjax.policy import NetworkSettings, PolicyParameters, PredictorSettings
 from openjax.pursuit import PursuitSettings
-from openjax.runs import adaptation
 from openjax.store.policies import load_policy
 from openjax.store.policy_files import save_policy_file
 from openjax.vehicle import family
@@ -120,10 +119,10 @@ def test_the_best_step_on_the_way_is_kept():
 
 def test_what_is_won_back_is_the_share_of_a_loss_beyond_chance():
     chance = np.random.default_rng(0).normal(0.0, 0.1, 400)
-    nominal = {name: np.ones(400) for name in adaptation.LOSSES}
+    nominal = {name: np.ones(400) for name in adapt_policy.LOSSES}
     before = nominal | {"crash_rate": 1.5 + chance, "capture_step": 1.0 + chance - chance.mean()}
     after = nominal | {"crash_rate": 1.1 + chance}
-    shares = adaptation.won_back({"nominal": nominal, "before": before, "after": after})
+    shares = adapt_policy.won_back({"nominal": nominal, "before": before, "after": after})
     assert shares["crash_rate"] == pytest.approx(0.8, abs=0.01)
     assert shares["capture_step"] is None and shares["collision_rate"] is None
 
@@ -146,7 +145,7 @@ def test_moments_in_flight_are_the_nominal_vehicles_with_a_settled_other_one(
     adaptation = make_adaptation(loaded.settings, AdaptSettings(worlds=2))
     parameters = starting_parameters(loaded.parameters, loaded.settings)
     bounds = bounds_of({"mass": {"extra": 0.008}}, {}, rest=0.0)
-    flights = adaptation.fly(parameters, jax.random.key(0), bounds)
+    flights = adapt_policy.fly(parameters, jax.random.key(0), bounds)
     nominal = adaptation.fly(parameters, jax.random.key(0), bounds_of({}, {}, rest=0.0))
     own = flights.state.drones
     other = nominal.state.drones
@@ -181,7 +180,7 @@ def test_a_policy_is_fine_tuned_measured_and_written(policy_file, tmp_path, monk
     command = adapt.AdaptCommand(
         effects, str(policy_file), tmp_path / "out", episodes=2, training=training
     )
-    results = adaptation.adapt(command)
+    results = adapt_policy.adapt(command)
     assert json.loads((command.out / "adapt.json").read_text())["effects"] == ["motor_lag"]
     assert "motor_lag.extra_up" in (command.out / "adapt.html").read_text()
     before = load_policy(policy_file)
@@ -194,8 +193,8 @@ def test_a_policy_is_fine_tuned_measured_and_written(policy_file, tmp_path, monk
     )
     assert changed == results["kept"].startswith("fine-tuned")
     assert len(results["looks"]) == 2  # before and after its one step
-    assert set(results["nominal"]) == set(adaptation.FIGURES) and set(results["won_back"]) == set(
-        adaptation.LOSSES
+    assert set(results["nominal"]) == set(adapt_policy.FIGURES) and set(results["won_back"]) == set(
+        adapt_policy.LOSSES
     )
     with pytest.raises(UserError, match="already exists"):
         adapt.main([str(effects), "--policy", str(policy_file), "--out", str(command.out)])

@@ -118,11 +118,11 @@ class Tuner:
     def __init__(self, policy: str, episodes: int, updates: int, seed: int):
         import jax
 
+        from openjax.commands.adapt_policy import compile_programs
         from openjax.evaluation.validation import uniform_tasks
         from openjax.learning.adaptation import make_adaptation
         from openjax.learning.adapting_game import bounds_of, starting_parameters
         from openjax.learning.settings import AdaptSettings
-        from openjax.runs.adaptation import compile_programs
         from openjax.store.policies import load_policy
 
         loaded = load_policy(policy)
@@ -153,8 +153,8 @@ class Tuner:
 
     def tuned(self, bounds):
         """The policy fine-tuned to vehicles of the bounds, as `openjax adapt` does."""
+        from openjax.commands.adapt_policy import look_of
         from openjax.learning.fine_tuning import fine_tune
-        from openjax.runs.adaptation import look_of
 
         usual = self.fly(self.before, self.nominal, 0)
         steps = self.adaptation.game.episode_length

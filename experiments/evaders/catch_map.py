@@ -18,9 +18,9 @@ import numpy as np
 
 from experiments.table import Page, Table, page_parser, publish
 from openjax.command_line import run_command
+from openjax.commands.catch_map import cells_against
+from openjax.commands.map_page import map_page
 from openjax.files import read_json, write_text
-from openjax.runs.catch_map import cells_against
-from openjax.runs.map_page import map_page
 from openjax.show.plots import plot_map
 
 KINDS = {

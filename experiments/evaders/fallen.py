@@ -17,13 +17,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from openjax.commands.catch_map import draw_task, map_game
+from openjax.commands.options import MapCommand
 from openjax.evaluation.episodes import make_evaluate, wilson
 from openjax.files import write_json
 from openjax.pursuit import Observation, Pursuit, PursuitSettings, PursuitState, observe
 from openjax.pursuit.evaders.kinds import HELD_OUT
-from openjax.runs.catch_map import draw_task, map_game
 from openjax.runs.machine import describe_machine
-from openjax.runs.options import MapCommand
 from openjax.store.policies import load_policy
 from openjax.vehicle import DroneState
 

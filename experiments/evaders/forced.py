@@ -19,13 +19,13 @@ import numpy as np
 from experiments.evaders.points import game_of_points, stack_team
 from openjax.baselines import Heuristic
 from openjax.baselines.stack import stack_bound
+from openjax.commands.catch_map import Cell, cells_of, draw_task
+from openjax.commands.options import MapCommand
 from openjax.evaluation.episodes import wilson
 from openjax.files import read_json, write_json
 from openjax.pursuit import Pursuit, PursuitSettings
 from openjax.pursuit.evaders.kinds import HELD_OUT
-from openjax.runs.catch_map import Cell, cells_of, draw_task
 from openjax.runs.machine import describe_machine
-from openjax.runs.options import MapCommand
 
 WITHIN = 0.95
 """Cells count whose speed ratio is below this share of the bound: at the bound itself a

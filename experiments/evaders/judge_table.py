@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from experiments.evaders.judged import JUDGES, PLACES, vehicle_of
+from openjax.commands.exploit_report import verdict
 from openjax.files import read_json
 from openjax.pursuit.evaders import HELD_OUT
-from openjax.runs.exploit_report import verdict
 
 FILES = ("nominal", "slower", "apart")
 STEPS = "the paper's, mean steps"

@@ -16,10 +16,10 @@ from experiments import figures
 from experiments.flying.vehicles import SLOWER
 from experiments.table import RESULTS, Page, Table, page_parser, publish
 from openjax.command_line import run_command
+from openjax.commands.exploit_report import verdict
 from openjax.files import read_json
 from openjax.pursuit import SCENARIOS
 from openjax.pursuit.evaders import HELD_OUT
-from openjax.runs.exploit_report import verdict
 from openjax.store import DEFAULT_POLICY
 from openjax.vehicle.effects import load_effects
 from openjax.vehicle.parameters import NOMINAL

@@ -14,6 +14,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from openjax.commands.exploit_evaders import record
 from openjax.errors import UserError
 from openjax.evaluation.evaluator import layout_slots, layout_tasks, stack
 from openjax.evaluation.judges.receding_horizon import RecedingHorizon
@@ -22,7 +23,6 @@ from openjax.evaluation.validation import uniform_tasks
 from openjax.files import write_json
 from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings, RewardSettings, Task
 from openjax.pursuit.settings import LAYOUT_PURSUERS
-from openjax.runs.exploit import record
 from openjax.store.compiled_programs import cache_programs
 from openjax.store.environments import make_environment
 from openjax.store.policies import LoadedPolicy, load_policy

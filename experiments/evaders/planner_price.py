@@ -14,11 +14,11 @@ import numpy as np
 
 from experiments.evaders.judged_game import JudgedGame, game_parser, judged_game
 from openjax.background import compile_ahead
+from openjax.commands.exploit_evaders import record
 from openjax.evaluation.judges.duel import Duel
 from openjax.evaluation.judges.planner import Planner
 from openjax.evaluation.judges.settings import PlannerSettings
 from openjax.files import write_json
-from openjax.runs.exploit import record
 from openjax.store.environments import make_environment
 
 SHORT = {"pieces": 8, "piece_steps": 10}

@@ -9,8 +9,8 @@ from experiments.evaders.judged import page, rows_of, vehicle_of
 from experiments.evaders.judged_game import spread
 from experiments.evaders.survival import curves_of
 from experiments.flying.vehicles import SLOWER
+from openjax.commands.exploit_report import remark, verdict
 from openjax.pursuit import PursuitSettings
-from openjax.runs.exploit_report import remark, verdict
 from openjax.vehicle.effects import load_effects
 
 

@@ -14,8 +14,8 @@ from openjax.files import read_json
 from openjax.learning import build, preset
 from openjax.pursuit import Pursuit
 from openjax.runs.last_stage import keep_best
-from openjax.runs.options import TrainCommand
 from openjax.runs.start import other_compiler, prepare
+from openjax.runs.train_command import TrainCommand
 from openjax.runs.training import awaits_validation
 from openjax.store.checkpoints import CheckpointRecord
 from openjax.store.leaves import named_leaves

@@ -10,9 +10,9 @@ import dataclasses
 from collections.abc import Sequence
 
 from openjax.command_line import output_console, parse
+from openjax.commands.options import AdaptCommand
 from openjax.errors import UserError
 from openjax.files import check_output_folder
-from openjax.runs.options import AdaptCommand
 from openjax.show.progress import Steps
 from openjax.store.compiled_programs import cache_programs
 
@@ -31,8 +31,8 @@ def main(arguments: Sequence[str]) -> int:
         cache_programs()
     import jax
 
-    from openjax.runs.adapt_report import in_words
-    from openjax.runs.adaptation import ON_CPU, STEPS, adapt, check
+    from openjax.commands.adapt_policy import ON_CPU, STEPS, adapt, check
+    from openjax.commands.adapt_report import in_words
 
     console = output_console()
     on_cpu = jax.default_backend() == "cpu"

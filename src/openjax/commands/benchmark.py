@@ -12,10 +12,10 @@ import importlib
 from collections.abc import Sequence
 
 from openjax.command_line import output_console, parse, peek
+from openjax.commands.options import PARTS, BenchmarkCommand
 from openjax.errors import UserError
 from openjax.files import check_output, write_json
 from openjax.learning.presets import preset
-from openjax.runs.options import PARTS, BenchmarkCommand
 from openjax.show.progress import Steps
 
 PROGRAM = "openjax benchmark"
@@ -37,7 +37,7 @@ def main(arguments: Sequence[str]) -> int:
     # said before minutes of compiling
     if max(command.devices) > (available := len(jax.devices())):
         raise UserError(f"--devices is {max(command.devices)}; {available} are here")
-    from openjax.runs.benchmark_cases import cases, time_compiled
+    from openjax.commands.benchmark_cases import cases, time_compiled
     from openjax.runs.machine import describe_machine
 
     machine = describe_machine()

@@ -12,10 +12,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from openjax.command_line import output_console, parse
+from openjax.commands.options import MapCommand
 from openjax.errors import UserError
 from openjax.files import check_output, write_json, write_text
 from openjax.pursuit.evaders.kinds import check_evaders
-from openjax.runs.options import MapCommand
 from openjax.store.compiled_programs import cache_programs
 
 PROGRAM = "openjax map"
@@ -38,8 +38,8 @@ def main(arguments: Sequence[str]) -> int:
         cache_programs()
     import jax
 
-    from openjax.runs.catch_map import draw_map, map_game
-    from openjax.runs.map_page import map_page
+    from openjax.commands.catch_map import draw_map, map_game
+    from openjax.commands.map_page import map_page
     from openjax.store.policies import load_policy
 
     policy = load_policy(command.policy)
@@ -73,7 +73,7 @@ def _show(command, results, console):
     """Draw the picture, of evaders that learned where there are some, and tell the
     least cell.
     """
-    from openjax.runs.catch_map import cells_against
+    from openjax.commands.catch_map import cells_against
     from openjax.show.plots import plot_map
 
     who = "learned" if command.best_response else "scripted"

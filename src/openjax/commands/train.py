@@ -41,7 +41,7 @@ def _help(arguments):
     devices.
     """
     from openjax.learning.presets import preset
-    from openjax.runs.options import PROGRAM, TrainCommand
+    from openjax.runs.train_command import PROGRAM, TrainCommand
 
     default = TrainCommand(settings=preset(peek(arguments, "preset") or "quick"))
     parse(TrainCommand, default, ["--help"], PROGRAM)  # prints and exits

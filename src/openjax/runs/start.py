@@ -20,7 +20,7 @@ from openjax.files import remove_unfinished, to_plain
 from openjax.learning import TrainSettings, preset
 from openjax.runs.job import ALL_SHIPPED, OwnParts, TrainingJob
 from openjax.runs.machine import describe_machine
-from openjax.runs.options import MAY_CHANGE, PROGRAM, TrainCommand
+from openjax.runs.train_command import MAY_CHANGE, PROGRAM, TrainCommand
 from openjax.runs.training import run_job
 from openjax.runs.words import different_settings, opening_words
 from openjax.store.checkpoints import Checkpoints

@@ -121,7 +121,7 @@ def plot_map(path: Path, cells: Sequence[dict], title: str) -> None:
     the line below which a theorem forces one, and, dashed, the one below which points
     can force one that fly one above another.
 
-    cells: records of `openjax.runs.catch_map.cell_record`.
+    cells: records of `openjax.commands.catch_map.cell_record`.
     """
     sizes = sorted({cell["num_pursuers"] for cell in cells})
     columns = min(4, len(sizes))

@@ -5,7 +5,7 @@ neither game theory nor drones.
 from collections.abc import Mapping
 from pathlib import Path
 
-from openjax.runs.catch_map import cells_against
+from openjax.commands.catch_map import cells_against
 from openjax.show.pages import fill_template
 
 SHOWN = (
@@ -17,7 +17,7 @@ WHO = {
     "learned": "one that learned to escape from this team",
     "scripted": "one that flies by rules",
 }
-"""Kinds of evaders (`openjax.runs.catch_map.cells_against`), and how the page calls
+"""Kinds of evaders (`openjax.commands.catch_map.cells_against`), and how the page calls
 them.
 """
 
@@ -26,7 +26,7 @@ def map_page(maps: Mapping[str, dict]) -> str:
     """One HTML page that needs nothing else.
 
     Args:
-      maps: what `openjax.runs.catch_map.draw_map` returns, by what was flown in a few
+      maps: what `openjax.commands.catch_map.draw_map` returns, by what was flown in a few
       words; the first is shown first.
     """
     first = next(iter(maps.values()))

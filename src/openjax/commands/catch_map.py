@@ -15,6 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from openjax.baselines.stack import planar_bound, stack_bound
+from openjax.commands.map_evaders import Flight, MapEvaders, least_caught
+from openjax.commands.options import MapCommand
 from openjax.errors import UserError
 from openjax.evaluation.episodes import wilson
 from openjax.pursuit import (
@@ -26,8 +28,6 @@ from openjax.pursuit import (
     uniform_task,
 )
 from openjax.runs.machine import describe_machine
-from openjax.runs.map_evaders import Flight, MapEvaders, least_caught
-from openjax.runs.options import MapCommand
 from openjax.store.policies import LoadedPolicy
 
 FALL_OUT = 2.0

@@ -10,13 +10,13 @@ import pytest
 from scipy.stats import binomtest
 
 import openjax
+from openjax.commands.catch_map import draw_map, map_game
+from openjax.commands.map_evaders import least_caught
+from openjax.commands.map_page import map_page
+from openjax.commands.options import MapCommand
 from openjax.evaluation.episodes import wilson
 from openjax.evaluation.judges.settings import BestResponseSettings, PlannerSettings
 from openjax.pursuit import PursuitSettings, RewardSettings
-from openjax.runs.catch_map import draw_map, map_game
-from openjax.runs.map_evaders import least_caught
-from openjax.runs.map_page import map_page
-from openjax.runs.options import MapCommand
 from openjax.store.policies import own_controller
 
 GAME = PursuitSettings(

@@ -18,6 +18,8 @@ import numpy as np
 
 from openjax.background import compile_ahead
 from openjax.baselines import Heuristic
+from openjax.commands.adapt_report import FIGURES, WHICH, page
+from openjax.commands.options import AdaptCommand
 from openjax.errors import UserError
 from openjax.evaluation.evaluator import episode_figures
 from openjax.evaluation.validation import selection_score, uniform_tasks
@@ -28,9 +30,7 @@ from openjax.learning.adaptation import make_adaptation
 from openjax.learning.adapting_game import bounds_of, starting_parameters
 from openjax.learning.fine_tuning import Look, fine_tune
 from openjax.learning.train_state import TrainState
-from openjax.runs.adapt_report import FIGURES, WHICH, page
 from openjax.runs.machine import describe_machine
-from openjax.runs.options import AdaptCommand
 from openjax.store.policies import load_policy
 from openjax.store.policy_files import save_policy_file
 from openjax.vehicle.effects.effects_file import load_effects, load_intervals

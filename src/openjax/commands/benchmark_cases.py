@@ -13,13 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from openjax.cluster.devices import carry_shardings, check_devices, make_device_step
+from openjax.commands.options import BenchmarkCommand
 from openjax.errors import UserError
 from openjax.evaluation.validation import uniform_tasks
 from openjax.learning import TrainSettings, build, make_start, training_step
 from openjax.learning.rollout import Noise, Players, collect
 from openjax.pursuit import Pursuit, hover_action
 from openjax.pursuit.environment import action_to_command
-from openjax.runs.options import BenchmarkCommand
 from openjax.store.leaves import place
 from openjax.vehicle import hover_state, load_vehicle, make_drones_step
 

@@ -11,14 +11,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from openjax.commands.exploit_evaders import Findings, compile_learning, learn
+from openjax.commands.options import MapCommand
 from openjax.errors import UserError
 from openjax.evaluation.episodes import make_evaluate
 from openjax.evaluation.judges.best_response import BestResponse, Evaders, fly_learners
 from openjax.evaluation.judges.duel import Duel
 from openjax.evaluation.judges.planner import Planner
 from openjax.pursuit import EpisodeStatistics, Pursuit, PursuitSettings, Task
-from openjax.runs.exploit import Findings, compile_learning, learn
-from openjax.runs.options import MapCommand
 from openjax.store.policies import LoadedPolicy
 from openjax.store.policy_files import fill, load_policy_file, save_policy_file
 
