@@ -2,6 +2,8 @@
 the same.
 """
 
+import subprocess
+import sys
 import warnings
 
 import gymnasium
@@ -19,6 +21,7 @@ from openjax.interfaces.flat import flat_observation, flat_size
 from openjax.interfaces.gymnasium import PursuitEnv, PursuitVectorEnv
 from openjax.interfaces.jaxmarl import PursuitMultiAgentEnv
 from openjax.interfaces.pettingzoo import PursuitParallelEnv
+from openjax.interfaces.restarts import make_restart
 
 LENGTH = 5
 
@@ -160,3 +163,69 @@ def test_jaxmarl_interface_keeps_a_time_limit_and_what_it_hides(observe_time):
         for agent in adapter.agents:
             np.testing.assert_allclose(infos["final_obs"][agent], last[agent], atol=1e-6)
             assert not np.allclose(observations[agent], last[agent])
+
+
+WRONG_CALLS = """
+import jax, numpy as np, openjax
+from openjax.errors import UserError
+from openjax.interfaces.gymnasium import PursuitEnv, PursuitVectorEnv
+from openjax.interfaces.jaxmarl import PursuitMultiAgentEnv
+from openjax.interfaces.pettingzoo import PursuitParallelEnv
+
+game = openjax.make()
+key = jax.random.key(0)
+state = jax.eval_shape(game.reset, key)[1]
+for wrong in (
+    lambda: game.reset(0),
+    lambda: jax.eval_shape(game.reset, jax.random.split(key, 2)),
+    lambda: jax.eval_shape(game.step, key, state, np.zeros(4, np.float32)),
+    lambda: PursuitEnv(game).step(np.zeros(3)),
+    lambda: PursuitVectorEnv(4, game).step(np.zeros((3, 12))),
+    lambda: PursuitMultiAgentEnv(num_pursuer=2),
+    lambda: PursuitParallelEnv(game, num_pursuers=2),
+):
+    try:
+        wrong()
+    except UserError as error:
+        print(error)
+"""
+
+
+def test_wrong_calls_are_one_line_each():
+    """In a process of its own, whose types nobody checks, as a user's."""
+    call = [sys.executable, "-c", WRONG_CALLS]
+    lines = subprocess.run(call, check=True, capture_output=True, text=True).stdout.splitlines()
+    hints = (
+        "hand in jax.random.key(0)",
+        "jax.vmap(reset)",
+        "3 pursuers take (3, 4)",
+        "this takes (12,)",
+        "this takes (4, 12)",
+        "did you mean num_pursuers?",
+        "num_pursuers beside an environment",
+    )
+    assert len(lines) == len(hints)
+    for line, hint in zip(lines, hints, strict=True):
+        assert hint in line
+
+
+def test_settings_are_keywords_of_every_interface():
+    assert PursuitMultiAgentEnv(num_pursuers=2).num_agents == 2
+    assert len(PursuitParallelEnv(num_pursuers=2).possible_agents) == 2
+
+
+@pytest.mark.parametrize("ending", [0, 2, 100], ids=["none", "few", "many"])
+def test_worlds_that_end_start_as_if_each_drew_alone(ending):
+    """However many end, the drawn starts are those of their own keys."""
+    worlds = 200
+
+    def start(key):
+        return {"place": jax.random.normal(key, (3,)), "step": jnp.zeros((), jnp.int32)}
+
+    over = jnp.arange(worlds) % 100 < ending // 2
+    states = {"place": jnp.zeros((worlds, 3)), "step": jnp.full(worlds, 7)}
+    keys = jax.random.split(jax.random.key(0), worlds)
+    found = jax.jit(jax.vmap(make_restart(start)))(over, keys, states)
+    expected = jax.vmap(lambda key: jax.random.normal(key, (3,)))(keys) * over[:, None]
+    np.testing.assert_allclose(found["place"], expected, rtol=1e-6)
+    np.testing.assert_array_equal(found["step"], jnp.where(over, 0, 7))

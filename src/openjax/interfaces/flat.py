@@ -6,11 +6,27 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from openjax.pursuit import Observation, PursuitSettings
+from openjax.errors import UserError
+from openjax.pursuit import Observation, Pursuit, PursuitSettings, make
 from openjax.pursuit.axes import turned_back
 
 ACTION_SIZE = 4
 """Collective thrust, roll, pitch and yaw rate, each in -1..1."""
+
+
+def game_of(environment: Pursuit | None, changes: dict) -> Pursuit:
+    """The game that an interface was asked for: `environment`, or the nominal one with
+    some settings changed.
+
+    Raises:
+      UserError: both are given, or there is no such setting.
+    """
+    if environment is not None and changes:
+        raise UserError(
+            f"{', '.join(changes)} beside an environment: settings are given to the environment, "
+            "or alone"
+        )
+    return environment or make(**changes)
 
 
 def flat_size(settings: PursuitSettings) -> int:

@@ -10,8 +10,8 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from openjax.errors import UserError
-from openjax.interfaces.flat import ACTION_SIZE, flat_observation, flat_size, to_numpy
-from openjax.pursuit import Pursuit, make
+from openjax.interfaces.flat import ACTION_SIZE, flat_observation, flat_size, game_of, to_numpy
+from openjax.pursuit import Pursuit
 from openjax.pursuit.rows import where_rows
 
 
@@ -21,12 +21,7 @@ class _Team:
     """
 
     def __init__(self, environment: Pursuit | None, changes: dict):
-        if environment is not None and changes:
-            raise UserError(
-                f"{', '.join(changes)} beside an environment: settings are given to the "
-                "environment, or alone"
-            )
-        self.environment = environment or make(**changes)
+        self.environment = game_of(environment, changes)
         settings = self.environment.settings
         self._number = settings.num_pursuers
         size = (self._number * flat_size(settings),)
@@ -87,7 +82,8 @@ class PursuitEnv(Env):
         return np.array(observation), {}
 
     def step(self, action):
-        """One control step."""
+        """One control step. Raises UserError for an action of another shape."""
+        _check_shape("step(action)", action, self.action_space)
         action = jnp.asarray(action, jnp.float32)
         observation, self._state, *rest = self._step(self._state, action)
         reward, terminated, truncated, events = jax.device_get(rest)
@@ -138,7 +134,10 @@ class PursuitVectorEnv(VectorEnv):
         return to_numpy(observation), {}
 
     def step(self, actions):
-        """One control step of all worlds."""
+        """One control step of all worlds. Raises UserError for actions of another
+        shape.
+        """
+        _check_shape("step(actions)", actions, self.action_space)
         actions = jnp.asarray(actions, jnp.float32)
         observation, self._state, reward, terminated, truncated, info = self._step(
             self._state, actions
@@ -161,3 +160,8 @@ class PursuitVectorEnv(VectorEnv):
     def _keys(self):
         self._key, key = jax.random.split(self._key)
         return jax.random.split(key, self.num_envs)
+
+
+def _check_shape(call, actions, space):
+    if np.shape(actions) != space.shape:
+        raise UserError(f"{call}: an array {np.shape(actions)}, but this takes {space.shape}")

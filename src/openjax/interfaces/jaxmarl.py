@@ -10,7 +10,8 @@ import functools
 import jax
 import jax.numpy as jnp
 
-from openjax.interfaces.flat import ACTION_SIZE, flat_observation, flat_size
+from openjax.interfaces.flat import ACTION_SIZE, flat_observation, flat_size, game_of
+from openjax.interfaces.restarts import make_restart
 from openjax.pursuit import Pursuit, PursuitState
 from openjax.pursuit.spaces import Box
 
@@ -21,10 +22,15 @@ class PursuitMultiAgentEnv:
 
     Args:
       environment: the game; None is the nominal one.
+      changes: settings of the nominal game, as for `openjax.make`.
+
+    Raises:
+      UserError: both are given, or there is no such setting.
     """
 
-    def __init__(self, environment: Pursuit | None = None):
-        self.environment = environment or Pursuit()
+    def __init__(self, environment: Pursuit | None = None, **changes):
+        self.environment = game_of(environment, changes)
+        self._restart = make_restart(lambda key: self.environment.reset(key)[1])
         self.num_agents = self.environment.settings.num_pursuers
         self.agents = [f"pursuer_{i}" for i in range(self.num_agents)]
         size = flat_size(self.environment.settings)
@@ -55,19 +61,17 @@ class PursuitMultiAgentEnv:
         self, key: jax.Array, state: PursuitState, actions: dict[str, jax.Array], reset_state=None
     ):
         """`step_env`, and a new episode (of `reset_state`, where given) in place of one
-        that has ended.
+        that has ended. Starts are drawn for the worlds that need one alone; see
+        `openjax.interfaces.restarts`.
         """
         key, reset_key = jax.random.split(key)
-        observations, state, rewards, dones, infos = self.step_env(key, state, actions)
-        if reset_state is None:
-            fresh = self.reset(reset_key)
-        else:
-            fresh = (self.get_obs(reset_state), reset_state)
+        _, state, rewards, dones, infos = self.step_env(key, state, actions)
         over = dones["__all__"]
-        observations, state = jax.tree.map(
-            lambda new, old: jnp.where(over, new, old), fresh, (observations, state)
-        )
-        return observations, state, rewards, dones, infos
+        if reset_state is None:
+            state = self._restart(over, reset_key, state)
+        else:
+            state = jax.tree.map(lambda new, old: jnp.where(over, new, old), reset_state, state)
+        return self.get_obs(state), state, rewards, dones, infos
 
     def step_env(self, key: jax.Array, state: PursuitState, actions: dict[str, jax.Array]):
         """One control step: observations, state, rewards, dones (with `__all__`),

@@ -6,7 +6,7 @@ import numpy as np
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
-from openjax.interfaces.flat import ACTION_SIZE, flat_observation, flat_size, to_numpy
+from openjax.interfaces.flat import ACTION_SIZE, flat_observation, flat_size, game_of, to_numpy
 from openjax.pursuit import Pursuit
 
 
@@ -19,6 +19,10 @@ class PursuitParallelEnv(ParallelEnv):
 
     Args:
       environment: the game; None is the nominal one.
+      changes: settings of the nominal game, as for `openjax.make`.
+
+    Raises:
+      UserError: both are given, or there is no such setting.
     """
 
     metadata = {  # noqa: RUF012
@@ -27,8 +31,8 @@ class PursuitParallelEnv(ParallelEnv):
         "is_parallelizable": True,
     }
 
-    def __init__(self, environment: Pursuit | None = None):
-        self.environment = environment or Pursuit()
+    def __init__(self, environment: Pursuit | None = None, **changes):
+        self.environment = game_of(environment, changes)
         settings = self.environment.settings
         self.possible_agents = [f"pursuer_{i}" for i in range(settings.num_pursuers)]
         self.agents: list[str] = []

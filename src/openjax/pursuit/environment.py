@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from openjax.errors import UserError
+from openjax.pursuit.arguments import check_action, check_key
 from openjax.pursuit.axes import rotation_axes
 from openjax.pursuit.collisions import breaches, crashed
 from openjax.pursuit.evaders import (
@@ -207,7 +208,11 @@ class Pursuit:
 
         Returns:
           observation, state, both of one world.
+
+        Raises:
+          UserError: `key` is no single key.
         """
+        check_key("reset", key)
         task_key, reset_key = jax.random.split(key)
         return self.reset_to(reset_key, uniform_task(self.settings, task_key))
 
@@ -222,6 +227,7 @@ class Pursuit:
         Returns:
           observation, state, both of one world.
         """
+        check_key("reset_to", key)
         settings = arena_of(self.settings, task)
         task = task.with_starts(task.pursuer_position)
         chex.assert_shape(task.pursuer_position, (settings.num_pursuers, 3))
@@ -372,9 +378,13 @@ class Pursuit:
 
         Returns:
           observation, state, reward (N,), terminated (), truncated (), info.
+
+        Raises:
+          UserError: `action` has another shape.
         """
         del key
-        action = jnp.clip(action.astype(jnp.float32), -1.0, 1.0)
+        check_action(action, self.settings.num_pursuers)
+        action = jnp.clip(jnp.asarray(action, jnp.float32), -1.0, 1.0)
         return self.follow(state, action, self.move(state, action), wish)
 
     def move(self, state: PursuitState, action: Actions) -> DroneState:
@@ -383,7 +393,7 @@ class Pursuit:
         """
         settings = self.settings
         task = state.task
-        chex.assert_shape(action, (settings.num_pursuers, 4))
+        check_action(action, settings.num_pursuers, "move(state, action)")
         drones = self.dynamics(
             self.vehicle,
             state.drones,
