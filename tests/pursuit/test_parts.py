@@ -135,15 +135,22 @@ def test_what_is_no_part_is_a_line(part, words):
         Pursuit(GAME, **part)
 
 
-def test_a_part_that_gives_another_shape_is_a_line_with_its_name():
+def test_a_part_that_is_wrong_inside_is_a_line_with_its_name():
     def of_seven(step):
         return jnp.zeros(7)
 
     def place_alone(scene, memory):
         return scene.position
 
+    def misspelt(step):
+        return step.state.drones.velocities[:, 0]
+
     for part, words in (
         ({"reward": (Term(of_seven, 1.0),)}, r"reward term of_seven gives shape \(7,\)"),
+        (
+            {"reward": (Term(misspelt, 1.0),)},
+            r"term misspelt: DroneState has no velocities; did you mean velocity\?",
+        ),
         ({"evaders": (place_alone,)}, r"evader place_alone gives arrays of shapes"),
     ):
         game = Pursuit(GAME, **part)

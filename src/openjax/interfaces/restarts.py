@@ -39,8 +39,8 @@ def make_restart(start: Callable[[jax.Array], Any]) -> Callable[[Any, Any, Any],
     @restart.def_vmap
     def restart_worlds(worlds, is_mapped, over, keys, states):
         over, keys, states = (
-            _mapped(worlds, mapped, tree)
-            for mapped, tree in zip(is_mapped, (over, keys, states), strict=True)
+            _with_axis(worlds, has_axis, tree)
+            for has_axis, tree in zip(is_mapped, (over, keys, states), strict=True)
         )
         few = max(1, worlds // SHARE)
 
@@ -53,17 +53,17 @@ def make_restart(start: Callable[[jax.Array], Any]) -> Callable[[Any, Any, Any],
             return where_rows(over, jax.vmap(start)(keys), states)
 
         number = jnp.sum(over)
-        needed = jnp.where(number == 0, 0, jnp.where(number <= few, 1, 2))
-        states = jax.lax.switch(needed, [lambda: states, some, all_of_them])
+        branch = jnp.where(number == 0, 0, jnp.where(number <= few, 1, 2))
+        states = jax.lax.switch(branch, [lambda: states, some, all_of_them])
         return states, jax.tree.map(lambda _: True, states)
 
     return restart
 
 
-def _mapped(worlds, is_mapped, tree):
+def _with_axis(worlds, has_axis, tree):
     """The tree with its worlds' axis in each leaf."""
 
-    def leaf(mapped, value):
-        return value if mapped else jnp.broadcast_to(value, (worlds, *jnp.shape(value)))
+    def leaf(has_axis, value):
+        return value if has_axis else jnp.broadcast_to(value, (worlds, *jnp.shape(value)))
 
-    return jax.tree.map(leaf, is_mapped, tree)
+    return jax.tree.map(leaf, has_axis, tree)

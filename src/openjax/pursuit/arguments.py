@@ -24,7 +24,7 @@ def check_key(function: str, key: Any) -> None:
         )
     if kind is None or kind != jnp.uint32 or jnp.ndim(key) != 1:
         raise UserError(
-            f"{function}(key): {_told(key)} is no random key; hand in jax.random.key(0)"
+            f"{function}(key): {_description(key)} is no random key; hand in jax.random.key(0)"
         )
 
 
@@ -33,12 +33,12 @@ def check_action(action: Any, num_pursuers: int, what: str = "step(key, state, a
     shape = jnp.shape(action)
     if shape != (num_pursuers, 4):
         raise UserError(
-            f"{what}: an action {shape}, but {num_pursuers} pursuers take ({num_pursuers}, 4), each "
-            "collective thrust, roll, pitch and yaw rate in -1..1; many worlds are mapped with "
-            "jax.vmap"
+            f"{what}: an action {shape}, but {num_pursuers} pursuers take ({num_pursuers}, 4), "
+            "each collective thrust, roll, pitch and yaw rate in -1..1; many worlds are mapped "
+            "with jax.vmap"
         )
 
 
-def _told(value):
+def _description(value):
     shape = getattr(value, "shape", None)
     return f"{type(value).__name__} {value!r}" if shape is None else f"an array {shape}"

@@ -5,6 +5,7 @@ A term of one's own is a function of a `Transition`; `Pursuit(settings, reward=(
 takes it.
 """
 
+import dataclasses
 import functools
 import operator
 from collections.abc import Callable
@@ -15,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from openjax.errors import UserError, part_name
+from openjax.errors import UserError, part_name, suggestion
 from openjax.pursuit.axes import rotation_axes
 from openjax.pursuit.collisions import breaches, crashed
 from openjax.pursuit.info import StepInfo
@@ -101,10 +102,19 @@ def check_terms(terms: Any) -> tuple[Term, ...]:
 
 
 def _weigh(term, transition):
-    """A term's part of the reward. Raises UserError where its function gives another
-    shape than () or (N,).
+    """A term's part of the reward. Raises UserError where its function asks for a field
+    that isn't there, or gives another shape than () or (N,).
     """
-    value = term.function(transition)
+    try:
+        value = term.function(transition)
+    except AttributeError as error:
+        if not dataclasses.is_dataclass(error.obj):
+            raise
+        fields = [field.name for field in dataclasses.fields(error.obj)]
+        raise UserError(
+            f"reward term {part_name(term.function)}: {type(error.obj).__name__} has no "
+            f"{error.name}; {suggestion(error.name, fields)}"
+        ) from None
     number = transition.settings.num_pursuers
     if getattr(value, "shape", ()) not in ((), (number,)):
         raise UserError(
