@@ -1,10 +1,12 @@
 PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
-READY  := $(VENV)/.ready
+# the versions that were tested; `make test PINS=` takes the newest of everything
+PINS   ?= -c constraints.txt
+READY  := $(VENV)/.ready$(if $(PINS),,-newest)
 PYTEST  = $(BIN)/python -m pytest -n auto --maxprocesses 8 --dist worksteal
 
-.PHONY: train test test-slow test-real-time test-all lint docs benchmark evaluate tables exam clean
+.PHONY: train test test-slow test-real-time test-all lint docs benchmark evaluate tables exam constraints clean
 
 # `make train` accepts extra options: make train ARGS="--preset paper --seed 1"
 train: $(READY)
@@ -29,7 +31,7 @@ lint: $(READY)
 
 # the site, into docs/_build/html; a warning is an error
 docs: $(READY)
-	$(BIN)/python -m pip install -q -e ".[docs]"
+	$(BIN)/python -m pip install -q --group docs $(PINS)
 	$(BIN)/python -m sphinx -W --keep-going -q docs docs/_build/html
 
 benchmark: $(READY)
@@ -44,13 +46,19 @@ tables: $(READY)
 exam: $(READY)
 	$(BIN)/python -m experiments.diagnosis.run $(ARGS)
 
-# One install for everything; again only when pyproject.toml changes. A GPU is used where nvidia-smi finds one.
-$(READY): pyproject.toml
+# One install for everything; again only when what it installs changes. A GPU is used where
+# nvidia-smi finds one.
+$(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install -q --upgrade pip
-	if command -v nvidia-smi >/dev/null 2>&1; then $(BIN)/python -m pip install -q -e ".[dev,cuda]"; \
-	else $(BIN)/python -m pip install -q -e ".[dev]"; fi
+	if command -v nvidia-smi >/dev/null 2>&1; then extras=all,cuda; else extras=all; fi; \
+	$(BIN)/python -m pip install -q -e ".[$$extras]" --group dev $(PINS) $(if $(PINS),,--upgrade)
 	touch $(READY)
+
+# the newest versions that fit together, for every Python that is promised; test them, then commit
+constraints:
+	uv pip compile pyproject.toml --universal --python-version 3.11 --all-extras --group dev \
+	  --group docs --no-annotate --no-header --upgrade --output-file constraints.txt
 
 clean:
 	rm -rf $(VENV) runs
