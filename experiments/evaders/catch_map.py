@@ -2,10 +2,10 @@
 ...`.
 
 Each FILE is what `openjax map --json FILE` wrote, by the names of `KINDS`: the whole
-map in an empty arena, and maps in which one thing is taken away; or, as `inertia`, what
-`experiments.evaders.forced` wrote. A map may come in several files of that name, with
-cells of its own in each. Losses are means over the cells that both maps have, which are
-flown from the same starts. Draws the eight small maps, and the page to move about in.
+map in an empty arena, and maps in which one thing is taken away. A map may come in
+several files of that name, with cells of its own in each. Losses are means over the
+cells that both maps have, which are flown from the same starts. Draws the eight small
+maps, and the page to move about in.
 """
 
 import itertools
@@ -33,8 +33,6 @@ KINDS = {
 with.
 """
 WHO = ("scripted", "learned", "planner")
-INERTIA = ("points", "vehicles")
-"""Who flies stack where it forces a capture for points, by the names of `forced`."""
 OFTEN = 0.9
 REACHES = {"reach_20": 0.2, "reach_30": 0.3, "reach_50": 0.5}
 """m, for which the fastest evader stands in the table that is caught `OFTEN`."""
@@ -49,9 +47,8 @@ def study(options) -> dict:
     for item in options.maps:
         name, file = item.split("=", 1)
         files[name].append(read_json(Path(file)))
-    inertia = files.pop("inertia", [stored.get("inertia", {"teams": []})])[-1]
     maps = {name: whole_map(parts) for name, parts in files.items()}
-    return {"maps": stored.get("maps", {}) | maps, "inertia": inertia}
+    return {"maps": stored.get("maps", {}) | maps}
 
 
 def whole_map(parts: list[dict]) -> dict:
@@ -107,7 +104,6 @@ def rows_of(results: Mapping) -> list[dict]:
     """A row for each size of team."""
     maps = results["maps"]
     flown = {who: by_cell(cells_against(maps["empty"], who)) for who in WHO}
-    inertia = {team["pursuers"]: team for team in results["inertia"]["teams"]}
     rows = []
     for size in sorted({key[0] for key in flown["scripted"]}):
         row = {"size": size}
@@ -128,7 +124,6 @@ def rows_of(results: Mapping) -> list[dict]:
         for kind in list(KINDS)[1:]:
             if kind in maps:
                 row[kind] = mean_difference(of_size["scripted"], by_cell(maps[kind]["cells"]))
-        row |= {who: inertia.get(size, {}).get(who) for who in INERTIA}
         rows.append(row)
     return rows
 
@@ -138,21 +133,20 @@ def page(results: Mapping) -> Page:
     rows = rows_of(results)
     columns = {
         "pursuers": "size",
-        "by rules": "scripted.mean:.3f",
-        "learned": "learned.mean:.3f",
+        "captures of scripted evaders": "scripted.mean:.2f",
+        "of evaders that learned": "learned.mean:.2f",
         **{
-            f"fastest learned caught {OFTEN:g}, at {reach:g} m": (f"learned.fastest.{name}")
+            f"fastest caught, reach {reach:g} m": f"learned.fastest.{name}"
             for name, reach in REACHES.items()
         },
-        **{f"{head}, learned": f"learned.{bound}:.3f" for bound, head in BOUNDS.items()},
-        "planner less learned": "planner.gain:+.3f",
+        **{head: f"learned.{bound}:.2f" for bound, head in BOUNDS.items()},
     }
-    losses = {kind: f"{kind}:+.3f" for kind in list(KINDS)[1:] if kind in results["maps"]}
-    losses["inertia, where stack forces"] = lambda row: (
-        None if row["points"] is None else f"{row['vehicles'] - row['points']:+.2f}"
-    )
-    short = Table(columns | losses, rows)
-    return Page("What can be caught", "Captures over speed ratios and capture radii.", short)
+    short = Table(columns, rows)
+    losses = {"pursuers": "size", "planner less learned": "planner.gain:+.3f"}
+    losses |= {kind: f"{kind}:+.3f" for kind in list(KINDS)[1:] if kind in results["maps"]}
+    lost = Table(losses, rows, "What takes captures away")
+    told = "Captures over speed ratios and capture radii."
+    return Page("What can be caught", told, (short, lost), short)
 
 
 def draw(results: Mapping, path: Path) -> None:

@@ -5,7 +5,7 @@
 # Two lanes run side by side on the GPU, so that one compiles while the other flies. What is known
 # is in OUTDIR at any time, and `python -m experiments.evaders.judge_table OUTDIR` reads it.
 # Variables: SEED of the evaders (7), STEPS and STEPS_SLOWER of all learners, nominal and slower
-# vehicle, SECONDS_IN_ALL (520), PYTHON; EXPLOIT, PRICE and APART are more options of these.
+# vehicle, SECONDS_IN_ALL (520), PYTHON; EXPLOIT: more of its options.
 set -u
 policy=$1
 out=$2
@@ -30,17 +30,12 @@ nominal() {
   part nominal $python -m openjax exploit --policy "$policy" --seed "$seed" \
     --total_steps "${STEPS:-600000000}" --out "$out/evader.npz" --json "$out/nominal.json" \
     ${EXPLOIT:-}
-  part price $python -m experiments.evaders.planner_price --policy "$policy" --episodes 30 \
-    --uniform 128 --opponent "$out/evader.npz" --json "$out/price.json" \
-    --only shipped "ahead 1.2 s" "short, refined" "and its own rule" ${PRICE:-}
 }
 
 slower() {
   part slower $python -m openjax exploit --policy "$policy" --seed "$seed" \
     --effects experiments/flying/slower.toml --total_steps "${STEPS_SLOWER:-300000000}" \
     --out "$out/evader_slower.npz" --json "$out/slower.json" ${EXPLOIT:-}
-  part apart $python -m experiments.evaders.apart --policy "$policy" ${APART:-} \
-    --json "$out/apart.json"
 }
 
 nominal &

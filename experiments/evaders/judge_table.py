@@ -2,9 +2,8 @@
 [DIRECTORY ...]`.
 
 Prints, of each directory's policy, the least capture rates of all judges with the
-interval of the least over learners and planner, what the planners of `planner_price`
-find beside, crashes, and how long the paper's evader is free, as a multiple of the
-first directory's.
+interval of the least over learners and planner, crashes, and how long the paper's
+evader is free, as a multiple of the first directory's.
 """
 
 import argparse
@@ -18,7 +17,7 @@ from openjax.commands.exploit_report import verdict
 from openjax.files import read_json
 from openjax.pursuit.evaders import HELD_OUT
 
-FILES = ("nominal", "slower", "apart")
+FILES = ("nominal", "slower")
 STEPS = "the paper's, mean steps"
 SECOND = "learners and planner"
 """The row that goals are about."""
@@ -76,14 +75,6 @@ def lines_of(directory: Path, today: dict[str, dict]) -> Iterator[str]:
             yield f"| {vehicle}: {STEPS} | {' | '.join(cells)} |"
             crashes = max(own["crash_rate"] for own in verdict(found["records"]))
             yield f"| {vehicle}: most crashes, any evader and tasks | {crashes:.3f} |"
-    path = directory / "price.json"
-    if path.exists():
-        found = read_json(path)
-        for planner, seconds in found["seconds"].items():
-            own = [record for record in found["records"] if record["evader"] == planner]
-            rates = {record["scenario"]: f"{record['capture_rate']:.2f}" for record in own}
-            cells = (rates.get(place, "-") for place in PLACES)
-            yield f"| planner, {planner} ({seconds:.0f} s) | {' | '.join(cells)} |"
 
 
 def main() -> None:

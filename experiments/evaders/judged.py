@@ -3,8 +3,7 @@
 
 Each FILE is what `openjax exploit --policy NAME --json FILE` wrote: evaders that
 learned against the policy, one that plans in the true simulation, and the scripted
-ones; or what the program `apart` beside this one wrote. None of them trained the
-pursuers. The slower vehicle is `--effects experiments/flying/slower.toml`.
+ones. None of them trained the pursuers. The slower vehicle is `--effects experiments/flying/slower.toml`.
 Stores the least capture rate of each kind, makes the table of judged.md, and writes the
 figures of README and pages (`experiments.figures`).
 """

@@ -3,9 +3,9 @@
 #   POLICY=FILE SEEDS="FILE FILE FILE" experiments/evaders/teams.sh OUTDIR [SECONDS]
 #
 # POLICY is `teams` by default, one that draws among its members or a single one. SEEDS
-# are single policies of other seeds: their tables, and teams mixed of them.
-# The tables of experiments/results/teams.md, the map in four pieces, best responses,
-# pillars, strangers and inertia are jobs in order of worth. Two of them share each GPU, as
+# are single policies of other seeds: their tables.
+# The tables of experiments/results/teams.md, the map in four pieces, best responses and
+# pillars are jobs in order of worth. Two of them share each GPU, as
 # one is compiled while the other flies; whoever is free takes the next one, and none
 # begins that can't end within SECONDS (460). All that is known lies in OUTDIR/teams.tgz
 # at any time, packed every 20 s; times.txt in it says what ran when.
@@ -34,7 +34,7 @@ packer=$!
 trap 'kill $packer' EXIT
 
 # what is less where it is only tried
-one="" few="" few_map="" planned="" strangers="" two="" speed="" forced=""
+one="" few="" few_map="" planned="" speed=""
 planner="--planner_episodes 20"
 cell="--speed_ratios 1.3 --radii 0.3" # of teams.md's table
 thin="--speed_ratios 0.8 1.2 1.6 2 3 --radii 0.1 0.2 0.3 0.4 0.5" # every second one
@@ -47,10 +47,7 @@ if [ "${TINY:-0}" = 1 ]; then
   few_map="--best_response True --learning.num_envs 16"
   planned="--planning.plans 3"
   planner="$planned --planner_share 1 --planner_episodes 1"
-  strangers="--episodes 4 --mates flight janosov"
-  two="--episodes 4"
   speed="--worlds 64 --steps 5"
-  forced="--sizes 3 --episodes 1"
   steps() { echo 30000; }
   episodes() { echo 2; }
 fi
@@ -101,14 +98,10 @@ job exploit_3 230 "$(exploit 3 480000000 100)"
 for seed in ${SEEDS:-}; do
   tables "$(basename "$seed" .npz)" "$seed" 30
 done
-[ -z "${SEEDS:-}" ] || job strangers 100 -m experiments.evaders.strangers --only teams \
-  --out "$K/strangers" --egos $SEEDS --mates flight no_clamp_seed_0 janosov --episodes 500 \
-  "$strangers"
 pillars 3 4 180
 pillars 7 8 220
 pillars 5 6 200
 pillars 1 2 150
-job two 60 -m experiments.evaders.strangers --only two --out "$K/two" --egos "$policy" "$two"
 job three 30 "$(map three evaders 1000 3)" $cell $uniform $scripted
 job three_cells 60 "$(map three_cells evaders 200 3)" $uniform $scripted
 for radius in 0.7 1.2 1.5; do
@@ -121,7 +114,6 @@ job sight 110 "$(map sight "$policy" 200 1 2 3 4 5 6 7 8)" $thin $scripted \
   --sight_angle 90 --sight_range 1
 job silence 110 "$(map silence "$policy" 200 2 3 4)" $thin $scripted $messages --batch 2048
 job masks 90 -m experiments.speed.environment_step --masked "$speed"
-job forced 75 -m experiments.evaders.forced --json "$K/forced.json" "$forced"
 
 if [ -n "${JOBS:-}" ]; then
   chosen=()

@@ -4,7 +4,6 @@ each with its own evader speed.
 
 import dataclasses
 import functools
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -25,16 +24,6 @@ class SweptSettings(PursuitSettings):
 
 
 @struct.dataclass
-class Paths:
-    """B episodes of T steps."""
-
-    pursuers: Any  # (B, T, N, 3) m
-    evader: Any  # (B, T, 3) m
-    seen: Any  # (B, T) bool
-    captured: Any  # (B, T, N) bool
-
-
-@struct.dataclass
 class Flights:
     """B episodes of the mean policy."""
 
@@ -43,7 +32,6 @@ class Flights:
     """(B, R) int32, first step with a capture within each radius; episode length + 1
     where there is none.
     """
-    paths: Paths
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1, 2))
@@ -71,8 +59,7 @@ def fly(
         swept = dataclasses.replace(
             environment, settings=SweptSettings(**{**plain, "evader_speed": speed})
         )
-        observation, state, *_, info = swept.step(jax.random.key(0), state, action)
-        return observation, state, info
+        return swept.step(jax.random.key(0), state, action)[:2]
 
     def caught(state):
         games = [dataclasses.replace(settings, capture_radius=radius) for radius in radii]
@@ -85,17 +72,16 @@ def fly(
         predicted = policy.predict(parameters, observation)
         mean, _ = policy.distribution(parameters.actor, observation, predicted)
         last_seen = observation.last_seen
-        observation, state, info = jax.vmap(step)(state, policy.action(mean, observation), speeds)
+        observation, state = jax.vmap(step)(state, policy.action(mean, observation), speeds)
         capture_step = jnp.where(jax.vmap(caught)(state), state.step[:, None], no_capture)
         guesses = jnp.stack([last_seen if predicted is None else predicted[:, 0], last_seen])
         errors = errors + jnp.linalg.norm(guesses - state.evader_position, axis=-1)
-        paths = Paths(state.drones.position, state.evader_position, info.seen, info.captured)
-        return (observation, state, jnp.minimum(first, capture_step), errors), paths
+        return (observation, state, jnp.minimum(first, capture_step), errors), None
 
     observation, state = jax.vmap(environment.reset_to)(jax.random.split(key, number), tasks)
     first = jnp.full((number, len(radii)), no_capture, jnp.int32)
     start = (observation, state, first, jnp.zeros((2, number), jnp.float32))
-    (_, state, first, errors), paths = jax.lax.scan(one, start, length=settings.episode_length)
+    (_, state, first, errors), _ = jax.lax.scan(one, start, length=settings.episode_length)
     predicted, last_seen = errors / settings.episode_length
     return Flights(
         evaluation=Evaluation(
@@ -106,7 +92,6 @@ def fly(
             last_seen_error=last_seen,
         ),
         first=first,
-        paths=jax.tree.map(lambda x: jnp.moveaxis(x, 0, 1), paths),
     )
 
 

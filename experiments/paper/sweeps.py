@@ -11,13 +11,10 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from experiments.paper.roster import COLORS, METHODS, flights_of
-from experiments.table import Page, Table, spread
+from experiments.table import Table, spread
 
 RADII = (0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.5)
 SPEEDS = (1.0, 1.2, 1.3, 1.4, 1.6, 1.8, 2.0, 2.3, 2.6)
-SHOWN_RADII = (0.2, 0.25, 0.3)
-SHOWN_SPEEDS = (1.3, 2.0, 2.6)
-"""What stands on the page; `--report` prints all."""
 RADIUS = 0.3
 SPEED = 1.3
 """Of the training."""
@@ -53,8 +50,8 @@ def seeds_by_method(results: dict) -> dict[str, list[dict]]:
     return {label: seeds for label, seeds in methods.items() if seeds}
 
 
-def page(results: dict) -> Page:
-    """A table of either sweep."""
+def parts(results: dict) -> list[Table | str]:
+    """A table of either sweep, and where OPEN isn't the best."""
     methods = seeds_by_method(results)
     parts = []
     for title, axis, values, unit in (
@@ -65,35 +62,9 @@ def page(results: dict) -> Page:
             f"{value} {unit}": at(axis, i) for i, value in enumerate(values)
         }
         rows = [{"method": label, "seeds": seeds} for label, seeds in methods.items()]
-        parts += [Table(columns, rows, title), not_above(methods, axis, values, unit)]
-    return Page(
-        "Capture radius and evader speed",
-        f"{max(1, results['episodes'] // 2)} episodes per seed and cell, three seeds, speed clamp, "
-        "drawn starts. Every policy "
-        f"is the one of the main table, trained or searched at {RADIUS} m and {SPEED} m/s only. "
-        "Capture rate (standard "
-        "deviation over seeds) / capture step. The paper shows both as figures without numbers.",
-        (*parts, "![Capture rate and step over radius and speed](sweeps.png)"),
-        shown(methods),
-    )
-
-
-def shown(methods: dict[str, list[dict]]) -> Table:
-    """The page's table: capture rates of three radii and three speeds, mean over the
-    seeds.
-    """
-    rows = []
-    for method, seeds in methods.items():
-        row = {"method": method}
-        for axis, values, unit, chosen in (
-            ("radius", RADII, "m", SHOWN_RADII),
-            ("speed", SPEEDS, "m/s", SHOWN_SPEEDS),
-        ):
-            for value in chosen:
-                rates = [seed[axis]["capture_rate"][values.index(value)] for seed in seeds]
-                row[f"{value} {unit}"] = f"{np.mean(rates):.2f}"
-        rows.append(row)
-    return Table({name: (lambda row, name=name: row[name]) for name in rows[0]}, rows)
+        prose = "Capture rate (standard deviation over seeds) / capture step, speed clamp."
+        parts += [Table(columns, rows, title, prose), not_above(methods, axis, values, unit)]
+    return parts
 
 
 def at(axis: str, i: int):

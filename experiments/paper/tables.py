@@ -2,40 +2,35 @@
 experiments.paper.tables [--episodes 100]`.
 
 Flies every method once, all its layouts, capture radii and evader speeds in one
-compiled call, and stores what came of it in experiments/results/tables.json; the pages
-in `PAGES` are made from there. `--report` makes them again.
+compiled call, and stores what came of it in experiments/results/tables.json; the page
+is made from there. `--report` makes it again.
 """
 
 import argparse
 import dataclasses
 import functools
-import json
 import time
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.paper import behaviours, main_tables, sweeps
+from experiments.paper import main_tables, sweeps
 from experiments.paper.flights import environment_of, fly
 from experiments.paper.roster import ABLATIONS, METHODS, seeds_of
-from experiments.table import facts, page_parser, write_page
+from experiments.table import Page, facts, page_parser, write_page
 from openjax.background import compile_ahead
 from openjax.baselines import METHODS as HEURISTICS
 from openjax.command_line import run_command
 from openjax.evaluation.episodes import summarise
 from openjax.evaluation.evaluator import layout_slots, repeat_task, stack
 from openjax.evaluation.result_tables import record_of
-from openjax.files import read_json, to_plain, write_text
+from openjax.files import read_json, write_json
 from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings, RewardSettings, Task, scenario_task
 from openjax.store.policies import LoadedPolicy, load_policy
 
-PAGES = {
-    "tab_main": (main_tables.page, None),
-    "behaviours": (behaviours.page, behaviours.draw),
-    "sweeps": (sweeps.page, sweeps.draw),
-}
-"""By file: page and figure."""
+NAME = "tab_main"
+"""Of the page and its figure."""
 LAYOUTS = ("wall", "narrow_gap", "random", "passage", "hidden")
 LABELS = (*METHODS, *ABLATIONS)
 LIMITS = {"clamp": "clamp", "no clamp": "none"}
@@ -100,11 +95,7 @@ def of_policy(name: str, seed: int, limit: str, physics: str, episodes: int) -> 
     layouts = {}
     for layout, part in zip(LAYOUTS, parts, strict=False):
         row = record_of(layout, episodes, summarise(part.evaluation), ("last_seen_error",))
-        layouts[layout] = {
-            "record": row,
-            "behaviour": behaviours.measure(layout, part.paths, part.evaluation.statistics),
-            "paths": behaviours.one_episode(part.paths),
-        }
+        layouts[layout] = {"record": row}
     return {
         "layouts": layouts,
         "sweeps": sweeps.figures(parts[len(LAYOUTS) :], game.episode_length),
@@ -157,23 +148,23 @@ def study(options: argparse.Namespace) -> None:
         for name, seed in seeds:
             begin = time.monotonic()
             record = of_policy(name, seed, LIMITS[condition], *rest)
-            if condition != "clamp" or (name, seed) != seeds[0]:
-                # one episode of each method is drawn
-                for layout in record["layouts"].values():
-                    del layout["paths"]
             about = {"method": label, "policy": name, "seed": seed, "condition": condition}
             flights.append({**about, "seconds": time.monotonic() - begin, **record})
             print(f"{time.monotonic() - start:5.0f} s  {label}: {name}, {condition}", flush=True)
         # after each, so that an interrupted study leaves what it has
         seconds = time.monotonic() - start
         results = {**facts(options.commit), "seconds": seconds, **alike, "flights": flights}
-        # paths are long: no line for each number
-        text = json.dumps(to_plain(results), allow_nan=False, separators=(",", ":"))
-        write_text(options.out / "tables.json", text)
+        write_json(options.out / "tables.json", results)
+
+
+def page(results: dict) -> Page:
+    """The paper's tables, then the two sweeps."""
+    whole = main_tables.page(results)
+    return dataclasses.replace(whole, parts=(*whole.parts, *sweeps.parts(results)))
 
 
 def main(arguments: list[str]) -> int:
-    """Fly or read the flights, then write all pages."""
+    """Fly or read the flights, then write the page."""
     parser = page_parser(__doc__, ".")
     parser.add_argument(
         "--episodes", type=int, default=100, help="per seed and layout; half for the sweeps"
@@ -188,8 +179,7 @@ def main(arguments: list[str]) -> int:
     if not options.report:
         study(options)
     results = read_json(options.out / "tables.json")
-    for name, (page, draw) in PAGES.items():
-        write_page(options.out / name, page, results, draw)
+    write_page(options.out / NAME, page, results, sweeps.draw)
     return 0
 
 

@@ -1,4 +1,4 @@
-"""Rows of the judges' table, and curves of how long evaders are free."""
+"""Rows of the judges' table, and how evaders escape."""
 
 import numpy as np
 
@@ -7,7 +7,6 @@ from experiments.evaders.judge_table import SECOND, rate
 from experiments.evaders.judge_table import rows_of as lines_of
 from experiments.evaders.judged import page, rows_of, vehicle_of
 from experiments.evaders.judged_game import spread
-from experiments.evaders.survival import curves_of
 from experiments.flying.vehicles import SLOWER
 from openjax.commands.exploit_report import remark, verdict
 from openjax.pursuit import PursuitSettings
@@ -69,13 +68,6 @@ def test_the_beginning_of_an_order_has_of_all_kinds_what_the_whole_has():
     assert sorted(order) == list(range(7))
     # of the first half: one, two, and one of the single
     assert sorted(np.digitize(order[:4], [2, 6])) == [0, 1, 1, 2]
-
-
-def test_a_curve_is_of_the_strongest_evader_and_ends_where_it_is_free():
-    curve = next(c for c in curves_of(RECORDS) if c["evaders"] == "evaders that learn")
-    assert curve["strongest"] == "learned 0"
-    free = curve["free"]
-    assert (free[0], free[9], free[10], free[20], free[-1]) == (1.0, 1.0, 0.75, 0.5, 0.5)
 
 
 def test_a_team_that_stands_round_the_evader_leaves_a_third_of_the_circle_open():

@@ -3,8 +3,12 @@ record.
 """
 
 import json
+import math
 import sys
 
+import pytest
+
+from experiments.flying.single_thread import share_out
 from experiments.table import Page, Table, page_parser, publish, write_page
 
 
@@ -73,3 +77,11 @@ def test_cells_of_records():
     }
     row = Table(columns, [record]).lines()[-1]
     assert row == "| one | 0.250 | 2.0 (1.4) | – | – | yes | 0.5 |"
+
+
+def test_a_job_that_fails_costs_no_other(capsys):
+    done = []
+    with pytest.raises(RuntimeError, match="1 of 3"):
+        for root in share_out(math.sqrt, [(4.0,), (-1.0,), (9.0,)], 2):
+            done.append(root)
+    assert sorted(done) == [2.0, 3.0] and "(-1.0,): ValueError" in capsys.readouterr().err

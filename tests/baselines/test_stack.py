@@ -7,12 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.evaders.points import game_of_points, stack_team
 from openjax.baselines import Heuristic
 from openjax.baselines.stack import planar_bound, stack_bound
 from openjax.pursuit import Pursuit, PursuitSettings, uniform_task
 from openjax.pursuit.evaders import draw_evader
 from openjax.pursuit.evaders.behaviours import MARGIN
+from tests.learning.points import game_of_points, stack_team
 
 STEP = PursuitSettings().time_step
 EVADERS = ("field", "greedy", "greedy_near", "wall_runner", "way_points")

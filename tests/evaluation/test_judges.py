@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.evaders.points import Team, game_of_points
 from openjax.evaluation.judges.duel import Duel
 from openjax.evaluation.judges.networks import likeliest, ways
 from openjax.evaluation.judges.planner import Planner
@@ -16,6 +15,7 @@ from openjax.evaluation.judges.senses import number_of_senses, sense, to_world
 from openjax.evaluation.judges.settings import BestResponseSettings, PlannerSettings
 from openjax.evaluation.judges.tasks import draw_own_task
 from openjax.pursuit import turn_task, uniform_task
+from tests.learning.points import Team, game_of_points
 
 KEY = jax.random.key(0)
 GAME = game_of_points(max_pillars=3, episode_length=80)

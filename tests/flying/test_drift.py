@@ -5,9 +5,9 @@ in a flight.
 import numpy as np
 import pytest
 
-from experiments.flying import observable
 from openjax.flying.drift import Drift, drifting
 from openjax.flying.judge import Verdict
+from tests.flying.fault_injection import observable
 from tests.flying.test_safety import event, pursuing
 
 USUAL = observable.VEHICLES["usual drag, attitude to .2 degrees"]

@@ -7,16 +7,14 @@ import math
 
 import pytest
 
-from experiments.flying import estimates
-from experiments.flying.fault_worlds import fly
-from experiments.flying.faults import BEYOND, FALL, KINDS, finite
-from experiments.flying.simulated import well
-from experiments.flying.single_thread import share_out
 from openjax.flying.safety import step
 from openjax.flying.state import Event, Mode, Request, initial_state
 from openjax.vehicle import load_vehicle
 from openjax.virtual_crazyflie.simulated import SimulatedSwarm
 from openjax.virtual_crazyflie.vehicles import VirtualVehicles
+from tests.flying.fault_injection import estimates
+from tests.flying.fault_injection.fault_worlds import fly
+from tests.flying.fault_injection.faults import BEYOND, FALL, KINDS, finite, well
 
 
 @pytest.mark.slow
@@ -50,14 +48,6 @@ def test_a_vehicle_of_another_weight_flies_or_is_stopped_before_it_could_fall(sh
         highest = max(highest, vehicles.report.position[0, 2])
     stopped = state.modes == (Mode.STOPPED,)
     assert stopped == (share != 1.0) and (highest < FALL if stopped else highest > 0.4)
-
-
-def test_a_job_that_fails_costs_no_other(capsys):
-    done = []
-    with pytest.raises(RuntimeError, match="1 of 3"):
-        for root in share_out(math.sqrt, [(4.0,), (-1.0,), (9.0,)], 2):
-            done.append(root)
-    assert sorted(done) == [2.0, 3.0] and "(-1.0,): ValueError" in capsys.readouterr().err
 
 
 def test_what_is_infinite_is_written_as_null_and_named():

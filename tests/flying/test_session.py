@@ -10,8 +10,6 @@ import pytest
 
 pytest.importorskip("cflib", reason='the extra "fly" is not installed')
 
-from experiments.flying.processes import Flown
-from experiments.flying.virtual import VirtualProcess
 from openjax.commands.fly import Arguments, Prepared
 from openjax.flying.controller import nominal_airframe
 from openjax.flying.game import Play
@@ -19,6 +17,8 @@ from openjax.flying.loop import flight_state
 from openjax.flying.session import SessionSettings
 from openjax.flying.state import SafetySettings
 from openjax.vehicle.vehicle_file import load_vehicle_file
+from tests.flying.fault_injection.processes import Flown
+from tests.flying.fault_injection.virtual import VirtualProcess
 
 pytestmark = [
     pytest.mark.slow,

@@ -14,12 +14,12 @@ import json
 import jax
 import jax.numpy as jnp
 
-from experiments.evaders.points import Team, game_of_points, stack_team
 from openjax.baselines.surroundings import length
 from openjax.evaluation.judges.best_response import BestResponse, fly_learners
 from openjax.evaluation.judges.duel import Duel
 from openjax.evaluation.judges.settings import BestResponseSettings
 from openjax.pursuit import Pursuit, PursuitSettings, Task, uniform_task
+from tests.learning.points import Team, game_of_points, stack_team
 
 STARTS = 128
 SIZES = {

@@ -270,3 +270,20 @@ def finite(row: dict) -> dict:
     """
     odd = {name: str(x) for name, x in row.items() if isinstance(x, float) and not math.isfinite(x)}
     return {**row, **dict.fromkeys(odd), "not_finite": odd} if odd else row
+
+
+SLOW = (
+    "packets lost",
+    "poses out of order",
+    "camera scaled",
+    "camera late",
+    "camera drifts",
+    FOLLOWED,
+)
+"""These may take effect long after they begin."""
+
+
+def well(row: dict) -> bool:
+    """Whether a flight ended as it must."""
+    in_time = row["seconds"] is None or row["seconds"] <= ENDING or row["kind"] in SLOW
+    return row["out"] <= MARGIN and not (row["fell"] or row["hard"] or row["armed"]) and in_time

@@ -10,8 +10,8 @@ import time
 
 import numpy as np
 
-from experiments.flying.faults import Fault, PoseDamage
 from openjax.flying.controller import Pose
+from tests.flying.fault_injection.faults import Fault, PoseDamage
 
 _POSE = 14  # time, position, velocity, quaternion, body rates
 EVERY = 0.01

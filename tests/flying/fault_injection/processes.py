@@ -22,8 +22,8 @@ import traceback
 from dataclasses import replace
 from pathlib import Path
 
-from experiments.flying.faults import ENDING, MARGIN, outcome
-from experiments.flying.process_faults import (
+from tests.flying.fault_injection.faults import ENDING, MARGIN, outcome
+from tests.flying.fault_injection.process_faults import (
     KEYS,
     ROLES,
     SIGNALS,
@@ -32,7 +32,7 @@ from experiments.flying.process_faults import (
     ends_flight,
     fault_of,
 )
-from experiments.flying.remote_game import RemoteGame, feed_of, play
+from tests.flying.fault_injection.remote_game import RemoteGame, feed_of, play
 
 LONGEST = 25.0
 """A flight is given up this long (s) after its fault."""

@@ -7,7 +7,7 @@ import time
 
 import numpy as np
 
-from experiments.flying.faults import Fault, PoseDamage
+from tests.flying.fault_injection.faults import Fault, PoseDamage
 
 
 def feed_of(fault: Fault, truth):

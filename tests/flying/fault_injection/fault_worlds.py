@@ -18,7 +18,6 @@ import jax
 import numpy as np
 
 import openjax
-from experiments.flying.faults import ASLEEP, ENDING, Fault, PoseDamage, draw_fault, outcome
 from openjax.flying.board import SILENCE
 from openjax.flying.controller import Pose
 from openjax.flying.estimation import see
@@ -33,6 +32,14 @@ from openjax.vehicle import load_vehicle
 from openjax.virtual_crazyflie.firmware import LEVEL_AFTER
 from openjax.virtual_crazyflie.simulated import SimulatedSwarm, Uplink
 from openjax.virtual_crazyflie.vehicles import VirtualVehicles
+from tests.flying.fault_injection.faults import (
+    ASLEEP,
+    ENDING,
+    Fault,
+    PoseDamage,
+    draw_fault,
+    outcome,
+)
 
 LATEST = 4.0
 """Nothing begins to go wrong after (s)."""
@@ -48,7 +55,7 @@ over.
 """
 PILOTS = ("loop stopped", "links stopped", "loop and links stopped", "loop and guard stopped")
 """Somebody else flies after a tenth of a second. (Which one takes over is for real
-processes: `experiments.flying.real_time`.)
+processes: `processes` beside this file.)
 """
 
 

@@ -5,7 +5,7 @@ import random
 from dataclasses import replace
 from itertools import combinations
 
-from experiments.flying.faults import BEYOND, CAMERA, GONE, RADIO, WILD, Fault, draw_fault
+from tests.flying.fault_injection.faults import BEYOND, CAMERA, GONE, RADIO, WILD, Fault, draw_fault
 
 ROLES = ("loop", "links", "guard")
 SIGNALS = ("KILL", "STOP", "TERM", "HUP", "INT", "TSTP", "QUIT")

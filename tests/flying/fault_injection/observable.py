@@ -1,20 +1,16 @@
-"""What teammates tell of a gentle drift of a vehicle's own estimate: `python -m
-experiments.flying.observable`.
+"""Accelerations of teams, in which a vehicle's estimate drifts gently, drawn at once.
 
-Position and velocity of an estimate drift together. A steady drift shows nowhere:
-thrust, attitude and gyroscope tell accelerations and turns, not speeds. While it sets
-in, the estimate accelerates as thrust doesn't explain. So does the air's drag, which
-nobody told the vehicle, and an attitude that is off by a tenth of a degree. Level
-accelerations of teams are simulated with these, and judged as `openjax.flying.drift`
-judges them, all flights at once.
+Position and velocity of an estimate drift together. A steady drift shows nowhere: thrust, attitude
+and gyroscope tell accelerations and turns, not speeds. While it sets in, the estimate accelerates as
+thrust doesn't explain. So do the air's drag, which nobody told the vehicle, and an attitude that is
+off by a tenth of a degree.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from experiments.table import Page, Table, page_parser, publish
-from openjax.flying.drift import FLOOR, FORGETTING, LEARNT, RATIO, SPREAD, WINDOW
+from openjax.flying.drift import FORGETTING, SPREAD, WINDOW
 
 PERIOD = 0.01
 SECONDS = 30.0
@@ -23,8 +19,6 @@ SPEED = 0.7
 """m/s, of a hunting vehicle (rms)."""
 BEGIN = (5.0, 12.0)
 """s, when a drift begins, after the hover."""
-SOON = 6.0
-"""A drift that is told later (s) isn't counted as told."""
 VEHICLES = {
     "as the simulator: no drag, still air, exact attitude": (0.0, 0.0, 0.0, 0.01),
     "little drag, attitude to .1 degree": (0.1, 0.05, 0.1, 0.02),
@@ -34,8 +28,6 @@ VEHICLES = {
 """Drag (1/s), air that moves (m/s), error of the attitude (degrees) and of the velocity
 (m/s, both rms). The sample Crazyflie's drag is .4/s.
 """
-DRIFTS = {".1 m/s within 2 s": (0.1, 2.0), ".3 m/s within 2 s": (0.3, 2.0)}
-DRIFTS |= {".5 m/s within 2 s": (0.5, 2.0), ".5 m/s within 4 s": (0.5, 4.0)}
 FLIGHTS = 300
 
 
@@ -101,48 +93,3 @@ def summed(rest: np.ndarray, velocity: np.ndarray) -> np.ndarray:
             learnt = np.linalg.solve(normal, moment[..., None])[..., 0]
         out[k] = np.linalg.norm(total, axis=-1)
     return out
-
-
-def told(sums: np.ndarray) -> np.ndarray:
-    """(FLIGHTS, TEAM) s, when each vehicle is told to drift; infinite for never."""
-    sums = sums[round(LEARNT / PERIOD) :]
-    seconds = PERIOD * np.arange(1, len(sums) + 1)[:, None, None]
-    usual = np.sqrt(PERIOD * np.cumsum(sums**2, 0) / seconds)
-    usual[seconds[:, 0, 0] <= 1.0] = np.inf
-    others = np.stack([np.delete(usual, i, 2).max(2) for i in range(TEAM)], 2)
-    beyond = sums > np.maximum(FLOOR, RATIO * others)
-    return np.where(beyond.any(0), LEARNT + PERIOD * beyond.argmax(0), np.inf)
-
-
-def study(options) -> dict:
-    """For each vehicle how many flights without a drift would end, and which drifts are
-    told.
-    """
-    rows = []
-    for name, vehicle in VEHICLES.items():
-        rng = np.random.default_rng(options.seed)
-        times = (options.hover, tuple(options.begin))
-        without = told(summed(*unexplained(rng, vehicle, (0.0, 1.0), *times)[:2]))
-        row = {"vehicle": name, "ended": float(np.isfinite(without).any(1).mean())}
-        for drift, size in DRIFTS.items():
-            rest, velocity, begin = unexplained(rng, vehicle, size, *times)
-            delays = told(summed(rest, velocity))[:, 0] - begin
-            row[drift] = float(((delays > 0.0) & (delays < SOON)).mean())
-        rows.append(row)
-    return {"flights": FLIGHTS, "rows": rows}
-
-
-def page(results) -> Page:
-    """The study's table."""
-    prose = "Share of drifts that are told within six seconds, and of flights that end for none."
-    columns = {"vehicle": "vehicle", "ended without a drift": "ended:.3f"}
-    columns |= {f"told: {drift}": (lambda row, d=drift: f"{row[d]:.2f}") for drift in DRIFTS}
-    return Page("What of a gentle drift can be told", prose, Table(columns, results["rows"]))
-
-
-if __name__ == "__main__":
-    parser = page_parser(__doc__, "flying_drifts")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--hover", type=float, default=0.0, help="s, before they hunt")
-    parser.add_argument("--begin", type=float, nargs=2, default=BEGIN, help="s, of a drift")
-    publish(parser.parse_args(), study, page)

@@ -1,27 +1,17 @@
-"""Estimates that go wrong so gently that no single pose shows it: `python -m
-experiments.flying.estimates [--each 6]`.
+"""Estimates that go wrong so gently that no single pose shows it.
 
-Three vehicles hunt in simulated time, as in `experiments.flying.simulated`, by their
-own estimates alone or, where a camera goes wrong, by its poses, which the estimators on
-board follow. Kinds that nothing on board can tell are flown, too, and counted apart.
+Three vehicles hunt in simulated time, as in `fault_worlds`, by their own estimates alone or, where a
+camera goes wrong, by its poses, which the estimators on board follow.
 """
 
 from __future__ import annotations
 
 import math
 import random
-import time
-from dataclasses import dataclass
-from pathlib import Path
 
-import tyro
-
-from experiments.flying.fault_worlds import LATEST, SECONDS, Worlds
-from experiments.flying.faults import ENDING, MARGIN, Fault, finite
-from experiments.flying.single_thread import use_single_thread
-from experiments.table import RESULTS, Page, Table, facts, write_page
-from openjax.files import read_json, write_json
 from openjax.flying.controller import Pose
+from tests.flying.fault_injection.fault_worlds import LATEST, SECONDS, Worlds
+from tests.flying.fault_injection.faults import ENDING, MARGIN, Fault
 
 ALONE = 4.0
 CAPTURED = 1.0
@@ -131,23 +121,6 @@ DAMAGES = {
     ),
 }
 """(damage, true pose, seconds since it began) -> what is received, by kind."""
-GROUPS = {
-    "position or height drifts": ("position drifts", "height drifts", "position wanders"),
-    "ways are too long": ("ways are too long",),
-    "velocity is held or zero": ("velocity is held", "velocity is zero"),
-    "all freezes": tuple(kind for kind in DAMAGES if kind.startswith("frozen")),
-    "all blends into a held pose": ("blends into a held pose",),
-    "a camera does": ("camera blends into a held pose",),
-    "position and velocity drift at once": (
-        "drifts with its velocity",
-        "height drifts with its velocity",
-    ),
-    "they drift gently": (
-        "drifts gently with its velocity",
-        "height drifts gently with its velocity",
-    ),
-}
-"""The rows of the page."""
 UNTOLD = tuple(kind for kind in DAMAGES if "with its velocity" in kind)
 """What nothing on board can tell where it is small, or sets in gently along the ground;
 teammates tell some of that, and the accelerometer some of the height.
@@ -155,27 +128,10 @@ teammates tell some of that, and the accelerometer some of the height.
 TOLD = tuple(kind for kind in DAMAGES if kind not in UNTOLD)
 
 
-@dataclass(frozen=True)
-class Arguments:
-    """Fly estimates that go wrong."""
-
-    each: int = 6
-    """Flights of each kind and layout."""
-    policy: str = "flight"
-    layouts: tuple[str, ...] = ("wall", "random", "passage")
-    seed: int = 0
-    kinds: tuple[str, ...] = tuple(DAMAGES)
-    later: float = 0.0
-    """By so much (s) each begins later: what is usual in the air has to be learnt
-    first.
-    """
-    out: Path = RESULTS / "flying_estimates.json"
-    commit: str | None = None
-    """Where git can't tell it."""
-
-
 def draw(kind: str, seed: int, later: float = 0.0) -> Fault:
-    """A fault of a kind. `later`: see `Arguments`."""
+    """A fault of a kind that begins `later` (s) than usual: until then a vehicle learns what
+    is usual in the air.
+    """
     rng = random.Random(f"{kind} {seed}")
     return Fault(
         kind,
@@ -199,85 +155,3 @@ def fly(kinds, seeds, layout: str, policy: str, later: float = 0.0) -> list[dict
 def well(row: dict) -> bool:
     """Whether a flight ended as it must; a small drift may take its time."""
     return row["out"] <= MARGIN and not (row["fell"] or row["hard"] or row["armed"])
-
-
-def main() -> None:
-    arguments = tyro.cli(Arguments)
-    use_single_thread()
-    begin = time.time()
-    records = []
-    for k, layout in enumerate(arguments.layouts):
-        first = arguments.seed + k * arguments.each
-        seeds = range(first, first + arguments.each)
-        records += fly(arguments.kinds, seeds, layout, arguments.policy, arguments.later)
-        write_json(
-            arguments.out,
-            {
-                **facts(arguments.commit),
-                "policy": arguments.policy,
-                "later": arguments.later,
-                "seconds": round(time.time() - begin),
-                "summary": [_summary(kind, records) for kind in arguments.kinds],
-                "not_well": [finite(row) for row in records if not well(row)],
-            },
-        )
-    write_page(arguments.out, page, read_json(arguments.out))
-
-
-def _summary(kind, records) -> dict:
-    mine = [row for row in records if row["kind"] == kind]
-    return {
-        "kind": kind,
-        "flights": len(mine),
-        "well": sum(map(well, mine)),
-        "landed": sum(row["ended"] for row in mine),
-        "farthest": max(row["out"] for row in mine),
-        "fell": sum(row["fell"] for row in mine),
-        "armed": sum(row["armed"] for row in mine),
-    }
-
-
-def page(results) -> Page:
-    """The page of the results."""
-    prose = (
-        "Does a flight end well when a vehicle's own estimate, or a camera, goes wrong so gently "
-        "that no single pose shows it? Flights that end well stay within 10 cm of the arena, and "
-        "nothing falls. The last four kinds move position and velocity together: where they are "
-        "small or set in gently, hardly anything tells them, and only the time limit ends the "
-        "flight (`docs/flying.md`)."
-    )
-    columns = {
-        "what goes wrong": "kind",
-        "flights": "flights:d",
-        "well": "well:d",
-        "landed by themselves": "landed:d",
-        "beyond the arena by (m)": "farthest:.2f",
-        "fell": "fell:d",
-        "on at the end": "armed:d",
-    }
-    rows = {row["kind"]: row for row in results["summary"]}
-    grouped = [
-        _together(name, [rows[kind] for kind in kinds])
-        for name, kinds in GROUPS.items()
-        if set(kinds) <= set(rows)
-    ]
-    if later := results.get("after_5_s"):
-        rows = {row["kind"]: row for row in later["summary"]}
-        for name, high in (
-            ("both, level, after 5 s in the air", False),
-            ("... of the height", True),
-        ):
-            kinds = [kind for kind in UNTOLD if kind.startswith("height") is high]
-            grouped.append(_together(name, [rows[kind] for kind in kinds]))
-    return Page("Estimates that go wrong gently", prose, Table(columns, grouped))
-
-
-def _together(name, rows) -> dict:
-    """One row of several."""
-    names = ("flights", "well", "landed", "fell", "armed")
-    numbers = {column: sum(row[column] for row in rows) for column in names}
-    return {"kind": name, "farthest": max(row["farthest"] for row in rows), **numbers}
-
-
-if __name__ == "__main__":
-    main()
