@@ -36,7 +36,8 @@ def test_every_command_and_target_of_the_readme_exists():
     for target in set(re.findall(r"(?:^|`)make ([a-z]+)\b", README, re.MULTILINE)):
         assert re.search(rf"^{target}:", makefile, re.MULTILINE), target
     pages = "".join(page.read_text(encoding="utf-8") for page in PAGES)
-    commands = set(re.findall(r"(?:^ *|`)openjax ([a-z]\w+)", README + pages, re.MULTILINE))
+    code = re.findall(r"^```.*?^```|`[^`\n]+`", README + pages, re.MULTILINE | re.DOTALL)
+    commands = set(re.findall(r"(?:^ *|`)openjax ([a-z]\w+)", "\n".join(code), re.MULTILINE))
     assert commands == set(COMMANDS), commands ^ set(COMMANDS)
 
 
@@ -58,7 +59,7 @@ def test_modules_that_the_pages_run_are_there():
 
 
 def test_readme_and_pages_stay_short():
-    """README 1,000 words, all pages of the documentation 19,700; a word has a letter,
+    """README 1,000 words, all pages of the documentation 20,000; a word has a letter,
     and what the API page lists of the code is no prose.
     """
 
@@ -67,7 +68,7 @@ def test_readme_and_pages_stay_short():
         return len(re.findall(r"\S*[^\W\d_]\S*", text))
 
     assert words(README) <= 1000
-    assert sum(words(page.read_text(encoding="utf-8")) for page in PAGES) <= 19_700
+    assert sum(words(page.read_text(encoding="utf-8")) for page in PAGES) <= 20_000
 
 
 def test_links_lead_somewhere():

@@ -65,7 +65,7 @@ def planar_bound(settings: PursuitSettings) -> float:
         sqrt(1 - 1 / v^2) - arccos(1 / v) / v < s / R.
 
     It isn't proved that neither side does better; the game of both points solved on
-    grids says the same within their errors (`experiments.evaders.planar`).
+    grids says the same within their errors (docs/what_can_be_caught.md).
     """
     reach = column_reach(settings) / settings.arena_radius
     if not reach:

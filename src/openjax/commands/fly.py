@@ -25,7 +25,7 @@ from openjax.store import default_policy
 PROGRAM = "openjax fly"
 DRIFT = 0.1
 """m/s, of an own estimate, that nothing on board tells
-(`experiments.flying.observable`).
+(experiments/results/flying.md).
 """
 
 

@@ -29,7 +29,7 @@ LEARNT = 30.0
 """... and is learnt with this time constant (s) at last."""
 BOUND = 0.16
 """Of the smoothed sum (m/s). In 24 public flights of a Crazyflie the largest was .14
-(`experiments.flying.climbs`)."""
+(experiments/results/flying.md)."""
 
 
 class Climb(NamedTuple):

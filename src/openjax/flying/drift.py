@@ -39,7 +39,7 @@ FLOOR = 0.15
 """
 RATIO = 4.0
 """Nor are sums that aren't so many times the teammates' root mean square: of flights of
-30 s without a drift, at most one in fifty was ended (`experiments.flying.observable`).
+30 s without a drift, at most one in fifty was ended (experiments/results/flying.md).
 """
 
 
