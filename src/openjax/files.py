@@ -4,6 +4,7 @@ all.
 
 import contextlib
 import dataclasses
+import errno
 import hashlib
 import json
 import os
@@ -245,6 +246,28 @@ def check_output_folder(path: str | Path, option: str) -> None:
             raise UserError(f"{option} {path}: {which} is a file; a folder is needed")
         with tempfile.TemporaryFile(dir=parent):
             pass
+
+
+def check_room(path: str | Path, size: int, option: str) -> None:
+    """Whether so many bytes can be written in a folder that is there or can be made;
+    leaves nothing. Raises UserError.
+    """
+    path = Path(path).absolute()
+    parent = next(folder for folder in (path, *path.parents) if folder.is_dir())
+    free = shutil.disk_usage(parent).free
+    if free < size:
+        raise UserError(
+            f"{option} {path}: {free / 1e6:.0f} MB are free there, {size / 1e6:.0f} MB are needed"
+        )
+    if not hasattr(os, "posix_fallocate"):
+        return
+    # taken and given back: free space doesn't tell of a user's limits
+    with _write_errors(option, path), tempfile.TemporaryFile(dir=parent) as file:
+        try:
+            os.posix_fallocate(file.fileno(), 0, size)
+        except OSError as error:
+            if error.errno in (errno.ENOSPC, errno.EFBIG, errno.EDQUOT):
+                raise OSError(error.errno, f"no room for {size / 1e6:.0f} MB") from None
 
 
 def check_new_folder(path: str | Path, option: str) -> None:

@@ -263,6 +263,10 @@ def test_a_copy_with_another_clock_and_layout_is_a_duplicate(case_folder, sample
     ("prepare", "reason"),
     [
         (lambda f: [p.unlink() for p in f.glob("*.gz")], "holds no flight log"),
+        (
+            lambda f: [p.rename(f / "flight.json") for p in f.glob("*.gz")],
+            "no game was flown; flight.json says why",
+        ),
         (lambda f: (f / "vehicle.toml").unlink(), "an empty one"),
         (
             lambda f: (f / "vehicle.toml").write_text("[vehicle]\nmass = 0.321\n"),

@@ -23,11 +23,12 @@ from openjax.flying.board import Board, Role
 from openjax.flying.controller import nominal_airframe
 from openjax.flying.crtp import Supervisor
 from openjax.flying.estimation import see
-from openjax.flying.flight_files import write_case
+from openjax.flying.flight_record import FlightRecord
 from openjax.flying.links import Links
 from openjax.flying.loop import Flight, Plan, flight_state
 from openjax.flying.motion_capture import MotionCaptured
 from openjax.flying.raw_links import RawLinks
+from openjax.flying.recorder import NewCase, Recorder
 from openjax.flying.set_point import (
     ANGLES,
     LEAST_THRUST,
@@ -40,7 +41,7 @@ from openjax.flying.set_point import (
 from openjax.flying.state import Mode, SafetySettings, initial_state
 from openjax.flying.takeover import fly_down
 from openjax.vehicle import load_vehicle
-from openjax.vehicle.vehicle_file import load_vehicle_file
+from openjax.vehicle.vehicle_file import load_vehicle_file, save_vehicle_file
 from openjax.virtual_crazyflie.firmware import VirtualFirmware
 from openjax.virtual_crazyflie.link import LinkFaults
 from openjax.virtual_crazyflie.process import VirtualCrazyflies
@@ -91,10 +92,10 @@ def uris():
 
 
 @contextmanager
-def connected(uris, body_logs, kind=Links):
+def connected(uris, body_logs, kind=Links, log=None):
     """Links that know all poses."""
     links = kind(uris, body_logs, silence=1.0)  # a busy machine
-    links.connect()
+    links.connect(log=log)
     try:
         while any(s.own is None for s in links.observe()):
             links.wait(time.perf_counter() + 0.02)
@@ -145,37 +146,41 @@ class Hovering:
         )  # fmt: skip
 
 
-def flight_of(links, seconds):
+def flight_of(links, seconds, **more):
     game = Hovering(links)
-    return Flight(links, game, flight_state(game, 3, PATIENT), Plan(episode_seconds=seconds))
+    state = flight_state(game, 3, PATIENT)
+    return Flight(links, game, state, Plan(episode_seconds=seconds), **more)
 
 
 def fly_hovering(uris, folder, body_logs, seconds):
-    """A short flight: the flight, what was recorded of the first vehicle, and the case
-    as the diagnosis reads it.
-    """
+    """A short flight: the flight, and the case as the diagnosis reads it."""
     from openjax.flights.case import load_case
 
-    with connected(uris, body_logs) as links:
+    save_vehicle_file(folder / "vehicle.toml", load_vehicle_file())
+    files = {path.name: path.read_bytes() for path in folder.iterdir()}
+    recorder = Recorder(NewCase(folder / "case", files, {}), 3)
+    record = FlightRecord(3, recorder.tell_tick, recorder.tell_game)
+    with connected(uris, body_logs, log=recorder.links_pipe) as links:
+        recorder.start()
         links.arm()
-        links.record()
-        flight = flight_of(links, seconds)
+        recorder.begin("")
+        flight = flight_of(links, seconds, record=record)
         flight.run()
         # the accelerometer comes up with the poses; down again it feels its weight
         for sample in links.observe():
             assert abs(sample.force[2] - 9.81) < 1.0
-        samples = links.samples()
-    write_case(folder, samples, flight.record, load_vehicle_file(), {})
-    return flight, samples[0], load_case(folder)
+        outcome = recorder.end(["over"])
+    recorder.close()
+    assert outcome.folder == folder / "case" and not outcome.complaint
+    return flight, load_case(outcome.folder)
 
 
 @pytest.mark.slow
 @pytest.mark.real_time
 def test_a_flight_from_the_floor_to_its_log(uris, tmp_path):
-    flight, samples, case = fly_hovering(uris, tmp_path, body_logs=1, seconds=2.3)
+    flight, case = fly_hovering(uris, tmp_path, body_logs=1, seconds=2.3)
     assert flight.state.all_in(Mode.LANDED)
-    assert samples.poses[:, 5].max() > 0.3
-    assert flight.record.episodes[0]["capture_step"] == 11
+    assert flight.record.games[0].capture_step == 11
     timing = flight.record.timing()
     assert timing["ticks"] > 200
     assert not any(d.contradiction for d in flight.state.drones)
@@ -198,7 +203,7 @@ def test_the_log_tells_the_links_latency_and_loss(tmp_path, latency, loss):
     them is at its limit.
     """
     with virtual("--latency_ms", str(latency), "--loss", str(loss)) as uris:
-        _, _, case = fly_hovering(uris, tmp_path, body_logs=5, seconds=4.0)
+        _, case = fly_hovering(uris, tmp_path, body_logs=5, seconds=4.0)
     delays = []
     sent = 0
     arrived = 0

@@ -4,6 +4,7 @@ true vehicles come down and are disarmed.
 
 import sys
 import threading
+import time
 from types import SimpleNamespace
 
 import pytest
@@ -11,6 +12,8 @@ import pytest
 pytest.importorskip("cflib", reason='the extra "fly" is not installed')
 
 from openjax.commands.fly import Arguments, Prepared
+from openjax.files import read_json
+from openjax.flights.csv_table import read_csv
 from openjax.flying.controller import nominal_airframe
 from openjax.flying.game import Play
 from openjax.flying.loop import flight_state
@@ -94,15 +97,30 @@ def test_whatever_happens_all_are_down_inside_and_disarmed(flying, kind):
     assert kind != "Ctrl-C three times" or "pose lost" not in record["said"], "it landed blindly"
 
 
-def test_a_closed_terminal_doesnt_cost_the_log(flying, tmp_path):
-    record = flying(7, "terminal closed", tmp_path / "log")
+@pytest.mark.parametrize(
+    "kind",
+    ["terminal closed", "KILL loop", "KILL links", "TERM loop", "KILL loop+links", "STOP loop"],
+)
+def test_a_flight_that_goes_wrong_leaves_a_log(flying, tmp_path, kind):
+    """Of all that was flown, in a form that the diagnosis reads."""
+    log = tmp_path / "log"
+    record = flying(7, kind, log)
     assert record["well"], str(record)
-    assert (tmp_path / "log" / "flight.json").exists()
+    deadline = time.monotonic() + 30.0
+    while "reasons" not in read_json(log / "flight.json") and time.monotonic() < deadline:
+        time.sleep(0.1)
+    (game,) = read_json(log / "flight.json")["games"]
+    times = read_csv(log / "game_00.csv.gz").columns["t"]
+    assert times[-1] > 0.01 * game["steps"] - 0.05
+    assert (log / "vehicle.toml").exists()
 
 
-def test_a_log_that_cant_be_written_is_a_line(flying, tmp_path):
-    """Its folder was there, or could be made, before the flight, and not after it."""
+def test_a_log_that_cant_be_written_is_somewhere_else(flying, tmp_path, monkeypatch):
+    """Its folder was there before the flight, and is a file during it."""
+    (tmp_path / "second").mkdir()
+    monkeypatch.setenv("TMPDIR", str(tmp_path / "second"))
     threading.Timer(1.0, (tmp_path / "folder").touch).start()
     record = flying(7, "key l", tmp_path / "folder" / "log")
     assert record["well"] and record["status"] == 2, str(record)
-    assert "error: no log: " in record["said"] and "Traceback" not in record["said"]
+    assert "Traceback" not in record["said"] and "the log is in" in record["said"]
+    assert list((tmp_path / "second").glob("*/game_00.csv.gz"))

@@ -9,14 +9,15 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
-from openjax.command_line import one_line, output_console, parse
+from openjax.command_line import output_console, parse
 from openjax.errors import UserError
-from openjax.files import check_new_folder, replacing
+from openjax.files import check_new_folder, check_room
 from openjax.flying.endpoints import UDP_PORT, endpoints_of, sole_command
 from openjax.flying.state import SafetySettings
 from openjax.ranges import Interval
@@ -124,29 +125,40 @@ def _fly(arguments: Arguments, preparation: Prepared | None) -> None:
     for line in setup.remarks:
         console.print(line, soft_wrap=True)
     console.print(f"connecting to {', '.join(setup.session.uris)} ...")
-    with Session(setup.session, setup.state) as session:
+    with Session(setup.session, setup.state, _case(arguments, setup)) as session:
         session.check()
         plan = Plan(arguments.episodes, arguments.episode_seconds or math.inf)
         flight = Flight(
-            session.links, setup.game, setup.state, plan, session.requests, session.watch
+            session.links,
+            setup.game,
+            setup.state,
+            plan,
+            session.requests,
+            session.watch,
+            session.record,
         )
         console.print("flying: space or q stops all motors; l, Ctrl-C or Ctrl-Z land; h waits")
-        samples, complaint = session.fly(flight)
-    # before a word is said: the terminal may be gone
-    if arguments.out is not None and samples:
-        try:
-            _write(arguments.out, setup, flight, samples, session.scheduler)
-        except OSError as error:
-            complaint = "; ".join(filter(None, (complaint, f"no log: {one_line(error)}")))
+        outcome = session.fly(flight)
     _show(console, flight, arguments.plan is not None)
     if session.scheduler != "real time":
         console.print(
             "no real-time scheduler: on a busy machine deadlines are missed (docs/flying.md)"
         )
-    if complaint:
-        raise UserError(complaint)
-    if arguments.out is not None and samples:
-        console.print(f"{arguments.out}: next, openjax diagnose {arguments.out}")
+    if outcome.folder is not None:
+        console.print(f"{outcome.folder}: {_next(outcome)}", soft_wrap=True)
+    if outcome.complaint:
+        raise UserError(outcome.complaint)
+
+
+def _next(outcome) -> str:
+    """What can be done with a flight's log, in words."""
+    from openjax.flights.airborne import SHORTEST
+
+    if outcome.longest >= SHORTEST:
+        return f"next, openjax diagnose {outcome.folder}"
+    if outcome.longest:
+        return f"{outcome.longest:.1f} s of a game; a diagnosis needs {SHORTEST:g} s of one flight"
+    return "no game was flown; flight.json says why the flight ended"
 
 
 class Prepared(NamedTuple):
@@ -158,6 +170,7 @@ class Prepared(NamedTuple):
     vehicle: object
     about: dict
     remarks: tuple[str, ...] = ()
+    seconds: float = math.inf  # that it may take in the air
 
 
 def prepare(arguments: Arguments) -> Prepared:
@@ -193,11 +206,12 @@ def prepare(arguments: Arguments) -> Prepared:
     game.airframe = airframe_of(vehicle.vehicle)
     uris = uris_of(arguments)
     state = flight_state(game, len(uris), arguments.safety)
-    remarks = _remarks(arguments, game, vehicle)
+    seconds = _longest_flight(arguments, settings)
+    remarks = _remarks(arguments, settings, vehicle, seconds)
     if line:
         remarks = (line, *remarks)
     about = {"policy": policy.source, "scenario": scenario.name, "uris": uris}
-    return Prepared(game, state, session, vehicle, about, remarks)
+    return Prepared(game, state, session, vehicle, about, remarks, seconds)
 
 
 def _prepare_plan(arguments: Arguments) -> Prepared:
@@ -215,8 +229,9 @@ def _prepare_plan(arguments: Arguments) -> Prepared:
     state = flight_state(game, 1, arguments.safety)
     source = f"plan {arguments.plan}"
     about = {"policy": source, "scenario": source, "uris": arguments.uri}
-    remarks = _time_remark(arguments, len(plan) * PERIOD)
-    return Prepared(game, state, _session(arguments), vehicle, about, remarks)
+    seconds = len(plan) * PERIOD
+    remarks = _time_remark(arguments, seconds)
+    return Prepared(game, state, _session(arguments), vehicle, about, remarks, seconds)
 
 
 def _session(arguments: Arguments):
@@ -235,13 +250,15 @@ def _session(arguments: Arguments):
     )
 
 
-def _remarks(arguments: Arguments, game, vehicle) -> tuple[str, ...]:
+def _longest_flight(arguments: Arguments, settings) -> float:
+    """s that the games of this flight take at most."""
+    length = settings.episode_length * settings.time_step
+    return arguments.episodes * min(length, arguments.episode_seconds or math.inf)
+
+
+def _remarks(arguments: Arguments, settings, vehicle, seconds: float) -> tuple[str, ...]:
     """What somebody should know before the vehicles rise."""
-    settings = game.settings
-    length = min(
-        settings.episode_length * settings.time_step, arguments.episode_seconds or math.inf
-    )
-    remarks = _time_remark(arguments, arguments.episodes * length)
+    remarks = _time_remark(arguments, seconds)
     if vehicle.airframe == settings.airframe:
         return remarks
     other = f"the policy was trained for {settings.airframe}; what flies is {vehicle.airframe}"
@@ -269,24 +286,29 @@ def _time_remark(arguments: Arguments, seconds: float) -> tuple[str, ...]:
     )
 
 
-def _write(out, preparation, flight, samples, scheduler):
-    """Write the case."""
-    from openjax.flying.flight_files import write_case
+def _case(arguments: Arguments, setup: Prepared):
+    """The case to be written, if one is to be; a flight for which there is no room
+    raises UserError.
+    """
+    from openjax.flying.flight_files import bytes_needed
+    from openjax.flying.recorder import NewCase
+    from openjax.vehicle.vehicle_file import save_vehicle_file
 
-    policy = preparation.about["policy"]
+    if arguments.out is None:
+        return None
+    alone = math.inf if arguments.motion_capture else arguments.safety.alone_time
+    needed = bytes_needed(len(setup.state.drones), min(setup.seconds, alone))
+    check_room(arguments.out, needed, "--out")
+    policy = setup.about["policy"]
     vehicle_file = dataclasses.replace(
-        preparation.vehicle,
+        setup.vehicle,
         path=None,
         log={"source": f"openjax.fly, policy {policy}", "floor_z": 0.0},
     )
-    about = {
-        **preparation.about,
-        "scheduler": scheduler,
-        "reasons": [drone.reason for drone in flight.state.drones],
-    }
-    with replacing(out) as folder:
-        folder.mkdir()
-        write_case(folder, samples, flight.record, vehicle_file, about)
+    with tempfile.TemporaryDirectory() as folder:
+        save_vehicle_file(Path(folder) / "vehicle.toml", vehicle_file)
+        files = {path.name: path.read_bytes() for path in Path(folder).iterdir()}
+    return NewCase(arguments.out, files, setup.about)
 
 
 def _check_numbers(arguments, starts, pursuers):
@@ -338,10 +360,10 @@ def _show(console, flight, is_plan):
         f"median, {age['p99']:.2f} ms p99; {timing['missed_deadlines']} missed deadlines "
         f"({timing['missed_share']:.2%})"
     )
-    for number, game in enumerate(() if is_plan else record.episodes):
-        outcome = f"caught at step {game['capture_step']}" if game["capture_step"] else "not caught"
+    for number, game in enumerate(() if is_plan else record.games):
+        outcome = f"caught at step {game.capture_step}" if game.capture_step else "not caught"
         console.print(
-            f"game {number}: {outcome}, {game['steps']} steps, {game['breaches']} with a breach"
+            f"game {number}: {outcome}, {game.steps} steps, {game.breaches} with a breach"
         )
     for i, drone in enumerate(flight.state.drones):
         if drone.reason not in ("", "asked to land"):

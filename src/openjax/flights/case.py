@@ -26,6 +26,7 @@ from openjax.flights.reading import LogError, flights_of
 from openjax.vehicle.vehicle_file import VehicleFile, load_vehicle_file
 
 NO_LOGS = ("vehicle.toml", MAPPING_FILE)
+FLIGHT_FILE = "flight.json"  # beside the logs of openjax fly
 SHOWN = 3  # files that are named where none is a log
 
 
@@ -104,6 +105,8 @@ def _not_flown(vehicle_file: VehicleFile, logs_read) -> list[Issue]:
 
 def _held_instead(path: Path) -> str:
     """What a folder without a log holds, in words, and what a log is."""
+    if (path / FLIGHT_FILE).exists():
+        return f": openjax fly wrote it, and no game was flown; {FLIGHT_FILE} says why"
     others = sorted(file.name for file in path.iterdir() if file.name not in NO_LOGS)
     formats = f"known are {', '.join(importer.name for importer in importers())}"
     listing = ", ".join(others[:SHOWN]) + f" and {len(others) - SHOWN} more" * (len(others) > SHOWN)

@@ -5,7 +5,7 @@ one.
 import gzip
 import math
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -124,8 +124,14 @@ def write_csv(path: str | Path, table: LogTable, decimals: dict[str, int] | None
     in it: same data, same bytes). `decimals` per column; 6 where it isn't named. A NaN
     becomes an empty cell.
     """
-    decimals = decimals or {}
     names = [n for n in LOG_COLUMNS if n in table.columns or n == "vehicle"]
+    data = f"{','.join(names)}\n{csv_rows(table, names, decimals or {})}".encode()
+    path = Path(path)
+    path.write_bytes(gzip.compress(data, 6, mtime=0) if path.suffix == ".gz" else data)
+
+
+def csv_rows(table: LogTable, names: Sequence[str], decimals: dict[str, int]) -> str:
+    """The lines of a table, without a header: the columns `names`, as `write_csv` says."""
 
     def cells(name):
         if name == "vehicle":
@@ -134,11 +140,7 @@ def write_csv(path: str | Path, table: LogTable, decimals: dict[str, int] | None
         numbers = np.asarray(table.columns[name], float).tolist()
         return ["" if math.isnan(number) else form % number for number in numbers]
 
-    rows = zip(*map(cells, names), strict=True)
-    lines = [",".join(names), *(",".join(row) for row in rows)]
-    data = ("\n".join(lines) + "\n").encode()
-    path = Path(path)
-    path.write_bytes(gzip.compress(data, 6, mtime=0) if path.suffix == ".gz" else data)
+    return "".join(",".join(row) + "\n" for row in zip(*map(cells, names), strict=True))
 
 
 def _check_header(header: Header, time: str) -> None:

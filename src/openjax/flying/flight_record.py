@@ -1,27 +1,66 @@
 """What happened at every tick of a flight, and how well it was on time."""
 
 from array import array
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
 from openjax.flying.set_point import OFF, as_sent
 from openjax.flying.ticks import PERIOD
 
+NOTED = 100
+"""The notes on a game are handed on each time it is so many steps older."""
+
+
+@dataclass
+class GameNotes:
+    """What came of one game."""
+
+    capture_step: int | None = None
+    breaches: int = 0
+    """Steps in which a pursuer came too close to something."""
+    crash: bool = False
+    steps: int = 0
+    end: str = ""
+    over_speed: int = 0
+    """Steps in which a pursuer was faster than the game allows."""
+
+    def count(self, play, is_too_fast: bool) -> None:
+        """Add a step, see `openjax.flying.game.Play`."""
+        self.steps += 1
+        if play.captured and self.capture_step is None:
+            self.capture_step = self.steps
+        self.breaches += int(play.breaches.any())
+        self.crash |= bool(play.crashed.any())
+        self.over_speed += is_too_fast
+
 
 class FlightRecord:
     """What happened at every tick of a flight with `vehicles`; as numbers, since
     objects would take two kilobytes a tick.
 
+    Args:
+      vehicles: their number.
+      tell_tick: called with the bytes of each tick's row.
+      tell_game: called with a game's number and its notes when it begins, when it ends,
+      and each second in between.
+
     Attributes:
-      episodes: notes on each game.
-      skipped: ticks that were left out because the one before took too long.
+      games: notes on each game.
     """
 
-    def __init__(self, vehicles: int):
+    def __init__(
+        self,
+        vehicles: int,
+        tell_tick: Callable[[bytes], None] = lambda row: None,
+        tell_game: Callable[[int, dict], None] = lambda number, notes: None,
+    ):
         self._rows = array("d")
         self._width = 3 + 7 * vehicles
-        self.episodes: list[dict] = []
-        self.skipped = 0
+        self._tell_tick = tell_tick
+        self._tell_game = tell_game
+        self.games: list[GameNotes] = []
 
     def keep(self, tick, arrivals, measured_times, set_points) -> None:
         """Add a row.
@@ -33,12 +72,39 @@ class FlightRecord:
           (s).
           set_points: each vehicle's.
         """
-        self._rows.extend(tick)
+        row = array("d", tick)
         for arrival, measured_at, s in zip(arrivals, measured_times, set_points, strict=True):
             # what a packet holds, not what was asked for: a diagnosis must know what
             # was sent
             s = s if s.mode == OFF else as_sent(s)
-            self._rows.extend((arrival, measured_at, s.mode, s.thrust, s.roll, s.pitch, s.yaw_rate))
+            row.extend((arrival, measured_at, s.mode, s.thrust, s.roll, s.pitch, s.yaw_rate))
+        self._rows.extend(row)
+        self._tell_tick(row.tobytes())
+
+    def add(self, rows: bytes) -> None:
+        """Add rows that another record told."""
+        self._rows.frombytes(rows)
+
+    def begin_game(self) -> int:
+        """The number of a game that begins now."""
+        self.games.append(GameNotes())
+        return self._hand_on()
+
+    def count(self, play, is_too_fast: bool) -> None:
+        """Add a step to the newest game."""
+        self.games[-1].count(play, is_too_fast)
+        if self.games[-1].steps % NOTED == 0:
+            self._hand_on()
+
+    def end_game(self, reason: str) -> None:
+        """The newest game is over."""
+        self.games[-1].end = reason
+        self._hand_on()
+
+    def _hand_on(self) -> int:
+        number = len(self.games) - 1
+        self._tell_game(number, asdict(self.games[-1]))
+        return number
 
     def table(self) -> tuple[np.ndarray, np.ndarray]:
         """(T, 3) due, sent, game; (T, N, 7) arrival, measured, mode, thrust, roll,
@@ -63,7 +129,9 @@ class FlightRecord:
         age, latency = 1e3 * (sent_at[:, None, None] - vehicles[..., :2]).max(1).T
         work = 1e3 * (sent_at - due)
         gaps = 1e3 * np.diff(sent_at)
-        misses = int((work > 1e3 * PERIOD).sum()) + self.skipped
+        # a schedule that stood still goes on with a tick that is due some periods later
+        omissions = int(np.maximum(np.rint(np.diff(due) / PERIOD) - 1.0, 0.0).sum())
+        misses = int((work > 1e3 * PERIOD).sum()) + omissions
         return {
             "ticks": len(due),
             "seconds": round(sent_at[-1] - due[0], 2),
@@ -72,7 +140,7 @@ class FlightRecord:
             "due_to_sent_ms": _percentiles(work),
             "between_set_points_ms": _percentiles(gaps) if len(gaps) else {},
             "missed_deadlines": misses,
-            "missed_share": misses / (len(due) + self.skipped),
+            "missed_share": misses / (len(due) + omissions),
         }
 
 

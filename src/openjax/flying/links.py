@@ -4,8 +4,8 @@ that `cflib`'s threads never keep the loop waiting: the loop's end of them.
 `cflib` has two Python threads per vehicle. In one interpreter with the loop they take
 it from each other, for milliseconds in one tick of a hundred. Here poses come up as
 they arrive, a record each; set-points go down, a datagram for all vehicles, which is
-answered with the time at which the last one had left. Everything else (arming,
-recording, the samples at the end) is a call over a pipe.
+answered with the time at which the last one had left. What is sampled on board goes to
+the recorder. Everything else, as arming, is a call over a pipe.
 """
 
 import contextlib
@@ -17,8 +17,6 @@ import socket
 import threading
 import time
 from collections.abc import Sequence
-
-import numpy as np
 
 from openjax.errors import UserError
 from openjax.flying.board import SILENCE, Board, Role, start_deaf
@@ -32,7 +30,6 @@ from openjax.flying.links_process import (
     Ends,
     serve,
 )
-from openjax.flying.member import Samples
 from openjax.flying.set_point import SetPoint
 from openjax.flying.state import PoseSample, State
 
@@ -86,11 +83,12 @@ class Links:
         self._lock = threading.Lock()
         self._blocks: tuple[int, ...] = ()
 
-    def connect(self, timeout: float = 20.0) -> None:
+    def connect(self, timeout: float = 20.0, log=None) -> None:
         """Open all links and start the log blocks.
 
         Args:
           timeout: for each vehicle (s).
+          log: a pipe to the recorder, if there is one.
 
         Raises:
           UserError: cflib isn't there, a vehicle doesn't answer, or lacks a variable.
@@ -106,7 +104,7 @@ class Links:
         # who is silent for longer than that isn't the pilot any more
         self._commands.settimeout(1.5 * self.board.silence)
         connection = Connection(self._uris, self._body_logs, self._watchdog, timeout)
-        ends = Ends(self._contacts, stream, commands, control)
+        ends = Ends(self._contacts, stream, commands, control, log)
         arguments = (connection, ends, self.board, os.getpid(), self._state)
         self._process = context.Process(target=serve, args=arguments, name="openjax links")
         start_deaf(self._process)
@@ -231,21 +229,6 @@ class Links:
     def disarm(self) -> bool:
         """Motors off, and disarm all; whether all said that they are."""
         return self._call("disarm")
-
-    def record(self) -> None:
-        """Keep all samples from now on."""
-        self._call("record")
-
-    def samples(self) -> list[Samples]:
-        """What was recorded of each vehicle."""
-        return [
-            Samples(
-                poses=np.frombuffer(poses).reshape(-1, 16),
-                bodies=np.frombuffer(bodies).reshape(-1, 8),
-                seen=np.zeros((0, 14)),
-            )
-            for poses, bodies in self._call("samples")
-        ]
 
     def pose_blocks(self) -> tuple[int, ...]:
         """The id of each vehicle's pose block."""

@@ -21,6 +21,7 @@ from openjax.flying.board import Board, Role, say, stand_alone
 from openjax.flying.controller import numbers_of
 from openjax.flying.guard import CHECK
 from openjax.flying.member import Member
+from openjax.flying.record_pipe import Kind, Teller
 from openjax.flying.set_point import SetPoint
 from openjax.flying.state import State
 from openjax.flying.swarm import Swarm
@@ -61,6 +62,8 @@ class Ends(NamedTuple):
     """Set-points come down."""
     control: Any
     """A pipe for all else, by calls."""
+    log: Any
+    """A pipe to the recorder, where there is one."""
 
 
 def serve(
@@ -79,6 +82,9 @@ def serve(
         target=_watch, args=(swarm, board, parent, state), daemon=True, name="watch"
     ).start()
     _pass_on(swarm, ends.contacts, ends.stream)
+    teller = Teller(ends.log)
+    for i, member in enumerate(swarm.members):
+        member.tell = functools.partial(_tell, teller, i)
     try:
         swarm.connect(connection.timeout)
     except Exception as error:  # whatever cflib raises, too
@@ -98,6 +104,11 @@ def serve(
 
 def _say_nothing(_) -> None:
     """In place of the traceback of a thread."""
+
+
+def _tell(teller: Teller, vehicle: int, kind: Kind, row) -> None:
+    """Tell the recorder what was sampled on board of a vehicle."""
+    teller.row(kind, vehicle, row)
 
 
 def _pass_on(swarm: Swarm, contacts, stream: socket.socket) -> None:

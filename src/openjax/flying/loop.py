@@ -66,6 +66,7 @@ class Flight:
       requests: asked at every tick for what the operator wants.
       watch: called after every tick with time and state; if it returns anything, all
       land for that reason.
+      record: what is kept of it.
     """
 
     def __init__(
@@ -76,6 +77,7 @@ class Flight:
         plan: Plan,
         requests: Callable[[], Request] = lambda: Request.NONE,
         watch: Callable[[float, State], str] = lambda now, state: "",
+        record: FlightRecord | None = None,
     ):
         self.vehicles = vehicles
         self.game = game
@@ -85,7 +87,7 @@ class Flight:
         self._watch = watch
         self._pursuers = game.settings.num_pursuers
         self._evader_flies = len(state.drones) > self._pursuers
-        self.record = FlightRecord(len(state.drones))
+        self.record = record or FlightRecord(len(state.drones))
         self._play = None
         self._episode = -1
         self._begun = 0.0
@@ -101,7 +103,6 @@ class Flight:
             while not self.over:
                 self.tick(perf_counter(), schedule.due)
                 due = schedule.next(perf_counter(), measured_times(self.vehicles.observe()))
-                self.record.skipped = schedule.skipped
                 await_poses(self.vehicles, due)
         finally:
             gc.enable()
@@ -156,7 +157,7 @@ class Flight:
         if state.all_in(Mode.READY) and self._episode < 0:
             if time - max(d.since for d in state.drones) < SETTLE:
                 return Request.NONE
-            if len(self.record.episodes) >= plan.episodes:
+            if len(self.record.games) >= plan.episodes:
                 return Request.LAND
             return Request.PURSUE
         underway = (Mode.GROUND, Mode.TRANSFER, Mode.READY)
@@ -176,31 +177,18 @@ class Flight:
         poses = [drone.estimate for drone in self.state.drones]
         if first:
             self._play = self.game.start(poses[: self._pursuers])
-            self._episode = len(self.record.episodes)
+            self._episode = self.record.begin_game()
             self._begun = time
-            notes = {"capture_step": None, "breaches": 0, "crash": False, "steps": 0, "end": ""}
-            self.record.episodes.append(notes | {"over_speed": 0})
         else:
             evader = np.array(poses[-1].position) if self._evader_flies else None
             self._play = self.game.step(poses[: self._pursuers], evader)
-            self._note(poses[: self._pursuers])
+            fastest = max(math.hypot(*pose.velocity) for pose in poses[: self._pursuers])
+            # a measured velocity has noise: a per cent more is no fault
+            self.record.count(self._play, fastest > 1.01 * self.game.settings.max_speed)
         set_points = [from_action(a, THRUST_LIMIT) for a in self._play.action]
         if self._evader_flies:
             set_points.append(self._steer_evader(poses[-1]))
         return tuple(set_points)
-
-    def _note(self, pursuers):
-        """What happened in the game's newest step, with the pursuers at these poses."""
-        play = self._play
-        notes = self.record.episodes[-1]
-        notes["steps"] += 1
-        if play.captured and notes["capture_step"] is None:
-            notes["capture_step"] = notes["steps"]
-        notes["breaches"] += int(play.breaches.any())
-        notes["crash"] |= bool(play.crashed.any())
-        fastest = max(math.hypot(*pose.velocity) for pose in pursuers)
-        # a measured velocity has noise: a per cent more is no fault
-        notes["over_speed"] += fastest > 1.01 * self.game.settings.max_speed
 
     def _steer_evader(self, pose):
         """The set-point of an evader that is a vehicle, at `pose`: to the velocity of
@@ -212,5 +200,5 @@ class Flight:
         return accelerate(pose.quaternion, acceleration, self.state.airframe, trim, RATES)
 
     def _end_episode(self, reason):
-        self.record.episodes[-1]["end"] = reason
+        self.record.end_game(reason)
         self._episode = -1

@@ -1,16 +1,13 @@
-"""One vehicle of the swarm: what its log blocks tell, and what is recorded of it."""
+"""One vehicle of the swarm: what its log blocks tell."""
 
 import math
-from array import array
 from collections.abc import Callable
-from dataclasses import dataclass
 from time import perf_counter
-
-import numpy as np
 
 from openjax.flying.controller import Pose, numbers_of
 from openjax.flying.crtp import expand_quaternion
 from openjax.flying.onboard_clock import OnboardClock
+from openjax.flying.record_pipe import Kind
 from openjax.flying.state import FORCE_AGE, PoseSample
 
 PERIOD_MS = 10
@@ -28,22 +25,6 @@ BODY_BLOCK = (
 )
 
 
-@dataclass(frozen=True)
-class Samples:
-    """What was recorded of one vehicle; times are host seconds. NumPy."""
-
-    poses: np.ndarray
-    """(K, 16) own estimates: arrival, voltage (V), when measured, position, velocity,
-    quaternion, body rates.
-    """
-    bodies: np.ndarray
-    """(K, 8): when measured, m1..m4 0..1, the specific force (m/s^2)."""
-    seen: np.ndarray
-    """(K, 14) by motion capture, where there is one: when measured, position, velocity,
-    quaternion, body rates.
-    """
-
-
 class Member:
     """One vehicle of the swarm."""
 
@@ -58,9 +39,8 @@ class Member:
         # host s, the newest specific force (m/s^2, body)
         self.felt: tuple = (-math.inf, None)
         self.error: str | None = None
-        self.poses = array("d")  # rows as in `Samples`
-        self.bodies = array("d")
-        self.recording = False
+        # rows as in `openjax.flying.flight_files.Samples`
+        self.tell: Callable[[Kind, tuple[float, ...]], None] = lambda kind, row: None
         self.listener: Callable[[bool], None] = lambda new_pose: None
         self.crazyflie = None
         self.blocks: list = []
@@ -96,8 +76,7 @@ class Member:
         self.pose = pose
         self.arrival = arrival
         self.last_contact = arrival
-        if self.recording:
-            self.poses.extend((arrival, self.voltage, *numbers_of(pose)))
+        self.tell(Kind.POSES, (arrival, self.voltage, *numbers_of(pose)))
         self.listener(True)
 
     def body_arrived(self, stamp: int, data: dict, _block=None) -> None:
@@ -109,8 +88,7 @@ class Member:
         force = tuple(9.81 * data[name] for name, _ in BODY_BLOCK[4:])
         if time > self.felt[0]:  # packets may overtake each other
             self.felt = time, force
-        if self.recording:
-            # motors are 16 bits, the accelerometer counts in g
-            motors = tuple(data[name] / 65536 for name, _ in BODY_BLOCK[:4])
-            self.bodies.extend((time, *motors, *force))
+        # motors are 16 bits, the accelerometer counts in g
+        motors = tuple(data[name] / 65536 for name, _ in BODY_BLOCK[:4])
+        self.tell(Kind.BODIES, (time, *motors, *force))
         self.listener(False)

@@ -13,22 +13,18 @@ what the vehicle knows, is also sent to it, for the estimator on board, by which
 vehicle lands should motion capture fail, or the loop.
 """
 
-import dataclasses
 import math
 import pkgutil
 import sys
 import threading
 import time
-from array import array
 from collections.abc import Callable
 from pathlib import Path
-
-import numpy as np
 
 from openjax.errors import UserError
 from openjax.flying.controller import Pose, numbers_of
 from openjax.flying.links import Links
-from openjax.flying.member import Samples
+from openjax.flying.record_pipe import Kind, Teller
 from openjax.flying.state import PoseSample
 
 
@@ -56,12 +52,14 @@ class MotionCaptured(Links):
     def __init__(self, *arguments, **options):
         super().__init__(*arguments, **options)
         self._captured: list[Pose | None] = [None] * len(self.counts)
-        self._seen = [array("d") for _ in self.counts]
-        self._recording = False
+        self._teller = Teller(None)
         self._arrived = threading.Event()
 
-    def feed(self, function: Callable) -> None:
-        """Let `function(update)` run in a thread of its own."""
+    def feed(self, function: Callable, teller: Teller) -> None:
+        """Let `function(update)` run in a thread of its own; what is believed is
+        told.
+        """
+        self._teller = teller
         threading.Thread(
             target=function, args=(self.update,), daemon=True, name="motion capture"
         ).start()
@@ -80,26 +78,12 @@ class MotionCaptured(Links):
         self._arrived.set()
 
     def believed(self, vehicle: int, pose: Pose, feeds_estimator: bool) -> None:
-        """This pose of motion capture was judged good: it is kept, and sent to the
-        vehicle if it `feeds_estimator`.
+        """This pose of motion capture was judged good: it is told to the recorder, and
+        sent to the vehicle if it `feeds_estimator`.
         """
-        if self._recording:
-            self._seen[vehicle].extend(numbers_of(pose))
+        self._teller.row(Kind.CAPTURE, vehicle, numbers_of(pose))
         if feeds_estimator:
             self.send_pose(vehicle, pose)
-
-    def record(self) -> None:
-        """Keep all samples from now on."""
-        self._recording = True
-        super().record()
-
-    def samples(self) -> list[Samples]:
-        """What was recorded of each vehicle, here and on board."""
-        both = zip(super().samples(), self._seen, strict=True)
-        return [
-            dataclasses.replace(s, seen=np.frombuffer(capture).reshape(-1, 14))
-            for s, capture in both
-        ]
 
     def wait(self, until: float) -> None:
         """Return at `until` (s), or as soon as motion capture sends a pose."""

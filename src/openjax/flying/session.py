@@ -13,6 +13,7 @@ from openjax.errors import UserError
 from openjax.flying import real_time
 from openjax.flying.board import SILENCE, Role, say
 from openjax.flying.crtp import Supervisor
+from openjax.flying.flight_record import FlightRecord
 from openjax.flying.guard import Guard
 from openjax.flying.keys import Operator
 from openjax.flying.links import Links
@@ -20,6 +21,7 @@ from openjax.flying.loop import Flight
 from openjax.flying.motion_capture import MotionCaptured
 from openjax.flying.preflight import faults, poses_arriving
 from openjax.flying.raw_links import RawLinks
+from openjax.flying.recorder import NewCase, Outcome, Recorder
 from openjax.flying.state import Request, State
 from openjax.flying.takeover import fly_down
 from openjax.flying.ticks import measured_times
@@ -62,9 +64,10 @@ class Session:
     Args:
       settings: how.
       state: before the flight.
+      case: where the flight is recorded; None: nowhere.
     """
 
-    def __init__(self, settings: SessionSettings, state: State):
+    def __init__(self, settings: SessionSettings, state: State, case: NewCase | None = None):
         self._settings = settings
         self._state = state
         kind = Links if settings.feed is None else MotionCaptured
@@ -72,6 +75,10 @@ class Session:
             settings.uris, settings.body_logs, settings.watchdog, state, settings.silence
         )
         self.requests = Operator()
+        self._recorder = Recorder(case, len(state.drones))
+        self.record = FlightRecord(
+            len(state.drones), self._recorder.tell_tick, self._recorder.tell_game
+        )
         self._guard: Guard | None = None
         self.scheduler = "ordinary"
         """What of the real-time scheduler was granted, see
@@ -86,9 +93,9 @@ class Session:
         with self._stack as stack:
             self.links.board.enter(Role.LOOP)
             stack.callback(self.links.close)
-            self.links.connect()
+            self.links.connect(log=self._recorder.links_pipe)
             if isinstance(self.links, MotionCaptured):
-                self.links.feed(settings.feed)
+                self.links.feed(settings.feed, self._recorder.teller)
             self._wait_for_poses()
             blocks = self.links.pose_blocks()
             # the loop's own, should links and guard both go; over a dongle they open
@@ -98,6 +105,8 @@ class Session:
                 self._guard = Guard(self.links.board, self._raw_links, self._state)
                 stack.callback(self._guard.close)
                 self._guard.wait()
+            stack.callback(self._recorder.close)
+            self._recorder.start()
             self._raw_links.open(udp_only=True)
             self.scheduler = real_time.hurry()
             self._stack = stack.pop_all()
@@ -122,15 +131,14 @@ class Session:
                 say(line)
             raise UserError(f"no take-off for these {len(problems)} reasons")
 
-    def fly(self, flight: Flight) -> tuple[list, str]:
-        """Arm and fly; what was recorded of each vehicle, and why another process
-        landed, if one did.
+    def fly(self, flight: Flight) -> Outcome:
+        """Arm and fly; what became of the log, with a complaint where another process
+        landed.
         """
         complaint = ""
-        samples = []
         with self.requests:
             self._arm()
-            self.links.record()
+            self._recorder.begin(self.scheduler)
             try:
                 flight.run()
             except Exception as error:  # whatever it is, vehicles are in the air
@@ -139,8 +147,9 @@ class Session:
             with contextlib.suppress(UserError):
                 if not self.links.disarm():
                     complaint = "; ".join(filter(None, (complaint, STILL_ARMED)))
-                samples = self.links.samples()
-        return samples, complaint
+            outcome = self._recorder.end([drone.reason for drone in flight.state.drones])
+        complaint = "; ".join(filter(None, (complaint, outcome.complaint)))
+        return outcome._replace(complaint=complaint)
 
     def watch(self, moment: float, state: State) -> str:
         """Tell the others that the loop lives and what it knows; why it must land, if

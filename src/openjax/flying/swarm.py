@@ -188,17 +188,6 @@ class Swarm:
         w, x, y, z = quaternion
         self.members[i].crazyflie.loc.send_extpose(tuple(position), (x, y, z, w))
 
-    def record(self) -> None:
-        """Keep all samples from now on."""
-        for member in self.members:
-            member.recording = True
-
-    def samples(self) -> list[tuple[bytes, bytes]]:
-        """What was recorded of each vehicle until now: poses and bodies, rows of
-        float64 as in `Samples`.
-        """
-        return [(member.poses.tobytes(), member.bodies.tobytes()) for member in self.members]
-
     def close(self) -> None:
         """Motors off, disarmed, links closed."""
         self.arm(False)

@@ -33,7 +33,6 @@ class TickSchedule:
 
     def __init__(self, first: float):
         self.due = first
-        self.skipped = 0
         self._in_step = False
 
     def next(self, time: float, pose_times: Sequence[float]) -> float:
@@ -58,7 +57,6 @@ class TickSchedule:
         self.due += PERIOD - shift
         while self.due < time - PERIOD:  # that one can't be caught up with any more
             self.due += PERIOD
-            self.skipped += 1
         return self.due
 
 

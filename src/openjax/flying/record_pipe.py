@@ -1,0 +1,78 @@
+"""What loop and links tell the recorder, and the pipe by which they do.
+
+Who tells never waits: what the pipe doesn't take is kept until the next record.
+"""
+
+import os
+import struct
+import threading
+import time
+from enum import IntEnum
+from multiprocessing.connection import Connection
+
+HEAD = struct.Struct("<iiI")
+"""Of a record: its kind, a number, and the bytes that follow."""
+REST = 0.05
+"""s between two looks of the recorder into its pipes."""
+_ATOM = 4096
+"""A pipe takes so many bytes whole or not at all."""
+
+
+class Kind(IntEnum):
+    """What a record tells; its number is a vehicle's or a game's."""
+
+    POSES = 0
+    BODIES = 1
+    CAPTURE = 2
+    TICK = 3
+    GAME = 4
+    BEGIN = 5
+    END = 6
+
+
+WIDTHS = {Kind.POSES: 16, Kind.BODIES: 8, Kind.CAPTURE: 14}
+"""Numbers in a row of `Samples`."""
+MEASURED = {Kind.POSES: 2, Kind.BODIES: 0, Kind.CAPTURE: 0}
+"""Which of them is the time of the measurement."""
+
+
+class Teller:
+    """One process' end of a pipe to the recorder.
+
+    Args:
+      pipe: nobody is told where there is none.
+    """
+
+    def __init__(self, pipe: Connection | None):
+        self._pipe = pipe
+        self._backlog = bytearray()
+        self._lock = threading.Lock()
+        if pipe is not None:
+            os.set_blocking(pipe.fileno(), False)
+
+    def row(self, kind: Kind, number: int, numbers) -> None:
+        """Tell a row of numbers."""
+        if self._pipe is not None:
+            self.tell(kind, number, struct.pack(f"<{len(numbers)}d", *numbers))
+
+    def tell(self, kind: Kind, number: int, data: bytes) -> None:
+        """Tell a record."""
+        if self._pipe is None:
+            return
+        with self._lock:
+            self._backlog += HEAD.pack(kind, number, len(data)) + data
+            try:
+                while self._backlog:
+                    count = os.write(self._pipe.fileno(), self._backlog[:_ATOM])
+                    del self._backlog[:count]
+            except BlockingIOError:
+                return  # the pipe is full
+            except OSError:
+                self._pipe = None  # nobody listens any more
+                self._backlog.clear()
+
+    def tell_all(self, deadline: float) -> None:
+        """Return once the pipe has taken everything, or at `deadline` (s)."""
+        while self._backlog and time.monotonic() < deadline:
+            time.sleep(REST)
+            self.tell(Kind.END, 0, b"")
