@@ -85,6 +85,27 @@ def test_clocks_apart_filters_and_noise_are_no_contradiction(sample_columns):
     assert found == [] and kept is not None
 
 
+def in_wind(columns, force):
+    """A flight whose motors answer a force (m/s^2) of a steady wind along x: what it does
+    along the body's z axis as that leans they leave out, and the path stays as it was.
+    """
+    rotations = Rotation.from_quat(np.stack([columns[f"q{a}"] for a in "xyzw"], 1)).as_matrix()
+    names = (*CHANNEL_COLUMNS["motor_command"], "cmd_thrust")
+    share = 1.0 - force * rotations[:, 0, 2] / 9.81
+    return columns | {name: np.clip(columns[name] * share, 0.0, 1.0) for name in names}
+
+
+def test_motors_that_answer_a_wind_contradict_no_force(sample_columns):
+    columns = sample_columns["flight_b"]
+    kept, found = refusals(in_wind(columns, 3.5))
+    assert found == [] and kept is not None
+    # motors of another flight are no wind
+    names = (*CHANNEL_COLUMNS["motor_command"], "cmd_thrust")
+    of_another_flight = {n: sample_columns["flight_a"][n] for n in names}
+    kept, found = refusals(in_wind(columns | of_another_flight, 3.5))
+    assert kept is None and found[0].kind == "garbage"
+
+
 def test_an_estimates_wandering_position_is_no_contradiction_while_hovering():
     rng = np.random.default_rng(5)
     t = np.arange(0.0, 8.0, 0.01)

@@ -502,6 +502,38 @@ def test_motors_that_a_px4_log_does_not_have_are_told(tmp_path, columns, change,
         read_log(tmp_path / "flight.ulg")
 
 
+@pytest.mark.parametrize("told", [{}, {"PWM_MAIN_MIN": 960}, {"PWM_MIN": 940, "PWM_MAX": 1980}])
+def test_an_output_whose_range_is_minus_one_has_that_of_all(tmp_path, columns, told):
+    """As the parameters of PX4 1.10 to 1.12 say it."""
+    pytest.importorskip("pyulog")
+    least = told.get("PWM_MAIN_MIN", told.get("PWM_MIN", 1000))
+    most = told.get("PWM_MAX", 2000)
+    of_each = {f"PWM_MAIN_{end}{i}": -1 for end in ("MIN", "MAX") for i in range(1, 9)}
+    topics = px4_topics(columns)
+    share = np.zeros((400, 16))
+    share[:, :4] = topics["actuator_motors"][1]["control"][1][:, :4]
+    data = ulog(_outputs(topics, least + (most - least) * share), told | of_each)
+    (tmp_path / "flight.ulg").write_bytes(data)
+    read = read_log(tmp_path / "flight.ulg")
+    assert_read(read, columns, ("m1", "m2", "m3", "m4"), 2e-3, slice(2, None))
+
+
+def test_a_px4_log_with_any_byte_flipped_is_read_or_refused(tmp_path, columns):
+    """Of its header and formats, up to the data."""
+    pytest.importorskip("pyulog")
+    short = {name: values[:40] for name, values in columns.items()}
+    data = ulog(px4_topics(short), {})
+    head = data.index(b"[logger]")
+    for at in np.random.default_rng(0).choice(np.arange(8, head), 150, replace=False):
+        changed = bytearray(data)
+        changed[at] ^= 0x04
+        (tmp_path / "flight.ulg").write_bytes(changed)
+        try:
+            read_log(tmp_path / "flight.ulg")
+        except LogError as error:
+            assert "\n" not in str(error)
+
+
 @pytest.mark.parametrize("data", [b"ULog\x01\x12\x35", b"ULog\x01\x12\x35\x01" + bytes(8)])
 def test_a_px4_log_without_a_flight_says_so(tmp_path, data):
     pytest.importorskip("pyulog")

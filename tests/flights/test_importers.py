@@ -2,7 +2,9 @@
 and vehicle.
 """
 
+import re
 import struct
+from pathlib import Path
 from zlib import crc32
 
 import numpy as np
@@ -11,8 +13,9 @@ import pytest
 from openjax.errors import UserError
 from openjax.flights.case import load_case
 from openjax.flights.csv_table import write_csv
-from openjax.flights.importers import find_logs, load_mapping, read_log
-from openjax.flights.importers.importer import check_table
+from openjax.flights.importers import find_logs, importer, load_mapping, read_log
+from openjax.flights.importers.firmware import VARIABLES
+from openjax.flights.importers.importer import Importer, check_table
 from openjax.flights.reading import LogError, LogTable, flights_of
 from openjax.flights.samples import log_of
 
@@ -103,6 +106,52 @@ def test_a_missing_column_is_named(tmp_path, columns, change, words):
     (tmp_path / "vehicle.toml").write_text("")
     with pytest.raises(UserError, match=words):
         load_case(tmp_path)
+
+
+def config_of(text):
+    """A card's config.txt as usddeck.c of the firmware reads it: white space and comments
+    are no part of a line, a line that is a comment is none. Version, buffer, file name,
+    log on boot; then after "on:fixedFrequency" frequency, mode, and up to 20 variables.
+    """
+    lines = ["".join(line.partition("#")[0].split()) for line in text.splitlines()]
+    lines = [
+        line for line, raw in zip(lines, text.splitlines(), strict=True) if raw.strip()[:1] != "#"
+    ]
+    version, buffer, name, boot, event, frequency, mode, *variables = lines
+    assert (version, event) == ("1", "on:fixedFrequency") and 1 <= len(name) <= 10
+    return int(buffer), boot == "1", int(frequency), int(mode), variables
+
+
+def test_the_pages_config_is_what_the_firmware_reads():
+    page = (Path(__file__).parents[2] / "docs" / "what_to_log.md").read_text(encoding="utf-8")
+    (block,) = [text for text in page.split("```")[1::2] if "on:fixedFrequency" in text]
+    buffer, on_boot, frequency, mode, variables = config_of(block.strip())
+    # the vendor's own measure: ten variables at 1 kHz go with 512 bytes
+    assert len(variables) * frequency <= 10_000 * buffer / 512
+    assert on_boot and mode == 1 and len(variables) <= 20 and set(variables) <= VARIABLES
+    others = re.findall(r"`(controller\.\w+)`", page)
+    swapped = [v for v in variables if not v.startswith("stateEstimate.q")] + others
+    assert len(others) == 4 and len(swapped) <= 20 and set(swapped) <= VARIABLES
+
+
+@pytest.mark.parametrize("tick", [1.0, 1e-3])
+def test_micro_sd_log_with_a_line_of_text_above_its_rows(tmp_path, columns, tick):
+    """As firmware of 2019 wrote it, in us or ms; the clock of us runs over meanwhile."""
+    variables = firmware_variables(columns) | {"pm.vbatMV": ("h", np.full(len(columns["t"]), 3900))}
+    names = ",".join(f"{name}({letter})" for name, (letter, _) in variables.items())
+    layout = "<I" + "".join(letter for letter, _ in variables.values())
+    stamps = (
+        (2**32 - 2_000_000 + 1e6 * columns["t"]).astype(int) if tick == 1.0 else 1e3 * columns["t"]
+    )
+    rows = zip(np.asarray(stamps, int) % 2**32, *(v for _, v in variables.values()), strict=True)
+    data = b"".join(struct.pack(layout, *row) for row in rows)
+    path = tmp_path / "log00"
+    path.write_bytes(f"#tick(I),{names}\n".encode() + data)
+    assert find_logs(tmp_path) == [path]
+    assert_same(read_log(path), columns)
+    path.write_bytes(path.read_bytes()[:-5])
+    table = read_log(path)
+    assert len(table.vehicle) == len(columns["t"]) - 1 and "cut off" in table.remarks[0]
 
 
 @pytest.mark.parametrize("version", [1, 2])
@@ -390,6 +439,15 @@ def test_a_px4_log_with_flipped_bits_is_read_quietly(tmp_path, capsys):
     with pytest.raises(LogError):
         read_log(tmp_path / "log.ulg")
     assert capsys.readouterr() == ("", "")
+
+
+def test_a_damage_that_an_importer_does_not_foresee_is_a_line(tmp_path, monkeypatch):
+    def read(path, mapping):
+        return {}["timestamp"]
+
+    monkeypatch.setattr(importer, "_IMPORTERS", [Importer("ours", lambda path: True, read)])
+    with pytest.raises(LogError, match=r"can.t be read as ours .KeyError: .timestamp..: damaged"):
+        read_log(tmp_path / "flight")
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from openjax.errors import UserError
 from openjax.flights.case import load_case
 from openjax.flights.csv_table import read_csv, write_csv
-from openjax.flights.importers import find_logs, read_log
+from openjax.flights.importers import find_logs, load_mapping, read_log
 from openjax.flights.samples import log_of
 from openjax.flights.track import tracks_of
 
@@ -81,6 +81,28 @@ def test_units_in_the_header_are_read(tmp_path, sample_columns, code):
     read = read_log(path)
     for name, values in columns.items():
         np.testing.assert_allclose(read.columns[name], values, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "named",
+    ['m1 = "u1 [PWM]"', 'm1 = "u1"', 'm1 = "u1"\nx = "x"\nvx = { from = "vx", unit = "mm/s" }'],
+)
+def test_units_in_the_header_count_beside_a_columns_toml(tmp_path, sample_columns, named):
+    """Of columns that it doesn't list, and of those that it lists without a unit."""
+    columns = sample_columns["flight_a"]
+    units = {"t": ("ms", 1e3), "x": ("mm", 1e3), "vx": ("mm/s", 1e3), "m1": ("PWM", 1.0)}
+    table = {}
+    for name, values in columns.items():
+        unit, size = units.get(name, ("", 1.0))
+        table[f"{'u1' if name == 'm1' else name} [{unit}]" if unit else name] = size * values
+    path = tmp_path / "flight.csv"
+    np.savetxt(
+        path, np.stack(list(table.values()), 1), delimiter=",", header=",".join(table), comments=""
+    )
+    (tmp_path / "columns.toml").write_text(f"[columns]\n{named}\n")
+    read = read_log(path, load_mapping(tmp_path / "columns.toml"))
+    for name, values in columns.items():
+        np.testing.assert_allclose(read.columns[name], values, rtol=1e-9, atol=1e-12, err_msg=name)
 
 
 def test_what_an_unknown_unit_holds_is_left_out_and_named(tmp_path, text):

@@ -8,7 +8,7 @@ explain.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -256,7 +256,7 @@ def _caused_pairs(s: Signals, along: np.ndarray | None, order: int) -> Iterator[
     force, order = (along, order) if s.force is None else (s.force[:, 2:], 0)
     if force is not None:
         usual = max(float(np.median(collective)), 1e-3)
-        yield Pair(
+        pair = Pair(
             names=("the force felt",),
             signal=force,
             what="what the motors would make",
@@ -266,6 +266,7 @@ def _caused_pairs(s: Signals, along: np.ndarray | None, order: int) -> Iterator[
             unit="m/s^2",
             derivatives=(order, None),
         )
+        yield pair if not pair.bad.any() else _without_air(s, pair)
     if s.thrust is not None and not s.has_saturation:
         yield Pair(
             names=("cmd_thrust",),
@@ -277,6 +278,22 @@ def _caused_pairs(s: Signals, along: np.ndarray | None, order: int) -> Iterator[
             unit="%",
             derivatives=(None, None),
         )
+
+
+def _without_air(s: Signals, pair: Pair) -> Pair:
+    """A pair of a force along the body's z axis without what goes with the air, where
+    attitude and velocity say how that goes: drag by the vehicle's own motion, and by a
+    steady wind that a leaning body meets along z. Motors answer both, so both sides lose it,
+    and what is left tells at half the usual size: less moves it.
+    """
+    if s.quaternion is None or s.velocity is None:
+        return pair
+    own_drag = to_body(s.quaternion, s.velocity)[:, 2:]
+    air = np.concatenate([own_drag, rotation(s.quaternion)[:, :2, 2]], 1)
+    sides = np.concatenate([pair.signal, pair.reference], 1)
+    weights = np.linalg.lstsq(in_band(air, pair.band), in_band(sides, pair.band), rcond=None)[0]
+    signal, reference = np.split(sides - air @ weights, 2, axis=1)
+    return replace(pair, signal=signal, reference=reference, least=0.5 * pair.least)
 
 
 @dataclass(frozen=True)

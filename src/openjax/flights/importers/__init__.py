@@ -7,6 +7,7 @@ format of your own is an `Importer` that you `register`.
 
 from pathlib import Path
 
+from openjax.errors import UserError
 from openjax.flights.importers import (
     betaflight,
     crazyflie,
@@ -70,4 +71,13 @@ def read_log(path: Path, mapping: ColumnMapping | None = None) -> LogTable:
     if importer is None:
         formats = ", ".join(importer.name for importer in importers())
         raise LogError(f"no known format; known are {formats}")
-    return check_table(importer.name, importer.read(path, mapping))
+    try:
+        table = importer.read(path, mapping)
+    except UserError:
+        raise
+    except Exception as error:  # a damaged file fails wherever its damage is first met
+        words = (str(error).splitlines() or [""])[0]
+        raise LogError(
+            f"can't be read as {importer.name} ({type(error).__name__}: {words}): damaged?"
+        ) from error
+    return check_table(importer.name, table)

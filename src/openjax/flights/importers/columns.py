@@ -23,7 +23,8 @@ stand for the quaternion.
 """
 
 import math
-from dataclasses import dataclass, field
+import re
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -46,6 +47,11 @@ UNITS = {
     "m/s^2": 1.0, "g": 9.80665, "mg": 9.80665e-3, "V": 1.0, "mV": 1e-3,
     "percent": 1e-2, "8bit": 1 / 255, "16bit": 1 / 65535,
 }  # fmt: skip
+
+WITH_UNIT = re.compile(r"(.+?) *[(\[](.+)[)\]]").fullmatch
+"""A name with its unit: "wx [deg/s]", "x (m)"."""
+WRITTEN = {"m/s2": "m/s^2", "m/s²": "m/s^2", "°": "deg", "°/s": "deg/s", "%": "percent", "-": "1"}
+"""Other spellings of units."""
 
 _MOTION = {
     *CHANNEL_COLUMNS["position"],
@@ -152,6 +158,40 @@ class ColumnMapping:
             raise LogError(f"no column {absent}; the log has {', '.join(raw.columns)}")
         columns["t"] = columns["t"] - np.nanmin(columns["t"])
         return LogTable(name, with_quaternion(columns), raw.vehicle, tuple(remarks))
+
+
+def with_units(mapping: ColumnMapping | None, names: list[str]) -> ColumnMapping:
+    """A mapping with what a header's names say of units, "wx [deg/s]": a column of the log
+    format is taken from such a name, and a source that the mapping gives without a unit,
+    with the brackets or without them, has the unit in them. A column of the log format whose
+    unit nobody knows isn't known either.
+    """
+    mapping = ColumnMapping() if mapping is None else mapping
+    units = {name: (match[1], _factor(match[2])) for name in names if (match := WITH_UNIT(name))}
+    bare = {name: full for full, (name, _) in units.items() if name not in names}
+
+    def in_header(source: Source) -> Source:
+        name = source.name if source.name in names else bare.get(source.name, source.name)
+        factor = units.get(name, ("", None))[1]
+        has_unit = abs(source.scale) != 1.0 or factor is None
+        return replace(source, name=name, scale=source.scale * (1.0 if has_unit else factor))
+
+    columns = {column: in_header(source) for column, source in mapping.columns.items()}
+    named_sources = {source.name for source in columns.values()}
+    by_angles = CHANNEL_COLUMNS["quaternion"] if set(EULER) & set(columns) else ()
+    for column in LOG_COLUMNS:
+        name = bare.get(column, "")
+        if name and column not in (*columns, *by_angles) and name not in named_sources:
+            if (factor := units[name][1]) is not None:
+                columns[column] = Source(name, factor)
+    clocks = tuple(replace(clock, source=in_header(clock.source)) for clock in mapping.clocks)
+    return replace(mapping, columns=columns, clocks=clocks)
+
+
+def _factor(unit: str) -> float | None:
+    """The factor of a unit as a header writes it; None where nobody knows it."""
+    unit = unit.strip()
+    return UNITS.get(WRITTEN.get(unit, unit))
 
 
 def load_mapping(path: str | Path) -> ColumnMapping:

@@ -5,8 +5,13 @@ or 2); uint16 number of event types; for each: uint16 id, name and NUL, uint16 n
 variables, each "group.name(T)" and NUL with T a struct letter. Then records: uint16
 event id, time stamp (version 1: uint32 ms, version 2: uint64 us), the variables packed.
 The last four bytes are the CRC-32 of all before.
+
+Before 2020 the firmware wrote one line of text, "#tick(I),group.name(T),...", and then
+rows of these variables, packed, little endian, without a checksum. Ticks are in ms or
+us, whatever the build counted.
 """
 
+import re
 import struct
 from pathlib import Path
 from zlib import crc32
@@ -15,6 +20,7 @@ import numpy as np
 
 from openjax.flights.csv_text import LARGEST, LogError
 from openjax.flights.importers.columns import ColumnMapping, Stream, merge_streams
+from openjax.flights.importers.csv_files import seconds_per_unit
 from openjax.flights.importers.firmware import firmware_columns, with_mixer
 from openjax.flights.importers.importer import Importer
 from openjax.flights.reading import LogTable
@@ -23,6 +29,11 @@ MAGIC = 0xBC
 # by version, how a record begins (its kind and its ticks), and seconds in a tick
 _VERSIONS = {1: ("<HI", 1e-3), 2: ("<HQ", 1e-6)}
 _TYPES = set("bBhHiIqQefd")
+_VARIABLE = r"\w+(?:\.\w+)?\([bBhHiIqQefd]\)"
+_TEXT_HEADER = re.compile(
+    rf"#?\s*(tick|timestamp|time)\(([IQ])\)((?:,\s*{_VARIABLE})+),?\s*".encode()
+)
+LONGEST_HEADER = 4096  # bytes: some hundred variables
 
 
 def is_micro_sd(path: Path) -> bool:
@@ -30,8 +41,10 @@ def is_micro_sd(path: Path) -> bool:
     if not path.is_file() or path.suffix in (".csv", ".gz", ".toml", ".md", ".txt"):
         return False
     with path.open("rb") as file:
-        head = file.read(5)
-    return len(head) == 5 and head[0] == MAGIC and int.from_bytes(head[1:3], "little") in _VERSIONS
+        head = file.read(LONGEST_HEADER)
+    if _TEXT_HEADER.fullmatch(head.partition(b"\n")[0]):
+        return True
+    return len(head) >= 5 and head[0] == MAGIC and int.from_bytes(head[1:3], "little") in _VERSIONS
 
 
 def read_micro_sd(path: str | Path, mapping: ColumnMapping | None = None) -> LogTable:
@@ -56,6 +69,9 @@ def decode(data: bytes) -> tuple[list[Stream], list[str]]:
     """The events of a micro-SD log as streams, one per event type, and remarks. Raises
     LogError if it is none.
     """
+    header, _, rows = data.partition(b"\n")
+    if match := _TEXT_HEADER.fullmatch(header):
+        return _packed_rows(match, rows)
     if len(data) < 9 or data[0] != MAGIC:
         raise LogError("not a micro-SD log (it doesn't start with 0xBC)")
     version, event_types = struct.unpack_from("<HH", data, 1)
@@ -86,6 +102,29 @@ def decode(data: bytes) -> tuple[list[Stream], list[str]]:
     if not streams:
         raise LogError("micro-SD log without a record")
     return streams, remarks
+
+
+def _packed_rows(header: re.Match, data: bytes) -> tuple[list[Stream], list[str]]:
+    """The only stream of a log with a line of text above its rows, and remarks."""
+    name, letter, rest = (group.decode() for group in header.groups())
+    variables = re.findall(r"([\w.]+)\((\w)\)", rest)
+    try:
+        dtype = np.dtype([(n, "<" + np.dtype(t).str[1:]) for n, t in [(name, letter), *variables]])
+    except ValueError as error:  # a name that occurs twice
+        raise LogError(f"micro-SD log with a corrupt header: {error}") from error
+    count, rest_bytes = divmod(len(data), dtype.itemsize)
+    if not count:
+        raise LogError("micro-SD log without a record")
+    rows = np.frombuffer(data, dtype, count)
+    # unsigned differences count on where a tick of 32 bits began again at zero
+    steps = np.diff(rows[name])
+    ticks = np.concatenate(
+        [[0.0], np.cumsum(steps.astype(np.int32 if letter == "I" else np.int64))]
+    )
+    stream = Stream(
+        ticks * seconds_per_unit(ticks), {n: rows[n].astype(float) for n, _ in variables}
+    )
+    return [stream], ["the last row is cut off and left out"] if rest_bytes else []
 
 
 def _records(

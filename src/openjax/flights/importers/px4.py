@@ -88,7 +88,9 @@ def read_ulog(path: Path, mapping: ColumnMapping | None = None) -> LogTable:
     mapping_columns = {} if mapping is None else mapping.over({})
     log = _parse(path, {source.name.partition(":")[0] for source in mapping_columns.values()})
     # of several sensors of a kind the first
-    topics = {data.name: data for data in log.data_list if data.multi_id == 0}
+    topics = {
+        data.name: data for data in log.data_list if data.multi_id == 0 and "timestamp" in data.data
+    }
     streams = {name: _stream(data, log.start_timestamp) for name, data in topics.items()}
     if f"{ATTITUDE}:q[0]" in streams.get(ATTITUDE, Stream(np.empty(0), {})).values:
         streams[ATTITUDE] = _turn(streams[ATTITUDE])
@@ -261,10 +263,8 @@ def _output_of(motor: int, parameters) -> int:
 
 def _signal(output: np.ndarray, index: int, parameters) -> np.ndarray:
     """An output as a share of its range. Raises LogError where that isn't its range."""
-    least, most = (
-        float(parameters.get(f"PWM_MAIN_{end}{index + 1}", parameters.get(f"PWM_{end}", usual)))
-        for end, usual in (("MIN", PULSE[0]), ("MAX", PULSE[1]))
-    )
+    least = _end_of_range("MIN", index, parameters, PULSE[0])
+    most = _end_of_range("MAX", index, parameters, PULSE[1])
     # a motor that is disarmed has one value or two below the least
     beyond = np.unique(output[(output < least) | (output > most)])
     if len(beyond) > SELDOM:
@@ -273,6 +273,15 @@ def _signal(output: np.ndarray, index: int, parameters) -> np.ndarray:
             f"their range is {least:g} to {most:g} (PWM_MIN, PWM_MAX): DShot? Log actuator_motors"
         )
     return np.clip((output - least) / max(most - least, 1.0), 0.0, 1.0)
+
+
+def _end_of_range(end: str, index: int, parameters, usual: float) -> float:
+    """The least or largest pulse of an output, in us: its own parameter, or that of all
+    outputs, of which PX4 up to 1.12 says -1 ("as all") or nothing.
+    """
+    names = (f"PWM_MAIN_{end}{index + 1}", f"PWM_MAIN_{end}", f"PWM_{end}")
+    values = (float(parameters.get(name, -1.0)) for name in names)
+    return next((value for value in values if value > 0.0), usual)
 
 
 IMPORTER = Importer("PX4 ULog", is_ulog, read_ulog)

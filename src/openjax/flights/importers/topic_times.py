@@ -14,7 +14,14 @@ from pathlib import Path
 import numpy as np
 
 from openjax.errors import suggestion
-from openjax.flights.importers.columns import EULER, ColumnMapping, Source, Stream, merge_streams
+from openjax.flights.importers.columns import (
+    EULER,
+    ColumnMapping,
+    Source,
+    Stream,
+    merge_streams,
+    with_units,
+)
 from openjax.flights.importers.csv_files import (
     delimiter_of,
     header_of,
@@ -68,6 +75,7 @@ def read_topic_times(path: Path, mapping: ColumnMapping | None = None) -> LogTab
     """A CSV of topics. Raises LogError where it holds no column that is known."""
     delimiter = delimiter_of(mapping)
     names = header_of(path, delimiter)
+    mapping = None if mapping is None else with_units(mapping, names)
     stamps = _named_stamps(names, mapping)
     repeats = []
     if mapping is None:
