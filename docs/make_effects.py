@@ -36,9 +36,7 @@ def usual(effect: Effect) -> dict:
     for i, (name, what) in enumerate(effect.parameters.items()):
         low, high = what.prior
         both = np.isclose(low + high, 2 * what.none)
-        values[name] = jnp.float32(
-            low + (0.3 if both and i % 2 else 0.75) * (high - low)
-        )
+        values[name] = jnp.float32(low + (0.3 if both and i % 2 else 0.75) * (high - low))
     return values
 
 
@@ -144,9 +142,7 @@ def draw_wrench(effect, axes):
         state = state_at(velocity=(speed, 0.0, 0.0))
         other = jnp.array([[offset, 0.0, 1.0]], jnp.float32)
         return np.asarray(
-            effect.wrench(
-                usual(effect), make_context(VEHICLE, state, others_position=other)
-            )[0]
+            effect.wrench(usual(effect), make_context(VEHICLE, state, others_position=other))[0]
         )
 
     speeds = np.linspace(-1.5, 1.5, 31)
@@ -163,9 +159,7 @@ def draw_wrench(effect, axes):
     axes.axhline(0.0, label="nominal", **GREY)
     for axis, colour in zip(range(3), COLOURS, strict=False):
         if np.abs(found[:, axis]).max() > 1e-6:
-            axes.plot(
-                grid, 1000 * found[:, axis], color=colour, label=f"body {'xyz'[axis]}"
-            )
+            axes.plot(grid, 1000 * found[:, axis], color=colour, label=f"body {'xyz'[axis]}")
     axes.set(xlabel=label, ylabel="force [mN]")
 
 
@@ -194,9 +188,7 @@ def draw_body(effect, axes):
     }
     most = max(
         scale,
-        key=lambda name: (
-            np.abs(answers[1][name] - answers[0][name]).max() / scale[name]
-        ),
+        key=lambda name: np.abs(answers[1][name] - answers[0][name]).max() / scale[name],
     )
     axes.plot(time, answers[0][most], label="nominal", **GREY)
     axes.plot(time, answers[1][most], color=COLOURS[0], label="with the effect")
@@ -204,16 +196,12 @@ def draw_body(effect, axes):
 
 
 def _flown(names, parameters, commands):
-    step = make_drones_step(
-        physics="rigid", dt=DT, substeps=1, contacts=False, effects=names
-    )
+    step = make_drones_step(physics="rigid", dt=DT, substeps=1, contacts=False, effects=names)
     drones = hover_state(VEHICLE, jnp.array([[0.0, 0.0, 0.6]], jnp.float32))
     drones = step.reset(VEHICLE, drones, jax.random.key(0))
 
     def one(drones, command):
-        drones = step(
-            VEHICLE, drones, command, jnp.zeros((0, 2)), jnp.zeros(0, bool), parameters
-        )
+        drones = step(VEHICLE, drones, command, jnp.zeros((0, 2)), jnp.zeros(0, bool), parameters)
         return drones, (drones.body_rates[0], drones.velocity[0])
 
     _, (rates, velocity) = jax.lax.scan(one, drones, jnp.asarray(commands))
@@ -233,11 +221,9 @@ def draw(effect: Effect, path: Path) -> None:
     """Write the picture of an effect."""
     figure = Figure(figsize=(4.6, 2.5), layout="constrained")
     axes = figure.subplots()
-    next(
-        function
-        for hook, function in DRAWN.items()
-        if getattr(effect, hook) is not None
-    )(effect, axes)
+    next(function for hook, function in DRAWN.items() if getattr(effect, hook) is not None)(
+        effect, axes
+    )
     axes.legend(fontsize="small", frameon=False)
     axes.spines[["top", "right"]].set_visible(False)
     figure.savefig(path, dpi=110, metadata={"Software": None})
@@ -248,29 +234,24 @@ def page() -> str:
     lines = [
         f"# The {len(EFFECTS)} effects",
         "",
-        "Each is one file in `src/openjax/vehicle/effects` and serves twice: `openjax train "
-        "--effects effects.toml`",
-        "flies with it, and `openjax diagnose` fits it. The pictures come from that code with "
-        "usual parameters;",
-        "grey is the nominal vehicle.",
+        "Each effect is one file in `src/openjax/vehicle/effects` and serves twice: `openjax train",
+        "--effects effects.toml` flies with it, and `openjax diagnose` fits it. The pictures come from",
+        "that code with usual parameters; grey is the nominal vehicle. Below a picture are the usual",
+        "ranges of the parameters, and their sources.",
         "",
-        "Symbols: $m$ motor command, $T_i$ and $Q_i$ thrust and reaction torque of rotor $i$, "
-        "$v_i$ velocity of its hub",
-        "through the air in the body frame, $R$ propeller radius, $z_i$ its height, $u$ command of "
-        "thrust and body rates,",
-        "$V$ battery voltage.",
+        "$m$ is a motor command, $T_i$ and $Q_i$ are thrust and reaction torque of rotor $i$, $v_i$ is the",
+        "velocity of its hub through the air in the body frame, $R$ the propeller radius, $z_i$ its height,",
+        "$u$ the command of thrust and body rates, $V$ the battery voltage.",
     ]
     for name, effect in EFFECTS.items():
         module = __import__(f"openjax.vehicle.effects.{name}", fromlist=["EFFECT"])
         sentence = " ".join(module.__doc__.split("\n\n")[0].split())
         lines += ["", f"## {name}", "", sentence, "", f"$${effect.formula}$$", ""]
         lines += [f"![{name}](pictures/effects/{name}.png)", ""]
-        lines += ["| parameter | unit | usual |", "|---|---|---|"]
         for parameter, what in effect.parameters.items():
             meaning = f" ({what.meaning})" if what.meaning else ""
-            lines.append(
-                f"| `{parameter}`{meaning} | {what.unit} | {what.prior[0]:g} … {what.prior[1]:g} |"
-            )
+            unit = "" if what.unit == "1" else f" {what.unit}"
+            lines.append(f"* `{parameter}`{meaning}: {what.prior[0]:g} to {what.prior[1]:g}{unit}")
         sources = dict.fromkeys(what.source for what in effect.parameters.values())
         lines += ["", f"*{'; '.join(sources)}.*"]
     return "\n".join(lines) + "\n"

@@ -31,9 +31,7 @@ def take(page: Path, name: str, folder: Path) -> None:
         by_qt(page, name, shot)
     else:
         by_browser(browser, page, name, shot)
-    picture = (
-        Image.open(shot).convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE)
-    )
+    picture = Image.open(shot).convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE)
     picture.save(DOCS / "pictures" / f"{name}.png", optimize=True)
 
 
@@ -49,9 +47,7 @@ def by_browser(browser: str, page: Path, name: str, shot: Path) -> None:
         f"--window-size={width},{height}",
         f"--screenshot={shot}",
     ]
-    subprocess.run(
-        [browser, *options, page.resolve().as_uri()], check=True, capture_output=True
-    )
+    subprocess.run([browser, *options, page.resolve().as_uri()], check=True, capture_output=True)
 
 
 def by_qt(page: Path, name: str, shot: Path) -> None:
@@ -88,9 +84,7 @@ def diagnosed(folder: Path) -> Path:
         ("sample_flights", "flights", "--effect", "rotor_drag"),
         ("diagnose", "flights"),
     ):
-        subprocess.run(
-            [sys.executable, "-m", "openjax", *words], cwd=folder, check=True
-        )
+        subprocess.run([sys.executable, "-m", "openjax", *words], cwd=folder, check=True)
     return folder / "diagnosis" / "flights" / "report.html"
 
 

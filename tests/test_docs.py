@@ -119,11 +119,7 @@ def test_policies_that_fly_are_as_stored():
     page = (DOCS / "policies_that_fly.md").read_text(encoding="utf-8")
 
     def mean(of_layouts, figure, digits):
-        return (
-            f"{np.mean([of_layouts[name][figure] for name in SCENARIOS]):.{digits}f}".removeprefix(
-                "0"
-            )
-        )
+        return f"{np.mean([of_layouts[name][figure] for name in SCENARIOS]):.{digits}f}"
 
     figures = {"capture_rate": 3, "crash_rate": 3, "over_speed_rate": 3}
     for name, of_vehicles in policies.items():

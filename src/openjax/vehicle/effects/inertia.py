@@ -60,7 +60,7 @@ EFFECT = Effect(
             "1",
             0.0,
             (-0.08, 0.08),
-            "a Crazyflie's product is .05 of its moments (Forster 2015)",
+            "a Crazyflie's product is 0.05 of its moments (Forster 2015)",
             "product of inertia J_xy, of the assumed moments",
             (-0.5, 0.5),
         )
