@@ -12,6 +12,7 @@ COMMANDS = {
     "train": "train pursuers, or go on with a run",
     "evaluate": "fly policies on layouts: captures, collisions, crashes",
     "view": "watch episodes in three dimensions, in a browser or as an HTML file",
+    "play": "be the evader, in a browser, against a policy",
     "exploit": "train an evader against a policy, and see how well the policy holds",
     "mix": "make one policy of several: a team that draws which of them it flies",
     "map": "show what a policy catches, over team sizes, speeds and capture radii",

@@ -293,6 +293,7 @@ def _unknown(argument, default, program):
 
     # a setting's own name often comes without its group, or with another: --n_pursuers
     # for --environment.n_pursuers
+    options = [option for option in options if option != name]  # one that is hidden here
     close = [option for option in options if last_part(option) == last_part(name)]
     # without the dashes, which all have in common
     names = {option.lstrip("-"): option for option in options}

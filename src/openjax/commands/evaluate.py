@@ -154,7 +154,7 @@ def prepare(command: EvaluateCommand, arguments: Sequence[str]) -> list[tuple]:
         game = policy.of_team(LAYOUT_PURSUERS).settings.environment
         default = dataclasses.replace(EvaluateCommand(), environment=game)
         options = parse(EvaluateCommand, default, arguments, PROGRAM)
-        _game(options, policy)
+        find_game(options, policy)
         policies.append((options, policy))
     return policies
 
@@ -178,7 +178,7 @@ def fly_scenarios(command: EvaluateCommand, policy, evaluators: dict) -> tuple[l
     from openjax.evaluation.judges.tasks import JUDGE_KEY
     from openjax.evaluation.validation import uniform_tasks
 
-    game, policy, layouts = _game(command, policy)
+    game, policy, layouts = find_game(command, policy)
     if words := policy.outside_of_training(game):
         note = f"note: {policy.source} was never trained for this: {'; '.join(words)}"
         output_console().print(note, soft_wrap=True)
@@ -220,8 +220,12 @@ def _settings(command):
     return settings if number is None else dataclasses.replace(settings, num_pursuers=number)
 
 
-def _game(command, policy):
-    """The game of a command, the policy in it, and the layouts; none: uniform tasks."""
+def find_game(command: EvaluateCommand, policy: "LoadedPolicy") -> tuple:
+    """The game of a command, the policy in it, and the layouts; none: uniform tasks.
+
+    Raises:
+      UserError: an unusable layout, or a game that the policy can't play.
+    """
     from openjax.evaluation.evaluator import layout_slots
     from openjax.pursuit.scenarios import SCENARIOS, find_scenario
 

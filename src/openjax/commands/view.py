@@ -81,12 +81,17 @@ def main(arguments: Sequence[str]) -> int:
         )
     if command.gif is None and command.html is None and command.mcap is None:
         with page_server(replay_page(flights), command.port) as server:
-            address = f"http://localhost:{server.server_port}"
-            print(f"{address} (Ctrl-C ends)", flush=True)
-            if command.browser:
-                webbrowser.open(address)
+            tell_address(server, command.browser)
             server.serve_forever()
     return 0
+
+
+def tell_address(server: ThreadingHTTPServer, browser: bool) -> None:
+    """Print where the page is, and open it in a browser where that is wanted."""
+    address = f"http://localhost:{server.server_port}"
+    print(f"{address} (Ctrl-C ends)", flush=True)
+    if browser:
+        webbrowser.open(address)
 
 
 def _written_line(path: Path) -> str:
@@ -153,7 +158,16 @@ def page_server(page: str, port: int) -> ThreadingHTTPServer:
         def log_message(self, *_):
             """Say nothing."""
 
+    return local_server(Handler, port)
+
+
+def local_server(handler: type[BaseHTTPRequestHandler], port: int) -> ThreadingHTTPServer:
+    """A server that this machine alone can reach.
+
+    Raises:
+      UserError: the port isn't free.
+    """
     try:
-        return ThreadingHTTPServer(("127.0.0.1", port), Handler)
+        return ThreadingHTTPServer(("127.0.0.1", port), handler)
     except OSError as error:
         raise UserError(f"--port {port}: {error.strerror or error}") from None

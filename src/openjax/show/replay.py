@@ -24,7 +24,9 @@ def replay_page(flights: Sequence[tuple[str, Trajectory]]) -> str:
     Args:
       flights: (policy's name, episode) pairs; an episode's title is its layout's name.
     """
-    data = json.dumps([_plain(policy, flight) for policy, flight in flights], separators=(",", ":"))
+    data = json.dumps(
+        [plain_episode(policy, flight) for policy, flight in flights], separators=(",", ":")
+    )
     # within a script element "<" may only stand escaped
     return TEMPLATE.read_text(encoding="utf-8").replace("@DATA@", data.replace("<", "\\u003c"))
 
@@ -34,9 +36,9 @@ def write_replay(path: Path, flights: Sequence[tuple[str, Trajectory]]) -> None:
     write_text(path, replay_page(flights))
 
 
-def _plain(policy: str, flight: Trajectory) -> dict:
-    """An episode up to two seconds after its capture: lengths in mm, quaternions in
-    thousandths, times in frames.
+def plain_episode(policy: str, flight: Trajectory) -> dict:
+    """What the page's script reads of an episode, up to two seconds after its capture:
+    lengths in mm, quaternions in thousandths, times in frames.
     """
     every = max(1, round(LONGEST_STEP / flight.time_step))
     steps = slice(0, flight.end(seconds=2.0), every)
