@@ -39,8 +39,8 @@ def record_of(vehicle: str, condition: str, truth: dict, answer: Report | Change
     alone.
     """
     out = {"vehicle": vehicle, "condition": condition, "truth": truth}
-    if isinstance(answer, Report) and answer.untested_change is not None:
-        answer = answer.untested_change
+    if isinstance(answer, Report) and not answer.named and answer.change_by_trims is not None:
+        answer = answer.change_by_trims
     if isinstance(answer, Report):
         return out | {
             "probability": 1.0 - answer.probabilities.get("none", 0.0),

@@ -12,7 +12,7 @@ import pytest
 
 from openjax.gap.report import Estimate, Report
 from openjax.gap.report.figures import Course, rms
-from openjax.gap.report.page import next_steps, page_of, sentence, shares
+from openjax.gap.report.page import next_steps, page_of, shares
 from openjax.gap.shares import Gap, Share, Split
 
 
@@ -101,7 +101,7 @@ def test_a_headline_says_what_its_chart_shows():
     small = report("effect", ["rotor_x"], ["rotor_x"])
     rest = {"effects": {"rotor_x": Share(0.03, (0.02, 0.05))}, "sensors": Share(0.04, (0.0, 0.1))}
     parts = dataclasses.replace(small.shares, **rest, unexplained=Share(0.93, (0.9, 0.95)))
-    words = sentence(dataclasses.replace(small, shares=parts))
+    words = dataclasses.replace(small, shares=parts).headline()
     assert "is 93 % unexplained; named is rotor x (3 %)" in words and "mostly" not in words
 
 
@@ -115,10 +115,11 @@ def test_a_constant_error_counts_whole():
 
 def test_a_normal_flight_is_not_charted_as_a_gap():
     assert shares(CASES["none"]) == []
-    assert sentence(CASES["none"]).startswith("The simulator agrees")
-    assert "y or z (20 %)" in sentence(CASES["two"])
-    assert "rotor x (70 %)" in sentence(CASES["effect"]) and "shrink by 70 %" in sentence(
-        CASES["effect"]
+    assert CASES["none"].headline().startswith("The simulator agrees")
+    assert "y or z (20 %)" in CASES["two"].headline()
+    assert (
+        "rotor x (70 %)" in CASES["effect"].headline()
+        and "shrink by 70 %" in CASES["effect"].headline()
     )
 
 

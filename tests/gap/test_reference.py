@@ -183,4 +183,4 @@ def test_a_slower_motor_is_named_and_one_that_was_as_slow_before_is_no_change(tm
         assert report.effects == expected
         assert "reference" in report.reference
         assert report.trims.effects == expected
-    assert "Trims and gains beside the reference" in page_of(report)
+    assert "Trims beside the reference" in page_of(report)

@@ -58,6 +58,7 @@ def test_a_good_report_breaks_no_rule():
     assert broken_rules(GOOD) == []
     nothing = {"effects": (), "parameters": {}, "verdict": "none", "shares": split({})}
     said = {"probabilities": {"none": 0.9, "unknown": 0.1}, "runner_up": "unknown (0.10)"}
+    said["gap"] = dataclasses.replace(GAP, before=1.0, after=1.0, reduction=0.0)
     assert broken_rules(dataclasses.replace(GOOD, **nothing, **said)) == []
 
 

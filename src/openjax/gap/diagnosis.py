@@ -22,12 +22,17 @@ from openjax.gap.report.rules import LEAST_SHARE
 from openjax.gap.residual import Check, check_residual
 from openjax.gap.selection import Selection, select
 from openjax.gap.shares import Split, split
+from openjax.gap.trims import Change
 from openjax.gap.where import locate
 from openjax.vehicle.effects import EFFECTS
 
 
 def diagnose_case(
-    case: Case, without: Iterable[str] = (), progress=None, reference: Sequence[Case] = ()
+    case: Case,
+    without: Iterable[str] = (),
+    progress=None,
+    reference: Sequence[Case] = (),
+    trims: Change | None = None,
 ) -> Report:
     """Diagnose the flights of a case.
 
@@ -37,6 +42,7 @@ def diagnose_case(
       progress: called with a text as the work goes on.
       reference: flights of the same vehicle while nothing was wrong with it, a case for
       each day; told is then what changed since.
+      trims: what the trims of all flights say changed, beside what days differ by.
 
     Raises:
       UserError: the flights are too short or hold no commands.
@@ -53,13 +59,13 @@ def diagnose_case(
     evidence = with_identification(evidence)
     if progress:
         progress("trying every effect that the flights can show")
-    report = conclude(evidence)
+    report = conclude(evidence, trims)
     seconds = time.perf_counter() - begin
-    return replace(report, identification=evidence.identification, seconds=seconds)
+    return replace(report, identification=evidence.identification, trims=trims, seconds=seconds)
 
 
-def conclude(evidence: Evidence) -> Report:
-    """The report that the evidence supports."""
+def conclude(evidence: Evidence, trims: Change | None = None) -> Report:
+    """The report that the evidence supports, beside what `trims` say changed."""
     selection = select(evidence)
     acting = {e: selection.probability(e) for e in selection.effects}
     acting |= {
@@ -69,9 +75,10 @@ def conclude(evidence: Evidence) -> Report:
         if differs(channel, e, evidence.baseline)
     }
     check = check_residual(evidence, selection.fit, selection.search.nothing.fit)
-    old = trimmed_before(
-        selection.fit.theta, selection.effects, evidence.baseline, evidence.vehicles[0]
-    )
+    theta = selection.fit.theta
+    vehicle = evidence.vehicles[0]
+    old = trimmed_before(theta, selection.effects, evidence.baseline, vehicle, trims)
+    old |= forbidden(theta, selection.effects, vehicle)
     if check.mostly_unknown:  # what acts is something else
         old |= set(selection.effects)
     candidates = [e for e, p in acting.items() if p >= 0.5 and e not in old]
@@ -85,8 +92,27 @@ def conclude(evidence: Evidence) -> Report:
     possible = evidence.library.effects
     chances = probabilities(present, parts.largest, check.probability, weights, possible)
     sure = max((share.interval90[0] for share in parts.effects.values()), default=0.0)
-    chances = agreeing(chances, words(check, parts) or ("none",), sure)
+    no_gap = parts.gap.probability_of_none
+    chances = agreeing(chances, words(check, parts) or ("none",), sure, no_gap)
     return _report(evidence, selection, check, parts, chances)
+
+
+def forbidden(theta: np.ndarray, effects: Iterable[str], vehicle) -> set[str]:
+    """Those of the motion's `effects` that do nothing once their parameters, as in theta
+    (P,), are brought to where physics allows them: drag that pushes, a battery that makes
+    more thrust the emptier it is.
+    """
+
+    def acts(effect: str) -> bool:
+        for entry in CARDS[effect].fitted:
+            parameter = EFFECTS[effect].parameters[entry.name]
+            least, most = parameter.limits(vehicle)
+            value = np.clip(theta[PLACE[effect, entry.name]], least, most)
+            if entry.name not in CARDS[effect].shape and value != parameter.none:
+                return True
+        return False
+
+    return {effect for effect in effects if not acts(effect)}
 
 
 def worth_naming(shares_of: Callable[[list[str]], Split], effects: list[str]) -> Split:
@@ -96,7 +122,12 @@ def worth_naming(shares_of: Callable[[list[str]], Split], effects: list[str]) ->
     """
     parts = shares_of(effects)
     while effects:
-        dropouts = [e for e in effects if parts.effects[e].interval90[1] < least_share(e)]
+        dropouts = [
+            e
+            for e in effects
+            if parts.effects[e].interval90[1] < least_share(e)
+            or parts.effects[e].value < LEAST_SHARE
+        ]
         if not dropouts and parts.gap.reduction < 0.0:
             dropouts = [min(effects, key=lambda e: parts.effects[e].value)]
         if not dropouts:

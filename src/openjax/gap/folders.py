@@ -46,7 +46,7 @@ def diagnose_folder(
         if trims is not None:
             _check_that_most_show_more(case, trims)
         days = [day.case() for day in logs_before]
-        report = diagnose_case(case, without, progress, days)
+        report = diagnose_case(case, without, progress, days, trims)
     except TooLittle as error:
         if trims is None:
             raise
@@ -56,7 +56,6 @@ def diagnose_folder(
         progress("asking which flight would tell most")
     return replace(
         report,
-        trims=trims,
         vehicle="" if vehicle_file.path is None else str(vehicle_file.path.resolve()),
         next_flight=next_flight(report.to_dict(), vehicle_file),
     )

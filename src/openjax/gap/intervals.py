@@ -7,6 +7,7 @@ replay's torques are biased where motors answer gusts.
 """
 
 import numpy as np
+from scipy.stats import truncnorm
 
 from openjax.gap.channels import Estimated, of_flights
 from openjax.gap.criteria import Measured
@@ -19,6 +20,8 @@ from openjax.gap.model.library import CARDS, PLACE, path_of
 from openjax.gap.report import Estimate
 from openjax.vehicle.effects import EFFECTS
 from openjax.vehicle.effects.effect import Parameter
+
+TINY = 1e-9  # of an error that is none at all
 
 
 def estimates(evidence: Evidence, fit: SetFit, effects) -> dict[str, dict[str, Estimate]]:
@@ -49,6 +52,13 @@ def _estimate(estimate: Estimated, parameter: Parameter, vehicle) -> Estimate:
     end = estimate.value + REACH * estimate.above
     least, most = parameter.limits(vehicle)
     value, low, high = np.clip((estimate.value, start, end), least, most).tolist()
+    if low == high:
+        # all of it lies beyond the domain: what a normal distribution has inside begins
+        # at the bound and falls off
+        error = max(estimate.below, estimate.above, TINY)
+        ends = (np.array([least, most]) - estimate.value) / error
+        inside = truncnorm(*ends, loc=estimate.value, scale=error).ppf([0.1, 0.9])
+        low, high = (value, float(inside[1])) if value == least else (float(inside[0]), value)
     return Estimate(
         value=value,
         unit=parameter.unit,

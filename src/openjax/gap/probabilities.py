@@ -44,21 +44,29 @@ def reliable(chance: dict[str, float], share: float, causes: Collection[str]) ->
     """Probabilities of a choice that is right in no more than a `share` of the cases,
     however often draws repeat it: what is left goes to all `causes` alike.
     """
-    alike = (1.0 - share) / len(causes)
-    return {name: share * p + alike * (name in causes) for name, p in chance.items()}
+    each = (1.0 - share) / len(causes)
+    return {name: share * p + each * (name in causes) for name, p in chance.items()}
 
 
-def agreeing(chance: dict[str, float], answers, sure: float) -> dict[str, float]:
+def alike(chance: dict[str, float]) -> float:
+    """The probability that a choice which is wrong leaves each cause."""
+    return (1.0 - DECISION.reliability) / len(chance)
+
+
+def agreeing(
+    chance: dict[str, float], answers, sure: float, no_gap: float = 1.0
+) -> dict[str, float]:
     """Probabilities that agree with the words `answers`. Where draws of blocks choose
-    nothing, though a share's interval begins at `sure`, they say that an effect is weak
-    in some flights, not that none acts. What isn't named is at most as likely as what
-    is.
+    nothing, though a share's interval begins at `sure` or the probability of no gap at
+    all is `no_gap`, they say that an effect is weak in some flights, not that none acts.
+    What isn't named is at most as likely as what is.
     """
     chance = dict(chance)
     answer = max(answers, key=lambda name: chance[name])
-    if sure > SURE_SHARE and chance["none"] > NOTHING:
-        chance[answer] += chance["none"] - NOTHING
-        chance["none"] = NOTHING
+    most = max(min(no_gap, NOTHING if sure > SURE_SHARE else 1.0), alike(chance))
+    if chance["none"] > most:
+        chance[answer] += chance["none"] - most
+        chance["none"] = most
     for rival in sorted(set(chance) - set(answers), key=lambda name: -chance[name]):
         if chance[rival] <= chance[answer]:
             break

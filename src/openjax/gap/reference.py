@@ -21,6 +21,7 @@ from openjax.gap.model.library import ABSENT, CARDS, PLACE, THETA, Library, libr
 from openjax.gap.model.table import build, with_effects
 from openjax.gap.residual import measure, residuals_of
 from openjax.gap.selection import search_sets
+from openjax.gap.trims import Change
 from openjax.vehicle.effects import EFFECTS
 from openjax.vehicle.effects.effect import VERY_RARE
 
@@ -105,13 +106,18 @@ def trim_of(theta: np.ndarray, effects, vehicle) -> np.ndarray:
     return out
 
 
-def trimmed_before(theta: np.ndarray, effects, baseline: Baseline | None, vehicle) -> set[str]:
-    """Those of the `effects` that are no change: trims that are more the
-    reference's than not, though no day need have the trims of another one.
+def trimmed_before(
+    theta: np.ndarray, effects, baseline: Baseline | None, vehicle, change: Change | None = None
+) -> set[str]:
+    """Those of the `effects` that are no change, though no day need have the trims of
+    another one: what the comparison of all flights' trims (`change`) leaves to the
+    spread of days; where logs allow none, trims that are more the reference's than not.
     """
     trims = set(effects) & set(OF_DAYS)
     if baseline is None or not trims:
         return set()
+    if change is not None:
+        return set() if change.trims_changed else trims
     trim = trim_of(theta, trims, vehicle)
     same = np.linalg.norm(trim - baseline.trim) < 0.5 * np.linalg.norm(trim)
     return trims if same else set()

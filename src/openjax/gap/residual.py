@@ -20,7 +20,7 @@ from openjax.flights.shapes import Chosen
 from openjax.flights.track import Track, specific_force_of, to_body
 from openjax.gap.decision import DECISION
 from openjax.gap.evidence import Evidence
-from openjax.gap.identification.corrections import CLEAR
+from openjax.gap.identification.quantities import CLEAR
 from openjax.gap.model.bounds import BOUND
 from openjax.gap.model.hypotheses import SetFit, without_nuisances
 from openjax.gap.model.nuisances import SIZE

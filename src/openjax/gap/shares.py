@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
+from scipy.stats import norm
 
 from openjax.gap.decision import DECISION
 from openjax.gap.evidence import Evidence
@@ -61,6 +62,13 @@ class Gap:
     """1 - after / before."""
     interval90: tuple[float, float]
     """Of the reduction."""
+
+    @property
+    def probability_of_none(self) -> float:
+        """That the named effects close no more of the gap than what matters."""
+        low, high = self.interval90
+        deviation = max((high - low) / 3.29, 1e-9)
+        return float(norm.cdf((DECISION.least_gap - self.reduction) / deviation))
 
     def in_words(self) -> str:
         """How far the gap shrinks, and a warning where it doesn't."""

@@ -43,9 +43,9 @@ def fill_template(template: str, folder: Path, **values) -> str:
     return re.sub(r"(?<=\d) %", "\u00a0%", page)
 
 
-def small_figure(height: float) -> tuple[Figure, Axes]:
-    """A figure of one panel as wide as a column of a page."""
-    figure = Figure(figsize=(5.8, height + 0.4), layout="constrained")
+def small_figure(size: tuple[float, float]) -> tuple[Figure, Axes]:
+    """A figure of one panel; width and height in inches."""
+    figure = Figure(figsize=size, layout="constrained")
     return figure, figure.subplots()
 
 

@@ -8,9 +8,6 @@ from openjax.gap.identification.quantities import REACH, Identification
 from openjax.gap.model.library import CARDS
 from openjax.vehicle.effects import EFFECTS
 
-CLEAR = 3.0  # standard deviations from the simulator's value
-MATTERS = {"motor_lag": 0.006, "inertia": 0.15, "yaw_torque": 0.2}
-"""s, and shares: differences from which training should know."""
 LAGS = {"extra_up": "spin_up", "extra_down": "spin_down"}
 """The time constant that an effect's parameter counts from the simulator's."""
 LEAST = 0.04  # of the simulator's number, where an estimate isn't positive
@@ -27,15 +24,6 @@ class _Number:
     """The simulator's."""
     error: float
     """Standard deviation of the logarithm, as the report's intervals have it."""
-
-    @property
-    def is_clear(self) -> bool:
-        """Whether it differs clearly from the simulator's, and by as much as
-        matters.
-        """
-        ratio = abs(np.log(self.value / self.nominal))
-        size = abs(self.value - self.nominal)
-        return bool(ratio > CLEAR * self.error and size > MATTERS[self.effect])
 
     @property
     def ends(self) -> tuple[float, float, float]:
@@ -66,7 +54,8 @@ def corrections(identification: Identification, effects) -> tuple[dict, dict]:
         of_effect = [number for number in numbers if number.effect == effect]
         if lag_alone and effect != "motor_lag":
             continue
-        if effect in effects or any(number.is_clear for number in of_effect):
+        departs = any(q.departs for q in identification.quantities.values() if q.effect == effect)
+        if effect in effects or departs:
             values[effect] = {n.parameter: n.ends[0] for n in of_effect}
             intervals[effect] = {n.parameter: n.ends[1:] for n in of_effect}
     return values, intervals

@@ -5,6 +5,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from openjax.flights.flight import Case
+from openjax.gap.decision import DECISION
 from openjax.gap.identification.estimates import EffectEstimates, of_fit
 from openjax.gap.identification.forces import identify_forces, trims
 from openjax.gap.identification.prediction_errors import NAMES
@@ -15,8 +16,6 @@ from openjax.gap.identification.torques import identify_torques
 
 REACH = 1.645  # standard deviations of a 90 % interval
 TALKED_OF = 5.0  # Hz: where rate loops of such vehicles work
-ALIKE = (0.8, 1.25)  # ratios of gains that nobody would feel
-ALIKE_PHASE = 10.0  # degrees, the same
 MAP = (
     "motor commands are duty cycles: inertia and yaw ratio hold the unknown slope of their thrust, "
     "too"
@@ -28,23 +27,39 @@ SAMPLES = (
 TURNS = 8.0  # standard deviations of noise: below, rows show a loop that answers noise
 CLOCK = 0.010  # s: rows off by more are worth a sentence
 POSITIVE = ("spin_up", "spin_down", "roll_gain", "pitch_gain", "yaw_gain")
-UNITS = {
-    **dict.fromkeys(("spin_up", "spin_down", "delay"), "s"),
-    **dict.fromkeys(("damping", "yaw_damping"), "1/s"),
-    **dict.fromkeys(("drag_xy", "drag_z"), "N s/m"),
-    "sag": "1/V",
+CLEAR = 3.0  # standard deviations from the simulator's value
+MATTERS = {"motor_lag": 0.006, "inertia": 0.15, "yaw_torque": 0.2}
+"""s, and shares: differences from which training should know, by effect."""
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What a number is in words, the effect to which it belongs, and its unit."""
+
+    words: str
+    effect: str = ""
+    unit: str = "1"
+
+
+KINDS = {
+    "spin_up": Kind("time constant of speeding up", "motor_lag", "s"),
+    "spin_down": Kind("time constant of slowing down", "motor_lag", "s"),
+    "delay": Kind("delay of the motors", "motor_lag", "s"),
+    "damping": Kind("damping of roll and pitch", unit="1/s"),
+    "yaw_damping": Kind("damping of yaw", unit="1/s"),
+    "inertia_roll": Kind("inertia about x, as a multiple", "inertia"),
+    "inertia_pitch": Kind("inertia about y, as a multiple", "inertia"),
+    "yaw_ratio": Kind("torque over inertia about z, as a multiple", "yaw_torque"),
+    "thrust_level": Kind("thrust, as a multiple", "thrust_scale"),
+    "thrust_slope": Kind("slope of the thrust, as a multiple", "thrust_curve"),
+    "sag": Kind("thrust per volt of the battery", "battery_sag", "1/V"),
+    "drag_xy": Kind("drag in the rotor plane", "rotor_drag", "N s/m"),
+    "drag_z": Kind("drag along the rotor axes", "rotor_drag", "N s/m"),
+    "roll_trim": Kind("trim of roll, share of the thrust", "motor_imbalance"),
+    "pitch_trim": Kind("trim of pitch, share of the thrust", "motor_imbalance"),
+    "yaw_trim": Kind("trim of yaw, share of the thrust", "motor_imbalance"),
 }
-EFFECTS_OF = {
-    **dict.fromkeys(("spin_up", "spin_down", "delay"), "motor_lag"),
-    **dict.fromkeys(("inertia_roll", "inertia_pitch"), "inertia"),
-    **dict.fromkeys(("drag_xy", "drag_z"), "rotor_drag"),
-    **dict.fromkeys(("roll_trim", "pitch_trim", "yaw_trim"), "motor_imbalance"),
-    "yaw_ratio": "yaw_torque",
-    "thrust_level": "thrust_scale",
-    "thrust_slope": "thrust_curve",
-    "sag": "battery_sag",
-}
-"""The effect in whose share of the gap a number has its part."""
+"""Every number of a vehicle that may be told."""
 
 
 @dataclass(frozen=True)
@@ -65,6 +80,27 @@ class Quantity:
     def differs(self) -> bool:
         """Whether the interval leaves the simulator's value out."""
         return not self.interval90[0] <= self.simulator <= self.interval90[1]
+
+    @property
+    def departs(self) -> bool:
+        """Whether a positive number differs from the simulator's by three standard
+        deviations, and by as much as training should know.
+        """
+        least = MATTERS.get(self.effect)
+        if least is None or self.simulator <= 0.0 or self.value <= 0.0:
+            return False
+        error = CLEAR / REACH * np.log(self.interval90[1] / self.value)
+        ratio = abs(np.log(self.value / self.simulator))
+        return bool(ratio > error and abs(self.value - self.simulator) > least)
+
+    def in_words(self, words: str) -> str:
+        """The number with its interval, beside the simulator's."""
+        factor, unit = (1e3, " ms") if self.unit == "s" else (1.0, f" {self.unit}")
+        value, low, high, nominal = (
+            f"{factor * v:.3g}" for v in (self.value, *self.interval90, self.simulator)
+        )
+        unit = "" if self.unit == "1" else unit
+        return f"{words} {value}{unit} [{low}, {high}], the simulator's {nominal}{unit}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,25 +141,27 @@ class Identification:
         if not self.trustworthy:
             return f"How torques answer can't be told from these logs: {self.remarks[0]}."
         ratio, lead = self.at(TALKED_OF)
-        lag = self.quantities["spin_up"]
-        if ALIKE[0] < ratio < ALIKE[1] and abs(lead) < ALIKE_PHASE:
-            return (
-                f"At {TALKED_OF:g} Hz this vehicle turns as the simulator does: gain × {ratio:.2f},"
-                f" phase {lead:+.0f}°."
-            )
-        text = (
-            f"At {TALKED_OF:g} Hz this vehicle turns with {ratio:.2f} of the simulator's "
-            "acceleration, "
-        )
+        ratio_error, lead_error = self.errors_at(TALKED_OF)
+        weaker = abs(np.log(ratio)) > max(ratio_error, DECISION.form_error)
+        has_shift = abs(lead) > max(lead_error, np.rad2deg(DECISION.form_error))
+        low, high = ratio * np.exp([-ratio_error, ratio_error])
+        gain = f"{ratio:.2f} [{low:.2f}, {high:.2f}]"
         shift = f"{abs(lead):.0f}° {'later' if lead < 0.0 else 'earlier'}"
-        text += "in phase with it" if abs(lead) < ALIKE_PHASE else shift
-        if lag.differs:
-            low, high = (1e3 * v for v in lag.interval90)
-            text += (
-                f": its motors take {1e3 * lag.value:.0f} ms [{low:.0f}, {high:.0f}] to speed up, "
-                f"the simulator's {1e3 * lag.simulator:.0f} ms"
-            )
-        return text + "."
+        text = f"At {TALKED_OF:g} Hz this vehicle turns "
+        if not weaker and not has_shift:
+            return f"{text}as the simulator does: gain × {gain}, phase {lead:+.0f}°."
+        strength = "as strongly as the simulator"
+        if weaker:
+            strength = f"with {gain} of the simulator's acceleration"
+        return f"{text}{strength}, {shift if has_shift else 'in phase with it'}."
+
+    def in_words(self, effect: str) -> str:
+        """The numbers that belong to an effect and depart from the simulator's."""
+        return "; ".join(
+            q.in_words(KINDS[name].words)
+            for name, q in self.quantities.items()
+            if q.effect == effect and q.departs
+        )
 
     def at(self, frequency: float) -> tuple[float, float]:
         """Gain as a share of the simulator's, and phase beyond it in degrees: means of
@@ -134,6 +172,18 @@ class Identification:
         ratio = np.mean([m[0] / s[0] for m, s in points])
         lead = np.mean([(m[1] - s[1] + 180.0) % 360.0 - 180.0 for m, s in points])
         return float(ratio), float(lead)
+
+    def errors_at(self, frequency: float) -> tuple[float, float]:
+        """Half widths of the 90 % intervals of `at`: of the gain's logarithm, and of the
+        phase in degrees.
+        """
+        squares = np.zeros(2)
+        for axis in ("roll", "pitch"):
+            for response in (self.responses[axis].measured, self.responses[axis].simulated):
+                (gain_low, _, gain_high), (low, _, high) = response.band_at(frequency)
+                squares += np.square([0.5 * np.log(gain_high / gain_low), 0.5 * (high - low)])
+        gain, phase = 0.5 * np.sqrt(squares)
+        return float(gain), float(phase)
 
 
 def identify(case: Case, one_clock: bool = True, gain_error: float = 0.0) -> Identification | None:
@@ -204,8 +254,8 @@ def _quantity(name: str, value: float, deviation: float, simulator: float) -> Qu
     has_bounds = name.startswith(("spin", "inertia")) or name == "yaw_ratio"
     gain = 1.0 / value if name.startswith("inertia") else value
     ends = has_bounds and bool(np.isclose(bounds, gain, rtol=0.02).any())
-    effect = EFFECTS_OF.get(name, "")
-    return Quantity(value, interval, simulator, UNITS.get(name, "1"), effect, ends)
+    kind = KINDS[name]
+    return Quantity(value, interval, simulator, kind.unit, kind.effect, ends)
 
 
 def doubts(records: list[Record], fit: TorqueFit, one_clock: bool) -> tuple[str, ...]:

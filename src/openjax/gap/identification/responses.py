@@ -39,8 +39,13 @@ class Response:
 
     def at(self, frequency: float) -> tuple[float, float]:
         """Gain and phase at the frequency next to one."""
+        gain, phase = self.band_at(frequency)
+        return gain[1], phase[1]
+
+    def band_at(self, frequency: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Low, middle and high of gain and phase at the frequency next to one."""
         nearest = int(np.argmin(np.abs(np.array(self.frequency) - frequency)))
-        return self.gain[nearest][1], self.phase[nearest][1]
+        return self.gain[nearest], self.phase[nearest]
 
 
 @dataclass(frozen=True)

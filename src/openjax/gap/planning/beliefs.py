@@ -129,13 +129,14 @@ def sentence(advice: Advice, report: dict) -> str:
     best = advice.promises[0]
     hopeless = [pair for pair, nats in advice.nats.items() if nats < DETECTABLE]
     weigh = [pair for pair in hopeless if set(pair) <= SCALE_ONLY]
-    pair = f"{best.pair[0]!r} from {best.pair[1]!r}"
+    causes = [cause for cause in best.pair if cause != "nothing"]
+    question = f"whether {causes[0]} acts" if len(causes) == 1 else " from ".join(causes)
     text = (
-        f"Fly {best.segment!r} next, {SEGMENTS[best.segment].shows}: in {SECONDS:.0f} s it tells "
-        f"{pair} by {best.nats:.0f} nats, and {DETECTABLE:.0f} are enough."
+        f"Fly {best.segment!r} next, {SEGMENTS[best.segment].shows}: {SECONDS:.0f} s of it are "
+        f"enough to tell {question}."
     )
     if best.nats < DETECTABLE:
-        text = f"No segment tells {pair}."
+        text = f"No segment tells {question}."
     if weigh:
         text += f" No flight tells {weigh[0][0]} from {weigh[0][1]}: weigh the vehicle."
     if mends := _to_mend(report):

@@ -18,6 +18,7 @@ from openjax.show.pages import AFTER, BEFORE, GREY, STYLE, add_legend, as_svg, s
 
 HORIZONS_SHOWN = (0.02, 0.05, 0.1, 0.25, 0.5, 1.0)  # s
 BINS = 15
+WIDTH = 4.6  # inches, read on a phone as on a desk
 
 
 def figures(report: Report) -> list[tuple[str, str, str]]:
@@ -52,7 +53,7 @@ def _places(report: Report):
     places = [place for place in report.where if place.share > 0.01][:8][::-1]
     if not report.effects or not places:
         return None
-    figure, axes = small_figure(0.6 + 0.42 * len(places))
+    figure, axes = small_figure((WIDTH, 1.0 + 0.42 * len(places)))
     rows = np.arange(len(places))
     nominal = np.array([place.before for place in places])
     with_effects = np.array([place.after for place in places])
@@ -180,7 +181,7 @@ def _course(report: Report):
     if course is None:
         return None
     nominal, remaining = course.errors(HORIZONS["velocity"])
-    figure, axes = small_figure(2.6)
+    figure, axes = small_figure((WIDTH, 3.0))
     time = course.time[-len(remaining) :] - course.time[0]
     # so many standard deviations hold 90 % of a normal distribution
     band = 1.645 * rms(remaining)
@@ -213,7 +214,7 @@ def _horizons(report: Report):
     if course is None or not course.adds_up:
         return None
     ahead = sorted({max(round(h / course.dt), 1) * course.dt for h in HORIZONS_SHOWN})
-    figure, axes = small_figure(2.6)
+    figure, axes = small_figure((WIDTH, 3.0))
     sizes = np.array([[rms(error) for error in course.errors(h)] for h in ahead])
     nominal, remaining = sizes.T
     for size, colour, label in _lines(report, nominal, remaining):
@@ -244,7 +245,7 @@ def _coordinate(report: Report):
     coordinate = CARDS[effects[0]].coordinate
     if not coordinate:  # its force follows none, or it makes torques or delays
         return None
-    figure, axes = small_figure(2.6)
+    figure, axes = small_figure((WIDTH, 3.0))
     for residuals, (_, colour, label) in zip(
         _residuals(report), _lines(report, None, None), strict=False
     ):

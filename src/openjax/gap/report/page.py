@@ -7,14 +7,11 @@ from pathlib import Path
 
 from openjax.gap.model.library import CARDS
 from openjax.gap.report.figures import figures
-from openjax.gap.report.report import VERDICTS, VERDICTS_SINCE, Report
+from openjax.gap.report.report import Report
 from openjax.gap.report.response import response_of
 from openjax.gap.report.trims_page import content_of
 from openjax.show.pages import fill_template
 from openjax.vehicle.effects import EFFECTS
-
-MOST = 0.5
-"""Share of the gap below which what is named isn't most of it."""
 
 
 def page_of(report: Report, folder: Path | None = None) -> str:
@@ -25,18 +22,29 @@ def page_of(report: Report, folder: Path | None = None) -> str:
     return fill_template(
         "page.html.jinja",
         Path(__file__).parent,
+        title=f"Diagnosis of {report.case}",
         report=report,
-        does=response_of(report.identification),
+        does=response_of(report),
         facts=facts(report),
-        sentence=sentence(report),
         shares=shares(report),
         steps=next_steps(report, folder),
         figures=figures(report),
-        trims=None if report.trims is None else content_of(report.trims),
+        trims=_trims(report),
         meanings={e: EFFECTS[e].description for e in report.parameters if e in EFFECTS},
-        hidden=[(e, CARDS[e].next_flight) for e in report.not_testable if e in CARDS],
-        ranked=[(name, p) for name, p in ranking[:8] if p > 5e-4],
+        hidden=[
+            (e.replace("_", " "), CARDS[e].next_flight) for e in report.not_testable if e in CARDS
+        ],
+        ranked=[(name.replace("_", " "), f"{p:.3f}") for name, p in ranking[:8] if p > 5e-4],
+        checks=[(q["flight"], q["issue"]) for q in report.quality],
     )
+
+
+def _trims(report: Report) -> dict | None:
+    """What the page shows of trims beside the reference; None without."""
+    if report.trims is None:
+        return None
+    answers = report.change_by_trims is not None
+    return content_of(report.trims, report.trims_in_words, answers)
 
 
 def facts(report: Report) -> list[tuple[str, str]]:
@@ -54,40 +62,6 @@ def facts(report: Report) -> list[tuple[str, str]]:
         ("Vehicle", f"{case.vehicle_file.name}, {mass}{remark}"),
         ("Flights", f"{len(case.flights)}, {seconds:.0f} s in all"),
     ]
-
-
-def sentence(report: Report) -> str:
-    """What was found, in one plain sentence that says what the chart of shares
-    shows.
-    """
-    effects = report.named
-    if not effects and report.untested_change is not None:
-        return report.untested_change.sentence()
-    if not effects:
-        return (VERDICTS_SINCE if report.reference else VERDICTS)[report.verdict]
-    what = "What changed since the reference" if report.reference else "What the simulator misses"
-    values = [report.shares.effects[effect].value for effect in effects]
-    names = [report.class_of(effect).replace("_", " ") for effect in effects]
-    parts = " and ".join(
-        f"{name} ({100 * value:.0f} %)" for name, value in zip(names, values, strict=True)
-    )
-    whole = sum(values)
-    if whole < MOST:
-        rest = {
-            "unexplained": report.shares.unexplained.value,
-            "of sensors and clocks": report.shares.sensors.value,
-        }
-        other = max(rest, key=rest.get)
-        text = f"{what} is {100 * rest[other]:.0f} % {other}; named is {parts}"
-    else:
-        qualifier = "" if whole > 0.995 else "mostly "  # .995 is 100 % as it is printed
-        text = f"{what} is {qualifier}{parts}"
-    if report.parameters:
-        those = "it" if len(effects) == 1 else "them"
-        smaller = f"{100 * report.gap.reduction:.0f} %"
-        text += f"; with {those}, errors on held-out flights shrink by {smaller}"
-    unknown = " Something unknown acts as well." if "unknown" in report.effects else ""
-    return f"{text}.{unknown}"
 
 
 def shares(report: Report) -> list[dict]:

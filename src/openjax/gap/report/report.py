@@ -2,27 +2,27 @@
 
 from dataclasses import asdict, dataclass, field, fields, is_dataclass
 
+from openjax.gap.identification.corrections import corrections
 from openjax.gap.identification.quantities import Identification
 from openjax.gap.shares import Gap, Split
 from openjax.gap.trims.change import Change
 from openjax.gap.where import Place, in_words
 
 VERDICTS = {
-    "none": "The simulator agrees with these flights to within the sensors' noise.",
+    "none": "The simulator agrees with these flights to within the noise of the sensors.",
     "unknown": "The simulator misses something that no known effect explains.",
-    "not_testable": (
-        "No effect is seen, but these flights couldn't show most of those that are usual."
-    ),
+    "not_testable": "No effect is seen, but these flights could not have shown most effects.",
 }
 """What is said of each verdict that names nothing."""
 VERDICTS_SINCE = {
-    "none": "The vehicle is as in its reference flights, to within what a day changes.",
+    "none": "The vehicle is as in its reference flights, to within what days differ by.",
     "unknown": "The vehicle changed in a way that no known effect explains.",
-    "not_testable": (
-        "No change is seen, but these flights couldn't show most of those that are usual."
-    ),
+    "not_testable": "No change is seen, but these flights could not have shown most changes.",
 }
 """The same where a reference of the vehicle was given."""
+MOST = 0.5
+"""Share of the gap below which what is named isn't most of it."""
+WIDEST = 10.0  # ratio of an interval's ends from which on it tells no size
 
 
 @dataclass(frozen=True)
@@ -39,18 +39,27 @@ class Estimate:
 
     def in_words(self, name: str) -> str:
         """The value of the parameter `name` with its interval and unit, and whether it
-        is unusual.
+        is unusual; the interval alone where it is no size.
         """
         low, high = self.interval90
-        text = f"{name} = {self.value:.4g} [{low:.4g}, {high:.4g}]"
-        if self.unit != "1":
-            text += f" {self.unit}"
+        unit = "" if self.unit == "1" else f" {self.unit}"
+        if not self.is_size:
+            return f"{name} between {low:.2g} and {high:.2g}{unit}, which is no size"
+        text = f"{name} = {self.value:.4g} [{low:.4g}, {high:.4g}]{unit}"
         return f"{text} (unusual)" if self.unusual else text
 
     @property
+    def is_size(self) -> bool:
+        """Whether the interval tells the order of magnitude."""
+        near, far = sorted(map(abs, self.interval90))
+        one_sign = self.interval90[0] * self.interval90[1] > 0.0
+        return not one_sign or far <= WIDEST * near
+
+    @property
     def unusual(self) -> bool:
-        """Whether it lies outside of its prior range."""
-        return not self.usual[0] <= self.value <= self.usual[1]
+        """Whether all of the interval lies outside of the prior range."""
+        low, high = self.interval90
+        return high < self.usual[0] or low > self.usual[1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,20 +118,46 @@ class Report:
         return [e for e in self.effects if e != "unknown"]
 
     @property
-    def untested_change(self) -> Change | None:
-        """What trims and gains say changed, where nothing is named and these flights
-        couldn't have shown it to the diagnosis; else None.
+    def change_by_trims(self) -> Change | None:
+        """What trims and gains say changed beyond what days differ by, where that is
+        none of the names: a cause that moves trims, or one that these flights could not
+        have shown the diagnosis. Else None.
         """
         trims = self.trims
-        if trims is None or self.effects or not trims.effects:
+        if trims is None or not trims.changed:
             return None
-        return trims if set(trims.effects) <= set(self.not_testable) else None
+        names = {*self.named, *(o for others in self.equivalent.values() for o in others)}
+        overlap = names & set(trims.effects)
+        decides = trims.trims_changed or set(trims.effects) <= set(self.not_testable)
+        return trims if decides and not overlap else None
+
+    @property
+    def trims_in_words(self) -> list[str]:
+        """By what trims differ from the reference's; what that means only where it is a
+        part of the answer.
+        """
+        trims = self.trims
+        if trims is None:
+            return []
+        if self.change_by_trims is not None or set(self.named) & set(trims.effects):
+            return trims.measured_in_words()
+        return trims.differences_in_words()
+
+    @property
+    def departures(self) -> list[str]:
+        """Effects whose numbers depart from the simulator's as they were measured, and
+        that aren't named.
+        """
+        does = self.identification
+        if does is None or self.reference:
+            return []
+        return [e for e in corrections(does, self.named)[0] if e not in self.named]
 
     @property
     def title(self) -> str:
         """The answer in a word."""
-        if self.untested_change is not None:
-            return ", ".join(self.untested_change.effects)
+        if not self.named and self.change_by_trims is not None:
+            return ", ".join(self.change_by_trims.effects) or "unknown"
         if self.effects or not self.reference:
             return ", ".join(self.effects) or self.verdict
         return "no change"
@@ -168,53 +203,103 @@ class Report:
             of_gap = {e: share.value for e, share in self.shares.effects.items()}
             plain["identification"] = self.identification.to_dict(of_gap)
         if self.trims is not None:
-            plain["trims"] = self.trims.to_dict()
+            plain["trims"] = self.trims.to_dict() | {"in_words": self.trims_in_words}
+            if not self.named and self.change_by_trims is not None:
+                plain["verdict"] = "trims"
         return _plain(plain | {"shares": shares, "parameters": estimates})
 
     def class_of(self, effect: str) -> str:
         """A named effect, and those that would do as well in its place."""
         return " or ".join([effect, *self.equivalent.get(effect, ())])
 
+    def headline(self) -> str:
+        """The verdict in a sentence or two: nothing else in the report is one."""
+        since = bool(self.reference)
+        by_trims = self.change_by_trims
+        parts = []
+        if self.named:
+            parts.append(self._named_in_words())
+            if by_trims is not None:
+                parts.append(f"The trims tell of more: {by_trims.causes_in_words()}.")
+        elif by_trims is not None:
+            parts.append(by_trims.sentence())
+        else:
+            parts.append((VERDICTS_SINCE if since else VERDICTS)[self.verdict])
+        if self.departures and not self.effects:
+            differing = "; ".join(self.identification.in_words(e) for e in self.departures)
+            parts = [f"No effect is named, but the vehicle's own numbers differ: {differing}."]
+        elif "unknown" in self.effects and self.verdict != "unknown":
+            parts.append(f"Something unknown {'changed' if since else 'acts'} as well.")
+        return " ".join(parts)
+
+    def _named_in_words(self) -> str:
+        """What share of the gap the named effects cause, and what they are good for."""
+        what = "What changed since the reference" if self.reference else "What the simulator misses"
+        values = [self.shares.effects[effect].value for effect in self.named]
+        parts = " and ".join(
+            f"{self.class_of(effect).replace('_', ' ')} ({100 * value:.0f} %)"
+            for effect, value in zip(self.named, values, strict=True)
+        )
+        if sum(values) < MOST:
+            rest = {
+                "unexplained": self.shares.unexplained.value,
+                "of sensors and clocks": self.shares.sensors.value,
+            }
+            other = max(rest, key=rest.get)
+            text = f"{what} is {100 * rest[other]:.0f} % {other}; named is {parts}"
+        else:
+            qualifier = "" if sum(values) > 0.995 else "mostly "  # 100 % as it is printed
+            text = f"{what} is {qualifier}{parts}"
+        if self.parameters:
+            those = "it" if len(self.named) == 1 else "them"
+            smaller = f"{100 * self.gap.reduction:.0f} %"
+            text += f"; with {those}, errors on held-out flights shrink by {smaller}"
+        unusual = [e for e, p in self.parameters.items() if any(v.unusual for v in p.values())]
+        if unusual:
+            text += (
+                f". {' and '.join(unusual).replace('_', ' ').capitalize()} would be unusually "
+                "large: a cause that is not on the list may act instead"
+            )
+        return f"{text}."
+
+    def measured_in_words(self) -> list[str]:
+        """What the vehicle does, beside the simulator, without any cause."""
+        does = self.identification
+        if does is None or not does.trustworthy:
+            return []
+        numbers = [does.in_words(e) for e in self.named if does.in_words(e)]
+        others = [does.in_words(e) for e in self.departures if self.effects]
+        lines = [does.sentence()]
+        if numbers:
+            lines.append(f"Measured: {'; '.join(numbers)}.")
+        if others:
+            lines.append(f"Measured too, but not named: {'; '.join(others)}.")
+        return lines
+
     def shares_in_words(self) -> str:
         """Every named class' share with its interval, then sensors and clocks, then
         what is unexplained.
         """
-        class_shares = []
-        for effect in self.named:
-            share = self.shares.effects[effect]
-            low, high = share.interval90
-            interval = f"[{_short(low)}, {_short(high)}]"
-            class_shares.append(f"{self.class_of(effect)} {_short(share.value)} {interval}")
-        parts = [
-            *([", ".join(class_shares)] if class_shares else []),
-            f"sensors and clocks {_short(self.shares.sensors.value)}",
-            f"unexplained {_short(self.shares.unexplained.value)}",
+        parts = {self.class_of(e): self.shares.effects[e] for e in self.named}
+        rows = [
+            f"{name} {share.value:.2f} [{share.interval90[0]:.2f}, {share.interval90[1]:.2f}]"
+            for name, share in parts.items()
         ]
-        return f"Shares of the gap: {'; '.join(parts)}."
-
-    def verdict_in_words(self) -> str:
-        """What a verdict that names nothing means, and how probable it is."""
-        if self.untested_change is not None:
-            return " ".join(self.untested_change.in_words()[:2])
-        meanings = VERDICTS_SINCE if self.reference else VERDICTS
-        meaning = meanings.get(self.verdict, "")
-        sure = self.probabilities.get(self.verdict)
-        return meaning if sure is None else f"{meaning} Probability {sure:.2f}."
+        rows.append(f"sensors and clocks {self.shares.sensors.value:.2f}")
+        rows.append(f"unexplained {self.shares.unexplained.value:.2f}")
+        return f"Shares of the gap: {'; '.join(rows)}."
 
     def in_words(self) -> list[str]:
-        """The shares, then what they mean, in a few plain sentences."""
+        """The answer, what was measured, then what is behind it, in plain sentences."""
         lines = [f"Left out: {text}." for text in self.left_out]
-        does = self.identification
-        if does is not None and does.trustworthy:
-            lines.append(does.sentence())
+        sure = "" if self.effects else self.probabilities.get(self.verdict)
+        lines.append(self.headline() + (f" Probability {sure:.2f}." if sure else ""))
+        lines += self.measured_in_words()
         if self.effects or self.sensors:
             lines.append(self.shares_in_words())
-        if not self.parameters:
-            lines.append(self.verdict_in_words())
         lines += [f"Sensors: {text}." for text in self.sensors]
         lines += [self.rest, self.reference]
-        if self.trims is not None and self.untested_change is None:
-            lines.append(f"Trims and gains alone: {self.trims.sentence()}")
+        lines += self.trims_in_words
         if self.effects:
             lines.append(f"Where: {in_words(self.where)}.")
         lines += self._parameters_in_words()
@@ -226,7 +311,7 @@ class Report:
         """What is left open, and what would tell it."""
         lines = []
         if self.runner_up:
-            lines.append(f"Runner-up: {self.runner_up}.")
+            lines.append(f"Next most probable: {self.runner_up}.")
         if self.not_testable:
             lines.append(f"Not testable with these flights: {', '.join(self.not_testable)}.")
         lines.append(self.next_flight)
@@ -260,8 +345,3 @@ def _plain(value):
     if isinstance(value, list | tuple):
         return [_plain(v) for v in value]
     return float(f"{value:.6g}") if isinstance(value, float) else value
-
-
-def _short(value: float) -> str:
-    """Two digits without a leading zero."""
-    return f"{value:.2f}".replace("0.", ".", 1)

@@ -1,97 +1,108 @@
-"""The first half of a report: what the vehicle does, beside the simulator."""
+"""What was measured of the vehicle, before any cause is asked for: its numbers and its
+response to its motors, beside the simulator's.
+"""
+
+from collections.abc import Collection
 
 import numpy as np
 from matplotlib import rc_context
+from matplotlib.figure import Figure
+from matplotlib.ticker import NullLocator
 
-from openjax.gap.identification.quantities import Identification
+from openjax.gap.identification.quantities import KINDS, Identification, Quantity
+from openjax.gap.identification.responses import Pair
+from openjax.gap.model.library import CARDS
+from openjax.gap.report.report import Report
 from openjax.show.pages import AFTER, BEFORE, STYLE, as_svg
 
-TITLE = "What the vehicle does"
-WORDS = {
-    "spin_up": "time constant of speeding up",
-    "spin_down": "time constant of slowing down",
-    "delay": "delay of the motors",
-    "damping": "damping of roll and pitch",
-    "yaw_damping": "damping of yaw",
-    "inertia_roll": "inertia about x, as a multiple",
-    "inertia_pitch": "inertia about y, as a multiple",
-    "yaw_ratio": "torque over inertia about z, as a multiple",
-    "thrust_level": "thrust, as a multiple",
-    "thrust_slope": "thrust's slope, as a multiple",
-    "sag": "thrust per volt of the battery",
-    "drag_xy": "drag in the rotor plane",
-    "drag_z": "drag along the rotor axes",
-    "roll_trim": "trim of roll, share of the thrust",
-    "pitch_trim": "trim of pitch, share of the thrust",
-    "yaw_trim": "trim of yaw, share of the thrust",
-}
+PANEL = (2.9, 4.0)  # inches, of one axis
 
 
-def response_of(identification: Identification | None) -> dict | None:
-    """Sentence, remarks, rows of numbers and the picture (SVG) for the page; None
-    without.
+def response_of(report: Report) -> dict | None:
+    """What `response.html.jinja` shows: sentences, remarks, rows of numbers and the
+    pictures (SVG) of every axis; None where nothing was measured.
     """
-    if identification is None:
+    does = report.identification
+    if does is None:
         return None
     rows = [
         {
-            "name": WORDS.get(name, name.replace("_", " ")),
-            "value": f"{q.value:.3g}",
+            "name": KINDS[name].words,
+            "value": " ".join(f"{q.value:.3g} {q.unit}".removesuffix(" 1").split()),
             "interval": f"{q.interval90[0]:.3g} … {q.interval90[1]:.3g}",
             "simulator": f"{q.simulator:.3g}",
-            "unit": "" if q.unit == "1" else q.unit,
+            "effect": q.effect.replace("_", " "),
+            "meaning": meaning_of(name, q, report),
             "differs": q.differs,
         }
-        for name, q in identification.quantities.items()
+        for name, q in does.quantities.items()
     ]
     return {
-        "sentence": identification.sentence(),
-        "remarks": identification.remarks,
-        "rows": rows,
-        "picture": _picture(identification),
+        "sentences": report.measured_in_words() or [does.sentence()],
+        "remarks": does.remarks if does.trustworthy else does.remarks[1:],
+        "rows": sorted(rows, key=lambda row: not row["differs"]),
+        "pictures": pictures_of(does),
     }
 
 
-def _picture(identification: Identification) -> str:
-    """Gain and phase of every axis over frequency, measured with 90 % bands beside
+def meaning_of(name: str, quantity: Quantity, report: Report) -> str:
+    """Whether a number differs from the simulator's, and whether that matters."""
+    if not quantity.differs:
+        return "as in the simulator"
+    if quantity.effect in report.named or moves(name, report.named):
+        return "differs: a cause below"
+    if not report.identification.trustworthy:
+        return "differs, but is not trusted"
+    if quantity.effect in report.departures:
+        return "differs: in effects.toml, no cause below"
+    return "differs too little to matter"
+
+
+def moves(name: str, effects: Collection[str]) -> bool:
+    """Whether one of the `effects` moves a number that belongs to another one: what
+    weakens the thrust weakens all torques.
+    """
+    cards = [CARDS[e] for e in effects if e in CARDS]
+    if name.endswith("_trim"):
+        return any(card.trim is not None for card in cards)
+    if name.startswith("thrust"):
+        return any(card.scales_motion for card in cards)
+    return name.startswith(("inertia", "yaw")) and any(card.scales_torques for card in cards)
+
+
+def pictures_of(identification: Identification) -> list[tuple[str, str]]:
+    """(axis, gain over phase as SVG) of every axis that was measured."""
+    pictures = []
+    with rc_context(STYLE):
+        for axis, pair in identification.responses.items():
+            pictures.append((axis, as_svg(_draw(axis, pair), f"response of {axis}")))
+    return pictures
+
+
+def _draw(axis: str, pair: Pair) -> Figure:
+    """Gain and phase of one axis over frequency, measured with 90 % bands beside
     simulated.
     """
-    from matplotlib.figure import Figure
-    from matplotlib.ticker import NullLocator
-
-    with rc_context(STYLE):
-        count = len(identification.responses)
-        width = 2.6 * count
-        figure = Figure(figsize=(width, 4.2))
-        # inches around and between what is always as large; a layout that is searched
-        # for takes as long as the drawing
-        figure.subplots_adjust(
-            left=0.75 / width,
-            right=1.0 - 0.1 / width,
-            bottom=0.5 / 4.2,
-            top=1.0 - 0.65 / 4.2,
-            wspace=0.3,
-            hspace=0.12,
-        )
-        grid = figure.subplots(2, count, sharex=True, squeeze=False)
-        for column, (axis, pair) in enumerate(identification.responses.items()):
-            lines = (
-                (pair.simulated, BEFORE, "nominal simulator"),
-                (pair.measured, AFTER, "measured"),
-            )
-            for response, color, name in lines:
-                for row, values in enumerate((response.gain, response.phase)):
-                    low, middle, high = np.array(values).T
-                    axes = grid[row, column]
-                    axes.plot(response.frequency, middle, color=color, label=name)
-                    axes.fill_between(response.frequency, low, high, color=color, alpha=0.25)
-            unit = "m/s² per unit" if axis == "thrust" else "rad/s² per unit"
-            grid[0, column].set(title=axis, xscale="log", ylim=(0.0, None))
-            grid[1, column].set(xlabel="frequency, Hz")
-            if axis in ("roll", "thrust"):
-                grid[0, column].set(ylabel=unit)
-                grid[1, column].set(ylabel="phase, °")
-            grid[1, column].set_xticks([1, 2, 5, 10], ["1", "2", "5", "10"])
-            grid[1, column].xaxis.set_minor_locator(NullLocator())
-        figure.legend(*grid[0, 0].get_legend_handles_labels(), loc="upper left", ncols=2)
-        return as_svg(figure, TITLE)
+    width, height = PANEL
+    figure = Figure(figsize=PANEL)
+    # inches around and between what is always as large; a layout that is searched for
+    # takes as long as the drawing
+    figure.subplots_adjust(
+        left=0.7 / width,
+        right=1.0 - 0.1 / width,
+        bottom=0.5 / height,
+        top=1.0 - 0.1 / height,
+        hspace=0.12,
+    )
+    gain, phase = figure.subplots(2, 1, sharex=True)
+    for response, colour in ((pair.simulated, BEFORE), (pair.measured, AFTER)):
+        for axes, values in ((gain, response.gain), (phase, response.phase)):
+            low, middle, high = np.array(values).T
+            axes.plot(response.frequency, middle, color=colour)
+            axes.fill_between(response.frequency, low, high, color=colour, alpha=0.25)
+    unit = "m/s²" if axis == "thrust" else "rad/s²"
+    gain.set(xscale="log", ylim=(0.0, None), ylabel=f"gain [{unit}]")
+    phase.set(xlabel="frequency [Hz]", ylabel="phase [°]")
+    phase.set_xticks([1, 2, 5, 10], ["1", "2", "5", "10"])
+    phase.xaxis.set_minor_locator(NullLocator())
+    return figure

@@ -6,30 +6,47 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib import rc_context
-from matplotlib.figure import Figure
+from matplotlib.axes import Axes
 
 from openjax.gap.trims.change import Change, difference_in_words
 from openjax.gap.trims.figures import FIGURES, TRIMS
-from openjax.show.pages import AFTER, BEFORE, GREY, STYLE, as_svg, fill_template
+from openjax.show.pages import AFTER, BEFORE, GREY, STYLE, as_svg, fill_template, small_figure
+
+PANEL = (2.4, 3.0)  # inches
 
 
-def content_of(change: Change) -> dict:
-    """What `trims.html.jinja` shows of it."""
+def content_of(change: Change, lines: list[str], answers: bool) -> dict:
+    """What `trims.html.jinja` shows of it, and what is said of it in `lines`. With
+    `answers` the probabilities of places are shown, too.
+    """
+    level = np.mean([f.values["hover"][0] for f in change.reference])
+    pictures = []
     with rc_context(STYLE):
-        picture = as_svg(draw(change), change.name)
+        for name in TRIMS:
+            figure, axes = small_figure(PANEL)
+            _draw_trim(axes, change, name, level)
+            pictures.append((name, as_svg(figure, f"{change.name} {name}")))
+        if answers:
+            figure, axes = small_figure(PANEL)
+            _draw_places(axes, change)
+            pictures.append(("probability", as_svg(figure, change.name)))
     differences = [
         (FIGURES[name].words, difference_in_words(name, d)) for name, d in change.figures.items()
     ]
-    return {"lines": change.in_words(), "picture": picture, "differences": differences}
+    return {"lines": lines, "pictures": pictures, "differences": differences}
 
 
 def page_of_trims(change: Change) -> str:
     """The page of flights that show no more than trims; nothing to fetch from
     elsewhere.
     """
-    folder = Path(__file__).parent
-    trims = content_of(change)
-    return fill_template("trims_page.html.jinja", folder, change=change, trims=trims)
+    return fill_template(
+        "trims_page.html.jinja",
+        Path(__file__).parent,
+        title=f"What changed: {change.name}",
+        change=change,
+        trims=content_of(change, change.in_words()[1:], answers=True),
+    )
 
 
 def _in_percent(flights, name, level):
@@ -40,7 +57,7 @@ def _in_percent(flights, name, level):
     return 100 * (values / level - 1.0 if name == "hover" else values)
 
 
-def _draw_trim(axis, change, name, level):
+def _draw_trim(axes: Axes, change: Change, name: str, level: float) -> None:
     """A trim of every flight, day by day, on the band of normal days."""
     for k, figures in enumerate((change.reference, change.flights)):
         days = list(dict.fromkeys(f.day for f in figures))
@@ -48,30 +65,21 @@ def _draw_trim(axis, change, name, level):
             of_day = [f for f in figures if f.day == day]
             values = _in_percent(of_day, name, level)
             place = k + 0.6 * ((j + 0.5) / len(days) - 0.5)
-            axis.plot(
+            axes.plot(
                 np.full(len(values), place), values, "o", ms=5, color=(GREY, BEFORE)[k], alpha=0.8
             )
     middle = _in_percent(change.reference, name, level).mean()
     spread = 100 * change.spread[name]
-    axis.axhspan(middle - 1.645 * spread, middle + 1.645 * spread, color=AFTER, alpha=0.12, lw=0)
-    axis.set(title=name, xticks=(0, 1), xticklabels=("reference", "new"), xlim=(-0.6, 1.6))
+    axes.axhspan(middle - 1.645 * spread, middle + 1.645 * spread, color=AFTER, alpha=0.12, lw=0)
+    axes.set(xticks=(0, 1), xticklabels=("reference", "new"), xlim=(-0.6, 1.6))
 
 
-def draw(change: Change):
-    """Trims of every flight, day by day, beside what days differ by; and where the
-    change would sit.
-    """
-    figure = Figure(figsize=(11, 3.6), layout="constrained")
-    axes = figure.subplots(1, 5, width_ratios=(1, 1, 1, 1, 1.3))
-    level = np.mean([f.values["hover"][0] for f in change.reference])
-    for axis, name in zip(axes, TRIMS, strict=False):
-        _draw_trim(axis, change, name, level)
-    axes[0].set_ylabel("% of hover (band: 90 % of normal days)")
+def _draw_places(axes: Axes, change: Change) -> None:
+    """How probable no change is, and each place of one."""
     places = sorted(change.places.items(), key=lambda item: -item[1])[:6]
     names = [
         "all" if len(p) == 4 else "+".join(f"m{i}" for i in p) or "no rotor's" for p, _ in places
     ]
     shares = [change.probability * share for _, share in places]
-    axes[4].barh(["no change", *names][::-1], [1 - change.probability, *shares][::-1], color=AFTER)
-    axes[4].set(title="probability", xlim=(0, 1))
-    return figure
+    axes.barh(["no change", *names][::-1], [1 - change.probability, *shares][::-1], color=AFTER)
+    axes.set(xlim=(0, 1))

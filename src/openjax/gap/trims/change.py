@@ -101,7 +101,18 @@ class Change:
 
     def in_words(self) -> list[str]:
         """The answer in a few plain sentences."""
-        lines = [self.sentence()]
+        lines = [self.sentence(), *self.measured_in_words()]
+        if not self.changed and self.probability > 0.2:
+            lines.append(f"Below the spread of days; if anything, {self._sentences()[0]}.")
+        if self.alone_because:
+            lines.append(
+                f"Trims alone were compared, as a diagnosis needs more: {self.alone_because}."
+            )
+        return lines
+
+    def measured_in_words(self) -> list[str]:
+        """How large the change is, and the differences behind it."""
+        lines = []
         if self.trims_changed:
             value, low, high = (100 * v for v in (self.size.value, self.size.low, self.size.high))
             end = " lost." if value > 0 else " (negative: it got stronger or lighter)."
@@ -119,19 +130,7 @@ class Change:
                 for n in names
                 if n in self.figures
             ]
-        elif self.probability > 0.2:
-            lines.append(f"Below the spread of days; if anything, {self._sentences()[0]}.")
-        if self.charge_unknown:
-            lines.append(
-                "What may differ is the battery: an emptier one makes less thrust of a duty cycle. "
-                "Log vbat, and thrust can be compared."
-            )
-        lines += self._differences()
-        if self.alone_because:
-            lines.append(
-                f"Trims alone were compared, as a diagnosis needs more: {self.alone_because}."
-            )
-        return lines
+        return lines + self.differences_in_words()
 
     def sentence(self) -> str:
         """Whether something changed, and by which cause."""
@@ -141,15 +140,18 @@ class Change:
                 "No change beyond what days of such vehicles differ by (probability of one: "
                 f"{chance})."
             )
-        causes = " or ".join(self._sentences())
-        return f"The vehicle changed (probability {chance}): {causes}."
+        return f"The vehicle changed (probability {chance}): {self.causes_in_words()}."
+
+    def causes_in_words(self) -> str:
+        """The causes that these flights can't tell apart."""
+        return " or ".join(self._sentences())
 
     def _sentences(self) -> list[str]:
         """The likely causes in words, each once."""
         return list(dict.fromkeys(_cause_in_words(self, cause) for cause in self.likely_causes))
 
-    def _differences(self) -> list[str]:
-        """By what trims differ, and what that is compared with."""
+    def differences_in_words(self) -> list[str]:
+        """By what trims differ, and what that is compared with: no verdict."""
         differences = ", ".join(
             f"{n} {100 * v.value:+z.1f} % [{100 * v.low:+z.1f}, {100 * v.high:+z.1f}]"
             for n, v in self.figures.items()
@@ -161,7 +163,12 @@ class Change:
             if self.days > 1
             else "a prior: fly the reference on several days"
         )
+        battery = (
+            "What may differ is the battery: an emptier one makes less thrust of a duty cycle. "
+            "Log vbat, and thrust can be compared."
+        )
         return [
+            *([battery] if self.charge_unknown else []),
             "Trims against the reference, as shares of hover, with the spread of days: "
             f"{differences}.",
             f"The reference holds {len(self.reference)} flights of {days} (their spread is "

@@ -47,6 +47,7 @@ EFFECT = Effect(
                 "0 with voltage compensation, 2 where speed follows voltage; to 40 % less thrust "
                 "empty"
             ),
+            domain=NOT_NEGATIVE,
         ),
         "reference": Parameter(
             "V", 3.9, (3.7, 4.2), _CELL, "voltage at which the nominal thrust holds", NOT_NEGATIVE

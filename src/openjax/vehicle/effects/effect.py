@@ -77,9 +77,9 @@ def make_context(vehicle: Vehicle, state: DroneState, **fields) -> Context:
 Domain = tuple[float, float]
 NOT_NEGATIVE: Domain = (0.0, np.inf)
 """Of strengths, lengths and times."""
-RATIO: Domain = (0.05, np.inf)
-"""Of multiples of what is assumed: no vehicle flies with less than a twentieth of
-it.
+RATIO: Domain = (0.05, 20.0)
+"""Of multiples of what is assumed: no vehicle flies with less than a twentieth or more
+than twenty times of it.
 """
 
 # Forces are shares of the weight; drag over mass is alike, since the rotors of larger

@@ -12,7 +12,7 @@ def body(parameters, vehicle):
 
 def some_is_left(vehicle):
     """kg: a vehicle weighs something."""
-    return (RATIO[0] - 1.0) * float(vehicle.mass), RATIO[1]
+    return (RATIO[0] - 1.0) * float(vehicle.mass), np.inf
 
 
 EFFECT = Effect(

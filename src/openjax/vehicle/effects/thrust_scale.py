@@ -24,7 +24,7 @@ EFFECT = Effect(
             none=0.0,
             prior=(-0.2, 0.2),
             source="spread of published Crazyflie thrust maps and of propellers: 2-20 %",
-            domain=(RATIO[0] - 1.0, RATIO[1]),
+            domain=(RATIO[0] - 1.0, RATIO[1] - 1.0),
         )
     },
     body=body,

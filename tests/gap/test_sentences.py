@@ -1,0 +1,259 @@
+"""No sentence of a report contradicts another: reports of all kinds are read whole, and
+each contradiction that a stranger found is told alone.
+"""
+
+import dataclasses
+import itertools
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from openjax.commands.sample_flights import Arguments, make_case
+from openjax.gap.channels import Estimated
+from openjax.gap.diagnosis import _runner_up, forbidden
+from openjax.gap.folders import diagnose_folder
+from openjax.gap.identification.quantities import KINDS, Identification, Quantity
+from openjax.gap.identification.responses import FREQUENCIES, Pair, Response
+from openjax.gap.intervals import _estimate
+from openjax.gap.model.library import ABSENT, CARDS, PLACE
+from openjax.gap.planning.beliefs import sentence
+from openjax.gap.probabilities import agreeing
+from openjax.gap.reference import trimmed_before
+from openjax.gap.report import VERDICTS, Estimate, Report
+from openjax.gap.report.page import page_of
+from openjax.gap.report.report import VERDICTS_SINCE
+from openjax.gap.report.rules import broken_rules
+from openjax.gap.shares import Gap, Share, Split
+from openjax.gap.trims import change_between
+from openjax.gap.trims.figures import FlightFigures, mixer_of
+from openjax.vehicle import load_vehicle
+from openjax.vehicle.effects import EFFECTS
+
+VEHICLE = load_vehicle()
+CASE = SimpleNamespace(
+    vehicle_of=lambda flight: VEHICLE,
+    flights=[None],
+    vehicle_file=SimpleNamespace(motor_permutation=(0, 1, 2, 3)),
+)
+
+
+def flights_of(day, factors=(1.0, 1.0, 1.0, 1.0)):
+    """Trims of three flights of a vehicle whose rotors need these factors."""
+    rng = np.random.default_rng(len(day))
+    mixed = mixer_of(VEHICLE) @ np.asarray(factors)
+    out = []
+    for number in range(3):
+        values = np.r_[0.6 * mixed[0], mixed[1:] / mixed[0]] + 0.001 * rng.standard_normal(4)
+        named = zip(("hover", "roll", "pitch", "yaw"), values, strict=True)
+        figures = {name: (float(value), 0.001) for name, value in named}
+        out.append(FlightFigures(f"{day}{number}", day, figures, None))
+    return out
+
+
+def change(rise):
+    """What trims say of a third rotor that needs so much more."""
+    old = [flight for day in ("monday", "friday") for flight in flights_of(day)]
+    return change_between("tuesday", flights_of("new", (1, 1, 1 + rise, 1)), old, CASE)
+
+
+def identification(ratio=1.0, error=0.03, lag=0.025, lag_error=0.1, trusted=True):
+    """Torques that are so many times the simulator's, and motors of so many seconds;
+    errors are half widths of logarithms at 90 %.
+    """
+
+    def response(axis, gain, width):
+        band = tuple((gain * np.exp([-width, 0.0, width])).tolist())
+        count = len(FREQUENCIES)
+        return Response(
+            axis, tuple(FREQUENCIES.tolist()), (band,) * count, ((-2.0, 0.0, 2.0),) * count
+        )
+
+    pairs = {
+        axis: Pair(response(axis, 100.0 * ratio, error), response(axis, 100.0, 0.5 * error))
+        for axis in ("roll", "pitch")
+    }
+    low, high = (lag * np.exp(sign * lag_error) for sign in (-1.0, 1.0))
+    quantities = {
+        "spin_up": Quantity(lag, (low, high), 0.025, "s", KINDS["spin_up"].effect),
+        "yaw_trim": Quantity(0.01, (-0.01, 0.03), 0.0, "1", KINDS["yaw_trim"].effect),
+    }
+    deviation = lag_error / 1.645 * lag
+    estimates = SimpleNamespace(
+        names=(("motor_lag", "extra_up"),),
+        value=np.array([lag - 0.025]),
+        covariance=np.array([[deviation**2]]),
+    )
+    remarks = () if trusted else ("the vehicle hardly turns; fly the segments yaw or step",)
+    return Identification(quantities, pairs, remarks, estimates, trusted)
+
+
+def report(effects=(), verdict="none", before=1.0, after=1.0, **more):
+    """A report with shares of .7 for the first effect and .2 for others."""
+    named = [e for e in effects if e != "unknown"]
+    found = {e: Share(0.2 if i else 0.7, (0.1, 0.8)) for i, e in enumerate(named)}
+    rest = 1.0 - sum(share.value for share in found.values())
+    reduction = 1.0 - after / before
+    gap = Gap("rms", before, after, 1.0, reduction, (reduction - 0.05, reduction + 0.05))
+    shares = Split(gap, found, Share(rest, (0.0, 1.0)), Share(0.0, (0.0, 0.1)), {})
+    sizes = {
+        e: {
+            p.name: Estimate(p.start, "1", (0.8 * p.start, 1.2 * p.start), (0.0, 2.0 * p.start))
+            for p in CARDS[e].fitted[:1]
+        }
+        for e in named
+    }
+    others = {"none": 0.05, "unknown": 0.02} | dict.fromkeys(named, 0.4)
+    if not named:
+        others = {"none": 0.9, "unknown": 0.05} | (
+            {"unknown": 0.95, "none": 0.02} if effects else {}
+        )
+    filled = {
+        "probabilities": others, "equivalent": {}, "where": [], "not_testable": ["downwash"],
+        "quality": [], "parameters": sizes,
+    } | more  # fmt: skip
+    return Report("tuesday", verdict, tuple(effects), shares=shares, gap=gap, **filled)
+
+
+NAMED = {
+    "nothing": {},
+    "drag": {"effects": ("rotor_drag",), "verdict": "effect", "before": 4.0},
+    "lag": {"effects": ("motor_lag",), "verdict": "effect", "before": 2.0},
+    "rotors": {"effects": ("motor_imbalance", "rotor_drag"), "verdict": "effect", "before": 3.0},
+    "drag and more": {"effects": ("rotor_drag", "unknown"), "verdict": "effect", "before": 4.0},
+    "unknown": {"effects": ("unknown",), "verdict": "unknown", "before": 3.0, "after": 3.0},
+    "little seen": {"verdict": "not_testable"},
+}
+MEASURED = {
+    "alike": identification(),
+    "weaker": identification(ratio=0.86),
+    "slow motors": identification(ratio=0.6, lag=0.049),
+    "not trusted": identification(trusted=False),
+}
+SINCE = "Held against the reference flights of the same vehicle."
+TRIMS = {"alone": None, "a normal day": change(0.0), "a weak rotor": change(0.2)}
+MADE = list(itertools.product(NAMED, MEASURED, TRIMS))
+
+
+@pytest.mark.parametrize(("named", "measured", "trims"), MADE)
+def test_every_sentence_agrees_with_every_other(named, measured, trims):
+    """84 reports: whatever is named, measured and seen in trims."""
+    made = report(**NAMED[named])
+    reference = "" if TRIMS[trims] is None else SINCE
+    parts = {"identification": MEASURED[measured], "trims": TRIMS[trims], "reference": reference}
+    made = dataclasses.replace(made, **parts)
+    assert broken_rules(made) == []
+    if measured != "slow motors":
+        return  # a page takes longer to draw than to read
+    page = page_of(made)
+    assert page.count('class="sentence"') == 1
+    # what is said elsewhere on the page is said by the same words
+    for verdict in (*VERDICTS.values(), *VERDICTS_SINCE.values()):
+        assert (verdict in page) == (verdict in made.headline())
+
+
+def test_one_page_has_one_verdict_beside_a_reference():
+    """A change within what days differ by isn't one, whichever part of the diagnosis
+    saw it; and a change beyond that is one.
+    """
+    quiet, weak = change(0.0), change(0.2)
+    assert not quiet.trims_changed and weak.trims_changed
+    theta = ABSENT.copy()
+    theta[PLACE["motor_imbalance", "m3"]] = -0.02
+    known = SimpleNamespace(trim=np.zeros(4))
+    names = ("motor_imbalance", "rotor_drag")
+    assert trimmed_before(theta, names, known, VEHICLE, quiet) == {"motor_imbalance"}
+    assert trimmed_before(theta, names, known, VEHICLE, weak) == set()
+    calm = dataclasses.replace(report(), reference=SINCE, trims=quiet)
+    assert calm.title == "no change" and "as in its reference" in calm.headline()
+    assert not any("No change beyond" in line for line in calm.in_words())
+    told = dataclasses.replace(report(), reference=SINCE, trims=weak)
+    assert told.headline().startswith("The vehicle changed") and "motor_imbalance" in told.title
+    assert told.to_dict()["verdict"] == "trims"
+    both = dataclasses.replace(report(**NAMED["drag"]), reference=SINCE, trims=weak)
+    assert "The trims tell of more" in both.headline()
+
+
+@pytest.mark.parametrize(
+    ("ratio", "error", "words"),
+    [
+        (0.86, 0.03, "turns with 0.86 [0.84, 0.88] of the simulator's acceleration"),
+        (0.86, 0.3, "turns as the simulator does: gain × 0.86 [0.68, 1.09]"),
+        (1.02, 0.005, "turns as the simulator does: gain × 1.02"),
+    ],
+)
+def test_a_response_is_alike_where_its_band_says_so(ratio, error, words):
+    assert words in identification(ratio, error).sentence()
+
+
+def test_a_report_that_names_nothing_tells_of_numbers_that_differ():
+    made = dataclasses.replace(report(), identification=identification(lag=0.049))
+    assert "agrees" not in made.headline()
+    assert (
+        "time constant of speeding up 49 ms [44.3, 54.2], the simulator's 25 ms" in made.headline()
+    )
+    slightly = dataclasses.replace(report(), identification=identification(lag=0.028))
+    assert "agrees" in slightly.headline() and "28" not in " ".join(slightly.in_words())
+    # a cause is named, and the lag beside it is told as a measurement
+    drag = dataclasses.replace(report(**NAMED["drag"]), identification=identification(lag=0.049))
+    assert "Measured too, but not named" in " ".join(drag.in_words())
+
+
+def test_an_interval_over_more_than_a_factor_of_ten_is_no_size():
+    wide = Estimate(3.0, "1", (0.05, 20.0), (0.7, 1.6))
+    assert "between 0.05 and 20, which is no size" in wide.in_words("zz")
+    assert Estimate(3.0, "1", (1.0, 9.0), (0.7, 1.6)).is_size
+    assert Estimate(0.1, "N", (-0.1, 0.3), (0.0, 1.0)).is_size
+
+
+def test_what_may_be_usual_is_not_called_unusual():
+    assert not Estimate(0.16, "1", (0.14, 0.18), (-0.15, 0.15)).unusual
+    assert Estimate(0.18, "1", (0.16, 0.2), (-0.15, 0.15)).unusual
+
+
+def test_an_interval_beyond_the_domain_has_a_width_and_begins_at_its_end():
+    drag = EFFECTS["rotor_drag"].parameters["d_z"]
+    low, high = _estimate(Estimated(-0.004, 0.001, 0.001), drag, VEHICLE).interval90
+    assert low == 0.0 < high < 0.001
+    assert _estimate(Estimated(0.004, 0.001, 0.001), drag, VEHICLE).interval90[0] > 0.002
+
+
+def test_what_physics_forbids_is_not_named():
+    theta = ABSENT.copy()
+    theta[PLACE["battery_sag", "exponent"]] = -6.3
+    theta[PLACE["rotor_drag", "d_xy"]] = 0.01
+    theta[PLACE["rotor_drag", "d_z"]] = -0.001
+    assert forbidden(theta, ("battery_sag", "rotor_drag"), VEHICLE) == {"battery_sag"}
+    for axis in ("xx", "yy", "zz"):
+        assert EFFECTS["inertia"].parameters[axis].limits()[1] < 68.9
+
+
+def test_nothing_is_no_runner_up_of_a_gap_that_surely_closes():
+    gap = Gap("rms", 50.0, 1.0, 1.0, 0.98, (0.97, 0.99))
+    chance = {"mass": 0.5, "none": 0.4, "wind": 0.1}
+    agreed = agreeing(chance, ("mass",), 0.4, gap.probability_of_none)
+    assert sum(agreed.values()) == pytest.approx(1.0) and agreed["none"] < 0.05
+    assert _runner_up(agreed, ("mass",), {}) == "wind"
+    weak = Gap("rms", 1.05, 1.0, 1.0, 0.05, (0.0, 0.1))
+    assert agreeing(chance, ("mass",), 0.4, weak.probability_of_none)["none"] > 0.2
+
+
+def test_advice_is_said_without_units_of_evidence():
+    promise = SimpleNamespace(segment="high", pair=("nothing", "thrust_saturation"), nats=167.0)
+    words = sentence(SimpleNamespace(promises=[promise], nats={}), {})
+    assert "tell whether thrust saturation acts" in words
+    assert "nats" not in words and "nothing" not in words
+
+
+@pytest.mark.slow
+def test_reports_of_flights_with_every_effect_agree_with_themselves(tmp_path):
+    """What is generated, not made up: a report of each effect, alone and with another
+    day's flights as the reference.
+    """
+    make_case(Arguments(tmp_path / "before", seed=1))
+    for number, effect in enumerate(("none", *EFFECTS)):
+        make_case(Arguments(tmp_path / effect, effect=(effect,), seed=2 + number))
+        # every fourth beside another day, too
+        days = [(), (tmp_path / "before",)]
+        for reference in days[: 1 + (number % 4 == 0)]:
+            assert broken_rules(diagnose_folder(tmp_path / effect, reference)) == []
