@@ -15,9 +15,9 @@ import numpy as np
 
 from experiments.diagnosis.rate_flights import Truth, fly, rows_of, vehicle_of
 from openjax.flights.case import load_case
+from openjax.flights.track import Track
 from openjax.gap.identification.prediction_errors import NAMES, Problem
 from openjax.gap.identification.quantities import identify
-from openjax.gap.identification.records import Record
 from openjax.gap.identification.responses import responses
 from openjax.gap.identification.search import TorqueFit, begin, search
 from openjax.gap.identification.torques import identify_torques
@@ -49,13 +49,15 @@ ROWS = {
 TOLD = NAMES[:8]
 
 
-def record_of(rates, motor, rate: int, samples: bool, vehicle) -> Record:
-    """A record of rows without anything but rates and motors."""
-    rest = dict.fromkeys(("force", "velocity", "quaternion", "voltage"))
-    return Record("flight", 1.0 / rate, rates, motor, vehicle=vehicle, samples=samples, **rest)
+def record_of(rates, motor, rate: int, samples: bool, vehicle) -> Track:
+    """A track of rows without anything but rates and motors."""
+    time = np.arange(len(rates)) / rate
+    return Track(
+        "flight", "flight", 1.0 / rate, time, rates, motor=motor, vehicle=vehicle, samples=samples
+    )
 
 
-def fitted(record: Record, free: bool) -> TorqueFit:
+def fitted(record: Track, free: bool) -> TorqueFit:
     """The fit; not `free`: as if rows hid nothing."""
     if free:
         return identify_torques([record])

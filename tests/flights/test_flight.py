@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from openjax.flights.airborne import airborne_part
 from openjax.flights.flight import Case, Flight
-from openjax.flights.track import flight_tracks
+from openjax.flights.track import TAKE_OFF, flight_tracks, own_tracks
 from openjax.vehicle.vehicle_file import load_vehicle_file
 
 
@@ -101,3 +102,21 @@ def test_heights_of_tracks_are_above_the_floor(below):
     np.testing.assert_allclose(track.position, path[: len(track)], atol=1e-9)
     np.testing.assert_allclose(track.neighbours[0, :, 2] - track.position[:, 2], 0.4)
     assert track.ceiling == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize("begins_in_the_air", [True, False])
+def test_a_dip_of_the_thrust_is_no_landing_and_a_take_off_tells_nothing(begins_in_the_air):
+    """Of torques, while the floor still acts; the one rule holds for rows of any clock."""
+    rng = np.random.default_rng(0)
+    time = 0.01 * np.arange(1000)
+    motors = 0.6 + 0.02 * rng.standard_normal((1000, 4))
+    motors[(time > 6.0) & (time < 6.4)] *= 0.2  # a manoeuvre
+    if not begins_in_the_air:
+        motors[time < 2.0] *= 0.2
+    logged = flight(time, body_rates=rng.standard_normal((1000, 3)), motor_command=motors)
+    in_air = airborne_part(logged, None, lambda kind, text: None)
+    (track,) = own_tracks(Case("case", (in_air,), load_vehicle_file()))
+    begin = 0.0 if begins_in_the_air else 2.0 + TAKE_OFF
+    assert track.time[0] == pytest.approx(begin, abs=0.02)
+    assert track.time[-1] == pytest.approx(9.97, abs=0.02)
+    assert in_air.in_the_air(time).tolist() == (time >= (2.0 if begin else 0.0)).tolist()

@@ -14,12 +14,12 @@ from experiments.diagnosis.rate_flights import Truth, fly, rows_of, vehicle_of
 from openjax.flights.clocks import case_on_gyroscope_clock
 from openjax.flights.flight import Case, Flight
 from openjax.flights.kinematics import Kinematics
+from openjax.flights.track import Track, own_tracks
 from openjax.gap import evidence
 from openjax.gap.identification.corrections import corrections
 from openjax.gap.identification.estimates import ESTIMATED, of_fit
 from openjax.gap.identification.prediction_errors import NAMES
 from openjax.gap.identification.quantities import Identification, doubts, quantities_of
-from openjax.gap.identification.records import Record, records_of
 from openjax.gap.identification.responses import responses
 from openjax.gap.identification.rotor_rows import rotor_rows
 from openjax.gap.identification.support import predict, support, told_by
@@ -37,17 +37,17 @@ TRUTHS = {
 }
 
 
-def record_of(name, seen, motors, rate) -> Record:
+def record_of(name, seen, motors, rate) -> Track:
     """A flight as rows of so many Hz, with motors as means."""
     rates, motor = rows_of(seen, motors, rate, samples=False)
-    return Record(
+    return Track(
+        name=name,
         flight=name,
         dt=1.0 / rate,
-        rates=rates,
+        time=np.arange(len(rates)) / rate,
+        body_rates=rates,
         motor=motor,
         vehicle=vehicle_of(load_vehicle()),
-        samples=False,
-        **dict.fromkeys(("force", "velocity", "quaternion", "voltage")),
     )
 
 
@@ -98,8 +98,7 @@ def test_the_search_hears_that_slow_motors_are_no_inertia(records):
 def test_motors_logged_late_are_a_clock(records):
     record = records["nominal"]
     rows = 4
-    cut = len(record.rates) - rows
-    late = Record(**{**vars(record), "rates": record.rates[rows:], "motor": record.motor[:cut]})
+    late = replace(record.rows(slice(rows, None)), motor=record.motor[: len(record) - rows])
     fit = identify_torques([late])
     assert abs(fit.clock + rows * record.dt) < 0.005
     assert abs(fit.value[0] - 0.025) < 0.006
@@ -180,10 +179,10 @@ def test_no_line_stands_for_motors_that_were_not_logged():
     holes = (time % 3.0 > 2.7) | (time % 3.0 == 1.0)  # a single row is no hole
     case = case_without(holes)
     for moved in (case, case_on_gyroscope_clock(case, {"a": 0.02})):
-        parts = records_of(moved)
-        assert [len(r.rates) for r in parts] == pytest.approx([270] * 3, abs=3)
+        parts = own_tracks(moved)
+        assert [len(r) for r in parts] == pytest.approx([270] * 3, abs=3)
         assert not any(r.bridges_holes for r in parts)
-    assert all(r.bridges_holes for r in records_of(case_without(time % 0.5 > 0.3)))
+    assert all(r.bridges_holes for r in own_tracks(case_without(time % 0.5 > 0.3)))
 
 
 def test_a_gyroscope_that_reads_too_much_is_no_lighter_body(monkeypatch):

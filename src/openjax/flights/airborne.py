@@ -1,4 +1,10 @@
-"""The part of a flight that is in the air."""
+"""When a flight is in the air: the one rule, which `Flight.airborne` keeps.
+
+Off the ground motors give at least 40 % of their usual command, and the vehicle isn't at
+rest on the floor; shorter dips (half a second) are manoeuvres.
+"""
+
+import dataclasses
 
 import numpy as np
 
@@ -13,11 +19,11 @@ GROUND_CLEARANCE = 0.02  # m above the floor
 
 
 def airborne_part(flight: Flight, floor_z: float | None, note, every: bool = False) -> Flight:
-    """Cut to the longest airborne stretch, or to `every` one of a useful length. Off
-    the ground: motors give at least 40 % of their usual command, and the vehicle isn't
-    at rest on the floor; shorter dips (half a second) are manoeuvres.
+    """Cut to the longest airborne stretch, or to `every` one of a useful length; the
+    flight that is returned knows its take-offs and landings.
     """
     runs = runs_of(~_on_ground(flight, floor_z))
+    flight = dataclasses.replace(flight, airborne=_times(runs, flight.time))
     if not runs:
         raise Refused("short", "never took off")
     start, stop = max(runs, key=lambda r: flight.time[r[1] - 1] - flight.time[r[0]])
@@ -37,6 +43,14 @@ def airborne_part(flight: Flight, floor_z: float | None, note, every: bool = Fal
         note("ground", f"{seconds:.1f} s on the ground are cut away (kept: {part})")
         flight = flight.rows(slice(start, stop))
     return flight
+
+
+def _times(runs: list[tuple[int, int]], time: np.ndarray) -> np.ndarray:
+    """(A, 2) s, begin and end of runs of rows; infinite at the log's own."""
+    ends = [
+        (time[a] if a > 0 else -np.inf, time[b - 1] if b < len(time) else np.inf) for a, b in runs
+    ]
+    return np.array(ends, float).reshape(-1, 2)
 
 
 def _on_ground(flight, floor_z):

@@ -93,6 +93,9 @@ class Flight:
         # s by which a pose may be older than its row, because the log held the last one
         0.0
     )
+    # (A, 2) s, take-off and landing of each stretch in the air; infinite where the log
+    # begins or ends there. By the checks; None: not told yet
+    airborne: Array | None = None
     # hash of the whole log's values, the same for copies under other names
     fingerprint: str = ""
 
@@ -138,6 +141,15 @@ class Flight:
             raise ValueError(f"{self.name}: no channel {channel}")
         rows = np.isfinite(values.reshape(len(values), -1)).all(1)
         return self.time[rows], values[rows]
+
+    def in_the_air(self, time: Float[Array, " times"], clear: float = 0.0) -> Bool[Array, " times"]:
+        """(S,) at which times it flies, with its last take-off and its next landing at
+        least `clear` s away.
+        """
+        if self.airborne is None:
+            return np.ones(len(time), bool)
+        take_off, landing = self.airborne.T[:, :, None]
+        return ((time >= take_off + clear) & (time <= landing - clear)).any(0)
 
     def holes(
         self, channel: str, least: float = HOLE, samples: float = 10.0

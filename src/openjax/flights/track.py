@@ -1,11 +1,17 @@
-"""A flight on a uniform clock: the arrays that the replay runs on.
+"""A flight on a uniform clock: the arrays that replays and identifications run on.
 
 Replays step from row to row, so a flight is put on an even time grid once: rows between
 100 Hz and 50 Hz are kept, faster logs are averaged down to 100 Hz, and a longer gap
 splits a flight into two tracks.
+
+What motors do is seen best at the rate of the loop that commands them, so for an
+identification faster logs keep their rows, down to 2 ms.
 """
 
-from dataclasses import dataclass, replace
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -13,6 +19,7 @@ from scipy.ndimage import convolve1d
 from scipy.spatial.transform import Rotation
 
 from openjax.flights.flight import HOLE, SENSORS, Case, Flight
+from openjax.flights.sampling import runs_of
 from openjax.flights.shapes import Columns, Motors, Quaternions, Times, Vectors
 
 Array = np.ndarray
@@ -25,6 +32,13 @@ MISSED_SAMPLES = 3.0  # and a channel that misses more than so many has a hole
 RHYTHM = 50  # new commands from which their rhythm is looked for
 RHYTHMIC = 0.5  # concentration of their phases (0 to 1) from which they have one
 EARLY = 25.0  # per cent of them that may come before the rows that are made for them
+# s, the period of the firmware's rate loop: faster rows hold nothing new
+FASTEST_ROW = 0.002
+LOOP_ROWS = 0.003  # s: rows as short show every cycle of the rate loop
+TORQUES = ("motor_command", "body_rates")
+# s between holes; its first quarter only tells what was before the rest
+SHORTEST_PART = 1.0
+TAKE_OFF = 1.0  # s after a take-off and before a landing in which the floor still acts
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,27 +52,45 @@ class Track:
     flight: str  # name of the flight it comes from: the unit that is held out
     dt: float
     time: Array  # (T,)
-    position: Array | None  # (T, 3), z above the floor
-    quaternion: Array | None  # (T, 4)
-    velocity: Array | None  # (T, 3)
     body_rates: Array  # (T, 3)
-    specific_force: Array | None  # (T, 3)
-    command: Array | None  # (T, 4) thrust 0..1, body rates rad/s
-    motor: Array | None  # (T, 4) 0..1 thrust fraction
-    voltage: Array | None  # (T,)
-    neighbours: Array  # (K, T, 3) m, positions of the vehicles that flew along
+    position: Array | None = None  # (T, 3), z above the floor
+    quaternion: Array | None = None  # (T, 4)
+    velocity: Array | None = None  # (T, 3)
+    specific_force: Array | None = None  # (T, 3)
+    command: Array | None = None  # (T, 4) thrust 0..1, body rates rad/s
+    motor: Array | None = None  # (T, 4) 0..1 thrust fraction
+    voltage: Array | None = None  # (T,)
+    # (K, T, 3) m, positions of the vehicles that flew along
+    neighbours: Array = field(default_factory=lambda: np.zeros((0, 0, 3)))
     pose_age: float = 0.0  # s by which the pose may be older than its row, see `Flight`
     # False: made by the nominal rate controller from the commands
     motors_logged: bool = True
+    # a row's motors are one sample of a faster loop, not the mean over the row
+    samples: bool = False
+    # lines stand for motors or body rates that weren't logged
+    bridges_holes: bool = False
     # of logs faster than the grid: times (S,) s, mean of the motors (S,)
     fast_thrust: tuple[Array, Array] | None = None
     attitude_derived: bool = False  # of gyroscope, accelerometer and path, not measured
     ceiling: float | None = None  # m above the floor; None: no ceiling is known
     # (T,) rows that weren't logged: lines between their neighbours
     missing: Array | None = None
+    vehicle: Any = None  # its nominal `Vehicle`
 
     def __len__(self) -> int:
         return len(self.time)
+
+    def rows(self, rows: slice) -> Track:
+        """The track with some of its rows, without what isn't of rows."""
+        channels = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "neighbours"}
+        cut = {n: v[rows] for n, v in channels.items() if isinstance(v, np.ndarray)}
+        neighbours = self.neighbours[:, rows] if len(self.neighbours) else self.neighbours
+        return replace(self, **cut, neighbours=neighbours, fast_thrust=None)
+
+    @property
+    def hides_ticks(self) -> bool:
+        """Whether the rate loop ran several times within a row."""
+        return self.dt > LOOP_ROWS
 
     @property
     def logs_attitude(self) -> bool:
@@ -191,6 +223,65 @@ def _on_grid(part: Flight, flight: Flight, case: Case, name: str) -> Track:
         ceiling=None if ceiling is None else ceiling - floor[2],
         fast_thrust=fast_thrust,
         missing=_missing(part.time, grid, period),
+        vehicle=case.vehicle_of(flight),
+    )
+
+
+def own_tracks(case: Case) -> list[Track]:
+    """All stretches of a case's flights with body rates and motor commands, in the air,
+    at the rate of their log.
+    """
+    tracks = []
+    for flight in case.flights:
+        if not flight.has_motors or flight.body_rates is None or flight.body_rates_derived:
+            continue
+        holes = flight.in_holes(TORQUES, MAX_GAP, MISSED_SAMPLES)
+        parts = _own_stretches(flight.rows(~holes), flight, case, SHORTEST_PART)
+        if not parts:
+            whole = _own_stretches(flight, flight, case, MIN_DURATION)
+            parts = [replace(track, bridges_holes=bool(holes.any())) for track in whole]
+        tracks += parts
+    # One estimator reads rows of one period: the one that holds most of the flights.
+    periods = [track.dt for track in tracks for _ in range(len(track))]
+    usual = max(set(periods), key=periods.count) if periods else 0.0
+    return [track for track in tracks if track.dt == usual]
+
+
+def _own_stretches(rows: Flight, flight: Flight, case: Case, least: float) -> list[Track]:
+    """Tracks of the stretches in the air, at least so many s long, of some `rows` of a
+    flight. Lines over longer gaps than these would make motors look quicker or slower, by
+    a tenth to a fifth.
+    """
+    tracks = []
+    for stretch in rows.stretches(max(MAX_GAP, MISSED_SAMPLES * flight.row_period), least):
+        track = _own_track(rows.rows(stretch), flight, case)
+        runs = runs_of(flight.in_the_air(track.time, TAKE_OFF))
+        tracks += [track.rows(slice(a, b)) for a, b in runs if (b - a) * track.dt >= least]
+    return tracks
+
+
+def _own_track(part: Flight, flight: Flight, case: Case) -> Track:
+    """A stretch of a flight at the rate of its log, motors as means of what they held."""
+    period = max(round(flight.row_period, 4), FASTEST_ROW)
+    grid = np.arange(part.time[0], part.time[-1] - period, period)
+    vehicle = case.vehicle_of(flight)
+    motor = _means(*part.sampled("motor_command"), grid, period, True)
+    voltage = None
+    if part.battery_voltage is not None:
+        voltage = smooth(part.interpolated("battery_voltage", grid), 0.3, period)
+    if case.vehicle_file.motor.command == "pwm":
+        motor = pwm_thrust(motor, voltage, vehicle)
+    channels = [c for c in SENSORS if c != "position" and getattr(part, c) is not None]
+    return Track(
+        name=flight.name,
+        flight=flight.log,
+        dt=period,
+        time=grid,
+        **{channel: part.interpolated(channel, grid) for channel in channels},
+        motor=motor,
+        voltage=voltage,
+        vehicle=vehicle,
+        samples=case.vehicle_file.log.get("motor_rows", "mean") == "sample",
     )
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from openjax.gap.identification.records import Record
+from openjax.flights.track import Track
 from openjax.gap.identification.search import TorqueFit
 
 
@@ -43,7 +43,7 @@ stands.
 """
 
 
-def of_fit(fit: TorqueFit, records: list[Record]) -> EffectEstimates:
+def of_fit(fit: TorqueFit, records: list[Track]) -> EffectEstimates:
     """What a fit of the torques says of motor lag, inertia and yaw torque, with nothing
     taken for granted of the loop around them.
 

@@ -9,8 +9,7 @@ Linear in the numbers once the rotors' lag is known, with a constant for every f
 import numpy as np
 from scipy.signal import lfilter
 
-from openjax.flights.track import specific_force_of, to_body
-from openjax.gap.identification.records import Record
+from openjax.flights.track import Track, specific_force_of, to_body
 from openjax.gap.identification.regression import solve
 from openjax.gap.identification.rotor_rows import rotor_rows
 from openjax.gap.identification.search import BLOCK
@@ -24,7 +23,7 @@ map.
 Numbers = dict[str, tuple[float, float]]
 
 
-def identify_forces(records: list[Record], lags: np.ndarray) -> Numbers:
+def identify_forces(records: list[Track], lags: np.ndarray) -> Numbers:
     """{name: (value, standard deviation)}: `thrust_level` and `thrust_slope` over the
     nominal, `sag` (share of thrust per V), `drag_xy` and `drag_z` (N s/m); only what
     the records hold. `lags` (3,): spin-up, spin-down and delay, s.
@@ -62,7 +61,7 @@ def identify_forces(records: list[Record], lags: np.ndarray) -> Numbers:
     }
 
 
-def trims(records: list[Record]) -> Numbers:
+def trims(records: list[Track]) -> Numbers:
     """{axis: (share of the mean thrust that motors hold against, its standard deviation
     over flights)}: what keeps the vehicle from turning by itself.
     """
@@ -77,15 +76,15 @@ def trims(records: list[Record]) -> Numbers:
     }
 
 
-def _force(record: Record) -> np.ndarray | None:
-    if record.force is not None:
-        return record.force
+def _force(record: Track) -> np.ndarray | None:
+    if record.specific_force is not None:
+        return record.specific_force
     if record.velocity is None or record.quaternion is None:
         return None
     return specific_force_of(record.quaternion, record.velocity, record.dt)
 
 
-def _thrusts(records: list[Record], lags: np.ndarray) -> list[np.ndarray]:
+def _thrusts(records: list[Track], lags: np.ndarray) -> list[np.ndarray]:
     """(T,) thrust at each row's time, as a share of the largest, of each record."""
     rotors = rotor_rows([r.motor for r in records], records[0].dt, np.asarray(lags, float)[None])
     # a row's speed is the one at its end, where the next row begins

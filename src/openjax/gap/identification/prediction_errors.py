@@ -19,7 +19,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.signal import butter, lfilter
 
-from openjax.gap.identification.records import Record
+from openjax.flights.track import Track
 from openjax.gap.identification.regression import Regression, lag_columns, polynomial, solve
 from openjax.gap.identification.rotor_rows import rotor_rows
 
@@ -50,9 +50,9 @@ TINY = 1e-12  # rad^2/s^2: rates that never change
 FREE = 0.01
 
 
-def earlier(record: Record, rows: int) -> Record:
+def earlier(record: Track, rows: int) -> Track:
     """The record as if its motors had acted `rows` earlier than logged."""
-    count = len(record.rates) - rows
+    count = len(record) - rows
     return replace(record.rows(slice(0, count)), motor=record.motor[rows:])
 
 
@@ -61,7 +61,7 @@ class Problem:
     through the firmware's filter of the gyroscope.
     """
 
-    def __init__(self, records: list[Record], low_pass: bool = False):
+    def __init__(self, records: list[Track], low_pass: bool = False):
         self.records = records
         self.dt = records[0].dt
         self.low_pass = low_pass
@@ -80,20 +80,20 @@ class Problem:
         self.precision = np.diag(SPREAD**-2.0)
         self.precision[:2, :2] += np.array([[1.0, -1.0], [-1.0, 1.0]]) / UNEQUAL**2
         self.new = [self._new(r) if r.hides_ticks else None for r in records]
-        self.count = sum(len(r.rates) - self.order - 1 for r in records)
+        self.count = sum(len(r) - self.order - 1 for r in records)
         self.surprise = 0.0
         if records[0].hides_ticks:
             every = np.concatenate(self.new)
             self.surprise = 0.5 * len(every) * float(np.log(every.var(0) + TINY).sum())
 
-    def _new(self, record: Record) -> np.ndarray:
+    def _new(self, record: Track) -> np.ndarray:
         """(T - order - 1, 3) what is new in the motors' shares of each axis in the rows
         from `order` on, given rates until then and motors before.
         """
         shares = record.motor @ np.sign(self.base).T / 4.0
         out = []
         for axis in range(3):
-            rates = lag_columns(record.rates[1:, axis], self.order)
+            rates = lag_columns(record.body_rates[1:, axis], self.order)
             motors = lag_columns(shares[:-1, axis], self.order)
             past = np.concatenate([rates, motors, np.ones((len(rates), 1))], 1)
             present = shares[self.order : -1, axis]
@@ -110,7 +110,8 @@ class Problem:
         rotors = rotor_rows([r.motor for r in self.records], self.dt, lags)
         both = zip(self.records, rotors, strict=True)
         return [
-            self._errors_of(value, record.rates, square, speed) for record, (square, speed) in both
+            self._errors_of(value, record.body_rates, square, speed)
+            for record, (square, speed) in both
         ]
 
     def _errors_of(

@@ -5,11 +5,11 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from openjax.flights.flight import Case
+from openjax.flights.track import Track, own_tracks
 from openjax.gap.decision import DECISION
 from openjax.gap.identification.estimates import EffectEstimates, of_fit
 from openjax.gap.identification.forces import identify_forces, trims
 from openjax.gap.identification.prediction_errors import NAMES
-from openjax.gap.identification.records import Record, records_of
 from openjax.gap.identification.responses import Pair, responses
 from openjax.gap.identification.search import SEARCHED, TorqueFit
 from openjax.gap.identification.torques import identify_torques
@@ -192,7 +192,7 @@ def identify(case: Case, one_clock: bool = True, gain_error: float = 0.0) -> Ide
     what is said of torques then isn't trusted. `gain_error`: standard deviation of the
     gyroscope's gain.
     """
-    records = records_of(case)
+    records = own_tracks(case)
     if not records:
         return None
     fit = identify_torques(records, one_clock).with_gain_error(gain_error)
@@ -210,7 +210,7 @@ def identify(case: Case, one_clock: bool = True, gain_error: float = 0.0) -> Ide
     )
 
 
-def quantities_of(records: list[Record], fit: TorqueFit) -> dict[str, Quantity]:
+def quantities_of(records: list[Track], fit: TorqueFit) -> dict[str, Quantity]:
     vehicle = records[0].vehicle
     up = float(vehicle.motor_time_constant)
     usual = dict.fromkeys(NAMES, 0.0) | {
@@ -258,7 +258,7 @@ def _quantity(name: str, value: float, deviation: float, simulator: float) -> Qu
     return Quantity(value, interval, simulator, kind.unit, kind.effect, ends)
 
 
-def doubts(records: list[Record], fit: TorqueFit, one_clock: bool) -> tuple[str, ...]:
+def doubts(records: list[Track], fit: TorqueFit, one_clock: bool) -> tuple[str, ...]:
     """Why what is said of torques isn't to be trusted."""
     reasons = []
     if not one_clock:

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from openjax.flights.track import Track
 from openjax.gap.identification.prediction_errors import Problem, earlier, value_at
-from openjax.gap.identification.records import Record
 from openjax.gap.identification.regression import solve
 from openjax.gap.identification.rotor_rows import rotor_rows
 from openjax.gap.identification.search import EARLIEST, TorqueFit
@@ -56,7 +56,7 @@ class Pair:
     simulated: Response
 
 
-def responses(records: list[Record], fit: TorqueFit) -> dict[str, Pair]:
+def responses(records: list[Track], fit: TorqueFit) -> dict[str, Pair]:
     """{axis: pair} of all axes that the records hold. `fit` gives the clock, and what a
     row of means does to its own end, which such rows can't tell from the loop's answer.
     """
@@ -72,22 +72,22 @@ def responses(records: list[Record], fit: TorqueFit) -> dict[str, Pair]:
         _nominal_rates(r, error, rng) for r, (error, _) in zip(problem.records, errors, strict=True)
     ]
     for axis in range(3):
-        rates = [r.rates[:, axis] for r in problem.records]
+        rates = [r.body_rates[:, axis] for r in problem.records]
         replay = [s[:, axis] for s in rates_of_nominal]
         pairs[AXES[axis]] = Pair(
             _of_axis(problem, axis, rates, problem.at_once(real, axis)),
             _of_axis(problem, axis, replay, problem.at_once(value_at(nominal), axis)),
         )
-    if all(r.force is not None for r in records):
+    if all(r.specific_force is not None for r in records):
         pairs["thrust"] = _of_thrust(problem, rng)
     return pairs
 
 
-def _nominal_rates(record: Record, error: np.ndarray, rng) -> np.ndarray:
+def _nominal_rates(record: Track, error: np.ndarray, rng) -> np.ndarray:
     """Rates (T, 3) of the nominal vehicle, from what they leave of the record's, as a
     gyroscope shows them.
     """
-    return record.rates - error + GYROSCOPE * rng.standard_normal(error.shape)
+    return record.body_rates - error + GYROSCOPE * rng.standard_normal(error.shape)
 
 
 def _of_axis(problem: Problem, axis: int, outputs: list, at_once: float) -> Response:
@@ -101,7 +101,7 @@ def _of_axis(problem: Problem, axis: int, outputs: list, at_once: float) -> Resp
 def _of_thrust(problem: Problem, rng) -> Pair:
     """Of the specific force along body z."""
     shares = [r.motor.mean(1) for r in problem.records]
-    forces = [r.force[:, 2] for r in problem.records]
+    forces = [r.specific_force[:, 2] for r in problem.records]
     vehicle = problem.records[0].vehicle
     full = 4.0 * float(vehicle.thrust_constant * vehicle.max_rotor_speed**2 / vehicle.mass)
     lags = value_at(problem.start)[None, :3]

@@ -37,8 +37,8 @@ def turning(problem: Problem, axes: list) -> tuple[np.ndarray, np.ndarray]:
     """
     noise = np.array([e.var() for e, _, _ in axes]) + TINY
     rows = max(round(QUICK / problem.dt), 1)
-    whole = np.concatenate([r.rates for r in problem.records])
-    quick = np.concatenate([r.rates[rows:] - r.rates[:-rows] for r in problem.records])
+    whole = np.concatenate([r.body_rates for r in problem.records])
+    quick = np.concatenate([r.body_rates[rows:] - r.body_rates[:-rows] for r in problem.records])
     return np.sqrt(whole.var(0) / noise), np.sqrt(0.5 * quick.var(0) / noise)
 
 

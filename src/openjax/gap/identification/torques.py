@@ -2,8 +2,8 @@
 
 from dataclasses import replace
 
+from openjax.flights.track import Track
 from openjax.gap.identification.prediction_errors import Problem, earlier
-from openjax.gap.identification.records import Record
 from openjax.gap.identification.search import TorqueFit, begin, search
 
 FAST_ROWS = 0.005  # s: slower rows show 2 ms of delay in its place
@@ -15,7 +15,7 @@ SOON = 0.12  # s; the slowest motors that fly
 CLEARLY = 10.0  # nats by which motors logged too late must be better
 
 
-def identify_torques(records: list[Record], one_clock: bool = True) -> TorqueFit:
+def identify_torques(records: list[Track], one_clock: bool = True) -> TorqueFit:
     """The most likely fit of records with body rates, over the motors' clock as well;
     where streams share no `one_clock`, none is looked for.
     """

@@ -14,7 +14,7 @@ from openjax.flights.signals import RATE, clock_of, first_order, in_band, on_clo
 from openjax.flights.track import GRAVITY, pwm_thrust, to_body
 
 CLEAR_OF_FLOOR = 0.25  # m, where the ground's cushion is gone
-SETTLED = 0.5  # s after take-off and before landing that are left out
+SETTLED = 0.5  # s after a stretch's begin and before its end that are left out
 BLOCK = 2.0  # s, over which rows of a flight count as one
 TURNING = (1.0, 10.0)  # Hz, where motors turn the vehicle
 DELAYS = (0, 2, 4, 6)  # rows, of the commands as instruments
@@ -99,7 +99,7 @@ def figures_of(flight: Flight, case: Case, day: str) -> FlightFigures | str:
     vehicle = case.vehicle_of(flight)
     motor = flight.interpolated("motor_command")
     voltage = None if flight.battery_voltage is None else flight.interpolated("battery_voltage")
-    rows = _in_the_air(flight, case)
+    rows = _settled_rows(flight, case)
     if rows.sum() < 100 or flight.row_period * rows.sum() < 2.0:
         return "less than 2 s clear of the floor"
     full = float((motor[rows] > FULL).any(1).mean())
@@ -117,7 +117,10 @@ def figures_of(flight: Flight, case: Case, day: str) -> FlightFigures | str:
     return FlightFigures(flight.name, day, values, mean, duty)
 
 
-def _in_the_air(flight: Flight, case: Case) -> np.ndarray:
+def _settled_rows(flight: Flight, case: Case) -> np.ndarray:
+    """(T,) which rows, all in the air, are away from where a stretch of them begins or
+    ends, and from the floor.
+    """
     rows = np.zeros(len(flight), bool)
     for stretch in flight.stretches(max(0.2, 5 * flight.row_period)):
         time = flight.time[stretch]
