@@ -8,7 +8,8 @@ program. Prints a line of JSON for each.
 
 With `--masked` each source is timed a second time with masks: a game of teams of any
 size, in which all slots are in use, and the evader's speed and the capture radius are
-the task's.
+the task's. With `--restarts` it is timed a second time as JaxMARL's users step it: an
+episode that ends starts anew, and the worlds are spread evenly over an episode.
 """
 
 import argparse
@@ -20,11 +21,12 @@ import time
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
+WAYS = ("plain", "masked", "restarts")
 REPEATS = 3
 """Runs after the first, of which the fastest counts."""
 
 
-def measure(worlds: int, steps: int, contacts: bool, masked: bool) -> dict:
+def measure(worlds: int, steps: int, contacts: bool, way: str) -> dict:
     """In this process: seconds to compile, and drone steps a second."""
     import jax
 
@@ -32,15 +34,22 @@ def measure(worlds: int, steps: int, contacts: bool, masked: bool) -> dict:
 
     jax.config.update("jax_enable_compilation_cache", False)
     teams = {"team_sizes": (3,), "evader_speeds": (0.8, 2.0), "capture_radii": (0.2, 0.4)}
-    environment = openjax.make(physics="rigid", contacts=contacts, **(teams if masked else {}))
+    changes = teams if way == "masked" else {}
+    environment = openjax.make(physics="rigid", contacts=contacts, **changes)
     key = jax.random.key(0)
-    state = jax.jit(jax.vmap(environment.reset))(jax.random.split(key, worlds))[1]
+    keys = jax.random.split(key, worlds)
+    state = jax.jit(jax.vmap(environment.reset))(keys)[1]
     pursuers = environment.settings.num_pursuers
     action = 0.1 * jax.random.normal(key, (worlds, pursuers, 4))
-    step = jax.vmap(environment.step, in_axes=(None, 0, 0))
+    if way == "restarts":
+        length = environment.settings.episode_length
+        state = state.replace(step=jax.numpy.arange(worlds, dtype=jax.numpy.int32) % length)
+        advance = restarting(environment, keys, action)
+    else:
+        advance = plain(environment, key, action)
 
     def fly(state):
-        return jax.lax.scan(lambda s, _: (step(key, s, action)[1], None), state, length=steps)[0]
+        return jax.lax.scan(lambda s, _: (advance(s), None), state, length=steps)[0]
 
     began = time.perf_counter()
     program = jax.jit(fly).lower(state).compile()
@@ -53,10 +62,38 @@ def measure(worlds: int, steps: int, contacts: bool, masked: bool) -> dict:
         seconds.append(time.perf_counter() - began)
     return {
         "device": jax.devices()[0].device_kind,
-        "masked": masked,
+        "way": way,
         "compile_seconds": compiling,
+        "environment_steps_a_second": worlds * steps / min(seconds),
         "drone_steps_a_second": worlds * pursuers * steps / min(seconds),
     }
+
+
+def plain(environment, key, action):
+    """The step of all worlds, whose episodes may end."""
+    import jax
+
+    step = jax.vmap(environment.step, in_axes=(None, 0, 0))
+    return lambda state: step(key, state, action)[1]
+
+
+def restarting(environment, keys, action):
+    """The step of all worlds as JaxMARL steps them, for `keys` and `action` by world."""
+    import jax
+
+    from openjax.interfaces.jaxmarl import PursuitMultiAgentEnv
+
+    game = PursuitMultiAgentEnv(environment)
+    actions = {agent: action[:, place] for place, agent in enumerate(game.agents)}
+
+    def advance(state):
+        observed, state, rewards, *_ = jax.vmap(game.step)(keys, state, actions)
+        # what nobody reads would not be worked out
+        total = sum(leaf.sum() for leaf in jax.tree.leaves((observed, rewards)))
+        position = state.evader_position.at[0, 0].add(1e-9 * total)
+        return state.replace(evader_position=position)
+
+    return advance
 
 
 def main(arguments: list[str]) -> None:
@@ -67,20 +104,19 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--steps", type=int, default=50)
     parser.add_argument("--free", action="store_true", help="without contacts")
     parser.add_argument("--masked", action="store_true", help="with masks, too")
-    parser.add_argument("--here", action="store_true", help=argparse.SUPPRESS)
+    parser.add_argument("--restarts", action="store_true", help="with restarts, too")
+    parser.add_argument("--here", choices=WAYS, help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
     if options.here:
-        contacts = not options.free
-        print(json.dumps(measure(options.worlds, options.steps, contacts, options.masked)))
+        print(json.dumps(measure(options.worlds, options.steps, not options.free, options.here)))
         return
-    plain = [argument for argument in arguments if argument != "--masked"]
-    ways = [plain, arguments] if options.masked else [plain]
+    ways = [way for way in WAYS if way == "plain" or getattr(options, way)]
     for _ in range(2):  # in turns: a machine warms up
         for source in options.source:
             environment = os.environ | {"PYTHONPATH": str(Path(source).resolve())}
             print(source, flush=True)
             for way in ways:
-                command = [sys.executable, __file__, "--here", *way]
+                command = [sys.executable, __file__, *arguments, "--here", way]
                 subprocess.run(command, env=environment, check=True)
 
 

@@ -14,12 +14,9 @@ import jax
 import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
 
-from openjax.pursuit.rows import where_rows
-
-SHARE = 64
-"""A step in which at most one world in so many ends draws that many starts, otherwise it
-draws one for each world. An episode of 800 steps ends in one world of 800 a step, if
-episodes aren't in step.
+SHARE = 256
+"""Starts are drawn for one world in so many at a time, as often as worlds wait for one.
+An episode of 800 steps ends in one world of 800 a step, if episodes aren't in step.
 """
 
 
@@ -42,19 +39,18 @@ def make_restart(start: Callable[[jax.Array], Any]) -> Callable[[Any, Any, Any],
             _with_axis(worlds, has_axis, tree)
             for has_axis, tree in zip(is_mapped, (over, keys, states), strict=True)
         )
-        few = max(1, worlds // SHARE)
+        batch = max(1, worlds // SHARE)
 
-        def some():
-            place = jnp.nonzero(over, size=few, fill_value=worlds)[0]
+        def start_some(carry):
+            waiting, states = carry
+            place = jnp.nonzero(waiting, size=batch, fill_value=worlds)[0]
             fresh = jax.vmap(start)(keys.at[place].get(mode="clip"))
-            return jax.tree.map(lambda old, new: old.at[place].set(new, mode="drop"), states, fresh)
+            states = jax.tree.map(
+                lambda old, new: old.at[place].set(new, mode="drop"), states, fresh
+            )
+            return waiting.at[place].set(False, mode="drop"), states
 
-        def all_of_them():
-            return where_rows(over, jax.vmap(start)(keys), states)
-
-        number = jnp.sum(over)
-        branch = jnp.where(number == 0, 0, jnp.where(number <= few, 1, 2))
-        states = jax.lax.switch(branch, [lambda: states, some, all_of_them])
+        _, states = jax.lax.while_loop(lambda carry: jnp.any(carry[0]), start_some, (over, states))
         return states, jax.tree.map(lambda _: True, states)
 
     return restart
