@@ -21,7 +21,7 @@ extensions = [
 ]
 myst_enable_extensions = ["dollarmath", "colon_fence", "deflist"]
 myst_heading_anchors = 3
-exclude_patterns = ["_build"]
+exclude_patterns = ["_build", "notebooks"]
 suppress_warnings = ["myst.header"]  # pages of results may skip a level
 
 # notebooks run when the site is built, and again only when they change
@@ -39,7 +39,8 @@ autodoc_default_options = {"exclude-members": "replace, tree_flatten, tree_unfla
 
 html_theme = "furo"
 html_title = f"openjax {release}"
-html_static_path = []
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
 html_extra_path = [
     "extra"
 ]  # a replay of six layouts: `openjax view --scenario all --seed 3 --html FILE`

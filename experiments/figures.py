@@ -205,11 +205,22 @@ def game() -> str:
     return table(["arena", "pursuers", "evader", "capture", "commands"], [row])
 
 
+def address() -> str:
+    """The repository's, as pyproject.toml has it."""
+    return read_toml(ROOT / "pyproject.toml")["tool"]["openjax"]["repository"]
+
+
+def colab(tutorial: str) -> str:
+    """Where a tutorial runs as a notebook; `docs/make_notebooks.py` makes it."""
+    place = address().removeprefix("https://github.com/")
+    notebook = f"{place}/blob/main/docs/notebooks/{tutorial}.ipynb"
+    return f"[Run it in Colab](https://colab.research.google.com/github/{notebook})."
+
+
 def clone() -> str:
-    """The commands that install, with the address of pyproject.toml."""
-    address = read_toml(ROOT / "pyproject.toml")["tool"]["openjax"]["repository"]
+    """The commands that install."""
     commands = (
-        (f"git clone {address} openjax && cd openjax", ""),
+        (f"git clone {address()} openjax && cd openjax", ""),
         ("make train", "installs into .venv, trains a team, shows what it learned"),
         (". .venv/bin/activate", "makes `openjax` a command"),
     )
@@ -224,6 +235,8 @@ BLOCKS: dict[str, Callable[[], str]] = {
     "members": members,
     "hold": hold,
     "game": game,
+    "colab_own_game": lambda: colab("own_game"),
+    "colab_log_to_cause": lambda: colab("log_to_cause"),
 }
 PAGES = (
     "README.md",
@@ -231,6 +244,8 @@ PAGES = (
     "docs/model_cards.md",
     "docs/questions.md",
     "docs/start.md",
+    "docs/tutorials/log_to_cause.md",
+    "docs/tutorials/own_game.md",
     "experiments/results/judged.md",
 )
 

@@ -101,10 +101,33 @@ def test_programs_that_results_name_are_there(path):
             assert moved or COMMIT.search(line) or "NAME" in name or find_spec(name), name
 
 
+def program_of_docs(name: str):
+    """A program beside the pages, which are no package."""
+    spec = importlib.util.spec_from_file_location(name, DOCS / f"{name}.py")
+    program = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(program)
+    return program
+
+
+def test_notebooks_are_made_from_the_tutorials():
+    """Colab opens them: the same text and code, after a cell that installs."""
+    made = program_of_docs("make_notebooks").made()
+    assert set(made) == set((DOCS / "notebooks").glob("*.ipynb")) and len(made) == 2
+    for path, text in made.items():
+        assert path.read_text(encoding="utf-8") == text, "run python docs/make_notebooks.py"
+        book = json.loads(text)
+        cells = ["".join(cell["source"]) for cell in book["cells"]]
+        page = (DOCS / "tutorials" / f"{path.stem}.md").read_text(encoding="utf-8")
+        assert "%pip install" in cells[0] and "<!--" not in "".join(cells)
+        code = [cell for cell in book["cells"] if cell["cell_type"] == "code"]
+        assert len(code) == 1 + page.count("```{code-cell}")
+        for cell in code[1:]:
+            ast.parse("".join(cell["source"]))
+            assert "".join(cell["source"]) in page
+
+
 def test_page_of_the_effects_is_made_from_their_files():
-    spec = importlib.util.spec_from_file_location("make_effects", DOCS / "make_effects.py")
-    make_effects = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(make_effects)
+    make_effects = program_of_docs("make_effects")
     told = (DOCS / "effects.md").read_text(encoding="utf-8")
     assert told == make_effects.page(), "run python docs/make_effects.py"
     for name, effect in EFFECTS.items():
