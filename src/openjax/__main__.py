@@ -61,8 +61,8 @@ def main(arguments: Sequence[str]) -> int | None:
 
 
 def entry(*command: str) -> None:
-    """What the installed script `openjax` calls; with a command's name, what `python -m
-    openjax.NAME` does.
+    """Run the installed script `openjax`; with a command's name, the same as `python -m
+    openjax.NAME`.
     """
     interruption.install()
     from openjax.command_line import run_command  # takes its time, so only now

@@ -187,9 +187,7 @@ def run_command(main: Callable[[Sequence[str]], int | None]) -> None:
 
 
 def one_line(error: BaseException) -> str | None:
-    """What to tell of an error that the user or the machine made, in one line; None:
-    it's a mistake in openjax.
-    """
+    """One line about an error that the user or the machine made; None for a mistake in openjax."""
     text = " ".join(str(error).split())
     if isinstance(error, OSError):
         reason = error.strerror or text or type(error).__name__

@@ -18,9 +18,7 @@ class TooLittle(UserError):
 
 
 def suggestion(name: str, names: Iterable[str]) -> str:
-    """What an error can say of a name that isn't among the `names` that there are: the
-    one that is nearest, or all.
-    """
+    """The end of an error about a name that isn't among `names`: the nearest of them, or all."""
     names = list(names)
     # `drag` is short of `rotor_drag` by more than one typing error
     longer = [other for other in names if name and name in other]
@@ -29,7 +27,5 @@ def suggestion(name: str, names: Iterable[str]) -> str:
 
 
 def part_name(part: Any) -> str:
-    """What an error calls a part that somebody handed in: the name of a function or a
-    class, or the class of an object.
-    """
+    """The name of a part in an error: that of a function or a class, or of an object's class."""
     return getattr(part, "__name__", type(part).__name__)

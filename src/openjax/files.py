@@ -201,8 +201,8 @@ def write_json(path: str | Path, value: Any) -> None:
 
 
 def check_output(path: str | Path | None, option: str) -> None:
-    """Whether a file can be written later, asked before the work that leads to it; None
-    is fine.
+    """Raise UserError unless a file can be written later, before the work that leads to it; None is
+    fine.
 
     Raises:
       UserError: its folder is missing or can't be written to, or it's a folder itself.
@@ -224,7 +224,7 @@ def check_output(path: str | Path | None, option: str) -> None:
 
 @contextlib.contextmanager
 def _write_errors(option, path):
-    """What the system says of a place that can't be written to, as a line."""
+    """The system's message about a place that can't be written to, as a line."""
     try:
         yield
     except OSError as error:
@@ -234,8 +234,8 @@ def _write_errors(option, path):
 
 
 def check_output_folder(path: str | Path, option: str) -> None:
-    """Whether a folder is there or can be made, and can be written to; changes nothing.
-    Raises UserError.
+    """Raise UserError unless a folder is there or can be made, and can be written to; changes
+    nothing.
     """
     path = Path(path).absolute()
     with _write_errors(option, path):
@@ -249,8 +249,8 @@ def check_output_folder(path: str | Path, option: str) -> None:
 
 
 def check_room(path: str | Path, size: int, option: str) -> None:
-    """Whether so many bytes can be written in a folder that is there or can be made;
-    leaves nothing. Raises UserError.
+    """Raise UserError unless so many bytes can be written in a folder that is there or can be made;
+    leaves nothing.
     """
     path = Path(path).absolute()
     parent = next(folder for folder in (path, *path.parents) if folder.is_dir())
@@ -271,9 +271,7 @@ def check_room(path: str | Path, size: int, option: str) -> None:
 
 
 def check_new_folder(path: str | Path, option: str) -> None:
-    """Whether a folder can be made there, or is there and empty; changes nothing.
-    Raises UserError.
-    """
+    """Raise UserError unless a folder can be made there, or is there and empty; changes nothing."""
     path = Path(path)
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
         raise UserError(f"{option} {path}: exists and isn't an empty folder; name another one")

@@ -95,8 +95,8 @@ def settle() -> None:
 
 @contextlib.contextmanager
 def patience(signals: int) -> Iterator[None]:
-    """How many signals are left to whoever else handles them, inside; the process ends
-    at once at the next one. Elsewhere all are.
+    """Leave so many signals to other handlers inside; the process ends at the next one. By default
+    all of them.
     """
     settle()
     previous = _watch.patience
@@ -194,7 +194,7 @@ def _clean_up() -> None:
 
 
 class StopRequest:
-    """What SIGINT and SIGTERM mean to a run; a context manager.
+    """SIGINT and SIGTERM as a run handles them; a context manager.
 
     Where something is being learnt (`while_learning`), they ask to stop after the
     present update, and a second one interrupts at once. Elsewhere, above all while

@@ -1,5 +1,5 @@
-"""What this machine computes with: cores as devices; a formula or its hand-written
-kernel, and what kernels need of arrays.
+"""The hardware of this machine: cores as devices; a formula or its hand-written kernel, and what
+kernels need of arrays.
 """
 
 import contextlib
@@ -34,8 +34,8 @@ def make_cores_devices() -> None:
 
 @functools.cache
 def can_compile_for_cuda() -> bool:
-    """Whether JAX's CUDA compiler is installed: without it, nobody asks for kernels,
-    and they needn't be traced.
+    """True if JAX's CUDA compiler is installed: without it, no kernels are asked for, and they
+    needn't be traced.
     """
     if importlib.util.find_spec("jax_plugins") is None:
         return False

@@ -97,7 +97,7 @@ def ranged_fields(settings: type) -> tuple[Ranged, ...]:
 
 
 def check_intervals(settings: Any, group: str = "") -> None:
-    """Whether every number of a dataclass lies in its interval.
+    """Raise UserError unless every number of a dataclass lies in its interval.
 
     Args:
       settings: dataclass; nested ones check themselves.
@@ -127,8 +127,8 @@ def check_intervals(settings: Any, group: str = "") -> None:
 
 
 def changed(settings: Any, **changes) -> Any:
-    """`dataclasses.replace` for settings within settings: a dict stands for changes of
-    the settings under that name.
+    """`dataclasses.replace` for settings within settings: a dict holds changes of the settings
+    under that name.
 
     `changed(preset("paper"), seed=1, environment=dict(reward=dict(crash=40.0)))`
 

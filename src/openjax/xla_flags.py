@@ -49,9 +49,7 @@ def _jaxlib_version():
 
 
 def _computes_on_cpu():
-    """Whether JAX has found its devices, and computes on CPUs where nothing else is
-    said.
-    """
+    """True if JAX has found its devices and computes on CPUs unless told otherwise."""
     bridge = sys.modules.get("jax._src.xla_bridge")
     if bridge is None or not bridge.backends_are_initialized():
         return False

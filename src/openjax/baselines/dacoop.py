@@ -42,19 +42,19 @@ class DacoopPolicy(CraftPolicy):
         return tuple(math.atanh(min(max(place, -0.95), 0.95)) for place in places)
 
     def action(self, sample: jax.Array, observation: Observation) -> jax.Array:
-        """The action (..., N, 4) in -1..1 that a sample (..., N, 2) of the Gaussian, or
-        its mean, stands for.
+        """The action (..., N, 4) in -1..1 of a sample (..., N, 2) of the Gaussian,
+        or of its mean.
         """
         return velocity_action(self.craft, observation, self.desired_velocity(sample, observation))
 
     def desired_velocity(self, sample: jax.Array, observation: Observation) -> jax.Array:
-        """Velocities (..., N, 3), m/s, world, that a sample stands for."""
+        """The velocities (..., N, 3), m/s, world, that a sample asks for."""
         parameters = field_parameters(super().action(sample, observation))
         return apf(self.craft, parameters, surroundings(self.craft, observation))
 
 
 def field_parameters(output: jax.Array) -> ApfParameters:
-    """The field (leaves (..., N)) that outputs (..., N, 2) in -1..1 stand for."""
+    """The field (leaves (..., N)) that outputs (..., N, 2) in -1..1 choose."""
     outputs = {}
     for i, name in enumerate(LEARNED):
         low, high = ranges(ApfParameters)[name]
@@ -66,6 +66,6 @@ def field_parameters(output: jax.Array) -> ApfParameters:
 
 
 def _place(name, value):
-    """Where a value lies in its range on the logarithmic scale, in -1..1."""
+    """A value's place in its range on the logarithmic scale, from -1 to 1."""
     low, high = ranges(ApfParameters)[name]
     return 2.0 * math.log(value / low) / math.log(high / low) - 1.0

@@ -37,7 +37,7 @@ METHODS = {
 
 
 class WithoutNetwork:
-    """What isn't learnt, with the interface of `openjax.policy.Policy`; a subclass has
+    """A policy that isn't learnt, with the interface of `openjax.policy.Policy`; a subclass has
     `mean`.
     """
 
@@ -69,7 +69,7 @@ class WithoutNetwork:
 
 @dataclasses.dataclass(frozen=True)
 class Heuristic(WithoutNetwork):
-    """A method of `METHODS` as a policy; its parameters stand in the actor's place."""
+    """A method of `METHODS` as a policy; its parameters take the actor's place."""
 
     name: str
     craft: Craft = dataclasses.field(default_factory=Craft)

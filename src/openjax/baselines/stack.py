@@ -42,8 +42,8 @@ def stack_bound(settings: PursuitSettings) -> float:
 
 
 def column_reach(settings: PursuitSettings) -> float:
-    """How far across (m) points capture that fly one above another and cover the whole
-    height; 0 where they don't.
+    """Horizontal reach (m) of points that fly one above another and cover the whole height; 0 if
+    they don't cover it.
     """
     half = settings.arena_height / (2 * settings.num_pursuers)
     square = settings.capture_radius**2 - half**2
@@ -82,16 +82,16 @@ def planar_bound(settings: PursuitSettings) -> float:
 
 
 def nearest_in_disc(ratio: float) -> float:
-    """How near a point comes to one in a disc that is `ratio` > 1 times as fast, in
-    radii; see `planar_bound`.
+    """The distance to which a point can approach one that is `ratio` > 1 times as fast in a disc,
+    in radii; see `planar_bound`.
     """
     return math.sqrt(1.0 - ratio**-2) - math.acos(1.0 / ratio) / ratio
 
 
 @struct.dataclass
 class StackParameters:
-    """How well pursuers must stand on the ray before they move outwards, and how fast
-    they correct themselves.
+    """Limits of when pursuers on the ray move outwards, and gains by which they
+    correct themselves.
     """
 
     tolerance: jax.Array = parameter(0.05, 0.005, 0.2)

@@ -1,6 +1,4 @@
-"""What a pursuer knows of its surroundings, read out of its observation in plain
-terms.
-"""
+"""A pursuer's knowledge of its surroundings, read out of its observation in plain terms."""
 
 import dataclasses
 
@@ -23,7 +21,7 @@ VELOCITY = slice(7, 10)
 
 @dataclasses.dataclass(frozen=True)
 class Craft:
-    """What a pursuer knows before it starts: its arena and its vehicle."""
+    """A pursuer's knowledge before it starts: its arena and its vehicle."""
 
     arena_radius: float = 0.9
     """m"""

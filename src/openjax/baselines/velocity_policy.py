@@ -29,8 +29,8 @@ class VelocityPolicy(CraftPolicy):
         return 0.0, 0.0, 0.0
 
     def action(self, sample: jax.Array, observation: Observation) -> jax.Array:
-        """The action (..., N, 4) in -1..1 that a sample (..., N, 3) of the Gaussian, or
-        its mean, stands for.
+        """The action (..., N, 4) in -1..1 of a sample (..., N, 3) of the Gaussian,
+        or of its mean.
         """
         velocity = self.craft.speed * super().action(sample, observation)
         # components in -1..1 make a cube: its corners are cut to the largest speed

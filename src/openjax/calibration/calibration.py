@@ -109,7 +109,7 @@ class Calibration:
     """Of all flights together."""
 
     def calibrated(self) -> dict[str, CalibratedValue]:
-        """What goes into the vehicle file: determined quantities only."""
+        """The entries of the vehicle file: determined quantities only."""
         return {
             name: CalibratedValue(q.value, q.interval90, q.notes)
             for name, q in self.quantities.items()
@@ -260,8 +260,8 @@ def _quantity(
 def _cannot_tell(
     evidence: Evidence, fit: SetFit, quantities: dict[str, Quantity], share: float
 ) -> list[str]:
-    """What these flights leave open, in words. `share` of the rates' changes that the
-    fitted vehicle explains.
+    """A sentence on what these flights leave open. `share` of the rates' changes that the fitted
+    vehicle explains.
     """
     file = evidence.case.vehicle_file
     out = []

@@ -25,14 +25,14 @@ _SHARED_OUT = ("observation", "state")
 
 
 def can_share_out(settings: TrainSettings, number: int) -> bool:
-    """Whether each of `number` devices gets the same share of the worlds, of every task
-    and of every minibatch.
+    """True if each of `number` devices gets the same share of the worlds, of every task and of
+    every minibatch.
     """
     return number == 1 or settings.num_envs % (number * _group(settings)) == 0
 
 
 def check_devices(settings: TrainSettings, number: int) -> None:
-    """Whether the worlds can be shared out.
+    """Raise UserError unless the worlds can be shared out.
 
     Raises:
       UserError: they can't, with the next number of worlds that could, and the numbers
@@ -54,8 +54,7 @@ def _group(settings):
 
 
 def check_memory(settings: TrainSettings, number: int) -> None:
-    """Whether what the worlds, a rollout and the archive hold at least fits into
-    `number` devices.
+    """Raise UserError unless the worlds, a rollout and the archive fit into `number` devices.
 
     Raises:
       UserError: it doesn't; said before anything is compiled.
@@ -88,7 +87,7 @@ def _memory():
 
 
 def carry_shardings(number: int) -> TrainCarry | jax.sharding.Sharding:
-    """Where the leaves of a carry lie, as a prefix of its tree."""
+    """The shardings of a carry's leaves, as a prefix of its tree."""
     same = everywhere(number)
     if number == 1:
         return same

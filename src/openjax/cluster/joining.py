@@ -81,8 +81,8 @@ def find_membership(
 
 
 def _detect(place):
-    """Who tells what is missing of address, number and id, and all three, as
-    `jax.distributed.initialize` itself would find them.
+    """The launcher that knows what is missing of address, number and id, and all three, as
+    `jax.distributed.initialize` would find them.
 
     Only its private part tells; the public one joins at once, and the processes' own
     connections come before that.

@@ -65,7 +65,7 @@ class Processes:
 
     @property
     def is_first(self) -> bool:
-        """Whether this is the process that writes and shows."""
+        """True in the process that writes and shows."""
         return self.index == 0
 
     def everyone(self, value: Any = None) -> list:
@@ -112,7 +112,7 @@ class Processes:
         threading.Event().wait(GRACE if self._links else 0.0)
 
     def receive(self, other: int, message: dict) -> None:
-        """What another process sent."""
+        """Receive what another process sent."""
         if "value" in message:
             self._asked[other].put(message["value"])
         elif "values" in message:

@@ -1,4 +1,4 @@
-"""How well pursuers hear each other."""
+"""The quality of messages between pursuers."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -22,5 +22,5 @@ class MessageSettings:
 
     @property
     def perfect(self) -> bool:
-        """Whether all know at once what one knows."""
+        """True if all pursuers know at once what one knows."""
         return not (self.lost or self.late)

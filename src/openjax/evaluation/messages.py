@@ -30,7 +30,7 @@ twice the time in which a vehicle turns its velocity round.
 
 @struct.dataclass
 class Sent:
-    """What the N pursuers of a world send in a step."""
+    """The messages that the N pursuers of a world send in a step."""
 
     position: jax.Array  # (N, 3) m, their own
     velocity: jax.Array  # (N, 3) m/s, their own
@@ -42,7 +42,7 @@ class Sent:
 
 @struct.dataclass
 class Beliefs:
-    """What each of the N pursuers of a world takes it to be."""
+    """The beliefs of each of the N pursuers about its world."""
 
     # (N, N, 3) m, where each pursuer (second axis) was when it told
     position: jax.Array
@@ -169,9 +169,7 @@ class Hearsay:
         return jnp.concatenate([beliefs.frames[:, 1:], frames[:, None]], axis=1)
 
     def observations(self, beliefs: Beliefs, state: PursuitState) -> Observation:
-        """What each pursuer observes in its own view: observations (N, ...) of one
-        pursuer each.
-        """
+        """The observations of each pursuer in its own view: (N, ...) of one pursuer each."""
 
         def view(i, belief):
             place = self._place(belief, state.step)

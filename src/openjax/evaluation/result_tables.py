@@ -1,4 +1,4 @@
-"""What an evaluation says: records, and tables of them."""
+"""Results of an evaluation: records, and tables of them."""
 
 import math
 from collections.abc import Sequence

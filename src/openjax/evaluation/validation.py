@@ -91,8 +91,7 @@ class Validation:
 
 
 def selection_score(summary: dict, episode_length: int) -> float:
-    """By which the best checkpoint is chosen, on the uniform validation tasks; at most
-    1.
+    """The score that chooses the best checkpoint, on the uniform validation tasks; at most 1.
 
     Captures and safety come first: a tenth of the episode's length sooner is worth a
     200th of the captures, a 100th of the crashes. The reward isn't asked: how it weighs

@@ -1,5 +1,5 @@
-"""The game with JaxMARL's manners: dictionaries by agent, `step` that starts anew where
-an episode ends.
+"""The game as JaxMARL expects it: dictionaries by agent, and a `step` that restarts when an episode
+ends.
 
 It has the methods of `jaxmarl.environments.MultiAgentEnv` without needing JaxMARL:
 everything is pure, so its trainers can map and compile it.
@@ -43,11 +43,11 @@ class PursuitMultiAgentEnv:
         return "openjax_pursuit"
 
     def observation_space(self, agent: str) -> Box:
-        """Of one agent."""
+        """The space of one agent's observations."""
         return self.observation_spaces[agent]
 
     def action_space(self, agent: str) -> Box:
-        """Of one agent."""
+        """The space of one agent's actions."""
         return self.action_spaces[agent]
 
     @functools.partial(jax.jit, static_argnums=0)

@@ -45,11 +45,11 @@ class PursuitParallelEnv(ParallelEnv):
         self._step = jax.jit(self.environment.step)
 
     def observation_space(self, agent: str) -> spaces.Box:
-        """Of one agent."""
+        """The space of one agent's observations."""
         return self._observation_space
 
     def action_space(self, agent: str) -> spaces.Box:
-        """Of one agent."""
+        """The space of one agent's actions."""
         return self._action_space
 
     def reset(self, seed: int | None = None, options: dict | None = None):

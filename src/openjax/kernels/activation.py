@@ -11,7 +11,7 @@ from jax.experimental.pallas import triton as pallas_triton
 
 
 class Arithmetic(NamedTuple):
-    """How a kernel does what a GPU has instructions for."""
+    """The operations by which a kernel uses a GPU's own instructions."""
 
     tanh: Callable
     multiply_add: Callable
@@ -22,7 +22,7 @@ PLAIN = Arithmetic(jnp.tanh, lambda a, b, c: a * b + c)
 
 
 def kernel_arithmetic(dtype: jnp.dtype, interpret: bool) -> Arithmetic:
-    """What a kernel computes with whose results are stored as `dtype`.
+    """The arithmetic of a kernel whose results are stored as `dtype`.
 
     The GPU's own tanh errs by less than a bfloat16 can show. Triton's compiler leaves
     products and sums apart unless told.

@@ -180,7 +180,7 @@ def _in_blocks(operands, rows):
 
 
 def forward_by_kernel(layout, operands, interpret=False):
-    """What the reference gives, by a kernel; `interpret` runs it without a GPU."""
+    """The reference's result, by a kernel; `interpret` runs it without a GPU."""
     batch = operands.token.shape[0]
     operands, specs = _in_blocks(operands, ROWS)
     query = operands.query

@@ -1,4 +1,4 @@
-"""What attends to what, and in which sizes."""
+"""The operands of an attention, and their sizes."""
 
 from typing import NamedTuple
 
@@ -42,7 +42,7 @@ class Layout(NamedTuple):
 
 
 class Operands(NamedTuple):
-    """What attends to what, for B samples; all but `inputs` are differentiable."""
+    """The operands of an attention for B samples; all but `inputs` are differentiable."""
 
     query: jax.Array
     """(B, heads * features), one query per head in the space of the embeddings"""

@@ -40,8 +40,7 @@ def _numbers(array):
 
 
 def evaluate(program: ClosedJaxpr, arguments: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """What a traced function gives for `arguments`, arrays of objects of its inputs'
-    shapes.
+    """The result of a traced function for `arguments`, arrays of objects of its inputs' shapes.
 
     A component is a number, a scalar or a block (all of one shape) of the input's type;
     so are the results'.

@@ -124,7 +124,7 @@ def _backward_kernel(activate, arithmetic, x_ref, affine_ref, g_ref, dx_ref, daf
 
 
 def forward_by_kernel(activate, x, affine, interpret=False):
-    """What the reference gives, by a kernel; `interpret` runs it without a GPU."""
+    """The reference's result, by a kernel; `interpret` runs it without a GPU."""
     blocks = whole_blocks(x, ROWS)
     block = pl.BlockSpec((ROWS, x.shape[1]), lambda i: (i, 0))
     out = pl.pallas_call(

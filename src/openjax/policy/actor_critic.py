@@ -99,8 +99,8 @@ class Critic(nn.Module):
         return value.reshape(leading)
 
     def _encode(self, itself, observation, dtype):
-        """What an encoder of the critic's own makes of a pursuer's own part and the
-        rest.
+        """The embedding that the critic's own encoder makes of a pursuer's own part
+        and the rest.
         """
         settings = self.settings
         leading = itself.shape[:-1]

@@ -112,7 +112,7 @@ class SelfAttention(nn.Module):
         )
 
     def _attend_fused(self, token, query, output, entities):
-        """By the kernels for GPUs, and the formula that stands for them elsewhere."""
+        """Attend by the kernels for GPUs, or by their formula elsewhere."""
         f = self.features
         h = self.heads
         width = f // h

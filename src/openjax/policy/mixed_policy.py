@@ -61,8 +61,8 @@ class MixedPolicy:
     def _pick(
         self, function: Callable[[Any], Any], parameters: Any, observation: Observation
     ) -> Any:
-        """What `function` makes of the parameters of the member that each world has
-        drawn; leaves with the worlds' axes first.
+        """Apply `function` to the parameters of the member that each world has drawn; leaves with
+        the worlds' axes first.
         """
         # written out and not mapped: exported policies have neither loops nor indices
         result = function(_member(parameters, 0))

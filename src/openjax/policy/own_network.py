@@ -14,8 +14,8 @@ from openjax.pursuit import Observation
 
 @runtime_checkable
 class Network(Protocol):
-    """What acts and what judges, as pure functions of their parameters. Observations
-    have any leading axes.
+    """An actor and a critic, as pure functions of their parameters. Observations have any leading
+    axes.
     """
 
     def init(self, key: jax.Array, observation: Observation) -> tuple[Any, Any]:

@@ -129,7 +129,7 @@ class Policy:
         sample: Float[Array, "*worlds pursuers sample"],
         observation: Observation | None = None,
     ) -> Float[Array, "*worlds pursuers sample"]:
-        """The action in -1..1 that a sample of the Gaussian, or its mean, stands for.
+        """The action in -1..1 of a sample of the Gaussian, or of its mean.
 
         Policies whose samples aren't commands work the four out from the `observation`
         (`openjax.baselines.dacoop`).

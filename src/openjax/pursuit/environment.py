@@ -77,7 +77,7 @@ def action_to_command(action: Float[Array, "*drones 4"]) -> Float[Array, "*drone
 
 @runtime_checkable
 class Dynamics(Protocol):
-    """What moves the pursuers: `openjax.vehicle.DronesStep`, or a world outside."""
+    """The motion of the pursuers: `openjax.vehicle.DronesStep`, or a world outside."""
 
     def reset(self, vehicle: Vehicle, drones: DroneState, key: PRNGKeyArray) -> DroneState:
         """The drones (leading axis N) at the start of an episode."""
@@ -99,7 +99,7 @@ class Dynamics(Protocol):
 
 @runtime_checkable
 class Observer(Protocol):
-    """What pursuers observe; `openjax.pursuit.observe` is the game's own."""
+    """The observation of the pursuers; `openjax.pursuit.observe` is the game's own."""
 
     def __call__(
         self, settings: PursuitSettings, state: PursuitState, seen_drones: DroneState
@@ -179,7 +179,7 @@ class Pursuit:
 
     @property
     def evader_rows(self) -> tuple[EvaderKind, ...]:
-        """What each of `settings.evaders` is."""
+        """The row of each of `settings.evaders`."""
         return evader_rows(self.settings.evaders, self._handed_in)
 
     @property
@@ -290,9 +290,7 @@ class Pursuit:
         return draw_row(rows, key, task.pursuer_position, self.evader_share, task.evader)
 
     def _first_own_history(self, drones, action):
-        """What pursuers remember of themselves at the start; None where that isn't
-        observed.
-        """
+        """The pursuers' memory of themselves at the start; None if it isn't observed."""
         settings = self.settings
         if not settings.observe_history:
             return None
@@ -457,8 +455,8 @@ class Pursuit:
         return (self._observe(state, seen_drones), state, rewards, terminated, truncated, info)
 
     def _outcome(self, start, state, active):
-        """What happened in a step from `start` to `state` to the slots that are
-        `active`, and its rewards.
+        """The outcome of a step from `start` to `state` for the slots that are `active`, and its
+        rewards.
         """
         info = self._events(state).of_team(active)
         settings = arena_of(self.settings, state.task)
@@ -467,7 +465,7 @@ class Pursuit:
         return info.replace(penalty=penalty), rewards
 
     def _events(self, state):
-        """What happened in the step that ended with `state`, but for the penalties."""
+        """The events of the step that ended with `state`, without the penalties."""
         task = state.task
         settings = arena_of(self.settings, task)
         drones = state.drones

@@ -1,5 +1,5 @@
-"""Where an evader is taken to be that nobody sees: where it was last seen, or the
-nearest place to that where it can be.
+"""The assumed place of an evader that nobody sees: where it was last seen, or the nearest place to
+that where it can be.
 
 Pursuers know the pillars and one another, so they know what they see: an evader that
 was last seen at a place in full view isn't there. What all of them leave hidden is some

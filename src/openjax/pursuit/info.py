@@ -1,4 +1,4 @@
-"""What happened in a step of one world."""
+"""Events of a step of one world."""
 
 import jax
 from flax import struct
@@ -10,7 +10,7 @@ from openjax.pursuit.teams import of_team
 
 @struct.dataclass
 class StepInfo:
-    """What happened in one step, beside the reward."""
+    """The events of one step, beside the reward."""
 
     captured: jax.Array
     """(N,) bool: the evader is within the capture radius."""

@@ -1,4 +1,4 @@
-"""What each pursuer observes, and what the critic may see beside it."""
+"""The observation of each pursuer, and what the critic may see beside it."""
 
 import functools
 
@@ -116,8 +116,7 @@ def own_frame(
 
 
 def observe(settings: PursuitSettings, state: PursuitState, seen_drones: DroneState) -> Observation:
-    """The observation of all N pursuers in `state`; the evader seen by one is seen by
-    all.
+    """The observation of all N pursuers in `state`; if one sees the evader, all do.
 
     `seen_drones` is what sensors tell of `state.drones`; only the critic sees these
     themselves.

@@ -10,8 +10,8 @@ T = TypeVar("T")
 
 
 def where_rows(mask: Bool[Array, "*rows"], new: T, old: T) -> T:
-    """Of two trees, whose leaves have the mask's axes (...) first, the rows of `new`
-    where the mask holds, else those of `old`.
+    """The rows of `new` where the mask holds, and those of `old` elsewhere; the leaves of both
+    trees have the mask's axes (...) first.
     """
 
     def select(new_leaf, old_leaf):

@@ -137,7 +137,7 @@ def find_scenario(name_or_path: str, settings: PursuitSettings) -> Scenario:
 
 
 def _faults(layout: Scenario, settings: PursuitSettings) -> list[str]:
-    """What can't be about a layout."""
+    """The faults of a layout."""
     pursuers = layout.pursuers
     pillars = layout.pillars
     radius = settings.arena_radius

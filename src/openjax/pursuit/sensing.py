@@ -1,6 +1,4 @@
-"""Who sees the evader: line of sight past the pillars, within range and cone; a team
-shares it.
-"""
+"""Line of sight to the evader, past the pillars, within range and cone; a team shares it."""
 
 import jax.numpy as jnp
 import numpy as np

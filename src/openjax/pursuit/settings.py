@@ -96,7 +96,7 @@ class RewardSettings:
 
     @property
     def needs_paths(self) -> bool:
-        """Whether worlds have to know the shortest paths round their pillars."""
+        """True if worlds have to know the shortest paths round their pillars."""
         return self.path != 0.0 or self.territory != 0.0
 
 
@@ -275,7 +275,7 @@ class PursuitSettings:
         check_evaders(self.evaders)
 
     def _check_numbers(self):
-        """Raises UserError for numbers of which one rules the other out."""
+        """Raise UserError for numbers that exclude each other."""
         if self.min_pillars > self.max_pillars:
             raise UserError(
                 f"environment.min_pillars {self.min_pillars} is more than environment.max_pillars "
@@ -328,7 +328,7 @@ class PursuitSettings:
 
     @property
     def limited_sight(self) -> bool:
-        """Whether something else than pillars can hide the evader."""
+        """True if something else than pillars can hide the evader."""
         full_sight = PursuitSettings.sight_range, PursuitSettings.sight_angle
         return (self.sight_range, self.sight_angle) != full_sight
 

@@ -1,5 +1,4 @@
-"""How far it is to the evader for who can't fly through pillars: shortest paths in the
-plane, by a visibility graph.
+"""Distances to the evader round the pillars: shortest paths in the plane, by a visibility graph.
 
 A shortest path round discs is straight but for where it bends about one. Here the
 discs, pillars with their safety distance, are polygons, and a path bends at their
@@ -157,5 +156,5 @@ def _straight(settings, task, start, end):
 
 
 def _reach(settings):
-    """How far from the axis of a pillar a path keeps (m)."""
+    """The distance (m) that a path keeps from a pillar's axis."""
     return settings.pillar_radius + settings.pillar_clearance + ROOM

@@ -1,4 +1,4 @@
-"""What actions and observations can be: boxes, without another library."""
+"""Spaces of actions and observations: boxes, without another library."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""What is counted over an episode: the paper's metrics and ours."""
+"""Counts of an episode: the paper's metrics and ours."""
 
 import jax
 import jax.numpy as jnp

@@ -137,9 +137,7 @@ def task_descriptor(tasks: Task) -> Float[Array, "tasks features"]:
 
 
 def starts_clear(settings: PursuitSettings, task: Task) -> Flag:
-    """Whether no pursuer starts in a breach and the evader starts outside all pillars.
-    () bool.
-    """
+    """True if no pursuer starts in a breach and the evader starts outside all pillars. () bool."""
     breach = breaches(
         arena_of(settings, task), task.pursuer_position, task.pillar_position, task.pillar_active
     )

@@ -1,1 +1,1 @@
-"""What people look at: progress, metrics, plots and animations."""
+"""Displays for people: progress, metrics, plots and animations."""

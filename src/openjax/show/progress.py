@@ -1,5 +1,5 @@
-"""What a run, or another command that takes its time, shows on the terminal: a live
-display, or plain lines into a file.
+"""The terminal's view of a run, or of another command that takes its time: a live display, or plain
+lines into a file.
 """
 
 import math
@@ -28,8 +28,8 @@ LONG = 30.0
 
 
 class _Display:
-    """What `_render` returns, drawn again and again on a terminal while it is entered;
-    into a file it draws nothing.
+    """The output of `_render`, drawn again and again on a terminal while it is entered; into a file
+    it draws nothing.
     """
 
     def __init__(self, console: Console, stays: bool):

@@ -37,8 +37,8 @@ def write_replay(path: Path, flights: Sequence[tuple[str, Trajectory]]) -> None:
 
 
 def plain_episode(policy: str, flight: Trajectory) -> dict:
-    """What the page's script reads of an episode, up to two seconds after its capture:
-    lengths in mm, quaternions in thousandths, times in frames.
+    """The data of an episode for the page's script, up to two seconds after its capture: lengths in
+    mm, quaternions in thousandths, times in frames.
     """
     every = max(1, round(LONGEST_STEP / flight.time_step))
     steps = slice(0, flight.end(seconds=2.0), every)

@@ -39,8 +39,8 @@ _LETTERS = 20  # pixels
 
 
 def animate(path: Path, trajectories: Sequence[Trajectory]) -> None:
-    """Write an animated GIF up to a second after the first capture; time, capture and
-    crash stand above it.
+    """Write an animated GIF up to a second after the first capture, with time, capture and crash
+    above it.
 
     Args:
       path: the .gif file.
@@ -78,9 +78,7 @@ def _stack(films):
 
 
 def caption(trajectory: Trajectory, step: int) -> tuple[str, str]:
-    """What is written above the frame of a step: title and time; and what happened
-    until then.
-    """
+    """The caption of a step's frame: title, time, and what happened until then."""
     events = []
     for word, index in (("caught", trajectory.capture_index), ("crashed", trajectory.crash_index)):
         if index is not None and index <= step:
@@ -168,8 +166,8 @@ class _Pen:
         self._camera = (0, 0, 0.38 * height) - DISTANCE * radius * self._axes[2]
 
     def depth(self, place) -> float:
-        """What hides what: how far off along the floor, as pillars reach all the way
-        up.
+        """The order in which things hide each other: how far off along the floor, as pillars reach
+        all the way up.
         """
         return float(self._axes[2, :2] @ place[:2])
 

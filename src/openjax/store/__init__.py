@@ -1,4 +1,4 @@
-"""What a run leaves on disk: its directory, settings, checkpoints and policies."""
+"""The files of a run: its directory, settings, checkpoints and policies."""
 
 from openjax.pursuit.settings import PursuitSettings
 

@@ -83,7 +83,7 @@ class Checkpoints:
         return records
 
     def any_finished(self) -> bool:
-        """Whether there is a checkpoint, damaged or not."""
+        """True if there is a checkpoint, damaged or not."""
         return any(is_checkpoint(path) for path in self.directory.glob("[0-9]" * _DIGITS))
 
     def last_finished(self) -> int | None:
@@ -147,7 +147,7 @@ class Checkpoints:
         self._pending = in_background(functools.partial(commit, path, write))
 
     def _holds(self, path, score):
-        """Whether a checkpoint is there, with a score if there is one to write."""
+        """True if a checkpoint is there, with a score if there is one to write."""
         if not is_checkpoint(path) or path.name in self._damaged:
             return False
         return score is None or any(
@@ -224,7 +224,7 @@ class Checkpoints:
 
 
 def _record(path):
-    """What is known of a checkpoint. Raises DamagedError."""
+    """The record of a checkpoint. Raises DamagedError."""
     check_state(path)
     try:
         notes = dict(load_orbax().metadata(path.absolute()).custom_metadata or {})

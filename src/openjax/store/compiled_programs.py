@@ -78,9 +78,7 @@ def _own_folder():
 
 
 def _is_private(folder):
-    """Whether it's a folder, no link to one, this user's, and nobody else can write to
-    it.
-    """
+    """True if it's a folder, no link to one, this user's, and nobody else can write to it."""
     status = folder.lstat()
     return (
         stat.S_ISDIR(status.st_mode)

@@ -79,8 +79,8 @@ def make_environment(
 
 
 def is_evader_file(opponent: Any) -> bool:
-    """Whether it is a file that `openjax exploit` wrote, neither a scripted evader's
-    name nor code.
+    """True if it is a file that `openjax exploit` wrote, neither a scripted
+    evader's name nor code.
     """
     is_name = isinstance(opponent, str | Path) and str(opponent) not in SCRIPTED
     return is_name and not is_own_code(opponent)

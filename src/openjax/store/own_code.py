@@ -8,12 +8,12 @@ from openjax.errors import UserError
 
 
 def is_own_code(name: Any) -> bool:
-    """Whether it names something in a Python file, `FILE.py:name`."""
+    """True if it names something in a Python file, `FILE.py:name`."""
     return isinstance(name, str) and ".py:" in name
 
 
 def own_code(option: str, name: str, kinds: tuple[type, ...], what: str) -> Any:
-    """What `FILE.py:name` names; the file is run.
+    """The object that `FILE.py:name` names; the file is run.
 
     Args:
       option: that asked for it.

@@ -77,12 +77,12 @@ class LoadedPolicy:
 
     @property
     def is_heuristic(self) -> bool:
-        """Whether it was written and not trained."""
+        """True if the policy was written and not trained."""
         return isinstance(self.policy, Heuristic)
 
     @property
     def any_number(self) -> bool:
-        """Whether it flies with any number of pursuers."""
+        """True if the policy flies with any number of pursuers."""
         return bool(self.settings.environment.team_sizes)
 
     def of_team(self, number: int) -> "LoadedPolicy":

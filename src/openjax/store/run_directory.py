@@ -56,7 +56,7 @@ class RunDirectory:
 
     @property
     def settings_file(self) -> Path:
-        """What determines the run, as JSON; a folder that has it is a run."""
+        """The settings that determine the run, as JSON; a folder that has it is a run."""
         return self.path / SETTINGS_FILE
 
     @property
@@ -81,7 +81,7 @@ class RunDirectory:
         write_json(self.settings_file, {"format": _FORMAT, "settings": settings, **facts})
 
     def read_facts(self) -> dict:
-        """What `write_settings` was told beside the settings."""
+        """The facts that `write_settings` was given beside the settings."""
         return read_json(self.settings_file)
 
     def read_settings(self) -> TrainSettings:
@@ -98,7 +98,7 @@ class RunDirectory:
 
 
 def is_run(path: Path) -> bool:
-    """Whether the directory holds a run."""
+    """True if the directory holds a run."""
     return (Path(path) / SETTINGS_FILE).is_file()
 
 
@@ -117,7 +117,7 @@ def open_run(path: Path) -> RunDirectory:
 
 
 def check_free(path: Path, overwrite: bool) -> None:
-    """Whether a new run may be written to `path`; changes nothing.
+    """Raise UserError unless a new run may be written to `path`; changes nothing.
 
     What a run left that was killed before it had settings is in nobody's way.
 
@@ -183,5 +183,5 @@ def lock_run(path: Path) -> Iterator[None]:
 
 
 def _is_ours(name):
-    """Whether a run writes something of this name, or left it unfinished."""
+    """True if a run writes something of this name, or left it unfinished."""
     return name in (*_FILES, *_FOLDERS, _LOCK) or name.startswith(WRITING)

@@ -104,7 +104,7 @@ def _read(file):
 
 
 def _key(name, carry, made_from):
-    """What a program depends on, in short."""
+    """A short key of everything that a program depends on."""
     # all sources: which of them a program depends on, nobody knows without tracing it
     digest = hashlib.sha256()
     sources = [*Path(__file__).parents[1].rglob("*.py"), *assets_directory().iterdir()]

@@ -1,5 +1,5 @@
-"""How the bodies of N drones move under the wrenches on them, in free flight and among
-solid things.
+"""The motion of the bodies of N drones under the wrenches on them, in free flight and among solid
+things.
 """
 
 import functools
@@ -57,8 +57,8 @@ class Bodies:
     def around(
         self, drones: DroneState, pillar_position: Pillars, pillar_active: Active
     ) -> Surroundings | None:
-        """What each drone (leading axis N) may touch in this step; None where nothing
-        is solid.
+        """The things that each drone (leading axis N) may touch in this step; None if nothing is
+        solid.
 
         pillar_position (P, 2) m, pillar_active (P,): which of them are in use.
         """

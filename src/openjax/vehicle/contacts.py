@@ -1,4 +1,4 @@
-"""What contacts with solid things do to a drone: MuJoCo's soft contacts, written out.
+"""The forces of contacts with solid things on a drone: MuJoCo's soft contacts, written out.
 
 `contact_acceleration` does it for one drone and all things around it at once,
 `looped_contact_acceleration` for a block of drones and one thing after the other, as a
@@ -23,8 +23,8 @@ def contact_acceleration(
     around: Surroundings,
     dt: Seconds,
 ) -> Vector:
-    """What contacts add over a step of dt seconds to the `acceleration` (3,) m/s^2 that
-    a drone would have without them.
+    """The acceleration that contacts add over a step of dt seconds to the `acceleration` (3,) m/s^2
+    that a drone would have without them.
 
     MuJoCo's soft contacts (its documentation, "Computation": constraint model, primal
     problem) written out for a sphere without friction. They act on its centre along the
@@ -100,9 +100,8 @@ def _reference(thing, normal, gap, velocity, dt):
 
 
 def _terms(thing, normal, gap, lacking):
-    """What one contact adds to the pull (3,) and to the matrix (xx, yy, zz, xy, xz, yz)
-    of the Newton step, where the free acceleration is `lacking` (< 0) against the
-    reference.
+    """The terms of one contact in the pull (3,) and the matrix (xx, yy, zz, xy, xz, yz) of the
+    Newton step, where the free acceleration is `lacking` (< 0) against the reference.
     """
     x, y, z = normal
     impedance = jnp.asarray(thing.contact.impedance, gap.dtype)

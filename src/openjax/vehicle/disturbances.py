@@ -1,5 +1,5 @@
-"""What differs from flight to flight and moment to moment: gusts, sensor noise,
-commands and poses that come unevenly.
+"""Differences from flight to flight and moment to moment: gusts, sensor noise, commands and poses
+that come unevenly.
 
 Effects like those of `openjax.vehicle.effects`, for flying with only: they're random,
 so no diagnosis looks for them.

@@ -145,8 +145,8 @@ class DronesStep:
         return drones.replace(effect_memory=jax.vmap(memory)(drones, number))
 
     def seen(self, drones: DroneState, effect_parameters=None) -> DroneState:
-        """What the off-board controller sees of `drones` (leading axis N): they
-        themselves without sensor effects.
+        """The off-board controller's view of `drones` (leading axis N): the drones themselves
+        without sensor effects.
         """
         if not self.effects:
             return drones
@@ -156,7 +156,7 @@ class DronesStep:
 
     @property
     def _bodies(self) -> Bodies:
-        """What moves in a substep."""
+        """The motion of the bodies in a substep."""
         return Bodies(self.physics, self.contacts, self.arena, self.dt / self.substeps)
 
     def _parameters(self, values, drones):

@@ -24,9 +24,7 @@ can't rule out that a little of it acts.
 
 
 class VehicleRange(NamedTuple):
-    """Where one parameter of an effect is drawn from: uniformly in its range, now and
-    then in a wider one.
-    """
+    """The range of one parameter of an effect: drawn uniformly, now and then from a wider one."""
 
     parameter: str
     """`effect.parameter`, for example `motor_lag.extra_up`."""

@@ -63,8 +63,8 @@ class Vehicle:
 
 
 def assets_directory() -> Path:
-    """Where the MJCF files lie: inside the installed package, or at the top of the
-    source tree. UserError: nowhere.
+    """The folder of the MJCF files: inside the installed package, or at the top of the source tree.
+    Raises UserError if there is none.
     """
     file = Path(__file__).resolve()
     for candidate in (file.parents[1] / "assets", file.parents[3] / "assets"):

@@ -83,8 +83,8 @@ def euler_step(
 def accelerations(
     vehicle: Vehicle, drone: DroneState, force_world: Vector, torque_body: Vector
 ) -> tuple[Vector, Vector]:
-    """Of one drone in free flight, by the Newton-Euler equations: (3,) m/s^2 world and
-    (3,) rad/s^2 body.
+    """The accelerations of one drone in free flight, by the Newton-Euler equations: (3,) m/s^2
+    world and (3,) rad/s^2 body.
 
     force_world (3,) N without gravity, torque_body (3,) N m about the centre of mass.
     """

@@ -35,7 +35,7 @@ WARPS = 4
 
 
 class FusedStep(NamedTuple):
-    """What a step does to one drone: hashable, since compiled code is kept for each."""
+    """The step of one drone: hashable, since compiled code is kept for each."""
 
     accelerate: Callable[[Vehicle, DroneState, jax.Array], tuple[DroneState, jax.Array, jax.Array]]
     """(vehicle, drone, command (4,)) -> the drone with its controller and rotors a
@@ -178,7 +178,7 @@ def kernel_call(
 
 
 class _Worlds(NamedTuple):
-    """What `kernel_call` is given of W worlds."""
+    """The inputs of `kernel_call` for W worlds."""
 
     drones: DroneState
     command: jax.Array
@@ -193,7 +193,7 @@ class _Worlds(NamedTuple):
         return [whole_blocks(leaf.reshape(number, -1), DRONES, mode="edge") for leaf in leaves]
 
     def around(self):
-        """What each drone looks up: where all drones and pillars are; nothing in free
+        """The places that each drone looks up: those of all drones and pillars; nothing in free
         flight.
         """
         if not self.pillars:
@@ -294,8 +294,8 @@ def _numbers(constants_ref, leaves):
 
 
 def _contacts(step, drone, free, sizes, around):
-    """What contacts add to the accelerations in free flight of a block of drones,
-    components (3,); `sizes`: worlds, and drones in each.
+    """The accelerations that contacts add to those of free flight for a block of drones, components
+    (3,); `sizes`: worlds, and drones in each.
     """
     position_ref, velocity_ref, pillar_ref, active_ref = around
     worlds, n = sizes

@@ -40,7 +40,7 @@ PARKED = -100.0  # m, height of a pillar that isn't there
 
 @flax.struct.dataclass
 class Surroundings:
-    """What one drone may touch beside the floor: P pillar slots and K other drones."""
+    """The things that one drone may touch beside the floor: P pillar slots and K other drones."""
 
     pillar_position: Pillars
     pillar_active: Active
@@ -135,7 +135,7 @@ def others(n: int) -> np.ndarray:
 def surroundings(
     position: Team, velocity: Team, pillar_position: Pillars, pillar_active: Active
 ) -> Surroundings:
-    """What each of N drones may touch, leading axis N.
+    """The things that each of N drones may touch, leading axis N.
 
     position and velocity (N, 3) of the drones, pillar_position (P, 2) m, pillar_active
     (P,).
@@ -233,7 +233,7 @@ def shown_gap(gap, gap_ahead, hit):
 
 
 def place_solids(gaps: Encounters) -> Things:
-    """Where one drone's shapes are shown to it, (M, 3) m, in the order of
+    """The places at which one drone's shapes are shown to it, (M, 3) m, in the order of
     `solids_xml`.
     """
     shift = gaps.shown - gaps.gap

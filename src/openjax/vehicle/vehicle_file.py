@@ -41,8 +41,8 @@ NOMINAL_NAME = "crazyflie-2.1"
 
 @dataclass(frozen=True, eq=False)
 class VehicleFile:
-    """What a vehicle file says. `vehicle` is the nominal one with everything of the
-    file applied, its motors in the nominal order; `motor` is of the logged columns.
+    """The content of a vehicle file. `vehicle` is the nominal one with everything of the file
+    applied, its motors in the nominal order; `motor` is of the logged columns.
     """
 
     vehicle: Vehicle
@@ -72,8 +72,8 @@ class VehicleFile:
         return self.vehicle if mass is None else with_values(self.vehicle, mass=mass)
 
     def mass_weighed_of(self, vehicle_id: str) -> bool:
-        """Whether the mass of `vehicle_id` was weighed, so that a thrust error can't be
-        explained by it.
+        """True if the mass of `vehicle_id` was weighed, so that a thrust error can't be explained
+        by it.
         """
         of_vehicle = self.vehicles.get(vehicle_id, Overrides()).mass_weighed
         return self.mass_weighed if of_vehicle is None else of_vehicle

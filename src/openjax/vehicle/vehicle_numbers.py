@@ -47,9 +47,7 @@ class CalibratedValue:
 
 
 def spins_of(motor: Motor, nominal: Vehicle, root: str) -> tuple[Spin, ...]:
-    """How the motors m1 to m4 of the log spin. Raises UserError unless two spin either
-    way.
-    """
+    """The spins of the motors m1 to m4 of the log. Raises UserError unless two spin either way."""
     # an array of NumPy's: going through one of JAX's compiles, which a flight can't
     # that writes its log in a fork
     usual = ["cw" if spin > 0 else "ccw" for spin in np.asarray(nominal.rotor_spin)]

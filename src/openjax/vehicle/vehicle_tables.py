@@ -69,7 +69,7 @@ class CalibratedTable:
 
 @dataclass(frozen=True)
 class LogKeys:
-    """What openjax reads of `[log]`."""
+    """The keys of `[log]` that openjax reads."""
 
     floor_z: Annotated[float, Interval("[-1000, 1000]", "m")] = 0.0
     ceiling_z: Annotated[float, Interval("[-1000, 1000]", "m")] | None = None

@@ -1,4 +1,4 @@
-"""Judges of a policy: evaders that look for whatever it can't catch.
+"""Judges of a policy: evaders that look for its weaknesses.
 
 Evaders that learn (`best_response`), and one that plans (`planner`). They share nothing
 with `openjax.learning`, whose evaders the pursuers may have been trained against:

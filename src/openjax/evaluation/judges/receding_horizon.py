@@ -1,5 +1,5 @@
-"""Who plans again and again: a plan is made, its beginning is flown, and so on to the
-episode's end.
+"""Receding-horizon planning: a plan is made, its beginning is flown, and so on to the episode's
+end.
 """
 
 from abc import ABC, abstractmethod

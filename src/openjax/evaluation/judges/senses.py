@@ -1,4 +1,4 @@
-"""What a judge's evader knows: all of the world's state, as numbers in axes of its own.
+"""The observation of a judge's evader: all of the world's state, as numbers in axes of its own.
 
 The x axis points away from the arena's axis, so that a game that is turned looks the
 same; with `world_axes` it is the world's. Pursuers and pillars are sorted by their

@@ -9,7 +9,7 @@ from openjax.ranges import Interval, check_intervals
 
 @dataclass(frozen=True)
 class BestResponseSettings:
-    """How evaders learn against fixed pursuers."""
+    """Settings of evaders that learn against fixed pursuers."""
 
     learners: Annotated[int, Interval("[1, 64]")] = 8
     """Evaders that learn side by side; every second one in the world's axes."""
@@ -104,7 +104,7 @@ class BestResponseSettings:
 
 @dataclass(frozen=True)
 class PlannerSettings:
-    """How an evader plans."""
+    """Settings of an evader that plans."""
 
     plans: Annotated[int, Interval("[3, 10000]")] = 48
     """That are tried each time."""

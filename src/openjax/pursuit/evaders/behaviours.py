@@ -1,4 +1,4 @@
-"""What evaders do: pure functions of what one knows and of its memory, of static
+"""The evaders' behaviours: pure functions of what an evader knows and of its memory, of static
 shapes.
 
     behaviour(scene, memory) -> wish (3,), memory (MEMORY,)
@@ -46,7 +46,7 @@ FAR_AWAY = 100.0
 
 @struct.dataclass
 class Scene:
-    """What an evader in one world knows."""
+    """An evader's knowledge of its world."""
 
     settings: PursuitSettings = struct.field(pytree_node=False)
     position: jax.Array  # (3,) m, its own

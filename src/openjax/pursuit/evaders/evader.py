@@ -142,7 +142,7 @@ def evader_velocity(
 
 
 def scene_of(settings: PursuitSettings, world: PursuitState) -> Scene:
-    """What the evader of a world knows of it."""
+    """The knowledge of a world's evader."""
     numbers = world.evader.numbers
     key = world.evader.key
     is_known = world.in_sight | (numbers["sees_all"] > 0.5)

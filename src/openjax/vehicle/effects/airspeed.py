@@ -1,6 +1,4 @@
-"""Where the hubs are and how they move: shared by the effects that act at each
-rotor.
-"""
+"""Positions and velocities of the hubs, shared by the effects that act at each rotor."""
 
 import jax
 import jax.numpy as jnp

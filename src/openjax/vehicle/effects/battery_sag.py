@@ -19,7 +19,7 @@ def voltage(parameters, context):
 
 
 def motor(parameters, motor_command, context):
-    """m (V / V0)^exponent, of which thrust is a linear function."""
+    """m (V / V0)^exponent; thrust is a linear function of it."""
     ratio = voltage(parameters, context) / parameters["reference"]
     return motor_command * ratio ** parameters["exponent"]
 

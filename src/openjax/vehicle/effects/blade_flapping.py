@@ -16,9 +16,8 @@ def wrench(parameters, context):
 
 
 def tilts_back(value, deviation):
-    """Whether blades don't clearly (three standard deviations) tilt the thrust along
-    the motion, or pitch the body forward; without motors in the log nothing says how they
-    pitch it.
+    """True unless blades clearly (three standard deviations) tilt the thrust along the motion, or
+    pitch the body forward; without motors in the log nothing says how they pitch it.
     """
     return all(value[name] > -3.0 * deviation[name] for name in ("tilt", "stiffness"))
 

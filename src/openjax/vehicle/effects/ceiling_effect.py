@@ -24,16 +24,12 @@ def thrust(parameters, thrust, reaction, context):
 
 
 def above(position) -> bool:
-    """Whether a flight (T, 3) m was higher than the paper's ceiling: then there is
-    none.
-    """
+    """True if a flight (T, 3) m was higher than the paper's ceiling: then there is none."""
     return bool((position[:, 2] > ARENA_CEILING).any())
 
 
 def acts(values, deviations) -> bool:
-    """Whether a ceiling can be as strong: a stronger one is some slow change of
-    thrust.
-    """
+    """True if a ceiling can be as strong: a stronger one is some slow change of thrust."""
     return values["strength"] < STRONGEST
 
 

@@ -6,7 +6,7 @@ from openjax.vehicle.parameters import hover_command
 
 
 def initial_memory(vehicle, state, dt, key):
-    """As if hover had been commanded before."""
+    """A memory in which hover had been commanded before."""
     return fill(hover_command(vehicle, state.position.dtype), dt)
 
 

@@ -175,7 +175,7 @@ def record(effects, memory, state: DroneState, dt):
 
 
 def seen_state(effects, parameters, state: DroneState) -> DroneState:
-    """What the off-board controller sees of one drone in `state`."""
+    """The off-board controller's view of one drone in `state`."""
     for effect in effects:
         if effect.sensor is not None:
             result = effect.sensor(parameters[effect.name], state.effect_memory[effect.name], state)

@@ -1,5 +1,5 @@
-"""What an effect is: named parameters, and pure functions that hook into the step of
-one drone.
+"""The form of an effect: named parameters, and pure functions that hook into the
+step of one drone.
 """
 
 from collections.abc import Callable, Mapping
@@ -23,9 +23,7 @@ ARENA_CEILING = Arena.height  # m
 
 @flax.struct.dataclass
 class Context:
-    """What surrounds one drone at a moment; the input of most hooks. NaN stands for
-    "not known".
-    """
+    """The surroundings of one drone at a moment; the input of most hooks. NaN means "not known"."""
 
     position: jax.Array  # (3,) m, world
     quaternion: jax.Array  # (4,) body to world
@@ -96,8 +94,8 @@ are written.
 
 
 def growth(unit: str, vehicle: Vehicle) -> float:
-    """By what the usual range of a parameter in `unit` is multiplied for a vehicle; 1
-    for those of about a Crazyflie's size.
+    """The factor on the usual range of a parameter in `unit` for a vehicle; 1 for those of about a
+    Crazyflie's size.
     """
     if unit not in GROWTH:
         return 1.0
@@ -162,7 +160,7 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Fitted:
-    """How one parameter is fitted; all numbers are in its unit."""
+    """The fit of one parameter; all numbers are in its unit."""
 
     name: str
     mean: float
@@ -190,7 +188,7 @@ VERY_RARE = -6.0
 
 @dataclass(frozen=True)
 class Card:
-    """How an effect is told from flights."""
+    """The diagnosis' knowledge of an effect."""
 
     fitted: tuple[Fitted, ...]
     """Its parameters."""

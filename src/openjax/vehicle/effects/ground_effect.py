@@ -28,8 +28,8 @@ STRONGEST = 3.0
 
 
 def acts(values, deviations) -> bool:
-    """Whether a floor can be as strong; asked at the height of one rotor's radius, as
-    strength and offset trade against each other.
+    """True if a floor can be as strong; asked at the height of one rotor's radius, as strength and
+    offset trade against each other.
     """
     height = PROPELLER_RADIUS + values["offset"]
     return values["strength"] * (PROPELLER_RADIUS / height) ** 2 < STRONGEST

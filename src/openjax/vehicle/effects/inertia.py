@@ -34,11 +34,10 @@ def wrench(parameters, context):
 
 
 def heavy_inside(value, deviation):
-    """Whether the moments are those of a body that holds its mass inside its rotors: a
-    third to three times the assumed ones. With all its mass at the hubs, a Crazyflie
-    has 2.1 times the nominal moments about x and y. A product turns the principal axes
-    by half a right angle where it equals the moments' difference; a sixth of a moment
-    is three times what was measured.
+    """True if the moments are those of a body that holds its mass inside its rotors: a third to
+    three times the assumed ones. With all its mass at the hubs, a Crazyflie has 2.1 times the
+    nominal moments about x and y. A product turns the principal axes by half a right angle where it
+    equals the moments' difference; a sixth of a moment is three times what was measured.
     """
     return all(1 / 3 < value[axis] < 3 for axis in AXES) and abs(value["xy"]) < 1 / 6
 

@@ -20,8 +20,8 @@ STRONGEST = 0.30  # above the rotors' mean, twice what is usual
 
 
 def flies(values, deviations) -> bool:
-    """Whether no rotor is stronger than propellers of a kind can be: where torques
-    tell nothing, a difference of rotors follows what slow turns do to the thrust.
+    """True if no rotor is stronger than propellers of a kind can be: where torques tell nothing, a
+    difference of rotors follows what slow turns do to the thrust.
     """
     return max(values.values()) < STRONGEST
 

@@ -16,9 +16,7 @@ EARLY = 0.0025  # s
 
 
 def body(parameters, vehicle):
-    """Both time constants, of which the vehicle holds the first and the ratio of the
-    second to it.
-    """
+    """Both time constants; the vehicle holds the first, and the ratio of the second to it."""
     up = jnp.maximum(vehicle.motor_time_constant + parameters["extra_up"], _SHORTEST)
     down = vehicle.motor_time_constant * vehicle.motor_slowdown_ratio + parameters["extra_down"]
     return vehicle.replace(

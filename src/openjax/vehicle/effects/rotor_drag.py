@@ -21,9 +21,7 @@ _SOURCE = (
 
 
 def brakes(value, deviation):
-    """Whether a fitted drag isn't clearly a push along the motion: three standard
-    deviations.
-    """
+    """True unless a fitted drag is clearly a push along the motion: three standard deviations."""
     return bool(value["d_xy"] > -3.0 * deviation["d_xy"])
 
 

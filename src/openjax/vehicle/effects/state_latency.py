@@ -13,7 +13,7 @@ def _pose(state):
 
 
 def initial_memory(vehicle, state, dt, key):
-    """As if the drone had been here before. The step is remembered, since `sensor` has
+    """A memory in which the drone had been here before. The step is remembered, since `sensor` has
     no other way to know it.
     """
     return {"pose": fill(_pose(state), dt), "dt": jnp.asarray(dt, state.position.dtype)}

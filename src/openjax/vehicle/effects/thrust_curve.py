@@ -6,7 +6,7 @@ from openjax.vehicle.effects.effect import RARE, Card, Effect, Fitted, Parameter
 
 
 def motor(parameters, motor_command, context):
-    """offset + slope m + curvature m^2, of which thrust is a linear function."""
+    """offset + slope m + curvature m^2; thrust is a linear function of it."""
     square = parameters["curvature"] * motor_command * motor_command
     return parameters["offset"] + parameters["slope"] * motor_command + square
 
@@ -27,8 +27,8 @@ LEAST_BEND = 0.004
 
 
 def rises(value, deviation):
-    """Whether a fitted curve rises over the usual commands as a motor's does; if not,
-    the motors don't make this force.
+    """True if a fitted curve rises over the usual commands as a motor's does; if not, the motors
+    don't make this force.
     """
     slope = value["slope"] + 2.0 * value["curvature"] * _USUAL_COMMANDS
     return bool(_LEAST_SLOPE < slope.min() and slope.max() < _LARGEST_SLOPE)

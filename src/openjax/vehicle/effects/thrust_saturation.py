@@ -19,9 +19,7 @@ def motor(parameters, motor_command, context):
 
 
 def tops_out(value, deviation):
-    """Whether the limit is one that full commands reach; above 1 it is a thrust curve's
-    form.
-    """
+    """True if full commands reach the limit; above 1 it is a thrust curve's form."""
     return value["limit"] < 1.0
 
 

@@ -10,8 +10,8 @@ from openjax.vehicle.rigid_body import rotate_inverse
 
 
 def wrench(parameters, context):
-    """-drag (v - w) at the hubs, of which a share along the rotors' axes: rotor drag in
-    air that moves.
+    """-drag (v - w) at the hubs, a share of it along the rotors' axes: rotor drag in air that
+    moves.
     """
     in_world = jnp.stack([parameters["x"], parameters["y"], parameters["z"]])
     wind = rotate_inverse(context.quaternion, in_world)
