@@ -13,7 +13,7 @@ import tempfile
 import tomllib
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from openjax.errors import UserError
 from openjax.interruption import undivided, unfinished
@@ -138,6 +138,49 @@ def _put_in_place(partial: Path, path: Path) -> None:
             shutil.rmtree(path)
         os.replace(partial, path)
     flush(path.parent)
+
+
+@contextlib.contextmanager
+def claim(path: Path, option: str) -> Iterator[None]:
+    """Keep `path` for this process while the block runs; its folder is made and, where
+    nothing was written, goes again. Raises UserError where another process has it.
+    """
+    is_new = not path.parent.exists()
+    with _write_errors(option, path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        lock = path.with_name(f"{WRITING}{path.name}.lock")
+        file = lock.open("w")
+    try:
+        with unfinished(lock), file:
+            try:
+                _lock(file)
+            except OSError:
+                raise UserError(
+                    f"{option} {path}: another process is writing there; wait for it, or name "
+                    "another folder"
+                ) from None
+            try:
+                yield
+            finally:
+                lock.unlink(missing_ok=True)
+    finally:
+        if is_new:
+            with contextlib.suppress(OSError):
+                path.parent.rmdir()
+
+
+def _lock(file: IO) -> None:
+    """Lock an open file until it is closed or its process ends, however it ends. Raises
+    OSError where another process has it.
+    """
+    if os.name == "nt":
+        import msvcrt
+
+        msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
+    else:
+        import fcntl
+
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 def flush(path: Path) -> None:

@@ -126,6 +126,12 @@ def test_the_first_sentence_and_the_training_know_slow_motors(records):
     weaker = replace(found, quantities=numbers, estimates=of_fit(other, [record]))
     assert "inertia" in corrections(weaker, effects=())[0]
     assert "inertia" not in corrections(weaker, effects=("battery_sag",))[0]
+    # yaw tells a torque over an inertia, which isn't flown with twice
+    slow_yaw = replace(fit, value=np.where(np.arange(9) == 5, 0.6, 1.0) * fit.value)
+    numbers = quantities_of([record], slow_yaw)
+    turning = replace(found, quantities=numbers, estimates=of_fit(slow_yaw, [record]))
+    assert "yaw_torque" in corrections(turning, effects=())[0]
+    assert "yaw_torque" not in corrections(turning, effects=("inertia",))[0]
     # A lag of 75 instead of 25 ms and 4 ms of delay, at 5 Hz.
     ratio = (1 + 2j * np.pi * 5.0 * 0.025) / (1 + 2j * np.pi * 5.0 * 0.075)
     gain, later = found.at(5.0)

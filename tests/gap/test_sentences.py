@@ -13,107 +13,19 @@ from openjax.commands.sample_flights import Arguments, make_case
 from openjax.gap.channels import Estimated
 from openjax.gap.diagnosis import _runner_up, forbidden
 from openjax.gap.folders import diagnose_folder
-from openjax.gap.identification.quantities import KINDS, Identification, Quantity
-from openjax.gap.identification.responses import FREQUENCIES, Pair, Response
 from openjax.gap.intervals import _estimate
-from openjax.gap.model.library import ABSENT, CARDS, PLACE
+from openjax.gap.model.library import ABSENT, PLACE
 from openjax.gap.planning.beliefs import sentence
 from openjax.gap.probabilities import agreeing
 from openjax.gap.reference import trimmed_before
-from openjax.gap.report import VERDICTS, Estimate, Report
+from openjax.gap.report import VERDICTS, Estimate
 from openjax.gap.report.page import page_of
 from openjax.gap.report.report import VERDICTS_SINCE
 from openjax.gap.report.rules import broken_rules
-from openjax.gap.shares import Gap, Share, Split
-from openjax.gap.trims import change_between
-from openjax.gap.trims.figures import FlightFigures, mixer_of
-from openjax.vehicle import load_vehicle
+from openjax.gap.shares import Gap
+from openjax.gap.where import without_nuisances
 from openjax.vehicle.effects import EFFECTS
-
-VEHICLE = load_vehicle()
-CASE = SimpleNamespace(
-    vehicle_of=lambda flight: VEHICLE,
-    flights=[None],
-    vehicle_file=SimpleNamespace(motor_permutation=(0, 1, 2, 3)),
-)
-
-
-def flights_of(day, factors=(1.0, 1.0, 1.0, 1.0)):
-    """Trims of three flights of a vehicle whose rotors need these factors."""
-    rng = np.random.default_rng(len(day))
-    mixed = mixer_of(VEHICLE) @ np.asarray(factors)
-    out = []
-    for number in range(3):
-        values = np.r_[0.6 * mixed[0], mixed[1:] / mixed[0]] + 0.001 * rng.standard_normal(4)
-        named = zip(("hover", "roll", "pitch", "yaw"), values, strict=True)
-        figures = {name: (float(value), 0.001) for name, value in named}
-        out.append(FlightFigures(f"{day}{number}", day, figures, None))
-    return out
-
-
-def change(rise):
-    """What trims say of a third rotor that needs so much more."""
-    old = [flight for day in ("monday", "friday") for flight in flights_of(day)]
-    return change_between("tuesday", flights_of("new", (1, 1, 1 + rise, 1)), old, CASE)
-
-
-def identification(ratio=1.0, error=0.03, lag=0.025, lag_error=0.1, trusted=True):
-    """Torques that are so many times the simulator's, and motors of so many seconds;
-    errors are half widths of logarithms at 90 %.
-    """
-
-    def response(axis, gain, width):
-        band = tuple((gain * np.exp([-width, 0.0, width])).tolist())
-        count = len(FREQUENCIES)
-        return Response(
-            axis, tuple(FREQUENCIES.tolist()), (band,) * count, ((-2.0, 0.0, 2.0),) * count
-        )
-
-    pairs = {
-        axis: Pair(response(axis, 100.0 * ratio, error), response(axis, 100.0, 0.5 * error))
-        for axis in ("roll", "pitch")
-    }
-    low, high = (lag * np.exp(sign * lag_error) for sign in (-1.0, 1.0))
-    quantities = {
-        "spin_up": Quantity(lag, (low, high), 0.025, "s", KINDS["spin_up"].effect),
-        "yaw_trim": Quantity(0.01, (-0.01, 0.03), 0.0, "1", KINDS["yaw_trim"].effect),
-    }
-    deviation = lag_error / 1.645 * lag
-    estimates = SimpleNamespace(
-        names=(("motor_lag", "extra_up"),),
-        value=np.array([lag - 0.025]),
-        covariance=np.array([[deviation**2]]),
-    )
-    remarks = () if trusted else ("the vehicle hardly turns; fly the segments yaw or step",)
-    return Identification(quantities, pairs, remarks, estimates, trusted)
-
-
-def report(effects=(), verdict="none", before=1.0, after=1.0, **more):
-    """A report with shares of .7 for the first effect and .2 for others."""
-    named = [e for e in effects if e != "unknown"]
-    found = {e: Share(0.2 if i else 0.7, (0.1, 0.8)) for i, e in enumerate(named)}
-    rest = 1.0 - sum(share.value for share in found.values())
-    reduction = 1.0 - after / before
-    gap = Gap("rms", before, after, 1.0, reduction, (reduction - 0.05, reduction + 0.05))
-    shares = Split(gap, found, Share(rest, (0.0, 1.0)), Share(0.0, (0.0, 0.1)), {})
-    sizes = {
-        e: {
-            p.name: Estimate(p.start, "1", (0.8 * p.start, 1.2 * p.start), (0.0, 2.0 * p.start))
-            for p in CARDS[e].fitted[:1]
-        }
-        for e in named
-    }
-    others = {"none": 0.05, "unknown": 0.02} | dict.fromkeys(named, 0.4)
-    if not named:
-        others = {"none": 0.9, "unknown": 0.05} | (
-            {"unknown": 0.95, "none": 0.02} if effects else {}
-        )
-    filled = {
-        "probabilities": others, "equivalent": {}, "where": [], "not_testable": ["downwash"],
-        "quality": [], "parameters": sizes,
-    } | more  # fmt: skip
-    return Report("tuesday", verdict, tuple(effects), shares=shares, gap=gap, **filled)
-
+from tests.gap.made_reports import VEHICLE, change, identification, report
 
 NAMED = {
     "nothing": {},
@@ -170,6 +82,11 @@ def test_one_page_has_one_verdict_beside_a_reference():
     told = dataclasses.replace(report(), reference=SINCE, trims=weak)
     assert told.headline().startswith("The vehicle changed") and "motor_imbalance" in told.title
     assert told.to_dict()["verdict"] == "trims"
+    # a battery that sags is why all rotors need more
+    heavier = change(0.2, rotors=(0, 1, 2, 3))
+    sag = report(("battery_sag",), "effect", before=9.0)
+    sag = dataclasses.replace(sag, reference=SINCE, trims=heavier)
+    assert heavier.changed and "trims" not in sag.headline() and broken_rules(sag) == []
     both = dataclasses.replace(report(**NAMED["drag"]), reference=SINCE, trims=weak)
     assert "The trims tell of more" in both.headline()
 
@@ -236,6 +153,19 @@ def test_nothing_is_no_runner_up_of_a_gap_that_surely_closes():
     assert _runner_up(agreed, ("mass",), {}) == "wind"
     weak = Gap("rms", 1.05, 1.0, 1.0, 0.05, (0.0, 0.1))
     assert agreeing(chance, ("mass",), 0.4, weak.probability_of_none)["none"] > 0.2
+
+
+def test_what_nuisances_explain_is_no_place_of_the_effect():
+    """A drag's fit leaves a yaw torque to its nuisances; a fit without drag needs
+    neither.
+    """
+    rows = np.ones(50)
+    powers = {"force_x": [40.0 * rows, rows, rows], "torque_z": [14.0 * rows, rows, rows]}
+    credited = without_nuisances(powers, {"force_x": 48.0 * rows, "torque_z": 1.1 * rows})
+    assert credited["force_x"][0].mean() == 40.0 and credited["torque_z"][0].mean() < 1.2
+    # an inertia that nuisances of each flight can take stays where it acts
+    taken = without_nuisances(powers, {"force_x": 1.1 * rows, "torque_z": 1.1 * rows})
+    assert taken["torque_z"][0].mean() == 14.0
 
 
 def test_advice_is_said_without_units_of_evidence():

@@ -2,6 +2,7 @@
 ...]`.
 """
 
+import contextlib
 import sys
 import time
 import traceback
@@ -9,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 from rich.panel import Panel
@@ -17,14 +18,26 @@ from rich.text import Text
 
 from openjax.command_line import one_line, one_thread_for_matrices, output_console, parse
 from openjax.errors import UserError
-from openjax.files import check_output, check_output_folder, replacing, write_json
+from openjax.files import (
+    check_output,
+    check_output_folder,
+    claim,
+    replacing,
+    write_json,
+    write_text,
+)
 from openjax.show.progress import Steps
 from openjax.store.compiled_programs import cache_programs
 from openjax.vehicle.effect_names import effect_names
 
+if TYPE_CHECKING:
+    from openjax.gap.report.fleet import Member
+
 PROGRAM = "openjax diagnose"
 SECONDS = 5.0
 """Of a case on a laptop, about."""
+TOGETHER = "vehicles"
+"""What the report of several vehicles is called."""
 _WITHOUT_HELP = f"Effects that are not to be looked for: any of {', '.join(effect_names())}."
 
 
@@ -34,11 +47,11 @@ class Options:
     effect causes it, how far it shrinks.
 
     Writes OUT/<case>/report.html, report.json and effects.toml (which `openjax train
-    --effects` flies with).
+    --effects` flies with); of several vehicles, OUT/vehicles.html shows them side by side.
     """
 
     cases: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """Folders of flight logs, each with a vehicle.toml."""
+    """Folders of flight logs, one for each vehicle, each with a vehicle.toml."""
     reference: tuple[Path, ...] = ()
     """Folders of earlier flights of the same vehicle, one for each day: the vehicle is
     learnt from them first, and the report says what changed since; for trims and rotors
@@ -69,36 +82,67 @@ def run(options: Options) -> int:
     """
     one_thread_for_matrices()
     cache_programs()
-    console = output_console()
     names = _checked_names(options)
     from openjax.gap.model.library import library
 
     # a misspelt effect is an error of all cases, and said before the first
     library(options.without)
-    predictions = {}
-    failures = 0
+    with contextlib.ExitStack() as stack:
+        for name in names:
+            stack.enter_context(claim(options.out / name, "--out"))
+        answers = _answers(options, names)
+        if len(answers) > 1:
+            _compare(options, [answer.member for answer in answers])
+        if options.predictions is not None and answers:
+            write_json(options.predictions, {a.member.name: a.prediction for a in answers})
+    return 0 if answers else 2
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What is kept of a case once its report is written."""
+
+    member: "Member"
+    title: str
+    lines: list[str]
+    prediction: dict
+
+
+def _answers(options: Options, names: Sequence[str]) -> list[Answer]:
+    """The answers to the cases that can be diagnosed, each shown as it comes."""
+    console = output_console()
+    answers = []
     for i, (folder, name) in enumerate(zip(options.cases, names, strict=True)):
         try:
             # shows how long all that are still to come will take
             with Steps("diagnosing", {case: SECONDS for case in names[i:]}, console) as steps:
                 steps.begin(name)
-                title, lines, prediction = _diagnosis(
-                    options, folder, name, partial(steps.begin, name)
-                )
-        except UserError as error:
-            failures += 1
-            print(f"error: {one_line(error)}", file=sys.stderr)
-        except Exception as error:  # a fault of the program in one case must not cost the others
-            failures += 1
-            print(f"error: {_unforeseen(name, error)}", file=sys.stderr)
-        else:
-            predictions[name] = prediction
-            console.print(
-                Panel(Text("\n".join(lines)), title=f"{name}: {title}", title_align="left")
-            )
-    if options.predictions is not None and predictions:
-        write_json(options.predictions, predictions)
-    return 2 if failures == len(names) else 0
+                answer = _diagnosis(options, folder, name, partial(steps.begin, name))
+        except Exception as error:  # one case must not cost the others
+            line = one_line(error)
+            if line is None:
+                line = _unforeseen(name, error)
+            elif not isinstance(error, UserError):
+                line = f"{name}: {line}"
+            print(f"error: {line}", file=sys.stderr)
+            continue
+        answers.append(answer)
+        text = Text("\n".join(answer.lines))
+        console.print(Panel(text, title=f"{name}: {answer.title}", title_align="left"))
+    return answers
+
+
+def _compare(options: Options, members: Sequence["Member"]) -> None:
+    """Show and write in what several vehicles differ from each other."""
+    from openjax.gap.report.fleet import fleet_in_words, fleet_to_dict, page_of_fleet
+
+    lines = fleet_in_words(members)
+    write_json(options.out / f"{TOGETHER}.json", fleet_to_dict(members))
+    if options.html:
+        write_text(options.out / f"{TOGETHER}.html", page_of_fleet(members))
+    lines.append(f"({options.out / TOGETHER}{'.html' if options.html else '.json'})")
+    title = f"{len(members)} vehicles side by side"
+    output_console().print(Panel(Text("\n".join(lines)), title=title, title_align="left"))
 
 
 def _checked_names(options: Options) -> list[str]:
@@ -120,23 +164,26 @@ def _checked_names(options: Options) -> list[str]:
             f"--reference {itself}: is the case itself; name flights of before the change"
         )
     check_output_folder(options.out, "--out")
-    for name in names:
-        if (options.out / name).exists() and not options.overwrite:
-            raise UserError(
-                f"{options.out / name} already exists: choose another --out or give --overwrite"
-            )
+    for path in _outputs(options, names):
+        if path.exists() and not options.overwrite:
+            raise UserError(f"{path} already exists: choose another --out or give --overwrite")
     check_output(options.predictions, "--predictions")
     return names
 
 
-def _diagnosis(
-    options: Options, folder: Path, name: str, tell: Callable[[str], None]
-) -> tuple[str, list[str], dict]:
-    """Title, lines and prediction of what causes a case's gap, or of what changed since
-    the reference, after its report was written whole.
+def _outputs(options: Options, names: Sequence[str]) -> list[Path]:
+    """What is written into OUT."""
+    together = [options.out / f"{TOGETHER}.json"] if len(names) > 1 else []
+    return [*(options.out / name for name in names), *together]
+
+
+def _diagnosis(options: Options, folder: Path, name: str, tell: Callable[[str], None]) -> Answer:
+    """What causes a case's gap, or what changed since the reference, after its report
+    was written whole.
     """
     from openjax.gap.folders import diagnose_folder
     from openjax.gap.report import write_report
+    from openjax.gap.report.fleet import member_of
 
     begin = time.perf_counter()
     answer = diagnose_folder(folder, options.reference, options.without, tell)
@@ -153,7 +200,7 @@ def _diagnosis(
         f"Noted in the logs: {text}{more * (len(answer.notes) > 1)}." for text in answer.notes[:1]
     ]
     lines = [*remark, *answer.in_words(), f"({seconds:.1f} s; {report_file})"]
-    return answer.title, lines, answer.prediction()
+    return Answer(member_of(name, answer), answer.title, lines, answer.prediction())
 
 
 def _unforeseen(name: str, error: Exception) -> str:

@@ -5,13 +5,14 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 
+import jax
 import numpy as np
 
 from openjax.flights.flight import Case
 from openjax.gap.criteria import DETECTABLE
 from openjax.gap.decision import DECISION
 from openjax.gap.evidence import Evidence, gather, with_identification
-from openjax.gap.intervals import estimates
+from openjax.gap.intervals import estimates, links
 from openjax.gap.model.bounds import BOUND
 from openjax.gap.model.library import CARDS, PLACE, library, path_of
 from openjax.gap.planning.beliefs import acts_in_physics
@@ -47,6 +48,12 @@ def diagnose_case(
     Raises:
       UserError: the flights are too short or hold no commands.
     """
+    with jax.enable_x64(False):  # whatever the environment asks for
+        return _diagnose(case, without, progress, reference, trims)
+
+
+def _diagnose(case: Case, without, progress, reference, trims) -> Report:
+    """`diagnose_case` in the precision that the fits are made for."""
     begin = time.perf_counter()
     baseline = read_reference(join(reference), progress) if reference else None
     evidence = gather(case, library(without), progress, baseline)
@@ -184,7 +191,7 @@ def _report(
         shares=parts,
         equivalent=equivalent,
         parameters=estimates(evidence, selection.fit, causes),
-        where=locate(evidence, selection.fit, causes),
+        where=locate(evidence, selection.fit, selection.search.nothing.fit, causes),
         gap=parts.gap,
         not_testable=missing,
         to_show=_beside_segments(evidence, (*others, *missing, second)),
@@ -194,6 +201,7 @@ def _report(
         ],
         runner_up=f"{second} ({chances[second]:.2f})" if second else "",
         rest=check.in_words(),
+        links=links(evidence),
         sensors=tuple(evidence.sensors.findings.values()),
         contradictions=tuple(
             f"{i.flight}: {i.issue}" for i in evidence.case.quality if i.kind == "garbage"

@@ -13,7 +13,7 @@ from openjax.gap.channels import Estimated, of_flights
 from openjax.gap.criteria import Measured
 from openjax.gap.decision import DECISION
 from openjax.gap.evidence import Evidence
-from openjax.gap.identification.quantities import REACH
+from openjax.gap.identification.quantities import REACH, Quantity
 from openjax.gap.identification.support import told_by
 from openjax.gap.model.hypotheses import SetFit
 from openjax.gap.model.library import CARDS, PLACE, path_of
@@ -41,6 +41,24 @@ def estimates(evidence: Evidence, fit: SetFit, effects) -> dict[str, dict[str, E
             )
             parameter = EFFECTS[effect].parameters[entry.name]
             out[effect][entry.name] = _estimate(estimate, parameter, evidence.vehicles[0])
+    return out
+
+
+def links(evidence: Evidence) -> dict[str, Quantity]:
+    """{"effect.parameter": number} of what pose, radio and rate loop tell, whether it
+    is named or not.
+    """
+    out = {}
+    for channel in evidence.channels:
+        shown = set(evidence.library.of(channel.path)) - set(channel.undetectable())
+        for effect in sorted(shown):
+            for entry in CARDS[effect].fitted:
+                parameter = EFFECTS[effect].parameters[entry.name]
+                estimate = channel.estimate(effect, entry.name)
+                number = _estimate(estimate, parameter, evidence.vehicles[0])
+                out[f"{effect}.{entry.name}"] = Quantity(
+                    number.value, number.interval90, parameter.none, number.unit, effect
+                )
     return out
 
 

@@ -26,6 +26,7 @@ CHANNELS = (
     "firmware",
 )
 LEAST_TIME = 0.5  # s in a regime, or it isn't judged
+STANDS_OUT = 1.15  # times the noise floor: less is no place of a gap
 CALM = 0.12  # s over which the rest is smoothed: sensor noise out, causes in
 
 
@@ -45,16 +46,19 @@ class Place:
     """Spent in the regime."""
 
 
-def locate(evidence: Evidence, fit: SetFit, effects=()) -> list[Place]:
+def locate(evidence: Evidence, fit: SetFit, nothing: SetFit, effects=()) -> list[Place]:
     """The table, largest share first. `fit` is the physics part of the verdict,
-    `effects` all named effects.
+    `nothing` the fit of no effect, `effects` all named effects.
     """
     names = [e for e in effects if e in fit.effects]
     masks = [{r: m[int(SKIP / t.dt) :] for r, m in regimes_of(t).items()} for t in evidence.tracks]
     inside = {r: np.concatenate([m[r] for m in masks]) for r in REGIMES}
     seconds = {r: int(m.sum()) * evidence.tracks[0].dt for r, m in inside.items()}
     places = []
-    powers_of = _motion_powers(evidence, fit, names) | _other_powers(evidence, effects)
+    powers_of = _motion_powers(evidence, fit, names)
+    if names:
+        powers_of = without_nuisances(powers_of, _powers(evidence, residuals_of(nothing)))
+    powers_of |= _other_powers(evidence, effects)
     for channel, powers in powers_of.items():
         floor = powers[2].mean() + 1e-18
         for regime in (r for r in REGIMES if seconds[r] >= LEAST_TIME):
@@ -83,20 +87,40 @@ def _motion_powers(evidence: Evidence, fit: SetFit, effects) -> dict[str, list[n
     """{channel: squared smoothed disturbances (rows,) before, after and at the
     floor}.
     """
-    both = []
-    for residuals in before_and_after(fit, effects):
-        rows = []
-        for track, residual in zip(evidence.tracks, residuals, strict=True):
-            rest = disturbances(track, residual)
-            # without a path the accelerometer is all that feels a force
-            force = rest[:, 3:6] if evidence.replay.usable[3] else rest[:, 6:9]
-            calm = smooth(np.concatenate([force, rest[:, :3]], 1), CALM, track.dt)
-            rows.append(calm[int(SKIP / track.dt) :] ** 2)
-        both.append(np.concatenate(rows))
+    before, after = (_powers(evidence, r) for r in before_and_after(fit, effects))
+    # the motion's floor is what all effects leave of it
+    return {name: [before[name], after[name], after[name]] for name in before}
+
+
+def _powers(evidence: Evidence, residuals: list[np.ndarray]) -> dict[str, np.ndarray]:
+    """{channel of the motion: squared smoothed disturbances (rows,)}."""
+    rows = []
+    for track, residual in zip(evidence.tracks, residuals, strict=True):
+        rest = disturbances(track, residual)
+        # without a path the accelerometer is all that feels a force
+        force = rest[:, 3:6] if evidence.replay.usable[3] else rest[:, 6:9]
+        calm = smooth(np.concatenate([force, rest[:, :3]], 1), CALM, track.dt)
+        rows.append(calm[int(SKIP / track.dt) :] ** 2)
+    return dict(zip(CHANNELS, np.concatenate(rows).T, strict=False))
+
+
+def without_nuisances(
+    powers_of: dict[str, list[np.ndarray]], of_nothing: dict[str, np.ndarray]
+) -> dict[str, list[np.ndarray]]:
+    """Powers before, after and at the floor without credit for what nuisances alone
+    explain as well: where a fit of no effect leaves a gap, the channels in which it
+    leaves none are none of the effects' places. Where nuisances take all of it, nothing
+    tells their places from the effects'.
+    """
+    growth = {
+        name: np.sqrt(of_nothing[name].mean() / (floor.mean() + 1e-18))
+        for name, (_, _, floor) in powers_of.items()
+    }
+    if max(growth.values()) < STANDS_OUT:
+        return powers_of
     return {
-        # the motion's floor is what all effects leave of it
-        name: [both[0][:, k], both[1][:, k], both[1][:, k]]
-        for k, name in enumerate(CHANNELS[:6])
+        name: [of_nothing[name] if growth[name] < STANDS_OUT else powers[0], *powers[1:]]
+        for name, powers in powers_of.items()
     }
 
 
@@ -135,7 +159,7 @@ def in_words(places: list[Place]) -> str:
     """The two largest cells as text."""
     words = {"force": "force along body", "torque": "torque about body"}
     parts = []
-    for place in (p for p in places[:2] if p.share >= 0.02 and p.before >= 1.15):
+    for place in (p for p in places[:2] if p.share >= 0.02 and p.before >= STANDS_OUT):
         kind, _, axis = place.channel.partition("_")
         name = f"{words[kind]} {axis}" if kind in words else place.channel
         regime = place.regime.replace("_", " ")

@@ -50,9 +50,13 @@ def corrections(identification: Identification, effects) -> tuple[dict, dict]:
     lag_alone = identification.duty_cycles or any(
         CARDS[effect].scales_torques for effect in effects if effect in CARDS
     )
+    # yaw tells a torque over an inertia: where the inertia is named, that has all of it
+    has_inertia = any(p.name == "zz" for e in effects if e in CARDS for p in CARDS[e].fitted)
     for effect in dict.fromkeys(number.effect for number in numbers):
         of_effect = [number for number in numbers if number.effect == effect]
         if lag_alone and effect != "motor_lag":
+            continue
+        if has_inertia and effect not in effects and CARDS[effect].torque_axes == (2,):
             continue
         departs = any(q.departs for q in identification.quantities.values() if q.effect == effect)
         if effect in effects or departs:

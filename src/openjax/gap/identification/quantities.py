@@ -59,7 +59,12 @@ KINDS = {
     "pitch_trim": Kind("trim of pitch, share of the thrust", "motor_imbalance"),
     "yaw_trim": Kind("trim of yaw, share of the thrust", "motor_imbalance"),
 }
-"""Every number of a vehicle that may be told."""
+"""Every number of a vehicle that may be told by its motion."""
+
+
+def words_of(name: str) -> str:
+    """What a number is called: one of `KINDS`, or "effect.parameter"."""
+    return KINDS[name].words if name in KINDS else name.replace(".", " ").replace("_", " ")
 
 
 @dataclass(frozen=True)
@@ -93,14 +98,23 @@ class Quantity:
         ratio = abs(np.log(self.value / self.simulator))
         return bool(ratio > error and abs(self.value - self.simulator) > least)
 
-    def in_words(self, words: str) -> str:
-        """The number with its interval, beside the simulator's."""
-        factor, unit = (1e3, " ms") if self.unit == "s" else (1.0, f" {self.unit}")
-        value, low, high, nominal = (
-            f"{factor * v:.3g}" for v in (self.value, *self.interval90, self.simulator)
-        )
-        unit = "" if self.unit == "1" else unit
-        return f"{words} {value}{unit} [{low}, {high}], the simulator's {nominal}{unit}"
+    @property
+    def scale(self) -> tuple[float, str]:
+        """Factor and unit in which the number is printed: times in ms."""
+        if self.unit == "s":
+            return 1e3, " ms"
+        return 1.0, "" if self.unit == "1" else f" {self.unit}"
+
+    def printed(self) -> str:
+        """The number with its 90 % interval."""
+        factor, unit = self.scale
+        value, low, high = (f"{factor * v:.3g}" for v in (self.value, *self.interval90))
+        return f"{value}{unit} [{low}, {high}]"
+
+    def beside(self, number: float) -> str:
+        """Another number in the same units."""
+        factor, unit = self.scale
+        return f"{factor * number:.3g}{unit}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,7 +172,7 @@ class Identification:
     def in_words(self, effect: str) -> str:
         """The numbers that belong to an effect and depart from the simulator's."""
         return "; ".join(
-            q.in_words(KINDS[name].words)
+            f"{KINDS[name].words} {q.printed()}, the simulator's {q.beside(q.simulator)}"
             for name, q in self.quantities.items()
             if q.effect == effect and q.departs
         )

@@ -1,9 +1,11 @@
 """What was found in one case, as plain data and as text."""
 
+from collections.abc import Collection
 from dataclasses import asdict, dataclass, field, fields, is_dataclass
 
 from openjax.gap.identification.corrections import corrections
-from openjax.gap.identification.quantities import Identification
+from openjax.gap.identification.quantities import Identification, Quantity
+from openjax.gap.model.library import CARDS
 from openjax.gap.shares import Gap, Split
 from openjax.gap.trims.change import Change
 from openjax.gap.where import Place, in_words
@@ -93,6 +95,8 @@ class Report:
     runner_up: str = ""
     rest: str = ""
     """What is left when the named effects are accounted for."""
+    links: dict[str, Quantity] = field(default_factory=dict)
+    """{"effect.parameter": number} of pose, radio and rate loop."""
     sensors: tuple[str, ...] = ()
     contradictions: tuple[str, ...] = ()
     nuisances: dict[str, str] = field(default_factory=dict)
@@ -124,12 +128,19 @@ class Report:
         have shown the diagnosis. Else None.
         """
         trims = self.trims
-        if trims is None or not trims.changed:
+        if trims is None or not trims.changed or self._explains(trims):
             return None
-        names = {*self.named, *(o for others in self.equivalent.values() for o in others)}
-        overlap = names & set(trims.effects)
         decides = trims.trims_changed or set(trims.effects) <= set(self.not_testable)
-        return trims if decides and not overlap else None
+        return trims if decides else None
+
+    def _explains(self, trims: Change) -> bool:
+        """Whether a named effect is what trims say changed: by its name, by one that
+        would do as well, or as both change the thrust.
+        """
+        names = {*self.named, *(o for others in self.equivalent.values() for o in others)}
+        if names & set(trims.effects):
+            return True
+        return _scale_motion(names) and _scale_motion(trims.effects)
 
     @property
     def trims_in_words(self) -> list[str]:
@@ -152,6 +163,12 @@ class Report:
         if does is None or self.reference:
             return []
         return [e for e in corrections(does, self.named)[0] if e not in self.named]
+
+    @property
+    def numbers(self) -> dict[str, Quantity]:
+        """All that was measured, by name."""
+        does = self.identification
+        return (does.quantities if does is not None else {}) | self.links
 
     @property
     def title(self) -> str:
@@ -334,6 +351,11 @@ class Report:
         for effect, others in self.equivalent.items():
             doubts.append(f"These flights can't tell {effect} from {', '.join(others)}.")
         return lines + doubts
+
+
+def _scale_motion(effects: Collection[str]) -> bool:
+    """Whether one of the effects changes all accelerations in proportion."""
+    return any(CARDS[e].scales_motion for e in effects if e in CARDS)
 
 
 def _plain(value):

@@ -9,7 +9,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
-from openjax.gap.identification.quantities import KINDS, Identification, Quantity
+from openjax.gap.identification.quantities import Identification, Quantity, words_of
 from openjax.gap.identification.responses import Pair
 from openjax.gap.model.library import CARDS
 from openjax.gap.report.report import Report
@@ -27,15 +27,14 @@ def response_of(report: Report) -> dict | None:
         return None
     rows = [
         {
-            "name": KINDS[name].words,
-            "value": " ".join(f"{q.value:.3g} {q.unit}".removesuffix(" 1").split()),
-            "interval": f"{q.interval90[0]:.3g} … {q.interval90[1]:.3g}",
-            "simulator": f"{q.simulator:.3g}",
+            "name": words_of(name),
+            "value": q.printed(),
+            "simulator": q.beside(q.simulator),
             "effect": q.effect.replace("_", " "),
             "meaning": meaning_of(name, q, report),
             "differs": q.differs,
         }
-        for name, q in does.quantities.items()
+        for name, q in report.numbers.items()
     ]
     return {
         "sentences": report.measured_in_words() or [does.sentence()],
