@@ -50,8 +50,8 @@ def links(evidence: Evidence) -> dict[str, Quantity]:
     """
     out = {}
     for channel in evidence.channels:
-        shown = set(evidence.library.of(channel.path)) - set(channel.undetectable())
-        for effect in sorted(shown):
+        effects = set(evidence.library.of(channel.path)) - set(channel.undetectable())
+        for effect in sorted(effects):
             for entry in CARDS[effect].fitted:
                 parameter = EFFECTS[effect].parameters[entry.name]
                 estimate = channel.estimate(effect, entry.name)

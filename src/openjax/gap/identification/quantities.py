@@ -105,7 +105,7 @@ class Quantity:
             return 1e3, " ms"
         return 1.0, "" if self.unit == "1" else f" {self.unit}"
 
-    def printed(self) -> str:
+    def as_text(self) -> str:
         """The number with its 90 % interval."""
         factor, unit = self.scale
         value, low, high = (f"{factor * v:.3g}" for v in (self.value, *self.interval90))
@@ -172,7 +172,7 @@ class Identification:
     def in_words(self, effect: str) -> str:
         """The numbers that belong to an effect and depart from the simulator's."""
         return "; ".join(
-            f"{KINDS[name].words} {q.printed()}, the simulator's {q.beside(q.simulator)}"
+            f"{KINDS[name].words} {q.as_text()}, the simulator's {q.beside(q.simulator)}"
             for name, q in self.quantities.items()
             if q.effect == effect and q.departs
         )

@@ -40,7 +40,7 @@ class Difference:
     def in_words(self) -> str:
         """The number, and the others'."""
         others = self.value.beside(self.others)
-        return f"{words_of(self.number)} {self.value.printed()}, {others} elsewhere"
+        return f"{words_of(self.number)} {self.value.as_text()}, {others} elsewhere"
 
 
 def member_of(name: str, answer: Report | Change) -> Member:
@@ -55,7 +55,7 @@ def differences(members: Sequence[Member]) -> list[Difference]:
     """Where a vehicle's number is further from the median than errors and what forms
     may be wrong by; of two vehicles, from the other's.
     """
-    found = []
+    out = []
     for number in dict.fromkeys(n for member in members for n in member.numbers):
         each = {m.name: m.numbers[number] for m in members if number in m.numbers}
         for vehicle, quantity in each.items():
@@ -64,8 +64,8 @@ def differences(members: Sequence[Member]) -> list[Difference]:
             middle = float(np.median([q.value for q in others])) if others else quantity.value
             error = float(np.median([_error(q) for q in others])) if others else 0.0
             if _differs(quantity, middle, error):
-                found.append(Difference(vehicle, number, quantity, middle))
-    return found
+                out.append(Difference(vehicle, number, quantity, middle))
+    return out
 
 
 def _differs(quantity: Quantity, middle: float, error: float) -> bool:
@@ -129,6 +129,6 @@ def _cell(number: str, member: Member, marks: set[tuple[str, str]]) -> dict:
     quantity = member.numbers.get(number)
     return {
         "vehicle": member.name,
-        "text": "not each" if quantity is None else quantity.printed(),
+        "text": "not told" if quantity is None else quantity.as_text(),
         "differs": (number, member.name) in marks,
     }

@@ -28,7 +28,7 @@ def response_of(report: Report) -> dict | None:
     rows = [
         {
             "name": words_of(name),
-            "value": q.printed(),
+            "value": q.as_text(),
             "simulator": q.beside(q.simulator),
             "effect": q.effect.replace("_", " "),
             "meaning": meaning_of(name, q, report),
