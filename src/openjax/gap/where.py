@@ -87,9 +87,9 @@ def _motion_powers(evidence: Evidence, fit: SetFit, effects) -> dict[str, list[n
     """{channel: squared smoothed disturbances (rows,) before, after and at the
     floor}.
     """
-    nominal, corrected = (_powers(evidence, r) for r in before_and_after(fit, effects))
+    nominal, with_effects = (_powers(evidence, r) for r in before_and_after(fit, effects))
     # the motion's floor is what all effects leave of it
-    return {name: [nominal[name], corrected[name], corrected[name]] for name in nominal}
+    return {name: [nominal[name], with_effects[name], with_effects[name]] for name in nominal}
 
 
 def _powers(evidence: Evidence, residuals: list[np.ndarray]) -> dict[str, np.ndarray]:
