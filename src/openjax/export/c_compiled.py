@@ -66,7 +66,7 @@ class Compiled:
         return np.stack(outputs)
 
     def seconds(self, repeats: int = 500) -> float:
-        """Of one call; the best of five batches."""
+        """Seconds of one call; the best of five batches."""
         batches = timeit.repeat(lambda: self._function(*self._pointers), number=repeats, repeat=5)
         return min(batches) / repeats
 

@@ -50,7 +50,7 @@ class Array:
 
     @property
     def dense(self) -> bool:
-        """Whether its entries follow one another row by row."""
+        """True if its entries follow one another row by row."""
         axes = zip(self.shape, self.strides, row_by_row(self.shape), strict=True)
         return not self.number and all(
             size == 1 or stride == dense_stride for size, stride, dense_stride in axes

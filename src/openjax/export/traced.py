@@ -35,12 +35,12 @@ class Operation:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Of its first result."""
+        """The shape of its first result."""
         return tuple(self.equation.outvars[0].aval.shape)
 
     @property
     def shapes(self) -> list[tuple[int, ...]]:
-        """Of its inputs."""
+        """The shapes of its inputs."""
         return [tuple(atom.aval.shape) for atom in self.equation.invars]
 
 
@@ -160,13 +160,13 @@ class Walk:
 
 
 def _is_known(value) -> bool:
-    """Whether a value is known here already."""
+    """True if a value is known here already."""
     return isinstance(value, np.ndarray | np.generic)
 
 
 def outer_padding(operation: Operation) -> tuple[list[int], list[int]]:
-    """What a `pad` adds before and after each axis. Raises UserError where it adds
-    between entries, or takes away.
+    """The padding that a `pad` adds before and after each axis. Raises UserError if it adds between
+    entries, or takes away.
     """
     low, high, between = zip(*operation.parameters["padding_config"], strict=True)
     if any(between) or min(*low, *high, 0) < 0:

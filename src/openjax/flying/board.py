@@ -1,5 +1,5 @@
-"""What the three processes of a flight know of each other: a page of shared memory that
-outlives any of them.
+"""The shared state of a flight's three processes: a page of shared memory that outlives any of
+them.
 
 The loop flies through the links. If it falls silent the links' process lands the
 vehicles; if that one is silent too the guard does, over links of its own; if both are

@@ -1,4 +1,4 @@
-"""Whether a vehicle's estimated climb is the one that its accelerometer feels.
+"""Compare a vehicle's estimated climb with the one that its accelerometer feels.
 
 A height that drifts together with its velocity looks like flight to thrust and
 attitude: the floor's cushion, another vehicle's wake and an emptier battery accelerate
@@ -33,7 +33,7 @@ BOUND = 0.16
 
 
 class Climb(NamedTuple):
-    """What of an estimate's climb the accelerometer doesn't feel."""
+    """The part of an estimate's climb that the accelerometer doesn't feel."""
 
     time: float = -math.inf  # s, of the last pose
     speed: float = 0.0  # m/s, upwards, of that
@@ -71,7 +71,7 @@ class Climb(NamedTuple):
 
     @property
     def contradicts(self) -> bool:
-        """Whether the estimate climbs or sinks as the accelerometer doesn't feel."""
+        """True if the estimate climbs or sinks as the accelerometer doesn't feel."""
         return abs(self.smooth) > BOUND
 
 

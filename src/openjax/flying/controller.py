@@ -32,7 +32,7 @@ CLIMB_LIMIT = 4.0
 
 
 class Pose(NamedTuple):
-    """Where a vehicle is; world frame, SI units, quaternion wxyz body to world."""
+    """A vehicle's pose; world frame, SI units, quaternion wxyz body to world."""
 
     time: float  # s, host clock, when it was measured
     position: Vector
@@ -59,7 +59,7 @@ def pose_of(numbers: Sequence[float]) -> Pose:
 
 @dataclass(frozen=True)
 class Airframe:
-    """What flying needs to know of a vehicle; all of it follows from its parameters."""
+    """The numbers of a vehicle that flying needs; all of them follow from its parameters."""
 
     hover_thrust: float
     """Share of the maximal thrust at which it hovers."""

@@ -1,4 +1,4 @@
-"""Whether a vehicle's estimated velocity drifts gently, told by its teammates.
+"""Detect a gentle drift of a vehicle's estimated velocity by comparison with its teammates.
 
 While a drift sets in, the estimate accelerates as thrust and attitude don't explain. So
 do the air's drag, which nobody told the vehicle, and an attitude that is off by a tenth
@@ -73,7 +73,7 @@ class Fit(NamedTuple):
 
 
 class Drift(NamedTuple):
-    """What of a vehicle's level velocity nothing explains."""
+    """The part of a vehicle's level velocity that nothing explains."""
 
     fits: tuple[Fit, Fit] = (Fit(), Fit())
     totals: tuple[float, float] = (0.0, 0.0)  # m/s, over the window
@@ -98,7 +98,7 @@ class Drift(NamedTuple):
 
     @property
     def size(self) -> float:
-        """Of the sum (m/s)."""
+        """The size of the sum (m/s)."""
         return math.hypot(*self.totals)
 
     @property
@@ -111,8 +111,8 @@ class Drift(NamedTuple):
 
 
 def drifting(drifts: Sequence[Drift]) -> tuple[bool, ...]:
-    """Of each vehicle, whether its sum is larger than what its teammates' are. Nobody
-    tells that of a lone one.
+    """For each vehicle, True if its sum is larger than its teammates' are. A lone vehicle has
+    nothing to compare with.
     """
     usual = [drift.usual for drift in drifts]
     largest = [max((*usual[:i], *usual[i + 1 :]), default=math.inf) for i in range(len(usual))]

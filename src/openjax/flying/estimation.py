@@ -1,5 +1,5 @@
-"""What is seen: each vehicle's estimate brought to now, by what of its poses can be
-believed.
+"""The estimate of each vehicle, brought to the present by those of its poses that
+can be believed.
 """
 
 import math

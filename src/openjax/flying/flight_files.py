@@ -121,7 +121,7 @@ class CaseFolder:
 
 @dataclass(frozen=True)
 class Samples:
-    """What was recorded of one vehicle; times are host seconds. NumPy."""
+    """The recorded samples of one vehicle; times are host seconds. NumPy."""
 
     poses: np.ndarray
     """(K, 16) own estimates: arrival, voltage (V), when measured, position, velocity,
@@ -176,7 +176,7 @@ class GameLog:
 
 
 class _Source(NamedTuple):
-    """What one sensor or log block gave."""
+    """The samples of one sensor or log block."""
 
     time: np.ndarray
     """(K,) s"""
@@ -186,8 +186,8 @@ class _Source(NamedTuple):
     """(K, columns)"""
 
     def during(self, window) -> "_Source":
-        """What was measured after the first and up to the last moment (s) of a window,
-        times as a log writes them.
+        """The measurements after the first and up to the last moment (s) of a window, with times as
+        a log writes them.
         """
         time = np.round(self.time, DECIMALS["t"])
         inside = (time > window[0]) & (time <= window[1])

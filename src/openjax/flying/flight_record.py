@@ -15,7 +15,7 @@ NOTED = 100
 
 @dataclass
 class GameNotes:
-    """What came of one game."""
+    """The outcome of one game."""
 
     capture_step: int | None = None
     breaches: int = 0

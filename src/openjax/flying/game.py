@@ -20,7 +20,7 @@ from openjax.pursuit.teams import draw_strategies
 
 
 class Play(NamedTuple):
-    """What came of one tick; NumPy."""
+    """The result of one tick; NumPy."""
 
     action: np.ndarray  # (N, 4) in -1..1
     evader_position: np.ndarray  # (3,) m

@@ -55,7 +55,7 @@ class Guard:
             time.sleep(0.02)
 
     def lives(self) -> bool:
-        """Whether anything was heard of it lately."""
+        """True if the process gave a sign of life lately."""
         return self._board.silent(Role.GUARD, time.perf_counter()) < 2.0 * self._board.silence
 
     def close(self) -> None:

@@ -1,5 +1,4 @@
-"""Whether a vehicle's own estimate agrees with itself, with its gyroscope, and with
-what was sent.
+"""Check a vehicle's own estimate against itself, its gyroscope, and what was sent.
 
 A single pose says little: a drift of .3 m/s moves it by 3 mm. So what a pose adds to
 the last one is compared with what it should add, and the differences, the innovations,
@@ -30,7 +29,7 @@ ZERO = (0.0, 0.0, 0.0)
 
 
 class Memory(NamedTuple):
-    """How an innovation is summed up, and how large it may get."""
+    """The time constant over which an innovation is summed up, and its limit."""
 
     forgetting: float
     """Time constant (s)."""
@@ -176,7 +175,7 @@ class Innovations(NamedTuple):
         )
 
     def verdict(self) -> Verdict:
-        """What the estimate contradicts; good if nothing."""
+        """The contradiction of the estimate; good if there is none."""
         *level, rise = self.speed
         is_push = math.hypot(*level) > SPEED.bound or not -SINKING < rise < RISING
         if math.hypot(*self.way) > WAY.bound:
@@ -217,7 +216,7 @@ def _turn_beyond_gyroscope(last: Pose, pose: Pose) -> Vector:
 
 
 def _share(dt: float, time_constant: float) -> float:
-    """Of the way to its input that a low-pass goes in `dt` (s)."""
+    """The share of the way to its input that a low-pass goes in `dt` (s)."""
     return -math.expm1(-dt / time_constant)
 
 

@@ -1,5 +1,5 @@
-"""Whether a pose may be flown by: a measurement against what a vehicle can have done
-since the last good one.
+"""Judge whether a pose may be flown by: a measurement against what a vehicle can have done since
+the last good one.
 
 `judge` compares a pose with the last good one of the same source, `agree` motion
 capture with the vehicle's own estimate. Both are pure. What they don't accept is a lost
@@ -15,7 +15,7 @@ from openjax.flying.controller import Airframe, Pose, moved_on, numbers_of
 
 
 class Verdict(StrEnum):
-    """What is wrong with a pose; empty where nothing is."""
+    """The fault of a pose; empty if there is none."""
 
     GOOD = ""
     NOT_FINITE = "pose not finite"
@@ -89,7 +89,7 @@ def pose_limits(airframe: Airframe, horizon: float) -> PoseLimits:
 def judge(
     pose: Pose, last: Pose | None, unseen: float, limits: PoseLimits, prediction: Pose | None = None
 ) -> Verdict:
-    """What is wrong with a pose.
+    """The fault of a pose.
 
     Args:
       pose: the newest.
@@ -130,14 +130,14 @@ def judge(
 
 
 class Track(NamedTuple):
-    """What is known of one source of a vehicle's poses."""
+    """The history of one source of a vehicle's poses."""
 
     pose: Pose | None = None  # the last good one
     verdict: Verdict = Verdict.GOOD  # on the newest
     last_time: float = -math.inf  # s, when that was measured
 
     def fresh(self, time: float, limits: PoseLimits) -> bool:
-        """Whether its last good pose is new enough to fly by at `time` (s)."""
+        """True if its last good pose is new enough to fly by at `time` (s)."""
         return self.pose is not None and time - self.pose.time <= limits.horizon
 
     def update(
@@ -176,9 +176,7 @@ def at_one_time(a: Pose, b: Pose) -> tuple[Pose, Pose]:
 
 
 def agree(capture: Pose, estimate: Pose, limits: PoseLimits) -> Verdict:
-    """Whether motion capture and the vehicle's own estimate tell the same, at the later
-    one's time.
-    """
+    """Compare motion capture with the vehicle's own estimate, at the later one's time."""
     capture, estimate = at_one_time(capture, estimate)
     is_near = math.dist(capture.position, estimate.position) <= limits.apart
     is_aligned = angle_between(capture.quaternion, estimate.quaternion) <= limits.turned
@@ -186,8 +184,8 @@ def agree(capture: Pose, estimate: Pose, limits: PoseLimits) -> Verdict:
 
 
 def follows(capture: Pose, estimate: Pose, limits: PoseLimits) -> bool:
-    """Whether the estimator on board may be told a pose of motion capture: errors
-    explain the distance from its own, at the later one's time.
+    """True if the estimator on board may be given a pose of motion capture: errors explain the
+    distance from its own, at the later one's time.
 
     An estimator that is told late or drifting poses takes their error for a velocity,
     by which it would have to land.

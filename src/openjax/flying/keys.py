@@ -1,6 +1,4 @@
-"""What the person at the terminal wants: keys, and the signals that a terminal sends,
-as requests to the loop.
-"""
+"""Requests of the person at the terminal: keys, and the signals that a terminal sends."""
 
 from __future__ import annotations
 
@@ -68,7 +66,7 @@ class Operator:
         self._signalled = True
 
     def __call__(self) -> Request:
-        """What was asked for since the last look."""
+        """The requests since the last look."""
         keys = self._keys()
         if any(key in STOP for key in keys):
             return Request.STOP

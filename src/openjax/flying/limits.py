@@ -1,4 +1,4 @@
-"""Where a vehicle may stop, turn back, part and wait, and what it can follow.
+"""Places where a vehicle may stop, turn back, part and wait, and the commands that it can follow.
 
 Plain mechanics of poses, limits in `SafetySettings`: nothing here knows who flies a
 vehicle, or why. That is `openjax.flying.safety`'s.
@@ -32,7 +32,7 @@ ROUNDS = 20
 def stopping_point(
     settings: SafetySettings, pose: Pose, acceleration: Vector | None = None
 ) -> Vector:
-    """Where a vehicle comes to rest that brakes now (m): its acceleration fades with
+    """The point at which a vehicle that brakes now comes to rest (m): its acceleration fades with
     the time constant `reaction`, and as slowly the braking sets in.
 
     `acceleration`: at present (m/s^2, world); that of level flight at its tilt, if it
@@ -128,8 +128,8 @@ def within_reach(action: SetPoint, previous: SetPoint, airframe: Airframe, dt: f
 def resting_places(
     settings: SafetySettings, pillars: Sequence[Vector], poses: Sequence[Pose | None]
 ) -> list[Vector]:
-    """Where vehicles may wait or land: near where they would stop, inside, off the
-    pillars, apart (m).
+    """Places where vehicles may wait or land: near where they would stop, inside, off the pillars,
+    apart (m).
 
     Args:
       settings: limits.

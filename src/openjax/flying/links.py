@@ -183,13 +183,13 @@ class Links:
             select.select([self._stream], [], [], seconds_left)
 
     def observe(self) -> tuple[PoseSample, ...]:
-        """What is known of each vehicle now."""
+        """The latest samples of each vehicle."""
         self._drain()
         samples = zip(self._samples, self._contacts, strict=True)
         return tuple(sample._replace(last_contact=contact) for sample, contact in samples)
 
     def arrivals(self) -> tuple[float, ...]:
-        """When each vehicle's newest pose arrived (s, host)."""
+        """The time at which each vehicle's newest pose arrived (s, host)."""
         self._drain()
         return tuple(self._arrivals)
 

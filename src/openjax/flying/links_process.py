@@ -42,7 +42,7 @@ SENT_RECORD = struct.Struct("<qd")
 
 
 class Connection(NamedTuple):
-    """What the links' process connects to, and how."""
+    """The vehicles that the links' process connects to, and the way it does."""
 
     uris: tuple[str, ...]
     body_logs: int

@@ -46,7 +46,7 @@ def flight_state(game: Game, number: int, safety: SafetySettings) -> State:
 
 @dataclass(frozen=True)
 class Plan:
-    """What is to be flown."""
+    """The plan of a flight."""
 
     episodes: int = 1
     """Games, one after the other; between them all fly back to their starts."""
@@ -110,7 +110,7 @@ class Flight:
 
     @property
     def over(self) -> bool:
-        """Whether all that flew is down, or nothing is going to fly."""
+        """True if all that flew is down, or nothing is going to fly."""
         # half a second for the first poses to come, before which all stand on the
         # ground
         if self.state.flying or self.state.time - self._since < 0.5:
@@ -147,7 +147,7 @@ class Flight:
             self._end_episode("safety")
 
     def _plan(self, time) -> Request:
-        """What the plan asks for at this tick."""
+        """The plan's set-points at this tick."""
         state = self.state
         plan = self.plan
         delay = time - self._since

@@ -48,7 +48,7 @@ class Member:
         self.phases: dict = {}
 
     def sample(self) -> PoseSample:
-        """What is known of it."""
+        """The latest sample of the vehicle."""
         is_recent = self.pose is not None and abs(self.pose.time - self.felt[0]) <= FORCE_AGE
         return PoseSample(
             own=self.pose,

@@ -91,10 +91,10 @@ class MotionCaptured(Links):
         self._arrived.clear()
 
     def observe(self) -> tuple[PoseSample, ...]:
-        """What is known of each vehicle now."""
+        """The latest samples of each vehicle."""
         samples = super().observe()
         return tuple(s._replace(captured=p) for p, s in zip(self._captured, samples, strict=True))
 
     def arrivals(self) -> tuple[float, ...]:
-        """When each vehicle's newest pose of motion capture arrived (s, host)."""
+        """The time at which each vehicle's newest pose of motion capture arrived (s, host)."""
         return tuple(-math.inf if p is None else p.time for p in self._captured)

@@ -54,8 +54,7 @@ def poses_arriving(links) -> list[float]:
 def faults(
     state: State, samples: Sequence[PoseSample], rates: Sequence[float], has_guard: bool
 ) -> list[str]:
-    """What speaks against taking off, a line each; vehicles are counted from 0 in the
-    order of --uri.
+    """Reasons against taking off, a line each; vehicles are counted from 0 in the order of --uri.
 
     Args:
       state: before the flight, for starts and settings.
@@ -76,8 +75,8 @@ def faults(
 
 
 def _firmware_faults(settings, sample, rate) -> Iterator[str]:
-    """What its firmware, battery and link say against it. Of the firmware's bits the
-    first fault only: the others follow from it.
+    """Reasons by its firmware, battery and link. Of the firmware's bits the first fault only: the
+    others follow from it.
     """
     bits = sample.supervisor
     if bits & (Supervisor.TUMBLED | Supervisor.CRASHED):
@@ -99,7 +98,7 @@ def _firmware_faults(settings, sample, rate) -> Iterator[str]:
 
 
 def _pose_faults(state, sample, start: Vector) -> Iterator[str]:
-    """What its poses say against it. A pose that can't be one hides all else."""
+    """Reasons by its poses. A pose that can't be one hides all else."""
     # motion capture says where a vehicle is, where there is one: the own estimate
     # follows it
     pose = sample.captured or sample.own

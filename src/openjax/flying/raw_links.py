@@ -51,7 +51,7 @@ class RawLinks:
                 never_wait(self._links[uri])
 
     def observe(self) -> tuple[PoseSample, ...]:
-        """What is known of each vehicle, after what has arrived."""
+        """The latest samples of each vehicle, after the packets that have arrived."""
         for member, link, block in zip(
             self._members, self._links.values(), self._blocks, strict=True
         ):

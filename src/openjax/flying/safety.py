@@ -118,7 +118,7 @@ def _transfer(state, event, drone, start) -> Drone:
 
 
 def lift_fault(state: State, drone: Drone) -> str:
-    """What speaks against a vehicle's poses in its test lift; empty while nothing does.
+    """The fault of a vehicle's poses in its test lift; empty if there is none.
 
     Each source must rise, stay above its stand, and not rise past where a fall still
     does no harm; both by the same.
@@ -223,12 +223,12 @@ def _react(state, drones, troubles) -> tuple[Drone, ...]:
 
 
 def _has_lifted(drone, time) -> bool:
-    """Whether a test lift is over; not before its rotors must have turned up."""
+    """True once a test lift is over; not before its rotors must have turned up."""
     is_near = abs(drone.estimate.position[2] - drone.anchor[2]) < RISEN
     return is_near and time - drone.since > 2.0 * SPIN_UP
 
 
 def resting_places_of(state: State) -> list[Vector]:
-    """Where the vehicles of a flight may wait or land (m)."""
+    """Places where the vehicles of a flight may wait or land (m)."""
     poses = [drone.estimate for drone in state.drones]
     return resting_places(state.settings, state.pillars, poses)

@@ -38,7 +38,7 @@ POSES = 5.0
 
 @dataclass(frozen=True)
 class SessionSettings:
-    """How vehicles are connected and watched."""
+    """Settings of how vehicles are connected and watched."""
 
     uris: tuple[str, ...]
     """Of the vehicles, in the order of the game: the pursuers first."""

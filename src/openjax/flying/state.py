@@ -1,6 +1,4 @@
-"""What is known and wanted of the vehicles of a flight: limits, modes, requests,
-samples of poses, and the state of all.
-"""
+"""The state of a flight's vehicles: limits, modes, requests, samples of poses."""
 
 import math
 from collections.abc import Sequence
@@ -100,7 +98,7 @@ class SafetySettings:
 
 
 class Mode(StrEnum):
-    """Who flies a vehicle, and what it does."""
+    """The control of a vehicle: by whom, and to what end."""
 
     GROUND = "ground"
     LIFT = "test lift"  # a hand's breadth, to see that poses rise as they should
@@ -119,7 +117,7 @@ FLYING = (Mode.LIFT, Mode.TRANSFER, Mode.READY, Mode.PURSUIT, Mode.HOLD, *LANDIN
 
 
 class Request(StrEnum):
-    """What the operator or the flight plan asks for."""
+    """A request of the operator or the flight plan."""
 
     NONE = ""
     TRANSFER = "transfer"
@@ -130,7 +128,7 @@ class Request(StrEnum):
 
 
 class PoseSample(NamedTuple):
-    """What is known of one vehicle at a tick, however old."""
+    """The latest sample of one vehicle at a tick, however old."""
 
     own: Pose | None
     """The newest estimate of the vehicle itself."""
@@ -219,16 +217,16 @@ class State(NamedTuple):
 
     @property
     def flying(self) -> bool:
-        """Whether any motor may be on."""
+        """True if any motor may be on."""
         return any(drone.mode in FLYING for drone in self.drones)
 
     @property
     def modes(self) -> tuple[Mode, ...]:
-        """Of all vehicles."""
+        """The modes of all vehicles."""
         return tuple(drone.mode for drone in self.drones)
 
     def all_in(self, *modes: Mode) -> bool:
-        """Whether every vehicle is in one of these modes."""
+        """True if every vehicle is in one of these modes."""
         return all(drone.mode in modes for drone in self.drones)
 
 

@@ -1,5 +1,5 @@
-"""How a vehicle is flown in each mode: by the policy within the limits, or by the
-controller. `openjax.flying.safety` decides the mode.
+"""The commands of a vehicle in each mode: by the policy within the limits, or by the controller.
+`openjax.flying.safety` decides the mode.
 """
 
 import math
@@ -72,7 +72,7 @@ def _watch(state, drone, sample) -> Drone:
 
 
 def _is_low(state, drone) -> bool:
-    """Whether a landing is near the floor, or long enough on the way."""
+    """True if a landing is near the floor, or long enough on the way."""
     overdue = state.time - drone.since > state.settings.landing_time
     return overdue or drone.estimate.position[2] < LOW
 

@@ -91,7 +91,7 @@ class Swarm:
         raise UserError(f"{member.uri}: no connection ({reason}); {question}, is the URI right?")
 
     def _answers(self, member, make, timeout) -> bool:
-        """Whether the vehicle has told all that `cflib` asks for."""
+        """True if the vehicle has sent all that `cflib` asks for."""
         answered_event = threading.Event()
         member.error = None
         member.crazyflie = crazyflie = make()
@@ -169,7 +169,7 @@ class Swarm:
         return tuple(m.blocks[0].id for m in self.members)
 
     def observe(self) -> tuple[PoseSample, ...]:
-        """What is known of each vehicle."""
+        """The latest samples of each vehicle."""
         return tuple(member.sample() for member in self.members)
 
     def send(self, set_points: Sequence[SetPoint]) -> float:

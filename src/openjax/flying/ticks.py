@@ -1,4 +1,4 @@
-"""When the loop's ticks are due, and how it waits for the poses of the next one."""
+"""The times of the loop's ticks, and the wait for the poses of the next one."""
 
 import itertools
 import math
@@ -24,8 +24,7 @@ GONE = 0.1
 
 
 class TickSchedule:
-    """When the ticks are due: every 10 ms, just after the moments at which poses are
-    measured.
+    """The times of the ticks: every 10 ms, just after the moments at which poses are measured.
 
     Those moments are regular, unlike arrivals: the vehicles send by clocks of their
     own, which drift a little.
@@ -83,7 +82,7 @@ def await_poses(vehicles: Links, due: float) -> None:
 
 
 def measured_times(samples) -> tuple[float, ...]:
-    """When each vehicle's newest pose was measured (s); minus infinity where there is
+    """The time at which each vehicle's newest pose was measured (s); minus infinity if there is
     none.
     """
     poses = (sample.captured or sample.own for sample in samples)

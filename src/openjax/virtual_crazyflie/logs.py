@@ -85,7 +85,7 @@ class LogBlocks:
         return 0
 
     def next(self) -> float:
-        """When the next log packet is due (s); infinite if no block runs."""
+        """The time at which the next log packet is due (s); infinite if no block runs."""
         return min((b.due for b in self._blocks.values() if b.period > 0), default=np.inf)
 
     def packets(self, firmware, time: float, sensors: Sensors) -> list[bytes]:

@@ -1,5 +1,5 @@
-"""What a virtual Crazyflie's firmware has names for: log variables and parameters, with
-their types and values.
+"""The names of a virtual Crazyflie's firmware: log variables and parameters, with their types and
+values.
 """
 
 import zlib
@@ -14,9 +14,7 @@ from openjax.flying.crtp import FULL_SCALE, compress_quaternion
 
 @dataclass(frozen=True)
 class Sensors:
-    """What the firmware knows of its vehicle; SI units, frames as everywhere in
-    openjax.
-    """
+    """The firmware's knowledge of its vehicle; SI units, frames as everywhere in openjax."""
 
     position: np.ndarray  # (3,) m
     velocity: np.ndarray  # (3,) m/s
