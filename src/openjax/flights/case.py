@@ -91,7 +91,7 @@ def read_folder(path: str | Path, dtype=jnp.float32) -> LogFolder:
 
 
 def _not_flown(vehicle_file: VehicleFile, logs_read) -> list[Issue]:
-    """What the vehicle file says of vehicles that are in none of the logs: an id with
+    """Issues about vehicles of the vehicle file that are in none of the logs: an id with
     another spelling, whose mass would go unnoticed.
     """
     vehicles = sorted({flight.vehicle for flights, _ in logs_read for flight in flights})

@@ -148,8 +148,8 @@ def case_on_gyroscope_clock(case: Case, delays: Mapping[str, float]) -> Case:
 
 
 def read_command_clock(tracks: Sequence[Track], row: float) -> str:
-    """What is wrong with the clock of commanded thrust against the motors, which follow
-    it after the link's delay; empty where nothing is.
+    """The fault of the clock of commanded thrust against the motors, which follow it after the
+    link's delay; empty if there is none.
     """
     both = [t for t in tracks if t.command is not None and t.motor is not None]
     pairs = ((t, t.motor.mean(1)[:, None], t.command[:, :1]) for t in both)

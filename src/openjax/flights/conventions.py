@@ -32,8 +32,8 @@ class Convention:
 
 
 def upright(signals: Signals) -> bool:
-    """Whether the body's z is up most of the time, as in a flight; what is compared in
-    a band of frequencies can't tell a world that stands on its head.
+    """True if the body's z is up most of the time, as in a flight; a comparison in a band of
+    frequencies can't detect a world that is upside down.
     """
     if signals.quaternion is None:
         return True

@@ -115,7 +115,7 @@ def find_header(lines: list[str], delimiter: str = "") -> Header:
 
 
 def _holds_names(line: str) -> bool:
-    """Whether a line is a comment or a header, and no row of numbers."""
+    """True if a line is a comment or a header, and no row of numbers."""
     return line.startswith(COMMENT) or bool(LETTER.search(NUMBERS.sub("", line)))
 
 
@@ -141,8 +141,8 @@ def _open(path: Path, stack: ExitStack) -> io.BufferedIOBase:
 
 
 def _is_plain(data: bytes) -> bool:
-    """Whether bytes are a table with a degree sign or an umlaut beside it, as Windows
-    saves them.
+    """True if bytes are a table with a degree sign or an umlaut beside it, as
+    Windows saves them.
     """
     text = data.translate(None, CONTROLS)
     odd = len(text) - len(text.translate(None, BEYOND_ASCII))

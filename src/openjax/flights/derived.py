@@ -1,4 +1,4 @@
-"""What a log leaves out: velocities from positions, body rates from attitudes."""
+"""Quantities that a log leaves out: velocities from positions, body rates from attitudes."""
 
 import dataclasses
 

@@ -114,22 +114,22 @@ class Flight:
 
     @property
     def has_pose(self) -> bool:
-        """Whether position and attitude are logged."""
+        """True if position and attitude are logged."""
         return self.position is not None and self.quaternion is not None
 
     @property
     def has_imu(self) -> bool:
-        """Whether gyroscope and accelerometer are logged."""
+        """True if gyroscope and accelerometer are logged."""
         return self.body_rates is not None and self.specific_force is not None
 
     @property
     def has_motors(self) -> bool:
-        """Whether motor commands are logged."""
+        """True if motor commands are logged."""
         return self.motor_command is not None
 
     @property
     def has_commands(self) -> bool:
-        """Whether commanded thrust and body rates are logged."""
+        """True if commanded thrust and body rates are logged."""
         return self.command_thrust is not None and self.command_body_rates is not None
 
     def sampled(self, channel: str) -> tuple[Float[Array, " samples"], Float[Array, "samples ..."]]:
@@ -230,7 +230,7 @@ class Case:
         return tuple(f for f in self.flights if f.log == flight.log and f.vehicle != flight.vehicle)
 
     def left_out(self) -> tuple[Issue, ...]:
-        """What refused a log or a vehicle of it."""
+        """The reason for which a log or a vehicle of it was refused."""
         return tuple(issue for issue in self.quality if issue.refused)
 
     def vehicle_of(self, flight: Flight):

@@ -34,7 +34,7 @@ ONE_CLOCK = 0.93  # below which they don't share a clock
 
 @dataclass(frozen=True)
 class Kinematics:
-    """What the sensors of a case say of each other."""
+    """Comparisons between the sensors of a case."""
 
     gain: float
     """Of the gyroscope, 1 where it isn't clearly another."""

@@ -9,7 +9,7 @@ PERIOD = 0.01  # s, rows and off-board commands
 
 @dataclass(frozen=True)
 class Reference:
-    """What N vehicles are to fly, T rows at the row period."""
+    """The reference that N vehicles are to fly, T rows at the row period."""
 
     position: np.ndarray  # (T, N, 3) m
     yaw: np.ndarray  # (T, N) rad

@@ -37,9 +37,7 @@ FOLLOWED = 0.7
 
 
 def agrees(signals: Signals, bad: list[Pair]) -> bool:
-    """Whether with other `signals` no pair disagrees, and the `bad` ones clearly
-    fit.
-    """
+    """True if with other `signals` no pair disagrees, and the `bad` ones clearly fit."""
     pairs = {pair.what: pair for pair in pairs_of(signals)}
     return all(pair.what in pairs and pairs[pair.what].fits for pair in bad) and not any(
         pair.bad.any() for pair in pairs.values()

@@ -48,7 +48,7 @@ def order_findings(signals: Signals, vehicle) -> list[Finding]:
 
 
 def torques_fit(signals: Signals, vehicle) -> bool:
-    """Whether roll and pitch clearly turn as the motors in their order say."""
+    """True if roll and pitch clearly turn as the motors in their order say."""
     torques = _torques(signals, vehicle)
     return bool(torques and torques[IDENTITY][:2].min() > 0.4)
 

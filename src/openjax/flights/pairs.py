@@ -85,7 +85,7 @@ class Signals:
 
     @cached_property
     def has_saturation(self) -> bool:
-        """Whether motors have often nothing left to follow commands with."""
+        """True if motors often have nothing left to follow commands with."""
         return self.motor is not None and float((self.motor > FULL).any(1).mean()) > 0.2
 
     @cached_property
@@ -136,9 +136,7 @@ class Pair:
 
     @property
     def fits(self) -> bool:
-        """Whether all columns that could contradict their reference clearly follow
-        it.
-        """
+        """True if all columns that could contradict their reference clearly follow it."""
         shares = self.agreement.correlation[self.tells] / self.agreement.expectation[self.tells]
         return bool(len(shares) and shares.min() > FITS)
 
@@ -298,9 +296,7 @@ def _without_air(s: Signals, pair: Pair) -> Pair:
 
 @dataclass(frozen=True)
 class Agreement:
-    """How well `signal` follows `reference`, axis by axis, in the band of the
-    comparison.
-    """
+    """The agreement of `signal` with `reference`, axis by axis, in the band of the comparison."""
 
     correlation: np.ndarray  # (C,) at the best clock offset of each window, pooled
     # (C,) what the white part of the measured signal leaves of a perfect one

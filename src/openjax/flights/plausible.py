@@ -1,5 +1,5 @@
-"""What each channel of a flying quadrotor must look like by itself, or beside its own
-sum: gravity, a path, an order in time.
+"""Conditions on each channel of a flying quadrotor by itself, or beside its own sum: gravity, a
+path, an order in time.
 """
 
 import itertools

@@ -1,5 +1,5 @@
-"""When a sensor was sampled: rows that hold no new sample of it, and clocks of its
-own.
+"""Times at which a sensor was sampled: rows that hold no new sample of it, and
+clocks of its own.
 """
 
 import dataclasses
@@ -19,9 +19,8 @@ EDGE = 0.03  # cycles of that clock by which its phase may be wrong
 
 
 def several_recordings(time: np.ndarray, in_order: np.ndarray | None = None) -> str:
-    """What is wrong with the order of times (T,), in s: nothing if few rows are out of
-    it, or if all are those of one recording, shuffled. `in_order`: the same sorted,
-    less rows that stand twice.
+    """The fault in the order of times (T,), in s: nothing if few rows are out of it, or if all are
+    those of one recording, shuffled. `in_order`: the same sorted, less rows that occur twice.
     """
     steps = np.diff(time)
     backwards = int((steps < 0).sum())
@@ -37,8 +36,8 @@ def several_recordings(time: np.ndarray, in_order: np.ndarray | None = None) -> 
 
 
 def _even(time: np.ndarray) -> bool:
-    """Whether times (T,), sorted, are those of one recording: two that were put
-    together leave steps of all lengths, or a gap between them.
+    """True if times (T,), sorted, are those of one recording: two that were put together leave
+    steps of all lengths, or a gap between them.
     """
     steps = np.diff(time)
     middle = float(np.median(steps))

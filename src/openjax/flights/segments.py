@@ -40,7 +40,7 @@ class Segment:
     """Of the battery, open circuit (V)."""
 
     def reference(self, seconds: float | None = None) -> Reference:
-        """What one vehicle is to fly, from the middle back to the middle."""
+        """The reference of one vehicle, from the middle back to the middle."""
         t = np.arange(0.0, seconds or self.seconds, PERIOD)
         ease = np.clip(np.minimum(t, t[-1] - t) / EASE, 0.0, 1.0)
         # a minimum-jerk step: velocity and acceleration begin and end at zero

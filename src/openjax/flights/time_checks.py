@@ -1,5 +1,5 @@
-"""What a log's times have to be: in seconds, in order, without rows that stand twice,
-and of a vehicle whose motors turn.
+"""Conditions on a log's times: in seconds, in order, without rows that occur twice, and of a
+vehicle whose motors turn.
 """
 
 import numpy as np

@@ -89,12 +89,12 @@ class Track:
 
     @property
     def hides_ticks(self) -> bool:
-        """Whether the rate loop ran several times within a row."""
+        """True if the rate loop ran several times within a row."""
         return self.dt > LOOP_ROWS
 
     @property
     def logs_attitude(self) -> bool:
-        """Whether there is an attitude that the gyroscope has no part in."""
+        """True if there is an attitude in which the gyroscope has no part."""
         return self.quaternion is not None and not self.attitude_derived
 
 

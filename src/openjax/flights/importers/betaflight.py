@@ -40,7 +40,7 @@ _FIELD = re.compile(r"(.*?)(?: \((.*)\))?")
 
 
 def is_blackbox_csv(path: Path) -> bool:
-    """Whether a CSV is a decoded blackbox."""
+    """True if a CSV is a decoded blackbox."""
     if not is_csv(path):
         return False
     lines = head_of(path)
@@ -49,15 +49,13 @@ def is_blackbox_csv(path: Path) -> bool:
 
 
 def is_beside(path: Path) -> bool:
-    """Whether a file is no log of its own, but what a decoder wrote beside one."""
+    """True if a file is no log of its own, but what a decoder wrote beside one."""
     ending = next((end for end in BESIDE if path.name.endswith(end)), None)
     return ending is not None and path.with_name(path.name.removesuffix(ending) + ".csv").exists()
 
 
 def _lines_above(lines: list[str]) -> int | None:
-    """How many lines stand above the columns' names; None where there are no such
-    names.
-    """
+    """The number of lines above the columns' names; None if there are no such names."""
     first = (line.lstrip(' "').startswith(FIRST) for line in lines)
     return next((number for number, is_first in enumerate(first) if is_first), None)
 
@@ -69,7 +67,7 @@ def _headers(lines: list[str]) -> dict[str, str]:
 
 
 def is_blackbox_binary(path: Path) -> bool:
-    """Whether a file is a blackbox that is still to be decoded."""
+    """True if a file is a blackbox that is still to be decoded."""
     if not path.is_file():
         return False
     if path.suffix.lower() in (".bbl", ".bfl"):

@@ -69,7 +69,7 @@ _STALE = 5.0  # periods after which a stream's last value counts as not sampled
 
 @dataclass(frozen=True)
 class Source:
-    """Where a column comes from: raw name, and value = scale * raw + offset in the log
+    """The source of a column: raw name, and value = scale * raw + offset in the log
     format's unit.
     """
 

@@ -33,7 +33,7 @@ SELDOM = 2000.0  # ms between rows: the slowest log block of the firmware has 25
 
 
 def is_block(path: Path) -> bool:
-    """Whether a CSV holds a time and log variables of the firmware."""
+    """True if a CSV holds a time and log variables of the firmware."""
     names = header_of(path)
     variables = VARIABLES.intersection(names)
     evident = {name.partition(".")[0] for name in variables} & set(GROUPS)
@@ -43,8 +43,8 @@ def is_block(path: Path) -> bool:
 
 
 def is_client_log(path: Path) -> bool:
-    """Whether a path is such a CSV, or a folder of one flight's log blocks; a note may
-    lie beside.
+    """True if a path is such a CSV, or a folder of one flight's log blocks; a note
+    may lie beside.
     """
     if path.is_dir():
         inside = _blocks(path)

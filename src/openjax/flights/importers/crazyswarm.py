@@ -40,8 +40,8 @@ LARGEST_YAML = 1 << 20  # bytes
 
 
 def custom_topics(bag: Path) -> list[dict]:
-    """What the yaml files beside a bag and in it say, those that name custom topics.
-    One that can't be read says nothing: a case's folder may hold any.
+    """The custom topics of the yaml files beside a bag and in it. One that can't be read says
+    nothing: a case's folder may hold any.
     """
     from ruamel.yaml import YAML
     from ruamel.yaml.error import YAMLError
@@ -123,5 +123,5 @@ def pose_streams(topic: str, messages) -> dict[str, Stream]:
 
 
 def pose_source(topic: str, name: str, column: str) -> str:
-    """How a column of a body's pose is called among a bag's sources."""
+    """The name of a column of a body's pose among a bag's sources."""
     return f"{topic}:{name}:{column}"

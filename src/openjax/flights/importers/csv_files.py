@@ -1,4 +1,4 @@
-"""What the importers of CSV layouts share."""
+"""Functions that the importers of CSV layouts share."""
 
 from pathlib import Path
 
@@ -16,7 +16,7 @@ USUAL_STEP = 0.01
 
 
 def is_csv(path: Path) -> bool:
-    """Whether a path is a CSV file by its name."""
+    """True if a path is a CSV file by its name."""
     return path.is_file() and path.name.lower().endswith((".csv", ".csv.gz"))
 
 
@@ -33,14 +33,12 @@ def header_of(path: Path, delimiter: str = "") -> list[str]:
 
 
 def is_log_format(names: list[str]) -> bool:
-    """Whether a header's names are the log format's own: its time, and something of a
-    flight.
-    """
+    """True if a header's names are the log format's own: its time, and something of a flight."""
     return "t" in names and bool(set(names) & set(LOG_COLUMNS) - {"t", "vehicle"})
 
 
 def delimiter_of(mapping: ColumnMapping | None) -> str:
-    """What separates a CSV's cells, where a `columns.toml` says so; else nothing."""
+    """The delimiter of a CSV's cells, if a `columns.toml` says so; else nothing."""
     return "" if mapping is None else mapping.delimiter
 
 
@@ -57,8 +55,8 @@ def raw_columns(
 
 
 def seconds_per_unit(time: Shaped[np.ndarray, " rows"]) -> float:
-    """By what a clock's readings (R,) are multiplied to be seconds: the unit, of s, ms,
-    us and ns, in which rows come nearest to a usual step.
+    """The seconds of one unit of a clock's readings (R,): of s, ms, us and ns the unit in which
+    rows come nearest to a usual step.
     """
     steps = np.diff(np.unique(time[np.isfinite(time)]))
     if not len(steps):

@@ -1,5 +1,5 @@
-"""What the log variables of the Crazyflie's firmware hold, wherever they were written
-down: on the card, by the client or cflib, or in a topic of Crazyswarm2.
+"""Log variables of the Crazyflie's firmware, wherever they were written down: on the card, by the
+client or cflib, or in a topic of Crazyswarm2.
 """
 
 from pathlib import Path

@@ -19,7 +19,7 @@ from openjax.flights.reading import LogError, LogTable
 
 @dataclass(frozen=True)
 class Importer:
-    """How logs of one format are read."""
+    """A reader of logs of one format."""
 
     name: str
     """Of the format, in words."""
@@ -57,8 +57,8 @@ def importer_of(path: Path) -> Importer | None:
 
 
 def check_table(name: str, table: Any) -> LogTable:
-    """What the importer of that name has read. Raises LogError where it is no table
-    whose columns all have a row for each vehicle's id.
+    """The table that the importer of that name has read. Raises LogError unless it is a table whose
+    columns all have a row for each vehicle's id.
     """
     if not isinstance(table, LogTable):
         raise LogError(

@@ -37,7 +37,7 @@ LONGEST_HEADER = 4096  # bytes: some hundred variables
 
 
 def is_micro_sd(path: Path) -> bool:
-    """Whether a file starts like a micro-SD log."""
+    """True if a file starts like a micro-SD log."""
     if not path.is_file() or path.suffix in (".csv", ".gz", ".toml", ".md", ".txt"):
         return False
     with path.open("rb") as file:

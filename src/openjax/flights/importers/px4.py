@@ -69,7 +69,7 @@ OUTPUTS = "actuator_outputs"
 
 
 def is_ulog(path: Path) -> bool:
-    """Whether a file starts like a ULog, or is called like one."""
+    """True if a file starts like a ULog, or is called like one."""
     if not path.is_file():
         return False
     if path.suffix.lower() == ".ulg":
@@ -232,7 +232,7 @@ def _fields(stream: Stream, names: list[str]) -> list[np.ndarray]:
 
 
 def _places(parameters) -> tuple[str, ...]:
-    """Where PX4's motors 1 to 4 sit. Raises LogError where that isn't four corners."""
+    """The places of PX4's motors 1 to 4. Raises LogError unless they are four corners."""
     count = int(parameters.get("CA_ROTOR_COUNT", 4))
     if count != 4:
         raise LogError(f"the airframe has {count} rotors (CA_ROTOR_COUNT); four are needed")

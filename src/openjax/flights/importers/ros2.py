@@ -73,14 +73,12 @@ _ARRAY_NAMES = {
 
 
 def is_bag(path: Path) -> bool:
-    """Whether a path is a bag: a folder, with its `metadata.yaml` or without, or a
-    single file.
-    """
+    """True if a path is a bag: a folder, with its `metadata.yaml` or without, or a single file."""
     return bool(_files_of(path))
 
 
 def _files_of(path: Path) -> list[Path]:
-    """What a bag's reader is to be given; nothing where a path is no bag."""
+    """The files for a bag's reader; nothing if a path is no bag."""
     if path.is_file():
         return [path] if _is_storage(path) else []
     if not path.is_dir() or (path / "metadata.yaml").is_file():
@@ -90,8 +88,8 @@ def _files_of(path: Path) -> list[Path]:
 
 
 def _is_storage(path: Path) -> bool:
-    """Whether a file holds messages of ROS, by its first bytes; an MCAP file of others
-    may lie beside flights, too.
+    """True if a file holds messages of ROS, by its first bytes; an MCAP file of others may lie
+    beside flights, too.
     """
     start = STORAGE.get(path.suffix)
     if start is None or not path.is_file():
@@ -135,9 +133,9 @@ def read_bag(path: str | Path, mapping: ColumnMapping | None = None) -> LogTable
 
 @dataclass(eq=False)
 class _Recording:
-    """What a bag holds of one vehicle: streams of topics, for each of them its rank and
-    the sources of columns that its type names, and streams of log variables on the
-    firmware's clock, which is `ahead` s behind the bag's.
+    """The content of a bag for one vehicle: streams of topics, for each of them its rank and the
+    sources of columns that its type names, and streams of log variables on the firmware's clock,
+    which is `ahead` s behind the bag's.
     """
 
     streams: list[Stream] = field(default_factory=list)
@@ -153,9 +151,8 @@ class _Recording:
         self.sources.append((rank, columns))
 
     def columns(self) -> tuple[dict[str, Source], list[str]]:
-        """Where each column comes from, and remarks. Log variables are on the vehicle's
-        own clock and go before topics, but for a pose that a topic has more than twice
-        as often.
+        """The source of each column, and remarks. Log variables are on the vehicle's own clock and
+        go before topics, but for a pose that a topic has more than twice as often.
         """
         by_name, remarks = firmware_columns(self.log_streams)
         both = zip(self.sources, self.streams, strict=True)

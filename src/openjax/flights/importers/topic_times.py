@@ -66,7 +66,7 @@ def topic_of(name: str, topics) -> str | None:
 
 
 def has_topic_times(path: Path) -> bool:
-    """Whether a CSV has several time stamps, and none for all."""
+    """True if a CSV has several time stamps, and none for all."""
     names = header_of(path)
     return len(stamps_of(names)) > 1 and not is_log_format(names)
 
