@@ -20,7 +20,7 @@ DOCS = Path(__file__).parent
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 COLOURS = 128  # of the palette: a picture of some 30 kB
 SECONDS = {"replay": 8, "report": 2}  # that the page runs before it is taken
-SIZES = {"replay": (1000, 620), "report": (1000, 940)}  # pixels
+SIZES = {"replay": (1000, 620), "report": (1200, 940)}  # pixels
 
 
 def take(page: Path, name: str, folder: Path) -> None:
