@@ -1,5 +1,5 @@
-"""The page of the effects is what their files say, that of the flying policies what is
-stored, and pages of results have one form that reads at a glance.
+"""The page of the effects is what their files say, and pages of results have one form that
+reads at a glance.
 """
 
 import ast
@@ -10,11 +10,9 @@ import re
 from importlib.util import find_spec
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from openjax.__main__ import COMMANDS
-from openjax.pursuit import SCENARIOS
 from openjax.vehicle.effects import EFFECTS
 
 ROOT = Path(__file__).parents[1]
@@ -133,24 +131,6 @@ def test_page_of_the_effects_is_made_from_their_files():
     for name, effect in EFFECTS.items():
         assert effect.formula, f"{name}: no formula"
         assert (DOCS / "pictures" / "effects" / f"{name}.png").exists()
-
-
-def test_policies_that_fly_are_as_stored():
-    """Mean of the six layouts, of each policy with each kind of vehicle."""
-    results = RESULTS / "vehicles.json"
-    policies = json.loads(results.read_text(encoding="utf-8"))["policies"]
-    page = (DOCS / "policies_that_fly.md").read_text(encoding="utf-8")
-
-    def mean(of_layouts, figure, digits):
-        return f"{np.mean([of_layouts[name][figure] for name in SCENARIOS]):.{digits}f}"
-
-    figures = {"capture_rate": 3, "crash_rate": 3, "over_speed_rate": 3}
-    for name, of_vehicles in policies.items():
-        cells = [
-            " / ".join(mean(of_vehicles[vehicle], *figure) for figure in figures.items())
-            for vehicle in ("nominal", "table", "family")
-        ]
-        assert f"| `{name}` | {' | '.join(cells)} |" in page, name
 
 
 def test_names_of_the_api_page_are_there():
